@@ -26,7 +26,7 @@ CASES = {
     "bursts": {
         "network.channel.loss": {"kind": "gilbert-elliott", "mean_loss": 0.3, "mean_burst": 3.0}
     },
-    "blind": {"sensors": []},
+    "unobserved": {"sensors": []},
     "two kinds of sensors": {"sensors": [ONE_ROW, TWO_ROWS]},
     "several stretches of a step": {"sensors": [PRECISE]},
     "wide": {"filter.cov": [[1e9, 0.0], [0.0, 1e9]]},
@@ -122,10 +122,10 @@ def test_tables_of_lanes_hold_transitions_and_gains(ring, case):
     A, n = np.array(case.plant.A), case.plant.n
     lower = n * (n + 1) // 2
     model = next(model for model in case.models if len(model.H))
-    places = {"blind": waiting.blind.place, "sensing": waiting.sensing.place}
+    places = {"unobserved": waiting.unobserved.place, "sensing": waiting.sensing.place}
     # Two axes that are alike have few columns of their own.
-    assert (len(set(places["sensing"])) < 30) == (len(set(places["blind"])) < 10)
-    for kind, longest in (("blind", 0.9), ("sensing", 0.19)):
+    assert (len(set(places["sensing"])) < 30) == (len(set(places["unobserved"])) < 10)
+    for kind, longest in (("unobserved", 0.9), ("sensing", 0.19)):
         table = getattr(waiting, kind)
         out = np.empty((1, table.series.shape[3]))
         for gap in longest * np.random.default_rng(1).random(30):

@@ -28,14 +28,14 @@ from netkf.engines.compiled.event_loop import (
     TRANSMIT,
     WANT_REBASE,
     WANT_SHOWN,
+    count_sample,
+    find_shortage,
     next_event,
     next_of,
     next_tick,
-    note,
-    note_age,
-    note_sample,
     on_sense,
-    wanted_first,
+    record_event,
+    record_event_with_age,
 )
 from netkf.engines.compiled.message_queue import sort_places
 from netkf.engines.compiled.schedule import delay_is_zero
@@ -44,10 +44,10 @@ from netkf.engines.compiled.state import LINKS, NODES, Simulation
 from netkf.engines.compiled.visits import (
     MOST_VISITS,
     Visits,
-    add_visit,
-    make_visits,
-    show_later,
-    visit_one,
+    append_visit,
+    process_visits,
+    queue_sample,
+    queue_visit,
 )
 from netkf.linalg.arrays import IntArray
 from netkf.linalg.compiling import kernel
@@ -79,8 +79,8 @@ PROGRESS = np.dtype([(name, np.int64) for name in _POSITIONS])
 
 
 def is_immediate(scenario: Scenario) -> bool:
-    """Return True if a scenario's runs can be simulated so: convex combinations of messages that
-    take no time, by Poisson clocks, and no samples.
+    """Return True if lanes can simulate a scenario: convex combinations of messages without delay,
+    Poisson clocks, and no samples.
     """
     hosted, network = scenario.hosted, scenario.network
     return (
@@ -100,7 +100,9 @@ def together(nodes: int, runs: int) -> int:
 
 
 def pause_of(state: Simulation, ticks: int, count: int) -> float:
-    """Return after how many seconds ``count`` runs of so many ``ticks`` make their visits."""
+    """Return the seconds of simulated time after which ``count`` runs, of so many ``ticks`` each,
+    process their visits.
+    """
     nodes = len(state.nodes)
     each = ticks + len(state.path.grid) * len(state.sensing.host) + nodes * len(state.probes)
     # Some visits less than there is space for.
@@ -138,14 +140,14 @@ def simulate_agenda(
     visits = struct_at(visits_memory, Visits)
     if len(progress) == 0:
         if state.tick_at == 0:
-            fill_heard(state, 0, state.ticks_stop, 0)
-        wanted = follow(state, visits, NEVER)
-        make_visits(state, visits)
+            find_heard(state, 0, state.ticks_stop, 0)
+        wanted = run_agenda(state, visits, NEVER)
+        process_visits(state, visits)
         return wanted
     batch = struct_at(batch_memory, BatchArrays)
     runs = len(batch.lengths)
     for run in range(0 if batch.heard else runs):
-        fill_heard(state, batch.first[run], batch.first[run + 1], batch.first_delay[run])
+        find_heard(state, batch.first[run], batch.first[run + 1], batch.first_delay[run])
     for first in range(0, runs, len(progress)):
         simulate_group(
             state, visits, batch, progress[: min(len(progress), runs - first)], first, pause
@@ -162,7 +164,7 @@ def simulate_group(
     first: int,
     pause: float,
 ) -> None:
-    """Simulate the runs from ``first`` on that there is progress for."""
+    """Simulate the runs from ``first`` on, one for each entry of ``progress``."""
     state.first_run = first
     for k in range(len(progress)):
         reset_filters(state, batch, k * len(state.nodes))
@@ -173,9 +175,9 @@ def simulate_group(
         going = False
         for k in range(len(progress)):
             resume(state, batch, progress, k)
-            going = follow(state, visits, until) != DONE or going
+            going = run_agenda(state, visits, until) != DONE or going
             suspend(state, batch, progress, k)
-        make_visits(state, visits)
+        process_visits(state, visits)
         until += pause
     for k in range(len(progress)):
         resume(state, batch, progress, k)
@@ -184,7 +186,7 @@ def simulate_group(
 
 @kernel
 def suspend(state: Simulation, batch: BatchArrays, progress: np.ndarray, k: int) -> None:
-    """Keep where a run stands."""
+    """Store the position of a run, entry ``k`` of ``progress``."""
     mine = progress[k]
     mine.tick_at, mine.ticks_stop, mine.delays = state.tick_at, state.ticks_stop, state.delays
     mine.piece, mine.grid_at, mine.wake_at = state.piece, state.grid_at, state.wake_at
@@ -195,7 +197,7 @@ def suspend(state: Simulation, batch: BatchArrays, progress: np.ndarray, k: int)
 
 @kernel
 def resume(state: Simulation, batch: BatchArrays, progress: np.ndarray, k: int) -> None:
-    """Go on with a run."""
+    """Restore the position of a run."""
     mine = progress[k]
     state.tick_at, state.ticks_stop, state.delays = mine.tick_at, mine.ticks_stop, mine.delays
     state.piece, state.grid_at, state.wake_at = mine.piece, mine.grid_at, mine.wake_at
@@ -206,25 +208,27 @@ def resume(state: Simulation, batch: BatchArrays, progress: np.ndarray, k: int) 
 
 
 @kernel
-def follow(state: Simulation, visits: Visits, until: float) -> int:
-    """Follow the agenda of a run up to a time; makes visits where there are too many."""
+def run_agenda(state: Simulation, visits: Visits, until: float) -> int:
+    """Queue the visits of a run up to a time, and process them whenever the queue is full; returns
+    why it stopped (WANT_..., DONE or PAUSE).
+    """
     wanted = FULL
     # A batch has space for all of its samples: it stops behind the last one only.
     while wanted == FULL or (wanted == WANT_SHOWN and until < NEVER):
         wanted = agenda(state, visits, until)
         if wanted == FULL:
-            make_visits(state, visits)
+            process_visits(state, visits)
     return wanted
 
 
 @kernel
 def agenda(state: Simulation, visits: Visits, until: float) -> int:
-    """Go through the events of a run before a time and leave visits; returns why it stops."""
+    """Go through the events of a run before ``until`` and queue visits; returns why it stopped."""
     nodes = len(state.nodes)
     first, most = (state.run - state.first_run) * nodes, nodes + 2 + state.most_messages
     while True:
         event, now = next_event(state)
-        wanted = wanted_first(state, None, event, now)
+        wanted = find_shortage(state, None, event, now)
         if wanted != GO_ON:
             return wanted
         if now >= until:
@@ -234,23 +238,25 @@ def agenda(state: Simulation, visits: Visits, until: float) -> int:
         while state.path.stop[state.piece] < now:
             state.piece += 1
         if event == ON_TICK:
-            on_ticks_at_once(state, visits, first, min(until, next_but_ticks(state)))
+            queue_ticks(state, visits, first, min(until, next_but_ticks(state)))
         elif event == ON_SENSE:
-            visit_one(state, visits, now, first + state.sensing.host[state.wake_at])
+            queue_visit(state, visits, now, first + state.sensing.host[state.wake_at])
             on_sense(state, now)
         else:
             for h in range(nodes):
-                visit_one(state, visits, now, first + h)
+                queue_visit(state, visits, now, first + h)
             if event != ON_PROBE:
                 return WANT_REBASE
-            show_later(state, visits, first)
-            if not note_sample(state):
+            queue_sample(state, visits, first)
+            if not count_sample(state):
                 return WANT_SHOWN
 
 
 @kernel
 def next_but_ticks(state: Simulation) -> float:
-    """Time of the next event that is no tick, or of the end of a piece of the path or a window."""
+    """Return the time of the next event that is not a tick, or the end of the piece of the path or
+    of the window of ticks, whichever comes first.
+    """
     path, ticks = state.path, state.ticks
     event = min(next_of(state.frames, state.frame_at), next_of(path.grid, state.grid_at))
     event = min(event, next_of(state.probes, state.probe_at))
@@ -258,38 +264,42 @@ def next_but_ticks(state: Simulation) -> float:
 
 
 @kernel
-def on_ticks_at_once(state: Simulation, visits: Visits, first: int, until: float) -> None:
-    """All ticks before ``until``, one at least, as long as there is space for what they leave."""
+def queue_ticks(state: Simulation, visits: Visits, first: int, until: float) -> None:
+    """Queue the visits of at least one tick, and of all ticks before ``until`` for which there is
+    space.
+    """
     ticks, space = state.ticks, len(visits.records) - 2 - state.most_messages
-    on_tick_at_once(state, visits, first, ticks.t[state.tick_at])
+    queue_tick(state, visits, first, ticks.t[state.tick_at])
     # Rows of a trace may need more space: they are looked at one tick at a time.
     while not state.traced and next_tick(state) < until and visits.count < space:
-        on_tick_at_once(state, visits, first, ticks.t[state.tick_at])
+        queue_tick(state, visits, first, ticks.t[state.tick_at])
 
 
 @kernel
-def on_tick_at_once(state: Simulation, visits: Visits, first: int, now: float) -> None:
-    """A clock ticks, and what is sent arrives and is absorbed."""
+def queue_tick(state: Simulation, visits: Visits, first: int, now: float) -> None:
+    """Queue the visits of the next tick, with all that is sent and absorbed at its time."""
     ticks, nodes, k = state.ticks, state.nodes, state.tick_at
     entity, heard = state.entities[ticks.entity[k]], ticks.heard[k]
     state.tick_at += 1
     if state.traced:
-        note_tick(state, entity.sender, entity.other, entity.first, entity.after, heard, now)
+        record_tick(state, entity.sender, entity.other, entity.first, entity.after, heard, now)
     else:
         count_tick(state, entity.after - entity.first, heard)
     if heard != 0:
-        add_pairs(state, visits, k, first, now)
+        queue_pairs(state, visits, k, first, now)
         return
     # The sender of a message that is lost needs no prediction, unless it reads increments.
     if nodes[entity.sender].sensors > nodes[entity.sender].sensor:
-        visit_one(state, visits, now, first + entity.sender)
+        queue_visit(state, visits, now, first + entity.sender)
     if state.at == LINKS and nodes[entity.other].sensors > nodes[entity.other].sensor:
-        visit_one(state, visits, now, first + entity.other)
+        queue_visit(state, visits, now, first + entity.other)
 
 
 @kernel
 def count_tick(state: Simulation, sent: int, heard: int) -> None:
-    """Count what ``note_tick`` notes."""
+    """Count the events that ``record_tick`` records: ``sent`` messages, of which those in the bits
+    of ``heard`` arrive.
+    """
     arrived = 0
     while heard != 0:
         arrived, heard = arrived + 1, heard & (heard - 1)
@@ -303,38 +313,38 @@ def count_tick(state: Simulation, sent: int, heard: int) -> None:
 
 
 @kernel
-def note_tick(
+def record_tick(
     state: Simulation, i: int, j: int, begin: int, after: int, heard: int, now: float
 ) -> None:
-    """Note a tick of node i (and j), its messages on the links ``hearing`` from ``begin`` up to
-    ``after``, of which some are ``heard``, and who absorbs them.
+    """Record a tick of node i (and j), its messages on the directed links ``hearing[begin:after]``,
+    which arrive where ``heard`` has a bit, and their absorption.
     """
     nodes, receivers = state.nodes, 0
-    note(state, now, TICK, nodes[i].id, nodes[j].id if j >= 0 else -1, -1)
+    record_event(state, now, TICK, nodes[i].id, nodes[j].id if j >= 0 else -1, -1)
     # A node's clock makes one transmission, which each receiver hears or loses.
     if state.at >= NODES:
-        note(state, now, TRANSMIT, nodes[i].id, -1, nodes[i].sent)
+        record_event(state, now, TRANSMIT, nodes[i].id, -1, nodes[i].sent)
         nodes[i].sent += 1
     for m in range(begin, after):
         way = state.ways[state.hearing[m]]
         number, one, other = way.messages, nodes[way.sender].id, nodes[way.receiver].id
         way.messages += 1
-        note(state, now, SEND, one, other, number)
+        record_event(state, now, SEND, one, other, number)
         if (heard >> (m - begin)) & 1:
-            note_age(state, now, DELIVER, other, one, number, 0.0)
+            record_event_with_age(state, now, DELIVER, other, one, number, 0.0)
             state.waiting[receivers] = way.receiver
             receivers += 1
         else:
-            note(state, now, LOST, one, other, number)
+            record_event(state, now, LOST, one, other, number)
     sort_places(state.waiting, receivers)
     for m in range(receivers):
-        note_age(state, now, ABSORB, nodes[state.waiting[m]].id, -1, -1, 0.0)
+        record_event_with_age(state, now, ABSORB, nodes[state.waiting[m]].id, -1, -1, 0.0)
 
 
 @kernel
-def add_pairs(state: Simulation, visits: Visits, k: int, first: int, now: float) -> None:
-    """Add the visits of a tick of which something is heard: of both ends of a link together, and
-    else of the sender with each that hears it.
+def queue_pairs(state: Simulation, visits: Visits, k: int, first: int, now: float) -> None:
+    """Queue the visits of tick ``k``, of which something is heard: both ends of a link together,
+    otherwise the sender with each receiver.
     """
     heard, ways, hearing = state.ticks.heard[k], state.ways, state.hearing
     entity = state.entities[state.ticks.entity[k]]
@@ -344,10 +354,10 @@ def add_pairs(state: Simulation, visits: Visits, k: int, first: int, now: float)
         other = first + entity.other
         level = max(visits.level[sender], visits.level[other]) + 1
         visits.level[sender] = visits.level[other] = level
-        v = add_visit(state, visits, level, now, sender, other)
+        v = append_visit(state, visits, level, now, sender, other)
         for m in range(entity.after - begin):
             if (heard >> m) & 1:
-                hear(
+                set_heard_link(
                     visits,
                     v,
                     ways[hearing[begin + m]].receiver + first == sender,
@@ -364,13 +374,13 @@ def add_pairs(state: Simulation, visits: Visits, k: int, first: int, now: float)
         if (heard >> m) & 1:
             receiver = first + ways[hearing[begin + m]].receiver
             visits.level[receiver] = level
-            v = add_visit(state, visits, level, now, sender, receiver)
-            hear(visits, v, False, hearing[begin + m])
+            v = append_visit(state, visits, level, now, sender, receiver)
+            set_heard_link(visits, v, False, hearing[begin + m])
 
 
 @kernel
-def hear(visits: Visits, v: int, first: bool, way: int) -> None:
-    """The ``first`` node of a visit, or the second, hears the other on a directed link."""
+def set_heard_link(visits: Visits, v: int, first: bool, way: int) -> None:
+    """Let the ``first`` node of visit ``v``, or the second, hear the other over a directed link."""
     if first:
         visits.records[v].to_first = way
     else:
@@ -378,9 +388,9 @@ def hear(visits: Visits, v: int, first: bool, way: int) -> None:
 
 
 @kernel
-def fill_heard(state: Simulation, first: int, after: int, delays: int) -> None:
-    """Find out which messages of the ticks from ``first`` up to ``after`` arrive; their outcomes
-    are those from ``delays`` on.
+def find_heard(state: Simulation, first: int, after: int, delays: int) -> None:
+    """Write as bits which messages of the ticks ``first`` .. ``after`` - 1 arrive; their outcomes
+    begin at ``delays``.
     """
     ticks, entities = state.ticks, state.entities
     for k in range(first, after):

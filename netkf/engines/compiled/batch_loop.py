@@ -57,13 +57,15 @@ def simulate_batch(state: Simulation, batch: BatchArrays) -> None:
 
 
 def run_alone(state: Simulation) -> int:
-    """``event_loop`` for one run, by the kernel that batches use: it is compiled only once."""
+    """Run ``event_loop`` for one run through the kernel of batches, which is then compiled only
+    once.
+    """
     return int(simulate_runs(state, no_batch().memory, ALONE, True))
 
 
 @cache
 def no_batch() -> BatchArrays:
-    """A batch without runs."""
+    """Return a batch without runs."""
     none = np.zeros(0, dtype=np.int64)
     return BatchArrays(
         nodes=np.zeros(0, dtype=NODE),
@@ -112,7 +114,7 @@ def simulate_from(state: Simulation, batch: BatchArrays, run: int, begun: bool) 
 
 @kernel
 def begin(state: Simulation, batch: BatchArrays, run: int) -> None:
-    """Put the Simulation to time 0 of a run."""
+    """Set the Simulation to time 0 of a run."""
     state.run, place = run, run - state.first_run
     # Positions in the arrays of draws: the run begins at the first frame, piece, tick and sample.
     state.frame_at = state.piece = state.grid_at = state.wake_at = state.instant_at = 0
@@ -127,7 +129,7 @@ def begin(state: Simulation, batch: BatchArrays, run: int) -> None:
 
 @kernel
 def reset_filters(state: Simulation, batch: BatchArrays, first: int) -> None:
-    """Estimates and covariances at time 0, from place ``first`` on."""
+    """Reset estimates and covariances to time 0, from place ``first`` on."""
     n = batch.xhat.shape[1]
     for h in range(len(batch.nodes)):
         state.nodes[h] = batch.nodes[h]
@@ -141,7 +143,7 @@ def reset_filters(state: Simulation, batch: BatchArrays, first: int) -> None:
 
 @kernel
 def reset_messages(state: Simulation) -> None:
-    """No message is on its way; all of the pool is free."""
+    """Empty the network: no message is under way, all of the pool is free."""
     for w in range(len(state.ways)):
         state.ways[w].messages = 0
     # Chain the whole pool into the list of free messages.
@@ -154,15 +156,15 @@ def reset_messages(state: Simulation) -> None:
 
 @kernel
 def finish(state: Simulation, batch: BatchArrays, run: int) -> None:
-    """Find out how a run ended: at its first sample that is not finite, if there is one. What
-    happened after it did not happen.
+    """Record how a run ended: at its first sample that is not finite, if there is one, without what
+    happened later.
     """
     shown = state.shown
     for kind in range(batch.counts.shape[1]):
         batch.counts[run, kind] = state.counts[kind]
     for k in range(state.samples):
         batch.lengths[run] = k + 1
-        broken = broken_filters(state, run, k)
+        broken = count_broken_filters(state, run, k)
         if broken > 0:
             # The counts are those at the broken sample, not those at the end.
             for kind in range(batch.counts.shape[1]):
@@ -174,8 +176,8 @@ def finish(state: Simulation, batch: BatchArrays, run: int) -> None:
 
 
 @kernel
-def broken_filters(state: Simulation, run: int, k: int) -> int:
-    """Return how many filters are not finite in sample ``k`` of a run."""
+def count_broken_filters(state: Simulation, run: int, k: int) -> int:
+    """Return the number of filters that are not finite in sample ``k`` of a run."""
     xhat, P, n, broken = state.shown.xhat, state.shown.P, len(state.size), 0
     for h in range(len(state.nodes)):
         # Finiteness is enough, because P = S S' cannot be indefinite; 0 times a number that is not

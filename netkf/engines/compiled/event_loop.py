@@ -87,7 +87,7 @@ def event_loop(
         # Nothing changes before the loop knows that the event has all that it needs: it may stop
         # here and find the same event again.
         event, now = next_event(state)
-        wanted = wanted_first(state, history, event, now)
+        wanted = find_shortage(state, history, event, now)
         if wanted != GO_ON:
             return wanted
         # The piece of the path that the event lies in; events come in the order of time.
@@ -119,8 +119,8 @@ def event_loop(
 
 
 @kernel
-def wanted_first(state: Simulation, history: History | None, event: int, now: float) -> int:
-    """Return what an event needs before it can happen (WANT_..., DONE), or GO_ON."""
+def find_shortage(state: Simulation, history: History | None, event: int, now: float) -> int:
+    """Return what Python has to provide before an event can happen (WANT_..., DONE), or GO_ON."""
     # Worst cases of one event, so that no handler has to stop half-way.
     wanted = GO_ON
     if state.traced and state.row + state.most_rows > len(state.rows):
@@ -171,13 +171,13 @@ def next_event(state: Simulation) -> tuple[int, float]:
 
 @kernel
 def next_tick(state: Simulation) -> float:
-    """Time of the next tick of the run, or never."""
+    """Return the time of the next tick of the run, or NEVER."""
     return float(state.ticks.t[state.tick_at]) if state.tick_at < state.ticks_stop else NEVER
 
 
 @kernel
 def next_of(times: FloatArray, k: int) -> float:
-    """``times[k]``, or never."""
+    """Return ``times[k]``, or NEVER behind the last."""
     return float(times[k]) if k < len(times) else NEVER
 
 
@@ -185,7 +185,7 @@ def next_of(times: FloatArray, k: int) -> float:
 def predict_participants(
     state: Simulation, extras: Extras | None, event: int, lost: bool, now: float
 ) -> None:
-    """Predict the nodes that take part in an event; ``lost``: all messages of the tick are."""
+    """Predict the nodes that take part in an event; ``lost``: all messages of the tick are lost."""
     for k in range(count_participants(state, event)):
         h = participant(state, event, k)
         # The sender of a message that is lost needs no prediction, unless it reads increments.
@@ -195,7 +195,7 @@ def predict_participants(
 
 @kernel
 def count_participants(state: Simulation, event: int) -> int:
-    """Number of nodes that must be at the time of the event before it happens."""
+    """Return the number of nodes that are predicted to the time of an event before it happens."""
     count = 1
     # Samples and moves of the origin concern the states of all nodes at one time.
     if event in (ON_REBASE, ON_PROBE):
@@ -210,7 +210,7 @@ def count_participants(state: Simulation, event: int) -> int:
 
 @kernel
 def participant(state: Simulation, event: int, k: int) -> int:
-    """Return the index of the k-th of those nodes."""
+    """Return the index of the k-th participant of an event."""
     # Ends of a link are predicted one after the other; only then the tick happens.
     if event == ON_TICK:
         entity = state.entities[state.ticks.entity[state.tick_at]]
@@ -243,16 +243,18 @@ def readings_at_once(state: Simulation, event: int) -> int:
 
 
 @kernel
-def note(state: Simulation, t: float, kind: int, node: int, peer: int, message: int) -> None:
+def record_event(
+    state: Simulation, t: float, kind: int, node: int, peer: int, message: int
+) -> None:
     """Record an event without an age."""
-    note_age(state, t, kind, node, peer, message, np.nan)
+    record_event_with_age(state, t, kind, node, peer, message, np.nan)
 
 
 @kernel
-def note_age(
+def record_event_with_age(
     state: Simulation, t: float, kind: int, node: int, peer: int, message: int, age: float
 ) -> None:
-    """Write one row of the trace, or only count it."""
+    """Write one row of the trace, or count the event in a batch."""
     if not state.traced:
         # A batch keeps counts only: no row is written.
         state.counts[kind] += 1
@@ -272,7 +274,7 @@ def predict(state: Simulation, extras: Extras | None, h: int, time: float) -> No
     if not now < time:
         return
     state.now[h] = time
-    # With increment sensors the gap is cut into stretches.
+    # With increment sensors the gap is cut into intervals.
     if extras is not None and extras.kind == GAINS and node.sensors > node.sensor:
         predict_with_gain(state, extras, h, now, time)
     elif node.sensors > node.sensor:
@@ -289,9 +291,9 @@ def predict(state: Simulation, extras: Extras | None, h: int, time: float) -> No
 
 @kernel
 def on_sense(state: Simulation, now: float) -> None:
-    """A node has used its increments up to a point of the sensing grid."""
+    """Record that a node has used its increments up to a point of the sensing grid."""
     sensing = state.sensing
-    note(state, now, SENSE, sensing.node[state.wake_at], -1, -1)
+    record_event(state, now, SENSE, sensing.node[state.wake_at], -1, -1)
     state.wake_at += 1
     # One point of the grid wakes all nodes that sense increments, one event for each.
     if state.wake_at == len(sensing.host):
@@ -307,13 +309,13 @@ def on_sample(
     extras: Extras | None,
     now: float,
 ) -> None:
-    """A node uses all its samples of an instant."""
+    """Update a node with all its samples of an instant."""
     given, instant = state.instants, state.instant_at
     h, sensed = given.host[instant], -1
     for s in range(given.first[instant], given.first[instant + 1]):
         if given.node[s] != sensed:  # of a pooled filter several nodes, in order
             sensed = given.node[s]
-            note(state, now, SENSE, sensed, -1, -1)
+            record_event(state, now, SENSE, sensed, -1, -1)
     # Running sums weigh the reading, and late readings keep it in the past.
     if totals is not None:
         add_reading(state, totals, h, instant)
@@ -332,21 +334,21 @@ def on_sample(
 
 @kernel
 def on_tick(state: Simulation, totals: Totals | None, extras: Extras | None, now: float) -> None:
-    """A clock ticks, or a node has used a sample: who transmits sends to each receiver."""
+    """Handle a tick of a clock, or a transmission after a sample: send to each receiver."""
     ticks, nodes, k = state.ticks, state.nodes, state.tick_at
     # The record lists directed links, so that one tick may send on several.
     entity = state.entities[ticks.entity[k]]
     i, j = entity.sender, entity.other
     # A transmission after a sample has no tick of its own.
     if state.at != AFTER_READINGS:
-        note(state, now, TICK, nodes[i].id, nodes[j].id if j >= 0 else -1, -1)
+        record_event(state, now, TICK, nodes[i].id, nodes[j].id if j >= 0 else -1, -1)
     state.tick_at += 1
     # A node whose masses nobody hears does not transmit.
     if totals is not None and not offer_round(state, totals, i, now):
         return
     # A node's clock makes one transmission, which each receiver hears or loses.
     if state.at >= NODES:
-        note(state, now, TRANSMIT, nodes[i].id, -1, nodes[i].sent)
+        record_event(state, now, TRANSMIT, nodes[i].id, -1, nodes[i].sent)
         nodes[i].sent += 1
     # Outcomes of a tick lie one after the other in the order of its directed links.
     first = state.delays + ticks.at[k] - entity.first
@@ -369,10 +371,10 @@ def send(
     # The number is taken even if the message is lost: recorded losses name messages by it.
     way.messages += 1
     one, other = state.nodes[h].id, state.nodes[way.receiver].id
-    note(state, now, SEND, one, other, number)
+    record_event(state, now, SEND, one, other, number)
     # ``not >=`` catches both LOST, which is negative, and nan.
     if not delay >= 0.0:
-        note(state, now, LOST, one, other, number)
+        record_event(state, now, LOST, one, other, number)
         return
     # The horizon is half open: a message that arrives after it leaves no event.
     if delay > 0.0 and not now + delay < state.horizon:
@@ -418,7 +420,7 @@ def is_lost(state: Simulation) -> bool:
 
 @kernel
 def ends_instant(state: Simulation, now: float) -> bool:
-    """Return True if mail is absorbed before any other tick or delivery."""
+    """Return True if messages of this instant are absorbed before any other tick or delivery."""
     flying = state.flying > 0 and state.pool[state.heap[0]].arrival <= now
     return not flying and next_tick(state) > now
 
@@ -431,7 +433,7 @@ def absorb_messages(
     extras: Extras | None,
     now: float,
 ) -> None:
-    """Let all receivers absorb their mail."""
+    """Let all receivers of this instant absorb their messages."""
     sort_places(state.waiting, state.receivers)
     while state.receivers > 0:
         predict(state, extras, state.waiting[state.absorbing], now)
@@ -440,7 +442,7 @@ def absorb_messages(
 
 @kernel
 def on_deliver(state: Simulation, now: float) -> None:
-    """The next message arrives."""
+    """Deliver the message that arrives next."""
     m = pop(state.pool, state.heap, state.flying)
     state.flying -= 1
     arrive(state, m, now)
@@ -448,17 +450,17 @@ def on_deliver(state: Simulation, now: float) -> None:
 
 @kernel
 def arrive(state: Simulation, m: int, now: float) -> None:
-    """Put a message into the inbox of its receiver, unless it is too late."""
+    """Put a message into the inbox of its receiver, unless it is too old."""
     message = state.pool[m]
     way = state.ways[message.way]
     one, other = state.nodes[way.sender].id, state.nodes[way.receiver].id
     age = now - message.sent
     # ``not <=`` also rejects an age that is nan.
     if not age <= state.age_limit:
-        note_age(state, now, LATE, other, one, message.number, age)
+        record_event_with_age(state, now, LATE, other, one, message.number, age)
         release(state, m)
         return
-    note_age(state, now, DELIVER, other, one, message.number, age)
+    record_event_with_age(state, now, DELIVER, other, one, message.number, age)
     # The first message of the instant puts its receiver on the list of those that absorb.
     if state.nodes[way.receiver].inbox == -1:
         state.waiting[state.receivers] = way.receiver
@@ -475,7 +477,7 @@ def on_absorb(
     extras: Extras | None,
     now: float,
 ) -> None:
-    """A node uses all that arrived at this instant, in the order of senders."""
+    """Let a node absorb all messages of this instant, in the order of senders."""
     pool, h = state.pool, state.waiting[state.absorbing]
     node, oldest = state.nodes[h], 0.0
     # The age of the oldest message goes into the trace.
@@ -497,7 +499,7 @@ def on_absorb(
         release(state, m)
         m = following
     node.inbox = -1
-    note_age(state, now, ABSORB, node.id, -1, -1, oldest)
+    record_event_with_age(state, now, ABSORB, node.id, -1, -1, oldest)
     state.absorbing += 1
     # All mail of this instant is absorbed.
     if state.absorbing == state.receivers:
@@ -506,7 +508,7 @@ def on_absorb(
 
 @kernel
 def use_messages(state: Simulation, history: History, h: int, now: float) -> None:
-    """Readings of other nodes."""
+    """Use the readings of other nodes in the inbox of node ``h``."""
     m = state.nodes[h].inbox
     while m != -1:
         message = state.pool[m]
@@ -523,7 +525,7 @@ def combine_by_extras(state: Simulation, extras: Extras, h: int, now: float) -> 
     """Use what node ``h`` heard by the rule of a combination that needs extras."""
     if extras.kind == PREDICTIONS:
         use_readings_heard(state, h, now)
-    heard = bring_to_now(state, h, now)
+    heard = predict_payloads(state, h, now)
     if extras.kind == PREDICTIONS:
         add_consensus(state, extras, h)
     elif extras.kind == GAINS:
@@ -535,9 +537,9 @@ def combine_by_extras(state: Simulation, extras: Extras, h: int, now: float) -> 
 
 
 @kernel
-def bring_to_now(state: Simulation, h: int, now: float) -> float:
-    """Predict the estimates that node ``h`` heard to now without readings, where they took time;
-    return the sum of their weights.
+def predict_payloads(state: Simulation, h: int, now: float) -> float:
+    """Predict the estimates in the inbox of node ``h`` to now, without readings, where they were
+    delayed; returns the sum of their weights.
     """
     # The last model of the table has no sensors: prediction alone, as readings since then are
     # unknown here.
@@ -555,8 +557,8 @@ def bring_to_now(state: Simulation, h: int, now: float) -> float:
 
 @kernel
 def combine(state: Simulation, h: int, now: float) -> None:
-    """Estimates of other nodes, predicted to now."""
-    heard = bring_to_now(state, h, now)
+    """Combine node ``h`` with the estimates in its inbox, predicted to now."""
+    heard = predict_payloads(state, h, now)
     if state.kind == CONVEX:
         # Lost weight goes to the node itself, so that weights sum to 1.
         combine_convex(state, h, max(0.0, 1.0 - heard))
@@ -578,7 +580,9 @@ def combine(state: Simulation, h: int, now: float) -> None:
 
 @kernel
 def combine_convex(state: Simulation, h: int, own: float) -> None:
-    """H (7) and (9): what others sent is a copy, so that sums may grow in their place."""
+    """Combine by H (7) and (9): x = w x + sum w_j x_j and P = w P + sum w_j P_j, one message after
+    the other.
+    """
     # w_i P_i first, then + w_j P_j for each message.
     xhat, root, pool, ways = state.xhat, state.root, state.pool, state.ways
     scale_root(state.size, root, xhat, h, own)
@@ -591,7 +595,7 @@ def combine_convex(state: Simulation, h: int, own: float) -> None:
 
 @kernel
 def intersect(state: Simulation, h: int, own: float, total: float) -> None:
-    """D (8) and (9), with weights over their ``total``."""
+    """Intersect covariances by D (8) and (9), with weights divided by their ``total``."""
     xhat, root, pool, ways = state.xhat, state.root, state.pool, state.ways
     scratch = state.update_scratch
     # Means count from the node's own estimate: differences of near states lose no digits.
@@ -607,8 +611,8 @@ def intersect(state: Simulation, h: int, own: float, total: float) -> None:
 
 @kernel
 def on_probe(state: Simulation, totals: Totals | None) -> bool:
-    """Keep a sample of all nodes. False once there is no space for another one."""
-    show_all(state, state.run, 0, state.samples)
+    """Store a sample of all nodes. Returns False if there is no space for another."""
+    store_sample(state, state.run, 0, state.samples)
     # The weight of the whole network: held by nodes, sent, and less what was heard.
     if totals is not None:
         shown, count, k = state.shown, len(state.nodes), state.samples
@@ -617,12 +621,12 @@ def on_probe(state: Simulation, totals: Totals | None) -> bool:
             shown.terms[k, count + h] = totals.sent[h, 0]
         for w in range(len(state.ways)):
             shown.terms[k, 2 * count + w] = totals.heard[w, 0]
-    return note_sample(state)
+    return count_sample(state)
 
 
 @kernel
-def show_all(state: Simulation, run: int, first: int, k: int) -> None:
-    """Keep estimates and covariances ``P = S S'`` of the nodes from place ``first`` on as sample
+def store_sample(state: Simulation, run: int, first: int, k: int) -> None:
+    """Store estimates and covariances ``P = S S'`` of the nodes from place ``first`` on as sample
     ``k`` of a run.
     """
     xhat, P, root, n = state.shown.xhat, state.shown.P, state.root, len(state.size)
@@ -639,8 +643,8 @@ def show_all(state: Simulation, run: int, first: int, k: int) -> None:
 
 
 @kernel
-def note_sample(state: Simulation) -> bool:
-    """Count a sample that is kept. False once there is no space for another one."""
+def count_sample(state: Simulation) -> bool:
+    """Count a stored sample. Returns False if there is no space for another."""
     # Counts and rows at the sample: a run that diverges here ends with them.
     shown, run, k = state.shown, state.run, state.samples
     for kind in range(len(state.counts)):

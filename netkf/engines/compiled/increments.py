@@ -20,8 +20,8 @@ from netkf.rng.numbers import NormalZiggurat, normal_of
 def read_increments(
     state: Simulation, run: int, h: int, piece: int, now: float, end: float, out: FloatArray
 ) -> None:
-    """Moments (2 p,) of the readings of node ``h`` over [now, end], where x has the moments
-    ``scratch.state_moments``, in the step of a ``piece``.
+    """Write the moments (2 p,) of the increments that node ``h`` reads over [now, end], inside the
+    step of ``piece``, from the moments of x in ``scratch.state_moments``.
     """
     sensing, early = state.sensing, state.scratch.early
     x, H, root, row = state.scratch.state_moments, sensing.H, sensing.root, 0
@@ -40,7 +40,9 @@ def read_increments(
 
 @kernel(inlined=True)
 def begin_step(sensing: Sensing, run: int, s: int, step: int) -> int:
-    """Return the place of what is left of the noise of sensor ``s`` in a step."""
+    """Return the index of the remaining noise of sensor ``s`` in a step; the first reading of the
+    step copies it.
+    """
     # Streams are numbered run by run, sensor by sensor.
     k = run * len(sensing.rows) + s
     # The first reading of a step takes over the noise of that step.
@@ -52,7 +54,7 @@ def begin_step(sensing: Sensing, run: int, s: int, step: int) -> int:
 
 @kernel
 def draw_cut(sensing: Sensing, run: int, s: int, normals: FloatArray) -> None:
-    """The next standard normals (2, p) that cut a step of sensor ``s``."""
+    """Draw the standard normals (2, p) that divide the noise of sensor ``s`` within a step."""
     ziggurat = NormalZiggurat(sensing.height, sensing.width, sensing.inside)
     states, stream = sensing.cuts, run * len(sensing.rows) + s
     high, low = states[stream, 0], states[stream, 1]
@@ -63,8 +65,10 @@ def draw_cut(sensing: Sensing, run: int, s: int, normals: FloatArray) -> None:
 
 
 @kernel(inlined=True)
-def know_course(state: Simulation, run: int, piece: int) -> int:
-    """Make the course of x in a piece known; returns its place among those of the run."""
+def find_course(state: Simulation, run: int, piece: int) -> int:
+    """Return the index of the polynomial of x in a piece, among those of its run; computed once for
+    all nodes that read in the piece.
+    """
     path, k = state.path, run - state.first_run
     place: int = piece & (path.known.shape[1] - 1)
     # The same for all nodes that read a part of the piece.
@@ -85,14 +89,14 @@ def fill_moments_of_piece(state: Simulation, run: int, piece: int, now: float, e
     if now == start and end == stop:
         copy_matrix(scratch.state_moments, path.moments[run, piece])
         return
-    course = path.course[run - state.first_run, know_course(state, run, piece)]
+    course = path.course[run - state.first_run, find_course(state, run, piece)]
     seen, values = scratch.state_moments, scratch.values
     fill_state_moments(state.size, seen, course, now - start, end - now, stop - start, values)
 
 
 @kernel(inlined=True)
 def piece_of(path: PathBlock, piece: int, end: float) -> int:
-    """Return the piece that ``end`` lies in, which is not after ``piece``."""
+    """Return the piece of the path that contains ``end``, searched backwards from ``piece``."""
     # Back from the present piece: a node may be behind it.
     while piece > 0 and path.stop[piece - 1] >= end:
         piece -= 1
@@ -141,33 +145,33 @@ def fill_readings(
 
 
 @kernel(inlined=True)
-def next_stretch(rate: float, now: float, time: float, least: float) -> tuple[float, float]:
-    """Return until when readings may be used at once at a ``rate`` of information, ``time`` at
-    most, and the shortest stretch that may follow (``least`` is what this returned for the stretch
-    before, or 0).
+def next_interval(rate: float, now: float, time: float, least: float) -> tuple[float, float]:
+    """Return until when readings are used at once, at most ``time``, given the ``rate`` of
+    information trace(P G) in 1/s; and the least length of the following interval (``least`` of the
+    call before, first 0).
     """
-    end, stretch = time, usable(rate)
-    if stretch < time - now:
-        # A lower bound that is set once per gap, else an exploding P asks for ever shorter
-        # stretches.
+    end, interval = time, usable(rate)
+    if interval < time - now:
+        # A lower bound that is set once per gap, otherwise an exploding P asks for ever shorter
+        # intervals.
         if least == 0.0:
             least = SHORTEST_SHARE * (time - now)
-        end = stretch_end(now, time, max(stretch, least))
-    # The bound grows geometrically, so that a gap takes about a thousand stretches at most.
+        end = stretch_end(now, time, max(interval, least))
+    # The bound grows geometrically, so that a gap takes about a thousand intervals at most.
     return end, LONGER * least
 
 
 @kernel
-def use_stretch(
+def advance_over_interval(
     state: Simulation, run: int, h: int, k: int, piece: int, now: float, end: float
 ) -> None:
-    """Bring node ``h`` of a run, which is at place ``k``, from ``now`` to ``end``, which is not
-    after ``piece``, and use all readings between them at once.
+    """Predict node ``h`` of a run, at index ``k`` of the states, from ``now`` to ``end``, and use
+    all increments between them in one update.
     """
     table, m, scratch, gap = state.table, state.nodes[h].model, state.scratch, end - now
     xhat, root, readings = state.xhat, state.root, scratch.moments[: state.gains.moments[m]]
     # Predict first, with the moments of the reading used at the end: they belong to the whole
-    # stretch.
+    # interval.
     move_root(table, m, root, xhat, k, gap, state.flow_scratch)
     fill_readings(state, run, h, piece, now, end, readings)
     gains, reach = state.gains.series[m], state.gains.reach[m]
@@ -178,11 +182,11 @@ def use_stretch(
 def predict_with_increments(
     state: Simulation, run: int, h: int, k: int, piece: int, now: float, time: float
 ) -> None:
-    """``use_stretch`` up to ``time``, which is not after ``piece``, in as many as it takes."""
+    """Predict node ``h`` up to ``time`` with its increments, in as many intervals as P asks for."""
     seen, least = state.table.seen[state.nodes[h].model], 0.0
     while now < time:
         # How much of the gap may be used at once depends on the rate of information, trace(P G).
         rate = information_rate(ONE, state.size, seen, state.root[k])
-        end, least = next_stretch(rate, now, time, least)
-        use_stretch(state, run, h, k, piece, now, end)
+        end, least = next_interval(rate, now, time, least)
+        advance_over_interval(state, run, h, k, piece, now, end)
         now = end

@@ -15,7 +15,7 @@ from netkf.engines.compiled.increments import (
     draw_cut,
     fill_moments,
     fill_readings,
-    know_course,
+    find_course,
     piece_of,
 )
 from netkf.engines.compiled.state import Filters, Sensing, Simulation
@@ -68,7 +68,7 @@ class LaneReadings(Struct):
 
 
 def empty_readings(filters: Filters) -> LaneReadings:
-    """No readings."""
+    """Return arrays for the readings of such filters."""
     n, q = filters.xhat.shape[1], int(filters.gains.moments.max())
     p, width = q // 2, 2 * course_width(n)
     names = ("rate", "trace", "gap", "left", "first", "share")
@@ -95,8 +95,8 @@ def empty_readings(filters: Filters) -> LaneReadings:
 
 
 @kernel
-def know_model(readings: LaneReadings, q: int, m: int, seen: FloatArray) -> None:
-    """Write what the model of the node in lane q sees, unless it is there."""
+def load_model(readings: LaneReadings, q: int, m: int, seen: FloatArray) -> None:
+    """Copy R^-1/2 H of model ``m`` into lane q, unless the lane has it."""
     if readings.model[q] == m:
         return
     readings.model[q] = m
@@ -106,8 +106,8 @@ def know_model(readings: LaneReadings, q: int, m: int, seen: FloatArray) -> None
 
 
 @kernel
-def know_sensor(readings: LaneReadings, q: int, sensing: Sensing, s: int) -> None:
-    """Write H and the root of R of the sensor of the node in lane q, unless they are there."""
+def load_sensor(readings: LaneReadings, q: int, sensing: Sensing, s: int) -> None:
+    """Copy H and the root of R of sensor ``s`` into lane q, unless the lane has them."""
     if readings.kind[q] == sensing.kind[s]:
         return
     readings.kind[q] = sensing.kind[s]
@@ -131,7 +131,9 @@ def read_alone(
     end: float,
     q: int,
 ) -> None:
-    """Write the moments of the readings of node ``h`` over [now, end] into lane q."""
+    """Write the moments of the readings of node ``h`` over [now, end] into lane q, by the scalar
+    kernels.
+    """
     count = state.gains.moments[state.nodes[h].model]
     found, moments = state.scratch.moments[:count], readings.moments
     fill_readings(state, run, h, piece, now, end, found)
@@ -153,11 +155,11 @@ def begin_reading(
     end: float,
     q: int,
 ) -> None:
-    """Let lane q read for node ``h``, which has one sensor, over [now, end]: see
-    ``fill_readings``.
+    """Prepare the reading of node ``h``, which has one sensor, over [now, end] in lane q: draw its
+    normals and integrate the path.
     """
     path, sensing, s = state.path, state.sensing, state.nodes[h].sensor
-    know_sensor(readings, q, sensing, s)
+    load_sensor(readings, q, sensing, s)
     readings.stream[q] = begin_step(sensing, run, s, path.step[piece])
     last, normals = path.last[piece], state.scratch.cut
     readings.gap[0, q], readings.left[0, q] = end - now, last - now
@@ -170,18 +172,18 @@ def begin_reading(
     start, stop = path.start[k], path.stop[k]
     if now < start or (now == start and end == stop):
         fill_moments(state, run, piece, now, end)
-        give_moments(readings, q, state.scratch.state_moments)
+        set_moments(readings, q, state.scratch.state_moments)
         return
     first, share = (now - start) / (stop - start), (end - now) / (stop - start)
     readings.first[0, q], readings.share[0, q] = first, share
-    course = path.course[run - state.first_run, know_course(state, run, k)]
+    course = path.course[run - state.first_run, find_course(state, run, k)]
     fill_integrals(readings.rows[q], course, first, first + share)
 
 
 @kernel
-def give_moments(readings: LaneReadings, q: int, moments: FloatArray) -> None:
-    """Let lane q have these moments (2, n) of x, of a whole piece or parts of several: its
-    integrals are those of a piece in which x has them.
+def set_moments(readings: LaneReadings, q: int, moments: FloatArray) -> None:
+    """Set the moments (2, n) of x in lane q, of a whole piece or of several: as integrals over a
+    piece that would have them.
     """
     rows, n = readings.rows, moments.shape[1]
     half = rows.shape[1] // 2
@@ -194,7 +196,7 @@ def give_moments(readings: LaneReadings, q: int, moments: FloatArray) -> None:
 
 @kernel
 def end_readings(state: Simulation, readings: LaneReadings) -> None:
-    """Write the moments of what all lanes read."""
+    """Write the moments of the readings of all lanes."""
     r, size, p = readings, state.size, readings.rest.shape[1]
     for j in range(0, r.rows.shape[1], LANES):
         turn(MANY, r.rows, j, r.integrals)

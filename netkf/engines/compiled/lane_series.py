@@ -37,10 +37,10 @@ class LaneSeries(Struct):
 
 @once_per_scenario
 def series_of_lanes(scenario: Scenario) -> tuple[LaneSeries, LaneSeries]:
-    """Return the series of nodes that read nothing, and of those that read increments."""
+    """Return the series for nodes without sensors and for nodes that read increments."""
     filters = filters_at_start(scenario)
     period = float(scenario.truth.sensing_period or 0.0)
-    return blind_series(filters), sensing_series(filters, period)
+    return unobserved_series(filters), sensing_series(filters, period)
 
 
 def most_moments(filters: Filters) -> int:
@@ -48,8 +48,8 @@ def most_moments(filters: Filters) -> int:
     return int(filters.gains.moments.max())
 
 
-def blind_series(filters: Filters) -> LaneSeries:
-    """Q_g and exp(A g), for nodes that read nothing."""
+def unobserved_series(filters: Filters) -> LaneSeries:
+    """Return the series of Q_g and exp(A g), for nodes without sensors."""
     n, table = filters.xhat.shape[1], filters.table
     mine = table.sizes[:, 1] == 0
     width = n * (n + 1) // 2 + n * n
@@ -57,7 +57,9 @@ def blind_series(filters: Filters) -> LaneSeries:
 
 
 def sensing_series(filters: Filters, period: float) -> LaneSeries:
-    """Q_g, exp(A g), F and G_g with the gains U, W and C, for gaps up to ``period`` seconds."""
+    """Return the series of Q_g, exp(A g), F and G_g with the gains U, W and C, for gaps up to
+    ``period`` seconds.
+    """
     n, table = filters.xhat.shape[1], filters.table
     width, mine = n * (n + 1) + 2 * n * n, table.sizes[:, 1] > 0
     # Readings of more than a step of the sensing grid are never used at once.
@@ -90,8 +92,8 @@ def shifted(series: FloatArray, middle: float) -> FloatArray:
 
 
 def padded_gains(filters: Filters) -> FloatArray:
-    """The series of the gains of all models (M, terms, 3 n q) with the most rows of any: those that
-    a model does not have are 0.
+    """Return the series of the gains of all models (M, terms, 3 n q), padded with 0 to the most
+    rows of any.
     """
     n, most, gains = filters.xhat.shape[1], most_moments(filters), filters.gains
     known = gains.series.shape[1]

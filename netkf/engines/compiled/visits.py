@@ -1,14 +1,14 @@
-"""Filters side by side, eight visits at a time, where messages take no time.
+"""Predictions and combinations of filters in SIMD lanes, where messages take no time.
 
 What happens, and when, does not depend on estimates then. So ``agenda`` goes through the events of
-runs first and leaves visits: a node is predicted to a time, or two nodes are and combine what they
-have. The level of a visit is one more than that of the visits before it of the same nodes. Visits
-of one level have no node in common: their nodes, in whatever run they are, are predicted and
-combined side by side in the lanes of vector registers (linalg/lanes.py). Lanes do not mix, so a
-visit leaves the same bits in whatever company it is computed.
+several runs first and queues visits: at a time a node is predicted, or two nodes are predicted and
+combine what they have. The level of a visit is one more than those of earlier visits of the same
+nodes, so that visits of one level have no node in common: their nodes, of whatever run, are
+predicted and combined eight at a time in the lanes of vector registers (linalg/lanes.py). Lanes do
+not mix: a visit gives the same bits whichever visits share its registers.
 
-What a lane cannot do, a prediction in several steps, is made alone by the kernels of the event
-loop.
+A prediction that takes several steps (a long gap, a wide covariance) does not fit into a lane; it
+is made by the scalar kernels of the event loop.
 """
 
 from __future__ import annotations
@@ -30,14 +30,14 @@ from netkf.algorithms.kernels.root_flow import (
     width_of,
 )
 from netkf.algorithms.kernels.root_update import absorb_columns
-from netkf.engines.compiled.event_loop import show_all
-from netkf.engines.compiled.increments import next_stretch, use_stretch
+from netkf.engines.compiled.event_loop import store_sample
+from netkf.engines.compiled.increments import advance_over_interval, next_interval
 from netkf.engines.compiled.lane_readings import (
     LaneReadings,
     begin_reading,
     empty_readings,
     end_readings,
-    know_model,
+    load_model,
     read_alone,
 )
 from netkf.engines.compiled.lane_series import (
@@ -55,68 +55,79 @@ from netkf.linalg.structs import Struct
 MOST_VISITS = 1 << 14
 """Visits that wait: their records fit the processor's cache."""
 
-NOBODY, EVERYBODY, NOT_HEARD, SENSES, UNKNOWN = -1, -2, -1, -1, -1
-BLIND, SENSING = 0, 1
+NO_NODE, ALL_NODES, NOT_HEARD, HAS_SENSORS, UNKNOWN = -1, -2, -1, -1, -1
+UNOBSERVED, SENSING = 0, 1
 
 _NUMBERS = ("next", "first", "second", "to_first", "to_second", "run", "piece")
 VISIT = np.dtype([*((name, np.int32) for name in _NUMBERS), ("time", np.float64)], align=True)
-"""The nodes at the places ``first`` and ``second`` (NOBODY: there is only one) are predicted to
-``time``, which lies in the ``piece`` of the path of their ``run``, and hear each other over the
-directed links ``to_first`` and ``to_second``, or NOT_HEARD. Where ``second`` is EVERYBODY all nodes
-of the run, from ``first`` on, are shown as sample ``piece``. ``next`` is another visit of the same
-level, or -1.
+"""A visit: the nodes at the places ``first`` and ``second`` of the state arrays are predicted to
+``time``, which lies in ``piece`` of the path of their ``run``.
+
+They hear each other over the directed links ``to_first`` and ``to_second``, or not (NOT_HEARD).
+``second`` NO_NODE: only one node is predicted; ALL_NODES: the nodes of the run, from ``first`` on,
+are stored as sample number ``piece``. ``next`` is another visit of the same level, or -1.
 """
 
 
-STRETCH = np.dtype(
+INTERVAL = np.dtype(
     [*((name, np.int64) for name in ("place", "visit")), ("now", float), ("least", float)]
 )
-"""The node at a place has come to ``now`` on its way to a visit, see ``next_stretch``."""
+"""The node at ``place`` has been predicted up to ``now`` on its way to ``visit``; ``least`` is the
+shortest interval that may follow, see ``next_interval``.
+"""
 
 
 LANE = np.dtype(
     [*((name, np.int64) for name in ("visit", "model")), ("now", float), ("end", float)]
 )
-"""A prediction from ``now`` to ``end`` on the way to a visit."""
+"""The prediction in a lane: from ``now`` to ``end``, on the way to ``visit``."""
 
 
 class Visits(Struct):
-    """Visits that wait, and arrays to work with.
+    """Queued visits and the arrays that processing them needs. F places, C records, M models, W
+    directed links, L lanes, K distinct weights, E values of a series.
 
-    ``records`` (C,), of which ``count`` are used; the ``level`` (F,) of each place's last visit,
-    the ``first`` visit of each level (C + 2,) or -1, and the highest level, ``top``. Those of a
-    level that combine, ``pairs`` (C,), and the stretches that sensing nodes still have before them,
-    ``stretches`` (2^k >= F,), a ring of ``begun`` up to ``added``. ``model`` (F,) of the nodes at
-    places, SENSES of those with sensors, and the ``longest`` gap (M,) that one step of a model
-    spans. ``shares`` (K, 4), own weight and that of the message, and their roots: row
-    ``share[w]`` (W,) is that of directed link w.
+    The queue:
 
-    Predictions side by side, of nodes without sensors, of which some are ``waiting`` for company,
-    and with them: ``lanes`` (2, L), their ``places`` (2, L), what their series give, ``blind_rows``
-    and ``sensing_rows`` (L, W), and ``readings``. Pairs side by side: the places ``hearing`` (2, L)
-    of those that hear the other, and the shares of both ends ``in_lanes`` (8, L), those of the rows
-    ``known`` (2, L). The same by entry, of all lanes: ``columns``
-    (W, L), ``values`` (E, L) and ``gains`` (3 n q, L), states ``x`` and ``other_x`` (n, L), ``S``
-    and ``other_S`` (n, n, L); V, T (n, n, L) and ``moved`` (n, L) are scratch.
+    records   (C,) of VISIT, of which ``count`` are used
+    level     (F,) that of each place's last visit
+    first     (C + 2,) first visit of each level, or -1; ``top`` is the highest level
+    pairs     (C,) visits of a level that combine
+    intervals (2^k >= F,) of INTERVAL, a ring from ``begun`` up to ``added``
+    model     (F,) model of each place, HAS_SENSORS where the node reads increments
+    longest   (M,) longest gap in seconds that one step of a model spans
+    weight_row, weight_table  (W,) and (K, 4): row ``weight_row[w]`` holds own weight and message
+              weight of directed link w, and their square roots
+
+    The lanes, of nodes without sensors (index UNOBSERVED, of which some are ``waiting``) and with
+    them (SENSING):
+
+    lanes, places  (2, L) the predictions, and the places of their nodes
+    unobserved_rows, sensing_rows  (L, W') what the series give for each lane's gap
+    readings  what sensing nodes read
+    hearing   (2, L) places of the first and second nodes that hear the other
+    in_lanes  (8, L) weights of both directions; ``known`` (2, L) are their rows in the table
+    columns, values, gains  (W', L), (E, L), (3 n q, L) the same numbers by entry, for all lanes
+    x, other_x, moved  (n, L) means; S, other_S, V, T  (n, n, L) roots and scratch
     """
 
     records: np.ndarray
     level: IntArray
     first: IntArray
     pairs: IntArray
-    stretches: np.ndarray
+    intervals: np.ndarray
     model: IntArray
     longest: FloatArray
-    share: IntArray
-    shares: FloatArray
+    weight_row: IntArray
+    weight_table: FloatArray
     lanes: np.ndarray
     places: IntArray
     hearing: IntArray
     known: IntArray
     in_lanes: FloatArray
-    blind: LaneSeries
+    unobserved: LaneSeries
     sensing: LaneSeries
-    blind_rows: FloatArray
+    unobserved_rows: FloatArray
     sensing_rows: FloatArray
     readings: LaneReadings
     columns: FloatArray
@@ -139,25 +150,25 @@ class Visits(Struct):
 def empty_visits(
     filters: Filters, weights: FloatArray, places: int, series: tuple[LaneSeries, LaneSeries]
 ) -> Visits:
-    """No visits, of filters at so many ``places``; ``weights`` (W,) of directed links, ``series``
-    of nodes without sensors and with them.
+    """Return an empty queue for filters at so many ``places``; ``weights`` (W,) of directed links,
+    ``series`` of nodes without sensors and with them.
     """
     n, most = filters.xhat.shape[1], max(MOST_VISITS, 4 * places)
-    distinct, share = np.unique(weights, return_inverse=True)
+    distinct, weight_row = np.unique(weights, return_inverse=True)
     own, table = np.maximum(0.0, 1.0 - distinct), filters.table
-    (blind, sensing), q = series, most_moments(filters)
+    (unobserved, sensing), q = series, most_moments(filters)
     shapes = {
         "gains": (3 * n * q, LANES),
         **dict.fromkeys(("x", "other_x", "moved"), (n, LANES)),
         **dict.fromkeys(("S", "other_S", "V", "T"), (n, n, LANES)),
         "in_lanes": (8, LANES),
     }
-    for name, lane_table in (("blind", blind), ("sensing", sensing)):
+    for name, lane_table in (("unobserved", unobserved), ("sensing", sensing)):
         shapes[f"{name}_rows"] = (LANES, lane_table.series.shape[3])
-    width = max(blind.series.shape[3], sensing.series.shape[3])
+    width = max(unobserved.series.shape[3], sensing.series.shape[3])
     shapes |= {"columns": (width, LANES), "values": (n * (n + 1) + 2 * n * n, LANES)}
     nodes = filters.nodes
-    model = np.where(nodes["sensors"] > nodes["sensor"], SENSES, nodes["model"])
+    model = np.where(nodes["sensors"] > nodes["sensor"], HAS_SENSORS, nodes["model"])
     return Visits(
         records=np.zeros(most, dtype=VISIT),
         level=np.zeros(places, dtype=np.int64),
@@ -165,17 +176,17 @@ def empty_visits(
         pairs=np.zeros(most, dtype=np.int64),
         model=np.tile(model, places // len(nodes)),
         longest=table.unit * 2.0 ** table.sizes[:, 4],
-        share=share.astype(np.int64).reshape(-1),
-        shares=np.stack([own, distinct, np.sqrt(own), np.sqrt(distinct)], axis=1),
+        weight_row=weight_row.astype(np.int64).reshape(-1),
+        weight_table=np.stack([own, distinct, np.sqrt(own), np.sqrt(distinct)], axis=1),
         readings=empty_readings(filters),
         lanes=np.zeros((2, LANES), dtype=LANE),
         places=np.zeros((2, LANES), dtype=np.int64),
         hearing=np.zeros((2, LANES), dtype=np.int64),
         known=np.full((2, LANES), UNKNOWN, dtype=np.int64),
-        blind=blind,
+        unobserved=unobserved,
         sensing=sensing,
         **{name: with_spare(shape) for name, shape in shapes.items()},
-        stretches=np.zeros(1 << (places - 1).bit_length(), dtype=STRETCH),
+        intervals=np.zeros(1 << (places - 1).bit_length(), dtype=INTERVAL),
         waiting=0,
         count=0,
         top=0,
@@ -184,14 +195,14 @@ def empty_visits(
     )
 
 
-# What the agenda leaves.
+# The queue, which ``agenda`` fills.
 
 
 @kernel
-def add_visit(
+def append_visit(
     state: Simulation, visits: Visits, level: int, time: float, first: int, second: int
 ) -> int:
-    """Add a visit of nodes at places ``first`` and ``second``; returns its number."""
+    """Add a visit of the nodes at places ``first``, ``second`` to a level; returns its number."""
     v = visits.count
     visits.count = v + 1
     visit = visits.records[v]
@@ -205,34 +216,35 @@ def add_visit(
 
 
 @kernel
-def visit_one(state: Simulation, visits: Visits, time: float, place: int) -> None:
-    """The node at a place is predicted."""
+def queue_visit(state: Simulation, visits: Visits, time: float, place: int) -> None:
+    """Queue the prediction of the node at a place."""
+    # Behind the last visit of this node, and of no other: nodes of one level are independent.
     level = visits.level[place] + 1
     visits.level[place] = level
-    add_visit(state, visits, level, time, place, NOBODY)
+    append_visit(state, visits, level, time, place, NO_NODE)
 
 
 @kernel
-def show_later(state: Simulation, visits: Visits, first: int) -> None:
-    """All nodes of a run, from place ``first`` on, are shown once they have been visited."""
+def queue_sample(state: Simulation, visits: Visits, first: int) -> None:
+    """Queue a sample of all nodes of a run, from place ``first`` on, behind all their visits."""
     level = 0
     for h in range(len(state.nodes)):
         level = max(level, visits.level[first + h])
     level += 1
     for h in range(len(state.nodes)):
         visits.level[first + h] = level
-    v = add_visit(state, visits, level, 0.0, first, EVERYBODY)
+    v = append_visit(state, visits, level, 0.0, first, ALL_NODES)
     visits.records[v].piece = state.samples
 
 
-# Visits, level by level.
+# Processing, level by level.
 
 
 @kernel
-def make_visits(state: Simulation, visits: Visits) -> None:
-    """Make all visits that wait."""
+def process_visits(state: Simulation, visits: Visits) -> None:
+    """Process all queued visits, level by level, and empty the queue."""
     for level in range(1, visits.top + 1):
-        make_level(state, visits, visits.first[level])
+        process_level(state, visits, visits.first[level])
         visits.first[level] = -1
     visits.count = visits.top = 0
     for place in range(len(visits.level)):
@@ -240,31 +252,31 @@ def make_visits(state: Simulation, visits: Visits) -> None:
 
 
 @kernel
-def make_level(state: Simulation, visits: Visits, first: int) -> None:
-    """Make the visits of a level, of which one is ``first``."""
+def process_level(state: Simulation, visits: Visits, first: int) -> None:
+    """Process the visits of a level, the list of which begins with ``first``."""
     v, pairs = first, 0
     while v != -1:
         visit = visits.records[v]
-        if visit.second == EVERYBODY:
-            show_all(state, visit.run, visit.first, visit.piece)
+        if visit.second == ALL_NODES:
+            store_sample(state, visit.run, visit.first, visit.piece)
         else:
-            join(state, visits, v, visit.first)
-            if visit.second != NOBODY:
-                join(state, visits, v, visit.second)
+            queue_prediction(state, visits, v, visit.first)
+            if visit.second != NO_NODE:
+                queue_prediction(state, visits, v, visit.second)
                 visits.pairs[pairs] = v
                 pairs += 1
         v = visit.next
-    # All of them are predicted before any combine.
-    predict_blind(state, visits)
-    use_stretches(state, visits)
+    # Both ends of a link are predicted before either hears the other.
+    predict_unobserved(state, visits)
+    process_intervals(state, visits)
     for k in range(0, pairs, LANES):
         combine_pairs(state, visits, k, min(LANES, pairs - k))
 
 
 @kernel
-def join(state: Simulation, visits: Visits, v: int, place: int) -> None:
-    """Let the node at a place wait for its prediction, or make it at once where it is to be made
-    alone.
+def queue_prediction(state: Simulation, visits: Visits, v: int, place: int) -> None:
+    """Queue the node at a place for its prediction in a lane, or predict it at once if the gap is
+    too long for one step.
     """
     visit, now = visits.records[v], state.now[place]
     # A node may have several visits at one time: it is predicted with the first of them.
@@ -272,97 +284,101 @@ def join(state: Simulation, visits: Visits, v: int, place: int) -> None:
         return
     state.now[place] = visit.time
     m, gap = visits.model[place], visit.time - now
-    if m == SENSES:
-        add_stretch(visits, place, v, now, 0.0)
+    if m == HAS_SENSORS:
+        queue_interval(visits, place, v, now, 0.0)
         return
-    # Nothing is observed, so that P may be as wide as it is: one step moves it if the gap is short.
+    # Without sensors one step is exact for any P, if the gap lies inside the table of series.
     if not gap < visits.longest[m]:
         move_root(state.table, m, state.root, state.xhat, place, gap, state.flow_scratch)
         return
     q = visits.waiting
     visits.waiting = q + 1
-    use_lane(visits, BLIND, q, place, v, m, now, visit.time)
+    assign_lane(visits, UNOBSERVED, q, place, v, m, now, visit.time)
     if q + 1 == LANES:
-        predict_blind(state, visits)
+        predict_unobserved(state, visits)
 
 
 @kernel
 def node_at(state: Simulation, run: int, place: int) -> int:
-    """Return the number of the node of a run that is at a place."""
+    """Return the number in its run of the node at a place."""
     return place - (run - state.first_run) * len(state.nodes)
 
 
 @kernel(inlined=True)
-def in_ring(visits: Visits, number: int) -> int:
-    """Return the place of a stretch: the remainder by a power of two, without a division."""
-    return number & (len(visits.stretches) - 1)
+def ring_index(visits: Visits, number: int) -> int:
+    """Return the index of an interval in its ring, whose length is a power of two."""
+    return number & (len(visits.intervals) - 1)
 
 
 @kernel
-def add_stretch(visits: Visits, place: int, v: int, now: float, least: float) -> None:
-    """A node has come to ``now`` on its way to visit ``v``."""
+def queue_interval(visits: Visits, place: int, v: int, now: float, least: float) -> None:
+    """Queue a sensing node, predicted up to ``now`` so far, for the next interval on its way to
+    visit ``v``.
+    """
     # A node is on its way to one visit of a level only, so the ring has space for all.
-    stretch = visits.stretches[in_ring(visits, visits.added)]
-    stretch.place, stretch.visit, stretch.now, stretch.least = place, v, now, least
+    interval = visits.intervals[ring_index(visits, visits.added)]
+    interval.place, interval.visit, interval.now, interval.least = place, v, now, least
     visits.added += 1
 
 
 @kernel
-def use_stretches(state: Simulation, visits: Visits) -> None:
-    """Bring all sensing nodes of a level to their visits."""
+def process_intervals(state: Simulation, visits: Visits) -> None:
+    """Predict all sensing nodes of a level up to their visits, and use their increments."""
     while visits.begun < visits.added:
-        # What follows a stretch is added while it is used.
+        # What follows an interval is added while it is used.
         count = min(LANES, visits.added - visits.begun)
         for q in range(count):
-            stretch = visits.stretches[in_ring(visits, visits.begun + q)]
-            visits.places[SENSING, q] = stretch.place
-        take_states(state, visits.places[SENSING], count, visits.x, visits.S)
+            interval = visits.intervals[ring_index(visits, visits.begun + q)]
+            visits.places[SENSING, q] = interval.place
+        gather_states(state, visits.places[SENSING], count, visits.x, visits.S)
         fill_rates(state, visits, count)
         for q in range(count):
-            begin_stretch(state, visits, q)
+            begin_interval(state, visits, q)
         predict_sensing(state, visits, count)
 
 
 @kernel
 def fill_rates(state: Simulation, visits: Visits, count: int) -> None:
-    """Write trace(P G) and trace(P) of the nodes in lanes, of which so many are used."""
+    """Write trace(P G) (the rate of information, 1/s) and trace(P) for the nodes in ``count``
+    lanes.
+    """
     size, readings = state.size, visits.readings
     for q in range(count):
-        stretch = visits.stretches[in_ring(visits, visits.begun + q)]
-        visit = visits.records[stretch.visit]
-        h = node_at(state, visit.run, stretch.place)
-        know_model(readings, q, state.nodes[h].model, state.table.seen)
+        interval = visits.intervals[ring_index(visits, visits.begun + q)]
+        visit = visits.records[interval.visit]
+        h = node_at(state, visit.run, interval.place)
+        load_model(readings, q, state.nodes[h].model, state.table.seen)
     store(MANY, readings.rate, 0, information_rate(MANY, size, readings.seen, visits.S))
     store(MANY, readings.trace, 0, root_size(MANY, size, visits.S))
 
 
 @kernel
-def begin_stretch(state: Simulation, visits: Visits, q: int) -> None:
-    """Take the next stretch, whose node is in lane q: let it use the lane, or use it at once where
-    it is to be used alone.
+def begin_interval(state: Simulation, visits: Visits, q: int) -> None:
+    """Take the next interval from the ring, whose node is in lane q: assign it the lane, or predict
+    its node at once if P is too wide for one step.
     """
-    stretch, readings = visits.stretches[in_ring(visits, visits.begun)], visits.readings
-    place, now, v = stretch.place, stretch.now, stretch.visit
+    interval, readings = visits.intervals[ring_index(visits, visits.begun)], visits.readings
+    place, now, v = interval.place, interval.now, interval.visit
     visits.begun += 1
     visit = visits.records[v]
     h = node_at(state, visit.run, place)
     m, time = state.nodes[h].model, visit.time
-    end, least = next_stretch(readings.rate[0, q], now, time, stretch.least)
+    end, least = next_interval(readings.rate[0, q], now, time, interval.least)
     if is_quick(state.table, m, end - now, readings.trace[0, q]):
-        use_lane(visits, SENSING, q, place, v, m, now, end)
+        assign_lane(visits, SENSING, q, place, v, m, now, end)
     else:
-        visits.places[SENSING, q] = NOBODY
-        use_stretch(state, visit.run, h, place, visit.piece, now, end)
+        visits.places[SENSING, q] = NO_NODE
+        advance_over_interval(state, visit.run, h, place, visit.piece, now, end)
     if end < time:
-        add_stretch(visits, place, v, end, least)
+        queue_interval(visits, place, v, end, least)
 
 
 @kernel(inlined=True)
-def use_lane(
+def assign_lane(
     visits: Visits, kind: int, q: int, place: int, v: int, m: int, now: float, end: float
 ) -> None:
-    """Give a node at a place, with model ``m``, lane q among those of its kind, for its prediction
-    from ``now`` to ``end``.
+    """Assign lane q of its kind to a node with model ``m``, for its prediction from ``now`` to
+    ``end``.
     """
     lane = visits.lanes[kind, q]
     lane.visit, lane.model, lane.now, lane.end = v, m, now, end
@@ -370,13 +386,13 @@ def use_lane(
 
 
 @kernel
-def read_in_lanes(state: Simulation, visits: Visits, count: int) -> None:
-    """Write the moments of the readings of the nodes in lanes."""
+def read_increments_in_lanes(state: Simulation, visits: Visits, count: int) -> None:
+    """Write the moments of the increments that the nodes in lanes read."""
     places, readings = visits.places[SENSING], visits.readings
     for q in range(LANES):
-        readings.stream[q] = NOBODY
+        readings.stream[q] = NO_NODE
     for q in range(count):
-        if places[q] == NOBODY:
+        if places[q] == NO_NODE:
             continue
         lane = visits.lanes[SENSING, q]
         visit = visits.records[lane.visit]
@@ -390,13 +406,13 @@ def read_in_lanes(state: Simulation, visits: Visits, count: int) -> None:
 
 
 @kernel
-def take_states(
+def gather_states(
     state: Simulation, places: IntArray, count: int, x: FloatArray, S: FloatArray
 ) -> None:
-    """Copy the states at ``count`` places into lanes; the places of other lanes are NOBODY's."""
+    """Copy the states at ``count`` places into lanes; the other lanes get NO_NODE."""
     n = len(state.size)
     for q in range(count, LANES):
-        places[q] = NOBODY
+        places[q] = NO_NODE
     for first in range(0, n, LANES):
         gather(MANY, state.xhat, places, first, x)
     for first in range(0, n * n, LANES):
@@ -404,8 +420,8 @@ def take_states(
 
 
 @kernel
-def put_states(state: Simulation, places: IntArray, x: FloatArray, S: FloatArray) -> None:
-    """Copy them back, but not to NOBODY's place."""
+def scatter_states(state: Simulation, places: IntArray, x: FloatArray, S: FloatArray) -> None:
+    """Copy states in lanes back to their places, but not to NO_NODE."""
     n = len(state.size)
     for first in range(0, n, LANES):
         scatter(MANY, x, first, state.xhat, places, n - first)
@@ -414,69 +430,71 @@ def put_states(state: Simulation, places: IntArray, x: FloatArray, S: FloatArray
 
 
 @kernel
-def predict_blind(state: Simulation, visits: Visits) -> None:
-    """Predict the nodes without sensors that wait."""
-    n, count, places = len(state.size), visits.waiting, visits.places[BLIND]
+def predict_unobserved(state: Simulation, visits: Visits) -> None:
+    """Predict the queued nodes without sensors, at most L of them."""
+    n, count, places = len(state.size), visits.waiting, visits.places[UNOBSERVED]
     if count == 0:
         return
     visits.waiting = 0
     # What lanes do alone goes from lane to lane in short loops: a processor overlaps their turns.
     for q in range(count):
-        fill_lane(state, visits, BLIND, q, visits.blind, visits.blind_rows)
-    take_states(state, places, count, visits.x, visits.S)
-    turn_rows(visits.blind_rows, visits.columns)
-    spread_columns(visits.columns, visits.blind.place, 0, width_of(n, False), visits.values)
+        evaluate_series(state, visits, UNOBSERVED, q, visits.unobserved, visits.unobserved_rows)
+    gather_states(state, places, count, visits.x, visits.S)
+    transpose_rows(visits.unobserved_rows, visits.columns)
+    copy_columns(visits.columns, visits.unobserved.place, 0, width_of(n, False), visits.values)
     predict_lanes(state, visits, False)
-    put_states(state, places, visits.x, visits.S)
+    scatter_states(state, places, visits.x, visits.S)
 
 
 @kernel
 def predict_sensing(state: Simulation, visits: Visits, count: int) -> None:
-    """Predict the nodes with sensors in lanes, whose states are there, and use their readings."""
+    """Predict the nodes with sensors, whose states are in the lanes, and use their readings."""
     places = visits.places[SENSING]
     for q in range(count):
-        if places[q] != NOBODY:
-            fill_lane(state, visits, SENSING, q, visits.sensing, visits.sensing_rows)
-    read_in_lanes(state, visits, count)
-    turn_rows(visits.sensing_rows, visits.columns)
+        if places[q] != NO_NODE:
+            evaluate_series(state, visits, SENSING, q, visits.sensing, visits.sensing_rows)
+    read_increments_in_lanes(state, visits, count)
+    transpose_rows(visits.sensing_rows, visits.columns)
     width = width_of(len(state.size), True)
-    spread_columns(visits.columns, visits.sensing.place, 0, width, visits.values)
-    spread_columns(visits.columns, visits.sensing.place, width, len(visits.gains), visits.gains)
+    copy_columns(visits.columns, visits.sensing.place, 0, width, visits.values)
+    copy_columns(visits.columns, visits.sensing.place, width, len(visits.gains), visits.gains)
     predict_lanes(state, visits, True)
     moments = visits.readings.moments
     use_moments(MANY, state.size, visits.S, visits.x, visits.gains, moments)
-    put_states(state, places, visits.x, visits.S)
+    scatter_states(state, places, visits.x, visits.S)
 
 
 @kernel
-def fill_lane(
+def evaluate_series(
     state: Simulation, visits: Visits, kind: int, q: int, series: LaneSeries, rows: FloatArray
 ) -> None:
-    """Write what the series of the model in a lane give for its gap into its row."""
+    """Evaluate the series of the model in a lane at its gap, into row ``q``."""
     lane = visits.lanes[kind, q]
     cell, since = cell_of(state.table.unit[lane.model], lane.end - lane.now)
     fill_row(rows, q, series.series, series.row[lane.model], cell, since)
 
 
 @kernel
-def turn_rows(rows: FloatArray, out: FloatArray) -> None:
+def transpose_rows(rows: FloatArray, out: FloatArray) -> None:
     """Write rows (L, W) as (W, L)."""
     for j in range(0, rows.shape[1], LANES):
         turn(MANY, rows, j, out)
 
 
 @kernel
-def spread_columns(
+def copy_columns(
     columns: FloatArray, place: IntArray, first: int, count: int, out: FloatArray
 ) -> None:
-    """Write ``count`` entries, of which the ``first`` is that of ``place``."""
+    """Copy ``count`` values to ``out``; value e is the column ``place[first + e]``."""
     for e in range(count):
         store(MANY, out, e, load(MANY, columns, place[first + e]))
 
 
 @kernel(fused=True)
 def predict_lanes(state: Simulation, visits: Visits, reads: bool) -> None:
-    """Move the states in ``x`` and ``S`` by what is in ``values``, with readings or without."""
+    """Predict the states ``x`` and ``S`` by what is in ``values``: x = exp(A g) x, P = Q_g + F P (I
+    + G P)^-1 F'; G = 0 unless it ``reads``.
+    """
     size, n, values = state.size, len(state.size), visits.values
     S, V, T = (
         local_lanes_matrix(size, MANY, visits.other_S),
@@ -499,41 +517,41 @@ def predict_lanes(state: Simulation, visits: Visits, reads: bool) -> None:
 
 @kernel
 def combine_pairs(state: Simulation, visits: Visits, k: int, count: int) -> None:
-    """Let the nodes of ``count`` visits hear each other, from place ``k`` of ``pairs`` on."""
+    """Let the nodes of ``count`` visits hear each other, from index ``k`` of ``pairs`` on."""
     records, places = visits.records, visits.places
     heard_0, heard_1 = False, False
     for q in range(count):
         visit = records[visits.pairs[k + q]]
         places[0, q], places[1, q] = visit.first, visit.second
-        heard_0 = hear_in_lane(visits, 0, q, visit.to_first, visit.first) or heard_0
-        heard_1 = hear_in_lane(visits, 1, q, visit.to_second, visit.second) or heard_1
+        heard_0 = assign_receiver(visits, 0, q, visit.to_first, visit.first) or heard_0
+        heard_1 = assign_receiver(visits, 1, q, visit.to_second, visit.second) or heard_1
     for q in range(count, LANES):
-        visits.hearing[0, q] = visits.hearing[1, q] = NOBODY
+        visits.hearing[0, q] = visits.hearing[1, q] = NO_NODE
     # Both are as they were before either hears the other.
-    take_states(state, places[0], count, visits.x, visits.S)
-    take_states(state, places[1], count, visits.other_x, visits.other_S)
+    gather_states(state, places[0], count, visits.x, visits.S)
+    gather_states(state, places[1], count, visits.other_x, visits.other_S)
     if heard_0:
         combine_lanes(state, visits, 0, visits.x, visits.S, visits.other_x, visits.other_S)
-        put_states(state, visits.hearing[0], visits.moved, visits.V)
+        scatter_states(state, visits.hearing[0], visits.moved, visits.V)
     if heard_1:
         combine_lanes(state, visits, 1, visits.other_x, visits.other_S, visits.x, visits.S)
-        put_states(state, visits.hearing[1], visits.moved, visits.V)
+        scatter_states(state, visits.hearing[1], visits.moved, visits.V)
 
 
 @kernel
-def hear_in_lane(visits: Visits, side: int, lane: int, way: int, place: int) -> bool:
-    """Note in a lane that the node at a place hears something on a directed link, and by which
-    shares; False, and nobody's lane, where nothing is heard.
+def assign_receiver(visits: Visits, side: int, lane: int, way: int, place: int) -> bool:
+    """Let the node at a place hear a directed link in a lane, with the weights of that link;
+    returns False if it hears nothing (NOT_HEARD).
     """
     if way == NOT_HEARD:
-        visits.hearing[side, lane] = NOBODY
+        visits.hearing[side, lane] = NO_NODE
         return False
     visits.hearing[side, lane] = place
-    share = visits.share[way]
-    if visits.known[side, lane] != share:
-        visits.known[side, lane] = share
+    weight_row = visits.weight_row[way]
+    if visits.known[side, lane] != weight_row:
+        visits.known[side, lane] = weight_row
         for k in range(4):
-            visits.in_lanes[4 * side + k, lane] = visits.shares[share, k]
+            visits.in_lanes[4 * side + k, lane] = visits.weight_table[weight_row, k]
     return True
 
 
@@ -547,7 +565,7 @@ def combine_lanes(
     other_x: FloatArray,
     other_S: FloatArray,
 ) -> None:
-    """Write H (7) and (9) into ``moved`` and ``V``: of x and S with what they hear of others."""
+    """Write H (7) and (9), x = w x + w_j x_j and P = w P + w_j P_j, into ``moved`` and ``V``."""
     size, n, values = state.size, len(state.size), visits.in_lanes
     total, wide = local_lanes_matrix(size, MANY, visits.V), local_lanes_matrix(size, MANY, visits.T)
     own, weight = load(MANY, values, 4 * side), load(MANY, values, 4 * side + 1)
