@@ -2,9 +2,17 @@
 
 import gc
 import math
+import os
 import signal
+import sys
 from pathlib import Path
 
+# Dozens of tests start processes. Without bytecode on disk each of them would compile all modules
+# of netkf anew, half of what starting it takes; compiled kernels are kept beside it anyway.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+sys.dont_write_bytecode = False
+
+# ruff: noqa: E402
 import pytest
 from hypothesis import settings
 
