@@ -27,7 +27,6 @@ from netkf.runs.innovations import (
     Innovations,
     autocorrelations,
     chi_square_means,
-    innovations,
 )
 from netkf.runs.summary import CONFIDENCE, nees_bounds
 
@@ -74,7 +73,7 @@ def innovations_of(subject: Subject) -> Innovations:
             f"The run was {subject.status}, so that its readings are not replayed."
         )
     try:
-        return innovations(subject.run)
+        return subject.innovations
     except NetkfError as error:
         raise UnavailableError(f"There are no innovations to draw: {error}.") from None
 

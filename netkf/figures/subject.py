@@ -11,6 +11,7 @@ import numpy as np
 from netkf.core.errors import ScenarioError
 from netkf.ensembles.monte_carlo import Ensemble
 from netkf.linalg.arrays import FloatArray
+from netkf.runs.innovations import Innovations, innovations
 from netkf.runs.run import CompletedRun
 from netkf.runs.summary import (
     NO_COVARIANCE,
@@ -72,6 +73,15 @@ class Subject:
     def shows_errors(self) -> bool:
         """True if errors are known."""
         return self.scenario.plant.truth_known
+
+    @cached_property
+    def innovations(self) -> Innovations:
+        """The innovations of the run, which is replayed once for all figures.
+
+        Raises NetkfError where they cannot be computed.
+        """
+        assert self.run is not None
+        return innovations(self.run)
 
     @cached_property
     def sensing(self) -> np.ndarray:

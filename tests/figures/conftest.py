@@ -58,7 +58,7 @@ def make(kind, folder):
             )
         return netkf.open(folder / "stopped")
     if kind == "diverged":
-        changes = {"horizon": 8000.0, "probe": 100.0}
+        changes = {"horizon": 1100.0, "probe": 10.0, "plant.F": [[0.0, -2.0], [2.0, 0.0]]}
         scenario = netkf.load(SCENARIOS / "gossip_periodic.toml", changes)
         return netkf.simulate(scenario)
     assert kind == "slots"
