@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from netkf.algorithms.kernels.chains import trace_path
+from netkf.algorithms.kernels.chains import trace_paths
 from netkf.checks.evidence import Assumption, Finding, Promise
 from netkf.checks.exact import (
     check_bias,
@@ -160,8 +160,8 @@ def _path_averages(table: ModeTable, roots: FloatArray, sequences: np.ndarray) -
     over the second half of the slots, along each of K sequences of modes.
     """
     first, found = sequences.shape[1] // 2, []
-    for root, sequence in zip(roots, sequences, strict=True):
-        path = trace_path(root, sequence, *table)[first:]
+    for whole in trace_paths(roots, sequences, *table):
+        path = whole[first:]
         found.append(float((1.0 / (1.0 + np.einsum("tab,tab->t", path, path))).mean()))
     return np.array(found)
 
@@ -185,16 +185,18 @@ class IntermittentSamples(RunSamples):
     def reference(self) -> ArrivalSamples:
         """Samples of filters with independent arrivals, R (12)."""
         samples = reference_count(self.scenario, len(self.nodes))
-        return self._draw("arrivals", list(check_slots(self.scenario)), samples)
+        return self._draw("arrivals", list(check_slots(self.scenario)), samples, MAX_PATHS)
 
-    def _draw(self, purpose: str, slots: list[int], samples: int) -> ArrivalSamples:
-        """Return samples of all nodes after the given numbers of slots."""
+    def _draw(self, purpose: str, slots: list[int], samples: int, paths: int) -> ArrivalSamples:
+        """Return samples of all nodes after the given numbers of slots, of which the averages over
+        the slots are those of the first ``paths``.
+        """
         sampled = sampled_indices(self.scenario).tolist()
-        found = [self._draw_node(purpose, k, slots, samples) for k in sampled]
+        found = [self._draw_node(purpose, k, slots, samples, paths) for k in sampled]
         return ArrivalSamples(*(np.array(values) for values in zip(*found, strict=True)))
 
     def _draw_node(
-        self, purpose: str, k: int, slots: list[int], samples: int
+        self, purpose: str, k: int, slots: list[int], samples: int, paths: int
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return samples (K, S, n, n), (S, n, n) and (S',) of the k-th node."""
         scenario = self.scenario
@@ -215,12 +217,12 @@ class IntermittentSamples(RunSamples):
         first = np.repeat(initial_roots(scenario)[k : k + 1], samples, axis=0)
         far = FAR_START * first + np.eye(first.shape[-1])
         restarted = table.covariances(far, sequences, slots[-1:])[0]
-        averages = _path_averages(table, first[:MAX_PATHS], sequences[:MAX_PATHS])
+        averages = _path_averages(table, first[:paths], sequences[:paths])
         return table.covariances(first, sequences, slots), restarted, averages
 
     def later(self, slots: int) -> ArrivalSamples:
-        """Return a few samples after half of ``slots`` and after all of them."""
-        return self._draw("later arrivals", [slots // 2, slots], MIN_CHAINS // 4)
+        """Return a few samples after half of ``slots`` and after all of them, without averages."""
+        return self._draw("later arrivals", [slots // 2, slots], MIN_CHAINS // 4, 0)
 
 
 def _delivery(scenario: Scenario, direction: Direction) -> float:

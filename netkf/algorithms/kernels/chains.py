@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import itertools
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
@@ -82,11 +82,21 @@ def trace_path(
     root: FloatArray, sequence: np.ndarray, F: FloatArray, root_Q: FloatArray, modes: ReadingModes
 ) -> FloatArray:
     """Return the roots (T, n, n) of one chain after each mode of its sequence (T,)."""
-    n, path = len(F), np.empty((len(sequence), *root.shape))
-    lows = [np.ascontiguousarray(lower_triangular(one)) for one in (root, root_Q)]
+    return next(trace_paths(root[None], sequence[None], F, root_Q, modes))
+
+
+def trace_paths(
+    roots: FloatArray, sequences: np.ndarray, F: FloatArray, root_Q: FloatArray, modes: ReadingModes
+) -> Iterator[FloatArray]:
+    """Yield the roots (T, n, n) of each of K chains after each mode of its sequence (K, T)."""
+    lows = np.ascontiguousarray(lower_triangular(roots))
+    low_Q = np.ascontiguousarray(lower_triangular(root_Q))
+    n = len(F)
     work = np.empty((modes.H.shape[1] + n, 2 * n + modes.H.shape[1]))
-    run_path(lows[0][None], sequence, F, lows[1], *modes, work, path)
-    return path
+    for low, sequence in zip(lows, sequences, strict=True):
+        path = np.empty((len(sequence), *low.shape))
+        run_path(low[None], sequence, F, low_Q, *modes, work, path)
+        yield path
 
 
 @kernel
