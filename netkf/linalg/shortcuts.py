@@ -27,6 +27,10 @@ NOT_NEEDED = (
 """Passes of numba for what kernels do not contain."""
 
 
+MANY = 10_000
+"""Objects that are worth to be passed over by the collector, see without_collection."""
+
+
 @contextmanager
 def without_collection() -> Iterator[None]:
     """Inside, no garbage is collected: the compiler makes many objects, hardly any of which become
@@ -38,8 +42,9 @@ def without_collection() -> Iterator[None]:
         yield
     finally:
         if enabled:
-            # All objects become old ones, unlooked at: the next collection would visit each.
-            if not gc.get_freeze_count():
+            # All objects become old ones, unlooked at: the next collection would visit each. What
+            # is only loaded makes few, and to count the frozen ones takes long where there are any.
+            if gc.get_count()[0] > MANY and not gc.get_freeze_count():
                 gc.freeze()
                 gc.unfreeze()
             gc.enable()
