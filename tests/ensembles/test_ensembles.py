@@ -398,16 +398,20 @@ def test_processes_start_only_where_they_are_worth_it(ring, monkeypatch):
         netkf.monte_carlo(short, 2600)
 
 
-@pytest.mark.parametrize("done", [0, 1, 3])
-def test_bits_do_not_depend_on_when_processes_start(short, monkeypatch, done):
+def test_bits_do_not_depend_on_when_processes_start(short, monkeypatch):
     """After so many blocks in this process."""
-    alone, blocks = netkf.monte_carlo(short, 2600, workers=1), []
+    alone = netkf.monte_carlo(short, 2600, workers=1)
     monkeypatch.setattr(pools, "cores", lambda: 2)
-    monkeypatch.setattr(
-        pools.AdaptivePool, "_worth_processes", lambda *_: blocks.append(0) or len(blocks) > done
-    )
-    assert_same_bits(netkf.monte_carlo(short, 2600), alone)
-    assert len(blocks) == done + 1
+    for done in (0, 1, 3):
+        blocks = []
+
+        def worth_processes(*_, done=done, blocks=blocks):
+            blocks.append(0)
+            return len(blocks) > done
+
+        monkeypatch.setattr(pools.AdaptivePool, "_worth_processes", worth_processes)
+        assert_same_bits(netkf.monte_carlo(short, 2600), alone)
+        assert len(blocks) == done + 1
 
 
 def begin(out, *arguments):

@@ -1,6 +1,7 @@
 """Parts of scenarios with one thing wrong each."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -11,34 +12,44 @@ from netkf.plants.linear import LinearPlant, SlotReadings
 from netkf.plants.sensors import LinearSensor
 
 
+class Other(LinearPlant):
+    """Its paths are those of another plant, ``drawn``."""
+
+    def truth(self, random, frames=False):
+        return self.drawn.truth(random, frames)
+
+
 @dataclass(frozen=True, eq=False)
-class Noisier(LinearPlant):
+class Noisier(Other):
     """Draws its noise with variances that are larger by a fifth."""
 
-    def truth(self, random, frames=False):
+    @cached_property
+    def drawn(self):
         return LinearPlant(
             mean=self.mean, cov=self.cov, F=self.F, Q=1.2 * self.Q, period=self.period
-        ).truth(random, frames)
+        )
 
 
 @dataclass(frozen=True, eq=False)
-class Faster(LinearPlant):
+class Faster(Other):
     """Follows another F."""
 
-    def truth(self, random, frames=False):
+    @cached_property
+    def drawn(self):
         return LinearPlant(
             mean=self.mean, cov=self.cov, F=self.F + 0.1, Q=self.Q, period=self.period
-        ).truth(random, frames)
+        )
 
 
 @dataclass(frozen=True, eq=False)
-class Elsewhere(LinearPlant):
+class Elsewhere(Other):
     """Starts with a smaller covariance."""
 
-    def truth(self, random, frames=False):
+    @cached_property
+    def drawn(self):
         return LinearPlant(
             mean=self.mean, cov=0.9 * self.cov, F=self.F, Q=self.Q, period=self.period
-        ).truth(random, frames)
+        )
 
 
 class Wrong(SlotReadings):
