@@ -142,7 +142,7 @@ def belief_slots(
                             lanes, told, links, plan.up, (b, s, e), h, scratch.xhat, arrays.scratch
                         )
                 for h in range(len(nodes.rows)):
-                    believe(nodes, links, scratch, arrays, b, h)
+                    update_beliefs(nodes, links, scratch, arrays, b, h)
             show(nodes, plan, samples, scratch, b, s)
             # Evidence counts from the estimate, and moves along.
             rebase(nodes, readings, scratch, b, s)
@@ -175,7 +175,7 @@ def predict_beliefs(nodes: SlotNodes, scratch: SlotScratch, arrays: BeliefArrays
 
 
 @kernel
-def believe(
+def update_beliefs(
     nodes: SlotNodes,
     links: SlotLinks,
     scratch: SlotScratch,
@@ -203,14 +203,14 @@ def believe(
 
 
 @kernel
-def add_one(parts: FloatArray, total: FloatArray, work: FloatArray) -> None:
+def add_part_single(parts: FloatArray, total: FloatArray, work: FloatArray) -> None:
     """Add all ``parts`` (K, n, n + 1, 1) to ``total`` (n, n + 1, 1) with one lane."""
     for k in range(len(parts)):
         add_part(ONE, total, parts[k], work)
 
 
 @kernel
-def read_one(
+def add_reading_single(
     y: FloatArray, H: FloatArray, centre: FloatArray, total: FloatArray, work: FloatArray
 ) -> None:
     """Add a whitened reading, y (1, 1, 1, p, 1), to ``total`` (n, n + 1, 1) with one lane."""
@@ -218,19 +218,21 @@ def read_one(
 
 
 @kernel
-def move_one(part: FloatArray, back: FloatArray, total: FloatArray, work: FloatArray) -> None:
+def move_part_single(
+    part: FloatArray, back: FloatArray, total: FloatArray, work: FloatArray
+) -> None:
     """Apply ``move_part`` to one piece of evidence (n, n + 1, 1) with one lane."""
     move_part(ONE, part, back, total, work)
 
 
 @kernel
-def recentre_one(part: FloatArray, before: FloatArray, after: FloatArray) -> None:
+def recentre_part_single(part: FloatArray, before: FloatArray, after: FloatArray) -> None:
     """Apply ``recentre_part`` to one piece of evidence (n, n + 1, 1) with one lane."""
     recentre_part(ONE, part, before, after, part)
 
 
 @kernel
-def finish_one(
+def finish_single(
     root: FloatArray, x: FloatArray, centre: FloatArray, total: FloatArray, work: FloatArray
 ) -> None:
     """Apply ``finish_lanes`` to one node with one lane, root (1, 1, n, n, 1), x (1, 1, n, 1)."""
@@ -328,7 +330,7 @@ class BeliefPropagation(Filter):
             nothing = np.zeros_like(state.own)
             return state._replace(prior=evidence_of(root), own=nothing, senders=(), told=())
         back = backward(state.model, gap)
-        return with_all(state, lambda evidence: move_evidence(evidence, back))
+        return with_all(state, lambda evidence: predict_evidence(evidence, back))
 
     def update(self, state: BeliefState, reading: Reading) -> BeliefState:
         """Add a reading to the own ones."""
@@ -354,7 +356,7 @@ class BeliefPropagation(Filter):
                 continue
             evidence = evidence_for(state.node, message.payload)
             if message.age > 0.0 and not isinstance(state.model, SlotModel):
-                evidence = move_evidence(evidence, backward(state.model, message.age))
+                evidence = predict_evidence(evidence, backward(state.model, message.age))
             centre, _ = state.model.extrapolate(message.payload.xhat, state.root, message.age)
             evidence = recentred(evidence, centre, state.xhat)
             known[message.sender] = HeardEvidence(evidence, sent)
@@ -375,7 +377,7 @@ def is_forest(scenario: Any) -> bool:
 def merge_evidence(parts: Sequence[FloatArray]) -> FloatArray:
     """Return independent pieces of evidence (n, n + 1) together."""
     stack = np.stack(parts)[..., None]
-    add_one(stack[1:], stack[0], np.empty(stack.shape[1:]))
+    add_part_single(stack[1:], stack[0], np.empty(stack.shape[1:]))
     return np.ascontiguousarray(stack[0, ..., 0])
 
 
@@ -384,7 +386,7 @@ def with_reading(state: BeliefState, reading: Reading) -> FloatArray:
     y, H = whiten_reading(reading.y, reading.H, reading.R)
     n, total = len(state.xhat), np.array(state.own)[..., None]
     whole, centre = (y.reshape(1, 1, 1, -1, 1), H.reshape(1, 1, 1, -1, n, 1)), np.array(state.xhat)
-    read_one(*whole, centre.reshape(1, n, 1), total, np.empty(total.shape))
+    add_reading_single(*whole, centre.reshape(1, n, 1), total, np.empty(total.shape))
     return np.ascontiguousarray(total[..., 0])
 
 
@@ -408,7 +410,7 @@ def believing(state: BeliefState) -> BeliefState:
     total = merge_evidence([state.prior, state.own, *(one.evidence for one in state.told)])
     n, before = len(total), state.xhat
     x, root, centre = np.zeros((1, 1, n, 1)), np.zeros((1, 1, n, n, 1)), np.array(before)
-    finish_one(root, x, centre.reshape(1, n, 1), total[..., None], np.empty((n, n + 1, 1)))
+    finish_single(root, x, centre.reshape(1, n, 1), total[..., None], np.empty((n, n + 1, 1)))
     state = state._replace(xhat=x.reshape(n), root=root.reshape(n, n))
     return with_all(state, lambda evidence: recentred(evidence, before, state.xhat))
 
@@ -429,16 +431,16 @@ def backward(model: Any, gap: float) -> FloatArray:
     return np.asarray(maps[0])
 
 
-def move_evidence(evidence: FloatArray, back: FloatArray) -> FloatArray:
+def predict_evidence(evidence: FloatArray, back: FloatArray) -> FloatArray:
     """Return evidence about a later state, from which ``back`` (n, n) leads to the earlier one."""
     moved = np.array(evidence)[..., None]
     back = np.ascontiguousarray(back)
-    move_one(moved, back, np.empty(moved.shape), np.empty(moved.shape))
+    move_part_single(moved, back, np.empty(moved.shape), np.empty(moved.shape))
     return np.ascontiguousarray(moved[..., 0])
 
 
 def recentred(evidence: FloatArray, before: FloatArray, after: FloatArray) -> FloatArray:
     """Return evidence that counts from ``before`` (n,) as it counts from ``after``."""
     moved, old, new = (np.array(part)[..., None] for part in (evidence, before, after))
-    recentre_one(moved, old, new)
+    recentre_part_single(moved, old, new)
     return np.ascontiguousarray(moved[..., 0])

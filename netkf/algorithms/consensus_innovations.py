@@ -91,7 +91,7 @@ class NodeGains(NamedTuple):
     root: FloatArray
 
 
-class GainTable(NamedTuple):
+class SlotGains(NamedTuple):
     """Gains of all N nodes in K slots: B (K, W, n, n) of the W directions, by receiver and sender;
     M, K and root (K, N, n, n) as ``NodeGains`` has them.
     """
@@ -151,7 +151,7 @@ class GainSequence:
             self._settled = len(self._found) > 1 and self._is_settled(*self._found[-2:])
         return self._found[min(slot, len(self._found)) - 1]
 
-    def table(self, first: int, count: int) -> tuple[np.ndarray, GainTable]:
+    def table(self, first: int, count: int) -> tuple[np.ndarray, SlotGains]:
         """Return the gains of so many slots from ``first`` on, with the place (count,) of each in
         the table; settled ones are there once. Nothing happens in slot 0, whose gains are any.
         """
@@ -163,9 +163,9 @@ class GainSequence:
         K, N, n = len(found), len(self._heard), self._n
         B, *rest = (
             np.concatenate([getattr(one, name).reshape(-1, n, n) for one in every])
-            for name in GainTable._fields
+            for name in SlotGains._fields
         )
-        made = GainTable(B.reshape(K, -1, n, n), *(part.reshape(K, N, n, n) for part in rest))
+        made = SlotGains(B.reshape(K, -1, n, n), *(part.reshape(K, N, n, n) for part in rest))
         return slots - slots[0], made
 
     @staticmethod
@@ -305,7 +305,7 @@ class PseudoArrays(NamedTuple):
     """
 
     pseudo: PseudoStates
-    gains: GainTable
+    gains: SlotGains
     place: np.ndarray
     yhat: FloatArray
     corrected: FloatArray
@@ -373,7 +373,7 @@ def correct_all(
 
 
 @kernel
-def predict_one(
+def predict_pseudo_single(
     x: FloatArray, y: FloatArray, A: FloatArray, rest: FloatArray, moved: FloatArray
 ) -> None:
     """Apply ``predict_pseudo`` to one node with one lane, x and y (1, 1, n, 1)."""
@@ -381,7 +381,7 @@ def predict_one(
 
 
 @kernel
-def correct_one(
+def correct_single(
     x: FloatArray,
     readings: ReadingBlock,
     links: SlotLinks,
@@ -461,7 +461,7 @@ class ConsensusInnovations(Filter):
         xhat, yhat = state.xhat, state.yhat.reshape(1, 1, n, 1).copy()
         for _ in range(round(gap / state.model.period)):
             x = np.array(xhat).reshape(1, 1, n, 1)
-            predict_one(x, yhat, state.pseudo.A, state.pseudo.rest, np.empty((n, 1)))
+            predict_pseudo_single(x, yhat, state.pseudo.A, state.pseudo.rest, np.empty((n, 1)))
             xhat, slot = state.model.F @ xhat, slot + 1
         state = state._replace(xhat=xhat, yhat=yhat.reshape(n), slot=slot, reading=None)
         return state._replace(root=state.gains.predicted)
@@ -510,10 +510,10 @@ def correct_estimates(
     n, y = len(state.xhat), np.stack([state.yhat, *heard])[None, :, :, None]
     links, up = star_of([1.0] * len(heard))
     readings = block_of_reading(*(state.reading or (np.zeros(0), np.zeros((0, n)))))
-    one = GainTable(*(np.array(getattr(gains, name)) for name in GainTable._fields))
-    table = GainTable(one.B[None], *(part[None, None] for part in one[1:]))
+    one = SlotGains(*(np.array(getattr(gains, name)) for name in SlotGains._fields))
+    table = SlotGains(one.B[None], *(part[None, None] for part in one[1:]))
     x = np.array(state.xhat).reshape(1, 1, n, 1)
     scratch = np.empty((1, n, 1)), np.empty((n, 1)), np.empty((n, 1))
     arrays = PseudoArrays(state.pseudo, table, np.zeros(1, dtype=np.int64), y, *scratch)
-    correct_one(x, readings, links, up, arrays)
+    correct_single(x, readings, links, up, arrays)
     return x.reshape(n), np.ascontiguousarray(y[0, 0, :, 0])

@@ -82,7 +82,7 @@ def applied_weights(lanes: Lanes, own: float, heard: Any, keep_own: bool) -> tup
 
 
 @kernel
-def weights_of_one(own: float, heard: float, keep_own: bool) -> tuple[float, float]:
+def applied_weights_single(own: float, heard: float, keep_own: bool) -> tuple[float, float]:
     """Return ``applied_weights`` of one filter with one lane."""
     found: tuple[float, float] = applied_weights(ONE, own, heard, keep_own)
     return found
@@ -239,5 +239,5 @@ class DiffusionFilter(Filter):
         nominal ones.
         """
         # fsum: the sum must not depend on the order of messages.
-        kept, divisor = weights_of_one(own, math.fsum(arrived), self.on_loss == "keep-own")
+        kept, divisor = applied_weights_single(own, math.fsum(arrived), self.on_loss == "keep-own")
         return kept, [weight / divisor for weight in arrived]

@@ -80,7 +80,7 @@ def diffusion_kalman_slots(
 
 
 @kernel
-def move_one(x: FloatArray, links: SlotLinks, up: Any, moved: FloatArray) -> None:
+def move_towards_single(x: FloatArray, links: SlotLinks, up: Any, moved: FloatArray) -> None:
     """Apply ``move_towards`` to one node, the first of x (1, H, n, 1), with one lane."""
     move_towards(ONE, x, 0, 0, links, up, 0, 0, True, moved)
 
@@ -175,5 +175,5 @@ def combine_estimates(psi: FloatArray, messages: Sequence[Message]) -> FloatArra
     n, x = len(psi), np.stack([psi, *(m.payload for m in messages)])[None, :, :, None]
     links, up = star_of([message.weight for message in messages])
     moved = np.empty((1, n, 1))
-    move_one(x, links, up, moved)
+    move_towards_single(x, links, up, moved)
     return np.asarray(psi + moved.reshape(n))

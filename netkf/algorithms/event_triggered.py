@@ -24,13 +24,13 @@ from netkf.algorithms.kernels.slots import (
     SlotPlan,
     SlotSamples,
     SlotScratch,
-    move_mean,
     predict_all,
     predict_root,
     read_all,
     rebase,
     show,
     take_silent,
+    transform_mean,
 )
 from netkf.algorithms.kernels.triggers import is_near
 from netkf.algorithms.models import first_root
@@ -138,7 +138,7 @@ def predict_copies(
     lanes = scratch.lanes
     for k in range(arrays.x.shape[1]):
         if any_lane(load_flags(lanes, arrays.known, b, k)):
-            move_mean(lanes, arrays.x, b, k, nodes.F, scratch.moved_mean)
+            transform_mean(lanes, arrays.x, b, k, nodes.F, scratch.moved_mean)
             predict_root(
                 lanes, arrays.root, b, k, nodes.F, nodes.root_Q, scratch.moved, scratch.noise
             )
@@ -264,7 +264,7 @@ def combine_copies(
 
 
 @kernel
-def is_near_one(
+def is_near_single(
     x: FloatArray,
     root: FloatArray,
     bounds: tuple[float, float],
@@ -397,7 +397,7 @@ class EventTriggeredCi(Filter):
         x = np.stack([state.xhat, sent.xhat]).reshape(1, 2, n, 1)
         root = np.stack([state.root, sent.root]).reshape(1, 2, n, n, 1)
         ratio, work = np.empty((n, n + 1, 1)), np.empty((n, n, 1))
-        return bool(is_near_one(x, root, (alpha, 1.0 + delta), ratio, work))
+        return bool(is_near_single(x, root, (alpha, 1.0 + delta), ratio, work))
 
     def absorb(
         self, state: TriggeredState, messages: Sequence[Message], exchange: Exchange

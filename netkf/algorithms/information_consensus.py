@@ -160,7 +160,7 @@ def begin_all(
 
 
 @kernel
-def begin_one(
+def begin_part_single(
     nodes: SlotNodes, readings: ReadingBlock, scratch: SlotScratch, arrays: ConsensusArrays
 ) -> None:
     """Apply ``begin_all`` to one filter with one lane."""
@@ -168,7 +168,9 @@ def begin_one(
 
 
 @kernel
-def mix_one(parts: FloatArray, links: SlotLinks, up: Any, centre: FloatArray, work: Any) -> None:
+def mix_parts_single(
+    parts: FloatArray, links: SlotLinks, up: Any, centre: FloatArray, work: Any
+) -> None:
     """Do a consensus step of one node, the first of ``parts`` (2, K, H, n, n + 1, 1), with one
     lane.
     """
@@ -176,7 +178,7 @@ def mix_one(parts: FloatArray, links: SlotLinks, up: Any, centre: FloatArray, wo
 
 
 @kernel
-def read_one(
+def read_off_single(
     root: FloatArray,
     x: FloatArray,
     parts: FloatArray,
@@ -354,7 +356,9 @@ def first_parts(state: ConsensusState, reading: Reading) -> FloatArray:
     readings = block_of_reading(y, H)
     shares, counts = state.recipe
     parts = np.zeros((2, len(shares), 1, n, n + 1, 1))
-    begin_one(nodes, readings, slot_scratch(1, n, ONE), ConsensusArrays(1, shares, counts, parts))
+    begin_part_single(
+        nodes, readings, slot_scratch(1, n, ONE), ConsensusArrays(1, shares, counts, parts)
+    )
     return parts[0, :, 0, :, :, 0]
 
 
@@ -367,7 +371,7 @@ def mix_node_parts(xhat: FloatArray, parts: FloatArray, messages: Sequence[Messa
     for m, message in enumerate(messages):
         stack[0, :, 1 + m, :, :, 0] = message.payload.parts
     links, up = star_of([message.weight for message in messages])
-    mix_one(stack, links, up, np.ascontiguousarray(centre), np.empty((2, n, n + 1, 1)))
+    mix_parts_single(stack, links, up, np.ascontiguousarray(centre), np.empty((2, n, n + 1, 1)))
     return stack[1, :, 0, :, :, 0]
 
 
@@ -379,5 +383,5 @@ def estimate_of(state: ConsensusState, parts: FloatArray) -> tuple[FloatArray, F
     x, root = state.xhat.reshape(1, 1, n, 1).copy(), state.root.reshape(1, 1, n, n, 1).copy()
     inverse, work = np.zeros((1, n, n, 1)), np.empty((2, n, n + 1, 1))
     centre = state.xhat.reshape(1, n, 1).copy()
-    read_one(root, x, stack, state.recipe.counts, inverse, centre, work)
+    read_off_single(root, x, stack, state.recipe.counts, inverse, centre, work)
     return x.reshape(n), np.tril(root.reshape(n, n))

@@ -100,7 +100,7 @@ def kcf_slots(
 
 
 @kernel
-def term_of_one(
+def consensus_term_single(
     x: FloatArray,
     links: SlotLinks,
     up: Any,
@@ -201,5 +201,5 @@ def consensus_term(
     n, x = len(prior), np.stack([prior, *heard])[None, :, :, None]
     links, up = star_of([1.0] * len(heard))
     moved, S = np.empty((1, n, 1)), np.ascontiguousarray(root).reshape(1, 1, n, n, 1)
-    term_of_one(x, links, up, S, epsilon, moved, np.empty((n, 1)))
+    consensus_term_single(x, links, up, S, epsilon, moved, np.empty((n, 1)))
     return moved.reshape(n)

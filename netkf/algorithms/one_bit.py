@@ -257,7 +257,7 @@ def use_bit(
 
 
 @kernel
-def send_one(
+def send_bits_single(
     x: FloatArray, root: FloatArray, readings: ReadingBlock, signs: FloatArray, work: FloatArray
 ) -> None:
     """Apply ``send_bits`` to one node with one lane, x (1, 1, n, 1)."""
@@ -265,7 +265,7 @@ def send_one(
 
 
 @kernel
-def hear_one(
+def use_bits_single(
     x: FloatArray, root: FloatArray, readings: ReadingBlock, signs: FloatArray, work: FloatArray
 ) -> None:
     """Apply ``use_bit`` to one node with one lane for each of its rows."""
@@ -321,7 +321,7 @@ class OneBit(Filter):
             return state, None
         y, H = whiten_reading(*state.reading[:3])
         signs = np.zeros(len(y))
-        return corrected(state, send_one, y, H, signs), Bits(signs, H)
+        return corrected(state, send_bits_single, y, H, signs), Bits(signs, H)
 
     def absorb(
         self, state: OneBitState, messages: Sequence[Message], exchange: Exchange
@@ -329,7 +329,7 @@ class OneBit(Filter):
         """Correct by the bits of the sender whose turn it is."""
         for message in messages:
             signs, H = message.payload
-            state = corrected(state, hear_one, np.zeros(len(signs)), H, signs)
+            state = corrected(state, use_bits_single, np.zeros(len(signs)), H, signs)
         return state
 
     shift = Filter.shift  # signs of innovations do not depend on the origin
@@ -342,8 +342,8 @@ class OneBit(Filter):
 def corrected(
     state: OneBitState, use: Any, y: FloatArray, H: FloatArray, signs: FloatArray
 ) -> OneBitState:
-    """Return the state after the bits of a whitened reading y (p,), H (p, n): ``send_one`` makes
-    the ``signs`` (p,), ``hear_one`` takes them.
+    """Return the state after ``use`` of the bits of a whitened reading y (p,), H (p, n):
+    ``send_bits_single`` writes the ``signs`` (p,), ``use_bits_single`` reads them.
     """
     n = len(state.xhat)
     x = np.array(state.xhat).reshape(1, 1, n, 1)

@@ -426,7 +426,7 @@ def correct(
 
 
 @kernel
-def add_gain_to_one(
+def add_gain_single(
     x: FloatArray,
     root: FloatArray,
     number: float,
@@ -439,19 +439,19 @@ def add_gain_to_one(
 
 
 @kernel
-def split_one(mass: FloatArray, degree: int, share: FloatArray) -> None:
+def split_mass_single(mass: FloatArray, degree: int, share: FloatArray) -> None:
     """Apply ``split_mass`` to one node with one lane, mass (1, 1, m, 1)."""
     split_mass(ONE, mass, 0, 0, degree, share)
 
 
 @kernel
-def keep_one(mass: FloatArray, share: FloatArray, times: int) -> None:
+def keep_share_single(mass: FloatArray, share: FloatArray, times: int) -> None:
     """Apply ``keep_share`` to one node with one lane, mass (1, 1, m, 1)."""
     keep_share(ONE, mass, 0, 0, share, times, False)
 
 
 @kernel
-def learn_one(
+def learn_network_single(
     mass: FloatArray, alone: FloatArray, information: FloatArray, number: FloatArray
 ) -> None:
     """Apply ``learn_network`` to one node with one lane, mass (1, 1, m, 1)."""
@@ -459,7 +459,7 @@ def learn_one(
 
 
 @kernel
-def correct_one(
+def correct_root_single(
     root: FloatArray, information: FloatArray, rest: FloatArray, scratch: SlotScratch
 ) -> None:
     """Apply ``correct_root`` to one filter with one lane, root (1, 1, n, n, 1)."""
@@ -670,7 +670,7 @@ class PushSum(Filter):
         root = state.network.root
         # Without asymptotic gains P (7) with the node's G; with them P_inf.
         if root is None:
-            root = correct_one_root(state.root, state.network.information)
+            root = correct_root_alone(state.root, state.network.information)
         y, H, R = reading[:3]
         xhat = correct_estimate(state.xhat, root, state.network.number, y, H, R)
         return state._replace(xhat=xhat, root=root)
@@ -799,7 +799,7 @@ def correct_estimate(
     if len(y):
         # The kernel takes readings whose noise has variance 1.
         y, H = whiten_reading(y, H, R)
-        add_gain_to_one(
+        add_gain_single(
             x.reshape(1, 1, n, 1),
             np.ascontiguousarray(root).reshape(1, 1, n, n, 1),
             number,
@@ -813,7 +813,7 @@ def correct_estimate(
 def share(mass: FloatArray, degree: int) -> FloatArray:
     """Return what a node of ``degree`` neighbours sends to each: its mass / (degree + 1)."""
     part = np.empty(mass.shape)
-    split_one(mass.reshape(1, 1, -1, 1), degree, part.reshape(1, -1, 1))
+    split_mass_single(mass.reshape(1, 1, -1, 1), degree, part.reshape(1, -1, 1))
     return part
 
 
@@ -824,7 +824,7 @@ def conserve_mass(mass: FloatArray, received: Sequence[FloatArray], degree: int)
     total = np.array(sum(received, np.zeros(mass.shape)))
     # The same kernels as in slots, on arrays of one place: both engines round alike.
     own = share(mass, degree).reshape(1, -1, 1)
-    keep_one(total.reshape(1, 1, -1, 1), own, degree + 1 - len(received))
+    keep_share_single(total.reshape(1, 1, -1, 1), own, degree + 1 - len(received))
     return total
 
 
@@ -834,17 +834,17 @@ def network(mass: FloatArray, model: SlotModel) -> NetworkInformation:
     """
     alone = model.information
     information, number = np.empty((*alone.shape, 1)), np.empty((1, 1))
-    learn_one(mass.reshape(1, 1, -1, 1), alone[None], information, number)
+    learn_network_single(mass.reshape(1, 1, -1, 1), alone[None], information, number)
     return NetworkInformation(information[:, :, 0], float(number[0, 0]))
 
 
-def correct_one_root(root: FloatArray, information: FloatArray) -> FloatArray:
+def correct_root_alone(root: FloatArray, information: FloatArray) -> FloatArray:
     """Return root of ``(P^-1 + G)^-1 = P (I + G P)^-1``, P (7), for the lower triangular root of P,
     possibly singular, and the information G (n, n).
     """
     n = len(root)
     result, known = (np.array(a).reshape(1, 1, n, n, 1) for a in (root, information))
-    correct_one(result, known, np.empty((n, n, 1)), slot_scratch(1, n, ONE))
+    correct_root_single(result, known, np.empty((n, n, 1)), slot_scratch(1, n, ONE))
     return np.asarray(result.reshape(n, n))
 
 
@@ -884,5 +884,5 @@ def asymptotic_root(F: FloatArray, Q: FloatArray, information: FloatArray) -> Fl
                 if np.abs(G).max() * np.abs(P).max() > MAX_SPREAD:
                     return None
                 # P is the predicted covariance: use the reading to get that of P (12).
-                return correct_one_root(lower_root(square_root(P)), information)
+                return correct_root_alone(lower_root(square_root(P)), information)
     return None

@@ -26,13 +26,13 @@ from netkf.algorithms.kernels.slots import (
     SlotSamples,
     SlotScratch,
     block_of_reading,
-    move_mean,
     predict_all,
     rebase,
     rotate_lanes,
     show,
     take_silent,
-    use_reading,
+    transform_mean,
+    update_by_reading,
     whiten_reading,
 )
 from netkf.algorithms.kernels.triggers import NO_READING, chance_of_silence, weigh_news
@@ -95,13 +95,13 @@ def news_of(reading: Reading, xhat: FloatArray, Y: float | FloatArray) -> float:
     p, n = H.shape
     readings = block_of_reading(y, H)
     trigger = np.ascontiguousarray(whitened_trigger(Y, reading.R))[None]
-    return news_of_one(
+    return weigh_news_single(
         np.ascontiguousarray(xhat).reshape(1, 1, n, 1), readings, trigger, np.empty((p, 1))
     )
 
 
 @kernel
-def news_of_one(x: FloatArray, readings: ReadingBlock, Y: FloatArray, z: FloatArray) -> float:
+def weigh_news_single(x: FloatArray, readings: ReadingBlock, Y: FloatArray, z: FloatArray) -> float:
     """Return ``weigh_news`` of one reading with one lane."""
     news: float = weigh_news(ONE, x, readings, (0, 0, 0), len(z), Y, z)
     return news
@@ -170,7 +170,7 @@ def scheduled_slots(
             if plan.part != SENDING:
                 if plan.exchanged[s]:
                     for h in range(len(nodes.rows)):
-                        hear_sensors(nodes, readings, plan, links, scratch, arrays, b, s, h)
+                        update_by_sensors(nodes, readings, plan, links, scratch, arrays, b, s, h)
                 show(nodes, plan, samples, scratch, b, s)
                 rebase(nodes, readings, scratch, b, s)
 
@@ -203,7 +203,7 @@ def schedule_reading(
 
 
 @kernel
-def hear_sensors(
+def update_by_sensors(
     nodes: SlotNodes,
     readings: ReadingBlock,
     plan: SlotPlan,
@@ -219,14 +219,14 @@ def hear_sensors(
     """
     sent = load_flags(scratch.lanes, plan.sent, b, s, 0, h)
     own = len(links.sender) + h
-    hear_one(nodes, readings, scratch, arrays, b, s, h, h, own, sent)
+    update_by_sensor(nodes, readings, scratch, arrays, b, s, h, h, own, sent)
     for m in range(links.first[h], links.first[h + 1]):
         arrived = load_flags(scratch.lanes, plan.up, b, s, 0, links.way[m])
-        hear_one(nodes, readings, scratch, arrays, b, s, h, links.sender[m], m, arrived)
+        update_by_sensor(nodes, readings, scratch, arrays, b, s, h, links.sender[m], m, arrived)
 
 
 @kernel
-def hear_one(
+def update_by_sensor(
     nodes: SlotNodes,
     readings: ReadingBlock,
     scratch: SlotScratch,
@@ -250,7 +250,7 @@ def hear_one(
                 before = load(lanes, arrays.H, b, place, k, i)
                 now = load(lanes, readings.H, d, t, sender, k, i)
                 store(lanes, arrays.H, b, place, k, i, select(arrived, now, before))
-        use_reading(nodes, readings, scratch, b, s, h, sender, arrived)
+        update_by_reading(nodes, readings, scratch, b, s, h, sender, arrived)
     silent = select(arrived, 0.0, select(known, 1.0, 0.0)) > 0.0
     if any_lane(silent):
         use_silence(nodes, scratch, arrays, b, h, sender, place, silent)
@@ -541,7 +541,7 @@ def expect_all(
                 x -= load(lanes, readings.local, b, s, i)
             store(lanes, arrays.x, b, h, i, x)
         if predicted:
-            move_mean(lanes, arrays.x, b, h, nodes.F, scratch.moved_mean)
+            transform_mean(lanes, arrays.x, b, h, nodes.F, scratch.moved_mean)
         news = weigh_news(
             lanes, arrays.x, readings, (b, s, h), nodes.rows[h], arrays.trigger, arrays.z
         )

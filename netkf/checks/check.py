@@ -38,7 +38,7 @@ from netkf.checks.looks import (
 from netkf.checks.paper import PaperChecks
 from netkf.checks.parts.rows import gaussian_noises, part_promises
 from netkf.checks.parts.samples import PartSummary, stack_parts, summarise_parts
-from netkf.checks.points import check_slots, sample_times
+from netkf.checks.points import check_slots, probe_times
 from netkf.checks.rounding import EPS, OPERATIONS
 from netkf.checks.samples import ReplicaSummary, stack_summaries
 from netkf.core.errors import ScenarioError, TheoryError
@@ -122,7 +122,7 @@ def find_checks(scenario: Scenario) -> PaperChecks:
 
 def with_check_times(scenario: Scenario) -> Scenario:
     """Return the scenario with samples at the times where promises are checked."""
-    return dataclasses.replace(scenario, probe=np.array(sample_times(scenario)))
+    return dataclasses.replace(scenario, probe=np.array(probe_times(scenario)))
 
 
 class ReplicaResult(NamedTuple):

@@ -32,7 +32,7 @@ from netkf.checks.points import (
     check_slots,
     checked_samples,
     errors_at_once,
-    sample_times,
+    probe_times,
     sampled_indices,
 )
 from netkf.checks.rounding import EPS, OPERATIONS, compare_identities
@@ -91,7 +91,7 @@ def summarise_exactly(scenario: Scenario, run: Run) -> ReplicaSummary:
 
 def most_replayed(scenario: Scenario) -> int:
     """Return the number of replicas whose exact covariances are computed."""
-    per_run = len(sample_times(scenario)) * errors_at_once(scenario)
+    per_run = len(probe_times(scenario)) * errors_at_once(scenario)
     steps, least = integration_steps(scenario), 0
     if scenario.slotted:
         steps, least = check_slots(scenario)[-1], ENOUGH_RUNS
@@ -123,18 +123,23 @@ def _replayed_summary(
 ) -> ReplicaSummary:
     """Return the summary of a run with the exact law of its errors."""
     at, sampled = checked_samples(scenario, run.times), sampled_indices(scenario)
-    nodes, times, hosts, n = len(scenario.nodes), len(run.times), law.P.shape[1], scenario.plant.n
-    size = hosts * n
+    nodes, times, estimators, n = (
+        len(scenario.nodes),
+        len(run.times),
+        law.P.shape[1],
+        scenario.plant.n,
+    )
+    size = estimators * n
     # Blocks on the diagonal: the covariance at each time.
     stacked = np.einsum("kakb->kab", law.covariance.reshape(times, size, times, size))
-    mean = law.mean.reshape(times, hosts, n)
-    Sigma, replayed = diagonal_blocks(stacked, hosts), law.P
-    centred = run.error[:, :hosts] - mean
+    mean = law.mean.reshape(times, estimators, n)
+    Sigma, replayed = diagonal_blocks(stacked, estimators), law.P
+    centred = run.error[:, :estimators] - mean
     floor = np.maximum((BLUR * run.rounding) ** 2, _variance_floor(scenario))
     whole = whiten_errors(centred[at], stacked[at], LEAST_VARIANCE, floor[at])
     joint, bias = _pool_times(centred, law.covariance, float(floor.max()))
-    quadratic = _pool_nees(centred, run.P[:, :hosts], law)
-    if hosts < nodes:  # all share one pooled filter
+    quadratic = _pool_nees(centred, run.P[:, :estimators], law)
+    if estimators < nodes:  # all share one pooled filter
         mean, Sigma, replayed = (np.repeat(part, nodes, axis=1) for part in (mean, Sigma, replayed))
     lost = blurred_samples(run, Sigma)[at][:, sampled]
     if lost.any():
@@ -170,8 +175,8 @@ def _pool_times(
 
 
 def _pool_nees(e: FloatArray, P: FloatArray, law: ErrorLaw) -> FloatArray:
-    """Return the sum of ``e' P^-1 e`` over all times and hosts, each in units of its expected value
-    over n, and its weights given the events, (1 + K M n,); all nan if some P has no inverse.
+    """Return the sum of ``e' P^-1 e`` over all times and estimators, each in units of its expected
+    value over n, and its weights given the events, (1 + K M n,); all nan if some P has no inverse.
 
     ``e`` is (K, M, n) less its mean, ``P`` (K, M, n, n) that of the run; expected values and
     weights are those for the P that the events should give. In these units a node that is far too

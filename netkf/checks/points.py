@@ -49,7 +49,7 @@ def errors_at_once(scenario: Scenario) -> int:
     return filters * scenario.plant.n
 
 
-def sample_times(scenario: Scenario) -> list[float]:
+def probe_times(scenario: Scenario) -> list[float]:
     """Return the times at which runs are sampled: those of :func:`check_times`, and others spread
     evenly over the horizon at which only all errors together are looked at.
     """

@@ -92,7 +92,7 @@ def next_ticks(
     return t
 
 
-def all_ticks(
+def generate_ticks(
     clock: Clock,
     entity: Entity,
     phase: Callable[[], np.random.Generator],

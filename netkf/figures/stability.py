@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from netkf.algorithms.intermittent import Intermittent
+from netkf.algorithms.registry import built_in_filters
 from netkf.core.errors import NetkfError, TheoryError
 from netkf.figures.style import (
     EXACT,
@@ -273,8 +273,11 @@ def _invariant_law(subject: Subject) -> FloatArray | None:
     """Return draws of the trace of P by the invariant law, None if R's model is not this one."""
     scenario = subject.scenario
     loss = scenario.network.channel.loss
-    chosen = scenario.slotted and type(scenario.filter.algorithm) is Intermittent
-    if not (chosen and isinstance(loss, Bernoulli) and len(scenario.sensors) == 1):
+    # Exactly the built-in class: a class derived from it may have another law.
+    intermittent = type(scenario.filter.algorithm) is built_in_filters()["intermittent"]
+    if not (intermittent and scenario.slotted and len(scenario.sensors) == 1):
+        return None
+    if not isinstance(loss, Bernoulli):
         return None
     H = getattr(scenario.sensors[0], "H", None)
     if H is None or not _hears_one(scenario).any() or not scenario.filters_know_the_truth:

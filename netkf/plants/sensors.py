@@ -17,7 +17,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from netkf.core.clock import Clock, all_ticks
+from netkf.core.clock import Clock, generate_ticks
 from netkf.core.fields import (
     Component,
     definite_covariance,
@@ -98,7 +98,7 @@ def sampling_ticks(
     "sampling" and "sampling phase".
     """
     phase = partial(generator, "sampling phase")
-    return all_ticks(clock, entity, phase, generator("sampling"), horizon, "sampling")
+    return generate_ticks(clock, entity, phase, generator("sampling"), horizon, "sampling")
 
 
 @dataclass(frozen=True, eq=False)

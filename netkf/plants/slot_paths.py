@@ -153,14 +153,14 @@ def draw_paths(
 
 
 class SlotSensors(NamedTuple):
-    """M drawn sensors: which filter reads each (``host``) and its first ``row`` and number of
+    """M drawn sensors: which filter reads each (``estimator``) and its first ``row`` and number of
     ``rows`` in that filter's reading (M, each), H (M, p, n) and factor of the noise (M, p, p).
 
     Where H is random, ``driven`` (M,) is the place of the sensor's regressor ``C s`` with C
     (D, n, k), else -1.
     """
 
-    host: np.ndarray
+    estimator: np.ndarray
     row: np.ndarray
     rows: np.ndarray
     H: FloatArray
@@ -181,11 +181,11 @@ def draw_readings(
     y: FloatArray,
     H: FloatArray,
 ) -> None:
-    """Fill the readings y (B, S, hosts, p, L), and H (B, S, hosts, p, n, L) where it is random,
-    from the states x (B, S, n, L) and ``regressors`` (D, B, S, k, L), with the next numbers of the
-    streams ``states`` (R M, >= 4); ``scratch`` (p, L) is scratch.
+    """Fill the readings y (B, S, estimators, p, L), and H (B, S, estimators, p, n, L) where it is
+    random, from the states x (B, S, n, L) and ``regressors`` (D, B, S, k, L), with the next numbers
+    of the streams ``states`` (R M, >= 4); ``scratch`` (p, L) is scratch.
     """
-    count = len(sensors.host)
+    count = len(sensors.estimator)
     for b in range(x.shape[0] if count > 0 else 0):
         runs, first = len(states) // count - b * len(lanes), b * len(lanes) * count
         for s in range(x.shape[1]):
@@ -214,7 +214,7 @@ def read_row(
     H: FloatArray,
 ) -> None:
     """Write row ``i`` of the reading of sensor ``m``, and of its H if that is random."""
-    host, row, d = sensors.host[m], sensors.row[m] + i, sensors.driven[m]
+    estimator, row, d = sensors.estimator[m], sensors.row[m] + i, sensors.driven[m]
     total = spread(lanes, 0.0)
     for j in range(sensors.rows[m]):
         total += sensors.noise[m, i, j] * load(lanes, normals, j)
@@ -227,6 +227,6 @@ def read_row(
             for k in range(sensors.C.shape[2]):
                 weight += sensors.C[d, j, k] * load(lanes, regressors, d, b, s, k)
             weight *= sensors.H[m, i, 0]
-            store(lanes, H, b, s, host, row, j, weight)
+            store(lanes, H, b, s, estimator, row, j, weight)
         total += weight * load(lanes, x, b, s, j)
-    store(lanes, y, b, s, host, row, total)
+    store(lanes, y, b, s, estimator, row, total)

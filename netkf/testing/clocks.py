@@ -11,7 +11,7 @@ from scipy.special import stdtrit
 
 from netkf.checks.parts.sources import stated_part
 from netkf.checks.parts.ticks import (
-    Ticks,
+    TickSample,
     distance_from_lattice,
     gap_law,
     ticks_on_lattice,
@@ -243,7 +243,9 @@ def _check_stated_law(watched: Watched, gaps: FloatArray, times: FloatArray) -> 
     remedy = "define mean_rate and memoryless too if it differs by design"
     if ticks_on_lattice(stated):
         number = np.tile(np.arange(times.shape[1]), len(times))
-        ticks = Ticks(times.ravel(), number, np.full(number.shape, times.shape[1]), number == 0)
+        ticks = TickSample(
+            times.ravel(), number, np.full(number.shape, times.shape[1]), number == 0
+        )
         off = distance_from_lattice(stated, ticks)
         words = f"{off:.3g} s beside one of them"
         demand(

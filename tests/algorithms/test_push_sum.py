@@ -17,7 +17,7 @@ from netkf.algorithms.push_sum import (
     asymptotic_root,
     average_estimates,
     conserve_mass,
-    correct_one_root,
+    correct_root_alone,
     share,
 )
 
@@ -109,7 +109,7 @@ def test_the_correction_is_the_formula_of_the_paper(n):
     for rank in range(n + 1):
         A, B = random.standard_normal((n, n)), random.standard_normal((n, rank))
         M, G = A @ A.T, B @ B.T
-        root = correct_one_root(np.linalg.cholesky(M), G)
+        root = correct_root_alone(np.linalg.cholesky(M), G)
         expected = M @ np.linalg.inv(np.eye(n) + G @ M)
         np.testing.assert_allclose(root @ root.T, expected, rtol=1e-10, atol=1e-12)
 
@@ -117,7 +117,7 @@ def test_the_correction_is_the_formula_of_the_paper(n):
 def test_the_correction_survives_a_covariance_that_grew_for_long():
     """A node without mass lets P grow; when information comes, what is seen is known again."""
     P, G = np.diag([1e20, 1e18]), np.diag([4.0, 0.0])
-    root = correct_one_root(np.sqrt(P), G)
+    root = correct_root_alone(np.sqrt(P), G)
     np.testing.assert_allclose(root @ root.T, np.diag([0.25, 1e18]), rtol=1e-12)
 
 

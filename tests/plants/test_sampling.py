@@ -5,7 +5,7 @@ import functools
 import numpy as np
 import pytest
 
-from netkf.core.clock import all_ticks
+from netkf.core.clock import generate_ticks
 from netkf.core.errors import ScenarioError
 from netkf.network.clocks import Periodic, Poisson, Renewal
 from netkf.plants.recorded import RecordedReadings, RecordedSensor
@@ -68,7 +68,7 @@ def test_a_clock_that_does_not_advance_is_refused():
             return np.full(count, 1.5)
 
     with pytest.raises(ScenarioError, match=r"ticks of node .* must increase, after 1.5 s"):
-        all_ticks(Stuck(rate=1.0), (4,), None, None, 9.0)
+        generate_ticks(Stuck(rate=1.0), (4,), None, None, 9.0)
 
 
 def test_noise_is_the_cholesky_factor_times_normals_in_order():

@@ -30,7 +30,7 @@ def fill_moments_of(
     doublings, step = 0, gap
     while norm > 0.5:
         norm, step, doublings = 0.5 * norm, 0.5 * step, doublings + 1
-    fill_series(M, sign, step, first, work)
+    fill_exponential_integrals(M, sign, step, first, work)
     for _ in range(doublings):
         double_gap(step, first, work)
         step *= 2.0
@@ -40,7 +40,7 @@ def fill_moments_of(
 
 
 @kernel
-def fill_series(
+def fill_exponential_integrals(
     M: FloatArray, sign: float, step: float, first: FloatArray, work: FloatArray
 ) -> None:
     """Write ``J_1 = int_0^s e^{M u} du`` into ``first``, and e^{M s} and
@@ -64,7 +64,7 @@ def fill_series(
 
 @kernel
 def double_gap(step: float, first: FloatArray, work: FloatArray) -> None:
-    """Make what ``fill_series`` wrote for a step that of two steps."""
+    """Make what ``fill_exponential_integrals`` wrote for a step that of two steps."""
     n, E, moved, later = len(first), work[0], work[2], work[3]
     multiply_square(moved, E, later)
     for i in range(n):

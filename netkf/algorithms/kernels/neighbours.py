@@ -14,7 +14,7 @@ from netkf.algorithms.kernels.slots import (
     SlotNodes,
     SlotPlan,
     SlotScratch,
-    use_reading,
+    update_by_reading,
     write_root_column,
 )
 from netkf.linalg.arrays import FloatArray
@@ -114,13 +114,13 @@ def fuse_readings(
     """Update filter ``h`` of a block with its own reading and, where they ``share`` them, those
     that arrive in the first step of the slot.
     """
-    use_reading(nodes, readings, scratch, b, s, h, h, True)
+    update_by_reading(nodes, readings, scratch, b, s, h, h, True)
     if not share:
         return
     for m in range(links.first[h], links.first[h + 1]):
         arrived = load_flags(scratch.lanes, plan.up, b, s, 0, links.way[m])
         if any_lane(arrived):
-            use_reading(nodes, readings, scratch, b, s, h, links.sender[m], arrived)
+            update_by_reading(nodes, readings, scratch, b, s, h, links.sender[m], arrived)
 
 
 @kernel

@@ -268,11 +268,11 @@ def read_all(
 ) -> None:
     """Update all filters of a block with their own readings of slot ``s``."""
     for h in range(len(nodes.rows)):
-        use_reading(nodes, readings, scratch, b, s, h, h, True)
+        update_by_reading(nodes, readings, scratch, b, s, h, h, True)
 
 
 @kernel(inlined=True)
-def use_reading(
+def update_by_reading(
     nodes: SlotNodes,
     readings: ReadingBlock,
     scratch: SlotScratch,
@@ -350,14 +350,14 @@ def predict_all(nodes: SlotNodes, scratch: SlotScratch, b: int) -> None:
 @kernel(inlined=True)
 def predict_mean(nodes: SlotNodes, scratch: SlotScratch, b: int, h: int) -> None:
     """Move the estimate of a filter to the next slot, ``F xhat``."""
-    move_mean(scratch.lanes, nodes.xhat, b, h, nodes.F, scratch.moved_mean)
+    transform_mean(scratch.lanes, nodes.xhat, b, h, nodes.F, scratch.moved_mean)
 
 
 @kernel(inlined=True)
-def move_mean(
+def transform_mean(
     lanes: Lanes, x: FloatArray, b: int, h: int, F: FloatArray, moved_mean: FloatArray
 ) -> None:
-    """Make an estimate of ``x`` (B, H, n, L) ``F`` times that; ``moved_mean`` (n, L) is scratch."""
+    """Multiply estimate [b, h] of ``x`` (B, H, n, L) by F; ``moved_mean`` (n, L) is scratch."""
     n = x.shape[2]
     for i in range(n):
         total = spread(lanes, 0.0)
@@ -442,7 +442,7 @@ def write_root_column(
 
 
 @kernel
-def predict_one(
+def predict_root_single(
     root: FloatArray, F: FloatArray, root_Q: FloatArray, moved: FloatArray, noise: FloatArray
 ) -> None:
     """Apply ``predict_root`` to one filter with one lane, root (1, 1, n, n, 1)."""
@@ -453,5 +453,5 @@ def predict_root_alone(root: FloatArray, F: FloatArray, root_Q: FloatArray) -> F
     """Return the lower triangular root (n, n) of ``F S S' F' + Q``, of lower triangular roots."""
     n = len(F)
     moved = np.array(root).reshape(1, 1, n, n, 1)
-    predict_one(moved, F, root_Q, np.empty((n, n, 1)), np.empty((n, n, 1)))
+    predict_root_single(moved, F, root_Q, np.empty((n, n, 1)), np.empty((n, n, 1)))
     return np.asarray(moved.reshape(n, n))

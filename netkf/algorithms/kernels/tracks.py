@@ -248,11 +248,11 @@ def write_combined_root(
                         total += weights[i, b * n + k] * joint[b, a, k, j]
                 for c in range(i + 1):
                     P[i, c] += total * weights[c, a * n + j]
-    take_root(P, root)
+    fill_cholesky(P, root)
 
 
 @kernel
-def take_root(P: FloatArray, root: FloatArray) -> None:
+def fill_cholesky(P: FloatArray, root: FloatArray) -> None:
     """Write the lower triangular root (n, n) of P, of which the lower triangle is read; where P is
     singular columns of zeros.
     """

@@ -21,8 +21,8 @@ from netkf.checks.parts.moments import (
 from netkf.checks.parts.samples import PartSamples
 from netkf.checks.parts.ticks import (
     ClockGroup,
+    count_drawn_ticks,
     draw_samples,
-    draw_ticks,
     network_clocks,
     relative_variance,
     sampling_clocks,
@@ -57,7 +57,7 @@ LATTICE_TOLERANCE = 1e-9
 """Seconds, for each second of the run, by which rounding may move a tick."""
 
 
-class Clocks(NamedTuple):
+class ClockSamples(NamedTuple):
     """Clocks of one kind, the counts of their ticks in all runs, and how more are drawn."""
 
     scenario: Scenario
@@ -78,18 +78,20 @@ class Clocks(NamedTuple):
         return all(stated.memoryless for stated in self.group.stated)
 
 
-def _network(samples: PartSamples) -> Clocks:
+def _network(samples: PartSamples) -> ClockSamples:
     scenario = samples.scenario
-    return Clocks(scenario, samples.seed, network_clocks(scenario), samples.ticks, draw_ticks)
+    return ClockSamples(
+        scenario, samples.seed, network_clocks(scenario), samples.ticks, count_drawn_ticks
+    )
 
 
-def _sampling(samples: PartSamples) -> Clocks:
+def _sampling(samples: PartSamples) -> ClockSamples:
     scenario = samples.scenario
     group = sampling_clocks(scenario)
-    return Clocks(scenario, samples.seed, group, samples.sampling, draw_samples)
+    return ClockSamples(scenario, samples.seed, group, samples.sampling, draw_samples)
 
 
-Group = Callable[[PartSamples], Clocks]
+Group = Callable[[PartSamples], ClockSamples]
 
 
 @lru_cache(maxsize=4)
@@ -104,7 +106,7 @@ def _drawn_counts(
     return np.array([draw(scenario, seed, first + k) for k in range(count)])
 
 
-def _counts_of_each(clocks: Clocks) -> np.ndarray:
+def _counts_of_each(clocks: ClockSamples) -> np.ndarray:
     """Return the ticks (R', E) of each clock in the runs, and in as many further replicas, of which
     only the clocks are drawn, as it takes to find that one rate is off by WANTED_RATE.
     """
@@ -117,7 +119,7 @@ def _counts_of_each(clocks: Clocks) -> np.ndarray:
     return np.concatenate([counts, more])
 
 
-def _number_drawn(clocks: Clocks, runs: float) -> int:
+def _number_drawn(clocks: ClockSamples, runs: float) -> int:
     """Return the number of replicas of which the clocks are drawn beside those of the runs."""
     rates = clocks.rates * clocks.scenario.horizon
     wanted = min(
@@ -164,7 +166,7 @@ def _rates(group: Group, samples: PartSamples, level: float) -> Finding:
     return finding._replace(message=finding.message + note)
 
 
-def _ticks_of_start(clocks: Clocks, counts: np.ndarray) -> FloatArray:
+def _ticks_of_start(clocks: ClockSamples, counts: np.ndarray) -> FloatArray:
     """Return by how many ticks (E,) the mean count of each clock in a run may be off its rate.
 
     A renewal process that begins with a run has between rate T - 1 and rate T + c^2 ticks in T
@@ -190,7 +192,7 @@ def _rates_by_window(windows: np.ndarray, mean: float, level: float) -> list[tup
 
 
 def _limit_of_one_clock(
-    clocks: Clocks, each: np.ndarray, singles: list[Interval], level: float
+    clocks: ClockSamples, each: np.ndarray, singles: list[Interval], level: float
 ) -> str:
     """Return what no test could find at one clock, where that is more than WANTED_RATE.
 
@@ -314,7 +316,7 @@ def largest_correlation(
     return deviation_interval(0.0, found), (int(kept[a]), int(kept[b]))
 
 
-def _promises(clocks: Clocks, group: Group, words: dict[str, str]) -> list[Promise]:
+def _promises(clocks: ClockSamples, group: Group, words: dict[str, str]) -> list[Promise]:
     """Return the promises about one group of clocks, with a sentence for each test."""
     rows: list[tuple[str, Callable[..., Finding], bool]] = [("rates", _rates, False)]
     if clocks.poisson:

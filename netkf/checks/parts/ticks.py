@@ -15,7 +15,7 @@ import scipy.special
 
 from netkf.checks.parts.moments import count_cells
 from netkf.checks.parts.sources import stated_part
-from netkf.core.clock import Entity, all_ticks
+from netkf.core.clock import Entity, generate_ticks
 from netkf.linalg.arrays import FloatArray
 from netkf.network.clocks import LinkClock, OnReadings, Periodic, Renewal
 from netkf.rng.streams import Streams
@@ -103,12 +103,12 @@ def count_samples(scenario: Scenario, streams: Streams) -> TickCounts | None:
     return _count(group, np.concatenate(found), which, scenario.horizon)
 
 
-def draw_ticks(scenario: Scenario, seed: int, replica: int) -> np.ndarray:
+def count_drawn_ticks(scenario: Scenario, seed: int, replica: int) -> np.ndarray:
     """Return how often each clock of the network ticks in a replica, (E,), from its stream."""
     clock: Any = scenario.network.activation
     streams = Streams(seed, replica)
     ticks = [
-        all_ticks(
+        generate_ticks(
             clock,
             entity,
             partial(streams.generator, "phase", *entity),
@@ -158,7 +158,7 @@ def _count(group: ClockGroup, times: np.ndarray, which: np.ndarray, horizon: flo
     uniform, off = np.full(len(t), np.nan), 0.0
     for clock in dict.fromkeys(group.stated):
         mine = np.array([one is clock for one in group.stated])[e]
-        ticks = Ticks(t[mine], number[mine], total[e[mine]], first[mine])
+        ticks = TickSample(t[mine], number[mine], total[e[mine]], first[mine])
         uniform[mine] = _as_uniform(clock, ticks, horizon)
         off = max(off, distance_from_lattice(clock, ticks))
     known = np.isfinite(uniform)
@@ -166,7 +166,7 @@ def _count(group: ClockGroup, times: np.ndarray, which: np.ndarray, horizon: flo
     return TickCounts(windows, cells, correlate_neighbours(uniform, first), np.array(off))
 
 
-class Ticks(NamedTuple):
+class TickSample(NamedTuple):
     """Times (K,) of ticks, clock by clock, the number of each on its clock from 0, how many its
     clock has in all, and whether it is the first.
     """
@@ -183,7 +183,7 @@ class Ticks(NamedTuple):
         return np.where(self.first, 0.0, before)
 
 
-def _as_uniform(clock: Any, ticks: Ticks, horizon: float) -> np.ndarray:
+def _as_uniform(clock: Any, ticks: TickSample, horizon: float) -> np.ndarray:
     """Return a number for each tick that is uniform in [0, 1), and independent of those before it,
     if the clock keeps its law; nan where it has no law that is known here.
 
@@ -259,7 +259,7 @@ def ticks_on_lattice(clock: Any) -> bool:
     return constant or type(clock) is Periodic
 
 
-def distance_from_lattice(clock: Any, ticks: Ticks) -> float:
+def distance_from_lattice(clock: Any, ticks: TickSample) -> float:
     """Return the largest distance in seconds of a tick from where it may be, 0 without a lattice.
 
     Clocks with a random phase may all be early or late by one time.

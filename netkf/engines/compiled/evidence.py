@@ -26,7 +26,7 @@ from netkf.linalg.lanes import ONE
 from netkf.linalg.structs import Struct
 
 
-class Evidence(Struct):
+class EvidenceArrays(Struct):
     """Evidence (n, n + 1, 1) that counts from the beliefs of nodes: priors and own readings
     (N, ...), what was told last on each of W directed links, and when that was sent (``sent_at``,
     (W,); never: -inf), and what messages carry (C, ...). The links that node h hears are
@@ -58,7 +58,7 @@ class Evidence(Struct):
     maps: FloatArray
 
 
-def empty_evidence(state: Simulation, A: FloatArray, roots: FloatArray) -> Evidence:
+def empty_evidence(state: Simulation, A: FloatArray, roots: FloatArray) -> EvidenceArrays:
     """Return that of nodes that have read and heard nothing; ``roots`` (1, N, n, n, 1)."""
     N, n = state.xhat.shape
     ways, p, part = state.ways, len(state.scratch.y), (n, n + 1, 1)
@@ -66,7 +66,7 @@ def empty_evidence(state: Simulation, A: FloatArray, roots: FloatArray) -> Evide
     prior = np.zeros((N, *part))
     for h in range(N):
         take_one_prior(roots, h, prior[h])
-    return Evidence(
+    return EvidenceArrays(
         prior=prior,
         own=np.zeros((N, *part)),
         told=np.zeros((len(ways), *part)),
@@ -88,7 +88,7 @@ def empty_evidence(state: Simulation, A: FloatArray, roots: FloatArray) -> Evide
     )
 
 
-def more_evidence(evidence: Evidence, capacity: int) -> None:
+def more_evidence(evidence: EvidenceArrays, capacity: int) -> None:
     """Make space for what so many messages carry."""
     grown = np.zeros((capacity, *evidence.carried.shape[1:]))
     grown[: len(evidence.carried)] = evidence.carried
@@ -96,7 +96,7 @@ def more_evidence(evidence: Evidence, capacity: int) -> None:
 
 
 @kernel
-def move_evidence(evidence: Evidence, h: int, gap: float) -> None:
+def move_evidence(evidence: EvidenceArrays, h: int, gap: float) -> None:
     """Let all evidence of node ``h`` speak about the state ``gap`` seconds later."""
     fill_inverse_transition(evidence.A, gap, evidence.maps)
     back, total, work = evidence.maps[0], evidence.total, evidence.work
@@ -107,7 +107,7 @@ def move_evidence(evidence: Evidence, h: int, gap: float) -> None:
 
 
 @kernel
-def believe(state: Simulation, evidence: Evidence, h: int) -> None:
+def update_belief(state: Simulation, evidence: EvidenceArrays, h: int) -> None:
     """Make the belief of node ``h`` from its prior and all evidence, which counts from it then."""
     total, work, centre = evidence.total, evidence.work, evidence.centre
     for i in range(state.xhat.shape[1]):
@@ -126,7 +126,7 @@ def believe(state: Simulation, evidence: Evidence, h: int) -> None:
 
 
 @kernel
-def add_samples(state: Simulation, evidence: Evidence, h: int, instant: int) -> None:
+def add_samples(state: Simulation, evidence: EvidenceArrays, h: int, instant: int) -> None:
     """Add the samples of an instant to the own evidence of node ``h``."""
     given, n = state.instants, state.xhat.shape[1]
     for i in range(n):
@@ -149,11 +149,11 @@ def add_samples(state: Simulation, evidence: Evidence, h: int, instant: int) -> 
             ONE, evidence.own[h], 1.0, evidence.y, evidence.H, (0, 0, 0), rows,
             evidence.centre[h : h + 1], evidence.work,
         )  # fmt: skip
-    believe(state, evidence, h)
+    update_belief(state, evidence, h)
 
 
 @kernel
-def send_evidence(state: Simulation, evidence: Evidence, m: int, h: int) -> None:
+def send_evidence(state: Simulation, evidence: EvidenceArrays, m: int, h: int) -> None:
     """Put what node ``h`` has read and heard into a message, without what its receiver told."""
     receiver = state.ways[state.pool[m].way].receiver
     copy_state(state.size, state.pool_x, state.pool_root, m, state.xhat, state.root, h)
@@ -165,7 +165,7 @@ def send_evidence(state: Simulation, evidence: Evidence, m: int, h: int) -> None
 
 
 @kernel
-def hear_evidence_now(state: Simulation, evidence: Evidence, h: int, now: float) -> None:
+def hear_evidence_now(state: Simulation, evidence: EvidenceArrays, h: int, now: float) -> None:
     """Replace what the senders of messages told node ``h`` before, unless it was sent later; the
     centres of what they carry are predicted to now.
     """
@@ -185,4 +185,4 @@ def hear_evidence_now(state: Simulation, evidence: Evidence, h: int, now: float)
             )
             evidence.sent_at[w] = message.sent
         m = message.next
-    believe(state, evidence, h)
+    update_belief(state, evidence, h)

@@ -26,7 +26,7 @@ from netkf.algorithms.kernels.root_flow import (
 from netkf.algorithms.kernels.slots import predict_root
 from netkf.algorithms.models import usable
 from netkf.engines.base import LONGER, SHORTEST_SHARE
-from netkf.engines.compiled.evidence import Evidence, empty_evidence
+from netkf.engines.compiled.evidence import EvidenceArrays, empty_evidence
 from netkf.engines.compiled.increments import fill_readings
 from netkf.engines.compiled.late_readings import copy_state, use_instant
 from netkf.engines.compiled.state import (
@@ -83,7 +83,7 @@ class Extras(Struct):
     maps: FloatArray
     work: FloatArray
     flow_scratch: FlowScratch
-    evidence: Evidence
+    evidence: EvidenceArrays
 
 
 def extras_of(scenario: Scenario, state: Simulation) -> Extras | None:

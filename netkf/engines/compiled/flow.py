@@ -50,7 +50,7 @@ from netkf.engines.compiled.state import (
     SampleBuffer,
     Sensing,
     Simulation,
-    Ticks,
+    TickArrays,
     add_messages,
     empty_pool,
     entity_records,
@@ -280,10 +280,10 @@ class Workspace:
         }
 
 
-def ticks_of(window: Window) -> Ticks:
+def ticks_of(window: Window) -> TickArrays:
     """The ticks of a window."""
     heard = np.zeros(len(window.t), dtype=np.int64) if window.heard is None else window.heard
-    return Ticks(**window._replace(heard=heard)._asdict())
+    return TickArrays(**window._replace(heard=heard)._asdict())
 
 
 def empty_samples(

@@ -247,12 +247,12 @@ def gain_mass(state: Simulation, totals: Totals, h: int, size: float, share: flo
             inner[i, j] = 0.5 * share * total + (1.0 if i == j else 0.0)
     # By eigenvalues, because U is a difference of sums and may be indefinite by rounding.
     diagonalise(inner, vectors)
-    shrink_root(state, h, inner, vectors)
+    update_root_by_gain(state, h, inner, vectors)
     move_by_gain(state, h, gained, share, totals.scratch[3, 0])
 
 
 @kernel
-def shrink_root(state: Simulation, h: int, values: FloatArray, vectors: FloatArray) -> None:
+def update_root_by_gain(state: Simulation, h: int, values: FloatArray, vectors: FloatArray) -> None:
     """The triangular root of ``S V D^-1 V' S'``: D is the diagonal of ``values``, at least 1."""
     root, F, n = state.root, state.flow_scratch.values, state.xhat.shape[1]
     wide, noise = state.flow_scratch.wide, state.flow_scratch.T

@@ -77,7 +77,7 @@ class Ticks(NamedTuple):
         return Window(end, self.t, self.entity, np.cumsum(sent) - sent, self.delay)
 
 
-class Clocks:
+class TickSource:
     """The ticks of E entities in all runs, run by run and block by block: ``last`` (E,) are the
     last ones known, infinite after the horizon, and ``drawn`` (E,) how many were drawn.
     """
@@ -304,7 +304,7 @@ class EntityDraws:
         self, scenario: Scenario, streams: Streams | ReplicaStreams, senders: Senders
     ) -> None:
         self.count = len(senders.entities) * streams.runs
-        self._clocks = Clocks(scenario, streams, senders)
+        self._clocks = TickSource(scenario, streams, senders)
         self._outcomes = Outcomes(scenario, streams, senders)
         self.sizes = self._outcomes.sizes
         # Longer blocks cost less for each tick, but must not make too many at once.

@@ -379,7 +379,7 @@ class Moment(NamedTuple):
 
 
 @kernel
-def note(
+def write_row(
     rows: Rows, m: Moment, kind: int, node: int, peer: int, message: int, age: float, at: int
 ) -> int:
     """Write one event into row ``at``; return the next row."""
@@ -443,7 +443,7 @@ def _slot_rows(
         if m.step < 0:
             if times.sensed[s]:
                 for node in h.sensing:
-                    at = note(rows, m, SENSE, node, -1, -1, NAN, at)
+                    at = write_row(rows, m, SENSE, node, -1, -1, NAN, at)
         elif times.exchanged[s]:
             at = _sent(c, h, d, rows, m, pairwise, at)
             # Absorptions happen at the end of the step, when its inboxes close.
@@ -457,13 +457,13 @@ def _slot_rows(
 def _sent(c: Channels, h: Hearing, d: Drawn, rows: Rows, m: Moment, pairwise: bool, at: int) -> int:
     """Write what is sent in a step, after the tick of each pair or one round; return the row."""
     if not pairwise:
-        at = note(rows, m, ROUND, -1, -1, -1, NAN, at)
+        at = write_row(rows, m, ROUND, -1, -1, -1, NAN, at)
     links = d.pairs[0, m.s, m.step] if pairwise else len(c.ends)
     for a in range(links):
         link = d.active[0, m.s, m.step, a] if pairwise else a
         if pairwise:
             i, j = h.nodes[c.ends[link, 0]], h.nodes[c.ends[link, 1]]
-            at = note(rows, m, TICK, i, j, -1, NAN, at)
+            at = write_row(rows, m, TICK, i, j, -1, NAN, at)
         at = _link_rows(c, h, d, rows, m, link, at)
     return at
 
@@ -478,11 +478,11 @@ def _link_rows(c: Channels, h: Hearing, d: Drawn, rows: Rows, m: Moment, link: i
         # Messages of a direction are numbered from 0, lost ones included.
         number, sender, receiver = h.sent[w], h.nodes[i], h.nodes[c.ends[link, 1 - end]]
         h.sent[w] = number + 1
-        at = note(rows, m, SEND, sender, receiver, number, NAN, at)
+        at = write_row(rows, m, SEND, sender, receiver, number, NAN, at)
         if d.up[0, m.s, m.step, w, 0] == 1:
-            at = note(rows, m, DELIVER, receiver, sender, number, 0.0, at)
+            at = write_row(rows, m, DELIVER, receiver, sender, number, 0.0, at)
         else:
-            at = note(rows, m, LOST, sender, receiver, number, NAN, at)
+            at = write_row(rows, m, LOST, sender, receiver, number, NAN, at)
     return at
 
 
@@ -505,12 +505,12 @@ def _closed(
                 if pairwise:
                     # The message of this step is the last one that was numbered.
                     peer, number = h.nodes[h.sender[k]], h.sent[h.way[k]] - 1
-                    at = note(rows, m, SWAP, h.nodes[i], peer, number, 0.0, at)
+                    at = write_row(rows, m, SWAP, h.nodes[i], peer, number, 0.0, at)
         if heard and not pairwise:
-            at = note(rows, m, ABSORB, h.nodes[i], -1, -1, 0.0, at)
+            at = write_row(rows, m, ABSORB, h.nodes[i], -1, -1, 0.0, at)
         # A node that stops in this slot does so after it absorbed.
         if m.step == stopping and h.stopped[0, i, 0] == m.slot:
-            at = note(rows, m, STOP, h.nodes[i], -1, -1, NAN, at)
+            at = write_row(rows, m, STOP, h.nodes[i], -1, -1, NAN, at)
     return at
 
 
@@ -568,7 +568,7 @@ def count_step(
     """Count the events of one step of an exchange in the runs of a block."""
     stops = m.step == stopping
     if pairwise:
-        count_pairs(lanes, c, d, m, scratch, counts, b)
+        count_matched_pairs(lanes, c, d, m, scratch, counts, b)
     else:
         add_count(lanes, scratch, ROUND, 1.0)
         sent = 0
@@ -595,7 +595,7 @@ def count_step(
 
 
 @kernel
-def count_pairs(
+def count_matched_pairs(
     lanes: Lanes,
     c: Channels,
     d: Drawn,

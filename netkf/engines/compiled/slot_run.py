@@ -106,11 +106,11 @@ class SlotRuns:
             setup.root_Q,
             setup.rows,
         )
-        self._room = slot_scratch(setup.hosts, setup.n)
+        self._room = slot_scratch(setup.estimators, setup.n)
         self._extra = setup.algorithm.slot_arrays(setup.states, setup.infos, runs)
         # No slot reaches it: a node that never stops.
-        self._stopped = np.full((blocks, setup.hosts, LANES), NEVER)
-        self._conserved = aligned((blocks, setup.hosts, 2, LANES))
+        self._stopped = np.full((blocks, setup.estimators, LANES), NEVER)
+        self._conserved = aligned((blocks, setup.estimators, 2, LANES))
         self._sent = np.zeros(len(setup.directions), dtype=np.int64)
         self.counts = np.zeros((runs, len(KINDS)), dtype=np.int64)
         self._begin_truth()
@@ -257,8 +257,8 @@ class SlotRuns:
 
     def _space(self, count: int) -> SampledStates:
         """Space for so many samples."""
-        runs, hosts, n = self.runs, self.setup.hosts, self.setup.n
-        shape = runs, count, hosts, n
+        runs, estimators, n = self.runs, self.setup.estimators, self.setup.n
+        shape = runs, count, estimators, n
         shapes = (runs, count, n), shape, (*shape, n), shape
         ends = np.cumsum([math.prod(each) for each in shapes])
         # One piece of memory: numpy asks for huge pages for large ones, which cost little to get.
@@ -372,7 +372,7 @@ class SlotRuns:
 
     def _readings(self, times: SlotTimes, local: FloatArray, rebased: np.ndarray) -> ReadingBlock:
         setup, count = self.setup, local.shape[1]
-        shape = self._blocks, count, setup.hosts, setup.p
+        shape = self._blocks, count, setup.estimators, setup.p
         y: FloatArray = unset((*shape, LANES))
         H: FloatArray = setup.H
         if setup.varies:
@@ -396,8 +396,8 @@ class SlotRuns:
             values, matrices = path.several(slots, x[0, times.sensed, :, 0])
             # Whitened with the R that filters believe; all runs read the same.
             white = solve_lower(s.root, values.T).T, solve_lower(s.root, matrices)
-            y[:, times.sensed, s.host, some] = white[0][..., None]
-            H[:, times.sensed, s.host, some] = white[1][..., None]
+            y[:, times.sensed, s.estimator, some] = white[0][..., None]
+            H[:, times.sensed, s.estimator, some] = white[1][..., None]
         return ReadingBlock(y, H, local, rebased)
 
     def events(self, block: SlotBlock) -> tuple[np.ndarray, np.ndarray]:

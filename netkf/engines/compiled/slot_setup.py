@@ -41,13 +41,13 @@ def slot_setup(scenario: Scenario) -> SlotSetup:
 
 
 class AssignedSensor(NamedTuple):
-    """A sensor of ``node``: which filter reads it (``host``) and its first ``row`` there; ``root``
-    (p, p) is the Cholesky factor of R as the filters believe it.
+    """A sensor of ``node``: which filter reads it (``estimator``) and its first ``row`` there;
+    ``root`` (p, p) is the Cholesky factor of R as the filters believe it.
     """
 
     node: int
     place: PlacedSensor
-    host: int
+    estimator: int
     row: int
     root: FloatArray
 
@@ -122,19 +122,21 @@ class SlotSetup:
     def _set_sensors(self, scenario: Scenario) -> None:
         """Assign the readings of each sensor: one filter reads those of one node, or of all."""
         pooled = self.algorithm.pooled
-        self.hosts = 1 if pooled else len(scenario.nodes)
-        rows = np.zeros(self.hosts, dtype=np.int64)
+        self.estimators = 1 if pooled else len(scenario.nodes)
+        rows = np.zeros(self.estimators, dtype=np.int64)
         self.sensing = np.array(scenario.sensing, dtype=np.int64)
         self.placed: list[AssignedSensor] = []
         for node in scenario.sensing:
-            host = 0 if pooled else scenario.topology.index[node]
+            estimator = 0 if pooled else scenario.topology.index[node]
             for place in scenario.placed[node]:
                 R = scenario.noise(place.entry, believed=True)
                 root = cholesky(R)
                 # A filter stacks the readings of its sensors: each begins where the one before
                 # ends.
-                self.placed.append(AssignedSensor(node, place, host, int(rows[host]), root))
-                rows[host] += len(root)
+                self.placed.append(
+                    AssignedSensor(node, place, estimator, int(rows[estimator]), root)
+                )
+                rows[estimator] += len(root)
         self.rows, self.p = rows, int(rows.max(initial=1))
         kinds = [type(scenario.sensors[s.place.entry]) for s in self.placed]
         self.recorded = [s for s, k in zip(self.placed, kinds, strict=True) if k is RecordedSensor]
@@ -142,7 +144,7 @@ class SlotSetup:
         self.drawn = [s for s, k in zip(self.placed, kinds, strict=True) if k is not RecordedSensor]
         self.driven = [s for s, k in zip(self.placed, kinds, strict=True) if k is RegressorSensor]
         self.varies = bool(self.recorded or self.driven)
-        self.H: FloatArray = aligned((1, 1, self.hosts, self.p, self.n, LANES))
+        self.H: FloatArray = aligned((1, 1, self.estimators, self.p, self.n, LANES))
         self._set_drawn(scenario)
 
     def _set_drawn(self, scenario: Scenario) -> None:
@@ -161,7 +163,7 @@ class SlotSetup:
                 driven[m], H[m, 0, 0] = self.driven.index(s), 1.0 / s.root[0, 0]
                 continue
             H[m, :rows] = solve_lower(s.root, sensor.H)
-            self.H[0, 0, s.host, s.row : s.row + rows] = H[m, :rows, :, None]
+            self.H[0, 0, s.estimator, s.row : s.row + rows] = H[m, :rows, :, None]
         regressors: list[Any] = [scenario.sensors[s.place.entry] for s in self.driven]
         # Regressors of different sizes are padded with zeros, which stay zero.
         k = max((len(sensor.A) for sensor in regressors), default=1)
@@ -177,7 +179,7 @@ class SlotSetup:
             # Columns of noise are not padded: each takes as many numbers as it does alone.
             self.regressors.append((A, np.ascontiguousarray(drive[:, : root.shape[1]]), start))
         self.sensors = SlotSensors(
-            np.array([s.host for s in self.drawn], dtype=np.int64),
+            np.array([s.estimator for s in self.drawn], dtype=np.int64),
             np.array([s.row for s in self.drawn], dtype=np.int64),
             np.array([len(s.root) for s in self.drawn], dtype=np.int64),
             H,
@@ -211,7 +213,7 @@ class SlotSetup:
         )
         # zip() of nothing gives no columns.
         receivers, senders, ways, weights = zip(*heard, strict=True) if heard else [()] * 4
-        first = np.searchsorted(np.array(receivers, dtype=np.int64), np.arange(self.hosts + 1))
+        first = np.searchsorted(np.array(receivers, dtype=np.int64), np.arange(self.estimators + 1))
         return SlotLinks(
             np.asarray(first, dtype=np.int64),
             np.array(senders, dtype=np.int64),
@@ -299,7 +301,7 @@ class SlotSetup:
 
     def bytes_of_slot(self) -> int:
         """Bytes that are drawn for one slot of one run."""
-        floats = self.hosts * self.p * (1 + self.varies * self.n) + 3 * self.n
+        floats = self.estimators * self.p * (1 + self.varies * self.n) + 3 * self.n
         messages = len(self.fresh) * (len(self.directions) + 8 * self.most_pairs + 8)
         mask = self.decides or self.may_miss
         asked = len(self.nodes) * (mask + 8 * self.algorithm.randomised)
@@ -316,7 +318,7 @@ class SlotSetup:
 
     def batch_runs(self) -> int:
         """Runs that are simulated side by side."""
-        samples = max(1, 8 * len(self.samples) * self.hosts * (2 + self.n) * self.n)
+        samples = max(1, 8 * len(self.samples) * self.estimators * (2 + self.n) * self.n)
         # A power of two, a node of the tree over runs, unless not even a block of lanes fits.
         together = min(BATCH_BYTES // samples, BLOCK_BYTES // (8 * self.bytes_of_slot()))
         whole = 1 << max(0, int(min(together, MOST_RUNS)).bit_length() - 1)
@@ -324,7 +326,7 @@ class SlotSetup:
 
     def quick_runs(self) -> int:
         """A power of two of runs, a block of lanes at least, that take some ten milliseconds."""
-        flops = self.hosts * (50 + 4 * self.n**3) + 10 * len(self.fresh) * len(self.directions)
+        flops = self.estimators * (50 + 4 * self.n**3) + 10 * len(self.fresh) * len(self.directions)
         runs = min(QUICK_FLOPS // (max(1, self.slots) * flops), MOST_RUNS)
         return int(max(LANES, 1 << (runs.bit_length() - 1) if runs else 0))
 

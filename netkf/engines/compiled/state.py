@@ -163,7 +163,7 @@ class PathBlock(Struct):
     known: np.ndarray
 
 
-class Ticks(Struct):
+class TickArrays(Struct):
     """The ticks of a ``schedule.Window``, or those of several runs one after the other; where no
     message takes time, which of them arrive: a bit for each outcome (``heard``, (K,)).
     """
@@ -229,7 +229,7 @@ class Simulation(Struct):
     instants: Instants
     sensing: Sensing
     path: PathBlock
-    ticks: Ticks
+    ticks: TickArrays
     frames: FloatArray
     probes: FloatArray
     shown: SampleBuffer

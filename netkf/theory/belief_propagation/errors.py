@@ -18,7 +18,7 @@ from netkf.linalg.arrays import FloatArray
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.arrivals import arrivals_by_step, require_traced_exchanges
 from netkf.theory.common.error_rules import ErrorRule, SentMessage
-from netkf.theory.common.observations import HostObservations
+from netkf.theory.common.observations import EstimatorObservations
 from netkf.theory.common.stacked_errors import StackedErrors
 from netkf.theory.numerics.prediction import triangular_root
 from netkf.trace.run import Run
@@ -41,10 +41,12 @@ class BeliefRule(ErrorRule):
             raise TheoryError("the filters' plant is not the true one: messages follow the state")
         self._steps = algorithm.steps
         self._arrivals = arrivals_by_step(scenario, run) if scenario.slotted else {}
-        self._told: dict[int, dict[int, float]] = {host: {} for host in range(errors.hosts)}
+        self._told: dict[int, dict[int, float]] = {
+            estimator: {} for estimator in range(errors.estimators)
+        }
         self._evidence: set[Hashable] = set()
-        for host in range(errors.hosts):
-            errors.copy(host, _prior(host), host)
+        for estimator in range(errors.estimators):
+            errors.copy(estimator, _prior(estimator), estimator)
 
     def _put(self, name: Hashable, U: FloatArray, s: FloatArray) -> None:
         """Set a piece of evidence."""
@@ -80,33 +82,33 @@ class BeliefRule(ErrorRule):
             self._move(np.asarray(np.linalg.inv(self.scenario.slot_belief[0]), dtype=np.float64))
             return
         self._drop(list(self._evidence))
-        for host, told in self._told.items():
+        for estimator, told in self._told.items():
             told.clear()
-            self.errors.copy(host, _prior(host), host)
+            self.errors.copy(estimator, _prior(estimator), estimator)
 
-    def sense(self, time: float, observations: HostObservations) -> None:
+    def sense(self, time: float, observations: EstimatorObservations) -> None:
         """Add the readings to the nodes' own evidence."""
         if self.scenario.slotted:
             self._begin_slot()
         columns = self.errors.reading_noises(observations)
-        for host, one in observations.items():
+        for estimator, one in observations.items():
             weighted = np.linalg.solve(one.R, one.H).T
-            U, s = self._sum([_own(host)])
-            s[:, columns[host]] += weighted @ one.root
-            self._put(_own(host), U + weighted @ one.H, s)
-        for host in observations:
-            self._believe(host)
+            U, s = self._sum([_own(estimator)])
+            s[:, columns[estimator]] += weighted @ one.root
+            self._put(_own(estimator), U + weighted @ one.H, s)
+        for estimator in observations:
+            self._believe(estimator)
 
-    def _believe(self, host: int) -> None:
+    def _believe(self, estimator: int) -> None:
         """Set the error and the root of P of a node."""
         errors, eye = self.errors, np.eye(self.errors.n)
-        U, s = self._sum([_own(host), *((host, j) for j in self._told[host])])
-        S = errors.roots[_prior(host)]
+        U, s = self._sum([_own(estimator), *((estimator, j) for j in self._told[estimator])])
+        S = errors.roots[_prior(estimator)]
         spread = np.linalg.cholesky(eye + S.T @ U @ S)
         root = scipy.linalg.solve_triangular(spread, S.T, lower=True).T
         P = root @ root.T
-        errors.stack.put(host, (eye - P @ U) @ errors.stack.form(_prior(host)) - P @ s)
-        errors.roots[host] = triangular_root(root)
+        errors.stack.put(estimator, (eye - P @ U) @ errors.stack.form(_prior(estimator)) - P @ s)
+        errors.roots[estimator] = triangular_root(root)
 
     def _said(self, sender: int, receiver: int) -> tuple[FloatArray, FloatArray]:
         """Return what a node says to another: all but what that one told."""
@@ -115,8 +117,8 @@ class BeliefRule(ErrorRule):
 
     def exchange(self, slot: int, phase: int, messages: Sequence[SentMessage]) -> None:
         """Pass the messages of all steps of a slot that arrived."""
-        hosts = self.errors.hosts
-        nothing = np.zeros((hosts, hosts))
+        estimators = self.errors.estimators
+        nothing = np.zeros((estimators, estimators))
         for step in range(self._steps):
             up = self._arrivals.get((slot, phase, step), nothing)
             pairs = [(i, j) for i, j in np.argwhere(up).tolist()]
@@ -124,8 +126,8 @@ class BeliefRule(ErrorRule):
             for (i, j), (U, s) in said.items():
                 self._put((i, j), U, s)
                 self._told[i][j] = slot
-        for host in range(hosts):
-            self._believe(host)
+        for estimator in range(estimators):
+            self._believe(estimator)
 
     def send(self, messages: Sequence[SentMessage]) -> None:
         """Keep the evidence of each message that takes time."""
@@ -149,16 +151,16 @@ class BeliefRule(ErrorRule):
                 told[message.sender] = message.time
                 self._put((message.receiver, message.sender), *said[message])
         self._drop(late)
-        for host in {message.receiver for message in messages}:
-            self._believe(host)
+        for estimator in {message.receiver for message in messages}:
+            self._believe(estimator)
 
 
-def _prior(host: int) -> Hashable:
-    return ("prior", host)
+def _prior(estimator: int) -> Hashable:
+    return ("prior", estimator)
 
 
-def _own(host: int) -> Hashable:
-    return ("own", host)
+def _own(estimator: int) -> Hashable:
+    return ("own", estimator)
 
 
 def rule(

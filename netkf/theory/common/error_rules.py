@@ -12,7 +12,7 @@ from typing import ClassVar, NamedTuple
 
 from netkf.linalg.arrays import FloatArray
 from netkf.scenario.scenario import Scenario
-from netkf.theory.common.observations import HostObservations
+from netkf.theory.common.observations import EstimatorObservations
 from netkf.theory.common.stacked_errors import StackedErrors, Term
 
 
@@ -45,11 +45,11 @@ class ErrorRule:
     ) -> None:
         self.scenario, self.errors, self.times = scenario, errors, times
 
-    def sense(self, time: float, observations: HostObservations) -> None:
-        """Update each host by its readings of this instant."""
+    def sense(self, time: float, observations: EstimatorObservations) -> None:
+        """Update each estimator by its readings of this instant."""
         columns = self.errors.reading_noises(observations)
-        for host, observation in observations.items():
-            self.errors.update(host, observation, columns[host])
+        for estimator, observation in observations.items():
+            self.errors.update(estimator, observation, columns[estimator])
 
     def send(self, messages: Sequence[SentMessage]) -> None:
         """Record messages that leave at this instant and will arrive."""

@@ -20,11 +20,11 @@ from netkf.scenario.scenario import Scenario
 from netkf.theory.numerics.updates import Observation, stack_observations
 from netkf.trace.run import Run
 
-HostObservations = dict[int, Observation]
-"""Observations by the index of the host that uses them."""
+EstimatorObservations = dict[int, Observation]
+"""Observations by the index of the estimator that uses them."""
 
 
-def nodes_by_host(scenario: Scenario) -> list[tuple[int, ...]]:
+def nodes_by_estimator(scenario: Scenario) -> list[tuple[int, ...]]:
     """Return the nodes whose readings each filter uses: one filter uses all if they are pooled."""
     if scenario.filter.algorithm.pooled:
         return [scenario.nodes]
@@ -44,7 +44,7 @@ def _noises(scenario: Scenario) -> list[tuple[FloatArray, FloatArray]]:
 
 
 def increment_observations(scenario: Scenario) -> list[Observation]:
-    """Return the continuous readings of each host; p is 0 for hosts without any.
+    """Return the continuous readings of each estimator; p is 0 for estimators without any.
 
     Hosts with the sensors of the same ``[[sensors]]`` entries share one object.
     """
@@ -54,7 +54,7 @@ def increment_observations(scenario: Scenario) -> list[Observation]:
     single = {k: Observation(scenario.sensors[k].H, *noises[k]) for k in used}
     stacked: dict[tuple[int, ...], Observation] = {}
     found = []
-    for nodes in nodes_by_host(scenario):
+    for nodes in nodes_by_estimator(scenario):
         entries = tuple(sensor.entry for node in nodes for sensor in placed.get(node, ()))
         if entries not in stacked:
             stacked[entries] = stack_observations([single[k] for k in entries], n)
@@ -62,35 +62,35 @@ def increment_observations(scenario: Scenario) -> list[Observation]:
     return found
 
 
-def slot_observations(scenario: Scenario, run: Run) -> Callable[[int], HostObservations]:
-    """Return a function from a slot to its readings by host; call it with increasing slots."""
+def slot_observations(scenario: Scenario, run: Run) -> Callable[[int], EstimatorObservations]:
+    """Return a function from a slot to its readings by estimator; call it with increasing slots."""
     streams, n = Streams(run.seed, run.replica), scenario.plant.n
     noises = _noises(scenario)
-    hosts = [
+    estimators = [
         [
             (sensor, scenario.slot_path(streams, node, sensor))
             for node in nodes
             for sensor in scenario.placed.get(node, ())
         ]
-        for nodes in nodes_by_host(scenario)
+        for nodes in nodes_by_estimator(scenario)
     ]
 
-    def observe(slot: int) -> HostObservations:
+    def observe(slot: int) -> EstimatorObservations:
         found = {}
-        for host, paths in enumerate(hosts):
+        for estimator, paths in enumerate(estimators):
             if not paths:
                 continue
             rows = [(sensor, path.matrix(slot)) for sensor, path in paths]
             # A sensor without a reading in this slot has a matrix without rows.
             readings = [Observation(H, *noises[sensor.entry]) for sensor, H in rows if len(H)]
-            found[host] = stack_observations(readings, n)
+            found[estimator] = stack_observations(readings, n)
         return found
 
     return observe
 
 
-def timed_observations(scenario: Scenario, run: Run) -> dict[float, HostObservations]:
-    """Return the samples of a run in continuous time, by time (seconds) and host.
+def timed_observations(scenario: Scenario, run: Run) -> dict[float, EstimatorObservations]:
+    """Return the samples of a run in continuous time, by time (seconds) and estimator.
 
     Samples that one filter gets at one instant are one observation.
     """
@@ -98,7 +98,7 @@ def timed_observations(scenario: Scenario, run: Run) -> dict[float, HostObservat
     by_node, noises = scenario.sampled_sensors, _noises(scenario)
     times = sample_times(scenario, streams)
     found: dict[float, dict[int, list[Observation]]] = {}
-    for host, nodes in enumerate(nodes_by_host(scenario)):
+    for estimator, nodes in enumerate(nodes_by_estimator(scenario)):
         for node in nodes:
             for place in by_node.get(node, ()):
                 sensor = scenario.sensors[place.entry]
@@ -108,8 +108,10 @@ def timed_observations(scenario: Scenario, run: Run) -> dict[float, HostObservat
                 for k, time in enumerate(times[node, place.ordinal].tolist()):
                     H = path.reading(k, np.zeros(n))[1] if path is not None else sensor.H
                     at_time = found.setdefault(time, {})
-                    at_time.setdefault(host, []).append(Observation(H, *noises[place.entry]))
+                    at_time.setdefault(estimator, []).append(Observation(H, *noises[place.entry]))
     return {
-        time: {host: stack_observations(readings, n) for host, readings in at_time.items()}
+        time: {
+            estimator: stack_observations(readings, n) for estimator, readings in at_time.items()
+        }
         for time, at_time in found.items()
     }

@@ -18,8 +18,8 @@ from netkf.scenario.scenario import Scenario
 from netkf.theory.common.error_rules import ErrorRule, SentMessage
 from netkf.theory.common.evidence import NONLINEAR
 from netkf.theory.common.observations import (
-    HostObservations,
-    nodes_by_host,
+    EstimatorObservations,
+    nodes_by_estimator,
     slot_observations,
     timed_observations,
 )
@@ -31,7 +31,7 @@ from netkf.trace.schema import CODES
 
 
 def replay_covariances(scenario: Scenario, run: Run) -> FloatArray:
-    """Return the joint error covariance (T, M n, M n) of M hosts at ``run.times``.
+    """Return the joint error covariance (T, M n, M n) of M estimators at ``run.times``.
 
     M = 1 if all nodes share one pooled filter. Raises TheoryError for a filter whose equations are
     not known here.
@@ -39,12 +39,12 @@ def replay_covariances(scenario: Scenario, run: Run) -> FloatArray:
     errors = _stacked_errors(scenario)
     # The generator stops at each sample, when the errors have their values of that time.
     found = [errors.covariance() for _ in _replay(scenario, run, errors)]
-    size = errors.hosts * errors.n
+    size = errors.estimators * errors.n
     return np.array(found).reshape(-1, size, size)
 
 
 class ErrorLaw(NamedTuple):
-    """The Gaussian law of the errors of M hosts at T times given the events of a run.
+    """The Gaussian law of the errors of M estimators at T times given the events of a run.
 
     ``mean`` (T M n,) and ``covariance`` (T M n, T M n) of all errors together, ``P`` (T, M, n, n).
     """
@@ -68,7 +68,7 @@ def replay_law(scenario: Scenario, run: Run) -> ErrorLaw:
 
 def _stacked_errors(scenario: Scenario) -> StackedErrors:
     require_known_filter(scenario)
-    return StackedErrors(scenario, len(nodes_by_host(scenario)))
+    return StackedErrors(scenario, len(nodes_by_estimator(scenario)))
 
 
 def _replay(scenario: Scenario, run: Run, errors: StackedErrors) -> Iterator[None]:
@@ -192,7 +192,7 @@ def _replay_slot(
     prediction: Prediction,
     phases: tuple[str, ...],
     slot: int,
-    observations: HostObservations,
+    observations: EstimatorObservations,
     arrivals: dict[tuple[int, int], list[SentMessage]],
 ) -> None:
     """Apply the phases of one slot in the filter's order."""

@@ -45,16 +45,16 @@ class Roots:
 
 
 class StackedErrors:
-    """Errors of the estimates of M hosts and of copies of them.
+    """Errors of the estimates of M estimators and of copies of them.
 
     roots   : a square root (n, n) of P for each estimate
-    owner   : the host whose increments an estimate uses; None for a message, which is only
+    owner   : the estimator whose increments an estimate uses; None for a message, which is only
               predicted
     follows : whether the errors depend on the state
     """
 
-    def __init__(self, scenario: Scenario, hosts: int) -> None:
-        self.n, self.hosts = scenario.plant.n, hosts
+    def __init__(self, scenario: Scenario, estimators: int) -> None:
+        self.n, self.estimators = scenario.plant.n, estimators
         self.stack = GaussianStack(self.n)
         self.owner: dict[Hashable, int | None] = {}
         self.roots = Roots(self.stack, self.owner)
@@ -66,11 +66,11 @@ class StackedErrors:
         if self.follows:
             self.stack.put(STATE, np.zeros((self.n, 0)))
             self.stack.add(STATE, columns, first)
-        for host, node in enumerate(scenario.nodes[:hosts]):
-            self.stack.put(host, np.zeros((self.n, 0)))
-            self.stack.add(host, columns, first)
-            self.owner[host] = host
-            self.roots[host] = square_root(np.asarray(scenario.start(node)[1]))
+        for estimator, node in enumerate(scenario.nodes[:estimators]):
+            self.stack.put(estimator, np.zeros((self.n, 0)))
+            self.stack.add(estimator, columns, first)
+            self.owner[estimator] = estimator
+            self.roots[estimator] = square_root(np.asarray(scenario.start(node)[1]))
         self._add_offsets(scenario)
 
     def _add_offsets(self, scenario: Scenario) -> None:
@@ -81,7 +81,8 @@ class StackedErrors:
         """
         start, n = scenario.plant.start_mean, self.n
         offsets: dict[Hashable, FloatArray] = {
-            host: start - scenario.start(scenario.nodes[host])[0] for host in range(self.hosts)
+            estimator: start - scenario.start(scenario.nodes[estimator])[0]
+            for estimator in range(self.estimators)
         }
         if self.follows:
             offsets[STATE] = start
@@ -94,14 +95,14 @@ class StackedErrors:
             self.stack.add(name, one, offset[:, None])
 
     def keep(self) -> None:
-        """Keep the errors of all hosts as they are now, for ``law``."""
-        self._kept.append(self.stack.settle(range(self.hosts)))
+        """Keep the errors of all estimators as they are now, for ``law``."""
+        self._kept.append(self.stack.settle(range(self.estimators)))
 
     def law(self) -> tuple[FloatArray, FloatArray]:
-        """Return the mean (K M n,) and the joint covariance of the errors of the hosts that were
-        kept K times.
+        """Return the mean (K M n,) and the joint covariance of the errors of the estimators that
+        were kept K times.
         """
-        rows, width = self.hosts * self.n, self.stack.used
+        rows, width = self.estimators * self.n, self.stack.used
         forms = np.zeros((len(self._kept), rows, width))
         for k, kept in enumerate(self._kept):
             forms[k, :, : kept.shape[2]] = kept.reshape(rows, -1)
@@ -118,14 +119,14 @@ class StackedErrors:
         return mean, np.asarray(rest @ rest.T)
 
     def covariance(self) -> FloatArray:
-        """Return the joint covariance (M n, M n) of the errors of the hosts."""
-        forms = self.stack.forms(range(self.hosts))
-        return self._mean_and_covariance(forms.reshape(self.hosts * self.n, -1))[1]
+        """Return the joint covariance (M n, M n) of the errors of the estimators."""
+        forms = self.stack.forms(range(self.estimators))
+        return self._mean_and_covariance(forms.reshape(self.estimators * self.n, -1))[1]
 
     def covariances(self) -> FloatArray:
-        """Return P (M, n, n) of the hosts."""
+        """Return P (M, n, n) of the estimators."""
         # P = S S'
-        S = self.stack.matrices[self.stack.indices(range(self.hosts))]
+        S = self.stack.matrices[self.stack.indices(range(self.estimators))]
         return np.asarray(S @ np.swapaxes(S, 1, 2))
 
     def copy(self, name: Hashable, new: Hashable, owner: int | None) -> None:
@@ -145,7 +146,7 @@ class StackedErrors:
         del self.owner[name]
 
     def reading_noises(self, observations: Mapping[int, Observation]) -> dict[int, slice]:
-        """Return new inputs for the noises of readings, by host.
+        """Return new inputs for the noises of readings, by estimator.
 
         Use the columns before any other operation that adds inputs.
         """
@@ -153,8 +154,8 @@ class StackedErrors:
         columns = self.stack.inputs(ends[-1])
         begin = columns.start
         return {
-            host: slice(begin + a, begin + b)
-            for host, a, b in zip(observations, ends, ends[1:], strict=False)
+            estimator: slice(begin + a, begin + b)
+            for estimator, a, b in zip(observations, ends, ends[1:], strict=False)
         }
 
     def update(self, name: Hashable, observation: Observation, columns: slice) -> None:
@@ -214,12 +215,12 @@ def _errors_follow_state(scenario: Scenario) -> bool:
 class IncrementFlows(NamedTuple):
     """Flows of errors in a run with increment sensors.
 
-    hosts    : of each host
+    estimators : of each estimator
     messages : of estimates under way, which use no readings
     plant    : the true A (n, n) and B (n, m)
     """
 
-    hosts: list[ErrorFlow]
+    estimators: list[ErrorFlow]
     messages: ErrorFlow
     plant: tuple[FloatArray, FloatArray]
 
@@ -229,7 +230,7 @@ class ErrorPropagator:
 
     def __init__(self, scenario: Scenario, errors: StackedErrors) -> None:
         self._errors, self._now = errors, 0.0
-        self._flows = _increment_flows(scenario, errors.hosts)
+        self._flows = _increment_flows(scenario, errors.estimators)
         A, B = scenario.truth.A, scenario.truth.B
         A_f, Q_f = scenario.belief
         # The filters' B is only known by B B' = Q; the plant's own is as good if it has that Q.
@@ -250,7 +251,7 @@ class ErrorPropagator:
             step = self._predictor(gap)
             return gap, self._errors.predict(step), step.state_noise
         # The series and the quadrature of a flow hold over one unit only.
-        unit = min(flow.unit for flow in (*self._flows.hosts, self._flows.messages))
+        unit = min(flow.unit for flow in (*self._flows.estimators, self._flows.messages))
         steps = math.ceil(gap / unit)
         for _ in range(steps):
             self._step(gap / steps)
@@ -262,7 +263,7 @@ class ErrorPropagator:
         assert flows is not None
         groups: dict[int, tuple[ErrorFlow, list[Hashable]]] = {}
         for name, owner in self._errors.owner.items():
-            flow = flows.messages if owner is None else flows.hosts[owner]
+            flow = flows.messages if owner is None else flows.estimators[owner]
             groups.setdefault(id(flow), (flow, []))[1].append(name)
         return list(groups.values())
 
@@ -321,11 +322,11 @@ def integration_steps(scenario: Scenario) -> int:
     flows = _increment_flows(scenario, len(scenario.nodes))
     if flows is None:
         return 0
-    unit = min(flow.unit for flow in (*flows.hosts, flows.messages))
+    unit = min(flow.unit for flow in (*flows.estimators, flows.messages))
     return math.ceil(scenario.horizon / unit)
 
 
-def _increment_flows(scenario: Scenario, hosts: int) -> IncrementFlows | None:
+def _increment_flows(scenario: Scenario, estimators: int) -> IncrementFlows | None:
     """Return the flows of a scenario, or None if no sensor senses increments."""
     observations = increment_observations(scenario)
     if not any(len(one.H) for one in observations):
@@ -344,4 +345,4 @@ def _increment_flows(scenario: Scenario, hosts: int) -> IncrementFlows | None:
 
     empty = np.zeros((0, 0))
     unobserved = flow(Observation(np.zeros((0, scenario.plant.n)), empty, empty))
-    return IncrementFlows([flow(one) for one in observations[:hosts]], unobserved, plant)
+    return IncrementFlows([flow(one) for one in observations[:estimators]], unobserved, plant)

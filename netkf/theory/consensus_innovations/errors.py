@@ -16,7 +16,7 @@ from netkf.linalg.arrays import FloatArray
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.arrivals import require_traced_exchanges
 from netkf.theory.common.error_rules import ErrorRule, SentMessage
-from netkf.theory.common.observations import HostObservations
+from netkf.theory.common.observations import EstimatorObservations
 from netkf.theory.common.stacked_errors import StackedErrors
 from netkf.trace.run import Run
 
@@ -28,30 +28,30 @@ class PseudoStateRule(ErrorRule):
         super().__init__(scenario, errors)
         algorithm = scenario.filter.algorithm
         assert isinstance(algorithm, ConsensusInnovations)
-        self._seen: HostObservations = {}
+        self._seen: EstimatorObservations = {}
         state = algorithm.init(
             scenario.slot_models[0], *scenario.start(scenario.nodes[0]), scenario.node_infos[0]
         )
         self._design, self._pseudo = state.design, state.pseudo
         self._slot = 0
-        for host in range(errors.hosts):
-            errors.stack.put(_difference(host), np.zeros((errors.n, 0)))
+        for estimator in range(errors.estimators):
+            errors.stack.put(_difference(estimator), np.zeros((errors.n, 0)))
 
-    def sense(self, time: float, observations: HostObservations) -> None:
+    def sense(self, time: float, observations: EstimatorObservations) -> None:
         """Predict the differences, and keep the readings of the slot."""
         self._seen, self._slot, stack = observations, self._slot + 1, self.errors.stack
-        for host in range(self.errors.hosts):
-            stack.put(_difference(host), self._pseudo.A @ stack.form(_difference(host)))
+        for estimator in range(self.errors.estimators):
+            stack.put(_difference(estimator), self._pseudo.A @ stack.form(_difference(estimator)))
         gains = gain_sequence(self._design).at(self._slot)
-        for host, one in enumerate(gains):
-            self.errors.roots[host] = one.predicted
+        for estimator, one in enumerate(gains):
+            self.errors.roots[estimator] = one.predicted
 
     def exchange(self, slot: int, phase: int, messages: Sequence[SentMessage]) -> None:
         """Correct all estimates by what was heard and read."""
-        errors, G, hosts = self.errors, self._pseudo.G, range(self.errors.hosts)
+        errors, G, estimators = self.errors, self._pseudo.G, range(self.errors.estimators)
         columns = errors.reading_noises(self._seen)
-        states = [errors.stack.form(host) for host in hosts]
-        before = [errors.stack.form(_difference(i)) + G @ states[i] for i in hosts]
+        states = [errors.stack.form(estimator) for estimator in estimators]
+        before = [errors.stack.form(_difference(i)) + G @ states[i] for i in estimators]
         after = [form.copy() for form in before]
         gains = gain_sequence(self._design).at(self._slot)
         for message in messages:
@@ -63,18 +63,18 @@ class PseudoStateRule(ErrorRule):
             seen = weighted @ one.H
             after[i] -= gains[i].M @ seen @ self._pseudo.inverse @ before[i]
             after[i][:, columns[i]] -= gains[i].M @ weighted @ one.root
-        for i in hosts:
+        for i in estimators:
             e = states[i] - gains[i].K @ (G @ states[i] - after[i])
             self._set(i, e, after[i] - G @ e)
             errors.roots[i] = gains[i].root
 
-    def _set(self, host: int, e: FloatArray, u: FloatArray) -> None:
-        self.errors.stack.put(host, e)
-        self.errors.stack.put(_difference(host), u)
+    def _set(self, estimator: int, e: FloatArray, u: FloatArray) -> None:
+        self.errors.stack.put(estimator, e)
+        self.errors.stack.put(_difference(estimator), u)
 
 
-def _difference(host: int) -> Hashable:
-    return ("difference", host)
+def _difference(estimator: int) -> Hashable:
+    return ("difference", estimator)
 
 
 def rule(

@@ -12,7 +12,7 @@ from netkf.linalg.arrays import FloatArray
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.arrivals import require_traced_exchanges
 from netkf.theory.common.error_rules import ErrorRule, EstimateExchangeRule, SentMessage
-from netkf.theory.common.observations import HostObservations
+from netkf.theory.common.observations import EstimatorObservations
 from netkf.theory.common.stacked_errors import StackedErrors
 from netkf.theory.numerics.prediction import triangular_root
 from netkf.theory.numerics.updates import average_covariances
@@ -22,18 +22,20 @@ from netkf.trace.run import Run
 class ConstantGainRule(EstimateExchangeRule):
     """Updates with the given gains, and the resets H (7), (9)."""
 
-    def sense(self, time: float, observations: HostObservations) -> None:
+    def sense(self, time: float, observations: EstimatorObservations) -> None:
         """Move each error to ``(I - L H) e - L v``."""
         algorithm, errors = self.scenario.filter.algorithm, self.errors
         assert isinstance(algorithm, ConstantGain)
         columns = errors.reading_noises(observations)
-        for host, one in observations.items():
-            L = algorithm.gain_of(host)
+        for estimator, one in observations.items():
+            L = algorithm.gain_of(estimator)
             closed = np.eye(errors.n) - L @ one.H
             noise = L @ np.linalg.cholesky(one.R)
-            root = triangular_root(np.concatenate([closed @ errors.roots[host], noise], axis=1))
-            errors.multiply(host, closed, root)
-            errors.stack.add(host, columns[host], -L @ one.root)
+            root = triangular_root(
+                np.concatenate([closed @ errors.roots[estimator], noise], axis=1)
+            )
+            errors.multiply(estimator, closed, root)
+            errors.stack.add(estimator, columns[estimator], -L @ one.root)
 
     def combine(
         self, node: int, weights: list[float], roots: list[FloatArray]

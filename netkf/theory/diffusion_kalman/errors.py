@@ -11,7 +11,7 @@ from netkf.linalg.arrays import FloatArray
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.arrivals import require_traced_exchanges
 from netkf.theory.common.error_rules import ErrorRule, SentMessage
-from netkf.theory.common.observations import HostObservations
+from netkf.theory.common.observations import EstimatorObservations
 from netkf.theory.common.stacked_errors import StackedErrors, Term
 from netkf.trace.run import Run
 
@@ -23,14 +23,14 @@ class DiffusionKalmanRule(ErrorRule):
 
     def __init__(self, scenario: Scenario, errors: StackedErrors) -> None:
         super().__init__(scenario, errors)
-        self._seen: HostObservations = {}
+        self._seen: EstimatorObservations = {}
         self._columns: dict[int, slice] = {}
 
-    def sense(self, time: float, observations: HostObservations) -> None:
+    def sense(self, time: float, observations: EstimatorObservations) -> None:
         """Update by the nodes' own readings, and keep them for their neighbours."""
         self._seen, self._columns = observations, self.errors.reading_noises(observations)
-        for host, observation in observations.items():
-            self.errors.update(host, observation, self._columns[host])
+        for estimator, observation in observations.items():
+            self.errors.update(estimator, observation, self._columns[estimator])
 
     def exchange(self, slot: int, phase: int, messages: Sequence[SentMessage]) -> None:
         """Use the readings that arrived, or combine the estimates."""
@@ -45,11 +45,11 @@ class DiffusionKalmanRule(ErrorRule):
             weight = self.scenario.weight(nodes[message.receiver], nodes[message.sender])
             weights.setdefault(message.receiver, {})[message.sender] = weight
         changes: dict[Hashable, tuple[FloatArray, Sequence[Term]]] = {}
-        for host, heard in weights.items():
+        for estimator, heard in weights.items():
             # The weight of what did not come stays with the node.
-            terms: list[Term] = [(host, (1.0 - sum(heard.values())) * eye)]
+            terms: list[Term] = [(estimator, (1.0 - sum(heard.values())) * eye)]
             terms += [(sender, weight * eye) for sender, weight in heard.items()]
-            changes[host] = self.errors.roots[host], terms
+            changes[estimator] = self.errors.roots[estimator], terms
         self.errors.combine(changes)
 
 

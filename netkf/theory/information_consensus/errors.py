@@ -16,7 +16,7 @@ from netkf.linalg.arrays import FloatArray
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.arrivals import arrivals_by_step, require_traced_exchanges
 from netkf.theory.common.error_rules import ErrorRule, SentMessage
-from netkf.theory.common.observations import HostObservations
+from netkf.theory.common.observations import EstimatorObservations
 from netkf.theory.common.stacked_errors import StackedErrors, Term
 from netkf.theory.hybrid.errors import ResetRule
 from netkf.theory.numerics.prediction import triangular_root
@@ -58,9 +58,9 @@ class ConsensusRule(ErrorRule):
         super().__init__(scenario, errors)
         self._arrivals, self._weights = arrivals_by_step(scenario, run), step_weights(scenario)
         self._steps = scenario.hosted.exchange_steps(0)
-        self._observations: HostObservations = {}
+        self._observations: EstimatorObservations = {}
 
-    def sense(self, time: float, observations: HostObservations) -> None:
+    def sense(self, time: float, observations: EstimatorObservations) -> None:
         """Keep the readings of the slot, which are combined before they are used."""
         self._observations = observations
 
@@ -73,12 +73,12 @@ class ConsensusRule(ErrorRule):
         ]
         of_predictions, of_readings = effective_weights(self.scenario, heard)
         errors, seen = self.errors, self._observations
-        columns, hosts = errors.reading_noises(seen), range(errors.hosts)
-        inverses = [np.linalg.inv(errors.roots[j]) for j in hosts]
+        columns, estimators = errors.reading_noises(seen), range(errors.estimators)
+        inverses = [np.linalg.inv(errors.roots[j]) for j in estimators]
         # R^-1/2 H of each reading, whose square is its information.
         white = {j: np.linalg.solve(np.linalg.cholesky(o.R), o.H) for j, o in seen.items()}
         changes: dict[Hashable, tuple[FloatArray, Sequence[Term]]] = {}
-        for i in hosts:
+        for i in estimators:
             a, b = of_predictions[i], of_readings[i]
             rows = [np.sqrt(a[j]) * V for j, V in enumerate(inverses)]
             rows += [np.sqrt(b[j]) * V for j, V in white.items()]
@@ -86,7 +86,7 @@ class ConsensusRule(ErrorRule):
             terms = [(j, a[j] * root @ root.T @ V.T @ V) for j, V in enumerate(inverses)]
             changes[i] = root, terms
         errors.combine(changes)
-        for i in hosts:
+        for i in estimators:
             for j, one in seen.items():
                 # e+ = P (sum_j a_ij P_j^-1 e_j - sum_j b_ij H_j' R_j^-1 v_j)
                 root, information = errors.roots[i], np.linalg.solve(one.R, one.H).T

@@ -6,7 +6,7 @@ from collections.abc import Hashable, Mapping, Sequence
 
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.error_rules import ErrorRule, SentMessage
-from netkf.theory.common.observations import HostObservations
+from netkf.theory.common.observations import EstimatorObservations
 from netkf.theory.common.stacked_errors import StackedErrors
 from netkf.trace.run import Run
 
@@ -34,29 +34,31 @@ class ReadingExchangeRule(ErrorRule):
         self._branches: dict[tuple[int, float], list[float]] = {}
         for (receiver, arrives), time in sorted(first.items()):
             self._branches.setdefault((receiver, time), []).append(arrives)
-        self._versions: dict[int, list[float]] = {host: [] for host in range(errors.hosts)}
-        self._observations: HostObservations = {}
+        self._versions: dict[int, list[float]] = {
+            estimator: [] for estimator in range(errors.estimators)
+        }
+        self._observations: EstimatorObservations = {}
         self._columns: Mapping[int, slice] = {}
 
-    def sense(self, time: float, observations: HostObservations) -> None:
+    def sense(self, time: float, observations: EstimatorObservations) -> None:
         """Update each version of each estimate by the readings that it will have got."""
         self._observations, self._columns = observations, self.errors.reading_noises(observations)
-        for host in range(self.errors.hosts):
-            self._branch(host, time)
-            self._update(host, [host])
-            for until in self._versions[host]:
-                sent = self._sent.get((host, time), [])
+        for estimator in range(self.errors.estimators):
+            self._branch(estimator, time)
+            self._update(estimator, [estimator])
+            for until in self._versions[estimator]:
+                sent = self._sent.get((estimator, time), [])
                 senders = [m.sender for m in sent if m.arrives <= until]
-                self._update(("version", host, until), [host, *senders])
+                self._update(("version", estimator, until), [estimator, *senders])
 
-    def _branch(self, host: int, time: float) -> None:
+    def _branch(self, estimator: int, time: float) -> None:
         """Start the versions for late readings of this instant."""
-        live = self._versions[host]
-        for until in self._branches.get((host, time), ()):
+        live = self._versions[estimator]
+        for until in self._branches.get((estimator, time), ()):
             # The version that ends last before this one has all readings that this one has so far.
             before = [t for t in live if t < until]
-            source = ("version", host, max(before)) if before else host
-            self.errors.copy(source, ("version", host, until), host)
+            source = ("version", estimator, max(before)) if before else estimator
+            self.errors.copy(source, ("version", estimator, until), estimator)
             live.append(until)
             live.sort()
 
@@ -67,12 +69,12 @@ class ReadingExchangeRule(ErrorRule):
 
     def arrive(self, time: float, messages: Sequence[SentMessage]) -> None:
         """Use readings that come in time, or replace an estimate by its finished version."""
-        for host in {m.receiver for m in messages}:
-            if time in self._versions[host]:
-                self._versions[host].remove(time)
-                self.errors.replace(("version", host, time), host)
+        for estimator in {m.receiver for m in messages}:
+            if time in self._versions[estimator]:
+                self._versions[estimator].remove(time)
+                self.errors.replace(("version", estimator, time), estimator)
             else:
-                self._update(host, [m.sender for m in messages if m.receiver == host])
+                self._update(estimator, [m.sender for m in messages if m.receiver == estimator])
 
 
 def rule(

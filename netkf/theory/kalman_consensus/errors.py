@@ -15,7 +15,7 @@ from netkf.linalg.arrays import FloatArray
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.arrivals import require_traced_exchanges
 from netkf.theory.common.error_rules import ErrorRule, SentMessage
-from netkf.theory.common.observations import HostObservations
+from netkf.theory.common.observations import EstimatorObservations
 from netkf.theory.common.stacked_errors import StackedErrors
 from netkf.trace.run import Run
 
@@ -31,7 +31,7 @@ class KcfRule(ErrorRule):
         algorithm = scenario.filter.algorithm
         assert isinstance(algorithm, Kcf)
         self._epsilon, self._share = algorithm.epsilon, algorithm.share_readings
-        self._seen: HostObservations = {}
+        self._seen: EstimatorObservations = {}
         self._columns: dict[int, slice] = {}
 
     def elapse(self, gap: float, columns: slice | None, noise: FloatArray | None) -> None:
@@ -41,25 +41,25 @@ class KcfRule(ErrorRule):
 
     def _forget(self) -> None:
         self.errors.drop(
-            [name for name in map(_prior, range(self.errors.hosts)) if self._has(name)]
+            [name for name in map(_prior, range(self.errors.estimators)) if self._has(name)]
         )
         self._seen, self._columns = {}, {}
 
     def _has(self, name: Hashable) -> bool:
         return name in self.errors.roots
 
-    def _prediction(self, host: int) -> Hashable:
+    def _prediction(self, estimator: int) -> Hashable:
         """Return the name of the node's prediction of this instant."""
-        return _prior(host) if self._has(_prior(host)) else host
+        return _prior(estimator) if self._has(_prior(estimator)) else estimator
 
-    def sense(self, time: float, observations: HostObservations) -> None:
+    def sense(self, time: float, observations: EstimatorObservations) -> None:
         """Update by the nodes' own readings, and keep their predictions."""
         self._forget()
-        for host in observations:
-            self.errors.copy(host, _prior(host), host)
+        for estimator in observations:
+            self.errors.copy(estimator, _prior(estimator), estimator)
         self._seen, self._columns = observations, self.errors.reading_noises(observations)
-        for host, observation in observations.items():
-            self.errors.update(host, observation, self._columns[host])
+        for estimator, observation in observations.items():
+            self.errors.update(estimator, observation, self._columns[estimator])
 
     def send(self, messages: Sequence[SentMessage]) -> None:
         """Copy the sender's prediction for each message that takes time."""
@@ -74,20 +74,23 @@ class KcfRule(ErrorRule):
         for message in sorted(messages, key=lambda m: (m.sender, m.time, m.number)):
             inboxes.setdefault(message.receiver, {})[message.sender] = message
         # All terms before any estimate changes, since predictions may be estimates.
-        terms = {host: self._term(host, list(inbox.values())) for host, inbox in inboxes.items()}
-        for host, inbox in inboxes.items():
+        terms = {
+            estimator: self._term(estimator, list(inbox.values()))
+            for estimator, inbox in inboxes.items()
+        }
+        for estimator, inbox in inboxes.items():
             for message in inbox.values():
                 if self._share and not message.late and message.sender in self._seen:
                     seen, columns = self._seen[message.sender], self._columns[message.sender]
-                    self.errors.update(host, seen, columns)
-            form = self.errors.stack.form(host)
-            form[:, : terms[host].shape[1]] += terms[host]
-            self.errors.stack.put(host, form)
+                    self.errors.update(estimator, seen, columns)
+            form = self.errors.stack.form(estimator)
+            form[:, : terms[estimator].shape[1]] += terms[estimator]
+            self.errors.stack.put(estimator, form)
         self.errors.drop([message for message in messages if message.late])
 
-    def _term(self, host: int, inbox: list[SentMessage]) -> FloatArray:
+    def _term(self, estimator: int, inbox: list[SentMessage]) -> FloatArray:
         """Return the form of ``gamma P sum_j (ebar_j - ebar)``."""
-        own, stack = self._prediction(host), self.errors.stack
+        own, stack = self._prediction(estimator), self.errors.stack
         root = self.errors.roots[own]
         P = root @ root.T
         total = np.zeros_like(stack.form(own))
@@ -97,8 +100,8 @@ class KcfRule(ErrorRule):
         return np.asarray(self._epsilon / (1.0 + np.linalg.norm(P)) * P @ total)
 
 
-def _prior(host: int) -> Hashable:
-    return ("prediction", host)
+def _prior(estimator: int) -> Hashable:
+    return ("prediction", estimator)
 
 
 def rule(

@@ -23,7 +23,7 @@ from netkf.linalg.arrays import FloatArray, as_kernel_array
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.arrivals import arrivals_by_step, require_traced_exchanges
 from netkf.theory.common.error_rules import ErrorRule, SentMessage
-from netkf.theory.common.observations import HostObservations
+from netkf.theory.common.observations import EstimatorObservations
 from netkf.theory.common.stacked_errors import StackedErrors
 from netkf.theory.numerics.roots import fade_totals
 from netkf.theory.numerics.updates import add_information_to_root
@@ -87,21 +87,21 @@ class AveragingRule(ErrorRule):
             retained = (self._nu - received.sum(axis=1))[:, None]
             self._z = retained * shares + received @ shares
             return
-        mixing, hosts = np.eye(self._N), range(self._N)
+        mixing, estimators = np.eye(self._N), range(self._N)
         for step in range(self._gamma):
             received = self._received(slot, 1, step)
             # z <- (I - L / delta) z with the Laplacian L of the links that are up in this step.
             laplacian = np.diag(received.sum(axis=1)) - received
             mixing = mixing - laplacian @ mixing / self._delta
         stack = self.errors.stack
-        indices = stack.indices(hosts)
+        indices = stack.indices(estimators)
         forms = stack.table[indices, :, : stack.used].reshape(self._N, -1)
         stack.table[indices, :, : stack.used] = (mixing @ forms).reshape(self._N, -1, stack.used)
 
     def _received(self, slot: int, phase: int, step: int) -> FloatArray:
         return self._arrivals.get((slot, phase, step), np.zeros((self._N, self._N)))
 
-    def sense(self, time: float, observations: HostObservations) -> None:
+    def sense(self, time: float, observations: EstimatorObservations) -> None:
         """Update the estimates, P step 4, with the G and N that the masses estimate, P (6)-(8)."""
         n, errors = self.errors.n, self.errors
         heard = self._z[:, 0] > 0.0  # before any weight arrives a node knows its own sensor only
@@ -110,15 +110,15 @@ class AveragingRule(ErrorRule):
         G = np.where(heard[:, None, None], learned, self._own)
         number = np.where(heard, self._z[:, 1] / weight, 1.0)
         columns = errors.reading_noises(observations)
-        for host in range(self._N):
-            root = add_information_to_root(errors.roots[host], G[host])
-            if host not in observations:
-                errors.roots[host] = root
+        for estimator in range(self._N):
+            root = add_information_to_root(errors.roots[estimator], G[estimator])
+            if estimator not in observations:
+                errors.roots[estimator] = root
                 continue
-            one = observations[host]
-            K = number[host] * root @ root.T @ np.linalg.solve(one.R, one.H).T
-            errors.multiply(host, np.eye(n) - K @ one.H, root)
-            errors.stack.add(host, columns[host], -K @ one.root)
+            one = observations[estimator]
+            K = number[estimator] * root @ root.T @ np.linalg.solve(one.R, one.H).T
+            errors.multiply(estimator, np.eye(n) - K @ one.H, root)
+            errors.stack.add(estimator, columns[estimator], -K @ one.root)
 
 
 class RunningTotalsRule(ErrorRule):
@@ -137,15 +137,15 @@ class RunningTotalsRule(ErrorRule):
         plant, n = scenario.truth, errors.n
         self._A, self._rounds = plant.A, rounds
         self._rate = max(0.0, -float(np.linalg.eigvals(plant.A).real.min()))
-        self._weights = [1.0] * errors.hosts
+        self._weights = [1.0] * errors.estimators
         # The weight of each total; the stack has their information and errors.
         self._totals: dict[Hashable, float] = {}
         self._number: dict[tuple[int, int], int] = {}
-        self._receivers = [0] * errors.hosts
+        self._receivers = [0] * errors.estimators
         for sender, _ in scenario.topology.directions:
             self._receivers[scenario.topology.index[sender]] += 1
-        for host in range(errors.hosts):
-            self._put(("sent", host), 0.0, np.zeros((n, n)), np.zeros((n, 0)))
+        for estimator in range(errors.estimators):
+            self._put(("sent", estimator), 0.0, np.zeros((n, n)), np.zeros((n, 0)))
 
     def _put(self, name: Hashable, weight: float, U: FloatArray, form: FloatArray) -> None:
         """Set a total: its weight, its information U (n, n) and the form of its error."""
@@ -172,31 +172,31 @@ class RunningTotalsRule(ErrorRule):
             *(inverse, fading, as_kernel_array(noise), columns.start),
         )
 
-    def sense(self, time: float, observations: HostObservations) -> None:
+    def sense(self, time: float, observations: EstimatorObservations) -> None:
         """Update by samples, each N / w times, then add the shares of nodes that broadcast now."""
-        columns, number = self.errors.reading_noises(observations), self.errors.hosts
-        for host, one in observations.items():
-            counted = one._replace(R=one.R * (self._weights[host] / number))
-            self.errors.update(host, counted, columns[host])
-        for host in self._rounds.get(time, ()):
-            self._add_share(host)
+        columns, number = self.errors.reading_noises(observations), self.errors.estimators
+        for estimator, one in observations.items():
+            counted = one._replace(R=one.R * (self._weights[estimator] / number))
+            self.errors.update(estimator, counted, columns[estimator])
+        for estimator in self._rounds.get(time, ()):
+            self._add_share(estimator)
 
-    def _add_share(self, host: int) -> None:
+    def _add_share(self, estimator: int) -> None:
         """Add the node's share of its mass to the total that it sends to each receiver.
 
         The mass is ``(w / N) (P^-1, P^-1 xhat)``, and its error ``-(w / N) P^-1 e``.
         """
-        count, name, stack = self._receivers[host], ("sent", host), self.errors.stack
+        count, name, stack = self._receivers[estimator], ("sent", estimator), self.errors.stack
         if count == 0:
             return
-        weight, share = self._weights[host], 1.0 / (count + 1)
-        inverse = np.linalg.inv(self.errors.roots[host])
-        U = (share * weight / self.errors.hosts) * (inverse.T @ inverse)
+        weight, share = self._weights[estimator], 1.0 / (count + 1)
+        inverse = np.linalg.inv(self.errors.roots[estimator])
+        U = (share * weight / self.errors.estimators) * (inverse.T @ inverse)
         before = self._totals[name]
-        sent, form = before + share * weight, stack.form(name) - U @ stack.form(host)
+        sent, form = before + share * weight, stack.form(name) - U @ stack.form(estimator)
         self._put(name, sent, self._information(name) + U, form)
         # One share stays with the node, the others are on their way to its receivers.
-        self._weights[host] = weight - count * (sent - before)
+        self._weights[estimator] = weight - count * (sent - before)
 
     def send(self, messages: Sequence[SentMessage]) -> None:
         """Store the sender's total for each message, as it is when the message leaves."""
@@ -207,19 +207,19 @@ class RunningTotalsRule(ErrorRule):
 
     def arrive(self, time: float, messages: Sequence[SentMessage]) -> None:
         """Add to each receiver the growth of its senders' totals since the last that it got."""
-        for host in sorted({message.receiver for message in messages}):
-            mine = [m for m in messages if m.receiver == host]
-            self._receive(host, sorted(mine, key=lambda m: (m.sender, m.number)))
+        for estimator in sorted({message.receiver for message in messages}):
+            mine = [m for m in messages if m.receiver == estimator]
+            self._receive(estimator, sorted(mine, key=lambda m: (m.sender, m.number)))
         for message in messages:
             del self._totals[message]
         self.errors.stack.drop(messages)
 
-    def _receive(self, host: int, messages: Sequence[SentMessage]) -> None:
+    def _receive(self, estimator: int, messages: Sequence[SentMessage]) -> None:
         """Add the growth of the received totals to a node's mass, and update its estimate."""
         errors, n = self.errors, self.errors.n
         weight, U, form = 0.0, np.zeros((n, n)), np.zeros((n, 1))
         for message in messages:
-            link, heard = (message.sender, host), ("heard", message.sender, host)
+            link, heard = (message.sender, estimator), ("heard", message.sender, estimator)
             # An older total than the last one holds nothing new.
             if message.number <= self._number.get(link, -1):
                 continue
@@ -232,16 +232,18 @@ class RunningTotalsRule(ErrorRule):
             self._totals[heard] = self._totals[message]
         if not weight > 0.0:
             return
-        after = self._weights[host] + weight
-        share = errors.hosts / after
+        after = self._weights[estimator] + weight
+        share = errors.estimators / after
         # Information adds up: (w+ / N) P+^-1 = (w / N) P^-1 + U.
-        scaled = np.sqrt(after / self._weights[host]) * errors.roots[host]
+        scaled = np.sqrt(after / self._weights[estimator]) * errors.roots[estimator]
         root = add_information_to_root(scaled, share * U)
         # e+ = e - (N / w+) P+ (U e + u - U x)
         gain = share * root @ root.T
-        errors.stack.put(host, (np.eye(n) - gain @ U) @ errors.stack.form(host) - gain @ form)
-        errors.roots[host] = root
-        self._weights[host] = after
+        errors.stack.put(
+            estimator, (np.eye(n) - gain @ U) @ errors.stack.form(estimator) - gain @ form
+        )
+        errors.roots[estimator] = root
+        self._weights[estimator] = after
 
 
 def _rounds(scenario: Scenario, run: Run) -> dict[float, list[int]]:

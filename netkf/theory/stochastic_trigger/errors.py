@@ -18,7 +18,7 @@ from netkf.linalg.arrays import FloatArray
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.arrivals import require_traced_exchanges
 from netkf.theory.common.error_rules import ErrorRule, SentMessage
-from netkf.theory.common.observations import HostObservations
+from netkf.theory.common.observations import EstimatorObservations
 from netkf.theory.common.random_links import all_messages_arrive
 from netkf.theory.common.stacked_errors import StackedErrors
 from netkf.theory.numerics.updates import Observation
@@ -52,19 +52,19 @@ class ScheduleRule(ErrorRule):
         algorithm = scenario.filter.algorithm
         assert isinstance(algorithm, StochasticTrigger)
         self._Y, self._sent = algorithm.Y, decisions(scenario, run)
-        self._seen: HostObservations = {}
+        self._seen: EstimatorObservations = {}
 
-    def sense(self, time: float, observations: HostObservations) -> None:
+    def sense(self, time: float, observations: EstimatorObservations) -> None:
         """Keep the readings for the exchange of the slot."""
         self._seen = observations
 
     def exchange(self, slot: int, phase: int, messages: Sequence[SentMessage]) -> None:
         """Update all nodes by all sensors."""
         columns = self.errors.reading_noises(self._seen)
-        for host, one in self._seen.items():
-            used = one if (slot, host) in self._sent else silence(one, self._Y)
-            for hearer in range(self.errors.hosts):
-                self.errors.update(hearer, used, columns[host])
+        for estimator, one in self._seen.items():
+            used = one if (slot, estimator) in self._sent else silence(one, self._Y)
+            for hearer in range(self.errors.estimators):
+                self.errors.update(hearer, used, columns[estimator])
 
 
 def silence(reading: Observation, Y: float | FloatArray) -> Observation:

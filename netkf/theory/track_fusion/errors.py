@@ -20,7 +20,7 @@ from netkf.linalg.arrays import FloatArray, square_root
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.arrivals import require_traced_exchanges
 from netkf.theory.common.error_rules import ErrorRule, EstimateExchangeRule, SentMessage
-from netkf.theory.common.observations import HostObservations
+from netkf.theory.common.observations import EstimatorObservations
 from netkf.theory.common.stacked_errors import StackedErrors, Term
 from netkf.theory.numerics.prediction import triangular_root
 from netkf.theory.numerics.updates import intersect_covariances
@@ -75,19 +75,19 @@ class TrackRule(ErrorRule):
         super().__init__(scenario, errors)
         self._models = scenario.slot_models
         self._sensors = [whitened_sensors(model) for model in self._models]
-        nodes = range(errors.hosts)
+        nodes = range(errors.estimators)
         start = scenario.start(scenario.nodes[0])[1]
         self._joint = np.tile(start, (len(nodes), len(nodes), 1, 1))
-        for host in nodes:
-            errors.copy(host, _track(host), host)
+        for estimator in nodes:
+            errors.copy(estimator, _track(estimator), estimator)
 
-    def sense(self, time: float, observations: HostObservations) -> None:
+    def sense(self, time: float, observations: EstimatorObservations) -> None:
         """Update the tracks; a node that hears nothing shows its own."""
         self._joint = updated_joint(predicted_joint(self._joint, self._models[0]), self._sensors)
         columns = self.errors.reading_noises(observations)
-        for host, observation in observations.items():
-            self.errors.update(_track(host), observation, columns[host])
-        self._show({host: [] for host in range(self.errors.hosts)})
+        for estimator, observation in observations.items():
+            self.errors.update(_track(estimator), observation, columns[estimator])
+        self._show({estimator: [] for estimator in range(self.errors.estimators)})
 
     def exchange(self, slot: int, phase: int, messages: Sequence[SentMessage]) -> None:
         """Combine each node's track with those that it heard."""
@@ -100,23 +100,23 @@ class TrackRule(ErrorRule):
         """Set the errors of receivers to those of the combinations with what they heard."""
         errors, n = self.errors, self.errors.n
         changes: dict[Hashable, tuple[FloatArray, Sequence[Term]]] = {}
-        for host, senders in heard.items():
-            order = [host, *sorted(set(senders))]
-            own = errors.roots[_track(host)]
-            terms: list[Term] = [(_track(host), np.eye(n))]
+        for estimator, senders in heard.items():
+            order = [estimator, *sorted(set(senders))]
+            own = errors.roots[_track(estimator)]
+            terms: list[Term] = [(_track(estimator), np.eye(n))]
             root = own
             if len(order) > 1:
                 gain, root = best_combination(self._joint, order, own)
                 parts = np.split(gain, len(order) - 1, axis=1)
                 # e = e_i - sum_j G_j (e_i - e_j)
-                terms = [(_track(host), np.eye(n) - sum(parts))]
+                terms = [(_track(estimator), np.eye(n) - sum(parts))]
                 terms += [(_track(j), G) for j, G in zip(order[1:], parts, strict=True)]
-            changes[host] = root, terms
+            changes[estimator] = root, terms
         errors.combine(changes)
 
 
-def _track(host: int) -> Hashable:
-    return ("track", host)
+def _track(estimator: int) -> Hashable:
+    return ("track", estimator)
 
 
 def rule(
