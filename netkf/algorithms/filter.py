@@ -367,11 +367,13 @@ class Filter(Component):
         """
         return arrays
 
-    def carried_estimates(self, shown: FloatArray, arrays: tuple[Any, ...]) -> FloatArray:
-        """Return the estimates (B, H, n, L) that nodes go on with, where they are not those that
-        they show; ``arrays`` are those of ``slot_arrays``.
+    def carried_estimates(self, reported: FloatArray, arrays: tuple[Any, ...]) -> FloatArray:
+        """Return the estimates (B, H, n, L) with which nodes go on to the next slot.
+
+        By default they are the ``reported`` ones (B, H, n, L), which samples hold; ``arrays`` are
+        those of ``slot_arrays``.
         """
-        return shown
+        return reported
 
     def stopped(self, state: Any) -> bool:
         """Return True once the node has permanently frozen its network estimate."""

@@ -589,11 +589,16 @@ class TriggeredSlots:
                 judge_slot(carried, readings, plan, links, scratch, arrays, self._order, s)
             if plan.part == SENDING and not self._decides:
                 continue
-            here, one, shown = slot_alone(readings, plan, samples, s)
+            here, one, slot_samples = slot_alone(readings, plan, samples, s)
             if self._decides:
                 # The filter decides by itself, whatever the trigger says.
                 one = one._replace(sent=asked, part=plan.part)
-            given = links, shown, scratch, *self._inner.slot_gains(states, more, plan.first + s, 1)
+            given = (
+                links,
+                slot_samples,
+                scratch,
+                *self._inner.slot_gains(states, more, plan.first + s, 1),
+            )
             if self._order.split:
                 self._kernel(nodes, here, one._replace(sensed=NOWHERE), *given)
                 if plan.sensed[s]:
@@ -626,8 +631,8 @@ def slot_alone(
         plan.first + s, plan.sensed[here], plan.exchanged[here], plan.sample[here], taken(plan.up),
         *nothing, WHOLE,
     )  # fmt: skip
-    shown = samples._replace(absolute=taken(samples.absolute), local=taken(samples.local))
-    return alone, one, shown
+    slot_samples = samples._replace(absolute=taken(samples.absolute), local=taken(samples.local))
+    return alone, one, slot_samples
 
 
 class WrappedState(NamedTuple):

@@ -437,7 +437,7 @@ class BarShalomCampo(Filter):
             ),
         )
 
-    def carried_estimates(self, shown: FloatArray, arrays: tuple[Any, ...]) -> FloatArray:
+    def carried_estimates(self, reported: FloatArray, arrays: tuple[Any, ...]) -> FloatArray:
         """Return the own tracks."""
         tracks: TrackArrays = arrays[0]
         return tracks.xhat

@@ -55,10 +55,10 @@ def _legend(verdict: Verdict) -> list[str]:
 def _summary(verdict: Verdict) -> list[str]:
     """Return the lines that count the verdicts."""
     counts = Counter(row.verdict for row in verdict.rows)
-    shown = ", ".join(f"{counts[v]} {v}" for v in VERDICTS if counts[v])
+    counted_verdicts = ", ".join(f"{counts[v]} {v}" for v in VERDICTS if counts[v])
     looks = f" at all of {verdict.looks} looks" if verdict.looks > 1 else ""
     together = f"all intervals{looks} hold together with probability {verdict.confidence:.6g}"
-    lines = [f"{shown}; {verdict.runs:,} runs, {together}"]
+    lines = [f"{counted_verdicts}; {verdict.runs:,} runs, {together}"]
     needed = [row.needed for row in verdict.rows if row.needed is not None]
     if needed:
         lines.append(

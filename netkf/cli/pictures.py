@@ -35,9 +35,9 @@ def draw_picture(function: tuple[str, str], *results: Any) -> None:
         print_notes(["no picture: matplotlib is missing (pip install matplotlib)"])
         return
     try:
-        shown = draw(*results)
+        drawn = draw(*results)
     except WriteError as error:
         print_notes([f"no picture: {error}"])
     else:
-        if shown is False:
+        if drawn is False:
             print_notes([f"no picture: {UNSHOWN[function]}"])

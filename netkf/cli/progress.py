@@ -46,14 +46,14 @@ class ProgressLine:
 
     def simulated_time(self, horizon: float) -> Callable[[float], None]:
         """Return a function of the simulated time (seconds) that shows the percentage done."""
-        shown = -1
+        last_percent = -1
 
         def update(seconds: float) -> None:
             # Engines report far more often than the percentage changes.
-            nonlocal shown
+            nonlocal last_percent
             percent = int(100.0 * seconds / horizon)
-            if percent != shown:
-                shown = percent
+            if percent != last_percent:
+                last_percent = percent
                 self.show(f"{percent:3d} % of {horizon:g} simulated seconds")
 
         return update

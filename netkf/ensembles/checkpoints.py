@@ -212,9 +212,9 @@ def _describe(bad: list[tuple[str, str]]) -> list[str]:
     """Return no line, or one on all blocks that are done again."""
     if not bad:
         return []
-    shown = ", ".join(f"{name} {reason}" for name, reason in bad[:3])
+    listed = ", ".join(f"{name} {reason}" for name, reason in bad[:3])
     more = f" and {len(bad) - 3} more" if len(bad) > 3 else ""
-    return [f"kept blocks that are not those of this run are done again: {shown}{more}"]
+    return [f"kept blocks that are not those of this run are done again: {listed}{more}"]
 
 
 def _verify(file: Path) -> None:

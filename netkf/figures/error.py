@@ -130,10 +130,10 @@ def quantiles_figure(subject: Subject) -> Picture:
         label = f"root mean square of {label}" if subject.shows_errors else label
     figure = new_figure(7.4, 4.4)
     axes = figure.add_subplot()
-    shown = np.isfinite(values).any(axis=1)
-    if not shown.any():
+    finite = np.isfinite(values).any(axis=1)
+    if not finite.any():
         raise UnavailableError("No sample has a finite error.")
-    times, values = subject.times[shown], values[shown]
+    times, values = subject.times[finite], values[finite]
     with np.errstate(invalid="ignore"):
         low, quarter, median, three, high = np.nanquantile(values, QUANTILES, axis=1)
     axes.fill_between(times, low, high, color=RELAY, alpha=0.3, lw=0, label="90% of nodes")
@@ -159,11 +159,11 @@ def _mark_worst(
     """Mark the worst instants, each of another node, and return a sentence on the first."""
     used = np.flatnonzero(np.isin(times, subject.times[subject.used]))
     used = used if len(used) else np.arange(len(times))
-    shown = np.where(np.isfinite(values[used]), values[used], -np.inf)
-    order = np.argsort(-shown.max(axis=0), kind="stable")[:WORST]
+    errors = np.where(np.isfinite(values[used]), values[used], -np.inf)
+    order = np.argsort(-errors.max(axis=0), kind="stable")[:WORST]
     claim = ""
     for rank, k in enumerate(order.tolist()):
-        at = int(used[int(np.argmax(shown[:, k]))])
+        at = int(used[int(np.argmax(errors[:, k]))])
         t, value = times[at], values[at, k]
         if not math.isfinite(value):
             continue

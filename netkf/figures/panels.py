@@ -84,13 +84,13 @@ def draw_errors(axes: Any, subject: Subject, bound: bool = False) -> None:
     rms = np.sqrt(subject.sq_error.mean(axis=1))
     if len(subject.nodes) > 1:
         axes.plot(subject.times, rms, color=INK, lw=2.0, label="RMS of all nodes", zorder=4)
-    shown = [error]
+    curves = [error]
     promised = subject.promised.bound
     if bound and promised is not None:
         roots = np.sqrt(promised)
-        shown.append(roots)
+        curves.append(roots)
         _draw_bound(axes, subject.times, roots)
-    set_scale(axes, np.concatenate(shown))
+    set_scale(axes, np.concatenate(curves))
     axes.set(ylabel="error |x - xhat|" if subject.runs == 1 else RMS_ERROR, xlabel=SECONDS)
     draw_legend(axes)
 

@@ -231,11 +231,13 @@ def law_figure(subject: Subject) -> Picture:
         claim = (
             f"Mean trace of P {own.mean():.3g} in the run; the invariant law has {laws.mean():.3g}"
         )
-    shown = values[np.isfinite(values) & (values > 0.0)]
-    if shown.size and shown.max() > SPREAD * shown.min():
+    positive = values[np.isfinite(values) & (values > 0.0)]
+    if positive.size and positive.max() > SPREAD * positive.min():
         axes.set_xscale("log")
-    elif shown.size and shown.max() - shown.min() < EQUAL_TRACES * shown.max():  # rounding alone
-        axes.set_xlim(0.9 * shown.min(), 1.1 * shown.max())
+    elif (
+        positive.size and positive.max() - positive.min() < EQUAL_TRACES * positive.max()
+    ):  # rounding alone
+        axes.set_xlim(0.9 * positive.min(), 1.1 * positive.max())
     axes.set_yscale("log")
     axes.set(xlabel="trace of P, squared units of the state", ylabel="share of samples above")
     draw_legend(axes)

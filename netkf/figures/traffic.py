@@ -153,8 +153,9 @@ def _draw_age_law(axes: Any, ages: list[Ages], means: FloatArray, end: float) ->
         ]
     least = 1e-4
     for share, colour, dashes, label in rows:
-        shown = share > 0.1 * least
-        axes.plot(levels[shown], share[shown], color=colour, ls=dashes, label=label)
+        # The axis is logarithmic: smaller shares only stretch it.
+        visible = share > 0.1 * least
+        axes.plot(levels[visible], share[visible], color=colour, ls=dashes, label=label)
     axes.set_yscale("log")
     axes.set_ylim(least, 1.3)
     axes.set(xlabel="age, seconds", ylabel="share of time above")
@@ -248,9 +249,9 @@ def links_figure(subject: Subject) -> Picture:
         sum(len(d.lost) + len(d.delivered) for d in found),
     )
     claim = f"{lost:,} of {total:,} messages were lost ({lost / total:.1%})"
-    shown = f"{len(chosen)} of {len(found)} directions" if len(chosen) < len(found) else ""
+    directions = f"{len(chosen)} of {len(found)} directions" if len(chosen) < len(found) else ""
     part = f"the first {end:,.4g} s" if end < _end(subject) else ""
-    cut = " of ".join(filter(None, (shown, part)))
+    cut = " of ".join(filter(None, (directions, part)))
     sentence = f"Shown: {cut}; the claim counts all." if cut else "All messages are shown."
     finish_figure(figure, subject.claim(claim), subject.caption(sentence))
     return figure

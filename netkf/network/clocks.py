@@ -121,9 +121,11 @@ class Poisson(LinkClock):
         length, rule = (2, _node_rate) if self.at == "nodes" else (3, _link_rate)
         for k, given in enumerate(self.rates):
             if len(given) != length:
-                shown = [int(value) if value.is_integer() else value for value in map(float, given)]
+                printed = [
+                    int(value) if value.is_integer() else value for value in map(float, given)
+                ]
                 remedy = f'{rule.remedy}, because at = "{self.at}"'
-                raise ScenarioError(f"rates[{k}]", rule.requirement, shown, remedy)
+                raise ScenarioError(f"rates[{k}]", rule.requirement, printed, remedy)
 
     @cached_property
     def _own(self) -> dict[Entity, float]:

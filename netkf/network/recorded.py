@@ -84,8 +84,8 @@ def read_messages(
     for (sender, receiver, message), value in zip(keys, table[column].tolist(), strict=True):
         listed = values.setdefault((sender, receiver), {})
         if not allowed(value) or listed.setdefault(message, value) != value:
-            shown = int(value) if value.is_integer() else value
-            row = [sender, receiver, message, shown]
+            printed = int(value) if value.is_integer() else value
+            row = [sender, receiver, message, printed]
             raise ScenarioError("path", f"{source.name}: {rule}", row, "correct the row")
     return MessageTable(source, values)
 

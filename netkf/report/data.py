@@ -142,8 +142,8 @@ def sample_indices(run: StoredRun, values: int, instant: float) -> np.ndarray:
     if total <= most:
         return np.arange(total)
     step = -(-total // max(1, most - 1))
-    shown = min(int(np.searchsorted(run.times, instant)), total - 1)
-    chosen = {*range(0, total, step), shown, total - 1}
+    at_instant = min(int(np.searchsorted(run.times, instant)), total - 1)
+    chosen = {*range(0, total, step), at_instant, total - 1}
     if run.truth_known:
         error = np.where(np.isfinite(run.sq_error), run.sq_error, -1.0)
         chosen |= set(error.argmax(axis=0).tolist())

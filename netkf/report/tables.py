@@ -58,10 +58,10 @@ def summary_section(source: Opened) -> str:
     if not summary:
         return paragraph("There is no summary: the runs ended before it was written")
     rows = [[str(row["node"]), *_cells(row)] for row in summary["nodes"]]
-    shown = rows[:MAX_ROWS]
+    listed = rows[:MAX_ROWS]
     if len(rows) > MAX_ROWS:
-        shown.append([f"({len(rows) - MAX_ROWS:,} more)", *[""] * len(COLUMNS)])
-    shown.append(["all", *_cells(summary["overall"])])
+        listed.append([f"({len(rows) - MAX_ROWS:,} more)", *[""] * len(COLUMNS)])
+    listed.append(["all", *_cells(summary["overall"])])
     runs = f"averages over {source.runs:,} runs, +- one standard error" if source.runs > 1 else ""
     caption = f"Averages over time{'; ' + runs if runs else ''}: {source.label}"
     messages = summary["messages"]
@@ -76,7 +76,7 @@ def summary_section(source: Opened) -> str:
         if messages.get(name) is not None
     )
     notes = [f"messages: {counts}", *_bound_notes(source), *summary.get("notes", [])]
-    return table_box(caption, ["node", *COLUMNS.values()], shown) + bullets(notes)
+    return table_box(caption, ["node", *COLUMNS.values()], listed) + bullets(notes)
 
 
 def _cells(row: dict[str, Any]) -> list[str]:

@@ -239,9 +239,9 @@ def _by_node(scenario: Scenario, columns: list[dict[str, Any]]) -> str:
     sizes = np.nan_to_num(np.array(traces[-1], dtype=np.float64), nan=np.inf)
     order, third = np.argsort(sizes, kind="stable"), MAX_NODES // 3
     middle = (len(order) - third) // 2
-    shown = [*order[:third], *order[middle : middle + third], *order[-third:]]
+    listed = [*order[:third], *order[middle : middle + third], *order[-third:]]
     line = (
         f"the {third} nodes with the smallest, the middle and the largest bound of "
         f"{len(rows):,}; --json has all"
     )
-    return "\n".join([line, table(header, [rows[k] for k in shown])])
+    return "\n".join([line, table(header, [rows[k] for k in listed])])

@@ -82,9 +82,9 @@ def summary_table(
 
 def _node_table(summary: dict[str, Any]) -> Iterator[str]:
     nodes = sorted(summary["nodes"], key=lambda row: row["node"])
-    shown = _best_and_worst(nodes) if len(nodes) > MAX_NODES else nodes
-    omitted = len(nodes) - len(shown)
-    rows = [_cells(str(row["node"]), row) for row in shown]
+    listed = _best_and_worst(nodes) if len(nodes) > MAX_NODES else nodes
+    omitted = len(nodes) - len(listed)
+    rows = [_cells(str(row["node"]), row) for row in listed]
     if omitted:
         rows.append([f"({omitted} more)", *[""] * len(COLUMNS)])
     rows.append(_cells("all", summary["overall"]))

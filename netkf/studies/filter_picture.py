@@ -55,8 +55,8 @@ def _draw_quantity(axes: Any, rows: list[ComparedFilter], name: str, label: str)
         values, range(len(rows)), xerr=bars, ls="", marker="o", ms=4, capsize=2, color=BLUE
     )
     axes.set_xlabel(label)
-    shown = [value for value in values if math.isfinite(value) and value > 0.0]
-    if shown and max(shown) > 20.0 * min(shown):
+    positive = [value for value in values if math.isfinite(value) and value > 0.0]
+    if positive and max(positive) > 20.0 * min(positive):
         axes.set_xscale("log")
     elif name != "nees_ratio":
         axes.set_xlim(left=0.0)

@@ -303,10 +303,10 @@ def _route(source: InformationSource) -> str:
         return "-"
     if len(source.route) == 1:
         return "its own"
-    shown = (
+    nodes = (
         source.route if len(source.route) <= 6 else (*source.route[:3], "..", *source.route[-2:])
     )
-    return " -> ".join(map(str, shown))
+    return " -> ".join(map(str, nodes))
 
 
 def _listed(items: Sequence[object], others: str = "others") -> str:

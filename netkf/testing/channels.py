@@ -310,8 +310,8 @@ def _check_delay_law(watched: Watched, links: tuple[Link, ...]) -> None:
         for link in links:
             seconds = part.message_delay(link, 0, stated.fixed)
             off = not math.isnan(seconds) and seconds != stated.fixed
-            shown = f"{seconds:g} s for link {list(link)} instead of {stated.fixed:g}"
-            demand(not off, where, rule, shown, remedy)
+            got = f"{seconds:g} s for link {list(link)} instead of {stated.fixed:g}"
+            demand(not off, where, rule, got, remedy)
         return
     with user_code(where):
         random = Streams(7, 0).generator("delay")
@@ -363,14 +363,14 @@ def _check_message_delays(watched: Watched, links: tuple[Link, ...]) -> None:
     asked = [(link, message) for link in links for message in MESSAGES]
     found = {one: watched.call("message_delay", *one, drawn) for one in asked}
     for (link, message), seconds in found.items():
-        shown = f"message {message} of link {list(link)}"
+        subject = f"message {message} of link {list(link)}"
         number = isinstance(seconds, (int, float, np.floating))
-        demand(number, where, f"must be a number for {shown}", seconds)
+        demand(number, where, f"must be a number for {subject}", seconds)
         fine = math.isnan(seconds) or 0.0 <= seconds <= longest
         rule = f"must be from 0 to `longest` ({longest:g}) seconds, or nan where it is lost"
-        demand(fine, where, rule, f"{seconds:g} for {shown}")
+        demand(fine, where, rule, f"{seconds:g} for {subject}")
         kept = part.fixed is None or seconds == drawn or overrides_message_delay(part)
-        demand(kept, where, "must be `fixed` where delays are", f"{seconds:g} for {shown}")
+        demand(kept, where, "must be `fixed` where delays are", f"{seconds:g} for {subject}")
     for one in reversed(asked):
         same = watched.part.message_delay(*one, drawn)
         equal = same == found[one] or (math.isnan(same) and math.isnan(found[one]))

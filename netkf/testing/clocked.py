@@ -125,7 +125,7 @@ class ClockTrial(Trial):
         sensing = [node for node in self.nodes if node != 1 and len(self.system.H)]
         for node in self.nodes:
             read = self._increments and node in sensing
-            self.step(node, "predict", gap, shown=not read)
+            self.step(node, "predict", gap, checks=not read)
             if read:
                 self.step(node, "update", Increments(self._moments(start, gap), gap))
         if shift:

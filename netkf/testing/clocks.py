@@ -96,12 +96,12 @@ def _one_entity(watched: Watched, link: Entity) -> None:
         parts = _ticks(watched, link, blocks)
         if not np.array_equal(whole, parts):
             k = _first_difference(whole, parts)
-            shown = [f"{t[k]:.17g}" if k < len(t) else "nothing" for t in (whole, parts)]
+            texts = [f"{t[k]:.17g}" if k < len(t) else "nothing" for t in (whole, parts)]
             demand(
                 False,
                 f"{watched.name}.ticks",
                 "must not depend on the size of the blocks",
-                f"{shown[0]} as tick {k} of one block and {shown[1]} in blocks of {blocks[0]}, ...",
+                f"{texts[0]} as tick {k} of one block and {texts[1]} in blocks of {blocks[0]}, ...",
                 "add gaps up one by one from now, one draw a tick",
             )
 

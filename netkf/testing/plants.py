@@ -288,9 +288,11 @@ def _check_sampled(
     samples, probes = np.delete(times, np.s_[::3]), times[::3]
     horizon = float(times[-1]) * 1.01
 
-    def path(plant: Any, at: FloatArray, run: int = 0, shown: FloatArray = probes) -> FloatArray:
+    def path(
+        plant: Any, at: FloatArray, run: int = 0, sample_times: FloatArray = probes
+    ) -> FloatArray:
         randoms = [_random(seed, run, purpose) for purpose in ("plant", "probe")]
-        truth = attempt(where, plant.sampled_truth, *randoms, samples, shown, horizon)
+        truth = attempt(where, plant.sampled_truth, *randoms, samples, sample_times, horizon)
         asked = np.concatenate([[0.0], at])
         found = np.asarray(attempt(where, truth.states, asked)[1])
         return demand_array(where, "states", found, (len(asked), part.n))
@@ -299,7 +301,7 @@ def _check_sampled(
     _demand_same(where, whole, path(part, times), "at the second call")
     _demand_same(where, whole, path(copy, times), "of a pickled plant")
     drawn = np.isin(np.concatenate([[0.0], times]), probes, invert=True)
-    fewer = path(part, samples, shown=probes[:0])
+    fewer = path(part, samples, sample_times=probes[:0])
     _demand_same(where, whole[drawn], fewer, "when nothing is probed")
     laws = [transition_law(part.A, part.B, second * gap) for gap in GAPS]
     other = _moved(part)
@@ -325,7 +327,7 @@ def _check_grid(part: Diffusion, name: str, seed: int, steps: int) -> None:
     """Check paths on the sensing grid, which are drawn together or alone, cut or not."""
     where, period = f"{name}.paths", float(part.sensing_period or 0.0)
     count = -(-steps // 64)
-    shown = period * np.array([1.3, 4.0, 5.5, 5.7])
+    sample_times = period * np.array([1.3, 4.0, 5.5, 5.7])
     sampled = period * np.array([2.5, 5.6])
 
     def drawn(runs: Sequence[int], cuts: bool = False, blocks: int = count) -> Any:
@@ -334,7 +336,7 @@ def _check_grid(part: Diffusion, name: str, seed: int, steps: int) -> None:
             for purpose in ("plant", "probe", "samples")
         )
         none = np.empty(0)
-        at = (shown, samples, sampled) if cuts else (none, samples, none)
+        at = (sample_times, samples, sampled) if cuts else (none, samples, none)
         return attempt(where, part.paths, own, shows, *at).following(blocks)
 
     whole = drawn(range(3))
@@ -343,11 +345,11 @@ def _check_grid(part: Diffusion, name: str, seed: int, steps: int) -> None:
     cut = drawn([1], cuts=True)
     last = np.append(np.diff(cut.step) > 0, True)
     _demand_same(where, alone.x_end[0], cut.x_end[0][last], "at the points of its grid when cut")
-    _check_one_path(part, f"{name}.path", cut, (shown, sampled), seed)
+    _check_one_path(part, f"{name}.path", cut, (sample_times, sampled), seed)
     other = _moved(part)
     if other is not None:
         moved = other[0].paths(
-            *(GeneratorNormals([_random(seed, 1, p)]) for p in ("plant", "probe")), shown[:0]
+            *(GeneratorNormals([_random(seed, 1, p)]) for p in ("plant", "probe")), sample_times[:0]
         )
         Phi = np.array([scipy.linalg.expm(part.A * period * k) for k in range(1, steps + 1)])
         two = moved.following(count).x_end[0][:steps]

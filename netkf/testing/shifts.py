@@ -46,8 +46,8 @@ def check_shift(watched: Watched, plain: Sequence[Trial]) -> None:
 
 def _compare(watched: Watched, plain: Trial, shifted: Trial) -> None:
     # The shift itself shows each node once more.
-    moved = [shown for shown in shifted.shown if shown.after != "shift"]
-    for one, other in zip(plain.shown, moved, strict=True):
+    moved = [estimates for estimates in shifted.estimates if estimates.after != "shift"]
+    for one, other in zip(plain.estimates, moved, strict=True):
         for name, apart, size in differences(one, other):
             demand(
                 apart <= ROUNDING * size,

@@ -40,7 +40,7 @@ class Trial(ABC):
     def __init__(self, watched: Watched, system: System, shift: FloatArray | None = None) -> None:
         self.watched, self.part, self.system = watched, watched.part, system
         self.random = Streams(0).generator("testing")
-        self.shown: list[CheckedEstimate] = []
+        self.estimates: list[CheckedEstimate] = []
         self.ends: list[dict[int, CheckedEstimate]] = []
         """The estimate of each node at the end of each slot, or of each round under clocks."""
         self._last: dict[int, CheckedEstimate] = {}
@@ -79,16 +79,16 @@ class Trial(ABC):
         xhat, P = check_estimate(self.watched, state, len(self.system.M), after)
         size = float(np.abs(xhat).max())
         self._last[node] = CheckedEstimate(node, after, xhat - self.offset, P, size)
-        self.shown.append(self._last[node])
+        self.estimates.append(self._last[node])
 
     def end(self) -> None:
         """Keep the present estimates as those at the end of a slot or round."""
         self.ends.append(dict(self._last))
 
-    def step(self, node: int, method: str, *arguments: Any, shown: bool = True) -> None:
+    def step(self, node: int, method: str, *arguments: Any, checks: bool = True) -> None:
         """Call a method that returns the node's next state."""
         self.states[node] = self.watched.call(method, self.states[node], *arguments)
-        if shown:
+        if checks:
             self.show(node, self.states[node], method)
 
     def emit(self, node: int, exchange: Exchange) -> Any:

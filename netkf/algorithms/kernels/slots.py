@@ -132,7 +132,7 @@ class SlotScratch(NamedTuple):
     """The ``lanes`` and scratch: ``row``, ``gains`` and ``moved_mean`` (n, L) of a reading and a
     mean, ``moved`` and ``noise`` (n, n, L) of a prediction, ``whitened`` and ``total``
     (n, n + 1, L) of an intersection, and copies of what is sent, (H, n, L) and (H, n, n, L). Of a
-    sample ``shown_xhat`` and ``shown_error`` (>= H n, L), ``shown_P`` (>= H n n, L) and the
+    sample ``sampled_xhat`` and ``sampled_error`` (>= H n, L), ``sampled_P`` (>= H n n, L) and the
     ``places`` (L,) of its runs.
     """
 
@@ -146,9 +146,9 @@ class SlotScratch(NamedTuple):
     total: FloatArray
     xhat: FloatArray
     root: FloatArray
-    shown_xhat: FloatArray
-    shown_error: FloatArray
-    shown_P: FloatArray
+    sampled_xhat: FloatArray
+    sampled_error: FloatArray
+    sampled_P: FloatArray
     places: np.ndarray
 
 
@@ -206,10 +206,10 @@ def show(
             x = load(lanes, nodes.xhat, b, h, i)
             # In the coordinates of the estimates: a difference of large states loses digits.
             local = load(lanes, samples.local, b, s, i)
-            store(lanes, scratch.shown_error, h * n + i, local - x)
+            store(lanes, scratch.sampled_error, h * n + i, local - x)
             if samples.framed:
                 x += load(lanes, samples.absolute, b, s, i) - local
-            store(lanes, scratch.shown_xhat, h * n + i, x)
+            store(lanes, scratch.sampled_xhat, h * n + i, x)
             sum_of_all += x
             # P = S S', lower triangle and its mirror image, because samples hold covariances.
             for j in range(i + 1):
@@ -218,19 +218,19 @@ def show(
                     total += load(lanes, nodes.root, b, h, i, m) * load(
                         lanes, nodes.root, b, h, j, m
                     )
-                store(lanes, scratch.shown_P, (h * n + i) * n + j, total)
-                store(lanes, scratch.shown_P, (h * n + j) * n + i, total)
+                store(lanes, scratch.sampled_P, (h * n + i) * n + j, total)
+                store(lanes, scratch.sampled_P, (h * n + j) * n + i, total)
                 sum_of_all += total
     store(lanes, samples.total, b, sum_of_all)
     for q in range(len(lanes)):
-        # Idle lanes are not shown.
-        shown = first + q < len(samples.x)
-        scratch.places[q] = first + q if shown else -1
-        for i in range(n if shown else 0):
+        # The last block may have more lanes than runs are left.
+        used = first + q < len(samples.x)
+        scratch.places[q] = first + q if used else -1
+        for i in range(n if used else 0):
             samples.x[first + q, k, i] = samples.absolute[b, s, i, q]
-    hand_out(lanes, scratch.shown_xhat, samples.xhat[:, k], scratch.places)
-    hand_out(lanes, scratch.shown_error, samples.error[:, k], scratch.places)
-    hand_out(lanes, scratch.shown_P, samples.P[:, k], scratch.places)
+    hand_out(lanes, scratch.sampled_xhat, samples.xhat[:, k], scratch.places)
+    hand_out(lanes, scratch.sampled_error, samples.error[:, k], scratch.places)
+    hand_out(lanes, scratch.sampled_P, samples.P[:, k], scratch.places)
 
 
 @kernel

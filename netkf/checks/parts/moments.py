@@ -93,8 +93,11 @@ def moments(z: FloatArray, states: FloatArray | None = None) -> NoiseMoments:
         for k in range(2, FURTHER + 2)
     ]
     parts = zip(np.array_split(there, PARTS), np.array_split(z, PARTS), strict=True)
-    shown = np.zeros((len(z), 0, z.shape[1])) if states is None else np.nan_to_num(states)
-    number, added = (there[:, None] * (shown != 0.0)).sum(axis=0), (z[:, None] * shown).sum(axis=0)
+    known_states = np.zeros((len(z), 0, z.shape[1])) if states is None else np.nan_to_num(states)
+    number, added = (
+        (there[:, None] * (known_states != 0.0)).sum(axis=0),
+        (z[:, None] * known_states).sum(axis=0),
+    )
     return NoiseMoments(
         there.T @ there,
         z.sum(axis=0),

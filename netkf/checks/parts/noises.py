@@ -194,13 +194,13 @@ def reading_moments(scenario: Scenario, streams: Streams) -> NoiseMoments | None
     length = max(len(z) for z, _ in columns)
     n = scenario.plant.n
     z = np.full((length, sum(z.shape[1] for z, _ in columns)), np.nan)
-    shown = np.zeros((length, n, z.shape[1]))
+    given_states = np.zeros((length, n, z.shape[1]))
     place = 0
     for noises, states in columns:
         among = slice(place, place + noises.shape[1])
-        z[: len(noises), among], shown[: len(noises), :, among] = noises, states[:, :, None]
+        z[: len(noises), among], given_states[: len(noises), :, among] = noises, states[:, :, None]
         place = among.stop
-    return moments(z, shown)
+    return moments(z, given_states)
 
 
 def _noises(scenario: Scenario, streams: Streams, law: SensorLaw) -> tuple[FloatArray, FloatArray]:
@@ -221,29 +221,29 @@ def _noises(scenario: Scenario, streams: Streams, law: SensorLaw) -> tuple[Float
         pieces = [nothing, *_increment_noises(scenario, streams, law, random)]
         noises, states = (np.concatenate(part) for part in zip(*pieces, strict=True))
         return noises, states
-    x = _shown_states(scenario, random, count)
+    x = _typical_states(scenario, random, count)
     if not count:
         return np.empty((0, len(law.root))), np.empty((0, scenario.plant.n))
     y, H = path.several(range(count), x)
     expected = np.einsum("spn,sn->sp", H, x) if law.H is None else x @ law.H.T
-    return np.linalg.solve(law.root, (y - expected).T).T, _standardise(x, _shown_sizes(scenario, x))
+    return np.linalg.solve(law.root, (y - expected).T).T, _standardise(x, _state_sizes(scenario, x))
 
 
-def _shown_states(scenario: Scenario, random: np.random.Generator, count: int) -> FloatArray:
+def _typical_states(scenario: Scenario, random: np.random.Generator, count: int) -> FloatArray:
     """Return states (count, n) of the size of the first ones and of what some steps add."""
-    root = square_root(_shown_covariance(scenario))
+    root = square_root(_typical_covariance(scenario))
     plant: Any = scenario.plant
     return np.asarray(plant.start_mean + random.standard_normal((count, len(root))) @ root.T)
 
 
-def _shown_covariance(scenario: Scenario) -> FloatArray:
+def _typical_covariance(scenario: Scenario) -> FloatArray:
     plant: Any = scenario.plant
     return np.asarray(plant.start_cov + 10.0 * np.asarray(plant.Q))
 
 
-def _shown_sizes(scenario: Scenario, x: FloatArray) -> FloatArray:
+def _state_sizes(scenario: Scenario, x: FloatArray) -> FloatArray:
     """Return the root mean squares of the states x (S, n) that sensors are shown, (S, n)."""
-    sizes = np.sqrt(np.diagonal(_shown_covariance(scenario)) + scenario.plant.start_mean**2)
+    sizes = np.sqrt(np.diagonal(_typical_covariance(scenario)) + scenario.plant.start_mean**2)
     return np.asarray(np.broadcast_to(sizes, x.shape))
 
 
@@ -276,12 +276,12 @@ def _increment_noises(
         # Whole steps and cut ones take turns.
         cuts = [end] if k % 2 else [start + 0.3 * period, end]
         for stop in cuts:
-            x = _shown_states(scenario, random, 2)
+            x = _typical_states(scenario, random, 2)
             seen = x * (stop - start)
             dy = path.moments(_Grid(period, end), seen, start, stop)
             scale = np.sqrt((stop - start) * np.array([[1.0], [1.0 / 3.0]]))
             noises = np.linalg.solve(law.root, ((dy - seen @ law.H.T) / scale).T).T
-            yield noises, _standardise(x, _shown_sizes(scenario, x))
+            yield noises, _standardise(x, _state_sizes(scenario, x))
             start = stop
 
 

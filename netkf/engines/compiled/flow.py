@@ -414,7 +414,7 @@ class FlowRun:
         if not count:
             return True
         times = state.probes[state.probe_at - count : state.probe_at].copy()
-        local, x = self._draws.states.shown(times, state.path, shown.piece[0, :count])
+        local, x = self._draws.states.states_at(times, state.path, shown.piece[0, :count])
         # Index of the sample at which the run stands: the last, or the first that is broken.
         lost = [count - 1]
 

@@ -72,12 +72,12 @@ class SampledStates(NamedTuple):
 
 
 class SlotBlock(NamedTuple):
-    """Results of S slots of R runs: the slots that are ``sampled`` (T,), and what was ``shown``
+    """Results of S slots of R runs: the slots that are ``sampled`` (T,), and what was ``reported``
     there.
     """
 
     sampled: np.ndarray
-    shown: SampledStates
+    reported: SampledStates
     times: SlotTimes
     drawn: Drawn
 
@@ -96,7 +96,7 @@ class SlotRuns:
         self._slot = 0
         setup, runs = self.setup, self.runs
         # Samples of the whole runs if so many are wanted at once, else those of a block.
-        self.shown = self._space(len(setup.samples)) if whole else None
+        self.reported = self._space(len(setup.samples)) if whole else None
         self._blocks = blocks = blocks_of(runs)
         self._total = aligned((blocks, LANES))
         self._nodes = SlotNodes(
@@ -209,10 +209,10 @@ class SlotRuns:
         local, absolute, rebased = self._states(len(times.start))
         readings = self._readings(times, local, rebased)
         sampled = np.flatnonzero(times.sample >= 0)
-        shown = self.shown if self.shown is not None else self._space(len(sampled))
+        reported = self.reported if self.reported is not None else self._space(len(sampled))
         # Blocks without a sample have empty arrays, of which reshape cannot tell the last length.
         x, xhat, P, error = (
-            part.reshape(*part.shape[:2], math.prod(part.shape[2:])) for part in shown
+            part.reshape(*part.shape[:2], math.prod(part.shape[2:])) for part in reported
         )
         samples = SlotSamples(
             x, xhat, P, error, self._stopped, self._conserved, absolute, local, setup.frame > 0,
@@ -236,7 +236,7 @@ class SlotRuns:
             # Only now: filters decide for all nodes that are asked.
             drawn.sent[:, unread] = 0
         self._slot += count
-        return SlotBlock(sampled, shown, times, drawn)
+        return SlotBlock(sampled, reported, times, drawn)
 
     def _messages(self, rows: int, timed: bool) -> tuple[SlotTimes, Drawn]:
         """The next slots, of about so many ``rows`` of events, and their messages."""
@@ -287,7 +287,7 @@ class SlotRuns:
         sample = np.full(count, -1, dtype=np.int64)
         first, last = np.searchsorted(setup.samples, (self._slot, self._slot + count))
         # Counted from the first sample of the run, or of these slots.
-        here = np.arange(first, last) - (first if self.shown is None else 0)
+        here = np.arange(first, last) - (first if self.reported is None else 0)
         sample[setup.samples[first:last] - self._slot] = here
         start = np.zeros(count)
         # Times are computed only if rows are wanted: a batch has none.
@@ -493,7 +493,7 @@ def _record_block(
     if len(block.sampled):
         sums = runs.conserved()
         recorder.sums = {name: (float(v[0, 0]), float(v[0, 1])) for name, v in sums.items()}
-    x, xhat, P, error = (part[0] for part in block.shown)
+    x, xhat, P, error = (part[0] for part in block.reported)
     times = block.times.start[block.sampled]
 
     def pass_rows_on(k: int) -> None:
@@ -530,7 +530,7 @@ def slot_batch(
     it has (``with_ends`` mends that).
     """
     runs = SlotRuns(scenario, ReplicaStreams(seed, replicas.start, len(replicas)), whole=True)
-    assert runs.shown is not None
+    assert runs.reported is not None
     # That of trace.recorder: the rows of one run only pass by.
     passed = hashlib.sha256()
     while not runs.over:
@@ -539,7 +539,7 @@ def slot_batch(
         runs.count_events(block)
         for rows in runs.first_events(block) if fingerprint else ():
             passed.update(rows.data)
-    x, xhat, P, error = runs.shown
+    x, xhat, P, error = runs.reported
     return RunBatch(
         replicas=replicas,
         times=runs.setup.sample_times,

@@ -22,7 +22,7 @@ class States(Protocol):
     def offset(self, k: int, path: PathBlock, piece: int) -> FloatArray:
         """(n,) the local state just before ``frame_times[k]``, which ends a piece of the path."""
 
-    def shown(
+    def states_at(
         self, times: FloatArray, path: PathBlock, pieces: np.ndarray
     ) -> tuple[FloatArray, FloatArray]:
         """(T, n) local and absolute states at times in these pieces of the path."""
@@ -40,7 +40,7 @@ class KnownStates:
         # The truth keeps its own frames.
         return np.asarray(self.truth.rebase(k))
 
-    def shown(
+    def states_at(
         self, times: FloatArray, path: PathBlock, pieces: np.ndarray
     ) -> tuple[FloatArray, FloatArray]:
         """(T, n) local and absolute states."""
@@ -77,7 +77,7 @@ class PathStates:
         self._frame, self._begun = k + 1, time
         return np.asarray(x)
 
-    def shown(
+    def states_at(
         self, times: FloatArray, path: PathBlock, pieces: np.ndarray
     ) -> tuple[FloatArray, FloatArray]:
         """(T, n) local and absolute states at times in the present frame."""

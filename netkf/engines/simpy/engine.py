@@ -200,8 +200,8 @@ class _Simulation:
         """Record one sample; ``local`` is the state in the coordinates of the estimates."""
         scenario, recorder = self._scenario, self._recorder
         # By identity: a pooled filter is asked once, and its estimate serves all nodes.
-        shown = {id(n): n.algorithm.estimate(n.state) for n in distinct(nodes)}
-        estimates = [shown[id(nodes[node])] for node in scenario.nodes]
+        estimate_by_state = {id(n): n.algorithm.estimate(n.state) for n in distinct(nodes)}
+        estimates = [estimate_by_state[id(nodes[node])] for node in scenario.nodes]
         near, P, without = stack_estimates(estimates)
         # The trace shows absolute states; adding the origin loses digits, so the error is separate.
         far = near if x is local else near + (x - local)
