@@ -58,13 +58,13 @@ from netkf.linalg.lanes import LANES, ONE, aligned, blocks_of, in_lanes, store
 
 NEGLIGIBLE = 1e-6
 """Deviation of a difference, relative to those of its terms, that counts as rounding."""
-SETTLED = 1e-14
-"""Relative change of covariances in a slot from which on gains are taken to be constant."""
+CONVERGED = 1e-14
+"""Relative change of covariances in a slot below which gains count as constant: some roundings."""
 
 
 class Design(NamedTuple):
     """All that gains depend on, as keys: numbers of states and nodes; F, Q (n, n), the covariance
-    of x(0) and ``information`` (N, n, n) as bytes; the places of the nodes that each one hears.
+    of x(0) and ``information`` (N, n, n) as bytes; the indices of the nodes that each one hears.
     """
 
     n: int
@@ -79,7 +79,7 @@ class Design(NamedTuple):
 class NodeGains(NamedTuple):
     """The gains of one node in one slot.
 
-    B : (d, n, n) for the d nodes that it hears, in the order of their places
+    B : (d, n, n) for the d nodes that it hears, in the order of their indices
     M, K : (n, n) of the pseudo-observation, and of the pseudo-state
     predicted, root : (n, n) roots of the covariance of x - xhat before and after
     """
@@ -142,18 +142,21 @@ class GainSequence:
         self._driven, self._errors = alike @ square_root(Q), alike @ square_root(cov)
         self._F = F
         self._found: list[tuple[NodeGains, ...]] = []
-        self._settled = False
+        self._converged = False
 
     def at(self, slot: int) -> tuple[NodeGains, ...]:
         """Return the gains of all nodes in a slot, counted from 1."""
-        while len(self._found) < slot and not self._settled:
+        while len(self._found) < slot and not self._converged:
             self._found.append(self._advance())
-            self._settled = len(self._found) > 1 and self._is_settled(*self._found[-2:])
+            self._converged = len(self._found) > 1 and self._has_converged(*self._found[-2:])
         return self._found[min(slot, len(self._found)) - 1]
 
     def table(self, first: int, count: int) -> tuple[np.ndarray, SlotGains]:
-        """Return the gains of so many slots from ``first`` on, with the place (count,) of each in
-        the table; settled ones are there once. Nothing happens in slot 0, whose gains are any.
+        """Return the table rows (count,) of slots ``first`` to ``first + count - 1``, and the
+        table.
+
+        Slots after convergence share one row. Slot 0 gets that of slot 1, since nothing happens
+        in it.
         """
         slots = np.maximum(np.arange(first, first + count), 1)
         self.at(int(slots[-1]))
@@ -169,11 +172,11 @@ class GainSequence:
         return slots - slots[0], made
 
     @staticmethod
-    def _is_settled(before: tuple[NodeGains, ...], now: tuple[NodeGains, ...]) -> bool:
+    def _has_converged(before: tuple[NodeGains, ...], now: tuple[NodeGains, ...]) -> bool:
         """Return True if no covariance has changed by more than rounding."""
         roots = (np.stack([one.root for one in gains]) for gains in (before, now))
         old, new = (S @ np.swapaxes(S, 1, 2) for S in roots)
-        return bool(np.abs(new - old).max() <= SETTLED * np.abs(new).max())
+        return bool(np.abs(new - old).max() <= CONVERGED * np.abs(new).max())
 
     def _advance(self) -> tuple[NodeGains, ...]:
         """Carry the errors through a slot, and return its gains."""
@@ -266,7 +269,7 @@ def gain_sequence(design: Design) -> GainSequence:
 class PseudoState(NamedTuple):
     """Estimate ``xhat`` (n,), ``root`` (n, n) of its covariance and the model; the estimate of the
     pseudo-state, ``yhat`` (n,), and the matrices of ``pseudo``-states; the whitened ``reading``
-    y (p,), H (p, n) of this ``slot``; the ``design``, and the node's ``place`` in it.
+    y (p,), H (p, n) of this ``slot``; the ``design``, and the node's index in it.
     """
 
     xhat: FloatArray
@@ -277,7 +280,7 @@ class PseudoState(NamedTuple):
     reading: tuple[FloatArray, FloatArray] | None
     slot: int
     design: Design
-    place: int
+    node_index: int
 
     @property
     def P(self) -> FloatArray:
@@ -287,26 +290,26 @@ class PseudoState(NamedTuple):
     @property
     def gains(self) -> NodeGains:
         """The node's gains of this slot."""
-        return gain_sequence(self.design).at(self.slot)[self.place]
+        return gain_sequence(self.design).at(self.slot)[self.node_index]
 
 
 class PseudoEstimate(NamedTuple):
-    """A payload: the sender's ``yhat`` (n,), its ``place``, and G (n, n), which all nodes know."""
+    """A payload: the sender's ``yhat`` (n,) and index, and G (n, n), which all nodes know."""
 
     yhat: FloatArray
-    place: int
+    node_index: int
     G: FloatArray
 
 
 class PseudoArrays(NamedTuple):
-    """Matrices and gains of all nodes, the place (S,) of each slot in the table of gains, the
+    """Matrices and gains of all nodes, the row (S,) of each slot in the table of gains, the
     estimates of pseudo-states yhat (B, H, n, L), and scratch: the ``corrected`` ones (H, n, L),
     and ``state`` and ``z`` (n, L).
     """
 
     pseudo: PseudoStates
     gains: SlotGains
-    place: np.ndarray
+    table_row: np.ndarray
     yhat: FloatArray
     corrected: FloatArray
     state: FloatArray
@@ -351,7 +354,7 @@ def correct_all(
     s: int,
 ) -> None:
     """Correct all filters of a block by their readings and what they hear in slot ``s``."""
-    lanes, k = scratch.lanes, arrays.place[s]
+    lanes, k = scratch.lanes, arrays.table_row[s]
     for h in range(len(nodes.rows)):
         innovate(
             lanes, arrays.yhat, b, h, nodes.rows[h], arrays.pseudo.inverse, readings, s,
@@ -423,15 +426,15 @@ class ConsensusInnovations(Filter):
         H, n = len(states), len(states[0].xhat)
         yhat = in_lanes(np.stack([state.yhat for state in states]), blocks_of(runs))
         scratch = [aligned(shape) for shape in ((H, n, LANES), (n, LANES), (n, LANES))]
-        place, gains = gain_sequence(states[0].design).table(0, 1)
-        return (PseudoArrays(states[0].pseudo, gains, place, yhat, *scratch),)
+        rows, gains = gain_sequence(states[0].design).table(0, 1)
+        return (PseudoArrays(states[0].pseudo, gains, rows, yhat, *scratch),)
 
     def slot_gains(
         self, states: Sequence[Any], arrays: tuple[Any, ...], first: int, count: int
     ) -> tuple[PseudoArrays]:
         """Return the arrays with the gains of so many slots from ``first`` on."""
-        place, gains = gain_sequence(states[0].design).table(first, count)
-        return (arrays[0]._replace(place=place, gains=gains),)
+        rows, gains = gain_sequence(states[0].design).table(first, count)
+        return (arrays[0]._replace(table_row=rows, gains=gains),)
 
     def check_scenario(self, scenario: Any) -> None:
         """Raise ScenarioError where estimates do not begin alike."""
@@ -474,15 +477,15 @@ class ConsensusInnovations(Filter):
 
     def emit(self, state: PseudoState, exchange: Exchange) -> tuple[PseudoState, PseudoEstimate]:
         """Send the prediction of the pseudo-state."""
-        return state, PseudoEstimate(state.yhat, state.place, state.pseudo.G)
+        return state, PseudoEstimate(state.yhat, state.node_index, state.pseudo.G)
 
     def absorb(
         self, state: PseudoState, messages: Sequence[Message], exchange: Exchange
     ) -> PseudoState:
         """Correct the pseudo-state by what was heard and read, and the state by that."""
-        gains, order = state.gains, state.design.heard[state.place]
-        places = [order.index(message.payload.place) for message in messages]
-        chosen = gains._replace(B=gains.B[places])
+        gains, order = state.gains, state.design.heard[state.node_index]
+        senders = [order.index(message.payload.node_index) for message in messages]
+        chosen = gains._replace(B=gains.B[senders])
         heard = [message.payload.yhat for message in messages]
         xhat, yhat = correct_estimates(state, chosen, heard)
         return state._replace(xhat=xhat, yhat=yhat, root=gains.root)

@@ -176,7 +176,7 @@ class ConstantGain(Filter):
         return ConstantGainState(mean, first_root(cov), model, gain, loop)
 
     def gain_of(self, index: int) -> FloatArray:
-        """Return the gain of the node at a place in the order of ids."""
+        """Return the gain (n, p) of a node given by its index in the order of ids."""
         return self.gain[index] if isinstance(self.gain, tuple) else self.gain
 
     def predict(self, state: ConstantGainState, gap: float) -> ConstantGainState:
@@ -239,7 +239,7 @@ class ConstantGain(Filter):
         for index, node in enumerate(nodes):
             placed = scenario.placed.get(node, ())
             _check_kinds(scenario, node, placed)
-            p = sum(len(scenario.sensors[place.entry].H) for place in placed)
+            p = sum(len(scenario.sensors[placed_sensor.entry].H) for placed_sensor in placed)
             shape = self.gain_of(index).shape
             if p and shape != (n, p):
                 key = f"filter.gain[{index}]" if isinstance(self.gain, tuple) else "filter.gain"
@@ -251,7 +251,9 @@ def _check_kinds(scenario: Any, node: int, placed: Sequence[Any]) -> None:
     """Raise ScenarioError if a node has readings at several times, which one gain cannot weigh."""
     if scenario.slotted or len(placed) < 2:
         return
-    if any(getattr(scenario.sensors[place.entry], "sampling", None) for place in placed):
+    if any(
+        getattr(scenario.sensors[placed_sensor.entry], "sampling", None) for placed_sensor in placed
+    ):
         raise ScenarioError(
             "filter.gain",
             f"node {node} has several sensors, and one that takes samples must be its only one",

@@ -159,22 +159,22 @@ def rebase_copies(
 def copy_estimate(
     lanes: Lanes,
     to: tuple[FloatArray, FloatArray],
-    place: int,
+    index: int,
     x: FloatArray,
     root: FloatArray,
     sender: int,
     b: int,
     wanted: Any,
 ) -> None:
-    """Write the pair of ``sender`` of a block to a ``place`` of other pairs, in the lanes where it
+    """Write the pair of ``sender`` of a block to an ``index`` of other pairs, in the lanes where it
     is ``wanted``.
     """
     for i in range(x.shape[2]):
-        before, now = load(lanes, to[0], b, place, i), load(lanes, x, b, sender, i)
-        store(lanes, to[0], b, place, i, select(wanted, now, before))
+        before, now = load(lanes, to[0], b, index, i), load(lanes, x, b, sender, i)
+        store(lanes, to[0], b, index, i, select(wanted, now, before))
         for j in range(i + 1):
-            before, now = load(lanes, to[1], b, place, i, j), load(lanes, root, b, sender, i, j)
-            store(lanes, to[1], b, place, i, j, select(wanted, now, before))
+            before, now = load(lanes, to[1], b, index, i, j), load(lanes, root, b, sender, i, j)
+            store(lanes, to[1], b, index, i, j, select(wanted, now, before))
 
 
 @kernel
@@ -333,15 +333,15 @@ class EventTriggeredCi(Filter):
         """Return the copies of estimates, none so far."""
         (H, n), blocks = (len(states), len(states[0].xhat)), blocks_of(runs)
         ways, alpha = sum(info.degree for info in infos), self.thresholds[0]
-        places = ways + 2 * H
+        entries = ways + 2 * H
         return (
             TriggeredCiArrays(
                 alpha,
                 1.0 + self.thresholds[1],
                 1.0 / self.widening**2,
-                aligned((blocks, places, n, LANES)),
-                aligned((blocks, places, n, n, LANES)),
-                np.zeros((blocks, places, LANES), dtype=np.uint8),
+                aligned((blocks, entries, n, LANES)),
+                aligned((blocks, entries, n, n, LANES)),
+                np.zeros((blocks, entries, LANES), dtype=np.uint8),
                 aligned((ways + H, n, LANES)),
                 aligned((ways + H, n, n, LANES)),
             ),

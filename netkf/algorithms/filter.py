@@ -58,7 +58,7 @@ class NetworkInfo(NamedTuple):
     """The whole network of N nodes, for filters whose gains are computed before a run.
 
     information (N, n, n): H' R^-1 H of each node's sensors, as the filters believe it; heard: the
-    places, from 0 in the order of ids, of the nodes that each can hear.
+    indices, from 0 in the order of ids, of the nodes that each can hear.
     """
 
     information: FloatArray
@@ -72,7 +72,7 @@ class NodeInfo(NamedTuple):
     it; nodes: how many there are in all; own_weight: what is left to it when the messages of all
     neighbours arrive; information (n, n): the sum of H' R^-1 H over all sensors, as the filters
     believe it; max_delay: the longest time a message may take, seconds (inf where unbounded);
-    place: its place in the order of ids, from 0; network: of all nodes, if it ``needs_network``.
+    place: its index in the order of ids, from 0; network: of all nodes, if it ``needs_network``.
     """
 
     node: int

@@ -223,19 +223,19 @@ def use_bit(
     h: int,
     sign: Any,
     readings: ReadingBlock,
-    place: tuple[int, int, int],
+    index: tuple[int, int, int],
     arrived: Any,
     row: FloatArray,
     gains: FloatArray,
 ) -> None:
-    """Correct filter ``h`` by the ``sign`` of the innovation of the whitened row at ``place``
+    """Correct filter ``h`` by the ``sign`` of the innovation of the whitened row at ``index``
     [s, sender, k] of H, in the lanes where it has ``arrived``.
 
     With ``p = h P h'``, ``P - (2 / pi) P h' h P / (p + 1)`` is the Kalman update with noise
     ``r = (pi / 2 - 1) p + pi / 2``, and ``P h' sqrt(2 / pi / (p + 1))`` is its gain times
     ``sqrt(pi / 2 (p + 1))``.
     """
-    s, sender, k = place
+    s, sender, k = index
     n = x.shape[2]
     c, t = min(b, readings.H.shape[0] - 1), min(s, readings.H.shape[1] - 1)
     square = spread(lanes, 0.0)
@@ -278,7 +278,7 @@ def use_bits_single(
 @built_in("one-bit")
 @dataclass(frozen=True, eq=False)
 class OneBit(Filter):
-    """Nodes take turns: in slot k the node at place k mod N of the ids broadcasts the signs of its
+    """Nodes take turns: in slot k the node of index k mod N broadcasts the signs of its
     innovations, one bit for each row of its reading, and all who hear it correct by them,
     ``xhat + sqrt(2 / pi) P h' / sqrt(h P h' + r) b`` and ``P - (2 / pi) P h' h P / (h P h' + r)``.
 

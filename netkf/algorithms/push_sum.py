@@ -822,7 +822,7 @@ def conserve_mass(mass: FloatArray, received: Sequence[FloatArray], degree: int)
     once for itself and once for each link of its ``degree`` that failed.
     """
     total = np.array(sum(received, np.zeros(mass.shape)))
-    # The same kernels as in slots, on arrays of one place: both engines round alike.
+    # The same kernels as in slots, on arrays of one node: both engines round alike.
     own = share(mass, degree).reshape(1, -1, 1)
     keep_share_single(total.reshape(1, 1, -1, 1), own, degree + 1 - len(received))
     return total

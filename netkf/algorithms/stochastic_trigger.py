@@ -75,7 +75,7 @@ def trigger_matrix(Y: float | FloatArray, rows: int) -> FloatArray:
 
 def entries_at(scenario: Any, node: int) -> list[int]:
     """Return the entries of the sensors of a node."""
-    return [place.entry for place in scenario.placed.get(node, ())]
+    return [placed_sensor.entry for placed_sensor in scenario.placed.get(node, ())]
 
 
 def whitened_trigger(Y: float | FloatArray, R: FloatArray) -> FloatArray:
@@ -235,26 +235,26 @@ def update_by_sensor(
     s: int,
     h: int,
     sender: int,
-    place: int,
+    index: int,
     arrived: Any,
 ) -> None:
-    """Update filter ``h`` of a block with what ``sender`` says, at a ``place`` of the sensors that
+    """Update filter ``h`` of a block with what ``sender`` says, at an ``index`` of the sensors that
     are known: its reading where that has ``arrived``, else its silence.
     """
     lanes, rows = scratch.lanes, nodes.rows[sender]
-    known = load_flags(lanes, arrays.known, b, place)
+    known = load_flags(lanes, arrays.known, b, index)
     if any_lane(arrived):
         d, t = min(b, readings.H.shape[0] - 1), min(s, readings.H.shape[1] - 1)
         for k in range(rows):
             for i in range(nodes.xhat.shape[2]):
-                before = load(lanes, arrays.H, b, place, k, i)
+                before = load(lanes, arrays.H, b, index, k, i)
                 now = load(lanes, readings.H, d, t, sender, k, i)
-                store(lanes, arrays.H, b, place, k, i, select(arrived, now, before))
+                store(lanes, arrays.H, b, index, k, i, select(arrived, now, before))
         update_by_reading(nodes, readings, scratch, b, s, h, sender, arrived)
     silent = select(arrived, 0.0, select(known, 1.0, 0.0)) > 0.0
     if any_lane(silent):
-        use_silence(nodes, scratch, arrays, b, h, sender, place, silent)
-    store_flags(lanes, arrays.known, b, place, select(arrived, 1.0, select(known, 1.0, 0.0)) > 0.0)
+        use_silence(nodes, scratch, arrays, b, h, sender, index, silent)
+    store_flags(lanes, arrays.known, b, index, select(arrived, 1.0, select(known, 1.0, 0.0)) > 0.0)
 
 
 @kernel
@@ -265,7 +265,7 @@ def use_silence(
     b: int,
     h: int,
     sender: int,
-    place: int,
+    index: int,
     silent: Any,
 ) -> None:
     """Update filter ``h`` of a block with the reading ``H xbar`` with noise ``R + Y^-1``, in the
@@ -277,7 +277,7 @@ def use_silence(
         for i in range(n):
             total = spread(lanes, 0.0)
             for j in range(k + 1):
-                total += arrays.wider[sender, k, j] * load(lanes, arrays.H, b, place, j, i)
+                total += arrays.wider[sender, k, j] * load(lanes, arrays.H, b, index, j, i)
             store(lanes, arrays.seen, i, total)
             # No innovation with respect to the prediction.
             gap = load(lanes, arrays.prior, b, h, i) - load(lanes, nodes.xhat, b, h, i)
@@ -345,13 +345,13 @@ class ScheduledReadings(Filter):
         models, blocks = [state.model for state in states], blocks_of(runs)
         (H, n), ways = (len(models), len(states[0].xhat)), sum(info.degree for info in infos)
         weights = whitened_triggers(models, self.Y)
-        p, places = weights.shape[1], ways + H
+        p, entries = weights.shape[1], ways + H
         return (
             ScheduledArrays(
                 weights,
                 np.stack([silence_root(one) for one in weights]),
-                aligned((blocks, places, p, n, LANES)),
-                np.zeros((blocks, places, LANES), dtype=np.uint8),
+                aligned((blocks, entries, p, n, LANES)),
+                np.zeros((blocks, entries, LANES), dtype=np.uint8),
                 aligned((blocks, H, n, LANES)),
                 aligned((p, LANES)),
                 aligned((n, LANES)),
@@ -441,14 +441,14 @@ class TriggerArrays(NamedTuple):
 
 def trigger_arrays(models: Sequence[Any], Y: float | FloatArray, runs: int) -> TriggerArrays:
     """Return the arrays of nodes that have read nothing."""
-    trigger, places = whitened_triggers(models, Y), (blocks_of(runs), len(models))
+    trigger, shape = whitened_triggers(models, Y), (blocks_of(runs), len(models))
     return TriggerArrays(
         trigger,
-        np.full((*places, LANES), NO_READING),
-        undecided=np.ones((*places, LANES), dtype=np.uint8),
-        silent=np.zeros((*places, LANES), dtype=np.uint8),
-        begun=np.zeros((*places, LANES), dtype=np.uint8),
-        x=aligned((*places, len(models[0].F), LANES)),
+        np.full((*shape, LANES), NO_READING),
+        undecided=np.ones((*shape, LANES), dtype=np.uint8),
+        silent=np.zeros((*shape, LANES), dtype=np.uint8),
+        begun=np.zeros((*shape, LANES), dtype=np.uint8),
+        x=aligned((*shape, len(models[0].F), LANES)),
         z=aligned((trigger.shape[1], LANES)),
     )
 

@@ -102,10 +102,10 @@ def fuse_heard(
     links: SlotLinks,
     scratch: SlotScratch,
     arrays: FusionArrays,
-    place: tuple[int, int, int, int],
+    index: tuple[int, int, int, int],
 ) -> None:
-    """Fuse filter h of lane q, at ``place`` [b, s, h, q], with all that it hears, one by one."""
-    b, s, h, q = place
+    """Fuse filter h of lane q, at ``index`` [b, s, h, q], with all that it hears, one by one."""
+    b, s, h, q = index
     n, heard = nodes.xhat.shape[2], False
     for m in range(links.first[h], links.first[h + 1]):
         if not plan.up[b, s, 0, links.way[m], q]:
@@ -321,10 +321,10 @@ def combine_heard(
     plan: SlotPlan,
     links: SlotLinks,
     arrays: TrackArrays,
-    place: tuple[int, int, int, int],
+    index: tuple[int, int, int, int],
 ) -> None:
-    """Show what filter h of lane q, at ``place`` [b, s, h, q], makes of the tracks it hears."""
-    b, s, h, q = place
+    """Show what filter h of lane q, at ``index`` [b, s, h, q], makes of the tracks it hears."""
+    b, s, h, q = index
     n, count, heard = nodes.xhat.shape[2], 0, 0
     arrays.near[0] = h
     for m in range(links.first[h], links.first[h + 1]):
@@ -350,7 +350,7 @@ def combine_heard(
 
 @kernel
 def combination_of(arrays: TrackArrays, heard: int, count: int, degree: int) -> int:
-    """Return the place in the cache of the combination with ``count`` tracks ``near``, after it is
+    """Return the cache index of the combination with ``count`` tracks ``near``, after it is
     computed if it is not known; ``heard`` has a bit for each of the ``degree`` directions.
     """
     cache = arrays.cache
@@ -370,7 +370,7 @@ def combination_of(arrays: TrackArrays, heard: int, count: int, degree: int) -> 
 
 @kernel
 def pair_of(arrays: TrackArrays, i: int, j: int) -> int:
-    """Return the place of a pair of tracks, which are in the order of the second of them."""
+    """Return the index of a pair of tracks; pairs are in the order of the second track."""
     low, high = arrays.first[i], arrays.first[i + 1] - 1
     while low < high:
         middle = (low + high) // 2
@@ -571,7 +571,7 @@ def best_combination(
     """Return the gain (n, k n) by which the differences of k tracks to the own one correct it with
     the least covariance, and the root (n, n) of that covariance, ``own_root`` if they are the same.
 
-    ``joint`` (m, m, n, n) are the covariances of the errors of tracks, ``near`` the places of the
+    ``joint`` (m, m, n, n) are the covariances of the errors of tracks, ``near`` the indices of the
     own one and of the k others.
     """
     n, k = joint.shape[2], len(near) - 1

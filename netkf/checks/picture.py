@@ -51,8 +51,8 @@ def verdict_picture(path: Path, verdict: Verdict, claim: str) -> bool:
     with look():
         figure = new_figure(8.8, 1.7 + 0.27 * len(rows))
         axes = figure.add_subplot()
-        for place, row in enumerate(reversed(rows)):
-            _draw_row(axes, place, row)
+        for height, row in enumerate(reversed(rows)):
+            _draw_row(axes, height, row)
         for mark in dict.fromkeys(MARKS.get(row.verdict, OTHER) for row in rows):
             axes.plot([], [], color=mark.colour, marker=mark.marker, label=mark.label)
         axes.plot([], [], "|", color=INK, label="would have been seen")
@@ -80,16 +80,16 @@ def _title(rows: list[Evidence], claim: str) -> str:
     return f"{count}: {claim}" if broken else claim
 
 
-def _draw_row(axes: Any, place: int, row: Evidence) -> None:
-    """Draw the interval of a row at height ``place``."""
+def _draw_row(axes: Any, height: int, row: Evidence) -> None:
+    """Draw the interval of a row at height ``height``."""
     mark, unit = MARKS.get(row.verdict, OTHER), row.tolerance
     low, high = max(0.0, -row.high) / unit, min(max(0.0, -row.low) / unit, 2.0 * FURTHEST)
-    axes.plot([low, high], [place, place], color=mark.colour, lw=3.0, solid_capstyle="butt")
+    axes.plot([low, high], [height, height], color=mark.colour, lw=3.0, solid_capstyle="butt")
     style = {"marker": mark.marker, "color": mark.colour, "ms": 4.5, "mec": INK, "mew": 0.5}
-    axes.plot([min(row.off / unit, FURTHEST)], [place], **style)
+    axes.plot([min(row.off / unit, FURTHEST)], [height], **style)
     if np.isfinite(row.detectable):
         seen = min(row.detectable / unit, FURTHEST)
-        axes.plot([seen], [place], "|", color=INK, ms=9)
+        axes.plot([seen], [height], "|", color=INK, ms=9)
 
 
 def _label(row: Evidence) -> str:

@@ -175,20 +175,20 @@ def _results(path: Path, scenario: Scenario) -> list[ReplicaResult]:
         columns = {name: file[name] for name in file.files}
     chosen = with_check_times(scenario)
     summary_type = find_checks(chosen).summary_type
-    results, place = [], 0
+    results, index = [], 0
     for k, diverged in enumerate(columns["diverged"].tolist()):
         difference, expected = float(columns["difference"][k]), bool(columns["expected"][k])
         if diverged:
             results.append(ReplicaResult(None, difference, expected))
             continue
-        at = {name: values[place] for name, values in columns.items() if "." in name}
+        at = {name: values[index] for name, values in columns.items() if "." in name}
         summary = summary_type(**_fields(at, "summary"))
         parts = {
             part: cls(**_fields(at, part)) if _fields(at, part) else None
             for part, cls in PART_TYPES.items()
         }
         results.append(ReplicaResult(summary, difference, expected, PartSummary(**parts)))
-        place += 1
+        index += 1
     return results
 
 

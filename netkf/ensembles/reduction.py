@@ -100,7 +100,8 @@ class ReductionScratch(Struct):
     ``broken`` (L,), whether the sample counts as ``clear`` or as ``traced`` (L,); ``rows``
     (L, S, C) by run and their M2 ``work`` (L, S, C), ``size`` (L, S). Of nodes of the tree over
     runs, those that wait for a neighbour, ``node_size`` (D, S), ``mean`` and ``M2`` (D, S, C). Of a
-    sample alone ``one`` (n, n), ``solved`` (n, 1) and NEES ``alone`` (1,). ``places``: 0 .. L - 1.
+    sample alone ``one`` (n, n), ``solved`` (n, 1) and NEES ``alone`` (1,). ``lane_numbers``: 0 .. L
+    - 1.
     """
 
     lines: FloatArray
@@ -124,7 +125,7 @@ class ReductionScratch(Struct):
     one: FloatArray
     solved: FloatArray
     alone: FloatArray
-    places: np.ndarray
+    lane_numbers: np.ndarray
     times: int
 
 
@@ -162,7 +163,7 @@ def reduction_scratch(filters: int, n: int, largest: int) -> ReductionScratch:
         one=np.empty((n, n)),
         solved=np.empty((n, 1)),
         alone=np.empty(1),
-        places=np.arange(LANES),
+        lane_numbers=np.arange(LANES),
         times=times,
     )
 
@@ -385,7 +386,7 @@ def reduce_group(
         for f in range(filters):
             reduce_sample(lanes, b, sums, scratch, first, active, t + s, s, f)
     for c in range(0, count * scratch.rows.shape[2], len(lanes)):
-        scatter(lanes, scratch.columns, c, scratch.rows, scratch.places, len(lanes))
+        scatter(lanes, scratch.columns, c, scratch.rows, scratch.lane_numbers, len(lanes))
     for q in range(active):
         for f in range(filters):
             for a in range(3):
@@ -432,19 +433,19 @@ def reduce_sample(
         scratch.z,
     )
     n, filters = len(z), len(scratch.totals)
-    half, place, place_P = n * (n + 1) // 2, (s * filters + f) * n, (s * filters + f) * n * n
+    half, index, index_P = n * (n + 1) // 2, (s * filters + f) * n, (s * filters + f) * n * n
     column = (s * filters + f) * (2 * half + 1)
     last, square, trace = column + 2 * half, spread(lanes, 0.0), spread(lanes, 0.0)
     for i in range(n):
-        e = load(lanes, errors_of, place + i)
+        e = load(lanes, errors_of, index + i)
         store(lanes, z, i, e)
         square += e * e
-        trace += load(lanes, P, place_P + i * n + i)
+        trace += load(lanes, P, index_P + i * n + i)
         for j in range(i, n):
-            entry = load(lanes, P, place_P + i * n + j)
+            entry = load(lanes, P, index_P + i * n + j)
             store(lanes, factor, j, i, entry)
             store(lanes, columns, column, entry)
-            store(lanes, columns, half + column, e * load(lanes, errors_of, place + j))
+            store(lanes, columns, half + column, e * load(lanes, errors_of, index + j))
             column += 1
     if any_lane(nees_of_lanes(lanes, scratch)):
         # Singular or broken: alone, with a choice of pivots.
@@ -558,8 +559,8 @@ def find_blur(
             if b.exact:
                 size = magnitude(load(lanes, errors_of, f * n + i))
                 largest = select(size > largest, size, largest)
-    for place in range(0 if b.exact else s * n, 0 if b.exact else (s + 1) * n):
-        size = magnitude(load(lanes, scratch.x, place))
+    for index in range(0 if b.exact else s * n, 0 if b.exact else (s + 1) * n):
+        size = magnitude(load(lanes, scratch.x, index))
         largest = select(size > largest, size, largest)
     bound = ROUNDING * BLUR * largest
     clear = (least < np.inf) & (bound * bound < 0.5 * least)

@@ -150,8 +150,8 @@ def run_values(batch: RunBatch, scenario: Scenario, first: int = 0) -> RunValues
     ``first`` is the number of the first run in the tree over all runs, whose pieces these are.
     """
     # The runs of a batch that the tree merges by themselves, counted from the first of the batch.
-    places = [(k << level, level) for level, k in aligned_pieces(first, first + len(batch))]
-    pieces = [slice(at - first, at - first + (1 << level)) for at, level in places]
+    indices = [(k << level, level) for level, k in aligned_pieces(first, first + len(batch))]
+    pieces = [slice(at - first, at - first + (1 << level)) for at, level in indices]
     reduced, nodes = reduce_batch(batch, pieces), len(scenario.nodes)
     copies, averages = nodes // batch.error.shape[2], reduced.averages
     if copies > 1:

@@ -77,10 +77,10 @@ class GridLaws:
         return out
 
     def _fill_impulses(
-        self, out: FloatArray, row: int, end: float, places: FloatArray, weights: FloatArray
+        self, out: FloatArray, row: int, end: float, instants: FloatArray, weights: FloatArray
     ) -> None:
         tables = self.to_end, self.to_moments, self.B
-        fill_impulses(out, row, *tables, end, places, weights)
+        fill_impulses(out, row, *tables, end, instants, weights)
 
     def conditional_law(self, length: float, left: float) -> tuple[FloatArray, FloatArray]:
         """Return the conditional law of state and moments at ``left`` seconds of a step.
@@ -98,11 +98,11 @@ class GridLaws:
 
     def _conditional(self, length: float, left: float) -> tuple[FloatArray, FloatArray]:
         size = 3 * self.n
-        places = np.concatenate([_NODES * left, left + _NODES * (length - left)])
+        instants = np.concatenate([_NODES * left, left + _NODES * (length - left)])
         weights = np.concatenate([_WEIGHTS * left, _WEIGHTS * (length - left)])
-        factor = np.empty((2 * size, len(places) * self.B.shape[1]))
-        self._fill_impulses(factor, 0, length, places, weights)
-        self._fill_impulses(factor, size, left, places, weights)
+        factor = np.empty((2 * size, len(instants) * self.B.shape[1]))
+        self._fill_impulses(factor, 0, length, instants, weights)
+        self._fill_impulses(factor, size, left, instants, weights)
         C = matmul(factor, np.ascontiguousarray(factor.T))
         known, asked, cross = C[:size, :size], C[size:, size:], C[size:, :size]
         gain = product(cross, pseudo_inverse(known, 1e-13))
@@ -117,17 +117,17 @@ def fill_impulses(
     to_moments: FloatArray,
     B: FloatArray,
     end: float,
-    places: FloatArray,
+    instants: FloatArray,
     weights: FloatArray,
 ) -> None:
-    """Write what noise of unit density at each of K ``places``, times the root of its weight, adds
-    to x(end) and to the moments over [0, end] into 3 n rows of ``out`` (., K m) from ``row`` on.
-    Noise after ``end`` adds nothing. ``B`` is (n, m), the series are those of GridLaws.
+    """Write what noise of unit density at each of K ``instants``, times the root of its weight,
+    adds to x(end) and to the moments over [0, end] into 3 n rows of ``out`` (., K m) from ``row``
+    on. Noise after ``end`` adds nothing. ``B`` is (n, m), the series are those of GridLaws.
     """
     n, m = B.shape
-    for k in range(len(places)):
+    for k in range(len(instants)):
         # In an interval that begins with the noise it is a state, B dw.
-        rest = max(end - places[k], 0.0)
+        rest = max(end - instants[k], 0.0)
         moved, means = polynomial(to_end, rest), polynomial(to_moments, rest)
         # P_1 of the whole interval, which may be a point, is (1 - share) + share P_1 of the rest.
         share = rest / end if rest > 0.0 else 0.0

@@ -152,7 +152,7 @@ class NonlinearSamples:
 class PositionedSensor(NonlinearSensor):
     """A sensor of the position of a target relative to its node, in 2 or 3 dimensions.
 
-    positions  the places of ``nodes``, in their order: rows (x, y) or (x, y, z); "graph", the
+    positions  the coordinates of ``nodes``, in their order: rows (x, y) or (x, y, z); "graph", the
                default, takes those of the graph
     states     which components of the state are the target's position
     """
@@ -185,7 +185,7 @@ class PositionedSensor(NonlinearSensor):
         )
 
     def check_state(self, n: int) -> None:
-        """Raise ScenarioError if places, states or R do not fit."""
+        """Raise ScenarioError if positions, states or R do not fit."""
         if max(self.states) >= n or len(set(self.states)) < len(self.states):
             rule = f"must be different components of a state of {n}, counted from 0"
             raise ScenarioError("states", rule, list(self.states), "name those of the position")
@@ -203,8 +203,8 @@ class PositionedSensor(NonlinearSensor):
 
     def offset(self, x: FloatArray, node: int) -> FloatArray:
         """Return the target's position relative to a node."""
-        places = np.asarray(self.positions, dtype=np.float64)
-        return np.asarray(x[list(self.states)] - places[self.nodes.index(node)])
+        positions = np.asarray(self.positions, dtype=np.float64)
+        return np.asarray(x[list(self.states)] - positions[self.nodes.index(node)])
 
     def placed_columns(self, derivatives: FloatArray, n: int) -> FloatArray:
         """Return derivatives (p, d) by the position as those (p, n) by the state."""

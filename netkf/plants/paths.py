@@ -189,7 +189,7 @@ class DiffusionPaths:
         normals: FloatArray,
     ) -> None:
         """Draw the paths at ``times`` given the pieces in ``rows``, all of one length and cut at
-        the same place, and divide each with the rows after it up to its ``stops``.
+        the same position, and divide each with the rows after it up to its ``stops``.
         """
         laws = self.laws
         length = float(pieces.end[rows[0]] - pieces.start[rows[0]])
@@ -221,7 +221,7 @@ def split_pieces(
     work: FloatArray,
     pieces: tuple[FloatArray, FloatArray, FloatArray, FloatArray],
 ) -> None:
-    """Cut the pieces in ``rows`` (K,) of B paths, all of one length and at the same place, from
+    """Cut the pieces in ``rows`` (K,) of B paths, all of one length and at the same position, from
     standard normals (B, K, 3 n): a row becomes the part before the cut, and those after it up to
     its ``stops`` (K,) the rest. ``pieces`` are states at their starts and ends, moments and cubics
     as in ``fill_steps``. ``gain`` and ``spread`` (3 n, 3 n) are GridLaws.conditional_law,

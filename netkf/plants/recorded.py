@@ -229,8 +229,8 @@ class RecordedSensor(Sensor):
     def row_times(self) -> list[tuple[int, float]]:
         """Node and time of every row."""
         header, lines = self._lines
-        places = [header.index("t"), header.index("node")]
-        read = [finite_numbers(self.path, line, header, row, places) for line, row in lines]
+        indices = [header.index("t"), header.index("node")]
+        read = [finite_numbers(self.path, line, header, row, indices) for line, row in lines]
         nodes = whole(self.path, "node", np.array([node for _, node in read]))
         return list(zip(nodes, (t for t, _ in read), strict=True))
 
@@ -243,12 +243,12 @@ class RecordedSensor(Sensor):
         header, lines = self._lines
         p = self._outputs
         names = ("t", *(f"y{k}" for k in range(p)), *self._regressors)
-        places = [header.index(name) for name in names]
+        indices = [header.index(name) for name in names]
         beyond = [k for k, name in enumerate(header) if _component(name) >= p]
         rows: dict[int, list[tuple[float, FloatArray]]] = {node: [] for node in self.nodes}
         for node, (line, entries) in zip(self._ids, lines, strict=True):
             if node in rows:
-                t, *y = finite_numbers(self.path, line, header, entries, places)
+                t, *y = finite_numbers(self.path, line, header, entries, indices)
                 self._demand_empty(line, header, entries, beyond)
                 rows[node].append((t, np.array(y)))
         return rows
@@ -256,10 +256,10 @@ class RecordedSensor(Sensor):
     def _demand_empty(
         self, line: int, header: list[str], entries: list[str], beyond: list[int]
     ) -> None:
-        for place in beyond:
-            if entries[place].strip().lower() not in ("", "nan", "0", "0.0"):
-                rule = f"{self.path.name} line {line}: {header[place]} has no row in H"
-                raise ScenarioError("path", rule, entries[place], "leave it empty or correct H")
+        for index in beyond:
+            if entries[index].strip().lower() not in ("", "nan", "0", "0.0"):
+                rule = f"{self.path.name} line {line}: {header[index]} has no row in H"
+                raise ScenarioError("path", rule, entries[index], "leave it empty or correct H")
 
     def table(self, node: int, period: float) -> Table:
         """Return the readings (p,) of a node, with their regressors where there are any, by slot of

@@ -156,7 +156,7 @@ class SlotSensors(NamedTuple):
     """M drawn sensors: which filter reads each (``estimator``) and its first ``row`` and number of
     ``rows`` in that filter's reading (M, each), H (M, p, n) and factor of the noise (M, p, p).
 
-    Where H is random, ``driven`` (M,) is the place of the sensor's regressor ``C s`` with C
+    Where H is random, ``driven`` (M,) is the index of the sensor's regressor ``C s`` with C
     (D, n, k), else -1.
     """
 

@@ -43,14 +43,14 @@ class Transitions:
 
     def laws(self, gaps: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return ``Phi`` and ``L``, both (K, n, n), of K gaps in seconds, none below 0."""
-        distinct, place = np.unique(gaps, return_inverse=True)
+        distinct, index = np.unique(gaps, return_inverse=True)
         key = distinct.tobytes()
         if key not in self._known:
             if len(self._known) >= KNOWN:
                 self._known.clear()
             self._known[key] = self._laws(distinct)
         Phi, L = self._known[key]
-        return Phi[place], L[place]
+        return Phi[index], L[index]
 
     def _laws(self, distinct: FloatArray) -> tuple[FloatArray, FloatArray]:
         doublings = self._doublings(distinct)
@@ -65,24 +65,24 @@ class Transitions:
 
     def transitions(self, gaps: FloatArray) -> FloatArray:
         """Return ``Phi = e^{A g}`` (K, n, n) alone."""
-        distinct, place = np.unique(gaps, return_inverse=True)
+        distinct, index = np.unique(gaps, return_inverse=True)
         doublings = self._doublings(distinct)
         Phi = self._unit_transition(np.ldexp(distinct, -doublings))
         with np.errstate(over="ignore", invalid="ignore"):
             for level in range(int(doublings.max(initial=0))):
                 k = np.flatnonzero(doublings > level)
                 Phi[k] = product(Phi[k], Phi[k])
-        return np.asarray(Phi[place])
+        return np.asarray(Phi[index])
 
     def bridges(self, before: FloatArray, after: FloatArray) -> FloatArray:
         """Return rows D (K, n, 2 n) with ``z = D [z1; z2]``: how the noise of a whole gap is made
         of that of its two parts of ``before`` and ``after`` seconds (K,). Rows are orthonormal or
         zero.
         """
-        pairs, place = np.unique(np.stack([before, after]), axis=1, return_inverse=True)
+        pairs, index = np.unique(np.stack([before, after]), axis=1, return_inverse=True)
         L1, (Phi2, L2) = self.laws(pairs[0])[1], self.laws(pairs[1])
         directions = noise_factors(np.concatenate([product(Phi2, L1), L2], axis=2))[1]
-        return np.asarray(directions[place.reshape(-1)])
+        return np.asarray(directions[index.reshape(-1)])
 
     def _doublings(self, gaps: FloatArray) -> np.ndarray:
         """Return how often (K,) each gap is halved before the power series is used."""

@@ -146,8 +146,8 @@ class SampledTruth:
 
     def states(self, times: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return local and absolute states (K, n) at times in any order."""
-        places = np.searchsorted(self._times, times)
-        return self._local[places], self._absolute[places]
+        indices = np.searchsorted(self._times, times)
+        return self._local[indices], self._absolute[indices]
 
 
 def _drawn(

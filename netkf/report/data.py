@@ -157,13 +157,13 @@ def positions(source: Opened, run: StoredRun) -> list[list[float]]:
     given: Mapping[int, Any] | None = source.scenario.topology.positions
     if given is None or any(node not in given for node in run.nodes):
         given = _layout(source, run)
-    places = np.array([given[node] for node in run.nodes], dtype=float).reshape(-1, 2)
-    if not len(places) or not np.isfinite(places).all():
+    points = np.array([given[node] for node in run.nodes], dtype=float).reshape(-1, 2)
+    if not len(points) or not np.isfinite(points).all():
         return [[0.5, 0.5] for _ in run.nodes]
-    low, high = places.min(axis=0), places.max(axis=0)
+    low, high = points.min(axis=0), points.max(axis=0)
     size = max(float((high - low).max()), 1e-12)
-    places = (places - 0.5 * (low + high)) / size
-    return [[round(0.5 + x, 5), round(0.5 - y, 5)] for x, y in places.tolist()]
+    points = (points - 0.5 * (low + high)) / size
+    return [[round(0.5 + x, 5), round(0.5 - y, 5)] for x, y in points.tolist()]
 
 
 def _layout(source: Opened, run: StoredRun) -> dict[int, Any]:

@@ -114,22 +114,22 @@ def innovation_columns(
     step = max(1, -(-len(known) // max(1, most)))
     kept = known[::step]
     curves, counts = autocorrelations(found)
-    place = {node: k for k, node in enumerate(nodes)}
+    index = {node: k for k, node in enumerate(nodes)}
     means = node_means(found)
     return {
         "columns": {
             "t": packer.add(found.times[kept], "f8"),
-            "node": packer.add([place.get(node, -1) for node in found.nodes[kept].tolist()], "i2"),
+            "node": packer.add([index.get(node, -1) for node in found.nodes[kept].tolist()], "i2"),
             "nis": packer.add(found.nis[kept] / found.rows[kept], "f8"),
         },
         "step": step,
         "total": len(known),
         "means": {
-            str(place.get(node, -1)): [float(value) for value in values]
+            str(index.get(node, -1)): [float(value) for value in values]
             for node, *values in zip(*(part.tolist() for part in means), strict=True)
         },
         "correlations": {
-            str(place.get(node, -1)): {
+            str(index.get(node, -1)): {
                 "band": LEVEL / float(np.sqrt(counts[node])),
                 "values": curve.tolist(),
             }

@@ -237,11 +237,11 @@ def _header(entries: list[_Entry], comparison: Comparison | str | None) -> str:
         lines = findings(source, messages, readings)
         if isinstance(worst, Explanation):
             why = (k for k, line in enumerate(lines, 1) if line.startswith("Why: "))
-            place = next(why, len(lines))
-            lines.insert(place, mending_claim(worst))
+            index = next(why, len(lines))
+            lines.insert(index, mending_claim(worst))
             central = central_sample(source)
             if central is not None:
-                lines.insert(place + 1, price_claim(source, worst, central))
+                lines.insert(index + 1, price_claim(source, worst, central))
         parts.append(bullets((line + "." for line in lines), "findings"))
     heading = "<h1>Two runs on one clock</h1>" if len(entries) > 1 else ""
     if comparison is not None:

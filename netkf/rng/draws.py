@@ -181,11 +181,11 @@ def fill_units(states: np.ndarray, which: np.ndarray, counts: np.ndarray, out: F
     """Write the next ``counts`` uniform numbers of each of the streams ``which``, one stream after
     the other.
     """
-    place = 0
+    index = 0
     for m in range(len(which)):
         for _ in range(counts[m]):
-            out[place] = next_unit(states, which[m])
-            place += 1
+            out[index] = next_unit(states, which[m])
+            index += 1
 
 
 @kernel
@@ -193,11 +193,11 @@ def fill_exponentials(
     states: np.ndarray, which: np.ndarray, counts: np.ndarray, ziggurat: Ziggurat, out: FloatArray
 ) -> None:
     """Write the next ``counts`` exponential numbers of mean 1 of each of the streams ``which``."""
-    place = 0
+    index = 0
     for m in range(len(which)):
         for _ in range(counts[m]):
-            out[place] = next_exponential(states, which[m], ziggurat)
-            place += 1
+            out[index] = next_exponential(states, which[m], ziggurat)
+            index += 1
 
 
 class StreamBatch:

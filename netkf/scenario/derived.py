@@ -96,8 +96,8 @@ class DerivedScenario(ScenarioModel):
         heard: dict[int, list[int]] = {node: [] for node in self.nodes}
         for sender, receiver in self.topology.directions:
             heard[receiver].append(self.topology.index[sender])
-        places = tuple(tuple(sorted(heard[node])) for node in self.nodes)
-        return NetworkInfo(np.stack(list(self._informations)), places)
+        indices = tuple(tuple(sorted(heard[node])) for node in self.nodes)
+        return NetworkInfo(np.stack(list(self._informations)), indices)
 
     @property
     def believed_models(self) -> tuple[SlotModel, ...] | tuple[FlowModel, ...]:
@@ -124,7 +124,8 @@ class DerivedScenario(ScenarioModel):
         if filled.sensing_period is not None or not uses_grid(self):
             return filled
         sensing = Counter(
-            tuple(place.entry for place in placed) for placed in self.increment_sensors.values()
+            tuple(placed_sensor.entry for placed_sensor in placed)
+            for placed in self.increment_sensors.values()
         )
         informations = [self._true_information(entries) for entries in sensing]
         # A matrix of all readings at once would grow with the square of the network.
@@ -192,7 +193,7 @@ class DerivedScenario(ScenarioModel):
         to be. Raises TheoryError where H differs from slot to slot.
         """
         placed = (self.placed if self.slotted else self.increment_sensors).get(node, ())
-        for sensor in (self.sensors[place.entry] for place in placed):
+        for sensor in (self.sensors[placed_sensor.entry] for placed_sensor in placed):
             if sensor.varying:
                 what = (
                     "a regressor sensor, whose H is random" if sensor.linear else "no linear sensor"
@@ -203,7 +204,7 @@ class DerivedScenario(ScenarioModel):
     def _stacked(
         self, placed: tuple[PlacedSensor, ...], believed: bool
     ) -> tuple[FloatArray, FloatArray]:
-        return self._stack(tuple(place.entry for place in placed), believed)
+        return self._stack(tuple(placed_sensor.entry for placed_sensor in placed), believed)
 
     def _stack(self, entries: tuple[int, ...], believed: bool) -> tuple[FloatArray, FloatArray]:
         # Thousands of nodes may have the sensors of one [[sensors]] entry.
@@ -222,16 +223,16 @@ class DerivedScenario(ScenarioModel):
         """Return the times at which each sensor (node, ordinal) samples, below the horizon."""
         return sample_times(self, streams)
 
-    def sample_path(self, streams: Streams, node: int, place: PlacedSensor) -> Samples:
+    def sample_path(self, streams: Streams, node: int, placed_sensor: PlacedSensor) -> Samples:
         """Return the samples of one sensor of a node in one run in continuous time."""
-        return sample_path(self, streams, node, place)
+        return sample_path(self, streams, node, placed_sensor)
 
-    def slot_path(self, streams: Streams, node: int, place: PlacedSensor) -> Readings:
+    def slot_path(self, streams: Streams, node: int, placed_sensor: PlacedSensor) -> Readings:
         """Return the readings of one sensor of a node in one run in slots."""
-        sensor: Sensor = self.located_sensors[place.entry]
+        sensor: Sensor = self.located_sensors[placed_sensor.entry]
         period = self.slot_plant.period
         return sensor.slot_path(
-            node, period, lambda purpose: streams.generator(purpose, node, place.ordinal)
+            node, period, lambda purpose: streams.generator(purpose, node, placed_sensor.ordinal)
         )
 
     @cached_property
@@ -275,7 +276,7 @@ class DerivedScenario(ScenarioModel):
     @property
     def _everywhere(self) -> tuple[PlacedSensor, ...]:
         placed = self.placed if self.slotted else self.increment_sensors
-        return tuple(place for places in placed.values() for place in places)
+        return tuple(one for sensors in placed.values() for one in sensors)
 
     def _model(
         self, observation: tuple[FloatArray, FloatArray], made: dict[bytes, FlowModel]

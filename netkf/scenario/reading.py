@@ -116,9 +116,9 @@ def _shorten_array(line: str, arrays: dict[str, Any], mark: str) -> str:
         value = json.loads(_LAST_COMMA.sub("]", found[2]))
     except (ValueError, RecursionError):
         return line
-    place = f"{mark} {len(arrays)}"
-    arrays[place] = value
-    return f'{found[1]} = "{place}"'
+    index = f"{mark} {len(arrays)}"
+    arrays[index] = value
+    return f'{found[1]} = "{index}"'
 
 
 def _whole(value: Any, arrays: dict[str, Any]) -> Any:

@@ -26,42 +26,45 @@ MAX_SAMPLES = 1e9
 def sample_times(scenario: ScenarioModel, streams: Streams) -> dict[tuple[int, int], FloatArray]:
     """Return the times at which each sensor (node, ordinal) samples, below the horizon."""
     found = {}
-    for node, place in _iterate_placed(scenario):
-        sensor, generator = scenario.sensors[place.entry], _generator(streams, node, place)
+    for node, placed_sensor in _iterate_placed(scenario):
+        sensor, generator = (
+            scenario.sensors[placed_sensor.entry],
+            _generator(streams, node, placed_sensor),
+        )
         try:
-            times = sensor.sample_times(node, place.ordinal, generator, scenario.horizon)
+            times = sensor.sample_times(node, placed_sensor.ordinal, generator, scenario.horizon)
         except ScenarioError as error:
-            raise error.under(f"sensors[{place.entry}]") from None
-        found[node, place.ordinal] = times
+            raise error.under(f"sensors[{placed_sensor.entry}]") from None
+        found[node, placed_sensor.ordinal] = times
     return found
 
 
 def sample_path(
-    scenario: ScenarioModel, streams: Streams, node: int, place: PlacedSensor
+    scenario: ScenarioModel, streams: Streams, node: int, placed_sensor: PlacedSensor
 ) -> Samples:
     """Return the samples of one sensor of a node in one run."""
-    sensor: Sensor = scenario.located_sensors[place.entry]
-    return sensor.samples(node, _generator(streams, node, place), scenario.horizon)
+    sensor: Sensor = scenario.located_sensors[placed_sensor.entry]
+    return sensor.samples(node, _generator(streams, node, placed_sensor), scenario.horizon)
 
 
 def _iterate_placed(scenario: ScenarioModel) -> Iterator[tuple[int, PlacedSensor]]:
-    for node, places in scenario.sampled_sensors.items():
-        for place in places:
-            yield node, place
+    for node, placed_sensors in scenario.sampled_sensors.items():
+        for placed_sensor in placed_sensors:
+            yield node, placed_sensor
 
 
 def _generator(
-    streams: Streams, node: int, place: PlacedSensor
+    streams: Streams, node: int, placed_sensor: PlacedSensor
 ) -> Callable[[str], np.random.Generator]:
-    return lambda purpose: streams.generator(purpose, node, place.ordinal)
+    return lambda purpose: streams.generator(purpose, node, placed_sensor.ordinal)
 
 
 def sample_rate(scenario: ScenarioModel, node: int) -> float:
     """Return the samples per second of a node in the long run; nan if unknown before a run."""
-    places = scenario.sampled_sensors.get(node, ())
-    if len(places) != 1:  # several may sample at one instant
-        return math.nan if places else 0.0
-    sensor = scenario.sensors[places[0].entry]
+    placed_sensors = scenario.sampled_sensors.get(node, ())
+    if len(placed_sensors) != 1:  # several may sample at one instant
+        return math.nan if placed_sensors else 0.0
+    sensor = scenario.sensors[placed_sensors[0].entry]
     clock = getattr(sensor, "sampling", None)
     return math.nan if clock is None else clock.mean_rate((node, 0))
 
@@ -89,9 +92,9 @@ def demand_states(scenario: ScenarioModel, times: dict[tuple[int, int], FloatArr
         return
     try:
         plant.demand(scenario.times, "the probe")
-        for node, place in _iterate_placed(scenario):
-            if scenario.sensors[place.entry].is_random:
-                plant.demand(times[node, place.ordinal], f"a sample of node {node}")
+        for node, placed_sensor in _iterate_placed(scenario):
+            if scenario.sensors[placed_sensor.entry].is_random:
+                plant.demand(times[node, placed_sensor.ordinal], f"a sample of node {node}")
     except ScenarioError as error:
         raise error.under("plant") from None
 

@@ -88,8 +88,8 @@ def _set(node: Any, keys: list[str], value: Any, path: str) -> Any:
             raise ScenarioError(
                 path, f"has no entry {key!r} in a list of {len(node)}", None, "count from 0"
             )
-        place = int(key)
-        return [*node[:place], _set(node[place], rest, value, path), *node[place + 1 :]]
+        index = int(key)
+        return [*node[:index], _set(node[index], rest, value, path), *node[index + 1 :]]
     if node is None:
         node = {}
     if not isinstance(node, dict) or not key:

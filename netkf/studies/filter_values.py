@@ -86,7 +86,7 @@ def count_traffic(scenario: Scenario, seed: int, engine: Engine) -> Traffic:
     elif (log["kind"] == CODES["transmit"]).any():
         sent = log[log["kind"] == CODES["transmit"]]
     rows = {
-        node: sum(len(scenario.sensors[place.entry].R) for place in placed)
+        node: sum(len(scenario.sensors[placed_sensor.entry].R) for placed_sensor in placed)
         for node, placed in scenario.placed.items()
     }
     phases = sent["phase"].tolist() if slotted else [-1] * len(sent)

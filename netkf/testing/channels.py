@@ -244,11 +244,11 @@ def _independent(watched: Watched, arrived: FloatArray, links: tuple[Link, ...])
         if lag == 0:
             np.fill_diagonal(unlikely, False)
         if unlikely.any():
-            place = np.unravel_index(int(np.argmax(unlikely * np.abs(both - expected))), both.shape)
-            one, other = (list(links[k]) for k in place)
-            words = f"both arrive in {both[place]:.4g} of cases instead of {expected[place]:.4g}"
+            index = np.unravel_index(int(np.argmax(unlikely * np.abs(both - expected))), both.shape)
+            one, other = (list(links[k]) for k in index)
+            words = f"both arrive in {both[index]:.4g} of cases instead of {expected[index]:.4g}"
             apart = f"message k over link {one} and message k + {lag} over link {other}"
-            same = place[0] == place[1]
+            same = index[0] == index[1]
             which = "neighbouring activations" if same else "different links"
             demand(
                 False,
@@ -329,7 +329,7 @@ def _check_delay_law(watched: Watched, links: tuple[Link, ...]) -> None:
     # P(sqrt(N) D > x) <= 2 exp(-2 x^2), Massart 1990.
     far = distance > math.sqrt(0.5 * log_level(1) / values.size)
     if found is not None or far:
-        which = list(links[found.place[0] - 1]) if found and found.place[0] else "all links"
+        which = list(links[found.position[0] - 1]) if found and found.position[0] else "all links"
         words = f"a distance of {distance:.3g} from it, furthest off {which}"
         demand(False, where, rule, words, remedy)
 

@@ -179,9 +179,9 @@ def _check_slots_independent(where: str, topology: Topology, drawn: np.ndarray) 
         unlikely = (slots - lag) * divergence(both, expected) > log_level(both.size)
         if not unlikely.any():
             continue
-        place = np.unravel_index(int(np.argmax(unlikely * np.abs(both - expected))), both.shape)
-        one, other = (list(topology.links[k]) for k in place)
-        words = f"link {one} and then {other} in {both[place]:.4g} of slots"
+        index = np.unravel_index(int(np.argmax(unlikely * np.abs(both - expected))), both.shape)
+        one, other = (list(topology.links[k]) for k in index)
+        words = f"link {one} and then {other} in {both[index]:.4g} of slots"
         rule = f"matchings of slots that are {lag} apart must be independent"
         remedy = "remember nothing, and draw from the generator given"
-        fail(where, rule, f"{words} instead of {expected[place]:.4g}", remedy)
+        fail(where, rule, f"{words} instead of {expected[index]:.4g}", remedy)

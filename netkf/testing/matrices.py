@@ -10,10 +10,10 @@ from netkf.testing.watching import demand, fail
 
 def assert_dominated(P: ArrayLike, bound: ArrayLike, tolerance: float = 1e-9) -> None:
     """Assert ``P <= bound``: every eigenvalue of ``bound - P`` is at least ``-tolerance`` times the
-    largest entry of the bound at that place.
+    largest entry of the bound at that index.
 
     Both are (n, n), or stacks (..., n, n) that broadcast, such as (T, N, n, n). Raises
-    AssertionError that names the place where the least eigenvalue is furthest below.
+    AssertionError that names the index where the least eigenvalue is furthest below.
     """
     lower, upper = (np.asarray(a, dtype=np.float64) for a in (P, bound))
     for name, matrices in (("P", lower), ("bound", upper)):
@@ -30,13 +30,13 @@ def assert_dominated(P: ArrayLike, bound: ArrayLike, tolerance: float = 1e-9) ->
     size = np.maximum(np.abs(upper).max(axis=(-2, -1)), np.finfo(float).tiny)
     relative = np.asarray(least / size)
     if relative.size and float(relative.min()) < -tolerance:
-        place = np.unravel_index(int(np.argmin(relative)), relative.shape)
-        words = f"the least eigenvalue of bound - P is {float(least[place]):.4g}"
+        index = np.unravel_index(int(np.argmin(relative)), relative.shape)
+        words = f"the least eigenvalue of bound - P is {float(least[index]):.4g}"
         count = int((relative < -tolerance).sum())
         many = f", one of {count} places of {relative.size}" if relative.size > 1 else ""
-        fail(f"P{_at(place)}", f"must stay below the bound; {words}{many}")
+        fail(f"P{_at(index)}", f"must stay below the bound; {words}{many}")
 
 
-def _at(place: object) -> str:
-    numbers = [int(k) for k in place]  # type: ignore[attr-defined]
+def _at(index: object) -> str:
+    numbers = [int(k) for k in index]  # type: ignore[attr-defined]
     return f"[{', '.join(map(str, numbers))}]" if numbers else ""

@@ -25,11 +25,11 @@ FEWEST = 1000
 
 
 class Deviation(NamedTuple):
-    """The mean in a family that lies furthest from zero, its standard error, and its place."""
+    """The mean in a family that lies furthest from zero, its standard error, and its position."""
 
     mean: float
     error: float
-    place: tuple[int, ...]
+    position: tuple[int, ...]
 
 
 def standard_errors(count: int) -> float:
@@ -50,12 +50,14 @@ def largest_deviation(values: FloatArray, fewest: int = FEWEST) -> Deviation | N
     limit = standard_errors(mean.size)
     beyond = np.abs(mean) / (limit * error + NEGLIGIBLE)
     for k in np.argsort(-beyond, axis=None):
-        place = np.unravel_index(int(k), beyond.shape)
-        if beyond[place] <= 1.0:
+        position = np.unravel_index(int(k), beyond.shape)
+        if beyond[position] <= 1.0:
             return None
         chosen = values.reshape(count, -1)[:, int(k)]
-        if _is_sure(chosen, float(mean[place]), float(error[place]), limit):
-            return Deviation(float(mean[place]), float(error[place]), tuple(map(int, place)))
+        if _is_sure(chosen, float(mean[position]), float(error[position]), limit):
+            return Deviation(
+                float(mean[position]), float(error[position]), tuple(map(int, position))
+            )
     return None
 
 
@@ -122,10 +124,10 @@ def _check_moments(e: FloatArray, stated: Stated, when: str) -> None:
     if (found := largest_deviation(flat)) is not None:
         words = f"a mean of {found.mean:.3g} standard deviations (+- {found.error:.2g})"
         rule = f"{stated.noise} must have the mean 0"
-        fail(stated.where, rule, f"{words} in component {found.place[0]}{when}")
+        fail(stated.where, rule, f"{words} in component {found.position[0]}{when}")
     products = flat[:, :, None] * flat[:, None, :] - np.eye(q)
     if (found := largest_deviation(products)) is not None:
-        i, j = found.place
+        i, j = found.position
         size = f"{1.0 + found.mean:.4g} of the stated variance (+- {found.error:.2g})"
         if i != j:
             size = f"a correlation of {found.mean:.3g} (+- {found.error:.2g})"
@@ -144,7 +146,7 @@ def check_uncorrelated(one: FloatArray, other: FloatArray, stated: Stated, apart
     pairs = one.reshape(-1, one.shape[-1])[:, :, None] * other.reshape(-1, other.shape[-1])[:, None]
     found = largest_deviation(pairs)
     if found is not None:
-        i, j = found.place
+        i, j = found.position
         rule = f"{stated.noise} must be uncorrelated with {stated.noise} {apart}"
         words = f"a correlation of {found.mean:.3g} (+- {found.error:.2g})"
         fail(stated.where, rule, f"{words} of components {i} and {j}")
@@ -162,9 +164,13 @@ def check_unrelated(e: FloatArray, known: FloatArray, stated: Stated, what: str)
         if found is not None:
             rule = f"{stated.noise} must not depend on {what}"
             size = f"{2.0 * found.mean:.3g} (+- {2.0 * found.error:.2g})"
-            words = f"another {power} of component {found.place[0]}, by {size} in units of its own"
+            words = (
+                f"another {power} of component {found.position[0]}, by {size} in units of its own"
+            )
             fail(
-                stated.where, rule, f"{words}, where component {found.place[1]} is above its median"
+                stated.where,
+                rule,
+                f"{words}, where component {found.position[1]} is above its median",
             )
 
 

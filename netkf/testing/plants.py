@@ -377,5 +377,7 @@ def _check_one_path(
     times = np.unique(np.concatenate([cut.end[:20], *at]))
     with user_code(where):
         x = np.array([path.local(time) for time in times.tolist()])
-    places = np.searchsorted(cut.end, times)
-    _demand_same(where, cut.x_end[0][places], x, "from the one that `paths` draws for the same run")
+    indices = np.searchsorted(cut.end, times)
+    _demand_same(
+        where, cut.x_end[0][indices], x, "from the one that `paths` draws for the same run"
+    )

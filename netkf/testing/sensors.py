@@ -365,8 +365,8 @@ def _check_nonlinear(sensor: NonlinearSensor, name: str, seed: int) -> None:
     """``h`` and ``jacobian`` must be functions of the state and the node alone, with shapes that
     fit R, and the Jacobian the derivatives of ``h``.
     """
-    places = {node: (0.7 * k, -0.4 * k) for k, node in enumerate(sensor.nodes)}
-    sensor = sensor.located(places)
+    positions = {node: (0.7 * k, -0.4 * k) for k, node in enumerate(sensor.nodes)}
+    sensor = sensor.located(positions)
     p, n = len(sensor.R), _states_read(sensor, name)
     for node in sensor.nodes[:MAX_NODES]:
         for x in _states(seed, SHORT, n):

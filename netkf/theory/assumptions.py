@@ -134,7 +134,7 @@ def _judge_observability(scenario: Scenario) -> tuple[bool | None, str]:
 
 def _entries(scenario: Scenario, node: int) -> tuple[int, ...]:
     """Return the numbers of the [[sensors]] entries of a node."""
-    return tuple(place.entry for place in scenario.placed.get(node, ()))
+    return tuple(placed_sensor.entry for placed_sensor in scenario.placed.get(node, ()))
 
 
 def _sampling_rows(scenario: Scenario) -> list[AssumptionRow]:
@@ -143,8 +143,8 @@ def _sampling_rows(scenario: Scenario) -> list[AssumptionRow]:
         return []
     name = "sensors sample by Poisson clocks or at known times"
     source = "derived, docs/poisson_samples.md"
-    for node, place in randomly_sampled_sensors(scenario):
-        clock = sampling_clock(scenario.sensors[place.entry])
+    for node, placed_sensor in randomly_sampled_sensors(scenario):
+        clock = sampling_clock(scenario.sensors[placed_sensor.entry])
         if clock is not None and not clock.memoryless:
             evidence = f"node {node} samples by another random clock: the bound is not promised"
             return [(name, source, False, evidence)]

@@ -153,13 +153,13 @@ def hear_evidence(
     told: FloatArray,
     links: SlotLinks,
     up: Any,
-    place: tuple[int, int, int],
+    index: tuple[int, int, int],
     h: int,
     centre: FloatArray,
     room: BeliefScratch,
 ) -> None:
-    """Replace what the senders that node ``h`` hears told before, ``up`` at ``place`` [b, s, e]."""
-    b, s, e = place
+    """Replace what the senders that node ``h`` hears told before, ``up`` at ``index`` [b, s, e]."""
+    b, s, e = index
     n = told.shape[1]
     for m in range(links.first[h], links.first[h + 1]):
         arrived, sender = load_flags(lanes, up, b, s, e, links.way[m]), links.sender[m]

@@ -47,15 +47,15 @@ def add_reading_pair(
     share: float,
     y: FloatArray,
     H: FloatArray,
-    place: tuple[int, int, int],
+    index: tuple[int, int, int],
     rows: int,
     centre: FloatArray,
     work: FloatArray,
 ) -> None:
     """Add ``share`` times the information ``H' H`` and ``H' y`` of a whitened reading of so many
-    ``rows``, at ``place`` [b, s, h] of y and H, to ``total`` (n, n + 1, L); ``work`` is scratch.
+    ``rows``, at ``index`` [b, s, h] of y and H, to ``total`` (n, n + 1, L); ``work`` is scratch.
     """
-    b, s, h = place
+    b, s, h = index
     n, size = len(total), share**0.5
     # H that is fixed has one block and one slot.
     d, t = min(b, H.shape[0] - 1), min(s, H.shape[1] - 1)
@@ -80,14 +80,14 @@ def weigh_part(
     out: FloatArray,
     weight: Any,
     parts: FloatArray,
-    place: tuple[int, int, int],
+    index: tuple[int, int, int],
     centre: FloatArray,
     h: int,
 ) -> None:
-    """Write the root of ``weight`` times the pair at ``place`` [t, k, sender] of ``parts`` into
+    """Write the root of ``weight`` times the pair at ``index`` [t, k, sender] of ``parts`` into
     ``out`` (n, n + 1, L), counted from the centre of node ``h``.
     """
-    t, k, sender = place
+    t, k, sender = index
     n, size = len(out), root_of(weight)
     for i in range(n):
         mean = load(lanes, parts, t, k, sender, i, n)
@@ -101,10 +101,10 @@ def weigh_part(
 
 @kernel(inlined=True)
 def keep_part(
-    lanes: Lanes, parts: FloatArray, place: tuple[int, int, int], total: FloatArray
+    lanes: Lanes, parts: FloatArray, index: tuple[int, int, int], total: FloatArray
 ) -> None:
-    """Copy ``total`` (n, n + 1, L) to ``place`` [t, k, h] of ``parts``."""
-    t, k, h = place
+    """Copy ``total`` (n, n + 1, L) to ``index`` [t, k, h] of ``parts``."""
+    t, k, h = index
     n = len(total)
     for i in range(n):
         for j in range(i + 1):
@@ -121,19 +121,19 @@ def begin_part(
     inverse: FloatArray,
     y: FloatArray,
     H: FloatArray,
-    place: tuple[int, int, int],
+    index: tuple[int, int, int],
     rows: int,
     centre: FloatArray,
     total: FloatArray,
     work: FloatArray,
 ) -> None:
-    """Begin part ``k`` of the node of ``place`` [b, s, h]: ``shares[k]`` (2,) times the information
+    """Begin part ``k`` of the node of ``index`` [b, s, h]: ``shares[k]`` (2,) times the information
     of its prediction and of its reading.
     """
-    take_inverse(lanes, total, shares[k, 0], inverse, place[2])
+    take_inverse(lanes, total, shares[k, 0], inverse, index[2])
     if shares[k, 1] > 0.0:
-        add_reading_pair(lanes, total, shares[k, 1], y, H, place, rows, centre, work)
-    keep_part(lanes, parts, (0, k, place[2]), total)
+        add_reading_pair(lanes, total, shares[k, 1], y, H, index, rows, centre, work)
+    keep_part(lanes, parts, (0, k, index[2]), total)
 
 
 @kernel
@@ -144,15 +144,15 @@ def mix_parts(
     h: int,
     links: SlotLinks,
     up: Any,
-    place: tuple[int, int, int],
+    index: tuple[int, int, int],
     centre: FloatArray,
     total: FloatArray,
     work: FloatArray,
 ) -> None:
     """Take a consensus step of node ``h``: the convex combination of its pairs and those that it
-    hears, ``up`` at ``place`` [b, s, e]; the weight of what does not arrive stays with its own.
+    hears, ``up`` at ``index`` [b, s, e]; the weight of what does not arrive stays with its own.
     """
-    b, s, e = place
+    b, s, e = index
     t = step % 2
     heard = spread(lanes, 0.0)
     for m in range(links.first[h], links.first[h + 1]):

@@ -3,7 +3,7 @@
 A mass is (2 + n n,): the weight w, the number of nodes n~ and the information C~ of P (3)-(5). The
 order of every sum is fixed, since the rounding of the mass decides in which slot a node stops.
 
-Node ``h`` of block ``b`` has place ``[b, h]`` of stacks with lanes (``netkf.linalg.lanes``): masses
+Node ``h`` of block ``b`` has index ``[b, h]`` of stacks with lanes (``netkf.linalg.lanes``): masses
 (B, H, m, L), roots (B, H, n, n, L).
 """
 
@@ -85,7 +85,7 @@ def correct_root(
     scratch: SlotScratch,
 ) -> None:
     """Make the root of a filter that of ``(P^-1 + G)^-1 = P (I + G P)^-1``, P (7), for the
-    information G of its place in ``information`` (B, H, n, n, L); ``rest`` (n, n, L) is scratch.
+    information G of its index in ``information`` (B, H, n, n, L); ``rest`` (n, n, L) is scratch.
     """
     # G = sum v v' by Cholesky with the largest pivot first, and each v' is a row that is observed
     # with noise of variance 1: nothing is inverted, and P may be singular.

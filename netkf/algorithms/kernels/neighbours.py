@@ -1,6 +1,6 @@
 """Neighbours in kernels: their readings, the consensus term of the KCF, convex combinations.
 
-Filter ``h`` of a block has place ``[b, h]`` of stacks with lanes (``netkf.linalg.lanes``):
+Filter ``h`` of a block has index ``[b, h]`` of stacks with lanes (``netkf.linalg.lanes``):
 estimates (B, H, n, L), lower triangular roots (B, H, n, n, L).
 """
 

@@ -1,6 +1,6 @@
 """Consensus plus innovations in kernels: estimates yhat of the pseudo-state ``y = G x``.
 
-Filter ``h`` of a block has place ``[b, h]`` of stacks with lanes (``netkf.linalg.lanes``):
+Filter ``h`` of a block has index ``[b, h]`` of stacks with lanes (``netkf.linalg.lanes``):
 estimates of states and of pseudo-states (B, H, n, L).
 """
 

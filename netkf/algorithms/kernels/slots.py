@@ -96,7 +96,7 @@ class SlotPlan(NamedTuple):
 
 class SlotLinks(NamedTuple):
     """The directions that filter h may hear are those from ``first[h]`` (H + 1,) to
-    ``first[h + 1]``, by ``sender`` (W,), with their place in ``up`` (``way``) and their ``weight``.
+    ``first[h + 1]``, by ``sender`` (W,), with their index in ``up`` (``way``) and their ``weight``.
     """
 
     first: np.ndarray
@@ -133,7 +133,7 @@ class SlotScratch(NamedTuple):
     mean, ``moved`` and ``noise`` (n, n, L) of a prediction, ``whitened`` and ``total``
     (n, n + 1, L) of an intersection, and copies of what is sent, (H, n, L) and (H, n, n, L). Of a
     sample ``sampled_xhat`` and ``sampled_error`` (>= H n, L), ``sampled_P`` (>= H n n, L) and the
-    ``places`` (L,) of its runs.
+    ``sample_rows`` (L,) of its runs.
     """
 
     lanes: Lanes
@@ -149,7 +149,7 @@ class SlotScratch(NamedTuple):
     sampled_xhat: FloatArray
     sampled_error: FloatArray
     sampled_P: FloatArray
-    places: np.ndarray
+    sample_rows: np.ndarray
 
 
 def slot_scratch(H: int, n: int, lanes: Lanes = MANY) -> SlotScratch:
@@ -182,12 +182,14 @@ def block_of_reading(y: FloatArray, H: FloatArray) -> ReadingBlock:
 
 
 def star_of(weights: Sequence[float]) -> tuple[SlotLinks, np.ndarray]:
-    """Return the links of one receiver, in place 0, that hears senders in places 1, 2, ... with
+    """Return the links of one receiver, index 0, that hears senders 1, 2, ... with
     these ``weights``, and messages (1, 1, 1, W, 1) that all arrive.
     """
     count = len(weights)
-    places = np.arange(count)
-    links = SlotLinks(np.array([0, count]), places + 1, places, np.array(weights, dtype=np.float64))
+    indices = np.arange(count)
+    links = SlotLinks(
+        np.array([0, count]), indices + 1, indices, np.array(weights, dtype=np.float64)
+    )
     return links, np.ones((1, 1, 1, count, 1), dtype=np.uint8)
 
 
@@ -225,20 +227,20 @@ def show(
     for q in range(len(lanes)):
         # The last block may have more lanes than runs are left.
         used = first + q < len(samples.x)
-        scratch.places[q] = first + q if used else -1
+        scratch.sample_rows[q] = first + q if used else -1
         for i in range(n if used else 0):
             samples.x[first + q, k, i] = samples.absolute[b, s, i, q]
-    hand_out(lanes, scratch.sampled_xhat, samples.xhat[:, k], scratch.places)
-    hand_out(lanes, scratch.sampled_error, samples.error[:, k], scratch.places)
-    hand_out(lanes, scratch.sampled_P, samples.P[:, k], scratch.places)
+    hand_out(lanes, scratch.sampled_xhat, samples.xhat[:, k], scratch.sample_rows)
+    hand_out(lanes, scratch.sampled_error, samples.error[:, k], scratch.sample_rows)
+    hand_out(lanes, scratch.sampled_P, samples.P[:, k], scratch.sample_rows)
 
 
 @kernel
-def hand_out(lanes: Lanes, lines: FloatArray, samples: FloatArray, places: np.ndarray) -> None:
+def hand_out(lanes: Lanes, lines: FloatArray, samples: FloatArray, indices: np.ndarray) -> None:
     """Write the first C ``lines`` (>= C, L) of a block into the ``samples`` (R, C) of its runs."""
     count = samples.shape[1]
     for c in range(0, count, len(lanes)):
-        scatter(lanes, lines, c, samples, places, min(count - c, len(lanes)))
+        scatter(lanes, lines, c, samples, indices, min(count - c, len(lanes)))
 
 
 @kernel

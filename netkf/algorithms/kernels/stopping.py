@@ -28,10 +28,10 @@ def has_stopped(
     former_number: FloatArray,
     work: FloatArray,
 ) -> bool:
-    """Return True if a node stops by ``rule`` (its place in RULES).
+    """Return True if a node stops by ``rule`` (its index in RULES).
 
-    Its mass (2 + n n,) became that of place ``k`` from ``before``; what it makes of it became the
-    first place of ``information`` (1, n, n) and ``number`` (1,) from place ``k`` of the ``former``
+    Its mass (2 + n n,) became that of index ``k`` from ``before``; what it makes of it became the
+    first entry of ``information`` (1, n, n) and ``number`` (1,) from entry ``k`` of the ``former``
     ones. ``whole``: all links of the node were up. ``work`` (n, n) is scratch.
     """
     if rule == PAPER:
@@ -51,22 +51,22 @@ def has_stopped(
 def moved_within(
     mass: FloatArray, k: int, before: FloatArray, bound: float, work: FloatArray
 ) -> bool:
-    """Return True if the information of place ``k`` moved from ``before`` by a symmetric D of
+    """Return True if the information of entry ``k`` moved from ``before`` by a symmetric D of
     spectral norm below ``bound``: ``bound I - D`` and ``bound I + D`` have positive pivots only.
     """
     n = len(work)
     # |D_ii| < bound is necessary, costs n comparisons only and saves an elimination where it fails.
     # ``not <`` rejects nan.
     for i in range(n):
-        place = 2 + i * n + i
-        if not abs(mass[k, place] - before[place]) < bound:
+        index = 2 + i * n + i
+        if not abs(mass[k, index] - before[index]) < bound:
             return False
     # Spectral norm below bound if and only if bound I - D and bound I + D are positive definite.
     for sign in (-1.0, 1.0):
         for i in range(n):
             for j in range(n):
-                place = 2 + i * n + j
-                work[i, j] = sign * (mass[k, place] - before[place])
+                index = 2 + i * n + j
+                work[i, j] = sign * (mass[k, index] - before[index])
             work[i, i] += bound
         if not has_positive_pivots(work):
             return False
@@ -101,7 +101,7 @@ def has_settled(
     tolerance: float,
 ) -> bool:
     """Return True if G^(i) (1, n, n; Frobenius norm) and N^(i) moved by less than ``tolerance``,
-    relative to what they are, from place ``k`` of the ``former`` ones.
+    relative to what they are, from entry ``k`` of the ``former`` ones.
     """
     if not abs(number - former_number) < tolerance * number:
         return False

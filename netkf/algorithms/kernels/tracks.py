@@ -156,7 +156,7 @@ def combine_tracks(
     correct it with the least covariance, and the lower triangular ``root`` (n, n) of that; return
     the number of differences that were used. If it is 0 all tracks are the same.
 
-    ``joint`` (>= k + 1, >= k + 1, n, n) has the covariances of the own track, in place 0, and the
+    ``joint`` (>= k + 1, >= k + 1, n, n) has the covariances of the own track, index 0, and the
     others. For one other it is ``(P_i - P_ij) (P_i + P_j - P_ij - P_ji)^-1`` of Bar-Shalom and
     Campo.
     """
@@ -172,8 +172,8 @@ def combine_tracks(
         for i in range(n):
             total = scratch.parts[i, t]
             for later in range(t + 1, used):
-                place = scratch.order[later]
-                total -= gain[i, place] * scratch.factor[place, t]
+                index = scratch.order[later]
+                total -= gain[i, index] * scratch.factor[index, t]
             gain[i, q] = total / scratch.factor[q, t]
     write_combined_root(joint, count, gain, scratch, root)
     return used
@@ -203,22 +203,22 @@ def factor_differences(n: int, K: int, scratch: TrackScratch) -> int:
     spread, factor = scratch.spread, scratch.factor
     for t in range(K):
         q, best = -1, NEGLIGIBLE
-        for place in range(K):
+        for index in range(K):
             # Tracks that are the same, such as those of two blind nodes, leave nothing to choose.
-            if spread[place, place] > best * scratch.sizes[place]:
-                q, best = place, spread[place, place] / scratch.sizes[place]
+            if spread[index, index] > best * scratch.sizes[index]:
+                q, best = index, spread[index, index] / scratch.sizes[index]
         if q < 0:
             return t
         scratch.order[t], pivot = q, math.sqrt(spread[q, q])
-        for place in range(K):
-            factor[place, t] = spread[place, q] / pivot
+        for index in range(K):
+            factor[index, t] = spread[index, q] / pivot
         for i in range(n):
             scratch.parts[i, t] = scratch.cross[i, q] / pivot
-        for place in range(K):
+        for index in range(K):
             for other in range(K):
-                spread[place, other] -= factor[place, t] * factor[other, t]
+                spread[index, other] -= factor[index, t] * factor[other, t]
             for i in range(n):
-                scratch.cross[i, place] -= scratch.parts[i, t] * factor[place, t]
+                scratch.cross[i, index] -= scratch.parts[i, t] * factor[index, t]
         # Exactly nothing is left of a pivot.
         spread[q, q] = 0.0
     return K

@@ -1,6 +1,6 @@
 """Event triggers in kernels: how much news a reading brings, and whether a copy is near enough.
 
-Filter ``h`` of a block has place ``[b, h]`` of stacks with lanes (``netkf.linalg.lanes``):
+Filter ``h`` of a block has index ``[b, h]`` of stacks with lanes (``netkf.linalg.lanes``):
 estimates (B, H, n, L), lower triangular roots (B, H, n, n, L).
 """
 
@@ -30,16 +30,16 @@ def weigh_news(
     lanes: Lanes,
     x: FloatArray,
     readings: ReadingBlock,
-    place: tuple[int, int, int],
+    index: tuple[int, int, int],
     rows: int,
     Y: FloatArray,
     z: FloatArray,
 ) -> Any:
     """Return ``z' Y z`` with the innovation z = y - H x of the whitened reading of so many ``rows``
-    at ``place`` [b, s, h] and x (B, H, n, L); Y (H, p, p) is for whitened rows. NO_READING where
+    at ``index`` [b, s, h] and x (B, H, n, L); Y (H, p, p) is for whitened rows. NO_READING where
     there is none. ``z`` (p, L) is scratch.
     """
-    b, s, h = place
+    b, s, h = index
     # H that is fixed has one block and one slot.
     d, t = min(b, readings.H.shape[0] - 1), min(s, readings.H.shape[1] - 1)
     news = size = spread(lanes, 0.0)
@@ -65,7 +65,7 @@ def is_near(
     root: FloatArray,
     copies_x: FloatArray,
     copies_root: FloatArray,
-    place: tuple[int, int, int],
+    index: tuple[int, int, int],
     bounds: tuple[float, float],
     ratio: FloatArray,
     work: FloatArray,
@@ -73,10 +73,10 @@ def is_near(
     """Return the flags of ``|S^-1 (x - xbar)|^2 < alpha``, ``P < (1 + delta) Pbar`` and
     ``Pbar < (1 + delta) P`` with ``bounds`` alpha and 1 + delta.
 
-    x and the root S of P are those of ``place`` [b, h, k], xbar and the root of Pbar the copy at
+    x and the root S of P are those of ``index`` [b, h, k], xbar and the root of Pbar the copy at
     ``[b, k]``; ``ratio`` (n, n + 1, L) and ``work`` (n, n, L) are scratch.
     """
-    (b, h, k), n = place, x.shape[2]
+    (b, h, k), n = index, x.shape[2]
     distance = spread(lanes, 0.0)
     # S^-1 [Sbar, x - xbar] by forward substitution; both roots are lower triangular.
     for i in range(n):

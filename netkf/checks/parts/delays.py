@@ -10,7 +10,7 @@ import scipy.special
 
 from netkf.checks.evidence import Finding, Promise, find_identity
 from netkf.checks.laws import find_largest
-from netkf.checks.parts.events import direction_places, in_direction, one_fate_for_both
+from netkf.checks.parts.events import direction_indices, in_direction, one_fate_for_both
 from netkf.checks.parts.moments import (
     CELLS,
     MIN_COUNT,
@@ -76,20 +76,20 @@ def count_delays(scenario: Scenario, run: Run) -> DelayCounts | None:
     of their own delay alone, so that the delay of one that was seen has the stated law up to the
     end of the run.
     """
-    delay, places = stated_delay(scenario), direction_places(scenario)
+    delay, indices = stated_delay(scenario), direction_indices(scenario)
     rows = run.log[np.isin(run.log["kind"], (CODES["deliver"], CODES["late"]))]
-    if not places:
+    if not indices:
         return None
     ages, fixed = rows["age"], delay.fixed
     if fixed is not None:
         off = np.abs(ages - fixed).max(initial=0.0)
-        none = np.zeros((CELLS, 1)), np.zeros(3), np.zeros((2, len(places)))
+        none = np.zeros((CELLS, 1)), np.zeros(3), np.zeros((2, len(indices)))
         return DelayCounts(*none, np.array(off))
     law = delay_law(delay, ages)
     if law is None:
         return None
     # The receiver of a message comes first in the row of its arrival.
-    which = in_direction(rows["peer"], rows["node"], places)
+    which = in_direction(rows["peer"], rows["node"], indices)
     with np.errstate(invalid="ignore", divide="ignore"):
         whole = delay_law(delay, scenario.horizon - (rows["t"] - ages))
         assert whole is not None
@@ -100,7 +100,7 @@ def count_delays(scenario: Scenario, run: Run) -> DelayCounts | None:
     u, which = uniform[known][order], which[known][order]
     first = np.ones(len(u), dtype=bool)
     first[1:] = which[1:] != which[:-1]
-    sums = [np.bincount(which, weights, len(places)) for weights in (np.ones(len(u)), u - 0.5)]
+    sums = [np.bincount(which, weights, len(indices)) for weights in (np.ones(len(u)), u - 0.5)]
     cells = count_cells(u[:, None], np.ones((len(u), 1), dtype=bool))
     return DelayCounts(cells, correlate_neighbours(u, first), np.array(sums), np.array(0.0))
 

@@ -39,20 +39,20 @@ class PairCounts(NamedTuple):
 
 
 @lru_cache(maxsize=8)
-def direction_places(scenario: Scenario) -> dict[tuple[int, int], int]:
-    """Return the place of each direction (sender, receiver) in the topology."""
+def direction_indices(scenario: Scenario) -> dict[tuple[int, int], int]:
+    """Return the index of each direction (sender, receiver) in the topology."""
     return {direction: k for k, direction in enumerate(scenario.topology.directions)}
 
 
 def count_fates(scenario: Scenario, run: Run) -> FateCounts | None:
     """Return the counts of a run; None without links."""
-    places, log = direction_places(scenario), run.log
+    indices, log = direction_indices(scenario), run.log
     sends, losses = (log[log["kind"] == CODES[kind]] for kind in ("send", "lost"))
-    if not places:
+    if not indices:
         return None
-    size = len(places)
-    lost_at = in_direction(losses["node"], losses["peer"], places)
-    sent_at = in_direction(sends["node"], sends["peer"], places)
+    size = len(indices)
+    lost_at = in_direction(losses["node"], losses["peer"], indices)
+    sent_at = in_direction(sends["node"], sends["peer"], indices)
     sent = count_by_window(scenario, sends["t"], sent_at, size)
     lost = count_by_window(scenario, losses["t"], lost_at, size)
     number = losses["message"]
@@ -73,11 +73,11 @@ def count_fates(scenario: Scenario, run: Run) -> FateCounts | None:
 
 
 def in_direction(
-    senders: np.ndarray, receivers: np.ndarray, places: dict[tuple[int, int], int]
+    senders: np.ndarray, receivers: np.ndarray, indices: dict[tuple[int, int], int]
 ) -> np.ndarray:
-    """Return the place (K,) of the direction of each message."""
+    """Return the index (K,) of the direction of each message."""
     ids = zip(senders.tolist(), receivers.tolist(), strict=True)
-    return np.array([places[direction] for direction in ids], dtype=np.int64)
+    return np.array([indices[direction] for direction in ids], dtype=np.int64)
 
 
 @lru_cache(maxsize=8)
@@ -88,16 +88,16 @@ def one_fate_for_both(scenario: Scenario) -> np.ndarray:
     clock = scenario.network.activation
     at_once = getattr(clock, "at", "links") == "links"
     shared = at_once and scenario.network.channel.symmetric
-    senders = np.array([[i, j] for i, j in direction_places(scenario)])
+    senders = np.array([[i, j] for i, j in direction_indices(scenario)])
     second = (senders[:, 0] > senders[:, 1]) & (reversed_directions(scenario) >= 0)
     return np.asarray(second & shared)
 
 
 @lru_cache(maxsize=8)
 def reversed_directions(scenario: Scenario) -> np.ndarray:
-    """Return the place of the other direction of each, -1 without one."""
-    places = direction_places(scenario)
-    return np.array([places.get((j, i), -1) for i, j in places], dtype=np.int64)
+    """Return the index of the opposite direction of each, -1 without one."""
+    indices = direction_indices(scenario)
+    return np.array([indices.get((j, i), -1) for i, j in indices], dtype=np.int64)
 
 
 def count_pairs(scenario: Scenario, run: Run) -> PairCounts | None:

@@ -124,8 +124,8 @@ def moments(z: FloatArray, states: FloatArray | None = None) -> NoiseMoments:
 
 def count_cells(u: FloatArray, known: np.ndarray) -> FloatArray:
     """Return how many of the ``known`` numbers u (S, d) in [0, 1] lie in each cell, (CELLS, d)."""
-    place = np.minimum((CELLS * u).astype(np.int64), CELLS - 1) * u.shape[1] + np.arange(u.shape[1])
-    counts = np.bincount(place[known], minlength=CELLS * u.shape[1])
+    index = np.minimum((CELLS * u).astype(np.int64), CELLS - 1) * u.shape[1] + np.arange(u.shape[1])
+    counts = np.bincount(index[known], minlength=CELLS * u.shape[1])
     return counts.reshape(CELLS, u.shape[1]).astype(float)
 
 

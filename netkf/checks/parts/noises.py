@@ -142,7 +142,7 @@ class SensorLaw(NamedTuple):
 
     label: str
     node: int
-    place: PlacedSensor
+    placed_sensor: PlacedSensor
     H: FloatArray | None
     root: FloatArray
     sampled: bool
@@ -153,9 +153,9 @@ def sensor_laws(scenario: Scenario) -> tuple[SensorLaw, ...]:
     """Return the drawn sensors that are looked at; all of them unless they have many rows."""
     found: list[SensorLaw] = []
     rows = 0
-    for node, places in scenario.placed.items():
-        for place in places:
-            sensor = scenario.sensors[place.entry]
+    for node, placed_sensors in scenario.placed.items():
+        for placed_sensor in placed_sensors:
+            sensor = scenario.sensors[placed_sensor.entry]
             if not sensor.is_random or isinstance(sensor, RecordedSensor):
                 continue
             stated: Any = stated_part(sensor, "sensor")
@@ -164,10 +164,14 @@ def sensor_laws(scenario: Scenario) -> tuple[SensorLaw, ...]:
                 return tuple(found)
             # The row of a regressor is random, and travels with its reading.
             H = None if stated.varying else np.asarray(stated.H)
-            label = f"sensor {place.ordinal} of node {node}" if len(places) > 1 else f"node {node}"
+            label = (
+                f"sensor {placed_sensor.ordinal} of node {node}"
+                if len(placed_sensors) > 1
+                else f"node {node}"
+            )
             root = np.linalg.cholesky(stated.R)
             sampled = not scenario.slotted and takes_samples(sensor)
-            found.append(SensorLaw(label, node, place, H, root, sampled))
+            found.append(SensorLaw(label, node, placed_sensor, H, root, sampled))
     return tuple(found)
 
 
@@ -195,11 +199,11 @@ def reading_moments(scenario: Scenario, streams: Streams) -> NoiseMoments | None
     n = scenario.plant.n
     z = np.full((length, sum(z.shape[1] for z, _ in columns)), np.nan)
     given_states = np.zeros((length, n, z.shape[1]))
-    place = 0
+    index = 0
     for noises, states in columns:
-        among = slice(place, place + noises.shape[1])
+        among = slice(index, index + noises.shape[1])
         z[: len(noises), among], given_states[: len(noises), :, among] = noises, states[:, :, None]
-        place = among.stop
+        index = among.stop
     return moments(z, given_states)
 
 
@@ -207,14 +211,14 @@ def _noises(scenario: Scenario, streams: Streams, law: SensorLaw) -> tuple[Float
     """Return the whitened noises (S, p) of a sensor's first readings in one run, and the states
     (S, n) that it was shown, in units of their root mean squares.
     """
-    random = streams.generator("check readings", law.node, law.place.ordinal)
+    random = streams.generator("check readings", law.node, law.placed_sensor.ordinal)
     if scenario.slotted:
         count = min(MAX_STEPS, int(scenario.horizon / scenario.slot_plant.period))
-        path: Any = scenario.slot_path(streams, law.node, law.place)
+        path: Any = scenario.slot_path(streams, law.node, law.placed_sensor)
     elif law.sampled:
-        times = scenario.sample_times(streams)[law.node, law.place.ordinal]
+        times = scenario.sample_times(streams)[law.node, law.placed_sensor.ordinal]
         count = min(MAX_STEPS, len(times))
-        path = scenario.sample_path(streams, law.node, law.place)
+        path = scenario.sample_path(streams, law.node, law.placed_sensor)
     else:
         # A run may be shorter than one step of the sensor, and then has no reading.
         nothing = np.empty((0, len(law.root))), np.empty((0, scenario.plant.n))
@@ -265,8 +269,8 @@ def _increment_noises(
 
     Each part of a step has two moments, with the variances R length and R length / 3.
     """
-    sensor: Any = scenario.sensors[law.place.entry]
-    node, ordinal = law.node, law.place.ordinal
+    sensor: Any = scenario.sensors[law.placed_sensor.entry]
+    node, ordinal = law.node, law.placed_sensor.ordinal
     path = sensor.path(*(streams.generator(p, node, ordinal) for p in ("noise", "cut")))
     period = scenario.truth.sensing_period
     assert period is not None

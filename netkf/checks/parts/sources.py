@@ -34,8 +34,8 @@ def stated_part(part: Any, family: str) -> Any:
     from, with the same fields.
     """
     known, order = set(KINDS[family].values()), type(part).__mro__
-    place = next((k for k, cls in enumerate(order) if cls in known), 0)
-    own = {name for cls in order[:place] for name in vars(cls)}
-    if place == 0 or own.intersection(STATEMENTS.get(family, ())):
+    index = next((k for k, cls in enumerate(order) if cls in known), 0)
+    own = {name for cls in order[:index] for name in vars(cls)}
+    if index == 0 or own.intersection(STATEMENTS.get(family, ())):
         return part
-    return as_class(part, order[place])
+    return as_class(part, order[index])

@@ -65,14 +65,14 @@ def network_clocks(scenario: Scenario) -> ClockGroup:
 def sampling_clocks(scenario: Scenario) -> ClockGroup:
     """Return the clocks at which sensors sample; none where a sensor has no such clock."""
     entities, stated, labels = [], [], []
-    for node, places in scenario.sampled_sensors.items():
-        for place in places:
-            clock = getattr(scenario.sensors[place.entry], "sampling", None)
+    for node, placed_sensors in scenario.sampled_sensors.items():
+        for placed_sensor in placed_sensors:
+            clock = getattr(scenario.sensors[placed_sensor.entry], "sampling", None)
             if clock is None:
                 return ClockGroup((), (), ())
-            entities.append((node, place.ordinal))
+            entities.append((node, placed_sensor.ordinal))
             stated.append(stated_part(clock, "sampling"))
-            several = f"sensor {place.ordinal} of " if len(places) > 1 else ""
+            several = f"sensor {placed_sensor.ordinal} of " if len(placed_sensors) > 1 else ""
             labels.append(f"the clock of {several}node {node}")
     return ClockGroup(tuple(entities), tuple(stated), tuple(labels))
 
@@ -83,12 +83,12 @@ def count_ticks(scenario: Scenario, run: Run) -> TickCounts | None:
     if not group.entities:
         return None
     clock: Any = scenario.network.activation
-    place = {entity: k for k, entity in enumerate(group.entities)}
+    index = {entity: k for k, entity in enumerate(group.entities)}
     rows = run.log[run.log["kind"] == CODES["tick"]]
     columns = ("node",) if clock.at == "nodes" else ("node", "peer")
     ids = zip(*(rows[name].tolist() for name in columns), strict=True)
     ordered = clock.at == "links"
-    which = np.array([place[tuple(sorted(e)) if ordered else e] for e in ids], dtype=np.int64)
+    which = np.array([index[tuple(sorted(e)) if ordered else e] for e in ids], dtype=np.int64)
     return _count(group, rows["t"], which, scenario.horizon)
 
 
@@ -129,7 +129,7 @@ def draw_samples(scenario: Scenario, seed: int, replica: int) -> np.ndarray:
 def count_by_window(
     scenario: Scenario, times: np.ndarray, which: np.ndarray, size: int
 ) -> np.ndarray:
-    """Return how often each of ``size`` places occurs in each of the windows, (W, size)."""
+    """Return how often each of ``size`` indices occurs in each of the windows, (W, size)."""
     return _by_window(times, which, size, scenario.horizon)
 
 
@@ -137,11 +137,11 @@ def _by_window(times: np.ndarray, which: np.ndarray, size: int, horizon: float) 
     """Return the counts of :func:`count_by_window`.
 
     Windows are equal parts of the run. Counts of different windows are independent as those of
-    different runs are, so that correlations between places show in fewer runs.
+    different runs are, so that correlations between clocks show in fewer runs.
     """
     windows = WINDOWS if size <= MAX_WINDOWED else 1
-    place = np.minimum((times * (windows / horizon)).astype(np.int64), windows - 1)
-    counts = np.bincount(place * size + which, minlength=windows * size)
+    index = np.minimum((times * (windows / horizon)).astype(np.int64), windows - 1)
+    counts = np.bincount(index * size + which, minlength=windows * size)
     return counts.reshape(windows, size)
 
 

@@ -50,14 +50,16 @@ def steps_to_the_end(scenario: Scenario) -> int:
 
 
 def increments(scenario: Scenario) -> list[tuple[int, PlacedSensor]]:
-    """All increment sensors: node and place, in order."""
+    """Return all increment sensors, each with its node, in the order of nodes."""
     found = scenario.increment_sensors.items()
-    return [(node, place) for node, places in found for place in places]
+    return [(node, sensor) for node, placed in found for sensor in placed]
 
 
 def blocks_at_once(scenario: Scenario) -> int:
     """Number of blocks of steps that a run draws at once."""
-    rows = [len(scenario.sensors[place.entry].R) for _, place in increments(scenario)]
+    rows = [
+        len(scenario.sensors[placed_sensor.entry].R) for _, placed_sensor in increments(scenario)
+    ]
     # Two moments for each row of each sensor and step share the budget of normals.
     share = MOST_NORMALS // max(2 * sum(rows), 1)
     return min(MOST_BLOCKS, max(1, share // BLOCK), blocks_to_the_end(scenario))
@@ -153,26 +155,31 @@ def _sensors(scenario: Scenario) -> tuple[dict[str, np.ndarray], list[tuple[int,
     """The fields of a Sensing that all runs share, and the keys of the streams of its sensors."""
     placed = increments(scenario)
     # Many nodes may have the same sensor: its R is factored once.
-    used = {place.entry for _, place in placed}
+    used = {placed_sensor.entry for _, placed_sensor in placed}
     roots = {entry: cholesky(scenario.sensors[entry].R) for entry in used}
-    rows = np.array([len(roots[place.entry]) for _, place in placed], dtype=np.int64)
+    rows = np.array(
+        [len(roots[placed_sensor.entry]) for _, placed_sensor in placed], dtype=np.int64
+    )
     # Sensors with fewer rows are padded to the most.
     n, count, most = scenario.plant.n, len(placed), int(rows.max(initial=0))
     H, root = np.zeros((count, most, n)), np.zeros((count, most, most))
-    for k, (_, place) in enumerate(placed):
+    for k, (_, placed_sensor) in enumerate(placed):
         p = rows[k]
-        H[k, :p], root[k, :p, :p] = scenario.sensors[place.entry].H, roots[place.entry]
+        H[k, :p], root[k, :p, :p] = (
+            scenario.sensors[placed_sensor.entry].H,
+            roots[placed_sensor.entry],
+        )
     index, pooled = scenario.topology.index, scenario.hosted.pooled
     hosts = [0 if pooled else index[node] for node in scenario.increment_sensors]
     shared = {
         "rows": rows,
-        "kind": np.array([place.entry for _, place in placed], dtype=np.int64),
+        "kind": np.array([placed_sensor.entry for _, placed_sensor in placed], dtype=np.int64),
         "H": H,
         "root": root,
         "host": np.array(hosts, dtype=np.int64),
         "node": np.array(list(scenario.increment_sensors), dtype=np.int64),
     }
-    return shared, [(node, place.ordinal) for node, place in placed]
+    return shared, [(node, placed_sensor.ordinal) for node, placed_sensor in placed]
 
 
 class Noise:

@@ -144,8 +144,11 @@ def _gains(scenario: Scenario, state: Simulation) -> dict[str, Any]:
             tables.append(loop.flow)
         elif state.kind == GAINS and node in scenario.sampled_sensors:
             # A node that takes samples has one sensor.
-            (place,) = scenario.sampled_sensors[node]
-            H, R = scenario.sensors[place.entry].H, scenario.noise(place.entry, believed=True)
+            (placed_sensor,) = scenario.sampled_sensors[node]
+            H, R = (
+                scenario.sensors[placed_sensor.entry].H,
+                scenario.noise(placed_sensor.entry, believed=True),
+            )
             found["sampled"][k], found["noise"][k] = sample_maps(given[k], H, R)
     found["table"] = stack_tables(tables) if tables else state.table
     return found

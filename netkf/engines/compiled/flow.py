@@ -202,10 +202,10 @@ class Workspace:
 
     def visits(self, together: int = 1) -> Visits:
         """Space for the visits of so many runs."""
-        places = together * len(self._start.nodes)
-        if self._visits is None or len(self._visits.level) < places:
+        capacity = together * len(self._start.nodes)
+        if self._visits is None or len(self._visits.level) < capacity:
             series, weights = series_of_lanes(self._scenario), self._records[1]["weight"]
-            self._visits = empty_visits(self._start, weights, places, series)
+            self._visits = empty_visits(self._start, weights, capacity, series)
         return self._visits
 
     def begin(

@@ -71,7 +71,7 @@ def add_past(history: History, least: int) -> None:
 def use_instant(
     state: Simulation, instant: int, root: FloatArray, x: FloatArray, k: int, scale: float
 ) -> None:
-    """Update place ``k`` with all samples of an instant together, in the order of sensors; R counts
+    """Update entry ``k`` with all samples of an instant together, in the order of sensors; R counts
     ``scale``^2 times.
     """
     given, scratch, n, row = state.instants, state.scratch, x.shape[1], 0
@@ -104,7 +104,7 @@ def copy_state(
     from_root: FloatArray,
     m: int,
 ) -> None:
-    """Copy place ``m`` to place ``k``."""
+    """Copy entry ``m`` to entry ``k``."""
     for i in range(len(size)):
         x[k, i] = from_x[m, i]
         # Only the lower triangle of a root is ever read.

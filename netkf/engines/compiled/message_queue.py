@@ -23,7 +23,7 @@ def arrives_first(pool: np.ndarray, a: int, b: int) -> bool:
 @kernel
 def push(pool: np.ndarray, heap: np.ndarray, size: int, message: int) -> None:
     """Put a message on the heap of ``size``."""
-    # A binary heap of places in the pool: sift up. heapq would need Python objects.
+    # A binary heap of indices in the pool: sift up. heapq would need Python objects.
     k = size
     while k > 0 and arrives_first(pool, message, heap[(k - 1) // 2]):
         heap[k] = heap[(k - 1) // 2]
@@ -104,14 +104,14 @@ def put(state: Simulation, h: int, message: int) -> None:
 
 
 @kernel
-def sort_places(places: np.ndarray, count: int) -> None:
-    """Sort the first ``count`` places (Shell's sort: a few lines to compile)."""
+def sort_places(indices: np.ndarray, count: int) -> None:
+    """Sort the first ``count`` indices (Shell's sort: a few lines to compile)."""
     gap = count // 2
     while gap > 0:
         for k in range(gap, count):
-            moved, to = places[k], k
-            while to >= gap and places[to - gap] > moved:
-                places[to] = places[to - gap]
+            moved, to = indices[k], k
+            while to >= gap and indices[to - gap] > moved:
+                indices[to] = indices[to - gap]
                 to -= gap
-            places[to] = moved
+            indices[to] = moved
         gap //= 2

@@ -283,7 +283,7 @@ def move_by_gain(
         for j in range(n):
             total -= gained[1 + i * n + j] * xhat[h, j]
         news[i] = share * total
-    for j in range(n):  # S' news: place j is not read again
+    for j in range(n):  # S' news: entry j is not read again
         total = 0.0
         for i in range(j, n):
             total += root[h, i, j] * news[i]

@@ -15,14 +15,14 @@ from netkf.scenario.scenario import Scenario
 
 
 class SampledSensor(NamedTuple):
-    """One sensor: the ``times`` (K,) of its samples, what reads them, the places (K,) of its
-    samples among all, and its own place among sensors.
+    """One sensor: the ``times`` (K,) of its samples, what reads them, the indices (K,) of
+    its samples among all, and its own order among sensors.
     """
 
     times: FloatArray
     samples: Samples
-    places: np.ndarray
-    place: int
+    indices: np.ndarray
+    order: int
 
 
 class SampleTables:
@@ -33,10 +33,16 @@ class SampleTables:
     def __init__(
         self, scenario: Scenario, streams: Streams, times: dict[tuple[int, int], FloatArray]
     ) -> None:
-        placed = [(n, place) for n, some in scenario.sampled_sensors.items() for place in some]
-        counts = [len(times[node, place.ordinal]) for node, place in placed]
+        placed = [
+            (n, placed_sensor)
+            for n, some in scenario.sampled_sensors.items()
+            for placed_sensor in some
+        ]
+        counts = [len(times[node, placed_sensor.ordinal]) for node, placed_sensor in placed]
         # All samples of all sensors in one list, sensor by sensor.
-        t = np.concatenate([np.empty(0), *(times[n, place.ordinal] for n, place in placed)])
+        t = np.concatenate(
+            [np.empty(0), *(times[n, placed_sensor.ordinal] for n, placed_sensor in placed)]
+        )
         sensor = np.repeat(np.arange(len(placed)), counts)
         # Sorted by (time, sensor), the order in which one update stacks them.
         order = np.lexsort((sensor, t))
@@ -47,9 +53,12 @@ class SampleTables:
         parts = np.split(back, cuts) if placed else []
         self._sensors = [
             SampledSensor(
-                times[node, place.ordinal], scenario.sample_path(streams, node, place), some, k
+                times[node, placed_sensor.ordinal],
+                scenario.sample_path(streams, node, placed_sensor),
+                some,
+                k,
             )
-            for k, ((node, place), some) in enumerate(zip(placed, parts, strict=True))
+            for k, ((node, placed_sensor), some) in enumerate(zip(placed, parts, strict=True))
         ]
         self.instants = _instants(scenario, placed, t[order], sensor[order])
         self._matrices: list[FloatArray] = []
@@ -68,10 +77,10 @@ class SampleTables:
             # The state at each sample; ``times`` contains all of them.
             x = states[np.searchsorted(times, here)]
             y, H = sensor.samples.several(range(first, last), x)
-            places, p = sensor.places[first:last], y.shape[1]
-            given.y[places, :p] = y
-            if given.matrix[places[0]] >= len(given.rows):  # a sensor with an H for each sample
-                given.H[given.matrix[places], :p] = H
+            indices, p = sensor.indices[first:last], y.shape[1]
+            given.y[indices, :p] = y
+            if given.matrix[indices[0]] >= len(given.rows):  # a sensor with an H for each sample
+                given.H[given.matrix[indices], :p] = H
 
 
 def _instants(

@@ -29,7 +29,7 @@ def recorded(
 ) -> bool:
     """Record the states x (T, n), xhat (T, H, n), P (T, H, n, n) and errors (T, H, n) of H
     estimators at these times up to the first that is not sound; return True if there is none.
-    ``pass_rows_on`` is given the place of that one: what happened after it did not happen.
+    ``pass_rows_on`` is given the index of that one: what happened after it did not happen.
     """
     # The loop may stop for other reasons than samples.
     if not len(times):

@@ -39,10 +39,10 @@ LOST = -1.0
 
 
 class Window(NamedTuple):
-    """Ticks before ``end`` in the order of (time, entity): ``t`` (K,), ``entity`` (K,) places among
-    the senders' entities; the outcomes of what tick k sends are ``delay`` from ``at[k]`` on, in the
-    order of its directed links: seconds, or LOST. Where no message takes time it may say instead
-    which ones are ``heard`` (K,), a bit for each.
+    """Ticks before ``end`` in the order of (time, entity): ``t`` (K,), ``entity`` (K,) indices
+    among the senders' entities; the outcomes of what tick k sends are ``delay`` from ``at[k]`` on,
+    in the order of its directed links: seconds, or LOST. Where no message takes time it may say
+    instead which ones are ``heard`` (K,), a bit for each.
     """
 
     end: float
@@ -63,13 +63,13 @@ class Ticks(NamedTuple):
     delay: FloatArray
 
     def chosen(self, which: np.ndarray, sizes: np.ndarray) -> Ticks:
-        """Those in some places, where a tick of entity e has ``sizes[e]`` outcomes."""
-        # Outcomes lie tick after tick: the places of those that are chosen, in their new order.
+        """Return the ticks of some indices, where a tick of entity e has ``sizes[e]`` outcomes."""
+        # Outcomes lie tick after tick: the indices of those that are chosen, in their new order.
         sent = sizes[self.entity]
         first, count = (np.cumsum(sent) - sent)[which], sent[which]
         begin = np.cumsum(count) - count
-        places = np.repeat(first - begin, count) + np.arange(int(count.sum()))
-        return Ticks(self.t[which], self.entity[which], self.delay[places])
+        indices = np.repeat(first - begin, count) + np.arange(int(count.sum()))
+        return Ticks(self.t[which], self.entity[which], self.delay[indices])
 
     def window(self, end: float, sizes: np.ndarray) -> Window:
         """Ticks that are in order, as a window."""
@@ -111,35 +111,35 @@ class TickSource:
                 ]
             )
 
-    def more(self, places: np.ndarray, counts: np.ndarray) -> tuple[FloatArray, np.ndarray]:
+    def more(self, indices: np.ndarray, counts: np.ndarray) -> tuple[FloatArray, np.ndarray]:
         """So many more ticks of each of these entities: the times before the horizon, one entity
         after the other, and how many each has. The horizon is half open; later ticks, and there may
         be many, are not kept.
         """
         if self._all_poisson:
-            times, asked = self._exponential(places, counts), counts
+            times, asked = self._exponential(indices, counts), counts
         else:
-            drawn = [self._ticks(k, count) for k, count in zip(places, counts, strict=True)]
+            drawn = [self._ticks(k, count) for k, count in zip(indices, counts, strict=True)]
             asked = np.array([len(t) for t in drawn])
             # Rows of different lengths are padded with infinity.
-            times = np.full((len(places), max(asked.max(), 1)), np.inf)
+            times = np.full((len(indices), max(asked.max(), 1)), np.inf)
             for row, t in zip(times, drawn, strict=True):
                 row[: len(t)] = t
         # The horizon is half open.
         kept = times < self._horizon
         got = kept.sum(axis=1)
-        self.drawn[places] += asked
+        self.drawn[indices] += asked
         # Fewer than asked for lie before the horizon: this entity has ended.
         ended = (asked == 0) | (got < asked)
-        self.last[places] = np.where(ended, np.inf, times[np.arange(len(places)), asked - 1])
+        self.last[indices] = np.where(ended, np.inf, times[np.arange(len(indices)), asked - 1])
         return times[kept], got
 
-    def _exponential(self, places: np.ndarray, counts: np.ndarray) -> FloatArray:
+    def _exponential(self, indices: np.ndarray, counts: np.ndarray) -> FloatArray:
         """Times (E, count) of the next ticks, see ``Poisson.ticks``; infinite beyond the counts."""
-        times = np.full((len(places), counts.max() + 1), np.inf)
-        times[:, 0] = self.last[places]
+        times = np.full((len(indices), counts.max() + 1), np.inf)
+        times[:, 0] = self.last[indices]
         # Exponential gaps over the rate, one batch for all streams.
-        gaps = self._draws.exponentials(places, counts) / np.repeat(self._rates[places], counts)
+        gaps = self._draws.exponentials(indices, counts) / np.repeat(self._rates[indices], counts)
         times[:, 1:][np.arange(times.shape[1] - 1) < counts[:, None]] = gaps
         # Accumulated from the last tick, in the same order of additions as tick by tick.
         return np.asarray(np.add.accumulate(times, axis=1)[:, 1:])
@@ -207,12 +207,12 @@ class Outcomes:
             self._luck = StreamBatch(streams, "loss", senders.sources)
         self.sizes = np.tile(np.diff(senders.first), runs)
 
-    def of(self, places: np.ndarray, counts: np.ndarray, first: np.ndarray) -> FloatArray:
+    def of(self, indices: np.ndarray, counts: np.ndarray, first: np.ndarray) -> FloatArray:
         """The outcomes of the next ``counts`` activations of each entity, tick after tick; they are
         the activations ``first`` and so on.
         """
-        runs, entity = np.divmod(places, max(self._count, 1))
-        sizes = self.sizes[places]
+        runs, entity = np.divmod(indices, max(self._count, 1))
+        sizes = self.sizes[indices]
         out = np.empty(int((counts * sizes).sum()))
         begin = np.cumsum(counts * sizes) - counts * sizes
         drawn: tuple[np.ndarray, ...] = ()
@@ -322,13 +322,13 @@ class EntityDraws:
         # Measured: ticks so far over the time of the last.
         return float((self._clocks.drawn / self.last).sum())
 
-    def more(self, places: np.ndarray) -> Ticks:
-        """A block of ticks of each of these entities (places, in order)."""
-        first = self._clocks.drawn[places]
-        t, counts = self._clocks.more(places, self._block[places])
+    def more(self, indices: np.ndarray) -> Ticks:
+        """A block of ticks of each of these entities (increasing indices)."""
+        first = self._clocks.drawn[indices]
+        t, counts = self._clocks.more(indices, self._block[indices])
         # Blocks double: an entity with few ticks draws few.
-        self._block[places] = np.minimum(2 * self._block[places], self._longest)
-        return Ticks(t, np.repeat(places, counts), self._outcomes.of(places, counts, first))
+        self._block[indices] = np.minimum(2 * self._block[indices], self._longest)
+        return Ticks(t, np.repeat(indices, counts), self._outcomes.of(indices, counts, first))
 
 
 def _joined(parts: list[Ticks]) -> Ticks:
@@ -375,7 +375,7 @@ class Schedule:
 
 class ReadingsSchedule:
     """The windows of one run in which nodes transmit after their samples, at the times ``t`` (K,)
-    and places ``host`` (K,), in order.
+    and indices ``host`` (K,), in order.
     """
 
     def __init__(
@@ -402,9 +402,9 @@ class ReadingsSchedule:
         self._begin = stop
         t, host = self._t[begin:stop], self._host[begin:stop]
         # Outcomes are drawn entity by entity, and put back into the order of time.
-        places, counts = np.unique(host, return_counts=True)
-        delay = self._outcomes.of(places, counts, self._sent[places])
-        self._sent[places] += counts
+        indices, counts = np.unique(host, return_counts=True)
+        delay = self._outcomes.of(indices, counts, self._sent[indices])
+        self._sent[indices] += counts
         by_entity = np.argsort(host, kind="stable")
         ticks = Ticks(t[by_entity], host[by_entity], delay)
         back = np.empty(len(host), dtype=np.int64)

@@ -42,10 +42,10 @@ Row = tuple[float, int, int, int, int, int, float]
 
 
 class Direction:
-    """One direction of a link: its place, its messages so far and what is drawn for them."""
+    """One direction of a link: its index, its messages so far and what is drawn for them."""
 
-    def __init__(self, scenario: Scenario, streams: Streams, ends: Link, place: int) -> None:
-        self.ends, self.place, self.messages = ends, place, 0
+    def __init__(self, scenario: Scenario, streams: Streams, ends: Link, index: int) -> None:
+        self.ends, self.index, self.messages = ends, index, 0
         self.probability = scenario.table_probability(ends)
         self._sampler = ChannelSampler(
             scenario.network.channel, lambda purpose: streams.generator(purpose, *ends)
@@ -88,7 +88,7 @@ class SlotEvents:
         self._directions = [
             Direction(scenario, streams, ends, k) for k, ends in enumerate(setup.directions)
         ]
-        self._places = {way.ends: way.place for way in self._directions}
+        self._indices = {way.ends: way.index for way in self._directions}
         ways, own = setup.ways, setup.streams
         # Directions of a link are neighbours; a directed graph has one of them.
         pairs = [way.ends for way in self._directions[::ways]]
@@ -240,7 +240,7 @@ class SlotEvents:
             # A link that is down loses its messages whatever was drawn.
             here = up is None or (i, j) in up
             for way, draw in zip(ways, self._last[i, j], strict=True):
-                if self._setup.talks[step.step, way.place] and not self._is_silent(way, step):
+                if self._setup.talks[step.step, way.index] and not self._is_silent(way, step):
                     self._send(step, way, draw if here else None)
 
     def _pairs(self, step: Step) -> tuple[list[Link], set[Link] | None]:
@@ -287,7 +287,7 @@ class SlotEvents:
         elif now + delay < self._scenario.ends:
             self._order += 1
             # Order in the heap: time, directed link, order of sending.
-            mail = now + delay, way.place, self._order, way, number, now, step.phase, self._open
+            mail = now + delay, way.index, self._order, way, number, now, step.phase, self._open
             heapq.heappush(self._mail, mail)
 
     def _arrivals(self, until: float) -> None:
@@ -310,7 +310,7 @@ class SlotEvents:
             taken = self._inbox[node]
             for peer in sorted(taken):
                 number, age = taken[peer]
-                up[self._places[peer, node]] = 1
+                up[self._indices[peer, node]] = 1
                 if self._algorithm.pairwise:
                     self._note((step.end, SWAP, node, peer, number, step.phase, age))
             if not self._algorithm.pairwise:

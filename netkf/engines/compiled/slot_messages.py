@@ -36,7 +36,7 @@ NAN = np.nan
 
 
 class Matchings(NamedTuple):
-    """How pairs are drawn: place of the ``protocol`` in PROTOCOLS (-1: all links exchange), its
+    """How pairs are drawn: index of the ``protocol`` in PROTOCOLS (-1: all links exchange), its
     ``chance`` (lazy or p), streams ``states`` (R, 6); ``first`` and ``members`` list for
     node-wakeup the links of each node in the order of its peers, for uniform-maximal the links of
     each matching. ``order`` (L,) and ``busy`` (N,) are scratch.
@@ -53,7 +53,7 @@ class Matchings(NamedTuple):
 
 class Channels(NamedTuple):
     """Properties and draws of messages on L links with so many directions each (``ends`` (L, 2) are
-    places of nodes; direction 2 l goes from the first to the second).
+    indices of nodes; direction 2 l goes from the first to the second).
 
     ``delivery`` (2, W): chance of a direction in the good and the bad state of its link. Streams
     ``states`` and ``state_draws`` (B, K, 4, L) of K links or directions, empty where nothing is
@@ -123,8 +123,8 @@ def _free_links(m: Matchings, ends: np.ndarray, r: int, active: np.ndarray) -> i
             i, j = ends[m.order[k], 0], ends[m.order[k], 1]
             # Without a branch, which nobody could predict.
             free = (m.busy[i] | m.busy[j]) ^ 1
-            place = min(found, len(active) - 1)
-            active[place] += free * (m.order[k] - active[place])
+            index = min(found, len(active) - 1)
+            active[index] += free * (m.order[k] - active[index])
             m.busy[i], m.busy[j] = m.busy[i] | free, m.busy[j] | free
             found += free
         return found
@@ -367,7 +367,7 @@ class Drawn(NamedTuple):
 
 
 class Moment(NamedTuple):
-    """The circumstances of events: the ``slot`` by number and by place ``s`` in the block, ``step``
+    """The circumstances of events: the ``slot`` by number and by index ``s`` in the block, ``step``
     and ``phase`` of the exchange (-1 where nodes read), the time ``t`` in seconds.
     """
 
@@ -400,7 +400,7 @@ def make_rows(
     stop: int,
     rows: Rows,
 ) -> int:
-    """Write the events of the first run in the slots from place ``first`` up to ``stop`` in their
+    """Write the events of the first run in the slots from index ``first`` up to ``stop`` in their
     order; return how many there are.
     """
     at = 0
@@ -488,7 +488,7 @@ def _link_rows(c: Channels, h: Hearing, d: Drawn, rows: Rows, m: Moment, link: i
 
 @kernel
 def is_silent(d: Drawn, b: int, m: Moment, node: int, q: int) -> bool:
-    """Return True if the node at a place sends nothing in a step, in the run of a lane."""
+    """Return True if the node of an index sends nothing in a step, in the run of a lane."""
     return len(d.sent) > 0 and d.sent[b, m.s, m.step, node, q] == 0
 
 

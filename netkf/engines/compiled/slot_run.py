@@ -139,7 +139,7 @@ class SlotRuns:
 
     def _begin_readings(self) -> None:
         setup, streams = self.setup, self._streams
-        entities = [(s.node, s.place.ordinal) for s in setup.drawn]
+        entities = [(s.node, s.placed_sensor.ordinal) for s in setup.drawn]
         # One stream for each drawn sensor of each run.
         self._noise = StreamBatch(streams, "noise", entities).states
         self._regressors: list[tuple[Path, np.ndarray]] = []
@@ -147,11 +147,11 @@ class SlotRuns:
             x = in_lanes(start, self._blocks)
             # No frame: regressors do not grow as an unstable plant does.
             path = Path(A, drive, 0, x, np.zeros(x.shape))
-            states = StreamBatch(streams, "regressor", [(s.node, s.place.ordinal)]).states
+            states = StreamBatch(streams, "regressor", [(s.node, s.placed_sensor.ordinal)]).states
             self._regressors.append((path, states))
         scenario, first = self._scenario, self._first
         self._recorded: list[tuple[AssignedSensor, Any]] = [
-            (s, scenario.slot_path(first, s.node, s.place)) for s in setup.recorded
+            (s, scenario.slot_path(first, s.node, s.placed_sensor)) for s in setup.recorded
         ]
 
     def _begin_messages(self) -> None:
@@ -424,10 +424,10 @@ class SlotRuns:
         # Space for the largest number of rows.
         table = np.empty(setup.rows_of(stop - first), dtype=EVENT)
         # Kernels write the columns where the records have them.
-        places: Any = [table[name] for name in ROW_COLUMNS]
+        columns: Any = [table[name] for name in ROW_COLUMNS]
         count = make_rows(
             setup.stages, block.times, self._channels, self._hearing(), block.drawn,
-            setup.algorithm.pairwise, first, stop, Rows._make([*places, at_sample]),
+            setup.algorithm.pairwise, first, stop, Rows._make([*columns, at_sample]),
         )  # fmt: skip
         return table[:count]
 

@@ -46,7 +46,7 @@ class AssignedSensor(NamedTuple):
     """
 
     node: int
-    place: PlacedSensor
+    placed_sensor: PlacedSensor
     estimator: int
     row: int
     root: FloatArray
@@ -128,17 +128,17 @@ class SlotSetup:
         self.placed: list[AssignedSensor] = []
         for node in scenario.sensing:
             estimator = 0 if pooled else scenario.topology.index[node]
-            for place in scenario.placed[node]:
-                R = scenario.noise(place.entry, believed=True)
+            for placed_sensor in scenario.placed[node]:
+                R = scenario.noise(placed_sensor.entry, believed=True)
                 root = cholesky(R)
                 # A filter stacks the readings of its sensors: each begins where the one before
                 # ends.
                 self.placed.append(
-                    AssignedSensor(node, place, estimator, int(rows[estimator]), root)
+                    AssignedSensor(node, placed_sensor, estimator, int(rows[estimator]), root)
                 )
                 rows[estimator] += len(root)
         self.rows, self.p = rows, int(rows.max(initial=1))
-        kinds = [type(scenario.sensors[s.place.entry]) for s in self.placed]
+        kinds = [type(scenario.sensors[s.placed_sensor.entry]) for s in self.placed]
         self.recorded = [s for s, k in zip(self.placed, kinds, strict=True) if k is RecordedSensor]
         # Recorded sensors are read in Python, the others by kernels.
         self.drawn = [s for s, k in zip(self.placed, kinds, strict=True) if k is not RecordedSensor]
@@ -152,7 +152,7 @@ class SlotSetup:
         H, noise = np.zeros((count, p, n)), np.zeros((count, p, p))
         driven = np.full(count, -1, dtype=np.int64)
         for m, s in enumerate(self.drawn):
-            sensor = scenario.sensors[s.place.entry]
+            sensor = scenario.sensors[s.placed_sensor.entry]
             rows = len(s.root)
             true = cholesky(sensor.R)
             # Noise L_b^-1 L of a whitened reading, with the believed R = L_b L_b' and the true R =
@@ -164,7 +164,7 @@ class SlotSetup:
                 continue
             H[m, :rows] = solve_lower(s.root, sensor.H)
             self.H[0, 0, s.estimator, s.row : s.row + rows] = H[m, :rows, :, None]
-        regressors: list[Any] = [scenario.sensors[s.place.entry] for s in self.driven]
+        regressors: list[Any] = [scenario.sensors[s.placed_sensor.entry] for s in self.driven]
         # Regressors of different sizes are padded with zeros, which stay zero.
         k = max((len(sensor.A) for sensor in regressors), default=1)
         q = max((sensor.B.shape[1] for sensor in regressors), default=1)
@@ -253,10 +253,10 @@ class SlotSetup:
         self._recorded_slots = self._slots_with_rows(scenario) if self.of_readings.any() else {}
 
     def _slots_with_rows(self, scenario: Scenario) -> dict[int, set[int]]:
-        """The slots in which nodes that have recorded sensors alone read, by place of the node."""
+        """The slots in which nodes that have recorded sensors alone read, by index of the node."""
         found: dict[int, set[int]] = {}
         for s in self.recorded:
-            sensor: Any = scenario.sensors[s.place.entry]
+            sensor: Any = scenario.sensors[s.placed_sensor.entry]
             rows = sensor.table(s.node, scenario.slot_plant.period)
             found.setdefault(scenario.topology.index[s.node], set()).update(rows)
         for s in self.drawn:
@@ -273,8 +273,8 @@ class SlotSetup:
         on because they have not read anything.
         """
         missed = np.zeros((count, len(self.nodes)), dtype=bool)
-        for place, slots in self._recorded_slots.items():
-            missed[:, place] = [slot not in slots for slot in range(first, first + count)]
+        for index, slots in self._recorded_slots.items():
+            missed[:, index] = [slot not in slots for slot in range(first, first + count)]
         unread: np.ndarray = missed[:, None] & self.of_readings[:, None]
         return unread
 

@@ -40,7 +40,7 @@ the instant of its newest sample (``reading``), and its ``own`` weight.
 """
 
 WAY = _record("sender receiver messages", "weight")
-"""A directed link: nodes by place, how many messages went, the weight of each."""
+"""A directed link: nodes by index, how many messages went, the weight of each."""
 
 ENTITY = _record("sender other first after")
 """Whatever has a clock: the node that sends, the other end of a link (else -1), and the directed
@@ -121,7 +121,7 @@ class Sensing(Struct):
 class Instants(Struct):
     """K instants at which a node has samples, in order: ``t`` (K,), ``host`` (K,), its samples from
     ``first[k]`` up to ``first[k + 1]``. Of each of S samples: the ``node`` that took it, ``y``
-    (S, p), the places ``sensor`` and ``matrix`` (S,) of its noise and its H. Those are ``rows``
+    (S, p), the indices ``sensor`` and ``matrix`` (S,) of its noise and its H. Those are ``rows``
     (L,), ``root`` (L, p, p) of R and ``H`` (M, p, n).
     """
 
@@ -286,7 +286,7 @@ def filters_at_start(scenario: Scenario) -> Filters:
     models = (scenario.pooled_model,) if pooled else scenario.models
     # Nodes that share a model share its table.
     distinct = list({id(model): model for model in models}.values())
-    place = {id(model): k for k, model in enumerate(distinct)}
+    index = {id(model): k for k, model in enumerate(distinct)}
     starts = [scenario.start(node) for node in (ids[:1] if pooled else ids)]
     covariances = {id(cov): cov for _, cov in starts}  # nodes share them
     roots = {key: first_root(cov) for key, cov in covariances.items()}
@@ -294,7 +294,7 @@ def filters_at_start(scenario: Scenario) -> Filters:
     # Increment sensors of all nodes in one list: each has those up to ``sensors``.
     after = np.array([sum(counts)] if pooled else np.cumsum(counts), dtype=np.int64)
     nodes = np.zeros(len(starts), dtype=NODE)
-    nodes["model"] = [place[id(model)] for model in models]
+    nodes["model"] = [index[id(model)] for model in models]
     nodes["id"] = [-1] if pooled else ids
     # ``sensor`` of the first node stays 0.
     nodes["sensors"], nodes["sensor"][1:] = after, after[:-1]
@@ -308,7 +308,7 @@ def filters_at_start(scenario: Scenario) -> Filters:
 
 def _tables(models: list[FlowModel]) -> tuple[FlowTable, Gains]:
     n = len(models[0].A)
-    # A model without sensors has no gains; its place keeps the numbering.
+    # A model without sensors has no gains; its entry keeps the numbering.
     nothing = GainTable(n, 0, np.zeros((0, 1)))
     gains = [model.gains if len(model.H) else nothing for model in models]
     terms, width = np.max([gain.series.shape for gain in gains], axis=0)
@@ -331,9 +331,9 @@ def entity_records(scenario: Scenario) -> tuple[np.ndarray, np.ndarray]:
     entities = np.zeros(len(senders.entities), dtype=ENTITY)
     # (i, j) of a link or direction, (i, -1) of a node.
     ends = np.array([(*e, -1)[:2] for e in senders.entities], dtype=np.int64).reshape(-1, 2)
-    place = np.vectorize(lambda node: index.get(node, -1), otypes=[np.int64])
+    index_of = np.vectorize(lambda node: index.get(node, -1), otypes=[np.int64])
     if len(ends):
-        entities["sender"], entities["other"] = place(ends[:, 0]), place(ends[:, 1])
+        entities["sender"], entities["other"] = index_of(ends[:, 0]), index_of(ends[:, 1])
     if senders.at != "links":
         entities["other"][:] = [index[e[1]] if len(e) > 1 else -1 for e in senders.entities]
     entities["first"], entities["after"] = senders.first[:-1], senders.first[1:]

@@ -47,11 +47,11 @@ def clock_processes(
         _transmit_after_samples(timeline, *air)
         return []
     make = {"links": _links, "directions": _directions, "nodes": _nodes}
-    places = make[activation.at](*air)
+    activations = make[activation.at](*air)
     return [
         _ticking(scenario, streams, timeline, recorder, entity, k, activate)
-        # An entity's place is its index: it orders simultaneous ticks.
-        for k, (entity, activate) in enumerate(places)
+        # The index of an entity orders simultaneous ticks.
+        for k, (entity, activate) in enumerate(activations)
     ]
 
 
@@ -61,7 +61,7 @@ def _ticking(
     timeline: Timeline,
     recorder: Recorder,
     entity: tuple[int, ...],
-    place: int,
+    tick_order: int,
     activate: Activation,
 ) -> Process:
     """Wait for each tick up to the horizon, and activate the entity."""
@@ -79,7 +79,7 @@ def _ticking(
             # Half open: a tick at the horizon does not happen.
             if now >= scenario.horizon:
                 return
-            yield timeline.at(now, Rank.TICK, place)
+            yield timeline.at(now, Rank.TICK, tick_order)
             activate(now)
         # A clock that gives no more ticks has stopped for good.
         if not times:
@@ -90,7 +90,7 @@ def _ticking(
         count = min(2 * count, MAX_BLOCK)
 
 
-Places = list[tuple[tuple[int, ...], Activation]]
+Activations = list[tuple[tuple[int, ...], Activation]]
 
 
 def _links(
@@ -98,7 +98,7 @@ def _links(
     recorder: Recorder,
     transmitter: Transmitter,
     nodes: dict[int, ClockedNode],
-) -> Places:
+) -> Activations:
     """Return for each link an activation in which both ends exchange."""
 
     # A factory for each link, so that the closure binds these ends and not those of the last link.
@@ -121,7 +121,7 @@ def _directions(
     recorder: Recorder,
     transmitter: Transmitter,
     nodes: dict[int, ClockedNode],
-) -> Places:
+) -> Activations:
     """Return for each direction an activation in which one end pushes to the other."""
 
     def activation(link: tuple[int, int], entity: int) -> Activation:
@@ -180,7 +180,7 @@ def _nodes(
     recorder: Recorder,
     transmitter: Transmitter,
     nodes: dict[int, ClockedNode],
-) -> Places:
+) -> Activations:
     """Return for each node an activation in which it broadcasts."""
     transmit = broadcasts(scenario, recorder, transmitter, nodes)
 

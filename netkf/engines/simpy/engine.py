@@ -149,7 +149,7 @@ class _Simulation:
         # Filters, readers and the clock are processes that meet by time and rank only.
         processes = [node.running(self.timeline) for node in distinct(nodes)]
         for node, placed in scenario.placed.items():
-            sensors = [scenario.slot_path(streams, node, place) for place in placed]
+            sensors = [scenario.slot_path(streams, node, sensor) for sensor in placed]
             entity = scenario.topology.index[node]
             reader = Reader(recorder, schedule, node, entity, nodes[node])
             processes.append(reader.running(self.timeline, truth, sensors))

@@ -41,11 +41,11 @@ def sensor_processes(
     ]
     times, entity = scenario.sample_times(streams), 0
     for node, placed in scenario.sampled_sensors.items():
-        for place in placed:
-            samples = scenario.sample_path(streams, node, place)
+        for placed_sensor in placed:
+            samples = scenario.sample_path(streams, node, placed_sensor)
             # The filters' R, which may differ from that of the readings.
-            R = scenario.noise(place.entry, believed=True)
-            sensor = SamplingProcess(node, entity, times[node, place.ordinal], samples, R)
+            R = scenario.noise(placed_sensor.entry, believed=True)
+            sensor = SamplingProcess(node, entity, times[node, placed_sensor.ordinal], samples, R)
             processes.append(sensor.run(timeline, truth, nodes[node]))
             # Entities number sampled sensors over all nodes: they order samples of one instant.
             entity += 1
@@ -97,11 +97,13 @@ def increment_sensors(
 ) -> list[SensorPath]:
     """Return the readings of some increment sensors in one run."""
     paths = []
-    for node, place in placed:
-        sensor = scenario.sensors[place.entry]
+    for node, placed_sensor in placed:
+        sensor = scenario.sensors[placed_sensor.entry]
         assert isinstance(sensor, LinearSensor)
         # Noise on the grid and noise of cuts have streams of their own, so that the grid does not
         # depend on the network.
-        noise, cutting = (streams.generator(p, node, place.ordinal) for p in ("noise", "cut"))
+        noise, cutting = (
+            streams.generator(p, node, placed_sensor.ordinal) for p in ("noise", "cut")
+        )
         paths.append(sensor.path(noise, cutting))
     return paths

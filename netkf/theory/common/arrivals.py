@@ -28,9 +28,9 @@ def arrivals_by_step(scenario: Scenario, run: Run) -> ArrivalsByStep:
     if not len(rows):
         return {}
     keys, which = np.unique(np.stack([slot, rows["phase"], step]), axis=1, return_inverse=True)
-    place = np.vectorize(index.__getitem__, otypes=[int])
+    index_of = np.vectorize(index.__getitem__, otypes=[int])
     up = np.zeros((keys.shape[1], size, size))
-    up[which.reshape(-1), place(rows["node"]), place(rows["peer"])] = 1.0
+    up[which.reshape(-1), index_of(rows["node"]), index_of(rows["peer"])] = 1.0
     return {(t, phase, k): up[n] for n, (t, phase, k) in enumerate(keys.T.tolist())}
 
 

@@ -100,15 +100,19 @@ def timed_observations(scenario: Scenario, run: Run) -> dict[float, EstimatorObs
     found: dict[float, dict[int, list[Observation]]] = {}
     for estimator, nodes in enumerate(nodes_by_estimator(scenario)):
         for node in nodes:
-            for place in by_node.get(node, ()):
-                sensor = scenario.sensors[place.entry]
+            for placed_sensor in by_node.get(node, ()):
+                sensor = scenario.sensors[placed_sensor.entry]
                 # A varying H is drawn with the run's own streams, so that it is the one that the
                 # engine used.
-                path = sample_path(scenario, streams, node, place) if sensor.varying else None
-                for k, time in enumerate(times[node, place.ordinal].tolist()):
+                path = (
+                    sample_path(scenario, streams, node, placed_sensor) if sensor.varying else None
+                )
+                for k, time in enumerate(times[node, placed_sensor.ordinal].tolist()):
                     H = path.reading(k, np.zeros(n))[1] if path is not None else sensor.H
                     at_time = found.setdefault(time, {})
-                    at_time.setdefault(estimator, []).append(Observation(H, *noises[place.entry]))
+                    at_time.setdefault(estimator, []).append(
+                        Observation(H, *noises[placed_sensor.entry])
+                    )
     return {
         time: {
             estimator: stack_observations(readings, n) for estimator, readings in at_time.items()

@@ -120,9 +120,9 @@ class Ways(NamedTuple):
 
 
 def _add_blocks(blocks: FloatArray, rows: IntArray, columns: IntArray, terms: FloatArray) -> None:
-    """Add terms (S, P, n, n) to ``blocks`` (S, N, N, n, n) at P places, which may repeat."""
-    place: Any = (slice(None), rows, columns)
-    np.add.at(blocks, place, terms)
+    """Add terms (S, P, n, n) to ``blocks`` (S, N, N, n, n) at P indices, which may repeat."""
+    index: Any = (slice(None), rows, columns)
+    np.add.at(blocks, index, terms)
 
 
 def _join_blocks(blocks: FloatArray) -> FloatArray:
@@ -224,22 +224,22 @@ def _fail_together(scenario: Scenario) -> bool:
 def poisson_ticks(
     scenario: Scenario, links: list[tuple[int, int]]
 ) -> tuple[tuple[float, IntArray], ...]:
-    """Return the rate per second and the ways (places in ``links``) of each clock that makes nodes
+    """Return the rate per second and the ways (indices in ``links``) of each clock that makes nodes
     transmit; raises TheoryError unless they are Poisson processes.
     """
     clock = scenario.network.activation
     assert isinstance(clock, LinkClock)
     if clock.at == "readings" or not clock.memoryless:
         raise TheoryError("nodes do not transmit by Poisson clocks of their own")
-    entities, place = clock.entities(scenario.topology), {one: k for k, one in enumerate(links)}
+    entities, index = clock.entities(scenario.topology), {one: k for k, one in enumerate(links)}
     found = []
     for entity in entities:
         if clock.at == "nodes":
-            among = [k for link, k in place.items() if link[0] == entity[0]]
+            among = [k for link, k in index.items() if link[0] == entity[0]]
         else:
             ends = (entity[0], entity[1])
             both = (ends, ends[::-1]) if clock.at == "links" else (ends,)
-            among = [place[link] for link in both if link in place]
+            among = [index[link] for link in both if link in index]
         if among:
             found.append((float(clock.mean_rate(entity)), np.array(among, dtype=np.int64)))
     return tuple(found)

@@ -53,7 +53,7 @@ class JointErrorFlow(NamedTuple):
 
 
 class SampledNode(NamedTuple):
-    """A sensor that takes samples: the node's index, its ``clock`` and place among the node's
+    """A sensor that takes samples: the node's index, its ``clock`` and index among the node's
     sensors, ``lost`` = L H (n, n) of the error, and the covariance ``noise`` (n, n) that it adds.
     """
 
@@ -120,9 +120,9 @@ def _samples(scenario: Scenario) -> list[SampledNode]:
     """Return the sensors that take samples."""
     gains, found = _gains(scenario), []
     for k, node in enumerate(scenario.nodes):
-        for place in scenario.sampled_sensors.get(node, ()):
-            sensor, L = scenario.sensors[place.entry], gains[k]
-            clock, entity = sampling_clock(sensor), (node, place.ordinal)
+        for placed_sensor in scenario.sampled_sensors.get(node, ()):
+            sensor, L = scenario.sensors[placed_sensor.entry], gains[k]
+            clock, entity = sampling_clock(sensor), (node, placed_sensor.ordinal)
             noise = L @ sensor.R @ L.T
             found.append(SampledNode(k, clock, entity, L @ sensor.H, noise))
     return found

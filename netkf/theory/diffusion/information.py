@@ -92,15 +92,15 @@ def few_regressors(scenario: Scenario) -> bool:
     """Return True if the levels take seconds: pasts are drawn for each sensor whose H varies."""
     varying = [k for k, sensor in enumerate(scenario.sensors) if sensor.varying]
     placed = itertools.chain.from_iterable(scenario.placed.values())
-    return sum(place.entry in varying for place in placed) <= MAX_REGRESSORS
+    return sum(placed_sensor.entry in varying for placed_sensor in placed) <= MAX_REGRESSORS
 
 
 def _sources(scenario: Scenario) -> list[_Source]:
     """Return the scalar readings of all nodes; raises TheoryError for recorded sensors."""
     found = []
     for node in scenario.sensing:
-        for place in scenario.placed[node]:
-            sensor = scenario.sensors[place.entry]
+        for placed_sensor in scenario.placed[node]:
+            sensor = scenario.sensors[placed_sensor.entry]
             if isinstance(sensor, RegressorSensor):
                 drive = sensor.B @ sensor.xi_cov @ sensor.B.T
                 found.append(_Source(node, sensor.A, sensor.C, sensor.start, drive))
@@ -192,8 +192,8 @@ def _search(
 
     def level(x: FloatArray) -> float:
         states = [s[None] for s in start]
-        for place, k in enumerate(moving):
-            states[k] = x[None, ends[place] : ends[place + 1]]
+        for index, k in enumerate(moving):
+            states[k] = x[None, ends[index] : ends[index + 1]]
         return float(_levels(sources, states, window)[0])
 
     x = np.concatenate([np.zeros(0), *(start[k] for k in moving)])
@@ -262,6 +262,6 @@ def normalised_outer(mean: FloatArray, cov: FloatArray) -> FloatArray:
     decay = np.exp(-_U * np.einsum("ka,ua->ku", m * m, 1.0 / D))
     weights = _WEIGHTS / np.sqrt(D.prod(axis=1)) * decay
     shrunk = np.einsum("ku,ua,ub->kab", weights, 1.0 / D, 1.0 / D) * m[:, :, None] * m[:, None, :]
-    places = np.arange(len(cov))
-    shrunk[:, places, places] += np.einsum("ku,ua->ka", weights, spread / D)
+    indices = np.arange(len(cov))
+    shrunk[:, indices, indices] += np.einsum("ku,ua->ka", weights, spread / D)
     return np.asarray(axes @ shrunk @ axes.T)

@@ -59,8 +59,8 @@ def _draw_noises(scenario: Scenario, samples: int, random: np.random.Generator) 
         raise TheoryError("D (29) needs noises in slots with a law, not a record")
     variance = np.zeros(samples)
     for node in scenario.sensing:
-        for place in scenario.placed[node]:
-            root = square_root(scenario.noise(place.entry, believed=False))
+        for placed_sensor in scenario.placed[node]:
+            root = square_root(scenario.noise(placed_sensor.entry, believed=False))
             variance += ((random.standard_normal((samples, len(root))) @ root.T) ** 2).sum(axis=1)
     root = square_root(scenario.slot_plant.Q)
     increment = random.standard_normal((samples, len(root))) @ root.T

@@ -114,14 +114,14 @@ def detecting_walk(scenario: Scenario) -> list[int] | None:
     queue = deque((i, _extend_basis(start, rows[i]), [nodes[i]], step) for i in range(len(nodes)))
     visited: set[tuple[int, int, bytes]] = set()
     while queue:
-        place, space, walk, power = queue.popleft()
+        index, space, walk, power = queue.popleft()
         if len(space) == n:
             return walk
-        key = (place, len(walk), np.round(space.T @ space, 8).tobytes())
+        key = (index, len(walk), np.round(space.T @ space, 8).tobytes())
         if key in visited or len(visited) > MAX_VISITED or len(walk) > MAX_WALK:
             continue
         visited.add(key)
-        for following in neighbours[place]:
+        for following in neighbours[index]:
             wider = _extend_basis(space, rows[following] @ power)
             queue.append((following, wider, [*walk, nodes[following]], power @ step))
     return None

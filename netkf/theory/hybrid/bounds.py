@@ -311,8 +311,8 @@ class _SampleJumps:
 
     def before(self, begin: float, end: float) -> float:
         """Return the first jump (seconds) after ``begin``, or ``end`` if that is earlier."""
-        place = bisect.bisect_right(self._times, begin)
-        return min(end, self._times[place]) if place < len(self._times) else end
+        index = bisect.bisect_right(self._times, begin)
+        return min(end, self._times[index]) if index < len(self._times) else end
 
     def jumps_at(self, time: float) -> bool:
         """Return True if the solution jumps at ``time``."""

@@ -119,8 +119,8 @@ def _reason_of_samples(scenario: Scenario) -> str | None:
     """Return the reason why docs/poisson_samples.md does not apply, or None if it applies."""
     if not scenario.is_linear:
         return f"not promised: {NONLINEAR}"
-    for node, place in randomly_sampled_sensors(scenario):
-        clock = sampling_clock(scenario.sensors[place.entry])
+    for node, placed_sensor in randomly_sampled_sensors(scenario):
+        clock = sampling_clock(scenario.sensors[placed_sensor.entry])
         if clock is not None and not clock.memoryless:
             return (
                 f"not promised: when node {node} samples is random and no Poisson process, and for "
@@ -164,8 +164,8 @@ def coupling(scenario: Scenario) -> scipy.sparse.csr_array:
     # Losses thin the Poisson process of arrivals: the effective rate counts what arrives.
     heard = {pair: rate for pair, rate in rates.items() if rate > 0.0}
     values = np.array([rate * scenario.weight(i, j) for (j, i), rate in heard.items()])
-    places = np.array([(index[i], index[j]) for j, i in heard], dtype=np.int64).reshape(-1, 2)
-    entries = scipy.sparse.coo_array((values, (places[:, 0], places[:, 1])), shape=(size, size))
+    indices = np.array([(index[i], index[j]) for j, i in heard], dtype=np.int64).reshape(-1, 2)
+    entries = scipy.sparse.coo_array((values, (indices[:, 0], indices[:, 1])), shape=(size, size))
     matrix = scipy.sparse.csr_array(entries)
     matrix.eliminate_zeros()
     return matrix

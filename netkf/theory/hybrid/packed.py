@@ -35,10 +35,10 @@ class PackedRiccati:
         n = len(equations.A)
         self._i, self._j = np.triu_indices(n)
         self.m = len(self._i)
-        # Entry (i, j) of a symmetric matrix is at places[i, j] of its row.
-        places = np.zeros((n, n), dtype=np.int64)
-        places[self._i, self._j] = places[self._j, self._i] = np.arange(self.m)
-        self._places = places.reshape(-1)
+        # Entry (i, j) of a symmetric matrix is at indices[i, j] of its row.
+        indices = np.zeros((n, n), dtype=np.int64)
+        indices[self._i, self._j] = indices[self._j, self._i] = np.arange(self.m)
+        self._indices = indices.reshape(-1)
         # The symmetric unit matrices: a linear map on rows is known from its values on these.
         self._basis = np.zeros((self.m, n, n))
         self._basis[np.arange(self.m), self._i, self._j] = 1.0
@@ -76,10 +76,10 @@ class PackedRiccati:
         """True if elimination has little fill-in, because the network has small cuts everywhere."""
         coupling = scipy.sparse.csr_array(self.equations.coupling)
         order = scipy.sparse.csgraph.reverse_cuthill_mckee(coupling)
-        place = np.empty(len(order), dtype=np.int64)
-        place[order] = np.arange(len(order))
+        index = np.empty(len(order), dtype=np.int64)
+        index[order] = np.arange(len(order))
         i, j = coupling.nonzero()
-        width = int(np.abs(place[i] - place[j]).max(initial=0)) + 1
+        width = int(np.abs(index[i] - index[j]).max(initial=0)) + 1
         return len(order) * self.m * (width * self.m) ** 2 <= ELIMINATION_WORK
 
     @cached_property
@@ -95,7 +95,7 @@ class PackedRiccati:
     def unpack(self, Y: FloatArray) -> FloatArray:
         """Return the symmetric matrices (..., n, n) of upper triangles Y (..., m)."""
         n = len(self.equations.A)
-        return np.asarray(Y[..., self._places].reshape(*Y.shape[:-1], n, n))
+        return np.asarray(Y[..., self._indices].reshape(*Y.shape[:-1], n, n))
 
     def predict(self, Y: FloatArray) -> FloatArray:
         """Return rows (N, m) predicted over the delay, ``T P T' + q``."""
@@ -151,7 +151,7 @@ class PackedRiccati:
                 change += self._Q
             if sensed:
                 rows = np.ascontiguousarray(series[k, self._sensed].T)
-                P = rows[self._places].reshape(n, n, sensed)
+                P = rows[self._indices].reshape(n, n, sensed)
                 np.einsum("ijs,jrs->irs", P, self._across, out=every[k])
                 before = (k + 1) // 2
                 half = np.einsum("kirs,kjrs->ijs", every[:before], every[k : k - before : -1])
@@ -234,8 +234,8 @@ class LinearisedRiccati(NamedTuple):
             turned = np.swapaxes(maps, 1, 2)[entries.col] * entries.data[:, None, None]
             rows = entries.row[:, None, None] * m + np.arange(m)[None, :, None]
             columns = nodes[entries.col][:, None, None] * m + np.arange(m)[None, None, :]
-            places = np.broadcast_arrays(rows, columns)
-            flat = (turned.reshape(-1), tuple(place.reshape(-1) for place in places))
+            indices = np.broadcast_arrays(rows, columns)
+            flat = (turned.reshape(-1), tuple(index.reshape(-1) for index in indices))
             whole = whole + scipy.sparse.csr_array(scipy.sparse.coo_array(flat, shape=shape))
         return scipy.sparse.csc_array(whole)
 

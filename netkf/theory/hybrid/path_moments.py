@@ -70,8 +70,8 @@ def _messages(
     """Return the instants of arrivals, where each begins, and receivers, senders and weights."""
     rows = run.log[run.log["kind"] == CODES["deliver"]]
     index = scenario.topology.index
-    place = np.zeros(max(index) + 1, dtype=np.int64)
-    place[list(index)] = list(index.values())
+    index_of = np.zeros(max(index) + 1, dtype=np.int64)
+    index_of[list(index)] = list(index.values())
     pairs, which = np.unique(
         np.stack([rows["node"], rows["peer"]], axis=1), axis=0, return_inverse=True
     )
@@ -79,4 +79,4 @@ def _messages(
     instants, starts = np.unique(rows["t"], return_index=True)
     ends = np.append(starts, len(rows)).astype(np.int64)
     weights = table[which.reshape(-1)] if len(pairs) else np.zeros(0)
-    return instants, ends, place[rows["node"]], place[rows["peer"]], weights
+    return instants, ends, index_of[rows["node"]], index_of[rows["peer"]], weights

@@ -92,10 +92,10 @@ def has_known_times(sensor: Sensor) -> bool:
 def randomly_sampled_sensors(scenario: Scenario) -> list[tuple[int, PlacedSensor]]:
     """Return (node, sensor) for each sampled sensor whose times are not known beforehand."""
     return [
-        (node, place)
-        for node, places in scenario.sampled_sensors.items()
-        for place in places
-        if not has_known_times(scenario.sensors[place.entry])
+        (node, placed_sensor)
+        for node, placed_sensors in scenario.sampled_sensors.items()
+        for placed_sensor in placed_sensors
+        if not has_known_times(scenario.sensors[placed_sensor.entry])
     ]
 
 
@@ -125,11 +125,14 @@ def poisson_samples(scenario: Scenario) -> tuple[PoissonSamples, ...]:
     index, size = scenario.topology.index, len(scenario.nodes)
     pooled = scenario.filter.algorithm.pooled
     found: dict[int, list[tuple[int, FloatArray, FloatArray, float, int]]] = {}
-    for node, place in randomly_sampled_sensors(scenario):
-        sensor = scenario.sensors[place.entry]
+    for node, placed_sensor in randomly_sampled_sensors(scenario):
+        sensor = scenario.sensors[placed_sensor.entry]
         clock = sampling_clock(sensor)
         assert clock is not None
-        rate, R = clock.mean_rate((node, place.ordinal)), scenario.noise(place.entry, believed=True)
+        rate, R = (
+            clock.mean_rate((node, placed_sensor.ordinal)),
+            scenario.noise(placed_sensor.entry, believed=True),
+        )
         # All nodes have the covariance of a pooled filter, which uses the readings of each.
         for reader in range(size) if pooled else [index[node]]:
             entry = (reader, np.asarray(sensor.H), R, rate, index[node])
@@ -156,22 +159,22 @@ def _arrival_rates(
 
 def sample_jumps(scenario: Scenario) -> tuple[SampleJump, ...]:
     """Return the samples at known times below the horizon, in the order of time."""
-    places = {
-        (node, place.ordinal): place
+    placed_sensors = {
+        (node, placed_sensor.ordinal): placed_sensor
         for node, some in scenario.sampled_sensors.items()
-        for place in some
-        if has_known_times(scenario.sensors[place.entry])
+        for placed_sensor in some
+        if has_known_times(scenario.sensors[placed_sensor.entry])
     }
-    if not places:
+    if not placed_sensors:
         return ()
     # Known times do not depend on the seed; a varying H does, and is that of the scenario's seed.
     streams, n = Streams(scenario.seed), scenario.plant.n
     times, index = sample_times(scenario, streams), scenario.topology.index
     by_time: dict[float, dict[int, list[Observation]]] = {}
-    for (node, ordinal), place in places.items():
-        sensor = scenario.sensors[place.entry]
-        path = sample_path(scenario, streams, node, place) if sensor.varying else None
-        R = scenario.noise(place.entry, believed=True)
+    for (node, ordinal), placed_sensor in placed_sensors.items():
+        sensor = scenario.sensors[placed_sensor.entry]
+        path = sample_path(scenario, streams, node, placed_sensor) if sensor.varying else None
+        R = scenario.noise(placed_sensor.entry, believed=True)
         for k, time in enumerate(times[node, ordinal].tolist()):
             H = sensor.H if path is None else path.reading(k, np.zeros(n))[1]
             by_time.setdefault(time, {}).setdefault(index[node], []).append(Observation(H, R, R))

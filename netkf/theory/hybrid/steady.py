@@ -244,10 +244,10 @@ def _guess(known: list[tuple[float, float]], low: float, high: float, fine: floa
     The inverse of the covariances falls to 0 at the threshold, linearly in the end.
     """
     (f, inverse), (g, following) = known[-2:]
-    place = g - following * (f - g) / (inverse - following) if inverse != following else high
-    above = place * (1.0 + 0.4 * fine)
+    index = g - following * (f - g) / (inverse - following) if inverse != following else high
+    above = index * (1.0 + 0.4 * fine)
     # From two points above, the guess lies above too: the next one is as far below it.
-    factor = above if above < 0.5 * (place + high) else 2.0 * place - high
+    factor = above if above < 0.5 * (index + high) else 2.0 * index - high
     return factor if low < factor < high else float(np.sqrt(low * high))
 
 

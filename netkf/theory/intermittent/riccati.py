@@ -248,7 +248,8 @@ class _GainSearch:
         self._F, self._readings = F, readings
         n = len(F)
         rows, columns = np.triu_indices(n)
-        # vec(X) of a symmetric X from its upper triangle, and the places of the triangle in vec(X).
+        # vec(X) of a symmetric X from its upper triangle, and the indices of the triangle in
+        # vec(X).
         self._expand = np.zeros((n * n, len(rows)))
         self._expand[rows * n + columns, np.arange(len(rows))] = 1.0
         self._expand[columns * n + rows, np.arange(len(rows))] = 1.0

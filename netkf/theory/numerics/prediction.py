@@ -268,10 +268,10 @@ class ErrorFlow:
         assert self._state is not None
         parts = []
         for s in NODES * gap:  # noise at s moves the state from s on, and that the errors
-            places, w = s + NODES * (gap - s), WEIGHTS * (gap - s)
-            T11, T12, _, _ = self._blocks(places)
+            indices, w = s + NODES * (gap - s), WEIGHTS * (gap - s)
+            T11, T12, _, _ = self._blocks(indices)
             phi = FJ[:, None] @ T11 + FC[:, None] @ T12
-            states = self._state(places - s) @ self._plant[1]
+            states = self._state(indices - s) @ self._plant[1]
             parts.append((w[:, None, None] * phi @ self._difference @ states).sum(axis=1))
         return np.stack(parts, axis=1)
 

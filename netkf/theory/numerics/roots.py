@@ -1,9 +1,9 @@
 """Kernels for square roots of covariances, ``P = S S'``, and for the linear forms of errors.
 
-Errors are rows of ``forms`` (places, n, width): linear forms of independent standard normal inputs,
-of which the first ``used`` columns count. ``matrices`` (places, n, n) holds the root of P that
-belongs to each error. An update of one is an orthogonal triangularisation, so that no subtraction
-loses digits.
+Errors are rows of ``forms`` (vectors, n, width): linear forms of independent standard normal
+inputs, of which the first ``used`` columns count. ``matrices`` (vectors, n, n) holds the root of P
+that belongs to each error. An update of one is an orthogonal triangularisation, so that no
+subtraction loses digits.
 """
 
 from __future__ import annotations
@@ -97,7 +97,7 @@ def add_columns(form: FloatArray, first: int, matrix: FloatArray, sign: float) -
 def predict_estimates(
     forms: FloatArray,
     matrices: FloatArray,
-    places: IntArray,
+    indices: IntArray,
     used: int,
     error: FloatArray,
     noise: FloatArray,
@@ -111,15 +111,15 @@ def predict_estimates(
     """
     n, r = error.shape[0], root.shape[1]
     scratch, parts = np.empty((n, used)), np.empty((n, n + r))
-    for place in places:
-        multiply_form(forms[place], error, used, scratch)
-        add_columns(forms[place], first, noise, 1.0)
-        _multiply_into(parts, error, matrices[place])
+    for index in indices:
+        multiply_form(forms[index], error, used, scratch)
+        add_columns(forms[index], first, noise, 1.0)
+        _multiply_into(parts, error, matrices[index])
         for i in range(n):
             for k in range(r):
                 parts[i, n + k] = root[i, k]
         triangularise(parts, n, n + r)
-        _keep_root(matrices[place], parts)
+        _keep_root(matrices[index], parts)
 
 
 @kernel
@@ -178,7 +178,7 @@ def update_root(
 def update_estimate(
     forms: FloatArray,
     matrices: FloatArray,
-    place: int,
+    index: int,
     used: int,
     H: FloatArray,
     R: FloatArray,
@@ -191,12 +191,12 @@ def update_estimate(
     ``first`` on.
     """
     n, p = H.shape[1], H.shape[0]
-    closed, K, root = update_root(matrices[place], H, R)
-    multiply_form(forms[place], closed, used, np.empty((n, used)))
+    closed, K, root = update_root(matrices[index], H, R)
+    multiply_form(forms[index], closed, used, np.empty((n, used)))
     moved = np.empty((n, p))
     _multiply_into(moved, K, noise)
-    add_columns(forms[place], first, moved, -1.0)
-    _keep_root(matrices[place], root)
+    add_columns(forms[index], first, moved, -1.0)
+    _keep_root(matrices[index], root)
 
 
 @kernel(allocates=True)
@@ -259,7 +259,7 @@ def add_information(root: FloatArray, U: FloatArray) -> FloatArray:
 def fade_totals(
     forms: FloatArray,
     matrices: FloatArray,
-    places: IntArray,
+    indices: IntArray,
     used: int,
     inverse: FloatArray,
     fading: float,
@@ -278,18 +278,18 @@ def fade_totals(
     for i in range(n):
         for j in range(n):
             moved[i, j] = fading * inverse[j, i]
-    for place in places:
+    for index in indices:
         empty = True
         for i in range(n):
             for j in range(n):
-                empty = empty and matrices[place, i, j] == 0.0
+                empty = empty and matrices[index, i, j] == 0.0
         if empty:
             continue
-        _multiply_into(half, moved, matrices[place])
-        _multiply_into(matrices[place], half, inverse)
-        multiply_form(forms[place], moved, used, scratch)
-        _multiply_into(lost, matrices[place], noise)
-        add_columns(forms[place], first, lost, -1.0)
+        _multiply_into(half, moved, matrices[index])
+        _multiply_into(matrices[index], half, inverse)
+        multiply_form(forms[index], moved, used, scratch)
+        _multiply_into(lost, matrices[index], noise)
+        add_columns(forms[index], first, lost, -1.0)
 
 
 @kernel(allocates=True)
@@ -506,7 +506,7 @@ def flow_over_gap(
 def flow_estimates(
     forms: FloatArray,
     matrices: FloatArray,
-    places: IntArray,
+    indices: IntArray,
     used: int,
     columns: tuple[int, int],
     flow: tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray],
@@ -532,9 +532,9 @@ def flow_estimates(
     count, n, p = len(nodes), F.shape[0], whitened.shape[0]
     scratch, phi = np.empty((n, used)), np.empty((n, n))
     own = np.zeros((n, max(n, count * p)))
-    for e in range(len(places)):
-        form = forms[places[e]]
-        FJ, FC, root = flow_over_gap(F, Gamma, start, matrices[places[e]])
+    for e in range(len(indices)):
+        form = forms[indices[e]]
+        FJ, FC, root = flow_over_gap(F, Gamma, start, matrices[indices[e]])
         multiply_form(form, FJ, used, scratch)
         for i in range(n):
             for j in range(own.shape[1]):
@@ -552,4 +552,4 @@ def flow_estimates(
             for i in range(n):
                 for j in range(i + 1):
                     form[i, columns[1] + e * n + j] += own[i, j]
-        _keep_root(matrices[places[e]], root)
+        _keep_root(matrices[indices[e]], root)

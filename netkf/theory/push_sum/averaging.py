@@ -79,9 +79,9 @@ class Averaging:
         difference = np.zeros((len(i), N * N))
         each = np.arange(len(i))
         entries = zip(four, self._covariances, (1.0, -1.0, -1.0, 1.0), strict=True)
-        for place, covariance, sign in entries:
-            spread[place, each] = sign * covariance
-            difference[each, place] = sign
+        for index, covariance, sign in entries:
+            spread[index, each] = sign * covariance
+            difference[each, index] = sign
         return np.linalg.matrix_power(expected + spread @ difference, self.gamma)
 
     def second_moment(self, Y: FloatArray) -> FloatArray:

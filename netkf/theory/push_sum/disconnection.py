@@ -248,8 +248,8 @@ def _cut(neighbours: list[dict[int, float]], order: list[int]) -> float | None:
 
     A partition is the tuple of the labels of the open nodes, numbered in order of appearance.
     """
-    place = {node: k for k, node in enumerate(order)}
-    last = [max((place[k] for k in links), default=0) for links in neighbours]
+    index = {node: k for k, node in enumerate(order)}
+    last = [max((index[k] for k in links), default=0) for links in neighbours]
     open_: list[int] = []
     states: dict[tuple[int, ...], float] = {(): 1.0}
     cuts = []
@@ -262,7 +262,7 @@ def _cut(neighbours: list[dict[int, float]], order: list[int]) -> float | None:
             if len(states) > MAX_PARTITIONS:
                 return None
         # A node stays open as long as some neighbour is still to come.
-        keep = [x for x, other in enumerate(open_) if max(last[other], place[other]) > k]
+        keep = [x for x, other in enumerate(open_) if max(last[other], index[other]) > k]
         if k + 1 < len(order):
             states, lost = _close_nodes(states, keep)
             cuts.append(lost)
@@ -272,12 +272,12 @@ def _cut(neighbours: list[dict[int, float]], order: list[int]) -> float | None:
 
 
 def _apply_link(
-    states: dict[tuple[int, ...], float], place: int, up: float
+    states: dict[tuple[int, ...], float], index: int, up: float
 ) -> dict[tuple[int, ...], float]:
-    """Return the partitions after the link between open node ``place`` and the last open node."""
+    """Return the partitions after the link between open node ``index`` and the last open node."""
     found: defaultdict[tuple[int, ...], float] = defaultdict(float)
     for labels, p in states.items():
-        one, other = labels[place], labels[-1]
+        one, other = labels[index], labels[-1]
         # The link joins nodes that are connected already: its state does not matter.
         if one == other:
             found[labels] += p

@@ -94,11 +94,11 @@ def averaging_law(scenario: Scenario, delivery: float | None = None) -> Averagin
             f"messages may come after their step of {step:.3g} s: give a fixed, shorter delay"
         )
     # With symmetric losses both directions share one draw, else they are independent.
-    places = [[topology.index[i], topology.index[j]] for i, j in topology.links]
+    indices = [[topology.index[i], topology.index[j]] for i, j in topology.links]
     hears = _probabilities(scenario, delivery)
     return Averaging(
         nodes=len(topology.nodes),
-        links=np.array(places, dtype=np.int64).reshape(-1, 2),
+        links=np.array(indices, dtype=np.int64).reshape(-1, 2),
         hears=hears,
         both=hears.min(axis=1) if channel.symmetric else hears.prod(axis=1),
         delta=algorithm.delta,
