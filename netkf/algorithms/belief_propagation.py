@@ -1,7 +1,7 @@
 """Asynchronous Gaussian belief propagation on the graph of the network.
 
 Each node has a copy of the state, and links say that the copies at their ends are equal. A message
-to a neighbour is what the node has read together with what all its *other* neighbours have told it
+to a neighbour is the sum of the node's own evidence and of that of all its *other* neighbours
 (Weiss and Freeman, "Correctness of belief propagation in Gaussian graphical models of arbitrary
 topology", Neural Computation 13, 2001). On a tree no reading can arrive on two ways: a node's
 belief is the Kalman filter with all readings that have reached it, in any order of the messages.
@@ -23,8 +23,8 @@ from netkf.algorithms.kernels.beliefs import (
     clear_part,
     copy_part,
     gather_evidence,
-    hear_evidence,
     move_part,
+    receive_evidence,
     recentre_part,
     take_one_prior,
     take_prior,
@@ -66,7 +66,7 @@ class HeardEvidence(NamedTuple):
 
 class BeliefState(NamedTuple):
     """Belief ``xhat`` (n,) with ``root`` (n, n), and the model; the evidence of the estimate before
-    all readings that are kept (``prior``) and of the node's ``own`` ones, and what neighbours told,
+    all readings that are kept (``prior``) and of the node's ``own`` ones, and what neighbours sent,
     by ``senders``; the node's id. Evidence (n, n + 1) counts from ``xhat``, see kernels.beliefs.
     """
 
@@ -76,7 +76,7 @@ class BeliefState(NamedTuple):
     prior: FloatArray
     own: FloatArray
     senders: tuple[int, ...]
-    told: tuple[HeardEvidence, ...]
+    received: tuple[HeardEvidence, ...]
     node: int
 
     @property
@@ -87,7 +87,7 @@ class BeliefState(NamedTuple):
 
 class Beliefs(NamedTuple):
     """A payload: the evidence of the sender's ``own`` readings, and of each of its ``senders``,
-    which counts from its belief ``xhat`` (n,); a receiver leaves out what it has told itself.
+    which counts from its belief ``xhat`` (n,); a receiver leaves out what it has sent itself.
     """
 
     xhat: FloatArray
@@ -98,7 +98,7 @@ class Beliefs(NamedTuple):
 
 class BeliefArrays(NamedTuple):
     """Steps a slot, whether messages are kept from slot to slot, the inverse of F (n, n) if they
-    are; evidence of priors and own readings (B, H, n, n + 1, L) and of what was told on each
+    are; evidence of priors and own readings (B, H, n, n + 1, L) and of what was received on each
     direction (B, W, n, n + 1, L), in one block if nothing is kept; scratch.
     """
 
@@ -107,7 +107,7 @@ class BeliefArrays(NamedTuple):
     back: FloatArray
     prior: FloatArray
     own: FloatArray
-    told: FloatArray
+    received: FloatArray
     scratch: BeliefScratch
 
 
@@ -124,7 +124,7 @@ def belief_slots(
     """Carry filters by belief propagation through the slots of a plan."""
     for b in range(plan.up.shape[0]):
         k, lanes = min(b, arrays.own.shape[0] - 1), scratch.lanes
-        own, told = arrays.own[k], arrays.told[k]
+        own, received = arrays.own[k], arrays.received[k]
         for s in range(plan.up.shape[1]):
             if plan.sensed[s]:
                 predict_beliefs(nodes, scratch, arrays, b)
@@ -136,10 +136,17 @@ def belief_slots(
                 for e in range(arrays.steps):
                     for h in range(len(nodes.rows)):
                         first, last = links.first[h], links.first[h + 1]
-                        gather_evidence(lanes, own, told, first, last, h, arrays.scratch)
+                        gather_evidence(lanes, own, received, first, last, h, arrays.scratch)
                     for h in range(len(nodes.rows)):
-                        hear_evidence(
-                            lanes, told, links, plan.up, (b, s, e), h, scratch.xhat, arrays.scratch
+                        receive_evidence(
+                            lanes,
+                            received,
+                            links,
+                            plan.up,
+                            (b, s, e),
+                            h,
+                            scratch.xhat,
+                            arrays.scratch,
                         )
                 for h in range(len(nodes.rows)):
                     update_beliefs(nodes, links, scratch, arrays, b, h)
@@ -167,11 +174,11 @@ def predict_beliefs(nodes: SlotNodes, scratch: SlotScratch, arrays: BeliefArrays
             clear_part(lanes, arrays.own[k, h])
         for i in range(nodes.xhat.shape[2]):
             store(lanes, scratch.xhat, h, i, load(lanes, nodes.xhat, b, h, i))
-    for m in range(arrays.told.shape[1]):
+    for m in range(arrays.received.shape[1]):
         if arrays.keeps:
-            move_part(lanes, arrays.told[k, m], arrays.back, room.total, room.work)
+            move_part(lanes, arrays.received[k, m], arrays.back, room.total, room.work)
         else:
-            clear_part(lanes, arrays.told[k, m])
+            clear_part(lanes, arrays.received[k, m])
 
 
 @kernel
@@ -190,7 +197,7 @@ def update_beliefs(
     copy_part(lanes, arrays.prior[k, h], room.total)
     add_part(lanes, room.total, arrays.own[k, h], room.work)
     for m in range(links.first[h], links.first[h + 1]):
-        add_part(lanes, room.total, arrays.told[k, m], room.work)
+        add_part(lanes, room.total, arrays.received[k, m], room.work)
     finish_lanes(
         lanes, nodes.root, nodes.xhat, b, h, scratch.xhat, room.total, room.work, False
     )  # fmt: skip
@@ -199,7 +206,7 @@ def update_beliefs(
         for part in (arrays.prior[k, h], arrays.own[k, h]):
             recentre_part(lanes, part, before, after, part)
         for m in range(links.first[h], links.first[h + 1]):
-            recentre_part(lanes, arrays.told[k, m], before, after, arrays.told[k, m])
+            recentre_part(lanes, arrays.received[k, m], before, after, arrays.received[k, m])
 
 
 @kernel
@@ -242,7 +249,7 @@ def finish_single(
 @built_in("belief-propagation")
 @dataclass(frozen=True, eq=False)
 class BeliefPropagation(Filter):
-    """Nodes tell each neighbour their own readings and what the other neighbours have told them.
+    """Nodes send each neighbour the sum of their own evidence and of that of all other neighbours.
 
     steps   messages on each direction in a slot; with as many as the tree is wide, and no losses,
             every node is the central filter
@@ -328,7 +335,7 @@ class BeliefPropagation(Filter):
         state = state._replace(xhat=xhat, root=root)
         if isinstance(state.model, SlotModel) and self.memory == SLOT:
             nothing = np.zeros_like(state.own)
-            return state._replace(prior=evidence_of(root), own=nothing, senders=(), told=())
+            return state._replace(prior=evidence_of(root), own=nothing, senders=(), received=())
         back = backward(state.model, gap)
         return with_all(state, lambda evidence: predict_evidence(evidence, back))
 
@@ -340,16 +347,16 @@ class BeliefPropagation(Filter):
 
     def emit(self, state: BeliefState, exchange: Exchange) -> tuple[BeliefState, Beliefs]:
         """Send what was read and heard."""
-        heard = tuple(one.evidence for one in state.told)
+        heard = tuple(one.evidence for one in state.received)
         return state, Beliefs(state.xhat, state.own, state.senders, heard)
 
     def absorb(
         self, state: BeliefState, messages: Sequence[Message], exchange: Exchange
     ) -> BeliefState:
-        """Replace what the senders told before, unless it was sent later."""
+        """Replace the earlier evidence of each sender, unless that was sent later."""
         if not messages:
             return state
-        known = dict(zip(state.senders, state.told, strict=True))
+        known = dict(zip(state.senders, state.received, strict=True))
         for message in messages:
             sent = exchange.time - message.age
             if message.sender in known and known[message.sender].sent > sent:
@@ -361,7 +368,7 @@ class BeliefPropagation(Filter):
             evidence = recentred(evidence, centre, state.xhat)
             known[message.sender] = HeardEvidence(evidence, sent)
         senders = tuple(sorted(known))
-        return believing(state._replace(senders=senders, told=tuple(known[j] for j in senders)))
+        return believing(state._replace(senders=senders, received=tuple(known[j] for j in senders)))
 
     shift = Filter.shift  # evidence counts from the belief
     shift_payload = Filter.shift_payload
@@ -391,7 +398,7 @@ def with_reading(state: BeliefState, reading: Reading) -> FloatArray:
 
 
 def evidence_for(node: int, payload: Beliefs) -> FloatArray:
-    """Return what a payload says to a node: all but what that node told."""
+    """Return the evidence of a payload for one receiver: all but that of the receiver itself."""
     others = zip(payload.senders, payload.heard, strict=True)
     return merge_evidence([payload.own, *(one for sender, one in others if sender != node)])
 
@@ -407,7 +414,7 @@ def evidence_of(root: FloatArray) -> FloatArray:
 def believing(state: BeliefState) -> BeliefState:
     """Return the state with the belief that follows from its prior and all evidence."""
     # Not an update of the prior, which on an unstable plant is so far off that digits are lost.
-    total = merge_evidence([state.prior, state.own, *(one.evidence for one in state.told)])
+    total = merge_evidence([state.prior, state.own, *(one.evidence for one in state.received)])
     n, before = len(total), state.xhat
     x, root, centre = np.zeros((1, 1, n, 1)), np.zeros((1, 1, n, n, 1)), np.array(before)
     finish_single(root, x, centre.reshape(1, n, 1), total[..., None], np.empty((n, n + 1, 1)))
@@ -417,8 +424,8 @@ def believing(state: BeliefState) -> BeliefState:
 
 def with_all(state: BeliefState, change: Callable[[FloatArray], FloatArray]) -> BeliefState:
     """Return the state with all its evidence changed."""
-    told = tuple(one._replace(evidence=change(one.evidence)) for one in state.told)
-    return state._replace(prior=change(state.prior), own=change(state.own), told=told)
+    received = tuple(one._replace(evidence=change(one.evidence)) for one in state.received)
+    return state._replace(prior=change(state.prior), own=change(state.own), received=received)
 
 
 def backward(model: Any, gap: float) -> FloatArray:

@@ -116,9 +116,12 @@ class PseudoStates(NamedTuple):
 def pseudo_states(F: FloatArray, information: FloatArray) -> PseudoStates:
     """Return the matrices of pseudo-states, ``information`` (n, n) being that of all sensors."""
     inverse = np.asarray(np.linalg.pinv(information, hermitian=True))
-    seen = inverse @ information
+    projector = inverse @ information
     return PseudoStates(
-        information, inverse, information @ F @ inverse, information @ F @ (np.eye(len(F)) - seen)
+        information,
+        inverse,
+        information @ F @ inverse,
+        information @ F @ (np.eye(len(F)) - projector),
     )
 
 
@@ -138,8 +141,8 @@ class GainSequence:
         # Nodes without a sensor add no noise, and columns of zeros cost as much as others.
         self._noises = [without_zeros(square_root(one)) for one in self._information]
         # All estimates start at one mean, and the plant's noise is one.
-        alike = np.concatenate([np.tile(np.eye(n), (N, 1)), np.tile(p.G, (N, 1))])
-        self._driven, self._errors = alike @ square_root(Q), alike @ square_root(cov)
+        stacked = np.concatenate([np.tile(np.eye(n), (N, 1)), np.tile(p.G, (N, 1))])
+        self._driven, self._errors = stacked @ square_root(Q), stacked @ square_root(cov)
         self._F = F
         self._found: list[tuple[NodeGains, ...]] = []
         self._converged = False
@@ -215,14 +218,14 @@ class GainSequence:
         self._errors = np.hstack([self._errors, np.zeros((len(self._errors), inputs))])
         gains, corrected = [], []
         for i, heard in enumerate(self._heard):
-            e, seen = self._y(i), self._information[i] @ self._pseudo.inverse
-            innovation = seen @ e
+            e, observed = self._y(i), self._information[i] @ self._pseudo.inverse
+            innovation = observed @ e
             # The noise of the pseudo-observation has the covariance H' R^-1 H.
             stop = first + self._noises[i].shape[1]
             innovation[:, first:stop], first = self._noises[i], stop
             theta = np.concatenate([*(e - self._y(j) for j in heard), innovation])
             sizes = [variances(e) + variances(self._y(j)) for j in heard]
-            sizes.append(np.square(seen) @ variances(e) + np.diag(self._information[i]))
+            sizes.append(np.square(observed) @ variances(e) + np.diag(self._information[i]))
             gain = optimal_gain(e, theta, np.concatenate(sizes))
             corrected.append(e - gain @ theta)
             split = np.stack(np.split(gain, len(heard) + 1, axis=1))

@@ -356,11 +356,11 @@ class EventTriggeredCi(Filter):
     def scenario_notes(self, scenario: Any) -> tuple[str, ...]:
         """Return a note where messages may be lost."""
         channel = scenario.network.channel
-        sure = all(
+        lossless = all(
             channel.loss.mean_delivery(link, scenario.table_probability(link)) == 1.0
             for link in scenario.topology.directions
         )
-        if sure and channel.delay.fixed is not None:
+        if lossless and channel.delay.fixed is not None:
             return ()
         return (
             "event-triggered: messages may be lost, and a sender takes its neighbours to have "

@@ -18,7 +18,8 @@ from netkf.algorithms.kernels.slots import predict_root_alone
 from netkf.linalg.arrays import FloatArray, square_root, symmetric
 from netkf.linalg.compiling import kernel
 
-STRETCH = 1.0
+MAX_RELATIVE_GAIN = 1.0
+"""Largest integral of trace(P G) over readings that are used at once: see ``usable``."""
 TABLES = 32
 """Tables of flows that are kept, at most 256 KiB each."""
 
@@ -53,7 +54,7 @@ class FlowModel:
     ``dy = H x dt + dv``, ``cov(dv) = R dt``.
 
     ``A, Q`` (n, n), ``H`` (p, n), ``R`` (p, p), p may be 0; ``horizon`` is the longest gap and
-    ``interval`` the longest stretch of readings used at once, both in seconds.
+    ``interval`` the longest time over which readings are used at once, both in seconds.
     """
 
     A: FloatArray
@@ -188,7 +189,7 @@ def usable(rate: float) -> float:
     """Return the seconds of readings that may be used at once for ``rate = trace(P G)``, see
     ``Filter.max_measurement_interval``.
     """
-    return STRETCH / rate if rate > 0.0 else math.inf
+    return MAX_RELATIVE_GAIN / rate if rate > 0.0 else math.inf
 
 
 def first_root(cov: FloatArray) -> FloatArray:

@@ -35,7 +35,7 @@ from netkf.algorithms.kernels.slots import (
     update_by_reading,
     whiten_reading,
 )
-from netkf.algorithms.kernels.triggers import NO_READING, chance_of_silence, weigh_news
+from netkf.algorithms.kernels.triggers import NO_READING, silence_probability, weigh_news
 from netkf.algorithms.models import first_root, sample_update
 from netkf.algorithms.registry import built_in, built_in_filters
 from netkf.core.errors import ScenarioError
@@ -195,7 +195,7 @@ def schedule_reading(
     store(lanes, scratch.row, 0, news)
     for q in range(len(lanes)):
         # The first reading is sent in any case.
-        chance = chance_of_silence(scratch.row[0, q])
+        chance = silence_probability(scratch.row[0, q])
         known = arrays.known[b, len(links.sender) + h, q] == 1
         silent = known and plan.uniform[b, s, 0, h, q] < chance
         if scratch.row[0, q] == NO_READING or silent:
@@ -384,7 +384,7 @@ class ScheduledReadings(Filter):
             return state, None
         # The sender is known from its first message on: that is sent in any case.
         if -1 in state.senders:
-            chance = chance_of_silence(news_of(reading, state.prior, self.Y))
+            chance = silence_probability(news_of(reading, state.prior, self.Y))
             if exchange.uniform < chance:
                 return state, None
         return state._replace(sent=True), reading
@@ -511,7 +511,7 @@ def decide_step(plan: SlotPlan, arrays: TriggerArrays, b: int, s: int, e: int) -
             if arrays.undecided[b, h, q] == 1:
                 # After the first reading a node sends in any case.
                 news, u = arrays.news[b, h, q], plan.uniform[b, s, e, h, q]
-                silent = arrays.begun[b, h, q] == 1 and u < chance_of_silence(news)
+                silent = arrays.begun[b, h, q] == 1 and u < silence_probability(news)
                 arrays.undecided[b, h, q], arrays.silent[b, h, q] = 0, silent
                 if news >= 0.0:
                     arrays.begun[b, h, q] = 1
@@ -620,18 +620,20 @@ def slot_alone(
     """
     here = slice(s, s + 1)
 
-    def taken(values: Any) -> Any:
+    def at_slot(values: Any) -> Any:
         return np.ascontiguousarray(values[:, here])
 
-    local, fixed = taken(readings.local), readings.H.shape[1] == 1
-    H = readings.H if fixed else taken(readings.H)
-    alone = ReadingBlock(taken(readings.y), H, local, readings.rebased[here])
+    local, fixed = at_slot(readings.local), readings.H.shape[1] == 1
+    H = readings.H if fixed else at_slot(readings.H)
+    alone = ReadingBlock(at_slot(readings.y), H, local, readings.rebased[here])
     nothing = np.zeros((0,) * 5, dtype=np.uint8), np.zeros((0,) * 5)
     one = SlotPlan(
-        plan.first + s, plan.sensed[here], plan.exchanged[here], plan.sample[here], taken(plan.up),
-        *nothing, WHOLE,
+        plan.first + s, plan.sensed[here], plan.exchanged[here], plan.sample[here],
+        at_slot(plan.up), *nothing, WHOLE,
     )  # fmt: skip
-    slot_samples = samples._replace(absolute=taken(samples.absolute), local=taken(samples.local))
+    slot_samples = samples._replace(
+        absolute=at_slot(samples.absolute), local=at_slot(samples.local)
+    )
     return alone, one, slot_samples
 
 
@@ -726,7 +728,7 @@ class TriggeredMessages(Filter):
         silent = state.silent
         if silent is None:
             # After the first reading a node sends in any case.
-            silent = state.begun and exchange.uniform < chance_of_silence(state.news)
+            silent = state.begun and exchange.uniform < silence_probability(state.news)
             begun = state.begun or state.news >= 0.0
             state = state._replace(silent=silent, begun=begun)
         # As if the message were lost: the filter has sent it.

@@ -356,12 +356,12 @@ def check_bias(samples: RunSamples, level: float) -> Finding:
         return find_nothing(BIAS_TOLERANCE)
     information, vector = bias[:, :, :n].sum(axis=0), bias[:, :, n].sum(axis=0)
     values, vectors = np.linalg.eigh(information)
-    seen = values > 1e-10 * values[-1]
+    varying = values > 1e-10 * values[-1]
     # z is standard normal without a bias, and the bias is spread z.
-    z = (vectors.T @ vector)[seen] / np.sqrt(values[seen])
+    z = (vectors.T @ vector)[varying] / np.sqrt(values[varying])
     covariances = Sigma.reshape(-1, n, n)
     typical = covariances[np.isfinite(covariances).all(axis=(1, 2))].mean(axis=0)
-    spread = whitening_matrix(typical) @ (vectors[:, seen] / np.sqrt(values[seen]))
+    spread = whitening_matrix(typical) @ (vectors[:, varying] / np.sqrt(values[varying]))
     apart = _length_interval(spread, z, level)
     message = "bias that all errors share, in standard deviations of an error,"
     found = find_largest([(apart, "all nodes and times")], BIAS_TOLERANCE, message)

@@ -263,9 +263,9 @@ def _in_support(samples: IntermittentSamples, level: float) -> Finding:
     P, point, spread = samples.runs.P[:, -1], samples.runs.in_support, samples.runs.spread
     known = np.isfinite(point).all(axis=(0, -1, -2))
     size = np.trace(point, axis1=-2, axis2=-1)[:, known]
-    forgotten = spread[:, known] < SUPPORT_TOLERANCE * size
+    converged = spread[:, known] < SUPPORT_TOLERANCE * size
     message = (
-        f"{forgotten.sum() / max(1, spread.size):.0%} of the covariances at the end have forgotten "
+        f"{converged.sum() / max(1, spread.size):.0%} of the covariances at the end have forgotten "
         "their start and are points of the support"
     )
     gap = np.maximum(np.abs(P - point).max(axis=(-1, -2)) - np.maximum(spread, 0.0), 0.0)[:, known]
@@ -275,7 +275,7 @@ def _in_support(samples: IntermittentSamples, level: float) -> Finding:
     limits = size, terms, SUPPORT_TOLERANCE
     found = compare_identities(gap, *limits, message)
     found = found._replace(replica=first_wrong(gap, *limits))
-    if forgotten.any() or found.margin[0] < 0.0:
+    if converged.any() or found.margin[0] < 0.0:
         return found
     end = samples.scenario.horizon
     with np.errstate(divide="ignore", invalid="ignore"):

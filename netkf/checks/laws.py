@@ -152,9 +152,9 @@ def compare_growth(
     share, early = 0.5 * level / sum(pair.one.shape[-1] for pair in pairs), False
     found = []
     for pair, laws in zip(pairs, expected, strict=True):
-        seen = growth(pair.one, pair.other, share)
-        known = growth(*laws, share) if laws is not None else [None] * len(seen)
-        for k, (run, law) in enumerate(zip(seen, known, strict=True)):
+        growths = growth(pair.one, pair.other, share)
+        known = growth(*laws, share) if laws is not None else [None] * len(growths)
+        for k, (run, law) in enumerate(zip(growths, known, strict=True)):
             low = max(0.0, run.low - law.high) if law is not None else 0.0
             early |= (law.value if law is not None else run.low) > LAW_TOLERANCE
             found.append((run._replace(low=low), f"at {pair.label}, entry {k}"))

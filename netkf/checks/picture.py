@@ -88,8 +88,8 @@ def _draw_row(axes: Any, height: int, row: Evidence) -> None:
     style = {"marker": mark.marker, "color": mark.colour, "ms": 4.5, "mec": INK, "mew": 0.5}
     axes.plot([min(row.off / unit, FURTHEST)], [height], **style)
     if np.isfinite(row.detectable):
-        seen = min(row.detectable / unit, FURTHEST)
-        axes.plot([seen], [height], "|", color=INK, ms=9)
+        detectable = min(row.detectable / unit, FURTHEST)
+        axes.plot([detectable], [height], "|", color=INK, ms=9)
 
 
 def _label(row: Evidence) -> str:

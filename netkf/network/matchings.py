@@ -172,12 +172,12 @@ def _uniform_maximal(topology: Topology, random: np.random.Generator) -> list[Li
 
 
 def _greedy(links: list[Link]) -> list[Link]:
-    taken: set[int] = set()
+    matched: set[int] = set()
     chosen = []
     for i, j in links:
-        if i not in taken and j not in taken:
-            taken.add(i)
-            taken.add(j)
+        if i not in matched and j not in matched:
+            matched.add(i)
+            matched.add(j)
             chosen.append((i, j))
     return chosen
 

@@ -163,10 +163,10 @@ class SensorPath:
         self._rest = np.zeros((2, len(R)))
 
     def moments(
-        self, truth: DiffusionPath, seen: FloatArray, start: float, end: float
+        self, truth: DiffusionPath, x_moments: FloatArray, start: float, end: float
     ) -> FloatArray:
         """Return moments (2, p) of dy over ``[start, end]`` inside the truth's present step, where
-        x has the moments ``seen``; ``start`` is where the last call ended.
+        x has the moments ``x_moments``; ``start`` is where the last call ended.
         """
         last = truth.step_end()
         # A new step: what was left of the one before has been read to its end.
@@ -180,7 +180,7 @@ class SensorPath:
             noise, self._rest = cut(self._rest, normals, (end - start) / length, length)
         else:
             noise = self._rest
-        return reading(seen, self.H, noise, self._root)
+        return reading(x_moments, self.H, noise, self._root)
 
     def _draw(self, period: float) -> FloatArray:
         # Blocks of normals: one call for many steps.
@@ -199,10 +199,12 @@ def step_noise(normals: FloatArray, period: float) -> FloatArray:
     return np.asarray(normals * np.sqrt(np.array([[period], [period / 3.0]])))
 
 
-def reading(seen: FloatArray, H: FloatArray, noise: FloatArray, root: FloatArray) -> FloatArray:
+def reading(
+    x_moments: FloatArray, H: FloatArray, noise: FloatArray, root: FloatArray
+) -> FloatArray:
     """Return moments (2, p) of dy from those of x (2, n) and of unit white noise (2, p)."""
     out = np.empty(2 * len(H))
-    fill_reading(ONE, H[0], out, 0, len(H), seen, H[None], noise, root[None], 0)
+    fill_reading(ONE, H[0], out, 0, len(H), x_moments, H[None], noise, root[None], 0)
     return out.reshape(2, len(H))
 
 
@@ -213,13 +215,13 @@ def fill_reading(
     out: FloatArray,
     row: int,
     rows: int,
-    seen: FloatArray,
+    x_moments: FloatArray,
     H: FloatArray,
     noise: FloatArray,
     root: FloatArray,
     s: int,
 ) -> None:
-    """Write the moments of dy of sensor ``s``, ``rows`` of each, from those of x, ``seen``
+    """Write the moments of dy of sensor ``s``, ``rows`` of each, from those of x, ``x_moments``
     (2, n, L), and of unit white noise (2, p, L): the first ones from ``out[row]`` on and the second
     ones half of ``out`` (q, L) later. H is (S, p, n, L), root (S, p, p, L) and lower triangular.
     """
@@ -229,7 +231,7 @@ def fill_reading(
         for i in range(rows):
             total = spread(lanes, 0.0)
             for j in range(len(size)):
-                total += load(lanes, H, s, i, j) * load(lanes, seen, m, j)
+                total += load(lanes, H, s, i, j) * load(lanes, x_moments, m, j)
             for j in range(i + 1):
                 total += load(lanes, root, s, i, j) * load(lanes, noise, m, j)
             store(lanes, out, m * half + row + i, total)

@@ -191,12 +191,12 @@ def _axes(source: Opened, run: StoredRun, worst: Worst | None) -> list[int]:
     them was furthest off at the worst instant, else those that were furthest off.
     """
     n = run.x.shape[1]
-    seen: set[int] = set()
+    observed_states: set[int] = set()
     for sensor in source.scenario.sensors:
         H = getattr(sensor, "H", None)
         if H is not None:
-            seen |= set(np.flatnonzero(np.any(np.asarray(H) != 0.0, axis=0)).tolist())
-    first = sorted(seen)[:2] if len(seen) >= 2 else [0, min(1, n - 1)]
+            observed_states |= set(np.flatnonzero(np.any(np.asarray(H) != 0.0, axis=0)).tolist())
+    first = sorted(observed_states)[:2] if len(observed_states) >= 2 else [0, min(1, n - 1)]
     if worst is None or not worst.by_error:
         return first
     k, column = int(np.searchsorted(run.times, worst.time)), run.nodes.index(worst.node)

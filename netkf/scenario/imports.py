@@ -194,18 +194,18 @@ class _AllowedPaths:
     def _is_somewhere(self, top: str) -> bool:
         return _spec(top, [str(self._scenario), str(self._current), *sys.path]) is not None
 
-    def _is_part(self, module_name: str, name: str, seen: set[tuple[str, str]]) -> bool:
+    def _is_part(self, module_name: str, name: str, visited: set[tuple[str, str]]) -> bool:
         """Return True if the source of a module binds a name to a class derived from netkf's."""
         if module_name.partition(".")[0] == "netkf":
             return True
-        if (module_name, name) in seen or len(seen) >= MAX_HOPS:
+        if (module_name, name) in visited or len(visited) >= MAX_HOPS:
             return False
-        seen.add((module_name, name))
+        visited.add((module_name, name))
         specs = self._specs(module_name)
         if specs is None:
             return False
         source = _Source(module_name, specs[-1])
-        return any(self._is_part(*found, seen) for found in source.ancestors(name))
+        return any(self._is_part(*found, visited) for found in source.ancestors(name))
 
 
 def _is_below(location: Path, folder: Path) -> bool:

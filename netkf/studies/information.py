@@ -213,8 +213,8 @@ def find_flow(
         # What such a message carries is the reading of its instant: a segment of its own, which
         # nothing flows into.
         node = np.concatenate([nodes, messages.sender])
-        taken = np.searchsorted(log["t"], messages.sent, side="left")
-        start = np.concatenate([start, taken])
+        index = np.searchsorted(log["t"], messages.sent, side="left")
+        start = np.concatenate([start, index])
         origin = np.where(readings, len(nodes) + np.arange(count), origin)
     return Flow(
         messages=messages,
@@ -353,9 +353,9 @@ class KeptReadings:
             return float(self._times[end]) if end < len(self._times) else self._at
         rows = self._rows[node]
         k = int(np.searchsorted(rows, end)) - 1
-        return self.taken(int(rows[k])) if k >= 0 and rows[k] >= start else np.nan
+        return self.reading_time(int(rows[k])) if k >= 0 and rows[k] >= start else np.nan
 
-    def taken(self, row: int) -> float:
+    def reading_time(self, row: int) -> float:
         """Return the time at which the reading used at a row was taken."""
         time = float(self._times[row])
         if not self._scenario.slotted:

@@ -69,7 +69,7 @@ def check_made_channel(part: Any, topology: Topology | None, seed: int) -> None:
         _delays(watched, tuple(links))
         return
     for link, table_probability in links.items():
-        _chances(watched, link, table_probability)
+        _check_delivery_probabilities(watched, link, table_probability)
     _check_pure(watched, links)
     _check_identical_links(watched, tuple(links))
     _check_channel_state(watched)
@@ -114,31 +114,37 @@ def _check_identical_links(watched: Watched, links: tuple[Link, ...]) -> None:
         return
     for bad in (False, True):
         for message in MESSAGES:
-            chances = [part.delivery_probability(link, message, bad, 0.8) for link in links]
-            usual = float(np.median(chances))
-            for link, chance in zip(links, chances, strict=True):
+            probabilities = [part.delivery_probability(link, message, bad, 0.8) for link in links]
+            usual = float(np.median(probabilities))
+            for link, probability in zip(links, probabilities, strict=True):
                 demand(
-                    abs(chance - usual) <= EQUAL,
+                    abs(probability - usual) <= EQUAL,
                     f"{watched.name}.{watched.defined_name('delivery_probability')}",
                     "must be the same for links with equal entries in the graph's table",
-                    f"{chance:.4g} for link {list(link)} and {usual:.4g} for others",
+                    f"{probability:.4g} for link {list(link)} and {usual:.4g} for others",
                     "define mean_delivery beside it if links differ by design",
                 )
 
 
-def _chances(watched: Watched, link: Link, table_probability: float) -> None:
+def _check_delivery_probabilities(watched: Watched, link: Link, table_probability: float) -> None:
     part, where = watched.part, f"{watched.name}.{watched.defined_name('delivery_probability')}"
     for bad in (False, True):
         for message in (0, 1, 2, 1000):
-            chance = watched.call("delivery_probability", link, message, bad, table_probability)
-            number = isinstance(chance, (int, float, np.floating)) and 0.0 <= chance <= 1.0
-            demand(number, where, f"must be a number from 0 to 1 for message {message}", chance)
-            sure = not part.deterministic or chance in (0.0, 1.0)
+            probability = watched.call(
+                "delivery_probability", link, message, bad, table_probability
+            )
+            number = (
+                isinstance(probability, (int, float, np.floating)) and 0.0 <= probability <= 1.0
+            )
             demand(
-                sure,
+                number, where, f"must be a number from 0 to 1 for message {message}", probability
+            )
+            allowed = not part.deterministic or probability in (0.0, 1.0)
+            demand(
+                allowed,
                 where,
                 "must be 0 or 1 where the loss is deterministic",
-                chance,
+                probability,
                 "let deterministic be False",
             )
     mean = watched.call("mean_delivery", link, table_probability)
@@ -148,13 +154,13 @@ def _chances(watched: Watched, link: Link, table_probability: float) -> None:
 
 def _check_channel_state(watched: Watched) -> None:
     part, where = watched.part, f"{watched.name}.{watched.defined_name('next_state')}"
-    seen: dict[bool, list[Any]] = {}
+    histories: dict[bool, list[Any]] = {}
     for twin in range(2):
         random, bad, history = RecordingGenerator(5), None, []
         for k in range(DRAWS):
             bad = watched.call("next_state", bad, random, repeatable=False)
             demand(bad is True or bad is False, where, "must be True or False", bad)
-            calls = random.taken()
+            calls = random.take_calls()
             history.append((bad, calls))
             if not part.stateful:
                 demand(
@@ -172,9 +178,9 @@ def _check_channel_state(watched: Watched) -> None:
                     f"number {k}",
                     "draw first, then decide",
                 )
-        seen[bool(twin)] = history
+        histories[bool(twin)] = history
     demand(
-        seen[False] == seen[True],
+        histories[False] == histories[True],
         where,
         "must use no generator but the one it is given",
         "another outcome from an equal generator",
@@ -269,11 +275,11 @@ def _simulated(part: Loss, links: dict[Link, float], seed: int) -> FloatArray:
         for k, (link, table_probability) in enumerate(links.items()):
             sampler = ChannelSampler(Channel(loss=part), partial(_generator, streams, link))
             uniform, bad, _ = sampler.draws(LENGTH)
-            chances = [
+            probabilities = [
                 part.delivery_probability(link, message, here, table_probability)
                 for message, here in enumerate(bad.tolist())
             ]
-            arrived[chain, :, k] = uniform < chances
+            arrived[chain, :, k] = uniform < probabilities
     return arrived
 
 
@@ -283,9 +289,9 @@ def _generator(streams: Streams, link: Link, purpose: str) -> np.random.Generato
 
 def _delays(watched: Watched, links: tuple[Link, ...]) -> None:
     _check_message_delays(watched, links)
-    seen = [_drawn(watched) for _ in range(2)]
+    first_draws = [_drawn(watched) for _ in range(2)]
     demand(
-        seen[0] == seen[1],
+        first_draws[0] == first_draws[1],
         f"{watched.name}.draw",
         "must use no generator but the one it is given",
         "other delays from an equal generator",
@@ -387,7 +393,7 @@ def _drawn(watched: Watched) -> list[float]:
         seconds = watched.call("draw", random, repeatable=False)
         number = isinstance(seconds, (int, float, np.floating)) and math.isfinite(seconds)
         demand(number and seconds >= 0.0, where, rule, seconds, "shift or clip the law")
-        calls = random.taken()
+        calls = random.take_calls()
         first = calls if first is None else first
         demand(
             calls == first,

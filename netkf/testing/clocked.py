@@ -140,8 +140,8 @@ class ClockTrial(Trial):
         noise = self.random.normal(size=2 * len(self.system.H)) * np.sqrt(gap)
         added = np.zeros((2, len(self.system.H)))
         for z, weight in zip(POINTS, WEIGHTS, strict=True):
-            seen = self.system.H @ scipy.linalg.expm(0.5 * gap * (1.0 + z) * self._A) @ start
-            added += 0.5 * gap * weight * np.outer([1.0, z], seen)
+            effect = self.system.H @ scipy.linalg.expm(0.5 * gap * (1.0 + z) * self._A) @ start
+            added += 0.5 * gap * weight * np.outer([1.0, z], effect)
         return np.asarray(noise + added.reshape(-1))
 
     def shift(self) -> None:

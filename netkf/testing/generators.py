@@ -20,7 +20,7 @@ class RecordingGenerator(np.random.Generator):
 
     def __getattribute__(self, name: str) -> Any:
         found = super().__getattribute__(name)
-        if name.startswith("_") or name in ("calls", "taken", "bit_generator"):
+        if name.startswith("_") or name in ("calls", "take_calls", "bit_generator"):
             return found
 
         def drawing(*arguments: Any, **named: Any) -> Any:
@@ -30,8 +30,8 @@ class RecordingGenerator(np.random.Generator):
 
         return drawing
 
-    def taken(self) -> Calls:
-        """The draws since this was last asked."""
+    def take_calls(self) -> Calls:
+        """Return the draws since the last call."""
         calls, self.calls = self.calls, []
         return calls
 

@@ -54,14 +54,14 @@ def largest_deviation(values: FloatArray, fewest: int = FEWEST) -> Deviation | N
         if beyond[position] <= 1.0:
             return None
         chosen = values.reshape(count, -1)[:, int(k)]
-        if _is_sure(chosen, float(mean[position]), float(error[position]), limit):
+        if _is_certain(chosen, float(mean[position]), float(error[position]), limit):
             return Deviation(
                 float(mean[position]), float(error[position]), tuple(map(int, position))
             )
     return None
 
 
-def _is_sure(values: FloatArray, mean: float, error: float, limit: float) -> bool:
+def _is_certain(values: FloatArray, mean: float, error: float, limit: float) -> bool:
     """Return True if a mean is beyond ``limit`` standard errors for skewed values, too.
 
     A studentised mean of skewed values has one long tail; it is corrected to second order by the

@@ -357,13 +357,13 @@ def _check_grid(part: Diffusion, name: str, seed: int, steps: int) -> None:
     runs = max(2, GRID_RUNS * GRID_BLOCKS * 64 // (64 * count))
     found = drawn(range(runs))
     start, end = found.x_start[:, :steps], found.x_end[:, :steps]
-    seen = np.concatenate([end, *(found.moments[:, :steps, m] for m in range(2))], axis=2)
+    ends = np.concatenate([end, *(found.moments[:, :steps, m] for m in range(2))], axis=2)
     Phi, S = moment_law(part.A, part.B, period)
     words = f"the noise of x and its two moments over steps of {period:g} s"
     rule = "x and its moments must follow from the state before where B has no noise"
     # In units in which x and its moments are of one size.
     units = np.repeat([1.0, 1.0 / period, 1.0 / period], part.n)
-    noise = (seen - start @ Phi.T) * units
+    noise = (ends - start @ Phi.T) * units
     _check_noise(noise, S * np.outer(units, units), start, Stated(where, words, "B"), rule)
 
 

@@ -130,8 +130,8 @@ class IncrementReader:
             shares = CUTS[k % len(CUTS)] if cut else ()
             times = [first, *(first + share * (last - first) for share in shares), last]
             for start, end in pairwise(times):
-                seen = truth.moments(start, end)
-                moments = path.moments(truth, seen, start, end)
+                x_moments = truth.moments(start, end)
+                moments = path.moments(truth, x_moments, start, end)
                 found.append(demand_array(self.where, "moments", moments, (2, self.p)))
                 spans.append((start, end))
                 whose.append(k)

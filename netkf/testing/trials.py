@@ -130,8 +130,8 @@ class Trial(ABC):
         """Return the sums over all nodes of the quantities that ``conserved`` names."""
         where = f"{self.watched.name}.conserved"
         parts = [self.watched.call("conserved", state) for state in self.states]
-        alike = all(isinstance(p, dict) and p.keys() == parts[0].keys() for p in parts)
-        demand(alike, where, "must name the same quantities at every node", parts[0])
+        same_keys = all(isinstance(p, dict) and p.keys() == parts[0].keys() for p in parts)
+        demand(same_keys, where, "must name the same quantities at every node", parts[0])
         terms = {name: [np.atleast_1d(part[name]) for part in parts] for name in parts[0]}
         return {name: math.fsum(np.concatenate(values)) for name, values in terms.items()}
 

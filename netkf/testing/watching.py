@@ -65,16 +65,16 @@ def made(part: Any, contracts: tuple[type[Component], ...], settings: Mapping[st
         fail(name, words, describe_error(error), remedy)
 
 
-def leaves(value: Any, path: str = "", seen: frozenset[int] = frozenset()) -> Iterator[Any]:
+def leaves(value: Any, path: str = "", visited: frozenset[int] = frozenset()) -> Iterator[Any]:
     """(path, copy) of every number, text and array that a value is made of."""
     if isinstance(value, np.ndarray):
         yield path, value.copy()
-    elif id(value) in seen or isinstance(value, np.random.Generator) or callable(value):
+    elif id(value) in visited or isinstance(value, np.random.Generator) or callable(value):
         return
     elif isinstance(value, (str, bytes, int, float, complex, np.generic)) or value is None:
         yield path, value
     else:
-        inside = seen | {id(value)}
+        inside = visited | {id(value)}
         for name, item in _items(value):
             yield from leaves(item, f"{path}{name}", inside)
 

@@ -116,17 +116,19 @@ def _judge_observability(scenario: Scenario) -> tuple[bool | None, str]:
     A, n = scenario.truth.A, scenario.plant.n
     # Thousands of nodes may have the sensors of one [[sensors]] entry.
     counts = Counter(_entries(scenario, node) for node in scenario.nodes)
-    alike = {entries: _information(scenario, entries) for entries in counts}
+    information_by_sensors = {entries: _information(scenario, entries) for entries in counts}
     # (A, H) is observable if and only if (A, sum H' R^-1 H) is: both hide the same modes.
     information = np.zeros((n, n))
     for node in scenario.sensing:
-        information += alike[_entries(scenario, node)]
+        information += information_by_sensors[_entries(scenario, node)]
     hidden = unobservable_mode(A, information)
     if hidden is not None:
         evidence = f"the mode with eigenvalue {hidden:.6g} is not seen"
         return judge_plant(scenario, False, evidence)
     alone = sum(
-        count for entries, count in counts.items() if unobservable_mode(A, alike[entries]) is None
+        count
+        for entries, count in counts.items()
+        if unobservable_mode(A, information_by_sensors[entries]) is None
     )
     evidence = f"every mode is seen; {alone} of {len(scenario.nodes)} nodes see all alone"
     return judge_plant(scenario, True, evidence)

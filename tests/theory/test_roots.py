@@ -106,7 +106,7 @@ def test_settled_forms_stay_valid_while_inputs_are_reduced():
             stack.add(name, columns, part)
         total += square(parts.reshape(4, 3))
         if step % 40 == 7:
-            kept.append(stack.settle(["y", "x"]).reshape(4, -1))
+            kept.append(stack.freeze(["y", "x"]).reshape(4, -1))
             covariances.append(total[np.ix_([2, 3, 0, 1], [2, 3, 0, 1])])
     assert np.allclose(stack.covariance(["x", "y"]), total, rtol=1e-12)
     for i, one in enumerate(kept):

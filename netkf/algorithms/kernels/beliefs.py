@@ -1,10 +1,10 @@
-"""Belief propagation in kernels: evidence about the state, and who has told whom what.
+"""Belief propagation in kernels: evidence about the state, by who sent it.
 
 Evidence is a pair of information as its root (Z, z), n by n + 1, see ``kernels.information``: Z is
 lower triangular, and z counts from a centre c (n,), ``Z (x - c) = z + v`` with cov(v) = I. Of a
 block of runs filter ``h`` has own readings ``own[h]`` (H, n, n + 1, L), and direction m of
-``SlotLinks`` has what its sender told last, ``told[m]`` (W, n, n + 1, L), both counted from the
-centre of the filter that holds them.
+``SlotLinks`` has the evidence that its sender sent last, ``received[m]`` (W, n, n + 1, L), both
+counted from the centre of the filter that holds them.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from netkf.linalg.lanes import ONE, Lanes, any_lane, load, load_flags, select, s
 
 
 class BeliefScratch(NamedTuple):
-    """What all H nodes send: everything they know (``every``, H), and without what the sender of
-    each of W directions told (``others``, W); ``behind`` (D + 1,) sums from the last of D
+    """Evidence that H nodes send: all that they have (``every``, H), and for each of W directions
+    all but that of its sender (``others``, W); ``behind`` (D + 1,) sums from the last of D
     directions on, and ``total`` and ``work``. All are evidence (n, n + 1, L).
     """
 
@@ -124,13 +124,13 @@ def take_one_prior(roots: FloatArray, h: int, part: FloatArray) -> None:
 def gather_evidence(
     lanes: Lanes,
     own: FloatArray,
-    told: FloatArray,
+    received: FloatArray,
     first: int,
     last: int,
     h: int,
     room: BeliefScratch,
 ) -> None:
-    """Add up what node ``h`` knows, from its own readings and what was told on directions from
+    """Add up what node ``h`` knows, from its own readings and what was received on directions from
     ``first`` up to ``last``: all of it into ``every[h]``, and all but what came on direction m into
     ``others[m]`` (``room`` is BeliefScratch).
     """
@@ -139,18 +139,18 @@ def gather_evidence(
     clear_part(lanes, room.behind[D])
     for k in range(D - 1, 0, -1):
         copy_part(lanes, room.behind[k + 1], room.behind[k])
-        add_part(lanes, room.behind[k], told[first + k], room.work)
+        add_part(lanes, room.behind[k], received[first + k], room.work)
     copy_part(lanes, own[h], room.every[h])
     for k in range(D):
         copy_part(lanes, room.every[h], room.others[first + k])
         add_part(lanes, room.others[first + k], room.behind[k + 1], room.work)
-        add_part(lanes, room.every[h], told[first + k], room.work)
+        add_part(lanes, room.every[h], received[first + k], room.work)
 
 
 @kernel
-def hear_evidence(
+def receive_evidence(
     lanes: Lanes,
-    told: FloatArray,
+    received: FloatArray,
     links: SlotLinks,
     up: Any,
     index: tuple[int, int, int],
@@ -158,14 +158,17 @@ def hear_evidence(
     centre: FloatArray,
     room: BeliefScratch,
 ) -> None:
-    """Replace what the senders that node ``h`` hears told before, ``up`` at ``index`` [b, s, e]."""
+    """Replace the evidence from senders that node ``h`` hears, where ``up`` (at ``index`` [b, s,
+    e]) says that a message arrived.
+    """
     b, s, e = index
-    n = told.shape[1]
+    n = received.shape[1]
     for m in range(links.first[h], links.first[h + 1]):
         arrived, sender = load_flags(lanes, up, b, s, e, links.way[m]), links.sender[m]
         if not any_lane(arrived):
             continue
-        # The sender leaves out what the receiver told it; in a directed graph it may not hear it.
+        # The sender leaves out the evidence of the receiver, which would otherwise come back and
+        # count twice; in a directed graph it may not hear the receiver at all.
         source = room.every[sender]
         for k in range(links.first[sender], links.first[sender + 1]):
             if links.sender[k] == h:
@@ -175,4 +178,11 @@ def hear_evidence(
             for j in range(n + 1):
                 if j <= i or j == n:
                     entry = load(lanes, room.work, i, j)
-                    store(lanes, told, m, i, j, select(arrived, entry, load(lanes, told, m, i, j)))
+                    store(
+                        lanes,
+                        received,
+                        m,
+                        i,
+                        j,
+                        select(arrived, entry, load(lanes, received, m, i, j)),
+                    )

@@ -62,14 +62,14 @@ def gain_table(
     from_Y = np.einsum("j,jk,kba,bp->kajp", weight, c, E[:, n:, :n] * scale, HR)
     from_P = np.einsum("j,jk,kba,bp->kajp", weight, c, E[:, n:, n:], HR)
     # C = moments of H exp(-A (b - s)): the reading that x(b), taken back without noise, predicts.
-    seen = np.einsum("jk,pa,kab->kjpb", c, H, exponential_series(-A, terms))
+    predictor = np.einsum("jk,pa,kab->kjpb", c, H, exponential_series(-A, terms))
     series = np.zeros((terms + 1, 3 * n * MOMENTS * p))
     size_U = n * MOMENTS * p
     series[:-1, :size_U] = from_Y.reshape(terms, -1)
     series[:-1, size_U : 2 * size_U] = from_P.reshape(terms, -1)
     # One power of g more than the gains have: a moment of dy is an integral over the interval,
     # while a gain is a mean.
-    series[1:, 2 * size_U :] = seen.reshape(terms, -1)
+    series[1:, 2 * size_U :] = predictor.reshape(terms, -1)
     return GainTable(n, MOMENTS * p, with_reach(series, longest))
 
 

@@ -37,13 +37,13 @@ def has_stopped(
     if rule == PAPER:
         # P step 2.3 waits until information has reached the node: mass of zero does not move
         # either.
-        seen = False
+        has_mass = False
         for i in range(2, mass.shape[1]):
-            seen = seen or mass[k, i] != 0.0
-        return seen and moved_within(mass, k, before, tolerance, work)
+            has_mass = has_mass or mass[k, i] != 0.0
+        return has_mass and moved_within(mass, k, before, tolerance, work)
     # SAFE trusts a step only if all links were up: an outage also makes the estimate stand still.
     if rule == SAFE and whole and mass[k, 0] > 0.0:
-        return has_settled(information, number[0], former, k, former_number[k], tolerance)
+        return has_converged(information, number[0], former, k, former_number[k], tolerance)
     return False
 
 
@@ -92,7 +92,7 @@ def has_positive_pivots(work: FloatArray) -> bool:
 
 
 @kernel
-def has_settled(
+def has_converged(
     information: FloatArray,
     number: float,
     former: FloatArray,

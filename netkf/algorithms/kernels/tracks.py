@@ -130,20 +130,20 @@ def close_row(P: FloatArray, h: FloatArray, closed: FloatArray, k: FloatArray) -
         k[i] /= size
     # (I - k h) from the left of both.
     for j in range(n):
-        seen = known = 0.0
+        Ph = known = 0.0
         for i in range(n):
-            seen += h[i] * P[i, j]
+            Ph += h[i] * P[i, j]
             known += h[i] * closed[i, j]
         for i in range(n):
-            P[i, j] -= k[i] * seen
+            P[i, j] -= k[i] * Ph
             closed[i, j] -= k[i] * known
     # P (I - k h)' + k k', row by row, and the symmetric part of it.
     for i in range(n):
-        seen = -k[i]
+        Ph = -k[i]
         for j in range(n):
-            seen += P[i, j] * h[j]
+            Ph += P[i, j] * h[j]
         for j in range(n):
-            P[i, j] -= seen * k[j]
+            P[i, j] -= Ph * k[j]
             if j < i:
                 P[i, j] = P[j, i] = 0.5 * (P[i, j] + P[j, i])
 

@@ -18,7 +18,7 @@ NO_READING = -1.0
 
 
 @kernel
-def chance_of_silence(news: float) -> float:
+def silence_probability(news: float) -> float:
     """Return ``exp(-z' Y z / 2)`` for the ``news`` z' Y z of a reading, Han et al. (2015); 0 for
     NO_READING.
     """

@@ -10,7 +10,7 @@ import scipy.special
 
 from netkf.checks.evidence import Finding, Promise, find_identity
 from netkf.checks.laws import find_largest
-from netkf.checks.parts.events import direction_indices, in_direction, one_fate_for_both
+from netkf.checks.parts.events import direction_indices, in_direction, shares_draws
 from netkf.checks.parts.moments import (
     CELLS,
     MIN_COUNT,
@@ -95,7 +95,7 @@ def count_delays(scenario: Scenario, run: Run) -> DelayCounts | None:
         assert whole is not None
         uniform = np.clip(law / whole, 0.0, 1.0)
     # Where both directions of a link share their draws, one stands for both.
-    known = np.isfinite(uniform) & ~one_fate_for_both(scenario)[which]
+    known = np.isfinite(uniform) & ~shares_draws(scenario)[which]
     order = np.lexsort((rows["message"][known], which[known]))
     u, which = uniform[known][order], which[known][order]
     first = np.ones(len(u), dtype=bool)

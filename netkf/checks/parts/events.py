@@ -14,7 +14,7 @@ from netkf.trace.run import Run
 from netkf.trace.schema import CODES
 
 
-class FateCounts(NamedTuple):
+class LossCounts(NamedTuple):
     """Of D directions: messages ``sent`` and ``lost`` (W, D) in the windows of one run;
     ``followed`` (D,) losses that another message followed, ``repeated`` (D,) losses of a message
     and of the one before it, and ``both`` (D,) losses of a message and of the one with the same
@@ -44,7 +44,7 @@ def direction_indices(scenario: Scenario) -> dict[tuple[int, int], int]:
     return {direction: k for k, direction in enumerate(scenario.topology.directions)}
 
 
-def count_fates(scenario: Scenario, run: Run) -> FateCounts | None:
+def count_losses(scenario: Scenario, run: Run) -> LossCounts | None:
     """Return the counts of a run; None without links."""
     indices, log = direction_indices(scenario), run.log
     sends, losses = (log[log["kind"] == CODES[kind]] for kind in ("send", "lost"))
@@ -63,7 +63,7 @@ def count_fates(scenario: Scenario, run: Run) -> FateCounts | None:
     back = reversed_directions(scenario)[lost_at]
     both = np.isin(back * width + number, keys) & (back >= 0)
     followed = number + 1 < sent.sum(axis=0)[lost_at]
-    return FateCounts(
+    return LossCounts(
         sent,
         lost,
         np.bincount(lost_at[followed], minlength=size),
@@ -81,7 +81,7 @@ def in_direction(
 
 
 @lru_cache(maxsize=8)
-def one_fate_for_both(scenario: Scenario) -> np.ndarray:
+def shares_draws(scenario: Scenario) -> np.ndarray:
     """Return (D,) bool: the messages of this direction share all draws with those of the other
     direction of its link, which stands for both.
     """

@@ -61,16 +61,16 @@ def _direction_label(scenario: Scenario, k: int) -> str:
 
 def _losses(samples: PartSamples, level: float) -> Finding:
     """Compare lost shares with the stated ones, all directions together and one by one."""
-    scenario, fates = samples.scenario, samples.fates
+    scenario, counts = samples.scenario, samples.fates
     q = loss_probabilities(scenario)
-    sent, lost = fates.sent.sum(axis=1), fates.lost.sum(axis=1)
+    sent, lost = counts.sent.sum(axis=1), counts.lost.sum(axis=1)
     used = np.flatnonzero(sent.sum(axis=0) > 0)
     intervals = [(_loss_interval(scenario, sent, lost, q, used, level / 3.0), "all directions")]
-    windows = np.flatnonzero(fates.sent.sum(axis=(0, 2)) > 0)
-    for w in windows.tolist() if fates.sent.shape[1] > 1 else ():
-        part = fates.sent[:, w], fates.lost[:, w]
+    windows = np.flatnonzero(counts.sent.sum(axis=(0, 2)) > 0)
+    for w in windows.tolist() if counts.sent.shape[1] > 1 else ():
+        part = counts.sent[:, w], counts.lost[:, w]
         found = _loss_interval(scenario, *part, q, used, level / (3.0 * len(windows)))
-        label = f"all directions in part {w + 1} of {fates.sent.shape[1]} of the run"
+        label = f"all directions in part {w + 1} of {counts.sent.shape[1]} of the run"
         intervals.append((found, label))
     share = level / (3.0 * max(len(used), 1))
     for k in used.tolist():
@@ -115,8 +115,8 @@ def _loss_interval(
         return deviation_interval(expected, found)
     # A spread of at least one message of all: a few rare losses may show none.
     spread = math.sqrt(max(float(excess.var(ddof=1)) * runs, 1.0))
-    seen = expected + float(excess.sum()) / total
-    return deviation_interval(expected, student_interval(seen, spread / total, runs, level))
+    estimate = expected + float(excess.sum()) / total
+    return deviation_interval(expected, student_interval(estimate, spread / total, runs, level))
 
 
 def _share_of_bounded_runs(
@@ -172,12 +172,12 @@ def _losses_apart(samples: PartSamples, level: float) -> Finding:
     """Test that losses are independent from message to message, between both directions where they
     do not share one fate, and between links.
     """
-    scenario, fates = samples.scenario, samples.fates
-    q, sent = loss_probabilities(scenario), fates.sent.sum(axis=1)
+    scenario, counts = samples.scenario, samples.fates
+    q, sent = loss_probabilities(scenario), counts.sent.sum(axis=1)
     pairs = np.maximum(sent - 1, 0)
     # Where both directions of a link share one fate, each is counted twice.
     repeated = _neighbours_variance(q) * (2.0 if scenario.network.channel.symmetric else 1.0)
-    jobs = [("a message and the one before", fates.repeated, pairs, q, repeated)]
+    jobs = [("a message and the one before", counts.repeated, pairs, q, repeated)]
     if _directions_apart(scenario):
         # In each of two directions of a link the same pairs are counted: messages of one number.
         back = reversed_directions(scenario)
@@ -185,7 +185,7 @@ def _losses_apart(samples: PartSamples, level: float) -> Finding:
         joint = q * q[back]
         # Each pair is counted in both directions.
         variance = 2.0 * joint * (1.0 - joint)
-        jobs.append(("both directions of a link", fates.both, pairs, q[back], variance))
+        jobs.append(("both directions of a link", counts.both, pairs, q[back], variance))
     intervals = []
     for label, both, count, other, variance in jobs:
         scale = np.sqrt(q * (1.0 - q) * other * (1.0 - other))
@@ -200,19 +200,19 @@ def _losses_apart(samples: PartSamples, level: float) -> Finding:
 
 def _bursts(samples: PartSamples, level: float) -> Finding:
     """Compare how often a message is lost after another loss with the chain that is stated."""
-    scenario, fates = samples.scenario, samples.fates
+    scenario, counts = samples.scenario, samples.fates
     loss, q = _stated_loss(scenario), loss_probabilities(scenario)
-    runs, followed = len(fates.sent), fates.followed.sum(axis=1)
+    runs, followed = len(counts.sent), counts.followed.sum(axis=1)
     total = float(followed.sum())
     if total < MIN_COUNT or np.count_nonzero(followed) < MIN_EVENTS:
         return nothing_to_see(PROBABILITY_TOLERANCE)
     again = loss_twice(loss) / float(q.mean())
-    excess = fates.repeated.sum(axis=1) - again * followed
+    excess = counts.repeated.sum(axis=1) - again * followed
     # At least the spread of independent pairs: a few rare ones may show none.
     least = max(total * again * (1.0 - again), 1.0)
     spread = math.sqrt(max(float(excess.var(ddof=1)) * runs, least)) / total
-    seen = again + float(excess.sum()) / total
-    apart = deviation_interval(again, student_interval(seen, spread, runs, level))
+    estimate = again + float(excess.sum()) / total
+    apart = deviation_interval(again, student_interval(estimate, spread, runs, level))
     message = f"{total:,.0f} losses, after which the next message is lost with a probability off"
     return find_largest([(apart, "all directions")], PROBABILITY_TOLERANCE, message)
 
@@ -265,22 +265,22 @@ def _correlation_of_runs(
     values = excess.sum(axis=1)
     runs, least = len(values), float((count * variance).sum())
     spread = math.sqrt(max(float(values.var(ddof=1)) * runs, least, 1.0))
-    seen = float(values.sum()) / weight
-    return deviation_interval(0.0, student_interval(seen, spread / weight, runs, level))
+    estimate = float(values.sum()) / weight
+    return deviation_interval(0.0, student_interval(estimate, spread / weight, runs, level))
 
 
 def _links_apart(samples: PartSamples, level: float) -> list[tuple[Interval, str]]:
     """Return the correlations of losses between links: those that are largest, from the counts of
     runs.
     """
-    scenario, fates = samples.scenario, samples.fates
+    scenario, counts = samples.scenario, samples.fates
     # One direction of a link stands for both, which may share their fates.
-    seen: dict[tuple[int, int], int] = {}
+    estimate: dict[tuple[int, int], int] = {}
     for k, (i, j) in enumerate(scenario.topology.directions):
-        seen.setdefault((min(i, j), max(i, j)), k)
-    columns = np.array(list(seen.values()))
-    excess = (fates.lost - fates.sent * loss_probabilities(scenario)).reshape(
-        -1, fates.sent.shape[2]
+        estimate.setdefault((min(i, j), max(i, j)), k)
+    columns = np.array(list(estimate.values()))
+    excess = (counts.lost - counts.sent * loss_probabilities(scenario)).reshape(
+        -1, counts.sent.shape[2]
     )
     excess = excess[:, columns]
     found = largest_correlation(excess, level / 2.0)

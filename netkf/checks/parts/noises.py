@@ -90,8 +90,8 @@ def plant_moments(scenario: Scenario, streams: Streams) -> NoiseMoments | None:
     x = _states(scenario, streams, law)
     w = x[1:] - x[:-1] @ law.Phi.T
     # Differences of states that have grown far beyond the noise are rounding.
-    seen = np.abs(x[1:]).max(axis=1) * np.finfo(float).eps < VISIBLE * law.deviation
-    kept = len(seen) if seen.all() else int(np.argmin(seen))
+    accurate = np.abs(x[1:]).max(axis=1) * np.finfo(float).eps < VISIBLE * law.deviation
+    kept = len(accurate) if accurate.all() else int(np.argmin(accurate))
     z = w[:kept] @ law.white.T
     states = _standardise(x[:kept], law.sizes[:kept])
     return moments(z, np.repeat(states[:, :, None], z.shape[1], axis=2))
@@ -281,10 +281,10 @@ def _increment_noises(
         cuts = [end] if k % 2 else [start + 0.3 * period, end]
         for stop in cuts:
             x = _typical_states(scenario, random, 2)
-            seen = x * (stop - start)
-            dy = path.moments(_Grid(period, end), seen, start, stop)
+            x_integral = x * (stop - start)
+            dy = path.moments(_Grid(period, end), x_integral, start, stop)
             scale = np.sqrt((stop - start) * np.array([[1.0], [1.0 / 3.0]]))
-            noises = np.linalg.solve(law.root, ((dy - seen @ law.H.T) / scale).T).T
+            noises = np.linalg.solve(law.root, ((dy - x_integral @ law.H.T) / scale).T).T
             yield noises, _standardise(x, _state_sizes(scenario, x))
             start = stop
 

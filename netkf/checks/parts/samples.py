@@ -10,9 +10,9 @@ import numpy as np
 
 from netkf.checks.parts.delays import DelayCounts, count_delays
 from netkf.checks.parts.events import (
-    FateCounts,
+    LossCounts,
     PairCounts,
-    count_fates,
+    count_losses,
     count_pairs,
 )
 from netkf.checks.parts.moments import NoiseMoments
@@ -27,7 +27,7 @@ class PartSummary(NamedTuple):
     """What one run shows of each part; None where the scenario has no such part."""
 
     ticks: TickCounts | None
-    fates: FateCounts | None
+    fates: LossCounts | None
     pairs: PairCounts | None
     steps: NoiseMoments | None
     readings: NoiseMoments | None
@@ -37,7 +37,7 @@ class PartSummary(NamedTuple):
 
 PART_TYPES: dict[str, type[Any]] = {
     "ticks": TickCounts,
-    "fates": FateCounts,
+    "fates": LossCounts,
     "pairs": PairCounts,
     "steps": NoiseMoments,
     "readings": NoiseMoments,
@@ -52,7 +52,7 @@ def summarise_parts(scenario: Scenario, run: Run) -> PartSummary:
     streams = Streams(run.seed, run.replica)
     return PartSummary(
         count_ticks(scenario, run),
-        count_fates(scenario, run),
+        count_losses(scenario, run),
         count_pairs(scenario, run),
         plant_moments(scenario, streams),
         reading_moments(scenario, streams),

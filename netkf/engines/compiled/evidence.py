@@ -1,5 +1,5 @@
 """Belief propagation in the event loop (algorithms/belief_propagation, in loops): evidence that
-nodes keep of their own readings and of what each neighbour told last.
+nodes keep of their own readings and of what each neighbour sent last.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ from netkf.linalg.structs import Struct
 
 class EvidenceArrays(Struct):
     """Evidence (n, n + 1, 1) that counts from the beliefs of nodes: priors and own readings
-    (N, ...), what was told last on each of W directed links, and when that was sent (``sent_at``,
-    (W,); never: -inf), and what messages carry (C, ...). The links that node h hears are
-    ``way[k]`` from ``first[h]`` up to ``first[h + 1]``, in the order of senders.
+    (N, ...), what was received last on each of W directed links, and when that was sent
+    (``sent_at``, (W,); never: -inf), and what messages carry (C, ...). The links that node h hears
+    are ``way[k]`` from ``first[h]`` up to ``first[h + 1]``, in the order of senders.
 
     The estimates of the Simulation as ``lanes`` (1, N, n, 1) and its roots (1, N, n, n, 1); the
     plant's ``A`` (n, n). Scratch: ``centre`` (N, n, 1), ``before`` and ``after`` (n, 1), whitened
@@ -40,7 +40,7 @@ class EvidenceArrays(Struct):
 
     prior: FloatArray
     own: FloatArray
-    told: FloatArray
+    received: FloatArray
     sent_at: FloatArray
     carried: FloatArray
     first: IntArray
@@ -69,7 +69,7 @@ def empty_evidence(state: Simulation, A: FloatArray, roots: FloatArray) -> Evide
     return EvidenceArrays(
         prior=prior,
         own=np.zeros((N, *part)),
-        told=np.zeros((len(ways), *part)),
+        received=np.zeros((len(ways), *part)),
         sent_at=np.full(len(ways), -math.inf),
         carried=np.zeros((len(state.pool), *part)),
         first=np.searchsorted(ways["receiver"][heard], np.arange(N + 1)).astype(np.int64),
@@ -103,7 +103,7 @@ def move_evidence(evidence: EvidenceArrays, h: int, gap: float) -> None:
     move_part(ONE, evidence.prior[h], back, total, work)
     move_part(ONE, evidence.own[h], back, total, work)
     for k in range(evidence.first[h], evidence.first[h + 1]):
-        move_part(ONE, evidence.told[evidence.way[k]], back, total, work)
+        move_part(ONE, evidence.received[evidence.way[k]], back, total, work)
 
 
 @kernel
@@ -115,14 +115,14 @@ def update_belief(state: Simulation, evidence: EvidenceArrays, h: int) -> None:
     copy_part(ONE, evidence.prior[h], total)
     add_part(ONE, total, evidence.own[h], work)
     for k in range(evidence.first[h], evidence.first[h + 1]):
-        add_part(ONE, total, evidence.told[evidence.way[k]], work)
+        add_part(ONE, total, evidence.received[evidence.way[k]], work)
     finish_lanes(ONE, evidence.roots, evidence.lanes, 0, h, centre, total, work, False)
     before, after = centre[h], evidence.lanes[0, h]
     recentre_part(ONE, evidence.prior[h], before, after, evidence.prior[h])
     recentre_part(ONE, evidence.own[h], before, after, evidence.own[h])
     for k in range(evidence.first[h], evidence.first[h + 1]):
-        told = evidence.told[evidence.way[k]]
-        recentre_part(ONE, told, before, after, told)
+        received = evidence.received[evidence.way[k]]
+        recentre_part(ONE, received, before, after, received)
 
 
 @kernel
@@ -154,19 +154,19 @@ def add_samples(state: Simulation, evidence: EvidenceArrays, h: int, instant: in
 
 @kernel
 def send_evidence(state: Simulation, evidence: EvidenceArrays, m: int, h: int) -> None:
-    """Put what node ``h`` has read and heard into a message, without what its receiver told."""
+    """Write the evidence of node ``h`` into message ``m``, without that of its receiver."""
     receiver = state.ways[state.pool[m].way].receiver
     copy_state(state.size, state.pool_x, state.pool_root, m, state.xhat, state.root, h)
     copy_part(ONE, evidence.own[h], evidence.carried[m])
     for k in range(evidence.first[h], evidence.first[h + 1]):
         w = evidence.way[k]
         if state.ways[w].sender != receiver:
-            add_part(ONE, evidence.carried[m], evidence.told[w], evidence.work)
+            add_part(ONE, evidence.carried[m], evidence.received[w], evidence.work)
 
 
 @kernel
 def hear_evidence_now(state: Simulation, evidence: EvidenceArrays, h: int, now: float) -> None:
-    """Replace what the senders of messages told node ``h`` before, unless it was sent later; the
+    """Replace the earlier evidence of each sender to node ``h``, unless that was sent later; the
     centres of what they carry are predicted to now.
     """
     m, maps = state.nodes[h].inbox, evidence.maps
@@ -181,7 +181,7 @@ def hear_evidence_now(state: Simulation, evidence: EvidenceArrays, h: int, now: 
                 evidence.before[i, 0] = state.pool_x[m, i]
                 evidence.after[i, 0] = state.xhat[h, i]
             recentre_part(
-                ONE, evidence.carried[m], evidence.before, evidence.after, evidence.told[w]
+                ONE, evidence.carried[m], evidence.before, evidence.after, evidence.received[w]
             )
             evidence.sent_at[w] = message.sent
         m = message.next

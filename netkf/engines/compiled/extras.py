@@ -180,8 +180,8 @@ def predict_with_gain(state: Simulation, extras: Extras, h: int, now: float, tim
             extras.x[0, i] = state.xhat[h, i]
             for j in range(extras.x.shape[1]):
                 extras.root[0, i, j] = 0.0
-        blind = len(state.table.unit) - 1
-        move_root(state.table, blind, extras.root, extras.x, 0, gap, state.flow_scratch)
+        unobserved = len(state.table.unit) - 1
+        move_root(state.table, unobserved, extras.root, extras.x, 0, gap, state.flow_scratch)
         move_root(extras.table, m, state.root, state.xhat, h, gap, extras.flow_scratch)
         for i in range(extras.x.shape[1]):
             state.xhat[h, i] = extras.x[0, i]

@@ -191,10 +191,10 @@ class Outcomes:
         )
         # Probabilities that depend on the link only are tabulated.
         if self._identical:
-            self._chances = delivery_chances(scenario, senders.ways)
+            self._probabilities = delivery_chances(scenario, senders.ways)
         # Channels with memory or random delays keep a sampler for each stream.
         if not self._has_table_law:
-            self._fates = [
+            self._samplers = [
                 ChannelSampler(channel, partial(_stream, made, source))
                 for made in (
                     one.with_seeds(stream_purposes(channel), senders.sources)
@@ -204,7 +204,7 @@ class Outcomes:
             ]
         elif not channel.loss.deterministic:
             # A batch of streams draws for all links at once.
-            self._luck = StreamBatch(streams, "loss", senders.sources)
+            self._uniforms = StreamBatch(streams, "loss", senders.sources)
         self.sizes = np.tile(np.diff(senders.first), runs)
 
     def of(self, indices: np.ndarray, counts: np.ndarray, first: np.ndarray) -> FloatArray:
@@ -235,36 +235,38 @@ class Outcomes:
         """(K,) uniform draws, whether the link is in its bad state, and delays as drawn."""
         total = int(counts.sum())
         if not self._has_table_law:
-            parts = [self._fates[k].draws(n) for k, n in zip(sources, counts.tolist(), strict=True)]
+            parts = [
+                self._samplers[k].draws(n) for k, n in zip(sources, counts.tolist(), strict=True)
+            ]
             columns = zip(*parts, strict=True)
             return tuple(np.concatenate([np.empty(0), *column]) for column in columns)
         # A broadcast view: one delay for all.
         delay = np.broadcast_to(np.float64(self._channel.delay.fixed or 0.0), (total,))
         certain = self._channel.loss.deterministic
         # 0 is below every positive probability: nothing is lost where nothing is random.
-        luck = np.zeros(total) if certain else self._luck.units(sources, counts)
-        return luck, np.zeros(total, dtype=bool), delay
+        uniform = np.zeros(total) if certain else self._uniforms.units(sources, counts)
+        return uniform, np.zeros(total, dtype=bool), delay
 
     def _delays(
         self,
         ways: np.ndarray,
         counts: np.ndarray,
         first: np.ndarray,
-        luck: np.ndarray,
+        uniform: np.ndarray,
         bad: np.ndarray,
         delay: np.ndarray,
     ) -> FloatArray:
         """(K,) seconds or LOST."""
         if self._identical:
-            chance = np.repeat(self._chances[ways], counts)
+            probability = np.repeat(self._probabilities[ways], counts)
         else:
-            chance = self._chance(ways, counts, first, bad)
-        lost = luck >= chance
+            probability = self._delivery_probability(ways, counts, first, bad)
+        lost = uniform >= probability
         if delay_depends_on_message(self._channel.delay):
             delay = self._by_message(ways, counts, first, lost, delay)
         return np.where(lost, LOST, delay)
 
-    def _chance(
+    def _delivery_probability(
         self, ways: np.ndarray, counts: np.ndarray, first: np.ndarray, bad: np.ndarray
     ) -> FloatArray:
         loss, out, done = self._channel.loss, np.empty(len(bad)), 0

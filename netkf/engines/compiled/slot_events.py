@@ -100,7 +100,7 @@ class SlotEvents:
             link: [way.draws() for way in both[:own]] for link, both in self._ways.items()
         }
         self._last: dict[Link, list[Draw]] = {}
-        self._mail: list[tuple[float, int, int, Direction, int, float, int, int]] = []
+        self._in_flight: list[tuple[float, int, int, Direction, int, float, int, int]] = []
         self._slot, self._order, self._exchanges, self._open = 0, 0, 0, -1
         self._noted = True
         self._inbox: dict[int, dict[int, tuple[int, float]]] = {}
@@ -287,13 +287,13 @@ class SlotEvents:
         elif now + delay < self._scenario.ends:
             self._order += 1
             # Order in the heap: time, directed link, order of sending.
-            mail = now + delay, way.index, self._order, way, number, now, step.phase, self._open
-            heapq.heappush(self._mail, mail)
+            entry = now + delay, way.index, self._order, way, number, now, step.phase, self._open
+            heapq.heappush(self._in_flight, entry)
 
     def _arrivals(self, until: float) -> None:
         """Deliver what arrives by then; in time if the exchange it was sent in is still open."""
-        while self._mail and self._mail[0][0] <= until:
-            now, _, _, way, number, sent, phase, exchange = heapq.heappop(self._mail)
+        while self._in_flight and self._in_flight[0][0] <= until:
+            now, _, _, way, number, sent, phase, exchange = heapq.heappop(self._in_flight)
             (sender, receiver), in_time = way.ends, exchange == self._open
             # After the horizon nothing is recorded; the last exchange may still be finished.
             if now < self._scenario.horizon:
@@ -307,14 +307,14 @@ class SlotEvents:
         count = len(self._rows)
         # By receiver and sender, the order of the kernels and of SimPy.
         for node in sorted(self._inbox):
-            taken = self._inbox[node]
-            for peer in sorted(taken):
-                number, age = taken[peer]
+            arrived = self._inbox[node]
+            for peer in sorted(arrived):
+                number, age = arrived[peer]
                 up[self._indices[peer, node]] = 1
                 if self._algorithm.pairwise:
                     self._note((step.end, SWAP, node, peer, number, step.phase, age))
             if not self._algorithm.pairwise:
-                oldest = max(age for _, age in taken.values())
+                oldest = max(age for _, age in arrived.values())
                 self._note((step.end, ABSORB, node, -1, -1, step.phase, oldest))
         if step.step == self._setup.stages.stopping and self._noted:
             self._rows.append(Closed(step.slot, step.end, len(self._rows) - count))

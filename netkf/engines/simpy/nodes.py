@@ -131,8 +131,8 @@ class ClockedNode(Node):
 
     def _read(self, start: float, end: float) -> FloatArray:
         truth = self._truth
-        seen = truth.moments(start, end)
-        parts = [sensor.moments(truth, seen, start, end) for sensor in self._increments]
+        x_moments = truth.moments(start, end)
+        parts = [sensor.moments(truth, x_moments, start, end) for sensor in self._increments]
         # Stack the sensors: first moments of all rows, then the second ones.
         whole = parts[0] if len(parts) == 1 else np.concatenate(parts, axis=1)
         return np.asarray(whole.reshape(-1))

@@ -25,7 +25,7 @@ from netkf.trace.run import Run
 
 
 class BeliefRule(ErrorRule):
-    """Evidence of nodes and of what each was told, and the beliefs that follow from it.
+    """Evidence of nodes, own and received, and the beliefs that follow from it.
 
     In the stack of errors each piece of evidence is a vector s, whose matrix is U.
     """
@@ -41,7 +41,7 @@ class BeliefRule(ErrorRule):
             raise TheoryError("the filters' plant is not the true one: messages follow the state")
         self._steps = algorithm.steps
         self._arrivals = arrivals_by_step(scenario, run) if scenario.slotted else {}
-        self._told: dict[int, dict[int, float]] = {
+        self._received: dict[int, dict[int, float]] = {
             estimator: {} for estimator in range(errors.estimators)
         }
         self._evidence: set[Hashable] = set()
@@ -82,8 +82,8 @@ class BeliefRule(ErrorRule):
             self._move(np.asarray(np.linalg.inv(self.scenario.slot_belief[0]), dtype=np.float64))
             return
         self._drop(list(self._evidence))
-        for estimator, told in self._told.items():
-            told.clear()
+        for estimator, received in self._received.items():
+            received.clear()
             self.errors.copy(estimator, _prior(estimator), estimator)
 
     def sense(self, time: float, observations: EstimatorObservations) -> None:
@@ -102,7 +102,7 @@ class BeliefRule(ErrorRule):
     def _believe(self, estimator: int) -> None:
         """Set the error and the root of P of a node."""
         errors, eye = self.errors, np.eye(self.errors.n)
-        U, s = self._sum([_own(estimator), *((estimator, j) for j in self._told[estimator])])
+        U, s = self._sum([_own(estimator), *((estimator, j) for j in self._received[estimator])])
         S = errors.roots[_prior(estimator)]
         spread = np.linalg.cholesky(eye + S.T @ U @ S)
         root = scipy.linalg.solve_triangular(spread, S.T, lower=True).T
@@ -111,8 +111,8 @@ class BeliefRule(ErrorRule):
         errors.roots[estimator] = triangular_root(root)
 
     def _said(self, sender: int, receiver: int) -> tuple[FloatArray, FloatArray]:
-        """Return what a node says to another: all but what that one told."""
-        others = [(sender, j) for j in self._told[sender] if j != receiver]
+        """Return the evidence for one receiver: all but that of the receiver itself."""
+        others = [(sender, j) for j in self._received[sender] if j != receiver]
         return self._sum([_own(sender), *others])
 
     def exchange(self, slot: int, phase: int, messages: Sequence[SentMessage]) -> None:
@@ -125,7 +125,7 @@ class BeliefRule(ErrorRule):
             said = {(i, j): self._said(j, i) for i, j in pairs}
             for (i, j), (U, s) in said.items():
                 self._put((i, j), U, s)
-                self._told[i][j] = slot
+                self._received[i][j] = slot
         for estimator in range(estimators):
             self._believe(estimator)
 
@@ -136,7 +136,7 @@ class BeliefRule(ErrorRule):
                 self._put(message, *self._said(message.sender, message.receiver))
 
     def arrive(self, time: float, messages: Sequence[SentMessage]) -> None:
-        """Replace what the senders told before, unless it was sent later."""
+        """Replace the earlier evidence of each sender, unless that was sent later."""
         late = [message for message in messages if message.late]
         # All at once: a message says what its sender knew before this instant's messages.
         said = {
@@ -146,9 +146,9 @@ class BeliefRule(ErrorRule):
             for message in messages
         }
         for message in sorted(messages, key=lambda m: (m.sender, m.time, m.number)):
-            told = self._told[message.receiver]
-            if told.get(message.sender, -np.inf) <= message.time:
-                told[message.sender] = message.time
+            received = self._received[message.receiver]
+            if received.get(message.sender, -np.inf) <= message.time:
+                received[message.sender] = message.time
                 self._put((message.receiver, message.sender), *said[message])
         self._drop(late)
         for estimator in {message.receiver for message in messages}:

@@ -159,9 +159,9 @@ class DelayedJumps:
         N, n, G = self.nodes, len(self.A), self._mean[1]
         times = self.delay * chebyshev_points(self.points)
         E = np.stack([scipy.linalg.expm(s * self.A) for s in times])
-        alike = np.tile(E, (1, N, 1))
+        repeated = np.tile(E, (1, N, 1))
         start = np.tile(np.eye(n), (N, 1))
-        h = self._moved(start + np.tensordot(self._integral, G @ alike, 1))
+        h = self._moved(start + np.tensordot(self._integral, G @ repeated, 1))
         both = np.tensordot(self._integral, E @ self.Q @ np.swapaxes(h, 1, 2), 1)
         noise = np.tensordot(self._integral, E @ self.Q @ np.swapaxes(E, 1, 2), 1)
         return E @ both[::-1], symmetric(noise[-1])

@@ -96,7 +96,7 @@ class StackedErrors:
 
     def keep(self) -> None:
         """Keep the errors of all estimators as they are now, for ``law``."""
-        self._kept.append(self.stack.settle(range(self.estimators)))
+        self._kept.append(self.stack.freeze(range(self.estimators)))
 
     def law(self) -> tuple[FloatArray, FloatArray]:
         """Return the mean (K M n,) and the joint covariance of the errors of the estimators that

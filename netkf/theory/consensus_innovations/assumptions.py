@@ -13,6 +13,6 @@ NO_LOSS = "no message is lost"
 
 def slot_rows(scenario: Scenario) -> list[AssumptionRow]:
     """Return the rows about the model, the messages and the first covariances."""
-    sure = all_messages_arrive(scenario)
-    evidence = "every message arrives in its slot" if sure else "gains are those without losses"
-    return model_and_start_rows(scenario, SOURCE, (NO_LOSS, SOURCE, sure, evidence))
+    lossless = all_messages_arrive(scenario)
+    evidence = "every message arrives in its slot" if lossless else "gains are those without losses"
+    return model_and_start_rows(scenario, SOURCE, (NO_LOSS, SOURCE, lossless, evidence))

@@ -28,7 +28,7 @@ class PseudoStateRule(ErrorRule):
         super().__init__(scenario, errors)
         algorithm = scenario.filter.algorithm
         assert isinstance(algorithm, ConsensusInnovations)
-        self._seen: EstimatorObservations = {}
+        self._observations: EstimatorObservations = {}
         state = algorithm.init(
             scenario.slot_models[0], *scenario.start(scenario.nodes[0]), scenario.node_infos[0]
         )
@@ -39,7 +39,7 @@ class PseudoStateRule(ErrorRule):
 
     def sense(self, time: float, observations: EstimatorObservations) -> None:
         """Predict the differences, and keep the readings of the slot."""
-        self._seen, self._slot, stack = observations, self._slot + 1, self.errors.stack
+        self._observations, self._slot, stack = observations, self._slot + 1, self.errors.stack
         for estimator in range(self.errors.estimators):
             stack.put(_difference(estimator), self._pseudo.A @ stack.form(_difference(estimator)))
         gains = gain_sequence(self._design).at(self._slot)
@@ -49,7 +49,7 @@ class PseudoStateRule(ErrorRule):
     def exchange(self, slot: int, phase: int, messages: Sequence[SentMessage]) -> None:
         """Correct all estimates by what was heard and read."""
         errors, G, estimators = self.errors, self._pseudo.G, range(self.errors.estimators)
-        columns = errors.reading_noises(self._seen)
+        columns = errors.reading_noises(self._observations)
         states = [errors.stack.form(estimator) for estimator in estimators]
         before = [errors.stack.form(_difference(i)) + G @ states[i] for i in estimators]
         after = [form.copy() for form in before]
@@ -58,10 +58,10 @@ class PseudoStateRule(ErrorRule):
             i, j = message.receiver, message.sender
             B = gains[i].B[self._design.heard[i].index(j)]
             after[i] += B @ (before[j] - before[i])
-        for i, one in self._seen.items():
+        for i, one in self._observations.items():
             weighted = np.linalg.solve(one.R, one.H).T
-            seen = weighted @ one.H
-            after[i] -= gains[i].M @ seen @ self._pseudo.inverse @ before[i]
+            weighted_H = weighted @ one.H
+            after[i] -= gains[i].M @ weighted_H @ self._pseudo.inverse @ before[i]
             after[i][:, columns[i]] -= gains[i].M @ weighted @ one.root
         for i in estimators:
             e = states[i] - gains[i].K @ (G @ states[i] - after[i])

@@ -169,10 +169,10 @@ def _require_one_clock(clock: Periodic, samples: list[SampledNode]) -> None:
     if clock.jitter or isinstance(clock.phase, str):
         raise TheoryError("periodic clocks are known where all tick together, without jitter")
     for one in samples:
-        other, alike = one.clock, False
+        other, same_clock = one.clock, False
         if isinstance(other, Periodic) and not other.jitter:
-            alike = (other.period, other.phase) == (clock.period, clock.phase)
-        if not alike:
+            same_clock = (other.period, other.phase) == (clock.period, clock.phase)
+        if not same_clock:
             raise TheoryError("sensors do not sample at the ticks of the network's periodic clock")
 
 

@@ -23,12 +23,12 @@ class DiffusionKalmanRule(ErrorRule):
 
     def __init__(self, scenario: Scenario, errors: StackedErrors) -> None:
         super().__init__(scenario, errors)
-        self._seen: EstimatorObservations = {}
+        self._observations: EstimatorObservations = {}
         self._columns: dict[int, slice] = {}
 
     def sense(self, time: float, observations: EstimatorObservations) -> None:
         """Update by the nodes' own readings, and keep them for their neighbours."""
-        self._seen, self._columns = observations, self.errors.reading_noises(observations)
+        self._observations, self._columns = observations, self.errors.reading_noises(observations)
         for estimator, observation in observations.items():
             self.errors.update(estimator, observation, self._columns[estimator])
 
@@ -36,8 +36,11 @@ class DiffusionKalmanRule(ErrorRule):
         """Use the readings that arrived, or combine the estimates."""
         if phase == READINGS:
             for message in messages:
-                seen, columns = self._seen[message.sender], self._columns[message.sender]
-                self.errors.update(message.receiver, seen, columns)
+                observation, columns = (
+                    self._observations[message.sender],
+                    self._columns[message.sender],
+                )
+                self.errors.update(message.receiver, observation, columns)
             return
         nodes, eye = self.scenario.nodes, np.eye(self.errors.n)
         weights: dict[int, dict[int, float]] = {}

@@ -72,11 +72,11 @@ class ConsensusRule(ErrorRule):
             for step in range(self._steps)
         ]
         of_predictions, of_readings = effective_weights(self.scenario, heard)
-        errors, seen = self.errors, self._observations
-        columns, estimators = errors.reading_noises(seen), range(errors.estimators)
+        errors, observations = self.errors, self._observations
+        columns, estimators = errors.reading_noises(observations), range(errors.estimators)
         inverses = [np.linalg.inv(errors.roots[j]) for j in estimators]
         # R^-1/2 H of each reading, whose square is its information.
-        white = {j: np.linalg.solve(np.linalg.cholesky(o.R), o.H) for j, o in seen.items()}
+        white = {j: np.linalg.solve(np.linalg.cholesky(o.R), o.H) for j, o in observations.items()}
         changes: dict[Hashable, tuple[FloatArray, Sequence[Term]]] = {}
         for i in estimators:
             a, b = of_predictions[i], of_readings[i]
@@ -87,7 +87,7 @@ class ConsensusRule(ErrorRule):
             changes[i] = root, terms
         errors.combine(changes)
         for i in estimators:
-            for j, one in seen.items():
+            for j, one in observations.items():
                 # e+ = P (sum_j a_ij P_j^-1 e_j - sum_j b_ij H_j' R_j^-1 v_j)
                 root, information = errors.roots[i], np.linalg.solve(one.R, one.H).T
                 gain = of_readings[i, j] * root @ root.T @ information

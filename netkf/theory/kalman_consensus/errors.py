@@ -31,7 +31,7 @@ class KcfRule(ErrorRule):
         algorithm = scenario.filter.algorithm
         assert isinstance(algorithm, Kcf)
         self._epsilon, self._share = algorithm.epsilon, algorithm.share_readings
-        self._seen: EstimatorObservations = {}
+        self._observations: EstimatorObservations = {}
         self._columns: dict[int, slice] = {}
 
     def elapse(self, gap: float, columns: slice | None, noise: FloatArray | None) -> None:
@@ -43,7 +43,7 @@ class KcfRule(ErrorRule):
         self.errors.drop(
             [name for name in map(_prior, range(self.errors.estimators)) if self._has(name)]
         )
-        self._seen, self._columns = {}, {}
+        self._observations, self._columns = {}, {}
 
     def _has(self, name: Hashable) -> bool:
         return name in self.errors.roots
@@ -57,7 +57,7 @@ class KcfRule(ErrorRule):
         self._forget()
         for estimator in observations:
             self.errors.copy(estimator, _prior(estimator), estimator)
-        self._seen, self._columns = observations, self.errors.reading_noises(observations)
+        self._observations, self._columns = observations, self.errors.reading_noises(observations)
         for estimator, observation in observations.items():
             self.errors.update(estimator, observation, self._columns[estimator])
 
@@ -80,9 +80,12 @@ class KcfRule(ErrorRule):
         }
         for estimator, inbox in inboxes.items():
             for message in inbox.values():
-                if self._share and not message.late and message.sender in self._seen:
-                    seen, columns = self._seen[message.sender], self._columns[message.sender]
-                    self.errors.update(estimator, seen, columns)
+                if self._share and not message.late and message.sender in self._observations:
+                    observation, columns = (
+                        self._observations[message.sender],
+                        self._columns[message.sender],
+                    )
+                    self.errors.update(estimator, observation, columns)
             form = self.errors.stack.form(estimator)
             form[:, : terms[estimator].shape[1]] += terms[estimator]
             self.errors.stack.put(estimator, form)

@@ -3,7 +3,7 @@
 With ``T`` (rows, inputs) the matrix of the stacked forms, the joint covariance is ``T T'``: it
 stays positive semidefinite, and a small error keeps its digits where it is the difference of large
 ones. T has a column for each input that was drawn; once there are many, an orthogonal matrix
-reduces them to as many as there are rows. Columns of forms that somebody keeps are settled: they
+reduces them to as many as there are rows. Columns of forms that somebody keeps are frozen: they
 are never rotated again.
 """
 
@@ -31,7 +31,7 @@ class GaussianStack:
         self._n = n
         self._index: dict[Hashable, int] = {}
         self._free: list[int] = []
-        self._settled = 0
+        self._frozen = 0
         self.used = 0
         self.table: FloatArray = np.zeros((0, n, SPARE_INPUTS))
         self.matrices: FloatArray = np.zeros((0, n, n))
@@ -63,7 +63,7 @@ class GaussianStack:
         self.used += count
         return columns
 
-    def settle(self, names: Sequence[Hashable]) -> FloatArray:
+    def freeze(self, names: Sequence[Hashable]) -> FloatArray:
         """Return the forms (K, n, inputs) of K vectors, which stay valid: later forms have these
         inputs in the same columns, and the vectors do not depend on any others.
         """
@@ -71,23 +71,23 @@ class GaussianStack:
         others = [name for name in self._index if name not in first]
         self._reduce([*names, *others], 0)
         # Below a triangle of zeros, the first rows end within as many columns.
-        self._settled = min(self.used, self._settled + len(names) * self._n)
-        return self.table[self.indices(names), :, : self._settled]
+        self._frozen = min(self.used, self._frozen + len(names) * self._n)
+        return self.table[self.indices(names), :, : self._frozen]
 
     def _reduce(self, names: Iterable[Hashable], count: int) -> None:
-        """Rotate the inputs that are not settled so that few are left, the first ones for the first
+        """Rotate the inputs that are not frozen so that few are left, the first ones for the first
         names, and make space for ``count`` more.
         """
         rows = self.indices(names)
-        stacked = self.table[rows, :, self._settled : self.used].reshape(len(rows) * self._n, -1)
+        stacked = self.table[rows, :, self._frozen : self.used].reshape(len(rows) * self._n, -1)
         # Only T T' matters, so that T may be multiplied by any orthogonal matrix from the right:
         # T' = Q R, so T T' = R' R, and R' replaces T and has no more columns than rows.
         stacked = np.asarray(np.linalg.qr(stacked.T, mode="r")).T
-        settled, used = self._settled, self._settled + stacked.shape[1]
-        width = settled + len(self.table) * self._n + count + SPARE_INPUTS
+        frozen, used = self._frozen, self._frozen + stacked.shape[1]
+        width = frozen + len(self.table) * self._n + count + SPARE_INPUTS
         table = np.zeros((len(self.table), self._n, max(width, used + count + SPARE_INPUTS)))
-        table[rows, :, :settled] = self.table[rows, :, :settled]
-        table[rows, :, settled:used] = stacked.reshape(len(rows), self._n, -1)
+        table[rows, :, :frozen] = self.table[rows, :, :frozen]
+        table[rows, :, frozen:used] = stacked.reshape(len(rows), self._n, -1)
         self.table, self.used = table, used
 
     def form(self, name: Hashable) -> FloatArray:

@@ -38,16 +38,16 @@ def mass_totals(
     if degrees not in ("nominal", "last"):
         raise TheoryError(f'degrees must be "nominal" or "last", got {degrees!r}')
     nominal = np.bincount(links.reshape(-1), minlength=N) + 1.0
-    z, seen, totals = np.full(N, 1.0 / N), nominal, [1.0]
+    z, last_degrees, totals = np.full(N, 1.0 / N), nominal, [1.0]
     for row in present:
         open_, closed = links[row], links[~row]
-        share = z / (nominal if degrees == "nominal" else seen)
+        share = z / (nominal if degrees == "nominal" else last_degrees)
         z = share.copy()
         np.add.at(z, open_[:, 0], share[open_[:, 1]])
         np.add.at(z, open_[:, 1], share[open_[:, 0]])
         if degrees == "nominal":
             np.add.at(z, closed.reshape(-1), share[closed.reshape(-1)])
-        seen = np.bincount(open_.reshape(-1), minlength=N) + 1.0
+        last_degrees = np.bincount(open_.reshape(-1), minlength=N) + 1.0
         totals.append(float(z.sum()))
     return np.array(totals)
 

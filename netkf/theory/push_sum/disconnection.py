@@ -220,25 +220,25 @@ def _greedy(neighbours: list[dict[int, float]], root: int) -> tuple[float, list[
     soon as more than MAX_OPEN nodes are open.
     """
     waiting = [set(links) for links in neighbours]
-    effort, order, opened, taken = 0.0, [], set[int](), set[int]()
+    effort, order, opened, eliminated = 0.0, [], set[int](), set[int]()
     candidates = {root}
     while candidates:
         ranked = []
         for node in candidates:
             near = neighbours[node].keys()
             closed = sum(len(waiting[other]) == 1 for other in near & opened)
-            stays = int(not near <= taken)
-            ranked.append((stays - closed, len(near - taken - candidates), node))
+            stays = int(not near <= eliminated)
+            ranked.append((stays - closed, len(near - eliminated - candidates), node))
         node = min(ranked)[-1]
         order.append(node)
-        taken.add(node)
+        eliminated.add(node)
         opened.add(node)
         for other in neighbours[node]:
             waiting[other].discard(node)
         opened = {k for k in opened if waiting[k]}
         if len(opened) > MAX_OPEN:
             return None
-        candidates = (candidates | neighbours[node].keys()) - taken
+        candidates = (candidates | neighbours[node].keys()) - eliminated
         effort += 3.0 ** len(opened)
     return effort, order
 

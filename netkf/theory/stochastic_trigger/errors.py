@@ -52,16 +52,16 @@ class ScheduleRule(ErrorRule):
         algorithm = scenario.filter.algorithm
         assert isinstance(algorithm, StochasticTrigger)
         self._Y, self._sent = algorithm.Y, decisions(scenario, run)
-        self._seen: EstimatorObservations = {}
+        self._observations: EstimatorObservations = {}
 
     def sense(self, time: float, observations: EstimatorObservations) -> None:
         """Keep the readings for the exchange of the slot."""
-        self._seen = observations
+        self._observations = observations
 
     def exchange(self, slot: int, phase: int, messages: Sequence[SentMessage]) -> None:
         """Update all nodes by all sensors."""
-        columns = self.errors.reading_noises(self._seen)
-        for estimator, one in self._seen.items():
+        columns = self.errors.reading_noises(self._observations)
+        for estimator, one in self._observations.items():
             used = one if (slot, estimator) in self._sent else silence(one, self._Y)
             for hearer in range(self.errors.estimators):
                 self.errors.update(hearer, used, columns[estimator])

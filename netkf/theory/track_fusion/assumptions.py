@@ -20,6 +20,6 @@ def slot_rows(scenario: Scenario) -> list[AssumptionRow]:
     rows = model_and_start_rows(scenario, source)
     if scenario.hosted.combination != "tracks":
         return rows
-    sure = all_messages_arrive(scenario)
-    evidence = "every message arrives in its slot" if sure else "P depends on who is heard"
-    return [*rows, ("no message is lost", source, sure, evidence)]
+    lossless = all_messages_arrive(scenario)
+    evidence = "every message arrives in its slot" if lossless else "P depends on who is heard"
+    return [*rows, ("no message is lost", source, lossless, evidence)]

@@ -65,7 +65,7 @@ def steady_tracks(scenario: Scenario) -> tuple[FloatArray, float]:
 def _mean_shown_covariance(scenario: Scenario, joint: FloatArray, i: int) -> FloatArray:
     """Return the mean covariance (n, n) of what node i shows; ``joint`` (N, N, n, n)."""
     probabilities = _hearing_probabilities(scenario, scenario.nodes[i])
-    sure = [j for j, p in probabilities.items() if p == 1.0]
+    certain = [j for j, p in probabilities.items() if p == 1.0]
     unsure = [j for j, p in probabilities.items() if 0.0 < p < 1.0]
     if len(unsure) > MAX_NEIGHBOURS:
         raise TheoryError(
@@ -78,7 +78,7 @@ def _mean_shown_covariance(scenario: Scenario, joint: FloatArray, i: int) -> Flo
         probability = math.prod(
             probabilities[j] if one else 1.0 - probabilities[j] for j, one in outcomes
         )
-        order = [i, *sure, *(j for j, one in outcomes if one)]
+        order = [i, *certain, *(j for j, one in outcomes if one)]
         total += probability * _fuse(joint, order)
     return total
 

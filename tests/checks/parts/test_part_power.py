@@ -10,7 +10,7 @@ import pytest
 
 from netkf.checks.exact import _length_interval
 from netkf.checks.parts.clock_rows import _count_interval, largest_correlation
-from netkf.checks.parts.events import FateCounts, PairCounts, reversed_directions
+from netkf.checks.parts.events import LossCounts, PairCounts, reversed_directions
 from netkf.checks.parts.moments import (
     CELLS,
     _between,
@@ -50,10 +50,10 @@ def _samples(scenario, fates=None, pairs=None):
 
 
 def _count(scenario, lost):
-    """Count losses (R, W M, D) as `count_fates` does."""
+    """Count losses (R, W M, D) as `count_losses` does."""
     runs, _, directions = lost.shape
     parts = lost.reshape(runs, WINDOWS, MESSAGES, directions)
-    return FateCounts(
+    return LossCounts(
         np.full((runs, WINDOWS, directions), MESSAGES),
         parts.sum(axis=2),
         lost[:, :-1].sum(axis=1),
