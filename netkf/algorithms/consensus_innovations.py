@@ -209,6 +209,7 @@ class GainSequence:
         return self._x(len(self._heard) + i)
 
     def _root(self, i: int) -> FloatArray:
+        """Return the lower triangular root (n, n) of P of node ``i``."""
         return lower_root(np.ascontiguousarray(self._x(i)))
 
     def _correct_pseudo_states(self) -> list[tuple[FloatArray, FloatArray]]:

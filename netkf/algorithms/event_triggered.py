@@ -277,6 +277,9 @@ def is_near_single(
 
 
 def _is_information_consensus(value: Any) -> Filter:
+    """Return the filter if it is HCMCI with one step of consensus on information; raises TypeError
+    or ValueError, which the rule of the field turns into a ScenarioError.
+    """
     if not isinstance(value, Hcmci) or type(value) is not Hcmci:
         raise TypeError
     if value.consensus != INFORMATION or value.steps != 1:

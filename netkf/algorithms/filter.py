@@ -432,6 +432,7 @@ def commutes(algorithm: Filter) -> bool:
     order = type(algorithm).__mro__
 
     def owner(name: str) -> int:
+        """Return the position in the method resolution order of the class that defines ``name``."""
         return next((k for k, cls in enumerate(order) if name in cls.__dict__), len(order))
 
     return owner("shift") <= min(owner(name) for name in STEPS)

@@ -43,6 +43,7 @@ def _shared_flow_table(
 
 @lru_cache(maxsize=TABLES)
 def _known_flow_table(n: int, parts: tuple[bytes, ...], longest: float) -> FlowTable:
+    """Return the flow table of a model whose A, Q, H and R come as bytes, the keys of the cache."""
     A, Q, H, R = (np.frombuffer(part) for part in parts)
     p = len(H) // n
     return flow_table(A.reshape(n, n), Q.reshape(n, n), H.reshape(p, n), R.reshape(p, p), longest)

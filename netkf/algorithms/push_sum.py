@@ -739,6 +739,7 @@ class PushSum(Filter):
             )
 
     def _check_leader(self, scenario: Any) -> None:
+        """Raise ScenarioError unless the leader is a node of the graph."""
         nodes = scenario.nodes
         if self.leader not in scenario.topology.index:
             ids = ", ".join(map(str, nodes)) if len(nodes) <= 8 else f"{nodes[0]} .. {nodes[-1]}"
@@ -746,6 +747,7 @@ class PushSum(Filter):
             raise ScenarioError("filter.leader", rule, self.leader, remedy)
 
     def _check_gain(self, radius: float) -> None:
+        """Raise ScenarioError unless averaging with ``delta`` contracts; ``radius`` is rho(L)."""
         # Averaging contracts if and only if all eigenvalues of I - L / delta but one lie inside
         # (-1, 1).
         if self.delta <= 0.5 * radius * (1.0 + 1e-12):

@@ -39,6 +39,7 @@ def built_in(kind: str, **choice: str) -> Callable[[F], F]:
     """
 
     def register(cls: F) -> F:
+        """Register the class and return it unchanged."""
         _REGISTERED[choice_name(kind, choice)] = cls
         return cls
 

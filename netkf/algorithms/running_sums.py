@@ -96,6 +96,9 @@ def predict_offer(offer: Offer, back: Backward) -> Offer:
 
 
 def _move_total(total: FloatArray, back: Backward) -> FloatArray:
+    """Return a total (w, U, u) about a state one gap later: ``U <- s F^-T U F^-1``, ``u <- s F^-T
+    u``, where ``back`` is (F^-1, s).
+    """
     inverse, fading = back
     n, out = len(inverse), total.copy()
     U = total[1 : 1 + n * n].reshape(n, n)
@@ -182,6 +185,7 @@ def shift_offer(offer: Offer, offset: FloatArray) -> Offer:
 
 
 def _shift_total(total: FloatArray, offset: FloatArray) -> FloatArray:
+    """Return a total (w, U, u) after a shift of the state by ``offset`` (n,): ``u + U offset``."""
     n, out = len(offset), total.copy()
     out[1 + n * n :] += total[1 : 1 + n * n].reshape(n, n) @ offset
     return out

@@ -621,6 +621,7 @@ def slot_alone(
     here = slice(s, s + 1)
 
     def at_slot(values: Any) -> Any:
+        """Return the part of the values of a block at this slot."""
         return np.ascontiguousarray(values[:, here])
 
     local, fixed = at_slot(readings.local), readings.H.shape[1] == 1

@@ -156,6 +156,7 @@ def _test(promise: Promise, samples: Any, level: float) -> Finding:
 
 
 def _is_needed(promise: Promise, row: Assumption) -> bool:
+    """Return True if a promise relies on an assumption."""
     needs = (*promise.needs, GAUSSIAN) if promise.test in GAUSSIAN_TESTS else promise.needs
     return any(need in f"{row.assumption} [{row.source}]" for need in needs)
 
@@ -230,6 +231,7 @@ def _describe_horizon(seconds: float) -> str:
 
 
 def _reject(promise: Promise, why: str) -> Evidence:
+    """Return the row of a promise that is not made here, with the reason."""
     nan = math.nan
     return Evidence(
         promise.statement, promise.source, why, nan, nan, nan, nan, NOT_PROMISED, None, ""

@@ -86,6 +86,7 @@ class GossipSummary(ReplicaSummary):
 
 
 def _summarise(scenario: Scenario, run: Run) -> GossipSummary:
+    """Return the summary of a run: exact errors, and P replayed along the paths of tokens."""
     slots = list(check_slots(scenario))
     sources, table = pair_sources(scenario, run, slots[-1]), gossip_modes(scenario)
     starts, n, sampled = initial_roots(scenario), scenario.plant.n, sampled_indices(scenario)

@@ -120,6 +120,7 @@ def _least_roots(scenario: Scenario) -> FloatArray:
 
 
 def _summarise(scenario: Scenario, run: Run) -> IntermittentSummary:
+    """Return the summary of a run: exact errors, and P replayed along the arrivals."""
     slots, n = list(check_slots(scenario)), scenario.plant.n
     starts, least = initial_roots(scenario)[sampled_indices(scenario)], _least_roots(scenario)
     table, sequences, _ = find_arrivals(scenario, run, slots[-1])

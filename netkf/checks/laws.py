@@ -54,6 +54,7 @@ def find_largest(
     found = Finding(margin, tolerance, text, detectable=detectable)
 
     def forecast(factor: float) -> float:
+        """Return the expected upper end of the largest distance with ``factor`` times the runs."""
         return max(interval.expected_high(factor) for interval, _ in distances)
 
     return found._replace(seen=chosen.seen, expected=chosen.expected, forecast=forecast)

@@ -75,6 +75,7 @@ def verdict_picture(path: Path, verdict: Verdict, claim: str) -> bool:
 
 
 def _title(rows: list[Evidence], claim: str) -> str:
+    """Return the title: the claim, after the number of broken promises if there are any."""
     broken = sum(row.verdict == BROKEN for row in rows)
     count = f"{broken} of {len(rows)} promises with an interval are broken"
     return f"{count}: {claim}" if broken else claim
@@ -93,4 +94,5 @@ def _draw_row(axes: Any, height: int, row: Evidence) -> None:
 
 
 def _label(row: Evidence) -> str:
+    """Return the statement of a promise, shortened to one line of the picture."""
     return textwrap.shorten(row.promise, LONGEST_LABEL, placeholder=" ...")

@@ -70,6 +70,7 @@ def student_interval(value: float, deviation: float, count: int, level: float) -
     """
 
     def limits(value: float, factor: float) -> tuple[float, float]:
+        """Return both ends for another mean and ``factor`` times the samples."""
         quantile = -float(scipy.special.stdtrit(factor * count - 1.0, level / 2.0))
         reach = deviation / math.sqrt(factor) * quantile
         return value - reach, value + reach
@@ -79,6 +80,7 @@ def student_interval(value: float, deviation: float, count: int, level: float) -
 
 
 def _normal_quantile(probability: float) -> float:
+    """Return the quantile of the standard normal law."""
     return float(scipy.special.ndtri(probability))
 
 
@@ -87,6 +89,7 @@ def probability_interval(successes: int, trials: int, level: float) -> Interval:
     low = high = detectable = math.nan
 
     def limits(share: float, factor: float) -> tuple[float, float]:
+        """Return both ends for another share and ``factor`` times the trials (Clopper-Pearson)."""
         hits = min(max(share, 0.0), 1.0) * trials * factor
         missed = trials * factor - hits
         low = float(scipy.special.betaincinv(hits, missed + 1, level / 2)) if hits else 0.0
@@ -105,6 +108,7 @@ def affine(found: Interval, scale: float, shift: float) -> Interval:
     """Return the interval of ``scale`` times a quantity plus ``shift``; the scale is positive."""
 
     def limits(value: float, factor: float) -> tuple[float, float]:
+        """Return both ends for another value and ``factor`` times the samples."""
         low, high = found.limits((value - shift) / scale, factor)
         return scale * low + shift, scale * high + shift
 
@@ -118,6 +122,7 @@ def with_drawn(found: Interval, drawn: Callable[[float], float]) -> Interval:
     """
 
     def limits(value: float, factor: float) -> tuple[float, float]:
+        """Return both ends for ``factor`` times the runs, of which fewer may be drawn."""
         more = drawn(factor)
         # The value has been taken for one that shrinks with the runs.
         return found.limits(value * math.sqrt(factor / more), more)
@@ -134,6 +139,7 @@ def deviation_interval(expected: float, found: Interval) -> Interval:
     side = math.copysign(1.0, found.value - expected)
 
     def limits(value: float, factor: float) -> tuple[float, float]:
+        """Return 0 and the largest distance for another value and ``factor`` times the samples."""
         ends = found.limits(expected + side * value, factor)
         return 0.0, max(abs(end - expected) for end in ends)
 
@@ -175,6 +181,7 @@ def law_excess(one: FloatArray, other: FloatArray, level: float, rounding: float
 
 
 def _ecdf_gaps(one: FloatArray, other: FloatArray, rounding: float) -> FloatArray:
+    """Return the difference of two empirical distribution functions above each distinct value."""
     a, b = np.sort(one), np.sort(other)
     points = np.sort(np.concatenate([a, b]))
     # Neighbours that only rounding parts are one value: the gap is that above the last of them.
@@ -186,11 +193,15 @@ def _ecdf_gaps(one: FloatArray, other: FloatArray, rounding: float) -> FloatArra
 
 
 def _band_interval(gaps: FloatArray, a: int, b: int, level: float, grow: bool) -> Interval:
+    """Return the interval of the largest difference of two distribution functions of a and b
+    samples.
+    """
     value = max(0.0, float(gaps.max()))
     widths = band_width(a, level / 2.0), band_width(b, level / 2.0)
     width = sum(widths)
 
     def limits(value: float, factor: float) -> tuple[float, float]:
+        """Return both ends for another distance and ``factor`` times the samples."""
         first, second = widths[0] / math.sqrt(factor), widths[1]
         reach = first + (second / math.sqrt(factor) if grow else second)
         return value - reach, value + reach
@@ -226,6 +237,7 @@ def band_around(value: float, width: float, detectable: float = math.nan) -> Int
     """Return the interval for a difference of probabilities that is off by at most ``width``."""
 
     def limits(value: float, factor: float) -> tuple[float, float]:
+        """Return both ends for another distance and ``factor`` times the samples."""
         reach = width / math.sqrt(factor)
         return value - reach, value + reach
 
@@ -239,11 +251,13 @@ def scale_interval(total: float, freedom: float, level: float) -> Interval:
     """
 
     def quantiles(freedom: float) -> tuple[float, float]:
+        """Return the upper and lower quantile of chi-square."""
         tails = 1.0 - level / 2.0, level / 2.0
         upper, lower = (2.0 * float(scipy.special.gammaincinv(freedom / 2.0, p)) for p in tails)
         return upper, lower
 
     def limits(value: float, factor: float) -> tuple[float, float]:
+        """Return both ends for another variance and ``factor`` times the samples."""
         more = factor * freedom
         upper, lower = quantiles(more)
         return value * more / upper, value * more / lower

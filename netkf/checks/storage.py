@@ -54,6 +54,7 @@ def save_verdict(directory: Path, scenario: Scenario, verdict: Verdict, text: st
 
 
 def _save_verdict(directory: Path, scenario: Scenario, verdict: Verdict, text: str) -> None:
+    """Write scenario, results, table, text and JSON of a verdict into a directory."""
     if not (directory / "scenario.toml").exists():
         write_scenario(directory, scenario)
     results = io.BytesIO()
@@ -193,6 +194,7 @@ def _results(path: Path, scenario: Scenario) -> list[ReplicaResult]:
 
 
 def _fields(values: dict[str, Any], prefix: str) -> dict[str, Any]:
+    """Return the values whose names begin with ``prefix`` and a dot, without these."""
     return {
         name.split(".", 1)[1]: value
         for name, value in values.items()

@@ -56,6 +56,7 @@ def read_rows(
 
 
 def _demand(source: SourceFile, header: list[str], required: tuple[str, ...]) -> None:
+    """Raise ScenarioError if the header lacks a required column."""
     missing = [name for name in required if name not in header]
     if missing:
         rule = f"{source.name} must have the columns {', '.join(required)}"

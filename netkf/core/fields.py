@@ -119,6 +119,7 @@ class Component:
 
 
 def _are_equal(one: Any, other: Any) -> bool:
+    """Return True if two values of fields are equal, arrays and tuples entry by entry."""
     # Scenarios that are made from each other share most parts: caches look them up often.
     if one is other:
         return True
@@ -149,6 +150,7 @@ def number(
     ]
 
     def convert(value: Any) -> float:
+        """Return the value as a finite float within the limits."""
         if isinstance(value, bool) or not isinstance(value, (int, float, np.integer, np.floating)):
             raise TypeError
         result = float(value)
@@ -180,6 +182,7 @@ MIN_SECONDS, MAX_SECONDS = 1e-9, 1e15
 
 
 def _seconds(value: Any) -> float:
+    """Return a positive time in seconds within the limits of the simulator."""
     result: float = positive.convert(value)
     if not MIN_SECONDS <= result <= MAX_SECONDS:
         requirement = f"must be from {MIN_SECONDS:g} to {MAX_SECONDS:g} seconds"
@@ -200,6 +203,7 @@ def integer(low: int | None = None, high: int | None = None) -> Rule:
     """Return the rule for an integer from ``low`` to ``high``; None leaves that side open."""
 
     def convert(value: Any) -> int:
+        """Return the value as an int within the limits."""
         if isinstance(value, bool) or not isinstance(value, (int, np.integer)):
             raise TypeError
         if (low is not None and value < low) or (high is not None and value > high):
@@ -220,7 +224,10 @@ MAX_MAGNITUDE = 1e30
 
 
 def _instance_of(kind: type) -> Callable[[Any], Any]:
+    """Return a conversion that lets through nonempty values of one type only."""
+
     def convert(value: Any) -> Any:
+        """Return the value if it has the type."""
         if not isinstance(value, kind) or value == "":
             raise TypeError
         return value
@@ -237,12 +244,14 @@ boolean = Rule(
 
 
 def _one_line(value: Any) -> str:
+    """Return the value if it is printable text without line breaks."""
     if not isinstance(value, str) or not value.isprintable():
         raise TypeError
     return value
 
 
 def _nonempty_line(value: Any) -> str:
+    """Return the value if it is one nonempty line of printable text."""
     if not _one_line(value):
         raise TypeError
     return str(value)
@@ -266,6 +275,7 @@ def instance(*kinds: type) -> Rule:
     """Return the rule for an object of one of the classes ``kinds``."""
 
     def convert(value: Any) -> Any:
+        """Return the value if it is of one of the classes."""
         if not isinstance(value, kinds):
             raise TypeError
         return value
@@ -278,6 +288,7 @@ def choice(*names: str) -> Rule:
     """Return the rule for one of the given strings."""
 
     def convert(value: Any) -> str:
+        """Return the value if it is one of the names."""
         if value not in names:
             raise ValueError
         return str(value)
@@ -290,6 +301,7 @@ def either(first: Rule, second: Rule, is_second: Callable[[Any], bool]) -> Rule:
     """Return a rule that applies ``second`` to values for which ``is_second``, else ``first``."""
 
     def convert(value: Any) -> Any:
+        """Return the value as converted by the rule whose form it has."""
         rule = second if is_second(value) else first
         try:
             return rule.convert(value)
@@ -308,6 +320,7 @@ def nested(depth: int) -> Callable[[Any], bool]:
     """Return a test for lists or arrays that are nested at least ``depth`` deep."""
 
     def measure(value: Any) -> int:
+        """Return how deep lists, tuples and arrays are nested, 0 for a number."""
         if isinstance(value, np.ndarray):
             return value.ndim
         if isinstance(value, (list, tuple)):
@@ -321,6 +334,7 @@ def array(dimensions: int, kind: str) -> Rule:
     """Return the rule for a finite real array with that many dimensions, called a ``kind``."""
 
     def convert(value: Any) -> FloatArray:
+        """Return the value as a read-only array of finite float64 numbers."""
         if isinstance(value, (str, bytes)) or _has_bool(value):
             raise TypeError
         result = readonly_array(value)
@@ -345,6 +359,7 @@ def array(dimensions: int, kind: str) -> Rule:
 
 
 def _has_bool(value: Any) -> bool:
+    """Return True if a bool or a text is somewhere in nested lists."""
     # numpy would convert True to 1.0 and "1" to 1.0.
     if isinstance(value, (list, tuple)):
         return any(map(_has_bool, value))
@@ -356,6 +371,7 @@ matrix = array(2, "matrix")
 
 
 def _square(value: Any) -> FloatArray:
+    """Return the value as a square matrix."""
     result = matrix.convert(value)
     if result.shape[0] != result.shape[1]:
         raise _SpecificError(f"must be a square matrix, not {result.shape[0]} x {result.shape[1]}")
@@ -366,6 +382,7 @@ square = Rule("must be a square matrix of finite numbers", _square, matrix.remed
 
 
 def _symmetric(value: Any) -> FloatArray:
+    """Return the value as a symmetric matrix, up to rounding."""
     result = _square(value)
     if not np.allclose(result, result.T, rtol=1e-9, atol=1e-12 * np.abs(result).max()):
         raise _SpecificError("must be a symmetric matrix")
@@ -373,6 +390,7 @@ def _symmetric(value: Any) -> FloatArray:
 
 
 def _covariance(value: Any) -> FloatArray:
+    """Return the value as a positive semidefinite matrix."""
     result = _symmetric(value)
     if not is_semidefinite(result):
         least = np.linalg.eigvalsh(result)[0]
@@ -381,6 +399,7 @@ def _covariance(value: Any) -> FloatArray:
 
 
 def _definite(value: Any) -> FloatArray:
+    """Return the value as a positive definite matrix that is not close to singular."""
     result = _symmetric(value)
     values = np.linalg.eigvalsh(result)
     if not values[0] > max(1e-14 * abs(values[-1]), 1.0 / MAX_MAGNITUDE):
@@ -409,6 +428,7 @@ def several(rule: Rule, what: str, least: int = 1) -> Rule:
     """
 
     def convert(value: Any) -> tuple[Any, ...]:
+        """Return the items as a tuple, each converted by the rule."""
         if isinstance(value, (str, bytes)) or not isinstance(value, (Sequence, np.ndarray)):
             raise TypeError
         if len(value) < least:
@@ -424,6 +444,7 @@ def row(*rules: Rule, what: str) -> Rule:
     """Return the rule for a list of fixed length whose entries obey one rule each."""
 
     def convert(value: Any) -> tuple[Any, ...]:
+        """Return the items as a tuple, each converted by its own rule."""
         if not isinstance(value, (list, tuple, np.ndarray)) or len(value) != len(rules):
             raise TypeError
         return tuple(
@@ -456,6 +477,7 @@ class SourceFile:
 
 
 def _source_file(value: Any) -> SourceFile:
+    """Return the value as a SourceFile inside the folder of the scenario."""
     if isinstance(value, SourceFile):
         source = value
     elif isinstance(value, (str, Path)) and str(value):

@@ -21,6 +21,7 @@ class NotebookTable:
         return getattr(self, "table", None)
 
     def _repr_html_(self) -> str:
+        """Return the HTML that notebooks display."""
         line = f"<p><code>{html.escape(one_line(repr(self)))}</code></p>"
         table = self._notebook_table()
         # Texts in tables may come from files; pandas escapes them.

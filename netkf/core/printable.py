@@ -31,4 +31,5 @@ def cut_middle(text: str, longest: int) -> str:
 
 
 def _escape(character: str) -> str:
+    """Return the escape sequence of a character."""
     return character.encode("unicode_escape").decode("ascii")

@@ -79,6 +79,7 @@ class OnReadings(LinkClock):
 
 
 def _accumulate(now: float, gaps: FloatArray) -> FloatArray:
+    """Return the ticks (K,) at ``now`` plus the sums of the first 1, 2, ... ``gaps`` (K,)."""
     # One addition a tick, so that the size of a block never shows in a time.
     return np.asarray(np.add.accumulate(np.concatenate([[now], gaps]))[1:])
 
@@ -89,6 +90,7 @@ _node_rate = row(integer(), _rate, what="a pair [i, rate]")
 
 
 def _one_rate(value: Any) -> tuple[float, ...]:
+    """Return an entry of ``rates``: (node, rate) or (node, peer, rate)."""
     # Which of the two it must be depends on `at`; the clock checks that.
     single = isinstance(value, (list, tuple, np.ndarray)) and len(value) == 2
     rates: tuple[float, ...] = (_node_rate if single else _link_rate).convert(value)
@@ -129,9 +131,11 @@ class Poisson(LinkClock):
 
     @cached_property
     def _own(self) -> dict[Entity, float]:
+        """Rates of the entities that have one of their own, per second."""
         return {self._named(given): given[-1] for given in self.rates}
 
     def _named(self, given: tuple[float, ...]) -> Entity:
+        """Return the entity that an entry of ``rates`` names."""
         ids = tuple(int(number) for number in given[:-1])
         return tuple(sorted(ids)) if self.at == "links" else ids
 
@@ -231,6 +235,7 @@ class Renewal(LinkClock):
 
     @property
     def _mean(self) -> float:
+        """Mean gap in seconds."""
         if self.low is not None and self.high is not None:
             return 0.5 * (self.low + self.high)
         if self.scale is not None and self.shape is not None:
@@ -275,6 +280,7 @@ class Renewal(LinkClock):
 
 
 def _lattice(phase: float, period: float, first: int, count: int) -> FloatArray:
+    """Return ticks ``first`` to ``first + count - 1`` of a periodic clock, in seconds."""
     # Rounded so that lattices whose periods are multiples of each other meet exactly.
     return np.round(phase + period * np.arange(first, first + count), 12)
 
@@ -338,6 +344,7 @@ class RecordedClock(LinkClock):
 
     @cached_property
     def _times(self) -> dict[Entity, FloatArray]:
+        """Times of the table in seconds by entity, in the order of rows."""
         columns = ("node",) if self.at == "nodes" else ("node", "peer")
         if self.at == "nodes" and "peer" in read_header(self.path):
             raise ScenarioError(
@@ -364,6 +371,7 @@ class RecordedClock(LinkClock):
 
     @cached_property
     def _instants(self) -> dict[Entity, FloatArray]:
+        """Increasing distinct times of each entity, in seconds."""
         return {entity: np.unique(values) for entity, values in self._times.items()}
 
     @property

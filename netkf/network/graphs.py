@@ -88,13 +88,16 @@ class Topology:
 
     @cached_property
     def _receivers(self) -> dict[int, tuple[int, ...]]:
+        """Nodes that hear each node, in the order of ids."""
         return self._ends(0)
 
     @cached_property
     def _senders(self) -> dict[int, tuple[int, ...]]:
+        """Nodes that each node hears, in the order of ids."""
         return self._ends(1)
 
     def _ends(self, end: int) -> dict[int, tuple[int, ...]]:
+        """Return for each node the other end of each direction with it at position ``end``."""
         found: dict[int, list[int]] = {node: [] for node in self.nodes}
         for direction in self.directions:
             found[direction[end]].append(direction[1 - end])
@@ -152,11 +155,13 @@ class Graph(Component):
 
 
 def _topology(nodes: Iterable[int], links: Iterable[Link], **more: Any) -> Topology:
+    """Return the topology of undirected links, each given in any order of its ends."""
     pairs = {(min(link), max(link)) for link in links}
     return Topology(tuple(sorted(nodes)), tuple(sorted(pairs)), **more)
 
 
 def _from_networkx(graph: networkx.Graph[Any], **more: Any) -> Topology:
+    """Return the topology of an undirected networkx graph."""
     return _topology(graph.nodes, graph.edges, **more)
 
 
@@ -165,6 +170,7 @@ _node = integer(low=0, high=2**53)
 
 
 def _check_size(nodes: int, links: int) -> None:
+    """Raise ScenarioError for graphs beyond the limits."""
     if nodes > MAX_NODES or links > MAX_LINKS:
         rule = f"must have at most {MAX_NODES:,} nodes and {MAX_LINKS:,} links"
         raise ScenarioError("", rule, f"{nodes:,} nodes, {links:,} links", "make it smaller")
@@ -246,6 +252,7 @@ class RandomGraph(Graph):
     def _draw(
         self, seed: int, make: Callable[[np.random.RandomState], networkx.Graph[Any]]
     ) -> networkx.Graph[Any]:
+        """Return the first graph of successive seeds that is connected, if that is asked for."""
         import networkx
 
         first, tries, drawn = seed if self.seed is None else self.seed, 0, 0
@@ -286,6 +293,7 @@ class Regular(RandomGraph):
         _check_size(N, degree * N // 2)
 
         def make(state: np.random.RandomState) -> networkx.Graph[Any]:
+            """Return a random regular graph."""
             if 2 * degree < N:
                 sparse: networkx.Graph[Any] = networkx.random_regular_graph(degree, N, state)
                 return sparse
@@ -329,6 +337,7 @@ class Geometric(RandomGraph):
         _check_size(self.nodes, int(pairs * _chance_within(min(self.radius, 1.0))))
 
         def make(state: np.random.RandomState) -> networkx.Graph[Any]:
+            """Return a geometric graph of uniform points in the unit square."""
             points = {k: tuple(p) for k, p in enumerate(state.random_sample((self.nodes, 2)))}
             return networkx.random_geometric_graph(self.nodes, self.radius, pos=points)
 
@@ -428,6 +437,7 @@ class CsvGraph(Graph):
         )
 
     def _table(self) -> _Table:
+        """Delivery probability of each listed direction, and whether the file gives them."""
         columns = read_columns(self.path, ("sender", "receiver"), ("delivery_probability",))
         senders = whole(self.path, "sender", columns["sender"])
         receivers = whole(self.path, "receiver", columns["receiver"])
@@ -477,10 +487,12 @@ class CsvGraph(Graph):
         return links
 
     def _delivery(self, delivery: dict[Link, float], links: set[Link]) -> dict[Link, float]:
+        """Return the delivery probability of each direction, 0 where it is not listed."""
         pairs = links if self.directed else links | {(j, i) for i, j in links}
         return {pair: delivery.get(pair, 0.0) for pair in sorted(pairs)}
 
     def _positions(self, nodes: set[int]) -> dict[int, tuple[float, float]] | None:
+        """Return the coordinates (x, y) of the nodes, None without a file."""
         if self.positions is None:
             return None
         source = self.positions
@@ -504,6 +516,7 @@ class CsvGraph(Graph):
 
 
 def _isolated_note(nodes: set[int], minimum: float) -> tuple[str, ...]:
+    """Return a note on nodes that are left out because they have no link, if any."""
     if not nodes:
         return ()
     listed = ", ".join(map(str, sorted(nodes)))
@@ -512,11 +525,13 @@ def _isolated_note(nodes: set[int], minimum: float) -> tuple[str, ...]:
 
 
 def _one_way_note(pairs: list[Link]) -> tuple[str, ...]:
+    """Return a note on links that are left out because they are listed in one direction, if any."""
     if not pairs:
         return ()
     return (f"links listed in one direction only left out: {_listed(pairs)}",)
 
 
 def _listed(pairs: list[Link], most: int = 3) -> str:
+    """Return the first few directions as text."""
     text = ", ".join(f"{i} to {j}" for i, j in pairs[:most])
     return text if len(pairs) <= most else f"{text} and {len(pairs) - most} more"

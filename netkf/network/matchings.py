@@ -99,11 +99,13 @@ class Matching(SlotActivation):
         return draws[self.protocol](topology, random)
 
     def _one_edge(self, topology: Topology, random: np.random.Generator) -> list[Link]:
+        """Return one uniform link, or no link with probability ``lazy``."""
         lazy = random.random() < (self.lazy or 0.0)
         edge = topology.links[int(random.integers(len(topology.links)))]
         return [] if lazy else [edge]
 
     def _independent(self, topology: Topology, random: np.random.Generator) -> list[Link]:
+        """Return the links drawn with probability p that meet no other drawn link."""
         uniform = random.random(len(topology.links))
         up = [link for link, u in zip(topology.links, uniform, strict=True) if u < (self.p or 0.0)]
         busy = Counter(node for link in up for node in link)
@@ -123,6 +125,7 @@ class Matching(SlotActivation):
         return mean
 
     def _pairing_probabilities(self, topology: Topology) -> dict[Link, float]:
+        """Return the probability of each link to be paired in a slot."""
         links, degrees = topology.links, topology.degrees
         if self.protocol == "one-edge":
             return dict.fromkeys(links, (1.0 - (self.lazy or 0.0)) / max(len(links), 1))
@@ -147,10 +150,12 @@ class Matching(SlotActivation):
 
 
 def _meets(link: Link, pairs: list[Link]) -> bool:
+    """Return True if the link shares a node with one of the pairs."""
     return any(node in pair for pair in pairs for node in link)
 
 
 def _node_wakeup(topology: Topology, random: np.random.Generator) -> list[Link]:
+    """Return the link of a uniform node with a uniform neighbour."""
     node = topology.nodes[int(random.integers(len(topology.nodes)))]
     share = random.random()
     peers = sorted({j if i == node else i for i, j in topology.links if node in (i, j)})
@@ -161,17 +166,20 @@ def _node_wakeup(topology: Topology, random: np.random.Generator) -> list[Link]:
 
 
 def _random_greedy(topology: Topology, random: np.random.Generator) -> list[Link]:
+    """Return a maximal matching: links in random order, each if both ends are free."""
     links = topology.links
     order = random.permutation(len(links)).tolist()
     return _greedy([links[k] for k in order])
 
 
 def _uniform_maximal(topology: Topology, random: np.random.Generator) -> list[Link]:
+    """Return one of all maximal matchings, each with equal probability."""
     every = maximal_matchings(topology.links)
     return list(every[int(random.integers(len(every)))])
 
 
 def _greedy(links: list[Link]) -> list[Link]:
+    """Return the links whose ends are both free when their turn comes."""
     matched: set[int] = set()
     chosen = []
     for i, j in links:
@@ -188,6 +196,7 @@ def maximal_matchings(links: tuple[Link, ...]) -> tuple[tuple[Link, ...], ...]:
     found: set[tuple[Link, ...]] = set()
 
     def extend(chosen: tuple[Link, ...], free: tuple[Link, ...]) -> None:
+        """Add all maximal matchings of the ``chosen`` links and some ``free`` ones."""
         if not free:
             found.add(tuple(sorted(chosen)))
             return
@@ -214,6 +223,7 @@ def _greedy_shares(links: tuple[Link, ...]) -> tuple[float, ...]:
 
     @cache
     def shares(free: int) -> tuple[float, ...]:
+        """Return the probability of each link to be chosen among the ``free`` ones, a bit mask."""
         left = [a for a in range(count) if free >> a & 1]
         total = [0.0] * count
         for a in left:
@@ -256,6 +266,7 @@ class RecordedSlots(SlotActivation):
 
     @cached_property
     def _pairs(self) -> dict[tuple[int, int, int], list[Link]]:
+        """Pairs of the table by (slot, phase, step)."""
         names: tuple[str, ...] = ("slot", "node", "peer")
         matching = self.matching
         if not matching:

@@ -39,6 +39,7 @@ class MessageTable:
 
     @cached_property
     def _lengths(self) -> dict[Link, int]:
+        """Number of messages that each direction has in the table."""
         return {link: 1 + max(listed) for link, listed in self.values.items()}
 
     def value(self, link: Link, message: int, after: str) -> float | None:
@@ -188,6 +189,7 @@ class RecordedDelay(Delay):
 
 
 def _at(key: str, table: MessageTable, link: Link, message: int, after: str) -> float | None:
+    """Return the value of a message in the table; errors name ``key``."""
     # Asked for during a run, so the error must carry the whole path of its key.
     try:
         return table.value(link, message, after)

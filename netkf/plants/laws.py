@@ -79,6 +79,9 @@ class GridLaws:
     def _fill_impulses(
         self, out: FloatArray, row: int, end: float, instants: FloatArray, weights: FloatArray
     ) -> None:
+        """Write the responses to impulses of noise at ``instants`` into ``out`` from ``row`` on, as
+        ``fill_impulses``.
+        """
         tables = self.to_end, self.to_moments, self.B
         fill_impulses(out, row, *tables, end, instants, weights)
 
@@ -97,6 +100,9 @@ class GridLaws:
         return law
 
     def _conditional(self, length: float, left: float) -> tuple[FloatArray, FloatArray]:
+        """Return gain and root (3 n, 3 n) of the law at a cut, ``left`` seconds after the start of
+        a piece of ``length`` seconds, given the end and moments of the piece.
+        """
         size = 3 * self.n
         instants = np.concatenate([_NODES * left, left + _NODES * (length - left)])
         weights = np.concatenate([_WEIGHTS * left, _WEIGHTS * (length - left)])

@@ -64,6 +64,7 @@ class LinearPlant(Plant):
 
     @cached_property
     def _steps(self) -> Recursion:
+        """The recursion of the plant, with its cached powers of F."""
         return Recursion(self.F)
 
 
@@ -131,6 +132,7 @@ class LinearPath:
         return np.zeros(len(x)) if slot == self._rebased > 0 else x
 
     def _before(self, slot: int) -> FloatArray:
+        """Return the state (n,) at a slot; slots must not decrease."""
         while slot >= self._first + len(self._x):
             normals = self._random.standard_normal((BLOCK, self._root.shape[1]))
             noise = product(normals, self._root.T)

@@ -441,6 +441,7 @@ class DiffusionPath:
             k -= 1
 
     def _frame_times(self, horizon: float) -> FloatArray:
+        """Return the times in seconds below the horizon at which a new moving frame begins."""
         steps = self._paths.frame_steps
         if steps is None:
             return np.empty(0)
@@ -460,6 +461,7 @@ class DiffusionPath:
         return step.x_end if time == step.end else step.x_start
 
     def _begins_frame(self, time: float) -> bool:
+        """Return True if a frame begins at this time."""
         k = int(np.searchsorted(self.frame_times, time))
         return k < len(self.frame_times) and bool(self.frame_times[k] == time)
 

@@ -201,6 +201,7 @@ class RecordedSensor(Sensor):
 
     @cached_property
     def _regressors(self) -> list[str]:
+        """Names of the columns ``phi0, phi1, ...`` that the file has."""
         header = read_header(self.path)
         count = sum(_component(name, "phi") >= 0 for name in header)
         return [f"phi{k}" for k in range(count)]
@@ -212,11 +213,13 @@ class RecordedSensor(Sensor):
 
     @property
     def _outputs(self) -> int:
+        """Number p of the values of a reading."""
         H: FloatArray | None = self.H
         return 1 if self.varying or H is None else len(H)
 
     @cached_property
     def _lines(self) -> tuple[list[str], list[tuple[int, list[str]]]]:
+        """Header and numbered lines of the file."""
         wanted = tuple(f"y{k}" for k in range(self._outputs))
         return read_rows(self.path, ("t", "node", *wanted, *self._regressors))
 
@@ -236,10 +239,12 @@ class RecordedSensor(Sensor):
 
     @property
     def _ids(self) -> list[int]:
+        """Node id of each line."""
         return [node for node, _ in self.row_times]
 
     @cached_property
     def _rows(self) -> dict[int, list[tuple[float, FloatArray]]]:
+        """Times in seconds and values (y, then phi) of all lines, by node."""
         header, lines = self._lines
         p = self._outputs
         names = ("t", *(f"y{k}" for k in range(p)), *self._regressors)
@@ -256,6 +261,7 @@ class RecordedSensor(Sensor):
     def _demand_empty(
         self, line: int, header: list[str], entries: list[str], beyond: list[int]
     ) -> None:
+        """Raise ScenarioError for a value in a column y_k without a row in H."""
         for index in beyond:
             if entries[index].strip().lower() not in ("", "nan", "0", "0.0"):
                 rule = f"{self.path.name} line {line}: {header[index]} has no row in H"
@@ -353,6 +359,7 @@ class RecordedReadings:
 
 
 def _component(name: str, letter: str = "y") -> int:
+    """Return k of a column name such as ``y3``, -1 for other names."""
     number = name.removeprefix(letter)
     return int(number) if name.startswith(letter) and number.isdecimal() else -1
 
@@ -377,6 +384,7 @@ def by_slot(
 def _demand(
     source: SourceFile, table: Table, slots: Iterable[int], period: float, what: str
 ) -> None:
+    """Raise ScenarioError if a slot has no row in the table."""
     missing = next((slot for slot in slots if slot not in table), None)
     if missing is not None:
         rule = f"{source.name} has no {what} for slot {missing}, t = {missing * period:g}"

@@ -47,6 +47,9 @@ def _one_by_one(start: FloatArray, noise: FloatArray, to_later: FloatArray) -> F
 
 
 def _in_sums(start: FloatArray, noise: FloatArray, to_later: FloatArray) -> FloatArray:
+    """Return the states (count, steps + 1, n) of ``x <- F x + noise`` by prefix sums within blocks:
+    few products of large matrices instead of one small product a step.
+    """
     count, blocks, length, n = noise.shape
     x = np.empty((count, blocks * length + 1, n))
     x[:, 0] = start

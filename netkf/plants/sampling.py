@@ -80,6 +80,7 @@ class RecordedSampling(Clock):
 
     @cached_property
     def _times(self) -> dict[int, FloatArray]:
+        """Increasing sampling times in seconds, by node."""
         table = read_columns(self.path, ("t", "node"))
         nodes = np.array(whole(self.path, "node", table["node"]), dtype=np.int64)
         early = np.flatnonzero(table["t"] <= 0.0)
@@ -112,6 +113,7 @@ class RecordedSampling(Clock):
 
 
 def _sampling(value: object) -> Clock | None:
+    """Return the clock of a sensor, None for "continuous"; the rule of its field."""
     if isinstance(value, str) and value == "continuous":
         return None
     if not isinstance(value, Clock):

@@ -183,6 +183,7 @@ class SensorPath:
         return reading(x_moments, self.H, noise, self._root)
 
     def _draw(self, period: float) -> FloatArray:
+        """Return the noise moments (2, p) of the next step of ``period`` seconds."""
         # Blocks of normals: one call for many steps.
         if self._used == len(self._drawn):
             self._drawn = self._random.standard_normal((BLOCK, *self._drawn.shape[1:]))

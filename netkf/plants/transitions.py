@@ -53,6 +53,9 @@ class Transitions:
         return Phi[index], L[index]
 
     def _laws(self, distinct: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return transitions and noise factors (K, n, n) of K distinct gaps, by doubling from at
+        most one unit.
+        """
         doublings = self._doublings(distinct)
         units = np.ldexp(distinct, -doublings)
         Phi, L = self._unit_transition(units), noise_factors(self._unit_noise(units))[0]
@@ -90,6 +93,7 @@ class Transitions:
         return np.ceil(np.log2(sizes)).astype(np.int64)
 
     def _unit_transition(self, gaps: FloatArray) -> FloatArray:
+        """Return exp(A gap) (K, n, n) of gaps within one unit, by its power series."""
         n, terms = self.n, len(self._series)
         powers = _powers(gaps, terms)
         return product(powers, self._series.reshape(terms, n * n)).reshape(-1, n, n)
@@ -153,6 +157,7 @@ def frame_period(A: FloatArray) -> float | None:
 
 
 def _round(seconds: float) -> float:
+    """Return a time rounded to 9 significant digits."""
     # Frames are to begin at the same times whatever the last bits of an eigenvalue.
     return float(f"{seconds:.9g}")
 

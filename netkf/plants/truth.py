@@ -127,6 +127,7 @@ class SampledTruth:
             )
 
     def _index_of(self, time: float) -> int:
+        """Return the index of a time among those of the truth."""
         k = int(np.searchsorted(self._times, time))
         assert k < len(self._times), f"{time} is no sample, probe or frame time"
         assert self._times[k] == time, f"{time} is no sample, probe or frame time"

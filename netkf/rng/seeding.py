@@ -22,12 +22,16 @@ S32 = _L(32)
 
 @kernel
 def _scramble(value: Any, constant: Any, factor: Any) -> Any:
+    """Return ``hashmix`` of numpy's SeedSequence for one word of 32 bits, without its change of the
+    constant.
+    """
     mixed = _U(_U(value ^ constant) * _U(constant * factor))
     return _U(mixed ^ (mixed >> S16))
 
 
 @kernel
 def _mix(x: Any, y: Any) -> Any:
+    """Return ``mix`` of numpy's SeedSequence for two words of 32 bits."""
     mixed = _U(_U(MIX_LEFT * x) - _U(MIX_RIGHT * y))
     return _U(mixed ^ (mixed >> S16))
 

@@ -36,6 +36,7 @@ class Streams:
         return np.random.Generator(np.random.PCG64DXSM(self._sequence(purpose, *entity)))
 
     def _sequence(self, purpose: str, *entity: int) -> Any:
+        """Return the seed sequence of a purpose and an entity."""
         key = (self.replica, _code(purpose), *entity)
         return np.random.SeedSequence(entropy=self.seed, spawn_key=key)
 
@@ -76,6 +77,7 @@ class _Seeded(Streams):
     made: dict[tuple[str, tuple[int, ...]], _Words] = field(default_factory=dict)
 
     def _sequence(self, purpose: str, *entity: int) -> Any:
+        """Return the seed sequence, or the seed words if they are known already."""
         known = self.made.get((purpose, entity))
         return super()._sequence(purpose, *entity) if known is None else known
 
@@ -134,6 +136,7 @@ class _Words(ISeedSequence):
         self._words = words
 
     def generate_state(self, n_words: int, dtype: Any = np.uint32) -> np.ndarray:
+        """Return the four words, whatever numpy's bit generators ask for."""
         assert (n_words, np.dtype(dtype)) == (4, np.uint64)
         return self._words
 
@@ -161,4 +164,5 @@ def _entropy(seed: int) -> np.ndarray:
 
 @cache
 def _code(purpose: str) -> int:
+    """Return the number of a purpose: 4 bytes of its SHA-256, so that purposes need no register."""
     return int.from_bytes(hashlib.sha256(purpose.encode()).digest()[:4], "little")

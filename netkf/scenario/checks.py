@@ -55,6 +55,7 @@ def check_scenario(scenario: DerivedScenario) -> None:
 
 
 def _check_times(scenario: DerivedScenario) -> None:
+    """Raise ScenarioError for a horizon or sample times beyond the limits."""
     probe, horizon = scenario.probe, scenario.horizon
     if scenario.slotted and horizon / scenario.slot_plant.period > MAX_STEPS:
         raise ScenarioError(
@@ -103,6 +104,7 @@ def _check_entries(scenario: DerivedScenario, samples: float) -> None:
 
 
 def _check_plant(scenario: DerivedScenario) -> None:
+    """Raise ScenarioError if the shapes of the plant's matrices do not fit."""
     plant, n = scenario.plant, scenario.plant.n
     if isinstance(plant, Diffusion):
         why = f"plant.A has {n} rows"
@@ -117,6 +119,7 @@ def _check_plant(scenario: DerivedScenario) -> None:
 
 
 def _check_sensors(scenario: DerivedScenario) -> None:
+    """Raise ScenarioError if a sensor does not fit the state or names an unknown node."""
     n, known = scenario.plant.n, scenario.topology.index
     for k, sensor in enumerate(scenario.sensors):
         key = f"sensors[{k}]"
@@ -175,10 +178,12 @@ def _check_speed(scenario: DerivedScenario) -> None:
 
 
 def _ids(nodes: tuple[int, ...]) -> str:
+    """Return node ids as text, only the ends of long lists."""
     return ", ".join(map(str, nodes)) if len(nodes) <= 8 else f"{nodes[0]} .. {nodes[-1]}"
 
 
 def _check_network(scenario: DerivedScenario) -> None:
+    """Raise ScenarioError if graph, activation, channel and filter do not fit."""
     network, topology = scenario.network, scenario.topology
     algorithm = scenario.hosted
     for key, part in (
@@ -224,6 +229,7 @@ def _check_network(scenario: DerivedScenario) -> None:
 
 
 def _check_ticks(scenario: DerivedScenario) -> None:
+    """Raise ScenarioError if a clock would tick too often."""
     clock = scenario.network.activation
     assert isinstance(clock, LinkClock)
     what = clock.at.removesuffix("s")
@@ -239,6 +245,7 @@ def _check_ticks(scenario: DerivedScenario) -> None:
 
 
 def _check_filter(scenario: DerivedScenario) -> None:
+    """Raise ScenarioError if the filter's start or model does not fit the plant."""
     filtering, n = scenario.filter, scenario.plant.n
     why = f"the state has {n} components"
     for key, value, shape in (
@@ -285,6 +292,7 @@ def _check_filter(scenario: DerivedScenario) -> None:
 
 
 def _check_believed_noise(scenario: DerivedScenario) -> None:
+    """Raise ScenarioError if the believed R has another shape than the readings."""
     R, sensors = scenario.filter.model.R, scenario.sensors
     if R is None:
         return
@@ -304,6 +312,7 @@ def _check_believed_noise(scenario: DerivedScenario) -> None:
 
 
 def _check_degrees(scenario: DerivedScenario) -> None:
+    """Raise ScenarioError if a node has more links than the filter's gain allows."""
     algorithm = scenario.filter.algorithm
     if not algorithm.talks or not scenario.topology.links:
         return
@@ -318,6 +327,7 @@ def _check_degrees(scenario: DerivedScenario) -> None:
 
 
 def _check_sensing_period(scenario: DerivedScenario) -> None:
+    """Raise ScenarioError if the step of increments is too short or too long."""
     period, horizon = scenario.truth.sensing_period, scenario.horizon
     assert period is not None
     if horizon / period > MAX_STEPS:
@@ -357,10 +367,12 @@ def _check_sensing_period(scenario: DerivedScenario) -> None:
 
 
 def _longest(scenario: DerivedScenario, model: FlowModel) -> float:
+    """Return the longest step in seconds for a model's increments."""
     return longest_interval(*scenario.belief, model.H, model.R)
 
 
 def _check_slots(scenario: DerivedScenario) -> None:
+    """Raise ScenarioError if times, activation or sensors do not fit slots."""
     plant, algorithm = scenario.slot_plant, scenario.hosted
     off = [
         t

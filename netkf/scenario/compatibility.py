@@ -46,7 +46,7 @@ def check_activation(scenario: DerivedScenario) -> None:
             " or ".join(["give an undirected graph", *others]),
         )
     if clock.at not in hosted.clocks:
-        _wrong_at(clock.at, hosted.clocks, name)
+        _reject_clock(clock.at, hosted.clocks, name)
     if clock.at == "readings" and not any(map(takes_samples, scenario.sensors)):
         raise ScenarioError(
             "network.activation.kind",
@@ -56,7 +56,8 @@ def check_activation(scenario: DerivedScenario) -> None:
         )
 
 
-def _wrong_at(at: str, clocks: tuple[str, ...], name: str) -> None:
+def _reject_clock(at: str, clocks: tuple[str, ...], name: str) -> None:
+    """Raise ScenarioError: the filter does not run under clocks of this kind."""
     kinds = [f'at = "{one}"' for one in clocks if one != "readings"]
     kinds += ['kind = "readings"'] if "readings" in clocks else []
     listed = " or ".join(kinds)
@@ -69,10 +70,11 @@ def check_readings(scenario: DerivedScenario) -> None:
     """Raise ScenarioError if the filter cannot use the readings of a sensor."""
     if not scenario.slotted:
         for k, sensor in enumerate(scenario.sensors):
-            _readings(scenario, f"sensors[{k}]", sensor)
+            _check_readings(scenario, f"sensors[{k}]", sensor)
 
 
-def _readings(scenario: DerivedScenario, key: str, sensor: Sensor) -> None:
+def _check_readings(scenario: DerivedScenario, key: str, sensor: Sensor) -> None:
+    """Raise ScenarioError if the filter cannot use the readings of a sensor."""
     algorithm, hosted = scenario.filter.algorithm, scenario.hosted
     name = kind_name(algorithm)
     if isinstance(algorithm, FlowFilter) and takes_samples(sensor):

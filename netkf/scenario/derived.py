@@ -59,6 +59,7 @@ class DerivedScenario(ScenarioModel):
         )
 
     def _slot_model(self, observation: tuple[FloatArray, FloatArray]) -> SlotModel:
+        """Return the believed model in slots with these H and R."""
         return SlotModel(*self.slot_belief, *observation, self.slot_plant.period)
 
     @cached_property
@@ -204,9 +205,11 @@ class DerivedScenario(ScenarioModel):
     def _stacked(
         self, placed: tuple[PlacedSensor, ...], believed: bool
     ) -> tuple[FloatArray, FloatArray]:
+        """Return the stacked H (p, n) and block diagonal R (p, p) of some sensors of nodes."""
         return self._stack(tuple(placed_sensor.entry for placed_sensor in placed), believed)
 
     def _stack(self, entries: tuple[int, ...], believed: bool) -> tuple[FloatArray, FloatArray]:
+        """Return the stacked H and R of some ``[[sensors]]`` entries, from the cache if known."""
         # Thousands of nodes may have the sensors of one [[sensors]] entry.
         if (entries, believed) not in self._stacks:
             H = [self.sensors[entry].matrix_of(self.plant.n) for entry in entries]
@@ -217,6 +220,7 @@ class DerivedScenario(ScenarioModel):
 
     @cached_property
     def _stacks(self) -> dict[tuple[tuple[int, ...], bool], tuple[FloatArray, FloatArray]]:
+        """Cache of stacked H and R by entries and by whether R is the believed one."""
         return {}
 
     def sample_times(self, streams: Streams) -> dict[tuple[int, int], FloatArray]:
@@ -275,12 +279,14 @@ class DerivedScenario(ScenarioModel):
 
     @property
     def _everywhere(self) -> tuple[PlacedSensor, ...]:
+        """All sensors that a pooled filter reads."""
         placed = self.placed if self.slotted else self.increment_sensors
         return tuple(one for sensors in placed.values() for one in sensors)
 
     def _model(
         self, observation: tuple[FloatArray, FloatArray], made: dict[bytes, FlowModel]
     ) -> FlowModel:
+        """Return the believed model in continuous time, one object for equal H and R."""
         H, R = observation
         key = b"".join((H.tobytes(), b"|", R.tobytes()))
         if key not in made:
@@ -326,6 +332,7 @@ class DerivedScenario(ScenarioModel):
 
     @cached_property
     def _effective_rates(self) -> dict[Link, float]:
+        """Rates at which messages arrive on each direction, per second; empty in slots."""
         clock, loss = self.network.activation, self.network.channel.loss
         if not isinstance(clock, LinkClock) or not self.filter.algorithm.talks:
             return {}
@@ -336,6 +343,7 @@ class DerivedScenario(ScenarioModel):
         }
 
     def _send_rate(self, clock: LinkClock, direction: Link) -> float:
+        """Return the messages per second that a direction carries."""
         sender, receiver = direction
         if clock.at == "readings":
             return sample_rate(self, sender)

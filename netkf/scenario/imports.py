@@ -73,6 +73,7 @@ def _import_path(entries: list[str]) -> Iterator[None]:
 
 
 def _failure(kind: str, error: BaseException) -> ScenarioError:
+    """Return the error for a class that could not be imported."""
     rule = f"could not be imported ({type(error).__name__}: {quote(str(error))})"
     remedy = "put the module beside the scenario file or on the Python path"
     return ScenarioError("kind", rule, kind, remedy)
@@ -92,6 +93,7 @@ def forget_other(module_name: str, folder: Path) -> None:
 
 
 def _is_other(loaded: ModuleType | None, module_name: str, folder: Path) -> bool:
+    """Return True if a loaded module is another one than the file beside the scenario."""
     beside = folder / f"{module_name}.py"
     if loaded is None or not beside.exists():
         return False
@@ -133,6 +135,7 @@ class _AllowedPaths:
             raise ScenarioError("kind", rule, kind, f"choose another, or {REMEDY}")
 
     def _may_hold(self, entry: str) -> bool:
+        """Return True if modules may be imported from an entry of the path."""
         try:
             return self._allows(Path(entry).resolve())
         except (OSError, ValueError):
@@ -154,6 +157,7 @@ class _AllowedPaths:
 
     @cached_property
     def _editable(self) -> list[Path]:
+        """Folders of packages that are installed in place."""
         return list(_path_files())
 
     def _specs(self, module_name: str) -> list[ModuleSpec] | None:
@@ -192,6 +196,7 @@ class _AllowedPaths:
         return None
 
     def _is_somewhere(self, top: str) -> bool:
+        """Return True if a top-level module can be found at all."""
         return _spec(top, [str(self._scenario), str(self._current), *sys.path]) is not None
 
     def _is_part(self, module_name: str, name: str, visited: set[tuple[str, str]]) -> bool:
@@ -209,6 +214,7 @@ class _AllowedPaths:
 
 
 def _is_below(location: Path, folder: Path) -> bool:
+    """Return True if the location lies inside the folder."""
     return location != folder and location.is_relative_to(folder)
 
 
@@ -222,6 +228,7 @@ def _is_replaced(spec: ModuleSpec) -> bool:
 
 
 def _spec(name: str, path: list[str]) -> ModuleSpec | None:
+    """Return the spec of a module on this path, None if there is none."""
     try:
         return PathFinder.find_spec(name, path)
     except (OSError, ImportError, ValueError):
@@ -236,6 +243,7 @@ def _site_folders() -> list[Path]:
 
 
 def _package_folders() -> list[Path]:
+    """Return the folders in which Python installs packages."""
     paths = sysconfig.get_paths()
     folders = {paths["purelib"], paths["platlib"], *site.getsitepackages()}
     if site.ENABLE_USER_SITE:
@@ -284,11 +292,13 @@ class _Source:
                 yield from self._resolve(node.value, name)
 
     def _imported_names(self, node: ast.ImportFrom, name: str) -> Iterator[tuple[str, str]]:
+        """Yield the modules and names by which an import statement may bring ``name``."""
         for alias in node.names:
             if alias.name == "*" or (alias.asname or alias.name) == name:
                 yield self._absolute(node), name if alias.name == "*" else alias.name
 
     def _absolute(self, node: ast.ImportFrom) -> str:
+        """Return the absolute name of the module that an import statement names."""
         above = self._package.split(".")
         kept = above[: len(above) - node.level + 1] if node.level else []
         return ".".join([*kept, *([node.module] if node.module else [])])
@@ -318,6 +328,7 @@ class _Source:
 
 
 def _name(node: ast.expr) -> str:
+    """Return the identifier of an expression, empty for other expressions."""
     return node.id if isinstance(node, ast.Name) else ""
 
 

@@ -259,6 +259,7 @@ class ScenarioModel(Component):
         return self._sensors_over_diffusion(sampled=True)
 
     def _sensors_over_diffusion(self, sampled: bool) -> dict[int, tuple[PlacedSensor, ...]]:
+        """Return the sensors of each node that take samples, or those that give increments."""
         if self.slotted:
             return {}
         chosen = {

@@ -54,6 +54,7 @@ def from_table(table: Mapping[str, Any], folder: Path, trust: bool = True) -> Sc
 
 
 def _parse_file(path: Path) -> dict[str, Any]:
+    """Return the table of a TOML file; raises ScenarioError if it cannot be read."""
     try:
         return parse_toml(_text(path))
     except UnicodeDecodeError:
@@ -72,6 +73,7 @@ def _parse_file(path: Path) -> dict[str, Any]:
 
 
 def _text(path: Path) -> str:
+    """Return the text of a file up to MAX_BYTES."""
     # Not all at once: the file may be a device that never ends.
     content = b""
     with path.open("rb") as file:

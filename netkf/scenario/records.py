@@ -20,7 +20,7 @@ def check_records(scenario: DerivedScenario) -> None:
     for k, sensor in enumerate(scenario.sensors):
         key = f"sensors[{k}]"
         if isinstance(sensor, RecordedSensor):
-            _readings(scenario, key, sensor)
+            _check_readings(scenario, key, sensor)
         elif not scenario.plant.truth_known:
             raise ScenarioError(
                 f"{key}.kind",
@@ -30,25 +30,27 @@ def check_records(scenario: DerivedScenario) -> None:
             )
     plant = scenario.plant
     if isinstance(plant, RecordedPlant):
-        _under("plant", lambda: plant.demand(sorted(_state_slots(scenario))))
+        _check_under("plant", lambda: plant.demand(sorted(_state_slots(scenario))))
     if scenario.slotted and scenario.filter.algorithm.talks:
-        _exchanges(scenario)
+        _check_exchanges(scenario)
 
 
-def _under(key: str, check: Callable[[], None]) -> None:
+def _check_under(key: str, check: Callable[[], None]) -> None:
+    """Call a check; errors that it raises get ``key`` in front of their own."""
     try:
         check()
     except ScenarioError as error:
         raise error.under(key) from None
 
 
-def _readings(scenario: DerivedScenario, key: str, sensor: RecordedSensor) -> None:
+def _check_readings(scenario: DerivedScenario, key: str, sensor: RecordedSensor) -> None:
+    """Raise ScenarioError if recorded readings do not fit nodes or slots."""
     for node in sensor.listed:
         if node not in scenario.topology.index:
             rule = f"{sensor.path.name} names a node that the graph does not have"
             raise ScenarioError(f"{key}.path", rule, node, "correct the row or the graph")
     if scenario.slotted:
-        _under(key, lambda: sensor.demand(scenario.slot_plant.period))
+        _check_under(key, lambda: sensor.demand(scenario.slot_plant.period))
 
 
 def sensed_slots(scenario: DerivedScenario) -> range:
@@ -62,7 +64,8 @@ def sensed_slots(scenario: DerivedScenario) -> range:
     return range(1, end + (end in scenario.slots))
 
 
-def _exchanges(scenario: DerivedScenario) -> None:
+def _check_exchanges(scenario: DerivedScenario) -> None:
+    """Raise ScenarioError if recorded exchanges do not fit the steps of the filter."""
     activation, algorithm = scenario.network.activation, scenario.hosted
     if not isinstance(activation, RecordedSlots) or activation.matching:
         return

@@ -191,6 +191,7 @@ def _chosen_name(named: Mapping[str, Mapping[str, str]], choices: Mapping[str, A
 
 
 def _custom(family: str, kind: str, origin: Origin) -> type[Component] | None:
+    """Return a user's class given as "package.module:Class", None if ``kind`` has another form."""
     found = find_class(kind, origin)
     if found is None:
         return None
@@ -212,6 +213,7 @@ def _custom(family: str, kind: str, origin: Origin) -> type[Component] | None:
 
 
 def _is_abstract(attribute: object) -> bool:
+    """Return True if a subclass must define the attribute."""
     return bool(getattr(attribute, "__isabstractmethod__", False))
 
 

@@ -48,6 +48,7 @@ def sample_path(
 
 
 def _iterate_placed(scenario: ScenarioModel) -> Iterator[tuple[int, PlacedSensor]]:
+    """Yield each sensor that takes samples, with its node."""
     for node, placed_sensors in scenario.sampled_sensors.items():
         for placed_sensor in placed_sensors:
             yield node, placed_sensor
@@ -56,6 +57,7 @@ def _iterate_placed(scenario: ScenarioModel) -> Iterator[tuple[int, PlacedSensor
 def _generator(
     streams: Streams, node: int, placed_sensor: PlacedSensor
 ) -> Callable[[str], np.random.Generator]:
+    """Return a function from a purpose to the random generator of a sensor."""
     return lambda purpose: streams.generator(purpose, node, placed_sensor.ordinal)
 
 
@@ -133,6 +135,7 @@ def check_sampling(scenario: ScenarioModel) -> None:
 
 
 def _check_clock(scenario: ScenarioModel, key: str, sensor: LinearSensor | NonlinearSensor) -> None:
+    """Raise ScenarioError if a sampling clock does not fit its sensor."""
     clock = sensor.sampling
     assert clock is not None
     if scenario.slotted:

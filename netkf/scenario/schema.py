@@ -111,6 +111,7 @@ def keys_of(cls: type[Component]) -> list[KeyOf]:
 
 
 def _own_table(cls: type[Component], name: str) -> Schema | None:
+    """Return the schema of a key that is a table of its own, None for other keys."""
     if name == "sampling":
         return SAMPLING
     return next((s for (c, n), s in OWN_TABLES.items() if issubclass(cls, c) and n == name), None)
@@ -153,6 +154,7 @@ def _family(name: str, parts: Sequence[str]) -> Schema:
 
 
 def _variant(kind: str, cls: type[Component], shared: Sequence[KeyOf], optional: bool) -> Schema:
+    """Return the schema of one kind of a family."""
     name, choice = split_choice(kind)
     first = {key: {"const": value} for key, value in {"kind": name, **choice}.items()}
     found = _table([*keys_of(cls), *shared], first=first)
@@ -166,10 +168,12 @@ def _kinds_of_time() -> list[Schema]:
     recorded = {"enum": ["recorded", "unknown"]}
 
     def plant(kind: Schema, *keys: str) -> Schema:
+        """Return the schema of scenarios whose plant is of this kind and has these keys."""
         has = {"properties": {"kind": kind}, "required": ["kind", *keys]}
         return {"properties": {"plant": has}, "required": ["plant"]}
 
     def then(activations: str, filters: Sequence[str]) -> Schema:
+        """Return the schema that limits activation and filter to these kinds."""
         limits = {"activation": _kind_among(kinds_of(activations))}
         network = {"type": "object", "properties": limits}
         return {"properties": {"network": network, "filter": _kind_among(filters)}}
@@ -188,6 +192,7 @@ def _kinds_of_time() -> list[Schema]:
 
 
 def _kind_among(kinds: Sequence[str]) -> Schema:
+    """Return the schema of a table whose kind is one of these or a user's class."""
     kind = {"anyOf": [{"enum": [*kinds]}, {"type": "string", "pattern": CUSTOM}]}
     return {"type": "object", "properties": {"kind": kind}}
 
@@ -214,10 +219,12 @@ def describe(text: str, name: str) -> str:
 
 
 def _sentences(text: str) -> Iterator[str]:
+    """Yield the sentences of a docstring."""
     for paragraph in text.split("\n\n"):
         yield from re.split(r"(?<=[.:])\s+(?=[A-Z`])", " ".join(paragraph.split()))
 
 
 def _sentence(text: str) -> str:
+    """Return the text on one line with a full stop."""
     plain = " ".join(text.split())
     return plain if plain.endswith(".") else f"{plain}."

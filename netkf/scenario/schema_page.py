@@ -40,6 +40,7 @@ def schema_page() -> str:
 
 
 def _lines() -> Iterator[str]:
+    """Yield the lines of the page."""
     yield "# Keys of scenario files"
     yield ""
     yield "`netkf schema --markdown` prints this page. Keys whose default is a dash must be given."
@@ -59,6 +60,7 @@ def _lines() -> Iterator[str]:
 
 
 def _table(keys: Sequence[KeyOf]) -> Iterator[str]:
+    """Yield the lines of a table of keys."""
     yield "| key | value | default | |"
     yield "|---|---|---|---|"
     for key in keys:
@@ -67,6 +69,7 @@ def _table(keys: Sequence[KeyOf]) -> Iterator[str]:
 
 
 def _default(key: KeyOf) -> str:
+    """Return the default of a key as text."""
     if key.required:
         return "-"
     if isinstance(key.default, Component):

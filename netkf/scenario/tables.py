@@ -78,6 +78,7 @@ def with_changes(table: dict[str, Any], changes: Mapping[str, Any]) -> dict[str,
 
 
 def _set(node: Any, keys: list[str], value: Any, path: str) -> Any:
+    """Return a copy of a nested table in which the value at a key path is replaced or added."""
     if not keys:
         return value
     if isinstance(node, Component):
@@ -114,6 +115,7 @@ def build_scenario(cls: type[S], table: Mapping[str, Any], origin: Origin) -> S:
 
 
 def _build(cls: type[S], given: Mapping[str, Any], origin: Origin) -> Any:
+    """Return the scenario of a table."""
     table = dict(given)
     version = table.pop("format", None)
     if version is None:
@@ -138,6 +140,7 @@ def _build(cls: type[S], given: Mapping[str, Any], origin: Origin) -> Any:
 
 
 def _under(key: str, reader: Any, value: Any) -> Any:
+    """Return ``reader(value)``; errors that it raises get ``key`` in front of their own."""
     try:
         return reader(value)
     except ScenarioError as error:
@@ -177,10 +180,12 @@ def _part(
 
 
 def _waits(value: Any) -> bool:
+    """Return True if a class of the value is not known yet."""
     return value is WAITING or (isinstance(value, tuple) and any(map(_waits, value)))
 
 
 def _make(cls: type[Any], values: dict[str, Any]) -> Any:
+    """Return an object of the class with these fields; other errors become ScenarioError."""
     try:
         return cls(**values)
     except ScenarioError:
@@ -196,6 +201,7 @@ def _make(cls: type[Any], values: dict[str, Any]) -> Any:
 
 
 def _plant(value: Any, origin: Origin) -> Any:
+    """Return the plant of a table."""
     table = _table(value)
     known = table.get("kind") in ("recorded", "unknown")
     continuous = known and ("A" in table or "B" in table)
@@ -223,6 +229,7 @@ def _kind(
 
 
 def _table(value: Any) -> dict[str, Any]:
+    """Return a value as a new dictionary; raises ScenarioError unless it is a table."""
     if isinstance(value, Component):
         return part_as_table(value)
     if not isinstance(value, Mapping):
@@ -231,6 +238,7 @@ def _table(value: Any) -> dict[str, Any]:
 
 
 def _list(value: Any, origin: Origin) -> tuple[Any, ...]:
+    """Return the sensors of a list of tables."""
     if not isinstance(value, (list, tuple)):
         raise ScenarioError("", "must be a list of tables", value, "write [[sensors]]")
     return tuple(
@@ -239,6 +247,7 @@ def _list(value: Any, origin: Origin) -> tuple[Any, ...]:
 
 
 def _sensor(value: Any, origin: Origin) -> Any:
+    """Return the sensor of a table, with its sampling clock."""
     table = _table(value)
     if isinstance(table.get("sampling"), (Mapping, Component)):
         read = partial(_kind, "sampling", origin)
@@ -247,6 +256,7 @@ def _sensor(value: Any, origin: Origin) -> Any:
 
 
 def _network(value: Any, origin: Origin, time: str) -> Network:
+    """Return the network of a table; ``time`` tells plants in slots from continuous ones."""
     table = _table(value)
     if "graph" in table:
         table["graph"] = _under("graph", partial(_kind, "graph", origin), table["graph"])
@@ -260,6 +270,7 @@ def _network(value: Any, origin: Origin, time: str) -> Network:
 
 
 def _activation(origin: Origin, time: str, value: Any) -> Any:
+    """Return the activation of a table, of the plant's kind of time."""
     if time == "unknown":  # the plant waits
         kind = _table(value).get("kind")
         homes = [
@@ -272,6 +283,7 @@ def _activation(origin: Origin, time: str, value: Any) -> Any:
 
 
 def _channel(value: Any, origin: Origin) -> Channel:
+    """Return the channel of a table."""
     table = _table(value)
     for family in ("loss", "delay"):
         if family in table:
@@ -281,6 +293,7 @@ def _channel(value: Any, origin: Origin) -> Channel:
 
 
 def _filtering(value: Any, origin: Origin) -> Filtering:
+    """Return the filter of a table with its start and model."""
     table = _table(value)
     shared: dict[str, Any] = {
         key: table.pop(key) for key in ("mean", "cov", "model") if key in table

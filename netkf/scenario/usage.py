@@ -70,10 +70,12 @@ def usage_notes(usage: Mapping[str, Use]) -> tuple[str, ...]:
 
 
 def _use(path: str, rows: int, unused: int) -> Use:
+    """Return how many rows of a recorded file no run uses."""
     return {"path": path, "rows": rows, "unused": unused}
 
 
 def _activation(scenario: DerivedScenario) -> Use | None:
+    """Return the use of a recorded activation, None for others."""
     activation, talks = scenario.network.activation, scenario.filter.algorithm.talks
     if isinstance(activation, RecordedClock):
         rows = activation.rows
@@ -108,6 +110,7 @@ def _sensors(scenario: DerivedScenario) -> dict[str, Use]:
 def _times(
     scenario: DerivedScenario, part: RecordedSampling | RecordedSensor, nodes: set[int]
 ) -> Use:
+    """Return the use of recorded sampling times or readings of some nodes."""
     if isinstance(part, RecordedSensor):
         listed = part.row_times
     else:

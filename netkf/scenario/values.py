@@ -27,7 +27,7 @@ def split_setting(option: str, setting: str) -> tuple[str, str]:
 def typed_value(option: str, key: str, text: str) -> Any:
     """Return the value of a text: TOML, or a string for bare words."""
     try:
-        return _toml(text)
+        return _parse_value(text)
     except (ValueError, RecursionError):
         if text[0] in "[{\"'" or not text.isprintable() or len(text) > MAX_WORD:
             rule = f"value of {key} is not valid TOML"
@@ -40,26 +40,29 @@ def typed_values(option: str, key: str, text: str) -> list[Any]:
     """Return the values of ``v1,v2,...``; commas inside brackets and quotes separate nothing."""
     _require_short(option, text)
     try:
-        values = _toml(f"[{text}]")
+        values = _parse_value(f"[{text}]")
     except (ValueError, RecursionError):
-        return [typed_value(option, key, part.strip() or " ") for part in _parts(text)]
+        return [typed_value(option, key, part.strip() or " ") for part in _split_list(text)]
     return list(values)
 
 
 def _require_short(option: str, text: str) -> None:
+    """Raise ScenarioError for a setting that is too long."""
     if len(text) > MAX_SETTING:
         rule = f"must have at most {MAX_SETTING:,} characters"
         raise ScenarioError(option, rule, len(text), "write long values into the file")
 
 
-def _toml(text: str) -> Any:
+def _parse_value(text: str) -> Any:
+    """Return the value of a TOML expression."""
     found = parse_toml(f"value = {text}")
     if list(found) != ["value"]:
         raise ValueError
     return found["value"]
 
 
-def _parts(text: str) -> list[str]:
+def _split_list(text: str) -> list[str]:
+    """Return the parts of a text between its commas, except those in quotes and brackets."""
     parts, depth, quote = [""], 0, ""
     for letter in text:
         if quote:

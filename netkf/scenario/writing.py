@@ -42,6 +42,7 @@ def resolve_defaults(scenario: DerivedScenario) -> dict[str, Any]:
 
 
 def _fill_start(scenario: DerivedScenario) -> Plant:
+    """Return the plant with the mean and covariance of x(0) written out."""
     plant = scenario.plant if scenario.slotted else scenario.truth
     return dataclasses.replace(plant, mean=plant.start_mean, cov=plant.start_cov)
 
@@ -49,6 +50,7 @@ def _fill_start(scenario: DerivedScenario) -> Plant:
 def _scenario(
     scenario: DerivedScenario, plant: Plant, network: Network, filtering: Filtering, defaults: bool
 ) -> dict[str, Any]:
+    """Return the table of a scenario with these parts."""
     table = _fields(scenario, defaults)
     table["plant"] = _kind("plant", plant, defaults)
     table["sensors"] = [_sensor(sensor, defaults) for sensor in scenario.sensors]
@@ -77,6 +79,7 @@ def part_as_table(part: Component) -> dict[str, Any]:
 
 
 def _network(network: Network, defaults: bool) -> dict[str, Any]:
+    """Return the table of a network."""
     table = {"graph": _kind("graph", network.graph, defaults)}
     if network.activation is not None:
         table["activation"] = _kind("activation", network.activation, defaults)
@@ -84,6 +87,7 @@ def _network(network: Network, defaults: bool) -> dict[str, Any]:
 
 
 def _channel(channel: Channel, defaults: bool) -> dict[str, Any]:
+    """Return the table of a channel."""
     table = _fields(channel, True)
     table["loss"] = _kind("loss", channel.loss, defaults)
     table["delay"] = _kind("delay", channel.delay, defaults)
@@ -91,6 +95,7 @@ def _channel(channel: Channel, defaults: bool) -> dict[str, Any]:
 
 
 def _sensor(sensor: Sensor, defaults: bool) -> dict[str, Any]:
+    """Return the table of a sensor with its sampling clock."""
     table, clock = _kind("sensor", sensor, defaults), getattr(sensor, "sampling", None)
     if clock is not None:
         entries = _kind("sampling", clock, defaults)
@@ -99,6 +104,7 @@ def _sensor(sensor: Sensor, defaults: bool) -> dict[str, Any]:
 
 
 def _filtering(filtering: Filtering, defaults: bool) -> dict[str, Any]:
+    """Return the table of a filter with its start and model."""
     table = _kind("filter", filtering.algorithm, defaults)
     for name, value in _fields(filtering, defaults).items():
         if name in ("mean", "cov"):
@@ -108,11 +114,13 @@ def _filtering(filtering: Filtering, defaults: bool) -> dict[str, Any]:
 
 
 def _kind(family: str, part: Component, defaults: bool) -> dict[str, Any]:
+    """Return the table of a part with its kind."""
     kind, choice = split_choice(name_of(family, part))
     return {"kind": kind, **choice, **_fields(part, defaults)}
 
 
 def _fields(part: Component, defaults: bool) -> dict[str, Any]:
+    """Return the fields of a part as TOML values, those with default values only if asked."""
     table: dict[str, Any] = {}
     for field in (field for field in dataclasses.fields(part) if field.init):
         value = getattr(part, field.name)
@@ -125,6 +133,7 @@ def _fields(part: Component, defaults: bool) -> dict[str, Any]:
 
 
 def _toml_value(value: Any, defaults: bool) -> Any:
+    """Return a value of a field as TOML has it."""
     if isinstance(value, np.ndarray):
         return value.tolist()
     if isinstance(value, tuple):
@@ -146,6 +155,7 @@ def to_toml(table: dict[str, Any]) -> str:
 
 
 def _is_section(value: Any) -> bool:
+    """Return True if a value is written as a table of its own."""
     tables = isinstance(value, list) and bool(value) and all(isinstance(v, dict) for v in value)
     return isinstance(value, dict) or tables
 

@@ -53,6 +53,7 @@ def assumption_rows(scenario: Scenario) -> list[AssumptionRow]:
 
 
 def _slot_rows(scenario: Scenario) -> list[AssumptionRow]:
+    """Return the rows of the filter's paper, or those of any filter in slots."""
     paper_rows = paper_function(scenario, "assumptions", "slot_rows")
     if paper_rows is None:
         return [*slot_plant_rows(scenario), *start_rows(scenario, "G (10)")]

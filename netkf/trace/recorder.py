@@ -136,6 +136,7 @@ class Recorder:
                     thread.shutdown()
 
     def _flush_gathered(self) -> None:
+        """Pass the gathered rows to all sinks, or only count them."""
         if not self._rows:
             return
         if self.counts_only:
@@ -182,9 +183,11 @@ class Recorder:
             del self._handed[0]
 
     def _count(self, kinds: np.ndarray) -> None:
+        """Add the kinds of some events to the counts."""
         self._counts += np.bincount(kinds, minlength=len(KINDS))
 
     def _pass_on(self, rows: np.ndarray) -> None:
+        """Count and fingerprint some rows, and pass them to all sinks."""
         self._count(rows["kind"])
         self._hash.update(rows.data)
         for sink in self._sinks:
@@ -206,6 +209,7 @@ class Recorder:
             self._do(self._show, t, x, xhat, P, error)
 
     def _show(self, *sample: FloatArray) -> None:
+        """Pass a sample to all sinks."""
         for sink in self._sinks:
             sink.states(*sample)
 

@@ -87,6 +87,7 @@ def longest_interval_for(A: FloatArray, Q: FloatArray, G: FloatArray) -> float:
 
 
 def _terms(size: float) -> int:
+    """Return how many terms of the power series of exp(M) are needed for a norm ``size`` of M."""
     # Until size^k / k!, the next term of the exponential series, is below double rounding.
     terms, last = 1, 1.0
     while last > 1e-18 or terms < 8:

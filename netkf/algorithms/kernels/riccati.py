@@ -114,6 +114,9 @@ def _side_by_side(unit: float, *parts: FloatArray) -> FloatArray:
 def _triples(
     M: FloatArray, scale: float, A: FloatArray, unit: float, levels: int
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Return F, G, Q and exp(A t), each (levels, n, n), of the flow over 1, 2, 4, ... units: ``P(t)
+    = Q + F P (I + G P)^-1 F'``, by doubling.
+    """
     # Doubling also doubles the relative error, so it works in extended precision (where the
     # machine has it): after 2^14 units a table in double would have lost 1e-12.
     n, wide = len(A), np.longdouble

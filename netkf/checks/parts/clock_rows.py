@@ -79,6 +79,7 @@ class ClockSamples(NamedTuple):
 
 
 def _network(samples: PartSamples) -> ClockSamples:
+    """Return the samples of the network's clocks."""
     scenario = samples.scenario
     return ClockSamples(
         scenario, samples.seed, network_clocks(scenario), samples.ticks, count_drawn_ticks
@@ -86,6 +87,7 @@ def _network(samples: PartSamples) -> ClockSamples:
 
 
 def _sampling(samples: PartSamples) -> ClockSamples:
+    """Return the samples of the sensors' clocks."""
     scenario = samples.scenario
     group = sampling_clocks(scenario)
     return ClockSamples(scenario, samples.seed, group, samples.sampling, draw_samples)
@@ -227,6 +229,7 @@ def _count_interval(
     apart = deviation_interval(1.0, student_interval(total / whole, spread / whole, runs, level))
 
     def limits(value: float, factor: float) -> tuple[float, float]:
+        """Return both ends for another value and ``factor`` times the runs."""
         low, high = apart.limits(value, factor)
         return max(0.0, low - slack), max(0.0, high - slack)
 
@@ -241,6 +244,7 @@ def _poisson_interval(total: float, mean: float, level: float) -> Interval:
     """
 
     def limits(ratio: float, factor: float) -> tuple[float, float]:
+        """Return both ends for another ratio and ``factor`` times the runs."""
         seen, expected = ratio * mean * factor, mean * factor
         low = float(scipy.special.gammaincinv(seen, level / 2.0)) if seen else 0.0
         high = float(scipy.special.gammaincinv(seen + 1.0, 1.0 - level / 2.0))

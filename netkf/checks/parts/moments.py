@@ -153,6 +153,7 @@ def compare_variances(
         return nothing_to_see(VARIANCE_TOLERANCE)
 
     def interval(square: float, fourth: float, count: float, part: float) -> Interval:
+        """Return the interval of a variance relative to the stated one, at level ``part``."""
         # The freedom of a chi-square variable whose variance is that of the sum of squares.
         excess = 0.0 if gaussian else count * fourth / square**2 - 3.0
         freedom = 2.0 * count / max(2.0 + excess, 2.0)
@@ -253,10 +254,12 @@ def compare_cells(cells: FloatArray, labels: list[str], level: float, what: str)
 
 
 def _cell_interval(count: float, total: float, level: float) -> Interval:
+    """Return the interval of the distance between a cell's share of ranks and 1 / CELLS."""
     return deviation_interval(1.0 / CELLS, probability_interval(int(count), int(total), level))
 
 
 def _cell_label(k: int) -> str:
+    """Return the range of ranks of a cell as text."""
     return f"rank {k / CELLS:.2f} to {(k + 1) / CELLS:.2f}"
 
 
@@ -268,6 +271,7 @@ def correlation_interval(value: float, count: float, level: float) -> Interval:
     reach = -spread * float(scipy.special.ndtri(level / 2.0))
 
     def limits(value: float, factor: float) -> tuple[float, float]:
+        """Return both ends for another correlation and ``factor`` times the samples."""
         centre = math.atanh(min(max(value, -1.0 + 1e-12), 1.0 - 1e-12))
         wide = reach / math.sqrt(factor)
         return math.tanh(centre - wide), math.tanh(centre + wide)

@@ -43,6 +43,7 @@ MIN_EVENTS = 20
 
 
 def _stated_loss(scenario: Scenario) -> Any:
+    """Return the loss whose law the scenario states."""
     return stated_part(scenario.network.channel.loss, "loss")
 
 
@@ -55,6 +56,7 @@ def loss_probabilities(scenario: Scenario) -> FloatArray:
 
 
 def _direction_label(scenario: Scenario, k: int) -> str:
+    """Return the label of direction ``k``."""
     sender, receiver = scenario.topology.directions[k]
     return f"from {sender} to {receiver}"
 
@@ -132,6 +134,7 @@ def _share_of_bounded_runs(
     found = min(max(expected + float(excess.mean()) / most, 0.0), 1.0)
 
     def limits(value: float, factor: float) -> tuple[float, float]:
+        """Return both ends for another share and ``factor`` times the runs."""
         near = min(max(expected + (value - expected) / scale, 0.0), 1.0)
         limit = math.log(2.0 / level) / (factor * runs)
         low, high = (_share_at(near, end, limit) for end in (0.0, 1.0))

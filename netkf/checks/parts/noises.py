@@ -241,6 +241,7 @@ def _typical_states(scenario: Scenario, random: np.random.Generator, count: int)
 
 
 def _typical_covariance(scenario: Scenario) -> FloatArray:
+    """Return a covariance (n, n) of the size of x(0) and of the noise of ten steps."""
     plant: Any = scenario.plant
     return np.asarray(plant.start_cov + 10.0 * np.asarray(plant.Q))
 

@@ -30,15 +30,18 @@ LAW_LEVEL = 0.05
 
 
 def _labels(what: str, count: int) -> list[str]:
+    """Return numbered labels."""
     return [f"{what} {k}" for k in range(count)]
 
 
 @lru_cache(maxsize=4)
 def _starts(scenario: Scenario, seed: int) -> NoiseMoments:
+    """Return the moments of whitened first states."""
     return moments(whitened_starts(scenario, start_states(scenario, seed, STARTS)))
 
 
 def _start_variance(samples: PartSamples, level: float) -> Finding:
+    """Compare the variances of the first states with the stated covariance."""
     found = _starts(samples.scenario, samples.seed)
     labels = _labels("direction", len(found.first))
     gaussian = not is_own_class(samples.scenario.plant, "plant")
@@ -46,44 +49,53 @@ def _start_variance(samples: PartSamples, level: float) -> Finding:
 
 
 def _start_mean(samples: PartSamples, level: float) -> Finding:
+    """Compare the means of the first states with the stated ones."""
     found = _starts(samples.scenario, samples.seed)
     return compare_means(found, _labels("direction", len(found.first)), level)
 
 
 def _steps(samples: PartSamples) -> tuple[NoiseMoments, list[str]]:
+    """Return the moments of the plant's noise and their labels."""
     found = total(samples.steps)
     return found, _labels("direction", len(found.first))
 
 
 def _step_variance(samples: PartSamples, level: float) -> Finding:
+    """Compare the variances of the plant's noise with the stated ones."""
     found, labels = _steps(samples)
     gaussian = not is_own_class(samples.scenario.plant, "plant")
     return compare_variances(found, labels, level, "directions of the noise", gaussian)
 
 
 def _step_mean(samples: PartSamples, level: float) -> Finding:
+    """Compare the means of the plant's noise with zero."""
     return compare_means(*_steps(samples), level)
 
 
 def _step_correlation(samples: PartSamples, level: float) -> Finding:
+    """Compare the correlations of the plant's noise with zero."""
     return compare_correlations(*_steps(samples), level)
 
 
 def _reading_variance(samples: PartSamples, level: float) -> Finding:
+    """Compare the variances of the readings' noise with R."""
     labels = reading_labels(samples.scenario)
     gaussian = not _own_sensors(samples.scenario)
     return compare_variances(total(samples.readings), labels, level, "readings", gaussian)
 
 
 def _reading_mean(samples: PartSamples, level: float) -> Finding:
+    """Compare the means of the readings' noise with zero."""
     return compare_means(total(samples.readings), reading_labels(samples.scenario), level)
 
 
 def _reading_correlation(samples: PartSamples, level: float) -> Finding:
+    """Compare the correlations of the readings' noise with zero."""
     return compare_correlations(total(samples.readings), reading_labels(samples.scenario), level)
 
 
 def _own_sensors(scenario: Scenario) -> bool:
+    """Return True if a sensor is of a user's class."""
     return any(is_own_class(sensor, "sensor") for sensor in scenario.sensors)
 
 

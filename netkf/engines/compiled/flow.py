@@ -165,6 +165,7 @@ class Source:
 
 
 def _windows(scenario: Scenario, streams: Streams, instants: Instants) -> Windows:
+    """Return the source of windows of ticks, for clocks or for transmissions after readings."""
     senders = senders_of(scenario)
     if senders.at == "readings":
         return ReadingsSchedule(scenario, streams, senders, instants.t, instants.host)
@@ -262,6 +263,7 @@ class Workspace:
         return state
 
     def _numbers(self, instants: Instants) -> dict[str, Any]:
+        """Return the scalar fields of a Simulation by name."""
         algorithm: Any = self._scenario.hosted
         most = int(np.diff(self._senders.first).max(initial=0))
         return {
@@ -344,6 +346,7 @@ class FlowRun:
         return "complete"
 
     def _advance(self) -> int:
+        """Run the kernel that fits the filter until it needs something; return its request."""
         if self._visits is not None:
             return advance_alone(self._state, self._visits)
         if self._scenario.hosted.combination not in SPECIAL:
@@ -351,6 +354,7 @@ class FlowRun:
         return int(event_loop(self._state, self._totals, self._history, self._extras))
 
     def _give(self, wanted: int) -> None:
+        """Fulfil a request of the event loop: ticks, steps of the path, or space."""
         state = self._state
         if wanted == WANT_TICKS:
             window = self._draws.window()
@@ -371,6 +375,7 @@ class FlowRun:
             self._rebase()
 
     def _rebase(self) -> None:
+        """Make the present state the new origin of all states, estimates and messages."""
         state, k = self._state, self._state.frame_at
         # Estimates are lowered by the state, which is the new origin.
         offset = -self._draws.states.offset(k, state.path, state.piece)
@@ -381,6 +386,7 @@ class FlowRun:
         state.frame_at = k + 1
 
     def _more_messages(self) -> None:
+        """Enlarge the pool of messages and every array that has an entry for each of them."""
         add_messages(self._state, self._state.most_messages)
         # Totals are offered by message: their array grows with the pool.
         if self._totals is not None:
@@ -391,11 +397,13 @@ class FlowRun:
             more_evidence(self._extras.evidence, len(self._state.pool))
 
     def _make_rows(self) -> None:
+        """Make sure that the buffer of event rows is long enough for one more event."""
         least = max(recording.BLOCK, 2 * self._state.most_rows)
         if len(self._state.rows) < least:
             self._state.rows = np.empty(least, dtype=EVENT)
 
     def _pass_rows_on(self, used: int, counts: np.ndarray) -> None:
+        """Pass the first ``used`` rows of events, or their ``counts`` by kind, to the recorder."""
         state, recorder = self._state, self._recorder
         if not state.traced:
             recorder.add_counts(counts)
@@ -419,6 +427,7 @@ class FlowRun:
         lost = [count - 1]
 
         def pass_rows_on(k: int) -> None:
+            """Pass on the rows before sample ``k``, the first one that is not finite."""
             lost[0] = k
             # Rows up to that sample, and no row after it.
             self._pass_rows_on(int(shown.rows[0, k]), shown.counts[0, k])
@@ -447,6 +456,7 @@ def _sums(terms: FloatArray, receivers: np.ndarray) -> dict[str, tuple[float, fl
 
 
 def _totals(scenario: Scenario, state: Simulation) -> Totals | None:
+    """Return the arrays of running sums, or None for filters that send none."""
     if scenario.hosted.combination != "sums":
         return None
     receivers = np.array([info.receivers for info in scenario.node_infos], dtype=np.int64)
@@ -455,6 +465,7 @@ def _totals(scenario: Scenario, state: Simulation) -> Totals | None:
 
 
 def _history(scenario: Scenario, state: Simulation) -> History | None:
+    """Return the past of all nodes, or None for filters that never go back."""
     if scenario.hosted.combination != "readings":
         return None
     algorithm: Any = scenario.hosted

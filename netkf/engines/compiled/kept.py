@@ -19,6 +19,7 @@ def once_per_scenario(function: Callable[[Scenario], Result]) -> Callable[[Scena
 
     @wraps(function)
     def known(scenario: Scenario) -> Result:
+        """Return the cached result for this scenario, computed at the first call."""
         key = id(scenario)
         found = kept.get(key)
         if found is None or found[0]() is not scenario:

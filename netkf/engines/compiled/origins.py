@@ -54,6 +54,7 @@ def _move_totals(
 
 
 def _shift(total: FloatArray, offset: FloatArray) -> None:
+    """Shift a total (w, U, u) in place by ``offset`` (n,) of the state."""
     n = len(offset)
     # u = U x: it moves by U times the move of x.
     total[1 + n * n :] += total[1 : 1 + n * n].reshape(n, n) @ offset

@@ -86,6 +86,9 @@ class SampleTables:
 def _instants(
     scenario: Scenario, placed: list[tuple[int, PlacedSensor]], t: FloatArray, sensor: np.ndarray
 ) -> Instants:
+    """Return the instants at which nodes have samples, from the sorted times ``t`` (K,) and the
+    index of the ``sensor`` (K,) of each sample.
+    """
     index = scenario.topology.index if placed else {}
     pooled, n = scenario.hosted.pooled, scenario.plant.n
     node = np.array([node for node, _ in placed], dtype=np.int64)

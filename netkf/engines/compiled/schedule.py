@@ -145,6 +145,7 @@ class TickSource:
         return np.asarray(np.add.accumulate(times, axis=1)[:, 1:])
 
     def _ticks(self, k: int, count: int) -> FloatArray:
+        """Return the next ``count`` ticks of entity ``k``, fewer if its clock ends."""
         assert isinstance(self._clock, LinkClock)
         origin, index, now = float(self._origins[k]), int(self.drawn[k]), float(self.last[k])
         entity, random = self._entities[k], self._random[k]
@@ -269,6 +270,9 @@ class Outcomes:
     def _delivery_probability(
         self, ways: np.ndarray, counts: np.ndarray, first: np.ndarray, bad: np.ndarray
     ) -> FloatArray:
+        """Return the delivery probability of each message, way by way; ``bad`` is the channel state
+        of each.
+        """
         loss, out, done = self._channel.loss, np.empty(len(bad)), 0
         # Probabilities that may depend on the state of the link and on the number of the message.
         for w, count, number in zip(ways, counts.tolist(), first.tolist(), strict=True):
@@ -286,6 +290,9 @@ class Outcomes:
         lost: np.ndarray,
         delay: np.ndarray,
     ) -> FloatArray:
+        """Return the delays of all messages that are not ``lost``, by a law that depends on the
+        message.
+        """
         model, out, k = self._channel.delay, np.array(delay), 0
         for w, count, number in zip(ways, counts.tolist(), first.tolist(), strict=True):
             # A delay is asked only for messages that arrive.
@@ -334,6 +341,7 @@ class EntityDraws:
 
 
 def _joined(parts: list[Ticks]) -> Ticks:
+    """Return several lists of ticks one after the other."""
     return Ticks(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
 
@@ -444,4 +452,5 @@ NO_TICKS = Ticks(np.empty(0), np.empty(0, dtype=np.int64), np.empty(0))
 
 
 def _stream(streams: Streams, ends: Link, purpose: str) -> np.random.Generator:
+    """Return the random generator of a purpose for one directed link."""
     return streams.generator(purpose, *ends)

@@ -61,6 +61,7 @@ def senders_of(scenario: Scenario) -> Senders:
 
 
 def _links(links: tuple[Link, ...], directed: bool, symmetric: bool) -> Senders:
+    """Return the senders if links have clocks: an entity is a link of one or two directions."""
     if directed:
         each = np.arange(len(links))
         return Senders("links", links, links, np.arange(len(links) + 1), each, links, each)

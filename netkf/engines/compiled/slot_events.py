@@ -138,6 +138,9 @@ class SlotEvents:
         return len(made), np.stack(made)[None]
 
     def _one_slot(self) -> np.ndarray:
+        """Make all events of the present slot; return which messages were used, ``up`` (steps,
+        directions).
+        """
         setup, algorithm, slot = self._setup, self._algorithm, self._slot
         up = np.zeros((len(setup.fresh), len(self._directions)), dtype=np.uint8)
         if setup.may_miss:
@@ -159,6 +162,7 @@ class SlotEvents:
         return up
 
     def _stages(self, slot: int, up: np.ndarray) -> None:
+        """Make the events of the readings and exchanges of a slot, in order."""
         steps, now = self._steps(slot), self._scenario.slot_plant.slot_time(slot)
         for step in self._setup.stages.step.tolist():
             if step < 0:
@@ -219,10 +223,12 @@ class SlotEvents:
         return np.array(rows, dtype=EVENT), np.array(before, dtype=np.int64)
 
     def _note(self, row: Row) -> None:
+        """Append a row, unless events of this slot are not recorded."""
         if self._noted:
             self._rows.append(row)
 
     def _send_all(self, step: Step) -> None:
+        """Send all messages of a step, with a draw of the channel for each."""
         broadcast, now, phase = not self._algorithm.pairwise, step.begin, step.phase
         pairs, up = self._drawn.pop(0) if self._drawn else self._pairs(step)
         if broadcast:
@@ -266,6 +272,7 @@ class SlotEvents:
         return bool(self._setup.may_miss and self._unread[step.step, node])
 
     def _send(self, step: Step, way: Direction, draw: Draw | None) -> None:
+        """Send one message: it is lost, arrives at once, or is put among those in flight."""
         (sender, receiver), number, now = way.ends, way.messages, step.begin
         way.messages = number + 1
         self._note((now, SEND, sender, receiver, number, step.phase, NAN))

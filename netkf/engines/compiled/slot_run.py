@@ -119,6 +119,7 @@ class SlotRuns:
         self._begin_messages()
 
     def _begin_truth(self) -> None:
+        """Draw the first states of all runs, or make the recorded truth."""
         plant, setup = self._scenario.slot_plant, self.setup
         self._truth: Any = None
         self._path: Path | None = None
@@ -138,6 +139,7 @@ class SlotRuns:
         self._path = Path(F, noise, setup.frame, x, origin)
 
     def _begin_readings(self) -> None:
+        """Make the random streams and paths from which readings are drawn."""
         setup, streams = self.setup, self._streams
         entities = [(s.node, s.placed_sensor.ordinal) for s in setup.drawn]
         # One stream for each drawn sensor of each run.
@@ -155,6 +157,7 @@ class SlotRuns:
         ]
 
     def _begin_messages(self) -> None:
+        """Make the channels and matchings of all runs, and their random streams."""
         setup, streams, links = self.setup, self._streams, len(self.setup.ends)
         # Empty arrays tell the kernels to draw nothing.
         nothing = np.zeros((0, 0, 4, LANES), dtype=np.uint64)
@@ -296,6 +299,7 @@ class SlotRuns:
         return SlotTimes(self._slot, start, noted, sensed, exchanged, sample, algorithm.predicts)
 
     def _draw_messages(self, times: SlotTimes) -> Drawn:
+        """Return the pairs and messages of a block of slots, drawn for all runs."""
         setup = self.setup
         steps, pairs = (len(times.start), len(setup.fresh)), setup.most_pairs
         masked = setup.decides or setup.may_miss
@@ -367,10 +371,12 @@ class SlotRuns:
     def _draw_path(
         self, path: Path, states: np.ndarray, local: FloatArray, absolute: FloatArray
     ) -> None:
+        """Draw a block of a path into ``local`` and ``absolute`` (B, S, n, L)."""
         room = aligned((2, max(path.root.shape), LANES))
         draw_paths(MANY, path, states, normal_ziggurat(), self._slot, room, local, absolute)
 
     def _readings(self, times: SlotTimes, local: FloatArray, rebased: np.ndarray) -> ReadingBlock:
+        """Return the readings of a block of slots at the states ``local`` (B, S, n, L)."""
         setup, count = self.setup, local.shape[1]
         shape = self._blocks, count, setup.estimators, setup.p
         y: FloatArray = unset((*shape, LANES))
@@ -440,6 +446,7 @@ class SlotRuns:
         )  # fmt: skip
 
     def _hearing(self) -> Hearing:
+        """Return the links and nodes as the kernels of messages need them."""
         setup, heard = self.setup, self.setup.links
         return Hearing(
             setup.nodes, setup.sensing, heard.first, heard.sender, heard.way, self._sent,
@@ -497,6 +504,7 @@ def _record_block(
     times = block.times.start[block.sampled]
 
     def pass_rows_on(k: int) -> None:
+        """Pass on the rows up to sample ``k``, the first one that is not finite."""
         # The rows up to the first broken sample, if there is one.
         recorder.extend(rows[: before[k]])
 

@@ -92,6 +92,9 @@ class SlotSetup:
         self.sample_times = np.array([plant.slot_time(slot) for slot in self.samples.tolist()])
 
     def _set_stages(self, scenario: Scenario) -> None:
+        """Set the stages of a slot (readings and exchange steps), with phase and end in seconds of
+        each.
+        """
         algorithm, phase, step = self.algorithm, 0, 0
         length = scenario.phase_length if algorithm.talks else 0.0
         stages: list[tuple[int, int, float]] = []
@@ -148,6 +151,7 @@ class SlotSetup:
         self._set_drawn(scenario)
 
     def _set_drawn(self, scenario: Scenario) -> None:
+        """Set the arrays of all drawn sensors: whitened H and noise factors, by filter and row."""
         count, p, n = len(self.drawn), self.p, self.n
         H, noise = np.zeros((count, p, n)), np.zeros((count, p, p))
         driven = np.full(count, -1, dtype=np.int64)
@@ -205,6 +209,7 @@ class SlotSetup:
         self.root = np.stack([state.root for state in self.states])
 
     def _links(self, scenario: Scenario) -> SlotLinks:
+        """Return the directed links by receiver, with weights, as kernels need them."""
         index = scenario.topology.index
         # By receiver and sender: the order in which a filter adds what it hears.
         heard = sorted(

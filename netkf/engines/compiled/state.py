@@ -28,6 +28,7 @@ from netkf.scenario.scenario import Scenario
 
 
 def _record(integers: str, floats: str = "") -> np.dtype:
+    """Return a record type of int64 and float64 fields; blanks separate their names."""
     # int64 fields first, then float64 ones: every field is aligned without padding.
     fields = [(name, np.int64) for name in integers.split()]
     return np.dtype([*fields, *((name, np.float64) for name in floats.split())])
@@ -307,6 +308,7 @@ def filters_at_start(scenario: Scenario) -> Filters:
 
 
 def _tables(models: list[FlowModel]) -> tuple[FlowTable, Gains]:
+    """Return the stacked flow tables and gains of some models with equal n."""
     n = len(models[0].A)
     # A model without sensors has no gains; its entry keeps the numbering.
     nothing = GainTable(n, 0, np.zeros((0, 1)))

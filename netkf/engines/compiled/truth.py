@@ -89,6 +89,9 @@ class PathStates:
             return local, local + self._moved(times)
 
     def _moved(self, times: FloatArray) -> FloatArray:
+        """Return the absolute origin (T, n) of the present frame at some times: its transition from
+        where the frame began.
+        """
         # An origin of 0 stays 0, and its transition may overflow.
         if self._moves is None or not self._origin.any():
             return np.broadcast_to(self._origin, (len(times), len(self._origin)))

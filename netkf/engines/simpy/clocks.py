@@ -103,10 +103,12 @@ def _links(
 
     # A factory for each link, so that the closure binds these ends and not those of the last link.
     def activation(link: tuple[int, int], entity: int) -> Activation:
+        """Return the activation of a link: both ends send to each other."""
         i, j = link
         exchange = LinkExchange(scenario, transmitter, nodes, link, entity)
 
         def activate(now: float) -> None:
+            """Send a message in each direction."""
             recorder.append((now, TICK, i, j, -1, -1, NAN))
             # Both ends decide what they send before either hears the other.
             exchange.exchange((nodes[i].emit(now, (j,)), nodes[j].emit(now, (i,))))
@@ -125,10 +127,12 @@ def _directions(
     """Return for each direction an activation in which one end pushes to the other."""
 
     def activation(link: tuple[int, int], entity: int) -> Activation:
+        """Return the activation of a directed link: its sender sends one message."""
         i, j = link
         way = transmitter.directed_link(link, entity, nodes[j], transmitter.sampler(link))
 
         def activate(now: float) -> None:
+            """Send one message."""
             recorder.append((now, TICK, i, j, -1, -1, NAN))
             # Drawn before the payload is made: even if nothing is sent, the channel takes its step.
             outcome = way.sampler.draw()
@@ -154,9 +158,11 @@ def broadcasts(
         ways[i].append(transmitter.directed_link((i, j), k, nodes[j], transmitter.sampler((i, j))))
 
     def activation(node: int) -> Activation:
+        """Return the broadcast of a node: one payload to all its neighbours."""
         hearers, sent = tuple(way.link[1] for way in ways[node]), 0
 
         def transmit(now: float) -> None:
+            """Send one payload to each neighbour, each with an outcome of its own."""
             nonlocal sent
             # Drawn even if the filter sends nothing, so that the network does not depend on it.
             outcomes = [way.sampler.draw() for way in ways[node]]
@@ -185,7 +191,10 @@ def _nodes(
     transmit = broadcasts(scenario, recorder, transmitter, nodes)
 
     def activation(node: int) -> Activation:
+        """Return the activation of a node: a broadcast with a row for the tick."""
+
         def activate(now: float) -> None:
+            """Record the tick, then broadcast."""
             # The tick has its own row; transmit() adds that of the broadcast if there is one.
             recorder.append((now, TICK, node, -1, -1, -1, NAN))
             transmit[node](now)
@@ -209,6 +218,7 @@ def _transmit_after_samples(
         carrier = nodes[node]
 
         def after(now: float, node: int = node, entity: int = carrier.entity) -> None:
+            """Broadcast as soon as all samples of this instant have been used."""
             # At the rank of ticks: every sample of this instant has been used by then, at all
             # nodes.
             timeline.call_at(now, Rank.TICK, entity, lambda _: transmit[node](now))

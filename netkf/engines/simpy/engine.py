@@ -93,6 +93,7 @@ class _Simulation:
         truth = scenario.continuous_truth(streams)
 
         def make(node: int, entity: int, sensing: tuple[int, ...]) -> ClockedNode:
+            """Return one node in continuous time with its increment sensors."""
             # A pooled filter carries the increment sensors of all nodes.
             carriers = [(k, p) for k in sensing for p in scenario.increment_sensors.get(k, ())]
             sensors = increment_sensors(scenario, streams, carriers)
@@ -142,6 +143,7 @@ class _Simulation:
         schedule, period = SlotSchedule(scenario), scenario.slot_plant.period
 
         def make(node: int, entity: int, _: tuple[int, ...]) -> SlotNode:
+            """Return one node in slots."""
             own = _identity(scenario, node, entity)
             return SlotNode(recorder, schedule, period, streams, *own)
 
@@ -166,6 +168,7 @@ class _Simulation:
         predicts, recorder, slot = self._scenario.hosted.predicts, self._recorder, 0
 
         def sample() -> None:
+            """Record a sample if the slot has one, and move the origin if a frame begins."""
             if schedule.sampled(slot):
                 time = schedule.start(slot)
                 self._record(time, truth.absolute(slot), truth.local(slot), nodes, sums)
@@ -252,6 +255,7 @@ class _Sums:
         self.start = self._now()
 
     def _now(self) -> dict[str, float]:
+        """Return the conserved sums over all nodes by name."""
         parts = [_terms(node.algorithm, node.state) for node in self._nodes]
         # fsum: rounding of the check itself would look like a loss.
         return {name: math.fsum(t for part in parts for t in part[name]) for name in parts[0]}
@@ -263,5 +267,6 @@ class _Sums:
 
 
 def _terms(algorithm: Filter, state: Any) -> dict[str, list[float]]:
+    """Return the terms of a node to the conserved sums, as lists by name."""
     found = algorithm.conserved(state)
     return {name: np.atleast_1d(np.asarray(value)).tolist() for name, value in found.items()}

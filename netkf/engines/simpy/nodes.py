@@ -130,6 +130,9 @@ class ClockedNode(Node):
             self._now = end
 
     def _read(self, start: float, end: float) -> FloatArray:
+        """Return the moments (2 p,) of the increments of all sensors from ``start`` to ``end``, in
+        seconds.
+        """
         truth = self._truth
         x_moments = truth.moments(start, end)
         parts = [sensor.moments(truth, x_moments, start, end) for sensor in self._increments]
@@ -145,6 +148,7 @@ class ClockedNode(Node):
         self._samples.append((node, y, H, R))
 
     def _use_samples(self, _: simpy.Event) -> None:
+        """Update by all samples of this instant together."""
         time, samples = self._timeline.now, self._samples
         self._samples = []
         self.predict_to(time)
@@ -180,6 +184,7 @@ class ClockedNode(Node):
         self.put(envelope)
 
     def _absorb(self, _: simpy.Event) -> None:
+        """Absorb all messages that have arrived at this instant."""
         time = self._timeline.now
         self.predict_to(time)
         messages = self.take_messages()[1]

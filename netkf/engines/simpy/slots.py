@@ -96,6 +96,7 @@ class SlotSchedule:
         return (stages[-1].time, stages[-1].rank + 1) if stages else (self.start(slot), FIRST_RANK)
 
     def _stages_of(self, slot: int) -> Generator[Stage, None, None]:
+        """Yield the stages of a slot in order: sends, absorptions, updates and predictions."""
         algorithm, start = self._algorithm, self.start(slot)
         now, rank, phase = start, FIRST_RANK + 1, 0
         # A filtered estimate starts from what is known before any reading.
@@ -159,6 +160,7 @@ class SlotNode(Node):
             slot += 1
 
     def _do(self, stage: Stage, slot: int) -> None:
+        """Carry out one stage of a slot."""
         if stage.kind == "predict":
             self.state = self.algorithm.predict(self.state, self._period)
         elif stage.kind == "update":
@@ -228,6 +230,7 @@ class SlotNode(Node):
 
 
 def _rows(y: FloatArray, H: FloatArray) -> np.ndarray:
+    """Return which rows (p,) of a reading have a value."""
     # A reading without values has no row that counts.
     return np.isfinite(y) if len(y) == len(H) else np.zeros(len(H), dtype=bool)
 
@@ -292,6 +295,7 @@ class SlotClock:
             slot += 1
 
     def _exchange(self, stage: Stage, slot: int) -> None:
+        """Let all nodes of this exchange send, over the links or pairs that are active."""
         now, phase, broadcast = stage.time, stage.phase, not self._algorithm.pairwise
         # All inboxes open before anyone sends: a message without delay arrives at once.
         for node in self._distinct:

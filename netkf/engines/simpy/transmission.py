@@ -114,6 +114,7 @@ class Transmitter:
     def _arrive(
         self, way: DirectedLink, phase: int, envelope: Envelope, arrival: simpy.Event | None
     ) -> None:
+        """Deliver a message to its receiver, or record that it came too late."""
         now, (sender, receiver) = self._timeline.now, way.link
         # A message without delay arrives inside the tick, and keeps its age of 0.
         if arrival is not None:

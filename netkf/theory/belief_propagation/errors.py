@@ -55,6 +55,7 @@ class BeliefRule(ErrorRule):
         self.errors.stack.matrices[self.errors.stack.index(name)] = U
 
     def _drop(self, names: Sequence[Hashable]) -> None:
+        """Forget some evidence."""
         self._evidence.difference_update(names)
         self.errors.stack.drop(names)
 
@@ -71,6 +72,7 @@ class BeliefRule(ErrorRule):
             self._move(np.asarray(scipy.linalg.expm(-gap * self.scenario.belief[0])))
 
     def _move(self, back: FloatArray) -> None:
+        """Predict all evidence (U, s) to a later state: ``U <- back' U back``, ``s <- back' s``."""
         stack = self.errors.stack
         for name in self._evidence:
             U = stack.matrices[stack.index(name)]
@@ -156,10 +158,12 @@ class BeliefRule(ErrorRule):
 
 
 def _prior(estimator: int) -> Hashable:
+    """Return the name of an estimator's prior."""
     return ("prior", estimator)
 
 
 def _own(estimator: int) -> Hashable:
+    """Return the name of the evidence of an estimator's own readings."""
     return ("own", estimator)
 
 

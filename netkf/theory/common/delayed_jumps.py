@@ -204,6 +204,7 @@ class DelayedJumps:
 
     @cached_property
     def _lyapunov(self) -> LyapunovInverse:
+        """Inverse of the Lyapunov map of the mean drift."""
         return LyapunovInverse(self._mean[0][None])
 
     def _alone(self, right: FloatArray) -> FloatArray:
@@ -234,6 +235,7 @@ class DelayedJumps:
         none = np.zeros_like(right)
 
         def apply(x: FloatArray) -> FloatArray:
+            """Return the residual of the unknowns ``x``, preconditioned."""
             return -self._alone(self._residual(x.reshape(right.shape), none, jumps)).ravel()
 
         whole = scipy.sparse.linalg.LinearOperator((right.size, right.size), matvec=apply)
@@ -304,6 +306,7 @@ class DelayedJumps:
         K, M = self.points + 1, len(self.instant.drift)
 
         def ahead(y: FloatArray) -> FloatArray:
+            """Return the means one step later, after those of K steps in the past."""
             past = y.reshape(K, M)
             heard = self._integral @ (self._coupling @ past.T).T
             return self._moved((past[-1] + heard)[:, :, None]).ravel()

@@ -94,6 +94,7 @@ class EstimateExchangeRule(ErrorRule):
     def _combine_inbox(
         self, receiver: int, inbox: list[SentMessage]
     ) -> tuple[FloatArray, list[tuple[Hashable, FloatArray]]]:
+        """Return the new root (n, n) of a receiver, and the factor of each error that enters."""
         # An instantaneous message needs no copy: its content is the sender's present estimate.
         sources: list[Hashable] = [receiver]
         sources += [message if message.late else message.sender for message in inbox]

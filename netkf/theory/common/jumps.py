@@ -50,6 +50,7 @@ class SlotJumps:
 
     @cached_property
     def _all(self) -> IntArray:
+        """Indices of all directions."""
         return np.arange(len(self.ways.sender) if self.ways else 0)
 
     @cached_property
@@ -62,6 +63,7 @@ class SlotJumps:
 
     @cached_property
     def _mean(self) -> FloatArray:
+        """E[D] (S, M, M) over all directions, by mode."""
         assert self.ways is not None
         return self.ways.mean(self.nodes, self._all)
 
@@ -118,6 +120,7 @@ class ClockJumps:
 
     @cached_property
     def _chains(self) -> list[IntArray]:
+        """Channels that take a step at each kind of tick."""
         assert self.ways is not None
         return [np.unique(self.ways.source[among]) for _, among in self.ticks]
 
@@ -213,5 +216,8 @@ class LyapunovInverse:
 
     @staticmethod
     def _solve(T: FloatArray, U: FloatArray, Y: FloatArray) -> FloatArray:
+        """Return symmetric X with ``A X + X A' = -Y``, where A = U T U' is a real Schur form
+        (Bartels and Stewart 1972).
+        """
         X, scale, _ = scipy.linalg.lapack.dtrsyl(T, T, -(U.T @ Y @ U), trana="N", tranb="T")
         return symmetric(np.asarray(U @ (X / scale) @ U.T))

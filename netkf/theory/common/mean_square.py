@@ -180,6 +180,7 @@ def _maker(scenario: Scenario) -> Callable[[Scenario], LinearErrors] | None:
 
 
 def _require_size(shape: tuple[int, int, int]) -> None:
+    """Raise TheoryError for systems (S, M, M) that are too large."""
     S, M, _ = shape
     if M > MAX_ERRORS:
         raise TheoryError(
@@ -194,6 +195,7 @@ def _require_size(shape: tuple[int, int, int]) -> None:
 
 
 def _slots(system: SlotJumps) -> tuple[PositiveMap, FloatArray]:
+    """Return the map of second moments over a slot and the noise (S, M, M) that it adds."""
     return system.step, system.step(np.zeros(system.shape), noise=True)
 
 

@@ -76,6 +76,7 @@ def slot_observations(scenario: Scenario, run: Run) -> Callable[[int], Estimator
     ]
 
     def observe(slot: int) -> EstimatorObservations:
+        """Return the readings of a slot by estimator."""
         found = {}
         for estimator, paths in enumerate(estimators):
             if not paths:

@@ -192,6 +192,7 @@ def _deliveries(
         return np.array([[loss.mean_delivery(link, 1.0) for link in links]])
 
     def probabilities(bad: bool) -> FloatArray:
+        """Return the delivery probability of each link if all channels are in this state."""
         tables = ((link, scenario.table_probability(link)) for link in links)
         return np.array([loss.delivery_probability(link, 0, bad, table) for link, table in tables])
 
@@ -212,6 +213,7 @@ def _source(scenario: Scenario, link: tuple[int, int]) -> tuple[int, int]:
 
 
 def _sources(scenario: Scenario, links: list[tuple[int, int]]) -> list[tuple[int, int]]:
+    """Return the links whose channels have states of their own."""
     return list(dict.fromkeys(_source(scenario, link) for link in links))
 
 

@@ -67,6 +67,7 @@ def replay_law(scenario: Scenario, run: Run) -> ErrorLaw:
 
 
 def _stacked_errors(scenario: Scenario) -> StackedErrors:
+    """Return the errors at time 0."""
     require_known_filter(scenario)
     return StackedErrors(scenario, len(nodes_by_estimator(scenario)))
 
@@ -150,6 +151,7 @@ def _exchanged_messages(scenario: Scenario, run: Run) -> dict[tuple[int, int], l
 
 
 def _group_by_time(messages: list[SentMessage], column: int) -> dict[float, list[SentMessage]]:
+    """Return the messages by the time in their field number ``column``."""
     found: dict[float, list[SentMessage]] = {}
     for message in messages:
         found.setdefault(message[column], []).append(message)
@@ -159,6 +161,7 @@ def _group_by_time(messages: list[SentMessage], column: int) -> dict[float, list
 def _rule(
     scenario: Scenario, errors: StackedErrors, run: Run, messages: list[SentMessage]
 ) -> ErrorRule:
+    """Return the error rule of the filter's paper, or that of filters without messages."""
     if not scenario.hosted.paper:
         return ErrorRule(scenario, errors)
     made: ErrorRule = paper_module(scenario, "errors").rule(scenario, errors, run, messages)

@@ -26,8 +26,11 @@ def require_scenario(functions: dict[str, Any]) -> dict[str, Any]:
 
 
 def _check_first_argument(name: str, function: Callable[..., Any]) -> Callable[..., Any]:
+    """Return the function with a check that its first argument is a Scenario."""
+
     @wraps(function)
     def checked(scenario: Any, *args: Any, **kwargs: Any) -> Any:
+        """Call the function with a scenario; raises ScenarioError for anything else."""
         if not isinstance(scenario, Scenario):
             remedy = f"load it first: netkf.theory.{name}(netkf.load(path))"
             raise ScenarioError("", f"theory.{name} takes a netkf.Scenario", scenario, remedy)

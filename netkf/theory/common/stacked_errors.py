@@ -337,7 +337,8 @@ def _increment_flows(scenario: Scenario, estimators: int) -> IncrementFlows | No
     made: dict[bytes, ErrorFlow] = {}
 
     def flow(one: Observation) -> ErrorFlow:
-        # Hosts with equal sensors share a flow, and are then propagated together.
+        """Return the flow of errors with these sensors."""
+        # Estimators with equal sensors share a flow, and are then propagated together.
         key = b"|".join(part.tobytes() for part in one)
         if key not in made:
             made[key] = ErrorFlow(A, B, one.H, one.R, one.root, plant)

@@ -69,11 +69,15 @@ class PseudoStateRule(ErrorRule):
             errors.roots[i] = gains[i].root
 
     def _set(self, estimator: int, e: FloatArray, u: FloatArray) -> None:
+        """Set the errors of an estimator: ``e`` of xhat and ``u`` of yhat - G xhat, both (n,
+        inputs).
+        """
         self.errors.stack.put(estimator, e)
         self.errors.stack.put(_difference(estimator), u)
 
 
 def _difference(estimator: int) -> Hashable:
+    """Return the name of the error of yhat - G xhat."""
     return ("difference", estimator)
 
 

@@ -100,6 +100,7 @@ def clock_jumps(scenario: Scenario) -> ClockJumps | DelayedJumps | SlotJumps:
 
 
 def _own(k: int, n: int) -> slice:
+    """Return the rows of node ``k`` in stacked errors."""
     return slice(k * n, (k + 1) * n)
 
 

@@ -191,6 +191,7 @@ def _search(
     ends = np.cumsum([0, *(len(sources[k].start) for k in moving)])
 
     def level(x: FloatArray) -> float:
+        """Return the level at the regressors ``x``."""
         states = [s[None] for s in start]
         for index, k in enumerate(moving):
             states[k] = x[None, ends[index] : ends[index + 1]]

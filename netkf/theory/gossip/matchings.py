@@ -64,6 +64,7 @@ def effective_matching(scenario: Scenario) -> FloatArray:
 
 
 def _recorded_mean(scenario: Scenario, activation: RecordedSlots) -> FloatArray:
+    """Return the mean (N, N) of the recorded exchange matrices, each row of which sums to 1."""
     period, index = scenario.slot_plant.period, scenario.topology.index
     # Slot 0 holds the start: the first exchange is in slot 1.
     slots = range(1, max(2, int(np.ceil(scenario.horizon / period - 1e-9))))

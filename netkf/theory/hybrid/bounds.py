@@ -150,6 +150,9 @@ class _PiecewiseSolution:
                 self._first = self._jumped[end] = self._jumps.apply(end, self._first)
 
     def _piece_end(self, begin: float, last: float) -> float:
+        """Return how far the piece from ``begin`` may reach, seconds: inside it the delayed terms
+        are known.
+        """
         delay = self._packed.equations.delay
         if delay == 0.0:
             return last
@@ -159,6 +162,7 @@ class _PiecewiseSolution:
         return min(last, begin + max(delay, 0.5 / max(inflow, 1e-300)))
 
     def _append(self, end: float, output: Callable[[float], FloatArray]) -> None:
+        """Add a piece that ends at ``end``, given by its dense ``output``."""
         self._outputs.append(output)
         self._ends.append(end)
         self._first = output(end).reshape(self._packed.start.shape)
@@ -187,6 +191,7 @@ class _PiecewiseSolution:
         packed, silent, delay = self._packed, self._silent, self._packed.equations.delay
 
         def slope(t: float, y: FloatArray) -> FloatArray:
+            """Return dY/dt of the packed covariances."""
             Y = y.reshape(packed.start.shape)
             if not np.abs(y).max() < OVERFLOW:
                 raise TheoryError(f"H(12) grows beyond {OVERFLOW:g} before {t:g} s")
@@ -245,6 +250,7 @@ class _PiecewiseSolution:
             )
 
     def _solve(self, begin: float, end: float, slope: Slope, **method: Any) -> Any:
+        """Return the solution of a piece by scipy's ``solve_ivp``."""
         # It takes 0.4 s to import.
         import scipy.integrate
 
@@ -291,6 +297,7 @@ def _growth_event(limit: float) -> Callable[[float, FloatArray], float]:
     """Return an event of the solver that ends it where an entry exceeds ``limit``."""
 
     def below(_: float, y: FloatArray) -> float:
+        """Return a number that is negative beyond the limit."""
         return limit - float(np.abs(y).max()) if math.isfinite(limit) else 1.0
 
     below.terminal = True  # type: ignore[attr-defined]
@@ -353,6 +360,7 @@ def _limit_evaluations(slope: Slope) -> Slope:
     left = MAX_EXPLICIT_EVALUATIONS
 
     def counted(t: float, y: FloatArray) -> FloatArray:
+        """Return the slope; raises StiffError after too many evaluations."""
         nonlocal left
         left -= 1
         if left < 0:

@@ -214,6 +214,7 @@ def has_balanced_rates(scenario: Scenario) -> bool | None:
 
 
 def _is_symmetric(c: scipy.sparse.csr_array) -> bool:
+    """Return True if the rates are symmetric up to rounding."""
     difference, size = abs(c - c.T), abs(c.T)
     return bool((difference - RELATIVE_TOLERANCE * size).max() <= ABSOLUTE_TOLERANCE)
 

@@ -49,6 +49,7 @@ def solve_linearised(
 
 
 def _eliminate(linear: LinearisedRiccati, right: FloatArray) -> FloatArray:
+    """Return the solution of L(X) = -right by sparse elimination, nan where L is singular."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", scipy.sparse.linalg.MatrixRankWarning)
         # A singular map yields nan, which the caller takes as unstable.
@@ -72,13 +73,16 @@ def _solve_by_gmres(
         return None
 
     def apply(x: FloatArray) -> FloatArray:
+        """Return L(x) as a vector."""
         X = x.reshape(right.shape)
         return np.asarray(np.einsum("ik,ikl->il", X, blocks) + linear.arriving(X)).reshape(-1)
 
     def solve_alone(x: FloatArray) -> FloatArray:
+        """Return the solution for each node alone, without arrivals."""
         return np.asarray(np.einsum("ik,ikl->il", x.reshape(right.shape), inverse)).reshape(-1)
 
     def precondition(x: FloatArray) -> FloatArray:
+        """Return an approximate solution: the mean over nodes exactly, then each node alone."""
         together = np.tile(x.reshape(right.shape).mean(axis=0) @ coarse, len(right))
         return together + solve_alone(x - apply(together))
 

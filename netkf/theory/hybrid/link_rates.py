@@ -64,6 +64,7 @@ def link_rate_for(scenario: Scenario, delta: float) -> LinkRate:
     equations, S = _require_talk(scenario), limit_covariance(scenario)
 
     def excess(log_factor: float) -> float:
+        """Return the logarithm of distance over ``delta`` with all rates times a factor."""
         apart = _distance(equations, S, math.exp(log_factor))
         if apart is None:
             return NO_STEADY_STATE
@@ -86,6 +87,7 @@ def link_rate_for(scenario: Scenario, delta: float) -> LinkRate:
 
 
 def _require_talk(scenario: Scenario) -> CoupledRiccati:
+    """Return the coupled equations; raises TheoryError if no message ever arrives."""
     equations = coupled_riccati(scenario)
     if not equations.coupling.nnz:
         raise TheoryError("no message ever arrives, so that rates of links change nothing")
@@ -101,6 +103,7 @@ def _distance(equations: CoupledRiccati, S: FloatArray | None, factor: float) ->
 
 
 def _with_rate(scenario: Scenario, factor: float) -> LinkRate:
+    """Return the factor, with the rate that it stands for if all clocks have the same."""
     clock = scenario.network.activation
     rate = getattr(clock, "rate", None)
     if rate is None or getattr(clock, "rates", None):

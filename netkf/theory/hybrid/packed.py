@@ -67,6 +67,7 @@ class PackedRiccati:
         return other
 
     def _set_drift(self, A: FloatArray, Q: FloatArray) -> None:
+        """Set the terms A P + P A' and Q of each node."""
         drift = A @ self._basis
         self._own = self.pack(drift + np.swapaxes(drift, 1, 2))
         self._Q = self.pack(Q)

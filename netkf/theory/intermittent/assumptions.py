@@ -125,6 +125,7 @@ def _bounded_mean_row(scenario: Scenario) -> AssumptionRow:
 
 
 def _deliveries(scenario: Scenario, heard: list[tuple[int, int]]) -> list[float]:
+    """Return the mean delivery probability of each link."""
     loss = scenario.network.channel.loss
     return [loss.mean_delivery(link, scenario.table_probability(link)) for link in heard]
 

@@ -63,6 +63,7 @@ class ReadingExchangeRule(ErrorRule):
             live.sort()
 
     def _update(self, name: Hashable, nodes: Sequence[int]) -> None:
+        """Update an error by the readings of some nodes."""
         for node in nodes:
             if node in self._observations:
                 self.errors.update(name, self._observations[node], self._columns[node])

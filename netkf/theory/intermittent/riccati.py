@@ -47,6 +47,7 @@ def check_system(F: ArrayLike, Q: ArrayLike, H: ArrayLike, R: ArrayLike) -> Slot
 
 
 def _observation(H: ArrayLike, n: int) -> FloatArray:
+    """Return H as a finite matrix of n columns; raises TheoryError."""
     array = as_numbers("H", H)
     if array.ndim != 2 or array.shape[1] != n or not np.isfinite(array).all():
         raise TheoryError(f"H must be a finite matrix of {n} columns, its shape is {array.shape}")
@@ -207,6 +208,7 @@ def _critical_bounds(F: FloatArray, H: FloatArray, search: _GainSearch) -> tuple
     lower = max(0.0, 1.0 - 1.0 / alpha**2) if alpha > 0.0 else 0.0
 
     def radius(g: float) -> float:
+        """Return the best spectral radius with weight ``g`` on the open loop."""
         return search.best((1.0 - g, g))[0]
 
     # Without an unstable mode the mean is bounded for every probability.

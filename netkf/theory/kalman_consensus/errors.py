@@ -40,12 +40,14 @@ class KcfRule(ErrorRule):
             self._forget()
 
     def _forget(self) -> None:
+        """Drop the predictions and readings of the slot before."""
         self.errors.drop(
             [name for name in map(_prior, range(self.errors.estimators)) if self._has(name)]
         )
         self._observations, self._columns = {}, {}
 
     def _has(self, name: Hashable) -> bool:
+        """Return True if there is an error of this name."""
         return name in self.errors.roots
 
     def _prediction(self, estimator: int) -> Hashable:
@@ -104,6 +106,7 @@ class KcfRule(ErrorRule):
 
 
 def _prior(estimator: int) -> Hashable:
+    """Return the name of an estimator's prediction."""
     return ("prediction", estimator)
 
 

@@ -122,6 +122,7 @@ def lyapunov(A: FloatArray, Q: FloatArray) -> FloatArray:
 
 
 def _solve_lyapunov(A: FloatArray, Q: FloatArray) -> FloatArray:
+    """Return symmetric X (n, n) with ``A X + X A' = -Q``."""
     return symmetric(np.asarray(scipy.linalg.solve_continuous_lyapunov(A, -Q), dtype=np.float64))
 
 
@@ -136,6 +137,9 @@ def unobservable_mode(A: FloatArray, G: FloatArray) -> complex | None:
 
 
 def _hidden_mode(A: FloatArray, G: FloatArray, only_unstable: bool) -> complex | None:
+    """Return an eigenvalue of A whose mode G does not observe, or None (Popov-Belevitch-Hautus
+    test).
+    """
     n, size = len(A), max(float(np.linalg.norm(A, 2)), 1e-300)
     scaled = G / max(float(np.abs(G).max()), 1e-300) * size  # rank does not depend on units
     for value in np.linalg.eigvals(A):

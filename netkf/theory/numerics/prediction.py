@@ -102,6 +102,7 @@ class Predictor:
         return found
 
     def _discretise(self, gap: float) -> Prediction:
+        """Return the prediction over ``gap`` seconds."""
         F_f, root = self._belief.discretise(gap)
         if self._truth is None:
             return Prediction(F_f, F_f, np.zeros_like(F_f), root, root, root)

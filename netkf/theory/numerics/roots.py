@@ -135,6 +135,7 @@ def _multiply_into(out: FloatArray, a: FloatArray, b: FloatArray) -> None:
 
 @kernel
 def _keep_root(root: FloatArray, parts: FloatArray) -> None:
+    """Write the lower triangle of the first n columns of ``parts`` into ``root`` (n, n)."""
     n = root.shape[0]
     for i in range(n):
         for j in range(n):

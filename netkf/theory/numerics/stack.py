@@ -106,6 +106,7 @@ class GaussianStack:
         self.table[index, :, form.shape[1] : self.used] = 0.0
 
     def _index_for(self, name: Hashable) -> int:
+        """Return the index of a name, a free one if it is new."""
         index = self._index.get(name)
         if index is None:
             index = self._index[name] = self._free.pop() if self._free else self._grow()

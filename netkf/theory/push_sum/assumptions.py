@@ -55,6 +55,7 @@ def _plant_rows(scenario: Scenario) -> list[AssumptionRow]:
 
 
 def _observability_row(scenario: Scenario) -> AssumptionRow:
+    """Return the row: all sensors together observe every mode."""
     F, _ = scenario.slot_belief
     informations = [model.information for model in scenario.slot_models]
     hidden = unobservable_mode(F, np.sum(informations, axis=0))
@@ -68,6 +69,7 @@ def _observability_row(scenario: Scenario) -> AssumptionRow:
 
 
 def _link_rows(scenario: Scenario) -> list[AssumptionRow]:
+    """Return the rows about the graph and the losses."""
     law: Averaging | None
     try:
         law, reason = averaging_law(scenario), ""
@@ -82,6 +84,7 @@ def _link_rows(scenario: Scenario) -> list[AssumptionRow]:
 
 
 def _graph_row(scenario: Scenario) -> AssumptionRow:
+    """Return the row: the graph is undirected and connected."""
     topology = scenario.topology
     components = len(topology.components)
     return (
@@ -125,6 +128,7 @@ def _joint_failure_row(scenario: Scenario, law: Averaging | None) -> AssumptionR
 
 
 def _connection_row(scenario: Scenario) -> AssumptionRow:
+    """Return the row: with positive probability all links that are up connect all nodes."""
     name, source = "p_d < 1: the network is whole at times", "P Assumption 3"
     try:
         cut = disconnection_probability(scenario)
@@ -216,6 +220,7 @@ def _exact_row(
 
 
 def _certified_row(scenario: Scenario, moment: Moment, source: str) -> AssumptionRow:
+    """Return the row: gamma is at least the certified one for a moment."""
     gamma = push_sum_filter(scenario).gamma
     name = f"gamma is certified for the {moment.replace('-', ' ')}"
     try:

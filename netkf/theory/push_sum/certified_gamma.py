@@ -120,6 +120,7 @@ def minimum_gamma(scenario: Scenario, moment: Moment = "mean", sharp: bool = Fal
     test = {"mean": theorem_5, "mean-square": theorem_6}[_moment(moment)]
 
     def certified(gamma: int) -> bool:
+        """Return True if this gamma passes the test."""
         return test(constants, bound, gamma) < 1.0
 
     return _least_certified(certified, constants)
@@ -154,6 +155,7 @@ def corollary_2(scenario: Scenario, sharp: bool = False) -> CorollaryTwo:
 
 
 def _moment(moment: str) -> Moment:
+    """Return "mean" or "mean-square"; raises TheoryError for other names."""
     if moment not in ("mean", "mean-square"):
         raise TheoryError(f'moment must be "mean" or "mean-square", got {moment!r}')
     return "mean" if moment == "mean" else "mean-square"
@@ -199,6 +201,7 @@ def theorem_6(constants: GammaConstants, bound: float, gamma: int) -> float:
 
 
 def _rho(matrix: list[list[float]]) -> float:
+    """Return the spectral radius of a small matrix."""
     return float(np.abs(np.linalg.eigvals(np.array(matrix))).max())
 
 
@@ -225,4 +228,5 @@ def exact_minimum_gamma(
 
 
 def _with_gamma(steps: EstimationSteps, gamma: int) -> EstimationSteps:
+    """Return the estimation steps with another gamma."""
     return replace(steps, averaging=replace(steps.averaging, gamma=gamma))

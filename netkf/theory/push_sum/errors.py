@@ -99,6 +99,7 @@ class AveragingRule(ErrorRule):
         stack.table[indices, :, : stack.used] = (mixing @ forms).reshape(self._N, -1, stack.used)
 
     def _received(self, slot: int, phase: int, step: int) -> FloatArray:
+        """Return the weights (N, N) of the messages that arrived in a step, zeros if none did."""
         return self._arrivals.get((slot, phase, step), np.zeros((self._N, self._N)))
 
     def sense(self, time: float, observations: EstimatorObservations) -> None:

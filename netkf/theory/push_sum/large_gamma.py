@@ -88,6 +88,7 @@ def push_sum_covariances(scenario: Scenario, gammas: Sequence[int]) -> FloatArra
 
 
 def _with_gamma(steps: EstimationSteps, gamma: int) -> EstimationSteps:
+    """Return the estimation steps with another gamma, a whole number of at least 1."""
     law = replace(steps.averaging, gamma=as_whole("gamma", gamma, 1))
     return replace(steps, averaging=law)
 

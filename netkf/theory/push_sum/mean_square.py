@@ -74,6 +74,7 @@ def mean_radius(steps: EstimationSteps) -> float:
 
 
 def _mean_radius(law: Averaging, closed: FloatArray) -> float:
+    """Return the spectral radius of the mean errors of one group of states."""
     N, n, _ = closed.shape
     if N * n > DENSE_ROWS and not law.enumerated:
         return _mean_radius_by_arnoldi(law, closed)
@@ -87,6 +88,7 @@ def _mean_radius_by_arnoldi(law: Averaging, closed: FloatArray) -> float:
     N, n, _ = closed.shape
 
     def step(e: FloatArray) -> FloatArray:
+        """Return the mean errors (N n,) one slot later."""
         moved = (closed @ e.reshape(N, n, 1))[:, :, 0]
         for _ in range(law.gamma):
             moved = law.mean_step @ moved
@@ -140,6 +142,7 @@ def mapping(law: Averaging, closed: FloatArray) -> PositiveMap:
     N, n, _ = closed.shape
 
     def left(X: FloatArray) -> FloatArray:
+        """Return diag(A_j) X for X (N n, N n)."""
         return np.asarray(closed @ X.reshape(N, n, N * n)).reshape(X.shape)
 
     return lambda X: symmetric(law.second_moment(left(left(X[0]).T)))[None]

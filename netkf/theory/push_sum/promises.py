@@ -34,16 +34,20 @@ def slot_promises(scenario: Scenario) -> dict[str, Any]:
     """
 
     def limit() -> float:
+        """Return the trace of the limit of P."""
         return float(np.trace(push_sum_limits(scenario).P))
 
     def central() -> float:
+        """Return the trace of the central covariance."""
         return float(np.trace(central_covariance(scenario)))
 
     def by_node() -> list[float]:
+        """Return the trace of the error covariance of each node."""
         covariance = push_sum_error_covariance(scenario)
         return [float(trace) for trace in np.trace(covariance, axis1=1, axis2=2)]
 
     def exact_gamma() -> int:
+        """Return the least gamma with stable mean squares; raises TheoryError for large N n."""
         if not searches_gamma(scenario):
             raise TheoryError(
                 f"not looked for: the nodes have more than {MAX_SEARCHED} states together; "
@@ -52,14 +56,17 @@ def slot_promises(scenario: Scenario) -> dict[str, Any]:
         return exact_minimum_gamma(scenario, most=MAX_STEPS)
 
     def cut() -> list[float]:
+        """Return the interval of the disconnection probability."""
         found = disconnection_probability(scenario)
         return [found.low, found.high]
 
     def corollary() -> dict[str, float]:
+        """Return the numbers of Corollary 2 by name."""
         found = corollary_2(scenario)
         return found._asdict()
 
     def leader() -> int:
+        """Return the slots until all nodes follow the leader nearly surely."""
         known = leader_agreement(scenario, MAX_LEADER_SLOTS)
         late = known < AGREEMENT
         if late.all():
@@ -83,6 +90,7 @@ def slot_promises(scenario: Scenario) -> dict[str, Any]:
 
 
 def _value(function: Callable[[], Any]) -> dict[str, Any]:
+    """Return the value of a function, or the reason why there is none."""
     try:
         return {"value": function(), "reason": None}
     except TheoryError as error:
@@ -93,20 +101,24 @@ def slot_lines(found: dict[str, Any], number: Callable[[Any], str]) -> list[str]
     """Return the results as lines for a terminal; ``number`` formats a value."""
 
     def text(name: str, make: Callable[[Any], str] = number) -> str:
+        """Return a value as text, or the reason why there is none."""
         value = found[name]
         return value["reason"] or make(value["value"])
 
     def errors(traces: list[float]) -> str:
+        """Return mean and range of traces as text."""
         # The central trace is None where the central filter has no steady covariance.
         mean, central = float(np.mean(traces)), found["central_trace"]["value"]
         ratio = f", {mean / central:.4g} times the central one" if central else ""
         return f"mean {number(mean)}, from {number(min(traces))} to {number(max(traces))}{ratio}"
 
     def interval(ends: list[float]) -> str:
+        """Return an interval as text, one number if both ends are equal."""
         low, high = ends
         return number(low) if low == high else f"{number(low)} .. {number(high)} (simulated)"
 
     def corollary(found: dict[str, float]) -> str:
+        """Return the verdict on gamma as text."""
         verdict = "too few" if found["gamma"] < found["needed"] else "enough"
         return f"{found['gamma']}, where rho(A_R) is {number(found['radius'])}: {verdict}"
 

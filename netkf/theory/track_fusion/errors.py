@@ -116,6 +116,7 @@ class TrackRule(ErrorRule):
 
 
 def _track(estimator: int) -> Hashable:
+    """Return the name of the error of an estimator's own track."""
     return ("track", estimator)
 
 
