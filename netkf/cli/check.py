@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 
 
 def _declare(parser: argparse.ArgumentParser) -> None:
+    """Declare the options of ``netkf check``."""
     parser.add_argument(
         "--runs", type=parse_count, default=500, help="number of runs (default: 500)"
     )
@@ -69,6 +70,7 @@ def _run(options: argparse.Namespace) -> int:
 
 
 def _check(scenario: Scenario, options: argparse.Namespace) -> int:
+    """Check the promises, print the verdict and save it if asked; return the exit status."""
     from netkf.checks.points import sampling_note
     from netkf.checks.report import verdict_json, verdict_text
 

@@ -9,6 +9,7 @@ from netkf.cli.options import Command, add_json, print_json
 
 
 def _declare(parser: argparse.ArgumentParser) -> None:
+    """Declare the options of ``netkf compare``."""
     parser.add_argument("directories", type=Path, nargs="+", metavar="DIR", help="run directory")
     parser.add_argument(
         "--confidence",
@@ -20,6 +21,7 @@ def _declare(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(options: argparse.Namespace) -> int:
+    """Print the comparison of run directories; return the exit status."""
     from netkf.studies.compare import compare
     from netkf.studies.tables import comparison_text
 

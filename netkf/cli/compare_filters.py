@@ -22,6 +22,7 @@ from netkf.cli.progress import ProgressLine
 
 
 def _declare(parser: argparse.ArgumentParser) -> None:
+    """Declare the options of ``netkf compare-filters``."""
     parser.add_argument(
         "--filters",
         required=True,
@@ -47,6 +48,7 @@ def _declare(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(options: argparse.Namespace) -> int:
+    """Compare filters; return the exit status."""
     from netkf.runs.directory_lock import only_writer
 
     with only_writer(options.out, empty=True):
@@ -54,6 +56,7 @@ def _run(options: argparse.Namespace) -> int:
 
 
 def _compare(options: argparse.Namespace) -> int:
+    """Compare filters, print the table and save it if asked; return the exit status."""
     from netkf.scenario.values import typed_values
     from netkf.studies.compare_filters import compare_filters, write_comparison
     from netkf.studies.tables import filters_text

@@ -19,6 +19,7 @@ from netkf.cli.options import (
 
 
 def _declare(parser: argparse.ArgumentParser) -> None:
+    """Declare the options of ``netkf consistency``."""
     parser.add_argument("--runs", type=parse_count, default=50, help="number of runs (default: 50)")
     parser.add_argument(
         "--confidence",

@@ -95,6 +95,7 @@ def _attempt(arguments: Sequence[str], interruption: Interruption) -> _Ending:
 
 
 def _interrupted(what: str) -> _Ending:
+    """Return the ending of a command that was interrupted."""
     return _Ending(INTERRUPTED, f"interrupted; {what}" if what else "interrupted")
 
 
@@ -111,10 +112,12 @@ def _explain(error: Exception) -> str | None:
 
 
 def _reason(error: BaseException | None) -> str:
+    """Return why an error occurred, on one line."""
     return getattr(error, "strerror", None) or f"{type(error).__name__}: {error}"
 
 
 def _print_traceback(error: Exception) -> str:
+    """Print the traceback of an unexpected error; return the line that ends the command."""
     import traceback
 
     traceback.print_exception(error)

@@ -10,6 +10,7 @@ from netkf.cli.options import Command
 
 
 def _declare(parser: argparse.ArgumentParser) -> None:
+    """Declare the options of ``netkf new``."""
     parser.add_argument("name", metavar="NAME", help="NAME.toml and test_NAME.py are written")
     parser.add_argument(
         "--folder", type=Path, default=Path(), help="where (default: the current folder)"
@@ -17,6 +18,7 @@ def _declare(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(options: argparse.Namespace) -> int:
+    """Write a scenario and its tests; return the exit status."""
     from netkf.runs.template import write_template
 
     scenario, tests = write_template(options.name, options.folder)

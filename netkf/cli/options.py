@@ -36,6 +36,7 @@ class Parser(argparse.ArgumentParser):
         raise SystemExit(2)
 
     def _check_value(self, action: argparse.Action, value: Any) -> None:
+        """Raise ArgumentError for a value that is no choice, with the nearest one that is."""
         if action.choices is not None and value not in action.choices:
             known = [str(choice) for choice in action.choices]
             remedy = f"{nearest(value, known)}choose from {', '.join(known)}"
@@ -64,6 +65,7 @@ class Command:
 
 
 def _add_scenario(parser: argparse.ArgumentParser) -> None:
+    """Add the scenario file and the options that change it."""
     parser.add_argument("scenario", type=Path, help="scenario file (TOML)")
     parser.add_argument(
         "--set",
@@ -155,6 +157,7 @@ def parse_workers(text: str) -> int:
 
 
 def _parse_positive(text: str, most: int) -> int:
+    """Return an integer from 1 to ``most``; raises ArgumentTypeError."""
     if not text.isdecimal() or not 1 <= int(text[:20]) <= most:
         rule = f"must be an integer of at least 1 and at most {most:,}"
         raise argparse.ArgumentTypeError(f"{rule}, got {quote(text)}")

@@ -12,6 +12,7 @@ FORMATS = ("png", "svg", "pdf")
 
 
 def _declare(parser: argparse.ArgumentParser) -> None:
+    """Declare the options of ``netkf plot``."""
     parser.add_argument("directories", type=Path, nargs="+", metavar="DIR", help="run directory")
     parser.add_argument(
         "--figure",
@@ -29,6 +30,7 @@ def _declare(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(options: argparse.Namespace) -> int:
+    """Draw figures of directories into files; return the exit status."""
     try:
         from netkf.figures.catalogue import plot_to_files
     except ImportError:

@@ -71,6 +71,7 @@ class Interruption:
         self._ended, self._armed = True, False
 
     def _receive(self, number: int, frame: FrameType | None) -> None:
+        """Handle a signal: raise KeyboardInterrupt if armed, and remember it."""
         if self.received or self._ended:
             return
         self.received = True
@@ -95,6 +96,7 @@ class Interruption:
             _thread.start_new_thread(self._send_again, (next(iter(self._before)),))
 
     def _send_again(self, number: signal.Signals) -> None:
+        """Send the signal once more after a while, in case its exception was swallowed."""
         time.sleep(AGAIN_SECONDS)
         self.received = False
         # To the main thread itself: that ends what it waits for.
@@ -109,6 +111,7 @@ def end_later(status: int, seconds: float, line: str = "") -> None:
     """End the process with ``status`` after some seconds, whatever its main thread waits for."""
 
     def end() -> None:
+        """End the process after the delay."""
         time.sleep(seconds)
         if line:
             with contextlib.suppress(Exception):
@@ -192,6 +195,7 @@ class SafeStream:
 
     @contextlib.contextmanager
     def _failures(self) -> Iterator[None]:
+        """Turn failures of the stream into OutputError, or ignore them for output that may be lost."""
         try:
             yield
         except BrokenPipeError:

@@ -49,6 +49,7 @@ class ProgressLine:
         last_percent = -1
 
         def update(seconds: float) -> None:
+            """Show the share of the horizon that has been simulated."""
             # Engines report far more often than the percentage changes.
             nonlocal last_percent
             percent = int(100.0 * seconds / horizon)
@@ -63,6 +64,7 @@ class ProgressLine:
         began: tuple[float, int] | None = None
 
         def update(done: int, wanted: int) -> None:
+            """Show how much is done, and the estimated time left."""
             nonlocal began
             now = time.monotonic()
             # The rate counts from the first report: a resumed ensemble does not begin at 0.

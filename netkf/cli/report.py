@@ -9,6 +9,7 @@ from netkf.cli.options import Command, add_trust, parse_replica
 
 
 def _declare(parser: argparse.ArgumentParser) -> None:
+    """Declare the options of ``netkf report``."""
     parser.add_argument(
         "directories",
         type=Path,
@@ -25,6 +26,7 @@ def _declare(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(options: argparse.Namespace) -> int:
+    """Write the page; return the exit status."""
     from netkf.report.page import write_report
 
     path = write_report(options.directories, options.out, options.replica, options.trust)

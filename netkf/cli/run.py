@@ -33,6 +33,7 @@ MAX_LISTED_NODES = 12
 
 
 def _declare(parser: argparse.ArgumentParser) -> None:
+    """Declare the options of ``netkf run``."""
     parser.add_argument("--runs", type=parse_count, help="number of independent runs (default: 1)")
     parser.add_argument(
         "--replica", type=parse_replica, help="run this replica of an ensemble (default: 0)"
@@ -53,6 +54,7 @@ def _declare(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(options: argparse.Namespace) -> int:
+    """Simulate one run or several; return the exit status."""
     many = (options.runs or 1) > 1
     if many and options.replica is not None:
         remedy = "leave out --runs or --replica"
@@ -73,6 +75,7 @@ def _run(options: argparse.Namespace) -> int:
 
 
 def _run_once(scenario: Scenario, options: argparse.Namespace) -> int:
+    """Simulate one run into a directory; return the exit status."""
     from netkf.ensembles.resume import clear_unfinished_runs
     from netkf.runs.run import run_to_directory
 
@@ -106,6 +109,7 @@ def _run_once(scenario: Scenario, options: argparse.Namespace) -> int:
 
 
 def _run_many(scenario: Scenario, options: argparse.Namespace) -> int:
+    """Simulate several runs into a directory; return the exit status."""
     from netkf.ensembles.directory import EnsembleOptions, runs_to_directory
     from netkf.ensembles.pools import PoolOptions
 

@@ -9,12 +9,14 @@ from netkf.cli.options import Command
 
 
 def _declare(parser: argparse.ArgumentParser) -> None:
+    """Declare the options of ``netkf schema``."""
     parser.add_argument(
         "--markdown", action="store_true", help="print a reference of all keys instead"
     )
 
 
 def _run(options: argparse.Namespace) -> int:
+    """Print the schema or the page of keys; return the exit status."""
     if options.markdown:
         from netkf.scenario.schema_page import schema_page
 

@@ -22,6 +22,7 @@ from netkf.core.errors import ScenarioError
 
 
 def _declare(parser: argparse.ArgumentParser) -> None:
+    """Declare the options of ``netkf size``."""
     add_vary(parser, "KEY.PATH=LOW:HIGH", "the key to search and its range")
     parser.add_argument(
         "--target",

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 
 
 def _declare(parser: argparse.ArgumentParser) -> None:
+    """Declare the options of ``netkf sweep``."""
     add_vary(
         parser,
         "KEY.PATH=V1,V2,...",
@@ -46,6 +47,7 @@ def _declare(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(options: argparse.Namespace) -> int:
+    """Simulate a grid of scenarios into a directory; return the exit status."""
     from netkf.ensembles.pools import PoolOptions
     from netkf.runs.directory_lock import only_writer
     from netkf.studies.parameter_grid import parse_grid
@@ -75,6 +77,7 @@ def _run(options: argparse.Namespace) -> int:
 def _print_sweep(
     scenario: Scenario, completed: CompletedSweep, options: argparse.Namespace
 ) -> None:
+    """Print the table of a finished sweep."""
     from netkf.studies.tables import sweep_text
 
     if options.json:

@@ -8,10 +8,12 @@ from netkf.cli.options import Command, add_json, load_scenario, print_json, prin
 
 
 def _declare(parser: argparse.ArgumentParser) -> None:
+    """Declare the options of ``netkf theory``."""
     add_json(parser)
 
 
 def _run(options: argparse.Namespace) -> int:
+    """Print what is promised of a scenario; return the exit status."""
     scenario = load_scenario(options)
     # Afterwards: a scenario that is refused needs no theory, whose imports take half a second.
     from netkf.runs.failures import explain_failures

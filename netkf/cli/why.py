@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
 
 def _declare(parser: argparse.ArgumentParser) -> None:
+    """Declare the options of ``netkf why``."""
     parser.add_argument("directory", type=Path, metavar="DIR", help="run directory")
     parser.add_argument(
         "--node", type=int, metavar="I", help="id of the node (default: the one that is most off)"
@@ -57,6 +58,7 @@ def _declare(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(options: argparse.Namespace) -> int:
+    """Explain a sample of a run; return the exit status."""
     from netkf.runs.directory_lock import only_writer
 
     if (options.node is None) != (options.at is None):
@@ -67,6 +69,7 @@ def _run(options: argparse.Namespace) -> int:
 
 
 def _explain(options: argparse.Namespace) -> int:
+    """Explain a sample, print the text and save it if asked; return the exit status."""
     from netkf.studies.why import why
 
     node, at = options.node, options.at

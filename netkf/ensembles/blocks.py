@@ -131,6 +131,7 @@ def _check_versions(wanted: tuple[tuple[str, str], ...]) -> None:
 
 
 def _unpickle(travelling: PackedScenario) -> Scenario:
+    """Return the scenario in a worker, after its modules have been made importable there."""
     if travelling.versions:
         _check_versions(travelling.versions)
     for name, folder in travelling.modules:

@@ -139,10 +139,12 @@ class BlockCheckpoints:
         shutil.rmtree(self._folder, ignore_errors=True)
 
     def _files(self) -> list[Path]:
+        """Return the files of all blocks, in order."""
         found = self._folder.glob("*.npz") if self._folder.is_dir() else ()
         return sorted(file for file in found if file.stem.isdecimal())
 
     def _file(self, number: int) -> Path:
+        """Return the path of a block."""
         return self._folder / f"{number:06d}.npz"
 
     def _check(self, file: Path, identity: dict[str, Any]) -> None:
@@ -202,6 +204,7 @@ def is_block_size(value: object) -> bool:
 
 
 def _number(file: Path, identity: RunIdentity) -> int:
+    """Return the number of the block in a file; raises DamagedError."""
     number = int(file.stem[:12])
     if file.name != f"{number:06d}.npz" or number >= identity.blocks:
         raise DamagedError("has a number that no block has")
@@ -255,6 +258,7 @@ def _open_block(file: Path, verified: bool = True) -> Iterator[Any]:
 
 
 def _as_arrays(statistics: RunStatistics, identity: dict[str, Any]) -> dict[str, Any]:
+    """Return the statistics of a block as arrays by name, for one npz file."""
     arrays: dict[str, Any] = {"totals": statistics.totals}
     moments = {name: getattr(statistics, name) for name in PARTS}
     moments |= {f"conserved_{name}": found for name, (found, _) in statistics.conserved.items()}
@@ -279,7 +283,10 @@ def _read_texts(arrays: Any) -> dict[str, Any]:
 
 
 def _statistics(arrays: Any) -> RunStatistics:
+    """Return the statistics of a block from the arrays of its file."""
+
     def moments(name: str) -> Moments:
+        """Return the moments of one quantity."""
         return Moments(*(arrays[f"{name}_{field}"] for field in Moments._fields))
 
     texts = _read_texts(arrays)

@@ -203,6 +203,7 @@ class _Keeper:
         return whole
 
     def _runs(self, number: int) -> int:
+        """Return the number of runs in a block."""
         return min(self.plan.block, self.plan.runs - number * self.plan.block)
 
     def save_block(self, number: int, found: RunStatistics) -> RunStatistics:
@@ -237,4 +238,5 @@ class _Keeper:
         self._ended = True
 
     def _entries(self, **others: Any) -> dict[str, Any]:
+        """Return the entries of the manifest that say what belongs together."""
         return {"scenario": self.plan.scenario, "trace": self.plan.trace, **others}

@@ -44,6 +44,7 @@ class MergeTree:
 
 
 def _first(item: tuple[tuple[int, int], Any]) -> int:
+    """Return the index of the first block in a node of the tree."""
     (level, k), _ = item
     return k << level
 

@@ -204,6 +204,7 @@ def ensemble_table(ensemble: Ensemble) -> dict[str, np.ndarray]:
     i, j = np.triu_indices(n)
 
     def upper(values: FloatArray) -> list[FloatArray]:
+        """Return the columns of the upper triangle of matrices (T, N, n, n)."""
         return list(values[:, :, i, j].reshape(rows, -1).T)
 
     columns = [

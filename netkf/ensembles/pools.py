@@ -130,6 +130,7 @@ class AdaptivePool(LocalPool):
         return block_size(left, self.width)
 
     def _note_duration(self, job: Job, seconds: float) -> None:
+        """Keep the seconds that a block took, the first one apart."""
         super()._note_duration(job, seconds)
         self._spent += seconds
         if self._begun or seconds > 1.0:  # the first block fills caches
@@ -138,6 +139,7 @@ class AdaptivePool(LocalPool):
         self._begun = True
 
     def _worth_processes(self, job: Job) -> bool:
+        """Return True if processes would save more time than they take to start."""
         expected = 0.0
         if self._seconds > WARM:
             expected = self._seconds / self._runs * (job.stop - job.start)
@@ -172,6 +174,7 @@ class RemotePool(Pool):
         return self._send(job)
 
     def _pack(self, scenario: Scenario) -> PackedScenario:
+        """Return the scenario as it travels to the workers."""
         return pack_scenario(scenario)
 
     @abstractmethod
@@ -188,6 +191,7 @@ class ExecutorPool(RemotePool):
         self.width = getattr(executor, "_max_workers", None) or cores()
 
     def _send(self, job: Job) -> Future[Any]:
+        """Submit a block; return its future."""
         return self._executor.submit(work, job)
 
 
@@ -218,10 +222,12 @@ class DaskPool(RemotePool):
         self.width = max(1, sum(self._client.nthreads().values()))
 
     def _pack(self, scenario: Scenario) -> PackedScenario:
+        """Return the scenario with the versions that workers must have."""
         # Workers may join at any time, so each looks at its own versions.
         return pack_scenario(scenario)._replace(versions=tuple(versions().items()))
 
     def _send(self, job: Job) -> Future[Any]:
+        """Submit a block; return its future."""
         future: Future[Any] = self._executor.submit(work, job)
         return future
 
@@ -257,6 +263,7 @@ def _check_address(address: object) -> None:
 
 
 def _unreachable(address: str, reason: str) -> ScenarioError:
+    """Return the error for a scheduler that does not answer."""
     remedy = 'start one with "dask scheduler" and give its address, tcp://HOST:PORT'
     return ScenarioError("scheduler", f"cannot be reached ({reason})", address, remedy)
 
@@ -270,6 +277,7 @@ class ProcessPool(RemotePool):
         self._workers = WorkerProcesses(workers)
 
     def _send(self, job: Job) -> Future[Any]:
+        """Submit a block; return its future."""
         return self._workers.submit(job)
 
     def wait(self, futures: Collection[Future[Any]]) -> Collection[Future[Any]]:

@@ -139,6 +139,7 @@ def reduction_scratch(filters: int, n: int, largest: int) -> ReductionScratch:
     nodes, rows = (depth, wide, columns), (LANES, wide, columns)
 
     def in_lanes(numbers: int) -> FloatArray:
+        """Return aligned scratch with lanes for so many numbers of each chunk."""
         return np.asarray(aligned((wide * numbers + LANES, LANES)))
 
     return ReductionScratch(

@@ -92,6 +92,7 @@ def replicate_blocks(
 
 
 def _as_list(task: Task, scenario: Scenario, seed: int, replica: int) -> list[Any]:
+    """Return the result of a block unchanged."""
     """Return the result of one replica, for addition to join."""
     return [task(scenario, seed, replica)]
 
@@ -119,6 +120,7 @@ def _gather(
     tree, done, known = MergeTree(merge), 0, blocks.known
 
     def take(block: Job, result: Any) -> None:
+        """Add the result of a block to the tree and report progress."""
         nonlocal done
         tree.add(block.start // block.size, result, block.size.bit_length() - 1)
         done += len(block.replicas)

@@ -187,6 +187,7 @@ def _check_scenario(directory: Path, scenario: Scenario) -> None:
 
 
 def _prove(path: Path, check: Callable[[], None], remedy: str) -> None:
+    """Call a check; a DamagedError becomes a ScenarioError that names the file and the remedy."""
     try:
         check()
     except DamagedError as error:

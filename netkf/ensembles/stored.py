@@ -118,6 +118,7 @@ def _averages(rows: list[dict[str, Any]]) -> tuple[FloatArray, FloatArray]:
     """Return means and standard errors (N + 1, 3) of an ensemble from rows of its summary."""
 
     def column(name: str) -> FloatArray:
+        """Return one quantity of all nodes."""
         return np.array([row.get(name) for row in rows], dtype=np.float64)
 
     rms, rms_se = column("rms_error"), column("rms_error_se")

@@ -78,6 +78,9 @@ def _bounds(scenario: Scenario, promised: PromisedTraces) -> list[float | None]:
 
 
 def _row(mean: FloatArray, error: FloatArray, bound: float | None) -> dict[str, Any]:
+    """Return the summary of a node or of all nodes from means and standard errors of squared error,
+    trace and NEES.
+    """
     rms = float(np.sqrt(mean[0]))
     return {
         "rms_error": rms,

@@ -76,6 +76,7 @@ class FigureSet:
                 return message_figure(*self._explain(name, str(reason)))
 
     def _explain(self, name: str, reason: str) -> tuple[str, str, list[str]]:
+        """Return claim, message and caption of a figure that cannot be drawn."""
         claim = f"No {name.upper() if name in ACRONYMS else name} to show"
         if self._subject is None:
             return claim, reason, [f"{self._sweep.scenario.name}, a sweep."]

@@ -58,6 +58,7 @@ def nees_figure(subject: Subject) -> Picture:
 
 
 def _nees_claim(inside: float, mean: float, n: int) -> str:
+    """Return the claim of the figure of NEES."""
     claim = f"{inside:.0%} of the samples lie in the {CONFIDENCE:.0%} band of NEES"
     return f"{claim}; their mean is {mean:.3g} where exact covariances give {n}"
 
@@ -155,6 +156,7 @@ def whiteness_figure(subject: Subject) -> Picture:
 def _draw_correlations(
     axes: Any, curves: dict[int, FloatArray], worst: int, band: float, lags: int
 ) -> None:
+    """Draw the autocorrelations of innovations (lags,) of the nodes, by lag."""
     positions = np.arange(1, lags + 1)
     axes.axhspan(-band, band, color=EXACT, alpha=0.2, lw=0, label="95% if white")
     axes.axhline(0.0, color=EXACT, lw=0.8)

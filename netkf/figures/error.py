@@ -52,6 +52,7 @@ def error_figure(subject: Subject) -> Picture:
 
 
 def _interval_notes(subject: Subject) -> list[str]:
+    """Return the sentences on bands and bound."""
     if subject.runs > 1:
         return ["Bands: 95% intervals of the means (1.96 standard errors)."]
     if subject.promised.bound is None:
@@ -60,6 +61,7 @@ def _interval_notes(subject: Subject) -> list[str]:
 
 
 def _draw_innovations(axes: Any, subject: Subject) -> list[str]:
+    """Draw normalised innovations where there is no ground truth; return the sentences."""
     try:
         found = innovations_of(subject)
     except UnavailableError as error:
@@ -102,6 +104,7 @@ def _mean_claim(rows: list[dict[str, Any]]) -> str:
 
 
 def _size_claim(subject: Subject) -> str:
+    """Return the claim of the figure: the range of RMS errors."""
     values = [row["rms_error"] for row in subject.rows if _known(row.get("rms_error"))]
     if not values:
         return "The errors of the nodes over time"
@@ -111,10 +114,12 @@ def _size_claim(subject: Subject) -> str:
 
 
 def _known(value: Any) -> bool:
+    """Return True for a finite number."""
     return value is not None and math.isfinite(value)
 
 
 def _number(value: Any) -> float:
+    """Return the value, 0 if unknown."""
     return float(value) if _known(value) else 0.0
 
 
@@ -225,6 +230,7 @@ def ratios_figure(subject: Subject) -> Picture:
 
 
 def _nees_claim(rows: list[dict[str, Any]], key: str, scale: float) -> str:
+    """Return the claim where no bound applies: squared errors against P."""
     values = [row[key] * scale for row in rows]
     where = f"{min(values):.3g} to {max(values):.3g}" if len(values) > 1 else f"{values[0]:.3g}"
     return f"Squared errors are {where} times what P says; no bound applies"
@@ -233,6 +239,7 @@ def _nees_claim(rows: list[dict[str, Any]], key: str, scale: float) -> str:
 def _draw_ratios(
     axes: Any, subject: Subject, rows: list[dict[str, Any]], key: str, scale: float
 ) -> None:
+    """Draw the ratio of each node, with bars of 1.96 standard errors, against 1."""
     positions = np.arange(len(rows))
     values = scale * np.array([row[key] for row in rows])
     widths = scale * LEVEL * np.array([_number(row.get(f"{key}_se")) for row in rows])

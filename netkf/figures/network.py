@@ -54,6 +54,7 @@ def shades_of(subject: Subject, key: str) -> dict[int, float]:
 
 
 def _quantities(subject: Subject) -> dict[str, dict[int, float]]:
+    """Return the quantities that may colour the nodes, by label and node."""
     key, label = error_label(subject)
     found = {label: shades_of(subject, key)}
     if subject.runs == 1 and any("sent" in row for row in subject.rows):
@@ -71,6 +72,7 @@ def _bytes(subject: Subject) -> int:
 
 
 def _explain(subject: Subject) -> str:
+    """Return the sentences on links and energy."""
     size = _bytes(subject)
     links = "Links are as wide as the messages that they delivered. " if subject.delivered else ""
     if len(subject.scenario.topology.links) > MAX_LINKS:
@@ -82,6 +84,7 @@ def _explain(subject: Subject) -> str:
 
 
 def _claim(subject: Subject) -> str:
+    """Return the claim of the figure: the worst and the best node."""
     key, _ = error_label(subject)
     shades = {n: v for n, v in shades_of(subject, key).items() if math.isfinite(v)}
     what = "RMS error" if subject.shows_errors else "mean trace of P"
@@ -145,6 +148,7 @@ def _dot_size(subject: Subject) -> float:
 
 
 def _draw_links(axes: Any, subject: Subject, positions: Positions) -> None:
+    """Draw links, as wide as the messages that they delivered."""
     pairs = sorted({(min(i, j), max(i, j)) for i, j in subject.scenario.topology.links})
     if len(pairs) > MAX_LINKS:
         pairs = [pairs[k] for k in np.linspace(0, len(pairs) - 1, MAX_LINKS).astype(int).tolist()]

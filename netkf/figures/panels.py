@@ -96,6 +96,7 @@ def draw_errors(axes: Any, subject: Subject, bound: bool = False) -> None:
 
 
 def _draw_estimates(axes: Any, subject: Subject) -> None:
+    """Draw the first component of all estimates over time."""
     if subject.first is None:
         draw_message(axes, NO_TRUTH)
         return
@@ -132,6 +133,7 @@ def draw_promises(axes: Any, times: FloatArray, promised: PromisedTraces) -> Non
 
 
 def _draw_bound(axes: Any, times: FloatArray, roots: FloatArray) -> None:
+    """Draw the bounds ``roots`` (T, N), only the largest and smallest if nodes differ."""
     same = np.allclose(roots.max(axis=1), roots.min(axis=1))
     label = "bound H(12)" if same else "bound H(12): largest"
     axes.plot(times, roots.max(axis=1), color=INK, lw=1.3, ls="--", label=label, zorder=3)

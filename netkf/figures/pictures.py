@@ -51,6 +51,7 @@ def overview(subject: Subject) -> Picture:
 
 
 def _sentences(subject: Subject) -> list[str]:
+    """Return the sentences on bands, links and messages."""
     sentences = []
     if subject.runs > 1:
         sentences.append("Bands: 95% intervals of the means (1.96 standard errors).")

@@ -77,6 +77,7 @@ def stability_figure(subject: Subject) -> Picture:
 
 
 def _is_stable(scenario: Scenario, rate: float, delivery: float) -> bool:
+    """Return True if H(12) has a steady state at this rate and delivery probability."""
     return has_steady_state(scenario.replace({RATE: rate, DELIVERY: delivery}))
 
 
@@ -103,6 +104,7 @@ def sweep_figure(name: str, table: Any, keys: Sequence[str], status: str) -> Pic
 
 
 def _draw_curve(axes: Any, table: Any, keys: list[str]) -> str:
+    """Draw the errors of a sweep over one key; return the claim."""
     positions, labels = _axis_positions(axes.set_xscale, table[keys[0]])
     order = np.argsort(positions, kind="stable")
     series = (("worst_rms", "node with the largest error"), ("mean_rms", "all nodes"))
@@ -167,6 +169,7 @@ def _draw_map(axes: Any, table: Any, keys: list[str]) -> str:
 
 
 def _describe_best(table: Any, keys: Sequence[str]) -> str:
+    """Return the claim of a sweep: the point with the smallest worst error."""
     finite = table[np.isfinite(table["worst_rms"])]
     diverged = int(table["status"].astype(str).str.contains("diverged").sum())
     if not len(finite):
@@ -190,6 +193,7 @@ def _axis_positions(set_scale: Callable[[str], Any], values: Any) -> tuple[Float
 
 
 def _short(value: Any) -> str:
+    """Return a value as a text of at most 24 characters."""
     text = f"{value:.4g}" if isinstance(value, (int, float, np.number)) else str(value)
     return text if len(text) <= 24 else text[:21] + "..."
 
@@ -247,11 +251,13 @@ def law_figure(subject: Subject) -> Picture:
 
 
 def _draw_tail(axes: Any, sample: FloatArray, colour: str, dashes: str, label: str) -> None:
+    """Draw the share of a sorted ``sample`` (K,) above each value."""
     share = 1.0 - np.arange(len(sample)) / len(sample)
     axes.plot(sample, share, color=colour, ls=dashes, label=label, drawstyle="steps-post")
 
 
 def _tail_claim(values: FloatArray) -> str:
+    """Return the claim on the tail of the trace of P."""
     known = values[np.isfinite(values)]
     median, high = np.quantile(known, (0.5, 0.99))
     return f"The median trace of P is {median:.3g}; 1% of samples exceed {high:.3g}"

@@ -76,6 +76,7 @@ class Picture(Figure):
     """A figure that shows itself in a notebook, without pyplot."""
 
     def _repr_png_(self) -> bytes:
+        """Return the PNG that notebooks display."""
         buffer = io.BytesIO()
         with look():
             self.savefig(buffer, format="png", dpi=RESOLUTION)

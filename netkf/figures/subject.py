@@ -182,6 +182,7 @@ def subject_of(result: Any) -> Subject:
 
 
 def _of_run(run: Run) -> Subject:
+    """Return the subject of a run."""
     sink = SummarySink()
     sink.exact_errors = run.exact_errors
     sink.events(run.log)
@@ -243,6 +244,7 @@ def subject_of_samples(
 
 
 def _of_ensemble(ensemble: Ensemble) -> Subject:
+    """Return the subject of an ensemble."""
     scenario = ensemble.scenario
     assert scenario is not None
     promised = promise_traces(scenario, ensemble.times)

@@ -121,6 +121,7 @@ def age_figure(subject: Subject) -> Picture:
 
 
 def _draw_ages(axes: Any, edges: FloatArray, ages: list[Ages]) -> None:
+    """Draw mean and largest age of information within bins of time."""
     # Ages are sawtooths: instants of a grid would beat with the clocks, means over bins do not.
     centres = 0.5 * (edges[:-1] + edges[1:])
     means = np.array([each.mean(edges) for each in ages])
@@ -163,6 +164,7 @@ def _draw_age_law(axes: Any, ages: list[Ages], means: FloatArray, end: float) ->
 
 
 def _end(subject: Subject) -> float:
+    """Return the last recorded time in seconds."""
     last = float(subject.log["t"][-1])
     if len(subject.times):
         last = max(last, float(subject.times[-1]))
@@ -258,6 +260,7 @@ def links_figure(subject: Subject) -> Picture:
 
 
 def _with_messages(subject: Subject) -> list[DirectedMessages]:
+    """Return the messages by direction; raises UnavailableError without any."""
     found = directions_of(subject.log)
     if not found:
         raise UnavailableError("No message was delivered or lost.")

@@ -126,10 +126,12 @@ def _ending(source: Opened) -> list[str]:
 
 
 def _last(run: StoredRun | None) -> float:
+    """Return the last sampled time in seconds, 0 without samples."""
     return float(run.times[-1]) if run is not None and len(run.times) else 0.0
 
 
 def _of_trace(source: Opened, run: StoredRun, messages: np.ndarray) -> list[str]:
+    """Return the claims on the worst node of a run with a trace."""
     sample = source.worst
     if sample is None:
         return []
@@ -318,11 +320,13 @@ def _of_bound(source: Opened) -> list[str]:
 
 
 def _se(row: dict[str, Any]) -> str:
+    """Return the standard error of the mean trace as text."""
     error = row.get("mean_trace_se")
     return f" +- {error:.1g}" if error is not None else ""
 
 
 def _of_verdict(source: Opened) -> list[str]:
+    """Return the claims on a verdict: broken promises."""
     verdict = source.verdict or {}
     rows = verdict.get("rows", [])
     broken = [row for row in rows if row["verdict"] == "broken"]
@@ -338,10 +342,12 @@ def _of_verdict(source: Opened) -> list[str]:
 
 
 def _verdicts(rows: list[dict[str, Any]]) -> list[str]:
+    """Return the verdicts that occur, in alphabetical order."""
     return sorted({str(row["verdict"]) for row in rows})
 
 
 def _of_sweep(source: Opened) -> list[str]:
+    """Return the claims on a sweep: its best point."""
     assert source.sweep is not None
     table, varied = source.sweep.table, source.sweep.keys
     if not len(table):
@@ -387,8 +393,10 @@ def _of_filters(found: StoredComparison) -> list[str]:
 
 
 def _rms(row: ComparedFilter) -> Quantity:
+    """Return the RMS error of a compared filter."""
     return row.quantities["rms_error"]
 
 
 def _time(seconds: float) -> str:
+    """Return a time as text."""
     return f"t = {seconds:.6g} s"

@@ -167,6 +167,7 @@ def positions(source: Opened, run: StoredRun) -> list[list[float]]:
 
 
 def _layout(source: Opened, run: StoredRun) -> dict[int, Any]:
+    """Return coordinates for the nodes of a graph that has none of its own."""
     graph: networkx.Graph[int] = networkx.Graph()
     graph.add_nodes_from(run.nodes)
     graph.add_edges_from(source.scenario.topology.links)
@@ -211,6 +212,7 @@ def _broadcasts(run: StoredRun) -> bool:
 
 
 def _worst_data(worst: Worst | None) -> dict[str, Any] | None:
+    """Return the worst sample as an entry of the page's data."""
     return None if worst is None else worst._asdict()
 
 
@@ -234,6 +236,7 @@ def _limits(source: Opened) -> dict[str, Any]:
 def _sample_columns(
     source: Opened, run: StoredRun, chosen: np.ndarray, messages: np.ndarray, packer: Packer
 ) -> dict[str, Any]:
+    """Return the ``chosen`` samples as packed columns."""
     n = run.x.shape[1]
     i, j = np.triu_indices(n)
     total = len(run.times)
@@ -259,6 +262,7 @@ def _sample_columns(
 
 
 def _message_columns(kept: Kept, run: StoredRun, packer: Packer) -> dict[str, Any]:
+    """Return the messages as packed columns."""
     messages = kept.messages
     nodes = np.array(run.nodes)
     ended = np.where(np.isnan(messages["ended"]), np.inf, messages["ended"])

@@ -92,6 +92,7 @@ def innovation_claim(found: Innovations) -> str:
 
 
 def _judge_means(mean: float, low: float, high: float) -> str:
+    """Return whether a mean squared innovation fits P, as text."""
     inside = f"{format_number(low)} .. {format_number(high)}"
     if mean > high:
         return f"P is too sure: {CONFIDENCE:.0%} of such means would lie in {inside}"

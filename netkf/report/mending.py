@@ -50,6 +50,7 @@ def explain_worst(source: Opened) -> Explanation | str | None:
 
 
 def _command(source: Opened, worst: Worst) -> str:
+    """Return the command that explains the worst sample."""
     return f"netkf why {source.label} --node {worst.node} --at {worst.time:.10g}"
 
 
@@ -118,6 +119,7 @@ def price_claim(source: Opened, found: Explanation, central: CentralSample) -> s
 
 
 def _change(name: str, was: float, now: float) -> str:
+    """Return a value and its relative change as text."""
     change = f"{name} {format_number(now)} in place of {format_number(was)}"
     return f"{change} ({relative_change(now, was)})" if was > 0.0 else change
 

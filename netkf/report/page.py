@@ -140,6 +140,7 @@ def make_page(
 
 
 def _entry(directory: Path, replica: int | None, trust: bool) -> _Entry:
+    """Return what the page needs of a directory."""
     source = read_source(directory, replica, trust)
     none = np.empty(0, dtype=MESSAGE)
     if source.run is None:
@@ -168,6 +169,7 @@ def _merge_verdict(entries: list[_Entry]) -> list[_Entry]:
 def _command(
     directories: Sequence[str | Path], replica: int | None, trust: bool, out: Path | None
 ) -> str:
+    """Return the command that made the page."""
     command = ["netkf", "report", *map(str, directories)]
     command += ["--replica", str(replica)] if replica is not None else []
     command += ["--trust"] if trust else []
@@ -258,6 +260,7 @@ def _main(
     rules: list[str],
     live: bool,
 ) -> str:
+    """Return the sections of the page as HTML."""
     sources = [entry.source for entry in entries]
     parts = [_asset("live.html") if live else _nothing_moves(sources)]
     mended = [mending_section(e.source, e.worst) for e in entries if e.worst is not None]
@@ -284,12 +287,14 @@ def _figures(entries: list[_Entry]) -> str:
 
 
 def _differences(comparison: Comparison | str) -> str:
+    """Return the section on differences as HTML."""
     if isinstance(comparison, str):
         return paragraph(comparison)
     return tables.comparison_section(comparison)
 
 
 def _nothing_moves(sources: list[Opened]) -> str:
+    """Return the section that says why nothing is shown in motion."""
     kept_nothing = {"sweep": "sweep", "verdict": "verdict", "filters": "comparison of filters"}
     if sources[0].kind in kept_nothing:
         reason = (
@@ -306,6 +311,7 @@ def _nothing_moves(sources: list[Opened]) -> str:
 
 
 def _results(source: Opened) -> str:
+    """Return the tables of a source as HTML."""
     parts = []
     if source.verdict is not None:
         parts.append(tables.verdict_table(source))
@@ -327,6 +333,7 @@ def _results(source: Opened) -> str:
 
 
 def _scenario(source: Opened) -> str:
+    """Return the scenario file of a source as HTML."""
     label = f"scenario.toml of {source.label}"
     return (
         f"<h3>{text(label)}</h3>"
@@ -343,6 +350,7 @@ def _event_counts(run: StoredRun) -> str:
 
 
 def _origin(sources: list[Opened], command: str, rules: list[str]) -> str:
+    """Return the section on how the page and its sources were made."""
     parts = [
         paragraph("This page was made by:"),
         f'<pre tabindex="0" role="group" aria-label="command">{text(command)}</pre>',
@@ -401,4 +409,5 @@ def _script() -> str:
 
 @cache
 def _style() -> str:
+    """Return the style sheet."""
     return _asset("uPlot.min.css") + "\n" + _asset("page.css")

@@ -49,6 +49,7 @@ def verdict_table(source: Opened) -> str:
 
 
 def _rank(row: dict[str, Any]) -> int:
+    """Return a key that sorts rows by verdict."""
     return ORDER.index(row["verdict"]) if row["verdict"] in ORDER else len(ORDER)
 
 
@@ -80,10 +81,12 @@ def summary_section(source: Opened) -> str:
 
 
 def _cells(row: dict[str, Any]) -> list[str]:
+    """Return the cells of a row of the summary."""
     return [format_number(row[key]) + standard_error(row.get(f"{key}_se")) for key in COLUMNS]
 
 
 def _bound_notes(source: Opened) -> list[str]:
+    """Return the notes on bound and limits."""
     summary = source.summary
     found = [] if any(row["bound"] for row in summary["nodes"]) else [f"bound: {summary['bound']}"]
     if source.promised is not None:
@@ -108,6 +111,7 @@ def _limit_note(label: str) -> str:
 
 
 def _count(value: Any) -> str:
+    """Return a count as text."""
     return f"{value:,}" if isinstance(value, int) else f"{value:,.1f}"
 
 
@@ -134,10 +138,12 @@ def comparison_section(comparison: Comparison) -> str:
 
 
 def _value(entry: Entry) -> str:
+    """Return a value with its standard error as text."""
     return format_number(entry.value) + standard_error(entry.se)
 
 
 def _difference(entry: Entry) -> list[str]:
+    """Return the cells of a difference: value, interval, mark."""
     if entry.difference is None:
         return ["-", "-", "-"]
     interval = "-"
@@ -177,6 +183,7 @@ def filters_table(found: StoredComparison) -> str:
 
 
 def _quantity(found: Quantity) -> list[str]:
+    """Return the cells of a quantity: value, difference, mark."""
     value = format_number(found.value) + standard_error(found.se)
     if not math.isfinite(found.difference):
         return [value, "-", "-"]
@@ -200,6 +207,7 @@ def sweep_table(source: Opened) -> str:
 
 
 def _cell(value: Any, error: Any) -> str:
+    """Return a value of a sweep with its standard error as text."""
     if isinstance(value, (int, np.integer)):
         return f"{int(value):,}"
     if isinstance(value, (float, np.floating)):

@@ -41,6 +41,7 @@ def only_writer(directory: Path | None, empty: bool = False) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _locked(directory: Path) -> Iterator[None]:
+    """Hold the lock of a directory; go on with a note if its file system knows no locks."""
     opened = None
     try:
         opened = _open(directory)
@@ -57,6 +58,7 @@ def _locked(directory: Path) -> Iterator[None]:
 
 
 def _lock_or_refuse(opened: int, directory: Path) -> None:
+    """Take the lock; raises ScenarioError if another process holds it."""
     try:
         _lock(opened)
     except (BlockingIOError, PermissionError):  # the latter on Windows
@@ -69,6 +71,7 @@ def _lock_or_refuse(opened: int, directory: Path) -> None:
 
 
 def _print_note(directory: Path, error: OSError) -> None:
+    """Say on standard error that the directory is not locked."""
     note = f"note: {directory} cannot be locked ({error.strerror}): one command at a time on it"
     print(note, file=sys.stderr)
 
@@ -82,6 +85,7 @@ if sys.platform == "win32":
         return os.open(Path(tempfile.gettempdir()) / f"netkf-{name}.lock", os.O_RDWR | os.O_CREAT)
 
     def _lock(opened: int) -> None:
+        """Take the lock without waiting; raises OSError."""
         msvcrt.locking(opened, msvcrt.LK_NBLCK, 1)
 
 else:
@@ -92,4 +96,5 @@ else:
         return os.open(directory, os.O_RDONLY)
 
     def _lock(opened: int) -> None:
+        """Take the lock without waiting; raises OSError."""
         fcntl.flock(opened, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -44,6 +44,7 @@ def check_seal(document: Mapping[str, Any]) -> None:
 
 
 def _digest(document: Mapping[str, Any]) -> str:
+    """Return the SHA-256 of a document, whatever the order of its keys."""
     text = json.dumps(document, sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(text.encode()).hexdigest()
 
@@ -86,6 +87,7 @@ def read_document(path: Path) -> dict[str, Any]:
 
 
 def _refuse(name: str) -> Any:
+    """Raise ValueError for NaN and infinities, which JSON does not have."""
     raise ValueError(name)
 
 
@@ -145,17 +147,20 @@ def require(value: Any, form: Any, where: str = "") -> None:
 
 
 def _demand(kept: bool, form: str, where: str) -> None:
+    """Raise DamagedError unless ``kept``."""
     if not kept:
         raise DamagedError(f"needs {form} at {where}" if where else f"is not {form}")
 
 
 def _is_number(value: Any) -> bool:
+    """Return True for finite numbers and null."""
     if isinstance(value, int):
         return not isinstance(value, bool) and abs(value) <= MAX_COUNT
     return value is None or (isinstance(value, float) and math.isfinite(value))
 
 
 def _is_count(value: Any) -> bool:
+    """Return True for whole numbers from 0 up to MAX_COUNT."""
     return isinstance(value, int) and not isinstance(value, bool) and 0 <= value <= MAX_COUNT
 
 

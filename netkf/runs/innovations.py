@@ -83,11 +83,13 @@ def _noting(algorithm: Filter, noted: list[Any]) -> Filter:
     base: Any = type(algorithm)
 
     def update(self: Any, state: Any, reading: Any) -> Any:
+        """Note the sample with the estimate before it, then update."""
         if isinstance(reading, Reading):
             noted.append((reading, *self.estimate(state)))
         return base.update(self, state, reading)
 
     def shift(self: Any, state: Any, offset: FloatArray) -> Any:
+        """Shift as the filter does."""
         return base.shift(self, state, offset)
 
     # A class that defines ``update`` must define ``shift`` too, or it would lose its moving frame.

@@ -90,6 +90,7 @@ def _reading(path: Path) -> Iterator[Any]:
 
 
 def _open(path: Path, mode: str) -> Any:
+    """Return an open Arrow file."""
     # As bytes: pyarrow writes texts as UTF-8, which need not be the encoding of file names.
     return pa.OSFile(os.fsencode(path), mode)
 
@@ -117,6 +118,7 @@ def is_numeric_column(path: Path, name: str) -> bool:
 
 
 def _is_numeric(kind: Any) -> bool:
+    """Return True for Arrow types of numbers."""
     return bool(pa.types.is_integer(kind) or pa.types.is_floating(kind))
 
 
@@ -150,6 +152,7 @@ class ParquetSink(Sink):
                 self._flush()
 
     def _flush(self) -> None:
+        """Write the samples that have been gathered."""
         if self._states is None or not self._samples:
             return
         columns = zip(*self._samples, strict=True)
@@ -174,6 +177,7 @@ class ParquetSink(Sink):
 
 
 def _no_events() -> dict[str, Any]:
+    """Return the columns of an empty table of events."""
     return event_columns(np.empty(0, dtype=EVENT), 0, 0)
 
 
@@ -211,6 +215,7 @@ class TraceTables:
             self._flush()
 
     def _flush(self) -> None:
+        """Write the tables that have been gathered."""
         for gathered, table in zip(self._gathered, (self._events, self._states), strict=True):
             if gathered:
                 table.write(pd.concat(gathered, ignore_index=True))
@@ -254,6 +259,7 @@ class _Table:
         self._closed = False
 
     def write(self, columns: dict[str, Any] | pd.DataFrame) -> None:
+        """Append rows; the first ones create the file."""
         table = pa.Table.from_pandas(pd.DataFrame(columns), preserve_index=False)
         with self._or_nothing():
             if self._writer is None:
@@ -289,6 +295,7 @@ class _Table:
 
     @contextlib.contextmanager
     def _or_nothing(self) -> Iterator[None]:
+        """Discard the unfinished file if anything fails meanwhile."""
         try:
             with writing(self._path):
                 yield

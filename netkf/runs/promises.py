@@ -96,6 +96,7 @@ def _steady_error(scenario: Scenario) -> dict[str, Any]:
     """Return the exact steady mean squares of the errors and their radius."""
 
     def covariance() -> FloatArray:
+        """Return the steady error covariance; raises TheoryError if that takes long."""
         if not is_quickly_solved(scenario):
             raise TheoryError(
                 "left out, because it takes more than seconds; "
@@ -136,6 +137,7 @@ def _steady(scenario: Scenario) -> dict[str, Any]:
 
 
 def _value(function: Callable[[], FloatArray]) -> dict[str, Any]:
+    """Return a matrix with its trace, or the reason why there is none."""
     try:
         value = function()
     except TheoryError as error:
@@ -176,6 +178,7 @@ def _error_lines(scenario: Scenario, found: dict[str, Any]) -> list[str]:
 
 
 def _assumption_lines(rows: list[dict[str, Any]]) -> list[str]:
+    """Return the lines on assumptions."""
     lines = []
     for row in rows:
         lines.append(f"  {MARKS[row['holds']]:7}  {row['assumption']}  [{row['source']}]")
@@ -185,6 +188,7 @@ def _assumption_lines(rows: list[dict[str, Any]]) -> list[str]:
 
 
 def _bound_lines(scenario: Scenario, found: dict[str, Any]) -> list[str]:
+    """Return the lines on bounds, a table of traces by node."""
     lines = ["", "trace of the bound on E[P_i]"]
     columns = {
         f"at {scenario.horizon:g} s": found["bound_at_horizon"],
@@ -201,6 +205,7 @@ def _bound_lines(scenario: Scenario, found: dict[str, Any]) -> list[str]:
 
 
 def _limit_lines(scenario: Scenario, found: dict[str, Any]) -> list[str]:
+    """Return the lines on limits to compare with."""
     error_limit = "limit of the true error covariance (derived)" + delay_suffix(scenario)
     labels = {
         "limit_covariance": f"{limit_label(scenario)}, as links tick ever faster",

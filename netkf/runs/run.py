@@ -234,6 +234,7 @@ def _keep_partial_results(
 
 
 def _totals(recorder: Recorder) -> dict[str, Any]:
+    """Return number and fingerprint of the events for the manifest."""
     totals: dict[str, Any] = {"events": recorder.total, "fingerprint": recorder.fingerprint}
     return totals | ({"simpy": recorder.stats} if recorder.stats else {})
 

@@ -105,6 +105,7 @@ class StoredRun(WithPromises, Run):
         return self._column("nees")
 
     def _column(self, name: str) -> FloatArray:
+        """Return one column of the samples (T, N), nan if the file does not have it."""
         shape = len(self.times), len(self.nodes)
         if name not in self.stored:
             return np.full(shape, np.nan)
@@ -157,10 +158,12 @@ def read_run(
 
 
 def _status(log: np.ndarray) -> str:
+    """Return "diverged" or "complete"."""
     return "diverged" if (log["kind"] == CODES["diverged"]).any() else "complete"
 
 
 def _sums(conserved: Any) -> dict[str, tuple[float, float]]:
+    """Return the conserved sums of a manifest; raises DamagedError."""
     form = {"exact": NUMBER, "total": NUMBER}
     require(conserved, {}, "conserved")
     for name, found in conserved.items():

@@ -177,6 +177,7 @@ def _require_small_bound(scenario: Scenario, samples: int) -> None:
 
 
 def _steady_note(scenario: Scenario) -> str:
+    """Return a note if the bound on P has no steady state, or none that is known."""
     if scenario.slotted or reason_without_bound(scenario):
         return ""
     if len(scenario.nodes) * scenario.plant.n**2 > MAX_STEADY_ENTRIES:
@@ -196,6 +197,7 @@ def _steady_note(scenario: Scenario) -> str:
 
 
 def _trace(function: Any, scenario: Scenario) -> float:
+    """Return the trace of a promised matrix, nan if it is not promised."""
     try:
         return float(np.trace(function(scenario)))
     except TheoryError:

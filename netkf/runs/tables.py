@@ -81,6 +81,7 @@ def summary_table(
 
 
 def _node_table(summary: dict[str, Any]) -> Iterator[str]:
+    """Yield the lines of the table of nodes."""
     nodes = sorted(summary["nodes"], key=lambda row: row["node"])
     listed = _best_and_worst(nodes) if len(nodes) > MAX_NODES else nodes
     omitted = len(nodes) - len(listed)
@@ -112,6 +113,7 @@ def _sort_key(value: float | None) -> float:
 
 
 def _cells(name: str, row: dict[str, Any]) -> list[str]:
+    """Return the cells of a row."""
     return [
         name,
         *(format_number(row[key]) + standard_error(row.get(f"{key}_se")) for key in COLUMNS),
@@ -119,6 +121,7 @@ def _cells(name: str, row: dict[str, Any]) -> list[str]:
 
 
 def _limit_lines(summary: dict[str, Any], limit: str) -> list[str]:
+    """Return the line of limits to compare with."""
     traces = {limit: summary["limit"], "centralised filter": summary["central"]}
     known = [
         f"{label} {format_number(value)}"
@@ -129,6 +132,7 @@ def _limit_lines(summary: dict[str, Any], limit: str) -> list[str]:
 
 
 def _nees_lines(nees: dict[str, Any]) -> list[str]:
+    """Return the line on the consistency of P."""
     if not math.isfinite(nees.get("inside", math.nan)):
         return []
     return [
@@ -139,6 +143,7 @@ def _nees_lines(nees: dict[str, Any]) -> list[str]:
 
 
 def _message_line(messages: dict[str, Any]) -> str:
+    """Return the line that counts messages."""
     transmissions = messages.get("transmissions")
     if transmissions is None or math.isnan(transmissions):  # in slots they are not counted
         transmissions = messages["sent"]
@@ -153,6 +158,7 @@ def _message_line(messages: dict[str, Any]) -> str:
 
 
 def _conserved(sums: dict[str, dict[str, float]]) -> str:
+    """Return the conserved sums with their relative drift, as text."""
     totals = [
         f"{name} {format_number(found['total'])} of {format_number(found['exact'])} "
         f"({found['drift']:+.1e})"

@@ -97,6 +97,7 @@ class SentPerLink(Sink):
 
 
 def _count(counter: Counter[int], nodes: np.ndarray) -> None:
+    """Add how often each node occurs."""
     found, counts = np.unique(nodes, return_counts=True)
     for node, count in zip(found.tolist(), counts.tolist(), strict=True):
         counter[node] += count

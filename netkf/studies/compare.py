@@ -178,6 +178,7 @@ def read_directory(directory: Path) -> RunDirectory:
 
 
 def _read(directory: Path, name: str, form: dict[str, Any]) -> dict[str, Any]:
+    """Return a JSON document of a run directory; raises DamagedError if its form is wrong."""
     with damage_in(name):
         document = read_document(directory / name)
         require(document, form)
@@ -277,6 +278,7 @@ def compare(directories: Sequence[str | Path], confidence: float = 0.95) -> Comp
 
 
 def _read_all(directories: Sequence[str | Path]) -> list[RunDirectory]:
+    """Return the run directories; raises ScenarioError."""
     if isinstance(directories, (str, Path)) or not isinstance(directories, Sequence):
         remedy = "give all of them in one list: netkf.compare([one, other])"
         raise ScenarioError("directories", "must be a list", directories, remedy)
@@ -288,6 +290,7 @@ def _read_all(directories: Sequence[str | Path]) -> list[RunDirectory]:
 def _entry(
     first: RunDirectory, other: RunDirectory, quantity: str, node: int, level: float
 ) -> Entry:
+    """Return a quantity of one directory and its difference from the first one."""
     value, se = other.value(quantity, node)
     entry = Entry(value, se)
     if other is first or value is None:
@@ -317,6 +320,7 @@ def _pair_runs(
 
 
 def _same_truth(first: RunDirectory, other: RunDirectory) -> bool:
+    """Return True if the samples have equal states wherever both have runs and times."""
     one, two = first.samples, other.samples
     if one is None or two is None or first.manifest.get("seed") != other.manifest.get("seed"):
         return False
@@ -349,9 +353,11 @@ def _welch(
 
 
 def _interval(mean: float, error: float, freedom: float, level: float) -> tuple[float, float]:
+    """Return both ends of Student's interval."""
     width = float(scipy.special.stdtrit(freedom, 1.0 - level / 2.0)) * error
     return mean - width, mean + width
 
 
 def _excludes_zero(low: float, high: float) -> bool:
+    """Return True if an interval is finite and lies on one side of zero."""
     return bool(np.isfinite([low, high]).all() and (low > 0.0 or high < 0.0))

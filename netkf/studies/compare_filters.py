@@ -184,6 +184,7 @@ def compare_filters(
 
 
 def _simulate(scenario: Scenario, runs: int, seed: int, engine: str, pool: Pool) -> FilterValues:
+    """Return the values of all runs of a filter."""
     with explain_failures(scenario):
         task = partial(block_values, engine=choose_engine(engine, scenario))
         found: FilterValues = replicate_blocks(task, join_values, scenario, runs, seed, pool=pool)
@@ -198,6 +199,7 @@ def _row(
     n: int,
     level: float,
 ) -> ComparedFilter:
+    """Return the row of a filter, with differences from the ``first`` one."""
     diverged = int(values.diverged.sum())
     return ComparedFilter(
         label,
@@ -231,6 +233,7 @@ def _candidates(scenario: Scenario, filters: Any, engine: str) -> tuple[FilterEn
 
 
 def _candidate(scenario: Scenario, choice: Choice, engine: str) -> FilterEntry:
+    """Return a filter with its scenario, or with the reason why it cannot run here."""
     if isinstance(choice, Filter):
         filtering = dataclasses.replace(scenario.filter, algorithm=choice)
         make = partial(dataclasses.replace, scenario, filter=filtering)
@@ -277,6 +280,7 @@ def _settings(algorithm: Any) -> dict[str, str]:
 
 
 def _label(kind: str, settings: Mapping[str, Any]) -> str:
+    """Return the label of a filter: kind and settings."""
     return " ".join([kind, *(f"{key}={value}" for key, value in settings.items())])
 
 

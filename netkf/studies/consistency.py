@@ -99,6 +99,7 @@ def _mean(values: FloatArray, lost: np.ndarray) -> FloatArray:
 
 
 def _errors_of(scenario: Scenario) -> int:
+    """Return the number of errors N n of all nodes."""
     return len(scenario.nodes) * scenario.plant.n
 
 
@@ -348,10 +349,12 @@ def judge_consistency(
 
 
 def _covariance_given(runs: Sequence[RunConsistency]) -> bool:
+    """Return True if the filter gives covariances."""
     return any(run.covariance_given[0] for run in runs)
 
 
 def _blurred_from(runs: Sequence[RunConsistency]) -> float:
+    """Return the first time in seconds from which rounding blurs errors in some run."""
     return float(min(run.blurred_from[0] for run in runs))
 
 
@@ -367,6 +370,7 @@ def _share_inside(runs: Sequence[RunConsistency], low: float, high: float) -> Fl
 def _judge_node(
     scenario: Scenario, runs: Sequence[RunConsistency], i: int, inside: float, quantile: float
 ) -> NodeConsistency:
+    """Return the verdict on node ``i`` by the interval of its mean NEES over the runs."""
     nees = np.array([run.nees[i] for run in runs])
     expected = np.array([run.expected[i] for run in runs])
     known = bool(np.isfinite(expected).all())

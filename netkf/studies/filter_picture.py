@@ -48,6 +48,7 @@ def _claim(rows: list[ComparedFilter]) -> str:
 
 
 def _draw_quantity(axes: Any, rows: list[ComparedFilter], name: str, label: str) -> None:
+    """Draw a quantity of all filters with bars of two standard errors."""
     values = [row.quantities[name].value for row in rows]
     bars = [2.0 * row.quantities[name].se for row in rows]
     bars = [bar if math.isfinite(bar) else 0.0 for bar in bars]
@@ -65,5 +66,6 @@ def _draw_quantity(axes: Any, rows: list[ComparedFilter], name: str, label: str)
 
 
 def _draw_traffic(axes: Any, rows: list[ComparedFilter]) -> None:
+    """Draw the bytes that all nodes send."""
     axes.barh(range(len(rows)), [row.bytes / 1000.0 for row in rows], height=0.5, color=MUTED)
     axes.set_xlabel("kB sent in a run")

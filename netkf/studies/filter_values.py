@@ -44,6 +44,7 @@ def block_values(scenario: Scenario, seed: int, replicas: range, engine: Engine)
 
 
 def _batch_values(scenario: Scenario, batch: RunBatch) -> FilterValues:
+    """Return the values of a batch of runs."""
     values = run_values(batch, scenario)
     whole = values.averages[:, -1]
     worst = [
@@ -148,6 +149,7 @@ def _influences(values: FilterValues, n: int) -> dict[str, tuple[float, FloatArr
 
 
 def _standard_error(values: FloatArray) -> float:
+    """Return the standard error of a mean, nan for one value."""
     return float(values.std(ddof=1)) / math.sqrt(len(values)) if len(values) > 1 else math.nan
 
 

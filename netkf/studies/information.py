@@ -160,6 +160,7 @@ def rows_until(scenario: DerivedScenario, log: IntArray, at: float) -> IntArray:
 
 
 def _end(scenario: DerivedScenario, times: FloatArray, at: float) -> int:
+    """Return the number of events that the sample at ``at`` seconds contains."""
     if not scenario.slotted:
         return int(np.searchsorted(times, at, side="right"))
     plant = scenario.slot_plant
@@ -249,6 +250,7 @@ def _swaps(nodes: IntArray, rows: int, messages: Messages, used: IntArray) -> Fl
     keys = indices * length + start
 
     def segment(who: IntArray, row: IntArray) -> IntArray:
+        """Return the segment of each node at an event row."""
         wanted = np.searchsorted(nodes, who) * length + row
         return np.asarray(np.searchsorted(keys, wanted, side="right") - 1)
 
@@ -391,6 +393,7 @@ def newest_information(
 
 
 def _order(reading: float, known: float) -> tuple[float, float]:
+    """Return a key that sorts missing times first."""
     return (
         -np.inf if np.isnan(reading) else reading,
         -np.inf if np.isnan(known) else known,

@@ -131,6 +131,7 @@ class _Search:
         tolerance = NEGLIGIBLE * (base - self._limit)
 
         def negligible(count: int) -> bool:
+            """Return True if the first ``count`` candidates change next to nothing."""
             keys = [candidate.key for candidate in candidates[:count]]
             return abs(self.trace(keys) - base) <= tolerance
 

@@ -36,6 +36,7 @@ def parse_grid(settings: Sequence[str]) -> dict[str, list[Any]]:
 
 
 def _evenly(key: str, start: str, stop: str, count: str) -> list[Any]:
+    """Return the values of START:STOP:COUNT, whole numbers if all are whole."""
     try:
         low, high, number = float(start), float(stop), int(count)
         whole = [int(start), int(stop)]
@@ -51,6 +52,7 @@ def _evenly(key: str, start: str, stop: str, count: str) -> list[Any]:
 
 
 def _finite(*texts: str) -> bool:
+    """Return True if all texts are finite numbers."""
     try:
         return all(math.isfinite(float(text)) for text in texts)
     except ValueError:
@@ -93,6 +95,7 @@ def expand_grid(scenario: Scenario, grid: Mapping[str, Sequence[Any]]) -> list[G
 
 
 def _apply_changes(scenario: Scenario, changes: dict[str, Any]) -> Scenario:
+    """Return the scenario of a grid point; errors name the point."""
     try:
         return scenario.replace(changes)
     except ScenarioError as error:

@@ -209,6 +209,9 @@ class Replayer:
         return self._known[wanted, whole]
 
     def _replay(self, chosen: Chosen | None, whole: bool) -> IntArray:
+        """Simulate the run again with the ``chosen`` messages delivered, or all for None; return
+        the rows of events.
+        """
         self.count += 1
         hurried: Chosen = frozenset()
         if chosen is None or chosen:

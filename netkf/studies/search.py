@@ -249,9 +249,11 @@ class Search:
         return value, misses
 
     def _is_undecided(self, value: float) -> bool:
+        """Return True if a value was tried without a decision."""
         return any(p.value == value and p.target == UNDECIDED for p in self.probes)
 
     def _try(self, value: float) -> Probe:
+        """Try a value and keep the result."""
         self.probes.append(self._decide(value))
         return self.probes[-1]
 

@@ -127,6 +127,7 @@ def _simulate_points(
 
 
 def _make_row(point: GridPoint, metrics: RunMetrics) -> Row:
+    """Return the row of a grid point."""
     quantities: dict[str, MeanEstimate] = {
         "worst_rms": square_root_of(worst_node(metrics.mean_square)),
         "mean_rms": square_root_of(all_nodes(metrics.mean_square)),
@@ -146,6 +147,7 @@ def _make_row(point: GridPoint, metrics: RunMetrics) -> Row:
 
 
 def _describe_status(scenario: Scenario, metrics: RunMetrics) -> str:
+    """Return what a reader must know of the runs: divergence and rounding."""
     diverged = int(metrics.diverged.sum())
     status = f"{diverged} diverged" if diverged else "complete"
     blurred = float(metrics.rounding_from.min())
@@ -155,6 +157,7 @@ def _describe_status(scenario: Scenario, metrics: RunMetrics) -> str:
 
 
 def _value_or_nan(function: Callable[[], float]) -> float:
+    """Return the value of a function, nan if it is not promised."""
     try:
         return function()
     except TheoryError:

@@ -38,11 +38,13 @@ def sweep_text(found: pd.DataFrame, keys: Sequence[str]) -> str:
 
 
 def _short(value: Any) -> str:
+    """Return a value as a short text."""
     text = f"{value:g}" if isinstance(value, float) else str(value)
     return text if len(text) <= MAX_LENGTH else f"{text[: MAX_LENGTH - 3]}..."
 
 
 def _with_error(value: float | None, error: float | None) -> str:
+    """Return a value with its standard error as text."""
     return format_number(value) + standard_error(error)
 
 
@@ -209,4 +211,5 @@ def comparison_text(found: Comparison) -> str:
 
 
 def _mark(entry: Entry) -> str:
+    """Return a value as text, with a star if its difference is certain."""
     return _with_error(entry.value, entry.se) + (" *" if entry.real else "  ")

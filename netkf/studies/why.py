@@ -163,6 +163,7 @@ def _read_run(directory: str | Path, replica: int | None, trust: bool) -> Run:
 
 
 def _default_replays(events: int) -> int:
+    """Return how many replays take a time that a user waits for."""
     return min(MAX_REPLAYS, max(MIN_REPLAYS, MAX_EVENTS // max(1, events)))
 
 
@@ -246,6 +247,9 @@ class _Evidence:
     def _source(
         self, node: int, found: Sequence[Newest | None], every: Newest | None
     ) -> InformationSource:
+        """Return which readings of a node the estimate has, and which messages would have brought
+        newer ones.
+        """
         reading, *more = [math.nan if n is None else n.reading for n in found]
         last, unheard = self._direct(node)
         way: tuple[int, ...] = ()
@@ -286,14 +290,17 @@ class _Evidence:
 
 
 def _known(newest: Newest | None) -> float:
+    """Return the time at which a reading became known, nan without one."""
     return math.nan if newest is None else newest.known
 
 
 def _is_newer(reading: float, than: float) -> bool:
+    """Return True if a reading is newer than another, any than none."""
     return reading > than or (math.isnan(than) and not math.isnan(reading))
 
 
 def _missing(messages: Messages, m: int) -> Missing:
+    """Return what became of a message that did not arrive in time."""
     return Missing(
         messages.key(m),
         OUTCOMES[int(messages.outcome[m])],
@@ -328,6 +335,7 @@ def _what_ifs(
 
 
 def _notes(evidence: _Evidence) -> tuple[str, ...]:
+    """Return what a reader must know of the replays."""
     notes = []
     if not evidence.same_sends:
         notes.append(

@@ -86,10 +86,12 @@ def why_document(found: Explanation) -> dict[str, Any]:
 
 
 def _messages(found: Explanation, keys: Sequence[MessageKey] | None) -> list[dict[str, Any]] | None:
+    """Return messages as entries of the document."""
     return None if keys is None else [_message(found, key) for key in keys]
 
 
 def _message(found: Explanation, key: MessageKey) -> dict[str, Any]:
+    """Return a message as an entry of the document."""
     missing = found.missing[key]
     return {
         "sender": key.sender,
@@ -114,6 +116,7 @@ def sentences(found: Explanation) -> list[str]:
 
 
 def _state(found: Explanation) -> Iterator[str]:
+    """Yield the sentence on the estimate."""
     where = f"{shorten(found.scenario, 60)}, seed {found.seed}, replica {found.replica}"
     sentence = f"Node {found.node} at {found.at:g} s ({where})"
     if math.isfinite(found.trace):
@@ -178,6 +181,7 @@ def _readings(found: Explanation) -> Iterator[str]:
 
 
 def _smallest(found: Explanation) -> Iterator[str]:
+    """Yield the sentences on the smallest set of messages that would have sufficed."""
     smallest, whole = found.smallest, found.what_ifs[-1]
     if smallest is None:
         return
@@ -221,6 +225,7 @@ def _limit(found: Explanation, smallest: SmallestSet) -> str:
 
 
 def _tried(smallest: SmallestSet) -> str:
+    """Return which messages the search looked at."""
     sentence = f"{smallest.candidates} messages could have mattered"
     if smallest.considered < smallest.candidates:
         if not smallest.considered:
@@ -257,6 +262,7 @@ def _sources(found: Explanation) -> str:
 
 
 def _replays(found: Explanation) -> str:
+    """Return the table of replays."""
     truth = any(math.isfinite(w.error) for w in found.what_ifs)
     header = ["replayed with", "messages", "trace P", "change", *(["error"] if truth else [])]
     rows = [
@@ -273,6 +279,7 @@ def _replays(found: Explanation) -> str:
 
 
 def _count(what_if: WhatIf) -> str:
+    """Return the number of messages of a replay as text."""
     return "all" if what_if.messages is None else str(len(what_if.messages))
 
 
@@ -285,20 +292,24 @@ def relative_change(trace: float, base: float) -> str:
 
 
 def _time(seconds: float) -> str:
+    """Return seconds as text, "-" for nan."""
     return "-" if math.isnan(seconds) else f"{seconds:.6g}"
 
 
 def _age(found: Explanation, seconds: float) -> float:
+    """Return the age in seconds of something at the time of the sample."""
     return seconds if math.isnan(seconds) else max(0.0, found.at - seconds)
 
 
 def _ago(found: Explanation, seconds: float) -> str:
+    """Return a time as text, with its distance from the sample."""
     # A filtered sample is labelled with the beginning of the slot whose exchanges it has.
     since = "in this slot" if seconds > found.at else f"{found.at - seconds:.4g} s before"
     return f"at {seconds:.6g} s ({since})"
 
 
 def _route(source: InformationSource) -> str:
+    """Return the nodes on the way of a reading as text."""
     if not source.route:
         return "-"
     if len(source.route) == 1:
@@ -317,6 +328,7 @@ def _listed(items: Sequence[object], others: str = "others") -> str:
 
 
 def _and(parts: Sequence[str]) -> str:
+    """Return parts joined by commas and "and"."""
     if len(parts) < 2:
         return "".join(parts)
     return f"{', '.join(parts[:-1])} and {parts[-1]}"

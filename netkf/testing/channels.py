@@ -127,6 +127,7 @@ def _check_identical_links(watched: Watched, links: tuple[Link, ...]) -> None:
 
 
 def _check_delivery_probabilities(watched: Watched, link: Link, table_probability: float) -> None:
+    """Check the delivery probabilities of some messages in both states of the channel."""
     part, where = watched.part, f"{watched.name}.{watched.defined_name('delivery_probability')}"
     for bad in (False, True):
         for message in (0, 1, 2, 1000):
@@ -153,6 +154,7 @@ def _check_delivery_probabilities(watched: Watched, link: Link, table_probabilit
 
 
 def _check_channel_state(watched: Watched) -> None:
+    """Check that the next state is True or False and draws the same at each activation."""
     part, where = watched.part, f"{watched.name}.{watched.defined_name('next_state')}"
     histories: dict[bool, list[Any]] = {}
     for twin in range(2):
@@ -284,10 +286,12 @@ def _simulated(part: Loss, links: dict[Link, float], seed: int) -> FloatArray:
 
 
 def _generator(streams: Streams, link: Link, purpose: str) -> np.random.Generator:
+    """Return the random generator of a purpose for a directed link."""
     return streams.generator(purpose, *link)
 
 
 def _delays(watched: Watched, links: tuple[Link, ...]) -> None:
+    """Check the delays of a channel."""
     _check_message_delays(watched, links)
     first_draws = [_drawn(watched) for _ in range(2)]
     demand(

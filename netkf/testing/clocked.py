@@ -85,6 +85,7 @@ class ClockTrial(Trial):
             self.end()
 
     def _composes(self, node: int) -> None:
+        """Check that predictions over two gaps give that over their sum."""
         watched, state = self.watched, self.states[node]
         for first, second in GAPS:
             whole = watched.call("predict", state, first + second)
@@ -102,6 +103,7 @@ class ClockTrial(Trial):
     def _compare(
         self, name: str, one: FloatArray, other: FloatArray, first: float, second: float
     ) -> None:
+        """Check that two predictions are equal up to rounding."""
         apart = float(np.abs(one - other).max())
         size = max(float(np.abs(one).max()), float(np.abs(other).max()), 1e-300)
         method = self.watched.defined_name("predict")
@@ -155,6 +157,7 @@ class ClockTrial(Trial):
             self._flying[k] = flying._replace(payload=payload)
 
     def _exchange(self, k: int, quiet: bool) -> None:
+        """Let the nodes of round ``k`` send, and all messages of this round arrive."""
         nothing_in_flight = quiet and not self._flying
         before = self.sums() if nothing_in_flight else {}
         payloads = [
@@ -196,6 +199,7 @@ class ClockTrial(Trial):
                 self.absorb(node, messages, Exchange(time=self._time))
 
     def _accepted(self, flying: Flying) -> tuple[int, Message] | None:
+        """Return the receiver and the message, or None if the filter refuses its age."""
         age = self._time - flying.sent
         accepted = self.watched.call("accepts", flying.payload, age)
         truth = accepted is True or accepted is False

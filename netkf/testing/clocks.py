@@ -82,6 +82,7 @@ def _entities(part: Any) -> tuple[Entity, ...]:
 
 
 def _one_entity(watched: Watched, link: Entity) -> None:
+    """Check the ticks of one entity: increasing, repeatable, whatever the blocks."""
     _origin(watched, link)
     whole = _ticks(watched, link, BLOCKS[0])
     _increasing(watched, whole)
@@ -132,6 +133,7 @@ def _check_apart(watched: Watched, entities: tuple[Entity, ...]) -> None:
 
 
 def _phase(part: Any, entity: Entity, k: int) -> float:
+    """Return the origin that a clock draws from stream ``k``."""
     return float(part.origin(entity, lambda: RecordingGenerator(12, k)))
 
 
@@ -149,6 +151,7 @@ def _following(
 
 
 def _origin(watched: Watched, link: Entity) -> None:
+    """Check that the origin is a finite number that depends on its generator only."""
     first, other = (
         watched.call("origin", link, lambda: RecordingGenerator(8), repeatable=False)
         for _ in range(2)
@@ -160,6 +163,7 @@ def _origin(watched: Watched, link: Entity) -> None:
 
 
 def _ticks(watched: Watched, link: Entity, blocks: tuple[int, ...]) -> FloatArray:
+    """Return the ticks of an entity, asked for in blocks, after checks of their form."""
     random = RecordingGenerator(9)
     origin = watched.part.origin(link, lambda: RecordingGenerator(10))
     where, now, stopped = f"{watched.name}.ticks", 0.0, False
@@ -184,6 +188,7 @@ def _ticks(watched: Watched, link: Entity, blocks: tuple[int, ...]) -> FloatArra
 
 
 def _increasing(watched: Watched, times: FloatArray) -> None:
+    """Check that ticks are finite, positive and increasing."""
     where = f"{watched.name}.ticks"
     demand(
         np.isfinite(times).all(),
@@ -204,6 +209,7 @@ def _increasing(watched: Watched, times: FloatArray) -> None:
 
 
 def _first_difference(one: FloatArray, other: FloatArray) -> int:
+    """Return the first index at which two lists of times differ."""
     shorter = min(len(one), len(other))
     unequal = np.flatnonzero(one[:shorter] != other[:shorter])
     return int(unequal[0]) if unequal.size else shorter

@@ -31,6 +31,7 @@ def check_estimate(
 
 
 def _check_array(where: str, name: str, array: Any, shape: tuple[int, ...]) -> None:
+    """Check shape, type and finite values of an array."""
     demand(array.shape == shape, where, f"{name} must have the shape {shape}", str(array.shape))
     demand(array.dtype == np.float64, where, f"{name} must be float64", str(array.dtype))
     remedy = "return None where the filter has no P" if name == "P" else ""
@@ -38,6 +39,7 @@ def _check_array(where: str, name: str, array: Any, shape: tuple[int, ...]) -> N
 
 
 def _check_covariance(where: str, P: FloatArray) -> None:
+    """Check that P is symmetric and positive semidefinite up to rounding."""
     size = max(float(np.abs(P).max()), np.finfo(float).tiny)
     skew = float(np.abs(P - P.T).max())
     demand(

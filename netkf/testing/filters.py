@@ -94,6 +94,7 @@ def _class_variables(watched: Watched) -> None:
 
 
 def _schedule(watched: Watched) -> None:
+    """Check the phases of a slot and the numbers of their steps."""
     part, where = watched.part, f"{watched.name}.{watched.defined_name('schedule')}"
     schedule = part.schedule
     if isinstance(part, SlotAdapter):
@@ -116,6 +117,7 @@ def _schedule(watched: Watched) -> None:
 
 
 def _check_predicts(watched: Watched, schedule: tuple[str, ...]) -> None:
+    """Check that ``predicts`` fits the order of "sense" and "predict"."""
     if not {"predict", "sense"} <= set(schedule):
         return
     ahead = schedule.index("sense") < schedule.index("predict")
@@ -129,6 +131,7 @@ def _check_predicts(watched: Watched, schedule: tuple[str, ...]) -> None:
 
 
 def _weights(watched: Watched) -> None:
+    """Check the weights of a filter for all pairs of degrees."""
     part, where = watched.part, f"{watched.name}.weight"
     most = watched.call("largest_degree")
     demand(most >= 1.0, f"{watched.name}.largest_degree", "must be at least 1", most)
@@ -154,6 +157,7 @@ def _weights(watched: Watched) -> None:
 
 
 def _given_weights(watched: Watched, weights: FloatArray) -> None:
+    """Check a matrix of weights."""
     where = f"{watched.name}.pair_weights"
     square = weights.ndim == 2 and weights.shape[0] == weights.shape[1]
     demand(square, where, "must be a square matrix", str(weights.shape))

@@ -24,6 +24,7 @@ class RecordingGenerator(np.random.Generator):
             return found
 
         def drawing(*arguments: Any, **named: Any) -> Any:
+            """Draw, and record method and number of values."""
             values = found(*arguments, **named)
             self.calls.append((name, int(np.size(values))))
             return values

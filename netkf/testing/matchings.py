@@ -65,6 +65,7 @@ def check_made_matching(part: Any, topology: Topology | None, seed: int) -> None
 
 
 def _fits(part: Any, topology: Topology, name: str) -> bool:
+    """Return True if the matching accepts this graph."""
     with user_code(f"{name}.check"):
         try:
             part.check(topology)
@@ -81,6 +82,7 @@ def _check_recorded(part: RecordedSlots, name: str) -> None:
 
 
 def _check_network(watched: Watched, copy: Any, topology: Topology, seed: int) -> None:
+    """Check the draws on one graph: form, frequencies, independence of slots."""
     part, where = watched.part, f"{watched.name}.draw"
     first = watched.call("draw", topology, _random(seed, 0), repeatable=False)
     demand(isinstance(first, list), where, "must return a list of pairs", first)
@@ -102,6 +104,7 @@ def _check_network(watched: Watched, copy: Any, topology: Topology, seed: int) -
 
 
 def _random(seed: int, run: int) -> np.random.Generator:
+    """Return the random generator of a run."""
     return Streams(seed, run).generator("matching")
 
 
@@ -122,6 +125,7 @@ def _drawn(
 
 
 def _demand_matching(where: str, pairs: list[Link], slot: int) -> None:
+    """Check that no node is in two pairs."""
     nodes = [node for pair in pairs for node in pair]
     if len(set(nodes)) < len(nodes):
         fail(where, "must have every node in one pair at most", f"{list(pairs)} in slot {slot}")
@@ -151,6 +155,7 @@ def _stated_mean(watched: Watched, topology: Topology) -> FloatArray | None:
 def _check_frequencies(
     watched: Watched, topology: Topology, drawn: np.ndarray, mean: FloatArray | None
 ) -> None:
+    """Check how often links are paired, against the stated mean if there is one."""
     found, slots = drawn.mean(axis=0), len(drawn)
     if mean is None:
         if not edge_transitive(topology):
@@ -172,6 +177,7 @@ def _check_frequencies(
 
 
 def _check_slots_independent(where: str, topology: Topology, drawn: np.ndarray) -> None:
+    """Check that matchings of different slots are independent."""
     p, slots = drawn.mean(axis=0), len(drawn)
     expected = p[:, None] * p
     for lag in range(1, LAGS + 1):

@@ -38,5 +38,6 @@ def assert_dominated(P: ArrayLike, bound: ArrayLike, tolerance: float = 1e-9) ->
 
 
 def _at(index: object) -> str:
+    """Return an index as text."""
     numbers = [int(k) for k in index]  # type: ignore[attr-defined]
     return f"[{', '.join(map(str, numbers))}]" if numbers else ""

@@ -119,6 +119,7 @@ def check_white(e: FloatArray, stated: Stated) -> None:
 
 
 def _check_moments(e: FloatArray, stated: Stated, when: str) -> None:
+    """Check mean and covariance of whitened noise ``e`` (..., q)."""
     q = e.shape[-1]
     flat = e.reshape(-1, q)
     if (found := largest_deviation(flat)) is not None:
@@ -136,6 +137,7 @@ def _check_moments(e: FloatArray, stated: Stated, when: str) -> None:
 
 
 def _components(i: int, j: int) -> str:
+    """Return one or two components as text."""
     return f"component {i}" if i == j else f"components {i} and {j}"
 
 

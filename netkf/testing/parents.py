@@ -97,6 +97,7 @@ def _pairs(own: Watched, parent: Watched) -> Iterator[tuple[Trial, Trial, str]]:
 def _clocked_pairs(
     own: Watched, parent: Watched, system: System, clock: str | None
 ) -> Iterator[tuple[Trial, Trial, str]]:
+    """Yield trials of a class and of its parent under clocks, with the unit of their comparison."""
     increments = not (own.part.needs_samples or parent.part.needs_samples or clock == "readings")
     for with_increments in (False, True) if increments else (False,):
         pair = tuple(ClockTrial(w, system, None, clock, with_increments) for w in (own, parent))

@@ -87,6 +87,7 @@ def check_made_plant(part: Any, seed: int) -> None:
 
 
 def _check_form(part: Any, name: str) -> None:
+    """Check the shapes of a plant's matrices and the covariance of x(0)."""
     n = part.n
     matrix = part.F if isinstance(part, LinearPlant) else getattr(part, "A", np.zeros((n, n)))
     square = isinstance(n, int) and matrix.shape == (n, n)
@@ -114,10 +115,12 @@ def _moved(part: Any) -> tuple[Any, FloatArray] | None:
 
 
 def _random(seed: int, run: int, purpose: str = "plant") -> np.random.Generator:
+    """Return the random generator of a run."""
     return Streams(seed, run).generator(purpose)
 
 
 def _demand_same(where: str, one: FloatArray, other: FloatArray, when: str) -> None:
+    """Check that two paths from equal streams are equal."""
     apart = distance(one, other)
     demand(
         apart <= ROUNDING,
@@ -184,9 +187,11 @@ def _check_noise(
 
 
 def _check_slots(part: LinearPlant, copy: LinearPlant, name: str, seed: int) -> None:
+    """Check a plant in slots: repeatable paths, moving frames, and the law of the noise."""
     where = f"{name}.truth"
 
     def path(plant: Any, slots: Sequence[int], run: int = 0) -> FloatArray:
+        """Return the states (slots, n) of a run."""
         with user_code(where):
             truth = plant.truth(_random(seed, run))
             found = [truth.state(slot) for slot in slots]
@@ -224,6 +229,7 @@ def _check_frames(part: LinearPlant, where: str, whole: FloatArray, seed: int) -
 
 
 def _compare_frames(part: LinearPlant, where: str, whole: FloatArray, truth: Any) -> None:
+    """Check the absolute and local states of a truth with moving frames."""
     frame = truth.frame_slots
     origin = np.zeros(part.n)
     for slot, x in enumerate(whole):
@@ -264,6 +270,7 @@ def moment_law(A: FloatArray, B: FloatArray, gap: float) -> tuple[FloatArray, Fl
 
 
 def _check_diffusion(part: Diffusion, copy: Diffusion, name: str, seed: int) -> None:
+    """Check a plant in continuous time: first states, sampled truth and grid."""
     speed = float(np.abs(np.linalg.eigvals(part.A)).max())
     growth = float(np.linalg.eigvals(part.A).real.max())
     second = 1.0 / speed if speed > 0.0 else 1.0
@@ -291,6 +298,7 @@ def _check_sampled(
     def path(
         plant: Any, at: FloatArray, run: int = 0, sample_times: FloatArray = probes
     ) -> FloatArray:
+        """Return the states (times, n) of a run."""
         randoms = [_random(seed, run, purpose) for purpose in ("plant", "probe")]
         truth = attempt(where, plant.sampled_truth, *randoms, samples, sample_times, horizon)
         asked = np.concatenate([[0.0], at])
@@ -331,6 +339,7 @@ def _check_grid(part: Diffusion, name: str, seed: int, steps: int) -> None:
     sampled = period * np.array([2.5, 5.6])
 
     def drawn(runs: Sequence[int], cuts: bool = False, blocks: int = count) -> Any:
+        """Return the first paths of some runs on the grid."""
         own, shows, samples = (
             GeneratorNormals([_random(seed, run, purpose) for run in runs])
             for purpose in ("plant", "probe", "samples")

@@ -40,11 +40,13 @@ class SensorReader:
         """Make the path of one run."""
 
         def generator(purpose: str) -> np.random.Generator:
+            """Return the random generator of a purpose."""
             return streams.generator(purpose, node, 0)
 
         return attempt(self.where, self._made, node, generator)
 
     def _made(self, node: int, generator: Callable[[str], np.random.Generator]) -> Any:
+        """Return the path of the sensor's readings."""
         return self.sensor.slot_path(node, PERIOD, generator)
 
     def several(self, path: Any, ks: Sequence[int], x: FloatArray) -> ReadingSeries:
@@ -63,6 +65,7 @@ class SensorReader:
         return ReadingSeries(y[None], demand_array(self.where, "H", H, (self.p, self.n))[None])
 
     def _one(self, path: Any, k: int, x: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return reading ``k`` (p,) at the state x (n,), and its H (p, n)."""
         # As the engines do: first the reading, then its matrix.
         return path.reading(k, x), path.matrix(k)
 
@@ -73,9 +76,11 @@ class SampleReader(SensorReader):
     method = "samples"
 
     def _made(self, node: int, generator: Callable[[str], np.random.Generator]) -> Any:
+        """Return the path of the sensor's samples."""
         return self.sensor.samples(node, generator, HORIZON)
 
     def _one(self, path: Any, k: int, x: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return sample ``k`` (p,) at the state x (n,), and its H (p, n)."""
         y, H = path.reading(k, x)
         return y, H
 
@@ -117,6 +122,7 @@ class IncrementReader:
             return self._pieces(streams, node, x, steps, cut)
 
     def _pieces(self, streams: Streams, node: int, x: FloatArray, steps: int, cut: bool) -> Pieces:
+        """Return the moments of the increments at a constant state, with steps whole or cut."""
         plant = Diffusion(
             mean=x, A=np.zeros((self.n, self.n)), B=np.zeros((self.n, 1)), sensing_period=STEP
         )

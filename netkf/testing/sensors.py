@@ -133,6 +133,7 @@ def _check_same_readings(
 def _demand_equal(
     reader: SensorReader, one: ReadingSeries, other: ReadingSeries, when: str
 ) -> None:
+    """Check that two series of readings are equal."""
     for name, a, b in zip(("readings", "matrices H"), one, other, strict=True):
         apart = distance(a, b)
         demand(
@@ -145,10 +146,12 @@ def _demand_equal(
 
 
 def _joined(parts: list[ReadingSeries]) -> ReadingSeries:
+    """Return several series one after the other."""
     return ReadingSeries(*(np.concatenate(some) for some in zip(*parts, strict=True)))
 
 
 def _chosen(whole: ReadingSeries, ks: list[int]) -> ReadingSeries:
+    """Return some readings of a series."""
     return ReadingSeries(whole.y[ks], whole.H[ks])
 
 
@@ -238,6 +241,7 @@ def _check_increments(reader: IncrementReader, node: int, seed: int) -> None:
 
 
 def _check_increment_noise(reader: IncrementReader, node: int, x: FloatArray, seed: int) -> None:
+    """Check that the noise of increments is white with the stated R."""
     white = whitening(reader.sensor.R).free
     found = []
     for r in range(RUNS):
@@ -350,9 +354,11 @@ def _check_sampling_rate(sensor: Any, where: str, nodes: tuple[int, ...], seed: 
 
 
 def _times(sensor: Any, where: str, node: int, seed: int, horizon: float) -> FloatArray:
+    """Return the sampling times of a sensor after a check of their form."""
     streams = Streams(seed)
 
     def generator(purpose: str) -> np.random.Generator:
+        """Return the random generator of a purpose."""
         return streams.generator(purpose, node, 0)
 
     found = np.asarray(attempt(where, sensor.sample_times, node, 0, generator, horizon))

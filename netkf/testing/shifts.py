@@ -45,8 +45,9 @@ def check_shift(watched: Watched, plain: Sequence[Trial]) -> None:
 
 
 def _compare(watched: Watched, plain: Trial, shifted: Trial) -> None:
+    """Check that all estimates of two trials are equal, one of which was shifted."""
     # The shift itself shows each node once more.
-    moved = [estimates for estimates in shifted.estimates if estimates.after != "shift"]
+    moved = [estimate for estimate in shifted.estimates if estimate.after != "shift"]
     for one, other in zip(plain.estimates, moved, strict=True):
         for name, apart, size in differences(one, other):
             demand(
@@ -68,4 +69,5 @@ def differences(one: CheckedEstimate, other: CheckedEstimate) -> list[tuple[str,
 
 
 def _apart(one: FloatArray, other: FloatArray) -> float:
+    """Return the largest difference of two arrays."""
     return float(np.abs(one - other).max())

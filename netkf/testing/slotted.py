@@ -41,6 +41,7 @@ class SlotTrial(Trial):
             self.end()
 
     def _slot(self, slot: int, lost: bool) -> None:
+        """Carry out the phases of a slot, with all messages delivered or ``lost``."""
         part, phase = self.part, 0
         for kind in part.schedule:
             if kind == "exchange":
@@ -68,6 +69,7 @@ class SlotTrial(Trial):
             self.step(node, "update", reading)
 
     def _exchange(self, exchange: Exchange, lost: bool) -> None:
+        """Carry out one step of an exchange, and check conserved sums."""
         before = self.sums()
         payloads = {node: self.emit(node, exchange) for node in self._talking(exchange.slot)}
         for node, senders in enumerate(self._senders(exchange.slot)):

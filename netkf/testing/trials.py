@@ -62,6 +62,7 @@ class Trial(ABC):
         """Let everything happen that may happen."""
 
     def _start(self, node: int, models: Sequence[Any]) -> Any:
+        """Return the checked state of a node at time 0."""
         others = len(self.nodes) - 1
         own = max(0.0, 1.0 - float(self.weights[:, node].sum()))
         parts = np.stack([model.information for model in models])

@@ -80,6 +80,7 @@ def leaves(value: Any, path: str = "", visited: frozenset[int] = frozenset()) ->
 
 
 def _items(value: Any) -> Iterator[tuple[str, Any]]:
+    """Yield the parts of a value, with the text that names each."""
     if isinstance(value, Mapping):
         yield from ((f"[{key!r}]", item) for key, item in value.items())
     elif hasattr(value, "_fields"):
@@ -108,6 +109,7 @@ def difference(one: Leaves, other: Leaves) -> str | None:
 
 
 def _are_equal(one: np.ndarray, other: np.ndarray) -> bool:
+    """Return True if two arrays are equal in type, shape and every entry."""
     same_type = one.dtype == other.dtype and one.shape == other.shape
     # Nearly all are equal to the last bit, which is cheap to see.
     if same_type and one.dtype != object and one.tobytes() == other.tobytes():
@@ -137,6 +139,7 @@ def _python_randomness() -> Any:
 
 
 def _shared_random() -> Any:
+    """Return the generator behind Python's functions of ``random``."""
     return cast(Any, random.getstate).__self__
 
 
@@ -154,6 +157,7 @@ def _python_state_address() -> int | None:
 
 
 def _static(cls: type, name: str) -> Any:
+    """Return an attribute of a class without calling descriptors."""
     return inspect.getattr_static(cls, name, None)
 
 
@@ -233,6 +237,9 @@ class Watched:
         return {path.strip("[]'"): leaf for path, leaf in leaves(kept)}
 
     def _result(self, where: str, method: str, arguments: tuple[Any, ...]) -> Any:
+        """Return the result of a method; failures and uses of global generators are
+        AssertionErrors.
+        """
         before = global_randomness()
         try:
             result = getattr(self.part, method)(*arguments)
@@ -253,6 +260,7 @@ class Watched:
         return result
 
     def _names(self, method: str, count: int) -> list[str]:
+        """Return the names of the first ``count`` parameters of a method."""
         names = list(inspect.signature(getattr(self.part, method)).parameters)
         return [*names, *["an argument"] * count][:count]
 
