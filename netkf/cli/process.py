@@ -195,7 +195,7 @@ class SafeStream:
 
     @contextlib.contextmanager
     def _failures(self) -> Iterator[None]:
-        """Turn failures of the stream into OutputError, or ignore them for output that may be lost."""
+        """Turn failures into OutputError, or ignore them where output may be lost."""
         try:
             yield
         except BrokenPipeError:

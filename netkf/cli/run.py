@@ -140,6 +140,7 @@ def _run_many(scenario: Scenario, options: argparse.Namespace) -> int:
 
 
 def _print_note(line: str) -> None:
+    """Print a note on standard error."""
     print_notes([line])
 
 

@@ -98,6 +98,7 @@ def _as_list(task: Task, scenario: Scenario, seed: int, replica: int) -> list[An
 
 
 def _as_it_came(number: int, result: Any) -> Any:  # noqa: ARG001
+    """Return the result of a block unchanged."""
     return result
 
 
