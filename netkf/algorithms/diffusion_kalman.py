@@ -150,7 +150,7 @@ class DiffusionKalman(Filter):
     def absorb(
         self, state: DiffusionKalmanState, messages: Sequence[Message], exchange: Exchange
     ) -> DiffusionKalmanState:
-        """Step 1, the incremental update, or step 2, the diffusion update, of Algorithm 1."""
+        """Do step 1 of Algorithm 1, the incremental update, or step 2, the diffusion update."""
         if not messages:
             return state
         if exchange.phase == ESTIMATES:

@@ -405,7 +405,9 @@ def correct(
     s: int,
     h: int,
 ) -> None:
-    """Step 4 after the prediction, P (7) and (8); with asymptotic gains step 3 too."""
+    """Correct filter ``h`` of a block after its prediction, step 4, P (7) and (8); with asymptotic
+    gains step 3 too.
+    """
     n, lanes = nodes.xhat.shape[2], scratch.lanes
     if arrays.asymptotic:
         # Asymptotic gains: xhat <- F xhat, and P_inf for the root.
@@ -572,7 +574,9 @@ class PushSum(Filter):
         )
 
     def init(self, model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo) -> Any:
-        """Step 1: the leader gets the weight; with asymptotic gains every node knows the limits."""
+        """Return the state of step 1: the leader has the weight; with asymptotic gains every node
+        knows the limits.
+        """
         if not isinstance(model, SlotModel):
             # A model without slots: clocks, where running sums are kept.
             return running_sums.start(model, mean, cov, node)
@@ -608,7 +612,7 @@ class PushSum(Filter):
         return self.links == "fresh" or step == 0
 
     def emit(self, state: Any, exchange: Exchange) -> tuple[Any, Any]:
-        """Step 2.1, the node's share of its mass, or step 5.1, z."""
+        """Send the node's share of its mass, step 2.1, or z, step 5.1."""
         if isinstance(state, RunningSums):
             return running_sums.offer(state)
         if exchange.phase == AVERAGE:

@@ -105,8 +105,10 @@ def own_attributes(algorithm: object) -> list[str]:
 
 
 def overridden(algorithm: object, known: type | None = None) -> list[str]:
-    """Methods and class variables that a user's class defines anew, other than weights of links:
-    theorems about the built-in class (``known``) do not speak about it.
+    """Return the methods and class variables that a user's class defines anew, other than weights
+    of links.
+
+    Theorems about the built-in class (``known``) do not hold for it.
     """
     known = known or built_in_class(algorithm)
     mine = type(algorithm)

@@ -710,7 +710,7 @@ class TriggeredMessages(Filter):
         return arrays
 
     def init(self, model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo) -> WrappedState:
-        """Nothing is decided yet."""
+        """Return the state of the wrapped filter, without a decision yet."""
         return WrappedState(self.inner.init(model, mean, cov, node))
 
     def predict(self, state: WrappedState, gap: float) -> WrappedState:
@@ -747,7 +747,7 @@ class TriggeredMessages(Filter):
         return self.inner.estimate(state.inner)
 
     def shift(self, state: WrappedState, offset: FloatArray) -> WrappedState:
-        """The trigger looks at innovations, which do not move."""
+        """Shift the wrapped filter; the trigger looks at innovations, which do not move."""
         return state._replace(inner=self.inner.shift(state.inner, offset))
 
     def stopped(self, state: WrappedState) -> bool:

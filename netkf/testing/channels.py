@@ -56,7 +56,7 @@ def check_channel(channel: Any, /, topology: Topology | None = None, **settings:
 
 
 def check_made_channel(part: Any, topology: Topology | None, seed: int) -> None:
-    """``check_channel`` of an object, with streams of the given seed."""
+    """Run ``check_channel`` on an object, with streams of the given seed."""
     if isinstance(part, Channel):
         check_made_channel(part.loss, topology, seed)
         check_made_channel(part.delay, topology, seed)
@@ -268,8 +268,8 @@ def _independent(watched: Watched, arrived: FloatArray, links: tuple[Link, ...])
 
 
 def _simulated(part: Loss, links: dict[Link, float], seed: int) -> FloatArray:
-    """(chains, length, links) of 0 and 1: what the engine would have delivered, where every
-    direction has streams of its own.
+    """Return what the engine would have delivered, (chains, length, links) of 0 and 1, with own
+    streams for each direction.
     """
     arrived = np.zeros((CHAINS, LENGTH, len(links)))
     for chain in range(CHAINS):
@@ -389,7 +389,7 @@ def _check_message_delays(watched: Watched, links: tuple[Link, ...]) -> None:
 
 
 def _drawn(watched: Watched) -> list[float]:
-    """Delays, each checked by itself."""
+    """Return some delays, each checked by itself."""
     fixed, where, random = watched.part.fixed, f"{watched.name}.draw", RecordingGenerator(6)
     first, rule = None, "must be a finite number of at least 0 seconds"
     delays: list[float] = []

@@ -74,7 +74,7 @@ class ClockTrial(Trial):
         return FlowModel(self._A, self.system.Q, H, R, HORIZON, interval)
 
     def run(self) -> None:
-        """Round after round."""
+        """Carry out round after round."""
         if self._clock in (None, *self.part.clocks[:1]):
             for node in self.nodes:
                 self._composes(node)
@@ -117,7 +117,7 @@ class ClockTrial(Trial):
         )
 
     def _pass(self, shift: bool) -> None:
-        """Time passes, the truth may be shifted, and sensors are sampled."""
+        """Let time pass: the truth may be shifted, and sensors are sampled."""
         longest = LONGEST_SAMPLE_GAP
         if self._increments:
             longest = min(LONGEST_INCREMENT_GAP, *(model.interval for model in self.models))
@@ -138,7 +138,9 @@ class ClockTrial(Trial):
                     self.step(node, "update", self.sample(node, self._time))
 
     def _moments(self, start: FloatArray, gap: float) -> FloatArray:
-        """Noise, and what a truth that is shifted by ``start`` at first adds to it."""
+        """Return moments (2 p,) of noise, plus the effect of a truth that is shifted by ``start``
+        (n,) at first.
+        """
         noise = self.random.normal(size=2 * len(self.system.H)) * np.sqrt(gap)
         added = np.zeros((2, len(self.system.H)))
         for z, weight in zip(POINTS, WEIGHTS, strict=True):
@@ -147,7 +149,7 @@ class ClockTrial(Trial):
         return np.asarray(noise + added.reshape(-1))
 
     def shift(self) -> None:
-        """Messages under way move by what the truth was when they were sent."""
+        """Shift the messages under way by the shift of the truth when they were sent."""
         if self._shift is None:
             return
         super().shift()
@@ -186,7 +188,7 @@ class ClockTrial(Trial):
         return [(node, tuple(peer for peer in self.nodes if peer != node)) for node in (one, other)]
 
     def _absorb(self, k: int) -> None:
-        """Every node with mail absorbs all that has arrived by now."""
+        """Let every node absorb all messages that have arrived by now."""
         landed = [flying for flying in self._flying if flying.lands <= k]
         self._flying = [flying for flying in self._flying if flying.lands > k]
         for node in self.nodes:

@@ -57,7 +57,7 @@ def check_clock(clock: Any, /, link: Link | None = None, **settings: Any) -> Non
 
 
 def check_made_clock(part: Any, link: Link | None, seed: int) -> None:
-    """``check_clock`` of an object, with streams of the given seed."""
+    """Run ``check_clock`` on an object, with streams of the given seed."""
     watched = Watched(part)
     watched.pickled()
     entities = _entities(part) if link is None else (link,)

@@ -16,7 +16,9 @@ SYMMETRY, SEMIDEFINITE = 1e-9, 1e-9
 def check_estimate(
     watched: Watched, state: Any, n: int, after: str
 ) -> tuple[FloatArray, FloatArray | None]:
-    """``estimate`` after a method: shapes, finite; P None, or symmetric, positive semidefinite."""
+    """Return the checked result of ``estimate`` after a method: of the right shapes, finite, P None
+    or symmetric and positive semidefinite.
+    """
     where = f"{watched.name}.estimate after {watched.defined_name(after)}"
     pair = watched.call("estimate", state)
     demand(isinstance(pair, tuple) and len(pair) == 2, where, "must be (xhat, P)", pair)
@@ -60,7 +62,7 @@ def _check_covariance(where: str, P: FloatArray) -> None:
 
 
 def check_state_pickles(watched: Watched, state: Any) -> None:
-    """A state that went through pickle shows the same estimate."""
+    """Check that a state that went through pickle gives the same estimate."""
     where = f"{watched.name}.init"
     try:
         copy = pickle.loads(pickle.dumps(state))

@@ -67,7 +67,7 @@ def check_filter(filter: Any, /, same_as_parent: bool | None = None, **settings:
 
 
 def former_names(hosted: Filter) -> dict[str, str]:
-    """How a class of a former contract calls the methods of the present one."""
+    """Return the names that a former contract has for methods of the present one."""
     if isinstance(hosted, FlowAdapter):
         return {"predict": "flow", "update": "measure", "max_measurement_interval": "stretch"}
     if isinstance(hosted, SlotAdapter):

@@ -42,7 +42,7 @@ def check_matching(matching: Any, /, topology: Topology | None = None, **setting
 
 
 def check_made_matching(part: Any, topology: Topology | None, seed: int) -> None:
-    """``check_matching`` of an object, with streams of the given seed."""
+    """Run ``check_matching`` on an object, with streams of the given seed."""
     watched = Watched(part)
     copy = watched.pickled()
     networks = small_networks() if topology is None else (topology,)

@@ -70,7 +70,7 @@ def check_plant(plant: Any, /, **settings: Any) -> None:
 
 
 def check_made_plant(part: Any, seed: int) -> None:
-    """``check_plant`` of an object, with streams of the given seed."""
+    """Run ``check_plant`` on an object, with streams of the given seed."""
     watched = Watched(part)
     copy = watched.pickled()
     name = watched.name

@@ -10,9 +10,9 @@ from netkf.scenario.scenario import Scenario
 
 
 def scenario_files(folder: str | Path = "scenarios") -> list[Path]:
-    """The scenario files (``*.toml``) of a folder in order, for ``pytest.mark.parametrize``.
+    """Return the scenario files (``*.toml``) of a folder in order, for ``pytest.mark.parametrize``.
 
-    Raises ScenarioError where there is none: a test without parameters would pass unseen.
+    Raises ScenarioError if there is none: a test without parameters would pass unseen.
     """
     found = sorted(Path(folder).glob("*.toml"))
     if not found:

@@ -70,7 +70,7 @@ def check_sensor(sensor: Any, /, **settings: Any) -> None:
 
 
 def check_made_sensor(part: Any, seed: int) -> None:
-    """``check_sensor`` of an object, with streams of the given seed."""
+    """Run ``check_sensor`` on an object, with streams of the given seed."""
     watched = Watched(part)
     copy = watched.pickled()
     if isinstance(part, NonlinearSensor):
@@ -96,14 +96,14 @@ def check_made_sensor(part: Any, seed: int) -> None:
 
 
 def _states(seed: int, count: int, n: int, which: int = 0) -> FloatArray:
-    """States (count, n) of any size to be read."""
+    """Return states (count, n) at which sensors are read."""
     return 3.0 * Streams(seed, which).generator("testing").normal(size=(count, n))
 
 
 def _check_same_readings(
     reader: SensorReader, copy: SensorReader, nodes: tuple[int, ...], seed: int
 ) -> None:
-    """Readings must depend on streams, numbers and states alone."""
+    """Check that readings depend on streams, numbers and states alone."""
     node, streams, x = nodes[0], Streams(seed), _states(seed, SHORT, reader.n)
     numbers = list(range(SHORT))
     whole = reader.several(reader.path(streams, node), numbers, x)
@@ -368,8 +368,8 @@ def _times(sensor: Any, where: str, node: int, seed: int, horizon: float) -> Flo
 
 
 def _check_nonlinear(sensor: NonlinearSensor, name: str, seed: int) -> None:
-    """``h`` and ``jacobian`` must be functions of the state and the node alone, with shapes that
-    fit R, and the Jacobian the derivatives of ``h``.
+    """Check that ``h`` and ``jacobian`` depend on the state and the node alone, have shapes that
+    fit R, and that the Jacobian has the derivatives of ``h``.
     """
     positions = {node: (0.7 * k, -0.4 * k) for k, node in enumerate(sensor.nodes)}
     sensor = sensor.located(positions)

@@ -26,11 +26,11 @@ class SlotTrial(Trial):
     slots = 0
 
     def model(self, sees: bool) -> SlotModel:
-        """Slots of one second."""
+        """Return the model of a node in slots of one second."""
         return SlotModel(self.system.M, self.system.Q, *self.matrices(sees), PERIOD)
 
     def run(self) -> None:
-        """Slot after slot, from just before nodes exchange."""
+        """Carry out slot after slot, each from just before nodes exchange."""
         part, slots = self.part, self.slots or slots_of(self.part)
         for slot in range(slots):
             if part.predicts and slot == slots - SHIFTED:
@@ -53,7 +53,7 @@ class SlotTrial(Trial):
                 self._advance(kind, slot)
 
     def _advance(self, kind: str, slot: int) -> None:
-        """A prediction or readings; the truth moves on where the filter does."""
+        """Predict, or use readings; the truth moves on where the filter does."""
         part = self.part
         alone = kind == "sense" and "predict" not in part.schedule
         if kind == "predict" or (alone and not part.predicts):
@@ -89,7 +89,7 @@ class SlotTrial(Trial):
         return [[k for k in paired if k != n] if n in paired else [] for n in self.nodes]
 
     def _talking(self, slot: int) -> list[int]:
-        """All nodes, or the pair of this slot."""
+        """Return all nodes, or the pair of this slot."""
         count = len(self.nodes)
         if not self.part.pairwise:
             return list(self.nodes)

@@ -6,7 +6,7 @@ from netkf.network.graphs import Complete, Cycle, Grid, Star, Topology
 
 
 def _renumbered(topology: Topology, ids: tuple[int, ...]) -> Topology:
-    """The same graph with other node ids, in increasing order."""
+    """Return the same graph with other node ids, in increasing order."""
     new = dict(zip(topology.nodes, ids, strict=True))
     return Topology(nodes=ids, links=tuple((new[i], new[j]) for i, j in topology.links))
 

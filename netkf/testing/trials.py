@@ -115,7 +115,7 @@ class Trial(ABC):
         return Reading(self.random.normal(size=len(H)) + H @ self.offset, H, R, time)
 
     def matrices(self, sees: bool) -> tuple[FloatArray, FloatArray]:
-        """``H`` and ``R`` of a node, without rows where it sees nothing."""
+        """Return ``H`` and ``R`` of a node, without rows if it has no sensor."""
         system = self.system
         return (system.H, system.R) if sees else (system.H[:0], system.R[:0, :0])
 

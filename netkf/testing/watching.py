@@ -33,13 +33,13 @@ def fail(where: str, rule: str, got: object = None, remedy: str = "") -> NoRetur
 
 
 def demand(holds: object, where: str, rule: str, got: object = None, remedy: str = "") -> None:
-    """:func:`fail` unless it holds."""
+    """Raise the error of :func:`fail` unless ``holds``."""
     if not holds:
         fail(where, rule, got, remedy)
 
 
 def made(part: Any, contracts: tuple[type[Component], ...], settings: Mapping[str, Any]) -> Any:
-    """An object of a user's class: ``part`` itself, or the class made with ``settings``."""
+    """Return an object of a user's class: ``part`` itself, or the class made with ``settings``."""
     cls = part if isinstance(part, type) else type(part)
     name = cls.__name__
     listed = " or ".join(contract.__name__ for contract in contracts)
@@ -66,7 +66,7 @@ def made(part: Any, contracts: tuple[type[Component], ...], settings: Mapping[st
 
 
 def leaves(value: Any, path: str = "", visited: frozenset[int] = frozenset()) -> Iterator[Any]:
-    """(path, copy) of every number, text and array that a value is made of."""
+    """Yield (path, copy) of every number, text and array that a value is made of."""
     if isinstance(value, np.ndarray):
         yield path, value.copy()
     elif id(value) in visited or isinstance(value, np.random.Generator) or callable(value):
@@ -96,7 +96,7 @@ def _items(value: Any) -> Iterator[tuple[str, Any]]:
 
 
 def difference(one: Leaves, other: Leaves) -> str | None:
-    """The path of the first leaf in which two values differ, None where all are equal."""
+    """Return the path of the first leaf in which two values differ, None if all are equal."""
     if one.keys() != other.keys():
         return (
             min(one.keys() ^ other.keys(), key=len, default="")
@@ -189,7 +189,9 @@ class Watched:
         return former if defined == former else method
 
     def call(self, method: str, *arguments: Any, repeatable: bool = True) -> Any:
-        """The result of a method; ``repeatable`` where it draws nothing."""
+        """Return the result of a method; called twice and compared if it is ``repeatable``, drawing
+        nothing.
+        """
         where = f"{self.name}.{self.defined_name(method)}"
         before = [dict(leaves(argument)) for argument in arguments]
         itself = self.attributes()
@@ -288,7 +290,7 @@ class Watched:
         )
 
     def pickled(self) -> Any:
-        """A copy of the part that went through pickle, as one that goes to a worker process."""
+        """Return a copy of the part that went through pickle, as for worker processes."""
         try:
             copy = pickle.loads(pickle.dumps(self._owner))
         except Exception as error:
@@ -307,7 +309,7 @@ class _Once(Watched):
     """See ``Watched.once``."""
 
     def call(self, method: str, *arguments: Any, repeatable: bool = True) -> Any:
-        """The result of a method."""
+        """Return the result of a method."""
         return self._result(f"{self.name}.{self.defined_name(method)}", method, arguments)
 
 
@@ -331,7 +333,7 @@ def user_code(where: str) -> Iterator[None]:
 
 
 def attempt(where: str, function: Callable[..., Any], *arguments: Any) -> Any:
-    """The result of a function of a user's class, see ``user_code``."""
+    """Return the result of a function of a user's class, see ``user_code``."""
     with user_code(where):
         return function(*arguments)
 
@@ -346,6 +348,8 @@ def demand_array(where: str, name: str, value: Any, shape: tuple[int, ...]) -> F
 
 
 def distance(one: FloatArray, other: FloatArray) -> float:
-    """The largest difference of two arrays of one shape, in units of 1 + their largest entry."""
+    """Return the largest difference of two arrays of one shape, in units of 1 + their largest
+    entry.
+    """
     size = 1.0 + max(np.abs(a).max(initial=0.0) for a in (one, other))
     return float(np.abs(one - other).max(initial=0.0) / size)

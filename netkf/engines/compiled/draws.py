@@ -33,12 +33,12 @@ time, and all of them would not fit the processor's cache.
 
 
 def blocks_to_the_end(scenario: Scenario) -> int:
-    """Number of blocks of steps that reach the horizon."""
+    """Return the number of blocks of steps that reach the horizon."""
     return -(-steps_to_the_end(scenario) // BLOCK)
 
 
 def steps_to_the_end(scenario: Scenario) -> int:
-    """Number of steps that reach the horizon."""
+    """Return the number of steps that reach the horizon."""
     period = scenario.truth.sensing_period
     assert period is not None
     # A first guess from below, which the loop completes.
@@ -56,7 +56,7 @@ def increments(scenario: Scenario) -> list[tuple[int, PlacedSensor]]:
 
 
 def blocks_at_once(scenario: Scenario) -> int:
-    """Number of blocks of steps that a run draws at once."""
+    """Return the number of blocks of steps that a run draws at once."""
     rows = [
         len(scenario.sensors[placed_sensor.entry].R) for _, placed_sensor in increments(scenario)
     ]
@@ -102,13 +102,15 @@ class Paths:
             self.frame_times = times[times < scenario.horizon]
 
     def following(self, most: int | None = None) -> Block:
-        """The next steps of all runs together, ``most`` of them at most; the last ones reach the
-        horizon, or beyond it.
+        """Return the next steps of all runs together, at most ``most``; the last ones reach the
+        horizon or beyond.
         """
         return self._paths.following(self._blocks, most)
 
     def block(self, block: Block, together: int = 1) -> PathBlock:
-        """The same for the event loop, which simulates so many runs ``together``."""
+        """Return a block of steps as arrays for the event loop, which simulates ``together`` runs
+        at a time.
+        """
         ends, laws = block.ends, self._paths.laws
         n = laws.n
         # A Struct takes C-contiguous arrays only.
@@ -152,7 +154,9 @@ def no_path(n: int) -> PathBlock:
 
 @once_per_scenario
 def _sensors(scenario: Scenario) -> tuple[dict[str, np.ndarray], list[tuple[int, int]]]:
-    """The fields of a Sensing that all runs share, and the keys of the streams of its sensors."""
+    """Return the fields of a Sensing that all runs share, and the keys of the streams of its
+    sensors.
+    """
     placed = increments(scenario)
     # Many nodes may have the same sensor: its R is factored once.
     used = {placed_sensor.entry for _, placed_sensor in placed}

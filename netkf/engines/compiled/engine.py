@@ -90,7 +90,9 @@ class CompiledEngine(Engine):
             return FlowRun(scenario, workspace, draws, recorder, progress).to_the_end()
 
     def together(self, scenario: Scenario) -> int:
-        """Runs are side by side: few of them take as long as several."""
+        """Return the number of runs that together take about as long as one, since they run side by
+        side.
+        """
         if not scenario.slotted:
             return quick_runs(scenario)
         return slot_setup(scenario).quick_runs() if slot_setup(scenario).is_drawn else 1

@@ -117,7 +117,7 @@ def extras_of(scenario: Scenario, state: Simulation) -> Extras | None:
 
 
 def _gains(scenario: Scenario, state: Simulation) -> dict[str, Any]:
-    """Gains of all nodes and what follows from them; nothing for other combinations."""
+    """Return the constant gains of all nodes, empty for filters of other combinations."""
     N, n = state.xhat.shape
     algorithm: Any = scenario.hosted
     given = [algorithm.gain_of(k) if state.kind == GAINS else np.zeros((n, 0)) for k in range(N)]

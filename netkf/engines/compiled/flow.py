@@ -96,7 +96,7 @@ class Windows(Protocol):
     """A source of ticks, window by window."""
 
     def following(self) -> Window:
-        """The next window; its end is infinite where nothing comes after it."""
+        """Return the next window; the last one ends at infinity."""
 
 
 class Draws(Protocol):
@@ -107,11 +107,12 @@ class Draws(Protocol):
     states: States
 
     def window(self) -> Window:
-        """The next ticks."""
+        """Return the next window of ticks."""
 
     def path(self, together: int = 1) -> PathBlock:
-        """The next steps of the path, of so many runs ``together``; the noise of them is in
-        ``sensing``, and what is sampled meanwhile in ``instants``.
+        """Return the next steps of the path for ``together`` runs.
+
+        Their noise is in ``sensing``, and the samples taken meanwhile in ``instants``.
         """
 
 
@@ -142,11 +143,11 @@ class Source:
             samples.read(known.truth.states(sampled)[0], sampled, -math.inf, math.inf)
 
     def window(self) -> Window:
-        """Some ticks of each entity."""
+        """Return the next window: some ticks of each entity."""
         return self._windows.following()
 
     def path(self, together: int = 1) -> PathBlock:
-        """A block of steps."""
+        """Return the next block of steps."""
         if not self._grid:
             return no_path(self._n)
         # Noise and path advance together, a block of steps at a time.
@@ -202,7 +203,7 @@ class Workspace:
         return self._start
 
     def visits(self, together: int = 1) -> Visits:
-        """Space for the visits of so many runs."""
+        """Return empty arrays for the visits of ``together`` runs."""
         capacity = together * len(self._start.nodes)
         if self._visits is None or len(self._visits.level) < capacity:
             series, weights = series_of_lanes(self._scenario), self._records[1]["weight"]
@@ -212,8 +213,8 @@ class Workspace:
     def begin(
         self, draws: Draws, traced: bool, shown: SampleBuffer | None = None, together: int = 1
     ) -> Simulation:
-        """The state of a run at time 0, or of runs of which so many are simulated together and
-        which are ``shown`` there.
+        """Return the state at time 0 of one run, or of several that are simulated ``together`` and
+        write their samples into ``shown``.
         """
         start, instants, window = self._start, draws.instants, draws.window()
         entities, ways = self._records
@@ -283,7 +284,7 @@ class Workspace:
 
 
 def ticks_of(window: Window) -> TickArrays:
-    """The ticks of a window."""
+    """Return the ticks of a window as arrays for kernels."""
     heard = np.zeros(len(window.t), dtype=np.int64) if window.heard is None else window.heard
     return TickArrays(**window._replace(heard=heard)._asdict())
 
@@ -291,8 +292,8 @@ def ticks_of(window: Window) -> TickArrays:
 def empty_samples(
     shape: tuple[int, int, int, int], terms: int = 0, make: Callable[..., Any] = np.zeros
 ) -> SampleBuffer:
-    """Space for samples, ``shape`` (R, B, N, n), with so many terms of sums; ``make`` makes the
-    arrays of estimates and covariances.
+    """Return empty arrays for samples of ``shape`` (R, B, N, n), with ``terms`` of sums; ``make``
+    makes those of estimates and covariances.
     """
     runs, count, _, n = shape
     return SampleBuffer(
@@ -446,7 +447,9 @@ class FlowRun:
 
 
 def _sums(terms: FloatArray, receivers: np.ndarray) -> dict[str, tuple[float, float]]:
-    """The weights that nodes hold, with what each sent and less what was heard."""
+    """Return the total weight of running sums at the start and now: what nodes hold and have sent,
+    less what was received.
+    """
     count = len(receivers)
     # A total is sent to each receiver of the node.
     sent = np.repeat(terms[count : 2 * count], receivers)

@@ -114,7 +114,7 @@ def copy_state(
 
 @kernel
 def take_past(history: History, time: float, instant: int, frame: int) -> int:
-    """A free entry, for what happens at ``time``."""
+    """Take an entry for an event at ``time`` from the free ones; return its index."""
     k = history.free[0]
     entry = history.past[k]
     history.free[0] = entry.before

@@ -101,7 +101,9 @@ def fill_inverse(totals: Totals, gap: float) -> None:
 
 @kernel
 def move_total(totals: Totals, values: FloatArray, k: int, gap: float) -> None:
-    """``U -> s Phi^-T U Phi^-1`` and ``u -> s Phi^-T u`` of row ``k``, ``gap`` seconds later."""
+    """Predict row ``k`` of totals by ``gap`` seconds: ``U <- s Phi^-T U Phi^-1``, ``u <- s Phi^-T
+    u``.
+    """
     if not gap > 0.0:
         return
     # Phi^-1 = exp(-A gap); information moves by Phi^-T from the left and by Phi^-1 from the right.
@@ -131,7 +133,9 @@ def move_total(totals: Totals, values: FloatArray, k: int, gap: float) -> None:
 
 @kernel
 def offer_round(state: Simulation, totals: Totals, h: int, now: float) -> bool:
-    """One round of node ``h``, whose masses all shrink by one factor; False if nobody hears it."""
+    """Offer node ``h``'s share of its mass to its receivers, which shrinks all its masses by one
+    factor; return False if nobody hears it.
+    """
     receivers, n, weight = totals.receivers[h], state.xhat.shape[1], totals.weight[h]
     if receivers == 0:
         return False
@@ -171,7 +175,9 @@ def offer_round(state: Simulation, totals: Totals, h: int, now: float) -> bool:
 
 @kernel
 def fill_inverse_root(out: FloatArray, root: FloatArray, h: int) -> None:
-    """Inverse of a lower triangular root, which must be regular."""
+    """Write the inverse of row ``h`` of ``root``, lower triangular and regular, into ``out`` (n,
+    n).
+    """
     n = root.shape[1]
     for i in range(n):
         for j in range(i + 1):
@@ -223,8 +229,10 @@ def hear(state: Simulation, totals: Totals, h: int, now: float) -> None:
 
 @kernel
 def gain_mass(state: Simulation, totals: Totals, h: int, size: float, share: float) -> None:
-    """``P^-1 <- (w P^-1 + N U) / w+`` and the estimate likewise; the root counts ``size`` times,
-    what was gained ``share`` times, and it cannot be less than nothing.
+    """Add gained mass to node ``h``: ``P^-1 <- (w P^-1 + N U) / w+`` and the estimate likewise.
+
+    The root is multiplied by ``size``, the gain by ``share``; gained information cannot be
+    negative.
     """
     root, gained, n = state.root, totals.gained, state.xhat.shape[1]
     inner, half, vectors = totals.scratch[0], totals.scratch[1], totals.scratch[2]
@@ -253,7 +261,9 @@ def gain_mass(state: Simulation, totals: Totals, h: int, size: float, share: flo
 
 @kernel
 def update_root_by_gain(state: Simulation, h: int, values: FloatArray, vectors: FloatArray) -> None:
-    """The triangular root of ``S V D^-1 V' S'``: D is the diagonal of ``values``, at least 1."""
+    """Write the triangular root of ``S V D^-1 V' S'``, where D (``values``, diagonal) is at least 1
+    and V are ``vectors``.
+    """
     root, F, n = state.root, state.flow_scratch.values, state.xhat.shape[1]
     wide, noise = state.flow_scratch.wide, state.flow_scratch.T
     for i in range(n):
@@ -275,7 +285,9 @@ def update_root_by_gain(state: Simulation, h: int, values: FloatArray, vectors: 
 def move_by_gain(
     state: Simulation, h: int, gained: FloatArray, share: float, news: FloatArray
 ) -> None:
-    """``xhat += P share (u - U xhat)``; ``news`` (n,) is a scratch array."""
+    """Correct the estimate by what was gained, ``xhat += P share (u - U xhat)``; ``news`` (n,) is
+    scratch.
+    """
     root, xhat, n = state.root, state.xhat, state.xhat.shape[1]
     # N / w (u - U xhat): the innovation in terms of information.
     for i in range(n):
@@ -296,7 +308,7 @@ def move_by_gain(
 
 @kernel
 def add_reading(state: Simulation, totals: Totals, h: int, instant: int) -> None:
-    """``U += H' R^-1 H`` and ``u += H' R^-1 y``: N / w times that in terms of P^-1."""
+    """Add a reading, ``U += H' R^-1 H`` and ``u += H' R^-1 y``, N / w times that in P^-1."""
     # R scaled by w / N: the information counts N / w times in P^-1.
     scale = math.sqrt(totals.weight[h] / len(state.nodes))
     use_instant(state, instant, state.root, state.xhat, h, scale)

@@ -72,7 +72,7 @@ class Ticks(NamedTuple):
         return Ticks(self.t[which], self.entity[which], self.delay[indices])
 
     def window(self, end: float, sizes: np.ndarray) -> Window:
-        """Ticks that are in order, as a window."""
+        """Return ticks that are in order of time as a window up to ``end``."""
         sent = sizes[self.entity]
         return Window(end, self.t, self.entity, np.cumsum(sent) - sent, self.delay)
 
@@ -112,9 +112,10 @@ class TickSource:
             )
 
     def more(self, indices: np.ndarray, counts: np.ndarray) -> tuple[FloatArray, np.ndarray]:
-        """So many more ticks of each of these entities: the times before the horizon, one entity
-        after the other, and how many each has. The horizon is half open; later ticks, and there may
-        be many, are not kept.
+        """Return the next ``counts`` ticks of some entities before the horizon, entity by entity,
+        and how many each has.
+
+        The horizon is half open; later ticks, which may be many, are dropped.
         """
         if self._all_poisson:
             times, asked = self._exponential(indices, counts), counts
@@ -135,7 +136,9 @@ class TickSource:
         return times[kept], got
 
     def _exponential(self, indices: np.ndarray, counts: np.ndarray) -> FloatArray:
-        """Times (E, count) of the next ticks, see ``Poisson.ticks``; infinite beyond the counts."""
+        """Return the times (E, count) of the next ticks of Poisson clocks, infinite beyond the
+        counts; see ``Poisson.ticks``.
+        """
         times = np.full((len(indices), counts.max() + 1), np.inf)
         times[:, 0] = self.last[indices]
         # Exponential gaps over the rate, one batch for all streams.
@@ -167,7 +170,7 @@ def delay_is_zero(channel: Channel) -> bool:
 
 
 def delivery_chances(scenario: Scenario, ways: tuple[Link, ...]) -> FloatArray:
-    """(W,) delivery probability of all messages of each directed link."""
+    """Return the delivery probability (W,) of the messages of each directed link."""
     loss = scenario.network.channel.loss
     return np.array(
         [loss.delivery_probability(way, 0, False, scenario.table_probability(way)) for way in ways]
@@ -209,8 +212,8 @@ class Outcomes:
         self.sizes = np.tile(np.diff(senders.first), runs)
 
     def of(self, indices: np.ndarray, counts: np.ndarray, first: np.ndarray) -> FloatArray:
-        """The outcomes of the next ``counts`` activations of each entity, tick after tick; they are
-        the activations ``first`` and so on.
+        """Return the outcomes of the next ``counts`` activations of each entity, whose first one
+        has number ``first``, tick after tick.
         """
         runs, entity = np.divmod(indices, max(self._count, 1))
         sizes = self.sizes[indices]
@@ -233,7 +236,9 @@ class Outcomes:
         return out
 
     def _draw(self, sources: np.ndarray, counts: np.ndarray) -> tuple[np.ndarray, ...]:
-        """(K,) uniform draws, whether the link is in its bad state, and delays as drawn."""
+        """Return for K messages uniform draws, whether the channel is in its bad state, and delays
+        as drawn.
+        """
         total = int(counts.sum())
         if not self._has_table_law:
             parts = [
@@ -257,7 +262,7 @@ class Outcomes:
         bad: np.ndarray,
         delay: np.ndarray,
     ) -> FloatArray:
-        """(K,) seconds or LOST."""
+        """Return the delays (K,) of messages in seconds, LOST for lost ones."""
         if self._identical:
             probability = np.repeat(self._probabilities[ways], counts)
         else:
@@ -332,7 +337,7 @@ class EntityDraws:
         return float((self._clocks.drawn / self.last).sum())
 
     def more(self, indices: np.ndarray) -> Ticks:
-        """A block of ticks of each of these entities (increasing indices)."""
+        """Return the next block of ticks of each of these entities, given in increasing order."""
         first = self._clocks.drawn[indices]
         t, counts = self._clocks.more(indices, self._block[indices])
         # Blocks double: an entity with few ticks draws few.
@@ -361,7 +366,7 @@ class Schedule:
         self._length = wanted / draws.rate if draws.rate > 0.0 else math.inf
 
     def following(self) -> Window:
-        """The next window; its end is infinite where nothing comes after it."""
+        """Return the next window; the last one ends at infinity."""
         end, draws = self._end + self._length, self._draws
         # The last window has no end, so that the loop asks for no other.
         if not self._end < end < self._horizon:
@@ -401,7 +406,7 @@ class ReadingsSchedule:
         self._sent = np.zeros(len(senders.entities), dtype=np.int64)
 
     def following(self) -> Window:
-        """The next window; its end is infinite where nothing comes after it."""
+        """Return the next window; the last one ends at infinity."""
         begin, sizes = self._begin, self._outcomes.sizes
         # As many instants as have about MOST_TICKS messages; a node without receivers counts as
         # one.
@@ -424,7 +429,7 @@ class ReadingsSchedule:
 
 
 def whole_schedules(scenario: Scenario, streams: ReplicaStreams) -> list[Window]:
-    """All ticks of each of several runs, as one window."""
+    """Return all ticks of each of several runs, one window a run."""
     senders, runs = senders_of(scenario), streams.runs
     draws = EntityDraws(scenario, streams, senders)
     if not draws.count:

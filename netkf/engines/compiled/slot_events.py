@@ -111,7 +111,9 @@ class SlotEvents:
         self._drawn: list[tuple[list[Link], set[Link] | None]] = []
 
     def asked(self) -> np.ndarray:
-        """Who is asked for a message in the steps of the next slot, 1 or 0 (E, N)."""
+        """Return which nodes are asked for a message in the steps of the next slot, (E, N) of 0 and
+        1.
+        """
         setup, index = self._setup, self._scenario.topology.index
         asked = np.zeros((len(setup.fresh), len(setup.nodes)), dtype=np.uint8)
         for step in self._steps(self._slot):
@@ -121,8 +123,10 @@ class SlotEvents:
         return asked
 
     def following(self, rows: int, sent: np.ndarray | None) -> tuple[int, np.ndarray]:
-        """The number of slots that were made, up to about so many ``rows`` of events, and ``up``
-        (1, S, E, W); one slot if ``sent`` (E, N) says who of those ``asked`` sends.
+        """Make the next slots, up to about ``rows`` events; return their number and ``up`` (1, S,
+        E, W).
+
+        It is one slot if ``sent`` (E, N) says which of the nodes ``asked`` send.
         """
         setup, made = self._setup, []
         self._rows, self._sent = [], sent
@@ -195,7 +199,7 @@ class SlotEvents:
                 yield made
 
     def rows(self, stopped: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The events as EVENT rows, and how many come before each sample."""
+        """Return the events as EVENT rows, and the number of rows before each sample."""
         rows: list[Row] = []
         before = []
         for row in self._rows:
@@ -250,7 +254,7 @@ class SlotEvents:
                     self._send(step, way, draw if here else None)
 
     def _pairs(self, step: Step) -> tuple[list[Link], set[Link] | None]:
-        """The links that are used, and of those the ones that are up (None: all)."""
+        """Return the links that are used, and the set of those that are up (None: all)."""
         activation, topology = self._scenario.network.activation, self._scenario.topology
         links = list(topology.links)
         if isinstance(activation, Matching):

@@ -110,8 +110,10 @@ def draw_matching(m: Matchings, ends: np.ndarray, r: int, active: np.ndarray) ->
 
 @kernel
 def _free_links(m: Matchings, ends: np.ndarray, r: int, active: np.ndarray) -> int:
-    """Maximal matchings take links in random order if both ends are free; of independent links
-    those that meet no other are kept.
+    """Move the links of a matching of run ``r`` to the front of ``active`` and return their number.
+
+    Maximal matchings take links in random order if both ends are free; of independent links those
+    that meet no other are kept.
     """
     count, found = len(ends), 0
     for h in range(len(m.busy)):
@@ -176,7 +178,7 @@ def draw_link(
 def draw_link_of_lane(
     c: Channels, b: int, link: int, fresh: bool, up: np.ndarray, s: int, e: int, q: int
 ) -> None:
-    """``draw_link`` for the run of lane ``q`` alone, which uses this link."""
+    """Draw one link for the run of lane ``q`` alone, as ``draw_link`` does for all lanes."""
     for d in range(c.ways):
         k = link * c.streams + min(d, c.streams - 1)
         if d < c.streams and len(c.states) > 0 and (fresh or c.drawn[b, k, q] < 0.0):
@@ -193,8 +195,8 @@ def draw_link_of_lane(
 
 @kernel
 def next_state(bad: int, u: float, to_bad: float, to_good: float) -> int:
-    """One step of the Gilbert-Elliott chain with the uniform number ``u``; the first is drawn from
-    its stationary law (``bad`` < 0).
+    """Return the next state of the Gilbert-Elliott chain by the uniform number ``u``; the first
+    one, after ``bad`` < 0, has the stationary law.
     """
     if bad < 0:
         return 1 if u < to_bad / (to_bad + to_good) else 0
@@ -228,8 +230,8 @@ def draw_matched(
     active: np.ndarray,
     count: np.ndarray,
 ) -> None:
-    """``draw_broadcasts`` for the links of matchings: ``active`` (R, S, E, A) gets them in their
-    order and ``count`` (R, S, E) their number.
+    """Draw the messages of matchings, as ``draw_broadcasts`` does for all links: ``active`` (R, S,
+    E, A) gets the paired links in their order and ``count`` (R, S, E) their number.
     """
     for b in range(up.shape[0]):
         for s in range(up.shape[1]):
@@ -276,7 +278,9 @@ def ask_all(lanes: Lanes, c: Channels, exchanged: np.ndarray, sent: np.ndarray) 
 def ask_pairs(
     lanes: Lanes, c: Channels, active: np.ndarray, count: np.ndarray, sent: np.ndarray
 ) -> None:
-    """``ask_all`` for the nodes of matchings, the first ``count`` of ``active``, see Drawn."""
+    """Mark the nodes that are asked for a message, as ``ask_all`` does, for matchings: the ends of
+    the first ``count`` links of ``active``, see Drawn.
+    """
     for r in range(count.shape[0]):
         for s in range(count.shape[1]):
             for e in range(count.shape[2]):

@@ -195,7 +195,7 @@ class SlotRuns:
         self._matchings = Matchings(protocol, chance, states, first, members, order, busy)
 
     def _in_lanes(self, purpose: str, entities: list[Link]) -> np.ndarray:
-        """States (B, K, 4, L) of the streams of K entities of each run."""
+        """Return the states (B, K, 4, L) of the random streams of K entities in each run."""
         return StreamBatch(self._streams, purpose, entities).in_lanes(self.runs)
 
     @property
@@ -242,7 +242,7 @@ class SlotRuns:
         return SlotBlock(sampled, reported, times, drawn)
 
     def _messages(self, rows: int, timed: bool) -> tuple[SlotTimes, Drawn]:
-        """The next slots, of about so many ``rows`` of events, and their messages."""
+        """Return the next slots, up to about ``rows`` events, and their messages."""
         setup, events = self.setup, self._events
         if events is None:
             # The kernels draw the messages of many slots and runs at once.
@@ -259,7 +259,7 @@ class SlotRuns:
         return self._times(count, True), _made(up, np.zeros((0,) * 4, dtype=np.uint8))
 
     def _space(self, count: int) -> SampledStates:
-        """Space for so many samples."""
+        """Return empty arrays for ``count`` samples."""
         runs, estimators, n = self.runs, self.setup.estimators, self.setup.n
         shape = runs, count, estimators, n
         shapes = (runs, count, n), shape, (*shape, n), shape
@@ -278,7 +278,7 @@ class SlotRuns:
         return np.asarray(~np.isfinite(by_run(self._total, self.runs)))
 
     def _times(self, count: int, wanted: bool) -> SlotTimes:
-        """Flags, samples and, if ``wanted``, start times of the next slots."""
+        """Return flags, samples and, if ``wanted``, start times of the next ``count`` slots."""
         setup, algorithm, plant = self.setup, self.setup.algorithm, self._scenario.slot_plant
         slots = np.arange(self._slot, self._slot + count)
         noted = slots < setup.last
@@ -341,7 +341,9 @@ class SlotRuns:
         return unread
 
     def _draw_uniforms(self, sent: np.ndarray) -> FloatArray:
-        """Numbers of the nodes that are asked (B, S, E, N, L), empty if filters need none."""
+        """Return uniform numbers (B, S, E, N, L) of the nodes that are asked, empty if the filter
+        needs none.
+        """
         if not self.setup.algorithm.randomised or not self.setup.decides:
             return np.zeros((0,) * 5)
         uniform = np.zeros(sent.shape)
@@ -349,7 +351,9 @@ class SlotRuns:
         return uniform
 
     def _states(self, count: int) -> tuple[FloatArray, FloatArray, np.ndarray]:
-        """Local and absolute states (B, S, n, L), and where the origin moves (S,)."""
+        """Return local and absolute states (B, S, n, L) of the next slots, and where the origin
+        moves (S,).
+        """
         setup = self.setup
         slots = range(self._slot, self._slot + count)
         rebased = np.zeros(count, dtype=bool)
@@ -407,7 +411,7 @@ class SlotRuns:
         return ReadingBlock(y, H, local, rebased)
 
     def events(self, block: SlotBlock) -> tuple[np.ndarray, np.ndarray]:
-        """The EVENT rows of a block of one run and how many of them come before each sample."""
+        """Return the EVENT rows of a block of one run, and the number before each sample."""
         if self._events is not None:
             return self._events.rows(self._stopped[0, :, 0])
         at_sample = np.zeros(len(block.sampled), dtype=np.int64)
@@ -423,8 +427,8 @@ class SlotRuns:
             yield self._rows(block, first, min(first + size, count), at_sample)
 
     def _rows(self, block: SlotBlock, first: int, stop: int, at_sample: np.ndarray) -> np.ndarray:
-        """EVENT rows of the first run in the slots ``first`` to ``stop`` of a block; ``at_sample``
-        (T,) gets how many of them come before each sample there.
+        """Return the EVENT rows of the first run in the slots ``first`` to ``stop`` of a block;
+        write the number of rows before each sample into ``at_sample`` (T,).
         """
         setup = self.setup
         # Space for the largest number of rows.
@@ -454,7 +458,9 @@ class SlotRuns:
         )  # fmt: skip
 
     def conserved(self) -> dict[str, FloatArray]:
-        """Sums over all nodes that exchanges conserve: (R, 2) at the start and the last sample."""
+        """Return the sums over all nodes that exchanges conserve, (R, 2) at the start and the last
+        sample.
+        """
         given: list[Any] = [self.setup.algorithm.conserved(s) for s in self.setup.states]
         found, sums = {}, by_run(self._conserved, self.runs)
         for k, name in enumerate(given[0]):
@@ -466,7 +472,9 @@ class SlotRuns:
 
 
 def _made(up: np.ndarray, sent: np.ndarray) -> Drawn:
-    """The messages (1, S, E, W) of one run, which Python makes, and who sends."""
+    """Return the messages (1, S, E, W) of one run, which Python made, and who sends, as kernels
+    need them.
+    """
     wide = [np.zeros((*part.shape, LANES), dtype=np.uint8) for part in (up, sent)]
     for lanes, part in zip(wide, (up, sent), strict=True):
         lanes[..., 0] = part
@@ -565,8 +573,8 @@ def slot_batch(
 
 
 def with_ends(batch: RunBatch, alone: Callable[[range, bool], Iterator[RunBatch]]) -> RunBatch:
-    """The batch with every run that diverges as it is ``alone``, where it ends; it gets the
-    replicas and whether their fingerprint is wanted.
+    """Return the batch in which every run that diverges is replaced by the same run ``alone``, up
+    to its end; that takes replicas and whether their fingerprint is wanted.
     """
     # A run that diverges goes on in a batch; its true end is that of the run alone.
     for r in np.flatnonzero(batch.diverged).tolist():

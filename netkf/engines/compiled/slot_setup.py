@@ -32,7 +32,7 @@ from netkf.scenario.scenario import Scenario
 
 
 def slot_setup(scenario: Scenario) -> SlotSetup:
-    """The arrays of a scenario, made once and kept with it like its cached properties."""
+    """Return the arrays of a scenario, made once and kept with it like its cached properties."""
     # The scenario is frozen: its dictionary is where its cached properties are kept, too.
     if "_slot_setup" not in vars(scenario):
         vars(scenario)["_slot_setup"] = SlotSetup(scenario)
@@ -79,7 +79,7 @@ class SlotSetup:
         self.is_drawn = self._draws_everything(scenario)
 
     def _set_slots(self, scenario: Scenario) -> None:
-        """The slots of a run: the last one, at the horizon, is there if it is sampled."""
+        """Set the slots of a run; the last one, at the horizon, exists only if it is sampled."""
         plant, last = scenario.slot_plant, 0
         # A guess below the last slot; the plant itself decides which is over.
         last = max(0, int(scenario.horizon / plant.period) - 2)
@@ -193,7 +193,7 @@ class SlotSetup:
         )
 
     def _set_states(self, scenario: Scenario) -> None:
-        """The filters at slot 0; equal nodes share what is worked out for one."""
+        """Set the filters at slot 0; equal nodes share one state."""
         infos: Sequence[NodeInfo] = scenario.node_infos
         models: Sequence[Any] = scenario.slot_models
         if self.algorithm.pooled:
@@ -227,7 +227,9 @@ class SlotSetup:
         )
 
     def _set_channel(self, scenario: Scenario) -> None:
-        """Chances of the directions, and the entities whose streams decide about messages."""
+        """Set the delivery probabilities of directions, and the entities whose streams decide about
+        messages.
+        """
         channel, ways = scenario.network.channel, self.ways
         self.loss, bad = channel.loss, (False, True)
         self.is_chain = type(self.loss) is GilbertElliott
@@ -258,7 +260,9 @@ class SlotSetup:
         self._recorded_slots = self._slots_with_rows(scenario) if self.of_readings.any() else {}
 
     def _slots_with_rows(self, scenario: Scenario) -> dict[int, set[int]]:
-        """The slots in which nodes that have recorded sensors alone read, by index of the node."""
+        """Return the slots in which nodes with recorded sensors only have readings, by index of the
+        node.
+        """
         found: dict[int, set[int]] = {}
         for s in self.recorded:
             sensor: Any = scenario.sensors[s.placed_sensor.entry]
@@ -296,7 +300,7 @@ class SlotSetup:
         return min(len(self.nodes) // 2, len(self.ends)) if self.matching[0] >= 0 else 0
 
     def rows_of(self, slots: int) -> int:
-        """The largest number of events in so many slots."""
+        """Return the largest number of events in so many slots."""
         pairs = self.most_pairs
         sends = self.ways * (pairs if self.matching[0] >= 0 else len(self.ends))
         # A send and its outcome for each direction, a tick for each pair, a round, and one
@@ -305,7 +309,7 @@ class SlotSetup:
         return slots * (len(self.sensing) + steps + len(self.nodes))
 
     def bytes_of_slot(self) -> int:
-        """Bytes that are drawn for one slot of one run."""
+        """Return the bytes that are drawn for one slot of one run."""
         floats = self.estimators * self.p * (1 + self.varies * self.n) + 3 * self.n
         messages = len(self.fresh) * (len(self.directions) + 8 * self.most_pairs + 8)
         mask = self.decides or self.may_miss
@@ -313,7 +317,7 @@ class SlotSetup:
         return 8 * floats + messages + len(self.fresh) * asked
 
     def block_slots(self, runs: int, rows: int) -> int:
-        """Slots of so many runs that one call takes; with about so many ``rows`` of events, if that
+        """Return the slots of ``runs`` that one call simulates, up to about ``rows`` events if that
         is not 0.
         """
         slots = BLOCK_BYTES // (blocks_of(runs) * LANES * self.bytes_of_slot())
@@ -322,7 +326,7 @@ class SlotSetup:
         return max(1, int(slots))
 
     def batch_runs(self) -> int:
-        """Runs that are simulated side by side."""
+        """Return the number of runs that are simulated side by side."""
         samples = max(1, 8 * len(self.samples) * self.estimators * (2 + self.n) * self.n)
         # A power of two, a node of the tree over runs, unless not even a block of lanes fits.
         together = min(BATCH_BYTES // samples, BLOCK_BYTES // (8 * self.bytes_of_slot()))
@@ -330,7 +334,9 @@ class SlotSetup:
         return int(min(max(whole, LANES), max(1, MOST_BATCH_BYTES // samples)))
 
     def quick_runs(self) -> int:
-        """A power of two of runs, a block of lanes at least, that take some ten milliseconds."""
+        """Return a number of runs, a power of two and at least a block of lanes, that takes some
+        ten milliseconds.
+        """
         flops = self.estimators * (50 + 4 * self.n**3) + 10 * len(self.fresh) * len(self.directions)
         runs = min(QUICK_FLOPS // (max(1, self.slots) * flops), MOST_RUNS)
         return int(max(LANES, 1 << (runs.bit_length() - 1) if runs else 0))
@@ -347,8 +353,8 @@ QUICK_FLOPS = 1 << 25
 
 
 def matching_lists(scenario: Scenario) -> tuple[int, float, np.ndarray, np.ndarray]:
-    """Place of the protocol in PROTOCOLS (-1: no matching), its chance, and the lists that
-    ``slot_messages.Matchings`` describes.
+    """Return the index of the protocol in PROTOCOLS (-1: no matching), its probability, and the
+    lists that ``slot_messages.Matchings`` describes.
     """
     activation, topology = scenario.network.activation, scenario.topology
     if not isinstance(activation, Matching):

@@ -328,7 +328,7 @@ def _tables(models: list[FlowModel]) -> tuple[FlowTable, Gains]:
 
 @once_per_scenario
 def entity_records(scenario: Scenario) -> tuple[np.ndarray, np.ndarray]:
-    """ENTITY and WAY records of a run that has not begun."""
+    """Return the ENTITY and WAY records of a run that has not begun."""
     senders, index = senders_of(scenario), scenario.topology.index
     entities = np.zeros(len(senders.entities), dtype=ENTITY)
     # (i, j) of a link or direction, (i, -1) of a node.
@@ -349,7 +349,7 @@ def entity_records(scenario: Scenario) -> tuple[np.ndarray, np.ndarray]:
 def scratch_arrays(
     table: FlowTable, gains: Gains, instants: Instants, unrolled: bool
 ) -> tuple[Scratch, FlowScratch, UpdateScratch]:
-    """Scratch arrays for all that is computed; ``unrolled``: of types for their n."""
+    """Return scratch arrays for all computations; ``unrolled`` ones have types that know n."""
     n, most, width = table.levels.shape[3], int(gains.moments.max()), gains.series.shape[2]
     # Rows of the reading of each sample, then the largest sum over one instant.
     rows = np.concatenate([instants.rows, [0]])[instants.sensor]
@@ -372,7 +372,7 @@ def scratch_arrays(
 
 
 def empty_pool(capacity: int, n: int) -> tuple[np.ndarray, FloatArray, FloatArray, np.ndarray]:
-    """Pool, xhat, root and heap of messages that are all free."""
+    """Return pool, xhat, root and heap for so many messages, all free."""
     pool = np.zeros(capacity, dtype=MESSAGE)
     pool["next"] = np.arange(1, capacity + 1)
     return pool, np.zeros((capacity, n)), np.zeros((capacity, n, n)), np.zeros(capacity, np.int64)

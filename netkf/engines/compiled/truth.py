@@ -20,12 +20,14 @@ class States(Protocol):
     frame_times: FloatArray
 
     def offset(self, k: int, path: PathBlock, piece: int) -> FloatArray:
-        """(n,) the local state just before ``frame_times[k]``, which ends a piece of the path."""
+        """Return the local state (n,) just before ``frame_times[k]``, where a piece of the path
+        ends.
+        """
 
     def states_at(
         self, times: FloatArray, path: PathBlock, pieces: np.ndarray
     ) -> tuple[FloatArray, FloatArray]:
-        """(T, n) local and absolute states at times in these pieces of the path."""
+        """Return local and absolute states (T, n) at times within these pieces of the path."""
 
 
 class KnownStates:
@@ -36,14 +38,14 @@ class KnownStates:
         self.frame_times = np.array(self.truth.frame_times, dtype=np.float64)
 
     def offset(self, k: int, path: PathBlock, piece: int) -> FloatArray:
-        """(n,) the local state just before ``frame_times[k]``."""
+        """Return the local state (n,) just before ``frame_times[k]``."""
         # The truth keeps its own frames.
         return np.asarray(self.truth.rebase(k))
 
     def states_at(
         self, times: FloatArray, path: PathBlock, pieces: np.ndarray
     ) -> tuple[FloatArray, FloatArray]:
-        """(T, n) local and absolute states."""
+        """Return local and absolute states (T, n)."""
         local, absolute = self.truth.states(times)
         return local, absolute
 
@@ -58,7 +60,7 @@ class PathStates:
         self._frame, self._begun, self._origin = 0, 0.0, np.zeros(scenario.plant.n)
 
     def local(self, times: FloatArray, path: PathBlock, pieces: np.ndarray) -> FloatArray:
-        """(T, n) states in the present frame, which are 0 where one begins."""
+        """Return the states (T, n) in the present frame, 0 where one begins."""
         # A time is the end of its piece, or the start of the first one.
         ends = (times == path.stop[pieces])[:, None]
         x = np.where(ends, path.x_stop[0, pieces], path.x_start[0, pieces])
@@ -68,7 +70,7 @@ class PathStates:
         return np.asarray(x)
 
     def offset(self, k: int, path: PathBlock, piece: int) -> FloatArray:
-        """(n,) the local state just before ``frame_times[k]``; from now on its frame counts."""
+        """Return the local state (n,) just before ``frame_times[k]``; there a frame begins."""
         x, time = path.x_stop[0, piece], float(self.frame_times[k])
         with np.errstate(over="ignore", invalid="ignore"):
             # The new origin: the old one moved to now, plus the local state.
@@ -80,7 +82,7 @@ class PathStates:
     def states_at(
         self, times: FloatArray, path: PathBlock, pieces: np.ndarray
     ) -> tuple[FloatArray, FloatArray]:
-        """(T, n) local and absolute states at times in the present frame."""
+        """Return local and absolute states (T, n) at times in the present frame."""
         local = self.local(times, path, pieces)
         # No frame has begun: local states are absolute.
         if not self._frame:
