@@ -343,7 +343,7 @@ class BeliefPropagation(Filter):
         """Add a reading to the own ones."""
         if not len(reading.y):
             return state
-        return believing(state._replace(own=with_reading(state, reading)))
+        return compute_belief(state._replace(own=add_to_own_evidence(state, reading)))
 
     def emit(self, state: BeliefState, exchange: Exchange) -> tuple[BeliefState, Beliefs]:
         """Send what was read and heard."""
@@ -365,10 +365,12 @@ class BeliefPropagation(Filter):
             if message.age > 0.0 and not isinstance(state.model, SlotModel):
                 evidence = predict_evidence(evidence, backward(state.model, message.age))
             centre, _ = state.model.extrapolate(message.payload.xhat, state.root, message.age)
-            evidence = recentred(evidence, centre, state.xhat)
+            evidence = recentre_evidence(evidence, centre, state.xhat)
             known[message.sender] = HeardEvidence(evidence, sent)
         senders = tuple(sorted(known))
-        return believing(state._replace(senders=senders, received=tuple(known[j] for j in senders)))
+        return compute_belief(
+            state._replace(senders=senders, received=tuple(known[j] for j in senders))
+        )
 
     shift = Filter.shift  # evidence counts from the belief
     shift_payload = Filter.shift_payload
@@ -388,7 +390,7 @@ def merge_evidence(parts: Sequence[FloatArray]) -> FloatArray:
     return np.ascontiguousarray(stack[0, ..., 0])
 
 
-def with_reading(state: BeliefState, reading: Reading) -> FloatArray:
+def add_to_own_evidence(state: BeliefState, reading: Reading) -> FloatArray:
     """Return the evidence (n, n + 1) of a node's own readings together with a new one."""
     y, H = whiten_reading(reading.y, reading.H, reading.R)
     n, total = len(state.xhat), np.array(state.own)[..., None]
@@ -411,7 +413,7 @@ def evidence_of(root: FloatArray) -> FloatArray:
     return np.ascontiguousarray(part[..., 0])
 
 
-def believing(state: BeliefState) -> BeliefState:
+def compute_belief(state: BeliefState) -> BeliefState:
     """Return the state with the belief that follows from its prior and all evidence."""
     # Not an update of the prior, which on an unstable plant is so far off that digits are lost.
     total = merge_evidence([state.prior, state.own, *(one.evidence for one in state.received)])
@@ -419,7 +421,7 @@ def believing(state: BeliefState) -> BeliefState:
     x, root, centre = np.zeros((1, 1, n, 1)), np.zeros((1, 1, n, n, 1)), np.array(before)
     finish_single(root, x, centre.reshape(1, n, 1), total[..., None], np.empty((n, n + 1, 1)))
     state = state._replace(xhat=x.reshape(n), root=root.reshape(n, n))
-    return with_all(state, lambda evidence: recentred(evidence, before, state.xhat))
+    return with_all(state, lambda evidence: recentre_evidence(evidence, before, state.xhat))
 
 
 def with_all(state: BeliefState, change: Callable[[FloatArray], FloatArray]) -> BeliefState:
@@ -446,7 +448,7 @@ def predict_evidence(evidence: FloatArray, back: FloatArray) -> FloatArray:
     return np.ascontiguousarray(moved[..., 0])
 
 
-def recentred(evidence: FloatArray, before: FloatArray, after: FloatArray) -> FloatArray:
+def recentre_evidence(evidence: FloatArray, before: FloatArray, after: FloatArray) -> FloatArray:
     """Return evidence that counts from ``before`` (n,) as it counts from ``after``."""
     moved, old, new = (np.array(part)[..., None] for part in (evidence, before, after))
     recentre_part_single(moved, old, new)

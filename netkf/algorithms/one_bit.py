@@ -321,7 +321,7 @@ class OneBit(Filter):
             return state, None
         y, H = whiten_reading(*state.reading[:3])
         signs = np.zeros(len(y))
-        return corrected(state, send_bits_single, y, H, signs), Bits(signs, H)
+        return apply_bits(state, send_bits_single, y, H, signs), Bits(signs, H)
 
     def absorb(
         self, state: OneBitState, messages: Sequence[Message], exchange: Exchange
@@ -329,7 +329,7 @@ class OneBit(Filter):
         """Correct by the bits of the sender whose turn it is."""
         for message in messages:
             signs, H = message.payload
-            state = corrected(state, use_bits_single, np.zeros(len(signs)), H, signs)
+            state = apply_bits(state, use_bits_single, np.zeros(len(signs)), H, signs)
         return state
 
     shift = Filter.shift  # signs of innovations do not depend on the origin
@@ -339,7 +339,7 @@ class OneBit(Filter):
         return payload
 
 
-def corrected(
+def apply_bits(
     state: OneBitState, use: Any, y: FloatArray, H: FloatArray, signs: FloatArray
 ) -> OneBitState:
     """Return the state after ``use`` of the bits of a whitened reading y (p,), H (p, n):

@@ -17,7 +17,7 @@ from netkf.checks.exact import (
     check_expected_nees,
     check_upper_bound,
     few_errors,
-    most_replayed,
+    max_replayed,
     summarise_exactly,
     with_promised_filter,
 )
@@ -89,7 +89,7 @@ def _errors_bounded(samples: RunSamples, level: float) -> Finding:
     """Compare the growth of the law of squared errors in the second half of the horizon with that
     of Gaussian errors that have the exact covariances.
     """
-    e, Sigma = samples.runs.e[:, -2:], samples.runs.Sigma[: most_replayed(samples.scenario), -2:]
+    e, Sigma = samples.runs.e[:, -2:], samples.runs.Sigma[: max_replayed(samples.scenario), -2:]
     if np.isnan(e).all():
         return find_nothing(LAW_TOLERANCE)
     square = e[..., :, None] * e[..., None, :]

@@ -80,16 +80,16 @@ def summarise_exactly(scenario: Scenario, run: Run) -> ReplicaSummary:
     e = np.where(blurred_samples(run, run.P)[..., None], np.nan, run.error)
     nees = np.where(np.isnan(e).any(axis=-1) | _nearly_singular(run.P), np.nan, nees)
     P, e, nees = run.P[at][:, sampled], e[at][:, sampled], nees[at][:, sampled]
-    if run.replica < most_replayed(scenario) and few_errors(scenario).holds:
+    if run.replica < max_replayed(scenario) and few_errors(scenario).holds:
         try:
             law = error_law(with_promised_filter(scenario), run)
         except TheoryError:  # an assumption says so, and rows that need them are not promised
-            return _unreplayed(P, e, nees, len(run.times) * errors_at_once(scenario))
+            return _summary_without_replay(P, e, nees, len(run.times) * errors_at_once(scenario))
         return _replayed_summary(scenario, run, law, e, nees)
-    return _unreplayed(P, e, nees, len(run.times) * errors_at_once(scenario))
+    return _summary_without_replay(P, e, nees, len(run.times) * errors_at_once(scenario))
 
 
-def most_replayed(scenario: Scenario) -> int:
+def max_replayed(scenario: Scenario) -> int:
     """Return the number of replicas whose exact covariances are computed."""
     per_run = len(probe_times(scenario)) * errors_at_once(scenario)
     steps, least = integration_steps(scenario), 0
@@ -100,7 +100,9 @@ def most_replayed(scenario: Scenario) -> int:
     return max(MIN_REPLAYED, min(MAX_REPLAYED, enough, affordable))
 
 
-def _unreplayed(P: FloatArray, e: FloatArray, nees: FloatArray, size: int) -> ReplicaSummary:
+def _summary_without_replay(
+    P: FloatArray, e: FloatArray, nees: FloatArray, size: int
+) -> ReplicaSummary:
     """Return a summary without exact covariances; ``size`` is the number of all errors."""
     times, n = len(P), P.shape[-1]
     unknown, pair = np.full(P.shape, np.nan), np.full(2, np.nan)
@@ -292,7 +294,7 @@ def promised_filter(algorithm: Any) -> Any:
 
 def check_upper_bound(samples: RunSamples, level: float) -> Finding:
     """Check that P - Sigma has no negative eigenvalue; Sigma is the exact covariance of errors."""
-    most = most_replayed(samples.scenario)
+    most = max_replayed(samples.scenario)
     P, Sigma = samples.runs.P[:most], samples.runs.Sigma[:most]
     size = np.trace(Sigma, axis1=-2, axis2=-1)
     gap = np.nan_to_num(P - Sigma, nan=-1e300, posinf=1e300, neginf=-1e300)
@@ -309,7 +311,7 @@ def check_error_covariance(samples: RunSamples, level: float) -> Finding:
     and for all nodes together.
     """
     runs, scenario = samples.runs, samples.scenario
-    n, most = scenario.plant.n, most_replayed(scenario)
+    n, most = scenario.plant.n, max_replayed(scenario)
     Sigma, whole = runs.Sigma[:most], runs.whole[:most]
     e = runs.e[:most] - runs.mean[:most]
     if np.isnan(e).all():
@@ -348,7 +350,7 @@ def check_bias(samples: RunSamples, level: float) -> Finding:
     The distance is that of the bias from 0 in standard deviations of an error: those of the mean
     covariance of all nodes and times.
     """
-    most = most_replayed(samples.scenario)
+    most = max_replayed(samples.scenario)
     bias, Sigma = samples.runs.bias[:most], samples.runs.Sigma[:most]
     bias = bias[np.isfinite(bias).all(axis=(1, 2))]
     n = bias.shape[1]
@@ -392,7 +394,7 @@ def check_expected_nees(samples: RunSamples, level: float) -> Finding:
     less that mean. Sums are in units of the expected values, which may differ widely.
     """
     runs, n = samples.runs, samples.scenario.plant.n
-    most = most_replayed(samples.scenario)
+    most = max_replayed(samples.scenario)
     P, Sigma = runs.replayed[:most], runs.Sigma[:most]
     inverse, m = np.linalg.pinv(P), runs.mean[:most]
     weights = np.linalg.eigvals(inverse @ Sigma).real

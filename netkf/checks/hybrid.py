@@ -311,7 +311,9 @@ class HybridChecks(PaperChecks):
     def promises(self, scenario: Scenario) -> tuple[Promise, ...]:
         """Return the promises about a scenario; those on limits only if the limits exist."""
         listed, promised = list(PROMISES), with_promised_filter(scenario)
-        for promise, compute in zip(COMPUTED, (_decided, _constant_gains, _limit), strict=True):
+        for promise, compute in zip(
+            COMPUTED, (_require_known_steadiness, _constant_gains, _limit), strict=True
+        ):
             try:
                 compute(promised)
             except TheoryError:
@@ -335,7 +337,7 @@ def _settling_rows(scenario: Scenario) -> list[Assumption]:
     return [Assumption("H(12) has a steady state", "H (12), (16)", settles, why)]
 
 
-def _decided(scenario: Scenario) -> None:
+def _require_known_steadiness(scenario: Scenario) -> None:
     """Raise TheoryError if it is not known whether the bound has a steady state."""
     has_steady_state(scenario)
 

@@ -6,7 +6,7 @@ import dataclasses
 from typing import ClassVar
 
 from netkf.checks.evidence import Assumption, Promise
-from netkf.checks.exact import most_replayed, summarise_exactly
+from netkf.checks.exact import max_replayed, summarise_exactly
 from netkf.checks.paper import PaperChecks
 from netkf.checks.points import checked_samples, sampled_indices
 from netkf.checks.samples import ReplicaSummary, check_replay
@@ -32,7 +32,7 @@ class BitChecks(PaperChecks):
     def summarise(self, scenario: Scenario, run: Run) -> ReplicaSummary:
         """Return the summary of a run whose samples are at ``check_times``."""
         found = summarise_exactly(scenario, run)
-        if run.replica >= most_replayed(scenario):
+        if run.replica >= max_replayed(scenario):
             return found
         at, sampled = checked_samples(scenario, run.times), sampled_indices(scenario)
         try:

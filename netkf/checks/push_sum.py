@@ -25,7 +25,7 @@ from netkf.checks.exact import (
     check_bias,
     check_error_covariance,
     few_errors,
-    most_replayed,
+    max_replayed,
     summarise_exactly,
     with_promised_filter,
 )
@@ -172,7 +172,7 @@ def _unbiased(samples: PushSumSamples, level: float) -> Finding:
         return find_nothing(BIAS_TOLERANCE)
     nodes, found = samples.nodes, []
     count, n = len(samples.followed), samples.scenario.plant.n
-    most = most_replayed(samples.scenario)
+    most = max_replayed(samples.scenario)
     # The mean of R standard Gaussian vectors is Gaussian with covariance I / R.
     wide = _gaussian_radius(level / len(nodes), n) / math.sqrt(count)
     for i, node in enumerate(nodes):
@@ -210,7 +210,7 @@ def _mean_square(samples: PushSumSamples, level: float) -> Finding:
         far = deviation_interval(1.0, affine(scale, float(expected[i]), 0.0))
         found.append((far._replace(low=off.low), f"at node {node}"))
     message = "largest relative difference of mean squares from the exact ones"
-    most = most_replayed(samples.scenario)
+    most = max_replayed(samples.scenario)
     finding = find_largest(found, SQUARE_TOLERANCE, message)._replace(most_runs=most)
     off_limit = float(np.abs(expected - 1.0).max())
     early = off_limit > SQUARE_TOLERANCE and not any(off.low > 0.0 for off, _ in found)

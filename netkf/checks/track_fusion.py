@@ -10,7 +10,7 @@ import numpy as np
 
 from netkf.checks.clocked import PROMISES, REACH, UPPER_BOUND
 from netkf.checks.evidence import Finding, Promise, find_identity
-from netkf.checks.exact import most_replayed, with_promised_filter
+from netkf.checks.exact import max_replayed, with_promised_filter
 from netkf.checks.kalman_consensus import EquationChecks
 from netkf.checks.points import check_slots, sampled_indices
 from netkf.checks.rounding import compare_identities
@@ -25,7 +25,7 @@ START_FACTOR, STEADY_TOLERANCE = 10.0, 1e-3
 
 def check_exact_covariance(samples: RunSamples, level: float) -> Finding:
     """Compare P with the exact covariance of the error."""
-    most = most_replayed(samples.scenario)
+    most = max_replayed(samples.scenario)
     P, Sigma = samples.runs.P[:most], samples.runs.Sigma[:most]
     size = np.trace(Sigma, axis1=-2, axis2=-1)
     gap = np.nan_to_num(np.abs(P - Sigma).max(axis=(-1, -2)), nan=1e300, posinf=1e300)

@@ -383,7 +383,7 @@ def reduce_group(
                 totals[f, a, q] = averages[first + q, f, a]
     for s in range(count):
         find_blur(lanes, b, sums, scratch, first, active, t + s, s)
-        choose_counted(b, sums, scratch, first, active, t + s)
+        mark_averaged(b, sums, scratch, first, active, t + s)
         for f in range(filters):
             reduce_sample(lanes, b, sums, scratch, first, active, t + s, s, f)
     for c in range(0, count * scratch.rows.shape[2], len(lanes)):
@@ -479,7 +479,7 @@ def nees_alone(
 
 
 @kernel
-def choose_counted(
+def mark_averaged(
     b: Batch, sums: Sums, scratch: ReductionScratch, first: int, active: int, t: int
 ) -> None:
     """Note in which runs sample ``t`` counts in the averages, by the rule of

@@ -147,7 +147,7 @@ def _read_samples(path: Path, scenario: Scenario) -> dict[str, Any]:
     runs = table["runs"]
     if runs.dtype.kind != "i" or (runs < 0).any():
         raise DamagedError(f"{path.name} has numbers of runs that are no counts")
-    values = _with_missing(table, ensemble_columns(n)[3:], (T, N))
+    values = _select_columns(table, ensemble_columns(n)[3:], (T, N))
     matrices = np.empty((4, T, N, n, n))
     for matrix, upper in zip(matrices, np.split(values[:, :, :-2], 4, axis=2), strict=True):
         matrix[:, :, i, j] = matrix[:, :, j, i] = upper
@@ -160,7 +160,7 @@ def _read_samples(path: Path, scenario: Scenario) -> dict[str, Any]:
     }
 
 
-def _with_missing(table: pd.DataFrame, names: list[str], shape: tuple[int, int]) -> FloatArray:
+def _select_columns(table: pd.DataFrame, names: list[str], shape: tuple[int, int]) -> FloatArray:
     """Return columns as an array (T, N, columns); those that the table lacks are nan."""
     return np.asarray(
         table.reindex(columns=names).to_numpy(dtype=np.float64).reshape(*shape, len(names))

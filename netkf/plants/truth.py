@@ -113,7 +113,7 @@ class SampledTruth:
         times = np.unique(np.concatenate([[0.0], samples, marks]))
         inside = np.unique(probes[~np.isin(probes, times)])
         rebased = np.isin(times, self.frame_times)
-        before, normals = _drawn(moves, start, random, times, rebased)
+        before, normals = _draw_states(moves, start, random, times, rebased)
         self.offsets = before[rebased]
         after = np.where(rebased[:, None], 0.0, before)
         between = _bridge(moves, times, after, normals, probing, inside)
@@ -151,7 +151,7 @@ class SampledTruth:
         return self._local[indices], self._absolute[indices]
 
 
-def _drawn(
+def _draw_states(
     moves: Transitions,
     start: FloatArray,
     random: np.random.Generator,

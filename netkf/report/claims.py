@@ -43,22 +43,22 @@ def findings(
     the most important first.
     """
     if source.kind == "sweep":
-        return [*_ending(source), *_of_sweep(source)]
+        return [*_describe_ending(source), *_describe_sweep(source)]
     if source.kind == "verdict":
-        return _of_verdict(source)
+        return _describe_verdict(source)
     if source.filters is not None:
         return _of_filters(source.filters)
-    found = [*_ending(source)]
+    found = [*_describe_ending(source)]
     if source.kind == "ensemble":
-        found += [*_of_ensemble(source), *_of_bound(source)]
+        found += [*_of_ensemble(source), *_describe_bound(source)]
     elif source.run is not None and len(source.run.times):
-        found += _of_trace(source, source.run, messages)
+        found += _describe_trace(source, source.run, messages)
         found += [innovation_claim(readings)] if isinstance(readings, Innovations) else []
-        found += _of_bound(source)
+        found += _describe_bound(source)
     elif source.status == "complete":
         found.append("No samples were recorded, so nothing moves here: run again with --trace full")
     if source.verdict is not None:
-        found += _of_verdict(source)
+        found += _describe_verdict(source)
     return found
 
 
@@ -99,14 +99,16 @@ def _first_event(one: Opened, other: Opened) -> list[str]:
     return [f"First difference{which}: {difference}"]
 
 
-def _ending(source: Opened) -> list[str]:
+def _describe_ending(source: Opened) -> list[str]:
     """Return sentences on a run that did not end as planned, or on one that never began."""
     found, run = [], source.run
     if source.status == "interrupted":
         done = source.manifest["runs"]
         many = f"{done['done']:,} of {done['wanted']:,} runs are done"
         sampled = run is not None and len(run.times) > 0
-        reached = f"after its sample at {_time(_last(run))}" if sampled else "before it was sampled"
+        reached = (
+            f"after its sample at {_time(_last_time(run))}" if sampled else "before it was sampled"
+        )
         what = many if done["wanted"] > 1 else f"the run stopped {reached}"
         found.append(f"Interrupted: {what}. Everything here is about what was finished")
     elif source.status == "failed":
@@ -125,12 +127,12 @@ def _ending(source: Opened) -> list[str]:
     return found
 
 
-def _last(run: StoredRun | None) -> float:
+def _last_time(run: StoredRun | None) -> float:
     """Return the last sampled time in seconds, 0 without samples."""
     return float(run.times[-1]) if run is not None and len(run.times) else 0.0
 
 
-def _of_trace(source: Opened, run: StoredRun, messages: np.ndarray) -> list[str]:
+def _describe_trace(source: Opened, run: StoredRun, messages: np.ndarray) -> list[str]:
     """Return the claims on the worst node of a run with a trace."""
     sample = source.worst
     if sample is None:
@@ -172,7 +174,7 @@ def _why(source: Opened, run: StoredRun, messages: np.ndarray, sample: WorstSamp
     if len(into):
         cut = float(source.cuts(np.array([worst.time]))[0])
         why = _heard(into, worst, cut) + _unusual(source, run, into, worst)
-        found.append(why + _arrived(messages, into))
+        found.append(why + _describe_arrivals(messages, into))
     if worst.by_error:
         found += _judge_error(source, run, worst)
     return found
@@ -239,7 +241,7 @@ def _heard(into: np.ndarray, worst: Worst, cut: float) -> str:
     return f"Why: {listed}; {lost}"
 
 
-def _arrived(messages: np.ndarray, into: np.ndarray) -> str:
+def _describe_arrivals(messages: np.ndarray, into: np.ndarray) -> str:
     """Return how many messages to the node arrived in the whole run, where that is unusual."""
     counts = [int((rows["outcome"] == DELIVERED).sum()) for rows in (into, messages)]
     own, all_nodes = counts[0] / max(1, len(into)), counts[1] / max(1, len(messages))
@@ -293,7 +295,7 @@ def _of_ensemble(source: Opened) -> list[str]:
     ]
 
 
-def _of_bound(source: Opened) -> list[str]:
+def _describe_bound(source: Opened) -> list[str]:
     """Return how the traces of P lie beside the bound: one run does not decide about a mean."""
     summary = source.summary
     if not summary:
@@ -304,7 +306,7 @@ def _of_bound(source: Opened) -> list[str]:
     top = max(rows, key=lambda row: float(row["mean_trace"]) / float(row["bound"]))
     ratio = float(top["mean_trace"]) / float(top["bound"])
     numbers = (
-        f"mean trace P {format_number(top['mean_trace'])}{_se(top)} against "
+        f"mean trace P {format_number(top['mean_trace'])}{_standard_error_text(top)} against "
         f"{format_number(top['bound'])} at node {top['node']}, ratio {format_number(ratio)}"
     )
     if source.runs > 1:
@@ -319,13 +321,13 @@ def _of_bound(source: Opened) -> list[str]:
     ]
 
 
-def _se(row: dict[str, Any]) -> str:
+def _standard_error_text(row: dict[str, Any]) -> str:
     """Return the standard error of the mean trace as text."""
     error = row.get("mean_trace_se")
     return f" +- {error:.1g}" if error is not None else ""
 
 
-def _of_verdict(source: Opened) -> list[str]:
+def _describe_verdict(source: Opened) -> list[str]:
     """Return the claims on a verdict: broken promises."""
     verdict = source.verdict or {}
     rows = verdict.get("rows", [])
@@ -346,7 +348,7 @@ def _verdicts(rows: list[dict[str, Any]]) -> list[str]:
     return sorted({str(row["verdict"]) for row in rows})
 
 
-def _of_sweep(source: Opened) -> list[str]:
+def _describe_sweep(source: Opened) -> list[str]:
     """Return the claims on a sweep: its best point."""
     assert source.sweep is not None
     table, varied = source.sweep.table, source.sweep.keys

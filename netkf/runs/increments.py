@@ -59,7 +59,7 @@ class Expectations:
         return np.asarray(np.linalg.solve(np.linalg.cholesky(S), y - H @ J @ xhat))
 
 
-def noting_increments(algorithm: Filter, intervals: list[WhitenedInnovation]) -> Filter:
+def record_increments(algorithm: Filter, intervals: list[WhitenedInnovation]) -> Filter:
     """Return the filter that does what it did, and notes the innovations of increments on the way.
 
     Its states are those of the filter with the node and the time that they belong to.

@@ -15,7 +15,7 @@ from scipy.special import gammaincinv
 from netkf.algorithms.filter import Filter, Reading
 from netkf.core.errors import NetkfError
 from netkf.linalg.arrays import FloatArray
-from netkf.runs.increments import WhitenedInnovation, noting_increments
+from netkf.runs.increments import WhitenedInnovation, record_increments
 from netkf.runs.simulate import simulate
 from netkf.scenario.scenario import Scenario
 from netkf.trace.run import Run, first_difference
@@ -61,8 +61,10 @@ def innovations(run: Run, most: int = MAX_EVENTS) -> Innovations:
     noted: list[tuple[Reading, FloatArray, FloatArray | None]] = []
     intervals: list[WhitenedInnovation] = []
     if not scenario.slotted and scenario.increment_sensors:
-        algorithm = noting_increments(algorithm, intervals)
-    filtering = dataclasses.replace(scenario.filter, algorithm=_noting(algorithm, noted))
+        algorithm = record_increments(algorithm, intervals)
+    filtering = dataclasses.replace(
+        scenario.filter, algorithm=_record_innovations(algorithm, noted)
+    )
     again = simulate(with_filter(scenario, filtering), run.seed, run.replica, "simpy")
     if len(run.log) and first_difference(run, again) is not None:
         raise NetkfError("a replay makes other events than the run: it is of another version")
@@ -78,7 +80,7 @@ def with_filter(scenario: Scenario, filtering: Any) -> Scenario:
     return found
 
 
-def _noting(algorithm: Filter, noted: list[Any]) -> Filter:
+def _record_innovations(algorithm: Filter, noted: list[Any]) -> Filter:
     """Return the filter with an ``update`` that notes each sample and the estimate before it."""
     base: Any = type(algorithm)
 

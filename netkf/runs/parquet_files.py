@@ -41,7 +41,7 @@ def read_numbers(
     Raises DamagedError for any other file, for one with more than MAX_READ_ROWS rows, and for
     empty cells that are not allowed.
     """
-    with _reading(path) as source, pq.ParquetFile(source) as file:
+    with _open_for_reading(path) as source, pq.ParquetFile(source) as file:
         names, types = file.schema_arrow.names, file.schema_arrow.types
         known = dict(zip(names, types, strict=True))
         wrong = [name for name in columns if names.count(name) != 1 or not _is_numeric(known[name])]
@@ -59,7 +59,7 @@ def read_texts(path: Path, column: str, run: int | None = None) -> pd.Series[str
     """Return a column of texts of a Parquet file, of one ``run`` if it is given; raises
     DamagedError for any other file.
     """
-    with _reading(path) as source, pq.ParquetFile(source) as file:
+    with _open_for_reading(path) as source, pq.ParquetFile(source) as file:
         names = file.schema_arrow.names
         if names.count(column) != 1:
             raise DamagedError(f"{path.name} has no column {column}")
@@ -72,7 +72,7 @@ def read_texts(path: Path, column: str, run: int | None = None) -> pd.Series[str
 
 def read_flags(path: Path, column: str) -> np.ndarray:
     """Return a column of truth values of a Parquet file; raises DamagedError for any other file."""
-    with _reading(path) as source, pq.ParquetFile(source) as file:
+    with _open_for_reading(path) as source, pq.ParquetFile(source) as file:
         known = dict(zip(file.schema_arrow.names, file.schema_arrow.types, strict=True))
         if not pa.types.is_boolean(known.get(column, pa.null())):
             raise DamagedError(f"{path.name} has no column {column} of truth values")
@@ -83,7 +83,7 @@ def read_flags(path: Path, column: str) -> np.ndarray:
 
 
 @contextlib.contextmanager
-def _reading(path: Path) -> Iterator[Any]:
+def _open_for_reading(path: Path) -> Iterator[Any]:
     """Open a file for pyarrow; raises DamagedError for what goes wrong inside."""
     with reading_file(path, path.name), _open(path, "rb") as source:
         yield source
@@ -107,13 +107,13 @@ def _read(file: Any, name: str, source: Any, columns: Sequence[str], run: int | 
 
 def column_names(path: Path) -> list[str]:
     """Return the names of the columns of a Parquet file; raises DamagedError."""
-    with _reading(path) as source:
+    with _open_for_reading(path) as source:
         return list(pq.read_schema(source).names)
 
 
 def is_numeric_column(path: Path, name: str) -> bool:
     """Return True if a column of a Parquet file holds numbers; raises DamagedError."""
-    with _reading(path) as source:
+    with _open_for_reading(path) as source:
         return _is_numeric(pq.read_schema(source).field(name).type)
 
 

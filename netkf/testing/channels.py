@@ -18,7 +18,7 @@ from netkf.network.graphs import Complete, Link, Topology
 from netkf.rng.streams import Streams
 from netkf.testing.generators import RecordingGenerator, describe_calls
 from netkf.testing.noise import divergence, largest_deviation, log_level
-from netkf.testing.watching import Watched, demand, fail, made, user_code
+from netkf.testing.watching import Watched, demand, fail, make_part, user_code
 
 CHAINS, LENGTH, DRAWS = 400, 50, 200
 DELAYS = 20_000
@@ -51,7 +51,7 @@ def check_channel(channel: Any, /, topology: Topology | None = None, **settings:
 
     Raises AssertionError with one line: the method, the rule, the value got, what to do.
     """
-    part = made(channel, (Channel, Loss, Delay), settings)
+    part = make_part(channel, (Channel, Loss, Delay), settings)
     check_made_channel(part, topology, 0)
 
 
@@ -62,7 +62,7 @@ def check_made_channel(part: Any, topology: Topology | None, seed: int) -> None:
         check_made_channel(part.delay, topology, seed)
         return
     watched = Watched(part)
-    watched.pickled()
+    watched.pickle_copy()
     graph = Complete(nodes=4).build(seed=0) if topology is None else topology
     links = table_entries(graph)
     if isinstance(part, Delay):
@@ -196,7 +196,7 @@ def _fractions(watched: Watched, links: dict[Link, float], seed: int) -> None:
     if np.isnan(stated).all() and not part.independent:
         return
     with user_code(watched.name):
-        arrived = _simulated(part, links, seed)
+        arrived = _simulate_arrivals(part, links, seed)
     rule = "must be the delivered fraction in the long run"
     for known in [~np.isnan(stated), *(np.arange(len(links)) == k for k in range(len(links)))]:
         if not known.any() or np.isnan(stated[known]).any():
@@ -267,7 +267,7 @@ def _independent(watched: Watched, arrived: FloatArray, links: tuple[Link, ...])
             )
 
 
-def _simulated(part: Loss, links: dict[Link, float], seed: int) -> FloatArray:
+def _simulate_arrivals(part: Loss, links: dict[Link, float], seed: int) -> FloatArray:
     """Return what the engine would have delivered, (chains, length, links) of 0 and 1, with own
     streams for each direction.
     """
@@ -293,7 +293,7 @@ def _generator(streams: Streams, link: Link, purpose: str) -> np.random.Generato
 def _delays(watched: Watched, links: tuple[Link, ...]) -> None:
     """Check the delays of a channel."""
     _check_message_delays(watched, links)
-    first_draws = [_drawn(watched) for _ in range(2)]
+    first_draws = [_draw_delays(watched) for _ in range(2)]
     demand(
         first_draws[0] == first_draws[1],
         f"{watched.name}.draw",
@@ -388,7 +388,7 @@ def _check_message_delays(watched: Watched, links: tuple[Link, ...]) -> None:
         demand(equal, where, rule, f"{found[one]:g} and {same:g}")
 
 
-def _drawn(watched: Watched) -> list[float]:
+def _draw_delays(watched: Watched) -> list[float]:
     """Return some delays, each checked by itself."""
     fixed, where, random = watched.part.fixed, f"{watched.name}.draw", RecordingGenerator(6)
     first, rule = None, "must be a finite number of at least 0 seconds"

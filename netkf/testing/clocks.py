@@ -24,7 +24,7 @@ from netkf.network.graphs import Complete, Link
 from netkf.rng.streams import Streams
 from netkf.testing.generators import RecordingGenerator
 from netkf.testing.noise import FAMILIES, LEVEL, largest_deviation
-from netkf.testing.watching import Watched, demand, made, user_code
+from netkf.testing.watching import Watched, demand, make_part, user_code
 
 BLOCKS = ((600,), (1,) * 600, (7, 64, 1, 256, 272))
 CHAINS, LENGTH = 800, 100
@@ -53,13 +53,13 @@ def check_clock(clock: Any, /, link: Link | None = None, **settings: Any) -> Non
 
     Raises AssertionError with one line: the method, the rule, the value got, what to do.
     """
-    check_made_clock(made(clock, (LinkClock,), settings), link, 0)
+    check_made_clock(make_part(clock, (LinkClock,), settings), link, 0)
 
 
 def check_made_clock(part: Any, link: Link | None, seed: int) -> None:
     """Run ``check_clock`` on an object, with streams of the given seed."""
     watched = Watched(part)
-    watched.pickled()
+    watched.pickle_copy()
     entities = _entities(part) if link is None else (link,)
     for entity in entities[:1] if link is None else entities:
         _one_entity(watched, entity)
@@ -114,10 +114,10 @@ def _check_apart(watched: Watched, entities: tuple[Entity, ...]) -> None:
     with user_code(where):
         for k, entity in enumerate(entities):
             random, position = RecordingGenerator(11, k), ClockPosition(_phase(part, entity, k))
-            alone[entity] = [tick for _, tick in _following(part, entity, position, random)]
+            alone[entity] = [tick for _, tick in _iterate_ticks(part, entity, position, random)]
         randoms = [RecordingGenerator(11, k) for k in range(len(entities))]
         running = [
-            _following(part, entity, ClockPosition(_phase(part, entity, k)), randoms[k])
+            _iterate_ticks(part, entity, ClockPosition(_phase(part, entity, k)), randoms[k])
             for k, entity in enumerate(entities)
         ]
         between: dict[Entity, list[float]] = {entity: [] for entity in entities}
@@ -137,7 +137,7 @@ def _phase(part: Any, entity: Entity, k: int) -> float:
     return float(part.origin(entity, lambda: RecordingGenerator(12, k)))
 
 
-def _following(
+def _iterate_ticks(
     part: Any, entity: Entity, position: ClockPosition, random: np.random.Generator
 ) -> Iterator[tuple[int, float]]:
     """Yield the first ticks of an entity with their numbers, one by one."""

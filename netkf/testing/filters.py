@@ -13,7 +13,7 @@ from netkf.algorithms.slot import SlotFilter
 from netkf.linalg.arrays import FloatArray
 from netkf.testing.parents import check_parent
 from netkf.testing.shifts import all_trials, check_shift
-from netkf.testing.watching import Watched, demand, made
+from netkf.testing.watching import Watched, demand, make_part
 
 MOST_LINKS = 8
 PHASES = ("predict", "sense", "exchange")
@@ -47,10 +47,10 @@ def check_filter(filter: Any, /, same_as_parent: bool | None = None, **settings:
 
     Raises AssertionError with one line: the method, the rule, the value got, what to do.
     """
-    part = made(filter, (Filter, FlowFilter, SlotFilter), settings)
+    part = make_part(filter, (Filter, FlowFilter, SlotFilter), settings)
     hosted = adapt(part)
     watched = Watched(hosted, part, former_names(hosted))
-    watched.pickled()
+    watched.pickle_copy()
     _class_variables(watched)
     if hosted.talks:
         _weights(watched)

@@ -13,7 +13,7 @@ from netkf.network.matchings import Broadcast, Matching, RecordedSlots, SlotActi
 from netkf.rng.streams import Streams
 from netkf.testing.noise import divergence, largest_deviation, log_level
 from netkf.testing.topologies import edge_transitive, small_networks
-from netkf.testing.watching import Watched, demand, demand_array, fail, made, user_code
+from netkf.testing.watching import Watched, demand, demand_array, fail, make_part, user_code
 
 SLOTS, SHORT, LAGS = 20_000, 200, 3
 
@@ -37,14 +37,14 @@ def check_matching(matching: Any, /, topology: Topology | None = None, **setting
 
     Raises AssertionError with one line: the method, the rule, the value got, what to do.
     """
-    part = made(matching, (SlotActivation,), settings)
+    part = make_part(matching, (SlotActivation,), settings)
     check_made_matching(part, topology, 0)
 
 
 def check_made_matching(part: Any, topology: Topology | None, seed: int) -> None:
     """Run ``check_matching`` on an object, with streams of the given seed."""
     watched = Watched(part)
-    copy = watched.pickled()
+    copy = watched.pickle_copy()
     networks = small_networks() if topology is None else (topology,)
     fitting = [network for network in networks if _fits(part, network, watched.name)]
     if isinstance(part, RecordedSlots):
@@ -86,9 +86,9 @@ def _check_network(watched: Watched, copy: Any, topology: Topology, seed: int) -
     part, where = watched.part, f"{watched.name}.draw"
     first = watched.call("draw", topology, _random(seed, 0), repeatable=False)
     demand(isinstance(first, list), where, "must return a list of pairs", first)
-    drawn = _drawn(part, topology, where, _random(seed, 0), SLOTS)
+    drawn = _draw_matchings(part, topology, where, _random(seed, 0), SLOTS)
     for words, other in (("at the second call", part), ("of a pickled object", copy)):
-        again = _drawn(other, topology, where, _random(seed, 0), SHORT)
+        again = _draw_matchings(other, topology, where, _random(seed, 0), SHORT)
         rule = "must draw the same from equal generators"
         differs = np.flatnonzero((again != drawn[:SHORT]).any(axis=1))
         got = f"other pairs in slot {differs[0]} {words}" if differs.size else None
@@ -97,7 +97,7 @@ def _check_network(watched: Watched, copy: Any, topology: Topology, seed: int) -
     _check_frequencies(watched, topology, drawn, mean)
     _check_slots_independent(where, topology, drawn)
     if drawn.any(axis=0).any() and (drawn[0] != drawn).any():
-        other = _drawn(part, topology, where, _random(seed, 1), SLOTS // 10)
+        other = _draw_matchings(part, topology, where, _random(seed, 1), SLOTS // 10)
         same = np.array_equal(other, drawn[: len(other)])
         rule = "must draw from the generator given"
         demand(not same, where, rule, "the same pairs from two different generators")
@@ -108,7 +108,7 @@ def _random(seed: int, run: int) -> np.random.Generator:
     return Streams(seed, run).generator("matching")
 
 
-def _drawn(
+def _draw_matchings(
     part: Any, topology: Topology, where: str, random: np.random.Generator, slots: int
 ) -> np.ndarray:
     """Return which links (slots, L) are in the matching of each slot."""

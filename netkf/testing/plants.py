@@ -30,7 +30,7 @@ from netkf.testing.watching import (
     demand,
     demand_array,
     distance,
-    made,
+    make_part,
     user_code,
 )
 
@@ -65,14 +65,14 @@ def check_plant(plant: Any, /, **settings: Any) -> None:
 
     Raises AssertionError with one line: the method, the rule, the value got, what to do.
     """
-    part = made(plant, (Plant,), settings)
+    part = make_part(plant, (Plant,), settings)
     check_made_plant(part, 0)
 
 
 def check_made_plant(part: Any, seed: int) -> None:
     """Run ``check_plant`` on an object, with streams of the given seed."""
     watched = Watched(part)
-    copy = watched.pickled()
+    copy = watched.pickle_copy()
     name = watched.name
     _check_form(part, name)
     if not part.is_random:
@@ -101,7 +101,7 @@ def _check_form(part: Any, name: str) -> None:
     demand(sound, where, "must be symmetric and positive semidefinite", cov)
 
 
-def _moved(part: Any) -> tuple[Any, FloatArray] | None:
+def _with_other_start(part: Any) -> tuple[Any, FloatArray] | None:
     """Return the plant with another mean of x(0), and by how much it moved; None where its class
     fixes the mean.
     """
@@ -208,7 +208,7 @@ def _check_slots(part: LinearPlant, copy: LinearPlant, name: str, seed: int) -> 
     some = [0, 0, 3, short // 2, short // 2, short]
     _demand_same(where, whole[some], path(part, some), "when slots are left out or asked for twice")
     _check_frames(part, where, whole, seed)
-    other = _moved(part)
+    other = _with_other_start(part)
     if other is not None:
         Phi = np.array([np.linalg.matrix_power(part.F, k) for k in numbers])
         _demand_follows(where, whole, path(other[0], numbers), Phi, other[1], "powers of F")
@@ -312,7 +312,7 @@ def _check_sampled(
     fewer = path(part, samples, sample_times=probes[:0])
     _demand_same(where, whole[drawn], fewer, "when nothing is probed")
     laws = [transition_law(part.A, part.B, second * gap) for gap in GAPS]
-    other = _moved(part)
+    other = _with_other_start(part)
     if other is not None:
         since = [np.eye(part.n)]
         for k in range(len(times)):
@@ -355,7 +355,7 @@ def _check_grid(part: Diffusion, name: str, seed: int, steps: int) -> None:
     last = np.append(np.diff(cut.step) > 0, True)
     _demand_same(where, alone.x_end[0], cut.x_end[0][last], "at the points of its grid when cut")
     _check_one_path(part, f"{name}.path", cut, (sample_times, sampled), seed)
-    other = _moved(part)
+    other = _with_other_start(part)
     if other is not None:
         moved = other[0].paths(
             *(GeneratorNormals([_random(seed, 1, p)]) for p in ("plant", "probe")), sample_times[:0]

@@ -43,9 +43,9 @@ class SensorReader:
             """Return the random generator of a purpose."""
             return streams.generator(purpose, node, 0)
 
-        return attempt(self.where, self._made, node, generator)
+        return attempt(self.where, self._make_path, node, generator)
 
-    def _made(self, node: int, generator: Callable[[str], np.random.Generator]) -> Any:
+    def _make_path(self, node: int, generator: Callable[[str], np.random.Generator]) -> Any:
         """Return the path of the sensor's readings."""
         return self.sensor.slot_path(node, PERIOD, generator)
 
@@ -60,11 +60,11 @@ class SensorReader:
     def one(self, path: Any, k: int, x: FloatArray) -> ReadingSeries:
         """Read a path once, with state x (n,): y (1, p) and H (1, p, n)."""
         with user_code(self.where):
-            y, H = self._one(path, k, x)
+            y, H = self._read_one(path, k, x)
         y = demand_array(self.where, "a reading", y, (self.p,))
         return ReadingSeries(y[None], demand_array(self.where, "H", H, (self.p, self.n))[None])
 
-    def _one(self, path: Any, k: int, x: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def _read_one(self, path: Any, k: int, x: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return reading ``k`` (p,) at the state x (n,), and its H (p, n)."""
         # As the engines do: first the reading, then its matrix.
         return path.reading(k, x), path.matrix(k)
@@ -75,11 +75,11 @@ class SampleReader(SensorReader):
 
     method = "samples"
 
-    def _made(self, node: int, generator: Callable[[str], np.random.Generator]) -> Any:
+    def _make_path(self, node: int, generator: Callable[[str], np.random.Generator]) -> Any:
         """Return the path of the sensor's samples."""
         return self.sensor.samples(node, generator, HORIZON)
 
-    def _one(self, path: Any, k: int, x: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def _read_one(self, path: Any, k: int, x: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return sample ``k`` (p,) at the state x (n,), and its H (p, n)."""
         y, H = path.reading(k, x)
         return y, H

@@ -30,7 +30,7 @@ from netkf.testing.readings import (
     gives_increments,
     readers,
 )
-from netkf.testing.watching import Watched, attempt, demand, distance, fail, made, user_code
+from netkf.testing.watching import Watched, attempt, demand, distance, fail, make_part, user_code
 
 READINGS, LENGTH, MAX_NODES = 100_000, 250, 8
 STEPS, RUNS = 500, 10
@@ -65,14 +65,14 @@ def check_sensor(sensor: Any, /, **settings: Any) -> None:
 
     Raises AssertionError with one line: the method, the rule, the value got, what to do.
     """
-    part = made(sensor, (Sensor,), settings)
+    part = make_part(sensor, (Sensor,), settings)
     check_made_sensor(part, 0)
 
 
 def check_made_sensor(part: Any, seed: int) -> None:
     """Run ``check_sensor`` on an object, with streams of the given seed."""
     watched = Watched(part)
-    copy = watched.pickled()
+    copy = watched.pickle_copy()
     if isinstance(part, NonlinearSensor):
         _check_nonlinear(part, watched.name, seed)
         return
@@ -116,15 +116,15 @@ def _check_same_readings(
             reader.one(other, k, x[k])
         between.append(reader.one(path, k, x[k]))
     apart = "when other sensors are read between its readings, one by one"
-    _demand_equal(reader, whole, _joined(between), apart)
+    _demand_equal(reader, whole, _concatenate(between), apart)
     path, some = reader.path(streams, node), [0, 1, 5, 6, 20, 39]
-    found = _joined([reader.one(path, k, x[k]) for k in some])
-    _demand_equal(reader, _chosen(whole, some), found, "when readings are left out")
+    found = _concatenate([reader.one(path, k, x[k]) for k in some])
+    _demand_equal(reader, _select(whole, some), found, "when readings are left out")
     path = reader.path(streams, node)
     parts = [reader.several(path, ks, x[ks]) for ks in ([0, 3], [4, 5, 6, 17], [39])]
-    found = _joined(parts)
+    found = _concatenate(parts)
     left = [0, 3, 4, 5, 6, 17, 39]
-    _demand_equal(reader, _chosen(whole, left), found, "when they are asked for in other groups")
+    _demand_equal(reader, _select(whole, left), found, "when they are asked for in other groups")
     _demand_equal(
         reader, whole, copy.several(copy.path(streams, node), numbers, x), "of a pickled sensor"
     )
@@ -145,12 +145,12 @@ def _demand_equal(
         )
 
 
-def _joined(parts: list[ReadingSeries]) -> ReadingSeries:
+def _concatenate(parts: list[ReadingSeries]) -> ReadingSeries:
     """Return several series one after the other."""
     return ReadingSeries(*(np.concatenate(some) for some in zip(*parts, strict=True)))
 
 
-def _chosen(whole: ReadingSeries, ks: list[int]) -> ReadingSeries:
+def _select(whole: ReadingSeries, ks: list[int]) -> ReadingSeries:
     """Return some readings of a series."""
     return ReadingSeries(whole.y[ks], whole.H[ks])
 

@@ -38,8 +38,12 @@ def demand(holds: object, where: str, rule: str, got: object = None, remedy: str
         fail(where, rule, got, remedy)
 
 
-def made(part: Any, contracts: tuple[type[Component], ...], settings: Mapping[str, Any]) -> Any:
-    """Return an object of a user's class: ``part`` itself, or the class made with ``settings``."""
+def make_part(
+    part: Any, contracts: tuple[type[Component], ...], settings: Mapping[str, Any]
+) -> Any:
+    """Return an object of a user's class: ``part`` itself, or the class make_part with
+    ``settings``.
+    """
     cls = part if isinstance(part, type) else type(part)
     name = cls.__name__
     listed = " or ".join(contract.__name__ for contract in contracts)
@@ -289,7 +293,7 @@ class Watched:
             "keep what changes in the paths and states that its methods return",
         )
 
-    def pickled(self) -> Any:
+    def pickle_copy(self) -> Any:
         """Return a copy of the part that went through pickle, as for worker processes."""
         try:
             copy = pickle.loads(pickle.dumps(self._owner))

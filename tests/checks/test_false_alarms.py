@@ -282,7 +282,7 @@ def test_runs_without_an_exact_covariance_are_judged_too(tmp_path, monkeypatch):
     monkeypatch.setattr(exact, "MIN_REPLAYED", 4)
     for kind in ("hybrid", "covariance-intersection"):
         scenario = scenario_of(RING, tmp_path, filter={"kind": kind, "epsilon": 0.3})
-        assert exact.most_replayed(scenario) == 4
+        assert exact.max_replayed(scenario) == 4
         found = check(scenario, runs=12, workers=1)
         assert found
         covariances = [row for row in found.rows if "e' Sigma^-1 e" in row.evidence]

@@ -10,7 +10,7 @@ import pytest
 import scipy.stats
 
 from netkf.checks.check import find_checks, judge_replicas, run_replica, with_check_times
-from netkf.checks.exact import _compare_pooled, _pool_nees, check_expected_nees, most_replayed
+from netkf.checks.exact import _compare_pooled, _pool_nees, check_expected_nees, max_replayed
 from netkf.checks.parts.clock_rows import _count_interval
 from netkf.checks.points import check_times, errors_at_once, sample_times
 from netkf.checks.samples import stack_summaries
@@ -85,7 +85,7 @@ def test_errors_have_the_freedom_to_find_five_per_cent(ring):
     scenario, results = ring
     joint = np.array([one.summary.joint for one in results])
     # The part of the level that the row has for all errors together, among ten rows.
-    found = _compare_pooled(np.tile(joint, (20, 1))[: most_replayed(scenario)], 0.01 / 40.0)
+    found = _compare_pooled(np.tile(joint, (20, 1))[: max_replayed(scenario)], 0.01 / 40.0)
     assert 0.0 < found.detectable <= 0.052
 
 
@@ -98,7 +98,7 @@ def test_runs_are_sampled_where_rows_look_and_often_enough(name):
     assert all(0.0 < time <= scenario.horizon for time in times)
     # A variance is known to 5 % with probability 0.9 from so many numbers, or from 500 runs.
     errors = len(times) * errors_at_once(scenario)
-    assert most_replayed(scenario) >= min(RUNS, 23_000 / errors)
+    assert max_replayed(scenario) >= min(RUNS, 23_000 / errors)
 
 
 @pytest.fixture(scope="module")

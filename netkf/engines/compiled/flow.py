@@ -36,7 +36,7 @@ from netkf.engines.compiled.origins import move_origin
 from netkf.engines.compiled.poisson import schedule
 from netkf.engines.compiled.running_totals import Totals, empty_totals
 from netkf.engines.compiled.sample_tables import SampleTables
-from netkf.engines.compiled.samples import recorded
+from netkf.engines.compiled.samples import record_samples
 from netkf.engines.compiled.schedule import ReadingsSchedule, Window
 from netkf.engines.compiled.senders import senders_of
 from netkf.engines.compiled.state import (
@@ -69,6 +69,7 @@ from netkf.scenario.scenario import Scenario
 from netkf.trace import recorder as recording
 from netkf.trace import schema
 from netkf.trace.recorder import Recorder
+from netkf.trace.run import StateSamples
 from netkf.trace.schema import EVENT
 
 FIRST_MESSAGES, FIRST_ROWS, FIRST_PAST = 64, 4096, 256
@@ -439,8 +440,9 @@ class FlowRun:
         error = local[:, None] - xhat
         if local is not x:
             xhat += (x - local)[:, None]
+        samples = StateSamples(times, x, xhat, P, error)
         parts = self._scenario, self._recorder, self._progress
-        fine = recorded(*parts, times, x, xhat, P, error, pass_rows_on)
+        fine = record_samples(*parts, samples, pass_rows_on)
         if self._totals is not None:
             self._recorder.sums = _sums(shown.terms[lost[0]], self._totals.receivers)
         return fine

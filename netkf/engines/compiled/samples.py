@@ -8,29 +8,27 @@ import numpy as np
 
 from netkf.engines.base import Progress
 from netkf.engines.soundness import sound_mask
-from netkf.linalg.arrays import FloatArray
 from netkf.scenario.scenario import Scenario
 from netkf.trace.recorder import NAN, Recorder
+from netkf.trace.run import StateSamples
 from netkf.trace.schema import CODES
 
 DIVERGED = CODES["diverged"]
 
 
-def recorded(
+def record_samples(
     scenario: Scenario,
     recorder: Recorder,
     progress: Progress,
-    times: FloatArray,
-    x: FloatArray,
-    xhat: FloatArray,
-    P: FloatArray,
-    error: FloatArray,
+    samples: StateSamples,
     pass_rows_on: Callable[[int], None],
 ) -> bool:
-    """Record the states x (T, n), xhat (T, H, n), P (T, H, n, n) and errors (T, H, n) of H
-    estimators at these times up to the first that is not sound; return True if there is none.
-    ``pass_rows_on`` is given the index of that one: what happened after it did not happen.
+    """Record samples up to the first that is not sound; return True if all are sound.
+
+    Where filters are pooled, ``samples`` have one estimator for all nodes. ``pass_rows_on`` is
+    called with the index of the first sample that is not sound: what happened after it is dropped.
     """
+    times, x, xhat, P, error = samples
     # The loop may stop for other reasons than samples.
     if not len(times):
         return True

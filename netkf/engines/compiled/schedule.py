@@ -345,7 +345,7 @@ class EntityDraws:
         return Ticks(t, np.repeat(indices, counts), self._outcomes.of(indices, counts, first))
 
 
-def _joined(parts: list[Ticks]) -> Ticks:
+def _concatenate(parts: list[Ticks]) -> Ticks:
     """Return several lists of ticks one after the other."""
     return Ticks(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
@@ -376,7 +376,7 @@ class Schedule:
         # An entity's ticks are complete up to ``end`` once its last known tick is beyond it.
         while len(late := np.flatnonzero(draws.last < end)):
             parts.append(draws.more(late))
-        known = _joined(parts)
+        known = _concatenate(parts)
         now = known.t < end
         # Ticks beyond the end wait for the next window.
         self._known = known.chosen(np.flatnonzero(~now), draws.sizes)
@@ -438,7 +438,7 @@ def whole_schedules(scenario: Scenario, streams: ReplicaStreams) -> list[Window]
     # All ticks up to the horizon: an entity whose last tick is infinite has ended.
     while len(late := np.flatnonzero(draws.last < math.inf)):
         parts.append(draws.more(late))
-    known, count = _joined(parts), draws.count // runs
+    known, count = _concatenate(parts), draws.count // runs
     run, entity = np.divmod(known.entity, count)
     # By run, then by (time, entity), as within one run.
     order = np.lexsort((entity, known.t, run))

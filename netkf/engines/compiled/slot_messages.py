@@ -453,7 +453,7 @@ def _slot_rows(
             # Absorptions happen at the end of the step, when its inboxes close.
             now = times.start[s] + stages.end[k]
             closing = Moment(m.slot, s, m.step, m.phase, now)
-            at = _closed(h, d, rows, closing, pairwise, stages.stopping, at)
+            at = _write_step_end(h, d, rows, closing, pairwise, stages.stopping, at)
     return at
 
 
@@ -497,7 +497,7 @@ def is_silent(d: Drawn, b: int, m: Moment, node: int, q: int) -> bool:
 
 
 @kernel
-def _closed(
+def _write_step_end(
     h: Hearing, d: Drawn, rows: Rows, m: Moment, pairwise: bool, stopping: int, at: int
 ) -> int:
     """Write who absorbs when a step ends, and who stops learning; return the row."""

@@ -26,7 +26,7 @@ from netkf.algorithms.kernels.slots import (
     slot_scratch,
 )
 from netkf.engines.base import Progress
-from netkf.engines.compiled.samples import recorded
+from netkf.engines.compiled.samples import record_samples
 from netkf.engines.compiled.slot_events import SlotEvents
 from netkf.engines.compiled.slot_messages import (
     Channels,
@@ -55,6 +55,7 @@ from netkf.rng.streams import ReplicaStreams, Streams
 from netkf.scenario.scenario import Scenario
 from netkf.trace.batch import COMPLETE, DIVERGED, RunBatch
 from netkf.trace.recorder import LONG, Recorder
+from netkf.trace.run import StateSamples
 from netkf.trace.schema import EVENT, KINDS
 
 NEVER = np.iinfo(np.int64).max
@@ -253,10 +254,10 @@ class SlotRuns:
             # One slot, and the filters say who sends before Python makes the messages.
             sent = events.asked()
             up = np.zeros((1, 1, len(sent), len(setup.directions)), dtype=np.uint8)
-            return self._times(1, True), _made(up, sent[None, None])
+            return self._times(1, True), _pack_messages(up, sent[None, None])
         # As many slots as gave about so many rows.
         count, up = events.following(rows, None)
-        return self._times(count, True), _made(up, np.zeros((0,) * 4, dtype=np.uint8))
+        return self._times(count, True), _pack_messages(up, np.zeros((0,) * 4, dtype=np.uint8))
 
     def _space(self, count: int) -> SampledStates:
         """Return empty arrays for ``count`` samples."""
@@ -471,7 +472,7 @@ class SlotRuns:
         return found
 
 
-def _made(up: np.ndarray, sent: np.ndarray) -> Drawn:
+def _pack_messages(up: np.ndarray, sent: np.ndarray) -> Drawn:
     """Return the messages (1, S, E, W) of one run, which Python made, and who sends, as kernels
     need them.
     """
@@ -516,7 +517,8 @@ def _record_block(
         # The rows up to the first broken sample, if there is one.
         recorder.extend(rows[: before[k]])
 
-    fine = recorded(scenario, recorder, progress, times, x, xhat, P, error, pass_rows_on)
+    samples = StateSamples(times, x, xhat, P, error)
+    fine = record_samples(scenario, recorder, progress, samples, pass_rows_on)
     if fine:
         recorder.extend(rows)
     return fine

@@ -49,13 +49,13 @@ def clock_processes(
     make = {"links": _links, "directions": _directions, "nodes": _nodes}
     activations = make[activation.at](*air)
     return [
-        _ticking(scenario, streams, timeline, recorder, entity, k, activate)
+        _tick_process(scenario, streams, timeline, recorder, entity, k, activate)
         # The index of an entity orders simultaneous ticks.
         for k, (entity, activate) in enumerate(activations)
     ]
 
 
-def _ticking(
+def _tick_process(
     scenario: Scenario,
     streams: Streams,
     timeline: Timeline,

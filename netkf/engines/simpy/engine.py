@@ -149,15 +149,15 @@ class _Simulation:
 
         nodes = _nodes(scenario, make)
         # Filters, readers and the clock are processes that meet by time and rank only.
-        processes = [node.running(self.timeline) for node in distinct(nodes)]
+        processes = [node.run_process(self.timeline) for node in distinct(nodes)]
         for node, placed in scenario.placed.items():
             sensors = [scenario.slot_path(streams, node, sensor) for sensor in placed]
             entity = scenario.topology.index[node]
             reader = Reader(recorder, schedule, node, entity, nodes[node])
-            processes.append(reader.running(self.timeline, truth, sensors))
+            processes.append(reader.run_process(self.timeline, truth, sensors))
         if scenario.hosted.talks:
             shared = (scenario, streams, recorder, schedule, self._transmitter, nodes)
-            processes.append(SlotClock(*shared).ticking(self.timeline))
+            processes.append(SlotClock(*shared).run_process(self.timeline))
         sums = _Sums(distinct(nodes))
         return [self._sampling_slots(truth, schedule, nodes, sums), *processes]
 

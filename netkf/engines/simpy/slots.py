@@ -147,7 +147,7 @@ class SlotNode(Node):
         self._stopped = False
         self._samples: list[tuple[FloatArray, Any]] = []
 
-    def running(self, timeline: Timeline) -> Process:
+    def run_process(self, timeline: Timeline) -> Process:
         """Run the process of the node: follow the schedule, slot after slot."""
         slot = 0
         # Readers and the clock follow the same stages; ranks put the processes in order.
@@ -244,7 +244,7 @@ class Reader:
         self._recorder, self._schedule = recorder, schedule
         self._node, self._entity, self._carrier = node, entity, carrier
 
-    def running(self, timeline: Timeline, truth: Any, sensors: list[Readings]) -> Process:
+    def run_process(self, timeline: Timeline, truth: Any, sensors: list[Readings]) -> Process:
         """Read at the "read" stage of every slot."""
         slot = 0
         while self._schedule.runs(slot):
@@ -284,7 +284,7 @@ class SlotClock:
             for k, link in enumerate(links)
         }
 
-    def ticking(self, timeline: Timeline) -> Process:
+    def run_process(self, timeline: Timeline) -> Process:
         """Tick at every "send" stage."""
         slot = 0
         while self._schedule.runs(slot):

@@ -142,7 +142,7 @@ class DelayedJumps:
         coupled = np.einsum("kl,aij->akilj", self._integral, self._own).reshape(-1, size, size)
         return np.linalg.inv(np.eye(size) - coupled)
 
-    def _moved(self, y: FloatArray) -> FloatArray:
+    def _apply_inverse(self, y: FloatArray) -> FloatArray:
         """Apply the inverse to y (k + 1, M, columns)."""
         N, (K, M, columns) = self.nodes, y.shape
         by_node = y.reshape(K, N, -1, columns).swapaxes(0, 1).reshape(N, -1, columns)
@@ -161,7 +161,7 @@ class DelayedJumps:
         E = np.stack([scipy.linalg.expm(s * self.A) for s in times])
         repeated = np.tile(E, (1, N, 1))
         start = np.tile(np.eye(n), (N, 1))
-        h = self._moved(start + np.tensordot(self._integral, G @ repeated, 1))
+        h = self._apply_inverse(start + np.tensordot(self._integral, G @ repeated, 1))
         both = np.tensordot(self._integral, E @ self.Q @ np.swapaxes(h, 1, 2), 1)
         noise = np.tensordot(self._integral, E @ self.Q @ np.swapaxes(E, 1, 2), 1)
         return E @ both[::-1], symmetric(noise[-1])
@@ -211,7 +211,7 @@ class DelayedJumps:
         """Return the solution K (k + 1, M, M) for nodes that hear nothing."""
         equation = symmetric(right[:1])
         first = 2.0 * (right[:1] - equation) + self._lyapunov(equation)
-        return self._moved(np.concatenate([first, right[1:] + first]))
+        return self._apply_inverse(np.concatenate([first, right[1:] + first]))
 
     @cached_property
     def _factors(self) -> dict[bool, Any]:
@@ -228,7 +228,7 @@ class DelayedJumps:
             scipy.linalg.lu_solve(self._factors[jumps], right.ravel()).reshape(right.shape)
         )
 
-    def _solved(self, right: FloatArray, jumps: bool, tolerance: float) -> FloatArray:
+    def _solve(self, right: FloatArray, jumps: bool, tolerance: float) -> FloatArray:
         """Return the solution K (k + 1, M, M) of the problem to a relative ``tolerance``."""
         if right.size <= MAX_DENSE:
             return self._by_elimination(right, jumps)
@@ -249,9 +249,9 @@ class DelayedJumps:
         """Return K (k + 1, M, M) at the points for an inhomogeneous part, with or without what
         jumps add. Raises TheoryError if it is not found.
         """
-        K = self._solved(right, jumps, FIRST_TOLERANCE)
+        K = self._solve(right, jumps, FIRST_TOLERANCE)
         for _ in range(MAX_ROUNDS):
-            change = self._solved(self._residual(K, right, jumps), jumps, CORRECTION)
+            change = self._solve(self._residual(K, right, jumps), jumps, CORRECTION)
             K, size = K + change, float(np.abs(change).max())
             if size <= TOLERANCE * np.abs(K).max():
                 return K
@@ -274,14 +274,14 @@ class DelayedJumps:
         heard = self._ways.products(*self.instant.all_pairs, Z)[:, :M, :M]
         return np.asarray(symmetric(self.instant.sampled(Z[:, :M, :M]) + heard)[0])
 
-    def excited(self, Phi: FloatArray) -> FloatArray:
+    def apply_jumps(self, Phi: FloatArray) -> FloatArray:
         """Return the Phi (1, M, M) that jumps make of errors driven by one, a positive map."""
         K = self._autocovariances(self._driven_by(Phi[0]), False)
         return self._inflow(self._moments(K, False))[None]
 
     @cached_property
     def is_bounded(self) -> bool:
-        """True if it is proved that the radius of ``excited`` is below 1: it maps some positive
+        """True if it is proved that the radius of ``apply_jumps`` is below 1: it maps some positive
         definite Phi to Phi - 1.
         """
         unit = self._driven_by(np.eye(len(self.instant.drift)))
@@ -309,7 +309,7 @@ class DelayedJumps:
             """Return the means one step later, after those of K steps in the past."""
             past = y.reshape(K, M)
             heard = self._integral @ (self._coupling @ past.T).T
-            return self._moved((past[-1] + heard)[:, :, None]).ravel()
+            return self._apply_inverse((past[-1] + heard)[:, :, None]).ravel()
 
         size = K * M
         if size <= MAX_DENSE_MEAN:

@@ -45,7 +45,9 @@ def mean_square_radius(scenario: Scenario) -> float:
         system = _system(scenario)
         if isinstance(system, DelayedJumps):
             return (
-                spectral_radius(system.excited, system.shape) if system.mean_is_stable else np.inf
+                spectral_radius(system.apply_jumps, system.shape)
+                if system.mean_is_stable
+                else np.inf
             )
     return _solve(scenario)[0]
 
