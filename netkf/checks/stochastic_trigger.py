@@ -42,8 +42,8 @@ def check_rate(samples: RunSamples, level: float) -> Finding:
     spread = float(difference.std(ddof=1)) / np.sqrt(len(difference))
     found = student_interval(1.0 + float(difference.mean()), spread, len(difference), level)
     apart = deviation_interval(1.0, found)
-    words = f"messages sent over those expected given the past, {sent.sum():,.0f} sent"
-    return find_largest([(apart, "all nodes and slots")], RATE_TOLERANCE, words)
+    text = f"messages sent over those expected given the past, {sent.sum():,.0f} sent"
+    return find_largest([(apart, "all nodes and slots")], RATE_TOLERANCE, text)
 
 
 NEEDS = ("the filters know", "every node hears", "the filters start", REACH)

@@ -131,10 +131,10 @@ def _draw_ages(axes: Any, edges: FloatArray, ages: list[Ages]) -> None:
         axes.fill_between(centres, low, high, color=SKY, alpha=0.5, lw=0, label="90% of nodes")
     else:
         median = means[0]
-    words = ("worst node", "median node") if len(ages) > 1 else ("the node", "the node")
-    label = f"{words[0]}, at its worst moment"
+    text = ("worst node", "median node") if len(ages) > 1 else ("the node", "the node")
+    label = f"{text[0]}, at its worst moment"
     axes.plot(centres, largest, color=SENSING, ls="--", lw=1.0, label=label)
-    axes.plot(centres, median, color=INK, lw=1.2, label=f"{words[1]}, on average")
+    axes.plot(centres, median, color=INK, lw=1.2, label=f"{text[1]}, on average")
     axes.set(xlabel=SECONDS, ylabel="age of information, seconds")
     axes.set_ylim(0.0, 1.05 * max(float(largest.max()), 1e-12))
     draw_legend(axes)

@@ -34,7 +34,7 @@ VERDICT: dict[str, Any] = {
 }
 COMPARISON: dict[str, Any] = {"filters": TEXTS, "confidence": NUMBER}
 """What the manifest of a comparison has beside that of a run."""
-WORDS = ("filter", "consistency", "status")
+TEXT_COLUMNS = ("filter", "consistency", "status")
 FILTERS = "filters.parquet"
 TRAFFIC = ("transmissions", "bytes")
 PARTS = ("se", "difference", "low", "high", "real")
@@ -65,7 +65,7 @@ def read_comparison(directory: Path, base: Scenario, manifest: dict[str, Any]) -
     numbers = read_numbers(path, [*QUANTITIES, *parts, *TRAFFIC], missing=True)
     columns: dict[str, Any] = {str(name): values.tolist() for name, values in numbers.items()}
     columns |= {name: read_flags(path, name).tolist() for name in FLAGS}
-    columns |= {name: read_texts(path, name).astype(str).tolist() for name in WORDS}
+    columns |= {name: read_texts(path, name).astype(str).tolist() for name in TEXT_COLUMNS}
     rows = [
         _read_filter({name: values[k] for name, values in columns.items()})
         for k in range(len(numbers))

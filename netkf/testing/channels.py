@@ -203,9 +203,9 @@ def _fractions(watched: Watched, links: dict[Link, float], seed: int) -> None:
             continue
         if (off := _deviation(arrived[:, :, known], stated[known], part.independent)) is not None:
             some = list(links)[int(np.argmax(known))] if known.sum() == 1 else "all links"
-            words = f"{stated[known].mean():.4g}, and {stated[known].mean() + off:.4g} of "
+            text = f"{stated[known].mean():.4g}, and {stated[known].mean() + off:.4g} of "
             count = f"{arrived[:, :, known].size:,} simulated messages came over {some}"
-            fail(where, rule, words + count)
+            fail(where, rule, text + count)
     if part.independent:
         _independent(watched, arrived, tuple(links))
     elif type(chain := stated_part(part, "loss")) is GilbertElliott:
@@ -218,10 +218,10 @@ def _check_bursts(watched: Watched, chain: GilbertElliott, arrived: FloatArray) 
     twice = (lost[:, 1:] * lost[:, :-1]).mean(axis=1) - expected
     found = largest_deviation(twice.reshape(-1, 1))
     if found is not None:
-        words = f"{expected + found.mean:.4g} (+- {found.error:.2g}) instead of {expected:.4g}"
+        text = f"{expected + found.mean:.4g} (+- {found.error:.2g}) instead of {expected:.4g}"
         rule = "losses must follow each other as in GilbertElliott, from which it derives"
         remedy = "define mean_delivery too if it differs by design"
-        demand(False, f"{watched.name}.next_state", rule, f"two in a row: {words}", remedy)
+        demand(False, f"{watched.name}.next_state", rule, f"two in a row: {text}", remedy)
 
 
 def _deviation(arrived: FloatArray, stated: FloatArray, independent: bool) -> float | None:
@@ -254,7 +254,7 @@ def _independent(watched: Watched, arrived: FloatArray, links: tuple[Link, ...])
         if unlikely.any():
             index = np.unravel_index(int(np.argmax(unlikely * np.abs(both - expected))), both.shape)
             one, other = (list(links[k]) for k in index)
-            words = f"both arrive in {both[index]:.4g} of cases instead of {expected[index]:.4g}"
+            text = f"both arrive in {both[index]:.4g} of cases instead of {expected[index]:.4g}"
             apart = f"message k over link {one} and message k + {lag} over link {other}"
             same = index[0] == index[1]
             which = "neighbouring activations" if same else "different links"
@@ -262,7 +262,7 @@ def _independent(watched: Watched, arrived: FloatArray, links: tuple[Link, ...])
                 False,
                 f"{watched.name}.independent",
                 f"must be False where outcomes of {which} are related",
-                f"{apart}: {words}",
+                f"{apart}: {text}",
                 "return False: theory relies on it",
             )
 
@@ -340,8 +340,8 @@ def _check_delay_law(watched: Watched, links: tuple[Link, ...]) -> None:
     far = distance > math.sqrt(0.5 * log_level(1) / values.size)
     if found is not None or far:
         which = list(links[found.position[0] - 1]) if found and found.position[0] else "all links"
-        words = f"a distance of {distance:.3g} from it, furthest off {which}"
-        demand(False, where, rule, words, remedy)
+        text = f"a distance of {distance:.3g} from it, furthest off {which}"
+        demand(False, where, rule, text, remedy)
 
 
 def _check_draws(watched: Watched) -> None:
@@ -362,8 +362,8 @@ def _check_draws(watched: Watched) -> None:
     unit = (rankdata(drawn) - 0.5) / len(drawn) - 0.5
     found = largest_deviation((unit[1:] * unit[:-1])[:, None]) if varies else None
     if found is not None:
-        words = f"a correlation of ranks of {12.0 * found.mean:.3g} (+- {12.0 * found.error:.2g})"
-        fail(where, "delays of neighbouring messages must be independent", words)
+        text = f"a correlation of ranks of {12.0 * found.mean:.3g} (+- {12.0 * found.error:.2g})"
+        fail(where, "delays of neighbouring messages must be independent", text)
 
 
 def _check_message_delays(watched: Watched, links: tuple[Link, ...]) -> None:
@@ -407,7 +407,7 @@ def _draw_delays(watched: Watched) -> list[float]:
             "draw a fixed number of values, then decide",
         )
         same = fixed is None or seconds == fixed
-        words = "must be what draw returns, or None"
-        demand(same, f"{watched.name}.fixed", words, f"{fixed} for {seconds}")
+        text = "must be what draw returns, or None"
+        demand(same, f"{watched.name}.fixed", text, f"{fixed} for {seconds}")
         delays.append(seconds)
     return delays

@@ -128,8 +128,8 @@ def _check_apart(watched: Watched, entities: tuple[Entity, ...]) -> None:
         got = [tick for tick in between[entity] if not math.isnan(tick)]
         same = got == alone[entity]
         rule = "ticks of a link must not depend on those of others"
-        words = f"other times of {list(entity)} when other links tick in between"
-        demand(same, where, rule, words, "use the generator given, and no memory of earlier calls")
+        text = f"other times of {list(entity)} when other links tick in between"
+        demand(same, where, rule, text, "use the generator given, and no memory of earlier calls")
 
 
 def _phase(part: Any, entity: Entity, k: int) -> float:
@@ -253,10 +253,8 @@ def _check_stated_law(watched: Watched, gaps: FloatArray, times: FloatArray) -> 
             times.ravel(), number, np.full(number.shape, times.shape[1]), number == 0
         )
         off = distance_from_lattice(stated, ticks)
-        words = f"{off:.3g} s beside one of them"
-        demand(
-            off <= 1e-9 * times.max(), where, f"must tick at the times of {known}", words, remedy
-        )
+        text = f"{off:.3g} s beside one of them"
+        demand(off <= 1e-9 * times.max(), where, f"must tick at the times of {known}", text, remedy)
     uniform = gap_law(stated, gaps.reshape(-1)).reshape(gaps.shape)
     if np.isfinite(uniform).all():
         _check_uniform(uniform, where, f"gaps must have the law of {known}", remedy)
@@ -278,8 +276,8 @@ def _check_drawn(watched: Watched, entities: tuple[Entity, ...], gaps: FloatArra
         demand(not same, f"{watched.name}.ticks", rule, "equal times from two generators")
     for a in range(1, len(entities) if varies and watched.part.memoryless else 0):
         same = np.array_equal(gaps[a] / gaps[a].mean(), gaps[0] / gaps[0].mean())
-        words = f"equal times of {list(entities[0])} and {list(entities[a])} from two generators"
-        demand(not same, f"{watched.name}.ticks", rule, words)
+        text = f"equal times of {list(entities[0])} and {list(entities[a])} from two generators"
+        demand(not same, f"{watched.name}.ticks", rule, text)
 
 
 def _check_rates(
@@ -304,11 +302,11 @@ def _check_rates(
         limit = float(stdtrit(len(values) - 1, 1.0 - 0.5 * LEVEL / (FAMILIES * len(groups))))
         off = float(values.mean())
         if abs(off) > limit * error + DRIFT:
-            words = f"{1.0 + off:.4g} (+- {error:.2g}) of the mean gap that it states"
+            text = f"{1.0 + off:.4g} (+- {error:.2g}) of the mean gap that it states"
             if not is_known:
-                words = f"{1.0 + off:.4g} (+- {error:.2g}) of the mean gap of other links"
+                text = f"{1.0 + off:.4g} (+- {error:.2g}) of the mean gap of other links"
             remedy = "" if is_known else "define mean_rate if links differ by design"
-            demand(False, where, rule, f"{words}, over {name}", remedy)
+            demand(False, where, rule, f"{text}, over {name}", remedy)
 
 
 def _exponential(watched: Watched, entities: tuple[Entity, ...], gaps: FloatArray) -> None:
@@ -323,9 +321,9 @@ def _exponential(watched: Watched, entities: tuple[Entity, ...], gaps: FloatArra
         for b, other in enumerate(entities[:a]):
             found = largest_deviation((unit[a] * unit[b]).reshape(-1, 1))
             if found is not None:
-                words = f"a correlation of {found.mean:.3g} of {list(other)} and {list(one)}"
+                text = f"a correlation of {found.mean:.3g} of {list(other)} and {list(one)}"
                 rule = "ticks of links with streams of their own must be independent"
-                demand(False, f"{watched.name}.ticks", rule, words, "use the generator given")
+                demand(False, f"{watched.name}.ticks", rule, text, "use the generator given")
 
 
 def _check_uniform(uniform: FloatArray, where: str, rule: str, remedy: str) -> FloatArray:
@@ -337,12 +335,12 @@ def _check_uniform(uniform: FloatArray, where: str, rule: str, remedy: str) -> F
     apart = float(max((steps[1:] - values).max(), (values - steps[:-1]).max()))
     # P(sqrt(N) D > x) <= 2 exp(-2 x^2), Massart 1990.
     limit = math.sqrt(0.5 * math.log(2.0 * FAMILIES / LEVEL) / values.size)
-    words = f"gaps at a distance of {apart:.3g} from the law"
-    demand(apart <= limit, where, rule, words, remedy)
+    text = f"gaps at a distance of {apart:.3g} from the law"
+    demand(apart <= limit, where, rule, text, remedy)
     # Of uniform numbers, so that long gaps do not hide the others.
     unit = np.asarray(math.sqrt(12.0) * (uniform - 0.5))
     pairs = (unit[:, :, 1:] * unit[:, :, :-1]).reshape(-1, 1)
     if (found := largest_deviation(pairs)) is not None:
-        words = f"neighbouring gaps with a correlation of {found.mean:.3g} +- {found.error:.2g}"
-        demand(False, where, rule, words, remedy)
+        text = f"neighbouring gaps with a correlation of {found.mean:.3g} +- {found.error:.2g}"
+        demand(False, where, rule, text, remedy)
     return unit

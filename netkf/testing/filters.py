@@ -83,8 +83,8 @@ def _class_variables(watched: Watched) -> None:
         demand(isinstance(value, bool), f"{name}.{flag}", "must be True or False", value)
     clocks = part.clocks
     known = isinstance(clocks, tuple) and set(clocks) <= set(CLOCKS)
-    words = ", ".join(f'"{clock}"' for clock in CLOCKS)
-    demand(known, f"{name}.clocks", f"must be a tuple of {words}", clocks)
+    text = ", ".join(f'"{clock}"' for clock in CLOCKS)
+    demand(known, f"{name}.clocks", f"must be a tuple of {text}", clocks)
     somewhere = bool(clocks) or part.schedule is not None or not part.talks
     rule = "must name a clock where schedule is None: the filter could not run at all"
     demand(somewhere, f"{name}.clocks", rule, clocks)
@@ -102,8 +102,8 @@ def _schedule(watched: Watched) -> None:
         demand(sound, where, 'must be a tuple of "exchange" and "sense" with one "sense"', schedule)
     else:
         known = isinstance(schedule, tuple) and set(schedule) <= set(PHASES)
-        words = ", ".join(f'"{phase}"' for phase in PHASES)
-        demand(known, where, f"must be None or a tuple of {words}", schedule)
+        text = ", ".join(f'"{phase}"' for phase in PHASES)
+        demand(known, where, f"must be None or a tuple of {text}", schedule)
         once = max(schedule.count("predict"), schedule.count("sense")) <= 1
         demand(once, where, 'must have one "predict" and one "sense" at most', schedule)
         _check_predicts(watched, schedule)

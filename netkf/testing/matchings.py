@@ -54,9 +54,9 @@ def check_made_matching(part: Any, topology: Topology | None, seed: int) -> None
     if isinstance(part, Broadcast):
         return
     drawn = isinstance(part, Matching)
-    words = "netkf.parts.Matching and define draw and mean"
+    text = "netkf.parts.Matching and define draw and mean"
     rule = "must be derived from Matching, RecordedSlots or Broadcast"
-    demand(drawn, watched.name, rule, None, f"derive it from {words}")
+    demand(drawn, watched.name, rule, None, f"derive it from {text}")
     before = watched.attributes()
     for network in fitting:
         with user_code(f"{watched.name}.draw"):
@@ -87,11 +87,11 @@ def _check_network(watched: Watched, copy: Any, topology: Topology, seed: int) -
     first = watched.call("draw", topology, _random(seed, 0), repeatable=False)
     demand(isinstance(first, list), where, "must return a list of pairs", first)
     drawn = _draw_matchings(part, topology, where, _random(seed, 0), SLOTS)
-    for words, other in (("at the second call", part), ("of a pickled object", copy)):
+    for text, other in (("at the second call", part), ("of a pickled object", copy)):
         again = _draw_matchings(other, topology, where, _random(seed, 0), SHORT)
         rule = "must draw the same from equal generators"
         differs = np.flatnonzero((again != drawn[:SHORT]).any(axis=1))
-        got = f"other pairs in slot {differs[0]} {words}" if differs.size else None
+        got = f"other pairs in slot {differs[0]} {text}" if differs.size else None
         demand(not differs.size, where, rule, got, "use only the generator given")
     mean = _stated_mean(watched, topology)
     _check_frequencies(watched, topology, drawn, mean)
@@ -166,14 +166,14 @@ def _check_frequencies(
         rule = "must pair links as often as mean says"
         count = largest_deviation(drawn.sum(axis=1)[:, None] - mean.sum())
         if count is not None:
-            words = f"{count.mean + mean.sum():.4g} (+- {count.error:.2g}) pairs a slot"
-            fail(f"{watched.name}.draw", rule, f"{words} instead of {mean.sum():.4g}")
+            text = f"{count.mean + mean.sum():.4g} (+- {count.error:.2g}) pairs a slot"
+            fail(f"{watched.name}.draw", rule, f"{text} instead of {mean.sum():.4g}")
     unlikely = slots * divergence(found, mean) > log_level(len(found))
     if unlikely.any():
         k = int(np.argmax(unlikely * np.abs(found - mean)))
-        words = f"{found[k]:.4g} for link {list(topology.links[k])} in {slots:,} slots"
+        text = f"{found[k]:.4g} for link {list(topology.links[k])} in {slots:,} slots"
         graph = f"on {len(topology.nodes)} nodes and {len(topology.links)} links"
-        fail(f"{watched.name}.draw", rule, f"{words} instead of {mean[k]:.4g}, {graph}")
+        fail(f"{watched.name}.draw", rule, f"{text} instead of {mean[k]:.4g}, {graph}")
 
 
 def _check_slots_independent(where: str, topology: Topology, drawn: np.ndarray) -> None:
@@ -187,7 +187,7 @@ def _check_slots_independent(where: str, topology: Topology, drawn: np.ndarray) 
             continue
         index = np.unravel_index(int(np.argmax(unlikely * np.abs(both - expected))), both.shape)
         one, other = (list(topology.links[k]) for k in index)
-        words = f"link {one} and then {other} in {both[index]:.4g} of slots"
+        text = f"link {one} and then {other} in {both[index]:.4g} of slots"
         rule = f"matchings of slots that are {lag} apart must be independent"
         remedy = "remember nothing, and draw from the generator given"
-        fail(where, rule, f"{words} instead of {expected[index]:.4g}", remedy)
+        fail(where, rule, f"{text} instead of {expected[index]:.4g}", remedy)

@@ -31,10 +31,10 @@ def assert_dominated(P: ArrayLike, bound: ArrayLike, tolerance: float = 1e-9) ->
     relative = np.asarray(least / size)
     if relative.size and float(relative.min()) < -tolerance:
         index = np.unravel_index(int(np.argmin(relative)), relative.shape)
-        words = f"the least eigenvalue of bound - P is {float(least[index]):.4g}"
+        text = f"the least eigenvalue of bound - P is {float(least[index]):.4g}"
         count = int((relative < -tolerance).sum())
         many = f", one of {count} places of {relative.size}" if relative.size > 1 else ""
-        fail(f"P{_at(index)}", f"must stay below the bound; {words}{many}")
+        fail(f"P{_at(index)}", f"must stay below the bound; {text}{many}")
 
 
 def _at(index: object) -> str:

@@ -123,9 +123,9 @@ def _check_moments(e: FloatArray, stated: Stated, when: str) -> None:
     q = e.shape[-1]
     flat = e.reshape(-1, q)
     if (found := largest_deviation(flat)) is not None:
-        words = f"a mean of {found.mean:.3g} standard deviations (+- {found.error:.2g})"
+        text = f"a mean of {found.mean:.3g} standard deviations (+- {found.error:.2g})"
         rule = f"{stated.noise} must have the mean 0"
-        fail(stated.where, rule, f"{words} in component {found.position[0]}{when}")
+        fail(stated.where, rule, f"{text} in component {found.position[0]}{when}")
     products = flat[:, :, None] * flat[:, None, :] - np.eye(q)
     if (found := largest_deviation(products)) is not None:
         i, j = found.position
@@ -150,8 +150,8 @@ def check_uncorrelated(one: FloatArray, other: FloatArray, stated: Stated, apart
     if found is not None:
         i, j = found.position
         rule = f"{stated.noise} must be uncorrelated with {stated.noise} {apart}"
-        words = f"a correlation of {found.mean:.3g} (+- {found.error:.2g})"
-        fail(stated.where, rule, f"{words} of components {i} and {j}")
+        text = f"a correlation of {found.mean:.3g} (+- {found.error:.2g})"
+        fail(stated.where, rule, f"{text} of components {i} and {j}")
 
 
 def check_unrelated(e: FloatArray, known: FloatArray, stated: Stated, what: str) -> None:
@@ -166,13 +166,13 @@ def check_unrelated(e: FloatArray, known: FloatArray, stated: Stated, what: str)
         if found is not None:
             rule = f"{stated.noise} must not depend on {what}"
             size = f"{2.0 * found.mean:.3g} (+- {2.0 * found.error:.2g})"
-            words = (
+            text = (
                 f"another {power} of component {found.position[0]}, by {size} in units of its own"
             )
             fail(
                 stated.where,
                 rule,
-                f"{words}, where component {found.position[1]} is above its median",
+                f"{text}, where component {found.position[1]} is above its median",
             )
 
 

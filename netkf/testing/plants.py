@@ -234,12 +234,12 @@ def _compare_frames(part: LinearPlant, where: str, whole: FloatArray, truth: Any
     origin = np.zeros(part.n)
     for slot, x in enumerate(whole):
         origin = part.F @ origin if slot else origin
-        for words, state in (
+        for text, state in (
             ("absolute", truth.absolute(slot)),
             ("local", truth.local(slot) + origin),
         ):
             apart = distance(np.asarray(state), x)
-            rule = f"{words} states must be the same in frames, up to the origin"
+            rule = f"{text} states must be the same in frames, up to the origin"
             demand(apart <= FRAMED, where, rule, f"{apart:.3g} of the state apart in slot {slot}")
         if frame and slot and slot % frame == 0:
             origin = origin + truth.rebase(slot)
@@ -326,9 +326,9 @@ def _check_sampled(
             states[:, k + 1 :: 4] - states[:, k:-1:4][:, : states[:, k + 1 :: 4].shape[1]] @ Phi.T
         )
         before = states[:, k:-1:4][:, : steps.shape[1]]
-        words = f"the noise x(t + g) - e^(A g) x(t) over {second * GAPS[k]:.3g} s"
+        text = f"the noise x(t + g) - e^(A g) x(t) over {second * GAPS[k]:.3g} s"
         rule = "x(t + g) must be e^(A g) x(t) where B has no noise"
-        _check_noise(steps, S, before, Stated(where, words, "B"), rule)
+        _check_noise(steps, S, before, Stated(where, text, "B"), rule)
 
 
 def _check_grid(part: Diffusion, name: str, seed: int, steps: int) -> None:
@@ -368,12 +368,12 @@ def _check_grid(part: Diffusion, name: str, seed: int, steps: int) -> None:
     start, end = found.x_start[:, :steps], found.x_end[:, :steps]
     ends = np.concatenate([end, *(found.moments[:, :steps, m] for m in range(2))], axis=2)
     Phi, S = moment_law(part.A, part.B, period)
-    words = f"the noise of x and its two moments over steps of {period:g} s"
+    text = f"the noise of x and its two moments over steps of {period:g} s"
     rule = "x and its moments must follow from the state before where B has no noise"
     # In units in which x and its moments are of one size.
     units = np.repeat([1.0, 1.0 / period, 1.0 / period], part.n)
     noise = (ends - start @ Phi.T) * units
-    _check_noise(noise, S * np.outer(units, units), start, Stated(where, words, "B"), rule)
+    _check_noise(noise, S * np.outer(units, units), start, Stated(where, text, "B"), rule)
 
 
 def _check_one_path(

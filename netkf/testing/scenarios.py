@@ -16,8 +16,8 @@ def scenario_files(folder: str | Path = "scenarios") -> list[Path]:
     """
     found = sorted(Path(folder).glob("*.toml"))
     if not found:
-        words = "holds no scenario files" if Path(folder).is_dir() else "is not a folder"
-        raise ScenarioError("scenario_files", words, str(folder), "name a folder of .toml files")
+        text = "holds no scenario files" if Path(folder).is_dir() else "is not a folder"
+        raise ScenarioError("scenario_files", text, str(folder), "name a folder of .toml files")
     return found
 
 

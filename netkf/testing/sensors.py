@@ -281,8 +281,8 @@ def _check_regressors(
             fail(reader.where, rule, f"{off:.3g} off where it is certain, in slot {k}")
         unit = gap @ law.free.T
         v = noise[:, :, k].reshape(-1, 1) / np.sqrt(sensor.R[0, 0])
-        words = Stated(reader.where, "the noise y - H x", "R")
-        check_unrelated(v, rows[:, :, k].reshape(len(v), -1), words, f"H, in slot {k}")
+        text = Stated(reader.where, "the noise y - H x", "R")
+        check_unrelated(v, rows[:, :, k].reshape(len(v), -1), text, f"H, in slot {k}")
         if unit.size:
             check_white(unit.reshape(-1, 1, unit.shape[-1]), stated)
         if unit.size and len(pair) > 1:
@@ -349,8 +349,8 @@ def _check_sampling_rate(sensor: Any, where: str, nodes: tuple[int, ...], seed: 
     found = largest_deviation(counts[:, None] / expected - 1.0, fewest=TIMES_RUNS // 2)
     # One tick more or less in a run is a matter of its phase.
     if found is not None and abs(found.mean) > 1.0 / expected:
-        words = f"{1.0 + found.mean:.4g} (+- {found.error:.2g}) of the stated number of samples"
-        fail(where, "must be as many as the mean rate of `sampling` states", words)
+        text = f"{1.0 + found.mean:.4g} (+- {found.error:.2g}) of the stated number of samples"
+        fail(where, "must be as many as the mean rate of `sampling` states", text)
 
 
 def _times(sensor: Any, where: str, node: int, seed: int, horizon: float) -> FloatArray:

@@ -64,9 +64,9 @@ def make_part(
     try:
         return cls(**settings)
     except Exception as error:
-        words = f"could not be made with the settings {dict(settings)!r}"
+        text = f"could not be made with the settings {dict(settings)!r}"
         remedy = "hand over an object, or the class with its settings as keywords"
-        fail(name, words, describe_error(error), remedy)
+        fail(name, text, describe_error(error), remedy)
 
 
 def leaves(value: Any, path: str = "", visited: frozenset[int] = frozenset()) -> Iterator[Any]:
@@ -129,8 +129,8 @@ def global_randomness() -> tuple[Any, Any]:
         return _python_randomness(), repr(shared.state)
     # Its memory: numpy takes 0.1 ms to list the state, and this is asked before and after each
     # call of a user's method.
-    words = ctypes.string_at(shared.ctypes.state_address, MERSENNE_BYTES)
-    return _python_randomness(), (id(shared), words)
+    text = ctypes.string_at(shared.ctypes.state_address, MERSENNE_BYTES)
+    return _python_randomness(), (id(shared), text)
 
 
 def _python_randomness() -> Any:
@@ -156,8 +156,8 @@ def _python_state_address() -> int | None:
     if sys.implementation.name != "cpython" or size < head + MERSENNE_BYTES:
         return None
     address = id(_shared_random()) + head
-    position, *words = struct.unpack("=625I", ctypes.string_at(address, MERSENNE_BYTES))
-    return address if random.getstate()[1] == (*words, position) else None
+    position, *text = struct.unpack("=625I", ctypes.string_at(address, MERSENNE_BYTES))
+    return address if random.getstate()[1] == (*text, position) else None
 
 
 def _static(cls: type, name: str) -> Any:
@@ -254,8 +254,8 @@ class Watched:
         except Exception as error:
             singular = isinstance(error, np.linalg.LinAlgError)
             remedy = "; set inverts = True where covariances must not be singular"
-            words = f"{where}: failed with {describe_error(error)}{remedy if singular else ''}"
-            raise AssertionError(words) from error
+            text = f"{where}: failed with {describe_error(error)}{remedy if singular else ''}"
+            raise AssertionError(text) from error
         demand(
             global_randomness() == before,
             where,

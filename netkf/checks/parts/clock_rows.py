@@ -320,7 +320,7 @@ def largest_correlation(
     return deviation_interval(0.0, found), (int(kept[a]), int(kept[b]))
 
 
-def _promises(clocks: ClockSamples, group: Group, words: dict[str, str]) -> list[Promise]:
+def _promises(clocks: ClockSamples, group: Group, sentences: dict[str, str]) -> list[Promise]:
     """Return the promises about one group of clocks, with a sentence for each test."""
     rows: list[tuple[str, Callable[..., Finding], bool]] = [("rates", _rates, False)]
     if clocks.poisson:
@@ -330,19 +330,19 @@ def _promises(clocks: ClockSamples, group: Group, words: dict[str, str]) -> list
     if not clocks.poisson and clocks.counts.cells.any():
         rows.append(("law", _gaps, False))
     return [
-        Promise(words[name], "the scenario", (), partial(test, group), exact)
+        Promise(sentences[name], "the scenario", (), partial(test, group), exact)
         for name, test, exact in rows
     ]
 
 
-NETWORK_WORDS = {
+NETWORK_SENTENCES = {
     "rates": "clocks tick at the rates of the scenario",
     "exponential": "gaps between ticks are exponential, and independent of those before",
     "apart": "clocks tick independently of each other",
     "lattice": "clocks tick at the times of the scenario",
     "law": "ticks follow the law of their clocks, and do not depend on those before",
 }
-SAMPLING_WORDS = {
+SAMPLING_SENTENCES = {
     "rates": "sensors sample at the rates of the scenario",
     "exponential": "gaps between samples are exponential, and independent of those before",
     "apart": "sensors sample independently of each other",
@@ -354,12 +354,12 @@ SAMPLING_WORDS = {
 def clock_promises(samples: PartSamples) -> list[Promise]:
     """Return the promises about clocks that have a stated law and were seen in the runs."""
     found: list[Promise] = []
-    for counts, group, words in (
-        (samples.ticks, _network, NETWORK_WORDS),
-        (samples.sampling, _sampling, SAMPLING_WORDS),
+    for counts, group, sentences in (
+        (samples.ticks, _network, NETWORK_SENTENCES),
+        (samples.sampling, _sampling, SAMPLING_SENTENCES),
     ):
         if counts is not None:
             clocks = group(samples)
             if np.isfinite(clocks.rates).all():
-                found += _promises(clocks, group, words)
+                found += _promises(clocks, group, sentences)
     return found

@@ -124,8 +124,8 @@ def start_states(scenario: Scenario, seed: int, count: int) -> FloatArray:
     """Return x(0) (count, n) of replicas 0 to count - 1."""
     # Ours are drawn together, with the same numbers; a class of a user draws as it does.
     if type(scenario.plant) in (LinearPlant, Diffusion):
-        words = ReplicaStreams(seed, 0, count).seed_words("plant", [()])
-        return scenario.plant.starts(StreamNormals(words))
+        text = ReplicaStreams(seed, 0, count).seed_words("plant", [()])
+        return scenario.plant.starts(StreamNormals(text))
     drawn = []
     for replica in range(count):
         random = Streams(seed, replica).generator("plant")

@@ -93,11 +93,11 @@ class BeliefRule(ErrorRule):
         if self.scenario.slotted:
             self._begin_slot()
         columns = self.errors.reading_noises(observations)
-        for estimator, one in observations.items():
-            weighted = np.linalg.solve(one.R, one.H).T
+        for estimator, observation in observations.items():
+            weighted = np.linalg.solve(observation.R, observation.H).T
             U, s = self._sum([_own(estimator)])
-            s[:, columns[estimator]] += weighted @ one.root
-            self._put(_own(estimator), U + weighted @ one.H, s)
+            s[:, columns[estimator]] += weighted @ observation.root
+            self._put(_own(estimator), U + weighted @ observation.H, s)
         for estimator in observations:
             self._believe(estimator)
 

@@ -150,7 +150,9 @@ class StackedErrors:
 
         Use the columns before any other operation that adds inputs.
         """
-        ends = np.cumsum([0, *(len(one.H) for one in observations.values())]).tolist()
+        ends = np.cumsum(
+            [0, *(len(observation.H) for observation in observations.values())]
+        ).tolist()
         columns = self.stack.inputs(ends[-1])
         begin = columns.start
         return {
@@ -329,21 +331,23 @@ def integration_steps(scenario: Scenario) -> int:
 def _increment_flows(scenario: Scenario, estimators: int) -> IncrementFlows | None:
     """Return the flows of a scenario, or None if no sensor senses increments."""
     observations = increment_observations(scenario)
-    if not any(len(one.H) for one in observations):
+    if not any(len(observation.H) for observation in observations):
         return None
     A, Q = scenario.belief
     plant = (scenario.truth.A, scenario.truth.B)
     B = plant[1] if np.array_equal(plant[1] @ plant[1].T, Q) else square_root(Q)
     made: dict[bytes, ErrorFlow] = {}
 
-    def flow(one: Observation) -> ErrorFlow:
+    def flow(observation: Observation) -> ErrorFlow:
         """Return the flow of errors with these sensors."""
         # Estimators with equal sensors share a flow, and are then propagated together.
-        key = b"|".join(part.tobytes() for part in one)
+        key = b"|".join(part.tobytes() for part in observation)
         if key not in made:
-            made[key] = ErrorFlow(A, B, one.H, one.R, one.root, plant)
+            made[key] = ErrorFlow(A, B, observation.H, observation.R, observation.root, plant)
         return made[key]
 
     empty = np.zeros((0, 0))
     unobserved = flow(Observation(np.zeros((0, scenario.plant.n)), empty, empty))
-    return IncrementFlows([flow(one) for one in observations[:estimators]], unobserved, plant)
+    return IncrementFlows(
+        [flow(observation) for observation in observations[:estimators]], unobserved, plant
+    )

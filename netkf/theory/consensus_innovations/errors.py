@@ -43,8 +43,8 @@ class PseudoStateRule(ErrorRule):
         for estimator in range(self.errors.estimators):
             stack.put(_difference(estimator), self._pseudo.A @ stack.form(_difference(estimator)))
         gains = gain_sequence(self._design).at(self._slot)
-        for estimator, one in enumerate(gains):
-            self.errors.roots[estimator] = one.predicted
+        for estimator, observation in enumerate(gains):
+            self.errors.roots[estimator] = observation.predicted
 
     def exchange(self, slot: int, phase: int, messages: Sequence[SentMessage]) -> None:
         """Correct all estimates by what was heard and read."""
@@ -58,11 +58,11 @@ class PseudoStateRule(ErrorRule):
             i, j = message.receiver, message.sender
             B = gains[i].B[self._design.heard[i].index(j)]
             after[i] += B @ (before[j] - before[i])
-        for i, one in self._observations.items():
-            weighted = np.linalg.solve(one.R, one.H).T
-            weighted_H = weighted @ one.H
+        for i, observation in self._observations.items():
+            weighted = np.linalg.solve(observation.R, observation.H).T
+            weighted_H = weighted @ observation.H
             after[i] -= gains[i].M @ weighted_H @ self._pseudo.inverse @ before[i]
-            after[i][:, columns[i]] -= gains[i].M @ weighted @ one.root
+            after[i][:, columns[i]] -= gains[i].M @ weighted @ observation.root
         for i in estimators:
             e = states[i] - gains[i].K @ (G @ states[i] - after[i])
             self._set(i, e, after[i] - G @ e)

@@ -27,15 +27,15 @@ class ConstantGainRule(EstimateExchangeRule):
         algorithm, errors = self.scenario.filter.algorithm, self.errors
         assert isinstance(algorithm, ConstantGain)
         columns = errors.reading_noises(observations)
-        for estimator, one in observations.items():
+        for estimator, observation in observations.items():
             L = algorithm.gain_of(estimator)
-            closed = np.eye(errors.n) - L @ one.H
-            noise = L @ np.linalg.cholesky(one.R)
+            closed = np.eye(errors.n) - L @ observation.H
+            noise = L @ np.linalg.cholesky(observation.R)
             root = triangular_root(
                 np.concatenate([closed @ errors.roots[estimator], noise], axis=1)
             )
             errors.multiply(estimator, closed, root)
-            errors.stack.add(estimator, columns[estimator], -L @ one.root)
+            errors.stack.add(estimator, columns[estimator], -L @ observation.root)
 
     def combine(
         self, node: int, weights: list[float], roots: list[FloatArray]

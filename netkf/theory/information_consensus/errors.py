@@ -87,11 +87,11 @@ class ConsensusRule(ErrorRule):
             changes[i] = root, terms
         errors.combine(changes)
         for i in estimators:
-            for j, one in observations.items():
+            for j, observation in observations.items():
                 # e+ = P (sum_j a_ij P_j^-1 e_j - sum_j b_ij H_j' R_j^-1 v_j)
-                root, information = errors.roots[i], np.linalg.solve(one.R, one.H).T
+                root, information = errors.roots[i], np.linalg.solve(observation.R, observation.H).T
                 gain = of_readings[i, j] * root @ root.T @ information
-                errors.stack.add(i, columns[j], -gain @ one.root)
+                errors.stack.add(i, columns[j], -gain @ observation.root)
 
 
 def rule(

@@ -36,8 +36,8 @@ def stack_observations(observations: list[Observation], n: int) -> Observation:
     """Join observations of a state (n,) with independent noises into one."""
     if len(observations) == 1:
         return observations[0]
-    H = np.concatenate([np.zeros((0, n)), *(one.H for one in observations)])
-    R, root = (block_diagonal([one[k] for one in observations]) for k in (1, 2))
+    H = np.concatenate([np.zeros((0, n)), *(observation.H for observation in observations)])
+    R, root = (block_diagonal([observation[k] for observation in observations]) for k in (1, 2))
     return Observation(H, R, root)
 
 

@@ -116,10 +116,10 @@ class AveragingRule(ErrorRule):
             if estimator not in observations:
                 errors.roots[estimator] = root
                 continue
-            one = observations[estimator]
-            K = number[estimator] * root @ root.T @ np.linalg.solve(one.R, one.H).T
-            errors.multiply(estimator, np.eye(n) - K @ one.H, root)
-            errors.stack.add(estimator, columns[estimator], -K @ one.root)
+            observation = observations[estimator]
+            K = number[estimator] * root @ root.T @ np.linalg.solve(observation.R, observation.H).T
+            errors.multiply(estimator, np.eye(n) - K @ observation.H, root)
+            errors.stack.add(estimator, columns[estimator], -K @ observation.root)
 
 
 class RunningTotalsRule(ErrorRule):
@@ -176,8 +176,8 @@ class RunningTotalsRule(ErrorRule):
     def sense(self, time: float, observations: EstimatorObservations) -> None:
         """Update by samples, each N / w times, then add the shares of nodes that broadcast now."""
         columns, number = self.errors.reading_noises(observations), self.errors.estimators
-        for estimator, one in observations.items():
-            counted = one._replace(R=one.R * (self._weights[estimator] / number))
+        for estimator, observation in observations.items():
+            counted = observation._replace(R=observation.R * (self._weights[estimator] / number))
             self.errors.update(estimator, counted, columns[estimator])
         for estimator in self._rounds.get(time, ()):
             self._add_share(estimator)

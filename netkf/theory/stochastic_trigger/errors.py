@@ -61,8 +61,8 @@ class ScheduleRule(ErrorRule):
     def exchange(self, slot: int, phase: int, messages: Sequence[SentMessage]) -> None:
         """Update all nodes by all sensors."""
         columns = self.errors.reading_noises(self._observations)
-        for estimator, one in self._observations.items():
-            used = one if (slot, estimator) in self._sent else silence(one, self._Y)
+        for estimator, observation in self._observations.items():
+            used = observation if (slot, estimator) in self._sent else silence(observation, self._Y)
             for hearer in range(self.errors.estimators):
                 self.errors.update(hearer, used, columns[estimator])
 

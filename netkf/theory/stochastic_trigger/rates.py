@@ -50,8 +50,8 @@ def expected_sends(scenario: Scenario, run: Run) -> tuple[int, float]:
                 count += (slot, k) in sent
                 expected += trigger_rate(P, H, R, trigger_matrix(Y, len(R)))
         root = square_root(P)
-        for k, one in sensors.items():
-            used = one if (slot, k) in sent else silence(one, Y)
+        for k, observation in sensors.items():
+            used = observation if (slot, k) in sent else silence(observation, Y)
             root = update_covariance_root(root, used)[2]
         P, slot = root @ root.T, slot + 1
     return count, expected
