@@ -53,7 +53,7 @@ from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
 from netkf.linalg.lanes import LANES, ONE, aligned, blocks_of, in_lanes, load, store
 
-MAX_STEPS = 10_000
+MAX_STEPS = 10_000  # far beyond the diameter of any tree of use: a larger value is a slip
 SLOT, ALL = "slot", "all"
 
 

@@ -28,7 +28,7 @@ from netkf.network.clocks import LinkClock
 from netkf.scenario.scenario import Scenario
 from netkf.trace.run import Run
 
-MASS_TOLERANCE = 1e-9
+MASS_TOLERANCE = 1e-9  # drift of the total, relative: rounding of many exchanges
 
 
 @dataclass(frozen=True, eq=False)

@@ -63,8 +63,8 @@ FAR_START = 30.0
 """Factor of the roots of P(0) in the other start, about a thousand times the covariance."""
 MIN_TOKENS = 100
 """Chains that start at one node below which their law is not compared."""
-BOUND_TOLERANCE = 1e-8
-PROBABILITY_TOLERANCE = 0.05
+BOUND_TOLERANCE = 1e-8  # of P, relative: roundings of a long product
+PROBABILITY_TOLERANCE = 0.05  # of a probability: smaller errors change no conclusion
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,7 +14,7 @@ from netkf.checks.evidence import BROKEN, NOT_PROMISED, VERDICTS, Evidence
 from netkf.runs.files import finite
 
 INDENT = " " * 13
-WIDTH = 87
+WIDTH = 87  # with the indent 100 columns
 
 PAPERS = {
     "H": "Tanwani: error bounds for locally optimal distributed filters",

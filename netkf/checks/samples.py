@@ -16,7 +16,7 @@ from netkf.checks.rounding import allowed_deviation, compare_identities, largest
 from netkf.linalg.arrays import ArrayLike, FloatArray, IntArray
 from netkf.scenario.scenario import Scenario
 
-REPLAY_TOLERANCE = 1e-7
+REPLAY_TOLERANCE = 1e-7  # of P, relative: two ways to compute it differ by roundings only
 
 
 @dataclass(frozen=True, eq=False)

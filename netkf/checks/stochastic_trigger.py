@@ -20,7 +20,7 @@ from netkf.theory.stochastic_trigger.errors import everyone_hears
 from netkf.theory.stochastic_trigger.rates import expected_sends
 from netkf.trace.run import Run
 
-RATE_TOLERANCE = 0.05
+RATE_TOLERANCE = 0.05  # of the share of slots with a message
 
 
 @dataclass(frozen=True, eq=False)

@@ -141,8 +141,8 @@ def parse_replica(text: str) -> int:
     return int(text)
 
 
-MAX_RUNS = 100_000_000
-WORKERS_PER_CORE = 8
+MAX_RUNS = 100_000_000  # more would take weeks: a slip
+WORKERS_PER_CORE = 8  # beyond that processes only fill the memory
 
 
 def parse_count(text: str) -> int:

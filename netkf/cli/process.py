@@ -24,7 +24,7 @@ END_SECONDS = 8.0
 """Seconds in which an interrupted command ends by itself; then it is ended."""
 EXIT_SECONDS = 4.0
 """Seconds that functions registered with ``atexit`` have."""
-AGAIN_SECONDS = 0.02
+AGAIN_SECONDS = 0.02  # long enough for the frame that swallowed the exception to return
 
 
 class Interruption:

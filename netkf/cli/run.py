@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from netkf.runs.run import CompletedRun
     from netkf.scenario.scenario import Scenario
 
-MAX_LISTED_NODES = 12
+MAX_LISTED_NODES = 12  # nodes that a note names
 
 
 def _declare(parser: argparse.ArgumentParser) -> None:

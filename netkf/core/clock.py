@@ -20,6 +20,7 @@ Entity = Any
 Any, so that a subclass may say ``tuple[int, int]`` where it is for links only.
 """
 
+# Ticks drawn at once, doubling: few for slow clocks, and never more than some MiB.
 FIRST_BLOCK, MAX_BLOCK = 8, 1 << 16
 
 

@@ -106,7 +106,7 @@ def _modules(scenario: Scenario) -> set[tuple[str, str]]:
     return found
 
 
-KEPT = 4
+KEPT = 4  # scenarios that a worker keeps unpickled: a sweep goes from one to the next
 _scenarios: dict[str, Scenario] = {}
 
 

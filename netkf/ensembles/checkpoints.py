@@ -30,8 +30,8 @@ from netkf.trace.schema import EVENT
 PARTS = ("samples", "averages", "messages")
 MARK = b"\nsha256 "
 SEAL_BYTES = len(MARK) + 64
-CHUNK = 1 << 20
-MAX_BLOCK = 1 << 32
+CHUNK = 1 << 20  # bytes hashed at once
+MAX_BLOCK = 1 << 32  # a number of runs beyond that is damage
 
 
 @dataclass(frozen=True)

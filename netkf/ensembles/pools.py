@@ -31,14 +31,14 @@ WARM, SAVING = 0.2, 2.0
 here, show after so many seconds. Starting them costs about as much.
 """
 
-MAX_BLOCK = 64
-MAX_BLOCKS = 4096
-ROUNDS = 16
+MAX_BLOCK = 64  # runs in a block: a killed command repeats at most so many
+MAX_BLOCKS = 4096  # blocks in all: each is a file and a message to a worker
+ROUNDS = 16  # blocks a worker: the last ones then end at nearly the same time
 
 PATIENCE = 8
 """Seconds to wait for a scheduler."""
 LOOK_SECONDS, CLOSE_SECONDS = 1.0, 2.0
-MAX_ADDRESS = 1024
+MAX_ADDRESS = 1024  # a longer one is no address
 
 
 class Pool(ABC):

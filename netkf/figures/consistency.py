@@ -30,7 +30,7 @@ from netkf.runs.innovations import (
 )
 from netkf.runs.summary import CONFIDENCE, nees_bounds
 
-BINS = 40
+BINS = 40  # of time, few enough that each has many readings
 
 
 def nees_figure(subject: Subject) -> Picture:

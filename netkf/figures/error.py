@@ -27,8 +27,8 @@ from netkf.figures.subject import LEVEL, Subject, UnavailableError
 from netkf.linalg.arrays import FloatArray
 
 QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
-WORST = 3
-MAX_ROWS = 60
+WORST = 3  # instants that are marked
+MAX_ROWS = 60  # nodes whose labels still fit beside each other
 
 
 def error_figure(subject: Subject) -> Picture:

@@ -11,6 +11,7 @@ import scipy.sparse.csgraph
 
 from netkf.network.graphs import Topology
 
+# Above so many nodes distances to some pivots replace those between all pairs.
 MAX_KAMADA_KAWAI, PIVOTS = 150, 50
 Positions = dict[int, tuple[float, float]]
 

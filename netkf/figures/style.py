@@ -67,7 +67,7 @@ RC: dict[str, Any] = {
     "svg.hashsalt": "netkf",
 }
 FORMATS = ("png", "svg", "pdf")
-RESOLUTION = 130
+RESOLUTION = 130  # dots per inch
 SECONDS = "simulated seconds"
 TITLE_SIZE, CAPTION_SIZE, LEGEND_SIZE = 10.5, 7.5, 7.5
 

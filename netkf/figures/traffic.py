@@ -26,12 +26,12 @@ from netkf.figures.subject import Subject, UnavailableError
 from netkf.linalg.arrays import FloatArray
 from netkf.trace.schema import CODES
 
-AGE_BINS = 160
-AGE_LEVELS = 400
-MAX_DIRECTIONS = 40
-MAX_MARKS = 3000
+AGE_BINS = 160  # of time, for means and maxima of the age
+AGE_LEVELS = 400  # levels at which the distribution of ages is drawn
+MAX_DIRECTIONS = 40  # rows that can still be told apart
+MAX_MARKS = 3000  # messages that can still be told apart
 CONFIDENCE = 0.95
-TIME_BINS = 30
+TIME_BINS = 30  # of time: each has enough messages for an interval
 
 
 def freshest(log: np.ndarray, node: int) -> tuple[FloatArray, FloatArray]:

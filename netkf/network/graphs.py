@@ -33,7 +33,8 @@ if TYPE_CHECKING:
     import networkx
 
 Link = tuple[int, int]
-MAX_TRIES = 1000
+MAX_TRIES = 1000  # random graphs that are tried until one is connected
+# Limits of what fits into memory with all states and messages.
 MAX_NODES, MAX_LINKS = 200_000, 1_000_000
 MAX_DRAWN = 400_000  # nodes and links of all graphs that are drawn until one is connected
 

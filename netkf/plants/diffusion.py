@@ -17,7 +17,7 @@ from netkf.plants.transitions import Transitions, frame_period
 from netkf.plants.truth import SampledTruth, TruthTimes, multiples
 from netkf.rng.normals import GeneratorNormals, Normals
 
-MAX_STEP = 8.0
+MAX_STEP = 8.0  # norm of A times a step, beyond which the series of e^{A g} loses digits
 NO_TIMES = np.empty(0)
 
 

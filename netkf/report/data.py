@@ -33,7 +33,7 @@ MAX_LINKS = 20_000
 MAX_MARKS = 5_000
 MARKS = ("stop", "crash", "restart", "diverged", "swap")
 """Events of nodes that views mark beside samples and messages."""
-ELLIPSE_LEVEL = 0.95
+ELLIPSE_LEVEL = 0.95  # probability within the ellipses and intervals that are drawn
 
 
 class Budget(NamedTuple):

@@ -22,7 +22,7 @@ MAX_EVENTS = 200_000
 """Events of a run up to which a page replays it for its readings, some seconds."""
 CONFIDENCE = 0.99
 """Probability that the interval of every node holds its mean, where P is exact."""
-LEVEL = 1.96
+LEVEL = 1.96  # standard deviations of a normal number that hold 95 %
 
 
 class NodeMeans(NamedTuple):

@@ -24,12 +24,13 @@ from netkf.linalg.words import high_word
 from netkf.rng.streams import ReplicaStreams, Streams
 
 _U = np.uint64
-CHEAP = _U(0xDA942042E4DD58B5)
+CHEAP = _U(0xDA942042E4DD58B5)  # the multiplier of PCG64DXSM, see numpy/random/src/pcg64
+# The multiplier of 128 bits that PCG64DXSM seeds with.
 FULL_HIGH, FULL_LOW = _U(0x2360ED051FC65DA4), _U(0x4385DF649FCCF645)
 ZERO, ONE, HALF, LAYER = _U(0), _U(1), _U(0xFFFFFFFF), _U(0xFF)
 S3, S8, S11, S32, S48, S63 = _U(3), _U(8), _U(11), _U(32), _U(48), _U(63)
-TO_UNIT = 2.0**-53
-EXPONENTIAL_TAIL = 7.69711747013104972
+TO_UNIT = 2.0**-53  # the spacing of numpy's uniform numbers
+EXPONENTIAL_TAIL = 7.69711747013104972  # where numpy's exponential ziggurat begins its tail
 
 
 class Ziggurat(NamedTuple):

@@ -12,8 +12,9 @@ import numpy as np
 
 from netkf.linalg.compiling import kernel
 
-POOL = 4
+POOL = 4  # words of the pool of numpy's SeedSequence
 _U, _L = np.uint32, np.uint64
+# The constants of SeedSequence, see numpy/random/bit_generator.pyx.
 MIX_LEFT, MIX_RIGHT, S16 = _U(0xCA01F9DD), _U(0x4973F715), _U(16)
 START_A, FACTOR_A = _U(0x43B0D7E5), _U(0x931E8875)
 START_B, FACTOR_B = _U(0x8B51F9DD), _U(0x58F38DED)

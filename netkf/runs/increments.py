@@ -79,18 +79,15 @@ def record_increments(algorithm: Filter, intervals: list[WhitenedInnovation]) ->
         """The filter on states that know their node and time."""
 
         def init(self, model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo) -> Noted:
-            """Return the state of the filter with what is needed to note innovations."""
             noted_node = -1 if base.pooled else node.node
             return Noted(base.init(self, model, mean, cov, node), noted_node, 0.0, (mean, None))
 
         def predict(self, state: Noted, gap: float) -> Noted:
-            """Predict, and keep the estimate at the start of the interval."""
             start = base.estimate(self, state.inner)
             inner = base.predict(self, state.inner, gap)
             return Noted(inner, state.node, state.time + gap, start)
 
         def update(self, state: Noted, reading: Increments | Reading) -> Noted:
-            """Note the innovation of the increments, then update."""
             xhat, P = state.start
             if isinstance(reading, Increments) and P is not None and np.isfinite(P).all():
                 y = reading.moments[: len(reading.moments) // 2]
@@ -99,33 +96,26 @@ def record_increments(algorithm: Filter, intervals: list[WhitenedInnovation]) ->
             return state._replace(inner=base.update(self, state.inner, reading))
 
         def emit(self, state: Noted, exchange: Any) -> tuple[Noted, Any]:
-            """Send what the filter sends."""
             inner, payload = base.emit(self, state.inner, exchange)
             return state._replace(inner=inner), payload
 
         def absorb(self, state: Noted, messages: Sequence[Any], exchange: Any) -> Noted:
-            """Absorb as the filter does."""
             return state._replace(inner=base.absorb(self, state.inner, messages, exchange))
 
         def estimate(self, state: Noted) -> tuple[FloatArray, FloatArray | None]:
-            """Return the estimate of the filter."""
             found: tuple[FloatArray, FloatArray | None] = base.estimate(self, state.inner)
             return found
 
         def shift(self, state: Noted, offset: FloatArray) -> Noted:
-            """Shift the state of the filter."""
             return state._replace(inner=base.shift(self, state.inner, offset))
 
         def max_measurement_interval(self, state: Noted) -> float:
-            """Return the filter's longest interval in seconds."""
             return float(base.max_measurement_interval(self, state.inner))
 
         def stopped(self, state: Noted) -> bool:
-            """Return whether the filter has stopped."""
             return bool(base.stopped(self, state.inner))
 
         def conserved(self, state: Noted) -> Any:
-            """Return the filter's conserved quantities."""
             return base.conserved(self, state.inner)
 
     Noting.__name__, Noting.__module__ = base.__name__, base.__module__

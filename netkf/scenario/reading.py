@@ -17,7 +17,8 @@ from netkf.scenario.scenario import Scenario
 from netkf.scenario.tables import MAX_DEPTH, build_scenario, explain_left_over, with_changes
 
 MAX_BYTES = 64 << 20
-MAX_DOTS = 100
+MAX_DOTS = 100  # parts of a key: tomllib takes time that grows with their square
+# Characters from which on lists of numbers are read by numpy instead of by tomllib.
 LONG_TEXT, LONG_LINE = 100_000, 1000
 _NUMBERS = re.compile(r"([A-Za-z0-9_-]+)[ \t]*=[ \t]*(\[[0-9eE+\-., \t\[\]]*\])[ \t]*")
 _LAST_COMMA, _FIRST_COMMA = re.compile(r",[ \t]*\]"), re.compile(r"\[[ \t]*,")

@@ -18,8 +18,8 @@ if TYPE_CHECKING:
     import pandas as pd
 
 COLUMNS = ("worst_rms", "mean_rms", "mean_trace", "bound", "central")
-MAX_ROWS = 40
-MAX_LENGTH = 30
+MAX_ROWS = 40  # rows that fit onto a screen
+MAX_LENGTH = 30  # characters of a cell
 
 
 def sweep_text(found: pd.DataFrame, keys: Sequence[str]) -> str:

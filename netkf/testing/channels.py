@@ -25,6 +25,7 @@ DELAYS = 20_000
 MESSAGES = (0, 1, 2, 7, 1000)
 TABLE = (1.0, 0.6, 0.85)
 """Entries of the graph's table, for one direction after the other."""
+# Probabilities that differ less are equal; messages apart up to which losses are compared.
 EQUAL, LAGS = 1e-9, 3
 
 

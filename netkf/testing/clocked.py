@@ -18,12 +18,15 @@ from netkf.testing.systems import System
 from netkf.testing.trials import Trial
 from netkf.testing.watching import Watched, demand
 
-HORIZON = 4.0
+HORIZON = 4.0  # seconds: longer than all rounds together
+# Seconds: below, about and above the time scale of the system.
 GAPS = ((1e-3, 0.02), (0.3, 0.5), (1.0, 2.0))
-COMPOSES = 1e-6
+COMPOSES = 1e-6  # relative: above the rounding of any way to solve the Riccati equation
+# The truth is shifted late, when messages of all kinds are under way.
 ROUNDS, SHIFTED = 6, 4
 LONGEST_SAMPLE_GAP, LONGEST_INCREMENT_GAP = 0.5, 0.05
-SAMPLED = 0.8
+SAMPLED = 0.8  # probability that a node samples: some rounds go without
+# More than enough for e^{A s} within one gap.
 POINTS, WEIGHTS = np.polynomial.legendre.leggauss(12)
 
 

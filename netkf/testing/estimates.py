@@ -10,6 +10,7 @@ import numpy as np
 from netkf.linalg.arrays import FloatArray
 from netkf.testing.watching import Watched, demand, difference, leaves
 
+# Relative to the largest entry of P: some thousand roundings.
 SYMMETRY, SEMIDEFINITE = 1e-9, 1e-9
 
 

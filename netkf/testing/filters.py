@@ -15,7 +15,7 @@ from netkf.testing.parents import check_parent
 from netkf.testing.shifts import all_trials, check_shift
 from netkf.testing.watching import Watched, demand, make_part
 
-MOST_LINKS = 8
+MOST_LINKS = 8  # weights are checked for all pairs of degrees up to this
 PHASES = ("predict", "sense", "exchange")
 FLAGS = (
     *("predicts", "pairwise", "one_way", "inverts", "talks", "pooled"),

@@ -15,6 +15,7 @@ from netkf.testing.noise import divergence, largest_deviation, log_level
 from netkf.testing.topologies import edge_transitive, small_networks
 from netkf.testing.watching import Watched, demand, demand_array, fail, make_part, user_code
 
+# Frequencies then have an error of half a percent; repeats need few slots.
 SLOTS, SHORT, LAGS = 20_000, 200, 3
 
 

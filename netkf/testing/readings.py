@@ -14,8 +14,9 @@ from netkf.plants.sensors import LinearSensor, Sensor
 from netkf.rng.streams import Streams
 from netkf.testing.watching import attempt, demand, demand_array, user_code
 
+# Seconds; no clock that is checked ticks up to this horizon.
 PERIOD, HORIZON = 1.0, 1e6
-STEP = 0.1
+STEP = 0.1  # seconds of an increment
 CUTS: tuple[tuple[float, ...], ...] = ((), (0.3,), (0.2, 0.65), (0.9,))
 """Shares of a step at which increments are cut, step after step."""
 

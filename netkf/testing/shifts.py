@@ -14,8 +14,9 @@ from netkf.testing.systems import systems
 from netkf.testing.trials import CheckedEstimate, Trial
 from netkf.testing.watching import Watched, demand
 
+# Large beside the estimates, so that an error of one percent shows.
 SHIFT = np.array([7.0, -11.0, 5.0])
-ROUNDING = 1e-9
+ROUNDING = 1e-9  # relative to the estimates before they are moved back
 
 
 def all_trials(watched: Watched, shift: FloatArray | None = None) -> Iterator[Trial]:

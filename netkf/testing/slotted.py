@@ -8,8 +8,9 @@ from netkf.algorithms.filter import Exchange, Message
 from netkf.algorithms.models import SlotModel
 from netkf.testing.trials import Trial
 
+# Few, since every method is called for every node and step.
 SLOTS, MOST_STEPS, MOST_WAIT = 5, 5, 20
-SHIFTED = 3
+SHIFTED = 3  # slots before the end: enough for every kind of message after the shift
 PERIOD = 1.0
 
 

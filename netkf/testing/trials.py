@@ -16,8 +16,8 @@ from netkf.testing.estimates import check_estimate, check_state_pickles
 from netkf.testing.systems import System
 from netkf.testing.watching import Watched, demand
 
-CONSERVED = 1e-9
-MAX_DELAY = 1.0
+CONSERVED = 1e-9  # relative change of a sum that an exchange should conserve
+MAX_DELAY = 1.0  # seconds; no message of a trial takes longer
 
 
 class CheckedEstimate(NamedTuple):

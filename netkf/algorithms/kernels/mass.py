@@ -140,7 +140,7 @@ def largest_row(lanes: Lanes, rest: FloatArray, v: FloatArray) -> Any:
     return pivot
 
 
-ROUNDING = 2.0**-52
+ROUNDING = 2.0**-52  # spacing of floating-point numbers at 1: smaller pivots are rounding
 
 
 @kernel(inlined=True)

@@ -38,7 +38,7 @@ from netkf.linalg.lanes import (
     with_sign,
 )
 
-TINY = 1e-200
+TINY = 1e-200  # far below any length that counts, yet above underflow
 
 
 class SlotNodes(NamedTuple):

@@ -14,7 +14,7 @@ from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
 from netkf.linalg.lanes import Lanes, load, magnitude, select, spread, store
 
-NO_READING = -1.0
+NO_READING = -1.0  # z' Y z is never negative, so that this cannot be the news of a reading
 
 
 @kernel

@@ -32,10 +32,11 @@ from netkf.rng.draws import StreamBatch
 from netkf.rng.streams import ReplicaStreams, Streams
 from netkf.scenario.scenario import Scenario
 
+# Ticks drawn at once for an entity, doubling: slow clocks draw few in vain.
 FIRST_BLOCK, LONGEST_BLOCK = 8, 1024
 TICKS_A_LINK = 256  # in a window, so that what a clock costs is spread over them
 MOST_TICKS, LEAST_TICKS = 1 << 20, 1 << 12
-LOST = -1.0
+LOST = -1.0  # no delay is negative
 
 
 class Window(NamedTuple):

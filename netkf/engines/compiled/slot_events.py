@@ -36,7 +36,7 @@ from netkf.trace.recorder import NAN
 from netkf.trace.schema import CODES, EVENT
 
 LATE = CODES["late"]
-DRAWN_TOGETHER = 64
+DRAWN_TOGETHER = 64  # draws of a channel at once: a call of numpy costs as much as some ten numbers
 Draw = tuple[float, bool, float]
 Row = tuple[float, int, int, int, int, int, float]
 

@@ -14,7 +14,7 @@ from netkf.theory.gossip.matchings import (
     primitive,
 )
 
-MAX_LISTED = 12
+MAX_LISTED = 12  # matchings that a row names
 
 
 def slot_rows(scenario: Scenario) -> list[AssumptionRow]:

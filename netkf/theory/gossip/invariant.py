@@ -15,7 +15,7 @@ from netkf.theory.gossip.matchings import effective_matching, primitive
 from netkf.theory.intermittent.riccati import couple_from_the_past
 from netkf.theory.numerics.matrices import as_whole
 
-MAX_SAMPLES_AT_ONCE = 2000
+MAX_SAMPLES_AT_ONCE = 2000  # bounds the memory of the arrays
 FAR_START_DEVIATIONS = 1e3  # standard deviations of the upper start, in units of those of the plant
 
 

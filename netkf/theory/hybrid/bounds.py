@@ -31,6 +31,7 @@ PARTS = (1, 40, 400)  # the solver's steps are at most this fraction of a piece,
 Slope = Callable[[float, FloatArray], FloatArray]
 """dy/dt of the flat packed solution y, from t (seconds) and y."""
 
+# Exact for polynomials of degree 9.
 _GAUSS, _GAUSS_WEIGHTS = np.polynomial.legendre.leggauss(5)
 
 

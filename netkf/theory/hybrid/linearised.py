@@ -18,7 +18,7 @@ from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray
 from netkf.theory.hybrid.packed import LinearisedRiccati, PackedRiccati
 
-FEW_UNKNOWNS = 2000
+FEW_UNKNOWNS = 2000  # elimination of a full matrix of that size takes a second
 MAX_ELIMINATED = 6000  # unknowns of a network without small cuts, whose fill-in is nearly full
 ROUNDS, ROUND_TOLERANCE = 4, 1e-7  # each round reduces the residual by this factor
 RESIDUAL_TOLERANCE = 1e-14  # relative to the right-hand side

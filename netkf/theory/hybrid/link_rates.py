@@ -15,9 +15,9 @@ from netkf.theory.hybrid.limits import limit_covariance
 from netkf.theory.hybrid.steady import steady_state, threshold_factor
 from netkf.theory.numerics.matrices import as_numbers
 
-MAX_FACTOR = 1e12
+MAX_FACTOR = 1e12  # of all rates: beyond it rounding decides
 NO_STEADY_STATE = 1e3  # stands for the logarithm of an infinite distance
-FACTOR_TOLERANCE = 1e-10
+FACTOR_TOLERANCE = 1e-10  # of the logarithm of the factor
 
 
 class LinkRate(NamedTuple):

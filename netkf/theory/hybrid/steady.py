@@ -25,12 +25,12 @@ from netkf.theory.hybrid.packed import PackedRiccati
 from netkf.theory.hybrid.samples import transmits_at_samples
 
 MAX_GROWTH = 1e9  # of P relative to its start, beyond which it is taken to grow without bound
-RESIDUAL = 1e-9
+RESIDUAL = 1e-9  # of H(12), relative to its terms: a fixed point up to rounding
 MAX_STEPS = 400  # implicit steps of the search for gains
-MAX_FACTOR = 1e6
+MAX_FACTOR = 1e6  # up to which the search for a steady state looks
 NEWTON_TOLERANCE = 1e-7  # of a change of P, relative to the slope that it has to undo
-POWER_STEPS = 60
-NEWTON_STEPS = 12
+POWER_STEPS = 60  # of the power method
+NEWTON_STEPS = 12  # convergence is quadratic: more would not help
 MAX_FACTORED = 3000  # nodes of a network without small cuts up to which its coupling is factored
 MAX_LISTED = 12  # nodes that a message names
 FEW_UNKNOWNS = 400  # up to which the threshold is found to 1e-6

@@ -12,10 +12,11 @@ from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray
 from netkf.theory.hybrid.packed import PackedRiccati
 
-ORDER = 28
+ORDER = 28  # terms: few steps, each still far from where powers overflow
 TERM_TOLERANCE = 1e-11  # of the last terms of a series, relative to the largest entry
 DEFECT_TOLERANCE = 1e-10  # of a step: its length times the error of the derivative, relative
 FLOOR = 1e-13  # times the scale of the problem: absolute error that is always allowed
+# After so many reductions, to 1e-6, the problem is stiff.
 STEP_REDUCTION, MAX_TRIES = 0.7, 40
 
 

@@ -18,7 +18,7 @@ from netkf.theory.information_consensus.errors import effective_weights, step_we
 
 SOURCE = "Battistelli and Chisci 2014"
 ONCE = "no reading counts more than once"
-TOLERANCE = 1e-12
+TOLERANCE = 1e-12  # of a count: rounding of products of weights
 
 
 def slot_rows(scenario: Scenario) -> list[AssumptionRow]:

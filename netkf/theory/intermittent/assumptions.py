@@ -17,6 +17,7 @@ from netkf.theory.intermittent.riccati import (
     undetectable_slot_mode,
 )
 
+# Subsets of the senders are enumerated: 2^8 are quick.
 MAX_LISTED, MAX_HEARD = 12, 8
 BOUNDED_MEAN = "readings arrive often enough for a bounded mean (sufficient)"
 

@@ -22,7 +22,7 @@ MAX_DEPTH = 22  # of the tree of compositions: 4 million covariances
 MAX_POLICIES = 40  # policy iterations at one value of s
 COALESCENCE_TOLERANCE = 1e-9  # relative difference of coupled chains that have met
 FIRST_PAST, MAX_PAST = 32, 100_000  # slots
-MAX_SAMPLES_AT_ONCE = 20_000
+MAX_SAMPLES_AT_ONCE = 20_000  # bounds the memory of the arrays
 
 
 class SlotSystem(NamedTuple):

@@ -9,7 +9,7 @@ from netkf.algorithms.kernels.riccati import propagate_riccati, riccati_table
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import ArrayLike, FloatArray, is_semidefinite, square_root, symmetric
 
-RESIDUAL = 1e-9
+RESIDUAL = 1e-9  # of an equation, relative to its terms: larger ones mean a failed solver
 
 
 def as_numbers(name: str, value: ArrayLike) -> FloatArray:

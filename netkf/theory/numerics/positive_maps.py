@@ -27,7 +27,9 @@ MAX_DENSE, MAX_DENSE_FALLBACK = 55, 820
 """Numbers in the triangles of a stack up to which T is a dense matrix: always, or if an iteration
 fails."""
 PROOF_TOLERANCE = 1e-6  # relative, between the radius and the bound that X proves
+# Vectors are as large as the stack: few of them fit.
 KRYLOV_VECTORS, RESTARTS = 24, 200
+# Iterative refinement stops at this residual; it gains some digits a round.
 RESIDUAL, MAX_ROUNDS = 1e-10, 20
 
 

@@ -23,6 +23,7 @@ from netkf.linalg.arrays import FloatArray, as_kernel_array
 from netkf.theory.numerics.roots import discretise, flow_estimates, triangular
 from netkf.theory.numerics.stack import GaussianStack
 
+# Exact to rounding for e^{A s} within one unit; moved from [-1, 1] to [0, 1].
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(8)
 NODES, WEIGHTS = 0.5 * (NODES + 1.0), 0.5 * WEIGHTS
 MAX_NORM, TERMS = 0.5, 22  # of |M| s in the series of exp(M s), whose rest is below 0.5^22 / 22!

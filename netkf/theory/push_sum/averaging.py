@@ -22,10 +22,11 @@ import scipy.sparse
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray, IntArray
 
+# All outcomes of the losses are enumerated up to these sizes.
 MAX_NODES, MAX_OUTCOMES = 60, 2**20
 MAX_KRONECKER = 16  # nodes up to which the Kronecker square is cheap
 MAX_WORK = 1e12  # multiplications of an enumeration
-MAX_OUTCOMES_AT_ONCE = 8192
+MAX_OUTCOMES_AT_ONCE = 8192  # bounds the memory of the products
 
 
 @dataclass(frozen=True, eq=False)

@@ -25,8 +25,8 @@ from netkf.theory.push_sum.limits import consensus_gain_bound
 from netkf.theory.push_sum.mean_square import mean_radius, radius
 
 Moment = Literal["mean", "mean-square"]
-MAX_STEPS = 10**7
-MAX_EXACT = 1000
+MAX_STEPS = 10**7  # no network could exchange so often in a slot
+MAX_EXACT = 1000  # default limit of the search for the exact gamma
 MAX_SEARCHED = 120  # states of all nodes, beyond which a search over gamma takes minutes
 
 

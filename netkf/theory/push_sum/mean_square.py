@@ -24,6 +24,7 @@ from netkf.theory.push_sum.estimation_steps import EstimationSteps, averaging_la
 
 MAX_ROWS = 500  # of X; with twice as many rows a step takes four times the work and memory
 DENSE_ROWS = 300  # of the mean dynamics up to which all eigenvalues are computed
+# Of Arnoldi's method for the mean: its vectors are small, unlike those of second moments.
 MEAN_KRYLOV_VECTORS, MEAN_RESTARTS = 40, 60
 
 
