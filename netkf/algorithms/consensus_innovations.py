@@ -150,7 +150,7 @@ class GainSequence:
     def at(self, slot: int) -> tuple[NodeGains, ...]:
         """Return the gains of all nodes in a slot, counted from 1."""
         while len(self._found) < slot and not self._converged:
-            self._found.append(self._advance())
+            self._found.append(self._advance_slot())
             self._converged = len(self._found) > 1 and self._has_converged(*self._found[-2:])
         return self._found[min(slot, len(self._found)) - 1]
 
@@ -181,17 +181,18 @@ class GainSequence:
         old, new = (S @ np.swapaxes(S, 1, 2) for S in roots)
         return bool(np.abs(new - old).max() <= CONVERGED * np.abs(new).max())
 
-    def _advance(self) -> tuple[NodeGains, ...]:
+    def _advance_slot(self) -> tuple[NodeGains, ...]:
         """Carry the errors through a slot, and return its gains."""
         nodes = range(len(self._heard))
         self._errors = np.hstack([self._predict(), self._driven])
-        predicted = [self._root(i) for i in nodes]
+        predicted = [self._covariance_root(i) for i in nodes]
         gains = self._correct_pseudo_states()
         K = [self._correct_state(i) for i in nodes]
         # Only products of rows count: as many inputs as rows are enough.
         self._errors = np.asarray(np.linalg.qr(self._errors.T, mode="r")).T
         return tuple(
-            NodeGains(B, M, K[i], predicted[i], self._root(i)) for i, (B, M) in enumerate(gains)
+            NodeGains(B, M, K[i], predicted[i], self._covariance_root(i))
+            for i, (B, M) in enumerate(gains)
         )
 
     def _predict(self) -> FloatArray:
@@ -200,17 +201,17 @@ class GainSequence:
         predicted = np.stack([self._F @ x, self._pseudo.rest @ x + self._pseudo.A @ y])
         return predicted.reshape(self._errors.shape)
 
-    def _x(self, i: int) -> FloatArray:
+    def _state_error(self, i: int) -> FloatArray:
         """Return the error (n, inputs) of a node's xhat, which may be written to."""
         return self._errors[i * self._n : (i + 1) * self._n]
 
-    def _y(self, i: int) -> FloatArray:
+    def _pseudo_error(self, i: int) -> FloatArray:
         """Return the error (n, inputs) of a node's yhat."""
-        return self._x(len(self._heard) + i)
+        return self._state_error(len(self._heard) + i)
 
-    def _root(self, i: int) -> FloatArray:
+    def _covariance_root(self, i: int) -> FloatArray:
         """Return the lower triangular root (n, n) of P of node ``i``."""
-        return lower_root(np.ascontiguousarray(self._x(i)))
+        return lower_root(np.ascontiguousarray(self._state_error(i)))
 
     def _correct_pseudo_states(self) -> list[tuple[FloatArray, FloatArray]]:
         """Correct all yhat at once; return B (d, n, n) and M (n, n) of each node."""
@@ -219,13 +220,13 @@ class GainSequence:
         self._errors = np.hstack([self._errors, np.zeros((len(self._errors), inputs))])
         gains, corrected = [], []
         for i, heard in enumerate(self._heard):
-            e, observed = self._y(i), self._information[i] @ self._pseudo.inverse
+            e, observed = self._pseudo_error(i), self._information[i] @ self._pseudo.inverse
             innovation = observed @ e
             # The noise of the pseudo-observation has the covariance H' R^-1 H.
             stop = first + self._noises[i].shape[1]
             innovation[:, first:stop], first = self._noises[i], stop
-            theta = np.concatenate([*(e - self._y(j) for j in heard), innovation])
-            sizes = [variances(e) + variances(self._y(j)) for j in heard]
+            theta = np.concatenate([*(e - self._pseudo_error(j) for j in heard), innovation])
+            sizes = [variances(e) + variances(self._pseudo_error(j)) for j in heard]
             sizes.append(np.square(observed) @ variances(e) + np.diag(self._information[i]))
             gain = optimal_gain(e, theta, np.concatenate(sizes))
             corrected.append(e - gain @ theta)
@@ -236,7 +237,7 @@ class GainSequence:
 
     def _correct_state(self, i: int) -> FloatArray:
         """Correct xhat_i by ``yhat_i - G xhat_i``, which is ``G e - e_y``; return K (n, n)."""
-        G, e, e_y = self._pseudo.G, self._x(i), self._y(i)
+        G, e, e_y = self._pseudo.G, self._state_error(i), self._pseudo_error(i)
         theta = G @ e - e_y
         K = optimal_gain(e, theta, np.square(G) @ variances(e) + variances(e_y))
         e -= K @ theta

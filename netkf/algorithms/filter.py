@@ -232,7 +232,7 @@ class Filter(Component):
                 raise TypeError(f"{cls.__name__}.{name} is now {present}, see netkf.parts.Filter")
         for name in ("init", "emit", "absorb"):
             wanted = list(inspect.signature(getattr(Filter, name)).parameters)
-            if not _takes(getattr(cls, name), len(wanted)):
+            if not _accepts(getattr(cls, name), len(wanted)):
                 raise TypeError(f"{cls.__name__}.{name} must take ({', '.join(wanted[1:])})")
 
     def init(self, model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo) -> Any:
@@ -413,7 +413,7 @@ class Filter(Component):
         return None
 
 
-def _takes(method: Any, count: int) -> bool:
+def _accepts(method: Any, count: int) -> bool:
     """Return True if a method takes ``count`` arguments and none by the name of SlotFilter's."""
     parameters = inspect.signature(method).parameters
     kinds = [parameter.kind for parameter in parameters.values()]

@@ -150,7 +150,7 @@ class Intermittent(Filter):
 
     def update(self, state: IntermittentState, reading: Reading) -> IntermittentState:
         """Use the reading, R (15)-(18), and keep the reading to be sent."""
-        return _use(state, reading)._replace(unsent=reading if len(reading.y) else None)
+        return _use_reading(state, reading)._replace(unsent=reading if len(reading.y) else None)
 
     def emit(
         self, state: IntermittentState, exchange: Exchange
@@ -166,7 +166,7 @@ class Intermittent(Filter):
             reading: Reading = message.payload
             # In slots a message of the exchange is always of now.
             if exchange.slot >= 0 or message.age <= 0.0:
-                state = _use(state, reading)
+                state = _use_reading(state, reading)
             else:
                 state = _use_late(state, reading, exchange.time)
         return state
@@ -189,7 +189,7 @@ class Intermittent(Filter):
         return payload
 
 
-def _use(state: IntermittentState, reading: Reading) -> IntermittentState:
+def _use_reading(state: IntermittentState, reading: Reading) -> IntermittentState:
     """Update with a reading of now."""
     # A reading without rows says nothing, and is not kept.
     if not len(reading.y):
@@ -200,7 +200,7 @@ def _use(state: IntermittentState, reading: Reading) -> IntermittentState:
         return state
     time, past = reading.time, state.past
     if time // state.lag > past.time // state.lag:  # now and then, so that it costs little
-        past = _recent(past, time - state.lag)
+        past = _drop_old(past, time - state.lag)
     return state._replace(time=time, past=Past(time, reading, None, xhat, root, past))
 
 
@@ -231,10 +231,10 @@ def _use_late(state: IntermittentState, reading: Reading, now: float) -> Intermi
     # From the last event to now.
     if now > past.time:
         xhat, root = model.predict(xhat, root, now - past.time)
-    return state._replace(xhat=xhat, root=root, time=now, past=_recent(past, now - state.lag))
+    return state._replace(xhat=xhat, root=root, time=now, past=_drop_old(past, now - state.lag))
 
 
-def _recent(past: Past, since: float) -> Past:
+def _drop_old(past: Past, since: float) -> Past:
     """Return the past without what no late reading can reach: all after ``since``, and one before
     it.
     """

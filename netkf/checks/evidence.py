@@ -139,15 +139,15 @@ def judge(
             why = "; ".join(
                 f"it assumes that {row.assumption} [{row.source}]: {row.evidence}" for row in rows
             )
-            found.append(_reject(promise, why))
+            found.append(_unpromised_row(promise, why))
         else:
             found.append(
-                _weigh(promise, _test(promise, samples, level / max(statistical, 1)), runs)
+                _judge(promise, _run_test(promise, samples, level / max(statistical, 1)), runs)
             )
     return found
 
 
-def _test(promise: Promise, samples: Any, level: float) -> Finding:
+def _run_test(promise: Promise, samples: Any, level: float) -> Finding:
     """Return the finding of a test; it is unknown if theory cannot compute what to compare with."""
     try:
         return promise.test(samples, level)
@@ -161,7 +161,7 @@ def _is_needed(promise: Promise, row: Assumption) -> bool:
     return any(need in f"{row.assumption} [{row.source}]" for need in needs)
 
 
-def _weigh(promise: Promise, finding: Finding, runs: int) -> Evidence:
+def _judge(promise: Promise, finding: Finding, runs: int) -> Evidence:
     """Return the verdict that follows from the interval of a finding."""
     (margin, low, high), tolerance, message = finding[:3]
     needed = None
@@ -230,7 +230,7 @@ def _describe_horizon(seconds: float) -> str:
     return "not reached in this horizon, lengthen it"
 
 
-def _reject(promise: Promise, why: str) -> Evidence:
+def _unpromised_row(promise: Promise, why: str) -> Evidence:
     """Return the row of a promise that is not made here, with the reason."""
     nan = math.nan
     return Evidence(

@@ -160,9 +160,9 @@ class GossipSamples(RunSamples):
     def reference(self) -> ChainSamples:
         """Samples of the switched chain of G (20)."""
         count = reference_count(self.scenario, 1)
-        return self._draw("switched chain", list(check_slots(self.scenario)), count)
+        return self._draw_paths("switched chain", list(check_slots(self.scenario)), count)
 
-    def _draw(self, purpose: str, slots: list[int], count: int) -> ChainSamples:
+    def _draw_paths(self, purpose: str, slots: list[int], count: int) -> ChainSamples:
         """Return samples of the chain after the given numbers of slots."""
         starts, random = initial_roots(self.scenario), Streams(self.seed).generator(purpose)
         positions = _draw_chains(self.matching, slots[-1], count, random)
@@ -173,7 +173,7 @@ class GossipSamples(RunSamples):
 
     def later(self, slots: int) -> ChainSamples:
         """Return a few samples after half of ``slots`` and after all of them."""
-        return self._draw("later chain", [slots // 2, slots], MIN_CHAINS // 4)
+        return self._draw_paths("later chain", [slots // 2, slots], MIN_CHAINS // 4)
 
 
 def _draw_chains(
@@ -283,7 +283,7 @@ def _share_from(values: FloatArray, points: FloatArray) -> FloatArray:
     return np.asarray(1.0 - below / len(values))
 
 
-def _tokens(samples: GossipSamples, level: float) -> Finding:
+def _check_tokens(samples: GossipSamples, level: float) -> Finding:
     """Compare each token at the end with the stationary switched chain, and to see if the horizon
     is too short with the chain that starts where the token does.
     """
@@ -309,7 +309,7 @@ def _initial_condition_forgotten(samples: GossipSamples, level: float) -> Findin
     return with_horizon(samples, found, _start_memory, LAW_TOLERANCE) if found.early else found
 
 
-def _bounded(samples: GossipSamples, level: float) -> Finding:
+def _check_bounded(samples: GossipSamples, level: float) -> Finding:
     """Compare the growth of the law of P at each sensor with that of the chain that is there."""
     runs, (drawn, _, positions) = samples.runs.P, samples.reference
     half = check_slots(samples.scenario)[-2]
@@ -388,13 +388,13 @@ PROMISES = (
         "every token has the same law in the end",
         "G Theorem 10 [ii], (25)",
         ERGODIC,
-        _tokens,
+        _check_tokens,
     ),
     Promise(
         "covariances are stochastically bounded: their laws do not grow any more",
         "G Theorem 10 [iii], (26)",
         STABLE,
-        _bounded,
+        _check_bounded,
     ),
     Promise(
         "the law in the end does not depend on the start",

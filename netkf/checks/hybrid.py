@@ -97,7 +97,7 @@ def _mean_below_bound(samples: HybridSamples, level: float) -> Finding:
     found = []
     for k in range(times):
         for i in range(nodes):
-            excess = _excess(P[:, k, i], bound[k, i], share)
+            excess = _relative_excess(P[:, k, i], bound[k, i], share)
             if excess is not None:
                 found.append((excess, f"at {samples.point_labels[k * nodes + i]}"))
     if not found:
@@ -106,7 +106,7 @@ def _mean_below_bound(samples: HybridSamples, level: float) -> Finding:
     return find_largest(found, BOUND_TOLERANCE, message)
 
 
-def _excess(P: FloatArray, bound: FloatArray, level: float) -> Interval | None:
+def _relative_excess(P: FloatArray, bound: FloatArray, level: float) -> Interval | None:
     """Return an interval for the largest eigenvalue of E[P] relative to ``bound``, less 1; P is
     (R, n, n). None if the bound is singular.
     """
@@ -312,7 +312,7 @@ class HybridChecks(PaperChecks):
         """Return the promises about a scenario; those on limits only if the limits exist."""
         listed, promised = list(PROMISES), with_promised_filter(scenario)
         for promise, compute in zip(
-            COMPUTED, (_require_known_steadiness, _constant_gains, _limit), strict=True
+            COMPUTED, (_require_known_steadiness, _constant_gains, _require_limit), strict=True
         ):
             try:
                 compute(promised)
@@ -350,7 +350,7 @@ def _constant_gains(scenario: Scenario) -> None:
         constant_gain_bound(scenario)
 
 
-def _limit(scenario: Scenario) -> None:
+def _require_limit(scenario: Scenario) -> None:
     """Raise TheoryError if the steady bound has no limit S."""
     if len(scenario.nodes) == 1 or scenario.network.channel.delay.fixed != 0.0:
         raise TheoryError("S is the limit for links that take no time")

@@ -94,7 +94,7 @@ class IntermittentSummary(ReplicaSummary):
     arrived: np.ndarray
 
 
-def _directions(scenario: Scenario) -> list[Direction]:
+def _heard_directions(scenario: Scenario) -> list[Direction]:
     """Return (sender, receiver) of all directed links that can carry readings."""
     senders = sensing_neighbours(scenario)
     return [(sender, node) for node in scenario.nodes for sender in senders[node]]
@@ -134,8 +134,8 @@ def _summarise(scenario: Scenario, run: Run) -> IntermittentSummary:
         in_support=table.covariances(least, sequences, last)[0],
         spread=np.trace(above - below, axis1=-2, axis2=-1),
         averages=_path_averages(table, starts, sequences),
-        sent=_count(scenario, run, "send", slots[-1]),
-        arrived=_count(scenario, run, "deliver", slots[-1]),
+        sent=_count_messages(scenario, run, "send", slots[-1]),
+        arrived=_count_messages(scenario, run, "deliver", slots[-1]),
     )
 
 
@@ -146,14 +146,14 @@ def _roots_above(*roots: FloatArray) -> FloatArray:
     return np.asarray(np.linalg.cholesky(above), dtype=np.float64)
 
 
-def _count(scenario: Scenario, run: Run, kind: str, slots: int) -> np.ndarray:
+def _count_messages(scenario: Scenario, run: Run, kind: str, slots: int) -> np.ndarray:
     """Return the number of events of a kind in each direction, (D,)."""
     # A message is sent by the node of its row, and delivered to it.
     sender, receiver = ("node", "peer") if kind == "send" else ("peer", "node")
     rows = run.log[run.log["kind"] == CODES[kind]]
     rows = rows[scenario.slot_plant.slots_of(rows["t"]) < slots]
     counts = Counter(zip(rows[sender].tolist(), rows[receiver].tolist(), strict=True))
-    return np.array([counts[pair] for pair in _directions(scenario)], dtype=int)
+    return np.array([counts[pair] for pair in _heard_directions(scenario)], dtype=int)
 
 
 def _path_averages(table: ModeTable, roots: FloatArray, sequences: np.ndarray) -> FloatArray:
@@ -186,9 +186,9 @@ class IntermittentSamples(RunSamples):
     def reference(self) -> ArrivalSamples:
         """Samples of filters with independent arrivals, R (12)."""
         samples = reference_count(self.scenario, len(self.nodes))
-        return self._draw("arrivals", list(check_slots(self.scenario)), samples, MAX_PATHS)
+        return self._draw_arrivals("arrivals", list(check_slots(self.scenario)), samples, MAX_PATHS)
 
-    def _draw(self, purpose: str, slots: list[int], samples: int, paths: int) -> ArrivalSamples:
+    def _draw_arrivals(self, purpose: str, slots: list[int], samples: int, paths: int) -> ArrivalSamples:
         """Return samples of all nodes after the given numbers of slots, of which the averages over
         the slots are those of the first ``paths``.
         """
@@ -204,7 +204,9 @@ class IntermittentSamples(RunSamples):
         node = scenario.nodes[k]
         senders = sensing_neighbours(scenario)[node]
         random = Streams(self.seed).generator(purpose, node)
-        probabilities = np.array([_delivery(scenario, (sender, node)) for sender in senders])
+        probabilities = np.array(
+            [_delivery_probabilities(scenario, (sender, node)) for sender in senders]
+        )
         arrived = random.random((samples, slots[-1], len(senders))) < probabilities
         # Only the sets of readings that occur become modes: there may be 2^len(senders).
         codes = arrived @ (1 << np.arange(len(senders)))
@@ -223,10 +225,10 @@ class IntermittentSamples(RunSamples):
 
     def later(self, slots: int) -> ArrivalSamples:
         """Return a few samples after half of ``slots`` and after all of them, without averages."""
-        return self._draw("later arrivals", [slots // 2, slots], MIN_CHAINS // 4, 0)
+        return self._draw_arrivals("later arrivals", [slots // 2, slots], MIN_CHAINS // 4, 0)
 
 
-def _delivery(scenario: Scenario, direction: Direction) -> float:
+def _delivery_probabilities(scenario: Scenario, direction: Direction) -> float:
     """Return the probability that a reading arrives in time; raises TheoryError if unknown."""
     channel = scenario.network.channel
     if not channel.loss.independent:
@@ -287,12 +289,12 @@ def _in_support(samples: IntermittentSamples, level: float) -> Finding:
 
 def _arrivals_counted(samples: IntermittentSamples, level: float) -> Finding:
     """Compare counts of arrivals with R (12); slots are independent, so counts are binomial."""
-    pairs = _directions(samples.scenario)
+    pairs = _heard_directions(samples.scenario)
     sent, arrived = samples.runs.sent.sum(axis=0), samples.runs.arrived.sum(axis=0)
     found = []
     for k, pair in enumerate(pairs):
         share = probability_interval(int(arrived[k]), int(sent[k]), level / len(pairs))
-        deviation = deviation_interval(_delivery(samples.scenario, pair), share)
+        deviation = deviation_interval(_delivery_probabilities(samples.scenario, pair), share)
         found.append((deviation, f"from node {pair[0]} to {pair[1]}"))
     message = f"largest difference in {int(sent.sum()):,} messages"
     return find_largest(found, PROBABILITY_TOLERANCE, message)
@@ -308,7 +310,7 @@ def _law_of_arrivals(samples: IntermittentSamples, level: float) -> Finding:
     return compare_laws(pairs, level, samples.first_trace)
 
 
-def _bounded(samples: IntermittentSamples, level: float) -> Finding:
+def _check_bounded(samples: IntermittentSamples, level: float) -> Finding:
     """Compare the growth of the law of P with that of filters with independent arrivals."""
     runs, drawn = samples.runs.P, samples.reference.P
     pairs = [
@@ -359,7 +361,7 @@ def _averages_of_paths(samples: IntermittentSamples, level: float) -> Finding:
     return find_largest(found, LAW_TOLERANCE, message)
 
 
-def _silence(scenario: Scenario) -> dict[int, float]:
+def _outage_factors(scenario: Scenario) -> dict[int, float]:
     """Return for each sampled node the factor (1 - g) alpha^2 by which outages let E[P] grow."""
     factors, neighbours = {}, sensing_neighbours(scenario)
     alpha = float(np.abs(np.linalg.eigvals(scenario.slot_belief[0])).max())
@@ -367,7 +369,10 @@ def _silence(scenario: Scenario) -> dict[int, float]:
         if node in scenario.placed:
             continue
         try:
-            missed = [1.0 - _delivery(scenario, (sender, node)) for sender in neighbours[node]]
+            missed = [
+                1.0 - _delivery_probabilities(scenario, (sender, node))
+                for sender in neighbours[node]
+            ]
         except TheoryError:
             continue
         factors[node] = float(np.prod(missed)) * alpha**2
@@ -376,7 +381,7 @@ def _silence(scenario: Scenario) -> dict[int, float]:
 
 def _mean_diverges(samples: IntermittentSamples, level: float) -> Finding:
     """Compute the lower bound on E[P] of the node that misses most, at the horizon and later."""
-    scenario, factors = samples.scenario, _silence(samples.scenario)
+    scenario, factors = samples.scenario, _outage_factors(samples.scenario)
     node = max(factors, key=lambda k: factors[k])
     F, Q = scenario.slot_belief
     alpha = float(np.abs(np.linalg.eigvals(F)).max())
@@ -407,7 +412,7 @@ def _scalar_laws(scenario: Scenario) -> dict[int, ScalarLaw]:
         model = scenario.slot_models[scenario.topology.index[peers[0]]]
         F, Q = scenario.slot_belief
         try:
-            delivery = _delivery(scenario, (peers[0], node))
+            delivery = _delivery_probabilities(scenario, (peers[0], node))
             laws[k] = scalar_law(F, Q, model.H, model.R, delivery)
         except TheoryError:
             continue
@@ -502,7 +507,7 @@ PROMISES = (
         "P is stochastically bounded: its law does not grow any more",
         "R Proposition 8, Theorem 9 [i]",
         LIMIT,
-        _bounded,
+        _check_bounded,
     ),
     Promise(
         "the law in the end does not depend on the start",
@@ -569,8 +574,8 @@ class IntermittentChecks(PaperChecks):
         """Return the assumptions of the tests beyond those of R."""
         try:
             known, why = True, "a known probability for each direction"
-            for direction in _directions(scenario):
-                _delivery(scenario, direction)
+            for direction in _heard_directions(scenario):
+                _delivery_probabilities(scenario, direction)
         except TheoryError as error:
             known, why = False, str(error)
         # A derived class may choose its broadcasts in any way.
@@ -585,7 +590,7 @@ class IntermittentChecks(PaperChecks):
 
     def promises(self, scenario: Scenario) -> tuple[Promise, ...]:
         """Return the promises about a scenario; more if the exact law of a node is known."""
-        grows = max(_silence(scenario).values(), default=0.0) >= 1.0
+        grows = max(_outage_factors(scenario).values(), default=0.0) >= 1.0
         more = (DIVERGES,) if grows else ()
         return PROMISES + more + (SCALAR if _scalar_laws(scenario) else ())
 

@@ -59,7 +59,7 @@ def verdict_picture(path: Path, verdict: Verdict, claim: str) -> bool:
         axes.axvline(1.0, color=INK, lw=0.8, ls=":", label="tolerated")
         axes.set_yticks(
             range(len(rows)),
-            [_label(row) for row in reversed(rows)],
+            [_make_label(row) for row in reversed(rows)],
             fontsize=7.5,
             parse_math=False,
         )
@@ -69,12 +69,12 @@ def verdict_picture(path: Path, verdict: Verdict, claim: str) -> bool:
         draw_legend(axes)
         note = f"{verdict.scenario}: {verdict.runs:,} runs. Intervals hold together with "
         note += f"probability {verdict.confidence:.6g}."
-        finish_figure(figure, _title(rows, claim or verdict.scenario), [note])
+        finish_figure(figure, _make_title(rows, claim or verdict.scenario), [note])
     write(figure, path)
     return True
 
 
-def _title(rows: list[Evidence], claim: str) -> str:
+def _make_title(rows: list[Evidence], claim: str) -> str:
     """Return the title: the claim, after the number of broken promises if there are any."""
     broken = sum(row.verdict == BROKEN for row in rows)
     count = f"{broken} of {len(rows)} promises with an interval are broken"
@@ -93,6 +93,6 @@ def _draw_row(axes: Any, height: int, row: Evidence) -> None:
         axes.plot([detectable], [height], "|", color=INK, ms=9)
 
 
-def _label(row: Evidence) -> str:
+def _make_label(row: Evidence) -> str:
     """Return the statement of a promise, shortened to one line of the picture."""
     return textwrap.shorten(row.promise, LONGEST_LABEL, placeholder=" ...")

@@ -127,12 +127,12 @@ def _mass_conserved(samples: PushSumSamples, level: float) -> Finding:
     """Compare the totals of weight and number at the end with 1 and N."""
     drift = np.abs(samples.runs.drift)
     message = f"drift of the totals of weight and number in {len(samples.runs.P)} runs"
-    limits = np.ones_like(drift), _exchanges(samples), 1e-9
+    limits = np.ones_like(drift), _count_exchanges(samples), 1e-9
     found = compare_identities(drift, *limits, message)
     return found._replace(replica=first_wrong(drift, *limits))
 
 
-def _exchanges(samples: PushSumSamples) -> float:
+def _count_exchanges(samples: PushSumSamples) -> float:
     """Return the number of sums in which a total takes part, each of which rounds."""
     return float(check_slots(samples.scenario)[-1] * len(samples.scenario.nodes))
 
@@ -164,7 +164,7 @@ def _decay_left(samples: PushSumSamples, limit: FloatArray) -> float:
     return 1.2 * (1.0 + 0.5 * math.log(last / STEADY_TOLERANCE) / math.log(half / last))
 
 
-def _unbiased(samples: PushSumSamples, level: float) -> Finding:
+def _check_unbiased(samples: PushSumSamples, level: float) -> Finding:
     """Test that the mean of the whitened errors at the end is 0, in all directions at once."""
     if not len(samples.followed):
         return find_unknown("no run has errors that were followed exactly", BIAS_TOLERANCE)
@@ -301,7 +301,7 @@ PROMISES = (
         "the estimates become unbiased",
         "P Theorem 5, (30)",
         (*LAWS, "P (30)", *FOLLOWED),
-        _unbiased,
+        _check_unbiased,
     ),
     Promise(
         "mean squares become the exact steady ones",

@@ -35,13 +35,13 @@ def verdict_text(verdict: Verdict, claim: str = "", command: str = "") -> str:
     for row in [*broken, *(row for row in verdict.rows if row.verdict != BROKEN)]:
         mark = row.verdict.upper() if row.verdict == BROKEN else row.verdict
         lines.append(f"{mark:<{len(INDENT)}}{row.promise}  [{row.source}]")
-        message = _describe(row)
+        message = _describe_row(row)
         lines += textwrap.wrap(message, WIDTH, initial_indent=INDENT, subsequent_indent=INDENT)
-    lines += ["", *_legend(verdict), *_summary(verdict)]
+    lines += ["", *_legend_lines(verdict), *_summary_line(verdict)]
     return "\n".join([*lines, *_broken_again(broken, command)])
 
 
-def _legend(verdict: Verdict) -> list[str]:
+def _legend_lines(verdict: Verdict) -> list[str]:
     """Return a line for each paper whose letter stands in a source."""
     # A letter is a paper's at the beginning of a source or of one of its parts.
     sources = "; ".join(row.source for row in verdict.rows)
@@ -52,7 +52,7 @@ def _legend(verdict: Verdict) -> list[str]:
     ]
 
 
-def _summary(verdict: Verdict) -> list[str]:
+def _summary_line(verdict: Verdict) -> list[str]:
     """Return the lines that count the verdicts."""
     counts = Counter(row.verdict for row in verdict.rows)
     counted_verdicts = ", ".join(f"{counts[v]} {v}" for v in VERDICTS if counts[v])
@@ -83,7 +83,7 @@ def _broken_again(broken: list[Evidence], command: str) -> list[str]:
     return ["", *lines] if lines else []
 
 
-def _describe(row: Evidence) -> str:
+def _describe_row(row: Evidence) -> str:
     """Return how far off a row is and what would have been seen, then its evidence; or the
     assumptions that fail.
     """
@@ -91,13 +91,15 @@ def _describe(row: Evidence) -> str:
         return row.assumptions
     parts = [f"needs about {row.needed:,} runs"] if row.needed is not None else []
     if row.low < row.high:
-        parts.append(f"off by {row.off:.3g}, at most {max(0.0, -row.low):.3g}{_limits(row)}")
+        parts.append(
+            f"off by {row.off:.3g}, at most {max(0.0, -row.low):.3g}{_describe_limits(row)}"
+        )
         if math.isfinite(row.seen) and math.isfinite(row.expected):
             parts.append(f"seen {row.seen:.4g}, expected {row.expected:.4g}")
     return "; ".join([*parts, row.evidence])
 
 
-def _limits(row: Evidence) -> str:
+def _describe_limits(row: Evidence) -> str:
     """Return what a row tolerates and what it would have found, in brackets; or nothing."""
     found = [f"{row.tolerance:g} is tolerated"] if row.tolerance else []
     if row.detectable > 0.0:

@@ -58,7 +58,7 @@ def _save_verdict(directory: Path, scenario: Scenario, verdict: Verdict, text: s
     if not (directory / "scenario.toml").exists():
         write_scenario(directory, scenario)
     results = io.BytesIO()
-    columns: dict[str, Any] = _columns(verdict.results)
+    columns: dict[str, Any] = _result_columns(verdict.results)
     np.savez_compressed(results, **columns)
     with write_atomically(directory / RESULTS) as part:
         part.write_bytes(results.getbuffer())
@@ -74,7 +74,7 @@ def _save_verdict(directory: Path, scenario: Scenario, verdict: Verdict, text: s
         "versions": versions(),
         "looks": verdict.looks,
         "spent": verdict.spent,
-        "infinite": _infinite(verdict),
+        "infinite": _restore_infinite(verdict),
         "machine": machine(),
         "files": file_digests(directory, [RESULTS, "scenario.toml"]),
     }
@@ -114,8 +114,8 @@ def load_verdict(directory: Path, scenario: Scenario, seed: int) -> Verdict:
         check_seal(found)
         check_files(directory, found)
         looks, spent = int(found["looks"]), float(found["spent"])
-        rows = _rows(found)
-        results = _results(directory / RESULTS, scenario)
+        rows = _read_rows(found)
+        results = _read_results(directory / RESULTS, scenario)
         count, confidence = int(found["runs"]), float(found["confidence"])
     except Exception as error:  # whatever is in the files, which may be anybody's
         reason = str(error) if isinstance(error, DamagedError) else type(error).__name__
@@ -131,7 +131,7 @@ def load_verdict(directory: Path, scenario: Scenario, seed: int) -> Verdict:
     return Verdict(scenario.name, count, seed, confidence, rows, tuple(results), looks, spent)
 
 
-def _infinite(verdict: Verdict) -> list[tuple[int, str, bool]]:
+def _restore_infinite(verdict: Verdict) -> list[tuple[int, str, bool]]:
     """Return which numbers of which rows are infinite, and if they are positive: in JSON they are
     null, as those that do not exist.
     """
@@ -141,7 +141,7 @@ def _infinite(verdict: Verdict) -> list[tuple[int, str, bool]]:
     return [(k, name, bool(value > 0.0)) for k, name, value in values if np.isinf(value)]
 
 
-def _rows(found: dict[str, Any]) -> tuple[Evidence, ...]:
+def _read_rows(found: dict[str, Any]) -> tuple[Evidence, ...]:
     """Return the rows of a document."""
     rows = [dict(row) for row in found["rows"]]
     for row in rows:
@@ -151,7 +151,7 @@ def _rows(found: dict[str, Any]) -> tuple[Evidence, ...]:
     return tuple(Evidence(**row) for row in rows)
 
 
-def _columns(results: tuple[ReplicaResult, ...]) -> dict[str, np.ndarray]:
+def _result_columns(results: tuple[ReplicaResult, ...]) -> dict[str, np.ndarray]:
     """Return all results as arrays with a first axis over the replicas."""
     columns = {
         "difference": np.array([one.difference for one in results]),
@@ -170,7 +170,7 @@ def _columns(results: tuple[ReplicaResult, ...]) -> dict[str, np.ndarray]:
     return columns
 
 
-def _results(path: Path, scenario: Scenario) -> list[ReplicaResult]:
+def _read_results(path: Path, scenario: Scenario) -> list[ReplicaResult]:
     """Return the results that :func:`save_verdict` wrote, in order."""
     with np.load(path, allow_pickle=False) as file:
         columns = {name: file[name] for name in file.files}
@@ -183,9 +183,9 @@ def _results(path: Path, scenario: Scenario) -> list[ReplicaResult]:
             results.append(ReplicaResult(None, difference, expected))
             continue
         at = {name: values[index] for name, values in columns.items() if "." in name}
-        summary = summary_type(**_fields(at, "summary"))
+        summary = summary_type(**_select_fields(at, "summary"))
         parts = {
-            part: cls(**_fields(at, part)) if _fields(at, part) else None
+            part: cls(**_select_fields(at, part)) if _select_fields(at, part) else None
             for part, cls in PART_TYPES.items()
         }
         results.append(ReplicaResult(summary, difference, expected, PartSummary(**parts)))
@@ -193,7 +193,7 @@ def _results(path: Path, scenario: Scenario) -> list[ReplicaResult]:
     return results
 
 
-def _fields(values: dict[str, Any], prefix: str) -> dict[str, Any]:
+def _select_fields(values: dict[str, Any], prefix: str) -> dict[str, Any]:
     """Return the values whose names begin with ``prefix`` and a dot, without these."""
     return {
         name.split(".", 1)[1]: value

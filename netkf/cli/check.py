@@ -74,10 +74,10 @@ def _check(scenario: Scenario, options: argparse.Namespace) -> int:
     from netkf.checks.points import sampling_note
     from netkf.checks.report import verdict_json, verdict_text
 
-    earlier = _prepare(scenario, options)
+    earlier = _read_earlier(scenario, options)
     # A command that was stopped after it had written its verdict is given again.
     done = earlier is not None and options.until is None and earlier.runs == options.runs
-    verdict = earlier if earlier is not None and done else _judge(scenario, options, earlier)
+    verdict = earlier if earlier is not None and done else _run_check(scenario, options, earlier)
     text = verdict_text(verdict, scenario.claim, _replay_command(options))
     print_notes((*scenario.notes, *filter(None, [sampling_note(scenario)])))
     try:
@@ -93,7 +93,7 @@ def _check(scenario: Scenario, options: argparse.Namespace) -> int:
     return 0 if verdict else FAILED
 
 
-def _judge(scenario: Scenario, options: argparse.Namespace, earlier: Verdict | None) -> Verdict:
+def _run_check(scenario: Scenario, options: argparse.Namespace, earlier: Verdict | None) -> Verdict:
     """Return the verdict on --runs runs, those of an ``earlier`` one included."""
     from netkf.checks.check import check
     from netkf.checks.looks import MOST_RUNS
@@ -125,7 +125,7 @@ def _explain_interrupt(options: argparse.Namespace, earlier: Verdict | None) -> 
         raise KeyboardInterrupt(message) from None
 
 
-def _prepare(scenario: Scenario, options: argparse.Namespace) -> Verdict | None:
+def _read_earlier(scenario: Scenario, options: argparse.Namespace) -> Verdict | None:
     """Make the directory of the verdict, or return the earlier verdict in it."""
     if options.out is None:
         if options.resume:

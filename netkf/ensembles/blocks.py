@@ -90,10 +90,10 @@ def pack_scenario(scenario: Scenario) -> PackedScenario:
         remedy = "classes and functions must be those of modules; or use workers=1"
         raise EngineError(f"{message}; {remedy}") from None
     digest = hashlib.sha256(payload).hexdigest()
-    return PackedScenario(digest, payload, tuple(sorted(_modules(scenario))))
+    return PackedScenario(digest, payload, tuple(sorted(_plugged_in_modules(scenario))))
 
 
-def _modules(scenario: Scenario) -> set[tuple[str, str]]:
+def _plugged_in_modules(scenario: Scenario) -> set[tuple[str, str]]:
     """Return the module of each plugged-in class, with the folder that it can be imported from."""
     found = set()
     for part in plugged_in(scenario):

@@ -69,7 +69,7 @@ class BlockCheckpoints:
 
     def begun_with(self) -> int | None:
         """Return the number of runs in a block, as the first block says that can be read."""
-        for file in self._files():
+        for file in self._block_paths():
             with contextlib.suppress(DamagedError), _open_block(file) as arrays:
                 size = _read_texts(arrays)["identity"]["block"]
                 if is_block_size(size):
@@ -81,9 +81,9 @@ class BlockCheckpoints:
         this run or cannot be read; those are removed.
         """
         bad: list[tuple[str, str]] = []
-        for file in self._files():
+        for file in self._block_paths():
             try:
-                number = _number(file, identity)
+                number = _block_number(file, identity)
                 self._check(file, identity.of(number))
             except DamagedError as error:
                 bad.append((file.name, str(error)))
@@ -99,11 +99,11 @@ class BlockCheckpoints:
         """
         found = []
         wanted = {"scenario": scenario_digest, "seed": seed}
-        for file in self._files():
+        for file in self._block_paths():
             with contextlib.suppress(DamagedError):
                 self._check(file, wanted)
                 with _open_block(file) as arrays:
-                    found.append(_statistics(arrays))
+                    found.append(_restore_statistics(arrays))
         return found
 
     def save(self, number: int, statistics: RunStatistics, identity: RunIdentity) -> None:
@@ -115,35 +115,35 @@ class BlockCheckpoints:
         arrays = _as_arrays(statistics, identity.of(number))
         np.savez(block, **arrays)
         block.write(MARK + _digest(block, block.tell()))
-        with write_atomically(self._file(number)) as part:
+        with write_atomically(self._block_path(number)) as part:
             part.write_bytes(block.getbuffer())
         self._numbers.add(number)
 
     def load(self, number: int) -> RunStatistics:
         """Return a block without its traces; raises EngineError if it was damaged meanwhile."""
-        with self._expect_block(number), _open_block(self._file(number)) as arrays:
-            return _statistics(arrays)
+        with self._expect_block(number), _open_block(self._block_path(number)) as arrays:
+            return _restore_statistics(arrays)
 
     def traces(self) -> Iterator[Trace]:
         """Yield the traces of all blocks in the order of replicas; raises EngineError as ``load``
         does.
         """
         for number in sorted(self._numbers):
-            file = self._file(number)
+            file = self._block_path(number)
             with self._expect_block(number), _open_block(file, verified=False) as arrays:
                 for k in range(_read_texts(arrays)["traces"]):
-                    yield self._trace(arrays, k)
+                    yield self._restore_trace(arrays, k)
 
     def remove(self) -> None:
         """Delete all blocks."""
         shutil.rmtree(self._folder, ignore_errors=True)
 
-    def _files(self) -> list[Path]:
+    def _block_paths(self) -> list[Path]:
         """Return the files of all blocks, in order."""
         found = self._folder.glob("*.npz") if self._folder.is_dir() else ()
         return sorted(file for file in found if file.stem.isdecimal())
 
-    def _file(self, number: int) -> Path:
+    def _block_path(self, number: int) -> Path:
         """Return the path of a block."""
         return self._folder / f"{number:06d}.npz"
 
@@ -154,10 +154,10 @@ class BlockCheckpoints:
             for key, value in identity.items():
                 if not isinstance(found, dict) or found.get(key) != value:
                     raise DamagedError(f"is of another {key}")
-            if not self._fits(_statistics(arrays)):
+            if not self._has_form(_restore_statistics(arrays)):
                 raise DamagedError("does not fit the scenario")
 
-    def _fits(self, found: RunStatistics) -> bool:
+    def _has_form(self, found: RunStatistics) -> bool:
         """Return True if all arrays have the shapes of statistics of the scenario."""
         count, n = len(self._scenario.nodes), self._scenario.plant.n
         columns = {"samples": count * (n * (n + 1) + 1), "averages": 3 * (count + 1)}
@@ -173,7 +173,7 @@ class BlockCheckpoints:
             for one, name in moments
         )
 
-    def _trace(self, arrays: Any, k: int) -> Trace:
+    def _restore_trace(self, arrays: Any, k: int) -> Trace:
         """Return a trace; raises DamagedError if it does not fit the scenario."""
         trace: Any = Trace(*(arrays[f"trace_{k}_{name}"] for name in Trace._fields))
         T, N, n = len(trace.times), len(self._scenario.nodes), self._scenario.plant.n
@@ -192,8 +192,8 @@ class BlockCheckpoints:
             yield
         except DamagedError as error:
             with contextlib.suppress(OSError):
-                self._file(number).unlink()
-            message, remedy = f"{self._file(number)} {error}", "go on with --resume"
+                self._block_path(number).unlink()
+            message, remedy = f"{self._block_path(number)} {error}", "go on with --resume"
             raise EngineError(f"{message}; {remedy}, which does it again") from None
 
 
@@ -203,7 +203,7 @@ def is_block_size(value: object) -> bool:
     return known and 0 < value <= MAX_BLOCK and value & (value - 1) == 0  # type: ignore[operator]
 
 
-def _number(file: Path, identity: RunIdentity) -> int:
+def _block_number(file: Path, identity: RunIdentity) -> int:
     """Return the number of the block in a file; raises DamagedError."""
     number = int(file.stem[:12])
     if file.name != f"{number:06d}.npz" or number >= identity.blocks:
@@ -282,7 +282,7 @@ def _read_texts(arrays: Any) -> dict[str, Any]:
     return found
 
 
-def _statistics(arrays: Any) -> RunStatistics:
+def _restore_statistics(arrays: Any) -> RunStatistics:
     """Return the statistics of a block from the arrays of its file."""
 
     def moments(name: str) -> Moments:

@@ -188,7 +188,7 @@ class _Keeper:
         if note is not None:
             for line in lines:
                 note(line)
-        self._done = sum(map(self._runs, self._known))
+        self._done = sum(map(self._runs_in_block, self._known))
         self.note()
 
     def simulate(
@@ -202,15 +202,15 @@ class _Keeper:
         )
         return whole
 
-    def _runs(self, number: int) -> int:
+    def _runs_in_block(self, number: int) -> int:
         """Return the number of runs in a block."""
         return min(self.plan.block, self.plan.runs - number * self.plan.block)
 
     def save_block(self, number: int, found: RunStatistics) -> RunStatistics:
         """Save a block; its traces stay on disk."""
         self.blocks.save(number, found, self.plan)
-        self._done += self._runs(number)
-        self.simulated += self._runs(number)
+        self._done += self._runs_in_block(number)
+        self.simulated += self._runs_in_block(number)
         if time.monotonic() - self._noted >= NOTE_SECONDS:
             self.note()
         return found._replace(traces=())
@@ -218,7 +218,9 @@ class _Keeper:
     def note(self, status: str = "interrupted", error: BaseException | None = None) -> None:
         """Write to the manifest how the runs stand, until they have ended."""
         if not self._ended:
-            self._manifest.write(status, self._entries(block=self.plan.block), self._done, error)
+            self._manifest.write(
+                status, self._identity_entries(block=self.plan.block), self._done, error
+            )
             self._noted = time.monotonic()
 
     def stop(self, error: BaseException) -> BaseException:
@@ -232,11 +234,11 @@ class _Keeper:
 
     def end(self, status: str, whole: RunStatistics) -> None:
         """Write the manifest of all runs, with the digests of the other files."""
-        entries = self._entries(diverged=int(whole.totals[1]), events=int(whole.totals[0]))
+        entries = self._identity_entries(diverged=int(whole.totals[1]), events=int(whole.totals[0]))
         entries["fingerprint"] = whole.fingerprint
         self._manifest.write(status, entries, self.plan.runs, names=own_names(self.scenario))
         self._ended = True
 
-    def _entries(self, **others: Any) -> dict[str, Any]:
+    def _identity_entries(self, **others: Any) -> dict[str, Any]:
         """Return the entries of the manifest that say what belongs together."""
         return {"scenario": self.plan.scenario, "trace": self.plan.trace, **others}

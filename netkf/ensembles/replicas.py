@@ -84,7 +84,7 @@ def replicate_blocks(
     ended = False
     try:
         job = Job(scenario, task, seed, first, 0, runs, blocks.size)
-        whole = _gather(pool, job, together, merge, blocks, progress or _quiet)
+        whole = _gather(pool, job, together, merge, blocks, progress or _report_nothing)
         ended = True
     finally:
         pool.close(at_once=not ended)
@@ -105,7 +105,7 @@ def _as_it_came(number: int, result: Any) -> Any:  # noqa: ARG001
 CHOSEN_BY_POOL = NumberedBlocks(0, {}, _as_it_came)
 
 
-def _quiet(done: int, wanted: int) -> None:
+def _report_nothing(done: int, wanted: int) -> None:
     """Report no progress."""
 
 
@@ -129,12 +129,12 @@ def _gather(
 
     for number in sorted(known):
         take(job._replace(start=number * job.size), known[number]())
-    for block, result in _complete_blocks(pool, _blocks(pool, job, together, known)):
+    for block, result in _complete_blocks(pool, _make_blocks(pool, job, together, known)):
         take(block, blocks.received(block.start // block.size, result))
     return tree.result()
 
 
-def _blocks(
+def _make_blocks(
     pool: Pool, job: Job, together: int | None, known: Mapping[int, Callable[[], Any]]
 ) -> Iterator[Job]:
     """Yield the blocks that are not known, in order; the pool chooses sizes as it is asked."""

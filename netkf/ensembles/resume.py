@@ -81,19 +81,21 @@ def ensemble_to_resume(
     for key, (wanted, remedy) in same.items():
         if found.get(key) != wanted:
             rule = f"{out} holds a run of another {key.removesuffix('s')}"
-            raise ScenarioError("--resume", rule, _difference(found.get(key), wanted), remedy)
+            raise ScenarioError(
+                "--resume", rule, _describe_difference(found.get(key), wanted), remedy
+            )
     blocks_prove = "remove it: the blocks prove themselves"
-    _prove(out / "manifest.json", lambda: check_seal(found), blocks_prove)
+    _require(out / "manifest.json", lambda: check_seal(found), blocks_prove)
     _check_scenario(out, scenario)
     finished = found["status"] in ENDED
     if finished:
-        _prove(out, lambda: check_files(out, found), ANOTHER)
+        _require(out, lambda: check_files(out, found), ANOTHER)
     return BegunEnsemble(
         out, found["block"] if is_block_size(found.get("block")) else size, finished
     )
 
 
-def _difference(found: Any, wanted: Any) -> Any:
+def _describe_difference(found: Any, wanted: Any) -> Any:
     """Return the entries of a table that are not as wanted, and other values as they are."""
     if isinstance(found, dict) and isinstance(wanted, dict):
         return {
@@ -186,7 +188,7 @@ def _check_scenario(directory: Path, scenario: Scenario) -> None:
     raise ScenarioError("--resume", rule, scenario.name, remedy)
 
 
-def _prove(path: Path, check: Callable[[], None], remedy: str) -> None:
+def _require(path: Path, check: Callable[[], None], remedy: str) -> None:
     """Call a check; a DamagedError becomes a ScenarioError that names the file and the remedy."""
     try:
         check()

@@ -80,7 +80,7 @@ def read_ensemble(directory: Path, scenario: Scenario, manifest: dict[str, Any])
     rows = [*summary["nodes"], summary["overall"]]
     if [row["node"] for row in summary["nodes"]] != list(scenario.nodes):
         raise DamagedError("summary.json has other nodes than the scenario")
-    average, se_average = _averages(rows)
+    average, se_average = _read_averages(rows)
     runs, messages = summary["runs"], summary["messages"]
     blurred = summary.get("rounding_from")
     return StoredEnsemble(
@@ -114,7 +114,7 @@ def _of_blocks(directory: Path, scenario: Scenario, manifest: dict[str, Any]) ->
     return ensemble_of(scenario, whole, int(manifest["seed"]), str(manifest.get("engine", "")))
 
 
-def _averages(rows: list[dict[str, Any]]) -> tuple[FloatArray, FloatArray]:
+def _read_averages(rows: list[dict[str, Any]]) -> tuple[FloatArray, FloatArray]:
     """Return means and standard errors (N + 1, 3) of an ensemble from rows of its summary."""
 
     def column(name: str) -> FloatArray:

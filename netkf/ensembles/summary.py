@@ -21,9 +21,9 @@ def summarise_ensemble(
     """
     mean = found.averages.mean.reshape(-1, 3)
     error = found.averages.standard_error().reshape(-1, 3)
-    bound = _bounds(scenario, promised)
+    bound = _mean_bounds(scenario, promised)
     blurred = found.rounding_from if np.isfinite(found.rounding_from) else None
-    rows = [_row(*values) for values in zip(mean, error, bound, strict=True)]
+    rows = [_make_row(*values) for values in zip(mean, error, bound, strict=True)]
     messages = found.messages.mean[0].tolist()
     messages_se = found.messages.standard_error()[0].tolist()
     nodes = [{"node": node, **row} for node, row in zip(scenario.nodes, rows[:-1], strict=True)]
@@ -68,7 +68,7 @@ def _chi_square(scenario: Scenario, found: RunStatistics) -> dict[str, float]:
     return {"n": n, "confidence": CONFIDENCE, "low": low, "high": high, "inside": inside}
 
 
-def _bounds(scenario: Scenario, promised: PromisedTraces) -> list[float | None]:
+def _mean_bounds(scenario: Scenario, promised: PromisedTraces) -> list[float | None]:
     """Return averages of the bound over the samples after time 0, of the nodes and of all."""
     if promised.bound is None:
         return [None] * (len(scenario.nodes) + 1)
@@ -77,7 +77,7 @@ def _bounds(scenario: Scenario, promised: PromisedTraces) -> list[float | None]:
     return [*nodes.tolist(), float(nodes.mean())]
 
 
-def _row(mean: FloatArray, error: FloatArray, bound: float | None) -> dict[str, Any]:
+def _make_row(mean: FloatArray, error: FloatArray, bound: float | None) -> dict[str, Any]:
     """Return the summary of a node or of all nodes from means and standard errors of squared error,
     trace and NEES.
     """

@@ -134,7 +134,7 @@ class WorkerProcesses:
             self._hand_out()
             busy = {worker.results: worker for worker in self._workers if worker.task is not None}
             for ready in multiprocessing.connection.wait(list(busy)):
-                self._take(busy[ready])  # type: ignore[index]
+                self._receive_result(busy[ready])  # type: ignore[index]
 
     def close(self, at_once: bool) -> None:
         """End all workers, idle ones by themselves; ``at_once`` kills them, whatever they do."""
@@ -159,9 +159,9 @@ class WorkerProcesses:
             try:
                 worker.send(task)
             except OSError:
-                self._bury(worker)
+                self._discard_worker(worker)
 
-    def _take(self, worker: _Worker) -> None:
+    def _receive_result(self, worker: _Worker) -> None:
         """Take the result of a worker, or take note that it died."""
         assert worker.task is not None
         future = worker.task.future
@@ -170,7 +170,7 @@ class WorkerProcesses:
         except (EOFError, OSError) as error:
             # An OSError of the task itself comes with the traceback of the worker.
             if not isinstance(error.__cause__, _RemoteError):
-                self._bury(worker)
+                self._discard_worker(worker)
                 return
             worker.task = None
             future.set_exception(error)
@@ -182,7 +182,7 @@ class WorkerProcesses:
             self._hand_out()  # before this process is busy with the result
             future.set_result(result)
 
-    def _bury(self, worker: _Worker) -> None:
+    def _discard_worker(self, worker: _Worker) -> None:
         """Put the task of a dead worker back to the others, unless too many died of it."""
         self._workers.remove(worker)
         worker.end()
@@ -206,10 +206,10 @@ def _serve(jobs: Connection, results: Connection) -> None:
     threading.Thread(target=_end_with_parent, daemon=True).start()
     with suppress(EOFError, OSError):
         while True:
-            results.send_bytes(_outcome(jobs.recv_bytes()))
+            results.send_bytes(_run_job(jobs.recv_bytes()))
 
 
-def _outcome(message: bytes) -> bytes:
+def _run_job(message: bytes) -> bytes:
     """Do a pickled job; return the pickle of (pickled result, pickled exception, traceback)."""
     try:
         answer: tuple[bytes | None, bytes | None, str]

@@ -73,7 +73,7 @@ def _draw_innovations(axes: Any, subject: Subject) -> list[str]:
 
 def bound_claim(subject: Subject) -> str:
     """Return a sentence on how many nodes stay below the bound, or what else can be said."""
-    rows = [row for row in subject.rows if _known(row.get("ratio"))]
+    rows = [row for row in subject.rows if _is_known(row.get("ratio"))]
     if rows:
         return (_mean_claim if subject.runs > 1 else _run_claim)(rows)
     if subject.shows_errors:
@@ -91,7 +91,7 @@ def _run_claim(rows: list[dict[str, Any]]) -> str:
 
 def _mean_claim(rows: list[dict[str, Any]]) -> str:
     """Return a sentence on the mean over runs, which counts the intervals of the ratios."""
-    margins = [LEVEL * _number(row.get("ratio_se")) for row in rows]
+    margins = [LEVEL * _known_or_zero(row.get("ratio_se")) for row in rows]
     above = sum(row["ratio"] - m > 1.0 for row, m in zip(rows, margins, strict=True))
     below = sum(row["ratio"] + m <= 1.0 for row, m in zip(rows, margins, strict=True))
     count = len(rows)
@@ -105,7 +105,7 @@ def _mean_claim(rows: list[dict[str, Any]]) -> str:
 
 def _size_claim(subject: Subject) -> str:
     """Return the claim of the figure: the range of RMS errors."""
-    values = [row["rms_error"] for row in subject.rows if _known(row.get("rms_error"))]
+    values = [row["rms_error"] for row in subject.rows if _is_known(row.get("rms_error"))]
     if not values:
         return "The errors of the nodes over time"
     if len(values) == 1:
@@ -113,14 +113,14 @@ def _size_claim(subject: Subject) -> str:
     return f"RMS errors of {len(values)} nodes lie between {min(values):.3g} and {max(values):.3g}"
 
 
-def _known(value: Any) -> bool:
+def _is_known(value: Any) -> bool:
     """Return True for a finite number."""
     return value is not None and math.isfinite(value)
 
 
-def _number(value: Any) -> float:
+def _known_or_zero(value: Any) -> float:
     """Return the value, 0 if unknown."""
-    return float(value) if _known(value) else 0.0
+    return float(value) if _is_known(value) else 0.0
 
 
 def quantiles_figure(subject: Subject) -> Picture:
@@ -196,13 +196,13 @@ def value_ratio(values: FloatArray, typical: float) -> str:
 
 def ratios_figure(subject: Subject) -> Picture:
     """Draw for each node its mean trace of P over the bound; without a bound NEES over n."""
-    rows = [row for row in subject.rows if _known(row.get("ratio"))]
+    rows = [row for row in subject.rows if _is_known(row.get("ratio"))]
     key, label, line = "ratio", "mean trace P / mean bound H(12)", "the bound"
     if not rows:
         subject.require_truth()
         key, n = "mean_nees", subject.scenario.plant.n
         label, line = f"mean NEES / n, n = {n}", "errors as P says"
-        rows = [row for row in subject.rows if _known(row.get(key))]
+        rows = [row for row in subject.rows if _is_known(row.get(key))]
         if not rows:
             raise UnavailableError("There are no ratios: no bound applies and NEES is unknown.")
         scale = 1.0 / n
@@ -242,7 +242,7 @@ def _draw_ratios(
     """Draw the ratio of each node, with bars of 1.96 standard errors, against 1."""
     positions = np.arange(len(rows))
     values = scale * np.array([row[key] for row in rows])
-    widths = scale * LEVEL * np.array([_number(row.get(f"{key}_se")) for row in rows])
+    widths = scale * LEVEL * np.array([_known_or_zero(row.get(f"{key}_se")) for row in rows])
     axes.hlines(positions, np.minimum(values, 1.0), np.maximum(values, 1.0), color=FAINT, lw=0.8)
     has = np.array([row["node"] in subject.scenario.placed for row in rows])
     for group, colour, marker, label in (

@@ -24,8 +24,8 @@ MAX_BESIDE = 2.2
 def network_figure(subject: Subject) -> Picture:
     """Draw the network once for each quantity of the nodes that is known."""
     positions = positions_of(subject.scenario.topology)
-    quantities = _quantities(subject)
-    aspect = _aspect(positions)
+    quantities = _colour_quantities(subject)
+    aspect = _figure_aspect(positions)
     across = 1 if aspect > MAX_BESIDE else len(quantities)
     down = len(quantities) // across
     size = (7.4, 1.4 + 6.6 / aspect * down) if across == 1 else (3.7 * across, 4.4)
@@ -36,7 +36,9 @@ def network_figure(subject: Subject) -> Picture:
     for axes, (label, shades) in zip(panels, quantities.items(), strict=True):
         draw_network(axes, subject, shades, label, positions)
     panels[0].legend(loc="upper left", bbox_to_anchor=(0.0, 0.0), ncols=2)
-    finish_figure(figure, subject.claim(_claim(subject)), subject.caption(_explain(subject)))
+    finish_figure(
+        figure, subject.claim(_make_claim(subject)), subject.caption(_explanation(subject))
+    )
     return figure
 
 
@@ -53,27 +55,27 @@ def shades_of(subject: Subject, key: str) -> dict[int, float]:
     return {node: math.nan if value is None else float(value) for node, value in values}
 
 
-def _quantities(subject: Subject) -> dict[str, dict[int, float]]:
+def _colour_quantities(subject: Subject) -> dict[str, dict[int, float]]:
     """Return the quantities that may colour the nodes, by label and node."""
     key, label = error_label(subject)
     found = {label: shades_of(subject, key)}
     if subject.runs == 1 and any("sent" in row for row in subject.rows):
-        size = _bytes(subject)
+        size = _message_bytes(subject)
         found["messages sent, all hearers counted"] = shades_of(subject, "sent")
         sent = shades_of(subject, "transmissions")
         found["kilobytes transmitted"] = {n: v * size / 1000.0 for n, v in sent.items()}
     return found
 
 
-def _bytes(subject: Subject) -> int:
+def _message_bytes(subject: Subject) -> int:
     """Return the bytes of an estimate with its covariance, as float64."""
     n = subject.scenario.plant.n
     return 8 * (n + n * (n + 1) // 2)
 
 
-def _explain(subject: Subject) -> str:
+def _explanation(subject: Subject) -> str:
     """Return the sentences on links and energy."""
-    size = _bytes(subject)
+    size = _message_bytes(subject)
     links = "Links are as wide as the messages that they delivered. " if subject.delivered else ""
     if len(subject.scenario.topology.links) > MAX_LINKS:
         links += f"{MAX_LINKS:,} links are drawn. "
@@ -83,7 +85,7 @@ def _explain(subject: Subject) -> str:
     return links + (energy if subject.runs == 1 else "")
 
 
-def _claim(subject: Subject) -> str:
+def _make_claim(subject: Subject) -> str:
     """Return the claim of the figure: the worst and the best node."""
     key, _ = error_label(subject)
     shades = {n: v for n, v in shades_of(subject, key).items() if math.isfinite(v)}
@@ -99,7 +101,7 @@ def _claim(subject: Subject) -> str:
     return f"{claim}, {shades[best]:.3g}"
 
 
-def _aspect(positions: Positions) -> float:
+def _figure_aspect(positions: Positions) -> float:
     """Return the width of a network over its height, at least 1."""
     xy = np.array(list(positions.values()), dtype=np.float64)
     width, height = np.ptp(xy, axis=0) if len(xy) else (1.0, 1.0)

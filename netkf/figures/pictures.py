@@ -46,11 +46,13 @@ def overview(subject: Subject) -> Picture:
     network.legend(loc="lower left", bbox_to_anchor=(0.0, 1.04), ncols=2, borderaxespad=0.2)
     scenario = subject.scenario
     title = f"{scenario.name}: {scenario.claim}" if scenario.claim else scenario.name
-    finish_figure(figure, subject.claim(title), subject.caption(*_sentences(subject), notes="both"))
+    finish_figure(
+        figure, subject.claim(title), subject.caption(*_caption_sentences(subject), notes="both")
+    )
     return figure
 
 
-def _sentences(subject: Subject) -> list[str]:
+def _caption_sentences(subject: Subject) -> list[str]:
     """Return the sentences on bands, links and messages."""
     sentences = []
     if subject.runs > 1:

@@ -73,10 +73,10 @@ class Ages(NamedTuple):
         """Return for how many seconds the age is above each of the ``levels`` (L,)."""
         top = self.low + self.stop - self.start
         # Seconds above a level: sums of (top - level) where that is positive, less the same of low.
-        return _excess(top, levels) - _excess(self.low, levels)
+        return _excess_time(top, levels) - _excess_time(self.low, levels)
 
 
-def _excess(values: FloatArray, levels: FloatArray) -> FloatArray:
+def _excess_time(values: FloatArray, levels: FloatArray) -> FloatArray:
     """Return the sum of ``max(0, value - level)`` over the values (K,) for each level (L,)."""
     ordered = np.sort(values)[::-1]
     sums = np.concatenate([[0.0], np.cumsum(ordered)])
@@ -97,7 +97,7 @@ def ages_of(log: np.ndarray, node: int, end: float) -> Ages:
 
 def age_figure(subject: Subject) -> Picture:
     """Draw the age of information over time, means and maxima over the nodes, and its law."""
-    end = _end(subject)
+    end = _last_time(subject)
     degrees = subject.scenario.topology.degrees
     receivers = [node for node in subject.nodes if degrees.get(node, 0)]
     if not receivers:
@@ -163,7 +163,7 @@ def _draw_age_law(axes: Any, ages: list[Ages], means: FloatArray, end: float) ->
     draw_legend(axes, 1)
 
 
-def _end(subject: Subject) -> float:
+def _last_time(subject: Subject) -> float:
     """Return the last recorded time in seconds."""
     last = float(subject.log["t"][-1])
     if len(subject.times):
@@ -219,7 +219,7 @@ def links_figure(subject: Subject) -> Picture:
     """Draw every message of each direction at its time: ticks for delivered, crosses for lost."""
     found = _with_messages(subject)
     chosen = [found[k] for k in select_evenly(np.arange(len(found)), MAX_DIRECTIONS).tolist()]
-    begin, end = _window(chosen, _end(subject))
+    begin, end = _readable_window(chosen, _last_time(subject))
     figure = new_figure(8.4, min(9.0, 2.0 + 0.16 * len(chosen)))
     axes = figure.add_subplot()
     for row, one in enumerate(chosen):
@@ -252,7 +252,7 @@ def links_figure(subject: Subject) -> Picture:
     )
     claim = f"{lost:,} of {total:,} messages were lost ({lost / total:.1%})"
     directions = f"{len(chosen)} of {len(found)} directions" if len(chosen) < len(found) else ""
-    part = f"the first {end:,.4g} s" if end < _end(subject) else ""
+    part = f"the first {end:,.4g} s" if end < _last_time(subject) else ""
     cut = " of ".join(filter(None, (directions, part)))
     sentence = f"Shown: {cut}; the claim counts all." if cut else "All messages are shown."
     finish_figure(figure, subject.claim(claim), subject.caption(sentence))
@@ -267,7 +267,7 @@ def _with_messages(subject: Subject) -> list[DirectedMessages]:
     return found
 
 
-def _window(chosen: list[DirectedMessages], end: float) -> tuple[float, float]:
+def _readable_window(chosen: list[DirectedMessages], end: float) -> tuple[float, float]:
     """Return the longest time from 0 on with at most MAX_MARKS messages, seconds."""
     times = np.sort(np.concatenate([np.concatenate([d.delivered, d.lost]) for d in chosen]))
     return 0.0, float(times[MAX_MARKS]) if len(times) > MAX_MARKS else end
@@ -287,7 +287,7 @@ def delivery_figure(subject: Subject) -> Picture:
     figure = new_figure(8.4, 4.2)
     left, right = figure.subplots(1, 2, width_ratios=[1.3, 1.0])
     outside = _draw_shares(left, subject, found, shares, ends)
-    _draw_loss(right, found, _end(subject))
+    _draw_loss(right, found, _last_time(subject))
     total = sum(len(d.delivered) + len(d.lost) for d in found)
     arrived = sum(len(d.delivered) for d in found)
     claim = f"{arrived / total:.1%} of {total:,} messages arrived"
@@ -316,7 +316,7 @@ def _draw_shares(
         label="95% interval",
     )
     axes.plot(positions, shares[order], ls="", marker=".", color=INK, ms=4, label="delivered")
-    said = np.array([_expected(subject, found[k]) for k in order.tolist()])
+    said = np.array([_stated_delivery(subject, found[k]) for k in order.tolist()])
     outside = None
     if np.isfinite(said).any():
         style = {"ls": "", "marker": "_", "ms": 5, "color": SENSING}
@@ -334,7 +334,7 @@ def _draw_shares(
     return outside
 
 
-def _expected(subject: Subject, one: DirectedMessages) -> float:
+def _stated_delivery(subject: Subject, one: DirectedMessages) -> float:
     """Return the delivery probability that the scenario gives a direction; nan if it varies."""
     link = one.sender, one.receiver
     loss = subject.scenario.network.channel.loss

@@ -132,9 +132,9 @@ class Poisson(LinkClock):
     @cached_property
     def _own(self) -> dict[Entity, float]:
         """Rates of the entities that have one of their own, per second."""
-        return {self._named(given): given[-1] for given in self.rates}
+        return {self._entity_of(given): given[-1] for given in self.rates}
 
-    def _named(self, given: tuple[float, ...]) -> Entity:
+    def _entity_of(self, given: tuple[float, ...]) -> Entity:
         """Return the entity that an entry of ``rates`` names."""
         ids = tuple(int(number) for number in given[:-1])
         return tuple(sorted(ids)) if self.at == "links" else ids
@@ -166,7 +166,7 @@ class Poisson(LinkClock):
         entities, named = self.entities(topology), set()
         known, what = set(entities), self.at.removesuffix("s")
         for k, given in enumerate(self.rates):
-            entity = self._named(given)
+            entity = self._entity_of(given)
             if entity not in known or entity in named:
                 again = f"names a {what} again"
                 rule = again if entity in named else f"must name a {what} of the graph"

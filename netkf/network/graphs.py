@@ -155,7 +155,7 @@ class Graph(Component):
         """Return the nodes and links; raises ScenarioError if there are none to build."""
 
 
-def _topology(nodes: Iterable[int], links: Iterable[Link], **more: Any) -> Topology:
+def _make_topology(nodes: Iterable[int], links: Iterable[Link], **more: Any) -> Topology:
     """Return the topology of undirected links, each given in any order of its ends."""
     pairs = {(min(link), max(link)) for link in links}
     return Topology(tuple(sorted(nodes)), tuple(sorted(pairs)), **more)
@@ -163,7 +163,7 @@ def _topology(nodes: Iterable[int], links: Iterable[Link], **more: Any) -> Topol
 
 def _from_networkx(graph: networkx.Graph[Any], **more: Any) -> Topology:
     """Return the topology of an undirected networkx graph."""
-    return _topology(graph.nodes, graph.edges, **more)
+    return _make_topology(graph.nodes, graph.edges, **more)
 
 
 _count = integer(low=1, high=MAX_NODES)
@@ -185,7 +185,9 @@ class Cycle(Graph):
 
     def build(self, seed: int) -> Topology:
         """Return the topology with links (k, k + 1) and (0, nodes - 1)."""
-        return _topology(range(self.nodes), [(k, (k + 1) % self.nodes) for k in range(self.nodes)])
+        return _make_topology(
+            range(self.nodes), [(k, (k + 1) % self.nodes) for k in range(self.nodes)]
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -196,7 +198,7 @@ class PathGraph(Graph):
 
     def build(self, seed: int) -> Topology:
         """Return the topology with links (k, k + 1)."""
-        return _topology(range(self.nodes), [(k, k + 1) for k in range(self.nodes - 1)])
+        return _make_topology(range(self.nodes), [(k, k + 1) for k in range(self.nodes - 1)])
 
 
 @dataclass(frozen=True, eq=False)
@@ -209,7 +211,7 @@ class Complete(Graph):
         """Return the topology that links all pairs."""
         _check_size(self.nodes, self.nodes * (self.nodes - 1) // 2)
         pairs = [(i, j) for i in range(self.nodes) for j in range(i + 1, self.nodes)]
-        return _topology(range(self.nodes), pairs)
+        return _make_topology(range(self.nodes), pairs)
 
 
 @dataclass(frozen=True, eq=False)
@@ -220,7 +222,7 @@ class Star(Graph):
 
     def build(self, seed: int) -> Topology:
         """Return the topology with links (0, k)."""
-        return _topology(range(self.nodes), [(0, k) for k in range(1, self.nodes)])
+        return _make_topology(range(self.nodes), [(0, k) for k in range(1, self.nodes)])
 
 
 @dataclass(frozen=True, eq=False)
@@ -237,7 +239,7 @@ class Grid(Graph):
         right = zip(ids[:, :-1].ravel().tolist(), ids[:, 1:].ravel().tolist(), strict=True)
         below = zip(ids[:-1].ravel().tolist(), ids[1:].ravel().tolist(), strict=True)
         positions = {int(ids[r, c]): (float(c), -float(r)) for r, c in np.ndindex(*ids.shape)}
-        return _topology(ids.ravel().tolist(), [*right, *below], positions=positions)
+        return _make_topology(ids.ravel().tolist(), [*right, *below], positions=positions)
 
 
 @dataclass(frozen=True, eq=False)
@@ -379,7 +381,7 @@ class Edges(Graph):
             raise ScenarioError("edges", "must name at least one node", [], "add nodes = N")
         if self.directed:
             return Topology(tuple(sorted(nodes)), tuple(sorted(set(self.edges))), directed=True)
-        return _topology(nodes, self.edges)
+        return _make_topology(nodes, self.edges)
 
 
 class _Table(NamedTuple):
@@ -418,7 +420,7 @@ class CsvGraph(Graph):
                 "path",
                 f"{self.path.name}: some links are listed in both directions and others in one, so "
                 "the probability of the other direction is not known",
-                _listed(one_way),
+                _list_directions(one_way),
                 "list every link twice, or every link once (then the row counts both ways), or set "
                 "directed = true",
             )
@@ -529,10 +531,10 @@ def _one_way_note(pairs: list[Link]) -> tuple[str, ...]:
     """Return a note on links that are left out because they are listed in one direction, if any."""
     if not pairs:
         return ()
-    return (f"links listed in one direction only left out: {_listed(pairs)}",)
+    return (f"links listed in one direction only left out: {_list_directions(pairs)}",)
 
 
-def _listed(pairs: list[Link], most: int = 3) -> str:
+def _list_directions(pairs: list[Link], most: int = 3) -> str:
     """Return the first few directions as text."""
     text = ", ".join(f"{i} to {j}" for i, j in pairs[:most])
     return text if len(pairs) <= most else f"{text} and {len(pairs) - most} more"

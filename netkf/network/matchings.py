@@ -149,7 +149,7 @@ class Matching(SlotActivation):
         return dict(zip(links, shares, strict=True))
 
 
-def _meets(link: Link, pairs: list[Link]) -> bool:
+def _shares_node(link: Link, pairs: list[Link]) -> bool:
     """Return True if the link shares a node with one of the pairs."""
     return any(node in pair for pair in pairs for node in link)
 
@@ -169,7 +169,7 @@ def _random_greedy(topology: Topology, random: np.random.Generator) -> list[Link
     """Return a maximal matching: links in random order, each if both ends are free."""
     links = topology.links
     order = random.permutation(len(links)).tolist()
-    return _greedy([links[k] for k in order])
+    return _choose_greedily([links[k] for k in order])
 
 
 def _uniform_maximal(topology: Topology, random: np.random.Generator) -> list[Link]:
@@ -178,7 +178,7 @@ def _uniform_maximal(topology: Topology, random: np.random.Generator) -> list[Li
     return list(every[int(random.integers(len(every)))])
 
 
-def _greedy(links: list[Link]) -> list[Link]:
+def _choose_greedily(links: list[Link]) -> list[Link]:
     """Return the links whose ends are both free when their turn comes."""
     matched: set[int] = set()
     chosen = []
@@ -280,7 +280,7 @@ class RecordedSlots(SlotActivation):
             phase, step = (0, 0) if matching else (columns["phase"][row], columns["step"][row])
             listed = pairs.setdefault((slot, phase, step), [])
             link = (min(i, j), max(i, j)) if matching else (i, j)
-            if matching and link not in listed and (i == j or _meets(link, listed)):
+            if matching and link not in listed and (i == j or _shares_node(link, listed)):
                 rule = f"{self.path.name}: a node may be paired once a slot"
                 raise ScenarioError("path", rule, [slot, i, j], "correct the row")
             if link not in listed:

@@ -121,7 +121,7 @@ class RecordedLoss(Loss):
         self, link: Link, message: int, bad: bool, table_probability: float
     ) -> float:
         """Return 0 or 1."""
-        value = _at("network.channel.loss", self.table, link, message, self.after)
+        value = _value_at("network.channel.loss", self.table, link, message, self.after)
         if value is None:
             return 0.0 if self.after == "lose" else 1.0
         return value
@@ -178,7 +178,7 @@ class RecordedDelay(Delay):
 
     def message_delay(self, link: Link, message: int, drawn: float) -> float:
         """Return the recorded seconds."""
-        value = _at("network.channel.delay", self.table, link, message, self.after)
+        value = _value_at("network.channel.delay", self.table, link, message, self.after)
         if value is None:
             return math.nan if self.after == "lose" else 0.0
         return value
@@ -188,7 +188,7 @@ class RecordedDelay(Delay):
         demand_links(self.path, self.table.values, topology)
 
 
-def _at(key: str, table: MessageTable, link: Link, message: int, after: str) -> float | None:
+def _value_at(key: str, table: MessageTable, link: Link, message: int, after: str) -> float | None:
     """Return the value of a message in the table; errors name ``key``."""
     # Asked for during a run, so the error must carry the whole path of its key.
     try:

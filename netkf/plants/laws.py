@@ -48,7 +48,7 @@ class GridLaws:
         self.to_end, self.to_moments = _response_series(A, period)
         self.course_table = course_table(self.to_end, self.n, period)
         self.response = self.responses(period)
-        self.noise_factor = _factor(self._noise(period))
+        self.noise_factor = _nonnegative_factor(self._impulse_responses(period))
         self._conditional_laws: dict[tuple[float, float], tuple[FloatArray, FloatArray]] = {}
         self._grids: dict[tuple[int, int], FloatArray] = {}
 
@@ -68,7 +68,7 @@ class GridLaws:
         values = [polynomial(series, gap) for series in (self.to_end, self.to_moments)]
         return np.concatenate(values).reshape(3, self.n, self.n)
 
-    def _noise(self, gap: float) -> FloatArray:
+    def _impulse_responses(self, gap: float) -> FloatArray:
         """Return the responses (3 n, 20 m) of the end and the moments to noise at the quadrature
         nodes.
         """
@@ -199,7 +199,7 @@ def course_table(to_end: FloatArray, n: int, longest: float) -> FloatArray:
     return table
 
 
-def _factor(noise: FloatArray) -> FloatArray:
+def _nonnegative_factor(noise: FloatArray) -> FloatArray:
     """Return the lower triangular S with ``S S' = noise noise'`` and no entry below zero on its
     diagonal, whose column is zero where a row of ``noise`` depends on those before it.
     """

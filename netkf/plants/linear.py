@@ -128,19 +128,19 @@ class LinearPath:
 
     def local(self, slot: int) -> FloatArray:
         """Return x (n,) in the present frame, at a slot not before the last one asked for."""
-        x = self._before(slot)
+        x = self._state_at(slot)
         return np.zeros(len(x)) if slot == self._rebased > 0 else x
 
-    def _before(self, slot: int) -> FloatArray:
+    def _state_at(self, slot: int) -> FloatArray:
         """Return the state (n,) at a slot; slots must not decrease."""
         while slot >= self._first + len(self._x):
             normals = self._random.standard_normal((BLOCK, self._root.shape[1]))
             noise = product(normals, self._root.T)
             self._first += len(self._x) - 1
-            self._x = self._following(noise)
+            self._x = self._next_states(noise)
         return np.asarray(self._x[slot - self._first])
 
-    def _following(self, noise: FloatArray) -> FloatArray:
+    def _next_states(self, noise: FloatArray) -> FloatArray:
         """Return states (BLOCK + 1, n) before any rebase, of which the first is known."""
         frame, first = self.frame_slots, self._first
         if frame is None:
@@ -172,11 +172,11 @@ class LinearPath:
     def rebase(self, slot: int) -> FloatArray:
         """Return the local state (n,) of a slot that begins a frame, which is zero from now on."""
         self._rebased = slot
-        return self._before(slot)
+        return self._state_at(slot)
 
     def absolute(self, slot: int) -> FloatArray:
         """Return x (n,), at a slot not before the last one asked for."""
-        x = self._before(slot)
+        x = self._state_at(slot)
         return x if self.frame_slots is None else self._move_origin(slot) + x
 
     state = absolute

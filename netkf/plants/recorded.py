@@ -75,7 +75,7 @@ class RecordedPlant(LinearPlant):
 
     def demand(self, slots: Iterable[int]) -> None:
         """Raise ScenarioError where the table lacks one of the slots."""
-        _demand(self.path, self.table, slots, self.period, "state")
+        _demand_rows(self.path, self.table, slots, self.period, "state")
 
     def truth(self, random: np.random.Generator, frames: bool = False) -> RecordedPath:
         """Return the states of the table."""
@@ -203,7 +203,7 @@ class RecordedSensor(Sensor):
     def _regressors(self) -> list[str]:
         """Names of the columns ``phi0, phi1, ...`` that the file has."""
         header = read_header(self.path)
-        count = sum(_component(name, "phi") >= 0 for name in header)
+        count = sum(_column_number(name, "phi") >= 0 for name in header)
         return [f"phi{k}" for k in range(count)]
 
     @property
@@ -249,7 +249,7 @@ class RecordedSensor(Sensor):
         p = self._outputs
         names = ("t", *(f"y{k}" for k in range(p)), *self._regressors)
         indices = [header.index(name) for name in names]
-        beyond = [k for k, name in enumerate(header) if _component(name) >= p]
+        beyond = [k for k, name in enumerate(header) if _column_number(name) >= p]
         rows: dict[int, list[tuple[float, FloatArray]]] = {node: [] for node in self.nodes}
         for node, (line, entries) in zip(self._ids, lines, strict=True):
             if node in rows:
@@ -358,7 +358,7 @@ class RecordedReadings:
         return y, H
 
 
-def _component(name: str, letter: str = "y") -> int:
+def _column_number(name: str, letter: str = "y") -> int:
     """Return k of a column name such as ``y3``, -1 for other names."""
     number = name.removeprefix(letter)
     return int(number) if name.startswith(letter) and number.isdecimal() else -1
@@ -381,7 +381,7 @@ def by_slot(
     return table
 
 
-def _demand(
+def _demand_rows(
     source: SourceFile, table: Table, slots: Iterable[int], period: float, what: str
 ) -> None:
     """Raise ScenarioError if a slot has no row in the table."""

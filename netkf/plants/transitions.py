@@ -48,11 +48,11 @@ class Transitions:
         if key not in self._known:
             if len(self._known) >= KNOWN:
                 self._known.clear()
-            self._known[key] = self._laws(distinct)
+            self._known[key] = self._distinct_laws(distinct)
         Phi, L = self._known[key]
         return Phi[index], L[index]
 
-    def _laws(self, distinct: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def _distinct_laws(self, distinct: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return transitions and noise factors (K, n, n) of K distinct gaps, by doubling from at
         most one unit.
         """
@@ -153,10 +153,10 @@ def frame_period(A: FloatArray) -> float | None:
     most 2^10 for the spectral abscissa a of ``A`` (n, n); None for a plant that is not unstable.
     """
     abscissa = float(np.linalg.eigvals(A).real.max())
-    return _round(GROWTH / abscissa) if abscissa > 0.0 else None
+    return _round_seconds(GROWTH / abscissa) if abscissa > 0.0 else None
 
 
-def _round(seconds: float) -> float:
+def _round_seconds(seconds: float) -> float:
     """Return a time rounded to 9 significant digits."""
     # Frames are to begin at the same times whatever the last bits of an eigenvalue.
     return float(f"{seconds:.9g}")
@@ -167,4 +167,4 @@ def frame_slots(F: FloatArray) -> int | None:
     spectral radius of ``F`` (n, n); None for a plant that is not unstable.
     """
     radius = float(np.abs(np.linalg.eigvals(F)).max())
-    return max(1, int(_round(GROWTH / math.log(radius)))) if radius > 1.0 else None
+    return max(1, int(_round_seconds(GROWTH / math.log(radius)))) if radius > 1.0 else None

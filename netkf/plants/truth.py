@@ -116,7 +116,7 @@ class SampledTruth:
         before, normals = _draw_states(moves, start, random, times, rebased)
         self.offsets = before[rebased]
         after = np.where(rebased[:, None], 0.0, before)
-        between = _bridge(moves, times, after, normals, probing, inside)
+        between = _bridge_gap(moves, times, after, normals, probing, inside)
         order = np.argsort(np.concatenate([times, inside]), kind="stable")
         self._times = np.concatenate([times, inside])[order]
         self._local = np.concatenate([after, between])[order]
@@ -177,7 +177,7 @@ def _draw_states(
     return states, np.concatenate(drawn)
 
 
-def _bridge(
+def _bridge_gap(
     moves: Transitions,
     times: FloatArray,
     states: FloatArray,

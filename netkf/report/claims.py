@@ -107,7 +107,9 @@ def _describe_ending(source: Opened) -> list[str]:
         many = f"{done['done']:,} of {done['wanted']:,} runs are done"
         sampled = run is not None and len(run.times) > 0
         reached = (
-            f"after its sample at {_time(_last_time(run))}" if sampled else "before it was sampled"
+            f"after its sample at {_format_time(_last_time(run))}"
+            if sampled
+            else "before it was sampled"
         )
         what = many if done["wanted"] > 1 else f"the run stopped {reached}"
         found.append(f"Interrupted: {what}. Everything here is about what was finished")
@@ -117,7 +119,7 @@ def _describe_ending(source: Opened) -> list[str]:
         rows = run.log[run.log["kind"] == CODES["diverged"]]
         nodes = ", ".join(map(str, rows["node"][:MAX_LISTED].tolist()))
         more = ", ..." if len(rows) > MAX_LISTED else ""
-        when = _time(float(rows["t"][0])) if len(rows) else "an unknown time"
+        when = _format_time(float(rows["t"][0])) if len(rows) else "an unknown time"
         found.append(
             f"Diverged: at {when} the estimate or the covariance of node {nodes}{more} was no "
             "longer usable, and the run ended there"
@@ -143,26 +145,29 @@ def _describe_trace(source: Opened, run: StoredRun, messages: np.ndarray) -> lis
         return [
             "There is no ground truth, so nobody knows which node was most wrong. Least certain by "
             f"its own covariance was node {worst.node}: square root of mean trace P "
-            f"{format_number(worst.value)}, the largest of {count} nodes; {_since(run, worst)}it "
-            f"peaked at {_time(worst.time)} with {format_number(worst.peak)}",
-            *_why(source, run, messages, sample),
+            f"{format_number(worst.value)}, the largest of {count} nodes; "
+            f"{_describe_start(run, worst)}it peaked at {_format_time(worst.time)} with "
+            f"{format_number(worst.peak)}",
+            *_explain_worst(source, run, messages, sample),
         ]
     overall = source.summary.get("overall", {}).get("rms_error")
     rank = f", the largest of {count} nodes (all nodes {format_number(overall)})"
     return [
         f"Node {worst.node} was worst: RMS error {format_number(worst.value)} over time"
-        f"{rank if count > 1 else ''}. {_since(run, worst).capitalize()}its error was largest at "
-        f"{_time(worst.time)}: {format_number(worst.peak)}",
-        *_why(source, run, messages, sample),
+        f"{rank if count > 1 else ''}. {_describe_start(run, worst).capitalize()}its error was "
+        f"largest at {_format_time(worst.time)}: {format_number(worst.peak)}",
+        *_explain_worst(source, run, messages, sample),
     ]
 
 
-def _since(run: StoredRun, worst: Worst) -> str:
+def _describe_start(run: StoredRun, worst: Worst) -> str:
     """Return the words that say that the worst sample is not looked for at time 0."""
     return "after time 0 " if run.times[0] <= 0.0 < worst.time else ""
 
 
-def _why(source: Opened, run: StoredRun, messages: np.ndarray, sample: WorstSample) -> list[str]:
+def _explain_worst(
+    source: Opened, run: StoredRun, messages: np.ndarray, sample: WorstSample
+) -> list[str]:
     """Return what the worst node had heard by its worst instant after its start-up, and what its P
     said.
     """
@@ -173,7 +178,7 @@ def _why(source: Opened, run: StoredRun, messages: np.ndarray, sample: WorstSamp
         found.append(_startup_claim(sample.overall, worst, sample.start))
     if len(into):
         cut = float(source.cuts(np.array([worst.time]))[0])
-        why = _heard(into, worst, cut) + _unusual(source, run, into, worst)
+        why = _describe_heard(into, worst, cut) + _describe_unusual(source, run, into, worst)
         found.append(why + _describe_arrivals(messages, into))
     if worst.by_error:
         found += _judge_error(source, run, worst)
@@ -183,7 +188,7 @@ def _why(source: Opened, run: StoredRun, messages: np.ndarray, sample: WorstSamp
 def _startup_claim(worst: Worst, later: Worst, start: StartUp) -> str:
     """Return that the worst sample was in the start-up, and which one is explained instead."""
     said = (
-        f"The filters had just started at {_time(worst.time)}: trace P was "
+        f"The filters had just started at {_format_time(worst.time)}: trace P was "
         f"{format_number(start.now)}, {format_number(start.first)} at the first sample and "
         f"{format_number(start.last)} on average over the last ones"
     )
@@ -192,7 +197,7 @@ def _startup_claim(worst: Worst, later: Worst, start: StartUp) -> str:
     what = "error" if worst.by_error else "square root of trace P"
     return (
         f"{said}. The largest {what} after this start-up was {format_number(later.peak)} at "
-        f"{_time(later.time)}, which is explained here"
+        f"{_format_time(later.time)}, which is explained here"
     )
 
 
@@ -212,13 +217,13 @@ def _judge_error(source: Opened, run: StoredRun, worst: Worst) -> list[str]:
         else f"within what its P allows: NEES {format_number(nees)}, not above"
     )
     return [
-        f"The error at {_time(worst.time)} was {judged} {format_number(limit)}, which the worst of "
-        f"{looked:,} samples exceeds with probability {CERTAIN:.0%} at most where P is exact (the "
-        f"mean is {n} then)"
+        f"The error at {_format_time(worst.time)} was {judged} {format_number(limit)}, which the "
+        f"worst of {looked:,} samples exceeds with probability {CERTAIN:.0%} at most where P is "
+        f"exact (the mean is {n} then)"
     ]
 
 
-def _heard(into: np.ndarray, worst: Worst, cut: float) -> str:
+def _describe_heard(into: np.ndarray, worst: Worst, cut: float) -> str:
     """Return when the node had last heard whom by ``cut`` seconds, and what was lost since."""
     links, missing = [], 0
     for sender in np.unique(into["sender"]).tolist():
@@ -254,7 +259,7 @@ def _describe_arrivals(messages: np.ndarray, into: np.ndarray) -> str:
     )
 
 
-def _unusual(source: Opened, run: StoredRun, into: np.ndarray, worst: Worst) -> str:
+def _describe_unusual(source: Opened, run: StoredRun, into: np.ndarray, worst: Worst) -> str:
     """Return if the age of what the node had heard was unusual at its worst instant."""
     cuts = source.cuts(run.times)
     ages: FloatArray = information_age(into, (worst.node,), run.times, cuts)[:, 0]
@@ -332,7 +337,9 @@ def _describe_verdict(source: Opened) -> list[str]:
     verdict = source.verdict or {}
     rows = verdict.get("rows", [])
     broken = [row for row in rows if row["verdict"] == "broken"]
-    counts = {name: sum(row["verdict"] == name for row in rows) for name in _verdicts(rows)}
+    counts = {
+        name: sum(row["verdict"] == name for row in rows) for name in _occurring_verdicts(rows)
+    }
     listed = ", ".join(f"{count} {name}" for name, count in counts.items())
     head = f"{len(broken)} promises are broken" if len(broken) > 1 else "1 promise is broken"
     found = [
@@ -343,7 +350,7 @@ def _describe_verdict(source: Opened) -> list[str]:
     return found + [f"Broken: {row['promise']} [{row['source']}]" for row in broken]
 
 
-def _verdicts(rows: list[dict[str, Any]]) -> list[str]:
+def _occurring_verdicts(rows: list[dict[str, Any]]) -> list[str]:
     """Return the verdicts that occur, in alphabetical order."""
     return sorted({str(row["verdict"]) for row in rows})
 
@@ -368,17 +375,17 @@ def _describe_sweep(source: Opened) -> list[str]:
 
 def _of_filters(found: StoredComparison) -> list[str]:
     """Return which filter did best, what is certain of the others, and which could not run."""
-    ran = [row for row in found.rows if row.ran and math.isfinite(_rms(row).value)]
+    ran = [row for row in found.rows if row.ran and math.isfinite(_rms_error(row).value)]
     if not ran:
         return ["No filter has a finite RMS error"]
-    best = min(ran, key=lambda row: _rms(row).value)
-    listed = ", ".join(f"{row.filter} {format_number(_rms(row).value)}" for row in ran)
+    best = min(ran, key=lambda row: _rms_error(row).value)
+    listed = ", ".join(f"{row.filter} {format_number(_rms_error(row).value)}" for row in ran)
     said = [
         f"Of {len(ran)} filters over {found.runs:,} runs of each, {best.filter} had the smallest "
         f"RMS error ({listed})"
     ]
     for row in ran:
-        gap = _rms(row)
+        gap = _rms_error(row)
         if gap.real:
             side = "less" if gap.difference < 0.0 else "more"
             said.append(
@@ -394,11 +401,11 @@ def _of_filters(found: StoredComparison) -> list[str]:
     return said + [f"{row.filter}: {row.status}" for row in noted]
 
 
-def _rms(row: ComparedFilter) -> Quantity:
+def _rms_error(row: ComparedFilter) -> Quantity:
     """Return the RMS error of a compared filter."""
     return row.quantities["rms_error"]
 
 
-def _time(seconds: float) -> str:
+def _format_time(seconds: float) -> str:
     """Return a time as text."""
     return f"t = {seconds:.6g} s"

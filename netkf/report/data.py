@@ -70,19 +70,19 @@ def run_data(
         "replica": run.replica,
         "horizon": horizon,
         "truth": run.truth_known,
-        "broadcasts": _broadcasts(run),
+        "broadcasts": _is_broadcast(run),
         "n": run.x.shape[1],
         "nodes": list(run.nodes),
         "sensors": [node for node in run.nodes if node in source.scenario.placed],
         "positions": positions(source, run),
         "knowledge": source.knowledge,
-        "flow": _flow(source),
+        "flow": _flow_kind(source),
         "continuous": sorted(source.scenario.increment_sensors),
         "period": source.period,
-        "axes": _axes(source, run, worst),
+        "axes": _state_axes(source, run, worst),
         "links": [list(pair) for pair in source.scenario.topology.directions[:MAX_LINKS]],
         "worst": _worst_data(worst),
-        "scale": _scales(),
+        "scale": _interval_scales(),
         "samples": _sample_columns(source, run, times, messages, packer),
         "messages": _message_columns(kept, run, packer),
         "senses": _event_columns(run, ("sense",), budget.messages // 2, packer),
@@ -95,7 +95,7 @@ def run_data(
             "samples": len(run.times),
             "links": len(source.scenario.topology.directions),
         },
-        "limits": _limits(source),
+        "limits": _drawing_limits(source),
     }
 
 
@@ -156,7 +156,7 @@ def positions(source: Opened, run: StoredRun) -> list[list[float]]:
     """
     given: Mapping[int, Any] | None = source.scenario.topology.positions
     if given is None or any(node not in given for node in run.nodes):
-        given = _layout(source, run)
+        given = _make_layout(source, run)
     points = np.array([given[node] for node in run.nodes], dtype=float).reshape(-1, 2)
     if not len(points) or not np.isfinite(points).all():
         return [[0.5, 0.5] for _ in run.nodes]
@@ -166,7 +166,7 @@ def positions(source: Opened, run: StoredRun) -> list[list[float]]:
     return [[round(0.5 + x, 5), round(0.5 - y, 5)] for x, y in points.tolist()]
 
 
-def _layout(source: Opened, run: StoredRun) -> dict[int, Any]:
+def _make_layout(source: Opened, run: StoredRun) -> dict[int, Any]:
     """Return coordinates for the nodes of a graph that has none of its own."""
     graph: networkx.Graph[int] = networkx.Graph()
     graph.add_nodes_from(run.nodes)
@@ -177,7 +177,7 @@ def _layout(source: Opened, run: StoredRun) -> dict[int, Any]:
     return networkx.spring_layout(graph, seed=1, iterations=30)
 
 
-def _flow(source: Opened) -> str:
+def _flow_kind(source: Opened) -> str:
     """Return how information flows: nodes ``combine`` what they hear, ``swap`` it for their own,
     send ``readings`` that nobody passes on, or one filter has the readings of all (``pooled``).
     """
@@ -187,7 +187,7 @@ def _flow(source: Opened) -> str:
     return hosted.combination if hosted.combination in ("swap", "readings") else "combine"
 
 
-def _axes(source: Opened, run: StoredRun, worst: Worst | None) -> list[int]:
+def _state_axes(source: Opened, run: StoredRun, worst: Worst | None) -> list[int]:
     """Return the two components of the state to show first: the two that sensors see if one of
     them was furthest off at the worst instant, else those that were furthest off.
     """
@@ -205,7 +205,7 @@ def _axes(source: Opened, run: StoredRun, worst: Worst | None) -> list[int]:
     return first if off[0] in first else sorted(off[:2])
 
 
-def _broadcasts(run: StoredRun) -> bool:
+def _is_broadcast(run: StoredRun) -> bool:
     """Return True if the messages of one node at one instant are one transmission."""
     in_slots = bool((run.log["phase"][run.log["kind"] == CODES["send"]] >= 0).any())
     return in_slots or run.count("transmit") > 0
@@ -216,7 +216,7 @@ def _worst_data(worst: Worst | None) -> dict[str, Any] | None:
     return None if worst is None else worst._asdict()
 
 
-def _scales() -> dict[str, float]:
+def _interval_scales() -> dict[str, float]:
     """Return the half axes of 95 % ellipses and intervals, in standard deviations."""
     return {
         "ellipse": math.sqrt(float(scipy.special.chdtri(2, 1.0 - ELLIPSE_LEVEL))),
@@ -224,7 +224,7 @@ def _scales() -> dict[str, float]:
     }
 
 
-def _limits(source: Opened) -> dict[str, Any]:
+def _drawing_limits(source: Opened) -> dict[str, Any]:
     """Return the horizontal lines of curves: limits of the bound and the interval of NEES."""
     promised = source.promised
     if promised is None:

@@ -41,7 +41,8 @@ def explain_worst(source: Opened) -> Explanation | str | None:
         return None
     events = int(np.searchsorted(run.log["t"], worst.time, side="right"))
     if events > MAX_EVENTS:
-        return f"{events:,} events until then are many to replay; {_command(source, worst)} does it"
+        command = _why_command(source, worst)
+        return f"{events:,} events until then are many to replay; {command} does it"
     replays = max(MIN_REPLAYS, min(MAX_REPLAYS, REPLAYED_EVENTS // max(1, events)))
     try:
         return why(run, worst.node, worst.time, replays=replays)
@@ -49,7 +50,7 @@ def explain_worst(source: Opened) -> Explanation | str | None:
         return str(error)
 
 
-def _command(source: Opened, worst: Worst) -> str:
+def _why_command(source: Opened, worst: Worst) -> str:
     """Return the command that explains the worst sample."""
     return f"netkf why {source.label} --node {worst.node} --at {worst.time:.10g}"
 
@@ -60,13 +61,13 @@ def mending_claim(found: Explanation) -> str:
     same = math.isclose(was.trace, best.trace, rel_tol=EQUAL_NUMBERS) or math.isnan(was.trace)
     if same and not abs(best.error - was.error) > EQUAL_NUMBERS * was.error:
         return "Messages would not have mended it: a replay in which none is missing is no better"
-    error = _change("error", was.error, best.error)
+    error = _describe_change("error", was.error, best.error)
     if same:
         change = f"{error} at the same trace P, {format_number(was.trace)}"
     else:
-        change = _change("trace P", was.trace, best.trace)
+        change = _describe_change("trace P", was.trace, best.trace)
         change += f" and {error}" if math.isfinite(best.error) else ""
-        change += _cost(found)
+        change += _describe_cost(found)
     return f"To mend it: with no message missing, a replay gives {change}"
 
 
@@ -118,13 +119,13 @@ def price_claim(source: Opened, found: Explanation, central: CentralSample) -> s
     )
 
 
-def _change(name: str, was: float, now: float) -> str:
+def _describe_change(name: str, was: float, now: float) -> str:
     """Return a value and its relative change as text."""
     change = f"{name} {format_number(now)} in place of {format_number(was)}"
     return f"{change} ({relative_change(now, was)})" if was > 0.0 else change
 
 
-def _cost(found: Explanation) -> str:
+def _describe_cost(found: Explanation) -> str:
     """Return how few messages would have done it, or the best that was tried."""
     smallest = found.smallest
     if smallest is None or smallest.messages == ():
@@ -156,6 +157,6 @@ def mending_section(source: Opened, found: Explanation | str) -> str:
     ]
     caption = f"Node {found.node} at {found.at:.10g} s, replayed with messages that did not come"
     replays = table_box(caption, ("replayed with", "messages", "trace P", "change", "error"), rows)
-    command = _command(source, source.worst.explained)
+    command = _why_command(source, source.worst.explained)
     more = f"By replays of the run, nothing is guessed: {command} says more"
     return bullets(sentences(found)) + replays + paragraph(more, "note")

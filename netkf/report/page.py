@@ -127,9 +127,9 @@ def make_page(
     """Return the page of one or two directories as HTML; see ``write_report``."""
     if not 1 <= len(directories) <= 2:
         raise ScenarioError("report", "takes one or two directories", len(directories))
-    entries = [_entry(Path(directory), replica, trust) for directory in directories]
+    entries = [_read_entry(Path(directory), replica, trust) for directory in directories]
     entries = _merge_verdict(entries)
-    command = _command(directories, replica, trust, out)
+    command = _report_command(directories, replica, trust, out)
     comparison = _compare(entries, directories)
     budget = Budget(*(part // len(entries) for part in BUDGET))
     while True:
@@ -139,7 +139,7 @@ def make_page(
         budget = budget.halve()
 
 
-def _entry(directory: Path, replica: int | None, trust: bool) -> _Entry:
+def _read_entry(directory: Path, replica: int | None, trust: bool) -> _Entry:
     """Return what the page needs of a directory."""
     source = read_source(directory, replica, trust)
     none = np.empty(0, dtype=MESSAGE)
@@ -166,7 +166,7 @@ def _merge_verdict(entries: list[_Entry]) -> list[_Entry]:
     return entries
 
 
-def _command(
+def _report_command(
     directories: Sequence[str | Path], replica: int | None, trust: bool, out: Path | None
 ) -> str:
     """Return the command that made the page."""
@@ -209,7 +209,9 @@ def _assemble(
         "labels": [entry.source.label for entry in entries],
         "sweep": tables.sweep_curves(entries[0].source),
     }
-    body = _header(entries, comparison) + _main(entries, comparison, command, rules, bool(runs))
+    body = _page_header(entries, comparison) + _main_sections(
+        entries, comparison, command, rules, bool(runs)
+    )
     title = " and ".join(dict.fromkeys(entry.source.scenario.name for entry in entries))
     script, style = _script(), _style()
     policy = POLICY.format(script=content_hash(script), style=content_hash(style))
@@ -225,7 +227,7 @@ def _assemble(
     )
 
 
-def _header(entries: list[_Entry], comparison: Comparison | str | None) -> str:
+def _page_header(entries: list[_Entry], comparison: Comparison | str | None) -> str:
     """Return the head of the page: names, claims, and what the data say."""
     parts = []
     for letter, (source, messages, worst, readings) in zip("AB", entries, strict=False):
@@ -253,7 +255,7 @@ def _header(entries: list[_Entry], comparison: Comparison | str | None) -> str:
     return f'<header class="top">{heading}{"".join(parts)}</header>'
 
 
-def _main(
+def _main_sections(
     entries: list[_Entry],
     comparison: Comparison | str | None,
     command: str,
@@ -262,38 +264,42 @@ def _main(
 ) -> str:
     """Return the sections of the page as HTML."""
     sources = [entry.source for entry in entries]
-    parts = [_asset("live.html") if live else _nothing_moves(sources)]
+    parts = [_asset("live.html") if live else _still_section(sources)]
     mended = [mending_section(e.source, e.worst) for e in entries if e.worst is not None]
     if mended:
         parts.append(section("mending", "What would have mended the worst sample", "".join(mended)))
     if comparison is not None:
-        parts.append(section("comparison", "What differs", _differences(comparison)))
+        parts.append(section("comparison", "What differs", _difference_section(comparison)))
     if any(source.kind not in ("filters", "verdict") for source in sources):
-        parts.append(section("figures", "Figures", _figures(entries)))
+        parts.append(section("figures", "Figures", _figure_section(entries)))
     drawn = "".join(filters_figure(s.filters) for s in sources if s.filters is not None)
     if drawn:
         parts.append(section("figures", "Errors of the filters", drawn))
-    parts.append(section("verdicts", "Verdicts and averages", "".join(map(_results, sources))))
-    parts.append(section("scenario", "Scenario", "".join(map(_scenario, sources))))
-    parts.append(section("origin", "Versions and command", _origin(sources, command, rules)))
+    parts.append(
+        section("verdicts", "Verdicts and averages", "".join(map(_result_tables, sources)))
+    )
+    parts.append(section("scenario", "Scenario", "".join(map(_scenario_text, sources))))
+    parts.append(
+        section("origin", "Versions and command", _origin_section(sources, command, rules))
+    )
     return "<main>" + "".join(parts) + "</main>"
 
 
-def _figures(entries: list[_Entry]) -> str:
+def _figure_section(entries: list[_Entry]) -> str:
     """Return the place of the curves, and why there are none of innovations."""
     reasons = dict.fromkeys(entry.readings for entry in entries if isinstance(entry.readings, str))
     notes = [paragraph(f"No innovations are shown: {reason}.", "note") for reason in reasons]
     return '<div id="curves" class="curves"></div>' + "".join(notes)
 
 
-def _differences(comparison: Comparison | str) -> str:
+def _difference_section(comparison: Comparison | str) -> str:
     """Return the section on differences as HTML."""
     if isinstance(comparison, str):
         return paragraph(comparison)
     return tables.comparison_section(comparison)
 
 
-def _nothing_moves(sources: list[Opened]) -> str:
+def _still_section(sources: list[Opened]) -> str:
     """Return the section that says why nothing is shown in motion."""
     kept_nothing = {"sweep": "sweep", "verdict": "verdict", "filters": "comparison of filters"}
     if sources[0].kind in kept_nothing:
@@ -310,7 +316,7 @@ def _nothing_moves(sources: list[Opened]) -> str:
     return section("live", "The network in motion", paragraph(reason, "note"))
 
 
-def _results(source: Opened) -> str:
+def _result_tables(source: Opened) -> str:
     """Return the tables of a source as HTML."""
     parts = []
     if source.verdict is not None:
@@ -332,7 +338,7 @@ def _results(source: Opened) -> str:
     return "".join(parts)
 
 
-def _scenario(source: Opened) -> str:
+def _scenario_text(source: Opened) -> str:
     """Return the scenario file of a source as HTML."""
     label = f"scenario.toml of {source.label}"
     return (
@@ -349,7 +355,7 @@ def _event_counts(run: StoredRun) -> str:
     return f"Events of replica {run.replica}: {len(run.log):,}{listed}"
 
 
-def _origin(sources: list[Opened], command: str, rules: list[str]) -> str:
+def _origin_section(sources: list[Opened], command: str, rules: list[str]) -> str:
     """Return the section on how the page and its sources were made."""
     parts = [
         paragraph("This page was made by:"),

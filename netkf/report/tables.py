@@ -29,7 +29,7 @@ INTERVAL = 2.0
 def verdict_table(source: Opened) -> str:
     """Return the rows of a verdict, broken ones first."""
     verdict = source.verdict or {}
-    rows = sorted(verdict.get("rows", []), key=_rank)
+    rows = sorted(verdict.get("rows", []), key=_verdict_rank)
     cells = [
         (
             f"{row['verdict'].upper() if row['verdict'] == 'broken' else row['verdict']}",
@@ -48,7 +48,7 @@ def verdict_table(source: Opened) -> str:
     return table_box(caption, header, cells, "words")
 
 
-def _rank(row: dict[str, Any]) -> int:
+def _verdict_rank(row: dict[str, Any]) -> int:
     """Return a key that sorts rows by verdict."""
     return ORDER.index(row["verdict"]) if row["verdict"] in ORDER else len(ORDER)
 
@@ -67,7 +67,7 @@ def summary_section(source: Opened) -> str:
     caption = f"Averages over time{'; ' + runs if runs else ''}: {source.label}"
     messages = summary["messages"]
     counts = ", ".join(
-        f"{_count(messages[name])} {label}"
+        f"{_format_count(messages[name])} {label}"
         for name, label in (
             ("sent", "sent"),
             ("delivered", "delivered"),
@@ -110,7 +110,7 @@ def _limit_note(label: str) -> str:
     )
 
 
-def _count(value: Any) -> str:
+def _format_count(value: Any) -> str:
     """Return a count as text."""
     return f"{value:,}" if isinstance(value, int) else f"{value:,.1f}"
 
@@ -121,7 +121,7 @@ def comparison_section(comparison: Comparison) -> str:
     for quantity, node, entries in comparison.rows:
         one, other = entries[0], entries[1]
         where = quantity if node < 0 else f"{quantity} of node {node}"
-        rows.append([where, _value(one), _value(other), *_difference(other)])
+        rows.append([where, _format_value(one), _format_value(other), *_difference_cells(other)])
     names = [
         f"{letter}: {label}" for letter, label in zip("AB", comparison.directories, strict=True)
     ]
@@ -137,12 +137,12 @@ def comparison_section(comparison: Comparison) -> str:
     return paragraph(certain) + table_box("Differences of B from A", header, rows)
 
 
-def _value(entry: Entry) -> str:
+def _format_value(entry: Entry) -> str:
     """Return a value with its standard error as text."""
     return format_number(entry.value) + standard_error(entry.se)
 
 
-def _difference(entry: Entry) -> list[str]:
+def _difference_cells(entry: Entry) -> list[str]:
     """Return the cells of a difference: value, interval, mark."""
     if entry.difference is None:
         return ["-", "-", "-"]
@@ -162,7 +162,7 @@ def filters_table(found: StoredComparison) -> str:
     rows = [
         [
             row.filter,
-            *(cell for name in QUANTITIES for cell in _quantity(row.quantities[name])),
+            *(cell for name in QUANTITIES for cell in _quantity_cells(row.quantities[name])),
             row.consistency,
             f"{row.transmissions:,.0f}",
             f"{row.bytes / 1000.0:,.6g}",
@@ -182,7 +182,7 @@ def filters_table(found: StoredComparison) -> str:
     return table_box(caption, header, rows) + bullets(notes)
 
 
-def _quantity(found: Quantity) -> list[str]:
+def _quantity_cells(found: Quantity) -> list[str]:
     """Return the cells of a quantity: value, difference, mark."""
     value = format_number(found.value) + standard_error(found.se)
     if not math.isfinite(found.difference):
@@ -200,13 +200,13 @@ def sweep_table(source: Opened) -> str:
         return paragraph("No point of the sweep is finished yet")
     names = [str(name) for name in found.columns if not str(name).endswith("_se")]
     rows = [
-        [_cell(record[name], record.get(f"{name}_se")) for name in names]
+        [_format_cell(record[name], record.get(f"{name}_se")) for name in names]
         for record in found.to_dict("records")[:MAX_ROWS]
     ]
     return table_box("Points of the sweep, +- one standard error", names, rows)
 
 
-def _cell(value: Any, error: Any) -> str:
+def _format_cell(value: Any, error: Any) -> str:
     """Return a value of a sweep with its standard error as text."""
     if isinstance(value, (int, np.integer)):
         return f"{int(value):,}"
@@ -233,8 +233,8 @@ def ensemble_curves(source: Opened) -> dict[str, Any] | None:
     found = source.ensemble
     if found is None:
         return None
-    trace, trace_se = _trace(found.mean_P), _trace(found.se_P)
-    square, square_se = _trace(found.mean_error), _trace(found.se_error)
+    trace, trace_se = _matrix_traces(found.mean_P), _matrix_traces(found.se_P)
+    square, square_se = _matrix_traces(found.mean_error), _matrix_traces(found.se_error)
     nodes: dict[str, Any] = {}
     for k, node in enumerate(found.nodes):
         nodes[str(node)] = {
@@ -261,8 +261,8 @@ def difference_curves(one: Opened, other: Opened) -> dict[str, Any] | None:
     freedom = min(one.runs, other.runs) - 1
     if not np.array_equal(first.times, second.times) or freedom < 1:
         return None
-    gap = _trace(second.mean_error) - _trace(first.mean_error)
-    error = np.hypot(_trace(first.se_error), _trace(second.se_error))
+    gap = _matrix_traces(second.mean_error) - _matrix_traces(first.mean_error)
+    error = np.hypot(_matrix_traces(first.se_error), _matrix_traces(second.se_error))
     level = (1.0 - CONFIDENCE) / (2.0 * gap.size)
     wide = float(stdtrit(freedom, 1.0 - level)) * error
     nodes = {
@@ -272,7 +272,7 @@ def difference_curves(one: Opened, other: Opened) -> dict[str, Any] | None:
     return {"confidence": CONFIDENCE, "times": first.times.tolist(), "nodes": nodes}
 
 
-def _trace(matrices: FloatArray) -> FloatArray:
+def _matrix_traces(matrices: FloatArray) -> FloatArray:
     """Return the traces (T, N) of matrices (T, N, n, n)."""
     return np.asarray(np.trace(matrices, axis1=2, axis2=3))
 

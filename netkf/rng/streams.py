@@ -33,11 +33,11 @@ class Streams:
         """Return the generator of ``purpose`` for ``entity`` (node ids, a link's two ends, ...:
         integers that are not negative).
         """
-        return np.random.Generator(np.random.PCG64DXSM(self._sequence(purpose, *entity)))
+        return np.random.Generator(np.random.PCG64DXSM(self._seed_sequence(purpose, *entity)))
 
-    def _sequence(self, purpose: str, *entity: int) -> Any:
+    def _seed_sequence(self, purpose: str, *entity: int) -> Any:
         """Return the seed sequence of a purpose and an entity."""
-        key = (self.replica, _code(purpose), *entity)
+        key = (self.replica, _purpose_code(purpose), *entity)
         return np.random.SeedSequence(entropy=self.seed, spawn_key=key)
 
     @property
@@ -76,10 +76,10 @@ class Streams:
 class _Seeded(Streams):
     made: dict[tuple[str, tuple[int, ...]], _Words] = field(default_factory=dict)
 
-    def _sequence(self, purpose: str, *entity: int) -> Any:
+    def _seed_sequence(self, purpose: str, *entity: int) -> Any:
         """Return the seed sequence, or the seed words if they are known already."""
         known = self.made.get((purpose, entity))
-        return super()._sequence(purpose, *entity) if known is None else known
+        return super()._seed_sequence(purpose, *entity) if known is None else known
 
 
 @dataclass(frozen=True)
@@ -111,14 +111,16 @@ class ReplicaStreams:
         last = self.replica + self.count - 1
         ids = _small_ids(tuple(entities))
         if last >= WORD or ids is None:
-            some = [s._sequence(purpose, *entity) for s in self.per_replica for entity in entities]
+            some = [
+                s._seed_sequence(purpose, *entity) for s in self.per_replica for entity in entities
+            ]
             return np.array([sequence.generate_state(4, np.uint64) for sequence in some])
         keys = np.empty((self.count, len(entities), 2 + len(entities[0])), dtype=np.uint32)
         keys[:, :, 0] = np.arange(self.replica, last + 1, dtype=np.uint32)[:, None]
-        keys[:, :, 1], keys[:, :, 2:] = _code(purpose), ids
+        keys[:, :, 1], keys[:, :, 2:] = _purpose_code(purpose), ids
         words = np.empty((self.count * len(entities), 4), dtype=np.uint64)
         pool = np.empty(POOL, dtype=np.uint32)
-        fill_seed_words(_entropy(self.seed), keys.reshape(len(words), -1), pool, words)
+        fill_seed_words(_entropy_words(self.seed), keys.reshape(len(words), -1), pool, words)
         return words
 
     def generators(
@@ -153,7 +155,7 @@ WORD, MASK = 1 << 32, (1 << 32) - 1
 
 
 @cache
-def _entropy(seed: int) -> np.ndarray:
+def _entropy_words(seed: int) -> np.ndarray:
     """Return the words of a seed, lowest first, at least as many as the pool has."""
     words = [seed & MASK]
     while seed := seed >> 32:
@@ -163,6 +165,6 @@ def _entropy(seed: int) -> np.ndarray:
 
 
 @cache
-def _code(purpose: str) -> int:
+def _purpose_code(purpose: str) -> int:
     """Return the number of a purpose: 4 bytes of its SHA-256, so that purposes need no register."""
     return int.from_bytes(hashlib.sha256(purpose.encode()).digest()[:4], "little")

@@ -80,13 +80,13 @@ def read_document(path: Path) -> dict[str, Any]:
     with reading_file(path):
         if path.stat().st_size > MAX_BYTES:
             raise DamagedError(f"is larger than {MAX_BYTES >> 20} MiB")
-        document = json.loads(path.read_text(encoding="utf-8"), parse_constant=_refuse)
+        document = json.loads(path.read_text(encoding="utf-8"), parse_constant=_refuse_constant)
     if not isinstance(document, dict):
         raise DamagedError("is no JSON object")
     return document
 
 
-def _refuse(name: str) -> Any:
+def _refuse_constant(name: str) -> Any:
     """Raise ValueError for NaN and infinities, which JSON does not have."""
     raise ValueError(name)
 
@@ -130,7 +130,7 @@ def require(value: Any, form: Any, where: str = "") -> None:
     keys, of which those that end in ``?`` may be missing; there may be other keys.
     """
     if isinstance(form, dict):
-        _demand(isinstance(value, dict), "a table", where)
+        _require_form(isinstance(value, dict), "a table", where)
         for key, inner in form.items():
             name = key.removesuffix("?")
             path = f"{where}.{name}" if where else name
@@ -139,14 +139,14 @@ def require(value: Any, form: Any, where: str = "") -> None:
             elif name == key:
                 raise DamagedError(f"lacks {path}")
     elif isinstance(form, list):
-        _demand(isinstance(value, list), "a list", where)
+        _require_form(isinstance(value, list), "a list", where)
         for item in value:
             require(item, form[0], where)
     else:
-        _demand(_FORMS[form](value), form, where)
+        _require_form(_FORMS[form](value), form, where)
 
 
-def _demand(kept: bool, form: str, where: str) -> None:
+def _require_form(kept: bool, form: str, where: str) -> None:
     """Raise DamagedError unless ``kept``."""
     if not kept:
         raise DamagedError(f"needs {form} at {where}" if where else f"is not {form}")

@@ -61,18 +61,18 @@ def compute_promises(scenario: Scenario) -> dict[str, Any]:
     if own is not None:
         found[scenario.hosted.paper] = own(scenario)
     elif scenario.slotted:
-        found["slot_central_covariance"] = _value(lambda: _slot_central(scenario))
+        found["slot_central_covariance"] = _value_or_reason(lambda: _slot_central(scenario))
     if has_linear_errors(scenario) and scenario.hosted.talks:
         found["steady_error"] = _steady_error(scenario)
     if scenario.slotted:
         plain: dict[str, Any] = finite(found)
         return plain
     ends = np.array([scenario.horizon])
-    found["bound_at_horizon"] = _value(lambda: covariance_bound(scenario, ends)[0])
+    found["bound_at_horizon"] = _value_or_reason(lambda: covariance_bound(scenario, ends)[0])
     found["steady_bound"] = _steady(scenario)
     found["link_rate"] = _link_rate(scenario)
     for name, function in LIMITS.items():
-        found[name] = _value(lambda function=function: function(scenario))  # type: ignore[misc]
+        found[name] = _value_or_reason(lambda function=function: function(scenario))  # type: ignore[misc]
     whole: dict[str, Any] = finite(found)
     return whole
 
@@ -104,7 +104,7 @@ def _steady_error(scenario: Scenario) -> dict[str, Any]:
             )
         return steady_error_covariance(scenario)
 
-    found = _value(covariance)
+    found = _value_or_reason(covariance)
     return {**found, "radius": None if found["reason"] else mean_square_radius(scenario)}
 
 
@@ -130,13 +130,13 @@ def _steady(scenario: Scenario) -> dict[str, Any]:
             "netkf.theory.steady_covariance_bound computes it however long it takes"
         )
         return {"value": None, "trace": None, "reason": reason}
-    found = _value(lambda: steady_covariance_bound(scenario))
+    found = _value_or_reason(lambda: steady_covariance_bound(scenario))
     if found["reason"] and not scenario.filter.algorithm.talks:
-        found = {**_value(lambda: steady_by_node(scenario)), "reason": found["reason"]}
+        found = {**_value_or_reason(lambda: steady_by_node(scenario)), "reason": found["reason"]}
     return found
 
 
-def _value(function: Callable[[], FloatArray]) -> dict[str, Any]:
+def _value_or_reason(function: Callable[[], FloatArray]) -> dict[str, Any]:
     """Return a matrix with its trace, or the reason why there is none."""
     try:
         value = function()

@@ -113,7 +113,7 @@ def run_to_directory(
         if explained is error:
             raise
         raise explained from error
-    output.manifest.write(status, _totals(recorder), done, names=own_names(scenario))
+    output.manifest.write(status, _event_totals(recorder), done, names=own_names(scenario))
     return completed
 
 
@@ -230,10 +230,10 @@ def _keep_partial_results(
         unknown = PromisedTraces(None, np.nan, np.nan, f"not computed: the run {ENDINGS[status]}")
         with contextlib.suppress(OSError):
             output.write_summary(unknown, recorder.count, recorder.sums, status)
-    output.manifest.write(status, _totals(recorder), done, error)
+    output.manifest.write(status, _event_totals(recorder), done, error)
 
 
-def _totals(recorder: Recorder) -> dict[str, Any]:
+def _event_totals(recorder: Recorder) -> dict[str, Any]:
     """Return number and fingerprint of the events for the manifest."""
     totals: dict[str, Any] = {"events": recorder.total, "fingerprint": recorder.fingerprint}
     return totals | ({"simpy": recorder.stats} if recorder.stats else {})

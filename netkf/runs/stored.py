@@ -144,9 +144,9 @@ def read_run(
         seed=int(manifest["seed"]),
         replica=number,
         engine=str(manifest.get("engine", "")),
-        status=str(manifest["status"]) if single else _status(log),
+        status=str(manifest["status"]) if single else _read_status(log),
         fingerprint=str(manifest.get("fingerprint", "")) if single or number == 0 else "",
-        sums=_sums(conserved),
+        sums=_read_sums(conserved),
         truth_known=scenario.plant.truth_known,
         stats=dict(manifest.get("simpy", {})) if single else {},
         scenario=scenario,
@@ -157,12 +157,12 @@ def read_run(
     )
 
 
-def _status(log: np.ndarray) -> str:
+def _read_status(log: np.ndarray) -> str:
     """Return "diverged" or "complete"."""
     return "diverged" if (log["kind"] == CODES["diverged"]).any() else "complete"
 
 
-def _sums(conserved: Any) -> dict[str, tuple[float, float]]:
+def _read_sums(conserved: Any) -> dict[str, tuple[float, float]]:
     """Return the conserved sums of a manifest; raises DamagedError."""
     form = {"exact": NUMBER, "total": NUMBER}
     require(conserved, {}, "conserved")

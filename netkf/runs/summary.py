@@ -154,8 +154,8 @@ def promise_traces(scenario: Scenario, times: FloatArray) -> PromisedTraces:
     notes = (_steady_note(scenario), mismatch_note(scenario), nees_note(scenario))
     return PromisedTraces(
         bound,
-        _trace(limit_covariance, scenario),
-        _trace(central_covariance, scenario),
+        _trace_or_nan(limit_covariance, scenario),
+        _trace_or_nan(central_covariance, scenario),
         reason or reason_without_bound(scenario) or "",
         limit_label(scenario),
         tuple(filter(None, notes)),
@@ -196,7 +196,7 @@ def _steady_note(scenario: Scenario) -> str:
     return "the bound has no steady state, it grows without end; see netkf theory"
 
 
-def _trace(function: Any, scenario: Scenario) -> float:
+def _trace_or_nan(function: Any, scenario: Scenario) -> float:
     """Return the trace of a promised matrix, nan if it is not promised."""
     try:
         return float(np.trace(function(scenario)))
@@ -240,9 +240,9 @@ def _average_rows(
     """Return a row of averages over time for each node, and one for all nodes together."""
     blurred = np.inf if sink.rounding_from is None else sink.rounding_from
     used = averaged_samples(np.array(sink.times), blurred, bool(sink.diverged))
-    square = _mean(sink.sq_error, used.errors, scenario)
-    trace = _mean(sink.trace, used.covariances, scenario)
-    nees = _mean(sink.nees, used.errors, scenario)
+    square = _mean_or_nan(sink.sq_error, used.errors, scenario)
+    trace = _mean_or_nan(sink.trace, used.covariances, scenario)
+    nees = _mean_or_nan(sink.nees, used.errors, scenario)
     columns = [square, trace, nees]
     with np.errstate(all="ignore"):  # ratios to a bound of 0, and diverged runs
         if promised.bound is not None:
@@ -257,7 +257,7 @@ def _average_rows(
     return nodes, {name: value for name, (value,) in means.items()}
 
 
-def _mean(values: list[FloatArray], indices: np.ndarray, scenario: Scenario) -> FloatArray:
+def _mean_or_nan(values: list[FloatArray], indices: np.ndarray, scenario: Scenario) -> FloatArray:
     """Return the mean (N,) of the samples at ``indices`` of T arrays (N,), nan without any."""
     if not len(indices):
         return np.full(len(scenario.nodes), np.nan)

@@ -74,7 +74,7 @@ def summary_table(
     lines += _limit_lines(summary, limit)
     lines += _nees_lines(summary.get("nees", {}))
     if "conserved" in summary:
-        lines.append("mass: " + _conserved(summary["conserved"]))
+        lines.append("mass: " + _describe_conserved(summary["conserved"]))
     lines.append(_message_line(summary["messages"]))
     lines += [f"note: {note}" for note in usage_notes(summary.get("records", {}))]
     return "\n".join(lines)
@@ -85,10 +85,10 @@ def _node_table(summary: dict[str, Any]) -> Iterator[str]:
     nodes = sorted(summary["nodes"], key=lambda row: row["node"])
     listed = _best_and_worst(nodes) if len(nodes) > MAX_NODES else nodes
     omitted = len(nodes) - len(listed)
-    rows = [_cells(str(row["node"]), row) for row in listed]
+    rows = [_row_cells(str(row["node"]), row) for row in listed]
     if omitted:
         rows.append([f"({omitted} more)", *[""] * len(COLUMNS)])
-    rows.append(_cells("all", summary["overall"]))
+    rows.append(_row_cells("all", summary["overall"]))
     yield table(["node", *COLUMNS.values()], rows)
     if omitted:
         half = MAX_NODES // 2
@@ -112,7 +112,7 @@ def _sort_key(value: float | None) -> float:
     return math.inf if value is None or not math.isfinite(value) else value
 
 
-def _cells(name: str, row: dict[str, Any]) -> list[str]:
+def _row_cells(name: str, row: dict[str, Any]) -> list[str]:
     """Return the cells of a row."""
     return [
         name,
@@ -147,17 +147,18 @@ def _message_line(messages: dict[str, Any]) -> str:
     transmissions = messages.get("transmissions")
     if transmissions is None or math.isnan(transmissions):  # in slots they are not counted
         transmissions = messages["sent"]
-    line = f"messages: {_count(messages['sent'])} sent"
+    line = f"messages: {_format_count(messages['sent'])} sent"
     # A broadcast is one transmission and a message to each node in range.
     if transmissions != messages["sent"]:
-        line += f" in {_count(transmissions)} transmissions"
-    line += f", {_count(messages['delivered'])} delivered, {_count(messages['lost'])} lost"
+        line += f" in {_format_count(transmissions)} transmissions"
+    line += f", {_format_count(messages['delivered'])} delivered"
+    line += f", {_format_count(messages['lost'])} lost"
     if messages["in_flight"]:
-        line += f", {_count(messages['in_flight'])} on their way at the end"
+        line += f", {_format_count(messages['in_flight'])} on their way at the end"
     return line
 
 
-def _conserved(sums: dict[str, dict[str, float]]) -> str:
+def _describe_conserved(sums: dict[str, dict[str, float]]) -> str:
     """Return the conserved sums with their relative drift, as text."""
     totals = [
         f"{name} {format_number(found['total'])} of {format_number(found['exact'])} "
@@ -169,6 +170,6 @@ def _conserved(sums: dict[str, dict[str, float]]) -> str:
     return ", ".join(totals) + (drifting if worst > DRIFT_TOLERANCE else "")
 
 
-def _count(value: float) -> str:
+def _format_count(value: float) -> str:
     """Format a count, or a mean of counts with one decimal."""
     return f"{value:,}" if isinstance(value, int) else f"{value:,.1f}"

@@ -35,10 +35,10 @@ class Transmissions:
     def add(self, rows: np.ndarray) -> None:
         """Count the next block of EVENT rows; blocks come in the order of the run."""
         sends = rows[rows["kind"] == SEND]
-        _count(self.sent, sends["node"])
-        _count(self._broadcasts, rows["node"][rows["kind"] == TRANSMIT])
+        _add_counts(self.sent, sends["node"])
+        _add_counts(self._broadcasts, rows["node"][rows["kind"] == TRANSMIT])
         in_slots = sends["phase"] >= 0
-        _count(self._under_clocks, sends["node"][~in_slots])
+        _add_counts(self._under_clocks, sends["node"][~in_slots])
         self._add_slots(sends[in_slots])
 
     def _add_slots(self, sends: np.ndarray) -> None:
@@ -57,7 +57,7 @@ class Transmissions:
         step[begins] = 1
         nodes, index = np.unique(sends["node"], return_inverse=True)
         pairs = np.unique(np.cumsum(step) * len(nodes) + index)  # (step, sender), once each
-        _count(self._in_slots, nodes[pairs[pairs >= len(nodes)] % len(nodes)])
+        _add_counts(self._in_slots, nodes[pairs[pairs >= len(nodes)] % len(nodes)])
         single = len(ends) == 2
         self._senders = self._senders | distinct if single else set(last.tolist())
         self._step = float(t[-1]), int(phase[-1])
@@ -96,7 +96,7 @@ class SentPerLink(Sink):
         """Ignore samples."""
 
 
-def _count(counter: Counter[int], nodes: np.ndarray) -> None:
+def _add_counts(counter: Counter[int], nodes: np.ndarray) -> None:
     """Add how often each node occurs."""
     found, counts = np.unique(nodes, return_counts=True)
     for node, count in zip(found.tolist(), counts.tolist(), strict=True):

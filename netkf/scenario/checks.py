@@ -139,7 +139,7 @@ def _check_sensors(scenario: DerivedScenario) -> None:
                     f"{key}.nodes[{index}]",
                     "must be a node of the graph",
                     node,
-                    f"{why if left_out else ''}node ids here are {_ids(scenario.nodes)}",
+                    f"{why if left_out else ''}node ids here are {_list_ids(scenario.nodes)}",
                 )
         if len(set(sensor.nodes)) < len(sensor.nodes):
             raise ScenarioError(
@@ -177,7 +177,7 @@ def _check_speed(scenario: DerivedScenario) -> None:
         )
 
 
-def _ids(nodes: tuple[int, ...]) -> str:
+def _list_ids(nodes: tuple[int, ...]) -> str:
     """Return node ids as text, only the ends of long lists."""
     return ", ".join(map(str, nodes)) if len(nodes) <= 8 else f"{nodes[0]} .. {nodes[-1]}"
 
@@ -347,7 +347,7 @@ def _check_sensing_period(scenario: DerivedScenario) -> None:
     pooled = scenario.filter.algorithm.pooled
     models = [scenario.pooled_model] if pooled else scenario.models
     distinct = {id(model): model for model in models if len(model.H)}.values()
-    longest = min((_longest(scenario, model) for model in distinct), default=period)
+    longest = min((_longest_step(scenario, model) for model in distinct), default=period)
     if min(period, horizon) <= longest * (1.0 + 1e-9):
         return
     if getattr(scenario.plant, "sensing_period", None) is not None:
@@ -366,7 +366,7 @@ def _check_sensing_period(scenario: DerivedScenario) -> None:
     )
 
 
-def _longest(scenario: DerivedScenario, model: FlowModel) -> float:
+def _longest_step(scenario: DerivedScenario, model: FlowModel) -> float:
     """Return the longest step in seconds for a model's increments."""
     return longest_interval(*scenario.belief, model.H, model.R)
 
@@ -398,7 +398,7 @@ def _check_slots(scenario: DerivedScenario) -> None:
         raise ScenarioError(
             "network.activation.kind",
             f"must be a {'matching' if algorithm.pairwise else 'broadcast'} for the {name} filter",
-            _describe(activation),
+            _describe_activation(activation),
             "choose another activation or another filter",
         )
     exchanges = (algorithm.schedule or ()).count("exchange")
@@ -411,7 +411,7 @@ def _check_slots(scenario: DerivedScenario) -> None:
         )
 
 
-def _describe(activation: Component) -> str:
+def _describe_activation(activation: Component) -> str:
     """Return the kind of an activation, with the columns of a recorded one."""
     name = kind_name(activation, "activation")
     if not isinstance(activation, RecordedSlots):

@@ -57,7 +57,7 @@ def from_table(table: Mapping[str, Any], folder: Path, trust: bool = True) -> Sc
 def _parse_file(path: Path) -> dict[str, Any]:
     """Return the table of a TOML file; raises ScenarioError if it cannot be read."""
     try:
-        return parse_toml(_text(path))
+        return parse_toml(_read_text(path))
     except UnicodeDecodeError:
         raise ScenarioError("", "is not UTF-8 text", None, "save it as UTF-8") from None
     except OSError as error:
@@ -73,7 +73,7 @@ def _parse_file(path: Path) -> dict[str, Any]:
         raise ScenarioError("", rule, None, "correct that line") from None
 
 
-def _text(path: Path) -> str:
+def _read_text(path: Path) -> str:
     """Return the text of a file up to MAX_BYTES."""
     # Not all at once: the file may be a device that never ends.
     content = b""
@@ -101,8 +101,8 @@ def parse_toml(text: str) -> dict[str, Any]:
     if len(text) > LONG_TEXT and '"""' not in text and "'''" not in text:
         mark = secrets.token_hex(16)
         text = "\n".join(_shorten_array(line, arrays, mark) for line in lines)
-    found: dict[str, Any] = _whole(tomllib.loads(text), arrays)
-    if _depth(found) > MAX_DEPTH:
+    found: dict[str, Any] = _insert_arrays(tomllib.loads(text), arrays)
+    if _nesting_depth(found) > MAX_DEPTH:
         raise ScenarioError("", "is nested too deep", None, "see the keys of a scenario file")
     return found
 
@@ -124,18 +124,18 @@ def _shorten_array(line: str, arrays: dict[str, Any], mark: str) -> str:
     return f'{found[1]} = "{index}"'
 
 
-def _whole(value: Any, arrays: dict[str, Any]) -> Any:
+def _insert_arrays(value: Any, arrays: dict[str, Any]) -> Any:
     """Return tables with arrays instead of their keys."""
     if not arrays:
         return value
     if isinstance(value, dict):
-        return {key: _whole(entry, arrays) for key, entry in value.items()}
+        return {key: _insert_arrays(entry, arrays) for key, entry in value.items()}
     if isinstance(value, list):
-        return [_whole(entry, arrays) for entry in value]
+        return [_insert_arrays(entry, arrays) for entry in value]
     return arrays.get(value, value) if isinstance(value, str) else value
 
 
-def _depth(value: Any) -> int:
+def _nesting_depth(value: Any) -> int:
     """Return how many tables and lists are inside one another, without recursion."""
     depth, level = 0, [value]
     while level and depth <= MAX_DEPTH:

@@ -72,13 +72,15 @@ class KeyOf(NamedTuple):
 def scenario_schema() -> Schema:
     """Return the JSON Schema (draft 2020-12) of scenario files."""
     keys = keys_of(Scenario)
-    whole = _table(keys, first={"format": {"const": FORMAT, "description": "The file format."}})
+    whole = _table_schema(
+        keys, first={"format": {"const": FORMAT, "description": "The file format."}}
+    )
     whole["required"] = ["format", *(name for name in whole["required"] if name != "sensors")]
-    families = {name: _family(name, parts) for name, parts in FAMILIES.items()}
+    families = {name: _family_schema(name, parts) for name, parts in FAMILIES.items()}
     tables = {
-        "network": _table(keys_of(Network)),
-        "channel": _table(keys_of(Channel)),
-        "model": _table(keys_of(Belief)),
+        "network": _table_schema(keys_of(Network)),
+        "channel": _table_schema(keys_of(Channel)),
+        "model": _table_schema(keys_of(Belief)),
     }
     return {
         "$schema": DIALECT,
@@ -117,17 +119,19 @@ def _own_table(cls: type[Component], name: str) -> Schema | None:
     return next((s for (c, n), s in OWN_TABLES.items() if issubclass(cls, c) and n == name), None)
 
 
-def _table(keys: Sequence[KeyOf], first: Mapping[str, Schema] = MappingProxyType({})) -> Schema:
+def _table_schema(
+    keys: Sequence[KeyOf], first: Mapping[str, Schema] = MappingProxyType({})
+) -> Schema:
     """Return the schema of a table with these keys and no others."""
     return {
         "type": "object",
-        "properties": {**first, **{key.name: _property(key) for key in keys}},
+        "properties": {**first, **{key.name: _key_schema(key) for key in keys}},
         "required": [key.name for key in keys if key.required],
         "additionalProperties": False,
     }
 
 
-def _property(key: KeyOf) -> Schema:
+def _key_schema(key: KeyOf) -> Schema:
     """Return the schema of the value of a key, with its description and its default."""
     known = key.rule and key.rule != "a table"
     sentences = [key.description, f"Must be {key.rule}." if known else ""]
@@ -139,12 +143,12 @@ def _property(key: KeyOf) -> Schema:
     return found
 
 
-def _family(name: str, parts: Sequence[str]) -> Schema:
+def _family_schema(name: str, parts: Sequence[str]) -> Schema:
     """Return the schema of a table whose ``kind`` says which keys it has."""
     shared = [key for key in keys_of(Filtering) if key.name != "algorithm"]
     shared = shared if name == "filter" else []
     variants = [
-        _variant(kind, cls, shared, OPTIONAL_KIND.get(name) == kind)
+        _kind_schema(kind, cls, shared, OPTIONAL_KIND.get(name) == kind)
         for part in parts
         for kind, cls in KINDS[part].items()
     ]
@@ -153,11 +157,13 @@ def _family(name: str, parts: Sequence[str]) -> Schema:
     return {"anyOf": [*variants, {"title": "a class of your own", **own}]}
 
 
-def _variant(kind: str, cls: type[Component], shared: Sequence[KeyOf], optional: bool) -> Schema:
+def _kind_schema(
+    kind: str, cls: type[Component], shared: Sequence[KeyOf], optional: bool
+) -> Schema:
     """Return the schema of one kind of a family."""
     name, choice = split_choice(kind)
     first = {key: {"const": value} for key, value in {"kind": name, **choice}.items()}
-    found = _table([*keys_of(cls), *shared], first=first)
+    found = _table_schema([*keys_of(cls), *shared], first=first)
     if not optional:
         found["required"] = [*first, *found["required"]]
     return {"title": kind, "description": summary(cls), **found}

@@ -36,10 +36,10 @@ SECTIONS = {
 
 def schema_page() -> str:
     """Return the page: a section for each table, with its kinds and their keys."""
-    return "\n".join(_lines())
+    return "\n".join(_page_lines())
 
 
-def _lines() -> Iterator[str]:
+def _page_lines() -> Iterator[str]:
     """Yield the lines of the page."""
     yield "# Keys of scenario files"
     yield ""
@@ -47,7 +47,7 @@ def _lines() -> Iterator[str]:
     for heading, cls in TABLES.items():
         keys = [key for key in keys_of(cls) if key.name != "algorithm"]
         yield from ("", f"## {heading}", "", summary(cls), "")
-        yield from _table(keys)
+        yield from _table_lines(keys)
     for family, heading in SECTIONS.items():
         yield from ("", f"## {heading}")
         for kind, cls in KINDS[family].items():
@@ -55,20 +55,20 @@ def _lines() -> Iterator[str]:
             keys = keys_of(cls)
             if keys:
                 yield ""
-                yield from _table(keys)
+                yield from _table_lines(keys)
     yield ""
 
 
-def _table(keys: Sequence[KeyOf]) -> Iterator[str]:
+def _table_lines(keys: Sequence[KeyOf]) -> Iterator[str]:
     """Yield the lines of a table of keys."""
     yield "| key | value | default | |"
     yield "|---|---|---|---|"
     for key in keys:
-        cells = [f"`{key.name}`", key.rule, _default(key), key.description]
+        cells = [f"`{key.name}`", key.rule, _format_default(key), key.description]
         yield f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells)} |"
 
 
-def _default(key: KeyOf) -> str:
+def _format_default(key: KeyOf) -> str:
     """Return the default of a key as text."""
     if key.required:
         return "-"

@@ -73,11 +73,11 @@ def with_changes(table: dict[str, Any], changes: Mapping[str, Any]) -> dict[str,
             raise ScenarioError(
                 path, "is not a key path of a scenario", None, "see the file's keys"
             )
-        table = _set(table, keys, value, path)
+        table = _set_key(table, keys, value, path)
     return table
 
 
-def _set(node: Any, keys: list[str], value: Any, path: str) -> Any:
+def _set_key(node: Any, keys: list[str], value: Any, path: str) -> Any:
     """Return a copy of a nested table in which the value at a key path is replaced or added."""
     if not keys:
         return value
@@ -90,12 +90,12 @@ def _set(node: Any, keys: list[str], value: Any, path: str) -> Any:
                 path, f"has no entry {key!r} in a list of {len(node)}", None, "count from 0"
             )
         index = int(key)
-        return [*node[:index], _set(node[index], rest, value, path), *node[index + 1 :]]
+        return [*node[:index], _set_key(node[index], rest, value, path), *node[index + 1 :]]
     if node is None:
         node = {}
     if not isinstance(node, dict) or not key:
         raise ScenarioError(path, "is not a key path of a scenario", None, "see the file's keys")
-    return {**node, key: _set(node.get(key), rest, value, path)}
+    return {**node, key: _set_key(node.get(key), rest, value, path)}
 
 
 def build_scenario(cls: type[S], table: Mapping[str, Any], origin: Origin) -> S:
@@ -125,7 +125,7 @@ def _build(cls: type[S], given: Mapping[str, Any], origin: Origin) -> Any:
     table.setdefault("sensors", [])
     time = ""
     if "plant" in table:
-        table["plant"] = _under("plant", lambda value: _plant(value, origin), table["plant"])
+        table["plant"] = _read_under("plant", lambda value: _plant(value, origin), table["plant"])
         time = "slot " if isinstance(table["plant"], SLOTTED) else ""
         time = "unknown" if table["plant"] is WAITING else time
     readers: dict[str, Callable[[Any], Any]] = {
@@ -135,11 +135,11 @@ def _build(cls: type[S], given: Mapping[str, Any], origin: Origin) -> Any:
     }
     for key, reader in readers.items():
         if key in table:
-            table[key] = _under(key, reader, table[key])
+            table[key] = _read_under(key, reader, table[key])
     return _part(cls, table, origin, ("format",))
 
 
-def _under(key: str, reader: Any, value: Any) -> Any:
+def _read_under(key: str, reader: Any, value: Any) -> Any:
     """Return ``reader(value)``; errors that it raises get ``key`` in front of their own."""
     try:
         return reader(value)
@@ -170,21 +170,21 @@ def _part(
         else value
         for name, value in table.items()
     }
-    if any(map(_waits, values.values())):
+    if any(map(_is_waiting, values.values())):
         for name, value in values.items():
             rule = fields[name].metadata.get("rule")
-            if rule is not None and not _waits(value):
+            if rule is not None and not _is_waiting(value):
                 rule(name, value)
         return WAITING
-    return _make(cls, values)
+    return _make_part(cls, values)
 
 
-def _waits(value: Any) -> bool:
+def _is_waiting(value: Any) -> bool:
     """Return True if a class of the value is not known yet."""
-    return value is WAITING or (isinstance(value, tuple) and any(map(_waits, value)))
+    return value is WAITING or (isinstance(value, tuple) and any(map(_is_waiting, value)))
 
 
-def _make(cls: type[Any], values: dict[str, Any]) -> Any:
+def _make_part(cls: type[Any], values: dict[str, Any]) -> Any:
     """Return an object of the class with these fields; other errors become ScenarioError."""
     try:
         return cls(**values)
@@ -224,7 +224,9 @@ def _kind(
     if family == "filter" and not inner:
         others = (*others, "mean", "cov", "model")
     if family == "filter" and isinstance(table.get("inner"), (Mapping, Component)):
-        table["inner"] = _under("inner", partial(_kind, family, origin, inner=True), table["inner"])
+        table["inner"] = _read_under(
+            "inner", partial(_kind, family, origin, inner=True), table["inner"]
+        )
     return WAITING if cls is None else _part(cls, table, origin, others)
 
 
@@ -242,7 +244,8 @@ def _list(value: Any, origin: Origin) -> tuple[Any, ...]:
     if not isinstance(value, (list, tuple)):
         raise ScenarioError("", "must be a list of tables", value, "write [[sensors]]")
     return tuple(
-        _under(f"[{k}]", lambda item: _sensor(item, origin), item) for k, item in enumerate(value)
+        _read_under(f"[{k}]", lambda item: _sensor(item, origin), item)
+        for k, item in enumerate(value)
     )
 
 
@@ -251,7 +254,7 @@ def _sensor(value: Any, origin: Origin) -> Any:
     table = _table(value)
     if isinstance(table.get("sampling"), (Mapping, Component)):
         read = partial(_kind, "sampling", origin)
-        table["sampling"] = _under("sampling", read, table["sampling"])
+        table["sampling"] = _read_under("sampling", read, table["sampling"])
     return _kind("sensor", origin, table, "linear")
 
 
@@ -259,12 +262,12 @@ def _network(value: Any, origin: Origin, time: str) -> Network:
     """Return the network of a table; ``time`` tells plants in slots from continuous ones."""
     table = _table(value)
     if "graph" in table:
-        table["graph"] = _under("graph", partial(_kind, "graph", origin), table["graph"])
+        table["graph"] = _read_under("graph", partial(_kind, "graph", origin), table["graph"])
     if "activation" in table:
         read = partial(_activation, origin, time)
-        table["activation"] = _under("activation", read, table["activation"])
+        table["activation"] = _read_under("activation", read, table["activation"])
     if "channel" in table:
-        table["channel"] = _under("channel", lambda v: _channel(v, origin), table["channel"])
+        table["channel"] = _read_under("channel", lambda v: _channel(v, origin), table["channel"])
     network: Network = _part(Network, table, origin)
     return network
 
@@ -287,7 +290,7 @@ def _channel(value: Any, origin: Origin) -> Channel:
     table = _table(value)
     for family in ("loss", "delay"):
         if family in table:
-            table[family] = _under(family, partial(_kind, family, origin), table[family])
+            table[family] = _read_under(family, partial(_kind, family, origin), table[family])
     channel: Channel = _part(Channel, table, origin)
     return channel
 
@@ -299,7 +302,7 @@ def _filtering(value: Any, origin: Origin) -> Filtering:
         key: table.pop(key) for key in ("mean", "cov", "model") if key in table
     }
     if "model" in shared:
-        shared["model"] = _under(
+        shared["model"] = _read_under(
             "model", lambda v: _part(Belief, _table(v), origin), shared["model"]
         )
     algorithm = _kind("filter", origin, table)

@@ -261,7 +261,9 @@ def compare(directories: Sequence[str | Path], confidence: float = 0.95) -> Comp
         wanted += [("rms_error", node) for node in first.nodes]
     level = (1.0 - confidence) / (len(wanted) * max(1, len(found) - 1))
     rows = [
-        ComparedRow(q, node, tuple(_entry(first, other, q, node, level) for other in found))
+        ComparedRow(
+            q, node, tuple(_compare_quantity(first, other, q, node, level) for other in found)
+        )
         for q, node in wanted
     ]
     rows += [
@@ -287,7 +289,7 @@ def _read_all(directories: Sequence[str | Path]) -> list[RunDirectory]:
     return [read_directory(as_path("directories", directory)) for directory in directories]
 
 
-def _entry(
+def _compare_quantity(
     first: RunDirectory, other: RunDirectory, quantity: str, node: int, level: float
 ) -> Entry:
     """Return a quantity of one directory and its difference from the first one."""
@@ -295,7 +297,7 @@ def _entry(
     entry = Entry(value, se)
     if other is first or value is None:
         return entry
-    return _pair_runs(first, other, quantity, node, level, entry) or _welch(
+    return _pair_runs(first, other, quantity, node, level, entry) or _welch_difference(
         first.value(quantity, node), entry, (first.runs, other.runs), level
     )
 
@@ -312,7 +314,7 @@ def _pair_runs(
     if len(gaps) < 2:
         return None
     mean, error = mean_over_runs(gaps)
-    ends = _interval(mean, error, len(gaps) - 1, level)
+    ends = _student_interval(mean, error, len(gaps) - 1, level)
     method = "paired" if quantity != "rms_error" else "paired, mean squares"
     return entry._replace(
         difference=mean, low=ends[0], high=ends[1], real=_excludes_zero(*ends), method=method
@@ -332,7 +334,7 @@ def _same_truth(first: RunDirectory, other: RunDirectory) -> bool:
     return bool(len(shared)) and bool(states[0].loc[shared].equals(states[1].loc[shared]))
 
 
-def _welch(
+def _welch_difference(
     base: tuple[float | None, float | None], entry: Entry, runs: tuple[int, int], level: float
 ) -> Entry:
     """Return the entry with the difference of independent runs, by Welch's interval."""
@@ -346,13 +348,15 @@ def _welch(
     total = sum(squares)
     parts = sum(s * s / (n - 1) for s, n in zip(squares, runs, strict=True))
     freedom = total * total / parts if parts > 0.0 else float(min(runs) - 1)
-    low, high = _interval(difference, math.sqrt(total), freedom, level)
+    low, high = _student_interval(difference, math.sqrt(total), freedom, level)
     return entry._replace(
         difference=difference, low=low, high=high, real=_excludes_zero(low, high), method="Welch"
     )
 
 
-def _interval(mean: float, error: float, freedom: float, level: float) -> tuple[float, float]:
+def _student_interval(
+    mean: float, error: float, freedom: float, level: float
+) -> tuple[float, float]:
     """Return both ends of Student's interval."""
     width = float(scipy.special.stdtrit(freedom, 1.0 - level / 2.0)) * error
     return mean - width, mean + width

@@ -178,7 +178,7 @@ def compare_filters(
             rows.append(ComparedFilter(label, {}, "-", math.nan, math.nan, reason))
             continue
         base = values[first] if label != first else None
-        row = _row(label, values[label], base, traffic[label], scenario.plant.n, level)
+        row = _make_row(label, values[label], base, traffic[label], scenario.plant.n, level)
         rows.append(dataclasses.replace(row, predicts=made.slotted and made.hosted.predicts))
     return FilterComparison(scenario.name, count, root, confidence, tuple(rows))
 
@@ -191,7 +191,7 @@ def _simulate(scenario: Scenario, runs: int, seed: int, engine: str, pool: Pool)
     return found
 
 
-def _row(
+def _make_row(
     label: str,
     values: FilterValues,
     first: FilterValues | None,
@@ -220,7 +220,7 @@ def _candidates(scenario: Scenario, filters: Any, engine: str) -> tuple[FilterEn
     if len(filters) > MAX_FILTERS:
         rule = f"must be at most {MAX_FILTERS} filters"
         raise ScenarioError("filters", rule, len(filters), "compare fewer at a time")
-    found = [_candidate(scenario, choice, engine) for choice in filters]
+    found = [_make_candidate(scenario, choice, engine) for choice in filters]
     labels = _distinct_labels(filters, [candidate.label for candidate in found])
     found = [one._replace(label=label) for one, label in zip(found, labels, strict=True)]
     for label in labels:
@@ -232,17 +232,17 @@ def _candidates(scenario: Scenario, filters: Any, engine: str) -> tuple[FilterEn
     return tuple(found)
 
 
-def _candidate(scenario: Scenario, choice: Choice, engine: str) -> FilterEntry:
+def _make_candidate(scenario: Scenario, choice: Choice, engine: str) -> FilterEntry:
     """Return a filter with its scenario, or with the reason why it cannot run here."""
     if isinstance(choice, Filter):
         filtering = dataclasses.replace(scenario.filter, algorithm=choice)
         make = partial(dataclasses.replace, scenario, filter=filtering)
-        label = _label(name_of("filter", choice), {})
+        label = _make_label(name_of("filter", choice), {})
     else:
         table = _filter_table(scenario, choice)
         given = {} if isinstance(choice, str) else {k: v for k, v in choice.items() if k != "kind"}
         label, make = (
-            _label(str(table["kind"]), given),
+            _make_label(str(table["kind"]), given),
             partial(scenario.replace, {"filter": table}),
         )
     try:
@@ -264,22 +264,22 @@ def _distinct_labels(filters: Sequence[Choice], labels: list[str]) -> list[str]:
         # A kind or a table beside an object of that kind: nothing tells what differs.
         if not all(isinstance(one, Filter) for one in objects):
             continue
-        settings = [_settings(one) for one in objects]
+        settings = [_filter_settings(one) for one in objects]
         names = dict.fromkeys(name for one in settings for name in one)
         differing = [name for name in names if len({one.get(name) for one in settings}) > 1]
         for k, own in zip(indices, settings, strict=True):
             # What is left out of a table is at its default.
             values = {name: own.get(name, str(getattr(filters[k], name))) for name in differing}
-            made[k] = _label(label, {name: shorten(value) for name, value in values.items()})
+            made[k] = _make_label(label, {name: shorten(value) for name, value in values.items()})
     return made
 
 
-def _settings(algorithm: Any) -> dict[str, str]:
+def _filter_settings(algorithm: Any) -> dict[str, str]:
     """Return the settings of a filter as a scenario file has them, in one line each."""
     return {name: one_line(value) for name, value in part_as_table(algorithm).items()}
 
 
-def _label(kind: str, settings: Mapping[str, Any]) -> str:
+def _make_label(kind: str, settings: Mapping[str, Any]) -> str:
     """Return the label of a filter: kind and settings."""
     return " ".join([kind, *(f"{key}={value}" for key, value in settings.items())])
 

@@ -156,10 +156,10 @@ def at_once(messages: Messages, log: IntArray) -> Messages:
 
 def rows_until(scenario: DerivedScenario, log: IntArray, at: float) -> IntArray:
     """Return the rows of an EVENT log that the state shown at ``at`` seconds contains."""
-    return np.asarray(log[: _end(scenario, log["t"], at)])
+    return np.asarray(log[: _count_events(scenario, log["t"], at)])
 
 
-def _end(scenario: DerivedScenario, times: FloatArray, at: float) -> int:
+def _count_events(scenario: DerivedScenario, times: FloatArray, at: float) -> int:
     """Return the number of events that the sample at ``at`` seconds contains."""
     if not scenario.slotted:
         return int(np.searchsorted(times, at, side="right"))
@@ -206,7 +206,7 @@ def find_flow(
     nodes = np.array(scenario.nodes)
     combination, count = scenario.hosted.combination, len(messages)
     if combination == "swap":
-        return _swaps(nodes, len(log), messages, np.asarray(used))
+        return _swap_flow(nodes, len(log), messages, np.asarray(used))
     origin = np.searchsorted(nodes, messages.sender)
     node, start = nodes, np.zeros(len(nodes), dtype=np.int64)
     readings = _carry_readings(combination, messages)
@@ -239,7 +239,7 @@ def _carry_readings(combination: str, messages: Messages) -> IntArray:
     return np.full(len(messages), combination == "readings")
 
 
-def _swaps(nodes: IntArray, rows: int, messages: Messages, used: IntArray) -> Flow:
+def _swap_flow(nodes: IntArray, rows: int, messages: Messages, used: IntArray) -> Flow:
     """Return the segments that begin with each swap."""
     swapped = np.flatnonzero(used)
     node = np.concatenate([nodes, messages.receiver[swapped]])
@@ -387,12 +387,12 @@ def newest_information(
         reading = readings.newest(node, int(flow.start[segment]), end)
         known = float(log["t"][end]) if end < len(log) else np.nan
         best = found.get(node)
-        if best is None or _order(reading, known) > _order(best.reading, best.known):
+        if best is None or _age_key(reading, known) > _age_key(best.reading, best.known):
             found[node] = Newest(reading, known, segment)
     return found
 
 
-def _order(reading: float, known: float) -> tuple[float, float]:
+def _age_key(reading: float, known: float) -> tuple[float, float]:
     """Return a key that sorts missing times first."""
     return (
         -np.inf if np.isnan(reading) else reading,

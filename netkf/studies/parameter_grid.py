@@ -31,18 +31,20 @@ def parse_grid(settings: Sequence[str]) -> dict[str, list[Any]]:
         if key in grid:
             raise ScenarioError("--vary", f"{key} is varied twice", setting, "give all in one list")
         evenly = _RANGE.match(text)
-        grid[key] = _evenly(key, *evenly.groups()) if evenly else typed_values("--vary", key, text)
+        grid[key] = (
+            _even_values(key, *evenly.groups()) if evenly else typed_values("--vary", key, text)
+        )
     return grid
 
 
-def _evenly(key: str, start: str, stop: str, count: str) -> list[Any]:
+def _even_values(key: str, start: str, stop: str, count: str) -> list[Any]:
     """Return the values of START:STOP:COUNT, whole numbers if all are whole."""
     try:
         low, high, number = float(start), float(stop), int(count)
         whole = [int(start), int(stop)]
     except ValueError:
         whole = []
-    if not _finite(start, stop) or not 2 <= int(count) <= MAX_POINTS:
+    if not _are_finite(start, stop) or not 2 <= int(count) <= MAX_POINTS:
         rule = f"range of {key} must be START:STOP:COUNT with two numbers and a count of at least 2"
         raise ScenarioError("--vary", rule, f"{start}:{stop}:{count}", "correct it")
     values = np.linspace(low, high, number)
@@ -51,7 +53,7 @@ def _evenly(key: str, start: str, stop: str, count: str) -> list[Any]:
     return [float(f"{value:.12g}") for value in values]
 
 
-def _finite(*texts: str) -> bool:
+def _are_finite(*texts: str) -> bool:
     """Return True if all texts are finite numbers."""
     try:
         return all(math.isfinite(float(text)) for text in texts)
@@ -112,7 +114,7 @@ def parse_interval(setting: str) -> tuple[str, float | int, float | int]:
     """Return the key and the ends of ``key.path=LOW:HIGH``; raises ScenarioError at --vary."""
     key, text = split_setting("--vary", setting)
     low, colon, high = text.partition(":")
-    if not colon or not _finite(low, high):
+    if not colon or not _are_finite(low, high):
         raise ScenarioError(
             "--vary", f"range of {key} must be LOW:HIGH, two numbers", text, "write 1.0:20.0"
         )

@@ -199,8 +199,8 @@ class Search:
 
     def run(self, low: float, high: float, confidence: float, quantity: str) -> Sizing:
         """Search between two values and return the result; ``quantity`` describes the quantity."""
-        first, last = self._try(low), self._try(high)
-        grows = self._grows(first, last)
+        first, last = self._probe(low), self._probe(high)
+        grows = self._detect_growth(first, last)
         good, bad = (first, last) if grows else (last, first)
         value: float | None = None
         misses: float | None = None
@@ -211,7 +211,7 @@ class Search:
         else:
             misses = good.value
             # One more value shows whether the quantity is monotone at all.
-            self._try(self._middle(low, high) or low)
+            self._probe(self._value_between(low, high) or low)
         problem, probes = self._problem, tuple(self.probes)
         return Sizing(
             problem.key,
@@ -227,7 +227,7 @@ class Search:
             advise(problem, probes, value, misses, grows),
         )
 
-    def _grows(self, first: Probe, last: Probe) -> bool:
+    def _detect_growth(self, first: Probe, last: Probe) -> bool:
         """Return True if the quantity grows with the key; bounds are compared with bounds only."""
         if BOUND in (first.by, last.by) and first.by != last.by:
             first, last = (decide_by_theory(self._problem, end.value) for end in (first, last))
@@ -238,10 +238,10 @@ class Search:
         from two such values.
         """
         while len(self.probes) < MAX_PROBES[self._problem.by]:
-            middle = self._middle(*sorted((value, misses)))
+            middle = self._value_between(*sorted((value, misses)))
             if middle is None:
                 break
-            reached = self._try(middle).target == REACHED
+            reached = self._probe(middle).target == REACHED
             value, misses = (middle, misses) if reached else (value, middle)
             # Noise hides the limit near a value that stayed undecided.
             if self._is_undecided(misses) and max(value, misses) <= END_RATIO * min(value, misses):
@@ -252,12 +252,12 @@ class Search:
         """Return True if a value was tried without a decision."""
         return any(p.value == value and p.target == UNDECIDED for p in self.probes)
 
-    def _try(self, value: float) -> Probe:
+    def _probe(self, value: float) -> Probe:
         """Try a value and keep the result."""
         self.probes.append(self._decide(value))
         return self.probes[-1]
 
-    def _middle(self, low: float, high: float) -> float | None:
+    def _value_between(self, low: float, high: float) -> float | None:
         """Return a value between two, an integer or rounded to DIGITS; None if there is none."""
         if self._problem.integer:
             middle = (low + high) // 2

@@ -27,7 +27,7 @@ def sweep_text(found: pd.DataFrame, keys: Sequence[str]) -> str:
     header = [*keys, *(name.replace("_", " ") for name in COLUMNS), "messages", "status"]
     rows = [
         [
-            *(_short(row[key]) for key in keys),
+            *(_format_short(row[key]) for key in keys),
             *(_with_error(row[name], row.get(f"{name}_se")) for name in COLUMNS),
             f"{row['sent']:,.6g}",
             row["status"],
@@ -37,7 +37,7 @@ def sweep_text(found: pd.DataFrame, keys: Sequence[str]) -> str:
     return table(header, shorten_rows(rows, MAX_ROWS))
 
 
-def _short(value: Any) -> str:
+def _format_short(value: Any) -> str:
     """Return a value as a short text."""
     text = f"{value:g}" if isinstance(value, float) else str(value)
     return text if len(text) <= MAX_LENGTH else f"{text[: MAX_LENGTH - 3]}..."
@@ -180,7 +180,7 @@ def comparison_text(found: Comparison) -> str:
     rows = [
         [
             row.quantity if row.node < 0 else f"{row.quantity} of node {row.node}",
-            *map(_mark, row.entries),
+            *map(_format_marked, row.entries),
         ]
         for row in found.rows
     ]
@@ -210,6 +210,6 @@ def comparison_text(found: Comparison) -> str:
     return "\n".join(lines)
 
 
-def _mark(entry: Entry) -> str:
+def _format_marked(entry: Entry) -> str:
     """Return a value as text, with a star if its difference is certain."""
     return _with_error(entry.value, entry.se) + (" *" if entry.real else "  ")

@@ -98,7 +98,7 @@ def why(
     Raises ScenarioError for a node, time or run that is not there, and for a run without events.
     """
     run, known = _check_run(run, scenario, replica, trust)
-    at = _instant(run, known, node, at)
+    at = _check_instant(run, known, node, at)
     most = integer(low=1, high=MAX_MISSING)("most", most)
     limit = None if below is None else number(above=0.0)("below", below)
     replayer = Replayer(known, run.seed, run.replica, node, at)
@@ -126,7 +126,7 @@ def why(
         what_ifs=_what_ifs(replayer, sources, found),
         smallest=found,
         missing=evidence.missing,
-        notes=_notes(evidence),
+        notes=_replay_notes(evidence),
     )
 
 
@@ -167,7 +167,7 @@ def _default_replays(events: int) -> int:
     return min(MAX_REPLAYS, max(MIN_REPLAYS, MAX_EVENTS // max(1, events)))
 
 
-def _instant(run: Run, scenario: Scenario, node: int, at: float) -> float:
+def _check_instant(run: Run, scenario: Scenario, node: int, at: float) -> float:
     """Return the time that is asked about, in slots the start of its slot."""
     if node not in scenario.topology.index:
         listed = ", ".join(map(str, scenario.nodes[:8]))
@@ -218,7 +218,8 @@ class _Evidence:
         every = find_flow(self.scenario, replayer.full_log, full)
         self._every = replayer.full_log, search_back(every, node)
         self.missing: dict[MessageKey, Missing] = {
-            self.messages.key(m): _missing(self.messages, m) for m in np.flatnonzero(~came).tolist()
+            self.messages.key(m): _describe_missing(self.messages, m)
+            for m in np.flatnonzero(~came).tolist()
         }
 
     def candidates(self) -> list[Candidate]:
@@ -242,16 +243,18 @@ class _Evidence:
         log, reach = self._every
         every = newest_information(reach, log, KeptReadings(scenario, log, at), 0)
         wanted = [n for n in scenario.nodes if n != self._node or n in scenario.placed]
-        return tuple(self._source(n, [b.get(n) for b in by_budget], every.get(n)) for n in wanted)
+        return tuple(
+            self._make_source(n, [b.get(n) for b in by_budget], every.get(n)) for n in wanted
+        )
 
-    def _source(
+    def _make_source(
         self, node: int, found: Sequence[Newest | None], every: Newest | None
     ) -> InformationSource:
         """Return which readings of a node the estimate has, and which messages would have brought
         newer ones.
         """
         reading, *more = [math.nan if n is None else n.reading for n in found]
-        last, unheard = self._direct(node)
+        last, unheard = self._last_direct(node)
         way: tuple[int, ...] = ()
         if found[0] is not None:
             way = route(self._reach, found[0].segment, 0)
@@ -261,7 +264,9 @@ class _Evidence:
             segment = found[newer]
             assert segment is not None
             passed = self._reach.messages_from(segment.segment, newer)
-            missing = tuple(_missing(self.messages, m) for m in passed if self._flow.cost[m])
+            missing = tuple(
+                _describe_missing(self.messages, m) for m in passed if self._flow.cost[m]
+            )
         return InformationSource(
             node=node,
             sensor=node in self.scenario.placed,
@@ -269,7 +274,7 @@ class _Evidence:
             heard=math.nan if last is None else float(self.messages.sent[last]),
             arrived=math.nan if last is None else float(self.messages.arrived[last]),
             unheard=unheard,
-            known=self._replayer.at if node == self._node else _known(found[0]),
+            known=self._replayer.at if node == self._node else _known_time(found[0]),
             reading=reading,
             route=way,
             with_more=tuple(more),
@@ -277,7 +282,7 @@ class _Evidence:
             missing=missing,
         )
 
-    def _direct(self, sender: int) -> tuple[int | None, int]:
+    def _last_direct(self, sender: int) -> tuple[int | None, int]:
         """Return the last message from a node that was used, and how many were sent since."""
         messages = self.messages
         mine = (messages.sender == sender) & (messages.receiver == self._node)
@@ -289,7 +294,7 @@ class _Evidence:
         return last, int((messages.sent[others] > messages.sent[last]).sum())
 
 
-def _known(newest: Newest | None) -> float:
+def _known_time(newest: Newest | None) -> float:
     """Return the time at which a reading became known, nan without one."""
     return math.nan if newest is None else newest.known
 
@@ -299,7 +304,7 @@ def _is_newer(reading: float, than: float) -> bool:
     return reading > than or (math.isnan(than) and not math.isnan(reading))
 
 
-def _missing(messages: Messages, m: int) -> Missing:
+def _describe_missing(messages: Messages, m: int) -> Missing:
     """Return what became of a message that did not arrive in time."""
     return Missing(
         messages.key(m),
@@ -334,7 +339,7 @@ def _what_ifs(
     )
 
 
-def _notes(evidence: _Evidence) -> tuple[str, ...]:
+def _replay_notes(evidence: _Evidence) -> tuple[str, ...]:
     """Return what a reader must know of the replays."""
     notes = []
     if not evidence.same_sends:

@@ -32,9 +32,9 @@ def source_table(found: Explanation) -> pd.DataFrame:
             "heard": s.heard,
             "arrived": s.arrived,
             "unheard": s.unheard,
-            "known_age": _age(found, s.known),
+            "known_age": _age_at_sample(found, s.known),
             "reading": s.reading,
-            "reading_age": _age(found, s.reading),
+            "reading_age": _age_at_sample(found, s.reading),
             "route": " -> ".join(map(str, s.route)),
             **{f"age_with_{k}_more": found.at - s.with_more[k - 1] for k in range(1, more + 1)},
             "age_without_losses": found.at - s.without_losses,
@@ -58,13 +58,13 @@ def why_document(found: Explanation) -> dict[str, Any]:
         "error": found.error,
         "sentences": sentences(found),
         "sources": [
-            {**vars(s), "missing": [_message(found, m.key) for m in s.missing]}
+            {**vars(s), "missing": [_message_entry(found, m.key) for m in s.missing]}
             for s in found.sources
         ],
         "what_ifs": [
             {
                 "label": w.label,
-                "messages": _messages(found, w.messages),
+                "messages": _message_entries(found, w.messages),
                 "trace": w.trace,
                 "error": w.error,
             }
@@ -74,23 +74,25 @@ def why_document(found: Explanation) -> dict[str, Any]:
         "notes": found.notes,
     }
     if smallest is not None:
-        messages = _messages(found, smallest.messages)
+        messages = _message_entries(found, smallest.messages)
         document["smallest"] = {
             **vars(smallest),
             "messages": messages,
-            "best": _messages(found, smallest.best),
+            "best": _message_entries(found, smallest.best),
             "proven": smallest.proven,
         }
     plain: dict[str, Any] = finite(document)
     return plain
 
 
-def _messages(found: Explanation, keys: Sequence[MessageKey] | None) -> list[dict[str, Any]] | None:
+def _message_entries(
+    found: Explanation, keys: Sequence[MessageKey] | None
+) -> list[dict[str, Any]] | None:
     """Return messages as entries of the document."""
-    return None if keys is None else [_message(found, key) for key in keys]
+    return None if keys is None else [_message_entry(found, key) for key in keys]
 
 
-def _message(found: Explanation, key: MessageKey) -> dict[str, Any]:
+def _message_entry(found: Explanation, key: MessageKey) -> dict[str, Any]:
     """Return a message as an entry of the document."""
     missing = found.missing[key]
     return {
@@ -105,17 +107,22 @@ def _message(found: Explanation, key: MessageKey) -> dict[str, Any]:
 
 def why_text(found: Explanation) -> str:
     """Return the answer for a terminal: sentences, the table of sources, the table of replays."""
-    lines = [*sentences(found), "", _sources(found), "", _replays(found)]
+    lines = [*sentences(found), "", _source_table(found), "", _replay_table(found)]
     lines += [f"note: {note}" for note in found.notes]
     return "\n".join(lines)
 
 
 def sentences(found: Explanation) -> list[str]:
     """Return the answer in sentences, one line each."""
-    return [*_state(found), *_heard(found), *_readings(found), *_smallest(found)]
+    return [
+        *_state_sentences(found),
+        *_heard_sentences(found),
+        *_reading_sentences(found),
+        *_smallest_sentences(found),
+    ]
 
 
-def _state(found: Explanation) -> Iterator[str]:
+def _state_sentences(found: Explanation) -> Iterator[str]:
     """Yield the sentence on the estimate."""
     where = f"{shorten(found.scenario, 60)}, seed {found.seed}, replica {found.replica}"
     sentence = f"Node {found.node} at {found.at:g} s ({where})"
@@ -128,7 +135,7 @@ def _state(found: Explanation) -> Iterator[str]:
     yield f"{sentence}{error}."
 
 
-def _heard(found: Explanation) -> Iterator[str]:
+def _heard_sentences(found: Explanation) -> Iterator[str]:
     """Yield whom the node heard directly."""
     neighbours = [s for s in found.sources if s.neighbour]
     if not neighbours:
@@ -136,12 +143,12 @@ def _heard(found: Explanation) -> Iterator[str]:
         return
     heard = sorted((s for s in neighbours if not math.isnan(s.heard)), key=lambda s: -s.heard)
     silent = [s.node for s in neighbours if math.isnan(s.heard)]
-    parts = [f"node {s.node} {_ago(found, s.heard)}" for s in heard[:MAX_LISTED]]
+    parts = [f"node {s.node} {_format_time_before(found, s.heard)}" for s in heard[:MAX_LISTED]]
     if parts:
         rest = f" and {len(heard) - MAX_LISTED} others before" if len(heard) > MAX_LISTED else ""
-        yield f"It last heard {_and(parts)}{rest} (times of sending)."
+        yield f"It last heard {_join_with_and(parts)}{rest} (times of sending)."
     if silent:
-        yield f"It had never heard node {_listed(silent)}."
+        yield f"It had never heard node {_list_messages(silent)}."
     unheard = sum(s.unheard for s in neighbours)
     if unheard:
         which = [f"{s.unheard} of node {s.node}" for s in neighbours if s.unheard]
@@ -149,11 +156,11 @@ def _heard(found: Explanation) -> Iterator[str]:
         verb = "was" if unheard == 1 else "were"
         yield (
             f"{unheard} {noun} sent to it since then {verb} lost, late or not used: "
-            f"{_listed(which, 'other nodes')}."
+            f"{_list_messages(which, 'other nodes')}."
         )
 
 
-def _readings(found: Explanation) -> Iterator[str]:
+def _reading_sentences(found: Explanation) -> Iterator[str]:
     """Yield the newest readings, and what kept newer ones away."""
     sensors = [s for s in found.sources if s.sensor and s.node != found.node]
     known = sorted((s for s in sensors if not math.isnan(s.reading)), key=lambda s: s.reading)
@@ -161,16 +168,17 @@ def _readings(found: Explanation) -> Iterator[str]:
     if known:
         oldest = known[:MAX_LISTED]
         parts = [
-            f"{found.at - s.reading:.4g} s old from node {s.node} ({_route(s)})" for s in oldest
+            f"{found.at - s.reading:.4g} s old from node {s.node} ({_format_route(s)})"
+            for s in oldest
         ]
         which = "The oldest of its" if len(known) > MAX_LISTED else "Its"
-        yield f"{which} newest readings are {_and(parts)}."
+        yield f"{which} newest readings are {_join_with_and(parts)}."
     if never:
-        yield f"No reading of node {_listed(never)} can have reached it."
+        yield f"No reading of node {_list_messages(never)} can have reached it."
     kept_away = [s for s in known + [s for s in sensors if math.isnan(s.reading)] if s.missing]
     for source in kept_away[:MAX_LISTED]:
         newest = source.with_more[len(source.missing) - 1]
-        messages = _and([str(m) for m in source.missing])
+        messages = _join_with_and([str(m) for m in source.missing])
         age = f"{found.at - newest:.4g} s old"
         yield f"A newer reading of node {source.node}, {age}, would have come with {messages}."
     if len(kept_away) > MAX_LISTED:
@@ -180,7 +188,7 @@ def _readings(found: Explanation) -> Iterator[str]:
         yield "No newer reading was kept away by up to three messages that did not come."
 
 
-def _smallest(found: Explanation) -> Iterator[str]:
+def _smallest_sentences(found: Explanation) -> Iterator[str]:
     """Yield the sentences on the smallest set of messages that would have sufficed."""
     smallest, whole = found.smallest, found.what_ifs[-1]
     if smallest is None:
@@ -189,20 +197,21 @@ def _smallest(found: Explanation) -> Iterator[str]:
     error = "" if math.isnan(whole.error) else f" and the error {whole.error:.4g}"
     yield f"Had no message been missing, trace P would be {whole.trace:.4g} ({change}){error}."
     if smallest.messages == ():
-        yield f"No message had to come: trace P as it was is at most {_limit(found, smallest)}."
+        limit = _format_limit(found, smallest)
+        yield f"No message had to come: trace P as it was is at most {limit}."
         return
-    tried = _tried(smallest)
+    tried = _describe_search(smallest)
     if smallest.messages is not None:
-        named = _and([str(found.missing[key]) for key in smallest.messages])
+        named = _join_with_and([str(found.missing[key]) for key in smallest.messages])
         one = len(smallest.messages) == 1
         what = "One message would" if one else f"{len(smallest.messages)} messages together would"
         fewer = "" if one else ("; fewer would not" if smallest.proven else "; perhaps fewer would")
         yield (
             f"{what} have brought trace P to {smallest.trace:.4g} (wanted: at most "
-            f"{_limit(found, smallest)}): {named}{fewer} ({tried})."
+            f"{_format_limit(found, smallest)}): {named}{fewer} ({tried})."
         )
         return
-    limit = _limit(found, smallest)
+    limit = _format_limit(found, smallest)
     if smallest.proven:
         yield f"No {smallest.most} messages or fewer would have brought it to {limit} ({tried})."
     else:
@@ -211,12 +220,12 @@ def _smallest(found: Explanation) -> Iterator[str]:
             f"tried ({tried}; --replays tries more)."
         )
     if smallest.best:
-        named = _and([str(found.missing[key]) for key in smallest.best])
+        named = _join_with_and([str(found.missing[key]) for key in smallest.best])
         change = relative_change(smallest.best_trace, found.trace)
         yield f"The best that was tried brings it to {smallest.best_trace:.4g} ({change}): {named}."
 
 
-def _limit(found: Explanation, smallest: SmallestSet) -> str:
+def _format_limit(found: Explanation, smallest: SmallestSet) -> str:
     """Return the trace that was wanted, and where it comes from unless it was asked for."""
     usual = (1.0 + GOOD_ENOUGH) * found.what_ifs[-1].trace
     where = f", {1.0 + GOOD_ENOUGH:g} times that with no message missing"
@@ -224,7 +233,7 @@ def _limit(found: Explanation, smallest: SmallestSet) -> str:
     return f"{smallest.limit:.4g}{where if own else ''}"
 
 
-def _tried(smallest: SmallestSet) -> str:
+def _describe_search(smallest: SmallestSet) -> str:
     """Return which messages the search looked at."""
     sentence = f"{smallest.candidates} messages could have mattered"
     if smallest.considered < smallest.candidates:
@@ -235,7 +244,7 @@ def _tried(smallest: SmallestSet) -> str:
     return f"{sentence}; {smallest.replays} replays"
 
 
-def _sources(found: Explanation) -> str:
+def _source_table(found: Explanation) -> str:
     """Return the table of sources: sensors and neighbours first."""
     chosen = [s for s in found.sources if s.sensor or s.neighbour or s.node == found.node]
     others = len(found.sources) - len(chosen)
@@ -245,11 +254,11 @@ def _sources(found: Explanation) -> str:
     rows = [
         [
             f"{s.node}{'' if s.sensor else ' (no sensor)'}",
-            _time(s.heard),
+            _format_time(s.heard),
             str(s.unheard) if s.neighbour else "-",
-            _time(s.reading),
+            _format_time(s.reading),
             *(format_number(found.at - t) for t in (s.reading, *s.with_more, s.without_losses)),
-            _route(s),
+            _format_route(s),
         ]
         for s in chosen
     ]
@@ -261,14 +270,14 @@ def _sources(found: Explanation) -> str:
     return f"{text}\n{explained}{rest}"
 
 
-def _replays(found: Explanation) -> str:
+def _replay_table(found: Explanation) -> str:
     """Return the table of replays."""
     truth = any(math.isfinite(w.error) for w in found.what_ifs)
     header = ["replayed with", "messages", "trace P", "change", *(["error"] if truth else [])]
     rows = [
         [
             w.label,
-            _count(w),
+            _count_messages(w),
             format_number(w.trace),
             "" if k == 0 else relative_change(w.trace, found.trace),
             *([format_number(w.error)] if truth else []),
@@ -278,7 +287,7 @@ def _replays(found: Explanation) -> str:
     return table(header, shorten_rows(rows, MAX_ROWS), left=1)
 
 
-def _count(what_if: WhatIf) -> str:
+def _count_messages(what_if: WhatIf) -> str:
     """Return the number of messages of a replay as text."""
     return "all" if what_if.messages is None else str(len(what_if.messages))
 
@@ -291,24 +300,24 @@ def relative_change(trace: float, base: float) -> str:
     return f"{percent:+.1f} %"
 
 
-def _time(seconds: float) -> str:
+def _format_time(seconds: float) -> str:
     """Return seconds as text, "-" for nan."""
     return "-" if math.isnan(seconds) else f"{seconds:.6g}"
 
 
-def _age(found: Explanation, seconds: float) -> float:
+def _age_at_sample(found: Explanation, seconds: float) -> float:
     """Return the age in seconds of something at the time of the sample."""
     return seconds if math.isnan(seconds) else max(0.0, found.at - seconds)
 
 
-def _ago(found: Explanation, seconds: float) -> str:
+def _format_time_before(found: Explanation, seconds: float) -> str:
     """Return a time as text, with its distance from the sample."""
     # A filtered sample is labelled with the beginning of the slot whose exchanges it has.
     since = "in this slot" if seconds > found.at else f"{found.at - seconds:.4g} s before"
     return f"at {seconds:.6g} s ({since})"
 
 
-def _route(source: InformationSource) -> str:
+def _format_route(source: InformationSource) -> str:
     """Return the nodes on the way of a reading as text."""
     if not source.route:
         return "-"
@@ -320,14 +329,14 @@ def _route(source: InformationSource) -> str:
     return " -> ".join(map(str, nodes))
 
 
-def _listed(items: Sequence[object], others: str = "others") -> str:
+def _list_messages(items: Sequence[object], others: str = "others") -> str:
     """Return the first items in words, and how many ``others`` there are."""
     parts = [str(item) for item in items[:MAX_LISTED]]
     more = len(items) - len(parts)
-    return _and([*parts, f"{more} {others}"] if more else parts)
+    return _join_with_and([*parts, f"{more} {others}"] if more else parts)
 
 
-def _and(parts: Sequence[str]) -> str:
+def _join_with_and(parts: Sequence[str]) -> str:
     """Return parts joined by commas and "and"."""
     if len(parts) < 2:
         return "".join(parts)

@@ -67,14 +67,14 @@ def check_made_channel(part: Any, topology: Topology | None, seed: int) -> None:
     graph = Complete(nodes=4).build(seed=0) if topology is None else topology
     links = table_entries(graph)
     if isinstance(part, Delay):
-        _delays(watched, tuple(links))
+        _check_delays(watched, tuple(links))
         return
     for link, table_probability in links.items():
         _check_delivery_probabilities(watched, link, table_probability)
     _check_pure(watched, links)
     _check_identical_links(watched, tuple(links))
     _check_channel_state(watched)
-    _fractions(watched, links, seed)
+    _check_fractions(watched, links, seed)
 
 
 def table_entries(topology: Topology) -> dict[Link, float]:
@@ -190,7 +190,7 @@ def _check_channel_state(watched: Watched) -> None:
     )
 
 
-def _fractions(watched: Watched, links: dict[Link, float], seed: int) -> None:
+def _check_fractions(watched: Watched, links: dict[Link, float], seed: int) -> None:
     """Check what arrives over all directions against ``mean_delivery`` and ``independent``."""
     part, where = watched.part, f"{watched.name}.mean_delivery"
     stated = np.array([part.mean_delivery(link, p) for link, p in links.items()])
@@ -208,7 +208,7 @@ def _fractions(watched: Watched, links: dict[Link, float], seed: int) -> None:
             count = f"{arrived[:, :, known].size:,} simulated messages came over {some}"
             fail(where, rule, text + count)
     if part.independent:
-        _independent(watched, arrived, tuple(links))
+        _check_independent(watched, arrived, tuple(links))
     elif type(chain := stated_part(part, "loss")) is GilbertElliott:
         _check_bursts(watched, chain, arrived)
 
@@ -242,7 +242,7 @@ def _deviation(arrived: FloatArray, stated: FloatArray, independent: bool) -> fl
     return off if found is not None and abs(off) > few else None
 
 
-def _independent(watched: Watched, arrived: FloatArray, links: tuple[Link, ...]) -> None:
+def _check_independent(watched: Watched, arrived: FloatArray, links: tuple[Link, ...]) -> None:
     """Check that outcomes (C, K, L) are independent in time and of different directions."""
     p = arrived.mean(axis=(0, 1))
     for lag in range(LAGS + 1):
@@ -276,7 +276,7 @@ def _simulate_arrivals(part: Loss, links: dict[Link, float], seed: int) -> Float
     for chain in range(CHAINS):
         streams = Streams(seed + 7, chain)
         for k, (link, table_probability) in enumerate(links.items()):
-            sampler = ChannelSampler(Channel(loss=part), partial(_generator, streams, link))
+            sampler = ChannelSampler(Channel(loss=part), partial(_make_generator, streams, link))
             uniform, bad, _ = sampler.draws(LENGTH)
             probabilities = [
                 part.delivery_probability(link, message, here, table_probability)
@@ -286,12 +286,12 @@ def _simulate_arrivals(part: Loss, links: dict[Link, float], seed: int) -> Float
     return arrived
 
 
-def _generator(streams: Streams, link: Link, purpose: str) -> np.random.Generator:
+def _make_generator(streams: Streams, link: Link, purpose: str) -> np.random.Generator:
     """Return the random generator of a purpose for a directed link."""
     return streams.generator(purpose, *link)
 
 
-def _delays(watched: Watched, links: tuple[Link, ...]) -> None:
+def _check_delays(watched: Watched, links: tuple[Link, ...]) -> None:
     """Check the delays of a channel."""
     _check_message_delays(watched, links)
     first_draws = [_draw_delays(watched) for _ in range(2)]

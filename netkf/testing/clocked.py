@@ -80,14 +80,14 @@ class ClockTrial(Trial):
         """Carry out round after round."""
         if self._clock in (None, *self.part.clocks[:1]):
             for node in self.nodes:
-                self._composes(node)
+                self._check_composes(node)
         for k in range(ROUNDS):
-            self._pass(shift=k == SHIFTED)
+            self._pass_time(shift=k == SHIFTED)
             if self.part.talks:
                 self._exchange(k, quiet=k % 2 == 0)
             self.end()
 
-    def _composes(self, node: int) -> None:
+    def _check_composes(self, node: int) -> None:
         """Check that predictions over two gaps give that over their sum."""
         watched, state = self.watched, self.states[node]
         for first, second in GAPS:
@@ -119,7 +119,7 @@ class ClockTrial(Trial):
             "solve over the gap exactly, as state.model.predict does, and keep no count of calls",
         )
 
-    def _pass(self, shift: bool) -> None:
+    def _pass_time(self, shift: bool) -> None:
         """Let time pass: the truth may be shifted, and sensors are sampled."""
         longest = LONGEST_SAMPLE_GAP
         if self._increments:
@@ -167,7 +167,7 @@ class ClockTrial(Trial):
         before = self.sums() if nothing_in_flight else {}
         payloads = [
             (node, receivers, self.emit(node, Exchange(time=self._time, receivers=receivers)))
-            for node, receivers in self._transmissions(k)
+            for node, receivers in self._choose_transmissions(k)
         ]
         for sender, receivers, payload in payloads:
             if payload is None:
@@ -181,7 +181,7 @@ class ClockTrial(Trial):
         if nothing_in_flight:
             self.compare(before, "none")
 
-    def _transmissions(self, k: int) -> list[tuple[int, tuple[int, ...]]]:
+    def _choose_transmissions(self, k: int) -> list[tuple[int, tuple[int, ...]]]:
         """Return the senders of a round, each with its receivers; two nodes send at once."""
         one, other = sorted({k % len(self.nodes), (k + 1) % len(self.nodes)})
         if self._clock == "links":
@@ -195,7 +195,7 @@ class ClockTrial(Trial):
         landed = [flying for flying in self._flying if flying.lands <= k]
         self._flying = [flying for flying in self._flying if flying.lands > k]
         for node in self.nodes:
-            inbox = [m for m in map(self._accepted, landed) if m is not None and m[0] == node]
+            inbox = [m for m in map(self._accept, landed) if m is not None and m[0] == node]
             messages = [message for _, message in sorted(inbox, key=lambda m: m[1].sender)]
             if self.part.newest_only:
                 newest = {m.sender: m for m in sorted(messages, key=lambda m: -m.age)}
@@ -203,7 +203,7 @@ class ClockTrial(Trial):
             if messages:
                 self.absorb(node, messages, Exchange(time=self._time))
 
-    def _accepted(self, flying: Flying) -> tuple[int, Message] | None:
+    def _accept(self, flying: Flying) -> tuple[int, Message] | None:
         """Return the receiver and the message, or None if the filter refuses its age."""
         age = self._time - flying.sent
         accepted = self.watched.call("accepts", flying.payload, age)

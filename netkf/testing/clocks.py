@@ -60,16 +60,16 @@ def check_made_clock(part: Any, link: Link | None, seed: int) -> None:
     """Run ``check_clock`` on an object, with streams of the given seed."""
     watched = Watched(part)
     watched.pickle_copy()
-    entities = _entities(part) if link is None else (link,)
+    entities = _all_entities(part) if link is None else (link,)
     for entity in entities[:1] if link is None else entities:
-        _one_entity(watched, entity)
+        _check_entity(watched, entity)
     _check_apart(watched, entities)
-    if len(_ticks(watched, entities[0], BLOCKS[0])) == sum(BLOCKS[0]):
+    if len(_read_ticks(watched, entities[0], BLOCKS[0])) == sum(BLOCKS[0]):
         _rates(watched, entities, seed)
     watched.finish()
 
 
-def _entities(part: Any) -> tuple[Entity, ...]:
+def _all_entities(part: Any) -> tuple[Entity, ...]:
     """Return the entities of a small network that have a clock of their own."""
     found = tuple(part.entities(Complete(nodes=4).build(seed=0)))[:MAX_ENTITIES]
     try:
@@ -81,12 +81,12 @@ def _entities(part: Any) -> tuple[Entity, ...]:
     return found or ((0, 1),)
 
 
-def _one_entity(watched: Watched, link: Entity) -> None:
+def _check_entity(watched: Watched, link: Entity) -> None:
     """Check the ticks of one entity: increasing, repeatable, whatever the blocks."""
-    _origin(watched, link)
-    whole = _ticks(watched, link, BLOCKS[0])
-    _increasing(watched, whole)
-    again = _ticks(watched, link, BLOCKS[0])
+    _check_origin(watched, link)
+    whole = _read_ticks(watched, link, BLOCKS[0])
+    _check_increasing(watched, whole)
+    again = _read_ticks(watched, link, BLOCKS[0])
     demand(
         np.array_equal(whole, again),
         f"{watched.name}.ticks",
@@ -94,7 +94,7 @@ def _one_entity(watched: Watched, link: Entity) -> None:
         "other times from an equal generator",
     )
     for blocks in BLOCKS[1:]:
-        parts = _ticks(watched, link, blocks)
+        parts = _read_ticks(watched, link, blocks)
         if not np.array_equal(whole, parts):
             k = _first_difference(whole, parts)
             texts = [f"{t[k]:.17g}" if k < len(t) else "nothing" for t in (whole, parts)]
@@ -113,11 +113,14 @@ def _check_apart(watched: Watched, entities: tuple[Entity, ...]) -> None:
     alone = {}
     with user_code(where):
         for k, entity in enumerate(entities):
-            random, position = RecordingGenerator(11, k), ClockPosition(_phase(part, entity, k))
+            random, position = (
+                RecordingGenerator(11, k),
+                ClockPosition(_draw_phase(part, entity, k)),
+            )
             alone[entity] = [tick for _, tick in _iterate_ticks(part, entity, position, random)]
         randoms = [RecordingGenerator(11, k) for k in range(len(entities))]
         running = [
-            _iterate_ticks(part, entity, ClockPosition(_phase(part, entity, k)), randoms[k])
+            _iterate_ticks(part, entity, ClockPosition(_draw_phase(part, entity, k)), randoms[k])
             for k, entity in enumerate(entities)
         ]
         between: dict[Entity, list[float]] = {entity: [] for entity in entities}
@@ -132,7 +135,7 @@ def _check_apart(watched: Watched, entities: tuple[Entity, ...]) -> None:
         demand(same, where, rule, text, "use the generator given, and no memory of earlier calls")
 
 
-def _phase(part: Any, entity: Entity, k: int) -> float:
+def _draw_phase(part: Any, entity: Entity, k: int) -> float:
     """Return the origin that a clock draws from stream ``k``."""
     return float(part.origin(entity, lambda: RecordingGenerator(12, k)))
 
@@ -150,7 +153,7 @@ def _iterate_ticks(
         position = position._replace(number=position.number + 1, now=tick)
 
 
-def _origin(watched: Watched, link: Entity) -> None:
+def _check_origin(watched: Watched, link: Entity) -> None:
     """Check that the origin is a finite number that depends on its generator only."""
     first, other = (
         watched.call("origin", link, lambda: RecordingGenerator(8), repeatable=False)
@@ -162,7 +165,7 @@ def _origin(watched: Watched, link: Entity) -> None:
     demand(first == other, where, "must use no generator but the one it is given", [first, other])
 
 
-def _ticks(watched: Watched, link: Entity, blocks: tuple[int, ...]) -> FloatArray:
+def _read_ticks(watched: Watched, link: Entity, blocks: tuple[int, ...]) -> FloatArray:
     """Return the ticks of an entity, asked for in blocks, after checks of their form."""
     random = RecordingGenerator(9)
     origin = watched.part.origin(link, lambda: RecordingGenerator(10))
@@ -187,7 +190,7 @@ def _ticks(watched: Watched, link: Entity, blocks: tuple[int, ...]) -> FloatArra
     return np.concatenate(times)
 
 
-def _increasing(watched: Watched, times: FloatArray) -> None:
+def _check_increasing(watched: Watched, times: FloatArray) -> None:
     """Check that ticks are finite, positive and increasing."""
     where = f"{watched.name}.ticks"
     demand(
@@ -225,7 +228,7 @@ def _rates(watched: Watched, entities: tuple[Entity, ...], seed: int) -> None:
     chains = []
     with user_code(f"{watched.name}.ticks"):
         for k, entity in enumerate(entities):
-            chains += [_chain(part, entity, seed, r, k) for r in range(runs)]
+            chains += [_read_chain(part, entity, seed, r, k) for r in range(runs)]
     if min(map(len, chains)) < LENGTH:
         return  # it stops by chance: there is no long run
     times = np.array(chains)
@@ -235,7 +238,7 @@ def _rates(watched: Watched, entities: tuple[Entity, ...], seed: int) -> None:
     if part.memoryless:
         found = gaps[:, :, 1:].mean(axis=(1, 2))
         known = np.where(np.isnan(stated), found, 1.0 / stated)
-        _exponential(watched, entities, gaps / known[:, None, None])
+        _check_exponential(watched, entities, gaps / known[:, None, None])
     else:
         _check_stated_law(watched, gaps, times)
 
@@ -260,7 +263,7 @@ def _check_stated_law(watched: Watched, gaps: FloatArray, times: FloatArray) -> 
         _check_uniform(uniform, where, f"gaps must have the law of {known}", remedy)
 
 
-def _chain(part: Any, entity: Entity, seed: int, run: int, k: int) -> FloatArray:
+def _read_chain(part: Any, entity: Entity, seed: int, run: int, k: int) -> FloatArray:
     """Return the first ticks of an entity in a run."""
     random = Streams(seed, run).generator("testing", k)
     origin = part.origin(entity, lambda: Streams(seed, run).generator("phase", k))
@@ -309,7 +312,7 @@ def _check_rates(
             demand(False, where, rule, f"{text}, over {name}", remedy)
 
 
-def _exponential(watched: Watched, entities: tuple[Entity, ...], gaps: FloatArray) -> None:
+def _check_exponential(watched: Watched, entities: tuple[Entity, ...], gaps: FloatArray) -> None:
     """Check that gaps (E, runs, length) of mean 1 are independent and exponential.
 
     The tests are Kolmogorov's and the correlations of neighbouring gaps and of links.

@@ -53,9 +53,9 @@ def check_filter(filter: Any, /, same_as_parent: bool | None = None, **settings:
     watched.pickle_copy()
     _class_variables(watched)
     if hosted.talks:
-        _weights(watched)
+        _check_weights(watched)
     if hosted.schedule is not None:
-        _schedule(watched)
+        _check_schedule(watched)
     plain = list(all_trials(watched))
     for trial in plain:
         trial.run()
@@ -93,7 +93,7 @@ def _class_variables(watched: Watched) -> None:
     demand(whole, f"{name}.first_slot", "must be a whole number of at least 0", first)
 
 
-def _schedule(watched: Watched) -> None:
+def _check_schedule(watched: Watched) -> None:
     """Check the phases of a slot and the numbers of their steps."""
     part, where = watched.part, f"{watched.name}.{watched.defined_name('schedule')}"
     schedule = part.schedule
@@ -130,14 +130,14 @@ def _check_predicts(watched: Watched, schedule: tuple[str, ...]) -> None:
     )
 
 
-def _weights(watched: Watched) -> None:
+def _check_weights(watched: Watched) -> None:
     """Check the weights of a filter for all pairs of degrees."""
     part, where = watched.part, f"{watched.name}.weight"
     most = watched.call("largest_degree")
     demand(most >= 1.0, f"{watched.name}.largest_degree", "must be at least 1", most)
     given = part.pair_weights
     if given is not None:
-        return _given_weights(watched, np.asarray(given))
+        return _check_given_weights(watched, np.asarray(given))
     degrees = range(1, int(min(most, MOST_LINKS)) + 1)
     for degree in degrees:
         found = [watched.call("weight", degree, peer) for peer in degrees]
@@ -156,7 +156,7 @@ def _weights(watched: Watched) -> None:
     return None
 
 
-def _given_weights(watched: Watched, weights: FloatArray) -> None:
+def _check_given_weights(watched: Watched, weights: FloatArray) -> None:
     """Check a matrix of weights."""
     where = f"{watched.name}.pair_weights"
     square = weights.ndim == 2 and weights.shape[0] == weights.shape[1]

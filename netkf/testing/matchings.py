@@ -47,7 +47,7 @@ def check_made_matching(part: Any, topology: Topology | None, seed: int) -> None
     watched = Watched(part)
     copy = watched.pickle_copy()
     networks = small_networks() if topology is None else (topology,)
-    fitting = [network for network in networks if _fits(part, network, watched.name)]
+    fitting = [network for network in networks if _accepts_graph(part, network, watched.name)]
     if isinstance(part, RecordedSlots):
         _check_recorded(part, watched.name)
         return
@@ -65,7 +65,7 @@ def check_made_matching(part: Any, topology: Topology | None, seed: int) -> None
     watched.demand_unchanged(before)
 
 
-def _fits(part: Any, topology: Topology, name: str) -> bool:
+def _accepts_graph(part: Any, topology: Topology, name: str) -> bool:
     """Return True if the matching accepts this graph."""
     with user_code(f"{name}.check"):
         try:
@@ -85,11 +85,11 @@ def _check_recorded(part: RecordedSlots, name: str) -> None:
 def _check_network(watched: Watched, copy: Any, topology: Topology, seed: int) -> None:
     """Check the draws on one graph: form, frequencies, independence of slots."""
     part, where = watched.part, f"{watched.name}.draw"
-    first = watched.call("draw", topology, _random(seed, 0), repeatable=False)
+    first = watched.call("draw", topology, _make_random(seed, 0), repeatable=False)
     demand(isinstance(first, list), where, "must return a list of pairs", first)
-    drawn = _draw_matchings(part, topology, where, _random(seed, 0), SLOTS)
+    drawn = _draw_matchings(part, topology, where, _make_random(seed, 0), SLOTS)
     for text, other in (("at the second call", part), ("of a pickled object", copy)):
-        again = _draw_matchings(other, topology, where, _random(seed, 0), SHORT)
+        again = _draw_matchings(other, topology, where, _make_random(seed, 0), SHORT)
         rule = "must draw the same from equal generators"
         differs = np.flatnonzero((again != drawn[:SHORT]).any(axis=1))
         got = f"other pairs in slot {differs[0]} {text}" if differs.size else None
@@ -98,13 +98,13 @@ def _check_network(watched: Watched, copy: Any, topology: Topology, seed: int) -
     _check_frequencies(watched, topology, drawn, mean)
     _check_slots_independent(where, topology, drawn)
     if drawn.any(axis=0).any() and (drawn[0] != drawn).any():
-        other = _draw_matchings(part, topology, where, _random(seed, 1), SLOTS // 10)
+        other = _draw_matchings(part, topology, where, _make_random(seed, 1), SLOTS // 10)
         same = np.array_equal(other, drawn[: len(other)])
         rule = "must draw from the generator given"
         demand(not same, where, rule, "the same pairs from two different generators")
 
 
-def _random(seed: int, run: int) -> np.random.Generator:
+def _make_random(seed: int, run: int) -> np.random.Generator:
     """Return the random generator of a run."""
     return Streams(seed, run).generator("matching")
 

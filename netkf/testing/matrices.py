@@ -20,7 +20,12 @@ def assert_dominated(P: ArrayLike, bound: ArrayLike, tolerance: float = 1e-9) ->
         square = matrices.ndim >= 2 and matrices.shape[-1] == matrices.shape[-2]
         demand(square, name, "must be a square matrix or a stack of them", matrices.shape)
         bad = np.argwhere(~np.isfinite(matrices).all(axis=(-2, -1)))
-        demand(not bad.size, name, "must be finite", f"nan or inf{_at(bad[0]) if bad.size else ''}")
+        demand(
+            not bad.size,
+            name,
+            "must be finite",
+            f"nan or inf{_format_index(bad[0]) if bad.size else ''}",
+        )
     try:
         shape = np.broadcast_shapes(lower.shape, upper.shape)
     except ValueError:
@@ -34,10 +39,10 @@ def assert_dominated(P: ArrayLike, bound: ArrayLike, tolerance: float = 1e-9) ->
         text = f"the least eigenvalue of bound - P is {float(least[index]):.4g}"
         count = int((relative < -tolerance).sum())
         many = f", one of {count} places of {relative.size}" if relative.size > 1 else ""
-        fail(f"P{_at(index)}", f"must stay below the bound; {text}{many}")
+        fail(f"P{_format_index(index)}", f"must stay below the bound; {text}{many}")
 
 
-def _at(index: object) -> str:
+def _format_index(index: object) -> str:
     """Return an index as text."""
     numbers = [int(k) for k in index]  # type: ignore[attr-defined]
     return f"[{', '.join(map(str, numbers))}]" if numbers else ""

@@ -114,7 +114,7 @@ def _with_other_start(part: Any) -> tuple[Any, FloatArray] | None:
     return (moved, offset) if offset.any() else None
 
 
-def _random(seed: int, run: int, purpose: str = "plant") -> np.random.Generator:
+def _make_random(seed: int, run: int, purpose: str = "plant") -> np.random.Generator:
     """Return the random generator of a run."""
     return Streams(seed, run).generator(purpose)
 
@@ -151,7 +151,7 @@ def _check_starts(
     part: Any, where: str, seed: int, start: Callable[[np.random.Generator], FloatArray]
 ) -> None:
     """Check the law of x(0), of which ``start`` draws one."""
-    white, random = whitening(part.start_cov), _random(seed, 0)
+    white, random = whitening(part.start_cov), _make_random(seed, 0)
     count = STARTS if len(white.free) else 10
     with user_code(where):
         found = [start(random) for _ in range(count)]
@@ -193,7 +193,7 @@ def _check_slots(part: LinearPlant, copy: LinearPlant, name: str, seed: int) -> 
     def path(plant: Any, slots: Sequence[int], run: int = 0) -> FloatArray:
         """Return the states (slots, n) of a run."""
         with user_code(where):
-            truth = plant.truth(_random(seed, run))
+            truth = plant.truth(_make_random(seed, run))
             found = [truth.state(slot) for slot in slots]
         demand_array(where, "a state", found[0], (part.n,))
         return np.array([np.asarray(x).reshape(-1) for x in found])
@@ -225,7 +225,7 @@ def _check_slots(part: LinearPlant, copy: LinearPlant, name: str, seed: int) -> 
 def _check_frames(part: LinearPlant, where: str, whole: FloatArray, seed: int) -> None:
     """Check that states in frames are those without, less the origin of the frame."""
     with user_code(where):
-        _compare_frames(part, where, whole, part.truth(_random(seed, 0), True))
+        _compare_frames(part, where, whole, part.truth(_make_random(seed, 0), True))
 
 
 def _compare_frames(part: LinearPlant, where: str, whole: FloatArray, truth: Any) -> None:
@@ -299,7 +299,7 @@ def _check_sampled(
         plant: Any, at: FloatArray, run: int = 0, sample_times: FloatArray = probes
     ) -> FloatArray:
         """Return the states (times, n) of a run."""
-        randoms = [_random(seed, run, purpose) for purpose in ("plant", "probe")]
+        randoms = [_make_random(seed, run, purpose) for purpose in ("plant", "probe")]
         truth = attempt(where, plant.sampled_truth, *randoms, samples, sample_times, horizon)
         asked = np.concatenate([[0.0], at])
         found = np.asarray(attempt(where, truth.states, asked)[1])
@@ -341,7 +341,7 @@ def _check_grid(part: Diffusion, name: str, seed: int, steps: int) -> None:
     def drawn(runs: Sequence[int], cuts: bool = False, blocks: int = count) -> Any:
         """Return the first paths of some runs on the grid."""
         own, shows, samples = (
-            GeneratorNormals([_random(seed, run, purpose) for run in runs])
+            GeneratorNormals([_make_random(seed, run, purpose) for run in runs])
             for purpose in ("plant", "probe", "samples")
         )
         none = np.empty(0)
@@ -358,7 +358,8 @@ def _check_grid(part: Diffusion, name: str, seed: int, steps: int) -> None:
     other = _with_other_start(part)
     if other is not None:
         moved = other[0].paths(
-            *(GeneratorNormals([_random(seed, 1, p)]) for p in ("plant", "probe")), sample_times[:0]
+            *(GeneratorNormals([_make_random(seed, 1, p)]) for p in ("plant", "probe")),
+            sample_times[:0],
         )
         Phi = np.array([scipy.linalg.expm(part.A * period * k) for k in range(1, steps + 1)])
         two = moved.following(count).x_end[0][:steps]
@@ -380,7 +381,7 @@ def _check_one_path(
     part: Diffusion, where: str, cut: Any, at: tuple[FloatArray, FloatArray], seed: int
 ) -> None:
     """Check that the path of one run is the one that is drawn with others."""
-    randoms = [_random(seed, 1, purpose) for purpose in ("plant", "probe", "samples")]
+    randoms = [_make_random(seed, 1, purpose) for purpose in ("plant", "probe", "samples")]
     own, shows, samples = randoms
     path = attempt(where, part.path, own, shows, at[0], samples, at[1])
     times = np.unique(np.concatenate([cut.end[:20], *at]))

@@ -120,9 +120,11 @@ class IncrementReader:
     def pieces(self, streams: Streams, node: int, x: FloatArray, steps: int, cut: bool) -> Pieces:
         """Return the pieces of ``steps`` steps with state x (n,)."""
         with user_code(self.where):
-            return self._pieces(streams, node, x, steps, cut)
+            return self._read_pieces(streams, node, x, steps, cut)
 
-    def _pieces(self, streams: Streams, node: int, x: FloatArray, steps: int, cut: bool) -> Pieces:
+    def _read_pieces(
+        self, streams: Streams, node: int, x: FloatArray, steps: int, cut: bool
+    ) -> Pieces:
         """Return the moments of the increments at a constant state, with steps whole or cut."""
         plant = Diffusion(
             mean=x, A=np.zeros((self.n, self.n)), B=np.zeros((self.n, 1)), sensing_period=STEP

@@ -95,7 +95,7 @@ def check_made_sensor(part: Any, seed: int) -> None:
     watched.demand_unchanged(before)
 
 
-def _states(seed: int, count: int, n: int, which: int = 0) -> FloatArray:
+def _make_states(seed: int, count: int, n: int, which: int = 0) -> FloatArray:
     """Return states (count, n) at which sensors are read."""
     return 3.0 * Streams(seed, which).generator("testing").normal(size=(count, n))
 
@@ -104,7 +104,7 @@ def _check_same_readings(
     reader: SensorReader, copy: SensorReader, nodes: tuple[int, ...], seed: int
 ) -> None:
     """Check that readings depend on streams, numbers and states alone."""
-    node, streams, x = nodes[0], Streams(seed), _states(seed, SHORT, reader.n)
+    node, streams, x = nodes[0], Streams(seed), _make_states(seed, SHORT, reader.n)
     numbers = list(range(SHORT))
     whole = reader.several(reader.path(streams, node), numbers, x)
     # Others are made and read in between, as in a simulation.
@@ -158,7 +158,7 @@ def _select(whole: ReadingSeries, ks: list[int]) -> ReadingSeries:
 def _check_linear(reader: SensorReader, node: int, seed: int) -> None:
     """Check that another state changes a reading by H times the difference, and H not at all."""
     streams, numbers = Streams(seed), list(range(LENGTH))
-    x, other = (_states(seed, LENGTH, reader.n, which) for which in (0, 1))
+    x, other = (_make_states(seed, LENGTH, reader.n, which) for which in (0, 1))
     one = reader.several(reader.path(streams, node), numbers, x)
     two = reader.several(reader.path(streams, node), numbers, other)
     apart = distance(one.H, two.H)
@@ -190,7 +190,7 @@ def _check_laws(reader: SensorReader, nodes: tuple[int, ...], seed: int) -> None
     noise = np.empty((len(nodes), runs, LENGTH, reader.p))
     rows = np.empty((len(nodes), runs, LENGTH, reader.p, reader.n))
     numbers = list(range(LENGTH))
-    x = _states(seed, LENGTH, reader.n)
+    x = _make_states(seed, LENGTH, reader.n)
     for a, node in enumerate(nodes):
         for r in range(runs):
             found = reader.several(reader.path(Streams(seed, r), node), numbers, x)
@@ -208,7 +208,7 @@ def _check_laws(reader: SensorReader, nodes: tuple[int, ...], seed: int) -> None
 
 def _check_increments(reader: IncrementReader, node: int, seed: int) -> None:
     """Check the moments of increments: additive over cuts, linear, white."""
-    x, other = _states(seed, 2, reader.n)
+    x, other = _make_states(seed, 2, reader.n)
     streams = Streams(seed)
     cut = reader.pieces(streams, node, x, SHORT, cut=True)
     uncut = reader.pieces(streams, node, x, SHORT, cut=False)
@@ -312,7 +312,7 @@ def _check_times(sensor: Any, name: str, nodes: tuple[int, ...], seed: int) -> N
     _check_sampling_rate(sensor, where, nodes, seed)
     for node in nodes:
         times = [
-            _times(sensor, where, node, seed, end) for end in (horizon, 0.4 * horizon, horizon)
+            _read_times(sensor, where, node, seed, end) for end in (horizon, 0.4 * horizon, horizon)
         ]
         for some, end in zip(times, (horizon, 0.4 * horizon, horizon), strict=True):
             inside = not len(some) or (some[0] > 0.0 and some[-1] < end)
@@ -341,7 +341,7 @@ def _check_sampling_rate(sensor: Any, where: str, nodes: tuple[int, ...], seed: 
     expected = SAMPLES
     counts = np.array(
         [
-            len(_times(sensor, where, node, seed + 1 + run, expected / rate))
+            len(_read_times(sensor, where, node, seed + 1 + run, expected / rate))
             for node in nodes
             for run in range(runs)
         ]
@@ -353,7 +353,7 @@ def _check_sampling_rate(sensor: Any, where: str, nodes: tuple[int, ...], seed: 
         fail(where, "must be as many as the mean rate of `sampling` states", text)
 
 
-def _times(sensor: Any, where: str, node: int, seed: int, horizon: float) -> FloatArray:
+def _read_times(sensor: Any, where: str, node: int, seed: int, horizon: float) -> FloatArray:
     """Return the sampling times of a sensor after a check of their form."""
     streams = Streams(seed)
 
@@ -375,7 +375,7 @@ def _check_nonlinear(sensor: NonlinearSensor, name: str, seed: int) -> None:
     sensor = sensor.located(positions)
     p, n = len(sensor.R), _states_read(sensor, name)
     for node in sensor.nodes[:MAX_NODES]:
-        for x in _states(seed, SHORT, n):
+        for x in _make_states(seed, SHORT, n):
             with user_code(name):
                 value = np.asarray(sensor.h(x.copy(), node))
                 again = np.asarray(sensor.h(x.copy(), node))

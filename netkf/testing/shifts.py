@@ -63,12 +63,12 @@ def _compare(watched: Watched, plain: Trial, shifted: Trial) -> None:
 
 def differences(one: CheckedEstimate, other: CheckedEstimate) -> list[tuple[str, float, float]]:
     """Return for xhat and P by how much two estimates differ, and the size of their entries."""
-    found = [("xhat", _apart(one.xhat, other.xhat), 1.0 + one.size + other.size)]
+    found = [("xhat", _largest_difference(one.xhat, other.xhat), 1.0 + one.size + other.size)]
     if one.P is not None and other.P is not None:
-        found.append(("P", _apart(one.P, other.P), 1.0 + float(np.abs(one.P).max())))
+        found.append(("P", _largest_difference(one.P, other.P), 1.0 + float(np.abs(one.P).max())))
     return found
 
 
-def _apart(one: FloatArray, other: FloatArray) -> float:
+def _largest_difference(one: FloatArray, other: FloatArray) -> float:
     """Return the largest difference of two arrays."""
     return float(np.abs(one - other).max())

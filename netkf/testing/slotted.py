@@ -36,12 +36,12 @@ class SlotTrial(Trial):
         for slot in range(slots):
             if part.predicts and slot == slots - SHIFTED:
                 self.shift()
-            self._slot(slot, lost=slot == slots - 1)
+            self._run_slot(slot, lost=slot == slots - 1)
             if not part.predicts and slot == slots - SHIFTED:
                 self.shift()
             self.end()
 
-    def _slot(self, slot: int, lost: bool) -> None:
+    def _run_slot(self, slot: int, lost: bool) -> None:
         """Carry out the phases of a slot, with all messages delivered or ``lost``."""
         part, phase = self.part, 0
         for kind in part.schedule:
@@ -72,8 +72,8 @@ class SlotTrial(Trial):
     def _exchange(self, exchange: Exchange, lost: bool) -> None:
         """Carry out one step of an exchange, and check conserved sums."""
         before = self.sums()
-        payloads = {node: self.emit(node, exchange) for node in self._talking(exchange.slot)}
-        for node, senders in enumerate(self._senders(exchange.slot)):
+        payloads = {node: self.emit(node, exchange) for node in self._talking_nodes(exchange.slot)}
+        for node, senders in enumerate(self._choose_senders(exchange.slot)):
             inbox = [
                 Message(k, float(self.weights[k, node]), payloads[k], 0.01 * (k + 1))
                 for k in senders
@@ -82,14 +82,14 @@ class SlotTrial(Trial):
             self.absorb(node, inbox, exchange)
         self.compare(before, "all" if lost else "none")
 
-    def _senders(self, slot: int) -> list[list[int]]:
+    def _choose_senders(self, slot: int) -> list[list[int]]:
         """Return the senders that each node hears: all others, or its partner in this slot."""
         if not self.part.pairwise:
             return [[k for k in self.nodes if k != node] for node in self.nodes]
-        paired = self._talking(slot)
+        paired = self._talking_nodes(slot)
         return [[k for k in paired if k != n] if n in paired else [] for n in self.nodes]
 
-    def _talking(self, slot: int) -> list[int]:
+    def _talking_nodes(self, slot: int) -> list[int]:
         """Return all nodes, or the pair of this slot."""
         count = len(self.nodes)
         if not self.part.pairwise:

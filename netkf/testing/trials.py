@@ -47,7 +47,7 @@ class Trial(ABC):
         self._shift = shift
         self.offset = np.zeros(len(system.M))
         """The present shift of the truth (n,)."""
-        self.nodes, self.weights = _network(self.part)
+        self.nodes, self.weights = _make_network(self.part)
         models = [self.model(sees=node != 1) for node in self.nodes]
         self.states = [self._start(node, models) for node in self.nodes]
         self.models = models
@@ -149,7 +149,7 @@ class Trial(ABC):
             )
 
 
-def _network(part: Any) -> tuple[range, FloatArray]:
+def _make_network(part: Any) -> tuple[range, FloatArray]:
     """Return the nodes and weights (N, N) of a complete graph.
 
     N is the size of ``pair_weights``, else 3 if the weights allow two links, else 2. Entry [l, i]

@@ -55,7 +55,7 @@ def make_part(
     missing = [
         attribute
         for attribute in sorted(dir(cls))
-        if getattr(_static(cls, attribute), "__isabstractmethod__", False)
+        if getattr(_static_attribute(cls, attribute), "__isabstractmethod__", False)
     ]
     demand(not missing, name, f"must define {', '.join(missing)}", None, "write what is missing")
     if not isinstance(part, type):
@@ -79,11 +79,11 @@ def leaves(value: Any, path: str = "", visited: frozenset[int] = frozenset()) ->
         yield path, value
     else:
         inside = visited | {id(value)}
-        for name, item in _items(value):
+        for name, item in _iterate_parts(value):
             yield from leaves(item, f"{path}{name}", inside)
 
 
-def _items(value: Any) -> Iterator[tuple[str, Any]]:
+def _iterate_parts(value: Any) -> Iterator[tuple[str, Any]]:
     """Yield the parts of a value, with the text that names each."""
     if isinstance(value, Mapping):
         yield from ((f"[{key!r}]", item) for key, item in value.items())
@@ -160,7 +160,7 @@ def _python_state_address() -> int | None:
     return address if random.getstate()[1] == (*text, position) else None
 
 
-def _static(cls: type, name: str) -> Any:
+def _static_attribute(cls: type, name: str) -> Any:
     """Return an attribute of a class without calling descriptors."""
     return inspect.getattr_static(cls, name, None)
 
@@ -186,7 +186,7 @@ class Watched:
         """Return the name by which the user's class defines a method or property."""
         if method in self._former:
             return self._former[method]
-        found = _static(type(self._owner), method)
+        found = _static_attribute(type(self._owner), method)
         defined = getattr(getattr(found, "fget", found), "__name__", method)
         # Under a former name of the contract, see Component.former_names.
         former = getattr(self._owner, "former_names", {}).get(method)
@@ -199,9 +199,9 @@ class Watched:
         where = f"{self.name}.{self.defined_name(method)}"
         before = [dict(leaves(argument)) for argument in arguments]
         itself = self.attributes()
-        results = [self._result(where, method, arguments) for _ in range(1 + repeatable)]
+        results = [self._call_method(where, method, arguments) for _ in range(1 + repeatable)]
         for argument, old, name in zip(
-            arguments, before, self._names(method, len(arguments)), strict=True
+            arguments, before, self._parameter_names(method, len(arguments)), strict=True
         ):
             path = difference(old, dict(leaves(argument)))
             if path is not None:
@@ -239,10 +239,14 @@ class Watched:
     def attributes(self) -> Leaves:
         """Return the attributes of the component, except for cached properties."""
         cls, own = type(self._owner), vars(self._owner)
-        kept = {k: v for k, v in own.items() if not isinstance(_static(cls, k), cached_property)}
+        kept = {
+            k: v
+            for k, v in own.items()
+            if not isinstance(_static_attribute(cls, k), cached_property)
+        }
         return {path.strip("[]'"): leaf for path, leaf in leaves(kept)}
 
-    def _result(self, where: str, method: str, arguments: tuple[Any, ...]) -> Any:
+    def _call_method(self, where: str, method: str, arguments: tuple[Any, ...]) -> Any:
         """Return the result of a method; failures and uses of global generators are
         AssertionErrors.
         """
@@ -265,7 +269,7 @@ class Watched:
         )
         return result
 
-    def _names(self, method: str, count: int) -> list[str]:
+    def _parameter_names(self, method: str, count: int) -> list[str]:
         """Return the names of the first ``count`` parameters of a method."""
         names = list(inspect.signature(getattr(self.part, method)).parameters)
         return [*names, *["an argument"] * count][:count]
@@ -314,7 +318,7 @@ class _Once(Watched):
 
     def call(self, method: str, *arguments: Any, repeatable: bool = True) -> Any:
         """Return the result of a method."""
-        return self._result(f"{self.name}.{self.defined_name(method)}", method, arguments)
+        return self._call_method(f"{self.name}.{self.defined_name(method)}", method, arguments)
 
 
 @contextmanager

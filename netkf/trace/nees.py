@@ -19,7 +19,7 @@ def errors(e: FloatArray, P: FloatArray) -> tuple[FloatArray, FloatArray]:
         square = (e * e).sum(axis=-1)
         matrices = np.ascontiguousarray(P).reshape(-1, n, n)
         if not fill_nees(flat, matrices, nees.reshape(-1), np.empty((n, n)), np.empty((n, 1))):
-            nees.reshape(-1)[~_regular(matrices)] = np.nan
+            nees.reshape(-1)[~_is_regular(matrices)] = np.nan
     return np.asarray(square), nees
 
 
@@ -48,7 +48,7 @@ def fill_nees(
     return regular
 
 
-def _regular(P: FloatArray) -> np.ndarray:
+def _is_regular(P: FloatArray) -> np.ndarray:
     """Return a mask (K,) of the matrices (K, n, n) that are finite and of full rank up to
     rounding.
     """

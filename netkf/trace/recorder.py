@@ -146,7 +146,7 @@ class Recorder:
             return
         rows = np.array(self._rows, dtype=EVENT)
         self._rows.clear()
-        self._do(self._pass_on, rows)
+        self._run_or_submit(self._pass_on, rows)
 
     def extend(self, rows: np.ndarray) -> None:
         """Record a block of EVENT rows; the caller must not write to it afterwards."""
@@ -161,7 +161,7 @@ class Recorder:
                 self._wait()  # one block at most waits for its turn
                 if self._thread is None:
                     self._thread = ThreadPoolExecutor(1, "netkf-recorder")
-            self._do(self._pass_on, rows)
+            self._run_or_submit(self._pass_on, rows)
 
     def add_counts(self, counts: np.ndarray) -> None:
         """Count events by kind (len(KINDS),), where they are only counted."""
@@ -169,7 +169,7 @@ class Recorder:
         self._flush_gathered()
         self._counts += counts
 
-    def _do(self, something: Callable[..., None], *arguments: Any) -> None:
+    def _run_or_submit(self, something: Callable[..., None], *arguments: Any) -> None:
         """Call ``something``, in the recorder's thread after earlier calls if it has one."""
         if self._thread is None:
             something(*arguments)
@@ -206,9 +206,9 @@ class Recorder:
     ) -> None:
         """Record several samples; the caller must not write to the arrays afterwards."""
         with defer_signals():  # a signal must not leave the sinks with different samples
-            self._do(self._show, t, x, xhat, P, error)
+            self._run_or_submit(self._pass_sample_on, t, x, xhat, P, error)
 
-    def _show(self, *sample: FloatArray) -> None:
+    def _pass_sample_on(self, *sample: FloatArray) -> None:
         """Pass a sample to all sinks."""
         for sink in self._sinks:
             sink.states(*sample)

@@ -61,7 +61,7 @@ def state_columns(n: int) -> list[str]:
     P is given by the rows of its upper triangle.
     """
     states = [f"{name}{i}" for name in ("x", "xhat") for i in range(n)]
-    return ["run", "t", "node", *states, *_upper("P", n), "sq_error", "nees"]
+    return ["run", "t", "node", *states, *_upper_names("P", n), "sq_error", "nees"]
 
 
 def ensemble_columns(n: int) -> list[str]:
@@ -70,12 +70,12 @@ def ensemble_columns(n: int) -> list[str]:
     They are means over ``runs`` of P, of E = (x - xhat)(x - xhat)' and of NEES, each followed by
     its standard error.
     """
-    P, E = _upper("P", n), _upper("E", n)
+    P, E = _upper_names("P", n), _upper_names("E", n)
     matrices = [*P, *(f"{name}_se" for name in P), *E, *(f"{name}_se" for name in E)]
     return ["t", "node", "runs", *matrices, "nees", "nees_se"]
 
 
-def _upper(name: str, n: int) -> list[str]:
+def _upper_names(name: str, n: int) -> list[str]:
     """Return the column names of the upper triangle of an n by n matrix, row by row."""
     join = "" if n <= 10 else "_"
     return [f"{name}{i}{join}{j}" for i in range(n) for j in range(i, n)]

@@ -202,7 +202,7 @@ def within(D, bound):
 
 
 def settled(information, number, former, former_number, tolerance):
-    return stopping.has_settled(
+    return stopping.has_converged(
         information[None], number, former[None], 0, former_number, tolerance
     )
 

@@ -12,7 +12,7 @@ import scipy.stats
 from netkf.checks.check import find_checks, judge_replicas, run_replica, with_check_times
 from netkf.checks.exact import _compare_pooled, _pool_nees, check_expected_nees, max_replayed
 from netkf.checks.parts.clock_rows import _count_interval
-from netkf.checks.points import check_times, errors_at_once, sample_times
+from netkf.checks.points import check_times, errors_at_once, probe_times
 from netkf.checks.samples import stack_summaries
 from netkf.scenario.reading import load
 from netkf.theory.common.replay import ErrorLaw
@@ -92,7 +92,7 @@ def test_errors_have_the_freedom_to_find_five_per_cent(ring):
 @pytest.mark.parametrize("name", NAMES)
 def test_runs_are_sampled_where_rows_look_and_often_enough(name):
     scenario = load_shipped(name)
-    times = sample_times(scenario)
+    times = probe_times(scenario)
     assert set(check_times(scenario)) <= set(times)
     assert len(times) <= max(24, len(check_times(scenario)))
     assert all(0.0 < time <= scenario.horizon for time in times)
@@ -116,7 +116,7 @@ def test_the_expected_nees_of_all_errors_is_exact(samples):
     assert abs(z.mean()) < 4.0 / math.sqrt(FEW)
     assert 0.3 < z.std() < 2.0
     # Each NEES counts in units of its expected value over n, that of a right P.
-    times, errors = len(sample_times(samples.scenario)), errors_at_once(samples.scenario)
+    times, errors = len(probe_times(samples.scenario)), errors_at_once(samples.scenario)
     np.testing.assert_allclose(weights.sum(axis=1), times * errors, rtol=1e-9)
 
 

@@ -137,14 +137,14 @@ def test_one_lossier_direction_is_found():
 def test_slower_clocks_are_found(cls, monkeypatch):
     # The form of ticks is looked at elsewhere: here it takes most of the time, and `now` is added
     # in another order.
-    monkeypatch.setattr("netkf.testing.clocks._one_entity", lambda *_: None)
-    monkeypatch.setattr("netkf.testing.clocks._exponential", lambda *_: None)
+    monkeypatch.setattr("netkf.testing.clocks._check_entity", lambda *_: None)
+    monkeypatch.setattr("netkf.testing.clocks._check_exponential", lambda *_: None)
     assert found_by(check_made_clock, cls(rate=2.0)) >= 7
 
 
 def test_sound_channels_and_clocks_pass_at_other_seeds(monkeypatch):
     monkeypatch.setattr(noise, "LEVEL", 1e-4)
-    monkeypatch.setattr("netkf.testing.clocks._one_entity", lambda *_: None)
+    monkeypatch.setattr("netkf.testing.clocks._check_entity", lambda *_: None)
     for seed in range(3):
         check_made_channel(parts.Bernoulli(0.7), None, seed)
         check_made_channel(parts.GilbertElliott(mean_loss=0.1, mean_burst=20.0), None, seed)

@@ -90,7 +90,7 @@ def test_norms_of_p_35():
     P = S @ S.T + np.eye(3)
     root = scipy.linalg.sqrtm(P).real
     plain = np.linalg.norm(root @ A @ np.linalg.inv(root), 2)
-    assert certified_gamma._norm(A, P) == pytest.approx(plain, rel=1e-10)
+    assert certified_gamma._weighted_norm(A, P) == pytest.approx(plain, rel=1e-10)
 
 
 @pytest.mark.parametrize(

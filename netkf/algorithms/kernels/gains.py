@@ -51,7 +51,7 @@ def gain_table(
     # The tolerance admits an interval that was computed from MAX_INTERVAL itself.
     if size > MAX_INTERVAL * (1.0 + 1e-9):
         raise ValueError(f"an interval of {longest:g} s is too long for the gains of this sensor")
-    terms = _terms(size)
+    terms = _count_terms(size)
     # k(s) looks back from the end b, hence exp(-M (b - s)).
     E = exponential_series(-M, terms)
     c = backward_coefficients(terms)
@@ -86,7 +86,7 @@ def longest_interval_for(A: FloatArray, Q: FloatArray, G: FloatArray) -> float:
     return MAX_INTERVAL / norm if norm > 0.0 else math.inf
 
 
-def _terms(size: float) -> int:
+def _count_terms(size: float) -> int:
     """Return how many terms of the power series of exp(M) are needed for a norm ``size`` of M."""
     # Until size^k / k!, the next term of the exponential series, is below double rounding.
     terms, last = 1, 1.0

@@ -102,7 +102,7 @@ def riccati_table(A: FloatArray, Q: FloatArray, G: FloatArray, longest: float) -
         short = _side_by_side(unit, transition, lyapunov_series(A, Q, TAYLOR_TERMS))
     # Binary digits of the largest number of whole units.
     levels = max(1, int(longest / unit).bit_length())
-    return RiccatiTable(n, unit, series, short, *_triples(M, scale, A, unit, levels))
+    return RiccatiTable(n, unit, series, short, *_doubling_tables(M, scale, A, unit, levels))
 
 
 def _side_by_side(unit: float, *parts: FloatArray) -> FloatArray:
@@ -111,7 +111,7 @@ def _side_by_side(unit: float, *parts: FloatArray) -> FloatArray:
     return with_reach(rows, unit)
 
 
-def _triples(
+def _doubling_tables(
     M: FloatArray, scale: float, A: FloatArray, unit: float, levels: int
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Return F, G, Q and exp(A t), each (levels, n, n), of the flow over 1, 2, 4, ... units: ``P(t)
@@ -123,7 +123,7 @@ def _triples(
     # exp(M unit) gives the first triple: with [X; Y] = E [I; P], F = X^-T, G = X^-1 E12 and Q = E21
     # X^-1.
     E = np.tensordot(wide(unit) ** np.arange(24), exponential_series(M.astype(wide), 24), 1)
-    inverse = _inverse(E[:n, :n])
+    inverse = _invert_extended(E[:n, :n])
     F, G, Q = inverse.T, inverse @ E[:n, n:], E[n:, :n] @ inverse
     move = np.tensordot(wide(unit) ** np.arange(24), exponential_series(A.astype(wide), 24), 1)
     tables = tuple(np.empty((levels, n, n)) for _ in range(4))
@@ -135,12 +135,12 @@ def _triples(
                 table[level] = value
             # Two equal gaps in a row: W = (I + G Q)^-1 joins the noise of the first with the
             # information of the second.
-            W = _inverse(np.eye(n) + G @ Q)
+            W = _invert_extended(np.eye(n) + G @ Q)
             move, F, G, Q = move @ move, F @ W.T @ F, G + F.T @ W @ G @ F, Q + F @ Q @ W @ F.T
     return tables  # type: ignore[return-value]
 
 
-def _inverse(matrix: FloatArray) -> FloatArray:
+def _invert_extended(matrix: FloatArray) -> FloatArray:
     """Return the inverse in the precision of ``matrix``, by Newton's iteration from double; nan
     where there is none, as after so many units of an unstable plant that nothing is left of them.
     """

@@ -78,7 +78,7 @@ class ClockSamples(NamedTuple):
         return all(stated.memoryless for stated in self.group.stated)
 
 
-def _network(samples: PartSamples) -> ClockSamples:
+def _network_clocks(samples: PartSamples) -> ClockSamples:
     """Return the samples of the network's clocks."""
     scenario = samples.scenario
     return ClockSamples(
@@ -86,7 +86,7 @@ def _network(samples: PartSamples) -> ClockSamples:
     )
 
 
-def _sampling(samples: PartSamples) -> ClockSamples:
+def _sampling_clocks(samples: PartSamples) -> ClockSamples:
     """Return the samples of the sensors' clocks."""
     scenario = samples.scenario
     group = sampling_clocks(scenario)
@@ -133,7 +133,7 @@ def _number_drawn(clocks: ClockSamples, runs: float) -> int:
     return int(max(wanted, 0))
 
 
-def _rates(group: Group, samples: PartSamples, level: float) -> Finding:
+def _check_rates(group: Group, samples: PartSamples, level: float) -> Finding:
     """Compare the ticks of all runs with the rates: all clocks together, also in parts of the run,
     and one by one.
     """
@@ -254,7 +254,7 @@ def _poisson_interval(total: float, mean: float, level: float) -> Interval:
     return Interval(total / mean, *limits(total / mean, 1.0), detectable, again=limits)
 
 
-def _gaps(group: Group, samples: PartSamples, level: float) -> Finding:
+def _check_gaps(group: Group, samples: PartSamples, level: float) -> Finding:
     """Compare gaps with the law of their clock, cell by cell, and with the gap before."""
     counts = group(samples).counts
     found = compare_cells(counts.cells.sum(axis=0), ["all clocks"], level / 2.0, "gaps")
@@ -270,7 +270,7 @@ def _gaps(group: Group, samples: PartSamples, level: float) -> Finding:
     return found._replace(message=f"{found.message}{text}, {apart.detectable:.2g} would be seen")
 
 
-def _lattice(group: Group, samples: PartSamples, level: float) -> Finding:
+def _check_lattice(group: Group, samples: PartSamples, level: float) -> Finding:
     """Compare ticks of clocks without randomness with where they should be."""
     counts, horizon = group(samples).counts, samples.scenario.horizon
     off, ticks = float(counts.off.max()), counts.ticks.sum()
@@ -322,13 +322,13 @@ def largest_correlation(
 
 def _promises(clocks: ClockSamples, group: Group, sentences: dict[str, str]) -> list[Promise]:
     """Return the promises about one group of clocks, with a sentence for each test."""
-    rows: list[tuple[str, Callable[..., Finding], bool]] = [("rates", _rates, False)]
+    rows: list[tuple[str, Callable[..., Finding], bool]] = [("rates", _check_rates, False)]
     if clocks.poisson:
-        rows += [("exponential", _gaps, False), ("apart", _clocks_apart, False)]
+        rows += [("exponential", _check_gaps, False), ("apart", _clocks_apart, False)]
     elif all(ticks_on_lattice(stated) for stated in clocks.group.stated):
-        rows.append(("lattice", _lattice, True))
+        rows.append(("lattice", _check_lattice, True))
     if not clocks.poisson and clocks.counts.cells.any():
-        rows.append(("law", _gaps, False))
+        rows.append(("law", _check_gaps, False))
     return [
         Promise(sentences[name], "the scenario", (), partial(test, group), exact)
         for name, test, exact in rows
@@ -355,8 +355,8 @@ def clock_promises(samples: PartSamples) -> list[Promise]:
     """Return the promises about clocks that have a stated law and were seen in the runs."""
     found: list[Promise] = []
     for counts, group, sentences in (
-        (samples.ticks, _network, NETWORK_SENTENCES),
-        (samples.sampling, _sampling, SAMPLING_SENTENCES),
+        (samples.ticks, _network_clocks, NETWORK_SENTENCES),
+        (samples.sampling, _sampling_clocks, SAMPLING_SENTENCES),
     ):
         if counts is not None:
             clocks = group(samples)

@@ -105,13 +105,13 @@ def count_delays(scenario: Scenario, run: Run) -> DelayCounts | None:
     return DelayCounts(cells, correlate_neighbours(u, first), np.array(sums), np.array(0.0))
 
 
-def _fixed(samples: Any, level: float) -> Finding:
+def _check_fixed(samples: Any, level: float) -> Finding:
     """Compare all delays with the constant that they should be."""
     off, horizon = float(samples.delays.off.max()), samples.scenario.horizon
     return find_identity(off / horizon, FIXED_TOLERANCE, "delays in units of the length of a run")
 
 
-def _law(samples: Any, level: float) -> Finding:
+def _check_law(samples: Any, level: float) -> Finding:
     """Compare delays with their law, cell by cell, of each direction by their mean rank, and with
     those of the message before.
     """
@@ -141,12 +141,14 @@ def _mean_interval(mean: float, count: float, level: float) -> Interval:
     return deviation_interval(0.5, Interval(0.5 + mean, 0.5 + mean - reach, 0.5 + mean + reach))
 
 
-FIXED = Promise("messages take the time of the scenario", "the scenario", (), _fixed, exact=True)
+FIXED = Promise(
+    "messages take the time of the scenario", "the scenario", (), _check_fixed, exact=True
+)
 LAW = Promise(
     "delays of messages have the law of the scenario, independent of each other",
     "the scenario",
     (),
-    _law,
+    _check_law,
 )
 
 

@@ -61,7 +61,7 @@ def _direction_label(scenario: Scenario, k: int) -> str:
     return f"from {sender} to {receiver}"
 
 
-def _losses(samples: PartSamples, level: float) -> Finding:
+def _check_losses(samples: PartSamples, level: float) -> Finding:
     """Compare lost shares with the stated ones, all directions together and one by one."""
     scenario, counts = samples.scenario, samples.fates
     q = loss_probabilities(scenario)
@@ -201,7 +201,7 @@ def _losses_apart(samples: PartSamples, level: float) -> Finding:
     return find_largest(intervals, CORRELATION_TOLERANCE, "largest difference")
 
 
-def _bursts(samples: PartSamples, level: float) -> Finding:
+def _check_bursts(samples: PartSamples, level: float) -> Finding:
     """Compare how often a message is lost after another loss with the chain that is stated."""
     scenario, counts = samples.scenario, samples.fates
     loss, q = _stated_loss(scenario), loss_probabilities(scenario)
@@ -292,14 +292,14 @@ def _links_apart(samples: PartSamples, level: float) -> list[tuple[Interval, str
     interval, (a, b) = found
     first, second = (_direction_label(scenario, int(columns[k])) for k in (a, b))
     intervals = [(interval, f"correlation of losses {first} and {second}")]
-    mean = _mean_correlation(excess, _variances(samples)[:, columns], level / 2.0)
+    mean = _mean_correlation(excess, _loss_variances(samples)[:, columns], level / 2.0)
     if mean is not None:
         # Correlations of some pairs cancel others only by design; a common cause adds up.
         intervals.append((deviation_interval(0.0, mean), "mean correlation of losses of all links"))
     return intervals
 
 
-def _variances(samples: PartSamples) -> FloatArray:
+def _loss_variances(samples: PartSamples) -> FloatArray:
     """Return the variance (K, D) of the losses of each direction in a part of a run, given how many
     messages were sent in it.
     """
@@ -342,7 +342,7 @@ def pair_probabilities(scenario: Scenario) -> FloatArray | None:
     return np.array([mean[index[i], index[j]] for i, j in scenario.topology.links])
 
 
-def _matchings(samples: PartSamples, level: float) -> Finding:
+def _check_matchings(samples: PartSamples, level: float) -> Finding:
     """Compare how often links are paired with the mean matching, in all slots and in two
     neighbouring ones.
     """
@@ -382,17 +382,17 @@ LOSSES = Promise(
     "messages are lost as often as the scenario says, in each direction",
     "the scenario",
     (),
-    _losses,
+    _check_losses,
 )
 LOSSES_APART = Promise(
     "messages are lost independently of each other", "the scenario", (), _losses_apart
 )
-BURSTS = Promise("losses follow each other as the scenario says", "the scenario", (), _bursts)
+BURSTS = Promise("losses follow each other as the scenario says", "the scenario", (), _check_bursts)
 MATCHINGS = Promise(
     "links are paired as often as the protocol says, whatever happened before",
     "the scenario",
     (),
-    _matchings,
+    _check_matchings,
 )
 
 

@@ -58,7 +58,7 @@ def path_law(scenario: Scenario) -> PathLaw | None:
         Phi, W = np.asarray(stated.F), np.asarray(stated.Q)
     else:
         times = np.linspace(0.0, scenario.horizon * (1.0 - 1e-9), MAX_STEPS + 1)
-        Phi, W = _discretised(stated.A, stated.B, float(times[1]))
+        Phi, W = _discretise(stated.A, stated.B, float(times[1]))
     size = float(np.sqrt(np.diagonal(W).max()))
     return PathLaw(times, Phi, whitening_matrix(W), size, _sizes(stated, Phi, W, len(times) - 1))
 
@@ -72,7 +72,7 @@ def _sizes(plant: Any, Phi: FloatArray, W: FloatArray, steps: int) -> FloatArray
     return np.array(found).reshape(steps, len(W))
 
 
-def _discretised(A: FloatArray, B: FloatArray, gap: float) -> tuple[FloatArray, FloatArray]:
+def _discretise(A: FloatArray, B: FloatArray, gap: float) -> tuple[FloatArray, FloatArray]:
     """Return ``exp(A gap)`` and the covariance of the noise over a gap, by Van Loan's formula."""
     n = len(A)
     blocks = np.block([[-A, B @ B.T], [np.zeros((n, n)), A.T]])
@@ -107,13 +107,13 @@ def _states(scenario: Scenario, streams: Streams, law: PathLaw) -> FloatArray:
     if scenario.slotted:
         truth = scenario.slot_plant.truth(streams.generator("plant"))
         return np.array([truth.absolute(slot) for slot in range(len(law.times))])
-    watched = _watched(scenario)
+    watched = _choose_times(scenario)
     path = watched.continuous_truth(streams, frames=False)
     return np.array([path.absolute(time) for time in law.times.tolist()])
 
 
 @lru_cache(maxsize=8)
-def _watched(scenario: Scenario) -> Scenario:
+def _choose_times(scenario: Scenario) -> Scenario:
     """Return the scenario with states at the times of its path law; cached for its tables."""
     law = path_law(scenario)
     assert law is not None
@@ -194,7 +194,7 @@ def reading_moments(scenario: Scenario, streams: Streams) -> NoiseMoments | None
     laws = sensor_laws(scenario)
     if not laws:
         return None
-    columns = [_noises(scenario, streams, law) for law in laws]
+    columns = [_whitened_noises(scenario, streams, law) for law in laws]
     length = max(len(z) for z, _ in columns)
     n = scenario.plant.n
     z = np.full((length, sum(z.shape[1] for z, _ in columns)), np.nan)
@@ -207,7 +207,9 @@ def reading_moments(scenario: Scenario, streams: Streams) -> NoiseMoments | None
     return moments(z, given_states)
 
 
-def _noises(scenario: Scenario, streams: Streams, law: SensorLaw) -> tuple[FloatArray, FloatArray]:
+def _whitened_noises(
+    scenario: Scenario, streams: Streams, law: SensorLaw
+) -> tuple[FloatArray, FloatArray]:
     """Return the whitened noises (S, p) of a sensor's first readings in one run, and the states
     (S, n) that it was shown, in units of their root mean squares.
     """

@@ -29,52 +29,52 @@ LAW_LEVEL = 0.05
 """Level at which a noise of a user's class is found not to be Gaussian."""
 
 
-def _labels(what: str, count: int) -> list[str]:
+def _number_labels(what: str, count: int) -> list[str]:
     """Return numbered labels."""
     return [f"{what} {k}" for k in range(count)]
 
 
 @lru_cache(maxsize=4)
-def _starts(scenario: Scenario, seed: int) -> NoiseMoments:
+def _start_moments(scenario: Scenario, seed: int) -> NoiseMoments:
     """Return the moments of whitened first states."""
     return moments(whitened_starts(scenario, start_states(scenario, seed, STARTS)))
 
 
 def _start_variance(samples: PartSamples, level: float) -> Finding:
     """Compare the variances of the first states with the stated covariance."""
-    found = _starts(samples.scenario, samples.seed)
-    labels = _labels("direction", len(found.first))
+    found = _start_moments(samples.scenario, samples.seed)
+    labels = _number_labels("direction", len(found.first))
     gaussian = not is_own_class(samples.scenario.plant, "plant")
     return compare_variances(found, labels, level, "directions of x(0)", gaussian)
 
 
 def _start_mean(samples: PartSamples, level: float) -> Finding:
     """Compare the means of the first states with the stated ones."""
-    found = _starts(samples.scenario, samples.seed)
-    return compare_means(found, _labels("direction", len(found.first)), level)
+    found = _start_moments(samples.scenario, samples.seed)
+    return compare_means(found, _number_labels("direction", len(found.first)), level)
 
 
-def _steps(samples: PartSamples) -> tuple[NoiseMoments, list[str]]:
+def _step_moments(samples: PartSamples) -> tuple[NoiseMoments, list[str]]:
     """Return the moments of the plant's noise and their labels."""
     found = total(samples.steps)
-    return found, _labels("direction", len(found.first))
+    return found, _number_labels("direction", len(found.first))
 
 
 def _step_variance(samples: PartSamples, level: float) -> Finding:
     """Compare the variances of the plant's noise with the stated ones."""
-    found, labels = _steps(samples)
+    found, labels = _step_moments(samples)
     gaussian = not is_own_class(samples.scenario.plant, "plant")
     return compare_variances(found, labels, level, "directions of the noise", gaussian)
 
 
 def _step_mean(samples: PartSamples, level: float) -> Finding:
     """Compare the means of the plant's noise with zero."""
-    return compare_means(*_steps(samples), level)
+    return compare_means(*_step_moments(samples), level)
 
 
 def _step_correlation(samples: PartSamples, level: float) -> Finding:
     """Compare the correlations of the plant's noise with zero."""
-    return compare_correlations(*_steps(samples), level)
+    return compare_correlations(*_step_moments(samples), level)
 
 
 def _reading_variance(samples: PartSamples, level: float) -> Finding:
@@ -109,7 +109,7 @@ def gaussian_noises(samples: PartSamples) -> Assumption:
         if samples.steps is not None:
             found.append((total(samples.steps).cells, "the noise of the plant"))
         if scenario.plant.is_random and np.any(scenario.plant.start_cov):
-            found.append((_starts(scenario, samples.seed).cells, "the law of x(0)"))
+            found.append((_start_moments(scenario, samples.seed).cells, "the law of x(0)"))
     if _own_sensors(scenario) and samples.readings is not None:
         found.append((total(samples.readings).cells, "the noise of the sensors"))
     off = [what for cells, what in found if not _fills_evenly(cells)]

@@ -89,7 +89,7 @@ def count_ticks(scenario: Scenario, run: Run) -> TickCounts | None:
     ids = zip(*(rows[name].tolist() for name in columns), strict=True)
     ordered = clock.at == "links"
     which = np.array([index[tuple(sorted(e)) if ordered else e] for e in ids], dtype=np.int64)
-    return _count(group, rows["t"], which, scenario.horizon)
+    return _count_in_windows(group, rows["t"], which, scenario.horizon)
 
 
 def count_samples(scenario: Scenario, streams: Streams) -> TickCounts | None:
@@ -100,7 +100,7 @@ def count_samples(scenario: Scenario, streams: Streams) -> TickCounts | None:
     times = scenario.sample_times(streams)
     found = [times[entity] for entity in group.entities]
     which = np.repeat(np.arange(len(found)), [len(t) for t in found])
-    return _count(group, np.concatenate(found), which, scenario.horizon)
+    return _count_in_windows(group, np.concatenate(found), which, scenario.horizon)
 
 
 def count_drawn_ticks(scenario: Scenario, seed: int, replica: int) -> np.ndarray:
@@ -145,7 +145,9 @@ def _by_window(times: np.ndarray, which: np.ndarray, size: int, horizon: float) 
     return counts.reshape(windows, size)
 
 
-def _count(group: ClockGroup, times: np.ndarray, which: np.ndarray, horizon: float) -> TickCounts:
+def _count_in_windows(
+    group: ClockGroup, times: np.ndarray, which: np.ndarray, horizon: float
+) -> TickCounts:
     """Return the counts of ticks at ``times`` (K,) of the clocks ``which`` (K,)."""
     size = len(group.entities)
     windows = _by_window(times, which, size, horizon)
@@ -199,7 +201,7 @@ def _as_uniform(clock: Any, ticks: TickSample, horizon: float) -> np.ndarray:
         with np.errstate(invalid="ignore", divide="ignore"):
             return np.asarray(gap_law(clock, gaps) / gap_law(clock, rest))
     if type(clock) is Periodic and clock.jitter > 0.0 and not isinstance(clock.phase, str):
-        share = (ticks.times - _lattice(clock, ticks.number)) / clock.jitter
+        share = (ticks.times - _lattice_times(clock, ticks.number)) / clock.jitter
         # Those before the end of the run only: the last tick may be beyond it.
         return np.where(ticks.number < ticks.total - 1, np.clip(share, 0.0, 1.0), np.nan)
     if type(clock) is Periodic and isinstance(clock.phase, str) and clock.period <= horizon:
@@ -244,7 +246,7 @@ def relative_variance(clock: Any) -> float:
     return (clock.high - clock.low) ** 2 / (3.0 * (clock.high + clock.low) ** 2)
 
 
-def _lattice(clock: Any, number: np.ndarray) -> np.ndarray:
+def _lattice_times(clock: Any, number: np.ndarray) -> np.ndarray:
     """Return the times (K,) of ticks number ``number`` (K,) without jitter and random phase."""
     if isinstance(clock, Renewal):
         return np.asarray((number + 1) / clock.mean_rate(()))
@@ -266,7 +268,7 @@ def distance_from_lattice(clock: Any, ticks: TickSample) -> float:
     """
     if not ticks_on_lattice(clock) or not len(ticks.times):
         return 0.0
-    late = ticks.times - _lattice(clock, ticks.number)
+    late = ticks.times - _lattice_times(clock, ticks.number)
     jitter = getattr(clock, "jitter", 0.0)
     if isinstance(getattr(clock, "phase", None), str):
         starts = np.flatnonzero(ticks.first)

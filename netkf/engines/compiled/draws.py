@@ -153,7 +153,7 @@ def no_path(n: int) -> PathBlock:
 
 
 @once_per_scenario
-def _sensors(scenario: Scenario) -> tuple[dict[str, np.ndarray], list[tuple[int, int]]]:
+def _sensor_fields(scenario: Scenario) -> tuple[dict[str, np.ndarray], list[tuple[int, int]]]:
     """Return the fields of a Sensing that all runs share, and the keys of the streams of its
     sensors.
     """
@@ -190,7 +190,7 @@ class Noise:
     """The noise of all sensors in some runs, drawn for stretches of so many ``steps``."""
 
     def __init__(self, scenario: Scenario, streams: Streams | ReplicaStreams, steps: int) -> None:
-        shared, keys = _sensors(scenario)
+        shared, keys = _sensor_fields(scenario)
         self._noise = StreamNormals(streams.seed_words("noise", keys))
         cuts = StreamNormals(streams.seed_words("cut", keys))
         # Without increment sensors the period is not used; it only must not be None.

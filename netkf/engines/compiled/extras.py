@@ -94,7 +94,7 @@ def extras_of(scenario: Scenario, state: Simulation) -> Extras | None:
     (N, n), root = state.xhat.shape, np.ascontiguousarray(state.root)
     assert root is state.root or np.shares_memory(root, state.root)
     prior_root = state.root.copy()
-    gains = _gains(scenario, state)
+    gains = _make_gains(scenario, state)
     return Extras(
         kind=state.kind,
         trace=getattr(algorithm, "minimise", "") == "trace",
@@ -116,7 +116,7 @@ def extras_of(scenario: Scenario, state: Simulation) -> Extras | None:
     )
 
 
-def _gains(scenario: Scenario, state: Simulation) -> dict[str, Any]:
+def _make_gains(scenario: Scenario, state: Simulation) -> dict[str, Any]:
     """Return the constant gains of all nodes, empty for filters of other combinations."""
     N, n = state.xhat.shape
     algorithm: Any = scenario.hosted

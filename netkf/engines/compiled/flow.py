@@ -127,7 +127,7 @@ class Source:
         self._samples = samples = SampleTables(scenario, streams, times)
         self._sampled = sampled = all_sample_times(times)
         self.instants = samples.instants
-        self._windows = _windows(scenario, streams, samples.instants)
+        self._windows = _make_windows(scenario, streams, samples.instants)
         self._grid = uses_grid(scenario)
         # Without a grid there are no steps.
         blocks = blocks_at_once(scenario) if self._grid else 0
@@ -166,7 +166,7 @@ class Source:
         return path
 
 
-def _windows(scenario: Scenario, streams: Streams, instants: Instants) -> Windows:
+def _make_windows(scenario: Scenario, streams: Streams, instants: Instants) -> Windows:
     """Return the source of windows of ticks, for clocks or for transmissions after readings."""
     senders = senders_of(scenario)
     if senders.at == "readings":
@@ -259,12 +259,12 @@ class Workspace:
             flow_scratch=flow,
             update_scratch=update,
             traced=traced,
-            **self._numbers(instants),
+            **self._scalar_fields(instants),
             **dict.fromkeys(AT_START, 0),
         )
         return state
 
-    def _numbers(self, instants: Instants) -> dict[str, Any]:
+    def _scalar_fields(self, instants: Instants) -> dict[str, Any]:
         """Return the scalar fields of a Simulation by name."""
         algorithm: Any = self._scenario.hosted
         most = int(np.diff(self._senders.first).max(initial=0))
@@ -322,8 +322,8 @@ class FlowRun:
         recorder.exact_errors = scenario.exact_errors
         self._draws, self._state = draws, workspace.begin(draws, not recorder.counts_only)
         self._visits = workspace.visits() if is_immediate(scenario) else None
-        self._totals = _totals(scenario, self._state)
-        self._history = _history(scenario, self._state)
+        self._totals = _make_totals(scenario, self._state)
+        self._history = _make_history(scenario, self._state)
         self._extras = extras_of(scenario, self._state)
 
     def to_the_end(self) -> str:
@@ -337,7 +337,7 @@ class FlowRun:
                 # it.
                 if not self._hand_samples_on():
                     return "diverged"
-                self._give(wanted)
+                self._fulfil(wanted)
         finally:
             # Ctrl-C between the two calls would lose rows that the loop has made.
             with defer_signals():
@@ -355,7 +355,7 @@ class FlowRun:
             return run_alone(self._state)
         return int(event_loop(self._state, self._totals, self._history, self._extras))
 
-    def _give(self, wanted: int) -> None:
+    def _fulfil(self, wanted: int) -> None:
         """Fulfil a request of the event loop: ticks, steps of the path, or space."""
         state = self._state
         if wanted == WANT_TICKS:
@@ -460,7 +460,7 @@ def _sums(terms: FloatArray, receivers: np.ndarray) -> dict[str, tuple[float, fl
     return {"weight": (float(count), now)}
 
 
-def _totals(scenario: Scenario, state: Simulation) -> Totals | None:
+def _make_totals(scenario: Scenario, state: Simulation) -> Totals | None:
     """Return the arrays of running sums, or None for filters that send none."""
     if scenario.hosted.combination != "sums":
         return None
@@ -469,7 +469,7 @@ def _totals(scenario: Scenario, state: Simulation) -> Totals | None:
     return empty_totals(state, receivers, model.A, model.forgetting)
 
 
-def _history(scenario: Scenario, state: Simulation) -> History | None:
+def _make_history(scenario: Scenario, state: Simulation) -> History | None:
     """Return the past of all nodes, or None for filters that never go back."""
     if scenario.hosted.combination != "readings":
         return None

@@ -48,12 +48,12 @@ def _move_totals(
     """Move every ``u`` by ``U offset``, in coordinates of the time that it refers to."""
     for times, values in ((totals.sent_at, totals.sent), (totals.heard_at, totals.heard)):
         for k, time in enumerate(times.tolist()):
-            _shift(values[k], scenario.move_back(offset, now - time))
+            _shift_total(values[k], scenario.move_back(offset, now - time))
     for m in state.heap[: state.flying]:
-        _shift(totals.offered[m], scenario.move_back(offset, now - state.pool["sent"][m]))
+        _shift_total(totals.offered[m], scenario.move_back(offset, now - state.pool["sent"][m]))
 
 
-def _shift(total: FloatArray, offset: FloatArray) -> None:
+def _shift_total(total: FloatArray, offset: FloatArray) -> None:
     """Shift a total (w, U, u) in place by ``offset`` (n,) of the state."""
     n = len(offset)
     # u = U x: it moves by U times the move of x.

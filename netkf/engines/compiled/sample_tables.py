@@ -60,7 +60,7 @@ class SampleTables:
             )
             for k, ((node, placed_sensor), some) in enumerate(zip(placed, parts, strict=True))
         ]
-        self.instants = _instants(scenario, placed, t[order], sensor[order])
+        self.instants = _make_instants(scenario, placed, t[order], sensor[order])
         self._matrices: list[FloatArray] = []
 
     def read(self, states: FloatArray, times: FloatArray, after: float, until: float) -> None:
@@ -83,7 +83,7 @@ class SampleTables:
                 given.H[given.matrix[indices], :p] = H
 
 
-def _instants(
+def _make_instants(
     scenario: Scenario, placed: list[tuple[int, PlacedSensor]], t: FloatArray, sensor: np.ndarray
 ) -> Instants:
     """Return the instants at which nodes have samples, from the sorted times ``t`` (K,) and the

@@ -43,7 +43,7 @@ def senders_of(scenario: Scenario) -> Senders:
         none = np.zeros(0, dtype=np.int64)
         return Senders("links", (), (), np.zeros(1, dtype=np.int64), none, (), none)
     if clock.at == "links":
-        return _links(topology.links, topology.directed, scenario.network.channel.symmetric)
+        return _link_senders(topology.links, topology.directed, scenario.network.channel.symmetric)
     ways = topology.directions
     each = np.arange(len(ways))
     # Each direction has a clock, and sends on itself only.
@@ -60,7 +60,7 @@ def senders_of(scenario: Scenario) -> Senders:
     return Senders(clock.at, entities, ways, first, hearing, ways, each)
 
 
-def _links(links: tuple[Link, ...], directed: bool, symmetric: bool) -> Senders:
+def _link_senders(links: tuple[Link, ...], directed: bool, symmetric: bool) -> Senders:
     """Return the senders if links have clocks: an entity is a link of one or two directions."""
     if directed:
         each = np.arange(len(links))

@@ -116,8 +116,8 @@ class SlotEvents:
         """
         setup, index = self._setup, self._scenario.topology.index
         asked = np.zeros((len(setup.fresh), len(setup.nodes)), dtype=np.uint8)
-        for step in self._steps(self._slot):
-            self._drawn.append(self._pairs(step))
+        for step in self._iterate_steps(self._slot):
+            self._drawn.append(self._choose_pairs(step))
             links = self._drawn[-1][0] if self._algorithm.pairwise else self._ways
             asked[step.step, [index[node] for link in links for node in link]] = 1
         return asked
@@ -138,7 +138,7 @@ class SlotEvents:
         # Messages that are still under way after the last slot may be delivered or late.
         if self._slot == setup.slots:
             self._noted = True
-            self._arrivals(math.inf)
+            self._deliver(math.inf)
         return len(made), np.stack(made)[None]
 
     def _one_slot(self) -> np.ndarray:
@@ -152,28 +152,28 @@ class SlotEvents:
         start = self._scenario.slot_plant.slot_time(slot)
         sampled = bool(np.isin(slot, setup.samples))
         # First what arrived since the slot before, at the latest at this very time.
-        self._arrivals(start)
+        self._deliver(start)
         # Filters that predict are sampled at the beginning of the slot, the others at its end.
         if sampled and algorithm.predicts:
             self._rows.append(None)
         # At the horizon only the sample matters: no events.
         self._noted = slot < setup.last
         if self._noted or not algorithm.predicts:
-            self._stages(slot, up)
+            self._make_stage_events(slot, up)
         self._noted = True
         if sampled and not algorithm.predicts:
             self._rows.append(None)
         return up
 
-    def _stages(self, slot: int, up: np.ndarray) -> None:
+    def _make_stage_events(self, slot: int, up: np.ndarray) -> None:
         """Make the events of the readings and exchanges of a slot, in order."""
-        steps, now = self._steps(slot), self._scenario.slot_plant.slot_time(slot)
+        steps, now = self._iterate_steps(slot), self._scenario.slot_plant.slot_time(slot)
         for step in self._setup.stages.step.tolist():
             if step < 0:
                 # Slot 0 of a filter that does not predict has no reading: it shows its start.
                 if slot > 0 or self._algorithm.predicts:
                     for node in self._scenario.sensing:
-                        self._note((now, SENSE, node, -1, -1, -1, NAN))
+                        self._append_row((now, SENSE, node, -1, -1, -1, NAN))
                 continue
             for made in islice(steps, 1):
                 now = made.end
@@ -181,10 +181,10 @@ class SlotEvents:
                 self._exchanges += 1
                 self._open = self._exchanges
                 self._send_all(made)
-                self._arrivals(made.end)
-                self._close(made, up[step])
+                self._deliver(made.end)
+                self._end_step(made, up[step])
 
-    def _steps(self, slot: int) -> Iterator[Step]:
+    def _iterate_steps(self, slot: int) -> Iterator[Step]:
         """Yield the steps of the exchanges of a slot, none where it has no exchange."""
         setup, algorithm, repeats = self._setup, self._algorithm, [0, 0]
         # At the horizon filters that predict are only sampled.
@@ -226,7 +226,7 @@ class SlotEvents:
                 rows.append(row)
         return np.array(rows, dtype=EVENT), np.array(before, dtype=np.int64)
 
-    def _note(self, row: Row) -> None:
+    def _append_row(self, row: Row) -> None:
         """Append a row, unless events of this slot are not recorded."""
         if self._noted:
             self._rows.append(row)
@@ -234,12 +234,12 @@ class SlotEvents:
     def _send_all(self, step: Step) -> None:
         """Send all messages of a step, with a draw of the channel for each."""
         broadcast, now, phase = not self._algorithm.pairwise, step.begin, step.phase
-        pairs, up = self._drawn.pop(0) if self._drawn else self._pairs(step)
+        pairs, up = self._drawn.pop(0) if self._drawn else self._choose_pairs(step)
         if broadcast:
-            self._note((now, ROUND, -1, -1, -1, phase, NAN))
+            self._append_row((now, ROUND, -1, -1, -1, phase, NAN))
         for i, j in pairs:
             if not broadcast:
-                self._note((now, TICK, i, j, -1, phase, NAN))
+                self._append_row((now, TICK, i, j, -1, phase, NAN))
             ways = self._ways[i, j]
             if self._setup.fresh[step.step] or (i, j) not in self._last:
                 # Drawn even if a node sends nothing, so that the network does not depend on the
@@ -253,7 +253,7 @@ class SlotEvents:
                 if self._setup.talks[step.step, way.index] and not self._is_silent(way, step):
                     self._send(step, way, draw if here else None)
 
-    def _pairs(self, step: Step) -> tuple[list[Link], set[Link] | None]:
+    def _choose_pairs(self, step: Step) -> tuple[list[Link], set[Link] | None]:
         """Return the links that are used, and the set of those that are up (None: all)."""
         activation, topology = self._scenario.network.activation, self._scenario.topology
         links = list(topology.links)
@@ -279,7 +279,7 @@ class SlotEvents:
         """Send one message: it is lost, arrives at once, or is put among those in flight."""
         (sender, receiver), number, now = way.ends, way.messages, step.begin
         way.messages = number + 1
-        self._note((now, SEND, sender, receiver, number, step.phase, NAN))
+        self._append_row((now, SEND, sender, receiver, number, step.phase, NAN))
         channel, delay = self._scenario.network.channel, math.nan
         if draw is not None:
             # Checked, because a user's channel may return anything.
@@ -289,9 +289,9 @@ class SlotEvents:
             if draw[0] < chance:
                 delay = checked_delay(channel.delay, way.ends, number, draw[2])
         if math.isnan(delay):
-            self._note((now, LOST, sender, receiver, number, step.phase, NAN))
+            self._append_row((now, LOST, sender, receiver, number, step.phase, NAN))
         elif delay == 0.0:
-            self._note((now, DELIVER, receiver, sender, number, step.phase, 0.0))
+            self._append_row((now, DELIVER, receiver, sender, number, step.phase, 0.0))
             # The inbox keeps one message of each sender, the last to arrive.
             self._inbox.setdefault(receiver, {})[sender] = (number, 0.0)
         # A message that would arrive after the end leaves no event.
@@ -301,7 +301,7 @@ class SlotEvents:
             entry = now + delay, way.index, self._order, way, number, now, step.phase, self._open
             heapq.heappush(self._in_flight, entry)
 
-    def _arrivals(self, until: float) -> None:
+    def _deliver(self, until: float) -> None:
         """Deliver what arrives by then; in time if the exchange it was sent in is still open."""
         while self._in_flight and self._in_flight[0][0] <= until:
             now, _, _, way, number, sent, phase, exchange = heapq.heappop(self._in_flight)
@@ -309,11 +309,11 @@ class SlotEvents:
             # After the horizon nothing is recorded; the last exchange may still be finished.
             if now < self._scenario.horizon:
                 kind = DELIVER if in_time else LATE
-                self._note((now, kind, receiver, sender, number, phase, now - sent))
+                self._append_row((now, kind, receiver, sender, number, phase, now - sent))
             if in_time:
                 self._inbox.setdefault(receiver, {})[sender] = (number, now - sent)
 
-    def _close(self, step: Step, up: np.ndarray) -> None:
+    def _end_step(self, step: Step, up: np.ndarray) -> None:
         """End a step: what its inboxes hold has arrived."""
         count = len(self._rows)
         # By receiver and sender, the order of the kernels and of SimPy.
@@ -323,10 +323,10 @@ class SlotEvents:
                 number, age = arrived[peer]
                 up[self._indices[peer, node]] = 1
                 if self._algorithm.pairwise:
-                    self._note((step.end, SWAP, node, peer, number, step.phase, age))
+                    self._append_row((step.end, SWAP, node, peer, number, step.phase, age))
             if not self._algorithm.pairwise:
                 oldest = max(age for _, age in arrived.values())
-                self._note((step.end, ABSORB, node, -1, -1, step.phase, oldest))
+                self._append_row((step.end, ABSORB, node, -1, -1, step.phase, oldest))
         if step.step == self._setup.stages.stopping and self._noted:
             self._rows.append(Closed(step.slot, step.end, len(self._rows) - count))
         self._inbox.clear()

@@ -449,7 +449,7 @@ def _slot_rows(
                 for node in h.sensing:
                     at = write_row(rows, m, SENSE, node, -1, -1, NAN, at)
         elif times.exchanged[s]:
-            at = _sent(c, h, d, rows, m, pairwise, at)
+            at = _write_sends(c, h, d, rows, m, pairwise, at)
             # Absorptions happen at the end of the step, when its inboxes close.
             now = times.start[s] + stages.end[k]
             closing = Moment(m.slot, s, m.step, m.phase, now)
@@ -458,7 +458,9 @@ def _slot_rows(
 
 
 @kernel
-def _sent(c: Channels, h: Hearing, d: Drawn, rows: Rows, m: Moment, pairwise: bool, at: int) -> int:
+def _write_sends(
+    c: Channels, h: Hearing, d: Drawn, rows: Rows, m: Moment, pairwise: bool, at: int
+) -> int:
     """Write what is sent in a step, after the tick of each pair or one round; return the row."""
     if not pairwise:
         at = write_row(rows, m, ROUND, -1, -1, -1, NAN, at)

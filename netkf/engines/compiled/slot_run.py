@@ -97,7 +97,7 @@ class SlotRuns:
         self._slot = 0
         setup, runs = self.setup, self.runs
         # Samples of the whole runs if so many are wanted at once, else those of a block.
-        self.reported = self._space(len(setup.samples)) if whole else None
+        self.reported = self._empty_samples(len(setup.samples)) if whole else None
         self._blocks = blocks = blocks_of(runs)
         self._total = aligned((blocks, LANES))
         self._nodes = SlotNodes(
@@ -209,11 +209,11 @@ class SlotRuns:
         any number); events need slots that are ``timed``.
         """
         setup = self.setup
-        times, drawn = self._messages(rows, timed)
-        local, absolute, rebased = self._states(len(times.start))
-        readings = self._readings(times, local, rebased)
+        times, drawn = self._next_messages(rows, timed)
+        local, absolute, rebased = self._next_states(len(times.start))
+        readings = self._draw_readings(times, local, rebased)
         sampled = np.flatnonzero(times.sample >= 0)
-        reported = self.reported if self.reported is not None else self._space(len(sampled))
+        reported = self.reported if self.reported is not None else self._empty_samples(len(sampled))
         # Blocks without a sample have empty arrays, of which reshape cannot tell the last length.
         x, xhat, P, error = (
             part.reshape(*part.shape[:2], math.prod(part.shape[2:])) for part in reported
@@ -229,7 +229,7 @@ class SlotRuns:
         count, algorithm = len(times.start), setup.algorithm
         extra = algorithm.slot_gains(setup.states, self._extra, self._slot, count)
         given, kernel = (setup.links, samples, self._room, *extra), algorithm.slot_kernel
-        unread = self._unread(drawn, count)
+        unread = self._missed_readings(drawn, count)
         if self._events is not None and setup.decides:
             kernel(self._nodes, readings, plan._replace(part=SENDING), *given)
             drawn.sent[:, unread] = 0
@@ -242,24 +242,24 @@ class SlotRuns:
         self._slot += count
         return SlotBlock(sampled, reported, times, drawn)
 
-    def _messages(self, rows: int, timed: bool) -> tuple[SlotTimes, Drawn]:
+    def _next_messages(self, rows: int, timed: bool) -> tuple[SlotTimes, Drawn]:
         """Return the next slots, up to about ``rows`` events, and their messages."""
         setup, events = self.setup, self._events
         if events is None:
             # The kernels draw the messages of many slots and runs at once.
             count = min(setup.block_slots(self.runs, rows), setup.slots - self._slot)
-            times = self._times(count, timed)
+            times = self._next_times(count, timed)
             return times, self._draw_messages(times)
         if setup.decides:
             # One slot, and the filters say who sends before Python makes the messages.
             sent = events.asked()
             up = np.zeros((1, 1, len(sent), len(setup.directions)), dtype=np.uint8)
-            return self._times(1, True), _pack_messages(up, sent[None, None])
+            return self._next_times(1, True), _pack_messages(up, sent[None, None])
         # As many slots as gave about so many rows.
         count, up = events.following(rows, None)
-        return self._times(count, True), _pack_messages(up, np.zeros((0,) * 4, dtype=np.uint8))
+        return self._next_times(count, True), _pack_messages(up, np.zeros((0,) * 4, dtype=np.uint8))
 
-    def _space(self, count: int) -> SampledStates:
+    def _empty_samples(self, count: int) -> SampledStates:
         """Return empty arrays for ``count`` samples."""
         runs, estimators, n = self.runs, self.setup.estimators, self.setup.n
         shape = runs, count, estimators, n
@@ -278,7 +278,7 @@ class SlotRuns:
         """
         return np.asarray(~np.isfinite(by_run(self._total, self.runs)))
 
-    def _times(self, count: int, wanted: bool) -> SlotTimes:
+    def _next_times(self, count: int, wanted: bool) -> SlotTimes:
         """Return flags, samples and, if ``wanted``, start times of the next ``count`` slots."""
         setup, algorithm, plant = self.setup, self.setup.algorithm, self._scenario.slot_plant
         slots = np.arange(self._slot, self._slot + count)
@@ -329,7 +329,7 @@ class SlotRuns:
             ask_all(MANY, channels, exchanged, drawn.sent)
         return drawn
 
-    def _unread(self, drawn: Drawn, count: int) -> np.ndarray:
+    def _missed_readings(self, drawn: Drawn, count: int) -> np.ndarray:
         """Take the messages of nodes that have no reading to send in the next slots out of ``up``;
         return who they are, (S, E, N).
         """
@@ -351,7 +351,7 @@ class SlotRuns:
         draw_uniforms(self._triggers, sent, uniform)
         return uniform
 
-    def _states(self, count: int) -> tuple[FloatArray, FloatArray, np.ndarray]:
+    def _next_states(self, count: int) -> tuple[FloatArray, FloatArray, np.ndarray]:
         """Return local and absolute states (B, S, n, L) of the next slots, and where the origin
         moves (S,).
         """
@@ -380,7 +380,9 @@ class SlotRuns:
         room = aligned((2, max(path.root.shape), LANES))
         draw_paths(MANY, path, states, normal_ziggurat(), self._slot, room, local, absolute)
 
-    def _readings(self, times: SlotTimes, local: FloatArray, rebased: np.ndarray) -> ReadingBlock:
+    def _draw_readings(
+        self, times: SlotTimes, local: FloatArray, rebased: np.ndarray
+    ) -> ReadingBlock:
         """Return the readings of a block of slots at the states ``local`` (B, S, n, L)."""
         setup, count = self.setup, local.shape[1]
         shape = self._blocks, count, setup.estimators, setup.p
@@ -437,7 +439,7 @@ class SlotRuns:
         # Kernels write the columns where the records have them.
         columns: Any = [table[name] for name in ROW_COLUMNS]
         count = make_rows(
-            setup.stages, block.times, self._channels, self._hearing(), block.drawn,
+            setup.stages, block.times, self._channels, self._make_hearing(), block.drawn,
             setup.algorithm.pairwise, first, stop, Rows._make([*columns, at_sample]),
         )  # fmt: skip
         return table[:count]
@@ -446,11 +448,11 @@ class SlotRuns:
         """Add the events of a block to ``counts``."""
         setup = self.setup
         count_events(
-            MANY, setup.stages, block.times, self._channels, self._hearing(), block.drawn,
+            MANY, setup.stages, block.times, self._channels, self._make_hearing(), block.drawn,
             setup.algorithm.pairwise, aligned((len(KINDS), LANES)), self.counts,
         )  # fmt: skip
 
-    def _hearing(self) -> Hearing:
+    def _make_hearing(self) -> Hearing:
         """Return the links and nodes as the kernels of messages need them."""
         setup, heard = self.setup, self.setup.links
         return Hearing(

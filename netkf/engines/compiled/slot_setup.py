@@ -73,7 +73,7 @@ class SlotSetup:
         self.directions: tuple[Link, ...] = tuple(
             way for i, j in links for way in ((i, j), (j, i))[: self.ways]
         )
-        self.links = self._links(scenario)
+        self.links = self._make_links(scenario)
         self._set_channel(scenario)
         self.matching = matching_lists(scenario)
         self.is_drawn = self._draws_everything(scenario)
@@ -208,7 +208,7 @@ class SlotSetup:
         self.xhat = np.stack([state.xhat for state in self.states])
         self.root = np.stack([state.root for state in self.states])
 
-    def _links(self, scenario: Scenario) -> SlotLinks:
+    def _make_links(self, scenario: Scenario) -> SlotLinks:
         """Return the directed links by receiver, with weights, as kernels need them."""
         index = scenario.topology.index
         # By receiver and sender: the order in which a filter adds what it hears.

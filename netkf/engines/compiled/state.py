@@ -27,28 +27,28 @@ from netkf.plants.laws import course_width
 from netkf.scenario.scenario import Scenario
 
 
-def _record(integers: str, floats: str = "") -> np.dtype:
+def _record_type(integers: str, floats: str = "") -> np.dtype:
     """Return a record type of int64 and float64 fields; blanks separate their names."""
     # int64 fields first, then float64 ones: every field is aligned without padding.
     fields = [(name, np.int64) for name in integers.split()]
     return np.dtype([*fields, *((name, np.float64) for name in floats.split())])
 
 
-NODE = _record("model id sensor sensors inbox last sent reading", "own")
+NODE = _record_type("model id sensor sensors inbox last sent reading", "own")
 """One filter: its model, the id in the trace (-1: pooled), its increment sensors from ``sensor`` up
 to ``sensors``, first and last message of its inbox (-1: none), how many transmissions it ``sent``,
 the instant of its newest sample (``reading``), and its ``own`` weight.
 """
 
-WAY = _record("sender receiver messages", "weight")
+WAY = _record_type("sender receiver messages", "weight")
 """A directed link: nodes by index, how many messages went, the weight of each."""
 
-ENTITY = _record("sender other first after")
+ENTITY = _record_type("sender other first after")
 """Whatever has a clock: the node that sends, the other end of a link (else -1), and the directed
 links that it sends on, ``Simulation.hearing`` from ``first`` up to ``after``.
 """
 
-MESSAGE = _record("way number next order tag", "sent arrival")
+MESSAGE = _record_type("way number next order tag", "sent arrival")
 """On its way or in an inbox; ``next`` in the same inbox or among the free ones. ``tag`` is the
 instant of a reading that is sent, or the number of a running sum.
 """
@@ -302,12 +302,12 @@ def filters_at_start(scenario: Scenario) -> Filters:
     nodes["inbox"] = nodes["reading"] = -1
     nodes["own"] = [scenario.own_weights[node] for node in (ids[:1] if pooled else ids)]
     # One table for each distinct model.
-    table, gains = _tables(distinct)
+    table, gains = _stack_model_tables(distinct)
     xhat = np.stack([mean for mean, _ in starts]).astype(np.float64)
     return Filters(nodes, xhat, np.stack([roots[id(cov)] for _, cov in starts]), table, gains)
 
 
-def _tables(models: list[FlowModel]) -> tuple[FlowTable, Gains]:
+def _stack_model_tables(models: list[FlowModel]) -> tuple[FlowTable, Gains]:
     """Return the stacked flow tables and gains of some models with equal n."""
     n = len(models[0].A)
     # A model without sensors has no gains; its entry keeps the numbering.

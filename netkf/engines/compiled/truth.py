@@ -74,7 +74,7 @@ class PathStates:
         x, time = path.x_stop[0, piece], float(self.frame_times[k])
         with np.errstate(over="ignore", invalid="ignore"):
             # The new origin: the old one moved to now, plus the local state.
-            self._origin = self._moved(np.array([time]))[0] + x
+            self._origin = self._origin_at(np.array([time]))[0] + x
         # From now on times count from this frame.
         self._frame, self._begun = k + 1, time
         return np.asarray(x)
@@ -88,9 +88,9 @@ class PathStates:
         if not self._frame:
             return local, local
         with np.errstate(over="ignore", invalid="ignore"):
-            return local, local + self._moved(times)
+            return local, local + self._origin_at(times)
 
-    def _moved(self, times: FloatArray) -> FloatArray:
+    def _origin_at(self, times: FloatArray) -> FloatArray:
         """Return the absolute origin (T, n) of the present frame at some times: its transition from
         where the frame began.
         """

@@ -46,7 +46,11 @@ def clock_processes(
     if activation.at == "readings":
         _transmit_after_samples(timeline, *air)
         return []
-    make = {"links": _links, "directions": _directions, "nodes": _nodes}
+    make = {
+        "links": _link_activations,
+        "directions": _direction_activations,
+        "nodes": _node_activations,
+    }
     activations = make[activation.at](*air)
     return [
         _tick_process(scenario, streams, timeline, recorder, entity, k, activate)
@@ -93,7 +97,7 @@ def _tick_process(
 Activations = list[tuple[tuple[int, ...], Activation]]
 
 
-def _links(
+def _link_activations(
     scenario: Scenario,
     recorder: Recorder,
     transmitter: Transmitter,
@@ -118,7 +122,7 @@ def _links(
     return [(link, activation(link, k)) for k, link in enumerate(scenario.topology.links)]
 
 
-def _directions(
+def _direction_activations(
     scenario: Scenario,
     recorder: Recorder,
     transmitter: Transmitter,
@@ -181,7 +185,7 @@ def broadcasts(
     return {node: activation(node) for node in scenario.nodes}
 
 
-def _nodes(
+def _node_activations(
     scenario: Scenario,
     recorder: Recorder,
     transmitter: Transmitter,

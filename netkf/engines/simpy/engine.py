@@ -98,7 +98,7 @@ class _Simulation:
             carriers = [(k, p) for k in sensing for p in scenario.increment_sensors.get(k, ())]
             sensors = increment_sensors(scenario, streams, carriers)
             common = (timeline, self._recorder, truth, sensors)
-            return ClockedNode(*common, *_identity(scenario, node, entity))
+            return ClockedNode(*common, *_identify(scenario, node, entity))
 
         nodes = _nodes(scenario, make)
         # Before anything happens: the sums that exchanges must conserve from now on.
@@ -144,7 +144,7 @@ class _Simulation:
 
         def make(node: int, entity: int, _: tuple[int, ...]) -> SlotNode:
             """Return one node in slots."""
-            own = _identity(scenario, node, entity)
+            own = _identify(scenario, node, entity)
             return SlotNode(recorder, schedule, period, streams, *own)
 
         nodes = _nodes(scenario, make)
@@ -231,7 +231,7 @@ def _nodes(scenario: Scenario, make: Callable[[int, int, tuple[int, ...]], Any])
     return {node: make(node, entity, (node,)) for entity, node in enumerate(nodes)}
 
 
-def _identity(scenario: Scenario, node: int, entity: int) -> tuple[Any, ...]:
+def _identify(scenario: Scenario, node: int, entity: int) -> tuple[Any, ...]:
     """Return the arguments of Node: filter, id, index, model, start and NodeInfo."""
     model, first = scenario.believed_models[entity], scenario.nodes[entity]
     # -1: the pooled filter is no node of the graph.
@@ -252,21 +252,21 @@ class _Sums:
 
     def __init__(self, nodes: list[Node]) -> None:
         self._nodes = nodes
-        self.start = self._now()
+        self.start = self._compute()
 
-    def _now(self) -> dict[str, float]:
+    def _compute(self) -> dict[str, float]:
         """Return the conserved sums over all nodes by name."""
-        parts = [_terms(node.algorithm, node.state) for node in self._nodes]
+        parts = [_conserved_terms(node.algorithm, node.state) for node in self._nodes]
         # fsum: rounding of the check itself would look like a loss.
         return {name: math.fsum(t for part in parts for t in part[name]) for name in parts[0]}
 
     def pairs(self) -> dict[str, tuple[float, float]]:
         """Return the sums (at the start, now) by name."""
-        now = self._now()
+        now = self._compute()
         return {name: (first, now[name]) for name, first in self.start.items()}
 
 
-def _terms(algorithm: Filter, state: Any) -> dict[str, list[float]]:
+def _conserved_terms(algorithm: Filter, state: Any) -> dict[str, list[float]]:
     """Return the terms of a node to the conserved sums, as lists by name."""
     found = algorithm.conserved(state)
     return {name: np.atleast_1d(np.asarray(value)).tolist() for name, value in found.items()}

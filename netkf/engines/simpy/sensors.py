@@ -36,7 +36,7 @@ def sensor_processes(
     index = scenario.topology.index
     processes = [
         # One process for all increment sensors of a node: they are read at the same times.
-        _increments(scenario, timeline, recorder, truth, nodes[node], node, index[node])
+        _increment_process(scenario, timeline, recorder, truth, nodes[node], node, index[node])
         for node in scenario.increment_sensors
     ]
     times, entity = scenario.sample_times(streams), 0
@@ -52,7 +52,7 @@ def sensor_processes(
     return processes
 
 
-def _increments(
+def _increment_process(
     scenario: Scenario,
     timeline: Timeline,
     recorder: Recorder,

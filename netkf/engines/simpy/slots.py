@@ -156,10 +156,10 @@ class SlotNode(Node):
                 # Reading and sending belong to other processes.
                 if stage.kind not in ("read", "send"):
                     yield timeline.at(stage.time, stage.rank, self.entity)
-                    self._do(stage, slot)
+                    self._perform(stage, slot)
             slot += 1
 
-    def _do(self, stage: Stage, slot: int) -> None:
+    def _perform(self, stage: Stage, slot: int) -> None:
         """Carry out one stage of a slot."""
         if stage.kind == "predict":
             self.state = self.algorithm.predict(self.state, self._period)
@@ -179,7 +179,9 @@ class SlotNode(Node):
         # Empty arrays first, so that nodes without sensors concatenate too.
         y = np.concatenate([np.empty(0), *(y for y, _ in samples)])
         H = np.concatenate([model.H[:0], *(H for _, H in samples)])
-        present = np.concatenate([np.empty(0, dtype=bool), *(_rows(y, H) for y, H in samples)])
+        present = np.concatenate(
+            [np.empty(0, dtype=bool), *(_finite_rows(y, H) for y, H in samples)]
+        )
         R = model.R
         # Rows without a value are left out of y, H and R alike.
         if not present.all():  # a recorded sensor without a row for this slot
@@ -229,7 +231,7 @@ class SlotNode(Node):
             append((now, STOP, self.node, -1, -1, phase, NAN))
 
 
-def _rows(y: FloatArray, H: FloatArray) -> np.ndarray:
+def _finite_rows(y: FloatArray, H: FloatArray) -> np.ndarray:
     """Return which rows (p,) of a reading have a value."""
     # A reading without values has no row that counts.
     return np.isfinite(y) if len(y) == len(H) else np.zeros(len(H), dtype=bool)

@@ -46,20 +46,20 @@ class BeliefRule(ErrorRule):
         }
         self._evidence: set[Hashable] = set()
         for estimator in range(errors.estimators):
-            errors.copy(estimator, _prior(estimator), estimator)
+            errors.copy(estimator, _prior_name(estimator), estimator)
 
-    def _put(self, name: Hashable, U: FloatArray, s: FloatArray) -> None:
+    def _put_evidence(self, name: Hashable, U: FloatArray, s: FloatArray) -> None:
         """Set a piece of evidence."""
         self._evidence.add(name)
         self.errors.stack.put(name, s)
         self.errors.stack.matrices[self.errors.stack.index(name)] = U
 
-    def _drop(self, names: Sequence[Hashable]) -> None:
+    def _drop_evidence(self, names: Sequence[Hashable]) -> None:
         """Forget some evidence."""
         self._evidence.difference_update(names)
         self.errors.stack.drop(names)
 
-    def _sum(self, names: Sequence[Hashable]) -> tuple[FloatArray, FloatArray]:
+    def _sum_evidence(self, names: Sequence[Hashable]) -> tuple[FloatArray, FloatArray]:
         """Return U (n, n) and the form of s (n, inputs) of several pieces of evidence together."""
         stack, n = self.errors.stack, self.errors.n
         known = [name for name in names if name in self._evidence]
@@ -69,24 +69,26 @@ class BeliefRule(ErrorRule):
     def elapse(self, gap: float, columns: slice | None, noise: FloatArray | None) -> None:
         """Let all evidence speak about the present state."""
         if gap > 0.0:
-            self._move(np.asarray(scipy.linalg.expm(-gap * self.scenario.belief[0])))
+            self._predict_evidence(np.asarray(scipy.linalg.expm(-gap * self.scenario.belief[0])))
 
-    def _move(self, back: FloatArray) -> None:
+    def _predict_evidence(self, back: FloatArray) -> None:
         """Predict all evidence (U, s) to a later state: ``U <- back' U back``, ``s <- back' s``."""
         stack = self.errors.stack
         for name in self._evidence:
             U = stack.matrices[stack.index(name)]
-            self._put(name, back.T @ U @ back, back.T @ stack.form(name))
+            self._put_evidence(name, back.T @ U @ back, back.T @ stack.form(name))
 
     def _begin_slot(self) -> None:
         """Move the evidence that is kept, or begin with what nodes believe as their priors."""
         if self._keeps:
-            self._move(np.asarray(np.linalg.inv(self.scenario.slot_belief[0]), dtype=np.float64))
+            self._predict_evidence(
+                np.asarray(np.linalg.inv(self.scenario.slot_belief[0]), dtype=np.float64)
+            )
             return
-        self._drop(list(self._evidence))
+        self._drop_evidence(list(self._evidence))
         for estimator, received in self._received.items():
             received.clear()
-            self.errors.copy(estimator, _prior(estimator), estimator)
+            self.errors.copy(estimator, _prior_name(estimator), estimator)
 
     def sense(self, time: float, observations: EstimatorObservations) -> None:
         """Add the readings to the nodes' own evidence."""
@@ -95,27 +97,31 @@ class BeliefRule(ErrorRule):
         columns = self.errors.reading_noises(observations)
         for estimator, observation in observations.items():
             weighted = np.linalg.solve(observation.R, observation.H).T
-            U, s = self._sum([_own(estimator)])
+            U, s = self._sum_evidence([_own_name(estimator)])
             s[:, columns[estimator]] += weighted @ observation.root
-            self._put(_own(estimator), U + weighted @ observation.H, s)
+            self._put_evidence(_own_name(estimator), U + weighted @ observation.H, s)
         for estimator in observations:
-            self._believe(estimator)
+            self._update_belief(estimator)
 
-    def _believe(self, estimator: int) -> None:
+    def _update_belief(self, estimator: int) -> None:
         """Set the error and the root of P of a node."""
         errors, eye = self.errors, np.eye(self.errors.n)
-        U, s = self._sum([_own(estimator), *((estimator, j) for j in self._received[estimator])])
-        S = errors.roots[_prior(estimator)]
+        U, s = self._sum_evidence(
+            [_own_name(estimator), *((estimator, j) for j in self._received[estimator])]
+        )
+        S = errors.roots[_prior_name(estimator)]
         spread = np.linalg.cholesky(eye + S.T @ U @ S)
         root = scipy.linalg.solve_triangular(spread, S.T, lower=True).T
         P = root @ root.T
-        errors.stack.put(estimator, (eye - P @ U) @ errors.stack.form(_prior(estimator)) - P @ s)
+        errors.stack.put(
+            estimator, (eye - P @ U) @ errors.stack.form(_prior_name(estimator)) - P @ s
+        )
         errors.roots[estimator] = triangular_root(root)
 
-    def _said(self, sender: int, receiver: int) -> tuple[FloatArray, FloatArray]:
+    def _evidence_for(self, sender: int, receiver: int) -> tuple[FloatArray, FloatArray]:
         """Return the evidence for one receiver: all but that of the receiver itself."""
         others = [(sender, j) for j in self._received[sender] if j != receiver]
-        return self._sum([_own(sender), *others])
+        return self._sum_evidence([_own_name(sender), *others])
 
     def exchange(self, slot: int, phase: int, messages: Sequence[SentMessage]) -> None:
         """Pass the messages of all steps of a slot that arrived."""
@@ -124,45 +130,45 @@ class BeliefRule(ErrorRule):
         for step in range(self._steps):
             up = self._arrivals.get((slot, phase, step), nothing)
             pairs = [(i, j) for i, j in np.argwhere(up).tolist()]
-            said = {(i, j): self._said(j, i) for i, j in pairs}
+            said = {(i, j): self._evidence_for(j, i) for i, j in pairs}
             for (i, j), (U, s) in said.items():
-                self._put((i, j), U, s)
+                self._put_evidence((i, j), U, s)
                 self._received[i][j] = slot
         for estimator in range(estimators):
-            self._believe(estimator)
+            self._update_belief(estimator)
 
     def send(self, messages: Sequence[SentMessage]) -> None:
         """Keep the evidence of each message that takes time."""
         for message in messages:
             if message.late:
-                self._put(message, *self._said(message.sender, message.receiver))
+                self._put_evidence(message, *self._evidence_for(message.sender, message.receiver))
 
     def arrive(self, time: float, messages: Sequence[SentMessage]) -> None:
         """Replace the earlier evidence of each sender, unless that was sent later."""
         late = [message for message in messages if message.late]
         # All at once: a message says what its sender knew before this instant's messages.
         said = {
-            message: self._sum([message])
+            message: self._sum_evidence([message])
             if message.late
-            else self._said(message.sender, message.receiver)
+            else self._evidence_for(message.sender, message.receiver)
             for message in messages
         }
         for message in sorted(messages, key=lambda m: (m.sender, m.time, m.number)):
             received = self._received[message.receiver]
             if received.get(message.sender, -np.inf) <= message.time:
                 received[message.sender] = message.time
-                self._put((message.receiver, message.sender), *said[message])
-        self._drop(late)
+                self._put_evidence((message.receiver, message.sender), *said[message])
+        self._drop_evidence(late)
         for estimator in {message.receiver for message in messages}:
-            self._believe(estimator)
+            self._update_belief(estimator)
 
 
-def _prior(estimator: int) -> Hashable:
+def _prior_name(estimator: int) -> Hashable:
     """Return the name of an estimator's prior."""
     return ("prior", estimator)
 
 
-def _own(estimator: int) -> Hashable:
+def _own_name(estimator: int) -> Hashable:
     """Return the name of the evidence of an estimator's own readings."""
     return ("own", estimator)
 

@@ -166,7 +166,7 @@ class DelayedJumps:
         noise = np.tensordot(self._integral, E @ self.Q @ np.swapaxes(E, 1, 2), 1)
         return E @ both[::-1], symmetric(noise[-1])
 
-    def _heard(self, K: FloatArray) -> FloatArray:
+    def _heard_products(self, K: FloatArray) -> FloatArray:
         """Return H K(d - s)' (k + 1, M, M) at the points, which lie symmetrically."""
         k, M, _ = K.shape
         columns = np.ascontiguousarray(K[::-1].transpose(2, 0, 1)).reshape(M, k * M)
@@ -194,7 +194,7 @@ class DelayedJumps:
         """
         k, M, _ = K.shape
         driven = (self._own @ K.reshape(k, self.nodes, -1, M)).reshape(K.shape)
-        heard = self._heard(K)
+        heard = self._heard_products(K)
         found = right + K[0] - K + np.tensordot(self._integral, driven + heard, 1)
         # Its antisymmetric part says that K(0) is symmetric.
         found[0] = right[0] + 2.0 * symmetric(driven[0] + heard[0]) + 0.5 * (K[0].T - K[0])
@@ -207,7 +207,7 @@ class DelayedJumps:
         """Inverse of the Lyapunov map of the mean drift."""
         return LyapunovInverse(self._mean[0][None])
 
-    def _alone(self, right: FloatArray) -> FloatArray:
+    def _solve_without_messages(self, right: FloatArray) -> FloatArray:
         """Return the solution K (k + 1, M, M) for nodes that hear nothing."""
         equation = symmetric(right[:1])
         first = 2.0 * (right[:1] - equation) + self._lyapunov(equation)
@@ -236,10 +236,12 @@ class DelayedJumps:
 
         def apply(x: FloatArray) -> FloatArray:
             """Return the residual of the unknowns ``x``, preconditioned."""
-            return -self._alone(self._residual(x.reshape(right.shape), none, jumps)).ravel()
+            return -self._solve_without_messages(
+                self._residual(x.reshape(right.shape), none, jumps)
+            ).ravel()
 
         whole = scipy.sparse.linalg.LinearOperator((right.size, right.size), matvec=apply)
-        start = self._alone(right).ravel()
+        start = self._solve_without_messages(right).ravel()
         found, _ = scipy.sparse.linalg.gmres(
             whole, start, rtol=tolerance, atol=0.0, restart=KRYLOV_VECTORS, maxiter=5
         )

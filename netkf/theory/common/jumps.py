@@ -72,10 +72,10 @@ class SlotJumps:
         N = self.nodes
         weight = self.ways.stationary if self.ways else np.ones(1)
         share = (weight if noise else 0.0 * weight)[:, None, None]
-        predicted = _times(self.F[None], X, N) + share * np.tile(self.Q, (N, N))
+        predicted = _multiply_blocks(self.F[None], X, N) + share * np.tile(self.Q, (N, N))
         if self.ways is not None:
             predicted = self.ways.advance(predicted, np.unique(self.ways.source))
-        updated = _times(self.closed, predicted, N) + share * self.noise
+        updated = _multiply_blocks(self.closed, predicted, N) + share * self.noise
         return updated if self.ways is None else self._exchange(predicted, updated)
 
     def _exchange(self, predicted: FloatArray, updated: FloatArray) -> FloatArray:
@@ -129,7 +129,7 @@ class ClockJumps:
         """The mean drift (S, M, M) of errors while the mode stays, see ``inflow``."""
         found, eye = np.tile(self.drift, (self.shape[0], 1, 1)), np.eye(len(self.drift))
         for node, rate, lost in self.samples:
-            _block(found, self.nodes, node)[...] -= rate * lost
+            _block_slice(found, self.nodes, node)[...] -= rate * lost
         for k, (rate, among) in enumerate(self.ticks):
             assert self.ways is not None
             stay = self.ways.stay(self._chains[k])[:, None, None]
@@ -164,8 +164,8 @@ class ClockJumps:
         """Return the part of ``inflow`` (S, M, M) that samples add."""
         found = np.zeros_like(X)
         for node, rate, lost in self.samples:
-            own = _block(X, self.nodes, node)
-            _block(found, self.nodes, node)[...] += rate * lost @ own @ lost.T
+            own = _block_slice(X, self.nodes, node)
+            _block_slice(found, self.nodes, node)[...] += rate * lost @ own @ lost.T
         return found
 
     def inflow(self, X: FloatArray) -> FloatArray:
@@ -187,13 +187,13 @@ class ClockJumps:
         return found
 
 
-def _block(X: FloatArray, nodes: int, i: int) -> FloatArray:
+def _block_slice(X: FloatArray, nodes: int, i: int) -> FloatArray:
     """Return the block (S, n, n) of node i of X (S, N n, N n), which may be written to."""
     n = X.shape[1] // nodes
     return X[:, i * n : (i + 1) * n, i * n : (i + 1) * n]
 
 
-def _times(maps: FloatArray, X: FloatArray, nodes: int) -> FloatArray:
+def _multiply_blocks(maps: FloatArray, X: FloatArray, nodes: int) -> FloatArray:
     """Return ``C X C'`` (S, M, M) for the block diagonal C of N ``maps`` (N, n, n), or of one."""
     S, M, _ = X.shape
     n = M // nodes

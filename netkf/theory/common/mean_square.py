@@ -41,8 +41,8 @@ def mean_square_radius(scenario: Scenario) -> float:
     1 that it is on; inf where errors already grow between jumps, or in their mean. Raises
     TheoryError where the scenario's filter has no constant gains or its network no such law.
     """
-    if _solver(scenario) is None:
-        system = _system(scenario)
+    if _choose_solver(scenario) is None:
+        system = _make_system(scenario)
         if isinstance(system, DelayedJumps):
             return (
                 spectral_radius(system.apply_jumps, system.shape)
@@ -81,12 +81,12 @@ def _solve(scenario: Scenario) -> tuple[float, FloatArray | None]:
     """Return the radius, and the covariances (N, n, n) if it is below 1; with delays a radius of 0
     stands for one that is only proved to be.
     """
-    solve = _solver(scenario)
+    solve = _choose_solver(scenario)
     if solve is not None:
         _require_known_law(scenario)
         solved: tuple[float, FloatArray | None] = solve(scenario)
         return solved
-    system = _system(scenario)
+    system = _make_system(scenario)
     if isinstance(system, DelayedJumps):
         # The radius takes many times as long as the covariance, which proves that it is below 1.
         radius = (
@@ -96,7 +96,7 @@ def _solve(scenario: Scenario) -> tuple[float, FloatArray | None]:
             return radius, None
         X = system.covariance
     else:
-        T, Q = _slots(system) if isinstance(system, SlotJumps) else _clocks(system)
+        T, Q = _slot_map(system) if isinstance(system, SlotJumps) else _clock_map(system)
         radius = spectral_radius(T, system.shape) if Q is not None else np.inf
         if Q is None or not radius < 1.0:
             return float(radius), None
@@ -108,7 +108,7 @@ def _solve(scenario: Scenario) -> tuple[float, FloatArray | None]:
 
 
 @lru_cache(maxsize=8)
-def _system(scenario: Scenario) -> LinearErrors:
+def _make_system(scenario: Scenario) -> LinearErrors:
     """Return the errors as a linear system of which mean squares can be computed."""
     system = linear_errors(scenario)
     _require_size(system.shape)
@@ -120,7 +120,7 @@ def linear_errors(scenario: Scenario) -> LinearErrors:
     where they are not.
     """
     _require_known_law(scenario)
-    make = _maker(scenario)
+    make = _system_maker(scenario)
     if make is None:
         given = kind_name(scenario.filter.algorithm)
         raise TheoryError(
@@ -148,12 +148,12 @@ def _require_known_law(scenario: Scenario) -> None:
 
 def has_linear_errors(scenario: Scenario) -> bool:
     """Return True if the class of the filter is one whose gains are constant in some scenarios."""
-    return _maker(scenario) is not None or _solver(scenario) is not None
+    return _system_maker(scenario) is not None or _choose_solver(scenario) is not None
 
 
 def is_quickly_solved(scenario: Scenario) -> bool:
     """Return True if the mean squares of a scenario with constant gains take a second or so."""
-    if _solver(scenario) is not None:
+    if _choose_solver(scenario) is not None:
         return len(scenario.nodes) * scenario.plant.n <= MAX_ERRORS
     system = linear_errors(scenario)
     S, M, _ = system.shape
@@ -162,7 +162,9 @@ def is_quickly_solved(scenario: Scenario) -> bool:
     return S * M * M * times <= QUICK_NUMBERS
 
 
-def _solver(scenario: Scenario) -> Callable[[Scenario], tuple[float, FloatArray | None]] | None:
+def _choose_solver(
+    scenario: Scenario,
+) -> Callable[[Scenario], tuple[float, FloatArray | None]] | None:
     """Return the function of a paper that solves for radius and covariances itself, if any."""
     found: Callable[[Scenario], tuple[float, FloatArray | None]] | None = paper_function(
         scenario, "steady_errors", f"{scenario.hosted.combination}_in_slots".replace(" ", "_")
@@ -170,7 +172,7 @@ def _solver(scenario: Scenario) -> Callable[[Scenario], tuple[float, FloatArray 
     return found if scenario.slotted else None
 
 
-def _maker(scenario: Scenario) -> Callable[[Scenario], LinearErrors] | None:
+def _system_maker(scenario: Scenario) -> Callable[[Scenario], LinearErrors] | None:
     """Return the function that makes the linear system of a scenario, if there is one."""
     if scenario.hosted.combination == "none":
         return silent_jumps if scenario.slotted else None
@@ -196,12 +198,12 @@ def _require_size(shape: tuple[int, int, int]) -> None:
         )
 
 
-def _slots(system: SlotJumps) -> tuple[PositiveMap, FloatArray]:
+def _slot_map(system: SlotJumps) -> tuple[PositiveMap, FloatArray]:
     """Return the map of second moments over a slot and the noise (S, M, M) that it adds."""
     return system.step, system.step(np.zeros(system.shape), noise=True)
 
 
-def _clocks(system: ClockJumps) -> tuple[PositiveMap, FloatArray | None]:
+def _clock_map(system: ClockJumps) -> tuple[PositiveMap, FloatArray | None]:
     """Return the map ``X -> S^-1(inflow(X))`` with ``S X = -(B X + X B')``, and ``S^-1(noise)``, or
     None if some B is not stable: errors then grow even without what jumps add.
     """

@@ -140,8 +140,8 @@ def ways_of(scenario: Scenario, weights: dict[tuple[int, int], FloatArray], wait
     _require_law(scenario)
     loss, delay = scenario.network.channel.loss, scenario.network.channel.delay.fixed
     links, index = list(weights), scenario.topology.index
-    at = {link: k for k, link in enumerate(_sources(scenario, links))}
-    source = np.array([at[_source(scenario, link)] for link in links], dtype=np.int64)
+    at = {link: k for k, link in enumerate(_all_sources(scenario, links))}
+    source = np.array([at[_source_of(scenario, link)] for link in links], dtype=np.int64)
     chained = isinstance(loss, GilbertElliott) and not loss.independent
     delivery = _deliveries(scenario, links, source, len(at))
     if delay is not None and delay > wait:
@@ -207,14 +207,14 @@ def _deliveries(
     return np.where(modes[:, None] >> source & 1, probabilities(True), probabilities(False))
 
 
-def _source(scenario: Scenario, link: tuple[int, int]) -> tuple[int, int]:
+def _source_of(scenario: Scenario, link: tuple[int, int]) -> tuple[int, int]:
     """Return the link whose draw decides on a direction: both share it if they are symmetric."""
     return min(link, link[::-1]) if _fail_together(scenario) else link
 
 
-def _sources(scenario: Scenario, links: list[tuple[int, int]]) -> list[tuple[int, int]]:
+def _all_sources(scenario: Scenario, links: list[tuple[int, int]]) -> list[tuple[int, int]]:
     """Return the links whose channels have states of their own."""
-    return list(dict.fromkeys(_source(scenario, link) for link in links))
+    return list(dict.fromkeys(_source_of(scenario, link) for link in links))
 
 
 def _fail_together(scenario: Scenario) -> bool:

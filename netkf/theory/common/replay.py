@@ -117,7 +117,7 @@ def delivered_messages(scenario: Scenario, run: Run) -> list[SentMessage]:
 def _replay_instants(scenario: Scenario, run: Run, errors: StackedErrors) -> Iterator[None]:
     """Replay a run in continuous time; yield at each of ``run.times``."""
     messages = delivered_messages(scenario, run)
-    rule = _rule(scenario, errors, run, messages)
+    rule = _make_rule(scenario, errors, run, messages)
     propagator = ErrorPropagator(scenario, errors)
     samples = timed_observations(scenario, run)
     leaving = _group_by_time(messages, SentMessage._fields.index("time"))
@@ -158,7 +158,7 @@ def _group_by_time(messages: list[SentMessage], column: int) -> dict[float, list
     return found
 
 
-def _rule(
+def _make_rule(
     scenario: Scenario, errors: StackedErrors, run: Run, messages: list[SentMessage]
 ) -> ErrorRule:
     """Return the error rule of the filter's paper, or that of filters without messages."""
@@ -178,7 +178,7 @@ def _replay_slots(scenario: Scenario, run: Run, errors: StackedErrors) -> Iterat
     # In slots all predictions are the same: x+ = F x + w, e+ = F_f e + (F - F_f) x + w.
     noise = square_root(plant.Q)
     prediction = Prediction(plant.F, F, plant.F - F, noise, noise, square_root(Q))
-    rule = _rule(scenario, errors, run, [])
+    rule = _make_rule(scenario, errors, run, [])
     observe = slot_observations(scenario, run)
     arrivals = _exchanged_messages(scenario, run) if rule.takes_messages else {}
     done = 0

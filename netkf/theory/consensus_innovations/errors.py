@@ -35,13 +35,16 @@ class PseudoStateRule(ErrorRule):
         self._design, self._pseudo = state.design, state.pseudo
         self._slot = 0
         for estimator in range(errors.estimators):
-            errors.stack.put(_difference(estimator), np.zeros((errors.n, 0)))
+            errors.stack.put(_difference_name(estimator), np.zeros((errors.n, 0)))
 
     def sense(self, time: float, observations: EstimatorObservations) -> None:
         """Predict the differences, and keep the readings of the slot."""
         self._observations, self._slot, stack = observations, self._slot + 1, self.errors.stack
         for estimator in range(self.errors.estimators):
-            stack.put(_difference(estimator), self._pseudo.A @ stack.form(_difference(estimator)))
+            stack.put(
+                _difference_name(estimator),
+                self._pseudo.A @ stack.form(_difference_name(estimator)),
+            )
         gains = gain_sequence(self._design).at(self._slot)
         for estimator, observation in enumerate(gains):
             self.errors.roots[estimator] = observation.predicted
@@ -51,7 +54,7 @@ class PseudoStateRule(ErrorRule):
         errors, G, estimators = self.errors, self._pseudo.G, range(self.errors.estimators)
         columns = errors.reading_noises(self._observations)
         states = [errors.stack.form(estimator) for estimator in estimators]
-        before = [errors.stack.form(_difference(i)) + G @ states[i] for i in estimators]
+        before = [errors.stack.form(_difference_name(i)) + G @ states[i] for i in estimators]
         after = [form.copy() for form in before]
         gains = gain_sequence(self._design).at(self._slot)
         for message in messages:
@@ -65,18 +68,18 @@ class PseudoStateRule(ErrorRule):
             after[i][:, columns[i]] -= gains[i].M @ weighted @ observation.root
         for i in estimators:
             e = states[i] - gains[i].K @ (G @ states[i] - after[i])
-            self._set(i, e, after[i] - G @ e)
+            self._set_errors(i, e, after[i] - G @ e)
             errors.roots[i] = gains[i].root
 
-    def _set(self, estimator: int, e: FloatArray, u: FloatArray) -> None:
+    def _set_errors(self, estimator: int, e: FloatArray, u: FloatArray) -> None:
         """Set the errors of an estimator: ``e`` of xhat and ``u`` of yhat - G xhat, both (n,
         inputs).
         """
         self.errors.stack.put(estimator, e)
-        self.errors.stack.put(_difference(estimator), u)
+        self.errors.stack.put(_difference_name(estimator), u)
 
 
-def _difference(estimator: int) -> Hashable:
+def _difference_name(estimator: int) -> Hashable:
     """Return the name of the error of yhat - G xhat."""
     return ("difference", estimator)
 

@@ -29,7 +29,7 @@ def link_weights(scenario: Scenario) -> dict[tuple[int, int], FloatArray]:
 
 def slot_jumps(scenario: Scenario) -> SlotJumps:
     """Return the system in slots: predict, ``e - L (H e + v)``, reset."""
-    gains, n = _gains(scenario), scenario.plant.n
+    gains, n = _node_gains(scenario), scenario.plant.n
     sensors = [scenario.observation(node) for node in scenario.nodes]
     closed = [np.eye(n) - L @ H for L, (H, _) in zip(gains, sensors, strict=True)]
     noise = block_diagonal([L @ R @ L.T for L, (_, R) in zip(gains, sensors, strict=True)])
@@ -71,7 +71,7 @@ def clock_jumps(scenario: Scenario) -> ClockJumps | DelayedJumps | SlotJumps:
     Raises TheoryError where clocks are others, delays random or, for bursts under Poisson clocks,
     not 0.
     """
-    flow, samples, weights = _flow(scenario), _samples(scenario), link_weights(scenario)
+    flow, samples, weights = _error_flow(scenario), _sampled_nodes(scenario), link_weights(scenario)
     clock = scenario.network.activation
     talks = bool(weights) and isinstance(clock, LinkClock)
     delay = scenario.network.channel.delay.fixed if talks else 0.0
@@ -88,7 +88,7 @@ def clock_jumps(scenario: Scenario) -> ClockJumps | DelayedJumps | SlotJumps:
     for one in samples:
         if one.clock is None or not one.clock.memoryless:
             raise TheoryError(f"node {scenario.nodes[one.node]} does not sample by a Poisson clock")
-        rate, own = float(one.clock.mean_rate(one.entity)), _own(one.node, n)
+        rate, own = float(one.clock.mean_rate(one.entity)), _node_slice(one.node, n)
         noise[own, own] += rate * one.noise
         found.append((one.node, rate, one.lost))
     drift = block_diagonal(list(flow.drift))
@@ -99,27 +99,27 @@ def clock_jumps(scenario: Scenario) -> ClockJumps | DelayedJumps | SlotJumps:
     return DelayedJumps(instant, scenario.truth.A, scenario.truth.B @ scenario.truth.B.T, delay)
 
 
-def _own(k: int, n: int) -> slice:
+def _node_slice(k: int, n: int) -> slice:
     """Return the rows of node ``k`` in stacked errors."""
     return slice(k * n, (k + 1) * n)
 
 
-def _flow(scenario: Scenario) -> JointErrorFlow:
+def _error_flow(scenario: Scenario) -> JointErrorFlow:
     """Return the errors between events; increments are used all the time."""
-    gains, truth = _gains(scenario), scenario.truth
+    gains, truth = _node_gains(scenario), scenario.truth
     N, n = len(gains), len(truth.A)
     drift, noise = np.tile(truth.A, (N, 1, 1)), np.tile(truth.B @ truth.B.T, (N, N))
     for k, node in enumerate(scenario.nodes):
         (H, R), L = scenario.observation(node), gains[k]
         if len(H):
             drift[k] -= L @ H
-            noise[_own(k, n), _own(k, n)] += L @ R @ L.T
+            noise[_node_slice(k, n), _node_slice(k, n)] += L @ R @ L.T
     return JointErrorFlow(drift, noise)
 
 
-def _samples(scenario: Scenario) -> list[SampledNode]:
+def _sampled_nodes(scenario: Scenario) -> list[SampledNode]:
     """Return the sensors that take samples."""
-    gains, found = _gains(scenario), []
+    gains, found = _node_gains(scenario), []
     for k, node in enumerate(scenario.nodes):
         for placed_sensor in scenario.sampled_sensors.get(node, ()):
             sensor, L = scenario.sensors[placed_sensor.entry], gains[k]
@@ -148,7 +148,7 @@ def _from_tick_to_tick(
     closed, added = np.tile(np.eye(n), (N, 1, 1)), np.zeros_like(flow.noise)
     for one in samples:
         closed[one.node] -= one.lost
-        added[_own(one.node, n), _own(one.node, n)] += one.noise
+        added[_node_slice(one.node, n), _node_slice(one.node, n)] += one.noise
     # To the tick, its samples, and to the arrival of what was sent at it.
     (before, noise), (after, rest) = (
         _move_errors(flow, gap) for gap in (clock.period - delay, delay)
@@ -156,7 +156,7 @@ def _from_tick_to_tick(
     C = block_diagonal(list(closed))
     noise = after @ (C @ noise @ C.T + added) @ after.T + rest
     whole = after @ C @ before
-    steps = np.stack([whole[_own(k, n), _own(k, n)] for k in range(N)])
+    steps = np.stack([whole[_node_slice(k, n), _node_slice(k, n)] for k in range(N)])
     return SlotJumps(np.eye(n), np.zeros((n, n)), steps, symmetric(noise), ways)
 
 
@@ -187,7 +187,7 @@ def _move_errors(flow: JointErrorFlow, gap: float) -> tuple[FloatArray, FloatArr
     return moved, symmetric(moved @ E[:M, M:])
 
 
-def _gains(scenario: Scenario) -> list[FloatArray]:
+def _node_gains(scenario: Scenario) -> list[FloatArray]:
     """Return the gain (n, p) of each node, without columns where it has no sensor."""
     algorithm, n = scenario.filter.algorithm, scenario.plant.n
     assert isinstance(algorithm, ConstantGain)

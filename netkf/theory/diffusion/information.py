@@ -59,13 +59,13 @@ def information_level(
 
     runs, seed = as_whole("runs", runs, 2), as_whole("seed", seed, 0)
     window = None if window is None else as_whole("window", window, 1)
-    sources = _sources(scenario)
-    past = _pasts(scenario, sources, runs, Streams(seed).generator("past"))
+    sources = _make_sources(scenario)
+    past = _draw_pasts(scenario, sources, runs, Streams(seed).generator("past"))
     whole = (-1, sources, past)
     if window is None:
         longest = 2 * scenario.plant.n
-        window = next((h for h in range(1, longest) if _row(*whole, h)[2] > 0.0), longest)
-    rows = [_row(*whole, window)]
+        window = next((h for h in range(1, longest) if _make_row(*whole, h)[2] > 0.0), longest)
+    rows = [_make_row(*whole, window)]
     rows += _sensor_rows(sources, past, window)
     names = ["node", "window", "level", "low", "high", "mean", "mean_low", "mean_high"]
     return pd.DataFrame(rows, columns=names)
@@ -95,7 +95,7 @@ def few_regressors(scenario: Scenario) -> bool:
     return sum(placed_sensor.entry in varying for placed_sensor in placed) <= MAX_REGRESSORS
 
 
-def _sources(scenario: Scenario) -> list[_Source]:
+def _make_sources(scenario: Scenario) -> list[_Source]:
     """Return the scalar readings of all nodes; raises TheoryError for recorded sensors."""
     found = []
     for node in scenario.sensing:
@@ -115,7 +115,7 @@ def _sources(scenario: Scenario) -> list[_Source]:
     return found
 
 
-def _pasts(
+def _draw_pasts(
     scenario: Scenario, sources: list[_Source], runs: int, random: np.random.Generator
 ) -> list[FloatArray]:
     """Return for each source (runs, m) states at random slots, the same slots for all sources."""
@@ -147,22 +147,22 @@ def _sensor_rows(sources: list[_Source], past: list[FloatArray], window: int) ->
     for group in _group_by_kind(sources):
         for k in group:
             same = rows[group[0]] if not sources[k].drive.size else None
-            found = same or _row(sources[k].node, [sources[k]], [past[k]], window)
+            found = same or _make_row(sources[k].node, [sources[k]], [past[k]], window)
             rows[k] = (sources[k].node, *found[1:])
     return [row for row in rows if row is not None]
 
 
-def _row(node: int, sources: list[_Source], past: list[FloatArray], window: int) -> LevelRow:
+def _make_row(node: int, sources: list[_Source], past: list[FloatArray], window: int) -> LevelRow:
     """Return the row of the given sources, as a network or a single sensor."""
     values = _levels(sources, past, window)
     mean = float(values.mean())
     error = QUANTILE * float(values.std(ddof=1)) / np.sqrt(len(values))
-    level = _least(sources, past, values, window)
+    level = _search_least(sources, past, values, window)
     interval = level * (1.0 - INTEGRAL_TOLERANCE), level * (1.0 + INTEGRAL_TOLERANCE)
     return node, window, level, *interval, mean, mean - error, mean + error
 
 
-def _least(
+def _search_least(
     sources: list[_Source], past: list[FloatArray], values: FloatArray, window: int
 ) -> float:
     """Return the least level found: by drawing, at states 0, and by a search from both."""

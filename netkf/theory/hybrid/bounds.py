@@ -70,14 +70,14 @@ def _solve_coupled(packed: PackedRiccati, times: FloatArray) -> FloatArray:
     if equations.delay == 0.0 and not equations.samples and not equations.jumps:
         with contextlib.suppress(StiffError), np.errstate(over="ignore", invalid="ignore"):
             return solve_by_taylor_series(
-                packed, times, _scale(packed), MAX_EXPLICIT_EVALUATIONS, OVERFLOW
+                packed, times, _covariance_scale(packed), MAX_EXPLICIT_EVALUATIONS, OVERFLOW
             )
     pieces = _PiecewiseSolution(packed)
     pieces.extend(float(times[-1]))
     return np.stack([pieces(float(t)) for t in times])
 
 
-def _scale(packed: PackedRiccati) -> float:
+def _covariance_scale(packed: PackedRiccati) -> float:
     """Return the size of the covariances that matter: of the start and of Q."""
     sizes = (np.abs(packed.start).max(), np.abs(packed.equations.Q).max())
     return max(*(float(size) for size in sizes), 1e-300)
@@ -247,7 +247,7 @@ class _PiecewiseSolution:
                 method="Radau",
                 jac=self._jacobian,
                 max_step=max_step,
-                events=_growth_event(growth * float(self._sizes().max())),
+                events=_growth_event(growth * float(self._entry_sizes().max())),
             )
 
     def _solve(self, begin: float, end: float, slope: Slope, **method: Any) -> Any:
@@ -272,7 +272,7 @@ class _PiecewiseSolution:
         of the root of the other's, whose inflow is rounded: a solver that is asked for more makes
         ever smaller steps. Raises TheoryError where rounding exceeds DEFECT_TOLERANCE.
         """
-        sizes = self._sizes()
+        sizes = self._entry_sizes()
         rounding = ROUNDING * sizes.max()
         if rounding > DEFECT_TOLERANCE * sizes.min():
             raise TheoryError(
@@ -283,9 +283,11 @@ class _PiecewiseSolution:
         tolerance = 1e-3 * TOLERANCE * sizes + rounding
         return np.repeat(tolerance, self._first.shape[1])
 
-    def _sizes(self) -> FloatArray:
+    def _entry_sizes(self) -> FloatArray:
         """Return the size (N,) of the covariance of each node, also where it begins at 0."""
-        return np.asarray(np.maximum(np.abs(self._first).max(axis=1), _scale(self._packed)))
+        return np.asarray(
+            np.maximum(np.abs(self._first).max(axis=1), _covariance_scale(self._packed))
+        )
 
     def _jacobian(self, t: float, y: FloatArray) -> Any:
         """Return the sparse Jacobian (N m, N m) of the right-hand side at ``y``."""
@@ -333,7 +335,7 @@ class _SampleJumps:
         if jump is not None:
             P = packed.unpack(Y)
             for node, observation in jump.observations.items():
-                P[node] = _update(P[node], observation)
+                P[node] = _joseph_update(P[node], observation)
             Y = packed.pack(P)
             if jump.weights is not None:
                 self._arrivals[time + equations.delay] = jump.weights, Y
@@ -348,7 +350,7 @@ class _SampleJumps:
         return np.asarray(own[:, None] * Y + weights @ sent)
 
 
-def _update(P: FloatArray, observation: Observation) -> FloatArray:
+def _joseph_update(P: FloatArray, observation: Observation) -> FloatArray:
     """Return ``g(P) = (I - K H) P (I - K H)' + K R K'`` (n, n), the Joseph form of the update."""
     H, R = observation.H, observation.R
     K = np.linalg.solve(H @ P @ H.T + R, H @ P).T

@@ -53,7 +53,7 @@ class PackedRiccati:
         leave = scipy.sparse.diags_array(self.leaving)
         self._exchange = scipy.sparse.csr_array(equations.coupling - leave)
         self._sensed = np.flatnonzero(np.abs(equations.G).max(axis=(1, 2)) > 0.0)
-        self._C = _factors(equations.G[self._sensed])
+        self._C = _low_rank_factors(equations.G[self._sensed])
         self._across = np.ascontiguousarray(self._C.transpose(1, 2, 0))
 
     def shift(self, A: FloatArray, Q: FloatArray) -> PackedRiccati:
@@ -241,7 +241,7 @@ class LinearisedRiccati(NamedTuple):
         return scipy.sparse.csc_array(whole)
 
 
-def _factors(G: FloatArray) -> FloatArray:
+def _low_rank_factors(G: FloatArray) -> FloatArray:
     """Return C (S, n, r) with ``C C' = G`` (S, n, n), r the largest rank."""
     # Scaled to a diagonal of ones, so that the units of the states do not matter to what is small.
     scale = np.sqrt(np.diagonal(G, axis1=1, axis2=2))

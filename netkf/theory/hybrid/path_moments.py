@@ -38,7 +38,7 @@ def expected_squares(scenario: Scenario, run: Run) -> FloatArray:
     # All estimates start at known means: their first errors are x(0) less a constant.
     means = np.array([scenario.start(node)[0] for node in nodes]) - scenario.plant.start_mean
     S = np.einsum("ia,jb->ijab", means, means) + np.asarray(scenario.plant.start_cov)
-    instants, ends, rows, columns, weights = _messages(scenario, run)
+    instants, ends, rows, columns, weights = _arrivals_in_order(scenario, run)
     fastest = max(float(np.abs(p @ g).max()) for p in P for g in G) + float(np.abs(A).max())
     plain = [np.ascontiguousarray(x, dtype=np.float64) for x in (A, Q, scenario.truth.Q)]
     model = (*plain, G, true_G)
@@ -64,7 +64,7 @@ def _require_plain(scenario: Scenario) -> None:
         raise TheoryError(f"mean squares by quadrature are for at most {MAX_ERRORS} errors")
 
 
-def _messages(
+def _arrivals_in_order(
     scenario: Scenario, run: Run
 ) -> tuple[FloatArray, np.ndarray, np.ndarray, np.ndarray, FloatArray]:
     """Return the instants of arrivals, where each begins, and receivers, senders and weights."""

@@ -38,7 +38,7 @@ def check_system(F: ArrayLike, Q: ArrayLike, H: ArrayLike, R: ArrayLike) -> Slot
     """Return the matrices as arrays; raises TheoryError if shapes or definiteness are wrong."""
     F_ = as_square("F", F)
     n = len(F_)
-    H_ = _observation(H, n)
+    H_ = _check_observation(H, n)
     R_ = as_covariance("R", R, len(H_))
     # R (17) inverts H P H' + R also where P is singular.
     if len(R_) and not np.linalg.eigvalsh(R_)[0] > 0.0:
@@ -46,7 +46,7 @@ def check_system(F: ArrayLike, Q: ArrayLike, H: ArrayLike, R: ArrayLike) -> Slot
     return SlotSystem(F_, as_covariance("Q", Q, n), H_, R_)
 
 
-def _observation(H: ArrayLike, n: int) -> FloatArray:
+def _check_observation(H: ArrayLike, n: int) -> FloatArray:
     """Return H as a finite matrix of n columns; raises TheoryError."""
     array = as_numbers("H", H)
     if array.ndim != 2 or array.shape[1] != n or not np.isfinite(array).all():
@@ -112,7 +112,7 @@ def steady_covariance(F: ArrayLike, Q: ArrayLike, H: ArrayLike, R: ArrayLike) ->
             P = symmetric(np.asarray(scipy.linalg.solve_discrete_are(F.T, H.T, Q, R)))
         # One step of Newton's method (Hewer) removes the rounding error of the solver:
         # P+ = (F - K H) P+ (F - K H)' + Q + K R K'.
-        K = _gain(P, F, H, R)
+        K = _optimal_gain(P, F, H, R)
         P = symmetric(np.asarray(scipy.linalg.solve_discrete_lyapunov(F - K @ H, Q + K @ R @ K.T)))
     except (np.linalg.LinAlgError, ValueError) as error:
         raise TheoryError(f"no stabilising fixed point of f_1: {error}") from None
@@ -120,7 +120,7 @@ def steady_covariance(F: ArrayLike, Q: ArrayLike, H: ArrayLike, R: ArrayLike) ->
     residual = np.abs(riccati_step(P, F, Q, H, R) - P).max()
     if not residual <= RESIDUAL * np.abs(P).max():
         raise TheoryError(f"P* was solved to {residual:.1e} only")
-    if not np.abs(np.linalg.eigvals(F - _gain(P, F, H, R) @ H)).max() < 1.0:
+    if not np.abs(np.linalg.eigvals(F - _optimal_gain(P, F, H, R) @ H)).max() < 1.0:
         raise TheoryError("the fixed point found does not stabilise the filter")
     return P
 
@@ -133,7 +133,7 @@ def filtered_covariance(F: FloatArray, Q: FloatArray, H: FloatArray, R: FloatArr
     return symmetric(np.asarray(np.linalg.solve(np.eye(len(P)) + P @ information, P)))
 
 
-def _gain(P: FloatArray, F: FloatArray, H: FloatArray, R: FloatArray) -> FloatArray:
+def _optimal_gain(P: FloatArray, F: FloatArray, H: FloatArray, R: FloatArray) -> FloatArray:
     """Return the predictor's gain ``F P H' (H P H' + R)^-1`` (n, p)."""
     return np.asarray(np.linalg.solve(H @ P @ H.T + R, H @ P @ F.T).T)
 
@@ -187,7 +187,7 @@ def critical_certificate(F: ArrayLike, H: ArrayLike) -> CriticalProbability:
     """
     transition = as_square("F", F)
     n = len(transition)
-    observation = _observation(H, n)
+    observation = _check_observation(H, n)
     hidden = undetectable_slot_mode(transition, observation)
     if hidden is not None:
         raise TheoryError(
@@ -261,7 +261,7 @@ class _GainSearch:
         """Return the least spectral radius, the gains (n, p) that attain it, the Perron matrix."""
         n = len(self._F)
         gains = self._improve([np.zeros((n, len(H))) for H in self._readings], np.eye(n))
-        gains = self._start(probabilities, gains)
+        gains = self._first_gains(probabilities, gains)
         best, X = self._perron(probabilities, gains)
         for _ in range(500):
             following = self._improve(gains, X)
@@ -271,7 +271,9 @@ class _GainSearch:
             best, X, gains = rho, X_new, following
         return best, gains, X
 
-    def _start(self, probabilities: Sequence[float], gains: list[FloatArray]) -> list[FloatArray]:
+    def _first_gains(
+        self, probabilities: Sequence[float], gains: list[FloatArray]
+    ) -> list[FloatArray]:
         """Return gains near the best ones, from any first ones.
 
         Policy iteration with the resolvent ``X = (s - L)^-1 I``, s above the radius of L, in place

@@ -42,23 +42,27 @@ class KcfRule(ErrorRule):
     def _forget(self) -> None:
         """Drop the predictions and readings of the slot before."""
         self.errors.drop(
-            [name for name in map(_prior, range(self.errors.estimators)) if self._has(name)]
+            [
+                name
+                for name in map(_prior_name, range(self.errors.estimators))
+                if self._has_error(name)
+            ]
         )
         self._observations, self._columns = {}, {}
 
-    def _has(self, name: Hashable) -> bool:
+    def _has_error(self, name: Hashable) -> bool:
         """Return True if there is an error of this name."""
         return name in self.errors.roots
 
-    def _prediction(self, estimator: int) -> Hashable:
+    def _prediction_name(self, estimator: int) -> Hashable:
         """Return the name of the node's prediction of this instant."""
-        return _prior(estimator) if self._has(_prior(estimator)) else estimator
+        return _prior_name(estimator) if self._has_error(_prior_name(estimator)) else estimator
 
     def sense(self, time: float, observations: EstimatorObservations) -> None:
         """Update by the nodes' own readings, and keep their predictions."""
         self._forget()
         for estimator in observations:
-            self.errors.copy(estimator, _prior(estimator), estimator)
+            self.errors.copy(estimator, _prior_name(estimator), estimator)
         self._observations, self._columns = observations, self.errors.reading_noises(observations)
         for estimator, observation in observations.items():
             self.errors.update(estimator, observation, self._columns[estimator])
@@ -67,7 +71,7 @@ class KcfRule(ErrorRule):
         """Copy the sender's prediction for each message that takes time."""
         for message in messages:
             if message.late:
-                self.errors.copy(self._prediction(message.sender), message, None)
+                self.errors.copy(self._prediction_name(message.sender), message, None)
 
     def arrive(self, time: float, messages: Sequence[SentMessage]) -> None:
         """Add the consensus terms, and use the readings that took no time."""
@@ -77,7 +81,7 @@ class KcfRule(ErrorRule):
             inboxes.setdefault(message.receiver, {})[message.sender] = message
         # All terms before any estimate changes, since predictions may be estimates.
         terms = {
-            estimator: self._term(estimator, list(inbox.values()))
+            estimator: self._consensus_term(estimator, list(inbox.values()))
             for estimator, inbox in inboxes.items()
         }
         for estimator, inbox in inboxes.items():
@@ -93,19 +97,19 @@ class KcfRule(ErrorRule):
             self.errors.stack.put(estimator, form)
         self.errors.drop([message for message in messages if message.late])
 
-    def _term(self, estimator: int, inbox: list[SentMessage]) -> FloatArray:
+    def _consensus_term(self, estimator: int, inbox: list[SentMessage]) -> FloatArray:
         """Return the form of ``gamma P sum_j (ebar_j - ebar)``."""
-        own, stack = self._prediction(estimator), self.errors.stack
+        own, stack = self._prediction_name(estimator), self.errors.stack
         root = self.errors.roots[own]
         P = root @ root.T
         total = np.zeros_like(stack.form(own))
         for message in inbox:
-            source = message if message.late else self._prediction(message.sender)
+            source = message if message.late else self._prediction_name(message.sender)
             total += stack.form(source) - stack.form(own)
         return np.asarray(self._epsilon / (1.0 + np.linalg.norm(P)) * P @ total)
 
 
-def _prior(estimator: int) -> Hashable:
+def _prior_name(estimator: int) -> Hashable:
     """Return the name of an estimator's prediction."""
     return ("prediction", estimator)
 

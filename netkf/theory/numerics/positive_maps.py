@@ -38,13 +38,13 @@ def spectral_radius(T: PositiveMap, shape: Shape) -> float:
 
     Raises TheoryError if it is neither proved nor found by two different searches.
     """
-    if _numbers(shape) > MAX_DENSE:
-        value, X = _extreme(T, np.broadcast_to(np.eye(shape[-1]), shape), "LR")
+    if _count_numbers(shape) > MAX_DENSE:
+        value, X = _extreme_eigenvalue(T, np.broadcast_to(np.eye(shape[-1]), shape), "LR")
         if _least_factor(T, X) <= value * (1.0 + PROOF_TOLERANCE):
             return value
-        if _numbers(shape) > MAX_DENSE_FALLBACK:
+        if _count_numbers(shape) > MAX_DENSE_FALLBACK:
             return _confirm(T, X, value)
-    return float(np.abs(np.linalg.eigvals(_dense(T, shape))).max())
+    return float(np.abs(np.linalg.eigvals(_dense_matrix(T, shape))).max())
 
 
 def fixed_point(T: PositiveMap, Q: FloatArray, radius: float) -> FloatArray:
@@ -56,18 +56,18 @@ def fixed_point(T: PositiveMap, Q: FloatArray, radius: float) -> FloatArray:
     """
     # The error of the solution is up to 1 / (1 - radius) times the residual.
     tolerance = RESIDUAL * max(1.0 - radius, 1e-3)
-    few, X = _numbers(Q.shape) <= MAX_DENSE, np.array(Q)
+    few, X = _count_numbers(Q.shape) <= MAX_DENSE, np.array(Q)
     for _ in range(MAX_ROUNDS):
         rest = Q + T(X) - X
         if _is_small(rest, X, tolerance):
             return symmetric(X)
         X = X + (_solve_by_elimination(T, rest) if few else _by_gmres(T, rest))
-    if not few and _numbers(Q.shape) <= MAX_DENSE_FALLBACK:
+    if not few and _count_numbers(Q.shape) <= MAX_DENSE_FALLBACK:
         return _solve_by_elimination(T, Q)
     raise TheoryError(f"the mean squares were solved to {np.abs(rest).max():.1e} only")
 
 
-def _numbers(shape: Shape) -> int:
+def _count_numbers(shape: Shape) -> int:
     """Return how many numbers the upper triangles of a stack have."""
     return shape[0] * shape[-1] * (shape[-1] + 1) // 2
 
@@ -77,13 +77,13 @@ def _confirm(T: PositiveMap, X: FloatArray, value: float) -> float:
     start, agrees; raises TheoryError if not.
     """
     start = X + np.diag(np.linspace(0.5, 1.5, X.shape[-1])) * np.trace(X.sum(axis=0))
-    again, _ = _extreme(T, start, "LM")
+    again, _ = _extreme_eigenvalue(T, start, "LM")
     if not abs(again - value) <= 1e-8 * value:
         raise TheoryError(f"the radius is not certain: searches found {value:.8g} and {again:.8g}")
     return value
 
 
-def _extreme(
+def _extreme_eigenvalue(
     T: PositiveMap, start: FloatArray, which: Literal["LR", "LM"]
 ) -> tuple[float, FloatArray]:
     """Return the modulus of an extreme eigenvalue of T and its X (S, M, M), of positive trace.
@@ -93,7 +93,7 @@ def _extreme(
     shape = start.shape
     try:
         values, vectors = scipy.sparse.linalg.eigs(
-            _operator(T, shape),
+            _linear_operator(T, shape),
             k=1,
             which=which,
             v0=start.ravel(),
@@ -102,7 +102,7 @@ def _extreme(
             maxiter=RESTARTS,
         )
     except scipy.sparse.linalg.ArpackError as error:
-        if _numbers(shape) <= MAX_DENSE_FALLBACK:
+        if _count_numbers(shape) <= MAX_DENSE_FALLBACK:
             return 0.0, np.zeros(shape)  # proves nothing
         raise TheoryError(f"the mean-square radius was not found: {error}") from None
     X = symmetric(vectors[:, 0].real.reshape(shape))
@@ -134,16 +134,16 @@ def _is_small(rest: FloatArray, X: FloatArray, tolerance: float) -> bool:
     return bool((np.abs(rest) <= tolerance * allowed).all())
 
 
-def _triangles(shape: Shape) -> tuple[IntArray, IntArray, IntArray]:
+def _triangle_indices(shape: Shape) -> tuple[IntArray, IntArray, IntArray]:
     """Return the indices of the upper triangles of a stack: of matrices, rows and columns."""
     rows, columns = np.triu_indices(shape[-1])
     which = np.repeat(np.arange(shape[0]), len(rows))
     return which, np.tile(rows, shape[0]), np.tile(columns, shape[0])
 
 
-def _dense(T: PositiveMap, shape: Shape) -> FloatArray:
+def _dense_matrix(T: PositiveMap, shape: Shape) -> FloatArray:
     """Return T as a matrix on upper triangles."""
-    at, columns = _triangles(shape), []
+    at, columns = _triangle_indices(shape), []
     for s, i, j in zip(*at, strict=True):
         unit = np.zeros(shape)
         unit[s, i, j] = unit[s, j, i] = 1.0
@@ -153,10 +153,10 @@ def _dense(T: PositiveMap, shape: Shape) -> FloatArray:
 
 def _solve_by_elimination(T: PositiveMap, right: FloatArray) -> FloatArray:
     """Return the solution (S, M, M) of ``X - T(X) = right`` by elimination."""
-    s, i, j = at = _triangles(right.shape)
+    s, i, j = at = _triangle_indices(right.shape)
     X = np.zeros_like(right)
     X[s, i, j] = X[s, j, i] = np.linalg.solve(
-        np.eye(len(s)) - _dense(T, right.shape), symmetric(right)[at]
+        np.eye(len(s)) - _dense_matrix(T, right.shape), symmetric(right)[at]
     )
     return X
 
@@ -164,7 +164,7 @@ def _solve_by_elimination(T: PositiveMap, right: FloatArray) -> FloatArray:
 def _by_gmres(T: PositiveMap, right: FloatArray) -> FloatArray:
     """Return an approximate solution (S, M, M) of ``X - T(X) = right``."""
     x, _ = scipy.sparse.linalg.gmres(
-        _operator(lambda X: X - T(X), right.shape),
+        _linear_operator(lambda X: X - T(X), right.shape),
         right.ravel(),
         rtol=1e-8,
         atol=0.0,
@@ -174,7 +174,7 @@ def _by_gmres(T: PositiveMap, right: FloatArray) -> FloatArray:
     return symmetric(np.asarray(x).reshape(right.shape))
 
 
-def _operator(apply: PositiveMap, shape: Shape) -> scipy.sparse.linalg.LinearOperator:
+def _linear_operator(apply: PositiveMap, shape: Shape) -> scipy.sparse.linalg.LinearOperator:
     """Return a map on vectors; what is not symmetric in a vector does not count."""
     size = int(np.prod(shape))
     return scipy.sparse.linalg.LinearOperator(

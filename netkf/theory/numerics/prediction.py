@@ -186,7 +186,9 @@ class ErrorFlow:
         if self._state is not None:
             self.unit = min(self.unit, self._state.unit)
 
-    def _blocks(self, times: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    def _exponential_blocks(
+        self, times: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         """Return the transposes (K, n, n) of the four blocks of exp(M s), without the scale."""
         n, c = self._n, self._scale
         E = np.swapaxes(self._exp(times), 1, 2)
@@ -195,7 +197,7 @@ class ErrorFlow:
     def transition(self, roots: FloatArray, gap: float) -> FlowTransition:
         """Return the transition of K filters with ``roots`` (K, n, n) of P over ``gap`` seconds."""
         times, w = NODES * gap, WEIGHTS * gap
-        T11, T12, T21, T22 = self._blocks(np.append(times, gap))
+        T11, T12, T21, T22 = self._exponential_blocks(np.append(times, gap))
         F = np.linalg.inv(T11[-1])
         at = np.sqrt(w)[:, None, None]
         # X(g)^T = (I + P G_g) T11(g), so X(g)^-T = T11^-1 J = F J with J = (I + P G_g)^-1.
@@ -215,7 +217,7 @@ class ErrorFlow:
         if own.shape[2] > self._n:
             own = triangular_root(own)
         # P at the end: the start through the closed loop, and the noise on the way.
-        root = self._root(F, F @ SZ, T11[:-1], T21[:-1], at)
+        root = self._final_root(F, F @ SZ, T11[:-1], T21[:-1], at)
         return FlowTransition(FJ, follow, _side_by_side(at * response), own, root)
 
     def move(
@@ -255,7 +257,7 @@ class ErrorFlow:
         J = eye - SZ @ (np.swapaxes(Z[:, n:], 1, 2) @ Gamma)
         return J, SZ @ np.swapaxes(SZ, 1, 2), SZ
 
-    def _root(
+    def _final_root(
         self, F: FloatArray, moved: FloatArray, T11: FloatArray, T21: FloatArray, at: FloatArray
     ) -> FloatArray:
         """Return the root of P at the end: F S Z_1 beside a root of the solution from P = 0."""
@@ -271,7 +273,7 @@ class ErrorFlow:
         parts = []
         for s in NODES * gap:  # noise at s moves the state from s on, and that the errors
             indices, w = s + NODES * (gap - s), WEIGHTS * (gap - s)
-            T11, T12, _, _ = self._blocks(indices)
+            T11, T12, _, _ = self._exponential_blocks(indices)
             phi = FJ[:, None] @ T11 + FC[:, None] @ T12
             states = self._state(indices - s) @ self._plant[1]
             parts.append((w[:, None, None] * phi @ self._difference @ states).sum(axis=1))

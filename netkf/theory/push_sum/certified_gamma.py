@@ -52,11 +52,11 @@ def gamma_constants(scenario: Scenario) -> GammaConstants:
     Raises TheoryError if a condition of the theorems fails: delta at or below rho(L), a singular
     P_inf, links held over the steps or failing in one direction.
     """
-    return _constants(scenario)
+    return _bound_constants(scenario)
 
 
 @lru_cache(maxsize=8)
-def _constants(scenario: Scenario) -> GammaConstants:
+def _bound_constants(scenario: Scenario) -> GammaConstants:
     """Return the constants, cached: both theorems use them, and p_d takes time."""
     steps = estimation_steps(scenario)
     law, P, N = steps.averaging, steps.limits.P, steps.limits.N
@@ -70,9 +70,9 @@ def _constants(scenario: Scenario) -> GammaConstants:
     theta = 1.0 - float(law.hears.min(initial=1.0)) * gap
     cut = _disconnection_bound(scenario, law)
     return GammaConstants(
-        contraction=_norm(joint.T, P) ** 2,
-        printed=(1.0 + N * size * _norm(G, P)) * _norm(F, P),
-        sharp=max(_norm(closed.T, P) for closed in steps.closed),
+        contraction=_weighted_norm(joint.T, P) ** 2,
+        printed=(1.0 + N * size * _weighted_norm(G, P)) * _weighted_norm(F, P),
+        sharp=max(_weighted_norm(closed.T, P) for closed in steps.closed),
         mean=theta,
         # P (59): a step contracts by theta if the network is connected.
         mean_square=(1.0 - cut) * theta**2 + cut,
@@ -101,7 +101,7 @@ def _disconnection_bound(scenario: Scenario, law: Averaging) -> float:
     return disconnection_probability(scenario.topology, up).high
 
 
-def _norm(A: FloatArray, P: FloatArray) -> float:
+def _weighted_norm(A: FloatArray, P: FloatArray) -> float:
     """Return |A|_P = sup over z of sqrt(z' A' P A z / z' P z), P (35)."""
     # The largest generalised eigenvalue of (A' P A, P).
     return float(np.sqrt(scipy.linalg.eigh(A.T @ P @ A, P, eigvals_only=True)[-1]))
@@ -117,7 +117,7 @@ def minimum_gamma(scenario: Scenario, moment: Moment = "mean", sharp: bool = Fal
     """
     constants = gamma_constants(scenario)
     bound = constants.sharp if sharp else max(constants.printed, constants.sharp)
-    test = {"mean": theorem_5, "mean-square": theorem_6}[_moment(moment)]
+    test = {"mean": theorem_5, "mean-square": theorem_6}[_check_moment(moment)]
 
     def certified(gamma: int) -> bool:
         """Return True if this gamma passes the test."""
@@ -154,7 +154,7 @@ def corollary_2(scenario: Scenario, sharp: bool = False) -> CorollaryTwo:
     return CorollaryTwo(gamma, theorem_5(constants, bound, gamma), needed)
 
 
-def _moment(moment: str) -> Moment:
+def _check_moment(moment: str) -> Moment:
     """Return "mean" or "mean-square"; raises TheoryError for other names."""
     if moment not in ("mean", "mean-square"):
         raise TheoryError(f'moment must be "mean" or "mean-square", got {moment!r}')
@@ -183,14 +183,14 @@ def theorem_5(constants: GammaConstants, bound: float, gamma: int) -> float:
     """Return rho(A_R(gamma)) of P (36) with c_B = ``bound``; below 1 it certifies gamma."""
     # Rows: deviation of the mean, and disagreement, which gamma steps reduce by theta^gamma.
     far = constants.mean**gamma * bound
-    return _rho([[constants.contraction**0.5, far], [bound, far]])
+    return _spectral_radius([[constants.contraction**0.5, far], [bound, far]])
 
 
 def theorem_6(constants: GammaConstants, bound: float, gamma: int) -> float:
     """Return rho(A_S(gamma)) of P (45) with c_B = ``bound``; below 1 it certifies gamma."""
     near, square = constants.contraction**0.5, bound * bound
     one, both = constants.mean**gamma, constants.mean_square**gamma
-    return _rho(
+    return _spectral_radius(
         [
             [near * near, bound * near, bound * near, square],
             [bound * one * near, bound * one * near, square * one, square * one],
@@ -200,7 +200,7 @@ def theorem_6(constants: GammaConstants, bound: float, gamma: int) -> float:
     )
 
 
-def _rho(matrix: list[list[float]]) -> float:
+def _spectral_radius(matrix: list[list[float]]) -> float:
     """Return the spectral radius of a small matrix."""
     return float(np.abs(np.linalg.eigvals(np.array(matrix))).max())
 
@@ -219,7 +219,7 @@ def exact_minimum_gamma(
     TheoryError if there is none up to ``most``.
     """
     steps, measure = estimation_steps(scenario), mean_radius
-    if _moment(moment) == "mean-square":
+    if _check_moment(moment) == "mean-square":
         measure = radius
     for gamma in range(1, most + 1):
         if measure(_with_gamma(steps, gamma)) < 1.0:

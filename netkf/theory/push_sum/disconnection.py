@@ -103,8 +103,8 @@ def _probability(
             neighbours[i][j] = neighbours[j][i] = p
     if not _is_connected(neighbours):
         return Probability(1.0, 1.0, 1.0, True)
-    order = _order(neighbours)
-    cut = None if order is None else _cut(neighbours, order)
+    order = _elimination_order(neighbours)
+    cut = None if order is None else _exact_probability(neighbours, order)
     if cut is not None:
         return Probability(cut, cut, cut, True)
     if samples is None:
@@ -202,18 +202,18 @@ def _is_connected(neighbours: list[dict[int, float]]) -> bool:
     return len(reached) == len(neighbours)
 
 
-def _order(neighbours: list[dict[int, float]]) -> list[int] | None:
+def _elimination_order(neighbours: list[dict[int, float]]) -> list[int] | None:
     """Return all nodes in an order in which few are open at a time.
 
     The best of greedy orders from several first nodes; None if too many are open in each.
     """
     nodes = range(len(neighbours))
     fewest = sorted(nodes, key=lambda node: len(neighbours[node]))[:MAX_ROOTS]
-    found = [_greedy(neighbours, root) for root in fewest]
+    found = [_greedy_order(neighbours, root) for root in fewest]
     return min((one for one in found if one is not None), default=(0.0, None))[1]
 
 
-def _greedy(neighbours: list[dict[int, float]], root: int) -> tuple[float, list[int]] | None:
+def _greedy_order(neighbours: list[dict[int, float]], root: int) -> tuple[float, list[int]] | None:
     """Return an estimate of the number of partitions and a greedy order of the nodes.
 
     The next node is the one that closes most open nodes and then opens fewest new ones. None as
@@ -243,7 +243,7 @@ def _greedy(neighbours: list[dict[int, float]], root: int) -> tuple[float, list[
     return effort, order
 
 
-def _cut(neighbours: list[dict[int, float]], order: list[int]) -> float | None:
+def _exact_probability(neighbours: list[dict[int, float]], order: list[int]) -> float | None:
     """Return the probability that the network is disconnected, None for too many partitions.
 
     A partition is the tuple of the labels of the open nodes, numbered in order of appearance.

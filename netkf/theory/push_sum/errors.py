@@ -76,7 +76,7 @@ class AveragingRule(ErrorRule):
     def exchange(self, slot: int, phase: int, messages: Sequence[SentMessage]) -> None:
         """Exchange the masses, P (3)-(5) (phase 0), or average the estimates, P step 5."""
         if phase == 0:
-            received = self._received(slot, 0, 0)
+            received = self._arrived_weights(slot, 0, 0)
             shares = self._z / self._nu[:, None]
             if self._running:
                 self._offered = self._offered + shares
@@ -89,7 +89,7 @@ class AveragingRule(ErrorRule):
             return
         mixing, estimators = np.eye(self._N), range(self._N)
         for step in range(self._gamma):
-            received = self._received(slot, 1, step)
+            received = self._arrived_weights(slot, 1, step)
             # z <- (I - L / delta) z with the Laplacian L of the links that are up in this step.
             laplacian = np.diag(received.sum(axis=1)) - received
             mixing = mixing - laplacian @ mixing / self._delta
@@ -98,7 +98,7 @@ class AveragingRule(ErrorRule):
         forms = stack.table[indices, :, : stack.used].reshape(self._N, -1)
         stack.table[indices, :, : stack.used] = (mixing @ forms).reshape(self._N, -1, stack.used)
 
-    def _received(self, slot: int, phase: int, step: int) -> FloatArray:
+    def _arrived_weights(self, slot: int, phase: int, step: int) -> FloatArray:
         """Return the weights (N, N) of the messages that arrived in a step, zeros if none did."""
         return self._arrivals.get((slot, phase, step), np.zeros((self._N, self._N)))
 
@@ -146,15 +146,15 @@ class RunningTotalsRule(ErrorRule):
         for sender, _ in scenario.topology.directions:
             self._receivers[scenario.topology.index[sender]] += 1
         for estimator in range(errors.estimators):
-            self._put(("sent", estimator), 0.0, np.zeros((n, n)), np.zeros((n, 0)))
+            self._put_total(("sent", estimator), 0.0, np.zeros((n, n)), np.zeros((n, 0)))
 
-    def _put(self, name: Hashable, weight: float, U: FloatArray, form: FloatArray) -> None:
+    def _put_total(self, name: Hashable, weight: float, U: FloatArray, form: FloatArray) -> None:
         """Set a total: its weight, its information U (n, n) and the form of its error."""
         stack, self._totals[name] = self.errors.stack, weight
         stack.put(name, form)
         stack.matrices[stack.index(name)] = U
 
-    def _information(self, name: Hashable) -> FloatArray:
+    def _copy_information(self, name: Hashable) -> FloatArray:
         """Return a copy of the information U (n, n) of a total."""
         stack = self.errors.stack
         U: FloatArray = stack.matrices[stack.index(name)].copy()
@@ -195,7 +195,7 @@ class RunningTotalsRule(ErrorRule):
         U = (share * weight / self.errors.estimators) * (inverse.T @ inverse)
         before = self._totals[name]
         sent, form = before + share * weight, stack.form(name) - U @ stack.form(estimator)
-        self._put(name, sent, self._information(name) + U, form)
+        self._put_total(name, sent, self._copy_information(name) + U, form)
         # One share stays with the node, the others are on their way to its receivers.
         self._weights[estimator] = weight - count * (sent - before)
 
@@ -210,12 +210,12 @@ class RunningTotalsRule(ErrorRule):
         """Add to each receiver the growth of its senders' totals since the last that it got."""
         for estimator in sorted({message.receiver for message in messages}):
             mine = [m for m in messages if m.receiver == estimator]
-            self._receive(estimator, sorted(mine, key=lambda m: (m.sender, m.number)))
+            self._receive_totals(estimator, sorted(mine, key=lambda m: (m.sender, m.number)))
         for message in messages:
             del self._totals[message]
         self.errors.stack.drop(messages)
 
-    def _receive(self, estimator: int, messages: Sequence[SentMessage]) -> None:
+    def _receive_totals(self, estimator: int, messages: Sequence[SentMessage]) -> None:
         """Add the growth of the received totals to a node's mass, and update its estimate."""
         errors, n = self.errors, self.errors.n
         weight, U, form = 0.0, np.zeros((n, n)), np.zeros((n, 1))
@@ -226,9 +226,9 @@ class RunningTotalsRule(ErrorRule):
                 continue
             self._number[link] = message.number
             weight += self._totals[message] - self._totals.get(heard, 0.0)
-            U, form = U + self._information(message), form + errors.stack.form(message)
+            U, form = U + self._copy_information(message), form + errors.stack.form(message)
             if heard in self._totals:
-                U, form = U - self._information(heard), form - errors.stack.form(heard)
+                U, form = U - self._copy_information(heard), form - errors.stack.form(heard)
             errors.stack.copy(message, heard)
             self._totals[heard] = self._totals[message]
         if not weight > 0.0:
@@ -247,7 +247,7 @@ class RunningTotalsRule(ErrorRule):
         self._weights[estimator] = after
 
 
-def _rounds(scenario: Scenario, run: Run) -> dict[float, list[int]]:
+def _read_rounds(scenario: Scenario, run: Run) -> dict[float, list[int]]:
     """Return the indices of the nodes that broadcast at each time (seconds)."""
     found: dict[float, list[int]] = {}
     rows = run.log[run.log["kind"] == CODES["transmit"]]
@@ -261,6 +261,6 @@ def rule(
 ) -> ErrorRule:
     """Return the rule of this filter; raises TheoryError if the errors in slots are not known."""
     if not scenario.slotted:
-        return RunningTotalsRule(scenario, errors, _rounds(scenario, run))
+        return RunningTotalsRule(scenario, errors, _read_rounds(scenario, run))
     require_known_errors(scenario, run)
     return AveragingRule(scenario, errors, run)

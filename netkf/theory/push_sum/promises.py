@@ -86,10 +86,10 @@ def slot_promises(scenario: Scenario) -> dict[str, Any]:
         "leader_slots": leader,
         "disconnection_probability": cut,
     }
-    return {name: _value(function) for name, function in functions.items()}
+    return {name: _value_or_reason(function) for name, function in functions.items()}
 
 
-def _value(function: Callable[[], Any]) -> dict[str, Any]:
+def _value_or_reason(function: Callable[[], Any]) -> dict[str, Any]:
     """Return the value of a function, or the reason why there is none."""
     try:
         return {"value": function(), "reason": None}

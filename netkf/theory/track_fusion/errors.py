@@ -79,43 +79,43 @@ class TrackRule(ErrorRule):
         start = scenario.start(scenario.nodes[0])[1]
         self._joint = np.tile(start, (len(nodes), len(nodes), 1, 1))
         for estimator in nodes:
-            errors.copy(estimator, _track(estimator), estimator)
+            errors.copy(estimator, _track_name(estimator), estimator)
 
     def sense(self, time: float, observations: EstimatorObservations) -> None:
         """Update the tracks; a node that hears nothing shows its own."""
         self._joint = updated_joint(predicted_joint(self._joint, self._models[0]), self._sensors)
         columns = self.errors.reading_noises(observations)
         for estimator, observation in observations.items():
-            self.errors.update(_track(estimator), observation, columns[estimator])
-        self._show({estimator: [] for estimator in range(self.errors.estimators)})
+            self.errors.update(_track_name(estimator), observation, columns[estimator])
+        self._combine_tracks({estimator: [] for estimator in range(self.errors.estimators)})
 
     def exchange(self, slot: int, phase: int, messages: Sequence[SentMessage]) -> None:
         """Combine each node's track with those that it heard."""
         heard: dict[int, list[int]] = {}
         for message in messages:
             heard.setdefault(message.receiver, []).append(message.sender)
-        self._show(heard)
+        self._combine_tracks(heard)
 
-    def _show(self, heard: dict[int, list[int]]) -> None:
+    def _combine_tracks(self, heard: dict[int, list[int]]) -> None:
         """Set the errors of receivers to those of the combinations with what they heard."""
         errors, n = self.errors, self.errors.n
         changes: dict[Hashable, tuple[FloatArray, Sequence[Term]]] = {}
         for estimator, senders in heard.items():
             order = [estimator, *sorted(set(senders))]
-            own = errors.roots[_track(estimator)]
-            terms: list[Term] = [(_track(estimator), np.eye(n))]
+            own = errors.roots[_track_name(estimator)]
+            terms: list[Term] = [(_track_name(estimator), np.eye(n))]
             root = own
             if len(order) > 1:
                 gain, root = best_combination(self._joint, order, own)
                 parts = np.split(gain, len(order) - 1, axis=1)
                 # e = e_i - sum_j G_j (e_i - e_j)
-                terms = [(_track(estimator), np.eye(n) - sum(parts))]
-                terms += [(_track(j), G) for j, G in zip(order[1:], parts, strict=True)]
+                terms = [(_track_name(estimator), np.eye(n) - sum(parts))]
+                terms += [(_track_name(j), G) for j, G in zip(order[1:], parts, strict=True)]
             changes[estimator] = root, terms
         errors.combine(changes)
 
 
-def _track(estimator: int) -> Hashable:
+def _track_name(estimator: int) -> Hashable:
     """Return the name of the error of an estimator's own track."""
     return ("track", estimator)
 

@@ -79,7 +79,7 @@ def _mean_shown_covariance(scenario: Scenario, joint: FloatArray, i: int) -> Flo
             probabilities[j] if one else 1.0 - probabilities[j] for j, one in outcomes
         )
         order = [i, *certain, *(j for j, one in outcomes if one)]
-        total += probability * _fuse(joint, order)
+        total += probability * _fuse_tracks(joint, order)
     return total
 
 
@@ -99,7 +99,7 @@ def _hearing_probabilities(scenario: Scenario, node: int) -> dict[int, float]:
     }
 
 
-def _fuse(joint: FloatArray, order: list[int]) -> FloatArray:
+def _fuse_tracks(joint: FloatArray, order: list[int]) -> FloatArray:
     """Return the covariance (n, n) of the best combination of tracks, the first one the own."""
     own: FloatArray = joint[order[0], order[0]]
     if len(order) == 1:

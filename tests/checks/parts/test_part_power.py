@@ -21,9 +21,9 @@ from netkf.checks.parts.moments import (
     moments,
 )
 from netkf.checks.parts.network_rows import (
-    _bursts,
+    _check_bursts,
+    _check_matchings,
     _losses_apart,
-    _matchings,
     _mean_correlation,
     pair_probabilities,
 )
@@ -98,7 +98,7 @@ def _bursts_of_losses(folder):
         for u in random.random((WINDOWS * MESSAGES - 1, *size_of)):
             steps.append(np.where(steps[-1], u >= leaves, u < arrives))
         lost = np.swapaxes(np.array(steps), 0, 1)
-        return _of(_bursts(_samples(scenario, _count(scenario, lost)), LEVEL))
+        return _of(_check_bursts(_samples(scenario, _count(scenario, lost)), LEVEL))
 
     return draw
 
@@ -112,7 +112,7 @@ def _matchings_of_slots(folder):
         paired = random.random((RUNS, slots, len(p))) < p + size / len(p)
         again = (paired[:, 1:] & paired[:, :-1]).sum(axis=1)
         pairs = PairCounts(paired.sum(axis=1), again, np.full(RUNS, float(slots)))
-        return _of(_matchings(_samples(scenario, pairs=pairs), LEVEL))
+        return _of(_check_matchings(_samples(scenario, pairs=pairs), LEVEL))
 
     return draw
 

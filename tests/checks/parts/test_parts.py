@@ -30,7 +30,7 @@ from netkf.checks.parts.network_rows import (
 from netkf.checks.parts.noises import start_states
 from netkf.checks.parts.rows import part_promises
 from netkf.checks.parts.samples import stack_parts, summarise_parts
-from netkf.checks.parts.ticks import ClockGroup, _count, relative_variance
+from netkf.checks.parts.ticks import ClockGroup, _count_in_windows, relative_variance
 from netkf.checks.statistics import probability_interval, scale_interval
 from netkf.parts import (
     ConstantDelay,
@@ -256,7 +256,7 @@ def test_gaps_are_uniform_numbers_however_short_the_run(name):
     for _ in range(4000):
         ticks = np.cumsum(law.rvs(60, random_state=random))
         ticks = ticks[ticks < horizon]
-        found = _count(group, ticks, np.zeros(len(ticks), int), horizon)
+        found = _count_in_windows(group, ticks, np.zeros(len(ticks), int), horizon)
         counts += found.cells[:, 0]
         products += found.products
     assert counts.sum() > 5000
