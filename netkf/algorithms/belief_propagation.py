@@ -65,9 +65,14 @@ class HeardEvidence(NamedTuple):
 
 
 class BeliefState(NamedTuple):
-    """Belief ``xhat`` (n,) with ``root`` (n, n), and the model; the evidence of the estimate before
-    all readings that are kept (``prior``) and of the node's ``own`` ones, and what neighbours sent,
-    by ``senders``; the node's id. Evidence (n, n + 1) counts from ``xhat``, see kernels.beliefs.
+    """The state of a node; evidence (n, n + 1) counts from ``xhat``, see kernels.beliefs.
+
+    xhat, root : the belief (n,) and the lower triangular root (n, n) of its covariance
+    model : of the plant and the node's sensors
+    prior : evidence of the estimate before all readings that are kept
+    own : evidence of the node's own readings
+    senders, received : ids of neighbours, and the evidence that each sent last
+    node : the node's id.
     """
 
     xhat: FloatArray
@@ -86,8 +91,11 @@ class BeliefState(NamedTuple):
 
 
 class Beliefs(NamedTuple):
-    """A payload: the evidence of the sender's ``own`` readings, and of each of its ``senders``,
-    which counts from its belief ``xhat`` (n,); a receiver leaves out what it has sent itself.
+    """A payload; evidence counts from ``xhat``, and a receiver leaves out what it sent itself.
+
+    xhat : the sender's belief (n,)
+    own : evidence (n, n + 1) of the sender's own readings
+    senders, heard : ids of the sender's neighbours, and the evidence of each.
     """
 
     xhat: FloatArray
@@ -97,9 +105,13 @@ class Beliefs(NamedTuple):
 
 
 class BeliefArrays(NamedTuple):
-    """Steps a slot, whether messages are kept from slot to slot, the inverse of F (n, n) if they
-    are; evidence of priors and own readings (B, H, n, n + 1, L) and of what was received on each
-    direction (B, W, n, n + 1, L), in one block if nothing is kept; scratch.
+    """Arrays of belief propagation for B blocks of runs, in one block if nothing is kept.
+
+    steps : steps of a slot
+    keeps : whether messages are kept from slot to slot
+    back : the inverse of F (n, n) if they are
+    prior, own : evidence of priors and own readings (B, H, n, n + 1, L)
+    received : evidence received on each direction (B, W, n, n + 1, L).
     """
 
     steps: int

@@ -63,8 +63,12 @@ CONVERGED = 1e-14
 
 
 class Design(NamedTuple):
-    """All that gains depend on, as keys: numbers of states and nodes; F, Q (n, n), the covariance
-    of x(0) and ``information`` (N, n, n) as bytes; the indices of the nodes that each one hears.
+    """Everything that determines the gains, as keys of a cache.
+
+    n, nodes : numbers of states and of nodes
+    F, Q, cov : matrices (n, n) as bytes; ``cov`` is that of x(0)
+    information : H' R^-1 H (N, n, n) of the nodes, as bytes
+    heard : indices of the nodes that each node hears.
     """
 
     n: int
@@ -92,8 +96,10 @@ class NodeGains(NamedTuple):
 
 
 class SlotGains(NamedTuple):
-    """Gains of all N nodes in K slots: B (K, W, n, n) of the W directions, by receiver and sender;
-    M, K and root (K, N, n, n) as ``NodeGains`` has them.
+    """Gains of all N nodes in K slots, see ``NodeGains``.
+
+    B : (K, W, n, n) of the W directions, by receiver and sender
+    M, K, root : (K, N, n, n).
     """
 
     B: FloatArray
@@ -103,8 +109,11 @@ class SlotGains(NamedTuple):
 
 
 class PseudoStates(NamedTuple):
-    """The matrices (n, n) by which pseudo-states belong to states: G, its pseudo-inverse, and
-    ``A = G F G^+`` and ``rest = G F (I - G^+ G)`` of their prediction.
+    """Matrices (n, n) of the pseudo-state ``G x``.
+
+    G : information of all sensors together
+    inverse : its pseudo-inverse G^+
+    A, rest : of the prediction, ``A = G F G^+`` and ``rest = G F (I - G^+ G)``.
     """
 
     G: FloatArray
@@ -272,9 +281,15 @@ def gain_sequence(design: Design) -> GainSequence:
 
 
 class PseudoState(NamedTuple):
-    """Estimate ``xhat`` (n,), ``root`` (n, n) of its covariance and the model; the estimate of the
-    pseudo-state, ``yhat`` (n,), and the matrices of ``pseudo``-states; the whitened ``reading``
-    y (p,), H (p, n) of this ``slot``; the ``design``, and the node's index in it.
+    """The state of a node.
+
+    xhat, root : estimate (n,) and root (n, n) of its covariance
+    model : of the plant and the node's sensors
+    yhat : estimate (n,) of the pseudo-state
+    pseudo : matrices of pseudo-states
+    reading : whitened y (p,) and H (p, n) of this slot, or None
+    slot : number of the slot
+    design, node_index : from which the gains follow.
     """
 
     xhat: FloatArray
@@ -307,9 +322,13 @@ class PseudoEstimate(NamedTuple):
 
 
 class PseudoArrays(NamedTuple):
-    """Matrices and gains of all nodes, the row (S,) of each slot in the table of gains, the
-    estimates of pseudo-states yhat (B, H, n, L), and scratch: the ``corrected`` ones (H, n, L),
-    and ``state`` and ``z`` (n, L).
+    """Arrays of all nodes for B blocks of runs.
+
+    pseudo, gains : matrices of pseudo-states, gains of some slots
+    table_row : row (S,) of each slot in ``gains``
+    yhat : estimates of pseudo-states (B, H, n, L)
+    corrected : (H, n, L), scratch
+    state, z : (n, L), scratch.
     """
 
     pseudo: PseudoStates

@@ -43,8 +43,12 @@ from netkf.linalg.lanes import load, store
 
 
 class ConstantGainState(NamedTuple):
-    """Estimate ``xhat`` (n,), ``root`` (n, n) of P, the model, the ``gain`` (n, p) of the node, and
-    the model of its closed ``loop`` where its sensors give increments.
+    """The state of a node.
+
+    xhat, root : estimate (n,) and root (n, n) of P
+    model : of the plant and the node's sensors
+    gain : L (n, p)
+    loop : model of the closed loop where sensors give increments, else None.
     """
 
     xhat: FloatArray

@@ -40,8 +40,11 @@ from netkf.linalg.lanes import ONE, Lanes, any_lane, load, load_flags, select, s
 
 
 class DiffusionState(NamedTuple):
-    """``xhat`` (n,), ``root`` (n, n) of its covariance, the model, and the weight that the node
-    gives to itself when all messages arrive.
+    """The state of a node.
+
+    xhat, root : estimate (n,) and root (n, n) of its covariance
+    model : of the plant and the node's sensors
+    own : weight that the node gives to itself when all messages arrive.
     """
 
     xhat: FloatArray

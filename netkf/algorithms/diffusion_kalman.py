@@ -37,8 +37,12 @@ READINGS, ESTIMATES = 0, 1
 
 
 class DiffusionKalmanState(NamedTuple):
-    """Estimate ``xhat`` (n,), psi between the exchanges; ``root`` (n, n) of P; the model; the
-    node's own ``reading`` of this slot.
+    """The state of a node.
+
+    xhat : estimate (n,), psi between the exchanges
+    root : root (n, n) of P
+    model : of the plant and the node's sensors
+    reading : the node's own reading of this slot, or None.
     """
 
     xhat: FloatArray

@@ -64,8 +64,12 @@ class Heard(NamedTuple):
 
 
 class TriggeredState(NamedTuple):
-    """Estimate ``xhat`` (n,) with ``root`` (n, n) and the model; the estimate that the neighbours
-    have of this node, ``sent``, None before the first message; theirs by ``senders``, ``heard``.
+    """The state of a node.
+
+    xhat, root : estimate (n,) and root (n, n) of its covariance
+    model : of the plant and the node's sensors
+    sent : the estimate that the neighbours have of this node, None before the first message
+    senders, heard : ids of neighbours, and the estimate of each.
     """
 
     xhat: FloatArray
@@ -82,11 +86,14 @@ class TriggeredState(NamedTuple):
 
 
 class TriggeredCiArrays(NamedTuple):
-    """``alpha``, 1 + delta, and the share of a silent neighbour's information that counts; the
-    copies of all nodes, estimates ``x`` (B, W + 2 H, n, L) and ``root`` (B, W + 2 H, n, n, L):
-    those heard on W directions, of each node what it sends, and what it sent last; which of them
-    there are, ``known`` (B, W + 2 H, L). Scratch: ``mean`` (W + H, n, L) and ``inverse``
-    (W + H, n, n, L).
+    """Arrays for B blocks of runs; W + 2 H copies of estimates: W heard, H sent now, H sent last.
+
+    alpha : threshold of the mean
+    ratio : 1 + delta, threshold of the covariance
+    share : share of a silent neighbour's information that counts
+    x, root : the copies (B, W + 2 H, n, L) and roots (B, W + 2 H, n, n, L)
+    known : which copies there are (B, W + 2 H, L)
+    mean, inverse : (W + H, n, L) and (W + H, n, n, L), scratch.
     """
 
     alpha: float

@@ -87,10 +87,14 @@ class NodeInfo(NamedTuple):
 
 
 class Exchange(NamedTuple):
-    """The circumstances of ``emit`` or ``absorb``: simulated ``time`` in seconds; under clocks the
-    nodes that may hear (``receivers``, for ``emit``); in slots the ``slot``, the number of the
-    exchange in it (``phase``) and of its repetition (``step``), all counted from 0. For ``emit`` of
-    a ``randomised`` filter in slots a ``uniform`` number in [0, 1) of the node's own.
+    """The circumstances of ``emit`` or ``absorb``.
+
+    time : simulated seconds
+    phase, step : number of the exchange in its slot, and of its repetition, from 0
+    slot : number of the slot, from 0; -1 under clocks
+    receivers : under clocks, for ``emit``, the nodes that may hear
+    uniform : in slots, for ``emit`` of a ``randomised`` filter, a number in [0, 1) of the node's
+              own.
     """
 
     time: float = 0.0
@@ -113,8 +117,11 @@ class Message(NamedTuple):
 
 
 class Reading(NamedTuple):
-    """A sample ``y = H x + v``, cov(v) = R: y (p,), H (p, n), R (p, p) as the node believes them,
-    p may be 0; taken at ``time`` seconds.
+    """A sample ``y = H x + v``, cov(v) = R.
+
+    y : values (p,); p may be 0
+    H, R : (p, n) and (p, p) as the node believes them
+    time : when it was taken, in seconds.
     """
 
     y: FloatArray

@@ -72,9 +72,14 @@ def recipe(shares: Sequence[Sequence[float]], counts: Sequence[float]) -> Recipe
 
 
 class ConsensusState(NamedTuple):
-    """Estimate ``xhat`` (n,) and ``root`` (n, n) of its covariance, in a slot the prediction until
-    the last step; the model; how often pairs count; the roots of the node's pairs after its reading
-    (K, n, n + 1), see ``kernels.information``, None outside of a slot.
+    """The state of a node.
+
+    xhat, root : estimate (n,) and root (n, n) of its covariance; the prediction until the last step
+                 of a slot
+    model : of the plant and the node's sensors
+    recipe : how often pairs count
+    parts : roots (K, n, n + 1) of the node's pairs after its reading, see ``kernels.information``;
+            None outside of a slot.
     """
 
     xhat: FloatArray

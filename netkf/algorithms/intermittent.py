@@ -34,8 +34,13 @@ TIME_TOLERANCE = 1e-14
 
 
 class Past(NamedTuple):
-    """One thing that happened at ``time``: a ``reading`` was used, or the frame of coordinates was
-    shifted by ``offset``; the estimate and root right after it, and the ``before`` of it.
+    """One event in the past of a node.
+
+    time : in seconds
+    reading : the reading that was used, or None
+    offset : shift of the frame of coordinates, or None
+    xhat, root : estimate (n,) and root (n, n) right after the event
+    before : the event before it.
     """
 
     time: float
@@ -47,9 +52,14 @@ class Past(NamedTuple):
 
 
 class IntermittentState(NamedTuple):
-    """Estimate ``xhat`` (n,), ``root`` (n, n) of its covariance, the model; the own reading of
-    this instant, which has not been sent yet; the ``time`` that the state is at and the ``past`` as
-    far back as a late reading may reach (``lag`` seconds; 0: none is kept).
+    """The state of a node.
+
+    xhat, root : estimate (n,) and root (n, n) of its covariance
+    model : of the plant and the node's sensors
+    unsent : own reading of this instant that has not been sent yet, or None
+    time : seconds that the state refers to
+    past : events as far back as a late reading may reach
+    lag : that far, in seconds; 0: no past is kept.
     """
 
     xhat: FloatArray

@@ -38,8 +38,12 @@ from netkf.linalg.lanes import ONE
 
 
 class KcfState(NamedTuple):
-    """Estimate ``xhat`` (n,), ``root`` (n, n) of P and the model; the prediction of this instant
-    with its root, ``prior`` and ``prior_root``, and the node's own ``reading`` of it.
+    """The state of a node.
+
+    xhat, root : estimate (n,) and root (n, n) of P
+    model : of the plant and the node's sensors
+    prior, prior_root : prediction of this instant and its root
+    reading : the node's own reading of this instant, or None.
     """
 
     xhat: FloatArray

@@ -61,8 +61,12 @@ class Bits(NamedTuple):
 
 
 class OneBitState(NamedTuple):
-    """Estimate ``xhat`` (n,) and ``root`` (n, n) of P, the model; the node's own ``reading`` of
-    this slot; its ``turn`` among so many ``nodes``.
+    """The state of a node.
+
+    xhat, root : estimate (n,) and root (n, n) of P
+    model : of the plant and the node's sensors
+    reading : the node's own reading of this slot, or None
+    turn, nodes : the node sends in slots k with ``k % nodes == turn``.
     """
 
     xhat: FloatArray

@@ -96,10 +96,15 @@ class NodeSums(NamedTuple):
 
 
 class PushSumState(NamedTuple):
-    """Estimate ``xhat`` (n,), z between the exchanges; ``root`` (n, n) of its covariance; ``mass``
-    (2 + n^2,), the weight w, the number n~ and the information C~ of P (3)-(5); what the node makes
-    of it, ``network``; whether that is frozen, ``stopped``; its nominal ``degree``; its running
-    ``sums``, if mass is exchanged by them.
+    """The state of a node.
+
+    xhat, root : estimate (n,), z between the exchanges, and root (n, n) of its covariance
+    model : of the plant and the node's sensors
+    mass : (2 + n^2,), weight w, number n~ and information C~ of P (3)-(5)
+    network : the node's estimate of the network, from its mass
+    stopped : whether that is frozen
+    degree : nominal number of links
+    sums : running sums, if mass is exchanged by them, else None.
     """
 
     xhat: FloatArray
@@ -152,8 +157,12 @@ class PushSumArrays(NamedTuple):
 
 
 class StopRoom(NamedTuple):
-    """What ``has_stopped`` compares, of one lane: ``mass`` (1, m) and mass ``before`` (m,),
-    information ``found`` and ``former`` (1, n, n), numbers (1,) of both, scratch (n, n).
+    """What ``has_stopped`` compares, for one lane.
+
+    mass, before : (1, m) and (m,), the mass now and before the step
+    found, former : information (1, n, n) that the mass gives now and gave before
+    number, former_number : number of nodes (1,), likewise
+    work : (n, n), scratch.
     """
 
     mass: FloatArray

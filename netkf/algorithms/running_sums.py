@@ -44,10 +44,15 @@ class Offer(NamedTuple):
 
 
 class RunningSums(NamedTuple):
-    """Estimate ``xhat`` (n,), ``root`` (n, n) of its covariance, the model, the ``weight`` w; the
-    total ``sent`` (1 + n n + n,) to each receiver, of w, information U and ``u = U xhat``, and in
-    how many ``rounds``; by sender the number and total ``heard`` last; how many can hear
-    (``receivers``) and how many ``nodes`` there are.
+    """The state of a node that exchanges mass by running sums.
+
+    xhat, root : estimate (n,) and root (n, n) of its covariance
+    model : of the plant and the node's sensors
+    weight : w
+    sent : total (1 + n n + n,) to each receiver, of w, information U and ``u = U xhat``
+    rounds : number of broadcasts
+    heard : number and total heard last, by sender
+    receivers, nodes : number of nodes that can hear, and of all.
     """
 
     xhat: FloatArray

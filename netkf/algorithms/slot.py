@@ -45,7 +45,9 @@ Messages = Sequence[tuple[float, Any, float]]
 
 
 class SlotState(NamedTuple):
-    """Estimate ``xhat`` (n,), ``root`` (n, n) of its covariance, the model, a ``kept`` reading."""
+    """The state of a node: estimate ``xhat`` (n,), ``root`` (n, n) of its covariance, the
+    ``model``, and a ``kept`` reading or None.
+    """
 
     xhat: FloatArray
     root: FloatArray
@@ -54,10 +56,13 @@ class SlotState(NamedTuple):
 
 
 class Role(NamedTuple):
-    """What a node may be told about the network before slot 0: its own id, how many ``neighbours``
-    it has when no link fails, how many ``nodes`` there are, the ``information`` (n, n) of all their
-    sensors together, the sum of H' R^-1 H as the filters believe it, and its ``own`` weight, which
-    is left to it when the messages of all neighbours arrive.
+    """What a node may know about the network before slot 0.
+
+    node : its id
+    neighbours : number of neighbours when no link fails
+    nodes : number of nodes
+    information : (n, n), sum of H' R^-1 H of all sensors as the filters believe it
+    own : weight left to the node when the messages of all neighbours arrive.
     """
 
     node: int

@@ -129,10 +129,14 @@ def silence_root(weight: FloatArray) -> FloatArray:
 
 
 class ScheduledArrays(NamedTuple):
-    """Of the sensors of each node, ``trigger`` (H, p, p) for whitened rows and ``wider`` (H, p, p),
-    see silence_root. Of the sensors that are ``known`` (B, W + H, L), by the direction on which
-    they were heard of, and a node's own: the whitened rows ``H`` (B, W + H, p, n, L). The
-    predictions of a slot, ``prior`` (B, H, n, L). Scratch: ``z`` (p, L) and ``seen`` (n, L).
+    """Sensors and predictions for B blocks of runs; W + H sensors: W heard of, H own.
+
+    trigger : (H, p, p), for whitened rows
+    wider : (H, p, p), see ``silence_root``
+    H : whitened rows (B, W + H, p, n, L)
+    known : which sensors are known (B, W + H, L)
+    prior : predictions of a slot (B, H, n, L)
+    z, seen : (p, L) and (n, L), scratch.
     """
 
     trigger: FloatArray
@@ -295,9 +299,14 @@ def use_silence(
 
 
 class ScheduledState(NamedTuple):
-    """Estimate ``xhat`` (n,) with ``root`` (n, n) and the model; ``prior`` (n,), the prediction of
-    this slot; the own ``reading``, and whether it was ``sent`` in this slot; the sensors (H, R) of
-    all nodes known to have some, by ``senders``, the own one as -1.
+    """The state of a node.
+
+    xhat, root : estimate (n,) and root (n, n) of its covariance
+    model : of the plant and the node's sensors
+    prior : prediction (n,) of this slot
+    reading : own reading, or None
+    sent : whether it was sent in this slot
+    senders, sensors : ids of nodes with known sensors (-1: itself), and (H, R) of each.
     """
 
     xhat: FloatArray
@@ -424,10 +433,14 @@ class ScheduledReadings(Filter):
 
 
 class TriggerArrays(NamedTuple):
-    """``trigger`` (H, p, p) for whitened rows; of the last reading of each node its ``news``
-    (B, H, L), and whether it is ``undecided`` if it is sent, and if not, ``silent``; whether a node
-    has ``begun`` to send after readings (B, H, L, each). Predictions ``x`` (B, H, n, L) and ``z``
-    (p, L) are scratch.
+    """Decisions of the nodes for B blocks of runs.
+
+    trigger : (H, p, p), for whitened rows
+    news : z' Y z of the last reading (B, H, L)
+    undecided : whether it is open if that is sent (B, H, L)
+    silent : the decision not to send (B, H, L)
+    begun : whether a node has begun to send after readings (B, H, L)
+    x, z : predictions (B, H, n, L) and (p, L), scratch.
     """
 
     trigger: FloatArray
@@ -454,9 +467,12 @@ def trigger_arrays(models: Sequence[Any], Y: float | FloatArray, runs: int) -> T
 
 
 class TriggerPlan(NamedTuple):
-    """How the slots of a filter go: the ``first`` step of an exchange after the reading; whether
-    estimates are ``predicted`` before it; whether frames begin before it (``framed``); whether an
-    exchange before it moves estimates, so that it must be ``split`` off.
+    """How the slots of a wrapped filter go.
+
+    first : first step of an exchange after the reading
+    predicted : estimates are predicted before the reading
+    framed : moving frames begin before the reading
+    split : an exchange before the reading moves estimates, so that it is simulated apart.
     """
 
     first: int
@@ -639,9 +655,12 @@ def slot_alone(
 
 
 class WrappedState(NamedTuple):
-    """The state of the wrapped filter, ``inner``; the ``news`` z' Y z of the last reading,
-    NO_READING without one; if the node has ``begun`` to send after readings; if it is ``silent``
-    until the next one, None before that is decided.
+    """The state of a filter with a trigger.
+
+    inner : state of the wrapped filter
+    news : z' Y z of the last reading, NO_READING without one
+    begun : whether the node has begun to send after readings
+    silent : whether it sends nothing until the next reading, None before that is decided.
     """
 
     inner: Any

@@ -210,11 +210,15 @@ class Track(NamedTuple):
 
 
 class TrackState(NamedTuple):
-    """The node's own track ``xhat`` (n,) with ``root`` (n, n) and the model; ``fused`` (n,) and
-    ``fused_root`` (n, n) of what it shows; the ``slot``, and the whitened sensors H of the
-    ``senders`` it has heard of, its own first (sender -1); ``joint`` (m, m, n, n), the covariances
-    of the errors of these m tracks; and the covariance ``start`` (n, n) that all of them began
-    with.
+    """The state of a node.
+
+    xhat, root : the node's own track (n,) and its root (n, n)
+    model : of the plant and the node's sensors
+    fused, fused_root : the reported estimate (n,) and its root (n, n)
+    slot : number of the slot
+    senders, sensors : ids of nodes heard of (-1: itself, first), and the whitened H of each
+    joint : (m, m, n, n), covariances of the errors of these m tracks
+    start : covariance (n, n) with which all of them began.
     """
 
     xhat: FloatArray
@@ -235,9 +239,11 @@ class TrackState(NamedTuple):
 
 
 class CombinationCache(NamedTuple):
-    """Combinations of one node in one slot that are known, by the directions that it heard: their
-    bits as ``key`` (C,), -1 where there is none, how many differences were ``used`` (C,), ``gain``
-    (C, n, k n) and ``root`` (C, n, n).
+    """Known combinations of one node in one slot, C at most.
+
+    key : (C,), directions that were heard as bits, -1 for a free entry
+    used : (C,), number of differences that count
+    gain, root : (C, n, k n) and (C, n, n).
     """
 
     key: np.ndarray
@@ -247,11 +253,14 @@ class CombinationCache(NamedTuple):
 
 
 class TrackArrays(NamedTuple):
-    """Own tracks ``xhat`` (B, H, n, L) and ``root`` (B, H, n, n, L), Q (n, n), whitened sensors H
-    (H, p, n), the covariances ``joint`` (K, n, n) of the ``pairs`` (K, 2) of tracks that some node
-    may combine, those of track i from ``first[i]`` (H + 1,) on; and scratch: ``closed`` (H, n, n),
-    ``near`` (D + 1,) tracks and their covariances ``block`` (D + 1, D + 1, n, n), and what belongs
-    to combinations.
+    """Tracks of all nodes for B blocks of runs.
+
+    xhat, root : own tracks (B, H, n, L) and (B, H, n, n, L)
+    Q, H : (n, n) and whitened sensors (H, p, n)
+    joint, pairs : covariances (K, n, n) of the pairs (K, 2) of tracks that some node may combine
+    first : (H + 1,), pairs of track i begin at ``first[i]``
+    closed : (H, n, n), scratch
+    near, block : tracks (D + 1,) and their covariances (D + 1, D + 1, n, n), scratch.
     """
 
     xhat: FloatArray

@@ -25,8 +25,11 @@ BlockTask = Callable[[Scenario, int, range], Any]
 
 
 class PackedScenario(NamedTuple):
-    """A scenario as it travels: its pickle, the digest of that, where its modules are, and the
-    versions that the worker must have, none if it is of this installation anyway.
+    """A scenario as it travels to a worker.
+
+    digest, payload : its pickle, and the digest of that
+    modules : where its modules are
+    versions : versions that the worker must have, none if it is of this installation anyway.
     """
 
     digest: str

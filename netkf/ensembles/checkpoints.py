@@ -36,10 +36,14 @@ MAX_BLOCK = 1 << 32  # a number of runs beyond that is damage
 
 @dataclass(frozen=True)
 class RunIdentity:
-    """What blocks must have in common to be merged: the digest of the resolved scenario with its
-    files, the seed, the number of runs, ``trace``, the engine, the digest of the installation
-    (versions of all packages and of netkf's own files, features of the processor), and the number
-    of runs in a block.
+    """What blocks must have in common to be merged.
+
+    scenario : digest of the resolved scenario with its files
+    seed, runs : seed and number of runs
+    trace, engine : as asked for
+    installation : digest of the versions of all packages and of netkf's own files, and of the
+                   processor's features
+    block : number of runs in a block.
     """
 
     scenario: str

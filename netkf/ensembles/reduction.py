@@ -56,9 +56,12 @@ class Reduced(NamedTuple):
 
 
 class Batch(Struct):
-    """The arrays of a RunBatch, with the samples of each run that are ``kept`` (R,), and NEES
-    ``given`` (R, T, F) of the runs that are ``known`` (R,). Averages begin with sample ``start``.
-    Once more with a row a run: ``x_rows`` (R, T n), ``P_rows`` and ``error_rows``.
+    """The arrays of a RunBatch for kernels, see there.
+
+    kept : (R,), number of samples of each run that count
+    known, given : runs (R,) whose NEES is given, and that NEES (R, T, F)
+    start : sample with which averages begin
+    x_rows, P_rows, error_rows : the same arrays with a row a run.
     """
 
     times: FloatArray
@@ -78,9 +81,12 @@ class Batch(Struct):
 
 
 class Sums(Struct):
-    """What is found: ``size`` (K, T) of K pieces, their ``mean`` and ``M2`` (K, T, F (2 u + 1)), of
-    the runs ``averages`` and ``rounding_from`` as in Reduced, and whether all their P are
-    ``regular`` (R,).
+    """Sums over K chunks of R runs.
+
+    size : (K, T), number of runs
+    mean, M2 : (K, T, F (2 u + 1))
+    averages, rounding_from : of the runs, as in Reduced
+    regular : (R,), whether all P of a run are regular.
     """
 
     size: FloatArray

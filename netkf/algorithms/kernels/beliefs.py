@@ -19,9 +19,12 @@ from netkf.linalg.lanes import ONE, Lanes, any_lane, load, load_flags, select, s
 
 
 class BeliefScratch(NamedTuple):
-    """Evidence that H nodes send: all that they have (``every``, H), and for each of W directions
-    all but that of its sender (``others``, W); ``behind`` (D + 1,) sums from the last of D
-    directions on, and ``total`` and ``work``. All are evidence (n, n + 1, L).
+    """Evidence (n, n + 1, L) that nodes send, and scratch.
+
+    every : all that each of H nodes has
+    others : for each of W directions, all of its receiver but what came from its sender
+    behind : (D + 1,) sums from the last of D directions on
+    total, work : scratch.
     """
 
     every: FloatArray

@@ -42,8 +42,11 @@ TINY = 1e-200  # far below any length that counts, yet above underflow
 
 
 class SlotNodes(NamedTuple):
-    """xhat (B, H, n, L) and lower triangular root (B, H, n, n, L) in B blocks; F and root of Q
-    (n, n, lower triangular) that all filters believe; how many rows each reads, ``rows`` (H,).
+    """The filters of B blocks of runs, and the model that all of them believe.
+
+    xhat, root : (B, H, n, L) and lower triangular (B, H, n, n, L)
+    F, root_Q : (n, n), the root lower triangular
+    rows : number of rows (H,) that each filter reads.
     """
 
     xhat: FloatArray
@@ -54,9 +57,12 @@ class SlotNodes(NamedTuple):
 
 
 class ReadingBlock(NamedTuple):
-    """Whitened readings y (B, S, H, p, L) and H (B, S, H, p, n, L), or (1, 1, H, p, n, L) if it is
-    fixed; the truth ``local`` (B, S, n, L) in the coordinates of the estimates, whose origin moves
-    there in slots that are ``rebased`` (S,).
+    """Readings of S slots, whitened.
+
+    y : (B, S, H, p, L)
+    H : (B, S, H, p, n, L), or (1, 1, H, p, n, L) if it is fixed
+    local : the true state (B, S, n, L) in the coordinates of the estimates
+    rebased : slots (S,) in which the origin of these moves.
     """
 
     y: FloatArray
@@ -95,8 +101,12 @@ class SlotPlan(NamedTuple):
 
 
 class SlotLinks(NamedTuple):
-    """The directions that filter h may hear are those from ``first[h]`` (H + 1,) to
-    ``first[h + 1]``, by ``sender`` (W,), with their index in ``up`` (``way``) and their ``weight``.
+    """Directed links by receiver: filter h hears those from ``first[h]`` up to ``first[h + 1]``.
+
+    first : (H + 1,)
+    sender : index (W,) of the sender
+    way : index (W,) in ``up``
+    weight : (W,) that the receiver gives.
     """
 
     first: np.ndarray

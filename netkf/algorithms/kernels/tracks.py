@@ -22,10 +22,13 @@ NEGLIGIBLE = 1e-12
 
 
 class TrackScratch(NamedTuple):
-    """Scratch for k tracks beside the own one: ``spread`` and ``factor`` (k n, k n), the covariance
-    of their differences to it and its factor; ``cross`` and ``parts`` (n, k n), the covariance of
-    the own error with both; ``sizes`` (k n,) and ``order`` (k n,) of pivots; ``weights``
-    (n, (k + 1) n) of all errors, ``work`` (n, n).
+    """Scratch for k tracks beside a node's own one.
+
+    spread, factor : (k n, k n), covariance of their differences to it, and its factor
+    cross, parts : (n, k n), covariance of the own error with both
+    sizes, order : (k n,), pivots
+    weights : (n, (k + 1) n), of all errors
+    work : (n, n).
     """
 
     spread: FloatArray

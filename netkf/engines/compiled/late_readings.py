@@ -18,11 +18,15 @@ PAST = np.dtype(
 
 
 class History(Struct):
-    """The past of nodes, for the use of late readings: a pool ``past`` (P,) of things that
-    happened, each with the instant of the reading that was used or the number of the frame that
-    began (else -1), and the state right after it, ``x`` (P, n), ``root`` (P, n, n). ``newest`` (N,)
-    of each node; ``free`` (2,) the first free one and how many are; ``offsets`` (F, n) of frames;
-    they are kept for ``lag`` seconds.
+    """The past of N nodes, for late readings: a pool of P events.
+
+    past : (P,), each with the instant of the reading used or the number of the frame begun (else
+           -1)
+    x, root : state right after each event (P, n), (P, n, n)
+    newest : (N,), index of the newest event of each node
+    free : (2,), first free entry and number of free ones
+    offsets : (F, n), of frames
+    lag : seconds for which events are kept.
     """
 
     past: np.ndarray

@@ -24,11 +24,15 @@ TERMS = 18  # of the exponential, for a norm of at most 1/2
 
 
 class Totals(Struct):
-    """Of N nodes: ``weight`` (N,), the total ``sent`` (N, m), m = 1 + n n + n, to each receiver,
-    the time ``sent_at`` (N,) that it refers to, ``rounds`` and ``receivers`` (N,). Of W directed
-    links: the total ``heard`` last (W, m), its ``number`` (W,) (-1: none) and ``heard_at`` (W,).
-    Of messages: the totals ``offered`` (C, m). ``A`` (n, n) and ``forgetting`` of the plant;
-    scratch arrays for what is ``gained`` (m,), and for matrices (4, n, n).
+    """Running sums of N nodes on W directed links; m = 1 + n n + n numbers each.
+
+    weight : (N,)
+    sent, sent_at : totals (N, m) to each receiver, and the times (N,) that they refer to
+    rounds, receivers : (N,), numbers of broadcasts and of nodes that can hear
+    heard, number, heard_at : last total (W, m) heard, its number (W,) (-1: none) and its time
+    offered : totals (C, m) of messages under way
+    A, forgetting : of the plant (n, n), and the rate at which old information fades
+    gained, scratch : (m,) and (4, n, n).
     """
 
     weight: FloatArray

@@ -40,10 +40,14 @@ LOST = -1.0  # no delay is negative
 
 
 class Window(NamedTuple):
-    """Ticks before ``end`` in the order of (time, entity): ``t`` (K,), ``entity`` (K,) indices
-    among the senders' entities; the outcomes of what tick k sends are ``delay`` from ``at[k]`` on,
-    in the order of its directed links: seconds, or LOST. Where no message takes time it may say
-    instead which ones are ``heard`` (K,), a bit for each.
+    """All ticks before ``end``, in the order of (time, entity).
+
+    end : seconds
+    t, entity : (K,), time and index of the entity among the senders'
+    at, delay : the outcomes of tick k begin at ``delay[at[k]]``, in the order of its directed
+                links: seconds or LOST
+    heard : (K,), where no message takes time instead of ``delay``: a bit for each message that
+            arrives.
     """
 
     end: float

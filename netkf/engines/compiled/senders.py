@@ -14,10 +14,14 @@ from netkf.scenario.scenario import Scenario
 
 
 class Senders(NamedTuple):
-    """E ``entities`` with a clock (``at`` "readings": nodes) and all directed links, ``ways`` (W,),
-    in the order in which simultaneous messages arrive. Entity e sends on the ways ``hearing`` from
-    ``first[e]`` up to ``first[e + 1]``. The outcomes of way w are those of stream ``source[w]``,
-    named by ``sources``; where ways share one, a tick draws it once.
+    """Which clock makes which node send on which directed links.
+
+    at : kind of clock: "links", "directions", "nodes" or "readings"
+    entities : the E entities with a clock; nodes for "readings"
+    ways : the W directed links, in the order in which simultaneous messages arrive
+    first, hearing : entity e sends on the ways ``hearing[first[e]:first[e + 1]]``
+    sources, source : streams of outcomes, and the index (W,) of that of each way; ways that share a
+                      stream share a draw at each tick.
     """
 
     at: str

@@ -36,10 +36,14 @@ NAN = np.nan
 
 
 class Matchings(NamedTuple):
-    """How pairs are drawn: index of the ``protocol`` in PROTOCOLS (-1: all links exchange), its
-    ``chance`` (lazy or p), streams ``states`` (R, 6); ``first`` and ``members`` list for
-    node-wakeup the links of each node in the order of its peers, for uniform-maximal the links of
-    each matching. ``order`` (L,) and ``busy`` (N,) are scratch.
+    """How pairs are drawn.
+
+    protocol : index in PROTOCOLS, -1: all links exchange
+    chance : lazy or p
+    states : random streams (R, 6)
+    first, members : for node-wakeup the links of each node in the order of its peers, for
+                     uniform-maximal the links of each matching
+    order, busy : (L,) and (N,), scratch.
     """
 
     protocol: int
@@ -305,9 +309,12 @@ def draw_uniforms(states: np.ndarray, sent: np.ndarray, uniform: FloatArray) -> 
 
 
 class Stages(NamedTuple):
-    """What a slot does in its order: the ``step`` of an exchange or -1 where nodes read, its
-    ``phase``, and when it ends (seconds after the slot begins), (K,) each; the step in which nodes
-    may stop for good (``stopping``, -1: in none).
+    """What happens in a slot, K stages in order.
+
+    step : (K,), step of an exchange, -1 where nodes read
+    phase : (K,)
+    end : (K,), seconds after the slot begins
+    stopping : step in which nodes may stop for good, -1: none.
     """
 
     step: np.ndarray
@@ -317,8 +324,12 @@ class Stages(NamedTuple):
 
 
 class SlotTimes(NamedTuple):
-    """Of S slots: number of the first and when each begins (S,); whether events are recorded, nodes
-    read, nodes exchange, and which sample it is, or -1 (S, each). ``predicts``: samples come first.
+    """When S slots begin and what happens in them.
+
+    first, start : number of the first slot, and the times (S,)
+    noted, sensed, exchanged : (S,), whether events are recorded, nodes read, nodes exchange
+    sample : (S,), index of the sample, -1: none
+    predicts : whether samples come first in a slot.
     """
 
     first: int
@@ -331,9 +342,12 @@ class SlotTimes(NamedTuple):
 
 
 class Hearing(NamedTuple):
-    """Ids of all nodes (N,) and of those with sensors; the directions by receiver, as
-    algorithms.kernels.slots.SlotLinks has them; the number of messages sent so far (W,) by a
-    recorded run; the slot in which each node stopped (B, N, L).
+    """Nodes and links of a recorded run.
+
+    nodes, sensing : ids of all nodes (N,) and of those with sensors
+    first, sender, way : directions by receiver, see ``SlotLinks``
+    sent : number of messages so far (W,)
+    stopped : slot in which each node stopped (B, N, L).
     """
 
     nodes: np.ndarray
@@ -359,9 +373,11 @@ class Rows(NamedTuple):
 
 
 class Drawn(NamedTuple):
-    """Messages of S slots: ``up`` (B, S, E, W, L), links ``active`` in matchings (R, S, E, A), and
-    their number ``pairs`` (R, S, E); who sends, ``sent`` (B, S, E, N, L), empty where filters do
-    not decide that.
+    """Messages of S slots with E steps each.
+
+    up : (B, S, E, W, L), whether a message arrives
+    active, pairs : paired links (R, S, E, A) and their number (R, S, E)
+    sent : who sends (B, S, E, N, L), empty where filters do not decide that.
     """
 
     up: np.ndarray
@@ -371,8 +387,11 @@ class Drawn(NamedTuple):
 
 
 class Moment(NamedTuple):
-    """The circumstances of events: the ``slot`` by number and by index ``s`` in the block, ``step``
-    and ``phase`` of the exchange (-1 where nodes read), the time ``t`` in seconds.
+    """The circumstances of events.
+
+    slot, s : number of the slot, and its index in the block
+    step, phase : of the exchange, -1 where nodes read
+    t : seconds.
     """
 
     slot: int

@@ -62,8 +62,11 @@ NEVER = np.iinfo(np.int64).max
 
 
 class SampledStates(NamedTuple):
-    """Samples of R runs in the coordinates of the plant: x (R, T, n), xhat (R, T, H, n), P
-    (R, T, H, n, n), and errors (R, T, H, n).
+    """Samples of R runs in the coordinates of the plant.
+
+    x : (R, T, n)
+    xhat, error : (R, T, H, n)
+    P : (R, T, H, n, n).
     """
 
     x: FloatArray

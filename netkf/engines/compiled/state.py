@@ -79,10 +79,13 @@ class Gains(Struct):
 
 
 class Scratch(Struct):
-    """Scratch arrays: moments (2 p,), noise ``early`` and normals of a ``cut`` (2, p) for the most
-    increments p of any node, moments of x (``state_moments``) and their ``total`` (2, n),
-    ``values`` of the longest series; a sample of at most q rows: ``y`` (q,), ``H`` (q, n),
-    ``root_R`` (q, q).
+    """Scratch arrays; p: most increment rows of a node, q: most rows of a sample.
+
+    moments : (2 p,)
+    early, cut : (2, p), noise of a part of a step, and normals for it
+    state_moments, total : (2, n), moments of x and their sum
+    values : of the longest series
+    y, H, root_R : (q,), (q, n), (q, q), a sample.
     """
 
     moments: FloatArray
@@ -97,11 +100,15 @@ class Scratch(Struct):
 
 
 class Sensing(Struct):
-    """S increment sensors of R runs: rows p (S,), H (S, p, n), root of R (S, p, p); noise of the
-    steps (R, S, steps, 2, p), the ``rest`` of that of the present step (R S, 2, p) and which step
-    that is (R S,); the streams ``cuts`` (R S, 4) of normals for parts of a step, with numpy's table
-    for these (height, width, inside). Sensors of one ``kind`` (S,) have the same H and R. ``host``
-    and ``node`` (K,) say who wakes at a grid point, in their order.
+    """S increment sensors of R runs.
+
+    rows, kind : (S,), number of rows; sensors of one kind have the same H and R
+    H, root : (S, p, n) and the root of R (S, p, p)
+    noise : of the steps (R, S, steps, 2, p)
+    rest, step : noise left of the present step (R S, 2, p), and its number (R S,)
+    cuts : streams (R S, 4) of normals for parts of a step
+    height, width, inside : numpy's ziggurat table for these
+    host, node : (K,), index and id of the nodes that wake at a grid point, in order.
     """
 
     rows: IntArray
@@ -120,10 +127,14 @@ class Sensing(Struct):
 
 
 class Instants(Struct):
-    """K instants at which a node has samples, in order: ``t`` (K,), ``host`` (K,), its samples from
-    ``first[k]`` up to ``first[k + 1]``. Of each of S samples: the ``node`` that took it, ``y``
-    (S, p), the indices ``sensor`` and ``matrix`` (S,) of its noise and its H. Those are ``rows``
-    (L,), ``root`` (L, p, p) of R and ``H`` (M, p, n).
+    """K instants at which a node has samples, S samples in all.
+
+    t, host : (K,), time and index of the node
+    first : (K + 1,), samples of instant k begin at ``first[k]``
+    node, y : (S,) and (S, p), of each sample
+    sensor, matrix : (S,), index of its noise and of its H
+    rows, root : (L,) and the root of R (L, p, p), by sensor
+    H : (M, p, n), by matrix.
     """
 
     t: FloatArray
@@ -178,10 +189,14 @@ class TickArrays(Struct):
 
 
 class SampleBuffer(Struct):
-    """Space for B samples of all N nodes in R runs: xhat (R, B, N, n), P (R, B, N, n, n), how many
-    ``rows`` (R, B) or events by kind (R, B, len(KINDS)) came before, in which ``piece`` (R, B) of
-    the path each is, and ``terms`` (B, T) of sums that are conserved, of one run. They are handed
-    on many at a time, since a call of the loop costs more than a sample.
+    """Space for B samples of all N nodes in R runs.
+
+    They are handed on many at a time, since a call of the loop costs more than a sample.
+
+    xhat, P : (R, B, N, n) and (R, B, N, n, n)
+    rows, counts : rows (R, B) of events, or events by kind (R, B, len(KINDS)), before each sample
+    piece : piece (R, B) of the path that each sample is in
+    terms : (B, T), terms of conserved sums, of one run.
     """
 
     xhat: FloatArray
