@@ -23,11 +23,11 @@ from netkf.algorithms.kernels.beliefs import (
     clear_part,
     copy_part,
     gather_evidence,
-    move_part,
+    predict_part,
     receive_evidence,
     recentre_part,
-    take_one_prior,
-    take_prior,
+    write_prior,
+    write_prior_single,
 )
 from netkf.algorithms.kernels.constant_gains import fill_inverse_transition
 from netkf.algorithms.kernels.information import add_reading_pair
@@ -179,16 +179,16 @@ def predict_beliefs(nodes: SlotNodes, scratch: SlotScratch, arrays: BeliefArrays
     for h in range(len(nodes.rows)):
         if arrays.keeps:
             predict_mean(nodes, scratch, b, h)
-            move_part(lanes, arrays.prior[k, h], arrays.back, room.total, room.work)
-            move_part(lanes, arrays.own[k, h], arrays.back, room.total, room.work)
+            predict_part(lanes, arrays.prior[k, h], arrays.back, room.total, room.work)
+            predict_part(lanes, arrays.own[k, h], arrays.back, room.total, room.work)
         else:
-            take_prior(lanes, nodes.root, b, h, arrays.prior[k, h])
+            write_prior(lanes, nodes.root, b, h, arrays.prior[k, h])
             clear_part(lanes, arrays.own[k, h])
         for i in range(nodes.xhat.shape[2]):
             store(lanes, scratch.xhat, h, i, load(lanes, nodes.xhat, b, h, i))
     for m in range(arrays.received.shape[1]):
         if arrays.keeps:
-            move_part(lanes, arrays.received[k, m], arrays.back, room.total, room.work)
+            predict_part(lanes, arrays.received[k, m], arrays.back, room.total, room.work)
         else:
             clear_part(lanes, arrays.received[k, m])
 
@@ -237,11 +237,11 @@ def add_reading_single(
 
 
 @kernel
-def move_part_single(
+def predict_part_single(
     part: FloatArray, back: FloatArray, total: FloatArray, work: FloatArray
 ) -> None:
-    """Apply ``move_part`` to one piece of evidence (n, n + 1, 1) with one lane."""
-    move_part(ONE, part, back, total, work)
+    """Apply ``predict_part`` to one piece of evidence (n, n + 1, 1) with one lane."""
+    predict_part(ONE, part, back, total, work)
 
 
 @kernel
@@ -421,7 +421,7 @@ def evidence_of(root: FloatArray) -> FloatArray:
     """Return an estimate with the root (n, n) of its covariance as evidence that counts from it."""
     n = len(root)
     part = np.zeros((n, n + 1, 1))
-    take_one_prior(np.array(root).reshape(1, 1, n, n, 1), 0, part)
+    write_prior_single(np.array(root).reshape(1, 1, n, n, 1), 0, part)
     return np.ascontiguousarray(part[..., 0])
 
 
@@ -456,7 +456,7 @@ def predict_evidence(evidence: FloatArray, back: FloatArray) -> FloatArray:
     """Return evidence about a later state, from which ``back`` (n, n) leads to the earlier one."""
     moved = np.array(evidence)[..., None]
     back = np.ascontiguousarray(back)
-    move_part_single(moved, back, np.empty(moved.shape), np.empty(moved.shape))
+    predict_part_single(moved, back, np.empty(moved.shape), np.empty(moved.shape))
     return np.ascontiguousarray(moved[..., 0])
 
 

@@ -24,12 +24,12 @@ from netkf.algorithms.kernels.slots import (
     SlotPlan,
     SlotSamples,
     SlotScratch,
+    drop_silent,
     predict_all,
     predict_root,
     read_all,
     rebase,
     show,
-    take_silent,
     transform_mean,
 )
 from netkf.algorithms.kernels.triggers import is_near
@@ -126,7 +126,7 @@ def triggered_ci_slots(
             if plan.part != ARRIVING and plan.exchanged[s]:
                 for h in range(len(nodes.rows)):
                     decide_estimate(nodes, plan, links, scratch, arrays, b, s, h)
-                take_silent(plan, links, b, s, 0)
+                drop_silent(plan, links, b, s, 0)
             if plan.part != SENDING:
                 if plan.exchanged[s]:
                     for h in range(len(nodes.rows)):

@@ -63,11 +63,11 @@ def swap_pairs(
             heard = load_flags(lanes, plan.up, b, s, 0, links.way[m])
             # Most links are idle in a matching of a single run.
             if any_lane(heard):
-                take_pair(nodes, scratch, b, h, links.sender[m], heard)
+                copy_pair(nodes, scratch, b, h, links.sender[m], heard)
 
 
 @kernel(inlined=True)
-def take_pair(
+def copy_pair(
     nodes: SlotNodes, scratch: SlotScratch, b: int, h: int, sender: int, heard: Any
 ) -> None:
     """Copy what ``sender`` sent to filter ``h`` in the lanes that ``heard`` it."""

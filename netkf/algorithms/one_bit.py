@@ -23,11 +23,11 @@ from netkf.algorithms.kernels.slots import (
     SlotSamples,
     SlotScratch,
     block_of_reading,
+    drop_silent,
     predict_all,
     rebase,
     rotate_lanes,
     show,
-    take_silent,
     whiten_reading,
 )
 from netkf.algorithms.models import first_root
@@ -104,7 +104,7 @@ def one_bit_slots(
             turn = (plan.first + s) % len(nodes.rows)
             if plan.exchanged[s] and plan.part != ARRIVING:
                 silence_others(plan, readings, nodes.rows, turn, b, s)
-                take_silent(plan, links, b, s, 0)
+                drop_silent(plan, links, b, s, 0)
             if plan.part == SENDING:
                 continue
             if plan.sensed[s]:

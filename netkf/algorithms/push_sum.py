@@ -36,13 +36,13 @@ from netkf.algorithms.kernels.slots import (
     SlotPlan,
     SlotSamples,
     SlotScratch,
+    drop_silent,
     predict_all,
     predict_mean,
     rebase,
     show,
     slot_scratch,
     star_of,
-    take_silent,
     whiten_reading,
 )
 from netkf.algorithms.kernels.stopping import NEVER, PAPER, RULES, has_stopped
@@ -191,7 +191,7 @@ def push_sum_slots(
             decides = arrays.rule == PAPER and not arrays.asymptotic
             if decides and plan.exchanged[s] and plan.part != ARRIVING:
                 silence_stopped(plan, samples, b, s)
-                take_silent(plan, links, b, s, MASS)
+                drop_silent(plan, links, b, s, MASS)
             if plan.part == SENDING:
                 continue
             # Step 3: with asymptotic gains the covariance is the limit, and only the mean is
@@ -256,7 +256,7 @@ def exchange_mass(
         for q in range(len(scratch.lanes)):
             arrays.silent[q] = samples.stopped[b, h, q] < slot
         if arrays.running:
-            hear_totals(arrays, plan, links, scratch, b, s, h)
+            receive_totals(arrays, plan, links, scratch, b, s, h)
             # Without a stop rule nobody asks how many shares came.
             learn(arrays, samples, scratch, b, h, spread(scratch.lanes, 0.0), slot)
         else:
@@ -290,7 +290,7 @@ def add_to_totals(arrays: PushSumArrays, scratch: SlotScratch, b: int) -> None:
 
 
 @kernel
-def hear_totals(
+def receive_totals(
     arrays: PushSumArrays,
     plan: SlotPlan,
     links: SlotLinks,

@@ -26,11 +26,11 @@ from netkf.algorithms.kernels.slots import (
     SlotSamples,
     SlotScratch,
     block_of_reading,
+    drop_silent,
     predict_all,
     rebase,
     rotate_lanes,
     show,
-    take_silent,
     transform_mean,
     update_by_reading,
     whiten_reading,
@@ -170,7 +170,7 @@ def scheduled_slots(
             if plan.part != ARRIVING and plan.exchanged[s]:
                 for h in range(len(nodes.rows)):
                     schedule_reading(nodes, readings, plan, links, scratch, arrays, b, s, h)
-                take_silent(plan, links, b, s, 0)
+                drop_silent(plan, links, b, s, 0)
             if plan.part != SENDING:
                 if plan.exchanged[s]:
                     for h in range(len(nodes.rows)):
@@ -495,7 +495,7 @@ def trigger_plan(inner: Filter) -> TriggerPlan | None:
 
 
 @kernel
-def judge_slot(
+def decide_senders(
     nodes: SlotNodes,
     readings: ReadingBlock,
     plan: SlotPlan,
@@ -514,7 +514,7 @@ def judge_slot(
         for e in range(order.first, plan.sent.shape[2]):
             decide_step(plan, arrays, b, s, e)
         for e in range(plan.sent.shape[2]):
-            take_silent(plan, links, b, s, e)
+            drop_silent(plan, links, b, s, e)
 
 
 @kernel
@@ -602,7 +602,7 @@ class TriggeredSlots:
         for s in range(plan.up.shape[1]):
             asked = plan.sent[:, s : s + 1].copy()
             if plan.part != ARRIVING:
-                judge_slot(carried, readings, plan, links, scratch, arrays, self._order, s)
+                decide_senders(carried, readings, plan, links, scratch, arrays, self._order, s)
             if plan.part == SENDING and not self._decides:
                 continue
             here, one, slot_samples = slot_alone(readings, plan, samples, s)

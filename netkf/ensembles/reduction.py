@@ -337,7 +337,7 @@ def merge_whole(lanes: Lanes, scratch: ReductionScratch, count: int, node: int) 
 
 
 @kernel
-def take_lines(
+def gather_samples(
     lanes: Lanes,
     samples: FloatArray,
     first: int,
@@ -374,21 +374,21 @@ def reduce_group(
     """
     filters, n = b.error.shape[2:]
     each, whole, kept, totals, averages = filters * n, True, b.kept, scratch.totals, sums.averages
-    take_lines(
+    gather_samples(
         lanes, b.error_rows, first, active, t * each, count * each, scratch.lines, scratch.error
     )
-    take_lines(
+    gather_samples(
         lanes, b.P_rows, first, active, t * each * n, count * each * n, scratch.lines, scratch.P
     )
     if not b.exact:
-        take_lines(lanes, b.x_rows, first, active, t * n, count * n, scratch.lines, scratch.x)
+        gather_samples(lanes, b.x_rows, first, active, t * n, count * n, scratch.lines, scratch.x)
     for q in range(active):
         whole = whole and t + count <= kept[first + q]
         for f in range(filters):
             for a in range(3):
                 totals[f, a, q] = averages[first + q, f, a]
     for s in range(count):
-        find_blur(lanes, b, sums, scratch, first, active, t + s, s)
+        mark_blurred(lanes, b, sums, scratch, first, active, t + s, s)
         mark_averaged(b, sums, scratch, first, active, t + s)
         for f in range(filters):
             reduce_sample(lanes, b, sums, scratch, first, active, t + s, s, f)
@@ -543,7 +543,7 @@ def nees_of_lanes(lanes: Lanes, scratch: ReductionScratch) -> Any:
 
 
 @kernel(inlined=True)
-def find_blur(
+def mark_blurred(
     lanes: Lanes,
     b: Batch,
     sums: Sums,

@@ -202,7 +202,7 @@ def _startup_claim(worst: Worst, later: Worst, start: StartUp) -> str:
 
 
 def _judge_error(source: Opened, run: StoredRun, worst: Worst) -> list[str]:
-    """Return if P allows the error of a sample that was chosen because it is large."""
+    """Return a sentence: whether P allows the error of a sample that was chosen for its size."""
     k, at = run.nodes.index(worst.node), int(np.searchsorted(run.times, worst.time))
     nees, n = float(run.nees[at, k]), run.x.shape[1]
     if not math.isfinite(nees):

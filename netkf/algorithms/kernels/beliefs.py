@@ -80,7 +80,7 @@ def recentre_part(
 
 
 @kernel
-def move_part(
+def predict_part(
     lanes: Lanes, part: FloatArray, back: FloatArray, total: FloatArray, work: FloatArray
 ) -> None:
     """Turn evidence into that about a later state, from which ``back`` (n, n) leads to the earlier
@@ -102,7 +102,7 @@ def move_part(
 
 
 @kernel
-def take_prior(lanes: Lanes, root: FloatArray, b: int, h: int, part: FloatArray) -> None:
+def write_prior(lanes: Lanes, root: FloatArray, b: int, h: int, part: FloatArray) -> None:
     """Write an estimate with the regular ``root[b, h]`` as evidence that counts from itself."""
     n = len(part)
     for i in range(n):
@@ -118,9 +118,9 @@ def take_prior(lanes: Lanes, root: FloatArray, b: int, h: int, part: FloatArray)
 
 
 @kernel
-def take_one_prior(roots: FloatArray, h: int, part: FloatArray) -> None:
-    """Apply ``take_prior`` to one of the ``roots`` (1, H, n, n, 1) with one lane."""
-    take_prior(ONE, roots, 0, h, part)
+def write_prior_single(roots: FloatArray, h: int, part: FloatArray) -> None:
+    """Apply ``write_prior`` to one of the ``roots`` (1, H, n, n, 1) with one lane."""
+    write_prior(ONE, roots, 0, h, part)
 
 
 @kernel

@@ -29,7 +29,9 @@ from netkf.linalg.lanes import (
 
 
 @kernel(inlined=True)
-def take_inverse(lanes: Lanes, out: FloatArray, share: float, inverse: FloatArray, h: int) -> None:
+def write_information(
+    lanes: Lanes, out: FloatArray, share: float, inverse: FloatArray, h: int
+) -> None:
     """Write the root of ``share`` times ``P^-1`` of node ``h``, whose root S has the inverse
     ``inverse[h]``, into ``out`` (n, n + 1, L); the centre is the node's estimate.
     """
@@ -100,7 +102,7 @@ def weigh_part(
 
 
 @kernel(inlined=True)
-def keep_part(
+def store_part(
     lanes: Lanes, parts: FloatArray, index: tuple[int, int, int], total: FloatArray
 ) -> None:
     """Copy ``total`` (n, n + 1, L) to ``index`` [t, k, h] of ``parts``."""
@@ -130,10 +132,10 @@ def begin_part(
     """Begin part ``k`` of the node of ``index`` [b, s, h]: ``shares[k]`` (2,) times the information
     of its prediction and of its reading.
     """
-    take_inverse(lanes, total, shares[k, 0], inverse, index[2])
+    write_information(lanes, total, shares[k, 0], inverse, index[2])
     if shares[k, 1] > 0.0:
         add_reading_pair(lanes, total, shares[k, 1], y, H, index, rows, centre, work)
-    keep_part(lanes, parts, (0, k, index[2]), total)
+    store_part(lanes, parts, (0, k, index[2]), total)
 
 
 @kernel
@@ -169,7 +171,7 @@ def mix_parts(
                 weight = select(arrived, links.weight[m], 0.0)
                 weigh_part(lanes, work, weight, parts, (t, k, links.sender[m]), centre, h)
                 merge_lanes(lanes, total, work)
-        keep_part(lanes, parts, (1 - t, k, h), total)
+        store_part(lanes, parts, (1 - t, k, h), total)
 
 
 @kernel
@@ -191,7 +193,7 @@ def read_off(
     times its pairs after the steps, ``parts[t]``, and its prediction.
     """
     K = parts.shape[1]
-    take_inverse(lanes, total, float(counts[K]), inverse, h)
+    write_information(lanes, total, float(counts[K]), inverse, h)
     for k in range(K):
         weigh_part(lanes, work, spread(lanes, counts[k]), parts, (t, k, h), centre, h)
         merge_lanes(lanes, total, work)

@@ -82,7 +82,7 @@ class SlotPlan(NamedTuple):
 
     The rest is for filters whose nodes may be silent (``Filter.decides_in_slots``). ``sent``
     (B, S, E, H, L) is 1 where a node is asked for a message; their kernel writes 0 where it sends
-    none, and takes those out of ``up`` (``take_silent``). ``uniform`` (B, S, E, H, L): the number
+    none, and takes those out of ``up`` (``drop_silent``). ``uniform`` (B, S, E, H, L): the number
     that a ``randomised`` filter is given when it is asked. Of other filters both are empty.
 
     Where messages are made one by one, who sends must be known before anything arrives. A kernel is
@@ -254,7 +254,7 @@ def hand_out(lanes: Lanes, lines: FloatArray, samples: FloatArray, indices: np.n
 
 
 @kernel
-def take_silent(plan: SlotPlan, links: SlotLinks, b: int, s: int, e: int) -> None:
+def drop_silent(plan: SlotPlan, links: SlotLinks, b: int, s: int, e: int) -> None:
     """Take the messages of nodes that send none in a step out of ``up``."""
     for m in range(len(links.sender)):
         for q in range(plan.up.shape[4]):

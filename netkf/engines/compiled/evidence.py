@@ -11,9 +11,9 @@ import numpy as np
 from netkf.algorithms.kernels.beliefs import (
     add_part,
     copy_part,
-    move_part,
+    predict_part,
     recentre_part,
-    take_one_prior,
+    write_prior_single,
 )
 from netkf.algorithms.kernels.constant_gains import fill_inverse_transition
 from netkf.algorithms.kernels.information import add_reading_pair
@@ -65,7 +65,7 @@ def empty_evidence(state: Simulation, A: FloatArray, roots: FloatArray) -> Evide
     heard = np.lexsort((ways["sender"], ways["receiver"]))
     prior = np.zeros((N, *part))
     for h in range(N):
-        take_one_prior(roots, h, prior[h])
+        write_prior_single(roots, h, prior[h])
     return EvidenceArrays(
         prior=prior,
         own=np.zeros((N, *part)),
@@ -100,10 +100,10 @@ def move_evidence(evidence: EvidenceArrays, h: int, gap: float) -> None:
     """Let all evidence of node ``h`` speak about the state ``gap`` seconds later."""
     fill_inverse_transition(evidence.A, gap, evidence.maps)
     back, total, work = evidence.maps[0], evidence.total, evidence.work
-    move_part(ONE, evidence.prior[h], back, total, work)
-    move_part(ONE, evidence.own[h], back, total, work)
+    predict_part(ONE, evidence.prior[h], back, total, work)
+    predict_part(ONE, evidence.own[h], back, total, work)
     for k in range(evidence.first[h], evidence.first[h + 1]):
-        move_part(ONE, evidence.received[evidence.way[k]], back, total, work)
+        predict_part(ONE, evidence.received[evidence.way[k]], back, total, work)
 
 
 @kernel
@@ -176,7 +176,7 @@ def hear_evidence_now(state: Simulation, evidence: EvidenceArrays, h: int, now: 
         if evidence.sent_at[w] <= message.sent:
             if age > 0.0:
                 fill_inverse_transition(evidence.A, age, maps)
-                move_part(ONE, evidence.carried[m], maps[0], evidence.total, evidence.work)
+                predict_part(ONE, evidence.carried[m], maps[0], evidence.total, evidence.work)
             for i in range(state.xhat.shape[1]):
                 evidence.before[i, 0] = state.pool_x[m, i]
                 evidence.after[i, 0] = state.xhat[h, i]

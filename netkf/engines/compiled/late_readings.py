@@ -117,7 +117,7 @@ def copy_state(
 
 
 @kernel
-def take_past(history: History, time: float, instant: int, frame: int) -> int:
+def allocate_past(history: History, time: float, instant: int, frame: int) -> int:
     """Take an entry for an event at ``time`` from the free ones; return its index."""
     k = history.free[0]
     entry = history.past[k]
@@ -132,7 +132,7 @@ def remember(
     state: Simulation, history: History, h: int, time: float, instant: int, frame: int
 ) -> None:
     """Keep the state of node ``h`` after it used a reading, or a frame began."""
-    k = take_past(history, time, instant, frame)
+    k = allocate_past(history, time, instant, frame)
     # Each node has a list of its past, the newest first.
     history.past[k].before = history.newest[h]
     history.newest[h] = k
@@ -187,7 +187,7 @@ def use_late_reading(state: Simulation, history: History, h: int, instant: int, 
         past[k].before = again
         again, k = k, before
     # The late reading becomes an entry of its own at its place in time.
-    before, k = k, take_past(history, time, instant, -1)
+    before, k = k, allocate_past(history, time, instant, -1)
     past[k].before = before
     # Go forward again: predict from the entry before, use the reading or move the origin, and store
     # the state.
