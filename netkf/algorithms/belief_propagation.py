@@ -358,7 +358,7 @@ class BeliefPropagation(Filter):
         return compute_belief(state._replace(own=add_to_own_evidence(state, reading)))
 
     def emit(self, state: BeliefState, exchange: Exchange) -> tuple[BeliefState, Beliefs]:
-        """Send what was read and heard."""
+        """Send the evidence of the node's own readings and of its neighbours."""
         heard = tuple(one.evidence for one in state.received)
         return state, Beliefs(state.xhat, state.own, state.senders, heard)
 

@@ -10,8 +10,8 @@ from netkf.linalg.arrays import FloatArray
 
 
 def closed_loop(model: FlowModel, gain: FloatArray) -> FlowModel:
-    """Return the model by which P moves with constant gain L (n, p) over the increments of a model:
-    that of ``A - L H`` with the noise ``Q + L R L'``, and nothing to read.
+    """Return a model without readings whose P is that of a constant gain L (n, p) over increments:
+    drift ``A - L H``, noise ``Q + L R L'``.
     """
     noise, nothing = model.Q + gain @ model.R @ gain.T, model.H[:0]
     closed = np.ascontiguousarray(model.A - gain @ model.H)

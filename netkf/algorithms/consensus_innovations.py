@@ -456,7 +456,7 @@ class ConsensusInnovations(Filter):
     def slot_gains(
         self, states: Sequence[Any], arrays: tuple[Any, ...], first: int, count: int
     ) -> tuple[PseudoArrays]:
-        """Return the arrays with the gains of so many slots from ``first`` on."""
+        """Return the arrays with the gains of slots ``first`` to ``first + count - 1``."""
         rows, gains = gain_sequence(states[0].design).table(first, count)
         return (arrays[0]._replace(table_row=rows, gains=gains),)
 
@@ -506,7 +506,9 @@ class ConsensusInnovations(Filter):
     def absorb(
         self, state: PseudoState, messages: Sequence[Message], exchange: Exchange
     ) -> PseudoState:
-        """Correct the pseudo-state by what was heard and read, and the state by that."""
+        """Correct the pseudo-state by messages and the node's reading, and the state by the
+        pseudo-state.
+        """
         gains, order = state.gains, state.design.heard[state.node_index]
         senders = [order.index(message.payload.node_index) for message in messages]
         chosen = gains._replace(B=gains.B[senders])

@@ -138,7 +138,7 @@ def combine_senders(
     s: int,
     h: int,
 ) -> None:
-    """Intersect what filter ``h`` of a block has with what it hears, D (8) and (9)."""
+    """Intersect the estimate of filter ``h`` of a block with those that it hears, D (8) and (9)."""
     lanes, heard = scratch.lanes, spread(scratch.lanes, 0.0)
     for m in range(links.first[h], links.first[h + 1]):
         arrived = load_flags(lanes, plan.up, b, s, 0, links.way[m])

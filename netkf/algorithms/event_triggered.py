@@ -195,7 +195,7 @@ def decide_estimate(
     s: int,
     h: int,
 ) -> None:
-    """Decide if node ``h`` sends its estimate, and keep what it sends."""
+    """Decide whether node ``h`` sends its estimate, and keep a copy of the one that was sent."""
     lanes, copies = scratch.lanes, (arrays.x, arrays.root)
     own = len(links.sender) + h
     last = own + len(nodes.rows)
@@ -228,8 +228,8 @@ def combine_copies(
     s: int,
     h: int,
 ) -> None:
-    """Combine what filter ``h`` of a block has with what it hears, and with its copies of what
-    those sent before who are silent.
+    """Combine the estimate of filter ``h`` of a block with those that it hears, and with wider
+    copies of the last estimates of silent neighbours.
     """
     lanes, ways, n = scratch.lanes, len(links.sender), nodes.xhat.shape[2]
     own, heard = ways + h, spread(lanes, 0.0)

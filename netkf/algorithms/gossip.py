@@ -50,7 +50,9 @@ def gossip_slots(
 def swap_pairs(
     nodes: SlotNodes, plan: SlotPlan, links: SlotLinks, scratch: SlotScratch, b: int, s: int
 ) -> None:
-    """Put what each node hears in place of its own pair, of several the last sender's."""
+    """Replace the pair (xhat, P) of each node by the one that it hears; of several by the last
+    sender's.
+    """
     lanes, n = scratch.lanes, nodes.xhat.shape[2]
     # All payloads are from before the exchange.
     for h in range(len(nodes.rows)):

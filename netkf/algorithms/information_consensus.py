@@ -217,7 +217,7 @@ class InformationConsensus(Filter):
 
     @abstractmethod
     def recipe(self, nodes: int) -> Recipe:
-        """Return what is combined in a network of so many nodes."""
+        """Return the recipe of combinations for a network of N ``nodes``."""
 
     def exchange_steps(self, phase: int) -> int:
         """Return ``steps``."""

@@ -171,7 +171,7 @@ class Intermittent(Filter):
     def absorb(
         self, state: IntermittentState, messages: Sequence[Message], exchange: Exchange
     ) -> IntermittentState:
-        """Use all that is of now as it comes, and what is late as if it had come in time."""
+        """Use the readings of this instant, and late ones as if they had come in time."""
         for message in messages:
             reading: Reading = message.payload
             # In slots a message of the exchange is always of now.
@@ -195,7 +195,7 @@ class Intermittent(Filter):
         return state._replace(xhat=xhat)
 
     def shift_payload(self, payload: Reading, offset: FloatArray) -> Reading:
-        """Return the payload as it is: a reading keeps the coordinates of its time."""
+        """Return the payload unchanged: a reading keeps the coordinates of its time."""
         return payload
 
 

@@ -339,7 +339,7 @@ class OneBit(Filter):
     shift = Filter.shift  # signs of innovations do not depend on the origin
 
     def shift_payload(self, payload: Bits, offset: FloatArray) -> Bits:
-        """Return the payload as it is: bits have no coordinates."""
+        """Return the payload unchanged: bits have no coordinates."""
         return payload
 
 

@@ -221,8 +221,8 @@ def push_sum_slots(
 def keep_sums(
     arrays: PushSumArrays, links: SlotLinks, samples: SlotSamples, scratch: SlotScratch, b: int
 ) -> None:
-    """Write what the nodes hold of the sums over the network: the weight, to 1, and n~, to N; with
-    running sums also what is on its way to them.
+    """Write the conserved sums that the nodes hold: of the weight (exactly 1) and of n~ (exactly
+    N); with running sums also those under way.
     """
     for h in range(len(arrays.degree)):
         for k in range(2):
@@ -299,7 +299,7 @@ def receive_totals(
     s: int,
     h: int,
 ) -> None:
-    """Make the mass of node ``h`` what has grown of the totals that arrive, and its own share."""
+    """Set the mass of node ``h`` to the growth of the totals that arrive, plus its own share."""
     lanes, mass = scratch.lanes, arrays.mass
     for i in range(mass.shape[2]):
         store(lanes, mass, b, h, i, 0.0)
@@ -364,7 +364,7 @@ def learn(
     received: Any,
     slot: int,
 ) -> None:
-    """Apply P (6) to the mass of node ``h``, which ``received`` so many shares; note where it
+    """Apply P (6) to the mass of node ``h``, which ``received`` that many shares; record whether it
     stops.
     """
     lanes, found = scratch.lanes, arrays.found
@@ -791,7 +791,7 @@ class PushSum(Filter):
 
 
 def _heard_totals(state: PushSumState, sums: NodeSums, messages: Sequence[Message]) -> PushSumState:
-    """Return the state whose mass is its own share and what has grown of the totals it hears."""
+    """Return the state whose mass is its own share plus the growth of the totals it hears."""
     heard, nothing = dict(sums.heard), np.zeros(state.mass.shape)
     gained = [message.payload - heard.get(message.sender, nothing) for message in messages]
     heard |= {message.sender: message.payload for message in messages}
@@ -826,7 +826,7 @@ def correct_estimate(
 
 
 def share(mass: FloatArray, degree: int) -> FloatArray:
-    """Return what a node of ``degree`` neighbours sends to each: its mass / (degree + 1)."""
+    """Return the mass that a node of ``degree`` neighbours sends to each: mass / (degree + 1)."""
     part = np.empty(mass.shape)
     split_mass_single(mass.reshape(1, 1, -1, 1), degree, part.reshape(1, -1, 1))
     return part
@@ -844,9 +844,7 @@ def conserve_mass(mass: FloatArray, received: Sequence[FloatArray], degree: int)
 
 
 def network(mass: FloatArray, model: SlotModel) -> NetworkInformation:
-    """Return C~ / w and n~ / w, P (6), or what the node knows of itself while its weight is exactly
-    0.
-    """
+    """Return C~ / w and n~ / w, P (6), or the node's own values while its weight is exactly 0."""
     alone = model.information
     information, number = np.empty((*alone.shape, 1)), np.empty((1, 1))
     learn_network_single(mass.reshape(1, 1, -1, 1), alone[None], information, number)

@@ -133,7 +133,9 @@ def offer(state: RunningSums) -> tuple[RunningSums, Offer | None]:
 
 
 def absorb_totals(state: RunningSums, messages: Sequence[Message]) -> RunningSums:
-    """Gain what each total grew by since it was heard last; an older one brings nothing."""
+    """Add to the mass the growth of each total since it was last heard; an older total adds
+    nothing.
+    """
     gained, heard = np.zeros_like(state.sent), dict(state.heard)
     for message in messages:
         news: Offer = message.payload
@@ -169,8 +171,8 @@ def update_sums(state: RunningSums, reading: Reading) -> RunningSums:
 
 
 def weights(state: RunningSums) -> dict[str, list[float]]:
-    """Return the terms of the node's weight, with what it sent and what it heard: over all nodes
-    they come to what nodes hold and what is under way, N.
+    """Return the terms of the node's weight, plus the totals it sent, less those it heard: summed
+    over all nodes they are N.
     """
     heard = [-float(offer.total[0]) for offer in state.heard.values()]
     sent = [float(state.sent[0])] * state.receivers

@@ -69,7 +69,9 @@ NOWHERE = np.zeros(1, dtype=bool)
 
 
 def trigger_matrix(Y: float | FloatArray, rows: int) -> FloatArray:
-    """Return Y (p, p) for a reading of so many rows: a number is that times the identity."""
+    """Return Y (p, p) for a reading of p ``rows``; a number stands for that multiple of the
+    identity.
+    """
     return np.asarray(Y if isinstance(Y, np.ndarray) else Y * np.eye(rows))
 
 
@@ -350,7 +352,7 @@ class ScheduledReadings(Filter):
     def slot_arrays(
         self, states: Sequence[Any], infos: Sequence[NodeInfo], runs: int
     ) -> tuple[ScheduledArrays]:
-        """Return what nodes know of each other's sensors, nothing so far."""
+        """Return empty tables of the sensors that nodes know of each other."""
         models, blocks = [state.model for state in states], blocks_of(runs)
         (H, n), ways = (len(models), len(states[0].xhat)), sum(info.degree for info in infos)
         weights = whitened_triggers(models, self.Y)
@@ -744,7 +746,7 @@ class TriggeredMessages(Filter):
         return WrappedState(self.inner.update(state.inner, reading), news, state.begun)
 
     def emit(self, state: WrappedState, exchange: Exchange) -> tuple[WrappedState, Any]:
-        """Send what the filter sends, or nothing until the next reading."""
+        """Send the payload of the wrapped filter, or nothing until the next reading."""
         silent = state.silent
         if silent is None:
             # After the first reading a node sends in any case.
@@ -758,7 +760,7 @@ class TriggeredMessages(Filter):
     def absorb(
         self, state: WrappedState, messages: Sequence[Message], exchange: Exchange
     ) -> WrappedState:
-        """Use what was sent."""
+        """Absorb the messages as the wrapped filter does."""
         return state._replace(inner=self.inner.absorb(state.inner, messages, exchange))
 
     def estimate(self, state: WrappedState) -> tuple[FloatArray, FloatArray | None]:
@@ -774,7 +776,7 @@ class TriggeredMessages(Filter):
         return self.inner.stopped(state.inner)
 
     def conserved(self, state: WrappedState) -> Any:
-        """Return what the filter conserves."""
+        """Return the conserved quantities of the wrapped filter."""
         return self.inner.conserved(state.inner)
 
 

@@ -216,8 +216,8 @@ def _nearly_singular(P: FloatArray) -> np.ndarray:
 
 
 def _variance_floor(scenario: Scenario) -> float:
-    """Return the variance below which errors are rounding: of the start and of what the readings
-    leave.
+    """Return the variance below which errors are rounding, from the start and the steady
+    covariance.
     """
     information = float(np.linalg.norm(scenario.node_infos[0].information, 2))
     left = 1.0 / information if information > 0.0 else 0.0

@@ -30,7 +30,7 @@ def is_decided(rows: Sequence[Evidence]) -> bool:
 
 
 def next_runs(rows: Sequence[Evidence], runs: int, most: int) -> int:
-    """Return the number of runs at which to look again: what the slowest row needs."""
+    """Return the number of runs at which to look again, as the row that needs most of them asks."""
     needed = [row.needed for row in rows if row.verdict == UNDECIDED and row.needed is not None]
     wanted = MARGIN * max(needed, default=runs)
     growth = min(max(wanted, LEAST_GROWTH * runs), MOST_GROWTH * runs)

@@ -138,7 +138,9 @@ def _count_exchanges(samples: PushSumSamples) -> float:
 
 
 def _at_steady_state(samples: PushSumSamples, level: float) -> Finding:
-    """Compare P of every node at the end with P_inf, and with what the steps make of the links."""
+    """Compare P of every node at the end with P_inf, and with the P that the links of these runs
+    give.
+    """
     limit = push_sum_limits(with_promised_filter(samples.scenario)).P
     known = ~np.isnan(samples.runs.replayed[:, -1, 0, 0, 0])
     P, replayed = samples.runs.P[known, -1], samples.runs.replayed[known, -1]

@@ -100,7 +100,7 @@ def _describe_row(row: Evidence) -> str:
 
 
 def _describe_limits(row: Evidence) -> str:
-    """Return what a row tolerates and what it would have found, in brackets; or nothing."""
+    """Return the tolerance and the detectable error of a row in brackets, or an empty text."""
     found = [f"{row.tolerance:g} is tolerated"] if row.tolerance else []
     if row.detectable > 0.0:
         found.append(f"an error of {row.detectable:.2g} would have been seen")

@@ -50,8 +50,8 @@ class Interval(NamedTuple):
         return value - (self.value - self.low) / root, value + (self.high - self.value) / root
 
     def expected_high(self, factor: float) -> float:
-        """Return the upper limit of a distance with ``factor`` times the samples, if what is seen
-        of the distance is chance.
+        """Return the upper limit of a distance with ``factor`` times the samples, if the distance
+        found is chance.
         """
         value = self.value / math.sqrt(factor) if self.value > 0.0 else self.value
         return self.limits(value, factor)[1]
@@ -65,8 +65,8 @@ def detectable_shift(deviation: float, level: float) -> float:
 
 
 def student_interval(value: float, deviation: float, count: int, level: float) -> Interval:
-    """Return the interval of Student for an estimate whose standard deviation was estimated from so
-    many independent values.
+    """Return Student's interval for an estimate whose standard deviation comes from ``count``
+    independent values.
     """
 
     def limits(value: float, factor: float) -> tuple[float, float]:

@@ -123,7 +123,8 @@ def end_later(status: int, seconds: float, line: str = "") -> None:
 
 
 def end_process(status: int) -> NoReturn:
-    """Run what was registered with ``atexit`` and end the process without waiting for threads.
+    """Call the functions registered with ``atexit``, and end the process without waiting for
+    threads.
 
     A command has written everything by now. The interpreter's own way to end joins threads, and
     writes to closed streams once more.
@@ -141,9 +142,8 @@ def end_process(status: int) -> NoReturn:
 
 
 def open_missing_streams() -> None:
-    """Open the null device for standard streams that are closed.
-
-    Files would get their numbers otherwise, and what is printed would end in them.
+    """Open the null device for standard streams that are closed: files would get their numbers
+    otherwise, and printed text would end in files.
     """
     for number, flags in enumerate((os.O_RDONLY, os.O_WRONLY, os.O_WRONLY)):
         try:

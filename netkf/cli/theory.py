@@ -13,7 +13,7 @@ def _declare(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(options: argparse.Namespace) -> int:
-    """Print what is promised of a scenario; return the exit status."""
+    """Print the promises about a scenario; return the exit status."""
     scenario = load_scenario(options)
     # Afterwards: a scenario that is refused needs no theory, whose imports take half a second.
     from netkf.runs.failures import explain_failures

@@ -64,7 +64,7 @@ class Pool(ABC):
         return wait(futures, return_when=FIRST_COMPLETED).done
 
     def close(self, at_once: bool) -> None:  # noqa: B027 - most have nothing of their own
-        """Give back what is ours; ``at_once`` without waiting for blocks that are being done."""
+        """Release the workers; ``at_once`` without waiting for unfinished blocks."""
 
 
 class LocalPool(Pool):
@@ -91,7 +91,7 @@ class LocalPool(Pool):
         return self._size
 
     def _note_duration(self, job: Job, seconds: float) -> None:
-        """Take note of how long a block took, without what was compiled meanwhile."""
+        """Remember how long a block took, without the time of compilation."""
         # Blocks may be larger than was asked for: of several that take as long as one.
         if seconds < QUICK_SECONDS and len(job.replicas) >= self._size:
             self._size = min(2 * job.size, MAX_BLOCK_HERE)
@@ -256,7 +256,7 @@ class DaskPool(RemotePool):
 
 
 def _check_address(address: object) -> None:
-    """Raise ScenarioError for what is no address of a scheduler."""
+    """Raise ScenarioError unless the value can be the address of a scheduler."""
     plain = isinstance(address, str) and address.isprintable() and " " not in address
     if not (plain and 0 < len(str(address)) <= MAX_ADDRESS):
         raise ScenarioError("scheduler", "must be an address", address, "give tcp://HOST:PORT")
@@ -321,9 +321,10 @@ ANYWHERE = PoolOptions()
 
 
 def make_pool(blocks: int, options: PoolOptions = ANYWHERE, open_ended: bool = False) -> Pool:
-    """Return the pool that was asked for, for so many blocks. ``open_ended``: more jobs follow.
+    """Return the pool that the options ask for, for ``blocks`` blocks; ``open_ended`` if more jobs
+    follow.
 
-    Raises ScenarioError where two were asked for, or where one is of the wrong kind.
+    Raises ScenarioError if the options ask for two pools, or for one of the wrong kind.
     """
     workers, executor, scheduler = options.workers, options.executor, options.scheduler
     asked = {"workers": workers, "executor": executor, "scheduler": scheduler}

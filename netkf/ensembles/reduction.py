@@ -136,7 +136,7 @@ class ReductionScratch(Struct):
 
 
 def reduction_scratch(filters: int, n: int, largest: int) -> ReductionScratch:
-    """Return scratch for so many filters of n states, in pieces of at most so many runs."""
+    """Return scratch for ``filters`` filters of n states, in chunks of at most ``largest`` runs."""
     columns = filters * (n * (n + 1) + 1)
     times = max(1, TOGETHER // columns)
     # L entries are moved at a time, which goes beyond the last column.
@@ -145,7 +145,7 @@ def reduction_scratch(filters: int, n: int, largest: int) -> ReductionScratch:
     nodes, rows = (depth, wide, columns), (LANES, wide, columns)
 
     def in_lanes(numbers: int) -> FloatArray:
-        """Return aligned scratch with lanes for so many numbers of each chunk."""
+        """Return aligned scratch with lanes for ``numbers`` numbers of each chunk."""
         return np.asarray(aligned((wide * numbers + LANES, LANES)))
 
     return ReductionScratch(

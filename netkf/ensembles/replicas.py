@@ -137,7 +137,7 @@ def _gather(
 def _make_blocks(
     pool: Pool, job: Job, together: int | None, known: Mapping[int, Callable[[], Any]]
 ) -> Iterator[Job]:
-    """Yield the blocks that are not known, in order; the pool chooses sizes as it is asked."""
+    """Yield the blocks that are not known yet, in order; the pool chooses sizes as it is asked."""
     if job.size:
         for number in range(-(-job.stop // job.size)):
             if number not in known:

@@ -60,7 +60,7 @@ class FigureSet:
         return ("stability",) if self._sweep is not None else tuple(FIGURES)
 
     def draw(self, name: str) -> Picture:
-        """Return the figure of a name; raises ScenarioError if there is none of that name."""
+        """Return the figure of this name; raises ScenarioError for an unknown name."""
         if name not in self.names:
             hint = nearest(name, self.names)
             remedy = f"{hint}figures of it are {', '.join(self.names)}"

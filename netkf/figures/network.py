@@ -171,7 +171,7 @@ def _draw_links(axes: Any, subject: Subject, positions: Positions) -> None:
 def _draw_nodes(
     axes: Any, subject: Subject, positions: Positions, shades: Mapping[int, float]
 ) -> Any:
-    """Draw the nodes and return what a colour bar needs; white if the shade is unknown."""
+    """Draw the nodes, white if their shade is unknown; return the mappable of the colour bar."""
     finite = [value for value in shades.values() if math.isfinite(value)]
     low, high = (min(finite), max(finite)) if finite else (0.0, 1.0)
     dots = None

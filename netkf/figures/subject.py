@@ -157,7 +157,7 @@ class Subject:
         return ""
 
     def _departures(self, about: str) -> list[str]:
-        """Return sentences on how a run differs from what its paper assumes."""
+        """Return sentences on how a run differs from the assumptions of its paper."""
         notes = [(note, "nees" if "NEES" in note else "bound") for note in self.promised.notes]
         return [f"Note: {note}." for note, kind in notes if about in (kind, "both")]
 
@@ -202,7 +202,7 @@ def _of_run(run: Run) -> Subject:
 
 
 def subject_of_completed(scenario: Scenario, completed: CompletedRun) -> Subject:
-    """Return what is to be drawn of a run that was written to a directory just now."""
+    """Return the data to draw of a run that was written to a directory just now."""
     status = "diverged" if completed.samples.diverged else completed.status
     return subject_of_samples(
         scenario,
@@ -221,7 +221,7 @@ def subject_of_samples(
     summary: dict[str, Any],
     **others: Any,
 ) -> Subject:
-    """Return what is to be drawn of the samples of one run and its summary."""
+    """Return the data to draw of the samples of one run and its summary."""
     shape = len(sink.times), len(scenario.nodes)
     error, trace, nees, first = (
         np.array(values, dtype=np.float64).reshape(shape)
@@ -254,7 +254,7 @@ def _of_ensemble(ensemble: Ensemble) -> Subject:
 def subject_of_ensemble(
     scenario: Scenario, ensemble: Ensemble, promised: PromisedTraces
 ) -> Subject:
-    """Return what is to be drawn of an ensemble."""
+    """Return the data to draw of an ensemble."""
     diverged = "diverged" if ensemble.diverged else "complete"
     return Subject(
         scenario,

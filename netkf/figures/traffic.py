@@ -303,8 +303,8 @@ def delivery_figure(subject: Subject) -> Picture:
 def _draw_shares(
     axes: Any, subject: Subject, found: list[DirectedMessages], shares: FloatArray, ends: FloatArray
 ) -> int | None:
-    """Draw the directions in the order of their shares; return how many intervals miss what the
-    channel says, None if it says nothing.
+    """Draw the directions in the order of their shares; return how many intervals miss the stated
+    probability, None if none is stated.
     """
     order = np.argsort(shares, kind="stable")
     positions = np.arange(len(order))

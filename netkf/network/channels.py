@@ -423,7 +423,7 @@ def stream_purposes(channel: Channel) -> tuple[str, ...]:
 
 
 def draw_delays(delay: Delay, random: np.random.Generator, count: int) -> FloatArray:
-    """Return (count,) delays in seconds, equal to the results of that many ``delay.draw`` calls."""
+    """Return delays (count,) in seconds, equal to those of ``count`` calls of ``delay.draw``."""
     # By exact type: a subclass may override draw.
     if type(delay) is ExponentialDelay:
         return delay.mean * random.standard_exponential(count)

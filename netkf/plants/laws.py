@@ -62,8 +62,8 @@ class GridLaws:
         return known
 
     def responses(self, gap: float) -> FloatArray:
-        """Return the matrices (3, n, n) of what a state adds to the state ``gap`` later and to the
-        two moments.
+        """Return the matrices (3, n, n) that map a state to the state ``gap`` seconds later and to
+        the two moments.
         """
         values = [polynomial(series, gap) for series in (self.to_end, self.to_moments)]
         return np.concatenate(values).reshape(3, self.n, self.n)

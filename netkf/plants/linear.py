@@ -100,7 +100,7 @@ class Readings(Protocol):
         """Return H (p, n) of a slot not before the last one asked for."""
 
     def reading(self, slot: int, x: FloatArray) -> FloatArray:
-        """Return the reading (p,) of that slot, in which the state is x."""
+        """Return the reading (p,) of a slot whose state is x."""
 
     def several(self, slots: Sequence[int], x: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return readings (S, p) and matrices (S, p, n) of increasing slots; x is (S, n)."""

@@ -278,8 +278,8 @@ def add_response(
     run: int,
     row: int,
 ) -> None:
-    """Write what is ``given`` (3 n,) and, with a ``sign``, what the state x[run, row] adds to state
-    and moments.
+    """Write ``given`` (3 n,) plus ``sign`` times the response of state and moments to the state
+    x[run, row].
     """
     n = x.shape[2]
     for m in range(3):
@@ -479,7 +479,7 @@ class DiffusionPath:
         return step.x_end
 
     def _move_origin(self, gap: float) -> FloatArray:
-        """Return the origin (n,) of the present frame so many seconds after its start."""
+        """Return the origin (n,) of the present frame ``gap`` seconds after its start."""
         # An origin at 0 stays there.
         if self._moves is None or not self._origin.any():
             return self._origin

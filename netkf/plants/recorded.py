@@ -275,7 +275,7 @@ class RecordedSensor(Sensor):
         return by_slot(self.path, self._rows[node], period, f" of node {node}")
 
     def demand(self, period: float) -> None:
-        """Raise ScenarioError where the table does not fit slots of that ``period``."""
+        """Raise ScenarioError if the table does not fit slots of ``period`` seconds."""
         for node in self.nodes:
             self.table(node, period)
 
@@ -332,9 +332,7 @@ class RecordedReadings:
         self._H, self._table = H, table
 
     def matrix(self, slot: int) -> FloatArray:
-        """Return H (p, n) as the filters take it to be, or as it is recorded; zeros
-        without a row.
-        """
+        """Return H (p, n) as the filters believe it or as it is recorded; zeros without a row."""
         row = self._table.get(slot)
         if row is None:
             return np.zeros_like(self._H)

@@ -168,9 +168,7 @@ def _describe_start(run: StoredRun, worst: Worst) -> str:
 def _explain_worst(
     source: Opened, run: StoredRun, messages: np.ndarray, sample: WorstSample
 ) -> list[str]:
-    """Return what the worst node had heard by its worst instant after its start-up, and what its P
-    said.
-    """
+    """Return sentences on the worst sample after the start-up: what was heard, and P."""
     worst = sample.explained
     into = messages[messages["receiver"] == worst.node]
     found = []
@@ -224,7 +222,9 @@ def _judge_error(source: Opened, run: StoredRun, worst: Worst) -> list[str]:
 
 
 def _describe_heard(into: np.ndarray, worst: Worst, cut: float) -> str:
-    """Return when the node had last heard whom by ``cut`` seconds, and what was lost since."""
+    """Return a sentence: when the node had last heard whom by ``cut`` seconds, and the losses
+    since.
+    """
     links, missing = [], 0
     for sender in np.unique(into["sender"]).tolist():
         link = into[(into["sender"] == sender) & (into["sent"] <= cut)]
@@ -260,7 +260,7 @@ def _describe_arrivals(messages: np.ndarray, into: np.ndarray) -> str:
 
 
 def _describe_unusual(source: Opened, run: StoredRun, into: np.ndarray, worst: Worst) -> str:
-    """Return if the age of what the node had heard was unusual at its worst instant."""
+    """Return a sentence if the age of the node's information was unusual at its worst instant."""
     cuts = source.cuts(run.times)
     ages: FloatArray = information_age(into, (worst.node,), run.times, cuts)[:, 0]
     now = ages[int(np.searchsorted(run.times, worst.time))]
@@ -374,7 +374,7 @@ def _describe_sweep(source: Opened) -> list[str]:
 
 
 def _of_filters(found: StoredComparison) -> list[str]:
-    """Return which filter did best, what is certain of the others, and which could not run."""
+    """Return sentences: the best filter, certain differences, and filters that could not run."""
     ran = [row for row in found.rows if row.ran and math.isfinite(_rms_error(row).value)]
     if not ran:
         return ["No filter has a finite RMS error"]

@@ -100,7 +100,7 @@ def run_data(
 
 
 def thinning_rules(data: dict[str, Any]) -> list[str]:
-    """Return sentences that say what the page leaves out of a run; none if it has everything."""
+    """Return sentences on the parts of a run that the page leaves out, if any."""
     rules = []
     messages, totals = data["messages"], data["totals"]
     if messages["step"] > 1:

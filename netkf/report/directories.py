@@ -60,7 +60,7 @@ class Opened:
 
     @property
     def kind(self) -> str:
-        """Return what the directory holds: run, ensemble, sweep, filters or verdict."""
+        """Return the kind of the directory: run, ensemble, sweep, filters or verdict."""
         if self.sweep is not None:
             return "sweep"
         if self.filters is not None:

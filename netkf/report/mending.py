@@ -56,7 +56,7 @@ def _why_command(source: Opened, worst: Worst) -> str:
 
 
 def mending_claim(found: Explanation) -> str:
-    """Return a sentence that says what it would have taken."""
+    """Return a sentence on the messages that would have mended the worst sample."""
     was, best = found.what_ifs[0], found.what_ifs[-1]
     same = math.isclose(was.trace, best.trace, rel_tol=EQUAL_NUMBERS) or math.isnan(was.trace)
     if same and not abs(best.error - was.error) > EQUAL_NUMBERS * was.error:

@@ -140,7 +140,7 @@ def make_page(
 
 
 def _read_entry(directory: Path, replica: int | None, trust: bool) -> _Entry:
-    """Return what the page needs of a directory."""
+    """Return the contents of a directory, read for the page."""
     source = read_source(directory, replica, trust)
     none = np.empty(0, dtype=MESSAGE)
     if source.run is None:
@@ -228,7 +228,7 @@ def _assemble(
 
 
 def _page_header(entries: list[_Entry], comparison: Comparison | str | None) -> str:
-    """Return the head of the page: names, claims, and what the data say."""
+    """Return the head of the page: names, claims and notes on the data."""
     parts = []
     for letter, (source, messages, worst, readings) in zip("AB", entries, strict=False):
         mark = f"{letter}: " if len(entries) > 1 else ""

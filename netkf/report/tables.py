@@ -100,7 +100,9 @@ def _bound_notes(source: Opened) -> list[str]:
 
 
 def _limit_note(label: str) -> str:
-    """Return what the limit of the bound is, and why it is not the centralised covariance."""
+    """Return a sentence that defines the limit of the bound, and says why it is not the centralised
+    covariance.
+    """
     weights = "1/N" if label.startswith("limit S") else "their weights"
     return (
         f"{label}: what the bound of every node tends to as links tick ever faster. It solves the "

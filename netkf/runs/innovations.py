@@ -102,7 +102,7 @@ def _record_innovations(algorithm: Filter, noted: list[Any]) -> Filter:
 
 
 def _collect(run: Run, noted: list[Any], intervals: list[WhitenedInnovation]) -> Innovations:
-    """Return the innovations of what was noted, in the order of time."""
+    """Return the innovations of the recorded readings and intervals, in the order of time."""
     nodes, kept = _match_nodes(run, [one for one in noted if len(one[0].y)])
     whitened = [_whiten(*one) for one in kept] + [one.whitened for one in intervals]
     nis = np.array([float(v @ v) for v in whitened])
@@ -119,7 +119,7 @@ def _collect(run: Run, noted: list[Any], intervals: list[WhitenedInnovation]) ->
 
 
 def _match_nodes(run: Run, noted: list[Any]) -> tuple[np.ndarray, list[Any]]:
-    """Return the nodes of what was noted, -1 where a pooled filter reads for several at once."""
+    """Return the node of each recorded reading, -1 where a pooled filter reads for all."""
     senses = run.log[run.log["kind"] == CODES["sense"]][["t", "node"]]
     # A node with several sensors uses them together, and may have an event for each.
     first = np.ones(len(senses), dtype=bool)

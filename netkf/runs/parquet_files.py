@@ -282,7 +282,7 @@ class _Table:
                 publish(self._part, self._path)
 
     def discard(self) -> None:
-        """Remove what was written, unless the file is finished."""
+        """Remove the unfinished file."""
         if self._closed:
             return
         self._closed = True

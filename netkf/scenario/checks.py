@@ -92,7 +92,7 @@ def _check_times(scenario: DerivedScenario) -> None:
 
 
 def _check_entries(scenario: DerivedScenario, samples: float) -> None:
-    """Raise ScenarioError if so many samples of all nodes do not fit into the memory."""
+    """Raise ScenarioError if ``samples`` samples of all nodes do not fit into memory."""
     nodes, n = len(scenario.nodes), scenario.plant.n
     if samples * nodes * n * n > MAX_ENTRIES:
         raise ScenarioError(

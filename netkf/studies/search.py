@@ -338,7 +338,7 @@ def _advise_runs(probe: Probe, target: Target) -> str:
 def _describe_certainty(
     probes: tuple[Probe, ...], confidence: float, grows: bool, none_reached: bool
 ) -> str:
-    """Return how sure the answer is and what was assumed."""
+    """Return a sentence on the certainty of the answer and its assumptions."""
     if all(probe.runs == 0 for probe in probes):
         certainty = "computed, no simulation"
         if any(probe.target == NOT_SHOWN for probe in probes):

@@ -109,7 +109,9 @@ def size(
 
 
 def _describe_quantity(problem: SizingProblem, low: float, simulated: str) -> str:
-    """Return the description of what is simulated, after that of the bound that is tried first."""
+    """Return the description of the simulated quantity, after that of the bound that is tried
+    first.
+    """
     if problem.by != "both":
         return simulated
     bound = quantity_by_theory(problem.at(low), problem.target)[1]

@@ -115,7 +115,7 @@ def plan_sweep(
 def _simulate_points(
     plan: SweepPlan, options: PoolOptions, progress: Progress | None
 ) -> Iterator[Row]:
-    """Yield the row of each point as it is done."""
+    """Yield the row of each point when it is finished."""
     with shared_pool(plan.runs, options) as pool:
         for k, point in enumerate(plan.points):
             with explain_failures(point.scenario):
@@ -147,7 +147,7 @@ def _make_row(point: GridPoint, metrics: RunMetrics) -> Row:
 
 
 def _describe_status(scenario: Scenario, metrics: RunMetrics) -> str:
-    """Return what a reader must know of the runs: divergence and rounding."""
+    """Return a note on divergence and rounding for the table."""
     diverged = int(metrics.diverged.sum())
     status = f"{diverged} diverged" if diverged else "complete"
     blurred = float(metrics.rounding_from.min())

@@ -340,7 +340,7 @@ def _what_ifs(
 
 
 def _replay_notes(evidence: _Evidence) -> tuple[str, ...]:
-    """Return what a reader must know of the replays."""
+    """Return notes on the limits of the replays."""
     notes = []
     if not evidence.same_sends:
         notes.append(

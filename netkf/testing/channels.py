@@ -85,7 +85,7 @@ def table_entries(topology: Topology) -> dict[Link, float]:
 
 
 def _check_pure(watched: Watched, links: dict[Link, float]) -> None:
-    """Check that probabilities do not depend on what was asked before."""
+    """Check that probabilities do not depend on earlier calls."""
     asked = [(link, m, bad, p) for link, p in links.items() for m in MESSAGES for bad in (0, 1)]
     there, back = (
         {one: watched.part.delivery_probability(*one[:2], bool(one[2]), one[3]) for one in order}

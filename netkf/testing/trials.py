@@ -76,7 +76,7 @@ class Trial(ABC):
         return state
 
     def show(self, node: int, state: Any, after: str) -> None:
-        """Check what the node shows and keep it."""
+        """Check the node's estimate and keep it."""
         xhat, P = check_estimate(self.watched, state, len(self.system.M), after)
         size = float(np.abs(xhat).max())
         self._last[node] = CheckedEstimate(node, after, xhat - self.offset, P, size)

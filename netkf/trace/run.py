@@ -174,8 +174,10 @@ def rounding_from(times: FloatArray, x: FloatArray, P: FloatArray, e: FloatArray
 
 
 def carried_size(x: FloatArray, e: FloatArray, exact: bool) -> FloatArray:
-    """Return the size (T, n) of what a run computes with: states x (T, n), or with exact errors no
-    more than the largest of the errors e (T, N, n), which a node may have passed on to others.
+    """Return the magnitude (T, n) of the numbers that a run computes with.
+
+    These are the states x (T, n); with exact errors they are at most the largest of the errors e
+    (T, N, n), which a node may have passed on to others.
     """
     return np.abs(e).max(axis=1) if exact else np.abs(x)
 

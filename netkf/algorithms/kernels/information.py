@@ -54,8 +54,10 @@ def add_reading_pair(
     centre: FloatArray,
     work: FloatArray,
 ) -> None:
-    """Add ``share`` times the information ``H' H`` and ``H' y`` of a whitened reading of so many
-    ``rows``, at ``index`` [b, s, h] of y and H, to ``total`` (n, n + 1, L); ``work`` is scratch.
+    """Add ``share`` times the information ``H' H`` and ``H' y`` of a whitened reading to ``total``
+    (n, n + 1, L).
+
+    The reading has ``rows`` rows at ``index`` [b, s, h] of y and H; ``work`` is scratch.
     """
     b, s, h = index
     n, size = len(total), share**0.5

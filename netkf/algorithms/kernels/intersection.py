@@ -109,8 +109,10 @@ def finish_lanes(
     whitened: FloatArray,
     kept: Any,
 ) -> None:
-    """Write the intersection ``total`` (n, n + 1, L) into filter ``h`` of a block, but in the lanes
-    that are ``kept`` as they are; means count from ``centre[h]``.
+    """Write the intersection ``total`` (n, n + 1, L) into filter ``h`` of a block; means count from
+    ``centre[h]``.
+
+    Lanes that are ``kept`` stay unchanged.
     """
     # S = Z^-1: the total is lower triangular, so P = Z^-1 Z^-T has the lower root Z^-1.
     n = len(total)

@@ -158,9 +158,8 @@ def add_gain(
     seen: FloatArray,
     turned: FloatArray,
 ) -> None:
-    """Correct an estimate, P (8): add ``number`` times ``S S' H' (y - H x)`` to the estimate of a
-    filter, for its whitened reading ``y[b, s, h]`` of so many ``rows`` and its H; ``seen`` and
-    ``turned`` (n, L) are scratch.
+    """Correct an estimate, P (8): ``x += number S S' H' (y - H x)`` for the whitened reading ``y[b,
+    s, h]``, of ``rows`` rows, and its H; ``seen`` and ``turned`` (n, L) are scratch.
     """
     n = x.shape[2]
     # H that is fixed has one block and one slot.

@@ -51,8 +51,8 @@ def innovate(
     state: FloatArray,
     z: FloatArray,
 ) -> None:
-    """Write ``H' R^-1 (reading - H G^+ yhat)`` of the reading of slot ``s``, of so many whitened
-    ``rows``, into ``z`` (n, L); ``state`` (n, L) is scratch for ``G^+ yhat``.
+    """Write ``H' R^-1 (reading - H G^+ yhat)`` into ``z`` (n, L), for the reading of slot ``s``
+    with ``rows`` whitened rows; ``state`` (n, L) is scratch for ``G^+ yhat``.
     """
     n = len(inverse)
     # H that is fixed has one block and one slot.

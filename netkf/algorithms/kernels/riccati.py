@@ -142,7 +142,7 @@ def _doubling_tables(
 
 def _invert_extended(matrix: FloatArray) -> FloatArray:
     """Return the inverse in the precision of ``matrix``, by Newton's iteration from double; nan
-    where there is none, as after so many units of an unstable plant that nothing is left of them.
+    where it is singular, as when all modes of an unstable plant have been forgotten.
     """
     if not np.isfinite(matrix).all():
         return np.full_like(matrix, np.nan)

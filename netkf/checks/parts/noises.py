@@ -83,7 +83,7 @@ def _discretise(A: FloatArray, B: FloatArray, gap: float) -> tuple[FloatArray, F
 
 
 def plant_moments(scenario: Scenario, streams: Streams) -> NoiseMoments | None:
-    """Return the moments of what the steps of one path add; None without noise or path."""
+    """Return the moments of the noise of one path, step by step; None without noise or path."""
     law = path_law(scenario)
     if law is None or not len(law.white):
         return None

@@ -89,7 +89,7 @@ def empty_evidence(state: Simulation, A: FloatArray, roots: FloatArray) -> Evide
 
 
 def more_evidence(evidence: EvidenceArrays, capacity: int) -> None:
-    """Make space for what so many messages carry."""
+    """Enlarge the arrays of evidence under way to ``capacity`` messages."""
     grown = np.zeros((capacity, *evidence.carried.shape[1:]))
     grown[: len(evidence.carried)] = evidence.carried
     evidence.carried = grown

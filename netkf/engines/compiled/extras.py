@@ -87,7 +87,7 @@ class Extras(Struct):
 
 
 def extras_of(scenario: Scenario, state: Simulation) -> Extras | None:
-    """Return what the combination of a scenario needs besides, if anything."""
+    """Return the extra arrays that the filter's combination needs, None if it needs none."""
     if state.kind not in (BEST, INVERSE, GAINS, PREDICTIONS, BELIEFS):
         return None
     algorithm: Any = scenario.hosted

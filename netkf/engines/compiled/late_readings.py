@@ -141,7 +141,9 @@ def remember(
 
 @kernel
 def forget(history: History, h: int, since: float) -> None:
-    """Free all that no late reading can reach: what is before the last thing before ``since``."""
+    """Free the events of node ``h`` that no late reading can reach: all before the last one before
+    ``since``.
+    """
     past = history.past
     k = history.newest[h]
     # The last event before ``since`` stays: a late reading starts from its state.

@@ -19,8 +19,8 @@ def move_origin(
     k: int,
     offset: FloatArray,
 ) -> None:
-    """Add ``offset`` (n,) to all estimates at the time of frame ``k``, and to what is under way
-    what the plant makes of it since that was sent.
+    """Shift all estimates by ``offset`` (n,) at the time of frame ``k``, and messages under way by
+    the offset taken back to when they were sent.
     """
     now = float(state.frames[k])
     # Covariances stay: only means refer to an origin.

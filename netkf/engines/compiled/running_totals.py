@@ -193,7 +193,9 @@ def fill_inverse_root(out: FloatArray, root: FloatArray, h: int) -> None:
 
 @kernel
 def hear(state: Simulation, totals: Totals, h: int, now: float) -> None:
-    """Gain what each total grew by since it was heard last; an older one brings nothing."""
+    """Add to the mass of node ``h`` the growth of each total since it was last heard; an older
+    total adds nothing.
+    """
     gained, pool, heard, offered = totals.gained, state.pool, totals.heard, totals.offered
     # Two passes over the inbox: gains first, because nothing is remembered if the mass did not
     # grow.

@@ -64,8 +64,8 @@ class SampleTables:
         self._matrices: list[FloatArray] = []
 
     def read(self, states: FloatArray, times: FloatArray, after: float, until: float) -> None:
-        """Fill in what is read in (``after``, ``until``], where the states (T, n) are those at
-        ``times`` (T,).
+        """Fill in the samples taken in (``after``, ``until``], from the states (T, n) at ``times``
+        (T,).
         """
         given = self.instants
         for sensor in self._sensors:

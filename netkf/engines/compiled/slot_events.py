@@ -314,7 +314,7 @@ class SlotEvents:
                 self._inbox.setdefault(receiver, {})[sender] = (number, now - sent)
 
     def _end_step(self, step: Step, up: np.ndarray) -> None:
-        """End a step: what its inboxes hold has arrived."""
+        """End a step: messages in the inboxes count as used, in ``up``."""
         count = len(self._rows)
         # By receiver and sender, the order of the kernels and of SimPy.
         for node in sorted(self._inbox):

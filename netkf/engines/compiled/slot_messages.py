@@ -480,7 +480,9 @@ def _slot_rows(
 def _write_sends(
     c: Channels, h: Hearing, d: Drawn, rows: Rows, m: Moment, pairwise: bool, at: int
 ) -> int:
-    """Write what is sent in a step, after the tick of each pair or one round; return the row."""
+    """Write the messages sent in a step, after the tick of each pair or one round; return the next
+    row.
+    """
     if not pairwise:
         at = write_row(rows, m, ROUND, -1, -1, -1, NAN, at)
     links = d.pairs[0, m.s, m.step] if pairwise else len(c.ends)
@@ -573,7 +575,7 @@ def count_events(
 
 @kernel(inlined=True)
 def add_count(lanes: Lanes, scratch: FloatArray, kind: int, number: Any) -> None:
-    """Count so many events of a kind in each lane."""
+    """Add ``number`` events of a kind in each lane."""
     store(lanes, scratch, kind, load(lanes, scratch, kind) + number)
 
 
@@ -629,7 +631,7 @@ def count_matched_pairs(
     counts: np.ndarray,
     b: int,
 ) -> None:
-    """Count the pairs of a step in the runs of a block, and what they send."""
+    """Count the pairs of a step in the runs of a block, and their messages."""
     first = b * len(lanes)
     for r in range(first, min(first + len(lanes), len(counts))):
         pairs, sent = d.pairs[r, m.s, m.step], 0

@@ -208,8 +208,8 @@ class SlotRuns:
         return self._slot >= self.setup.slots
 
     def following(self, rows: int, timed: bool = True) -> SlotBlock:
-        """Carry the filters through the next slots, of about so many ``rows`` of events at most (0:
-        any number); events need slots that are ``timed``.
+        """Simulate the next slots, about ``rows`` events at most (0: any number); events need slots
+        that are ``timed``.
         """
         setup = self.setup
         times, drawn = self._next_messages(rows, timed)
@@ -549,8 +549,8 @@ def slot_batches(
 def slot_batch(
     scenario: Scenario, seed: int, replicas: range, fingerprint: bool = False
 ) -> RunBatch:
-    """Simulate consecutive replicas side by side; a run that diverges goes on to the end with what
-    it has (``with_ends`` mends that).
+    """Simulate consecutive replicas side by side; a run that diverges goes on to the end with
+    invalid numbers, which ``with_ends`` replaces.
     """
     runs = SlotRuns(scenario, ReplicaStreams(seed, replicas.start, len(replicas)), whole=True)
     assert runs.reported is not None

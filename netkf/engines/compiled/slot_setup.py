@@ -278,8 +278,8 @@ class SlotSetup:
         return bool(self._recorded_slots)
 
     def unread(self, first: int, count: int) -> np.ndarray:
-        """Return (S, E, N) whether nodes send nothing in the steps of so many slots from ``first``
-        on because they have not read anything.
+        """Return (S, E, N) which nodes send nothing in the steps of slots ``first`` to ``first +
+        count - 1`` because they have no reading.
         """
         missed = np.zeros((count, len(self.nodes)), dtype=bool)
         for index, slots in self._recorded_slots.items():
@@ -300,7 +300,7 @@ class SlotSetup:
         return min(len(self.nodes) // 2, len(self.ends)) if self.matching[0] >= 0 else 0
 
     def rows_of(self, slots: int) -> int:
-        """Return the largest number of events in so many slots."""
+        """Return the largest number of events in ``slots`` slots."""
         pairs = self.most_pairs
         sends = self.ways * (pairs if self.matching[0] >= 0 else len(self.ends))
         # A send and its outcome for each direction, a tick for each pair, a round, and one

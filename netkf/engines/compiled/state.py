@@ -387,7 +387,7 @@ def scratch_arrays(
 
 
 def empty_pool(capacity: int, n: int) -> tuple[np.ndarray, FloatArray, FloatArray, np.ndarray]:
-    """Return pool, xhat, root and heap for so many messages, all free."""
+    """Return pool, xhat, root and heap for ``capacity`` messages, all free."""
     pool = np.zeros(capacity, dtype=MESSAGE)
     pool["next"] = np.arange(1, capacity + 1)
     return pool, np.zeros((capacity, n)), np.zeros((capacity, n, n)), np.zeros(capacity, np.int64)

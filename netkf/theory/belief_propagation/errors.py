@@ -79,7 +79,7 @@ class BeliefRule(ErrorRule):
             self._put_evidence(name, back.T @ U @ back, back.T @ stack.form(name))
 
     def _begin_slot(self) -> None:
-        """Move the evidence that is kept, or begin with what nodes believe as their priors."""
+        """Predict the evidence that is kept, or begin with the estimates as priors."""
         if self._keeps:
             self._predict_evidence(
                 np.asarray(np.linalg.inv(self.scenario.slot_belief[0]), dtype=np.float64)

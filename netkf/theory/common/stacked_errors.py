@@ -95,7 +95,7 @@ class StackedErrors:
             self.stack.add(name, one, offset[:, None])
 
     def keep(self) -> None:
-        """Keep the errors of all estimators as they are now, for ``law``."""
+        """Keep the present errors of all estimators, for ``law``."""
         self._kept.append(self.stack.freeze(range(self.estimators)))
 
     def law(self) -> tuple[FloatArray, FloatArray]:

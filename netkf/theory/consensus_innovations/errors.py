@@ -50,7 +50,7 @@ class PseudoStateRule(ErrorRule):
             self.errors.roots[estimator] = observation.predicted
 
     def exchange(self, slot: int, phase: int, messages: Sequence[SentMessage]) -> None:
-        """Correct all estimates by what was heard and read."""
+        """Correct all estimates by messages and readings."""
         errors, G, estimators = self.errors, self._pseudo.G, range(self.errors.estimators)
         columns = errors.reading_noises(self._observations)
         states = [errors.stack.form(estimator) for estimator in estimators]

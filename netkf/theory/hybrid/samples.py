@@ -53,7 +53,7 @@ class PoissonSamples(NamedTuple):
         return np.asarray(C @ np.linalg.solve(self.H @ C + self.R, np.swapaxes(C, 1, 2)))
 
     def restrict(self, node: int) -> PoissonSamples:
-        """Return the sensors of one node as those of a network of that node alone."""
+        """Return the sensors of one node as those of a network of one node."""
         mine = self.nodes == node
         count = int(mine.sum())
         silent = scipy.sparse.csr_array((1, count))

@@ -141,7 +141,7 @@ class GaussianStack:
             self._free.append(index)
 
     def rename(self, name: Hashable, other: Hashable) -> None:
-        """Store the vector ``name`` under the name ``other``, overwriting what was there."""
+        """Store the vector ``name`` under the name ``other``, which it overwrites."""
         if other in self._index:
             self.drop([other])
         self._index[other] = self._index.pop(name)

@@ -200,7 +200,7 @@ class RunningTotalsRule(ErrorRule):
         self._weights[estimator] = weight - count * (sent - before)
 
     def send(self, messages: Sequence[SentMessage]) -> None:
-        """Store the sender's total for each message, as it is when the message leaves."""
+        """Store the sender's present total for each message."""
         for message in messages:
             name = ("sent", message.sender)
             self.errors.stack.copy(name, message)

@@ -97,7 +97,9 @@ class TrackRule(ErrorRule):
         self._combine_tracks(heard)
 
     def _combine_tracks(self, heard: dict[int, list[int]]) -> None:
-        """Set the errors of receivers to those of the combinations with what they heard."""
+        """Set the errors of receivers to those of their combinations with the tracks that they
+        heard.
+        """
         errors, n = self.errors, self.errors.n
         changes: dict[Hashable, tuple[FloatArray, Sequence[Term]]] = {}
         for estimator, senders in heard.items():

@@ -39,7 +39,7 @@ def tracks_in_slots(scenario: Scenario) -> tuple[float, FloatArray]:
         raise TheoryError("the filters' model is not the true one")
     joint, radius = steady_tracks(scenario)
     nodes = range(len(scenario.nodes))
-    return radius, np.stack([_mean_shown_covariance(scenario, joint, i) for i in nodes])
+    return radius, np.stack([_mean_reported_covariance(scenario, joint, i) for i in nodes])
 
 
 def steady_tracks(scenario: Scenario) -> tuple[FloatArray, float]:
@@ -62,8 +62,8 @@ def steady_tracks(scenario: Scenario) -> tuple[FloatArray, float]:
     return joint, radius**2
 
 
-def _mean_shown_covariance(scenario: Scenario, joint: FloatArray, i: int) -> FloatArray:
-    """Return the mean covariance (n, n) of what node i shows; ``joint`` (N, N, n, n)."""
+def _mean_reported_covariance(scenario: Scenario, joint: FloatArray, i: int) -> FloatArray:
+    """Return the mean covariance (n, n) of node i's reported estimate; ``joint`` (N, N, n, n)."""
     probabilities = _hearing_probabilities(scenario, scenario.nodes[i])
     certain = [j for j, p in probabilities.items() if p == 1.0]
     unsure = [j for j, p in probabilities.items() if 0.0 < p < 1.0]
