@@ -96,6 +96,7 @@ class BeliefRule(ErrorRule):
             self._begin_slot()
         columns = self.errors.reading_noises(observations)
         for estimator, observation in observations.items():
+            # A reading adds U = H' R^-1 H and, in errors, s = H' R^-1 v.
             weighted = np.linalg.solve(observation.R, observation.H).T
             U, s = self._sum_evidence([_own_name(estimator)])
             s[:, columns[estimator]] += weighted @ observation.root
@@ -109,10 +110,12 @@ class BeliefRule(ErrorRule):
         U, s = self._sum_evidence(
             [_own_name(estimator), *((estimator, j) for j in self._received[estimator])]
         )
+        # P = (P_prior^-1 + U)^-1 = S (I + S' U S)^-1 S', with P_prior = S S' that may be singular.
         S = errors.roots[_prior_name(estimator)]
         spread = np.linalg.cholesky(eye + S.T @ U @ S)
         root = scipy.linalg.solve_triangular(spread, S.T, lower=True).T
         P = root @ root.T
+        # e = P (P_prior^-1 e_prior - s) = (I - P U) e_prior - P s
         errors.stack.put(
             estimator, (eye - P @ U) @ errors.stack.form(_prior_name(estimator)) - P @ s
         )
@@ -130,6 +133,7 @@ class BeliefRule(ErrorRule):
         for step in range(self._steps):
             up = self._arrivals.get((slot, phase, step), nothing)
             pairs = [(i, j) for i, j in np.argwhere(up).tolist()]
+            # All messages of a step before any is used: they are sent at once.
             said = {(i, j): self._evidence_for(j, i) for i, j in pairs}
             for (i, j), (U, s) in said.items():
                 self._put_evidence((i, j), U, s)

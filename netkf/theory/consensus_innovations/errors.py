@@ -40,23 +40,26 @@ class PseudoStateRule(ErrorRule):
     def sense(self, time: float, observations: EstimatorObservations) -> None:
         """Predict the differences, and keep the readings of the slot."""
         self._observations, self._slot, stack = observations, self._slot + 1, self.errors.stack
+        # yhat - G xhat does not depend on the plant's noise, since yhat and G xhat share it.
         for estimator in range(self.errors.estimators):
             stack.put(
                 _difference_name(estimator),
                 self._pseudo.A @ stack.form(_difference_name(estimator)),
             )
         gains = gain_sequence(self._design).at(self._slot)
-        for estimator, observation in enumerate(gains):
-            self.errors.roots[estimator] = observation.predicted
+        for estimator, node_gains in enumerate(gains):
+            self.errors.roots[estimator] = node_gains.predicted
 
     def exchange(self, slot: int, phase: int, messages: Sequence[SentMessage]) -> None:
         """Correct all estimates by messages and readings."""
         errors, G, estimators = self.errors, self._pseudo.G, range(self.errors.estimators)
         columns = errors.reading_noises(self._observations)
         states = [errors.stack.form(estimator) for estimator in estimators]
+        # The error of yhat: what is stored is that of yhat - G xhat.
         before = [errors.stack.form(_difference_name(i)) + G @ states[i] for i in estimators]
         after = [form.copy() for form in before]
         gains = gain_sequence(self._design).at(self._slot)
+        # e_i+ = e_i + sum_j B_ij (e_j - e_i): the true pseudo-state cancels.
         for message in messages:
             i, j = message.receiver, message.sender
             B = gains[i].B[self._design.heard[i].index(j)]
@@ -64,9 +67,11 @@ class PseudoStateRule(ErrorRule):
         for i, observation in self._observations.items():
             weighted = np.linalg.solve(observation.R, observation.H).T
             weighted_H = weighted @ observation.H
+            # Innovation H' R^-1 (y - H G^+ yhat), with y = H x + v.
             after[i] -= gains[i].M @ weighted_H @ self._pseudo.inverse @ before[i]
             after[i][:, columns[i]] -= gains[i].M @ weighted @ observation.root
         for i in estimators:
+            # xhat+ = xhat + K (yhat+ - G xhat), in errors.
             e = states[i] - gains[i].K @ (G @ states[i] - after[i])
             self._set_errors(i, e, after[i] - G @ e)
             errors.roots[i] = gains[i].root

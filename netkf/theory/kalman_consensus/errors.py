@@ -92,6 +92,7 @@ class KcfRule(ErrorRule):
                         self._columns[message.sender],
                     )
                     self.errors.update(estimator, observation, columns)
+            # Updates may have added inputs since: the term covers the first ones.
             form = self.errors.stack.form(estimator)
             form[:, : terms[estimator].shape[1]] += terms[estimator]
             self.errors.stack.put(estimator, form)
@@ -101,11 +102,13 @@ class KcfRule(ErrorRule):
         """Return the form of ``gamma P sum_j (ebar_j - ebar)``."""
         own, stack = self._prediction_name(estimator), self.errors.stack
         root = self.errors.roots[own]
+        # The gain uses the predicted P, as the consensus term does predictions.
         P = root @ root.T
         total = np.zeros_like(stack.form(own))
         for message in inbox:
             source = message if message.late else self._prediction_name(message.sender)
             total += stack.form(source) - stack.form(own)
+        # gamma = epsilon / (1 + |P|) keeps the gain bounded where P is large.
         return np.asarray(self._epsilon / (1.0 + np.linalg.norm(P)) * P @ total)
 
 

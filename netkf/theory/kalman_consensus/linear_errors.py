@@ -39,11 +39,13 @@ def slot_jumps(scenario: Scenario) -> SlotJumps:
     for k, senders in enumerate(heard):
         H = np.concatenate([sensors[j][0] for j in senders])
         R = block_diagonal([sensors[j][1] for j in senders])
+        # Gains are steady: each node runs the Riccati equation of the readings that it uses.
         P = steady_covariance(F, Q, H, R)
         K = np.linalg.solve(H @ P @ H.T + R, H @ P).T if len(H) else np.zeros((len(F), 0))
         columns = [np.arange(rows[j], rows[j + 1]) for j in senders]
         gains[k][:, np.concatenate(columns)] = K
         closed.append(np.eye(len(F)) - K @ H)
+        # The consensus term is gamma P times the differences of predictions.
         terms.append(algorithm.epsilon / (1.0 + np.linalg.norm(P)) * P)
     weights: dict[tuple[int, int], FloatArray] = {
         (i, j): terms[index[j]] for i, j in scenario.topology.directions

@@ -62,6 +62,7 @@ class ScheduleRule(ErrorRule):
         """Update all nodes by all sensors."""
         columns = self.errors.reading_noises(self._observations)
         for estimator, observation in self._observations.items():
+            # Silence counts as a reading that equals its prediction, with the noise R + Y^-1.
             used = observation if (slot, estimator) in self._sent else silence(observation, self._Y)
             for hearer in range(self.errors.estimators):
                 self.errors.update(hearer, used, columns[estimator])
@@ -70,6 +71,7 @@ class ScheduleRule(ErrorRule):
 def silence(reading: Observation, Y: float | FloatArray) -> Observation:
     """Return the reading that silence stands for, with the noise R + Y^-1."""
     R = silence_noise(reading.R, Y)
+    # The true noise, whose root the reading has, may differ from the believed R.
     root = np.asarray(np.linalg.cholesky(reading.root @ reading.root.T + R - reading.R))
     return Observation(reading.H, R, root)
 

@@ -43,6 +43,7 @@ def expected_sends(scenario: Scenario, run: Run) -> tuple[int, float]:
         if len(H)
     }
     count, expected, slot = 0, 0.0, 1
+    # All nodes hear everything, so that one P, given all decisions, is that of every node.
     while not scenario.slot_plant.over(slot, scenario.horizon):
         P = lyapunov_step(P, F, Q)
         if slot > 1:

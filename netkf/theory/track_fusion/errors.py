@@ -50,6 +50,7 @@ class PairRule(EstimateExchangeRule):
             w = fusion_weight(root, other, algorithm.inverse, algorithm.minimise == TRACE)
             fuse = fuse_inversely if algorithm.inverse else intersect_covariances
             root, (own, heard) = fuse([w, 1.0 - w], [root, other])
+            # Earlier factors are multiplied by that of the estimate that they have made.
             factors = [*(own @ factor for factor in factors), heard]
         return root, factors
 
@@ -63,6 +64,7 @@ def fuse_inversely(
     P_a, P_b = (S @ S.T for S in roots)
     inverses = [np.linalg.inv(P_a), np.linalg.inv(P_b)]
     mixed = np.linalg.inv(weights[0] * P_a + weights[1] * P_b)
+    # P^-1 = P_a^-1 + P_b^-1 - (w P_a + (1 - w) P_b)^-1: common information counts once.
     P = np.linalg.inv(inverses[0] + inverses[1] - mixed)
     factors = [P @ (V - w * mixed) for w, V in zip(weights, inverses, strict=True)]
     return triangular_root(square_root(0.5 * (P + P.T))), factors
@@ -77,6 +79,7 @@ class TrackRule(ErrorRule):
         self._sensors = [whitened_sensors(model) for model in self._models]
         nodes = range(errors.estimators)
         start = scenario.start(scenario.nodes[0])[1]
+        # All tracks begin with one mean: their errors are equal, and so are all covariances.
         self._joint = np.tile(start, (len(nodes), len(nodes), 1, 1))
         for estimator in nodes:
             errors.copy(estimator, _track_name(estimator), estimator)

@@ -54,6 +54,7 @@ def steady_tracks(scenario: Scenario) -> tuple[FloatArray, float]:
         noises.append(K @ R @ K.T)
     joint = np.zeros((len(closed), len(closed), n, n))
     for (i, C), (j, D) in itertools.combinations_with_replacement(enumerate(closed), 2):
+        # P_ij = C_i (F P_ij F' + Q) C_j' + [i = j] K R K', solved by vectorisation.
         driven = C @ Q @ D.T + (noises[i] if i == j else 0.0)
         block = np.linalg.solve(np.eye(n * n) - np.kron(C @ F, D @ F), driven.reshape(-1))
         joint[i, j] = block.reshape(n, n)
@@ -73,6 +74,7 @@ def _mean_reported_covariance(scenario: Scenario, joint: FloatArray, i: int) -> 
             f"{MAX_NEIGHBOURS} are looked at, in all combinations"
         )
     total: FloatArray = np.zeros_like(joint[i, i])
+    # E[P] over who is heard: best combinations are no linear function of the outcomes.
     for up in itertools.product((True, False), repeat=len(unsure)):
         outcomes = list(zip(unsure, up, strict=True))
         probability = math.prod(
