@@ -158,6 +158,7 @@ class GainSequence:
 
     def at(self, slot: int) -> tuple[NodeGains, ...]:
         """Return the gains of all nodes in a slot, counted from 1."""
+        # Gains do not depend on readings: they are computed once, as far as they are asked for.
         while len(self._found) < slot and not self._converged:
             self._found.append(self._advance_slot())
             self._converged = len(self._found) > 1 and self._has_converged(*self._found[-2:])
@@ -206,6 +207,7 @@ class GainSequence:
 
     def _predict(self) -> FloatArray:
         """Return the errors after F, (2 N n, inputs): those of all xhat, and then of all yhat."""
+        # e_x <- F e_x and e_y <- rest e_x + A e_y, with the plant's noise added by the caller.
         x, y = self._errors.reshape(2, len(self._heard), self._n, -1)
         predicted = np.stack([self._F @ x, self._pseudo.rest @ x + self._pseudo.A @ y])
         return predicted.reshape(self._errors.shape)
@@ -234,10 +236,12 @@ class GainSequence:
             # The noise of the pseudo-observation has the covariance H' R^-1 H.
             stop = first + self._noises[i].shape[1]
             innovation[:, first:stop], first = self._noises[i], stop
+            # What corrects yhat_i: differences to the neighbours' estimates, and the innovation.
             theta = np.concatenate([*(e - self._pseudo_error(j) for j in heard), innovation])
             sizes = [variances(e) + variances(self._pseudo_error(j)) for j in heard]
             sizes.append(np.square(observed) @ variances(e) + np.diag(self._information[i]))
             gain = optimal_gain(e, theta, np.concatenate(sizes))
+            # All yhat are corrected at once, from those before the exchange.
             corrected.append(e - gain @ theta)
             split = np.stack(np.split(gain, len(heard) + 1, axis=1))
             gains.append((split[:-1], split[-1]))
@@ -269,6 +273,8 @@ def optimal_gain(e: FloatArray, theta: FloatArray, terms: FloatArray) -> FloatAr
     """
     # What is left of a difference of equal estimates is rounding, and counts as 0.
     scale = np.divide(1.0, np.sqrt(terms), out=np.zeros_like(terms), where=terms > 0.0)
+    # E[e theta'] = e theta' for errors given by independent unit inputs; the pseudo-inverse comes
+    # from the singular values of theta, which has half the condition of E[theta theta'].
     U, S, V = np.linalg.svd(scale[:, None] * theta, full_matrices=False)
     used = S > NEGLIGIBLE
     return np.asarray((e @ V[used].T / S[used]) @ (U[:, used].T * scale))

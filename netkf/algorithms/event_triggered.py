@@ -119,6 +119,7 @@ def triggered_ci_slots(
     """Carry filters by event-triggered consensus through the slots of a plan."""
     for b in range(plan.up.shape[0]):
         for s in range(plan.up.shape[1]):
+            # A part of the plan: up to the decisions to send, or from the arrivals on.
             if plan.part != ARRIVING and plan.sensed[s]:
                 predict_all(nodes, scratch, b)
                 predict_copies(nodes, scratch, arrays, b)
@@ -197,6 +198,7 @@ def decide_estimate(
 ) -> None:
     """Decide whether node ``h`` sends its estimate, and keep a copy of the one that was sent."""
     lanes, copies = scratch.lanes, (arrays.x, arrays.root)
+    # Copies in order: those heard on each link, what each node sends now, what it sent last.
     own = len(links.sender) + h
     last = own + len(nodes.rows)
     near = is_near(
@@ -242,10 +244,12 @@ def combine_copies(
         for q in range(len(lanes)):
             if plan.up[b, s, 0, links.way[m], q] == 1:
                 arrays.known[b, m, q] = 1
+        # Silent neighbours count too: silence says that their estimate is near the copy.
         heard += select(load_flags(lanes, arrays.known, b, m), links.weight[m], 0.0)
         invert_lanes(lanes, arrays.inverse, arrays.root, b, m)
         for i in range(n):
             store(lanes, arrays.mean, m, i, load(lanes, arrays.x, b, m, i))
+    # A node that knows no neighbour's estimate keeps its own, without rounding.
     alone = heard == 0.0
     if not any_lane(heard > 0.0):
         return
@@ -254,6 +258,7 @@ def combine_copies(
         x = load(lanes, arrays.x, b, own, i)
         store(lanes, arrays.mean, own, i, x)
         store(lanes, scratch.xhat, h, i, x)
+    # Covariance intersection: sum_j w_j P_j^-1, as roots that are merged one after the other.
     rest = select(heard < 1.0, 1.0 - heard, 0.0)
     whiten(lanes, scratch.total, rest, arrays.inverse, arrays.mean, own, own)
     for m in range(links.first[h], links.first[h + 1]):

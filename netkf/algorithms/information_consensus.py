@@ -125,6 +125,7 @@ def consensus_slots(
     """Carry filters by consensus on information through the slots of a plan."""
     for b in range(plan.up.shape[0]):
         for s in range(plan.up.shape[1]):
+            # Slot 0 has no reading and no exchange: it shows the start.
             if plan.sensed[s]:
                 predict_all(nodes, scratch, b)
                 begin_all(nodes, readings, scratch, arrays, b, s)
@@ -301,6 +302,8 @@ class Hcmci(InformationConsensus):
     def recipe(self, nodes: int) -> Recipe:
         """Return the pairs of the paper's Algorithm, for the variant that was chosen."""
         omega = float(nodes) if self.novelty_weight is None else self.novelty_weight
+        # Rows: shares of prediction and reading in a pair; then how often each pair counts, and the
+        # prediction itself.
         if self.consensus == INFORMATION:
             return recipe([[1.0, 1.0]], [1.0, 0.0])
         if self.consensus == MEASUREMENTS:
@@ -369,6 +372,7 @@ def first_parts(state: ConsensusState, reading: Reading) -> FloatArray:
 
 def mix_node_parts(xhat: FloatArray, parts: FloatArray, messages: Sequence[Message]) -> FloatArray:
     """Return the roots (K, n, n + 1) of a node's pairs after a consensus step."""
+    # The kernel of slots on a network of one node and its senders.
     K, n, _ = parts.shape
     stack = np.zeros((2, K, 1 + len(messages), n, n + 1, 1))
     centre = np.stack([xhat, *(message.payload.xhat for message in messages)])[..., None]

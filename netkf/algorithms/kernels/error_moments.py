@@ -44,6 +44,7 @@ def covariance_slope(
 @kernel
 def error_slope(S: FloatArray, K: FloatArray, true_Q: FloatArray, dS: FloatArray) -> None:
     """Write d cov(e_i, e_j)/dt (N, N, n, n) without the noise of the sensors."""
+    # dS_ij = K_i S_ij + S_ij K_j' + Q: all errors share the plant's noise. S_ji is S_ij'.
     N, n = len(S), len(true_Q)
     for i in range(N):
         for j in range(i + 1):
@@ -59,6 +60,7 @@ def error_slope(S: FloatArray, K: FloatArray, true_Q: FloatArray, dS: FloatArray
 @kernel
 def add_sensor_noise(P: FloatArray, true_G: FloatArray, dS: FloatArray) -> None:
     """Add P_i Gt_i P_i to the derivative of cov(e_i), in place."""
+    # The gain P H' R^-1 times the sensors' noise; sensors of different nodes are independent.
     for i in range(len(P)):
         n = P.shape[1]
         for a in range(n):
@@ -120,6 +122,7 @@ def run_moments(
     K, P0, S0 = np.empty_like(P), np.empty_like(P), np.empty_like(S)
     dP, dS = np.empty((4, *P.shape)), np.empty((4, *S.shape))
     now, m, t = 0.0, 0, 0
+    # From event to event: the next message, or the next time that is asked for.
     while t < len(times):
         until = times[t]
         if m < len(instants) and instants[m] <= until:
@@ -129,6 +132,7 @@ def run_moments(
             h = (until - now) / count
             P0[:] = P
             S0[:] = S
+            # The classical Runge-Kutta method of order 4.
             for s in range(4):
                 if s > 0:
                     share = h if s == 3 else 0.5 * h

@@ -35,10 +35,12 @@ def write_information(
     """Write the root of ``share`` times ``P^-1`` of node ``h``, whose root S has the inverse
     ``inverse[h]``, into ``out`` (n, n + 1, L); the centre is the node's estimate.
     """
+    # P^-1 = S^-T S^-1, whose root is the inverse of S, lower triangular like S.
     n, size = len(out), share**0.5
     for i in range(n):
         for j in range(i + 1):
             store(lanes, out, i, j, size * load(lanes, inverse, h, i, j))
+        # An estimate that counts from itself has the mean 0.
         store(lanes, out, i, n, 0.0)
 
 
@@ -157,11 +159,13 @@ def mix_parts(
     hears, ``up`` at ``index`` [b, s, e]; the weight of what does not arrive stays with its own.
     """
     b, s, e = index
+    # Two copies take turns: all nodes read the one and write the other.
     t = step % 2
     heard = spread(lanes, 0.0)
     for m in range(links.first[h], links.first[h + 1]):
         arrived = load_flags(lanes, up, b, s, e, links.way[m])
         heard += select(arrived, links.weight[m], 0.0)
+    # Rounding may leave the own weight a little below 0, which has no root.
     own = 1.0 - heard
     own = select(own > 0.0, own, 0.0)
     for k in range(parts.shape[1]):
@@ -194,6 +198,7 @@ def read_off(
     """Write the estimate of filter ``h`` of a block and the root of its P from ``counts`` (K + 1,)
     times its pairs after the steps, ``parts[t]``, and its prediction.
     """
+    # Information adds up: that of the prediction first, then that of each pair.
     K = parts.shape[1]
     write_information(lanes, total, float(counts[K]), inverse, h)
     for k in range(K):

@@ -71,6 +71,7 @@ def scale_by_covariance(
     consensus gain of the KCF; ``work`` (n, L) is scratch.
     """
     n, square = root.shape[2], spread(lanes, 0.0)
+    # |P|^2 is the sum of the squares of the entries of S S'.
     for i in range(n):
         for j in range(i + 1):
             total = spread(lanes, 0.0)
@@ -119,6 +120,7 @@ def fuse_readings(
         return
     for m in range(links.first[h], links.first[h + 1]):
         arrived = load_flags(scratch.lanes, plan.up, b, s, 0, links.way[m])
+        # Saves the update where no run of the block has the message.
         if any_lane(arrived):
             update_by_reading(nodes, readings, scratch, b, s, h, links.sender[m], arrived)
 
@@ -153,6 +155,7 @@ def combine_convex_roots(
     for m in range(links.first[h], links.first[h + 1]):
         arrived = load_flags(lanes, plan.up, b, s, 0, links.way[m])
         heard += select(arrived, links.weight[m], 0.0)
+    # Rounding may leave the own weight a little below 0, which has no root.
     own = 1.0 - heard
     size = root_of(select(own > 0.0, own, 0.0))
     for i in range(n):

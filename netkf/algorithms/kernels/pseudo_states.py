@@ -34,6 +34,7 @@ def predict_pseudo(
         for j in range(n):
             total += A[i, j] * load(lanes, y, b, h, j) + rest[i, j] * load(lanes, x, b, h, j)
         store(lanes, moved, i, total)
+    # All rows need the old yhat, hence the copy.
     for i in range(n):
         store(lanes, y, b, h, i, load(lanes, moved, i))
 
@@ -57,12 +58,14 @@ def innovate(
     n = len(inverse)
     # H that is fixed has one block and one slot.
     c, t = min(b, readings.H.shape[0] - 1), min(s, readings.H.shape[1] - 1)
+    # G^+ yhat is the state that the pseudo-state stands for.
     for i in range(n):
         total = spread(lanes, 0.0)
         for j in range(n):
             total += inverse[i, j] * load(lanes, y, b, h, j)
         store(lanes, state, i, total)
         store(lanes, z, i, 0.0)
+    # Whitened rows have R = I, so that H' R^-1 is H'.
     for k in range(rows):
         innovation = load(lanes, readings.y, b, s, h, k)
         for j in range(n):
@@ -92,6 +95,7 @@ def correct_pseudo(
     ``B`` (W, n, n) in the order of ``links``, ``M`` (H, n, n), the innovation ``z`` (n, L).
     """
     n = M.shape[1]
+    # Into an array of its own: the other filters still hear the estimates from before.
     for i in range(n):
         total = load(lanes, y, b, h, i)
         for j in range(n):
@@ -123,6 +127,7 @@ def correct_state(
     it, ``xhat + K_h (yhat - G xhat)``; ``K`` (H, n, n), ``difference`` (n, L) is scratch.
     """
     n = len(G)
+    # The whole difference first: it needs all of the old xhat.
     for i in range(n):
         total = load(lanes, corrected, h, i)
         store(lanes, y, b, h, i, total)
