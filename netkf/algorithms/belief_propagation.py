@@ -173,14 +173,14 @@ def predict_beliefs(nodes: SlotNodes, scratch: SlotScratch, arrays: BeliefArrays
     state; else the belief is the prior, and nothing is known besides. Evidence counts from the
     predictions, which are copied to ``scratch``.
     """
-    lanes, room, k = scratch.lanes, arrays.scratch, min(b, arrays.own.shape[0] - 1)
+    lanes, beliefs, k = scratch.lanes, arrays.scratch, min(b, arrays.own.shape[0] - 1)
     if not arrays.keeps:
         predict_all(nodes, scratch, b)
     for h in range(len(nodes.rows)):
         if arrays.keeps:
             predict_mean(nodes, scratch, b, h)
-            predict_part(lanes, arrays.prior[k, h], arrays.back, room.total, room.work)
-            predict_part(lanes, arrays.own[k, h], arrays.back, room.total, room.work)
+            predict_part(lanes, arrays.prior[k, h], arrays.back, beliefs.total, beliefs.work)
+            predict_part(lanes, arrays.own[k, h], arrays.back, beliefs.total, beliefs.work)
         else:
             write_prior(lanes, nodes.root, b, h, arrays.prior[k, h])
             clear_part(lanes, arrays.own[k, h])
@@ -188,7 +188,7 @@ def predict_beliefs(nodes: SlotNodes, scratch: SlotScratch, arrays: BeliefArrays
             store(lanes, scratch.xhat, h, i, load(lanes, nodes.xhat, b, h, i))
     for m in range(arrays.received.shape[1]):
         if arrays.keeps:
-            predict_part(lanes, arrays.received[k, m], arrays.back, room.total, room.work)
+            predict_part(lanes, arrays.received[k, m], arrays.back, beliefs.total, beliefs.work)
         else:
             clear_part(lanes, arrays.received[k, m])
 
@@ -205,13 +205,13 @@ def update_beliefs(
     """Make the belief of filter ``h`` of a block from its prior and all evidence, which counts from
     the belief then if it is kept.
     """
-    lanes, room, k = scratch.lanes, arrays.scratch, min(b, arrays.own.shape[0] - 1)
-    copy_part(lanes, arrays.prior[k, h], room.total)
-    add_part(lanes, room.total, arrays.own[k, h], room.work)
+    lanes, beliefs, k = scratch.lanes, arrays.scratch, min(b, arrays.own.shape[0] - 1)
+    copy_part(lanes, arrays.prior[k, h], beliefs.total)
+    add_part(lanes, beliefs.total, arrays.own[k, h], beliefs.work)
     for m in range(links.first[h], links.first[h + 1]):
-        add_part(lanes, room.total, arrays.received[k, m], room.work)
+        add_part(lanes, beliefs.total, arrays.received[k, m], beliefs.work)
     finish_lanes(
-        lanes, nodes.root, nodes.xhat, b, h, scratch.xhat, room.total, room.work, False
+        lanes, nodes.root, nodes.xhat, b, h, scratch.xhat, beliefs.total, beliefs.work, False
     )  # fmt: skip
     if arrays.keeps:
         before, after = scratch.xhat[h], nodes.xhat[b, h]

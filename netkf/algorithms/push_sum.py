@@ -150,13 +150,13 @@ class PushSumArrays(NamedTuple):
     found: FloatArray
     found_number: FloatArray
     silent: np.ndarray
-    stop: StopRoom
+    stop: StopScratch
     running: bool
     offered: FloatArray
     heard: FloatArray
 
 
-class StopRoom(NamedTuple):
+class StopScratch(NamedTuple):
     """What ``has_stopped`` compares, for one lane.
 
     mass, before : (1, m) and (m,), the mass now and before the step
@@ -575,7 +575,7 @@ class PushSum(Filter):
                 found=aligned((n, n, LANES)),
                 found_number=aligned((1, LANES)),
                 silent=np.zeros(LANES, dtype=np.uint8),
-                stop=StopRoom(*(np.zeros(shape) for shape in shapes)),
+                stop=StopScratch(*(np.zeros(shape) for shape in shapes)),
                 running=running,
                 offered=aligned((blocks, H if running else 0, m, LANES)),
                 heard=aligned((blocks, ways, m, LANES)),

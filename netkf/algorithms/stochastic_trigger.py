@@ -201,9 +201,9 @@ def schedule_reading(
     store(lanes, scratch.row, 0, news)
     for q in range(len(lanes)):
         # The first reading is sent in any case.
-        chance = silence_probability(scratch.row[0, q])
+        probability = silence_probability(scratch.row[0, q])
         known = arrays.known[b, len(links.sender) + h, q] == 1
-        silent = known and plan.uniform[b, s, 0, h, q] < chance
+        silent = known and plan.uniform[b, s, 0, h, q] < probability
         if scratch.row[0, q] == NO_READING or silent:
             plan.sent[b, s, 0, h, q] = 0
 
@@ -395,8 +395,8 @@ class ScheduledReadings(Filter):
             return state, None
         # The sender is known from its first message on: that is sent in any case.
         if -1 in state.senders:
-            chance = silence_probability(news_of(reading, state.prior, self.Y))
-            if exchange.uniform < chance:
+            probability = silence_probability(news_of(reading, state.prior, self.Y))
+            if exchange.uniform < probability:
                 return state, None
         return state._replace(sent=True), reading
 

@@ -288,8 +288,8 @@ def quadratic_interval(total: float, weights: FloatArray, level: float) -> Inter
     # Quantiles in the middle are near those of a scaled chi-square variable.
     freedom = mean**2 / float((weights**2).sum())
     up, down = (
-        2.0 * mean / freedom * float(scipy.special.gammaincinv(freedom / 2.0, chance))
-        for chance in (1.0 - POWER, POWER)
+        2.0 * mean / freedom * float(scipy.special.gammaincinv(freedom / 2.0, probability))
+        for probability in (1.0 - POWER, POWER)
     )
     detectable = max(upper / up - 1.0, 1.0 - lower / down)
     # With more runs: as the chi-square variable of the same spread.

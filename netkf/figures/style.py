@@ -162,24 +162,24 @@ def draw_legend(axes: Any, columns: int | None = None) -> None:
         return
     figure = axes.figure
     share = axes.get_subplotspec().get_position(figure).width if axes.get_subplotspec() else 1.0
-    room = share * float(figure.get_size_inches()[0]) * 72.0 * 1.08
+    scratch = share * float(figure.get_size_inches()[0]) * 72.0 * 1.08
     axes.legend(
         handles,
         labels,
         loc="lower left",
         bbox_to_anchor=(0.0, 1.0),
-        ncols=columns or _columns(labels, room),
+        ncols=columns or _columns(labels, scratch),
         columnspacing=1.4,
         borderaxespad=0.2,
     )
 
 
-def _columns(labels: Sequence[str], room: float) -> int:
-    """Return the largest number of columns of a legend that fits ``room`` points."""
+def _columns(labels: Sequence[str], scratch: float) -> int:
+    """Return the largest number of columns of a legend that fits ``scratch`` points."""
     widths = [text_width(label, LEGEND_SIZE) + 6.0 * LEGEND_SIZE for label in labels]
     for count in range(len(labels), 1, -1):
         # Legends split their labels so: the first columns have one more where they are not equal.
-        if sum(column.max() for column in np.array_split(widths, count)) <= room:
+        if sum(column.max() for column in np.array_split(widths, count)) <= scratch:
             return count
     return 1
 

@@ -131,23 +131,23 @@ def gather_evidence(
     first: int,
     last: int,
     h: int,
-    room: BeliefScratch,
+    scratch: BeliefScratch,
 ) -> None:
     """Add up what node ``h`` knows, from its own readings and what was received on directions from
     ``first`` up to ``last``: all of it into ``every[h]``, and all but what came on direction m into
-    ``others[m]`` (``room`` is BeliefScratch).
+    ``others[m]`` (``scratch`` is BeliefScratch).
     """
     D = last - first
     # Sums from both ends leave one out in the middle without taking it away again.
-    clear_part(lanes, room.behind[D])
+    clear_part(lanes, scratch.behind[D])
     for k in range(D - 1, 0, -1):
-        copy_part(lanes, room.behind[k + 1], room.behind[k])
-        add_part(lanes, room.behind[k], received[first + k], room.work)
-    copy_part(lanes, own[h], room.every[h])
+        copy_part(lanes, scratch.behind[k + 1], scratch.behind[k])
+        add_part(lanes, scratch.behind[k], received[first + k], scratch.work)
+    copy_part(lanes, own[h], scratch.every[h])
     for k in range(D):
-        copy_part(lanes, room.every[h], room.others[first + k])
-        add_part(lanes, room.others[first + k], room.behind[k + 1], room.work)
-        add_part(lanes, room.every[h], received[first + k], room.work)
+        copy_part(lanes, scratch.every[h], scratch.others[first + k])
+        add_part(lanes, scratch.others[first + k], scratch.behind[k + 1], scratch.work)
+        add_part(lanes, scratch.every[h], received[first + k], scratch.work)
 
 
 @kernel
@@ -159,7 +159,7 @@ def receive_evidence(
     index: tuple[int, int, int],
     h: int,
     centre: FloatArray,
-    room: BeliefScratch,
+    scratch: BeliefScratch,
 ) -> None:
     """Replace the evidence from senders that node ``h`` hears, where ``up`` (at ``index`` [b, s,
     e]) says that a message arrived.
@@ -172,20 +172,13 @@ def receive_evidence(
             continue
         # The sender leaves out the evidence of the receiver, which would otherwise come back and
         # count twice; in a directed graph it may not hear the receiver at all.
-        source = room.every[sender]
+        source = scratch.every[sender]
         for k in range(links.first[sender], links.first[sender + 1]):
             if links.sender[k] == h:
-                source = room.others[k]
-        recentre_part(lanes, source, centre[sender], centre[h], room.work)
+                source = scratch.others[k]
+        recentre_part(lanes, source, centre[sender], centre[h], scratch.work)
         for i in range(n):
             for j in range(n + 1):
                 if j <= i or j == n:
-                    entry = load(lanes, room.work, i, j)
-                    store(
-                        lanes,
-                        received,
-                        m,
-                        i,
-                        j,
-                        select(arrived, entry, load(lanes, received, m, i, j)),
-                    )
+                    before, now = load(lanes, received, m, i, j), load(lanes, scratch.work, i, j)
+                    store(lanes, received, m, i, j, select(arrived, now, before))

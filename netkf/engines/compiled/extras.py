@@ -167,12 +167,12 @@ def predict_with_gain(state: Simulation, extras: Extras, h: int, now: float, tim
     """Bring node ``h`` with increments to ``time`` by its constant gain, in stretches that the gain
     can follow.
     """
-    piece, m, stretch = state.piece, extras.model[h], usable(extras.rate[h])
+    piece, m, longest = state.piece, extras.model[h], usable(extras.rate[h])
     least = SHORTEST_SHARE * (time - now)
     while now < time:
         end = time
-        if stretch < time - now:
-            end = stretch_end(now, time, max(stretch, least))
+        if longest < time - now:
+            end = stretch_end(now, time, max(longest, least))
             least *= LONGER
         gap = end - now
         # The mean moves as if nothing were read, and P by the closed loop, which counts that.

@@ -191,8 +191,8 @@ class Workspace:
         # Terms of conserved sums: weights held, totals sent and totals heard.
         terms = 2 * size + len(self._senders.ways) if kind == SUMS else 0
         # Space for many samples, within a budget of floats.
-        room = max(1, min(MOST_SAMPLES, SAMPLES_ROOM // (size * n * n)))
-        self._shown = empty_samples((1, room, size, n), terms)
+        scratch = max(1, min(MOST_SAMPLES, SAMPLES_ROOM // (size * n * n)))
+        self._shown = empty_samples((1, scratch, size, n), terms)
         self._visits: Visits | None = None
         # Code for each n makes runs of filters that combine estimates 1.5 times faster. Filters of
         # sums and of readings gain nothing: one event loop is compiled for every n.

@@ -174,8 +174,8 @@ def draw_link(
                 store_flags(lanes, up, b, s, e, w, number < c.delivery[0, w])
                 continue
             for q in range(len(lanes)):
-                chance = c.delivery[1, w] if c.bad[b, k, q] == 1 else c.delivery[0, w]
-                up[b, s, e, w, q] = c.drawn[b, k, q] < chance
+                probability = c.delivery[1, w] if c.bad[b, k, q] == 1 else c.delivery[0, w]
+                up[b, s, e, w, q] = c.drawn[b, k, q] < probability
 
 
 @kernel
@@ -193,8 +193,8 @@ def draw_link_of_lane(
         w = link * c.ways + d
         if c.talks[e, w] == 1:
             # A channel without a state has -1 there.
-            chance = c.delivery[1, w] if c.bad[b, k, q] == 1 else c.delivery[0, w]
-            up[b, s, e, w, q] = c.drawn[b, k, q] < chance
+            probability = c.delivery[1, w] if c.bad[b, k, q] == 1 else c.delivery[0, w]
+            up[b, s, e, w, q] = c.drawn[b, k, q] < probability
 
 
 @kernel

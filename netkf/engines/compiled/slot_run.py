@@ -138,8 +138,8 @@ class SlotRuns:
             np.array(part, order="C")
             for part in (plant.start_mean, plant.F, plant.start_root, plant.noise_root)
         )
-        room = np.zeros((setup.n, LANES))
-        draw_starts(MANY, self._plant_states, normal_ziggurat(), mean, root, room, x)
+        scratch = np.zeros((setup.n, LANES))
+        draw_starts(MANY, self._plant_states, normal_ziggurat(), mean, root, scratch, x)
         self._path = Path(F, noise, setup.frame, x, origin)
 
     def _begin_readings(self) -> None:
@@ -186,7 +186,7 @@ class SlotRuns:
             setup.ways,
             setup.streams,
         )
-        protocol, chance, first, members = setup.matching
+        protocol, probability, first, members = setup.matching
         # numpy's generator keeps half a 64-bit draw for small integers: two words more than the
         # state.
         states = np.zeros((self.runs, 6), dtype=np.uint64)
@@ -196,7 +196,7 @@ class SlotRuns:
             nodes = StreamBatch(streams, "trigger", [(node,) for node in setup.nodes.tolist()])
             self._triggers = nodes.in_lanes(self.runs)
         order, busy = (np.zeros(size, dtype=np.int64) for size in (links, len(setup.nodes)))
-        self._matchings = Matchings(protocol, chance, states, first, members, order, busy)
+        self._matchings = Matchings(protocol, probability, states, first, members, order, busy)
 
     def _in_lanes(self, purpose: str, entities: list[Link]) -> np.ndarray:
         """Return the states (B, K, 4, L) of the random streams of K entities in each run."""
@@ -380,8 +380,8 @@ class SlotRuns:
         self, path: Path, states: np.ndarray, local: FloatArray, absolute: FloatArray
     ) -> None:
         """Draw a block of a path into ``local`` and ``absolute`` (B, S, n, L)."""
-        room = aligned((2, max(path.root.shape), LANES))
-        draw_paths(MANY, path, states, normal_ziggurat(), self._slot, room, local, absolute)
+        scratch = aligned((2, max(path.root.shape), LANES))
+        draw_paths(MANY, path, states, normal_ziggurat(), self._slot, scratch, local, absolute)
 
     def _draw_readings(
         self, times: SlotTimes, local: FloatArray, rebased: np.ndarray
@@ -402,8 +402,8 @@ class SlotRuns:
         driven: FloatArray = unset((len(self._regressors), self._blocks, count, k, LANES))
         for path, (steps, states) in zip(driven, self._regressors, strict=True):
             self._draw_path(steps, states, path, path)
-        noise, room = self._noise, np.zeros((setup.p, LANES))
-        draw_readings(MANY, setup.sensors, noise, normal_ziggurat(), x, driven, room, y, H)
+        noise, scratch = self._noise, np.zeros((setup.p, LANES))
+        draw_readings(MANY, setup.sensors, noise, normal_ziggurat(), x, driven, scratch, y, H)
         if not self._recorded or not times.sensed.any():
             return ReadingBlock(y, H, local, rebased)
         slots = (self._slot + np.flatnonzero(times.sensed)).tolist()

@@ -370,6 +370,11 @@ def matching_lists(scenario: Scenario) -> tuple[int, float, np.ndarray, np.ndarr
     if protocol == UNIFORM_MAXIMAL:
         number = {link: k for k, link in enumerate(links)}
         lists = [[number[link] for link in some] for some in maximal_matchings(links)]
-    chance = {ONE_EDGE: activation.lazy, INDEPENDENT: activation.p}.get(protocol) or 0.0
+    probability = {ONE_EDGE: activation.lazy, INDEPENDENT: activation.p}.get(protocol) or 0.0
     first = np.cumsum([0, *map(len, lists)], dtype=np.int64)
-    return protocol, chance, first, np.array([k for some in lists for k in some], dtype=np.int64)
+    return (
+        protocol,
+        probability,
+        first,
+        np.array([k for some in lists for k in some], dtype=np.int64),
+    )

@@ -87,9 +87,9 @@ class _SecondMomentEquation:
         # Symmetric losses are lost together, others independently.
         both = min(to_i, to_j) if channel.symmetric else to_i * to_j
         at_i, at_j = scenario.weight(i, j), scenario.weight(j, i)
-        for x, y, chance, weight in ((a, b, to_i, at_i), (b, a, to_j, at_j)):
-            self._mixing[x, y] += rate * chance * weight
-            self._mixing[x, x] -= rate * chance * weight
+        for x, y, probability, weight in ((a, b, to_i, at_i), (b, a, to_j, at_j)):
+            self._mixing[x, y] += rate * probability * weight
+            self._mixing[x, x] -= rate * probability * weight
         self._outcomes += [
             (a, b, rate * (to_i - both), at_i, 0.0),
             (a, b, rate * (to_j - both), 0.0, at_j),

@@ -92,9 +92,9 @@ class ScalarLaw:
             open_ = ~above & (point >= lowest[left] * (1.0 - 1e-15)) & (share > NEGLIGIBLE)
             point, owner, share = point[open_], owner[open_], share[open_]
             reduced = (point - self.Q) / self.F**2
-            room = self.R - self.H**2 * reduced
+            scratch = self.R - self.H**2 * reduced
             with np.errstate(divide="ignore", invalid="ignore"):
-                before = np.where(room > 0.0, reduced * self.R / room, np.inf)
+                before = np.where(scratch > 0.0, reduced * self.R / scratch, np.inf)
             point = np.concatenate([reduced, before])
             owner = np.concatenate([owner, owner])
             share = np.concatenate([share * (1.0 - self.delivery), share * self.delivery])
