@@ -75,7 +75,7 @@ class GossipSummary(ReplicaSummary):
     bounds    : (K, N, n, n) bounds by the last readings of each pair, for any state before them
     tokens    : (N, n, n) covariance of each token at the last slot; arbitrary if pairs were copied
     moves     : number of slots, from slot 1 on, in which j handed its pair to i, for each pair of
-                ``_counted_pairs``
+                ``_pairs_to_count``
     slots     : number of slots counted in ``moves``
     """
 
@@ -110,7 +110,7 @@ def _summarise(scenario: Scenario, run: Run) -> GossipSummary:
     )
 
 
-def _counted_pairs(scenario: Scenario) -> tuple[IntArray, IntArray]:
+def _pairs_to_count(scenario: Scenario) -> tuple[IntArray, IntArray]:
     """Return the indices i and j of the pairs of nodes whose moves are counted: all pairs, or in a
     large network the ends of links, in both directions.
     """
@@ -127,7 +127,7 @@ def _count_moves(scenario: Scenario, sources: np.ndarray) -> np.ndarray:
     """Return the number of slots (rows of ``sources``) in which j handed its pair to i."""
     size = len(scenario.nodes)
     codes, counts = np.unique(np.arange(size) * size + sources, return_counts=True)
-    i, j = _counted_pairs(scenario)
+    i, j = _pairs_to_count(scenario)
     if not len(codes):
         return np.zeros(len(i), dtype=int)
     found = np.minimum(np.searchsorted(codes, i * size + j), len(codes) - 1)
@@ -215,7 +215,7 @@ def _walks_bound(samples: GossipSamples, level: float) -> Finding:
 
 def _tokens_move(samples: GossipSamples, level: float) -> Finding:
     """Compare counts of moves with Abar; slots are independent, so counts are binomial."""
-    i, j = _counted_pairs(samples.scenario)
+    i, j = _pairs_to_count(samples.scenario)
     trials, totals = int(np.sum(samples.runs.slots)), samples.runs.moves.sum(axis=0)
     nodes = samples.scenario.nodes
     found = []
@@ -296,7 +296,7 @@ def _check_tokens(samples: GossipSamples, level: float) -> Finding:
     return with_horizon(samples, found, _token_memory, LAW_TOLERANCE) if found.early else found
 
 
-def _initial_condition_forgotten(samples: GossipSamples, level: float) -> Finding:
+def _check_initial_condition(samples: GossipSamples, level: float) -> Finding:
     """Compare each sensor at the end with the chain that is there and started a thousand times
     larger.
     """
@@ -400,7 +400,7 @@ PROMISES = (
         "the law in the end does not depend on the start",
         "G Theorem 8",
         ERGODIC,
-        _initial_condition_forgotten,
+        _check_initial_condition,
     ),
     Promise(
         "errors have the covariance that swaps and readings give them",

@@ -287,7 +287,7 @@ def _in_support(samples: IntermittentSamples, level: float) -> Finding:
     return found._replace(early=True, horizon=1.2 * share * end)
 
 
-def _arrivals_counted(samples: IntermittentSamples, level: float) -> Finding:
+def _check_arrival_counts(samples: IntermittentSamples, level: float) -> Finding:
     """Compare counts of arrivals with R (12); slots are independent, so counts are binomial."""
     pairs = _heard_directions(samples.scenario)
     sent, arrived = samples.runs.sent.sum(axis=0), samples.runs.arrived.sum(axis=0)
@@ -321,7 +321,7 @@ def _check_bounded(samples: IntermittentSamples, level: float) -> Finding:
     return with_horizon(samples, found, _growth_of, LAW_TOLERANCE) if found.early else found
 
 
-def _initial_condition_forgotten(samples: IntermittentSamples, level: float) -> Finding:
+def _check_initial_condition(samples: IntermittentSamples, level: float) -> Finding:
     """Compare the law of P at the end with that from a start a thousand times larger."""
     P, restarted, _ = samples.reference
     pairs = [
@@ -496,7 +496,7 @@ PROMISES = (
         _in_support,
         exact=True,
     ),
-    Promise("readings arrive with the stated probability", "R (12)", FRESH, _arrivals_counted),
+    Promise("readings arrive with the stated probability", "R (12)", FRESH, _check_arrival_counts),
     Promise(
         "the law of P is that of independent arrivals, at every time",
         "R (18)",
@@ -513,7 +513,7 @@ PROMISES = (
         "the law in the end does not depend on the start",
         "R Theorem 9 [i]",
         LIMIT,
-        _initial_condition_forgotten,
+        _check_initial_condition,
     ),
     Promise(
         "averages over one path are those of the law of independent arrivals",

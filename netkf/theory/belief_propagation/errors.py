@@ -177,7 +177,7 @@ def _own_name(estimator: int) -> Hashable:
     return ("own", estimator)
 
 
-def rule(
+def error_rule(
     scenario: Scenario, errors: StackedErrors, run: Run, messages: Sequence[SentMessage]
 ) -> ErrorRule:
     """Return the rule of this filter for the errors of a run."""

@@ -130,7 +130,7 @@ class DelayedJumps:
 
     @cached_property
     def _late(self) -> FloatArray:
-        """What a delay makes of the errors of all nodes (M, M), e^{A d} for each."""
+        """Transition (M, M) of the errors of all nodes over the delay, e^{A d} for each."""
         return np.asarray(np.kron(np.eye(self.nodes), scipy.linalg.expm(self.delay * self.A)))
 
     @cached_property

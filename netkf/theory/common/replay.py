@@ -164,7 +164,7 @@ def _make_rule(
     """Return the error rule of the filter's paper, or that of filters without messages."""
     if not scenario.hosted.paper:
         return ErrorRule(scenario, errors)
-    made: ErrorRule = paper_module(scenario, "errors").rule(scenario, errors, run, messages)
+    made: ErrorRule = paper_module(scenario, "errors").error_rule(scenario, errors, run, messages)
     return made
 
 

@@ -89,7 +89,7 @@ def _difference_name(estimator: int) -> Hashable:
     return ("difference", estimator)
 
 
-def rule(
+def error_rule(
     scenario: Scenario, errors: StackedErrors, run: Run, messages: Sequence[SentMessage]
 ) -> ErrorRule:
     """Return the rule of this filter for the errors of a run."""

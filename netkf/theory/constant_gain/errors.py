@@ -44,7 +44,7 @@ class ConstantGainRule(EstimateExchangeRule):
         return average_covariances([1.0 - sum(weights), *weights], roots)
 
 
-def rule(
+def error_rule(
     scenario: Scenario, errors: StackedErrors, run: Run, messages: Sequence[SentMessage]
 ) -> ErrorRule:
     """Return the rule of this filter; raises TheoryError for sensors that give increments."""

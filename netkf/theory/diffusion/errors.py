@@ -26,7 +26,7 @@ class DiffusionRule(EstimateExchangeRule):
         return intersect_covariances([own, *heard], roots)
 
 
-def rule(
+def error_rule(
     scenario: Scenario, errors: StackedErrors, run: Run, messages: Sequence[SentMessage]
 ) -> ErrorRule:
     """Return the rule of this filter for the errors of a run."""

@@ -56,7 +56,7 @@ class DiffusionKalmanRule(ErrorRule):
         self.errors.combine(changes)
 
 
-def rule(
+def error_rule(
     scenario: Scenario, errors: StackedErrors, run: Run, messages: Sequence[SentMessage]
 ) -> ErrorRule:
     """Return the rule of this filter for the errors of a run."""

@@ -24,7 +24,7 @@ class SwapRule(EstimateExchangeRule):
         return roots[-1], np.concatenate([np.zeros((others, n, n)), np.eye(n)[None]])
 
 
-def rule(
+def error_rule(
     scenario: Scenario, errors: StackedErrors, run: Run, messages: Sequence[SentMessage]
 ) -> ErrorRule:
     """Return the rule of this filter for the errors of a run."""

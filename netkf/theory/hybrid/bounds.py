@@ -362,7 +362,7 @@ def _limit_evaluations(slope: Slope) -> Slope:
     """Return ``slope``, which raises StiffError after MAX_EXPLICIT_EVALUATIONS calls."""
     left = MAX_EXPLICIT_EVALUATIONS
 
-    def counted(t: float, y: FloatArray) -> FloatArray:
+    def limited(t: float, y: FloatArray) -> FloatArray:
         """Return the slope; raises StiffError after too many evaluations."""
         nonlocal left
         left -= 1
@@ -370,7 +370,7 @@ def _limit_evaluations(slope: Slope) -> Slope:
             raise StiffError
         return slope(t, y)
 
-    return counted
+    return limited
 
 
 def _check_defect(slope: Slope, output: Any) -> None:

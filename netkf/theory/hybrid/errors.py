@@ -25,7 +25,7 @@ class ResetRule(EstimateExchangeRule):
         return average_covariances(all_weights, roots)
 
 
-def rule(
+def error_rule(
     scenario: Scenario, errors: StackedErrors, run: Run, messages: Sequence[SentMessage]
 ) -> ErrorRule:
     """Return the rule of this filter for the errors of a run."""

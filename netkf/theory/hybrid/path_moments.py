@@ -26,7 +26,7 @@ def expected_squares(scenario: Scenario, run: Run) -> FloatArray:
 
     Raises TheoryError for filters, sensors and channels for which it is not known in this way.
     """
-    _require_plain(scenario)
+    _require_exact_model(scenario)
     A, Q = scenario.belief
     nodes = scenario.nodes
     G, true_G = np.zeros((2, len(nodes), *A.shape))
@@ -50,7 +50,7 @@ def expected_squares(scenario: Scenario, run: Run) -> FloatArray:
     return found
 
 
-def _require_plain(scenario: Scenario) -> None:
+def _require_exact_model(scenario: Scenario) -> None:
     """Raise TheoryError unless the filters follow H with increments and instant messages."""
     if scenario.slotted or scenario.sampled_sensors or not scenario.is_random:
         raise TheoryError("mean squares by quadrature are for random increments")

@@ -94,7 +94,7 @@ class ConsensusRule(ErrorRule):
                 errors.stack.add(i, columns[j], -gain @ observation.root)
 
 
-def rule(
+def error_rule(
     scenario: Scenario, errors: StackedErrors, run: Run, messages: Sequence[SentMessage]
 ) -> ErrorRule:
     """Return the rule of this filter for the errors of a run."""

@@ -78,7 +78,7 @@ class ReadingExchangeRule(ErrorRule):
                 self._update(estimator, [m.sender for m in messages if m.receiver == estimator])
 
 
-def rule(
+def error_rule(
     scenario: Scenario, errors: StackedErrors, run: Run, messages: Sequence[SentMessage]
 ) -> ErrorRule:
     """Return the rule of this filter for the errors of a run."""

@@ -117,7 +117,7 @@ def _prior_name(estimator: int) -> Hashable:
     return ("prediction", estimator)
 
 
-def rule(
+def error_rule(
     scenario: Scenario, errors: StackedErrors, run: Run, messages: Sequence[SentMessage]
 ) -> ErrorRule:
     """Return the rule of this filter for the errors of a run."""

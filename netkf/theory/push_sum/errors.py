@@ -256,7 +256,7 @@ def _read_rounds(scenario: Scenario, run: Run) -> dict[float, list[int]]:
     return found
 
 
-def rule(
+def error_rule(
     scenario: Scenario, errors: StackedErrors, run: Run, messages: Sequence[SentMessage]
 ) -> ErrorRule:
     """Return the rule of this filter; raises TheoryError if the errors in slots are not known."""

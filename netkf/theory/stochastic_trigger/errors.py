@@ -76,7 +76,7 @@ def silence(reading: Observation, Y: float | FloatArray) -> Observation:
     return Observation(reading.H, R, root)
 
 
-def rule(
+def error_rule(
     scenario: Scenario, errors: StackedErrors, run: Run, messages: Sequence[SentMessage]
 ) -> ErrorRule:
     """Return the rule of this filter for the errors of a run; raises TheoryError where silence may

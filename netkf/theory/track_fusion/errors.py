@@ -125,7 +125,7 @@ def _track_name(estimator: int) -> Hashable:
     return ("track", estimator)
 
 
-def rule(
+def error_rule(
     scenario: Scenario, errors: StackedErrors, run: Run, messages: Sequence[SentMessage]
 ) -> ErrorRule:
     """Return the rule of this filter for the errors of a run."""
