@@ -72,7 +72,7 @@ class BeliefState(NamedTuple):
     prior : evidence of the estimate before all readings that are kept
     own : evidence of the node's own readings
     senders, received : ids of neighbours, and the evidence that each sent last
-    node : the node's id.
+    node : the node's id
     """
 
     xhat: FloatArray
@@ -95,7 +95,7 @@ class Beliefs(NamedTuple):
 
     xhat : the sender's belief (n,)
     own : evidence (n, n + 1) of the sender's own readings
-    senders, heard : ids of the sender's neighbours, and the evidence of each.
+    senders, heard : ids of the sender's neighbours, and the evidence of each
     """
 
     xhat: FloatArray
@@ -111,7 +111,7 @@ class BeliefArrays(NamedTuple):
     keeps : whether messages are kept from slot to slot
     back : the inverse of F (n, n) if they are
     prior, own : evidence of priors and own readings (B, H, n, n + 1, L)
-    received : evidence received on each direction (B, W, n, n + 1, L).
+    received : evidence received on each direction (B, W, n, n + 1, L)
     """
 
     steps: int

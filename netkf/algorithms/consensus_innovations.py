@@ -68,7 +68,7 @@ class Design(NamedTuple):
     n, nodes : numbers of states and of nodes
     F, Q, cov : matrices (n, n) as bytes; ``cov`` is that of x(0)
     information : H' R^-1 H (N, n, n) of the nodes, as bytes
-    heard : indices of the nodes that each node hears.
+    heard : indices of the nodes that each node hears
     """
 
     n: int
@@ -99,7 +99,7 @@ class SlotGains(NamedTuple):
     """Gains of all N nodes in K slots, see ``NodeGains``.
 
     B : (K, W, n, n) of the W directions, by receiver and sender
-    M, K, root : (K, N, n, n).
+    M, K, root : (K, N, n, n)
     """
 
     B: FloatArray
@@ -113,7 +113,7 @@ class PseudoStates(NamedTuple):
 
     G : information of all sensors together
     inverse : its pseudo-inverse G^+
-    A, rest : of the prediction, ``A = G F G^+`` and ``rest = G F (I - G^+ G)``.
+    A, rest : of the prediction, ``A = G F G^+`` and ``rest = G F (I - G^+ G)``
     """
 
     G: FloatArray
@@ -295,7 +295,7 @@ class PseudoState(NamedTuple):
     pseudo : matrices of pseudo-states
     reading : whitened y (p,) and H (p, n) of this slot, or None
     slot : number of the slot
-    design, node_index : from which the gains follow.
+    design, node_index : from which the gains follow
     """
 
     xhat: FloatArray
@@ -334,7 +334,7 @@ class PseudoArrays(NamedTuple):
     table_row : row (S,) of each slot in ``gains``
     yhat : estimates of pseudo-states (B, H, n, L)
     corrected : (H, n, L), scratch
-    state, z : (n, L), scratch.
+    state, z : (n, L), scratch
     """
 
     pseudo: PseudoStates

@@ -48,7 +48,7 @@ class ConstantGainState(NamedTuple):
     xhat, root : estimate (n,) and root (n, n) of P
     model : of the plant and the node's sensors
     gain : L (n, p)
-    loop : model of the closed loop where sensors give increments, else None.
+    loop : model of the closed loop where sensors give increments, else None
     """
 
     xhat: FloatArray

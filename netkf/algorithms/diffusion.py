@@ -44,7 +44,7 @@ class DiffusionState(NamedTuple):
 
     xhat, root : estimate (n,) and root (n, n) of its covariance
     model : of the plant and the node's sensors
-    own : weight that the node gives to itself when all messages arrive.
+    own : weight that the node gives to itself when all messages arrive
     """
 
     xhat: FloatArray

@@ -42,7 +42,7 @@ class DiffusionKalmanState(NamedTuple):
     xhat : estimate (n,), psi between the exchanges
     root : root (n, n) of P
     model : of the plant and the node's sensors
-    reading : the node's own reading of this slot, or None.
+    reading : the node's own reading of this slot, or None
     """
 
     xhat: FloatArray

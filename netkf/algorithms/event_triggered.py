@@ -69,7 +69,7 @@ class TriggeredState(NamedTuple):
     xhat, root : estimate (n,) and root (n, n) of its covariance
     model : of the plant and the node's sensors
     sent : the estimate that the neighbours have of this node, None before the first message
-    senders, heard : ids of neighbours, and the estimate of each.
+    senders, heard : ids of neighbours, and the estimate of each
     """
 
     xhat: FloatArray
@@ -93,7 +93,7 @@ class TriggeredCiArrays(NamedTuple):
     share : share of a silent neighbour's information that counts
     x, root : the copies (B, W + 2 H, n, L) and roots (B, W + 2 H, n, n, L)
     known : which copies there are (B, W + 2 H, L)
-    mean, inverse : (W + H, n, L) and (W + H, n, n, L), scratch.
+    mean, inverse : (W + H, n, L) and (W + H, n, n, L), scratch
     """
 
     alpha: float

@@ -94,7 +94,7 @@ class Exchange(NamedTuple):
     slot : number of the slot, from 0; -1 under clocks
     receivers : under clocks, for ``emit``, the nodes that may hear
     uniform : in slots, for ``emit`` of a ``randomised`` filter, a number in [0, 1) of the node's
-              own.
+              own
     """
 
     time: float = 0.0
@@ -121,7 +121,7 @@ class Reading(NamedTuple):
 
     y : values (p,); p may be 0
     H, R : (p, n) and (p, p) as the node believes them
-    time : when it was taken, in seconds.
+    time : when it was taken, in seconds
     """
 
     y: FloatArray

@@ -79,7 +79,7 @@ class ConsensusState(NamedTuple):
     model : of the plant and the node's sensors
     recipe : how often pairs count
     parts : roots (K, n, n + 1) of the node's pairs after its reading, see ``kernels.information``;
-            None outside of a slot.
+            None outside of a slot
     """
 
     xhat: FloatArray

@@ -40,7 +40,7 @@ class Past(NamedTuple):
     reading : the reading that was used, or None
     offset : shift of the frame of coordinates, or None
     xhat, root : estimate (n,) and root (n, n) right after the event
-    before : the event before it.
+    before : the event before it
     """
 
     time: float
@@ -59,7 +59,7 @@ class IntermittentState(NamedTuple):
     unsent : own reading of this instant that has not been sent yet, or None
     time : seconds that the state refers to
     past : events as far back as a late reading may reach
-    lag : that far, in seconds; 0: no past is kept.
+    lag : that far, in seconds; 0: no past is kept
     """
 
     xhat: FloatArray

@@ -43,7 +43,7 @@ class KcfState(NamedTuple):
     xhat, root : estimate (n,) and root (n, n) of P
     model : of the plant and the node's sensors
     prior, prior_root : prediction of this instant and its root
-    reading : the node's own reading of this instant, or None.
+    reading : the node's own reading of this instant, or None
     """
 
     xhat: FloatArray

@@ -66,7 +66,7 @@ class OneBitState(NamedTuple):
     xhat, root : estimate (n,) and root (n, n) of P
     model : of the plant and the node's sensors
     reading : the node's own reading of this slot, or None
-    turn, nodes : the node sends in slots k with ``k % nodes == turn``.
+    turn, nodes : the node sends in slots k with ``k % nodes == turn``
     """
 
     xhat: FloatArray

@@ -104,7 +104,7 @@ class PushSumState(NamedTuple):
     network : the node's estimate of the network, from its mass
     stopped : whether that is frozen
     degree : nominal number of links
-    sums : running sums, if mass is exchanged by them, else None.
+    sums : running sums, if mass is exchanged by them, else None
     """
 
     xhat: FloatArray
@@ -162,7 +162,7 @@ class StopScratch(NamedTuple):
     mass, before : (1, m) and (m,), the mass now and before the step
     found, former : information (1, n, n) that the mass gives now and gave before
     number, former_number : number of nodes (1,), likewise
-    work : (n, n), scratch.
+    work : (n, n), scratch
     """
 
     mass: FloatArray

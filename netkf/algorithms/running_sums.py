@@ -52,7 +52,7 @@ class RunningSums(NamedTuple):
     sent : total (1 + n n + n,) to each receiver, of w, information U and ``u = U xhat``
     rounds : number of broadcasts
     heard : number and total heard last, by sender
-    receivers, nodes : number of nodes that can hear, and of all.
+    receivers, nodes : number of nodes that can hear, and of all
     """
 
     xhat: FloatArray

@@ -62,7 +62,7 @@ class Role(NamedTuple):
     neighbours : number of neighbours when no link fails
     nodes : number of nodes
     information : (n, n), sum of H' R^-1 H of all sensors as the filters believe it
-    own : weight left to the node when the messages of all neighbours arrive.
+    own : weight left to the node when the messages of all neighbours arrive
     """
 
     node: int

@@ -138,7 +138,7 @@ class ScheduledArrays(NamedTuple):
     H : whitened rows (B, W + H, p, n, L)
     known : which sensors are known (B, W + H, L)
     prior : predictions of a slot (B, H, n, L)
-    z, seen : (p, L) and (n, L), scratch.
+    z, seen : (p, L) and (n, L), scratch
     """
 
     trigger: FloatArray
@@ -308,7 +308,7 @@ class ScheduledState(NamedTuple):
     prior : prediction (n,) of this slot
     reading : own reading, or None
     sent : whether it was sent in this slot
-    senders, sensors : ids of nodes with known sensors (-1: itself), and (H, R) of each.
+    senders, sensors : ids of nodes with known sensors (-1: itself), and (H, R) of each
     """
 
     xhat: FloatArray
@@ -442,7 +442,7 @@ class TriggerArrays(NamedTuple):
     undecided : whether it is open if that is sent (B, H, L)
     silent : the decision not to send (B, H, L)
     begun : whether a node has begun to send after readings (B, H, L)
-    x, z : predictions (B, H, n, L) and (p, L), scratch.
+    x, z : predictions (B, H, n, L) and (p, L), scratch
     """
 
     trigger: FloatArray
@@ -474,7 +474,7 @@ class TriggerPlan(NamedTuple):
     first : first step of an exchange after the reading
     predicted : estimates are predicted before the reading
     framed : moving frames begin before the reading
-    split : an exchange before the reading moves estimates, so that it is simulated apart.
+    split : an exchange before the reading moves estimates, so that it is simulated apart
     """
 
     first: int
@@ -662,7 +662,7 @@ class WrappedState(NamedTuple):
     inner : state of the wrapped filter
     news : z' Y z of the last reading, NO_READING without one
     begun : whether the node has begun to send after readings
-    silent : whether it sends nothing until the next reading, None before that is decided.
+    silent : whether it sends nothing until the next reading, None before that is decided
     """
 
     inner: Any

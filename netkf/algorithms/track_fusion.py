@@ -218,7 +218,7 @@ class TrackState(NamedTuple):
     slot : number of the slot
     senders, sensors : ids of nodes heard of (-1: itself, first), and the whitened H of each
     joint : (m, m, n, n), covariances of the errors of these m tracks
-    start : covariance (n, n) with which all of them began.
+    start : covariance (n, n) with which all of them began
     """
 
     xhat: FloatArray
@@ -243,7 +243,7 @@ class CombinationCache(NamedTuple):
 
     key : (C,), directions that were heard as bits, -1 for a free entry
     used : (C,), number of differences that count
-    gain, root : (C, n, k n) and (C, n, n).
+    gain, root : (C, n, k n) and (C, n, n)
     """
 
     key: np.ndarray
@@ -260,7 +260,7 @@ class TrackArrays(NamedTuple):
     joint, pairs : covariances (K, n, n) of the pairs (K, 2) of tracks that some node may combine
     first : (H + 1,), pairs of track i begin at ``first[i]``
     closed : (H, n, n), scratch
-    near, block : tracks (D + 1,) and their covariances (D + 1, D + 1, n, n), scratch.
+    near, block : tracks (D + 1,) and their covariances (D + 1, D + 1, n, n), scratch
     """
 
     xhat: FloatArray

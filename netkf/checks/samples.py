@@ -36,7 +36,7 @@ class ReplicaSummary:
                  its estimate
 
     Papers add fields of their own. Summaries of R runs are stacked: every field gets a first axis
-    of length R.
+    of length R
     """
 
     P: FloatArray

@@ -165,7 +165,7 @@ class SafeStream:
     write  : a text with its control characters escaped, as far as the stream can encode it
     direct : a text as it is
     A ``lossy`` stream drops what cannot be written; else OutputError is raised, but where nobody
-    reads any more: that stops no command.
+    reads any more: that stops no command
     """
 
     def __init__(self, stream: TextIO, lossy: bool) -> None:

@@ -29,7 +29,7 @@ class PackedScenario(NamedTuple):
 
     digest, payload : its pickle, and the digest of that
     modules : where its modules are
-    versions : versions that the worker must have, none if it is of this installation anyway.
+    versions : versions that the worker must have, none if it is of this installation anyway
     """
 
     digest: str

@@ -43,7 +43,7 @@ class RunIdentity:
     trace, engine : as asked for
     installation : digest of the versions of all packages and of netkf's own files, and of the
                    processor's features
-    block : number of runs in a block.
+    block : number of runs in a block
     """
 
     scenario: str

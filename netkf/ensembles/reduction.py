@@ -61,7 +61,7 @@ class Batch(Struct):
     kept : (R,), number of samples of each run that count
     known, given : runs (R,) whose NEES is given, and that NEES (R, T, F)
     start : sample with which averages begin
-    x_rows, P_rows, error_rows : the same arrays with a row a run.
+    x_rows, P_rows, error_rows : the same arrays with a row a run
     """
 
     times: FloatArray
@@ -86,7 +86,7 @@ class Sums(Struct):
     size : (K, T), number of runs
     mean, M2 : (K, T, F (2 u + 1))
     averages, rounding_from : of the runs, as in Reduced
-    regular : (R,), whether all P of a run are regular.
+    regular : (R,), whether all P of a run are regular
     """
 
     size: FloatArray

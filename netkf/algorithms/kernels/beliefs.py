@@ -24,7 +24,7 @@ class BeliefScratch(NamedTuple):
     every : all that each of H nodes has
     others : for each of W directions, all of its receiver but what came from its sender
     behind : (D + 1,) sums from the last of D directions on
-    total, work : scratch.
+    total, work : scratch
     """
 
     every: FloatArray

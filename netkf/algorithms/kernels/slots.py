@@ -46,7 +46,7 @@ class SlotNodes(NamedTuple):
 
     xhat, root : (B, H, n, L) and lower triangular (B, H, n, n, L)
     F, root_Q : (n, n), the root lower triangular
-    rows : number of rows (H,) that each filter reads.
+    rows : number of rows (H,) that each filter reads
     """
 
     xhat: FloatArray
@@ -62,7 +62,7 @@ class ReadingBlock(NamedTuple):
     y : (B, S, H, p, L)
     H : (B, S, H, p, n, L), or (1, 1, H, p, n, L) if it is fixed
     local : the true state (B, S, n, L) in the coordinates of the estimates
-    rebased : slots (S,) in which the origin of these moves.
+    rebased : slots (S,) in which the origin of these moves
     """
 
     y: FloatArray
@@ -106,7 +106,7 @@ class SlotLinks(NamedTuple):
     first : (H + 1,)
     sender : index (W,) of the sender
     way : index (W,) in ``up``
-    weight : (W,) that the receiver gives.
+    weight : (W,) that the receiver gives
     """
 
     first: np.ndarray

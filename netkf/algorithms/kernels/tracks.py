@@ -28,7 +28,7 @@ class TrackScratch(NamedTuple):
     cross, parts : (n, k n), covariance of the own error with both
     sizes, order : (k n,), pivots
     weights : (n, (k + 1) n), of all errors
-    work : (n, n).
+    work : (n, n)
     """
 
     spread: FloatArray

@@ -26,7 +26,7 @@ class History(Struct):
     newest : (N,), index of the newest event of each node
     free : (2,), first free entry and number of free ones
     offsets : (F, n), of frames
-    lag : seconds for which events are kept.
+    lag : seconds for which events are kept
     """
 
     past: np.ndarray

@@ -32,7 +32,7 @@ class Totals(Struct):
     heard, number, heard_at : last total (W, m) heard, its number (W,) (-1: none) and its time
     offered : totals (C, m) of messages under way
     A, forgetting : of the plant (n, n), and the rate at which old information fades
-    gained, scratch : (m,) and (4, n, n).
+    gained, scratch : (m,) and (4, n, n)
     """
 
     weight: FloatArray

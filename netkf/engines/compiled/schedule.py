@@ -47,7 +47,7 @@ class Window(NamedTuple):
     at, delay : the outcomes of tick k begin at ``delay[at[k]]``, in the order of its directed
                 links: seconds or LOST
     heard : (K,), where no message takes time instead of ``delay``: a bit for each message that
-            arrives.
+            arrives
     """
 
     end: float

@@ -21,7 +21,7 @@ class Senders(NamedTuple):
     ways : the W directed links, in the order in which simultaneous messages arrive
     first, hearing : entity e sends on the ways ``hearing[first[e]:first[e + 1]]``
     sources, source : streams of outcomes, and the index (W,) of that of each way; ways that share a
-                      stream share a draw at each tick.
+                      stream share a draw at each tick
     """
 
     at: str

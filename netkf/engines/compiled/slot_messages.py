@@ -43,7 +43,7 @@ class Matchings(NamedTuple):
     states : random streams (R, 6)
     first, members : for node-wakeup the links of each node in the order of its peers, for
                      uniform-maximal the links of each matching
-    order, busy : (L,) and (N,), scratch.
+    order, busy : (L,) and (N,), scratch
     """
 
     protocol: int
@@ -314,7 +314,7 @@ class Stages(NamedTuple):
     step : (K,), step of an exchange, -1 where nodes read
     phase : (K,)
     end : (K,), seconds after the slot begins
-    stopping : step in which nodes may stop for good, -1: none.
+    stopping : step in which nodes may stop for good, -1: none
     """
 
     step: np.ndarray
@@ -329,7 +329,7 @@ class SlotTimes(NamedTuple):
     first, start : number of the first slot, and the times (S,)
     noted, sensed, exchanged : (S,), whether events are recorded, nodes read, nodes exchange
     sample : (S,), index of the sample, -1: none
-    predicts : whether samples come first in a slot.
+    predicts : whether samples come first in a slot
     """
 
     first: int
@@ -347,7 +347,7 @@ class Hearing(NamedTuple):
     nodes, sensing : ids of all nodes (N,) and of those with sensors
     first, sender, way : directions by receiver, see ``SlotLinks``
     sent : number of messages so far (W,)
-    stopped : slot in which each node stopped (B, N, L).
+    stopped : slot in which each node stopped (B, N, L)
     """
 
     nodes: np.ndarray
@@ -377,7 +377,7 @@ class Drawn(NamedTuple):
 
     up : (B, S, E, W, L), whether a message arrives
     active, pairs : paired links (R, S, E, A) and their number (R, S, E)
-    sent : who sends (B, S, E, N, L), empty where filters do not decide that.
+    sent : who sends (B, S, E, N, L), empty where filters do not decide that
     """
 
     up: np.ndarray
@@ -391,7 +391,7 @@ class Moment(NamedTuple):
 
     slot, s : number of the slot, and its index in the block
     step, phase : of the exchange, -1 where nodes read
-    t : seconds.
+    t : seconds
     """
 
     slot: int

@@ -66,7 +66,7 @@ class SampledStates(NamedTuple):
 
     x : (R, T, n)
     xhat, error : (R, T, H, n)
-    P : (R, T, H, n, n).
+    P : (R, T, H, n, n)
     """
 
     x: FloatArray

@@ -85,7 +85,7 @@ class Scratch(Struct):
     early, cut : (2, p), noise of a part of a step, and normals for it
     state_moments, total : (2, n), moments of x and their sum
     values : of the longest series
-    y, H, root_R : (q,), (q, n), (q, q), a sample.
+    y, H, root_R : (q,), (q, n), (q, q), a sample
     """
 
     moments: FloatArray
@@ -108,7 +108,7 @@ class Sensing(Struct):
     rest, step : noise left of the present step (R S, 2, p), and its number (R S,)
     cuts : streams (R S, 4) of normals for parts of a step
     height, width, inside : numpy's ziggurat table for these
-    host, node : (K,), index and id of the nodes that wake at a grid point, in order.
+    host, node : (K,), index and id of the nodes that wake at a grid point, in order
     """
 
     rows: IntArray
@@ -134,7 +134,7 @@ class Instants(Struct):
     node, y : (S,) and (S, p), of each sample
     sensor, matrix : (S,), index of its noise and of its H
     rows, root : (L,) and the root of R (L, p, p), by sensor
-    H : (M, p, n), by matrix.
+    H : (M, p, n), by matrix
     """
 
     t: FloatArray
@@ -196,7 +196,7 @@ class SampleBuffer(Struct):
     xhat, P : (R, B, N, n) and (R, B, N, n, n)
     rows, counts : rows (R, B) of events, or events by kind (R, B, len(KINDS)), before each sample
     piece : piece (R, B) of the path that each sample is in
-    terms : (B, T), terms of conserved sums, of one run.
+    terms : (B, T), terms of conserved sums, of one run
     """
 
     xhat: FloatArray

@@ -56,7 +56,7 @@ class DelayedJumps:
     A, Q    : (n, n) drift and noise a second of the plant
     delay   : seconds, positive
 
-    Raises TheoryError if the errors change too often during a delay.
+    Raises TheoryError if the errors change too often during a delay
     """
 
     instant: ClockJumps

@@ -32,7 +32,7 @@ class Ways(NamedTuple):
                        one source share it
     delivery         : (S, K) probability that a message arrives, by mode
     steps            : (to_bad, to_good) of a chain that makes a step at each activation; None if
-                       there is one mode only. Bit c of a mode says if chain c is bad.
+                       there is one mode only. Bit c of a mode says if chain c is bad
     """
 
     sender: IntArray
