@@ -35,22 +35,35 @@ def _record_type(integers: str, floats: str = "") -> np.dtype:
 
 
 NODE = _record_type("model id sensor sensors inbox last sent reading", "own")
-"""One filter: its model, the id in the trace (-1: pooled), its increment sensors from ``sensor`` up
-to ``sensors``, first and last message of its inbox (-1: none), how many transmissions it ``sent``,
-the instant of its newest sample (``reading``), and its ``own`` weight.
+"""One filter.
+
+model : index of its model
+id : id in the trace, -1 if pooled
+sensor, sensors : its increment sensors, from ``sensor`` up to ``sensors``
+inbox, last : first and last message of its inbox, -1: none
+sent : number of transmissions
+reading : instant of its newest sample
+own : its own weight
 """
 
 WAY = _record_type("sender receiver messages", "weight")
 """A directed link: nodes by index, how many messages went, the weight of each."""
 
 ENTITY = _record_type("sender other first after")
-"""Whatever has a clock: the node that sends, the other end of a link (else -1), and the directed
-links that it sends on, ``Simulation.hearing`` from ``first`` up to ``after``.
+"""Whatever has a clock.
+
+sender, other : the node that sends, and the other end of a link, else -1
+first, after : it sends on the directed links ``Simulation.hearing[first:after]``
 """
 
 MESSAGE = _record_type("way number next order tag", "sent arrival")
-"""On its way or in an inbox; ``next`` in the same inbox or among the free ones. ``tag`` is the
-instant of a reading that is sent, or the number of a running sum.
+"""A message under way or in an inbox.
+
+way, number : directed link, and number on it
+next : next message in the same inbox, or among the free ones
+order : number of the message on the heap, which orders simultaneous arrivals
+tag : instant of the reading that is sent, or number of a running sum
+sent, arrival : seconds
 """
 
 (CONVEX, INTERSECTION, SWAP, SHARES, READINGS, SUMS, SILENT, BEST, INVERSE, GAINS,
@@ -208,23 +221,50 @@ class SampleBuffer(Struct):
 
 
 class Simulation(Struct):
-    """Runs, and where they stand.
+    """The state of the event loop: R runs, of which G are simulated together.
 
-    The ``size`` n of states. Filters: ``nodes`` (N,), of the G runs that are simulated together
-    xhat (G N, n), root (G N, n, n) and the time that each has reached, ``now`` (G N,); the
-    ``table`` of their models and, last, of prediction alone. Messages: ``pool`` (C,), what they
-    carry (C, n), (C, n, n), the ``heap`` of arrivals (C,), ``waiting`` (N,) nodes with mail. Times
-    of ``frames`` (F,) and ``probes`` (T,). The trace: ``rows``, or where it is not ``traced`` only
-    ``counts`` (len(KINDS),) of events.
+    Filters
 
-    ``kind`` and ``at``: see COMBINATIONS and CLOCKS; ``..._at``: next frame, point of the sensing
-    grid, node that wakes there, instant of samples, tick and probe; the ``run`` of R, which is one
-    of those from ``first_run`` on; where its ticks end (``ticks_stop``) and its outcomes begin
-    (``delays``); the ``piece`` of the path; the next ``row``, and how many one
-    event may need (``most_rows``); the first ``free`` message and how many are (``free_count``,
-    ``most_messages``); messages on the heap (``flying``) and how many were put there (``order``);
-    nodes with mail (``receivers``), of which so many are done (``absorbing``) at ``mail_time``;
-    samples not handed on yet (``samples``); messages older than ``age_limit`` seconds are late.
+    size, nodes : n as a type, and NODE records (N,)
+    xhat, root : (G N, n) and (G N, n, n)
+    now : time (G N,) in seconds that each estimate refers to
+    table, gains : tables of all models, the last without sensors, for messages under way
+    kind, at, keep_own : the filter's combination (COMBINATIONS), its clocks (CLOCKS), its
+                         ``on_loss``
+
+    Links and messages
+
+    entities, hearing, ways : ENTITY records (E,), their directed links, WAY records (W,)
+    pool, pool_x, pool_root : MESSAGE records (C,) and what they carry, (C, n) and (C, n, n)
+    free, free_count, most_messages : first free message, number of free ones and of those that one
+                                      event may need
+    heap, flying, order : heap (C,) of arrivals, messages on it, and messages ever put there
+    waiting, receivers, absorbing, mail_time : nodes (N,) with messages, their number, how many of
+                                               them are done, and the instant
+    age_limit : messages older than so many seconds are late
+
+    Events to come; ``..._at`` is the index of the next one
+
+    instants, instant_at : samples of nodes
+    sensing, grid_at, wake_at : increment sensors, point of the sensing grid, node that wakes there
+    path, piece : path of the plant, and its present piece
+    ticks, tick_at, ticks_stop, delays : ticks, where those of this run end, and where their
+                                         outcomes begin
+    frames, frame_at : times (F,) at which frames begin
+    probes, probe_at : times (T,) of samples
+    run, first_run : number of the present run, and of the first one
+    horizon : seconds
+
+    Results
+
+    shown, samples : space for samples, and samples that are not handed on yet
+    traced, rows, row, most_rows : whether rows of events are written, the rows, the next one, and
+                                   how many one event may need
+    counts : events by kind (len(KINDS),)
+
+    Scratch
+
+    scratch, flow_scratch, update_scratch : arrays for computations.
     """
 
     size: Size
