@@ -132,8 +132,8 @@ class FlowModel:
 
     def max_interval(self, root: FloatArray) -> float:
         """Return the longest measurement interval, see ``Filter.max_measurement_interval``."""
-        seen = self.flow.seen[0] @ root
-        return usable(float((seen * seen).sum()))
+        HS = self.flow.seen[0] @ root
+        return usable(float((HS * HS).sum()))
 
 
 @dataclass(frozen=True, eq=False)

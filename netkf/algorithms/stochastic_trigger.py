@@ -147,7 +147,7 @@ class ScheduledArrays(NamedTuple):
     known: np.ndarray
     prior: FloatArray
     z: FloatArray
-    seen: FloatArray
+    row: FloatArray
 
 
 @kernel
@@ -284,14 +284,14 @@ def use_silence(
             total = spread(lanes, 0.0)
             for j in range(k + 1):
                 total += arrays.wider[sender, k, j] * load(lanes, arrays.H, b, index, j, i)
-            store(lanes, arrays.seen, i, total)
+            store(lanes, arrays.row, i, total)
             # No innovation with respect to the prediction.
             gap = load(lanes, arrays.prior, b, h, i) - load(lanes, nodes.xhat, b, h, i)
             innovation += total * gap
         for j in range(n):
             total = spread(lanes, 0.0)
             for i in range(j, n):
-                total += load(lanes, arrays.seen, i) * load(lanes, nodes.root, b, h, i, j)
+                total += load(lanes, arrays.row, i) * load(lanes, nodes.root, b, h, i, j)
             store(lanes, scratch.row, j, select(silent, total, 0.0))
         gains = scratch.gains
         step = innovation * rotate_lanes(lanes, nodes.root, b, h, scratch.row, gains)

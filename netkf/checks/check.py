@@ -302,7 +302,7 @@ def check(
     if not isinstance(scenario, Scenario):
         raise ScenarioError("", "check takes a netkf.Scenario", scenario, LOAD)
     count = integer(low=MIN_RUNS)("runs", runs)
-    sure = number(above=0.0, below=1.0)("confidence", confidence)
+    confident = number(above=0.0, below=1.0)("confidence", confidence)
     root = scenario.seed if seed is None else integer(low=0)("seed", seed)
     if until not in (None, "decided"):
         raise ScenarioError("until", "must be decided, or left out", until, 'write "decided"')
@@ -321,7 +321,7 @@ def check(
             pool=PoolOptions(workers, executor, scheduler),
             progress=progress,
         )
-        verdict = _look_again(chosen, verdict, found, root, sure, bool(until))
+        verdict = _look_again(chosen, verdict, found, root, confident, bool(until))
         if not until or not verdict or verdict.is_decided or count >= last:
             return verdict
         count = next_runs(verdict.rows, count, last)
@@ -342,9 +342,9 @@ def _look_again(
     spent = (before.spent if before is not None else 0.0) + share
     verdict = judge_replicas(scenario, results, seed, 1.0 - share)
     rows = keep_decisions(before.rows, verdict.rows) if before is not None else verdict.rows
-    sure = 1.0 - max(spent, level) if again else 1.0 - spent
+    confident = 1.0 - max(spent, level) if again else 1.0 - spent
     return dataclasses.replace(
-        verdict, rows=rows, confidence=sure, results=tuple(results), looks=look, spent=spent
+        verdict, rows=rows, confidence=confident, results=tuple(results), looks=look, spent=spent
     )
 
 

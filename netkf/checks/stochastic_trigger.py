@@ -16,7 +16,7 @@ from netkf.checks.samples import ReplicaSummary, RunSamples
 from netkf.checks.statistics import deviation_interval, student_interval
 from netkf.checks.track_fusion import EXACT
 from netkf.scenario.scenario import Scenario
-from netkf.theory.stochastic_trigger.errors import everyone_hears
+from netkf.theory.stochastic_trigger.errors import all_hear_all
 from netkf.theory.stochastic_trigger.rates import expected_sends
 from netkf.trace.run import Run
 
@@ -64,7 +64,7 @@ class TriggerChecks(EquationChecks):
     def summarise(self, scenario: Scenario, run: Run) -> TriggerSummary:
         """Return the summary of a run whose samples are at ``check_times``."""
         sends = np.full(2, np.nan)
-        if everyone_hears(scenario):
+        if all_hear_all(scenario):
             sends[:] = expected_sends(with_promised_filter(scenario), run)
         return TriggerSummary(**vars(summarise_exactly(scenario, run)), sends=sends)
 

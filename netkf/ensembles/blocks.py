@@ -109,7 +109,7 @@ def _plugged_in_modules(scenario: Scenario) -> set[tuple[str, str]]:
     return found
 
 
-KEPT = 4  # scenarios that a worker keeps unpickled: a sweep goes from one to the next
+MAX_KEPT = 4  # scenarios that a worker keeps unpickled: a sweep goes from one to the next
 _scenarios: dict[str, Scenario] = {}
 
 
@@ -117,7 +117,7 @@ def unpack_scenario(travelling: PackedScenario) -> Scenario:
     """Return the scenario that travelled, with its caches kept from one block to the next."""
     scenario = _scenarios.get(travelling.digest)
     if scenario is None:
-        while len(_scenarios) >= KEPT:
+        while len(_scenarios) >= MAX_KEPT:
             _scenarios.pop(next(iter(_scenarios)), None)
         scenario = _scenarios.setdefault(travelling.digest, _unpickle(travelling))
     return scenario

@@ -337,7 +337,7 @@ class Geometric(RandomGraph):
         import networkx
 
         pairs = 0.5 * self.nodes * (self.nodes - 1)
-        _check_size(self.nodes, int(pairs * _chance_within(min(self.radius, 1.0))))
+        _check_size(self.nodes, int(pairs * _probability_within(min(self.radius, 1.0))))
 
         def make(state: np.random.RandomState) -> networkx.Graph[Any]:
             """Return a geometric graph of uniform points in the unit square."""
@@ -349,7 +349,7 @@ class Geometric(RandomGraph):
         return _from_networkx(graph, positions=positions)
 
 
-def _chance_within(radius: float) -> float:
+def _probability_within(radius: float) -> float:
     """Return the probability that two points of the unit square are within ``radius`` <= 1."""
     return math.pi * radius**2 - 8.0 / 3.0 * radius**3 + 0.5 * radius**4
 

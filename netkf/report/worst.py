@@ -11,7 +11,7 @@ import numpy as np
 from netkf.runs.stored import StoredRun
 from netkf.runs.summary import SampleIndices, averaged_samples
 
-COME_DOWN, SETTLED = 0.8, 0.25
+COME_DOWN, LATE_SHARE = 0.8, 0.25
 """Trace P has a start-up if its mean over the last quarter of the samples is below this share of
 its first value."""
 
@@ -78,7 +78,7 @@ def after_start_up(
     k, at = run.nodes.index(worst.node), int(np.searchsorted(run.times, worst.time))
     traces = np.trace(run.P[:, k], axis1=1, axis2=2)
     first, now = float(traces[0]), float(traces[at])
-    last = float(traces[-max(1, int(SETTLED * len(traces))) :].mean())
+    last = float(traces[-max(1, int(LATE_SHARE * len(traces))) :].mean())
     low = np.flatnonzero(traces <= 0.5 * (first + last))
     if not last < COME_DOWN * first or not len(low) or low[0] <= at:
         return worst, None

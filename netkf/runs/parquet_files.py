@@ -129,7 +129,7 @@ class ParquetSink(Sink):
 
     def __init__(self, directory: Path, scenario: Scenario, replica: int, events: bool) -> None:
         self._nodes, self._replica, self._first = scenario.nodes, replica, 0
-        self._shown = scenario.plant.truth_known
+        self._truth_known = scenario.plant.truth_known
         self._events = _Table(directory / "events.parquet", EVENT_ENCODING) if events else None
         self._states = _Table(directory / "states.parquet", STATE_ENCODING) if events else None
         self._samples: list[tuple[FloatArray, ...]] = []
@@ -161,7 +161,10 @@ class ParquetSink(Sink):
         self._rows = 0
         self._states.write(
             state_table(
-                self._replica, self._nodes, StateSamples(times, x, xhat, P, error), self._shown
+                self._replica,
+                self._nodes,
+                StateSamples(times, x, xhat, P, error),
+                self._truth_known,
             )
         )
 
@@ -187,7 +190,7 @@ class TraceTables:
     """
 
     def __init__(self, directory: Path, scenario: Scenario) -> None:
-        self._nodes, self._shown = scenario.nodes, scenario.plant.truth_known
+        self._nodes, self._truth_known = scenario.nodes, scenario.plant.truth_known
         self._events = _Table(directory / "events.parquet", EVENT_ENCODING)
         self._states = _Table(directory / "states.parquet", STATE_ENCODING)
         self._gathered: tuple[list[pd.DataFrame], list[pd.DataFrame]] = ([], [])
@@ -205,7 +208,7 @@ class TraceTables:
     ) -> None:
         """Append one run: its EVENT rows, and its samples with the shapes of ``netkf.Run``."""
         samples = StateSamples(times, x, xhat, P, error)
-        states = state_table(replica, self._nodes, samples, self._shown)
+        states = state_table(replica, self._nodes, samples, self._truth_known)
         for gathered, columns in zip(
             self._gathered, (event_columns(log, replica, 0), states), strict=True
         ):

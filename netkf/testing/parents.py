@@ -42,11 +42,11 @@ def check_parent(watched: Watched, same_as_parent: bool | None) -> None:
     found = largest_difference(watched.once(), Watched(base_filter(part)).once())
     if found is None or found.apart <= TOLERANCE:
         return
-    words = f"{found.what} differs by {found.apart:.3g} of its size {found.where}"
+    size = f"{found.what} differs by {found.apart:.3g} of its size {found.where}"
     listed = ", ".join(own)
     rule = f"must have the numbers of {known.__name__}, which it derives from"
     remedy = "say same_as_parent=False if it differs by design"
-    text = f"{words}; its own: {listed}"
+    text = f"{size}; its own: {listed}"
     if same_as_parent is None and set(own) & set(STEPS):
         message = f"{watched.name}: {rule}, or say so; {text}; {remedy}"
         warnings.warn(message, UserWarning, stacklevel=4)

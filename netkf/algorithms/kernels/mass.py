@@ -155,30 +155,30 @@ def add_gain(
     s: int,
     H: FloatArray,
     rows: int,
-    seen: FloatArray,
+    projected: FloatArray,
     turned: FloatArray,
 ) -> None:
     """Correct an estimate, P (8): ``x += number S S' H' (y - H x)`` for the whitened reading ``y[b,
-    s, h]``, of ``rows`` rows, and its H; ``seen`` and ``turned`` (n, L) are scratch.
+    s, h]``, of ``rows`` rows, and its H; ``projected`` and ``turned`` (n, L) are scratch.
     """
     n = x.shape[2]
     # H that is fixed has one block and one slot.
     d, t = min(b, H.shape[0] - 1), min(s, H.shape[1] - 1)
     # H' (y - H x); the noise is white with variance 1, so no R^-1 appears.
     for i in range(n):
-        store(lanes, seen, i, 0.0)
+        store(lanes, projected, i, 0.0)
     for row in range(rows):
         innovation = load(lanes, y, b, s, h, row)
         for i in range(n):
             innovation -= load(lanes, H, d, t, h, row, i) * load(lanes, x, b, h, i)
         for i in range(n):
             weight = load(lanes, H, d, t, h, row, i)
-            store(lanes, seen, i, load(lanes, seen, i) + weight * innovation)
+            store(lanes, projected, i, load(lanes, projected, i) + weight * innovation)
     # S' times that, then S times it: P itself is never formed.
     for j in range(n):
         total = spread(lanes, 0.0)
         for i in range(j, n):
-            total += load(lanes, root, b, h, i, j) * load(lanes, seen, i)
+            total += load(lanes, root, b, h, i, j) * load(lanes, projected, i)
         store(lanes, turned, j, total)
     for i in range(n):
         total = spread(lanes, 0.0)

@@ -283,10 +283,10 @@ class SlotEvents:
         channel, delay = self._scenario.network.channel, math.nan
         if draw is not None:
             # Checked, because a user's channel may return anything.
-            chance = checked_delivery_probability(
+            probability = checked_delivery_probability(
                 channel.loss, way.ends, number, draw[1], way.probability
             )
-            if draw[0] < chance:
+            if draw[0] < probability:
                 delay = checked_delay(channel.delay, way.ends, number, draw[2])
         if math.isnan(delay):
             self._append_row((now, LOST, sender, receiver, number, step.phase, NAN))

@@ -39,7 +39,7 @@ class Matchings(NamedTuple):
     """How pairs are drawn.
 
     protocol : index in PROTOCOLS, -1: all links exchange
-    chance : lazy or p
+    probability : lazy or p
     states : random streams (R, 6)
     first, members : for node-wakeup the links of each node in the order of its peers, for
                      uniform-maximal the links of each matching
@@ -47,7 +47,7 @@ class Matchings(NamedTuple):
     """
 
     protocol: int
-    chance: float
+    probability: float
     states: np.ndarray
     first: np.ndarray
     members: np.ndarray
@@ -59,12 +59,12 @@ class Channels(NamedTuple):
     """Properties and draws of messages on L links with so many directions each (``ends`` (L, 2) are
     indices of nodes; direction 2 l goes from the first to the second).
 
-    ``delivery`` (2, W): chance of a direction in the good and the bad state of its link. Streams
-    ``states`` and ``state_draws`` (B, K, 4, L) of K links or directions, empty where nothing is
-    drawn; the last uniform numbers ``drawn`` and ``state_drawn`` and state ``bad`` (B, K, L; -1 at
-    first) of each; chances ``to_bad``, ``to_good``. ``talks`` (E, W): whether the sender has
-    something to send in a step. A link has so many ``ways`` (directions) and ``streams`` of its
-    own.
+    ``delivery`` (2, W): probability of a direction in the good and the bad state of its link.
+    Streams ``states`` and ``state_draws`` (B, K, 4, L) of K links or directions, empty where
+    nothing is drawn; the last uniform numbers ``drawn`` and ``state_drawn`` and state ``bad`` (B,
+    K, L; -1 at first) of each; probabilities ``to_bad``, ``to_good``. ``talks`` (E, W): whether the
+    sender has something to send in a step. A link has so many ``ways`` (directions) and ``streams``
+    of its own.
     """
 
     ends: np.ndarray
@@ -92,7 +92,7 @@ def draw_matching(m: Matchings, ends: np.ndarray, r: int, active: np.ndarray) ->
         return 0
     # The order of the draws is that of Matching.draw: it decides which numbers a protocol takes.
     if m.protocol == ONE_EDGE:
-        lazy = next_unit(m.states, r) < m.chance
+        lazy = next_unit(m.states, r) < m.probability
         active[0] = next_integer(m.states, r, count)
         return 0 if lazy else 1
     if m.protocol == NODE_WAKEUP:
@@ -136,7 +136,7 @@ def _free_links(m: Matchings, ends: np.ndarray, r: int, active: np.ndarray) -> i
         return found
     # Independent: each link wakes with the probability, and busy counts its ends.
     for k in range(count):
-        m.order[k] = 1 if next_unit(m.states, r) < m.chance else 0
+        m.order[k] = 1 if next_unit(m.states, r) < m.probability else 0
         m.busy[ends[k, 0]] += m.order[k]
         m.busy[ends[k, 1]] += m.order[k]
     # A link that meets no other is the only one at both of its ends.

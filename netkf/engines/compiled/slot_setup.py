@@ -234,9 +234,9 @@ class SlotSetup:
         self.loss, bad = channel.loss, (False, True)
         self.is_chain = type(self.loss) is GilbertElliott
         # Channels of a user's own have probabilities that only Python can ask for.
-        self.has_known_chances = identical_per_link(self.loss) or self.is_chain
+        self.has_known_probabilities = identical_per_link(self.loss) or self.is_chain
         self.delivery = np.ones((2, len(self.directions)))
-        if self.has_known_chances:
+        if self.has_known_probabilities:
             for w, way in enumerate(self.directions):
                 table = scenario.table_probability(way)
                 self.delivery[:, w] = [
@@ -292,7 +292,7 @@ class SlotSetup:
         network = scenario.network
         # Kernels know broadcasts and matchings without delay, with the built-in losses.
         exchanges = type(network.activation) in (Matching, Broadcast) or not self.algorithm.talks
-        return self.has_known_chances and network.channel.delay.fixed == 0.0 and exchanges
+        return self.has_known_probabilities and network.channel.delay.fixed == 0.0 and exchanges
 
     @property
     def most_pairs(self) -> int:

@@ -28,7 +28,7 @@ def slot_jumps(scenario: Scenario) -> SlotJumps:
     (F, Q), index = scenario.slot_belief, scenario.topology.index
     heard: list[list[int]] = [[k] for k in range(len(nodes))]
     if algorithm.share_readings:
-        _require_sure_links(scenario)
+        _require_lossless(scenario)
         for sender, receiver in scenario.topology.directions:
             heard[index[receiver]].append(index[sender])
     sensors = [scenario.observation(node, believed=True) for node in nodes]
@@ -56,7 +56,7 @@ def slot_jumps(scenario: Scenario) -> SlotJumps:
     return SlotJumps(plant.F, plant.Q, np.stack(closed), noise, ways, on_predictions=True)
 
 
-def _require_sure_links(scenario: Scenario) -> None:
+def _require_lossless(scenario: Scenario) -> None:
     """Raise TheoryError unless every message arrives in its slot."""
     if not all_messages_arrive(scenario):
         raise TheoryError(

@@ -5,7 +5,7 @@ from __future__ import annotations
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.evidence import AssumptionRow
 from netkf.theory.common.plant_assumptions import model_and_start_rows
-from netkf.theory.stochastic_trigger.errors import everyone_hears
+from netkf.theory.stochastic_trigger.errors import all_hear_all
 
 SOURCE = "Han et al. 2015"
 HEARD = "every node hears every other, without losses"
@@ -13,6 +13,6 @@ HEARD = "every node hears every other, without losses"
 
 def slot_rows(scenario: Scenario) -> list[AssumptionRow]:
     """Return the rows about the model, the network and the first covariances."""
-    heard = everyone_hears(scenario)
+    heard = all_hear_all(scenario)
     evidence = "silence is a decision" if heard else "who misses a message takes it for silence"
     return model_and_start_rows(scenario, SOURCE, (HEARD, SOURCE, heard, evidence))

@@ -29,7 +29,7 @@ Decisions = set[tuple[int, int]]
 """Slots and the indices of the nodes that sent in them."""
 
 
-def everyone_hears(scenario: Scenario) -> bool:
+def all_hear_all(scenario: Scenario) -> bool:
     """Return True if every node hears every other, without losses."""
     N = len(scenario.nodes)
     return len(scenario.topology.directions) == N * (N - 1) and all_messages_arrive(scenario)
@@ -83,7 +83,7 @@ def error_rule(
     be a loss, or the filters do not know the law of innovations.
     """
     require_traced_exchanges(scenario, run)
-    if not everyone_hears(scenario):
+    if not all_hear_all(scenario):
         raise TheoryError("who misses a message takes it for silence: errors follow the data")
     if not scenario.filters_know_the_truth:
         raise TheoryError("the filters take silence for what their model says, which is not true")
