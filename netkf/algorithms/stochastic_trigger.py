@@ -138,7 +138,7 @@ class ScheduledArrays(NamedTuple):
     H : whitened rows (B, W + H, p, n, L)
     known : which sensors are known (B, W + H, L)
     prior : predictions of a slot (B, H, n, L)
-    z, seen : (p, L) and (n, L), scratch
+    z, row : (p, L) and (n, L), scratch
     """
 
     trigger: FloatArray
