@@ -141,7 +141,7 @@ def parse_replica(text: str) -> int:
     return int(text)
 
 
-MAX_RUNS = 100_000_000  # more would take weeks: a slip
+MAX_RUNS = 100_000_000  # more are a slip
 WORKERS_PER_CORE = 8  # beyond that processes only fill the memory
 
 

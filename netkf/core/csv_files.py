@@ -14,7 +14,7 @@ from netkf.core.errors import ScenarioError
 from netkf.core.fields import MAX_MAGNITUDE, SourceFile
 from netkf.linalg.arrays import FloatArray
 
-MAX_BYTES = 256 << 20  # a file beyond that would not fit into memory as text
+MAX_BYTES = 256 << 20  # bounds the memory that reading takes
 MAX_ID = 2**53  # larger integers are not exact as floating-point numbers
 
 

@@ -28,8 +28,8 @@ from netkf.scenario.shapes import demand_shape
 MAX_SAMPLES = 10_000_000
 MAX_ENTRIES = 100_000_000
 """Entries of all sampled covariances of a run, of which it may hold a gigabyte."""
-MAX_STEPS = 100_000_000  # steps of one run: days of simulation
-MAX_TICKS = 1e9  # ticks of one clock: days of simulation
+MAX_STEPS = 100_000_000  # steps of one run; more are a slip in a unit of time
+MAX_TICKS = 1e9  # ticks of one clock; more are a slip in a unit of time
 MAX_CONSTANTS = 1e15  # as integers they can be counted
 MAX_GROWTH = 1e7  # the exponent: there is a frame for every seven
 

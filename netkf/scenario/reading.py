@@ -17,7 +17,7 @@ from netkf.scenario.scenario import Scenario
 from netkf.scenario.tables import MAX_DEPTH, build_scenario, explain_left_over, with_changes
 
 MAX_BYTES = 64 << 20
-MAX_DOTS = 100  # parts of a key: tomllib takes time that grows with their square
+MAX_DOTS = 100  # parts of a key: tomllib takes minutes and gigabytes for very many
 # Characters from which on lists of numbers are read by numpy instead of by tomllib.
 LONG_TEXT, LONG_LINE = 100_000, 1000
 _NUMBERS = re.compile(r"([A-Za-z0-9_-]+)[ \t]*=[ \t]*(\[[0-9eE+\-., \t\[\]]*\])[ \t]*")

@@ -20,7 +20,7 @@ from netkf.plants.sensors import LinearSensor, Sensor
 from netkf.rng.streams import Streams
 from netkf.scenario.model import PlacedSensor, ScenarioModel, takes_samples
 
-MAX_SAMPLES = 1e9  # samples of one sensor: days of simulation
+MAX_SAMPLES = 1e9  # samples of one sensor; more are a slip in a unit of time
 
 
 def sample_times(scenario: ScenarioModel, streams: Streams) -> dict[tuple[int, int], FloatArray]:

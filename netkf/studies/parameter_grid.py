@@ -16,7 +16,7 @@ from netkf.scenario.scenario import Scenario
 from netkf.scenario.values import split_setting, typed_values
 from netkf.scenario.writing import part_as_table, resolve_defaults, toml_text
 
-MAX_POINTS = 10_000  # more points are a slip, or no table that anybody reads
+MAX_POINTS = 10_000  # more are a slip
 _RANGE = re.compile(r"^([^:,\[{\"']+):([^:,]+):(\d+)$")
 
 

@@ -28,7 +28,7 @@ from netkf.scenario.scenario import Scenario
 if TYPE_CHECKING:
     import networkx
 
-MAX_PARTITIONS = 120_000  # partitions of open nodes at once: some seconds
+MAX_PARTITIONS = 120_000  # partitions of open nodes at once: bounds time and memory
 MAX_ROOTS = 12  # first nodes that are tried
 MAX_OPEN = 40  # open nodes at a time; beyond, there are far too many partitions
 MAX_SAMPLES, MIN_SAMPLES, NODE_SAMPLES = 200_000, 2_000, 2e7  # the last: samples times nodes
