@@ -188,7 +188,9 @@ class IntermittentSamples(RunSamples):
         samples = reference_count(self.scenario, len(self.nodes))
         return self._draw_arrivals("arrivals", list(check_slots(self.scenario)), samples, MAX_PATHS)
 
-    def _draw_arrivals(self, purpose: str, slots: list[int], samples: int, paths: int) -> ArrivalSamples:
+    def _draw_arrivals(
+        self, purpose: str, slots: list[int], samples: int, paths: int
+    ) -> ArrivalSamples:
         """Return samples of all nodes after the given numbers of slots, of which the averages over
         the slots are those of the first ``paths``.
         """
