@@ -104,7 +104,7 @@ class FlowFilter(Component):
 
 
 @kernel
-def stretch_end(now: float, time: float, stretch: float) -> float:
+def interval_end(now: float, time: float, stretch: float) -> float:
     """Return the end of a measurement interval that begins at ``now``, at most ``time``.
 
     An interval too short to change the clock would repeat for ever; it ends at ``time`` instead.

@@ -13,7 +13,7 @@ from netkf.algorithms.kernels.root_flow import (
     flow_table,
     gain_update_root,
     information_rate,
-    move_root,
+    propagate_root,
     stack_tables,
 )
 from netkf.algorithms.kernels.root_update import lower_root, update_with_sample
@@ -204,7 +204,7 @@ def test_models_side_by_side_are_what_they_are_alone():
     for gap in (0.01, 0.4, 7.0):
         for m, table in enumerate(tables):
             alone = flow_root(table, roots[m], means[m], gap)
-            move_root(stack, m, roots, means, m, gap, scratch)
+            propagate_root(stack, m, roots, means, m, gap, scratch)
             assert np.array_equal(np.tril(roots[m]), np.tril(alone[0]))
             assert np.array_equal(means[m], alone[1])
             P = np.tril(roots[m]) @ np.tril(roots[m]).T

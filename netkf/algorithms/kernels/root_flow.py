@@ -22,7 +22,7 @@ models side by side (a table is a stack of one), and m says which of a stack is 
 work in place on place ``k`` of root (K, n, n) (lower triangular, nothing above the diagonal is
 read or written) and x (K, n), with room from :func:`flow_scratch`:
 
-    move_root(table, m, root, x, k, gap, scratch)            any gap > 0
+    propagate_root(table, m, root, x, k, gap, scratch)            any gap > 0
     information_rate(lanes, size, seen, S) -> trace(P G)  1/s, see flow.stretch
     gain_root(moments, series, root, x, k, gap, values)   readings of a gap, see gains.py
 
@@ -441,7 +441,7 @@ def stack_tables(tables: Sequence[FlowTable]) -> FlowTable:
 
 
 @kernel
-def move_root(
+def propagate_root(
     table: FlowTable,
     m: int,
     root: FloatArray,
@@ -454,23 +454,23 @@ def move_root(
     # Beyond all cells: whole multiples of the first level that is longer than them.
     octaves = table.sizes[m, 4]
     if gap >= table.unit[m] * (1 << octaves):
-        gap = move_levels(table, m, octaves, root, x, k, gap, scratch)
+        gap = propagate_by_levels(table, m, octaves, root, x, k, gap, scratch)
     if not gap > 0.0:
         return
     if is_narrow(table, m, gap, trace_of(scratch.size, table, m, root, k)):
-        move_narrow(table, m, root, x, k, gap, scratch)
+        propagate_narrow(table, m, root, x, k, gap, scratch)
         return
     # Wide P: whole units by levels, and the rest row by row of Gamma.
-    gap = move_levels(table, m, 0, root, x, k, gap, scratch)
+    gap = propagate_by_levels(table, m, 0, root, x, k, gap, scratch)
     if gap > 0.0:
-        move_wide(table, m, root, x, k, gap, scratch)
+        propagate_wide(table, m, root, x, k, gap, scratch)
 
 
 @kernel
 def trace_of(size: Size, table: FlowTable, m: int, root: FloatArray, k: int) -> float:
     """Return ``trace(P)`` at place ``k`` as ``is_narrow`` asks for it, 0 where it does not."""
     # Where nothing is observed G is 0, and any P is narrow.
-    return 0.0 if table.sizes[m, 1] == 0 else float(root_size(ONE, size, root[k]))
+    return 0.0 if table.sizes[m, 1] == 0 else float(trace_of_root(ONE, size, root[k]))
 
 
 @kernel(inlined=True)
@@ -483,14 +483,14 @@ def is_narrow(table: FlowTable, m: int, gap: float, trace: float) -> bool:
 
 
 @kernel(inlined=True)
-def is_quick(table: FlowTable, m: int, gap: float, trace: float) -> bool:
-    """Return True if ``move_root`` takes one step inside a cell."""
+def takes_one_step(table: FlowTable, m: int, gap: float, trace: float) -> bool:
+    """Return True if ``propagate_root`` takes one step inside a cell."""
     longest = table.unit[m] * (1 << table.sizes[m, 4])
     return bool(gap < longest and is_narrow(table, m, gap, trace))
 
 
 @kernel(inlined=True)
-def root_size(lanes: Lanes, size: Size, S: FloatArray) -> Any:
+def trace_of_root(lanes: Lanes, size: Size, S: FloatArray) -> Any:
     """Return ``trace(P)`` of roots S (n, n, L)."""
     total = spread(lanes, 0.0)
     # |S|_F^2 = trace(S S').
@@ -501,7 +501,7 @@ def root_size(lanes: Lanes, size: Size, S: FloatArray) -> Any:
 
 
 @kernel
-def move_levels(
+def propagate_by_levels(
     table: FlowTable,
     m: int,
     level: int,
@@ -518,7 +518,7 @@ def move_levels(
     while whole > 0:
         # A binary digit of the number of steps, or one of many steps of the last level.
         if whole & 1 or level == levels - 1:
-            move_level(table, m, level, root, x, k, scratch)
+            propagate_level(table, m, level, root, x, k, scratch)
             whole -= 1
         if level < levels - 1:
             whole >>= 1
@@ -527,7 +527,7 @@ def move_levels(
 
 
 @kernel
-def move_level(
+def propagate_level(
     table: FlowTable,
     m: int,
     level: int,
@@ -536,7 +536,7 @@ def move_level(
     k: int,
     scratch: FlowScratch,
 ) -> None:
-    """Apply ``move_root`` over ``unit 2^level`` seconds."""
+    """Apply ``propagate_root`` over ``unit 2^level`` seconds."""
     n, levels, T, observed = len(scratch.size), table.levels, scratch.T, scratch.observed
     if table.sizes[m, 1] > 0:
         # Gamma_r S for each row r of Gamma, both triangular, as an observation of unit noise.
@@ -549,13 +549,13 @@ def move_level(
             rotate_out(scratch.size, root, k, observed, 0, scratch.gain, 1.0)
     # exp(A g) where nothing is observed, else F.
     flow = 0 if table.sizes[m, 1] == 0 else 1
-    # A copy: transform() uses T up.
+    # A copy: transform_root() uses T up.
     for i in range(n):
         for j in range(i + 1):
             T[i, j] = levels[m, level, 3, i, j]
         for j in range(n):
             scratch.values[i * n + j] = levels[m, level, flow, i, j]
-    transform(ONE, scratch.size, root[k], scratch.values, 0, scratch.wide, T)
+    transform_root(ONE, scratch.size, root[k], scratch.values, 0, scratch.wide, T)
     # The estimate moves open loop, by exp(A g): gain_root() corrects it when the readings are used.
     for i in range(n):
         total = 0.0
@@ -567,7 +567,7 @@ def move_level(
 
 
 @kernel
-def move_wide(
+def propagate_wide(
     table: FlowTable,
     m: int,
     root: FloatArray,
@@ -576,18 +576,18 @@ def move_wide(
     gap: float,
     scratch: FlowScratch,
 ) -> None:
-    """Apply ``move_root`` over less than a unit for any P, however wide."""
+    """Apply ``propagate_root`` over less than a unit for any P, however wide."""
     # First the information of the whole gap, then F and Q_g: P (I + G P)^-1, then F . F' + Q_g.
     use_readings(table, m, root, k, gap, scratch)
     n = len(scratch.size)
     # Without G_g, the last part of the series: Gamma has replaced it.
     width = n * (n + 1) // 2 + 2 * n * n
     fill_series(scratch.values, width, table.series[m, 0], table.reach[m, 0], 0, gap)
-    move_by_series(table, m, root, x, k, False, scratch)
+    propagate_by_series(table, m, root, x, k, False, scratch)
 
 
 @kernel
-def move_narrow(
+def propagate_narrow(
     table: FlowTable,
     m: int,
     root: FloatArray,
@@ -596,11 +596,11 @@ def move_narrow(
     gap: float,
     scratch: FlowScratch,
 ) -> None:
-    """Apply ``move_root`` over a gap inside a cell, where nothing is observed or P is not
+    """Apply ``propagate_root`` over a gap inside a cell, where nothing is observed or P is not
     too wide.
     """
     fill_values(scratch.values, table, m, gap)
-    move_by_series(table, m, root, x, k, True, scratch)
+    propagate_by_series(table, m, root, x, k, True, scratch)
 
 
 @kernel
@@ -627,7 +627,7 @@ def width_of(n: int, observed: bool) -> int:
 
 
 @kernel
-def move_by_series(
+def propagate_by_series(
     table: FlowTable,
     m: int,
     root: FloatArray,
@@ -636,7 +636,7 @@ def move_by_series(
     reads: bool,
     scratch: FlowScratch,
 ) -> None:
-    """Apply ``move_root`` with what is in ``values``; the readings of the gap are used already
+    """Apply ``propagate_root`` with what is in ``values``; the readings of the gap are used already
     where it does not read.
     """
     size, n, observed = scratch.size, len(scratch.size), table.sizes[m, 1] > 0
@@ -651,10 +651,10 @@ def move_by_series(
         local_vector(size, scratch.moved),
     )
     if observed and reads:
-        shrink_root(ONE, size, S, scratch.values, V)
-    move_mean(ONE, size, mean, scratch.values, moved)
-    take_root(ONE, size, T, scratch.values)
-    transform(ONE, size, S, scratch.values, place_of_flow(n, observed), V, T)
+        condition_root(ONE, size, S, scratch.values, V)
+    propagate_mean(ONE, size, mean, scratch.values, moved)
+    cholesky_in_lanes(ONE, size, T, scratch.values)
+    transform_root(ONE, size, S, scratch.values, place_of_flow(n, observed), V, T)
     for i in range(n):
         x[k, i] = mean[i]
         for j in range(i + 1):
@@ -669,7 +669,7 @@ def place_of_flow(n: int, observed: bool) -> int:
 
 
 @kernel(inlined=True, fused=True)
-def move_mean(
+def propagate_mean(
     lanes: Lanes, size: Size, x: FloatArray, values: FloatArray, moved: FloatArray
 ) -> None:
     """Compute ``x = exp(A g) x`` (n, L) in place; ``moved`` is scratch of the same shape."""
@@ -684,7 +684,9 @@ def move_mean(
 
 
 @kernel(inlined=True, fused=True)
-def shrink_root(lanes: Lanes, size: Size, S: FloatArray, values: FloatArray, V: FloatArray) -> None:
+def condition_root(
+    lanes: Lanes, size: Size, S: FloatArray, values: FloatArray, V: FloatArray
+) -> None:
     """Make S (n, n, L) the root of ``P (I + G P)^-1``, where G is packed by rows of its lower
     triangle behind Q_g, exp(A g) and F in ``values``; V (n, n, L) is scratch.
     """
@@ -731,7 +733,7 @@ def use_readings(
     """Use the information Gamma' Gamma of a gap of less than a unit."""
     n, q, rows, observed = len(scratch.size), table.sizes[m, 0], scratch.rows, scratch.observed
     gamma, width = table.gamma, q * n
-    trace = root_size(ONE, scratch.size, root[k])
+    trace = trace_of_root(ONE, scratch.size, root[k])
     factor = math.sqrt(gap)
     for block in range(table.sizes[m, 1]):
         # Later blocks shrink with g^(2 j + 1): their information is below rounding from here on.
@@ -761,7 +763,7 @@ def use_readings(
 
 
 @kernel(inlined=True, fused=True)
-def take_root(lanes: Lanes, size: Size, T: FloatArray, packed: FloatArray) -> None:
+def cholesky_in_lanes(lanes: Lanes, size: Size, T: FloatArray, packed: FloatArray) -> None:
     """Write Cholesky's root T (n, n, L) of a lower triangle packed by rows; pivots that are
     rounding count as 0.
     """
@@ -780,7 +782,7 @@ def take_root(lanes: Lanes, size: Size, T: FloatArray, packed: FloatArray) -> No
 
 
 @kernel(inlined=True, fused=True)
-def transform(
+def transform_root(
     lanes: Lanes,
     size: Size,
     S: FloatArray,
@@ -895,11 +897,11 @@ def use_moments(
 
 
 @kernel
-def move_alone(
+def propagate_one(
     table: IntArray, scratch: IntArray, root: FloatArray, x: FloatArray, gap: float
 ) -> None:
-    """Apply ``move_root`` to one node by a table of one model, given the memory of the structs."""
-    move_root(struct_at(table, FlowTable), 0, root, x, 0, gap, struct_at(scratch, FlowScratch))
+    """Apply ``propagate_root`` to one node by a table of one model, from the memory of structs."""
+    propagate_root(struct_at(table, FlowTable), 0, root, x, 0, gap, struct_at(scratch, FlowScratch))
 
 
 class _Scratches(threading.local):
@@ -929,7 +931,7 @@ def flow_root(
     n = len(x)
     roots, means = root.reshape(1, n, n).copy(), x.reshape(1, n).copy()
     if gap > 0.0:
-        move_alone(table.memory, _scratches.of(table).memory, roots, means, gap)
+        propagate_one(table.memory, _scratches.of(table).memory, roots, means, gap)
     return roots[0], means[0]
 
 

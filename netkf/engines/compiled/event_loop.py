@@ -12,7 +12,7 @@ import math
 
 import numpy as np
 
-from netkf.algorithms.kernels.root_flow import move_root
+from netkf.algorithms.kernels.root_flow import propagate_root
 from netkf.algorithms.kernels.root_update import (
     add_root,
     add_to_intersection,
@@ -282,7 +282,7 @@ def predict(state: Simulation, extras: Extras | None, h: int, time: float) -> No
     else:
         # One step of the Riccati flow, exact for a gap of any length.
         gap = time - now
-        move_root(state.table, node.model, state.root, state.xhat, h, gap, state.flow_scratch)
+        propagate_root(state.table, node.model, state.root, state.xhat, h, gap, state.flow_scratch)
     if extras is not None and extras.kind == PREDICTIONS:
         keep_prediction(state, extras, h)
     elif extras is not None and extras.kind == BELIEFS:
@@ -549,7 +549,9 @@ def predict_payloads(state: Simulation, h: int, now: float) -> float:
         age = now - pool[m].sent
         # SWAP takes over the last message of the inbox only, so the others need no prediction.
         if age > 0.0 and (state.kind != SWAP or pool[m].next == -1):
-            move_root(state.table, model, state.pool_root, state.pool_x, m, age, state.flow_scratch)
+            propagate_root(
+                state.table, model, state.pool_root, state.pool_x, m, age, state.flow_scratch
+            )
         heard += ways[pool[m].way].weight
         m = pool[m].next
     return heard

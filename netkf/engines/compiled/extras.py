@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from netkf.algorithms.closed_loops import closed_loop, gain_rate, sample_maps
-from netkf.algorithms.flow import stretch_end
+from netkf.algorithms.flow import interval_end
 from netkf.algorithms.kernels.constant_gains import correct_by_innovation, correct_by_moments
 from netkf.algorithms.kernels.neighbours import scale_by_covariance
 from netkf.algorithms.kernels.pair_fusion import fuse_pair
@@ -20,7 +20,7 @@ from netkf.algorithms.kernels.root_flow import (
     FlowScratch,
     FlowTable,
     flow_scratch,
-    move_root,
+    propagate_root,
     stack_tables,
 )
 from netkf.algorithms.kernels.slots import predict_root
@@ -172,7 +172,7 @@ def predict_with_gain(state: Simulation, extras: Extras, h: int, now: float, tim
     while now < time:
         end = time
         if longest < time - now:
-            end = stretch_end(now, time, max(longest, least))
+            end = interval_end(now, time, max(longest, least))
             least *= LONGER
         gap = end - now
         # The mean moves as if nothing were read, and P by the closed loop, which counts that.
@@ -181,8 +181,8 @@ def predict_with_gain(state: Simulation, extras: Extras, h: int, now: float, tim
             for j in range(extras.x.shape[1]):
                 extras.root[0, i, j] = 0.0
         unobserved = len(state.table.unit) - 1
-        move_root(state.table, unobserved, extras.root, extras.x, 0, gap, state.flow_scratch)
-        move_root(extras.table, m, state.root, state.xhat, h, gap, extras.flow_scratch)
+        propagate_root(state.table, unobserved, extras.root, extras.x, 0, gap, state.flow_scratch)
+        propagate_root(extras.table, m, state.root, state.xhat, h, gap, extras.flow_scratch)
         for i in range(extras.x.shape[1]):
             state.xhat[h, i] = extras.x[0, i]
         readings = state.scratch.moments[: state.gains.moments[state.nodes[h].model]]

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from netkf.algorithms.flow import stretch_end
-from netkf.algorithms.kernels.root_flow import gain_root, information_rate, move_root
+from netkf.algorithms.flow import interval_end
+from netkf.algorithms.kernels.root_flow import gain_root, information_rate, propagate_root
 from netkf.algorithms.models import usable
 from netkf.engines.base import LONGER, SHORTEST_SHARE
 from netkf.engines.compiled.state import PathBlock, Sensing, Simulation
@@ -156,7 +156,7 @@ def next_interval(rate: float, now: float, time: float, least: float) -> tuple[f
         # intervals.
         if least == 0.0:
             least = SHORTEST_SHARE * (time - now)
-        end = stretch_end(now, time, max(interval, least))
+        end = interval_end(now, time, max(interval, least))
     # The bound grows geometrically, so that a gap takes about a thousand intervals at most.
     return end, LONGER * least
 
@@ -172,7 +172,7 @@ def advance_over_interval(
     xhat, root, readings = state.xhat, state.root, scratch.moments[: state.gains.moments[m]]
     # Predict first, with the moments of the reading used at the end: they belong to the whole
     # interval.
-    move_root(table, m, root, xhat, k, gap, state.flow_scratch)
+    propagate_root(table, m, root, xhat, k, gap, state.flow_scratch)
     fill_readings(state, run, h, piece, now, end, readings)
     gains, reach = state.gains.series[m], state.gains.reach[m]
     gain_root(state.size, readings, gains, reach, 0, root, xhat, k, gap, scratch.values)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from netkf.algorithms.intermittent import TIME_TOLERANCE
-from netkf.algorithms.kernels.root_flow import move_root
+from netkf.algorithms.kernels.root_flow import propagate_root
 from netkf.algorithms.kernels.root_update import sample_root
 from netkf.engines.compiled.state import Simulation
 from netkf.linalg.arrays import FloatArray
@@ -197,7 +197,7 @@ def use_late_reading(state: Simulation, history: History, h: int, instant: int, 
         copy_state(state.size, x, root, k, x, root, before)
         if past[k].time > past[before].time:
             gap = past[k].time - past[before].time
-            move_root(state.table, model, root, x, k, gap, state.flow_scratch)
+            propagate_root(state.table, model, root, x, k, gap, state.flow_scratch)
         if past[k].instant >= 0:
             use_instant(state, past[k].instant, root, x, k, 1.0)
         # A frame that began since then: estimates count from its origin afterwards.
@@ -213,5 +213,5 @@ def use_late_reading(state: Simulation, history: History, h: int, instant: int, 
     # From the last event to now.
     if now > past[k].time:
         gap = now - past[k].time
-        move_root(state.table, model, state.root, state.xhat, h, gap, state.flow_scratch)
+        propagate_root(state.table, model, state.root, state.xhat, h, gap, state.flow_scratch)
     forget(history, h, now - history.lag)

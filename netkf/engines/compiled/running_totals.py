@@ -9,7 +9,7 @@ import math
 
 import numpy as np
 
-from netkf.algorithms.kernels.root_flow import transform
+from netkf.algorithms.kernels.root_flow import transform_root
 from netkf.algorithms.running_sums import MIN_ACCURACY
 from netkf.engines.compiled.late_readings import use_instant
 from netkf.engines.compiled.state import Simulation
@@ -284,7 +284,7 @@ def update_root_by_gain(state: Simulation, h: int, values: FloatArray, vectors: 
         for j in range(i + 1):
             root[h, i, j] = 1.0 if i == j else 0.0
             noise[i, j] = 0.0
-    transform(ONE, state.size, root[h], F, 0, wide, noise)
+    transform_root(ONE, state.size, root[h], F, 0, wide, noise)
 
 
 @kernel

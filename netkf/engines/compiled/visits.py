@@ -17,15 +17,15 @@ import numpy as np
 
 from netkf.algorithms.kernels.root_flow import (
     cell_of,
+    cholesky_in_lanes,
+    condition_root,
     information_rate,
-    is_quick,
-    move_mean,
-    move_root,
     place_of_flow,
-    root_size,
-    shrink_root,
-    take_root,
-    transform,
+    propagate_mean,
+    propagate_root,
+    takes_one_step,
+    trace_of_root,
+    transform_root,
     use_moments,
     width_of,
 )
@@ -289,7 +289,7 @@ def queue_prediction(state: Simulation, visits: Visits, v: int, place: int) -> N
         return
     # Without sensors one step is exact for any P, if the gap lies inside the table of series.
     if not gap < visits.longest[m]:
-        move_root(state.table, m, state.root, state.xhat, place, gap, state.flow_scratch)
+        propagate_root(state.table, m, state.root, state.xhat, place, gap, state.flow_scratch)
         return
     q = visits.waiting
     visits.waiting = q + 1
@@ -349,7 +349,7 @@ def fill_rates(state: Simulation, visits: Visits, count: int) -> None:
         h = node_at(state, visit.run, interval.place)
         load_model(readings, q, state.nodes[h].model, state.table.seen)
     store(MANY, readings.rate, 0, information_rate(MANY, size, readings.seen, visits.S))
-    store(MANY, readings.trace, 0, root_size(MANY, size, visits.S))
+    store(MANY, readings.trace, 0, trace_of_root(MANY, size, visits.S))
 
 
 @kernel
@@ -364,7 +364,7 @@ def begin_interval(state: Simulation, visits: Visits, q: int) -> None:
     h = node_at(state, visit.run, place)
     m, time = state.nodes[h].model, visit.time
     end, least = next_interval(readings.rate[0, q], now, time, interval.least)
-    if is_quick(state.table, m, end - now, readings.trace[0, q]):
+    if takes_one_step(state.table, m, end - now, readings.trace[0, q]):
         assign_lane(visits, SENSING, q, place, v, m, now, end)
     else:
         visits.places[SENSING, q] = NO_NODE
@@ -505,11 +505,11 @@ def predict_lanes(state: Simulation, visits: Visits, reads: bool) -> None:
         for j in range(i + 1):
             store(MANY, S, i, j, load(MANY, visits.S, i, j))
     if reads:
-        shrink_root(MANY, size, S, values, V)
+        condition_root(MANY, size, S, values, V)
     moved = local_lanes_vector(size, MANY, visits.moved)
-    move_mean(MANY, size, visits.x, values, moved)
-    take_root(MANY, size, T, values)
-    transform(MANY, size, S, values, place_of_flow(n, reads), V, T)
+    propagate_mean(MANY, size, visits.x, values, moved)
+    cholesky_in_lanes(MANY, size, T, values)
+    transform_root(MANY, size, S, values, place_of_flow(n, reads), V, T)
     for i in range(n):
         for j in range(i + 1):
             store(MANY, visits.S, i, j, load(MANY, S, i, j))

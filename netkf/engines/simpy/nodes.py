@@ -8,7 +8,7 @@ import numpy as np
 import simpy
 
 from netkf.algorithms.filter import Exchange, Filter, Increments, Message, NodeInfo, Reading
-from netkf.algorithms.flow import stretch_end
+from netkf.algorithms.flow import interval_end
 from netkf.engines.base import LONGER, SHORTEST_SHARE, Rank
 from netkf.engines.simpy.timeline import Timeline
 from netkf.linalg.arrays import FloatArray, block_diagonal
@@ -119,7 +119,7 @@ class ClockedNode(Node):
             interval = self.algorithm.max_measurement_interval(self.state)
             if interval < time - self._now:
                 # P changes too much over the whole gap: use the increments of a part of it.
-                end = stretch_end(self._now, time, max(interval, least))
+                end = interval_end(self._now, time, max(interval, least))
                 least *= LONGER
             # Predict first: the increments of a gap are an observation at its end.
             gap = end - self._now
