@@ -141,7 +141,7 @@ def combine_senders(
     """Intersect the estimate of filter ``h`` of a block with those that it hears, D (8) and (9)."""
     lanes, heard = scratch.lanes, spread(scratch.lanes, 0.0)
     for m in range(links.first[h], links.first[h + 1]):
-        arrived = load_flags(lanes, plan.up, b, s, 0, links.way[m])
+        arrived = load_flags(lanes, plan.up, b, s, 0, links.direction[m])
         heard += select(arrived, links.weight[m], 0.0)
     own, divisor = applied_weights(lanes, weights.own[h], heard, weights.keep_own)
     # Weight 1: nothing heard counts, and the estimate stays to the last bit.
@@ -150,7 +150,7 @@ def combine_senders(
     # The own term needs no merging: it is the first.
     whiten(lanes, scratch.total, own, scratch.root, scratch.xhat, h, h)
     for m in range(links.first[h], links.first[h + 1]):
-        arrived = load_flags(lanes, plan.up, b, s, 0, links.way[m])
+        arrived = load_flags(lanes, plan.up, b, s, 0, links.direction[m])
         # A weight of 0 adds no information.
         if links.weight[m] > 0.0 and any_lane(arrived):
             weight = select(arrived, links.weight[m] / divisor, 0.0)

@@ -233,16 +233,16 @@ def combine_copies(
     """Combine the estimate of filter ``h`` of a block with those that it hears, and with wider
     copies of the last estimates of silent neighbours.
     """
-    lanes, ways, n = scratch.lanes, len(links.sender), nodes.xhat.shape[2]
-    own, heard = ways + h, spread(lanes, 0.0)
+    lanes, W, n = scratch.lanes, len(links.sender), nodes.xhat.shape[2]
+    own, heard = W + h, spread(lanes, 0.0)
     for m in range(links.first[h], links.first[h + 1]):
-        arrived = load_flags(lanes, plan.up, b, s, 0, links.way[m])
+        arrived = load_flags(lanes, plan.up, b, s, 0, links.direction[m])
         copies = (arrays.x, arrays.root)
         if any_lane(arrived):
-            sender = ways + links.sender[m]
+            sender = W + links.sender[m]
             copy_estimate(lanes, copies, m, arrays.x, arrays.root, sender, b, arrived)
         for q in range(len(lanes)):
-            if plan.up[b, s, 0, links.way[m], q] == 1:
+            if plan.up[b, s, 0, links.direction[m], q] == 1:
                 arrays.known[b, m, q] = 1
         # Silent neighbours count too: silence says that their estimate is near the copy.
         heard += select(load_flags(lanes, arrays.known, b, m), links.weight[m], 0.0)
@@ -262,7 +262,7 @@ def combine_copies(
     rest = select(heard < 1.0, 1.0 - heard, 0.0)
     whiten(lanes, scratch.total, rest, arrays.inverse, arrays.mean, own, own)
     for m in range(links.first[h], links.first[h + 1]):
-        arrived = load_flags(lanes, plan.up, b, s, 0, links.way[m])
+        arrived = load_flags(lanes, plan.up, b, s, 0, links.direction[m])
         known = load_flags(lanes, arrays.known, b, m)
         if any_lane(known):
             # In place of a silent neighbour's pair there is a wider one.
@@ -347,8 +347,8 @@ class EventTriggeredCi(Filter):
     ) -> tuple[TriggeredCiArrays]:
         """Return the copies of estimates, none so far."""
         (H, n), blocks = (len(states), len(states[0].xhat)), blocks_of(runs)
-        ways, alpha = sum(info.degree for info in infos), self.thresholds[0]
-        entries = ways + 2 * H
+        W, alpha = sum(info.degree for info in infos), self.thresholds[0]
+        entries = W + 2 * H
         return (
             TriggeredCiArrays(
                 alpha,
@@ -357,8 +357,8 @@ class EventTriggeredCi(Filter):
                 aligned((blocks, entries, n, LANES)),
                 aligned((blocks, entries, n, n, LANES)),
                 np.zeros((blocks, entries, LANES), dtype=np.uint8),
-                aligned((ways + H, n, LANES)),
-                aligned((ways + H, n, n, LANES)),
+                aligned((W + H, n, LANES)),
+                aligned((W + H, n, n, LANES)),
             ),
         )
 

@@ -62,7 +62,7 @@ def swap_pairs(
                 store(lanes, scratch.root, h, i, j, load(lanes, nodes.root, b, h, i, j))
     for h in range(len(nodes.rows)):
         for m in range(links.first[h], links.first[h + 1]):
-            heard = load_flags(lanes, plan.up, b, s, 0, links.way[m])
+            heard = load_flags(lanes, plan.up, b, s, 0, links.direction[m])
             # Most links are idle in a matching of a single run.
             if any_lane(heard):
                 copy_pair(nodes, scratch, b, h, links.sender[m], heard)

@@ -178,7 +178,7 @@ def share_bits(
     for m in range(len(links.sender)):
         if links.sender[m] != turn:
             continue
-        arrived = load_flags(lanes, plan.up, b, s, 0, links.way[m])
+        arrived = load_flags(lanes, plan.up, b, s, 0, links.direction[m])
         for h in range(len(nodes.rows)):
             if any_lane(arrived) and links.first[h] <= m < links.first[h + 1]:
                 for k in range(rows):

@@ -304,7 +304,7 @@ def receive_totals(
     for i in range(mass.shape[2]):
         store(lanes, mass, b, h, i, 0.0)
     for m in range(links.first[h], links.first[h + 1]):
-        arrived = load_flags(lanes, plan.up, b, s, 0, links.way[m])
+        arrived = load_flags(lanes, plan.up, b, s, 0, links.direction[m])
         for i in range(mass.shape[2]):
             last = load(lanes, arrays.heard, b, m, i)
             total = load(lanes, arrays.offered, b, links.sender[m], i)
@@ -333,7 +333,7 @@ def mix_mass(
         store(lanes, arrays.before, i, load(lanes, mass, b, h, i))
         store(lanes, mass, b, h, i, 0.0)
     for m in range(links.first[h], links.first[h + 1]):
-        arrived = load_flags(lanes, plan.up, b, s, 0, links.way[m])
+        arrived = load_flags(lanes, plan.up, b, s, 0, links.direction[m])
         received += select(arrived, 1.0, 0.0)
         for i in range(mass.shape[2]):
             share = select(arrived, load(lanes, arrays.share, links.sender[m], i), 0.0)
@@ -554,7 +554,7 @@ class PushSum(Filter):
         limit = np.zeros((n, n)) if known[0].root is None else known[0].root
         mass = np.stack([state.mass for state in states])
         m, running = mass.shape[1], self._keeps_totals
-        ways = sum(info.degree for info in infos) if running else 0
+        W = sum(info.degree for info in infos) if running else 0
         shapes = (1, m), (m,), (1, n, n), (1,), (1, n, n), (1,), (n, n)
         return (
             PushSumArrays(
@@ -578,7 +578,7 @@ class PushSum(Filter):
                 stop=StopScratch(*(np.zeros(shape) for shape in shapes)),
                 running=running,
                 offered=aligned((blocks, H if running else 0, m, LANES)),
-                heard=aligned((blocks, ways, m, LANES)),
+                heard=aligned((blocks, W, m, LANES)),
             ),
         )
 

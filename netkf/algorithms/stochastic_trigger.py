@@ -227,7 +227,7 @@ def update_by_sensors(
     own = len(links.sender) + h
     update_by_sensor(nodes, readings, scratch, arrays, b, s, h, h, own, sent)
     for m in range(links.first[h], links.first[h + 1]):
-        arrived = load_flags(scratch.lanes, plan.up, b, s, 0, links.way[m])
+        arrived = load_flags(scratch.lanes, plan.up, b, s, 0, links.direction[m])
         update_by_sensor(nodes, readings, scratch, arrays, b, s, h, links.sender[m], m, arrived)
 
 
@@ -354,9 +354,9 @@ class ScheduledReadings(Filter):
     ) -> tuple[ScheduledArrays]:
         """Return empty tables of the sensors that nodes know of each other."""
         models, blocks = [state.model for state in states], blocks_of(runs)
-        (H, n), ways = (len(models), len(states[0].xhat)), sum(info.degree for info in infos)
+        (H, n), W = (len(models), len(states[0].xhat)), sum(info.degree for info in infos)
         weights = whitened_triggers(models, self.Y)
-        p, entries = weights.shape[1], ways + H
+        p, entries = weights.shape[1], W + H
         return (
             ScheduledArrays(
                 weights,

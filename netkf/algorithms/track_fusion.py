@@ -108,7 +108,7 @@ def fuse_heard(
     b, s, h, q = index
     n, heard = nodes.xhat.shape[2], False
     for m in range(links.first[h], links.first[h + 1]):
-        if not plan.up[b, s, 0, links.way[m], q]:
+        if not plan.up[b, s, 0, links.direction[m], q]:
             continue
         # The weight of a link is not used: whoever is heard counts by its covariance.
         sender = links.sender[m]
@@ -337,7 +337,7 @@ def combine_heard(
     n, count, heard = nodes.xhat.shape[2], 0, 0
     arrays.near[0] = h
     for m in range(links.first[h], links.first[h + 1]):
-        if plan.up[b, s, 0, links.way[m], q]:
+        if plan.up[b, s, 0, links.direction[m], q]:
             count += 1
             arrays.near[count] = links.sender[m]
             heard += 1 << min(m - links.first[h], MOST_BITS)

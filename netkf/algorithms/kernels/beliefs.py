@@ -167,7 +167,7 @@ def receive_evidence(
     b, s, e = index
     n = received.shape[1]
     for m in range(links.first[h], links.first[h + 1]):
-        arrived, sender = load_flags(lanes, up, b, s, e, links.way[m]), links.sender[m]
+        arrived, sender = load_flags(lanes, up, b, s, e, links.direction[m]), links.sender[m]
         if not any_lane(arrived):
             continue
         # The sender leaves out the evidence of the receiver, which would otherwise come back and

@@ -163,7 +163,7 @@ def mix_parts(
     t = step % 2
     heard = spread(lanes, 0.0)
     for m in range(links.first[h], links.first[h + 1]):
-        arrived = load_flags(lanes, up, b, s, e, links.way[m])
+        arrived = load_flags(lanes, up, b, s, e, links.direction[m])
         heard += select(arrived, links.weight[m], 0.0)
     # Rounding may leave the own weight a little below 0, which has no root.
     own = 1.0 - heard
@@ -171,7 +171,7 @@ def mix_parts(
     for k in range(parts.shape[1]):
         weigh_part(lanes, total, own, parts, (t, k, h), centre, h)
         for m in range(links.first[h], links.first[h + 1]):
-            arrived = load_flags(lanes, up, b, s, e, links.way[m])
+            arrived = load_flags(lanes, up, b, s, e, links.direction[m])
             # A weight of 0 adds no information.
             if links.weight[m] > 0.0 and any_lane(arrived):
                 weight = select(arrived, links.weight[m], 0.0)

@@ -208,7 +208,7 @@ def average(
         for i in range(n):
             own, total = load(lanes, z, b, h, i), spread(lanes, 0.0)
             for m in range(links.first[h], links.first[h + 1]):
-                arrived = load_flags(lanes, up, b, s, step, links.way[m])
+                arrived = load_flags(lanes, up, b, s, step, links.direction[m])
                 difference = load(lanes, z, b, links.sender[m], i) - own
                 total += select(arrived, difference, 0.0)
             # P (9): z <- z + (1 / delta) sum of the differences.

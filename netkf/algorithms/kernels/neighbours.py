@@ -50,7 +50,7 @@ def move_towards(
     for i in range(x.shape[2]):
         own, total = load(lanes, x, b, h, i), spread(lanes, 0.0)
         for m in range(links.first[h], links.first[h + 1]):
-            arrived = load_flags(lanes, up, b, s, e, links.way[m])
+            arrived = load_flags(lanes, up, b, s, e, links.direction[m])
             difference = load(lanes, x, b, links.sender[m], i) - own
             factor = links.weight[m] if weighted else 1.0
             total += select(arrived, factor * difference, 0.0)
@@ -119,7 +119,7 @@ def fuse_readings(
     if not share:
         return
     for m in range(links.first[h], links.first[h + 1]):
-        arrived = load_flags(scratch.lanes, plan.up, b, s, 0, links.way[m])
+        arrived = load_flags(scratch.lanes, plan.up, b, s, 0, links.direction[m])
         # Saves the update where no run of the block has the message.
         if any_lane(arrived):
             update_by_reading(nodes, readings, scratch, b, s, h, links.sender[m], arrived)
@@ -153,7 +153,7 @@ def combine_convex_roots(
     lanes, n = scratch.lanes, nodes.xhat.shape[2]
     heard = spread(lanes, 0.0)
     for m in range(links.first[h], links.first[h + 1]):
-        arrived = load_flags(lanes, plan.up, b, s, 0, links.way[m])
+        arrived = load_flags(lanes, plan.up, b, s, 0, links.direction[m])
         heard += select(arrived, links.weight[m], 0.0)
     # Rounding may leave the own weight a little below 0, which has no root.
     own = 1.0 - heard
@@ -162,7 +162,7 @@ def combine_convex_roots(
         for j in range(i + 1):
             store(lanes, nodes.root, b, h, i, j, size * load(lanes, scratch.root, h, i, j))
     for m in range(links.first[h], links.first[h + 1]):
-        arrived = load_flags(lanes, plan.up, b, s, 0, links.way[m])
+        arrived = load_flags(lanes, plan.up, b, s, 0, links.direction[m])
         if not any_lane(arrived):
             continue
         sender, weight = links.sender[m], select(arrived, links.weight[m], 0.0)

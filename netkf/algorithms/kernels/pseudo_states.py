@@ -102,7 +102,7 @@ def correct_pseudo(
             total += M[h, i, j] * load(lanes, z, j)
         store(lanes, corrected, h, i, total)
     for m in range(links.first[h], links.first[h + 1]):
-        arrived, sender = load_flags(lanes, up, b, s, 0, links.way[m]), links.sender[m]
+        arrived, sender = load_flags(lanes, up, b, s, 0, links.direction[m]), links.sender[m]
         for i in range(n):
             total = spread(lanes, 0.0)
             for j in range(n):

@@ -105,13 +105,13 @@ class SlotLinks(NamedTuple):
 
     first : (H + 1,)
     sender : index (W,) of the sender
-    way : index (W,) in ``up``
+    direction : index (W,) in ``up``
     weight : (W,) that the receiver gives
     """
 
     first: np.ndarray
     sender: np.ndarray
-    way: np.ndarray
+    direction: np.ndarray
     weight: FloatArray
 
 
@@ -259,7 +259,7 @@ def drop_silent(plan: SlotPlan, links: SlotLinks, b: int, s: int, e: int) -> Non
     for m in range(len(links.sender)):
         for q in range(plan.up.shape[4]):
             if plan.sent[b, s, e, links.sender[m], q] == 0:
-                plan.up[b, s, e, links.way[m], q] = 0
+                plan.up[b, s, e, links.direction[m], q] = 0
 
 
 @kernel

@@ -326,13 +326,14 @@ def record_tick(
         record_event(state, now, TRANSMIT, nodes[i].id, -1, nodes[i].sent)
         nodes[i].sent += 1
     for m in range(begin, after):
-        way = state.ways[state.hearing[m]]
-        number, one, other = way.messages, nodes[way.sender].id, nodes[way.receiver].id
-        way.messages += 1
+        direction = state.directions[state.hearing[m]]
+        one, other = nodes[direction.sender].id, nodes[direction.receiver].id
+        number = direction.messages
+        direction.messages = number + 1
         record_event(state, now, SEND, one, other, number)
         if (heard >> (m - begin)) & 1:
             record_event_with_age(state, now, DELIVER, other, one, number, 0.0)
-            state.waiting[receivers] = way.receiver
+            state.waiting[receivers] = direction.receiver
             receivers += 1
         else:
             record_event(state, now, LOST, one, other, number)
@@ -346,7 +347,7 @@ def queue_pairs(state: Simulation, visits: Visits, k: int, first: int, now: floa
     """Queue the visits of tick ``k``, of which something is heard: both ends of a link together,
     otherwise the sender with each receiver.
     """
-    heard, ways, hearing = state.ticks.heard[k], state.ways, state.hearing
+    heard, directions, hearing = state.ticks.heard[k], state.directions, state.hearing
     entity = state.entities[state.ticks.entity[k]]
     sender, begin = first + entity.sender, entity.first
     if state.at == LINKS:
@@ -360,31 +361,31 @@ def queue_pairs(state: Simulation, visits: Visits, k: int, first: int, now: floa
                 set_heard_link(
                     visits,
                     v,
-                    ways[hearing[begin + m]].receiver + first == sender,
+                    directions[hearing[begin + m]].receiver + first == sender,
                     hearing[begin + m],
                 )
         return
     level = visits.level[sender]
     for m in range(entity.after - begin):
         if (heard >> m) & 1:
-            level = max(level, visits.level[first + ways[hearing[begin + m]].receiver])
+            level = max(level, visits.level[first + directions[hearing[begin + m]].receiver])
     level += 1
     visits.level[sender] = level
     for m in range(entity.after - begin):
         if (heard >> m) & 1:
-            receiver = first + ways[hearing[begin + m]].receiver
+            receiver = first + directions[hearing[begin + m]].receiver
             visits.level[receiver] = level
             v = append_visit(state, visits, level, now, sender, receiver)
             set_heard_link(visits, v, False, hearing[begin + m])
 
 
 @kernel
-def set_heard_link(visits: Visits, v: int, first: bool, way: int) -> None:
+def set_heard_link(visits: Visits, v: int, first: bool, direction: int) -> None:
     """Let the ``first`` node of visit ``v``, or the second, hear the other over a directed link."""
     if first:
-        visits.records[v].to_first = way
+        visits.records[v].to_first = direction
     else:
-        visits.records[v].to_second = way
+        visits.records[v].to_second = direction
 
 
 @kernel

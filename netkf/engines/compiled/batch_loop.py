@@ -144,8 +144,8 @@ def reset_filters(state: Simulation, batch: BatchArrays, first: int) -> None:
 @kernel
 def reset_messages(state: Simulation) -> None:
     """Empty the network: no message is under way, all of the pool is free."""
-    for w in range(len(state.ways)):
-        state.ways[w].messages = 0
+    for w in range(len(state.directions)):
+        state.directions[w].messages = 0
     # Chain the whole pool into the list of free messages.
     for m in range(len(state.pool)):
         state.pool[m].next = m + 1

@@ -366,11 +366,11 @@ def send(
     now: float,
 ) -> None:
     """Send one message on a directed link; ``delay`` is LOST or nan where it is lost."""
-    way, pool = state.ways[w], state.pool
-    number, h = way.messages, way.sender
+    direction, pool = state.directions[w], state.pool
+    number, h = direction.messages, direction.sender
     # The number is taken even if the message is lost: recorded losses name messages by it.
-    way.messages += 1
-    one, other = state.nodes[h].id, state.nodes[way.receiver].id
+    direction.messages += 1
+    one, other = state.nodes[h].id, state.nodes[direction.receiver].id
     record_event(state, now, SEND, one, other, number)
     # ``not >=`` catches both LOST, which is negative, and nan.
     if not delay >= 0.0:
@@ -381,7 +381,7 @@ def send(
         return
     m = take(state)
     message = pool[m]
-    message.way, message.number, message.sent = w, number, now
+    message.direction, message.number, message.sent = w, number, now
     # The total after this round; rounds are numbered from 0.
     if totals is not None:
         message.tag = totals.rounds[h] - 1
@@ -452,8 +452,8 @@ def on_deliver(state: Simulation, now: float) -> None:
 def arrive(state: Simulation, m: int, now: float) -> None:
     """Put a message into the inbox of its receiver, unless it is too old."""
     message = state.pool[m]
-    way = state.ways[message.way]
-    one, other = state.nodes[way.sender].id, state.nodes[way.receiver].id
+    direction = state.directions[message.direction]
+    one, other = state.nodes[direction.sender].id, state.nodes[direction.receiver].id
     age = now - message.sent
     # ``not <=`` also rejects an age that is nan.
     if not age <= state.age_limit:
@@ -462,11 +462,11 @@ def arrive(state: Simulation, m: int, now: float) -> None:
         return
     record_event_with_age(state, now, DELIVER, other, one, message.number, age)
     # The first message of the instant puts its receiver on the list of those that absorb.
-    if state.nodes[way.receiver].inbox == -1:
-        state.waiting[state.receivers] = way.receiver
+    if state.nodes[direction.receiver].inbox == -1:
+        state.waiting[state.receivers] = direction.receiver
         state.receivers += 1
         state.mail_time = now
-    put(state, way.receiver, m)
+    put(state, direction.receiver, m)
 
 
 @kernel
@@ -543,7 +543,7 @@ def predict_payloads(state: Simulation, h: int, now: float) -> float:
     """
     # The last model of the table has no sensors: prediction alone, as readings since then are
     # unknown here.
-    pool, ways, model = state.pool, state.ways, len(state.table.unit) - 1
+    pool, directions, model = state.pool, state.directions, len(state.table.unit) - 1
     m, heard = state.nodes[h].inbox, 0.0
     while m != -1:
         age = now - pool[m].sent
@@ -552,7 +552,7 @@ def predict_payloads(state: Simulation, h: int, now: float) -> float:
             propagate_root(
                 state.table, model, state.pool_root, state.pool_x, m, age, state.flow_scratch
             )
-        heard += ways[pool[m].way].weight
+        heard += directions[pool[m].direction].weight
         m = pool[m].next
     return heard
 
@@ -586,11 +586,11 @@ def combine_convex(state: Simulation, h: int, own: float) -> None:
     the other.
     """
     # w_i P_i first, then + w_j P_j for each message.
-    xhat, root, pool, ways = state.xhat, state.root, state.pool, state.ways
+    xhat, root, pool, directions = state.xhat, state.root, state.pool, state.directions
     scale_root(state.size, root, xhat, h, own)
     m = state.nodes[h].inbox
     while m != -1:
-        weight = ways[pool[m].way].weight
+        weight = directions[pool[m].direction].weight
         add_root(root, xhat, h, weight, state.pool_root, state.pool_x, m, state.update_scratch)
         m = pool[m].next
 
@@ -598,14 +598,14 @@ def combine_convex(state: Simulation, h: int, own: float) -> None:
 @kernel
 def intersect(state: Simulation, h: int, own: float, total: float) -> None:
     """Intersect covariances by D (8) and (9), with weights divided by their ``total``."""
-    xhat, root, pool, ways = state.xhat, state.root, state.pool, state.ways
+    xhat, root, pool, directions = state.xhat, state.root, state.pool, state.directions
     scratch = state.update_scratch
     # Means count from the node's own estimate: differences of near states lose no digits.
     begin_intersection(scratch)
     add_to_intersection(own, root, xhat, h, xhat, h, scratch)
     m = state.nodes[h].inbox
     while m != -1:
-        weight = ways[pool[m].way].weight / total
+        weight = directions[pool[m].direction].weight / total
         add_to_intersection(weight, state.pool_root, state.pool_x, m, xhat, h, scratch)
         m = pool[m].next
     end_intersection(root, xhat, h, xhat, h, scratch)
@@ -621,7 +621,7 @@ def on_probe(state: Simulation, totals: Totals | None) -> bool:
         for h in range(count):
             shown.terms[k, h] = totals.weight[h]
             shown.terms[k, count + h] = totals.sent[h, 0]
-        for w in range(len(state.ways)):
+        for w in range(len(state.directions)):
             shown.terms[k, 2 * count + w] = totals.heard[w, 0]
     return count_sample(state)
 

@@ -30,7 +30,7 @@ class EvidenceArrays(Struct):
     """Evidence (n, n + 1, 1) that counts from the beliefs of nodes: priors and own readings
     (N, ...), what was received last on each of W directed links, and when that was sent
     (``sent_at``, (W,); never: -inf), and what messages carry (C, ...). The links that node h hears
-    are ``way[k]`` from ``first[h]`` up to ``first[h + 1]``, in the order of senders.
+    are ``direction[k]`` from ``first[h]`` up to ``first[h + 1]``, in the order of senders.
 
     The estimates of the Simulation as ``lanes`` (1, N, n, 1) and its roots (1, N, n, n, 1); the
     plant's ``A`` (n, n). Scratch: ``centre`` (N, n, 1), ``before`` and ``after`` (n, 1), whitened
@@ -44,7 +44,7 @@ class EvidenceArrays(Struct):
     sent_at: FloatArray
     carried: FloatArray
     first: IntArray
-    way: IntArray
+    direction: IntArray
     lanes: FloatArray
     roots: FloatArray
     A: FloatArray
@@ -61,19 +61,19 @@ class EvidenceArrays(Struct):
 def empty_evidence(state: Simulation, A: FloatArray, roots: FloatArray) -> EvidenceArrays:
     """Return that of nodes that have read and heard nothing; ``roots`` (1, N, n, n, 1)."""
     N, n = state.xhat.shape
-    ways, p, part = state.ways, len(state.scratch.y), (n, n + 1, 1)
-    heard = np.lexsort((ways["sender"], ways["receiver"]))
+    directions, p, part = state.directions, len(state.scratch.y), (n, n + 1, 1)
+    heard = np.lexsort((directions["sender"], directions["receiver"]))
     prior = np.zeros((N, *part))
     for h in range(N):
         write_prior_single(roots, h, prior[h])
     return EvidenceArrays(
         prior=prior,
         own=np.zeros((N, *part)),
-        received=np.zeros((len(ways), *part)),
-        sent_at=np.full(len(ways), -math.inf),
+        received=np.zeros((len(directions), *part)),
+        sent_at=np.full(len(directions), -math.inf),
         carried=np.zeros((len(state.pool), *part)),
-        first=np.searchsorted(ways["receiver"][heard], np.arange(N + 1)).astype(np.int64),
-        way=heard.astype(np.int64),
+        first=np.searchsorted(directions["receiver"][heard], np.arange(N + 1)).astype(np.int64),
+        direction=heard.astype(np.int64),
         lanes=state.xhat.reshape(1, N, n, 1),
         roots=roots,
         A=np.array(A),
@@ -103,7 +103,7 @@ def move_evidence(evidence: EvidenceArrays, h: int, gap: float) -> None:
     predict_part(ONE, evidence.prior[h], back, total, work)
     predict_part(ONE, evidence.own[h], back, total, work)
     for k in range(evidence.first[h], evidence.first[h + 1]):
-        predict_part(ONE, evidence.received[evidence.way[k]], back, total, work)
+        predict_part(ONE, evidence.received[evidence.direction[k]], back, total, work)
 
 
 @kernel
@@ -115,13 +115,13 @@ def update_belief(state: Simulation, evidence: EvidenceArrays, h: int) -> None:
     copy_part(ONE, evidence.prior[h], total)
     add_part(ONE, total, evidence.own[h], work)
     for k in range(evidence.first[h], evidence.first[h + 1]):
-        add_part(ONE, total, evidence.received[evidence.way[k]], work)
+        add_part(ONE, total, evidence.received[evidence.direction[k]], work)
     finish_lanes(ONE, evidence.roots, evidence.lanes, 0, h, centre, total, work, False)
     before, after = centre[h], evidence.lanes[0, h]
     recentre_part(ONE, evidence.prior[h], before, after, evidence.prior[h])
     recentre_part(ONE, evidence.own[h], before, after, evidence.own[h])
     for k in range(evidence.first[h], evidence.first[h + 1]):
-        received = evidence.received[evidence.way[k]]
+        received = evidence.received[evidence.direction[k]]
         recentre_part(ONE, received, before, after, received)
 
 
@@ -155,12 +155,12 @@ def add_samples(state: Simulation, evidence: EvidenceArrays, h: int, instant: in
 @kernel
 def send_evidence(state: Simulation, evidence: EvidenceArrays, m: int, h: int) -> None:
     """Write the evidence of node ``h`` into message ``m``, without that of its receiver."""
-    receiver = state.ways[state.pool[m].way].receiver
+    receiver = state.directions[state.pool[m].direction].receiver
     copy_state(state.size, state.pool_x, state.pool_root, m, state.xhat, state.root, h)
     copy_part(ONE, evidence.own[h], evidence.carried[m])
     for k in range(evidence.first[h], evidence.first[h + 1]):
-        w = evidence.way[k]
-        if state.ways[w].sender != receiver:
+        w = evidence.direction[k]
+        if state.directions[w].sender != receiver:
             add_part(ONE, evidence.carried[m], evidence.received[w], evidence.work)
 
 
@@ -172,7 +172,7 @@ def hear_evidence_now(state: Simulation, evidence: EvidenceArrays, h: int, now: 
     m, maps = state.nodes[h].inbox, evidence.maps
     while m != -1:
         message = state.pool[m]
-        w, age = message.way, now - message.sent
+        w, age = message.direction, now - message.sent
         if evidence.sent_at[w] <= message.sent:
             if age > 0.0:
                 fill_inverse_transition(evidence.A, age, maps)

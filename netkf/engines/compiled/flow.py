@@ -179,9 +179,9 @@ class Workspace:
 
     def __init__(self, scenario: Scenario) -> None:
         self._scenario, self._senders = scenario, senders_of(scenario)
-        self._start, (entities, ways) = filters_at_start(scenario), entity_records(scenario)
+        self._start, (entities, directions) = filters_at_start(scenario), entity_records(scenario)
         # Directed links count their messages, which are those of this workspace.
-        self._records = entities, ways.copy()
+        self._records = entities, directions.copy()
         self._waiting = np.zeros(len(self._start.nodes), dtype=np.int64)
         size, n = self._start.xhat.shape
         self._pool = empty_pool(FIRST_MESSAGES, n)
@@ -189,7 +189,7 @@ class Workspace:
         self._probes = np.array(scenario.times, dtype=np.float64)
         kind = COMBINATIONS.index(scenario.hosted.combination)
         # Terms of conserved sums: weights held, totals sent and totals heard.
-        terms = 2 * size + len(self._senders.ways) if kind == SUMS else 0
+        terms = 2 * size + len(self._senders.directions) if kind == SUMS else 0
         # Space for many samples, within a budget of floats.
         scratch = max(1, min(MOST_SAMPLES, SAMPLES_ROOM // (size * n * n)))
         self._shown = empty_samples((1, scratch, size, n), terms)
@@ -218,9 +218,9 @@ class Workspace:
         write their samples into ``shown``.
         """
         start, instants, window = self._start, draws.instants, draws.window()
-        entities, ways = self._records
+        entities, directions = self._records
         # Records are shared by all runs of the workspace: numbers of messages start again.
-        ways["messages"] = 0
+        directions["messages"] = 0
         pool = self._pool[0]
         # All messages are free, in the order of the pool.
         pool["next"] = np.arange(1, len(pool) + 1)
@@ -239,7 +239,7 @@ class Workspace:
             gains=start.gains,
             entities=entities,
             hearing=self._senders.hearing,
-            ways=ways,
+            directions=directions,
             pool=pool,
             pool_x=self._pool[1],
             pool_root=self._pool[2],

@@ -15,8 +15,8 @@ def arrives_first(pool: np.ndarray, a: int, b: int) -> bool:
     one, other = pool[a], pool[b]
     if one.arrival != other.arrival:
         return bool(one.arrival < other.arrival)
-    if one.way != other.way:
-        return bool(one.way < other.way)
+    if one.direction != other.direction:
+        return bool(one.direction < other.direction)
     return bool(one.order < other.order)
 
 
@@ -71,21 +71,23 @@ def put(state: Simulation, h: int, message: int) -> None:
     """Put a message into the inbox of node ``h``, in the order of senders; of several of one sender
     the newest counts, or all readings in the order of arrival.
     """
-    nodes, ways, pool, newest_only = state.nodes, state.ways, state.pool, state.kind != READINGS
-    node, peer = nodes[h], ways[pool[message].way].sender
+    nodes, directions, pool = state.nodes, state.directions, state.pool
+    newest_only = state.kind != READINGS
+    node, peer = nodes[h], directions[pool[message].direction].sender
     before, here = -1, node.inbox
     # Inboxes are linked lists, with the last one known: a message from a later sender goes to the
     # end.
-    if here != -1 and ways[pool[node.last].way].sender < peer:  # mostly they come in order
+    # Mostly they come in order.
+    if here != -1 and directions[pool[node.last].direction].sender < peer:
         before, here = node.last, -1
     while here != -1:
-        other = ways[pool[here].way].sender
+        other = directions[pool[here].direction].sender
         # Before the first message of a later sender, and in place of one of this sender if the
         # newest counts.
         if other > peer or (other == peer and newest_only):
             break
         before, here = here, pool[here].next
-    if here != -1 and ways[pool[here].way].sender == peer:
+    if here != -1 and directions[pool[here].direction].sender == peer:
         # An older message than the one that is there brings nothing.
         if pool[message].sent < pool[here].sent:
             release(state, message)

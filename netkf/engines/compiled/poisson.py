@@ -36,17 +36,23 @@ one costs is to be spread over some ticks.
 
 
 class Drawing(NamedTuple):
-    """E entities of several runs: the tick that is ``coming`` (E,), ``rate`` (E,), the states of
-    the streams of ``ticks`` (E, 4) and of what decides about messages, ``luck`` (S, 4), of which
-    each run has ``streams`` (S = 0: nothing is drawn). Of one run: entity e sends on the ways
-    ``hearing`` from ``first[e]`` up to ``first[e + 1]``, way w has the stream ``source[w]`` and the
-    ``chance[w]`` to arrive. ``bits``: what is drawn of a tick is only which messages arrive.
+    """The clocks of R runs, E entities in all, and the law of their messages.
+
+    coming  : (E,) time of the next tick, seconds
+    rate    : (E,) ticks per second
+    ticks   : (E, 4) states of the random streams of ticks
+    losses  : (S, 4) states of the streams that decide about losses, ``streams`` of them in each
+              run; S = 0: no message is lost
+    first, hearing : entity e of a run sends on the directions ``hearing[first[e]:first[e + 1]]``
+    source  : (W,) stream of each direction
+    chance  : (W,) probability that a message arrives
+    bits    : whether only the bits of messages that arrive are drawn, without outcomes
     """
 
     coming: FloatArray
     rate: FloatArray
     ticks: np.ndarray
-    luck: np.ndarray
+    losses: np.ndarray
     streams: int
     first: np.ndarray
     hearing: np.ndarray
@@ -128,10 +134,10 @@ def draw_outcomes(
     found: Found,
     used: np.ndarray,
 ) -> int:
-    """Draw which messages of a tick arrive, on the ways ``hearing`` from ``first`` up to ``after``;
+    """Draw which messages of a tick arrive, on the directions ``hearing[first:after]``;
     return where their outcomes begin, or a bit for each.
     """
-    at, luck, drawn = 0 if drawing.bits else used[1], 0.0, -1
+    at, uniform, drawn = 0 if drawing.bits else used[1], 0.0, -1
     # One uniform number for each source of outcomes: directions that share a source follow one
     # another.
     for m in range(first, after):
@@ -139,8 +145,8 @@ def draw_outcomes(
         if drawing.streams > 0 and drawing.source[w] != drawn:
             drawn = drawing.source[w]
             # The number is below 1, so that a link with probability 1 never loses.
-            luck = next_unit(drawing.luck, run * drawing.streams + drawn)
-        arrives = luck < drawing.chance[w]
+            uniform = next_unit(drawing.losses, run * drawing.streams + drawn)
+        arrives = uniform < drawing.chance[w]
         if drawing.bits:
             at |= np.int64(arrives) << (m - first)
         else:
@@ -257,11 +263,11 @@ def is_poisson(scenario: Scenario) -> bool:
 
 @once_per_scenario
 def _rates_and_chances(scenario: Scenario) -> tuple[FloatArray, FloatArray]:
-    """Ticks per second of each entity (E,), and the delivery probability of each way (W,)."""
+    """Ticks per second of each entity (E,), and the delivery probability of each direction (W,)."""
     clock, senders = scenario.network.activation, senders_of(scenario)
     assert isinstance(clock, LinkClock)
     rates = np.array([clock.mean_rate(entity) for entity in senders.entities])
-    return rates, delivery_chances(scenario, senders.ways)
+    return rates, delivery_chances(scenario, senders.directions)
 
 
 class PoissonSchedules:
@@ -278,16 +284,16 @@ class PoissonSchedules:
         senders = senders_of(scenario) if senders is None else senders
         ticks, count = StreamBatch(streams, "clock", senders.entities), len(senders.entities) * runs
         # No states where nothing is random: draw_ticks() then draws no number.
-        luck: np.ndarray = np.empty((0, 4), dtype=np.uint64)
+        losses: np.ndarray = np.empty((0, 4), dtype=np.uint64)
         if not scenario.network.channel.loss.deterministic:
-            luck = StreamBatch(streams, "loss", senders.sources).states
+            losses = StreamBatch(streams, "loss", senders.sources).states
         rates, chances = _rates_and_chances(scenario)
         self._drawing = Drawing(
             coming=ticks.exponentials(np.arange(count), np.ones(count, dtype=np.int64)),
             rate=np.tile(rates, runs),
             ticks=ticks.states,
-            luck=luck,
-            streams=len(luck) // runs,
+            losses=losses,
+            streams=len(losses) // runs,
             first=senders.first,
             hearing=senders.hearing,
             source=senders.source,
@@ -319,7 +325,7 @@ class PoissonSchedules:
 
     def whole(self) -> AllTicks:
         """All ticks of all runs."""
-        states = self._drawing.coming, self._drawing.ticks, self._drawing.luck
+        states = self._drawing.coming, self._drawing.ticks, self._drawing.losses
         # Streams as they are now: a try without enough space begins with them again.
         begun = [state.copy() for state in states]
         # A Poisson count exceeds its mean by eight standard deviations with a negligible chance,

@@ -55,16 +55,16 @@ def empty_totals(
 ) -> Totals:
     """Weight 1 at every node, and nothing sent yet."""
     count, n = state.xhat.shape
-    m, ways = 1 + n * n + n, len(state.ways)
+    m, directions = 1 + n * n + n, len(state.directions)
     return Totals(
         weight=np.ones(count),
         sent=np.zeros((count, m)),
         sent_at=np.zeros(count),
         rounds=np.zeros(count, dtype=np.int64),
         receivers=receivers,
-        heard=np.zeros((ways, m)),
-        number=np.full(ways, -1),
-        heard_at=np.zeros(ways),
+        heard=np.zeros((directions, m)),
+        number=np.full(directions, -1),
+        heard_at=np.zeros(directions),
         offered=np.zeros((len(state.pool), m)),
         A=np.array(A, dtype=np.float64),
         forgetting=forgetting,
@@ -204,7 +204,7 @@ def hear(state: Simulation, totals: Totals, h: int, now: float) -> None:
     m = state.nodes[h].inbox
     while m != -1:
         message = pool[m]
-        w = message.way
+        w = message.direction
         # A total of a later round contains all earlier ones: only growth since then counts.
         if message.tag > totals.number[w]:
             # Both totals are brought to now before they are compared.
@@ -221,10 +221,10 @@ def hear(state: Simulation, totals: Totals, h: int, now: float) -> None:
     m = state.nodes[h].inbox
     while m != -1:
         message = pool[m]
-        if message.tag > totals.number[message.way]:
-            totals.number[message.way] = message.tag
+        if message.tag > totals.number[message.direction]:
+            totals.number[message.direction] = message.tag
             for j in range(len(gained)):
-                heard[message.way, j] = offered[m, j]
+                heard[message.direction, j] = offered[m, j]
         m = message.next
     # The weight of the node grows by what it gained, and P^-1 becomes the weighted mean.
     weight = totals.weight[h] + gained[0]

@@ -174,11 +174,14 @@ def delay_is_zero(channel: Channel) -> bool:
     return delay.fixed == 0.0 and not delay.is_random and not delay_depends_on_message(delay)
 
 
-def delivery_chances(scenario: Scenario, ways: tuple[Link, ...]) -> FloatArray:
+def delivery_chances(scenario: Scenario, directions: tuple[Link, ...]) -> FloatArray:
     """Return the delivery probability (W,) of the messages of each directed link."""
     loss = scenario.network.channel.loss
     return np.array(
-        [loss.delivery_probability(way, 0, False, scenario.table_probability(way)) for way in ways]
+        [
+            loss.delivery_probability(direction, 0, False, scenario.table_probability(direction))
+            for direction in directions
+        ]
     )
 
 
@@ -190,17 +193,19 @@ class Outcomes:
     ) -> None:
         self._channel = channel = scenario.network.channel
         runs = streams.runs
-        self._senders, self._ways = senders, len(senders.ways)
+        self._senders, self._directions = senders, len(senders.directions)
         self._first, self._hearing = senders.first, senders.hearing
         self._count, self._sources = len(senders.entities), len(senders.sources)
-        self._measured = np.array([scenario.table_probability(way) for way in senders.ways])
+        self._measured = np.array(
+            [scenario.table_probability(direction) for direction in senders.directions]
+        )
         self._identical, self._has_table_law = (
             identical_per_link(channel.loss),
             has_table_law(channel),
         )
         # Probabilities that depend on the link only are tabulated.
         if self._identical:
-            self._probabilities = delivery_chances(scenario, senders.ways)
+            self._probabilities = delivery_chances(scenario, senders.directions)
         # Channels with memory or random delays keep a sampler for each stream.
         if not self._has_table_law:
             self._samplers = [
@@ -228,16 +233,16 @@ class Outcomes:
         # The k-th directed link of all entities that have one, so that each pass is vectorised.
         for k in range(int(sizes.max(initial=0))):
             some = sizes > k
-            ways = self._hearing[self._first[entity[some]] + k]
+            directions = self._hearing[self._first[entity[some]] + k]
             count = counts[some]
             # With a symmetric channel the second direction of a link takes the draws of the first.
             if not drawn or not self._senders.shared:
-                sources = runs[some] * self._sources + self._senders.source[ways]
+                sources = runs[some] * self._sources + self._senders.source[directions]
                 drawn = self._draw(sources, count)
             # Place of each outcome: tick after tick, and inside a tick in the order of its links.
             step = np.arange(int(count.sum())) - np.repeat(np.cumsum(count) - count, count)
             to = np.repeat(begin[some] + k, count) + step * np.repeat(sizes[some], count)
-            out[to] = self._delays(ways, count, first[some], *drawn)
+            out[to] = self._delays(directions, count, first[some], *drawn)
         return out
 
     def _draw(self, sources: np.ndarray, counts: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -260,7 +265,7 @@ class Outcomes:
 
     def _delays(
         self,
-        ways: np.ndarray,
+        directions: np.ndarray,
         counts: np.ndarray,
         first: np.ndarray,
         uniform: np.ndarray,
@@ -269,32 +274,34 @@ class Outcomes:
     ) -> FloatArray:
         """Return the delays (K,) of messages in seconds, LOST for lost ones."""
         if self._identical:
-            probability = np.repeat(self._probabilities[ways], counts)
+            probability = np.repeat(self._probabilities[directions], counts)
         else:
-            probability = self._delivery_probability(ways, counts, first, bad)
+            probability = self._delivery_probability(directions, counts, first, bad)
         lost = uniform >= probability
         if delay_depends_on_message(self._channel.delay):
-            delay = self._by_message(ways, counts, first, lost, delay)
+            delay = self._by_message(directions, counts, first, lost, delay)
         return np.where(lost, LOST, delay)
 
     def _delivery_probability(
-        self, ways: np.ndarray, counts: np.ndarray, first: np.ndarray, bad: np.ndarray
+        self, directions: np.ndarray, counts: np.ndarray, first: np.ndarray, bad: np.ndarray
     ) -> FloatArray:
-        """Return the delivery probability of each message, way by way; ``bad`` is the channel state
-        of each.
+        """Return the delivery probability of each message, by direction; ``bad`` (K,) is the state
+        of the channel for each.
         """
         loss, out, done = self._channel.loss, np.empty(len(bad)), 0
         # Probabilities that may depend on the state of the link and on the number of the message.
-        for w, count, number in zip(ways, counts.tolist(), first.tolist(), strict=True):
+        for w, count, number in zip(directions, counts.tolist(), first.tolist(), strict=True):
             part = slice(done, done + count)
-            way, measured = self._senders.ways[w], float(self._measured[w])
-            out[part] = delivery_probabilities(loss, way, number, bad[part].astype(bool), measured)
+            direction, measured = self._senders.directions[w], float(self._measured[w])
+            out[part] = delivery_probabilities(
+                loss, direction, number, bad[part].astype(bool), measured
+            )
             done += count
         return out
 
     def _by_message(
         self,
-        ways: np.ndarray,
+        directions: np.ndarray,
         counts: np.ndarray,
         first: np.ndarray,
         lost: np.ndarray,
@@ -304,12 +311,12 @@ class Outcomes:
         message.
         """
         model, out, k = self._channel.delay, np.array(delay), 0
-        for w, count, number in zip(ways, counts.tolist(), first.tolist(), strict=True):
+        for w, count, number in zip(directions, counts.tolist(), first.tolist(), strict=True):
             # A delay is asked only for messages that arrive.
             for message in range(number, number + count):
                 if not lost[k]:
-                    way = self._senders.ways[w]
-                    out[k] = checked_delay(model, way, message, float(delay[k]))
+                    direction = self._senders.directions[w]
+                    out[k] = checked_delay(model, direction, message, float(delay[k]))
                 k += 1
         return out
 

@@ -18,15 +18,15 @@ class Senders(NamedTuple):
 
     at : kind of clock: "links", "directions", "nodes" or "readings"
     entities : the E entities with a clock; nodes for "readings"
-    ways : the W directed links, in the order in which simultaneous messages arrive
-    first, hearing : entity e sends on the ways ``hearing[first[e]:first[e + 1]]``
-    sources, source : streams of outcomes, and the index (W,) of that of each way; ways that share a
-                      stream share a draw at each tick
+    directions : the W directed links, in the order in which simultaneous messages arrive
+    first, hearing : entity e sends on the directions ``hearing[first[e]:first[e + 1]]``
+    sources, source : streams of outcomes, and the index (W,) of the stream of each direction;
+                      directions that share a stream share a draw at each tick
     """
 
     at: str
     entities: tuple[Entity, ...]
-    ways: tuple[Link, ...]
+    directions: tuple[Link, ...]
     first: np.ndarray
     hearing: np.ndarray
     sources: tuple[Link, ...]
@@ -35,7 +35,7 @@ class Senders(NamedTuple):
     @property
     def shared(self) -> bool:
         """Return True if both directions of a link share outcomes."""
-        return len(self.sources) < len(self.ways)
+        return len(self.sources) < len(self.directions)
 
 
 @once_per_scenario
@@ -48,20 +48,20 @@ def senders_of(scenario: Scenario) -> Senders:
         return Senders("links", (), (), np.zeros(1, dtype=np.int64), none, (), none)
     if clock.at == "links":
         return _link_senders(topology.links, topology.directed, scenario.network.channel.symmetric)
-    ways = topology.directions
-    each = np.arange(len(ways))
+    directions = topology.directions
+    each = np.arange(len(directions))
     # Each direction has a clock, and sends on itself only.
     if clock.at == "directions":
-        first = np.arange(len(ways) + 1)
-        return Senders(clock.at, ways, ways, first, each, ways, each)
+        first = np.arange(len(directions) + 1)
+        return Senders(clock.at, directions, directions, first, each, directions, each)
     # Nodes have clocks: each sends on all directed links that leave it.
-    senders = np.array([topology.index[i] for i, _ in ways], dtype=np.int64)
+    senders = np.array([topology.index[i] for i, _ in directions], dtype=np.int64)
     counts = np.bincount(senders, minlength=len(topology.nodes))
     first = np.concatenate([[0], np.cumsum(counts)])
     entities = tuple((node,) for node in topology.nodes)
     # Stable, so that the links of a node keep the order in which messages arrive.
     hearing = np.argsort(senders, kind="stable")
-    return Senders(clock.at, entities, ways, first, hearing, ways, each)
+    return Senders(clock.at, entities, directions, first, hearing, directions, each)
 
 
 def _link_senders(links: tuple[Link, ...], directed: bool, symmetric: bool) -> Senders:
@@ -71,10 +71,10 @@ def _link_senders(links: tuple[Link, ...], directed: bool, symmetric: bool) -> S
         return Senders("links", links, links, np.arange(len(links) + 1), each, links, each)
     # Both directions of a link are neighbours, forth and back, so that 2 k and 2 k + 1 belong to
     # link k.
-    ways = tuple(way for i, j in links for way in ((i, j), (j, i)))
-    each = np.arange(len(ways))
-    first = np.arange(0, len(ways) + 1, 2)
+    directions = tuple(direction for i, j in links for direction in ((i, j), (j, i)))
+    each = np.arange(len(directions))
+    first = np.arange(0, len(directions) + 1, 2)
     # Both directions share the stream of their link.
     if symmetric:
-        return Senders("links", links, ways, first, each, links, each // 2)
-    return Senders("links", links, ways, first, each, ways, each)
+        return Senders("links", links, directions, first, each, links, each // 2)
+    return Senders("links", links, directions, first, each, directions, each)

@@ -88,16 +88,17 @@ class SlotEvents:
         self._directions = [
             Direction(scenario, streams, ends, k) for k, ends in enumerate(setup.directions)
         ]
-        self._indices = {way.ends: way.index for way in self._directions}
-        ways, own = setup.ways, setup.streams
+        self._indices = {direction.ends: direction.index for direction in self._directions}
+        each, own = setup.directions_per_link, setup.streams
         # Directions of a link are neighbours; a directed graph has one of them.
-        pairs = [way.ends for way in self._directions[::ways]]
-        self._ways = {
-            link: self._directions[k * ways : (k + 1) * ways] for k, link in enumerate(pairs)
+        pairs = [direction.ends for direction in self._directions[::each]]
+        self._by_link = {
+            link: self._directions[k * each : (k + 1) * each] for k, link in enumerate(pairs)
         }
         # With a symmetric channel only the first direction of a link draws.
         self._draws = {
-            link: [way.draws() for way in both[:own]] for link, both in self._ways.items()
+            link: [direction.draws() for direction in both[:own]]
+            for link, both in self._by_link.items()
         }
         self._last: dict[Link, list[Draw]] = {}
         self._in_flight: list[tuple[float, int, int, Direction, int, float, int, int]] = []
@@ -118,7 +119,7 @@ class SlotEvents:
         asked = np.zeros((len(setup.fresh), len(setup.nodes)), dtype=np.uint8)
         for step in self._iterate_steps(self._slot):
             self._drawn.append(self._choose_pairs(step))
-            links = self._drawn[-1][0] if self._algorithm.pairwise else self._ways
+            links = self._drawn[-1][0] if self._algorithm.pairwise else self._by_link
             asked[step.step, [index[node] for link in links for node in link]] = 1
         return asked
 
@@ -240,18 +241,20 @@ class SlotEvents:
         for i, j in pairs:
             if not broadcast:
                 self._append_row((now, TICK, i, j, -1, phase, NAN))
-            ways = self._ways[i, j]
+            both = self._by_link[i, j]
             if self._setup.fresh[step.step] or (i, j) not in self._last:
                 # Drawn even if a node sends nothing, so that the network does not depend on the
                 # filter.
                 drawn = [next(draws) for draws in self._draws[i, j]]
                 # Both directions take the one draw of a symmetric channel.
-                self._last[i, j] = drawn if len(drawn) == len(ways) else drawn * 2
+                self._last[i, j] = drawn if len(drawn) == len(both) else drawn * 2
             # A link that is down loses its messages whatever was drawn.
             here = up is None or (i, j) in up
-            for way, draw in zip(ways, self._last[i, j], strict=True):
-                if self._setup.talks[step.step, way.index] and not self._is_silent(way, step):
-                    self._send(step, way, draw if here else None)
+            for direction, draw in zip(both, self._last[i, j], strict=True):
+                if self._setup.talks[step.step, direction.index] and not self._is_silent(
+                    direction, step
+                ):
+                    self._send(step, direction, draw if here else None)
 
     def _choose_pairs(self, step: Step) -> tuple[list[Link], set[Link] | None]:
         """Return the links that are used, and the set of those that are up (None: all)."""
@@ -268,26 +271,26 @@ class SlotEvents:
         up = set(listed)
         return links, up if topology.directed else up | {(j, i) for i, j in listed}
 
-    def _is_silent(self, way: Direction, step: Step) -> bool:
+    def _is_silent(self, direction: Direction, step: Step) -> bool:
         """Return True if the sender sends nothing in this step."""
-        node = self._scenario.topology.index[way.ends[0]]
+        node = self._scenario.topology.index[direction.ends[0]]
         if self._sent is not None and not self._sent[step.step, node]:
             return True
         return bool(self._setup.may_miss and self._unread[step.step, node])
 
-    def _send(self, step: Step, way: Direction, draw: Draw | None) -> None:
+    def _send(self, step: Step, direction: Direction, draw: Draw | None) -> None:
         """Send one message: it is lost, arrives at once, or is put among those in flight."""
-        (sender, receiver), number, now = way.ends, way.messages, step.begin
-        way.messages = number + 1
+        (sender, receiver), number, now = direction.ends, direction.messages, step.begin
+        direction.messages = number + 1
         self._append_row((now, SEND, sender, receiver, number, step.phase, NAN))
         channel, delay = self._scenario.network.channel, math.nan
         if draw is not None:
             # Checked, because a user's channel may return anything.
             probability = checked_delivery_probability(
-                channel.loss, way.ends, number, draw[1], way.probability
+                channel.loss, direction.ends, number, draw[1], direction.probability
             )
             if draw[0] < probability:
-                delay = checked_delay(channel.delay, way.ends, number, draw[2])
+                delay = checked_delay(channel.delay, direction.ends, number, draw[2])
         if math.isnan(delay):
             self._append_row((now, LOST, sender, receiver, number, step.phase, NAN))
         elif delay == 0.0:
@@ -298,14 +301,23 @@ class SlotEvents:
         elif now + delay < self._scenario.ends:
             self._order += 1
             # Order in the heap: time, directed link, order of sending.
-            entry = now + delay, way.index, self._order, way, number, now, step.phase, self._open
+            entry = (
+                now + delay,
+                direction.index,
+                self._order,
+                direction,
+                number,
+                now,
+                step.phase,
+                self._open,
+            )
             heapq.heappush(self._in_flight, entry)
 
     def _deliver(self, until: float) -> None:
         """Deliver what arrives by then; in time if the exchange it was sent in is still open."""
         while self._in_flight and self._in_flight[0][0] <= until:
-            now, _, _, way, number, sent, phase, exchange = heapq.heappop(self._in_flight)
-            (sender, receiver), in_time = way.ends, exchange == self._open
+            now, _, _, direction, number, sent, phase, exchange = heapq.heappop(self._in_flight)
+            (sender, receiver), in_time = direction.ends, exchange == self._open
             # After the horizon nothing is recorded; the last exchange may still be finished.
             if now < self._scenario.horizon:
                 kind = DELIVER if in_time else LATE

@@ -63,8 +63,8 @@ class Channels(NamedTuple):
     Streams ``states`` and ``state_draws`` (B, K, 4, L) of K links or directions, empty where
     nothing is drawn; the last uniform numbers ``drawn`` and ``state_drawn`` and state ``bad`` (B,
     K, L; -1 at first) of each; probabilities ``to_bad``, ``to_good``. ``talks`` (E, W): whether the
-    sender has something to send in a step. A link has so many ``ways`` (directions) and ``streams``
-    of its own.
+    sender has something to send in a step. A link has
+    ``directions_per_link`` (1 or 2) and so many ``streams`` of its own.
     """
 
     ends: np.ndarray
@@ -77,7 +77,7 @@ class Channels(NamedTuple):
     to_bad: float
     to_good: float
     talks: np.ndarray
-    ways: int
+    directions_per_link: int
     streams: int
 
 
@@ -154,7 +154,7 @@ def draw_link(
     """Decide about the messages of one activation of a link in all runs of a block, in step ``e``
     of slot ``s`` of ``up``; links that are not ``fresh`` keep their last numbers.
     """
-    for d in range(c.ways):
+    for d in range(c.directions_per_link):
         # With one stream per link (symmetric) both directions use it.
         k = link * c.streams + min(d, c.streams - 1)
         # Held links keep their number; -1 marks one that has none yet.
@@ -167,7 +167,7 @@ def draw_link(
                     c.bad[b, k, q] = next_state(
                         c.bad[b, k, q], c.state_drawn[b, k, q], c.to_bad, c.to_good
                     )
-        w = link * c.ways + d
+        w = link * c.directions_per_link + d
         if c.talks[e, w] == 1:
             number = load(lanes, c.drawn, b, k)
             if len(c.state_draws) == 0:
@@ -183,14 +183,14 @@ def draw_link_of_lane(
     c: Channels, b: int, link: int, fresh: bool, up: np.ndarray, s: int, e: int, q: int
 ) -> None:
     """Draw one link for the run of lane ``q`` alone, as ``draw_link`` does for all lanes."""
-    for d in range(c.ways):
+    for d in range(c.directions_per_link):
         k = link * c.streams + min(d, c.streams - 1)
         if d < c.streams and len(c.states) > 0 and (fresh or c.drawn[b, k, q] < 0.0):
             c.drawn[b, k, q] = next_unit_of_lane(c.states, b, k, q)
             if len(c.state_draws) > 0:
                 u = next_unit_of_lane(c.state_draws, b, k, q)
                 c.bad[b, k, q] = next_state(c.bad[b, k, q], u, c.to_bad, c.to_good)
-        w = link * c.ways + d
+        w = link * c.directions_per_link + d
         if c.talks[e, w] == 1:
             # A channel without a state has -1 there.
             probability = c.delivery[1, w] if c.bad[b, k, q] == 1 else c.delivery[0, w]
@@ -345,7 +345,7 @@ class Hearing(NamedTuple):
     """Nodes and links of a recorded run.
 
     nodes, sensing : ids of all nodes (N,) and of those with sensors
-    first, sender, way : directions by receiver, see ``SlotLinks``
+    first, sender, direction : directions by receiver, see ``SlotLinks``
     sent : number of messages so far (W,)
     stopped : slot in which each node stopped (B, N, L)
     """
@@ -354,7 +354,7 @@ class Hearing(NamedTuple):
     sensing: np.ndarray
     first: np.ndarray
     sender: np.ndarray
-    way: np.ndarray
+    direction: np.ndarray
     sent: np.ndarray
     stopped: np.ndarray
 
@@ -498,8 +498,8 @@ def _write_sends(
 @kernel
 def _link_rows(c: Channels, h: Hearing, d: Drawn, rows: Rows, m: Moment, link: int, at: int) -> int:
     """Write the messages sent on a link, each followed by its arrival or loss; return the row."""
-    for end in range(c.ways):
-        w, i = link * c.ways + end, c.ends[link, end]
+    for end in range(c.directions_per_link):
+        w, i = link * c.directions_per_link + end, c.ends[link, end]
         if c.talks[m.step, w] == 0 or is_silent(d, 0, m, i, 0):
             continue
         # Messages of a direction are numbered from 0, lost ones included.
@@ -527,11 +527,11 @@ def _write_step_end(
     for i in range(len(h.nodes)):
         heard = False
         for k in range(h.first[i], h.first[i + 1]):
-            if d.up[0, m.s, m.step, h.way[k], 0] == 1:
+            if d.up[0, m.s, m.step, h.direction[k], 0] == 1:
                 heard = True
                 if pairwise:
                     # The message of this step is the last one that was numbered.
-                    peer, number = h.nodes[h.sender[k]], h.sent[h.way[k]] - 1
+                    peer, number = h.nodes[h.sender[k]], h.sent[h.direction[k]] - 1
                     at = write_row(rows, m, SWAP, h.nodes[i], peer, number, 0.0, at)
         if heard and not pairwise:
             at = write_row(rows, m, ABSORB, h.nodes[i], -1, -1, 0.0, at)
@@ -610,7 +610,7 @@ def count_step(
     for i in range(len(h.nodes)):
         heard = spread(lanes, 0.0)
         for k in range(h.first[i], h.first[i + 1]):
-            up = load_flags(lanes, d.up, b, m.s, m.step, h.way[k])
+            up = load_flags(lanes, d.up, b, m.s, m.step, h.direction[k])
             heard += select(up, 1.0, 0.0)
         came += heard
         absorbed += select(heard > 0.0, 1.0, 0.0)
@@ -637,9 +637,9 @@ def count_matched_pairs(
         pairs, sent = d.pairs[r, m.s, m.step], 0
         for a in range(pairs):
             link = d.active[r, m.s, m.step, a]
-            for way in range(c.ways):
-                if not is_silent(d, b, m, c.ends[link, way], r - first):
-                    sent += c.talks[m.step, link * c.ways + way]
+            for direction in range(c.directions_per_link):
+                if not is_silent(d, b, m, c.ends[link, direction], r - first):
+                    sent += c.talks[m.step, link * c.directions_per_link + direction]
         scratch[TICK, r - first] += pairs
         scratch[SEND, r - first] += sent
         scratch[LOST, r - first] += sent
@@ -651,9 +651,16 @@ def count_silent(
 ) -> None:
     """Take off the messages that nodes do not send."""
     silent = spread(lanes, 0.0)
-    for w in range(len(c.ends) * c.ways):
+    for w in range(len(c.ends) * c.directions_per_link):
         if c.talks[m.step, w] == 1:
-            sends = load_flags(lanes, d.sent, b, m.s, m.step, c.ends[w // c.ways, w % c.ways])
+            sends = load_flags(
+                lanes,
+                d.sent,
+                b,
+                m.s,
+                m.step,
+                c.ends[w // c.directions_per_link, w % c.directions_per_link],
+            )
             silent += select(sends, 0.0, 1.0)
     add_count(lanes, scratch, SEND, -silent)
     add_count(lanes, scratch, LOST, -silent)

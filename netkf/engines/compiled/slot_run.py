@@ -183,7 +183,7 @@ class SlotRuns:
             to_bad,
             to_good,
             setup.talks,
-            setup.ways,
+            setup.directions_per_link,
             setup.streams,
         )
         protocol, probability, first, members = setup.matching
@@ -340,7 +340,7 @@ class SlotRuns:
         if not setup.may_miss:
             return np.zeros((count, len(setup.fresh), len(setup.nodes)), dtype=bool)
         unread = setup.unread(self._slot, count)
-        senders = setup.ends[:, : setup.ways].reshape(-1)
+        senders = setup.ends[:, : setup.directions_per_link].reshape(-1)
         drawn.up[:, unread[:, :, senders]] = 0
         return unread
 
@@ -459,7 +459,7 @@ class SlotRuns:
         """Return the links and nodes as the kernels of messages need them."""
         setup, heard = self.setup, self.setup.links
         return Hearing(
-            setup.nodes, setup.sensing, heard.first, heard.sender, heard.way, self._sent,
+            setup.nodes, setup.sensing, heard.first, heard.sender, heard.direction, self._sent,
             self._stopped,
         )  # fmt: skip
 

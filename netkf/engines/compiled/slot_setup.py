@@ -69,9 +69,11 @@ class SlotSetup:
         ends = [[topology.index[i], topology.index[j]] for i, j in links]
         self.ends = np.array(ends, dtype=np.int64).reshape(-1, 2)
         # Directions 2 l and 2 l + 1 belong to link l, as in the SimPy engine.
-        self.ways = 1 if topology.directed else 2
+        self.directions_per_link = 1 if topology.directed else 2
         self.directions: tuple[Link, ...] = tuple(
-            way for i, j in links for way in ((i, j), (j, i))[: self.ways]
+            direction
+            for i, j in links
+            for direction in ((i, j), (j, i))[: self.directions_per_link]
         )
         self.links = self._make_links(scenario)
         self._set_channel(scenario)
@@ -213,16 +215,16 @@ class SlotSetup:
         index = scenario.topology.index
         # By receiver and sender: the order in which a filter adds what it hears.
         heard = sorted(
-            (index[receiver], index[sender], way, scenario.weight(receiver, sender))
-            for way, (sender, receiver) in enumerate(self.directions)
+            (index[receiver], index[sender], direction, scenario.weight(receiver, sender))
+            for direction, (sender, receiver) in enumerate(self.directions)
         )
         # zip() of nothing gives no columns.
-        receivers, senders, ways, weights = zip(*heard, strict=True) if heard else [()] * 4
+        receivers, senders, directions, weights = zip(*heard, strict=True) if heard else [()] * 4
         first = np.searchsorted(np.array(receivers, dtype=np.int64), np.arange(self.estimators + 1))
         return SlotLinks(
             np.asarray(first, dtype=np.int64),
             np.array(senders, dtype=np.int64),
-            np.array(ways, dtype=np.int64),
+            np.array(directions, dtype=np.int64),
             np.array(weights, dtype=np.float64),
         )
 
@@ -230,26 +232,28 @@ class SlotSetup:
         """Set the delivery probabilities of directions, and the entities whose streams decide about
         messages.
         """
-        channel, ways = scenario.network.channel, self.ways
+        channel, each = scenario.network.channel, self.directions_per_link
         self.loss, bad = channel.loss, (False, True)
         self.is_chain = type(self.loss) is GilbertElliott
         # Channels of a user's own have probabilities that only Python can ask for.
         self.has_known_probabilities = identical_per_link(self.loss) or self.is_chain
         self.delivery = np.ones((2, len(self.directions)))
         if self.has_known_probabilities:
-            for w, way in enumerate(self.directions):
-                table = scenario.table_probability(way)
+            for w, direction in enumerate(self.directions):
+                table = scenario.table_probability(direction)
                 self.delivery[:, w] = [
-                    self.loss.delivery_probability(way, 0, b, table) for b in bad
+                    self.loss.delivery_probability(direction, 0, b, table) for b in bad
                 ]
-        self.streams = 1 if channel.symmetric else ways
+        self.streams = 1 if channel.symmetric else each
         # Streams belong to the first direction of each link, or to each direction.
-        self.entities = [way for w, way in enumerate(self.directions) if w % ways < self.streams]
+        self.entities = [
+            direction for w, direction in enumerate(self.directions) if w % each < self.streams
+        ]
         # By phase: with asymptotic gains no mass is sent, and nodes without a sensor have no
         # reading.
         sends = self.algorithm.sends_in_slots
         talks = [
-            [sends(phase, way[0] in scenario.placed) for way in self.directions]
+            [sends(phase, direction[0] in scenario.placed) for direction in self.directions]
             for phase in self.phases
         ]
         self.talks = np.array(talks, dtype=np.uint8).reshape(len(talks), len(self.directions))
@@ -302,7 +306,7 @@ class SlotSetup:
     def rows_of(self, slots: int) -> int:
         """Return the largest number of events in ``slots`` slots."""
         pairs = self.most_pairs
-        sends = self.ways * (pairs if self.matching[0] >= 0 else len(self.ends))
+        sends = self.directions_per_link * (pairs if self.matching[0] >= 0 else len(self.ends))
         # A send and its outcome for each direction, a tick for each pair, a round, and one
         # absorption per node.
         steps = len(self.fresh) * (1 + pairs + 2 * sends + len(self.nodes))

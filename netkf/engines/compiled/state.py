@@ -56,10 +56,10 @@ sender, other : the node that sends, and the other end of a link, else -1
 first, after : it sends on the directed links ``Simulation.hearing[first:after]``
 """
 
-MESSAGE = _record_type("way number next order tag", "sent arrival")
+MESSAGE = _record_type("direction number next order tag", "sent arrival")
 """A message under way or in an inbox.
 
-way, number : directed link, and number on it
+direction, number : directed link, and number on it
 next : next message in the same inbox, or among the free ones
 order : number of the message on the heap, which orders simultaneous arrivals
 tag : instant of the reading that is sent, or number of a running sum
@@ -234,7 +234,7 @@ class Simulation(Struct):
 
     Links and messages
 
-    entities, hearing, ways : ENTITY records (E,), their directed links, WAY records (W,)
+    entities, hearing, directions : ENTITY records (E,), their directed links, WAY records (W,)
     pool, pool_x, pool_root : MESSAGE records (C,) and what they carry, (C, n) and (C, n, n)
     free, free_count, most_messages : first free message, number of free ones and of those that one
                                       event may need
@@ -276,7 +276,7 @@ class Simulation(Struct):
     gains: Gains
     entities: np.ndarray
     hearing: IntArray
-    ways: np.ndarray
+    directions: np.ndarray
     pool: np.ndarray
     pool_x: FloatArray
     pool_root: FloatArray
@@ -394,11 +394,11 @@ def entity_records(scenario: Scenario) -> tuple[np.ndarray, np.ndarray]:
     if senders.at != "links":
         entities["other"][:] = [index[e[1]] if len(e) > 1 else -1 for e in senders.entities]
     entities["first"], entities["after"] = senders.first[:-1], senders.first[1:]
-    ways = np.zeros(len(senders.ways), dtype=WAY)
-    ways["sender"] = [index[i] for i, _ in senders.ways]
-    ways["receiver"] = [index[j] for _, j in senders.ways]
-    ways["weight"] = [scenario.weight(j, i) for i, j in senders.ways]
-    return entities, ways
+    directions = np.zeros(len(senders.directions), dtype=WAY)
+    directions["sender"] = [index[i] for i, _ in senders.directions]
+    directions["receiver"] = [index[j] for _, j in senders.directions]
+    directions["weight"] = [scenario.weight(j, i) for i, j in senders.directions]
+    return entities, directions
 
 
 def scratch_arrays(

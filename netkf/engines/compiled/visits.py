@@ -539,15 +539,15 @@ def combine_pairs(state: Simulation, visits: Visits, k: int, count: int) -> None
 
 
 @kernel
-def assign_receiver(visits: Visits, side: int, lane: int, way: int, place: int) -> bool:
+def assign_receiver(visits: Visits, side: int, lane: int, direction: int, place: int) -> bool:
     """Let the node at a place hear a directed link in a lane, with the weights of that link;
     returns False if it hears nothing (NOT_HEARD).
     """
-    if way == NOT_HEARD:
+    if direction == NOT_HEARD:
         visits.hearing[side, lane] = NO_NODE
         return False
     visits.hearing[side, lane] = place
-    weight_row = visits.weight_row[way]
+    weight_row = visits.weight_row[direction]
     if visits.known[side, lane] != weight_row:
         visits.known[side, lane] = weight_row
         for k in range(4):

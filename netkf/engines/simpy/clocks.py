@@ -133,14 +133,14 @@ def _direction_activations(
     def activation(link: tuple[int, int], entity: int) -> Activation:
         """Return the activation of a directed link: its sender sends one message."""
         i, j = link
-        way = transmitter.directed_link(link, entity, nodes[j], transmitter.sampler(link))
+        direction = transmitter.directed_link(link, entity, nodes[j], transmitter.sampler(link))
 
         def activate(now: float) -> None:
             """Send one message."""
             recorder.append((now, TICK, i, j, -1, -1, NAN))
             # Drawn before the payload is made: even if nothing is sent, the channel takes its step.
-            outcome = way.sampler.draw()
-            transmitter.send(way, nodes[i].emit(now, (j,)), outcome)
+            outcome = direction.sampler.draw()
+            transmitter.send(direction, nodes[i].emit(now, (j,)), outcome)
 
         return activate
 
@@ -157,19 +157,21 @@ def broadcasts(
 
     Each hearer has an outcome of its own.
     """
-    ways: dict[int, list[Any]] = {node: [] for node in scenario.nodes}
+    directions: dict[int, list[Any]] = {node: [] for node in scenario.nodes}
     for k, (i, j) in enumerate(scenario.topology.directions):
-        ways[i].append(transmitter.directed_link((i, j), k, nodes[j], transmitter.sampler((i, j))))
+        directions[i].append(
+            transmitter.directed_link((i, j), k, nodes[j], transmitter.sampler((i, j)))
+        )
 
     def activation(node: int) -> Activation:
         """Return the broadcast of a node: one payload to all its neighbours."""
-        hearers, sent = tuple(way.link[1] for way in ways[node]), 0
+        hearers, sent = tuple(direction.link[1] for direction in directions[node]), 0
 
         def transmit(now: float) -> None:
             """Send one payload to each neighbour, each with an outcome of its own."""
             nonlocal sent
             # Drawn even if the filter sends nothing, so that the network does not depend on it.
-            outcomes = [way.sampler.draw() for way in ways[node]]
+            outcomes = [direction.sampler.draw() for direction in directions[node]]
             payload = nodes[node].emit(now, hearers)
             if payload is None:
                 return
@@ -177,8 +179,8 @@ def broadcasts(
             # link.
             recorder.append((now, TRANSMIT, node, -1, sent, -1, NAN))
             sent += 1
-            for way, outcome in zip(ways[node], outcomes, strict=True):
-                transmitter.send(way, payload, outcome)
+            for direction, outcome in zip(directions[node], outcomes, strict=True):
+                transmitter.send(direction, payload, outcome)
 
         return transmit
 

@@ -81,7 +81,7 @@ class Transmitter:
 
     def send(
         self,
-        way: DirectedLink,
+        direction: DirectedLink,
         payload: Any,
         outcome: ChannelDraw,
         phase: int = -1,
@@ -90,44 +90,46 @@ class Transmitter:
         """Send one message with its outcome; a payload of None is not sent."""
         if payload is None:
             return
-        now, (sender, receiver), number = self._timeline.now, way.link, way.messages
-        way.messages = number + 1
+        now, (sender, receiver), number = self._timeline.now, direction.link, direction.messages
+        direction.messages = number + 1
         append = self._recorder.append
         # Lost messages are numbered too: a recorded loss names a message by its number.
         append((now, SEND, sender, receiver, number, phase, NAN))
         # nan: the message is lost.
-        delay = transit_time(self._channel, way.link, number, outcome, way.table_probability)
+        delay = transit_time(
+            self._channel, direction.link, number, outcome, direction.table_probability
+        )
         if math.isnan(delay):
             append((now, LOST, sender, receiver, number, phase, NAN))
             return
-        envelope = Envelope(sender, number, way.weight, payload, now, exchange)
+        envelope = Envelope(sender, number, direction.weight, payload, now, exchange)
         # No event for a message without delay: it arrives inside the tick.
         if delay == 0.0:
-            self._arrive(way, phase, envelope, None)
+            self._arrive(direction, phase, envelope, None)
         # A message that would arrive after the end is neither delivered nor lost.
         elif now + delay < self._until:
             # Kept here and in the callback; the one here may be shifted meanwhile.
-            self._flying[way.link, number] = envelope
-            callback = partial(self._arrive, way, phase, envelope)
-            self._timeline.call_at(now + delay, Rank.DELIVER, way.entity, callback)
+            self._flying[direction.link, number] = envelope
+            callback = partial(self._arrive, direction, phase, envelope)
+            self._timeline.call_at(now + delay, Rank.DELIVER, direction.entity, callback)
 
     def _arrive(
-        self, way: DirectedLink, phase: int, envelope: Envelope, arrival: simpy.Event | None
+        self, direction: DirectedLink, phase: int, envelope: Envelope, arrival: simpy.Event | None
     ) -> None:
         """Deliver a message to its receiver, or record that it came too late."""
-        now, (sender, receiver) = self._timeline.now, way.link
+        now, (sender, receiver) = self._timeline.now, direction.link
         # A message without delay arrives inside the tick, and keeps its age of 0.
         if arrival is not None:
             # The stored envelope may have been shifted since it was sent.
-            envelope = self._flying.pop((way.link, envelope.number))
+            envelope = self._flying.pop((direction.link, envelope.number))
             envelope = envelope._replace(age=now - envelope.sent)
-        arrives_in_time = way.receiver.in_time(envelope)
+        arrives_in_time = direction.receiver.in_time(envelope)
         # After the horizon only the last slot is finished, for its sample: it leaves no events.
         if now < self._horizon or envelope.sent == now:
             kind, number = DELIVER if arrives_in_time else LATE, envelope.number
             self._recorder.append((now, kind, receiver, sender, number, phase, envelope.age))
         if arrives_in_time:
-            way.receiver.receive(envelope)
+            direction.receiver.receive(envelope)
 
     def shift(self, algorithm: Filter, offset: FloatArray) -> None:
         """Shift all messages under way: the origin of coordinates has moved by ``-offset``."""
@@ -160,10 +162,12 @@ class LinkExchange:
         self._outcomes: list[ChannelDraw] = []
         forth = transmitter.sampler((i, j))
         # Entities 2 k and 2 k + 1: the order in which simultaneous messages arrive.
-        self._ways = [transmitter.directed_link((i, j), 2 * entity, receivers[j], forth)]
+        self._directions = [transmitter.directed_link((i, j), 2 * entity, receivers[j], forth)]
         if not scenario.topology.directed:
             back = forth if self._shared else transmitter.sampler((j, i))
-            self._ways.append(transmitter.directed_link((j, i), 2 * entity + 1, receivers[i], back))
+            self._directions.append(
+                transmitter.directed_link((j, i), 2 * entity + 1, receivers[i], back)
+            )
 
     def exchange(
         self,
@@ -180,16 +184,20 @@ class LinkExchange:
         is drawn all the same.
         """
         if fresh or not self._outcomes:
-            first, *others = self._ways
+            first, *others = self._directions
             # The first direction draws; with a symmetric channel its draw serves both.
             drawn = first.sampler.draw()
             self._outcomes = [
                 drawn,
-                *(drawn if self._shared else way.sampler.draw() for way in others),
+                *(drawn if self._shared else direction.sampler.draw() for direction in others),
             ]
         # Not strict: in a directed graph only the first end sends.
-        for way, payload, outcome in zip(self._ways, payloads, self._outcomes, strict=False):
-            self._transmitter.send(way, payload, outcome if up else LINK_DOWN, phase, exchange)
+        for direction, payload, outcome in zip(
+            self._directions, payloads, self._outcomes, strict=False
+        ):
+            self._transmitter.send(
+                direction, payload, outcome if up else LINK_DOWN, phase, exchange
+            )
 
 
 def stream(streams: Streams, ends: tuple[int, ...], purpose: str) -> np.random.Generator:

@@ -35,7 +35,7 @@ import scipy.sparse.linalg
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray, symmetric
 from netkf.theory.common.jumps import ClockJumps, LyapunovInverse
-from netkf.theory.common.random_links import Ways
+from netkf.theory.common.random_links import Directions
 
 MIN_POINTS, MAX_POINTS = 12, 80
 MAX_DENSE, MAX_DENSE_MEAN = 1200, 600
@@ -78,11 +78,11 @@ class DelayedJumps:
         return self.instant.shape
 
     @cached_property
-    def _ways(self) -> Ways:
+    def _ways(self) -> Directions:
         """The links with messages as senders, which are counted behind the N nodes."""
-        ways = self.instant.ways
-        assert ways is not None
-        return ways._replace(sender=ways.sender + self.nodes)
+        directions = self.instant.directions
+        assert directions is not None
+        return directions._replace(sender=directions.sender + self.nodes)
 
     @cached_property
     def _mean(self) -> tuple[FloatArray, FloatArray]:

@@ -15,7 +15,7 @@ import numpy as np
 import scipy.linalg
 
 from netkf.linalg.arrays import FloatArray, IntArray, block_diagonal, symmetric
-from netkf.theory.common.random_links import Ways
+from netkf.theory.common.random_links import Directions
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,7 +25,7 @@ class SlotJumps:
     F, Q     : (n, n) of the plant, which the filters know
     closed   : (N, n, n) what readings make of the errors of predictions, I - K_i H_i
     noise    : (M, M) covariance that they add
-    ways     : the links, None where nothing is sent
+    directions     : the links, None where nothing is sent
     on_predictions : the exchange moves errors along differences of predictions, else along those of
                      the estimates after readings
     """
@@ -34,7 +34,7 @@ class SlotJumps:
     Q: FloatArray
     closed: FloatArray
     noise: FloatArray
-    ways: Ways | None
+    directions: Directions | None
     on_predictions: bool = False
 
     @property
@@ -46,51 +46,54 @@ class SlotJumps:
     def shape(self) -> tuple[int, int, int]:
         """(S, M, M) of second moments by mode."""
         M = self.nodes * len(self.F)
-        return (self.ways.modes if self.ways else 1, M, M)
+        return (self.directions.modes if self.directions else 1, M, M)
 
     @cached_property
     def _all(self) -> IntArray:
         """Indices of all directions."""
-        return np.arange(len(self.ways.sender) if self.ways else 0)
+        return np.arange(len(self.directions.sender) if self.directions else 0)
 
     @cached_property
     def _pairs(self) -> tuple[IntArray, IntArray]:
-        """Pairs of ways that one draw decides on, each with itself too: others are independent."""
-        assert self.ways is not None
-        same = self.ways.source[:, None] == self.ways.source
+        """Pairs of directions that share a draw, each with itself too; others are independent."""
+        assert self.directions is not None
+        same = self.directions.source[:, None] == self.directions.source
         first, second = np.nonzero(same)
         return first, second
 
     @cached_property
     def _mean(self) -> FloatArray:
         """E[D] (S, M, M) over all directions, by mode."""
-        assert self.ways is not None
-        return self.ways.mean(self.nodes, self._all)
+        assert self.directions is not None
+        return self.directions.mean(self.nodes, self._all)
 
     def step(self, X: FloatArray, noise: bool = False) -> FloatArray:
         """Return the second moments (S, M, M) one slot later, with or without the noises' part."""
         N = self.nodes
-        weight = self.ways.stationary if self.ways else np.ones(1)
+        weight = self.directions.stationary if self.directions else np.ones(1)
         share = (weight if noise else 0.0 * weight)[:, None, None]
         predicted = _multiply_blocks(self.F[None], X, N) + share * np.tile(self.Q, (N, N))
-        if self.ways is not None:
-            predicted = self.ways.advance(predicted, np.unique(self.ways.source))
+        if self.directions is not None:
+            predicted = self.directions.advance(predicted, np.unique(self.directions.source))
         updated = _multiply_blocks(self.closed, predicted, N) + share * self.noise
-        return updated if self.ways is None else self._exchange(predicted, updated)
+        return updated if self.directions is None else self._exchange(predicted, updated)
 
     def _exchange(self, predicted: FloatArray, updated: FloatArray) -> FloatArray:
         """Return the second moments (S, M, M) after the exchange."""
-        ways, mean = self.ways, self._mean
-        assert ways is not None
+        directions, mean = self.directions, self._mean
+        assert directions is not None
         moved, cross = updated, updated
         if self.on_predictions:
             moved = predicted
             cross = block_diagonal(list(self.closed)) @ predicted
         first, second = self._pairs
-        spread = ways.joint(first, second) - ways.delivery[:, first] * ways.delivery[:, second]
+        spread = (
+            directions.joint(first, second)
+            - directions.delivery[:, first] * directions.delivery[:, second]
+        )
         # E[(u + D s)(u + D s)'] with E[D] and the covariances of who hears whom.
         along = cross @ np.swapaxes(mean, 1, 2)
-        fluctuation = ways.products(first, second, spread, moved)
+        fluctuation = directions.products(first, second, spread, moved)
         both = mean @ moved @ np.swapaxes(mean, 1, 2)
         return symmetric(updated + 2.0 * symmetric(along) + both + fluctuation)
 
@@ -102,7 +105,7 @@ class ClockJumps:
     drift   : (M, M) of the errors between events
     noise   : (M, M) covariance per second, of readings too
     samples : (node, rate per second, I - closed) of nodes that take samples
-    ways    : the links, None where nothing is sent
+    directions    : the links, None where nothing is sent
     ticks   : (rate per second, its ways) of each clock that makes nodes transmit
     """
 
@@ -110,19 +113,19 @@ class ClockJumps:
     drift: FloatArray
     noise: FloatArray
     samples: tuple[tuple[int, float, FloatArray], ...]
-    ways: Ways | None
+    directions: Directions | None
     ticks: tuple[tuple[float, IntArray], ...] = field(default=())
 
     @property
     def shape(self) -> tuple[int, int, int]:
         """(S, M, M) of second moments by mode."""
-        return (self.ways.modes if self.ways else 1, *self.drift.shape)
+        return (self.directions.modes if self.directions else 1, *self.drift.shape)
 
     @cached_property
     def _chains(self) -> list[IntArray]:
         """Channels that take a step at each kind of tick."""
-        assert self.ways is not None
-        return [np.unique(self.ways.source[among]) for _, among in self.ticks]
+        assert self.directions is not None
+        return [np.unique(self.directions.source[among]) for _, among in self.ticks]
 
     @cached_property
     def flows(self) -> FloatArray:
@@ -131,34 +134,35 @@ class ClockJumps:
         for node, rate, lost in self.samples:
             _block_slice(found, self.nodes, node)[...] -= rate * lost
         for k, (rate, among) in enumerate(self.ticks):
-            assert self.ways is not None
-            stay = self.ways.stay(self._chains[k])[:, None, None]
+            assert self.directions is not None
+            stay = self.directions.stay(self._chains[k])[:, None, None]
             found += (
-                rate * stay * self.ways.mean(self.nodes, among) - 0.5 * rate * (1.0 - stay) * eye
+                rate * stay * self.directions.mean(self.nodes, among)
+                - 0.5 * rate * (1.0 - stay) * eye
             )
         return found
 
     @cached_property
     def _pairs(self) -> list[tuple[IntArray, IntArray, FloatArray]]:
         """Return for each tick pairs of its ways, and the rates (S, P) at which both arrive."""
-        assert self.ways is not None
+        assert self.directions is not None
         found = []
         for rate, among in self.ticks:
             first, second = (part.ravel() for part in np.meshgrid(among, among))
-            found.append((first, second, rate * self.ways.joint(first, second)))
+            found.append((first, second, rate * self.directions.joint(first, second)))
         return found
 
     @cached_property
     def all_pairs(self) -> tuple[IntArray, IntArray, FloatArray]:
-        """Pairs of ways of one tick, of all ticks, and the rates (S, P) at which both arrive."""
+        """Pairs of directions of each tick, and the rates (S, P) at which both messages arrive."""
         first, second = (np.concatenate([pair[k] for pair in self._pairs]) for k in (0, 1))
         return first, second, np.concatenate([rates for *_, rates in self._pairs], axis=1)
 
     @cached_property
     def _means(self) -> list[FloatArray]:
         """The mean change (S, M, M) by each tick."""
-        assert self.ways is not None
-        return [self.ways.mean(self.nodes, among) for _, among in self.ticks]
+        assert self.directions is not None
+        return [self.directions.mean(self.nodes, among) for _, among in self.ticks]
 
     def sampled(self, X: FloatArray) -> FloatArray:
         """Return the part of ``inflow`` (S, M, M) that samples add."""
@@ -173,17 +177,17 @@ class ClockJumps:
         ``flows``, a positive map: ``dX/dt = B X + X B' + inflow(X) + noise``.
         """
         found = self.sampled(X)
-        if self.ways is None or not self.ticks:
+        if self.directions is None or not self.ticks:
             return found
-        if self.ways.steps is None:
-            return np.asarray(found + self.ways.products(*self.all_pairs, X))
+        if self.directions.steps is None:
+            return np.asarray(found + self.directions.products(*self.all_pairs, X))
         for k, (rate, _) in enumerate(self.ticks):
             chains, (first, second, rates) = self._chains[k], self._pairs[k]
-            stepped = self.ways.advance(X, chains)
+            stepped = self.directions.advance(X, chains)
             # The part in which the mode stays and errors move by their mean is in ``flows``.
-            rest = rate * (stepped - self.ways.stay(chains)[:, None, None] * X)
+            rest = rate * (stepped - self.directions.stay(chains)[:, None, None] * X)
             found += rest + 2.0 * symmetric(self._means[k] @ rest)
-            found += self.ways.products(first, second, rates, stepped)
+            found += self.directions.products(first, second, rates, stepped)
         return found
 
 

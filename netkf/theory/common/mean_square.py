@@ -210,7 +210,7 @@ def _clock_map(system: ClockJumps) -> tuple[PositiveMap, FloatArray | None]:
     if max(np.linalg.eigvals(B).real.max() for B in system.flows) >= 0.0:
         return system.inflow, None
     inverse = LyapunovInverse(system.flows)
-    stationary = system.ways.stationary if system.ways else np.ones(1)
+    stationary = system.directions.stationary if system.directions else np.ones(1)
     return (
         lambda X: inverse(system.inflow(X)),
         inverse(stationary[:, None, None] * system.noise),

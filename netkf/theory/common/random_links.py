@@ -1,6 +1,6 @@
 """The law of who hears whom: directed links with their weights, and the moments of one exchange.
 
-A message on way k moves the error of its receiver i towards that of its sender j by a matrix W_k,
+A message on direction k moves the error of its receiver i towards that of its sender j by W_k,
 ``e_i + W_k (s_j - s_i)``, where s are estimates or predictions. With delta_k = 1 if it arrives an
 exchange is ``D = sum_k delta_k E_i W_k (E_j - E_i)'``, and only means and covariances of delta
 enter second moments.
@@ -23,13 +23,13 @@ MAX_CHAINS = 10
 """Independent chains of bursty links whose joint states are enumerated."""
 
 
-class Ways(NamedTuple):
+class Directions(NamedTuple):
     """K directed links and S joint states (modes) of their channels.
 
     sender, receiver : (K,) indices of nodes
     weight           : (K, n, n) the matrices W_k
-    source           : (K,) number of the draw, and of the chain, that decides on a way; ways with
-                       one source share it
+    source           : (K,) number of the draw, and of the chain, that decides on a direction;
+                       directions with one source share it
     delivery         : (S, K) probability that a message arrives, by mode
     steps            : (to_bad, to_good) of a chain that makes a step at each activation; None if
                        there is one mode only. Bit c of a mode says if chain c is bad
@@ -82,7 +82,7 @@ class Ways(NamedTuple):
         return found
 
     def mean(self, nodes: int, among: IntArray) -> FloatArray:
-        """Return E[D] (S, N n, N n) of the ways ``among``, by mode."""
+        """Return E[D] (S, N n, N n) of the directions ``among``, by mode."""
         n = self.weight.shape[-1]
         found = np.zeros((self.modes, nodes, nodes, n, n))
         parts = self.delivery[:, among, None, None] * self.weight[among]
@@ -94,7 +94,7 @@ class Ways(NamedTuple):
     def products(
         self, first: IntArray, second: IntArray, factor: FloatArray, Z: FloatArray
     ) -> FloatArray:
-        """Return ``sum c D_a Z D_b'`` (S, N n, N n) over pairs (a, b) of ways, factors c
+        """Return ``sum c D_a Z D_b'`` (S, N n, N n) over pairs (a, b) of directions, factors c
         (S, P) of P pairs, for second moments Z (S, N n, N n).
         """
         n = self.weight.shape[-1]
@@ -111,10 +111,10 @@ class Ways(NamedTuple):
 
     def joint(self, first: IntArray, second: IntArray) -> FloatArray:
         """Return the probability (S, P) that messages on both of two ways arrive in one activation,
-        by mode, for P pairs of ways.
+        by mode, for P pairs of directions.
         """
         p, q = self.delivery[:, first], self.delivery[:, second]
-        # Ways of one source are decided by one uniform number, which is below both.
+        # Directions of one source are decided by one uniform number, which is below both.
         same = self.source[first] == self.source[second]
         return np.asarray(np.where(same, np.minimum(p, q), p * q))
 
@@ -131,9 +131,11 @@ def _join_blocks(blocks: FloatArray) -> FloatArray:
     return np.asarray(np.swapaxes(blocks, 2, 3).reshape(S, N * n, N * n))
 
 
-def ways_of(scenario: Scenario, weights: dict[tuple[int, int], FloatArray], wait: float) -> Ways:
-    """Return the ways of a scenario, on which (sender, receiver) has ``weights`` (n, n); messages
-    of more than ``wait`` seconds are late, and lost.
+def directions_of(
+    scenario: Scenario, weights: dict[tuple[int, int], FloatArray], wait: float
+) -> Directions:
+    """Return the directions of a scenario with ``weights`` (n, n) for each (sender, receiver);
+    messages of more than ``wait`` seconds are late, and lost.
 
     Raises TheoryError where losses or delays have no law that can be used here.
     """
@@ -146,7 +148,7 @@ def ways_of(scenario: Scenario, weights: dict[tuple[int, int], FloatArray], wait
     delivery = _deliveries(scenario, links, source, len(at))
     if delay is not None and delay > wait:
         delivery = np.zeros_like(delivery)
-    return Ways(
+    return Directions(
         np.array([index[i] for i, _ in links], dtype=np.int64),
         np.array([index[j] for _, j in links], dtype=np.int64),
         np.stack(list(weights.values())),
@@ -226,8 +228,8 @@ def _fail_together(scenario: Scenario) -> bool:
 def poisson_ticks(
     scenario: Scenario, links: list[tuple[int, int]]
 ) -> tuple[tuple[float, IntArray], ...]:
-    """Return the rate per second and the ways (indices in ``links``) of each clock that makes nodes
-    transmit; raises TheoryError unless they are Poisson processes.
+    """Return rate (1/s) and directions (indices in ``links``) of each clock that makes nodes
+    transmit; raises TheoryError unless clocks are Poisson processes.
     """
     clock = scenario.network.activation
     assert isinstance(clock, LinkClock)

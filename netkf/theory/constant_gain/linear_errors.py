@@ -17,7 +17,7 @@ from netkf.network.matchings import Broadcast
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.delayed_jumps import DelayedJumps
 from netkf.theory.common.jumps import ClockJumps, SlotJumps
-from netkf.theory.common.random_links import Ways, poisson_ticks, ways_of
+from netkf.theory.common.random_links import Directions, directions_of, poisson_ticks
 from netkf.theory.hybrid.samples import sampling_clock
 
 
@@ -37,12 +37,12 @@ def slot_jumps(scenario: Scenario) -> SlotJumps:
     return SlotJumps(plant.F, plant.Q, np.stack(closed), noise, slot_ways(scenario))
 
 
-def slot_ways(scenario: Scenario) -> Ways | None:
+def slot_ways(scenario: Scenario) -> Directions | None:
     """Return the links of a scenario with broadcasts in slots, None if there is none."""
     if not isinstance(scenario.network.activation, Broadcast):
         raise TheoryError("the exchanges are recorded: one outcome, not a law")
     weights = link_weights(scenario)
-    return ways_of(scenario, weights, scenario.phase_length) if weights else None
+    return directions_of(scenario, weights, scenario.phase_length) if weights else None
 
 
 class JointErrorFlow(NamedTuple):
@@ -76,10 +76,10 @@ def clock_jumps(scenario: Scenario) -> ClockJumps | DelayedJumps | SlotJumps:
     talks = bool(weights) and isinstance(clock, LinkClock)
     delay = scenario.network.channel.delay.fixed if talks else 0.0
     if isinstance(clock, Periodic) and talks and delay is not None:
-        together = ways_of(scenario, weights, clock.period)
+        together = directions_of(scenario, weights, clock.period)
         return _from_tick_to_tick(clock, flow, samples, together, delay)
-    ways = ways_of(scenario, weights, math.inf) if talks else None
-    if delay and ways is not None and ways.modes > 1:
+    directions = directions_of(scenario, weights, math.inf) if talks else None
+    if delay and directions is not None and directions.modes > 1:
         raise TheoryError(
             "exact mean squares of bursts under Poisson clocks are known if messages take no time"
         )
@@ -93,7 +93,7 @@ def clock_jumps(scenario: Scenario) -> ClockJumps | DelayedJumps | SlotJumps:
         found.append((one.node, rate, one.lost))
     drift = block_diagonal(list(flow.drift))
     ticks = poisson_ticks(scenario, list(weights)) if talks else ()
-    instant = ClockJumps(N, drift, noise, tuple(found), ways, ticks)
+    instant = ClockJumps(N, drift, noise, tuple(found), directions, ticks)
     if not delay or not ticks:
         return instant
     return DelayedJumps(instant, scenario.truth.A, scenario.truth.B @ scenario.truth.B.T, delay)
@@ -130,7 +130,11 @@ def _sampled_nodes(scenario: Scenario) -> list[SampledNode]:
 
 
 def _from_tick_to_tick(
-    clock: Periodic, flow: JointErrorFlow, samples: list[SampledNode], ways: Ways, delay: float
+    clock: Periodic,
+    flow: JointErrorFlow,
+    samples: list[SampledNode],
+    directions: Directions,
+    delay: float,
 ) -> SlotJumps:
     """Return the system from one exchange of clocks that all tick together to the next.
 
@@ -157,7 +161,7 @@ def _from_tick_to_tick(
     noise = after @ (C @ noise @ C.T + added) @ after.T + rest
     whole = after @ C @ before
     steps = np.stack([whole[_node_slice(k, n), _node_slice(k, n)] for k in range(N)])
-    return SlotJumps(np.eye(n), np.zeros((n, n)), steps, symmetric(noise), ways)
+    return SlotJumps(np.eye(n), np.zeros((n, n)), steps, symmetric(noise), directions)
 
 
 def all_equal(drift: FloatArray) -> bool:

@@ -15,7 +15,7 @@ from netkf.linalg.arrays import FloatArray, block_diagonal
 from netkf.network.matchings import Broadcast
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.jumps import SlotJumps
-from netkf.theory.common.random_links import all_messages_arrive, ways_of
+from netkf.theory.common.random_links import all_messages_arrive, directions_of
 from netkf.theory.intermittent.riccati import steady_covariance
 
 
@@ -50,10 +50,10 @@ def slot_jumps(scenario: Scenario) -> SlotJumps:
     weights: dict[tuple[int, int], FloatArray] = {
         (i, j): terms[index[j]] for i, j in scenario.topology.directions
     }
-    ways = ways_of(scenario, weights, scenario.phase_length) if weights else None
+    directions = directions_of(scenario, weights, scenario.phase_length) if weights else None
     whole = gains.reshape(-1, rows[-1])
     plant, noise = scenario.slot_plant, whole @ true @ whole.T
-    return SlotJumps(plant.F, plant.Q, np.stack(closed), noise, ways, on_predictions=True)
+    return SlotJumps(plant.F, plant.Q, np.stack(closed), noise, directions, on_predictions=True)
 
 
 def _require_lossless(scenario: Scenario) -> None:

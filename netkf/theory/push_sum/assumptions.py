@@ -164,9 +164,9 @@ def _stop_row(scenario: Scenario) -> AssumptionRow:
     """Return the row on gains that freeze too early."""
     filter_, loss = push_sum_filter(scenario), scenario.network.channel.loss
     lossless = isinstance(scenario.network.activation, Broadcast) and all(
-        loss.mean_delivery(way, scenario.table_probability(way)) == 1.0
+        loss.mean_delivery(direction, scenario.table_probability(direction)) == 1.0
         for i, j in scenario.topology.links
-        for way in ((i, j), (j, i))
+        for direction in ((i, j), (j, i))
     )
     # P step 2.3 stops when masses no longer move, which also happens when all links are down.
     safe = filter_.stop != "paper" or filter_.asymptotic or lossless

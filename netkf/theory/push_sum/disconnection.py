@@ -181,8 +181,8 @@ def _channel_probabilities(scenario: Scenario) -> dict[Edge, float]:
     channel, probabilities = scenario.network.channel, {}
     for i, j in scenario.topology.links:
         one, other = (
-            channel.loss.mean_delivery(way, scenario.table_probability(way))
-            for way in ((i, j), (j, i))
+            channel.loss.mean_delivery(direction, scenario.table_probability(direction))
+            for direction in ((i, j), (j, i))
         )
         if math.isnan(one + other):
             raise TheoryError("the channel is a record, not a law: give delivery")

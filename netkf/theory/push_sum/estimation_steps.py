@@ -118,6 +118,8 @@ def _probabilities(scenario: Scenario, delivery: float | None) -> FloatArray:
         name = type(loss).__name__
         raise TheoryError(f"the draws of {name} depend on each other: no mean square is known")
     # The first end hears the second by the direction (j, i).
-    ways = [[(j, i), (i, j)] for i, j in links]
-    hears = [[loss.mean_delivery(w, scenario.table_probability(w)) for w in both] for both in ways]
+    directions = [[(j, i), (i, j)] for i, j in links]
+    hears = [
+        [loss.mean_delivery(w, scenario.table_probability(w)) for w in both] for both in directions
+    ]
     return np.array(hears, dtype=np.float64).reshape(-1, 2)
