@@ -110,6 +110,7 @@ def correct_by_gain(
 ) -> None:
     """Use the reading of filter ``h`` of a block: ``xhat + L (y - H xhat)`` and P."""
     lanes, n = scratch.lanes, nodes.xhat.shape[2]
+    # All innovations refer to the estimate before the reading: the gain is that of the whole of it.
     for i in range(n):
         store(lanes, scratch.moved_mean, i, 0.0)
     for k in range(nodes.rows[h]):
@@ -167,6 +168,7 @@ class ConstantGain(Filter):
             p = len(state.model.H)
             if p:
                 closed[k], noise[k] = sample_maps(state.gain, state.model.H, state.model.R)
+                # L times the Cholesky factor of R, because readings come whitened.
                 gain[k, :, :p] = state.gain @ np.linalg.cholesky(state.model.R)
         return (ConstantGainArrays(closed, noise, gain),)
 

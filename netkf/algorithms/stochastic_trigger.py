@@ -124,6 +124,7 @@ def silence_root(weight: FloatArray) -> FloatArray:
     """Return C^-1 with the lower triangular ``C C' = I + W^-1``, by which whitened rows have noise
     of variance 1 again when they stand for silence; W = ``weight`` (p, p), zeros beyond its rows.
     """
+    # A trigger is positive definite: zeros on the diagonal are rows that the node does not have.
     rows, made = int((weight.diagonal() > 0.0).sum()), np.zeros(weight.shape)
     noise = np.eye(rows) + np.linalg.inv(weight[:rows, :rows])
     made[:rows, :rows] = np.linalg.inv(np.linalg.cholesky(noise))
@@ -163,8 +164,10 @@ def scheduled_slots(
     """Carry filters that broadcast readings through the slots of a plan, Han et al. (2015)."""
     for b in range(plan.up.shape[0]):
         for s in range(plan.up.shape[1]):
+            # A part of the plan: up to the decisions to send, or from the arrivals on.
             if plan.part != ARRIVING and plan.sensed[s]:
                 predict_all(nodes, scratch, b)
+                # Silence is about the prediction, which readings replace in ``nodes``.
                 for h in range(len(nodes.rows)):
                     for i in range(nodes.xhat.shape[2]):
                         x = load(scratch.lanes, nodes.xhat, b, h, i)
@@ -198,6 +201,7 @@ def schedule_reading(
     news = weigh_news(
         lanes, arrays.prior, readings, (b, s, h), nodes.rows[h], arrays.trigger, arrays.z
     )
+    # Through memory, because each run decides by itself.
     store(lanes, scratch.row, 0, news)
     for q in range(len(lanes)):
         # The first reading is sent in any case.
@@ -251,12 +255,14 @@ def update_by_sensor(
     known = load_flags(lanes, arrays.known, b, index)
     if any_lane(arrived):
         d, t = min(b, readings.H.shape[0] - 1), min(s, readings.H.shape[1] - 1)
+        # H is remembered: later silence is about a reading with it.
         for k in range(rows):
             for i in range(nodes.xhat.shape[2]):
                 before = load(lanes, arrays.H, b, index, k, i)
                 now = load(lanes, readings.H, d, t, sender, k, i)
                 store(lanes, arrays.H, b, index, k, i, select(arrived, now, before))
         update_by_reading(nodes, readings, scratch, b, s, h, sender, arrived)
+    # A sensor that was never heard of may not exist: its silence says nothing.
     silent = select(arrived, 0.0, select(known, 1.0, 0.0)) > 0.0
     if any_lane(silent):
         use_silence(nodes, scratch, arrays, b, h, sender, index, silent)
@@ -281,6 +287,7 @@ def use_silence(
     for k in range(nodes.rows[sender]):
         innovation = spread(lanes, 0.0)
         for i in range(n):
+            # C^-1 H has noise of variance 1 again, where C C' is the noise of whitened silence.
             total = spread(lanes, 0.0)
             for j in range(k + 1):
                 total += arrays.wider[sender, k, j] * load(lanes, arrays.H, b, index, j, i)

@@ -88,6 +88,7 @@ def fusion_slots(
             if plan.exchanged[s]:
                 # What was sent: all estimates from before the exchange.
                 copy_pairs(nodes, scratch, b)
+                # Run by run: the best weight is found by iterations that differ from run to run.
                 for h in range(len(nodes.rows)):
                     for q in range(len(scratch.lanes)):
                         fuse_heard(nodes, plan, links, scratch, arrays, (b, s, h, q))
@@ -301,6 +302,7 @@ def track_slots(
                 predict_all(tracks, scratch, b)
                 read_all(tracks, readings, scratch, b, s)
                 show_tracks(nodes, tracks, scratch, b)
+            # Runs in which a node hears the same nodes share the combination of this slot.
             for h in range(len(nodes.rows)):
                 for k in range(len(arrays.cache.key)):
                     arrays.cache.key[k] = -1
@@ -315,7 +317,7 @@ def track_slots(
 
 @kernel
 def show_tracks(nodes: SlotNodes, tracks: SlotNodes, scratch: SlotScratch, b: int) -> None:
-    """Let all nodes of a block show their own tracks."""
+    """Report the own track as the estimate of every node of a block."""
     for h in range(len(nodes.rows)):
         for i in range(nodes.xhat.shape[2]):
             store(scratch.lanes, nodes.xhat, b, h, i, load(scratch.lanes, tracks.xhat, b, h, i))
@@ -332,7 +334,9 @@ def combine_heard(
     arrays: TrackArrays,
     index: tuple[int, int, int, int],
 ) -> None:
-    """Show what filter h of lane q, at ``index`` [b, s, h, q], makes of the tracks it hears."""
+    """Report the combination of the tracks that filter h of lane q, at ``index`` [b, s, h, q],
+    hears.
+    """
     b, s, h, q = index
     n, count, heard = nodes.xhat.shape[2], 0, 0
     arrays.near[0] = h
@@ -340,13 +344,16 @@ def combine_heard(
         if plan.up[b, s, 0, links.direction[m], q]:
             count += 1
             arrays.near[count] = links.sender[m]
+            # The senders heard, as bits of a number: the key of the combination.
             heard += 1 << min(m - links.first[h], MOST_BITS)
     if count == 0:
         return
     k = combination_of(arrays, heard, count, links.first[h + 1] - links.first[h])
     gain, root = arrays.cache.gain[k], arrays.cache.root[k]
+    # The others know no more than the node itself: its own track stays to the last bit.
     if arrays.cache.used[k] == 0:
         return
+    # xhat = x_h + sum_a G_a (x_a - x_h): the gains are those of differences to the own track.
     for a in range(count):
         for j in range(n):
             gap = arrays.xhat[b, arrays.near[1 + a], j, q] - arrays.xhat[b, h, j, q]
@@ -380,6 +387,7 @@ def combination_of(arrays: TrackArrays, heard: int, count: int, degree: int) -> 
 @kernel
 def pair_of(arrays: TrackArrays, i: int, j: int) -> int:
     """Return the index of a pair of tracks; pairs are in the order of the second track."""
+    # Bisection: pairs of track i are sorted by the second track.
     low, high = arrays.first[i], arrays.first[i + 1] - 1
     while low < high:
         middle = (low + high) // 2
