@@ -186,6 +186,7 @@ class Kcf(Filter):
             # A late one belongs to another instant.
             if reading is not None and (exchange.slot >= 0 or message.age <= 0.0):
                 xhat, root = sample_update(xhat, root, reading.y, reading.H, reading.R)
+        # Only the means are used: the consensus term has the node's own P as its gain.
         heard = [
             state.model.extrapolate(message.payload.xhat, state.root, message.age)[0]
             for message in messages

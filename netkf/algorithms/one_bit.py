@@ -101,6 +101,7 @@ def one_bit_slots(
     """Carry sign-of-innovations filters through the slots of a plan."""
     for b in range(plan.up.shape[0]):
         for s in range(plan.up.shape[1]):
+            # One node a slot: its bits refer to an estimate that all nodes share.
             turn = (plan.first + s) % len(nodes.rows)
             if plan.exchanged[s] and plan.part != ARRIVING:
                 silence_others(plan, readings, nodes.rows, turn, b, s)

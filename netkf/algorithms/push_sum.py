@@ -278,15 +278,9 @@ def add_to_totals(arrays: PushSumArrays, scratch: SlotScratch, b: int) -> None:
     """Add the share of each node to the total that it has offered to each of its neighbours."""
     for h in range(len(arrays.degree)):
         for i in range(arrays.mass.shape[2]):
-            total = load(scratch.lanes, arrays.offered, b, h, i)
-            store(
-                scratch.lanes,
-                arrays.offered,
-                b,
-                h,
-                i,
-                total + load(scratch.lanes, arrays.share, h, i),
-            )
+            before = load(scratch.lanes, arrays.offered, b, h, i)
+            total = before + load(scratch.lanes, arrays.share, h, i)
+            store(scratch.lanes, arrays.offered, b, h, i, total)
 
 
 @kernel
@@ -306,6 +300,7 @@ def receive_totals(
     for m in range(links.first[h], links.first[h + 1]):
         arrived = load_flags(lanes, plan.up, b, s, 0, links.direction[m])
         for i in range(mass.shape[2]):
+            # A lost total does no harm: the next one contains it.
             last = load(lanes, arrays.heard, b, m, i)
             total = load(lanes, arrays.offered, b, links.sender[m], i)
             gain = select(arrived, total - last, 0.0)
