@@ -8,11 +8,12 @@ Readings ``y = H x + v`` that were put together say ``u = U x + s``, with the su
 from __future__ import annotations
 
 from collections.abc import Hashable, Sequence
+from typing import Any
 
 import numpy as np
 import scipy.linalg
 
-from netkf.algorithms.belief_propagation import ALL, BeliefPropagation
+from netkf.algorithms.belief_propagation import ALL
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray
 from netkf.scenario.scenario import Scenario
@@ -34,8 +35,7 @@ class BeliefRule(ErrorRule):
 
     def __init__(self, scenario: Scenario, errors: StackedErrors, run: Run) -> None:
         super().__init__(scenario, errors)
-        algorithm = scenario.filter.algorithm
-        assert isinstance(algorithm, BeliefPropagation)
+        algorithm: Any = scenario.filter.algorithm
         self._keeps = not scenario.slotted or algorithm.memory == ALL
         if self._keeps and errors.follows:
             raise TheoryError("the filters' plant is not the true one: messages follow the state")

@@ -8,10 +8,11 @@ yhat is ``u + G e``.
 from __future__ import annotations
 
 from collections.abc import Hashable, Sequence
+from typing import Any
 
 import numpy as np
 
-from netkf.algorithms.consensus_innovations import ConsensusInnovations, gain_sequence
+from netkf.algorithms.consensus_innovations import gain_sequence
 from netkf.linalg.arrays import FloatArray
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.arrivals import require_traced_exchanges
@@ -26,8 +27,7 @@ class PseudoStateRule(ErrorRule):
 
     def __init__(self, scenario: Scenario, errors: StackedErrors) -> None:
         super().__init__(scenario, errors)
-        algorithm = scenario.filter.algorithm
-        assert isinstance(algorithm, ConsensusInnovations)
+        algorithm: Any = scenario.filter.algorithm
         self._observations: EstimatorObservations = {}
         state = algorithm.init(
             scenario.slot_models[0], *scenario.start(scenario.nodes[0]), scenario.node_infos[0]

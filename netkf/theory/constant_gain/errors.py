@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
-from netkf.algorithms.constant_gain import ConstantGain
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray
 from netkf.scenario.scenario import Scenario
@@ -24,8 +24,8 @@ class ConstantGainRule(EstimateExchangeRule):
 
     def sense(self, time: float, observations: EstimatorObservations) -> None:
         """Move each error to ``(I - L H) e - L v``."""
-        algorithm, errors = self.scenario.filter.algorithm, self.errors
-        assert isinstance(algorithm, ConstantGain)
+        algorithm: Any = self.scenario.filter.algorithm
+        errors = self.errors
         columns = errors.reading_noises(observations)
         for estimator, observation in observations.items():
             L = algorithm.gain_of(estimator)

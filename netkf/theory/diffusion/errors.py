@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
-from netkf.algorithms.diffusion import DiffusionFilter
 from netkf.linalg.arrays import FloatArray
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.error_rules import ErrorRule, EstimateExchangeRule, SentMessage
@@ -20,8 +20,7 @@ class DiffusionRule(EstimateExchangeRule):
         self, node: int, weights: list[float], roots: list[FloatArray]
     ) -> tuple[FloatArray, FloatArray]:
         """Share the weight of lost messages as the filter does, so that weights sum to 1."""
-        algorithm = self.scenario.filter.algorithm
-        assert isinstance(algorithm, DiffusionFilter)
+        algorithm: Any = self.scenario.filter.algorithm
         own, heard = algorithm.share(self.scenario.own_weights[node], weights)
         return intersect_covariances([own, *heard], roots)
 

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from netkf.algorithms.hybrid import Hybrid
+from typing import Any
+
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.evidence import AssumptionRow
 
 
 def weight_rows(scenario: Scenario) -> list[AssumptionRow]:
     """Return the row: Pi = I - epsilon L is doubly stochastic, H (5)."""
-    algorithm = scenario.filter.algorithm
-    assert isinstance(algorithm, Hybrid)
+    algorithm: Any = scenario.filter.algorithm
     epsilon = algorithm.epsilon
     degree = max(scenario.topology.degrees.values())
     diagonal = 1.0 - epsilon * degree

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from netkf.algorithms.push_sum import PushSum
-from netkf.algorithms.registry import overridden
+from netkf.algorithms.registry import built_in_filters, overridden
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray, symmetric
 from netkf.network.graphs import Topology
@@ -66,13 +65,13 @@ def push_sum_limits(scenario: Scenario) -> PushSumLimits:
     return PushSumLimits(share[:, None, None] * G, share * N, share, G, N, P, gains)
 
 
-def push_sum_filter(scenario: Scenario) -> PushSum:
+def push_sum_filter(scenario: Scenario) -> Any:
     """Return the scenario's filter; raises TheoryError unless it is the push-sum filter."""
-    algorithm = scenario.filter.algorithm
-    name = type(algorithm).__name__
-    if not isinstance(algorithm, PushSum):
+    algorithm: Any = scenario.filter.algorithm
+    name, known = type(algorithm).__name__, built_in_filters()["push-sum"]
+    if not isinstance(algorithm, known):
         raise TheoryError(f"this is about the push-sum filter, and the scenario's is {name}")
-    own = overridden(algorithm, PushSum)
+    own = overridden(algorithm, known)
     if own:
         raise TheoryError(f"this is about the push-sum filter, and {name} defines {own[0]} itself")
     return algorithm

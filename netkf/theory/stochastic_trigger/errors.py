@@ -9,10 +9,11 @@ reading: neither depends on what was read (Han et al. 2015, Theorem 2).
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
-from netkf.algorithms.stochastic_trigger import StochasticTrigger, silence_noise
+from netkf.algorithms.stochastic_trigger import silence_noise
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray
 from netkf.scenario.scenario import Scenario
@@ -49,8 +50,7 @@ class ScheduleRule(ErrorRule):
 
     def __init__(self, scenario: Scenario, errors: StackedErrors, run: Run) -> None:
         super().__init__(scenario, errors)
-        algorithm = scenario.filter.algorithm
-        assert isinstance(algorithm, StochasticTrigger)
+        algorithm: Any = scenario.filter.algorithm
         self._Y, self._sent = algorithm.Y, decisions(scenario, run)
         self._observations: EstimatorObservations = {}
 

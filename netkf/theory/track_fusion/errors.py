@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Hashable, Sequence
+from typing import Any
 
 import numpy as np
 
 from netkf.algorithms.kernels.pair_fusion import best_weight, common_basis
 from netkf.algorithms.track_fusion import (
     TRACE,
-    BarShalomCampo,
-    PairFusion,
     best_combination,
     predicted_joint,
     updated_joint,
@@ -43,8 +42,7 @@ class PairRule(EstimateExchangeRule):
         self, node: int, weights: list[float], roots: list[FloatArray]
     ) -> tuple[FloatArray, list[FloatArray]]:
         """Fuse in the order of the senders, in which the messages are."""
-        algorithm = self.scenario.filter.algorithm
-        assert isinstance(algorithm, PairFusion)
+        algorithm: Any = self.scenario.filter.algorithm
         root, factors = roots[0], [np.eye(len(roots[0]))]
         for other in roots[1:]:
             w = fusion_weight(root, other, algorithm.inverse, algorithm.minimise == TRACE)
@@ -131,6 +129,6 @@ def error_rule(
     """Return the rule of this filter for the errors of a run."""
     if scenario.slotted:
         require_traced_exchanges(scenario, run)
-    if isinstance(scenario.filter.algorithm, BarShalomCampo):
+    if scenario.hosted.combination == "tracks":
         return TrackRule(scenario, errors)
     return PairRule(scenario, errors)
