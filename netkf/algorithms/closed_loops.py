@@ -25,5 +25,5 @@ def sample_maps(L: FloatArray, H: FloatArray, R: FloatArray) -> tuple[FloatArray
 
 
 def gain_rate(L: FloatArray, H: FloatArray) -> float:
-    """Return how fast increments move an estimate by the gain L (n, p), 1/s."""
+    """Return the rate (1/s) at which increments move an estimate through the gain L (n, p)."""
     return float(np.linalg.norm(L @ H))

@@ -526,7 +526,7 @@ class PushSum(Filter):
         return n * (n + 1) // 2 + (2 if phase == MASS else 1 + n)
 
     def slot_stopping(self) -> int:
-        """Return where nodes stop: after an exchange of mass."""
+        """Return the exchange after which nodes may stop: that of mass."""
         # Without exchanges of mass there is nothing to stop.
         return MASS if not self.asymptotic and self.stop != "never" else -1
 

@@ -491,7 +491,9 @@ class TriggerPlan(NamedTuple):
 
 
 def trigger_plan(inner: Filter) -> TriggerPlan | None:
-    """Return how the slots of a filter go; None where innovations cannot be told from outside."""
+    """Return the order of steps in the slots of a filter; None if its innovations cannot be
+    computed from outside.
+    """
     schedule = inner.schedule or ()
     before = schedule[: schedule.index("sense")]
     early = before.count("exchange")

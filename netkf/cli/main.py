@@ -112,7 +112,7 @@ def _explain(error: Exception) -> str | None:
 
 
 def _reason(error: BaseException | None) -> str:
-    """Return why an error occurred, on one line."""
+    """Return the reason of an error on one line."""
     return getattr(error, "strerror", None) or f"{type(error).__name__}: {error}"
 
 

@@ -170,7 +170,7 @@ class Subject:
 
 
 def subject_of(result: Any) -> Subject:
-    """Return what is to be drawn of a ``netkf.Run`` or a ``netkf.Ensemble``.
+    """Return the data to draw of a ``netkf.Run`` or a ``netkf.Ensemble``.
 
     Raises ScenarioError for anything else, and if the scenario is not known.
     """

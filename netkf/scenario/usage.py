@@ -70,7 +70,7 @@ def usage_notes(usage: Mapping[str, Use]) -> tuple[str, ...]:
 
 
 def _use(path: str, rows: int, unused: int) -> Use:
-    """Return how many rows of a recorded file no run uses."""
+    """Return the use of a recorded file: its rows, and those that no run uses."""
     return {"path": path, "rows": rows, "unused": unused}
 
 

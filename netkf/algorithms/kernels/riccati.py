@@ -160,7 +160,7 @@ def _invert_extended(matrix: FloatArray) -> FloatArray:
 def substep(
     table: RiccatiTable, P: FloatArray, x: FloatArray, gap: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Return what ``propagate_riccati`` does, for a gap of at most one unit."""
+    """Return P and x after ``gap`` seconds, at most one unit, as ``propagate_riccati`` does."""
     n = table.n
     # G = 0, a Lyapunov equation: P <- e P e' + W, and no inverse is needed.
     if len(table.unobserved):

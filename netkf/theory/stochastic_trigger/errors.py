@@ -37,7 +37,7 @@ def all_hear_all(scenario: Scenario) -> bool:
 
 
 def decisions(scenario: Scenario, run: Run) -> Decisions:
-    """Return who sent in which slot of a run."""
+    """Return the pairs (slot, index of the node) of all messages sent in a run."""
     index, rows = scenario.topology.index, run.log[run.log["kind"] == CODES["send"]]
     slots = scenario.slot_plant.slots_of(rows["t"])
     return {(slot, index[node]) for slot, node in zip(slots, rows["node"].tolist(), strict=True)}
