@@ -177,6 +177,7 @@ def simulate_group(
             resume(state, batch, progress, k)
             going = run_agenda(state, visits, until) != DONE or going
             suspend(state, batch, progress, k)
+        # Visits of all runs are processed together: more of them are on one level.
         process_visits(state, visits)
         until += pause
     for k in range(len(progress)):
@@ -285,6 +286,7 @@ def queue_tick(state: Simulation, visits: Visits, first: int, now: float) -> Non
         record_tick(state, entity.sender, entity.other, entity.first, entity.after, heard, now)
     else:
         count_tick(state, entity.after - entity.first, heard)
+    # The bits of messages that arrive: both nodes of a pair have to meet.
     if heard != 0:
         queue_pairs(state, visits, k, first, now)
         return
@@ -300,6 +302,7 @@ def count_tick(state: Simulation, sent: int, heard: int) -> None:
     """Count the events that ``record_tick`` records: ``sent`` messages, of which those in the bits
     of ``heard`` arrive.
     """
+    # Clears the lowest bit in each turn.
     arrived = 0
     while heard != 0:
         arrived, heard = arrived + 1, heard & (heard - 1)
@@ -365,6 +368,7 @@ def queue_pairs(state: Simulation, visits: Visits, k: int, first: int, now: floa
                     hearing[begin + m],
                 )
         return
+    # A broadcast is heard by several: its level lies behind the visits of all who hear it.
     level = visits.level[sender]
     for m in range(entity.after - begin):
         if (heard >> m) & 1:

@@ -154,6 +154,7 @@ def empty_visits(
     ``series`` of nodes without sensors and with them.
     """
     n, most = filters.xhat.shape[1], max(MOST_VISITS, 4 * places)
+    # Networks have few distinct weights: lanes look them up in a table, roots included.
     distinct, weight_row = np.unique(weights, return_inverse=True)
     own, table = np.maximum(0.0, 1.0 - distinct), filters.table
     (unobserved, sensing), q = series, most_moments(filters)
@@ -209,6 +210,7 @@ def append_visit(
     visit.first, visit.second, visit.time = first, second, time
     visit.to_first = visit.to_second = NOT_HEARD
     visit.run, visit.piece = state.run, state.piece
+    # The list of a level is in no order: its visits do not depend on each other.
     visit.next = visits.first[level]
     visits.first[level] = v
     visits.top = max(visits.top, level)
@@ -227,6 +229,7 @@ def queue_visit(state: Simulation, visits: Visits, time: float, place: int) -> N
 @kernel
 def queue_sample(state: Simulation, visits: Visits, first: int) -> None:
     """Queue a sample of all nodes of a run, from place ``first`` on, behind all their visits."""
+    # A sample needs all nodes of the run: it is a barrier behind their last visits.
     level = 0
     for h in range(len(state.nodes)):
         level = max(level, visits.level[first + h])
@@ -348,6 +351,7 @@ def fill_rates(state: Simulation, visits: Visits, count: int) -> None:
         visit = visits.records[interval.visit]
         h = node_at(state, visit.run, interval.place)
         load_model(readings, q, state.nodes[h].model, state.table.seen)
+    # Both are found for all lanes at once, before each lane decides how far it goes.
     store(MANY, readings.rate, 0, information_rate(MANY, size, readings.seen, visits.S))
     store(MANY, readings.trace, 0, trace_of_root(MANY, size, visits.S))
 
@@ -369,6 +373,7 @@ def begin_interval(state: Simulation, visits: Visits, q: int) -> None:
     else:
         visits.places[SENSING, q] = NO_NODE
         advance_over_interval(state, visit.run, h, place, visit.piece, now, end)
+    # The rest of the gap waits for its turn, with the covariance that this interval leaves.
     if end < time:
         queue_interval(visits, place, v, end, least)
 
@@ -459,6 +464,7 @@ def predict_sensing(state: Simulation, visits: Visits, count: int) -> None:
     copy_columns(visits.columns, visits.sensing.place, 0, width, visits.values)
     copy_columns(visits.columns, visits.sensing.place, width, len(visits.gains), visits.gains)
     predict_lanes(state, visits, True)
+    # The covariance counts the readings already; the estimate uses them at the end of the gap.
     moments = visits.readings.moments
     use_moments(MANY, state.size, visits.S, visits.x, visits.gains, moments)
     scatter_states(state, places, visits.x, visits.S)
@@ -501,11 +507,14 @@ def predict_lanes(state: Simulation, visits: Visits, reads: bool) -> None:
         local_lanes_matrix(size, MANY, visits.V),
         local_lanes_matrix(size, MANY, visits.T),
     )
+    # Local arrays of a known size stay in registers.
     for i in range(n):
         for j in range(i + 1):
             store(MANY, S, i, j, load(MANY, visits.S, i, j))
+    # The root of P (I + G P)^-1.
     if reads:
         condition_root(MANY, size, S, values, V)
+    # x <- exp(A g) x, then the root of F P F' + Q_g with Q_g = T T'.
     moved = local_lanes_vector(size, MANY, visits.moved)
     propagate_mean(MANY, size, visits.x, values, moved)
     cholesky_in_lanes(MANY, size, T, values)
@@ -548,6 +557,7 @@ def assign_receiver(visits: Visits, side: int, lane: int, direction: int, place:
         return False
     visits.hearing[side, lane] = place
     weight_row = visits.weight_row[direction]
+    # Mostly all links have one weight, which the lane has from the visit before.
     if visits.known[side, lane] != weight_row:
         visits.known[side, lane] = weight_row
         for k in range(4):
@@ -576,6 +586,7 @@ def combine_lanes(
         for j in range(i + 1):
             store(MANY, total, i, j, own_root * load(MANY, S, i, j))
             store(MANY, wide, i, j, root * load(MANY, other_S, i, j))
+    # The root of w P + w_j P_j from the columns of both roots: nothing is subtracted.
     absorb_columns(MANY, size, total, wide)
     for i in range(n):
         for j in range(i + 1):
