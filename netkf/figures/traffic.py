@@ -180,7 +180,7 @@ class DirectedMessages(NamedTuple):
     lost: FloatArray
 
 
-def directions_of(log: np.ndarray) -> list[DirectedMessages]:
+def messages_by_direction(log: np.ndarray) -> list[DirectedMessages]:
     """Return the messages of each direction over which some were sent, by delivery and loss."""
     arrived = log[log["kind"] == CODES["deliver"]]
     missed = log[np.isin(log["kind"], (CODES["lost"], CODES["late"]))]
@@ -261,7 +261,7 @@ def links_figure(subject: Subject) -> Picture:
 
 def _with_messages(subject: Subject) -> list[DirectedMessages]:
     """Return the messages by direction; raises UnavailableError without any."""
-    found = directions_of(subject.log)
+    found = messages_by_direction(subject.log)
     if not found:
         raise UnavailableError("No message was delivered or lost.")
     return found

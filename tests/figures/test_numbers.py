@@ -8,7 +8,7 @@ import scipy.stats
 
 import netkf
 from netkf.algorithms.models import FlowModel
-from netkf.figures.traffic import ages_of, directions_of, wilson
+from netkf.figures.traffic import ages_of, messages_by_direction, wilson
 from netkf.runs.increments import Expectations
 from netkf.runs.innovations import autocorrelation, innovations
 from netkf.studies.consistency import run_consistency
@@ -46,12 +46,12 @@ def test_the_age_of_information_is_that_of_a_plain_loop(results, kind):
 def test_directions_have_the_messages_of_the_log(results, kind):
     run = results(kind)
     events = run.events
-    for one in directions_of(run.log):
+    for one in messages_by_direction(run.log):
         sent = events[(events["kind"] == "send") & (events["node"] == one.sender)]
         sent = sent[sent["peer"] == one.receiver]
         # What is on its way at the end has neither arrived nor been lost.
         assert 0 <= len(sent) - len(one.delivered) - len(one.lost) <= 1
-    found = directions_of(run.log)
+    found = messages_by_direction(run.log)
     assert sum(len(d.delivered) for d in found) == run.count("deliver")
     assert sum(len(d.lost) for d in found) == run.count("lost") + run.count("late")
 
