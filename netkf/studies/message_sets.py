@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from netkf.linalg.arrays import FloatArray
 from netkf.studies.information import MessageKey
 from netkf.studies.replay import Replayer
 
@@ -165,7 +166,7 @@ class _Search:
 
     def _in_order(
         self, candidates: Sequence[Candidate], size: int
-    ) -> tuple[list[tuple[MessageKey, ...]], bool]:
+    ) -> tuple[Iterator[tuple[MessageKey, ...]], bool]:
         """Return sets of a size, those first that should lower the trace most, or of the latest
         messages; and False where there are too many to list.
         """
@@ -174,27 +175,47 @@ class _Search:
         kept = len(ranked)
         while math.comb(kept, size) > MAX_SETS:
             kept = max(size, int(0.9 * kept))
-        sets = [
-            tuple(sorted(c.key for c in chosen))
-            for chosen in itertools.combinations(ranked[:kept], size)
-            if _is_joined(chosen)
-        ]
-        expected = np.array([self._expected(keys, alone) for keys in sets])
-        order = np.argsort(-expected, kind="stable").tolist()
-        return [sets[k] for k in order], kept == len(ranked)
+        numbers = itertools.chain.from_iterable(itertools.combinations(range(kept), size))
+        chosen = np.fromiter(numbers, np.intp, math.comb(kept, size) * size).reshape(-1, size)
+        needed = np.array([c.needed for c in ranked[:kept]], dtype=np.intp)
+        chosen = chosen[_are_joined(needed[chosen])]
+        keys = sorted(c.key for c in ranked[:kept])
+        place = {key: k for k, key in enumerate(keys)}
+        places = np.array([place[c.key] for c in ranked[:kept]], dtype=np.intp)
+        members = np.sort(places[chosen], axis=1)
+        order = np.argsort(-self._expected(members, keys, alone), kind="stable")
+        sets = (tuple(keys[k] for k in members[row].tolist()) for row in order.tolist())
+        return sets, kept == len(ranked)
 
-    def _expected(self, keys: tuple[MessageKey, ...], alone: Mapping[MessageKey, float]) -> float:
-        """Return the sum of what messages gain alone, and of what pairs gain beyond that."""
-        gain = sum(alone[key] for key in keys)
-        if len(keys) > 2:
-            for pair in itertools.combinations(keys, 2):
-                if pair in self._gains:
-                    gain += self._gains[pair] - alone[pair[0]] - alone[pair[1]]
+    def _expected(
+        self,
+        members: np.ndarray,
+        keys: Sequence[MessageKey],
+        alone: Mapping[MessageKey, float],
+    ) -> FloatArray:
+        """Return for sets ``members`` (S, size) of ``keys`` the sum (S,) of what their messages
+        gain alone, and of what pairs gain beyond that.
+        """
+        place = {key: k for k, key in enumerate(keys)}
+        size = members.shape[1]
+        single = np.array([alone[key] for key in keys])
+        gain = np.zeros(len(members))
+        for column in members.T:
+            gain += single[column]
+        if size > 2:
+            beyond = np.zeros((len(keys), len(keys)))
+            for pair, together in self._gains.items():
+                if len(pair) == 2 and set(pair) <= place.keys():
+                    a, b = pair
+                    beyond[place[a], place[b]] = together - alone[a] - alone[b]
+            for i, j in itertools.combinations(range(size), 2):
+                gain += beyond[members[:, i], members[:, j]]
         return gain
 
 
-def _is_joined(chosen: Sequence[Candidate]) -> bool:
-    """Return False if a member of a set cannot matter: too few others of it lead to the node."""
+def _are_joined(needed: np.ndarray) -> np.ndarray:
+    """Return for sets (S, size) of what their members need, see Candidate, False (S,) if a member
+    cannot matter: too few others of the set lead to the node.
+    """
     # Whoever needs two others needs one of those that need one other.
-    needed = sorted(candidate.needed for candidate in chosen)
-    return all(count <= position for position, count in enumerate(needed, start=1))
+    return np.asarray((np.sort(needed, axis=1) <= np.arange(1, needed.shape[1] + 1)).all(axis=1))
