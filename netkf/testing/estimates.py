@@ -72,5 +72,5 @@ def check_state_pickles(watched: Watched, state: Any) -> None:
             f"{where}: states must be picklable; got {type(error).__name__}: {error}; make the "
             "state a NamedTuple of arrays at the top level of a module"
         ) from error
-    one, other = (dict(leaves(watched.part.estimate(s))) for s in (state, copy))
+    one, other = (leaves(watched.part.estimate(s)) for s in (state, copy))
     demand(difference(one, other) is None, where, "states must be themselves after pickling")

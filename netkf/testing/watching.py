@@ -9,7 +9,7 @@ import pickle
 import random
 import struct
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import cache, cached_property
 from typing import Any, NoReturn, cast
@@ -69,34 +69,49 @@ def make_part(
         fail(name, text, describe_error(error), remedy)
 
 
-def leaves(value: Any, path: str = "", visited: frozenset[int] = frozenset()) -> Iterator[Any]:
-    """Yield (path, copy) of every number, text and array that a value is made of."""
-    if isinstance(value, np.ndarray):
-        yield path, value.copy()
-    elif id(value) in visited or isinstance(value, np.random.Generator) or callable(value):
+_PLAIN = frozenset((str, bytes, bool, int, float, complex, type(None)))
+"""Types of most leaves but arrays."""
+
+
+def leaves(value: Any) -> Leaves:
+    """Return copies of every number, text and array that a value is made of, by their paths."""
+    found: Leaves = {}
+    _add_leaves(value, "", set(), found)
+    return found
+
+
+def _add_leaves(value: Any, path: str, whole: set[int], found: Leaves) -> None:
+    """Add the leaves of a value at a path; ``whole``: what it is a part of, by identity."""
+    kind = type(value)
+    if kind in _PLAIN:
+        found[path] = value
+    elif isinstance(value, np.ndarray):
+        found[path] = value.copy()
+    elif id(value) in whole or isinstance(value, np.random.Generator) or callable(value):
         return
-    elif isinstance(value, (str, bytes, int, float, complex, np.generic)) or value is None:
-        yield path, value
+    elif isinstance(value, (str, bytes, int, float, complex, np.generic)):
+        found[path] = value
     else:
-        inside = visited | {id(value)}
+        whole.add(id(value))
         for name, item in _iterate_parts(value):
-            yield from leaves(item, f"{path}{name}", inside)
+            _add_leaves(item, path + name, whole, found)
+        whole.discard(id(value))
 
 
-def _iterate_parts(value: Any) -> Iterator[tuple[str, Any]]:
-    """Yield the parts of a value, with the text that names each."""
+def _iterate_parts(value: Any) -> Iterable[tuple[str, Any]]:
+    """Return the parts of a value, with the text that names each."""
+    fields = getattr(value, "_fields", None)
+    if fields is not None:
+        return [(f".{name}", getattr(value, name)) for name in fields]
+    if isinstance(value, (list, tuple)):
+        return [(f"[{k}]", item) for k, item in enumerate(value)]
     if isinstance(value, Mapping):
-        yield from ((f"[{key!r}]", item) for key, item in value.items())
-    elif hasattr(value, "_fields"):
-        yield from ((f".{name}", getattr(value, name)) for name in value._fields)
-    elif isinstance(value, (list, tuple)):
-        yield from ((f"[{k}]", item) for k, item in enumerate(value))
-    elif isinstance(value, (set, frozenset)):
-        yield from ((f"[{k}]", item) for k, item in enumerate(sorted(value, key=repr)))
-    elif dataclasses.is_dataclass(value):
-        yield from ((f".{f.name}", getattr(value, f.name)) for f in dataclasses.fields(value))
-    else:
-        yield from ((f".{name}", item) for name, item in getattr(value, "__dict__", {}).items())
+        return [(f"[{key!r}]", item) for key, item in value.items()]
+    if isinstance(value, (set, frozenset)):
+        return [(f"[{k}]", item) for k, item in enumerate(sorted(value, key=repr))]
+    if dataclasses.is_dataclass(value):
+        return [(f".{f.name}", getattr(value, f.name)) for f in dataclasses.fields(value)]
+    return [(f".{name}", item) for name, item in getattr(value, "__dict__", {}).items()]
 
 
 def difference(one: Leaves, other: Leaves) -> str | None:
@@ -160,6 +175,7 @@ def _python_state_address() -> int | None:
     return address if random.getstate()[1] == (*text, position) else None
 
 
+@cache
 def _static_attribute(cls: type, name: str) -> Any:
     """Return an attribute of a class without calling descriptors."""
     return inspect.getattr_static(cls, name, None)
@@ -186,7 +202,8 @@ class Watched:
         """Return the name by which the user's class defines a method or property."""
         if method in self._former:
             return self._former[method]
-        found = _static_attribute(type(self._owner), method)
+        cls: Any = type(self._owner)
+        found = _static_attribute(cls, method)
         defined = getattr(getattr(found, "fget", found), "__name__", method)
         # Under a former name of the contract, see Component.former_names.
         former = getattr(self._owner, "former_names", {}).get(method)
@@ -197,14 +214,13 @@ class Watched:
         nothing.
         """
         where = f"{self.name}.{self.defined_name(method)}"
-        before = [dict(leaves(argument)) for argument in arguments]
+        before = [leaves(argument) for argument in arguments]
         itself = self.attributes()
         results = [self._call_method(where, method, arguments) for _ in range(1 + repeatable)]
-        for argument, old, name in zip(
-            arguments, before, self._parameter_names(method, len(arguments)), strict=True
-        ):
-            path = difference(old, dict(leaves(argument)))
+        for k, old in enumerate(before):
+            path = difference(old, leaves(arguments[k]))
             if path is not None:
+                name = self._parameter_names(method, len(arguments))[k]
                 remedy = "return a new one; work on copies"
                 fail(
                     where,
@@ -220,7 +236,7 @@ class Watched:
             None,
             "keep what changes in the state that is handed in and returned",
         )
-        found = [dict(leaves(result)) for result in results]
+        found = [leaves(result) for result in results]
         path = difference(found[0], found[-1])
         demand(
             path is None,
@@ -238,13 +254,14 @@ class Watched:
 
     def attributes(self) -> Leaves:
         """Return the attributes of the component, except for cached properties."""
-        cls, own = type(self._owner), vars(self._owner)
+        cls: Any = type(self._owner)
+        own = vars(self._owner)
         kept = {
             k: v
             for k, v in own.items()
             if not isinstance(_static_attribute(cls, k), cached_property)
         }
-        return {path.strip("[]'"): leaf for path, leaf in leaves(kept)}
+        return {path.strip("[]'"): leaf for path, leaf in leaves(kept).items()}
 
     def _call_method(self, where: str, method: str, arguments: tuple[Any, ...]) -> Any:
         """Return the result of a method; failures and uses of global generators are
@@ -277,7 +294,7 @@ class Watched:
     def finish(self) -> None:
         """Check that no result of an earlier call has changed since."""
         for where, result, old in self._kept:
-            path = difference(old, dict(leaves(result)))
+            path = difference(old, leaves(result))
             demand(
                 path is None,
                 where,
@@ -308,7 +325,7 @@ class Watched:
                 describe_error(error),
                 "define the class at the top level of a module and keep no open files or lambdas",
             )
-        path = difference(dict(leaves(self._owner)), dict(leaves(copy)))
+        path = difference(leaves(self._owner), leaves(copy))
         demand(path is None, self.name, f"must be itself after pickling, and lost {path}")
         return copy
 

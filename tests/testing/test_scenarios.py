@@ -40,6 +40,8 @@ def promising():
 
 
 PROMISING = list(promising())
+CHECKED = set()
+"""Filters that keep their contract, as they show themselves."""
 
 
 def test_all_our_files_are_found():
@@ -66,7 +68,10 @@ def test_the_promises_of_our_files_are_kept(path):
 @pytest.mark.parametrize("path", testing.scenario_files(SCENARIOS), ids=lambda path: path.stem)
 def test_the_parts_of_our_files_keep_their_contracts(path):
     scenario = netkf.load(path)
-    testing.check_filter(scenario.filter.algorithm)
+    # Several files have the same filter.
+    if repr(scenario.filter.algorithm) not in CHECKED:
+        testing.check_filter(scenario.filter.algorithm)
+        CHECKED.add(repr(scenario.filter.algorithm))
     clock = scenario.network.activation
     if isinstance(clock, netkf.parts.LinkClock):
         testing.check_clock(clock, link=scenario.topology.links[0])
