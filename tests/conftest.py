@@ -39,11 +39,16 @@ LONGEST = (
     "engines/test_sample_path.py",
     "checks/parts/test_parts.py",
     "testing/test_scenarios.py",
+    "report/test_browser.py",
+    "ensembles/test_ensembles.py",
     "checks/test_rounding.py",
     "checks/test_false_alarms.py",
     "figures/test_figures.py",
     "test_documentation.py",
     "theory/test_replay.py",
+    "theory/test_bounds.py",
+    "report/test_page.py",
+    "ensembles/test_workers.py",
     "ensembles/test_cluster.py",
     "ensembles/test_resume.py",
     "algorithms/test_root_flow.py",
@@ -58,6 +63,7 @@ LONGEST = (
     "engines/test_visits.py",
     "linalg/test_portable.py",
     "test_process.py",
+    "test_cli.py",
 )
 """Files of more than ten seconds. They run first: a long one at the end would run alone."""
 
