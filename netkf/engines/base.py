@@ -41,8 +41,8 @@ class Rank(IntEnum):
 
 
 SHORTEST_SHARE, LONGER = 1e-9, 1.02
-"""The least part of a gap whose readings are used at once, however short the stretch, and by what
-it grows from one stretch to the next: a covariance beyond all bounds, which no reading shrinks as
+"""The least part of a gap whose readings are used at once, however short the interval, and by what
+it grows from one interval to the next: a covariance beyond all bounds, which no reading shrinks as
 it should, takes a thousand of them and not a billion.
 """
 

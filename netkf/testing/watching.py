@@ -171,8 +171,8 @@ def _python_state_address() -> int | None:
     if sys.implementation.name != "cpython" or size < head + MERSENNE_BYTES:
         return None
     address = id(_shared_random()) + head
-    position, *text = struct.unpack("=625I", ctypes.string_at(address, MERSENNE_BYTES))
-    return address if random.getstate()[1] == (*text, position) else None
+    position, *words = struct.unpack("=625I", ctypes.string_at(address, MERSENNE_BYTES))
+    return address if random.getstate()[1] == (*words, position) else None
 
 
 @cache

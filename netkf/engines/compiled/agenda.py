@@ -37,7 +37,7 @@ from netkf.engines.compiled.event_loop import (
     record_event,
     record_event_with_age,
 )
-from netkf.engines.compiled.message_queue import sort_places
+from netkf.engines.compiled.message_queue import sort_indices
 from netkf.engines.compiled.schedule import delay_is_zero
 from netkf.engines.compiled.senders import senders_of
 from netkf.engines.compiled.state import LINKS, NODES, Simulation
@@ -104,7 +104,7 @@ def pause_of(state: Simulation, ticks: int, count: int) -> float:
     process their visits.
     """
     nodes = len(state.nodes)
-    each = ticks + len(state.path.grid) * len(state.sensing.host) + nodes * len(state.probes)
+    each = ticks + len(state.path.grid) * len(state.sensing.index) + nodes * len(state.probes)
     # Some visits less than there is space for.
     return state.horizon * 0.7 * MOST_VISITS / max(1.0, count * each)
 
@@ -241,7 +241,7 @@ def agenda(state: Simulation, visits: Visits, until: float) -> int:
         if event == ON_TICK:
             queue_ticks(state, visits, first, min(until, next_but_ticks(state)))
         elif event == ON_SENSE:
-            queue_visit(state, visits, now, first + state.sensing.host[state.wake_at])
+            queue_visit(state, visits, now, first + state.sensing.index[state.wake_at])
             on_sense(state, now)
         else:
             for h in range(nodes):
@@ -340,7 +340,7 @@ def record_tick(
             receivers += 1
         else:
             record_event(state, now, LOST, one, other, number)
-    sort_places(state.waiting, receivers)
+    sort_indices(state.waiting, receivers)
     for m in range(receivers):
         record_event_with_age(state, now, ABSORB, nodes[state.waiting[m]].id, -1, -1, 0.0)
 

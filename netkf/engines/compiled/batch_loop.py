@@ -151,7 +151,7 @@ def reset_messages(state: Simulation) -> None:
         state.pool[m].next = m + 1
     # The heap needs no reset: only its first ``flying`` entries count.
     state.free = state.flying = state.order = state.receivers = state.absorbing = 0
-    state.free_count, state.mail_time = len(state.pool), 0.0
+    state.free_count, state.inbox_time = len(state.pool), 0.0
 
 
 @kernel
@@ -159,7 +159,7 @@ def finish(state: Simulation, batch: BatchArrays, run: int) -> None:
     """Record how a run ended: at its first sample that is not finite, if there is one, without what
     happened later.
     """
-    shown = state.shown
+    buffer = state.buffer
     for kind in range(batch.counts.shape[1]):
         batch.counts[run, kind] = state.counts[kind]
     for k in range(state.samples):
@@ -168,7 +168,7 @@ def finish(state: Simulation, batch: BatchArrays, run: int) -> None:
         if broken > 0:
             # The counts are those at the broken sample, not those at the end.
             for kind in range(batch.counts.shape[1]):
-                batch.counts[run, kind] = shown.counts[run, k, kind]
+                batch.counts[run, kind] = buffer.counts[run, k, kind]
             # One filter may stand for several nodes (pooled), each of which has diverged.
             batch.counts[run, DIVERGED] += broken * batch.carriers
             batch.diverged[run] = 1
@@ -178,7 +178,7 @@ def finish(state: Simulation, batch: BatchArrays, run: int) -> None:
 @kernel
 def count_broken_filters(state: Simulation, run: int, k: int) -> int:
     """Return the number of filters that are not finite in sample ``k`` of a run."""
-    xhat, P, n, broken = state.shown.xhat, state.shown.P, len(state.size), 0
+    xhat, P, n, broken = state.buffer.xhat, state.buffer.P, len(state.size), 0
     for h in range(len(state.nodes)):
         # Finiteness is enough, because P = S S' cannot be indefinite; 0 times a number that is not
         # finite is nan.

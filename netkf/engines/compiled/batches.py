@@ -96,23 +96,23 @@ def _all_at_once(scenario: Scenario, workspace: Workspace, draws: BatchDraws) ->
     """Simulate all runs in one call, or nearly so."""
     start, runs = workspace.filters, len(draws.replicas)
     # Runs that diverge go on to the end: all samples of all runs are written.
-    shown = empty_samples((runs, len(scenario.times), *start.xhat.shape), make=np.empty)
+    buffer = empty_samples((runs, len(scenario.times), *start.xhat.shape), make=np.empty)
     arrays = _batch_arrays(scenario, start, draws)
     if is_immediate(scenario):
         group = together(len(start.nodes), runs)
-        state = workspace.begin(draws, False, shown, group)
+        state = workspace.begin(draws, False, buffer, group)
         simulate_together(state, workspace.visits(group), arrays, group)
     else:
-        simulate_batch(workspace.begin(draws, False, shown), arrays)
+        simulate_batch(workspace.begin(draws, False, buffer), arrays)
     x = draws.sampled_states(scenario.times)
     return RunBatch(
         replicas=draws.replicas,
         times=scenario.times,
         x=x,
-        xhat=shown.xhat,
-        P=shown.P,
+        xhat=buffer.xhat,
+        P=buffer.P,
         # No origin moves in these runs: local and absolute states are the same.
-        error=x[:, :, None] - shown.xhat,
+        error=x[:, :, None] - buffer.xhat,
         lengths=arrays.lengths,
         counts=arrays.counts,
         status=np.where(arrays.diverged > 0, DIVERGED, COMPLETE),
@@ -246,7 +246,7 @@ class RunDraws:
         shared, count = batch.sensing, len(batch.sensing.rows)
         one, streams = slice(run, run + 1), slice(run * count, (run + 1) * count)
         mine = {name: getattr(shared, name)[streams] for name in ("rest", "step", "cuts")}
-        fixed = ("rows", "kind", "H", "root", "height", "width", "inside", "host", "node")
+        fixed = ("rows", "kind", "H", "root", "height", "width", "inside", "index", "node")
         self.sensing = Sensing(
             **{name: getattr(shared, name) for name in fixed}, **mine, noise=shared.noise[one]
         )

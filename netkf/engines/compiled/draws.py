@@ -174,20 +174,20 @@ def _sensor_fields(scenario: Scenario) -> tuple[dict[str, np.ndarray], list[tupl
             roots[placed_sensor.entry],
         )
     index, pooled = scenario.topology.index, scenario.hosted.pooled
-    hosts = [0 if pooled else index[node] for node in scenario.increment_sensors]
+    indices = [0 if pooled else index[node] for node in scenario.increment_sensors]
     shared = {
         "rows": rows,
         "kind": np.array([placed_sensor.entry for _, placed_sensor in placed], dtype=np.int64),
         "H": H,
         "root": root,
-        "host": np.array(hosts, dtype=np.int64),
+        "index": np.array(indices, dtype=np.int64),
         "node": np.array(list(scenario.increment_sensors), dtype=np.int64),
     }
     return shared, [(node, placed_sensor.ordinal) for node, placed_sensor in placed]
 
 
 class Noise:
-    """The noise of all sensors in some runs, drawn for stretches of so many ``steps``."""
+    """The noise of all sensors in some runs, drawn in blocks of ``steps`` steps."""
 
     def __init__(self, scenario: Scenario, streams: Streams | ReplicaStreams, steps: int) -> None:
         shared, keys = _sensor_fields(scenario)
@@ -209,14 +209,14 @@ class Noise:
         )
 
     def following(self) -> None:
-        """Draw the noise of the next stretch."""
+        """Draw the noise of the next block."""
         sensing, shape = self.sensing, self.sensing.noise.shape
         # Streams of all runs and sensors, run by run.
         normals = sensing.noise.reshape(shape[0] * shape[1], *shape[2:])
         # Standard normals become moments of white noise over one step: variances h and h / 3.
         scales = step_noise(np.ones((2, 1)), self._period)[:, 0]
         fill_noise(self._noise.states, sensing.rows, normal_ziggurat(), scales, normals)
-        # No sensor has begun a step of this stretch.
+        # No sensor has begun a step of this block.
         sensing.step[:] = -1
 
 

@@ -20,21 +20,21 @@ from netkf.algorithms.kernels.root_update import (
     end_intersection,
     scale_root,
 )
-from netkf.engines.compiled.evidence import (
-    add_samples,
-    hear_evidence_now,
-    move_evidence,
-    send_evidence,
-)
-from netkf.engines.compiled.extras import (
-    Extras,
+from netkf.engines.compiled.combination_state import (
+    CombinationState,
     add_consensus,
-    fuse_mail,
+    fuse_inbox,
     keep_prediction,
     predict_with_gain,
     sample_with_gain,
     send_prediction,
     use_readings_heard,
+)
+from netkf.engines.compiled.evidence import (
+    absorb_evidence,
+    add_samples,
+    predict_evidence,
+    send_evidence,
 )
 from netkf.engines.compiled.increments import predict_with_increments
 from netkf.engines.compiled.late_readings import (
@@ -44,7 +44,7 @@ from netkf.engines.compiled.late_readings import (
     use_late_reading,
     use_reading,
 )
-from netkf.engines.compiled.message_queue import pop, push, put, release, sort_places, take
+from netkf.engines.compiled.message_queue import pop, push, put, release, sort_indices, take
 from netkf.engines.compiled.running_totals import Totals, add_reading, hear, offer_round
 from netkf.engines.compiled.state import (
     AFTER_READINGS,
@@ -80,7 +80,10 @@ NEVER = math.inf
 
 @kernel
 def event_loop(
-    state: Simulation, totals: Totals | None, history: History | None, extras: Extras | None
+    state: Simulation,
+    totals: Totals | None,
+    history: History | None,
+    combination: CombinationState | None,
 ) -> int:
     """Simulate until the loop needs something from Python, and return what (WANT_... or DONE)."""
     while True:
@@ -95,19 +98,19 @@ def event_loop(
             state.piece += 1
         # Participants are predicted first.
         lost = event == ON_TICK and totals is None and history is None and is_lost(state)
-        predict_participants(state, extras, event, lost, now)
+        predict_participants(state, combination, event, lost, now)
         if event == ON_TICK:
-            on_tick(state, totals, extras, now)
+            on_tick(state, totals, combination, now)
             # The next events, unless there are others at this instant.
             alone = totals is None and history is None and ends_instant(state, now)
             if alone:
-                absorb_messages(state, totals, history, extras, now)
+                absorb_messages(state, totals, history, combination, now)
         elif event == ON_ABSORB:
-            on_absorb(state, totals, history, extras, now)
+            on_absorb(state, totals, history, combination, now)
         elif event == ON_SENSE:
             on_sense(state, now)
         elif event == ON_SAMPLE:
-            on_sample(state, totals, history, extras, now)
+            on_sample(state, totals, history, combination, now)
         elif event == ON_DELIVER:
             on_deliver(state, now)
         elif event == ON_REBASE:
@@ -160,7 +163,7 @@ def next_event(state: Simulation) -> tuple[int, float]:
     if deliver < now:
         event, now = ON_DELIVER, deliver
     # Mail is absorbed at the instant it arrived, after all arrivals of that instant.
-    absorb = state.mail_time if state.receivers > 0 else NEVER
+    absorb = state.inbox_time if state.receivers > 0 else NEVER
     if absorb < now:
         event, now = ON_ABSORB, absorb
     probe = next_of(state.probes, state.probe_at)
@@ -183,14 +186,14 @@ def next_of(times: FloatArray, k: int) -> float:
 
 @kernel
 def predict_participants(
-    state: Simulation, extras: Extras | None, event: int, lost: bool, now: float
+    state: Simulation, combination: CombinationState | None, event: int, lost: bool, now: float
 ) -> None:
     """Predict the nodes that take part in an event; ``lost``: all messages of the tick are lost."""
     for k in range(count_participants(state, event)):
         h = participant(state, event, k)
         # The sender of a message that is lost needs no prediction, unless it reads increments.
         if not lost or state.nodes[h].sensors > state.nodes[h].sensor:
-            predict(state, extras, h, now)
+            predict(state, combination, h, now)
 
 
 @kernel
@@ -219,12 +222,12 @@ def participant(state: Simulation, event: int, k: int) -> int:
         # Sorted once, before the first node absorbs: simultaneous events run in the order of
         # entities.
         if state.absorbing == 0:
-            sort_places(state.waiting, state.receivers)
+            sort_indices(state.waiting, state.receivers)
         return int(state.waiting[state.absorbing])
     if event == ON_SENSE:
-        return int(state.sensing.host[state.wake_at])
+        return int(state.sensing.index[state.wake_at])
     if event == ON_SAMPLE:
-        return int(state.instants.host[state.instant_at])
+        return int(state.instants.index[state.instant_at])
     return k
 
 
@@ -267,7 +270,7 @@ def record_event_with_age(
 
 
 @kernel
-def predict(state: Simulation, extras: Extras | None, h: int, time: float) -> None:
+def predict(state: Simulation, combination: CombinationState | None, h: int, time: float) -> None:
     """Predict node ``h`` to ``time``, unless it is there already."""
     node, now = state.nodes[h], state.now[h]
     # ``not <`` also stops at a time that is not a number.
@@ -275,18 +278,18 @@ def predict(state: Simulation, extras: Extras | None, h: int, time: float) -> No
         return
     state.now[h] = time
     # With increment sensors the gap is cut into intervals.
-    if extras is not None and extras.kind == GAINS and node.sensors > node.sensor:
-        predict_with_gain(state, extras, h, now, time)
+    if combination is not None and combination.kind == GAINS and node.sensors > node.sensor:
+        predict_with_gain(state, combination, h, now, time)
     elif node.sensors > node.sensor:
         predict_with_increments(state, state.run, h, h, state.piece, now, time)
     else:
         # One step of the Riccati flow, exact for a gap of any length.
         gap = time - now
         propagate_root(state.table, node.model, state.root, state.xhat, h, gap, state.flow_scratch)
-    if extras is not None and extras.kind == PREDICTIONS:
-        keep_prediction(state, extras, h)
-    elif extras is not None and extras.kind == BELIEFS:
-        move_evidence(extras.evidence, h, time - now)
+    if combination is not None and combination.kind == PREDICTIONS:
+        keep_prediction(state, combination, h)
+    elif combination is not None and combination.kind == BELIEFS:
+        predict_evidence(combination.evidence, h, time - now)
 
 
 @kernel
@@ -296,7 +299,7 @@ def on_sense(state: Simulation, now: float) -> None:
     record_event(state, now, SENSE, sensing.node[state.wake_at], -1, -1)
     state.wake_at += 1
     # One point of the grid wakes all nodes that sense increments, one event for each.
-    if state.wake_at == len(sensing.host):
+    if state.wake_at == len(sensing.index):
         state.wake_at = 0
         state.grid_at += 1
 
@@ -306,12 +309,12 @@ def on_sample(
     state: Simulation,
     totals: Totals | None,
     history: History | None,
-    extras: Extras | None,
+    combination: CombinationState | None,
     now: float,
 ) -> None:
     """Update a node with all its samples of an instant."""
     given, instant = state.instants, state.instant_at
-    h, sensed = given.host[instant], -1
+    h, sensed = given.index[instant], -1
     for s in range(given.first[instant], given.first[instant + 1]):
         if given.node[s] != sensed:  # of a pooled filter several nodes, in order
             sensed = given.node[s]
@@ -321,10 +324,10 @@ def on_sample(
         add_reading(state, totals, h, instant)
     elif history is not None:
         use_reading(state, history, h, instant)
-    elif extras is not None and extras.kind == GAINS:
-        sample_with_gain(state, extras, h, instant)
-    elif extras is not None and extras.kind == BELIEFS:
-        add_samples(state, extras.evidence, h, instant)
+    elif combination is not None and combination.kind == GAINS:
+        sample_with_gain(state, combination, h, instant)
+    elif combination is not None and combination.kind == BELIEFS:
+        add_samples(state, combination.evidence, h, instant)
     else:
         use_instant(state, instant, state.root, state.xhat, h, 1.0)
     # The newest sample: what a filter of readings sends after this event.
@@ -333,7 +336,9 @@ def on_sample(
 
 
 @kernel
-def on_tick(state: Simulation, totals: Totals | None, extras: Extras | None, now: float) -> None:
+def on_tick(
+    state: Simulation, totals: Totals | None, combination: CombinationState | None, now: float
+) -> None:
     """Handle a tick of a clock, or a transmission after a sample: send to each receiver."""
     ticks, nodes, k = state.ticks, state.nodes, state.tick_at
     # The record lists directed links, so that one tick may send on several.
@@ -353,14 +358,14 @@ def on_tick(state: Simulation, totals: Totals | None, extras: Extras | None, now
     # Outcomes of a tick lie one after the other in the order of its directed links.
     first = state.delays + ticks.at[k] - entity.first
     for m in range(entity.first, entity.after):
-        send(state, totals, extras, state.hearing[m], ticks.delay[first + m], now)
+        send(state, totals, combination, state.hearing[m], ticks.delay[first + m], now)
 
 
 @kernel
 def send(
     state: Simulation,
     totals: Totals | None,
-    extras: Extras | None,
+    combination: CombinationState | None,
     w: int,
     delay: float,
     now: float,
@@ -387,10 +392,10 @@ def send(
         message.tag = totals.rounds[h] - 1
         for k in range(totals.sent.shape[1]):
             totals.offered[m, k] = totals.sent[h, k]
-    elif extras is not None and extras.kind == PREDICTIONS:
-        send_prediction(state, extras, m, h)
-    elif extras is not None and extras.kind == BELIEFS:
-        send_evidence(state, extras.evidence, m, h)
+    elif combination is not None and combination.kind == PREDICTIONS:
+        send_prediction(state, combination, m, h)
+    elif combination is not None and combination.kind == BELIEFS:
+        send_evidence(state, combination.evidence, m, h)
     elif state.kind == READINGS:
         message.tag = state.nodes[h].reading
     else:
@@ -430,14 +435,14 @@ def absorb_messages(
     state: Simulation,
     totals: Totals | None,
     history: History | None,
-    extras: Extras | None,
+    combination: CombinationState | None,
     now: float,
 ) -> None:
     """Let all receivers of this instant absorb their messages."""
-    sort_places(state.waiting, state.receivers)
+    sort_indices(state.waiting, state.receivers)
     while state.receivers > 0:
-        predict(state, extras, state.waiting[state.absorbing], now)
-        on_absorb(state, totals, history, extras, now)
+        predict(state, combination, state.waiting[state.absorbing], now)
+        on_absorb(state, totals, history, combination, now)
 
 
 @kernel
@@ -465,7 +470,7 @@ def arrive(state: Simulation, m: int, now: float) -> None:
     if state.nodes[direction.receiver].inbox == -1:
         state.waiting[state.receivers] = direction.receiver
         state.receivers += 1
-        state.mail_time = now
+        state.inbox_time = now
     put(state, direction.receiver, m)
 
 
@@ -474,7 +479,7 @@ def on_absorb(
     state: Simulation,
     totals: Totals | None,
     history: History | None,
-    extras: Extras | None,
+    combination: CombinationState | None,
     now: float,
 ) -> None:
     """Let a node absorb all messages of this instant, in the order of senders."""
@@ -488,8 +493,8 @@ def on_absorb(
         hear(state, totals, h, now)
     elif history is not None:
         use_messages(state, history, h, now)
-    elif extras is not None:
-        combine_by_extras(state, extras, h, now)
+    elif combination is not None:
+        combine_with_state(state, combination, h, now)
     else:
         combine(state, h, now)
     # Messages go back to the pool only now, because handlers read them through the inbox.
@@ -521,19 +526,21 @@ def use_messages(state: Simulation, history: History, h: int, now: float) -> Non
 
 
 @kernel
-def combine_by_extras(state: Simulation, extras: Extras, h: int, now: float) -> None:
-    """Use what node ``h`` heard by the rule of a combination that needs extras."""
-    if extras.kind == PREDICTIONS:
+def combine_with_state(
+    state: Simulation, combination: CombinationState, h: int, now: float
+) -> None:
+    """Combine node ``h`` with its inbox, by a combination that has a state of its own."""
+    if combination.kind == PREDICTIONS:
         use_readings_heard(state, h, now)
     heard = predict_payloads(state, h, now)
-    if extras.kind == PREDICTIONS:
-        add_consensus(state, extras, h)
-    elif extras.kind == GAINS:
+    if combination.kind == PREDICTIONS:
+        add_consensus(state, combination, h)
+    elif combination.kind == GAINS:
         combine_convex(state, h, max(0.0, 1.0 - heard))
-    elif extras.kind == BELIEFS:
-        hear_evidence_now(state, extras.evidence, h, now)
+    elif combination.kind == BELIEFS:
+        absorb_evidence(state, combination.evidence, h, now)
     else:
-        fuse_mail(state, extras, h)
+        fuse_inbox(state, combination, h)
 
 
 @kernel
@@ -617,12 +624,12 @@ def on_probe(state: Simulation, totals: Totals | None) -> bool:
     store_sample(state, state.run, 0, state.samples)
     # The weight of the whole network: held by nodes, sent, and less what was heard.
     if totals is not None:
-        shown, count, k = state.shown, len(state.nodes), state.samples
+        buffer, count, k = state.buffer, len(state.nodes), state.samples
         for h in range(count):
-            shown.terms[k, h] = totals.weight[h]
-            shown.terms[k, count + h] = totals.sent[h, 0]
+            buffer.terms[k, h] = totals.weight[h]
+            buffer.terms[k, count + h] = totals.sent[h, 0]
         for w in range(len(state.directions)):
-            shown.terms[k, 2 * count + w] = totals.heard[w, 0]
+            buffer.terms[k, 2 * count + w] = totals.heard[w, 0]
     return count_sample(state)
 
 
@@ -631,7 +638,7 @@ def store_sample(state: Simulation, run: int, first: int, k: int) -> None:
     """Store estimates and covariances ``P = S S'`` of the nodes from place ``first`` on as sample
     ``k`` of a run.
     """
-    xhat, P, root, n = state.shown.xhat, state.shown.P, state.root, len(state.size)
+    xhat, P, root, n = state.buffer.xhat, state.buffer.P, state.root, len(state.size)
     for h in range(len(state.nodes)):
         place = first + h
         for i in range(n):
@@ -648,10 +655,10 @@ def store_sample(state: Simulation, run: int, first: int, k: int) -> None:
 def count_sample(state: Simulation) -> bool:
     """Count a stored sample. Returns False if there is no space for another."""
     # Counts and rows at the sample: a run that diverges here ends with them.
-    shown, run, k = state.shown, state.run, state.samples
+    buffer, run, k = state.buffer, state.run, state.samples
     for kind in range(len(state.counts)):
-        shown.counts[run, k, kind] = state.counts[kind]
-    shown.rows[run, k], shown.piece[run, k] = state.row, state.piece
+        buffer.counts[run, k, kind] = state.counts[kind]
+    buffer.rows[run, k], buffer.piece[run, k] = state.row, state.piece
     state.probe_at += 1
     state.samples += 1
-    return bool(state.samples < shown.rows.shape[1])
+    return bool(state.samples < buffer.rows.shape[1])

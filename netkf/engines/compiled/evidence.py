@@ -96,7 +96,7 @@ def more_evidence(evidence: EvidenceArrays, capacity: int) -> None:
 
 
 @kernel
-def move_evidence(evidence: EvidenceArrays, h: int, gap: float) -> None:
+def predict_evidence(evidence: EvidenceArrays, h: int, gap: float) -> None:
     """Let all evidence of node ``h`` speak about the state ``gap`` seconds later."""
     fill_inverse_transition(evidence.A, gap, evidence.maps)
     back, total, work = evidence.maps[0], evidence.total, evidence.work
@@ -165,7 +165,7 @@ def send_evidence(state: Simulation, evidence: EvidenceArrays, m: int, h: int) -
 
 
 @kernel
-def hear_evidence_now(state: Simulation, evidence: EvidenceArrays, h: int, now: float) -> None:
+def absorb_evidence(state: Simulation, evidence: EvidenceArrays, h: int, now: float) -> None:
     """Replace the earlier evidence of each sender to node ``h``, unless that was sent later; the
     centres of what they carry are predicted to now.
     """

@@ -17,6 +17,7 @@ from netkf.core.interrupts import defer_signals
 from netkf.engines.base import Progress
 from netkf.engines.compiled.agenda import advance_alone, is_immediate
 from netkf.engines.compiled.batch_loop import run_alone
+from netkf.engines.compiled.combination_state import combination_state_of
 from netkf.engines.compiled.draws import Noise, Paths, blocks_at_once, no_path
 from netkf.engines.compiled.event_loop import (
     DONE,
@@ -29,7 +30,6 @@ from netkf.engines.compiled.event_loop import (
     event_loop,
 )
 from netkf.engines.compiled.evidence import more_evidence
-from netkf.engines.compiled.extras import extras_of
 from netkf.engines.compiled.lane_series import series_of_lanes
 from netkf.engines.compiled.late_readings import History, add_past, empty_history
 from netkf.engines.compiled.origins import move_origin
@@ -170,7 +170,7 @@ def _make_windows(scenario: Scenario, streams: Streams, instants: Instants) -> W
     """Return the source of windows of ticks, for clocks or for transmissions after readings."""
     senders = senders_of(scenario)
     if senders.at == "readings":
-        return ReadingsSchedule(scenario, streams, senders, instants.t, instants.host)
+        return ReadingsSchedule(scenario, streams, senders, instants.t, instants.index)
     return schedule(scenario, streams, senders)
 
 
@@ -192,7 +192,7 @@ class Workspace:
         terms = 2 * size + len(self._senders.directions) if kind == SUMS else 0
         # Space for many samples, within a budget of floats.
         scratch = max(1, min(MOST_SAMPLES, SAMPLES_ROOM // (size * n * n)))
-        self._shown = empty_samples((1, scratch, size, n), terms)
+        self._buffer = empty_samples((1, scratch, size, n), terms)
         self._visits: Visits | None = None
         # Code for each n makes runs of filters that combine estimates 1.5 times faster. Filters of
         # sums and of readings gain nothing: one event loop is compiled for every n.
@@ -212,10 +212,10 @@ class Workspace:
         return self._visits
 
     def begin(
-        self, draws: Draws, traced: bool, shown: SampleBuffer | None = None, together: int = 1
+        self, draws: Draws, traced: bool, buffer: SampleBuffer | None = None, together: int = 1
     ) -> Simulation:
         """Return the state at time 0 of one run, or of several that are simulated ``together`` and
-        write their samples into ``shown``.
+        write their samples into ``buffer``.
         """
         start, instants, window = self._start, draws.instants, draws.window()
         entities, directions = self._records
@@ -252,7 +252,7 @@ class Workspace:
             ticks_stop=len(window.t),
             frames=draws.states.frame_times,
             probes=self._probes,
-            shown=self._shown if shown is None else shown,
+            buffer=self._buffer if buffer is None else buffer,
             rows=self._rows,
             counts=np.zeros(len(schema.KINDS), dtype=np.int64),
             scratch=scratch,
@@ -280,7 +280,7 @@ class Workspace:
             "most_rows": 2 + 3 * most + int(np.diff(instants.first).max(initial=0)),
             "horizon": self._scenario.horizon,
             "age_limit": getattr(algorithm, "max_age", math.inf),
-            "mail_time": 0.0,
+            "inbox_time": 0.0,
         }
 
 
@@ -324,7 +324,7 @@ class FlowRun:
         self._visits = workspace.visits() if is_immediate(scenario) else None
         self._totals = _make_totals(scenario, self._state)
         self._history = _make_history(scenario, self._state)
-        self._extras = extras_of(scenario, self._state)
+        self._combination = combination_state_of(scenario, self._state)
 
     def to_the_end(self) -> str:
         """Simulate up to the horizon; returns complete or diverged."""
@@ -353,7 +353,7 @@ class FlowRun:
             return advance_alone(self._state, self._visits)
         if self._scenario.hosted.combination not in SPECIAL:
             return run_alone(self._state)
-        return int(event_loop(self._state, self._totals, self._history, self._extras))
+        return int(event_loop(self._state, self._totals, self._history, self._combination))
 
     def _fulfil(self, wanted: int) -> None:
         """Fulfil a request of the event loop: ticks, steps of the path, or space."""
@@ -384,7 +384,9 @@ class FlowRun:
         # The past of each node gets one entry: the frame that begins.
         if self._history is not None and self._history.free[1] < len(state.nodes):
             add_past(self._history, len(state.nodes))
-        move_origin(self._scenario, state, self._totals, self._history, self._extras, k, offset)
+        move_origin(
+            self._scenario, state, self._totals, self._history, self._combination, k, offset
+        )
         state.frame_at = k + 1
 
     def _more_messages(self) -> None:
@@ -395,8 +397,8 @@ class FlowRun:
             grown = np.zeros((len(self._state.pool), self._totals.sent.shape[1]))
             grown[: len(self._totals.offered)] = self._totals.offered
             self._totals.offered = grown
-        if self._extras is not None:
-            more_evidence(self._extras.evidence, len(self._state.pool))
+        if self._combination is not None:
+            more_evidence(self._combination.evidence, len(self._state.pool))
 
     def _make_rows(self) -> None:
         """Make sure that the buffer of event rows is long enough for one more event."""
@@ -419,12 +421,12 @@ class FlowRun:
 
     def _hand_samples_on(self) -> bool:
         """Record the samples that are there; False where one of them is no longer finite."""
-        state, shown = self._state, self._state.shown
+        state, buffer = self._state, self._state.buffer
         count, state.samples = state.samples, 0
         if not count:
             return True
         times = state.probes[state.probe_at - count : state.probe_at].copy()
-        local, x = self._draws.states.states_at(times, state.path, shown.piece[0, :count])
+        local, x = self._draws.states.states_at(times, state.path, buffer.piece[0, :count])
         # Index of the sample at which the run stands: the last, or the first that is broken.
         lost = [count - 1]
 
@@ -432,10 +434,10 @@ class FlowRun:
             """Pass on the rows before sample ``k``, the first one that is not finite."""
             lost[0] = k
             # Rows up to that sample, and no row after it.
-            self._pass_rows_on(int(shown.rows[0, k]), shown.counts[0, k])
+            self._pass_rows_on(int(buffer.rows[0, k]), buffer.counts[0, k])
 
         # Copies: the loop writes the next samples into the same space.
-        xhat, P = shown.xhat[0, :count].copy(), shown.P[0, :count].copy()
+        xhat, P = buffer.xhat[0, :count].copy(), buffer.P[0, :count].copy()
         # In local coordinates: the difference of absolute states would lose digits.
         error = local[:, None] - xhat
         if local is not x:
@@ -444,7 +446,7 @@ class FlowRun:
         parts = self._scenario, self._recorder, self._progress
         fine = record_samples(*parts, samples, pass_rows_on)
         if self._totals is not None:
-            self._recorder.sums = _sums(shown.terms[lost[0]], self._totals.receivers)
+            self._recorder.sums = _sums(buffer.terms[lost[0]], self._totals.receivers)
         return fine
 
 

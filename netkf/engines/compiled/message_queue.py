@@ -106,7 +106,7 @@ def put(state: Simulation, h: int, message: int) -> None:
 
 
 @kernel
-def sort_places(indices: np.ndarray, count: int) -> None:
+def sort_indices(indices: np.ndarray, count: int) -> None:
     """Sort the first ``count`` indices (Shell's sort: a few lines to compile)."""
     gap = count // 2
     while gap > 0:

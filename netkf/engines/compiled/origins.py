@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from netkf.engines.compiled.extras import Extras
+from netkf.engines.compiled.combination_state import CombinationState
 from netkf.engines.compiled.late_readings import History, remember
 from netkf.engines.compiled.running_totals import Totals
 from netkf.engines.compiled.state import READINGS, Simulation
@@ -15,7 +15,7 @@ def move_origin(
     state: Simulation,
     totals: Totals | None,
     history: History | None,
-    extras: Extras | None,
+    combination: CombinationState | None,
     k: int,
     offset: FloatArray,
 ) -> None:
@@ -25,8 +25,8 @@ def move_origin(
     now = float(state.frames[k])
     # Covariances stay: only means refer to an origin.
     state.xhat[:] += offset
-    if extras is not None:
-        extras.prior[:] += offset
+    if combination is not None:
+        combination.prior[:] += offset
     if totals is not None:
         _move_totals(scenario, state, totals, now, offset)
     # A late reading that goes back over this time must move the origin again on its way forward.

@@ -2,7 +2,7 @@
 in compiled code.
 
 The clocks of a network are together as even in time as one clock of their sum of rates. So ticks
-are put in order by counting: as many stretches of a window as it has ticks, of about one each.
+are put in order by counting: as many bins of a window as it has ticks, of about one each.
 """
 
 from __future__ import annotations
@@ -156,7 +156,7 @@ def draw_outcomes(
 
 
 class Sorting(NamedTuple):
-    """Scratch to put K ticks in order: where the next tick of a stretch goes, ``place`` (K + 1,),
+    """Scratch to put K ticks in order: where the next tick of a bin goes, ``place`` (K + 1,),
     and which tick goes where, ``source`` (K,). Short integers stay in the cache.
     """
 
@@ -173,21 +173,21 @@ def put_in_time_order(
     begin: float, end: float, count: int, found: Found, ordered: Found, sorting: Sorting
 ) -> None:
     """Write the first ``count`` ticks, which lie in [begin, end), by (time, entity)."""
-    # Ticks are evenly spread, hence about one in each of ``count`` equal stretches.
+    # Ticks are evenly spread, hence about one in each of ``count`` equal bins.
     place, source, scale = sorting.place, sorting.source, count / (end - begin)
-    # Counting sort by stretch: count, sum up, and place.
+    # Counting sort by bin: count, sum up, and place.
     for m in range(count + 1):
         place[m] = 0
     for m in range(count):
-        place[stretch_of(found.t[m], begin, scale, count) + 1] += 1
+        place[bin_of(found.t[m], begin, scale, count) + 1] += 1
     for m in range(count):
         place[m + 1] += place[m]
     for m in range(count):
-        # place[k] is where the next tick of stretch k goes.
-        k = stretch_of(found.t[m], begin, scale, count)
+        # place[k] is where the next tick of bin k goes.
+        k = bin_of(found.t[m], begin, scale, count)
         source[place[k]] = m
         place[k] += 1
-    # Insertion sort mends the order inside stretches, in linear time on average, as few share one.
+    # Insertion sort mends the order inside bins, in linear time on average, as few share one.
     # It is by (time, entity): ties keep the order of entities.
     t, entity, at = ordered.t, ordered.entity, ordered.at
     for to in range(count):
@@ -200,8 +200,8 @@ def put_in_time_order(
 
 
 @kernel(inlined=True)
-def stretch_of(time: float, begin: float, scale: float, count: int) -> int:
-    """Return which of ``count`` stretches a time lies in, ``scale`` of them in a second."""
+def bin_of(time: float, begin: float, scale: float, count: int) -> int:
+    """Return which of ``count`` bins a time lies in, ``scale`` of them in a second."""
     return min(int((time - begin) * scale), count - 1)
 
 

@@ -92,7 +92,7 @@ def _make_instants(
     index = scenario.topology.index if placed else {}
     pooled, n = scenario.hosted.pooled, scenario.plant.n
     node = np.array([node for node, _ in placed], dtype=np.int64)
-    host = np.array([0 if pooled else index[k] for k in node.tolist()], dtype=np.int64)
+    filters = np.array([0 if pooled else index[k] for k in node.tolist()], dtype=np.int64)
     parts = [(scenario.sensors[p.entry], scenario.noise(p.entry, believed=True)) for _, p in placed]
     rows = np.array([len(R) for _, R in parts], dtype=np.int64)
     most = int(rows.max(initial=1))
@@ -105,14 +105,14 @@ def _make_instants(
     matrix, varying = sensor.copy(), own[sensor] if parts else np.zeros(0, dtype=bool)
     matrix[varying] = len(parts) + np.arange(int(varying.sum()))
     H = np.concatenate([H, np.zeros((int(varying.sum()), most, n))])
-    whose = host[sensor] if parts else sensor
+    whose = filters[sensor] if parts else sensor
     # Samples of one node at one time are one instant, and one update.
     begins = np.ones(len(t), dtype=bool)
     begins[1:] = (np.diff(t) != 0.0) | (np.diff(whose) != 0)
     first = np.flatnonzero(begins)
     return Instants(
         t=t[first],
-        host=whose[first],
+        index=whose[first],
         first=np.append(first, len(t)),
         node=node[sensor] if parts else sensor,
         y=np.zeros((len(t), most)),

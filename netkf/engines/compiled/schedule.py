@@ -402,7 +402,7 @@ class Schedule:
 
 class ReadingsSchedule:
     """The windows of one run in which nodes transmit after their samples, at the times ``t`` (K,)
-    and indices ``host`` (K,), in order.
+    and indices ``index`` (K,), in order.
     """
 
     def __init__(
@@ -411,10 +411,10 @@ class ReadingsSchedule:
         streams: Streams,
         senders: Senders,
         t: FloatArray,
-        host: np.ndarray,
+        index: np.ndarray,
     ) -> None:
         self._outcomes = Outcomes(scenario, streams, senders)
-        self._t, self._host, self._begin = t, host, 0
+        self._t, self._index, self._begin = t, index, 0
         self._sent = np.zeros(len(senders.entities), dtype=np.int64)
 
     def following(self) -> Window:
@@ -422,20 +422,20 @@ class ReadingsSchedule:
         begin, sizes = self._begin, self._outcomes.sizes
         # As many instants as have about MOST_TICKS messages; a node without receivers counts as
         # one.
-        sent = np.cumsum(np.maximum(sizes[self._host[begin:]], 1))
+        sent = np.cumsum(np.maximum(sizes[self._index[begin:]], 1))
         stop = begin + int(np.searchsorted(sent, MOST_TICKS))
         while 0 < stop < len(self._t) and self._t[stop] == self._t[stop - 1]:
             stop += 1  # an instant is in one window
         self._begin = stop
-        t, host = self._t[begin:stop], self._host[begin:stop]
+        t, index = self._t[begin:stop], self._index[begin:stop]
         # Outcomes are drawn entity by entity, and put back into the order of time.
-        indices, counts = np.unique(host, return_counts=True)
+        indices, counts = np.unique(index, return_counts=True)
         delay = self._outcomes.of(indices, counts, self._sent[indices])
         self._sent[indices] += counts
-        by_entity = np.argsort(host, kind="stable")
-        ticks = Ticks(t[by_entity], host[by_entity], delay)
-        back = np.empty(len(host), dtype=np.int64)
-        back[by_entity] = np.arange(len(host))
+        by_entity = np.argsort(index, kind="stable")
+        ticks = Ticks(t[by_entity], index[by_entity], delay)
+        back = np.empty(len(index), dtype=np.int64)
+        back[by_entity] = np.arange(len(index))
         end = float(self._t[stop]) if stop < len(self._t) else math.inf
         return ticks.chosen(back, sizes).window(end, sizes)
 

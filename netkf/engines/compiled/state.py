@@ -121,7 +121,7 @@ class Sensing(Struct):
     rest, step : noise left of the present step (R S, 2, p), and its number (R S,)
     cuts : streams (R S, 4) of normals for parts of a step
     height, width, inside : numpy's ziggurat table for these
-    host, node : (K,), index and id of the nodes that wake at a grid point, in order
+    index, node : (K,), index and id of the nodes that wake at a grid point, in order
     """
 
     rows: IntArray
@@ -135,14 +135,14 @@ class Sensing(Struct):
     height: FloatArray
     width: FloatArray
     inside: np.ndarray
-    host: IntArray
+    index: IntArray
     node: IntArray
 
 
 class Instants(Struct):
     """K instants at which a node has samples, S samples in all.
 
-    t, host : (K,), time and index of the node
+    t, index : (K,), time and index of the node
     first : (K + 1,), samples of instant k begin at ``first[k]``
     node, y : (S,) and (S, p), of each sample
     sensor, matrix : (S,), index of its noise and of its H
@@ -151,7 +151,7 @@ class Instants(Struct):
     """
 
     t: FloatArray
-    host: IntArray
+    index: IntArray
     first: IntArray
     node: IntArray
     y: FloatArray
@@ -239,7 +239,7 @@ class Simulation(Struct):
     free, free_count, most_messages : first free message, number of free ones and of those that one
                                       event may need
     heap, flying, order : heap (C,) of arrivals, messages on it, and messages ever put there
-    waiting, receivers, absorbing, mail_time : nodes (N,) with messages, their number, how many of
+    waiting, receivers, absorbing, inbox_time : nodes (N,) with messages, their number, how many of
                                                them are done, and the instant
     age_limit : messages older than so many seconds are late
 
@@ -257,7 +257,7 @@ class Simulation(Struct):
 
     Results
 
-    shown, samples : space for samples, and samples that are not handed on yet
+    buffer, samples : space for samples, and samples that are not handed on yet
     traced, rows, row, most_rows : whether rows of events are written, the rows, the next one, and
                                    how many one event may need
     counts : events by kind (len(KINDS),)
@@ -288,7 +288,7 @@ class Simulation(Struct):
     ticks: TickArrays
     frames: FloatArray
     probes: FloatArray
-    shown: SampleBuffer
+    buffer: SampleBuffer
     rows: np.ndarray
     counts: IntArray
     scratch: Scratch
@@ -321,7 +321,7 @@ class Simulation(Struct):
     samples: int
     horizon: float
     age_limit: float
-    mail_time: float
+    inbox_time: float
 
 
 class Filters(NamedTuple):

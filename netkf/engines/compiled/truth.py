@@ -1,4 +1,4 @@
-"""The state of one run where it is sampled, shown and counted from a new origin."""
+"""The state of one run at its samples, and relative to a moving origin."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
-"""What some combinations of messages need beside a Simulation: scratch, gains, predictions.
+"""State of the combinations that need more than estimates and messages.
 
-``Extras.kind`` is that of the Simulation: estimates that are fused one by one with the best weight
-(BEST, INVERSE), constant gains (GAINS), consensus on predictions, with readings (PREDICTIONS), or
-belief propagation (BELIEFS).
+Estimates fused one by one with the best weight (BEST, INVERSE), constant gains (GAINS), consensus
+on predictions (PREDICTIONS) and belief propagation (BELIEFS); other combinations have none, and
+nothing is compiled for them.
 """
 
 from __future__ import annotations
@@ -44,19 +44,29 @@ from netkf.linalg.structs import Struct
 from netkf.scenario.scenario import Scenario
 
 
-class Extras(Struct):
-    """Of N nodes: predictions ``prior`` (N, n) of this instant with ``prior_root`` (N, n, n), of
-    which ``prior_lanes`` (1, N, n, n, 1) is another view; the consensus term ``moved`` (N, n, 1),
-    its strength ``epsilon``, and whether readings are sent (``share``).
+class CombinationState(Struct):
+    """Arrays of one run, for N nodes, n states and p rows of readings.
 
-    Gains ``L`` (N, n, p); for increments the rows ``H`` (N, p, n), the ``table`` of closed loops
-    with the ``model`` (N,) of each node and its ``closed`` (N, n, n), and how fast they are
-    (``rate``, (N,)), for the plant ``A`` (n, n); for samples the maps ``sampled`` and their
-    ``noise`` (N, n, n), and the roots of the Simulation as ``lanes`` (1, N, n, n, 1).
+    kind    : combination of the Simulation (BEST, INVERSE, GAINS, PREDICTIONS or BELIEFS)
+    trace   : 1 where the best weight minimises the trace, 0 where it minimises the determinant
 
-    ``trace``: the best weight minimises the trace, else the determinant. Scratch: ``pair``
-    (2 n + 2, n), ``x`` (1, n), ``root`` (1, n, n), ``maps`` (6, n, n), ``work`` (2, n, n, 1), and
-    that of flows. ``evidence``: see there.
+    Consensus on predictions:
+
+    share, epsilon : whether readings are sent too; strength of the consensus term
+    prior, prior_root : predictions of this instant, (N, n) and (N, n, n)
+    prior_lanes : (1, N, n, n, 1) the same memory as ``prior_root``
+    moved   : (N, n, 1) the consensus term
+
+    Constant gains:
+
+    A, L, H : plant (n, n), gains (N, n, p), rows (N, p, n) of increment sensors
+    closed, table, model, rate : closed loops A - L H (N, n, n), tabulated, the row (N,) of each
+              node, and the rate in 1/s at which its error changes
+    sampled, noise : (N, n, n) I - L H and a root of L R L' of sampled sensors
+    lanes   : (1, N, n, n, 1) the roots of the Simulation
+
+    Scratch: ``pair`` (2 n + 2, n), ``x`` (1, n), ``root`` (1, n, n), ``maps`` (6, n, n), ``work``
+    (2, n, n, 1), ``flow_scratch``. Belief propagation has its own ``evidence``.
     """
 
     kind: int
@@ -86,7 +96,7 @@ class Extras(Struct):
     evidence: EvidenceArrays
 
 
-def extras_of(scenario: Scenario, state: Simulation) -> Extras | None:
+def combination_state_of(scenario: Scenario, state: Simulation) -> CombinationState | None:
     """Return the extra arrays that the filter's combination needs, None if it needs none."""
     if state.kind not in (BEST, INVERSE, GAINS, PREDICTIONS, BELIEFS):
         return None
@@ -95,7 +105,7 @@ def extras_of(scenario: Scenario, state: Simulation) -> Extras | None:
     assert root is state.root or np.shares_memory(root, state.root)
     prior_root = state.root.copy()
     gains = _make_gains(scenario, state)
-    return Extras(
+    return CombinationState(
         kind=state.kind,
         trace=getattr(algorithm, "minimise", "") == "trace",
         share=getattr(algorithm, "share_readings", False),
@@ -155,19 +165,21 @@ def _make_gains(scenario: Scenario, state: Simulation) -> dict[str, Any]:
 
 
 @kernel
-def keep_prediction(state: Simulation, extras: Extras, h: int) -> None:
+def keep_prediction(state: Simulation, combination: CombinationState, h: int) -> None:
     """Keep the prediction of node ``h``, before anything of this instant is used."""
-    copy_state(state.size, extras.prior, extras.prior_root, h, state.xhat, state.root, h)
+    copy_state(state.size, combination.prior, combination.prior_root, h, state.xhat, state.root, h)
     # A reading of an earlier instant is not sent any more.
     state.nodes[h].reading = -1
 
 
 @kernel
-def predict_with_gain(state: Simulation, extras: Extras, h: int, now: float, time: float) -> None:
-    """Bring node ``h`` with increments to ``time`` by its constant gain, in stretches that the gain
-    can follow.
+def predict_with_gain(
+    state: Simulation, combination: CombinationState, h: int, now: float, time: float
+) -> None:
+    """Bring node ``h`` with increments to ``time`` by its constant gain, in intervals that the
+    gain can follow.
     """
-    piece, m, longest = state.piece, extras.model[h], usable(extras.rate[h])
+    piece, m, longest = state.piece, combination.model[h], usable(combination.rate[h])
     least = SHORTEST_SHARE * (time - now)
     while now < time:
         end = time
@@ -176,41 +188,54 @@ def predict_with_gain(state: Simulation, extras: Extras, h: int, now: float, tim
             least *= LONGER
         gap = end - now
         # The mean moves as if nothing were read, and P by the closed loop, which counts that.
-        for i in range(extras.x.shape[1]):
-            extras.x[0, i] = state.xhat[h, i]
-            for j in range(extras.x.shape[1]):
-                extras.root[0, i, j] = 0.0
+        for i in range(combination.x.shape[1]):
+            combination.x[0, i] = state.xhat[h, i]
+            for j in range(combination.x.shape[1]):
+                combination.root[0, i, j] = 0.0
         unobserved = len(state.table.unit) - 1
-        propagate_root(state.table, unobserved, extras.root, extras.x, 0, gap, state.flow_scratch)
-        propagate_root(extras.table, m, state.root, state.xhat, h, gap, extras.flow_scratch)
-        for i in range(extras.x.shape[1]):
-            state.xhat[h, i] = extras.x[0, i]
+        propagate_root(
+            state.table, unobserved, combination.root, combination.x, 0, gap, state.flow_scratch
+        )
+        propagate_root(
+            combination.table, m, state.root, state.xhat, h, gap, combination.flow_scratch
+        )
+        for i in range(combination.x.shape[1]):
+            state.xhat[h, i] = combination.x[0, i]
         readings = state.scratch.moments[: state.gains.moments[state.nodes[h].model]]
         fill_readings(state, state.run, h, piece, now, end, readings)
-        correct_by_moments(
-            state.xhat, h, extras.A, extras.closed[h], extras.H[h], extras.L[h], readings, gap,
-            extras.maps,
+        A, closed, H, L = (
+            combination.A, combination.closed[h], combination.H[h], combination.L[h]
         )  # fmt: skip
+        correct_by_moments(state.xhat, h, A, closed, H, L, readings, gap, combination.maps)
         now = end
 
 
 @kernel
-def sample_with_gain(state: Simulation, extras: Extras, h: int, instant: int) -> None:
+def sample_with_gain(
+    state: Simulation, combination: CombinationState, h: int, instant: int
+) -> None:
     """Use the sample of node ``h`` by its constant gain."""
     given = state.instants
     s = given.first[instant]
     p = given.rows[given.sensor[s]]
     correct_by_innovation(
-        state.xhat, h, given.H[given.matrix[s]], extras.L[h], given.y[s, :p], extras.x[0]
+        state.xhat, h, given.H[given.matrix[s]], combination.L[h], given.y[s, :p], combination.x[0]
     )
     # (I - L H) P (I - L H)' + L R L' has the form of a prediction.
     predict_root(
-        ONE, extras.lanes, 0, h, extras.sampled[h], extras.noise[h], extras.work[0], extras.work[1]
+        ONE,
+        combination.lanes,
+        0,
+        h,
+        combination.sampled[h],
+        combination.noise[h],
+        combination.work[0],
+        combination.work[1],
     )
 
 
 @kernel
-def fuse_mail(state: Simulation, extras: Extras, h: int) -> None:
+def fuse_inbox(state: Simulation, combination: CombinationState, h: int) -> None:
     """Fuse the estimate of node ``h`` with each that it heard, one after the other, with the best
     weight.
     """
@@ -218,16 +243,18 @@ def fuse_mail(state: Simulation, extras: Extras, h: int) -> None:
     while m != -1:
         fuse_pair(
             state.xhat[h], state.root[h], state.pool_x[m], state.pool_root[m],
-            extras.kind == INVERSE, extras.trace == 1, extras.pair,
+            combination.kind == INVERSE, combination.trace == 1, combination.pair,
         )  # fmt: skip
         m = state.pool[m].next
 
 
 @kernel
-def send_prediction(state: Simulation, extras: Extras, m: int, h: int) -> None:
+def send_prediction(state: Simulation, combination: CombinationState, m: int, h: int) -> None:
     """Put the prediction of node ``h`` into a message, and its reading of this instant."""
-    copy_state(state.size, state.pool_x, state.pool_root, m, extras.prior, extras.prior_root, h)
-    state.pool[m].tag = state.nodes[h].reading if extras.share == 1 else -1
+    copy_state(
+        state.size, state.pool_x, state.pool_root, m, combination.prior, combination.prior_root, h
+    )
+    state.pool[m].tag = state.nodes[h].reading if combination.share == 1 else -1
 
 
 @kernel
@@ -243,17 +270,23 @@ def use_readings_heard(state: Simulation, h: int, now: float) -> None:
 
 
 @kernel
-def add_consensus(state: Simulation, extras: Extras, h: int) -> None:
+def add_consensus(state: Simulation, combination: CombinationState, h: int) -> None:
     """Add the consensus term on predictions to the estimate of node ``h``."""
     n = state.xhat.shape[1]
     for i in range(n):
         total, m = 0.0, state.nodes[h].inbox
         while m != -1:
-            total += state.pool_x[m, i] - extras.prior[h, i]
+            total += state.pool_x[m, i] - combination.prior[h, i]
             m = state.pool[m].next
-        extras.moved[h, i, 0] = total
+        combination.moved[h, i, 0] = total
     scale_by_covariance(
-        ONE, extras.prior_lanes, 0, h, extras.epsilon, extras.moved, extras.work[0, 0]
+        ONE,
+        combination.prior_lanes,
+        0,
+        h,
+        combination.epsilon,
+        combination.moved,
+        combination.work[0, 0],
     )
     for i in range(n):
-        state.xhat[h, i] += extras.moved[h, i, 0]
+        state.xhat[h, i] += combination.moved[h, i, 0]
