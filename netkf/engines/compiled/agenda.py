@@ -27,7 +27,7 @@ from netkf.engines.compiled.event_loop import (
     TICK,
     TRANSMIT,
     WANT_REBASE,
-    WANT_SHOWN,
+    WANT_SAMPLES,
     count_sample,
     find_shortage,
     next_event,
@@ -215,7 +215,7 @@ def run_agenda(state: Simulation, visits: Visits, until: float) -> int:
     """
     wanted = FULL
     # A batch has space for all of its samples: it stops behind the last one only.
-    while wanted == FULL or (wanted == WANT_SHOWN and until < NEVER):
+    while wanted == FULL or (wanted == WANT_SAMPLES and until < NEVER):
         wanted = agenda(state, visits, until)
         if wanted == FULL:
             process_visits(state, visits)
@@ -250,7 +250,7 @@ def agenda(state: Simulation, visits: Visits, until: float) -> int:
                 return WANT_REBASE
             queue_sample(state, visits, first)
             if not count_sample(state):
-                return WANT_SHOWN
+                return WANT_SAMPLES
 
 
 @kernel

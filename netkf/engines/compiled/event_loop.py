@@ -68,7 +68,7 @@ SENSE, TICK, SEND, DELIVER, LOST, LATE, ABSORB, TRANSMIT = (
     CODES[kind]
     for kind in ("sense", "tick", "send", "deliver", "lost", "late", "absorb", "transmit")
 )
-(GO_ON, WANT_TICKS, WANT_STEPS, WANT_MESSAGES, WANT_ROWS, WANT_SHOWN, WANT_REBASE,
+(GO_ON, WANT_TICKS, WANT_STEPS, WANT_MESSAGES, WANT_ROWS, WANT_SAMPLES, WANT_REBASE,
  WANT_PAST, DONE) = range(9)  # fmt: skip
 """Why the loop stopped: it needs the next window of ticks, the next steps of the path, a larger
 pool of messages, space for rows, for samples; the origin moves; a longer history.
@@ -118,7 +118,7 @@ def event_loop(
             return WANT_REBASE
         # No space for another sample: this one has been kept, and the loop goes on behind it.
         elif not on_probe(state, totals):
-            return WANT_SHOWN
+            return WANT_SAMPLES
 
 
 @kernel
