@@ -143,16 +143,18 @@ class GainSequence:
 
     def __init__(self, design: Design) -> None:
         n, N = design.n, design.nodes
-        self._heard, self._n = design.heard, n
-        F, Q, cov = (np.frombuffer(one).reshape(n, n) for one in (design.F, design.Q, design.cov))
+        self._n = n
+        self._heard = design.heard
+        self._F = np.frombuffer(design.F).reshape(n, n)
         self._information = np.frombuffer(design.information).reshape(N, n, n)
-        self._pseudo = p = pseudo_states(F, self._information.sum(axis=0))
-        # Nodes without a sensor add no noise, and columns of zeros cost as much as others.
-        self._noises = [without_zeros(square_root(one)) for one in self._information]
-        # All estimates start at one mean, and the plant's noise is one.
-        stacked = np.concatenate([np.tile(np.eye(n), (N, 1)), np.tile(p.G, (N, 1))])
-        self._driven, self._errors = stacked @ square_root(Q), stacked @ square_root(cov)
-        self._F = F
+        self._pseudo = pseudo_states(self._F, self._information.sum(axis=0))
+        # Columns of zeros, as of nodes without a sensor, cost as much as others and add no noise.
+        self._noises = [without_zeros(square_root(matrix)) for matrix in self._information]
+        # x and w enter every xhat alike, and every yhat by G: (2 N n, n).
+        stacked = np.concatenate([np.tile(np.eye(n), (N, 1)), np.tile(self._pseudo.G, (N, 1))])
+        # All nodes start from the same mean: only x(0) - mean makes errors, as does w later.
+        self._errors = stacked @ square_root(np.frombuffer(design.cov).reshape(n, n))
+        self._driven = stacked @ square_root(np.frombuffer(design.Q).reshape(n, n))
         self._found: list[tuple[NodeGains, ...]] = []
         self._converged = False
 
@@ -231,12 +233,14 @@ class GainSequence:
         self._errors = np.hstack([self._errors, np.zeros((len(self._errors), inputs))])
         gains, corrected = [], []
         for i, heard in enumerate(self._heard):
-            e, observed = self._pseudo_error(i), self._information[i] @ self._pseudo.inverse
+            e = self._pseudo_error(i)
+            observed = self._information[i] @ self._pseudo.inverse
             innovation = observed @ e
             # The noise of the pseudo-observation has the covariance H' R^-1 H.
             stop = first + self._noises[i].shape[1]
-            innovation[:, first:stop], first = self._noises[i], stop
-            # What corrects yhat_i: differences to the neighbours' estimates, and the innovation.
+            innovation[:, first:stop] = self._noises[i]
+            first = stop
+            # yhat_i is corrected by the differences to its neighbours' and by the innovation.
             theta = np.concatenate([*(e - self._pseudo_error(j) for j in heard), innovation])
             sizes = [variances(e) + variances(self._pseudo_error(j)) for j in heard]
             sizes.append(np.square(observed) @ variances(e) + np.diag(self._information[i]))
@@ -268,10 +272,10 @@ def variances(errors: FloatArray) -> FloatArray:
 
 
 def optimal_gain(e: FloatArray, theta: FloatArray, terms: FloatArray) -> FloatArray:
-    """Return ``E[e theta'] E[theta theta']^+`` (n, k) of errors e (n, inputs) and what corrects
-    them, theta (k, inputs), differences of ``terms`` (k,) so large in variance.
+    """Return the gain ``E[e theta'] E[theta theta']^+`` (n, k) that corrects errors e (n, inputs)
+    by differences theta (k, inputs), whose terms have the variances ``terms`` (k,).
     """
-    # What is left of a difference of equal estimates is rounding, and counts as 0.
+    # The difference of equal estimates is rounding, and counts as 0.
     scale = np.divide(1.0, np.sqrt(terms), out=np.zeros_like(terms), where=terms > 0.0)
     # E[e theta'] = e theta' for errors given by independent unit inputs; the pseudo-inverse comes
     # from the singular values of theta, which has half the condition of E[theta theta'].

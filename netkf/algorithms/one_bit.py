@@ -165,11 +165,11 @@ def share_bits(
     b: int,
     s: int,
 ) -> None:
-    """Make and use the bits of the node whose ``turn`` it is, and use them where they are heard in
-    slot ``s``.
+    """Compute the bits of node ``turn`` in slot ``s``, and correct it and the nodes that hear it by
+    them, in block ``b`` of runs.
     """
     lanes, rows = scratch.lanes, nodes.rows[turn]
-    # Not what ``sent`` says: its own bits a node uses even if something keeps it from sending them.
+    # ``sent`` is not asked: a node uses its own bits even if it is kept from sending them.
     if not has_links(links, turn) or not has_read(readings, rows, b, s, turn):
         return
     send_bits(
@@ -203,8 +203,8 @@ def send_bits(
     row: FloatArray,
     gains: FloatArray,
 ) -> None:
-    """Write the ``signs`` (p, L) of the innovations of filter ``h`` in slot ``s``, and use them;
-    ``row`` and ``gains`` (n, L) are scratch.
+    """Write the ``signs`` (p, L) of the innovations of filter ``h`` in slot ``s`` of block ``b`` of
+    runs, and correct the filter by them; ``row`` and ``gains`` (n, L) are scratch.
     """
     # H that is fixed has one block and one slot.
     c, t = min(b, readings.H.shape[0] - 1), min(s, readings.H.shape[1] - 1)
@@ -233,8 +233,9 @@ def use_bit(
     row: FloatArray,
     gains: FloatArray,
 ) -> None:
-    """Correct filter ``h`` by the ``sign`` of the innovation of the whitened row at ``index``
-    [s, sender, k] of H, in the lanes where it has ``arrived``.
+    """Correct filter ``h`` of block ``b`` of runs by the ``sign`` (+1 or -1 in each lane) of the
+    innovation of the whitened row at ``index`` [s, sender, k] of H, in the lanes where it has
+    ``arrived``; ``row`` and ``gains`` (n, L) are scratch.
 
     With ``p = h P h'``, ``P - (2 / pi) P h' h P / (p + 1)`` is the Kalman update with noise
     ``r = (pi / 2 - 1) p + pi / 2``, and ``P h' sqrt(2 / pi / (p + 1))`` is its gain times
@@ -242,7 +243,9 @@ def use_bit(
     """
     s, sender, k = index
     n = x.shape[2]
+    # H that is fixed has one block and one slot.
     c, t = min(b, readings.H.shape[0] - 1), min(s, readings.H.shape[1] - 1)
+    # ``row`` becomes h S with P = S S', and ``square`` p = h P h'.
     square = spread(lanes, 0.0)
     for j in range(n):
         total = spread(lanes, 0.0)
@@ -255,6 +258,7 @@ def use_bit(
     scale = 1.0 / root_of((HALF_PI - 1.0) * square + HALF_PI)
     for j in range(n):
         store(lanes, row, j, scale * load(lanes, row, j))
+    # ``row`` is scaled to unit noise. The gain of a real observation is ``gains`` times ``over``.
     over = rotate_lanes(lanes, root, b, h, row, gains)
     step = sign * over * scale * root_of(HALF_PI * (square + 1.0))
     for i in range(n):

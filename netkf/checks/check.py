@@ -164,19 +164,24 @@ def run_replica(
 
 
 def _error_difference(run: Run, twin: Run) -> float:
-    """Return the largest difference of the errors of two runs with one truth, in standard
-    deviations; nan if rounding is nowhere far below TWIN_TOLERANCE.
+    """Return the largest difference of the errors of two runs with the same true state, in standard
+    deviations; nan if rounding is nowhere small against TWIN_TOLERANCE.
     """
     both = min(len(run.times), len(twin.times))
     size = np.sqrt(np.trace(twin.P[:both], axis1=-2, axis2=-1))[..., None]
     rounding = np.maximum(run.rounding[:both], twin.rounding[:both])[:, None, None]
-    # Errors that were larger before have left their roundings.
+    # Roundings of errors that were larger at earlier times are still in the estimates.
     earlier = np.maximum.accumulate(np.nan_to_num(np.abs(twin.error[:both])).max(axis=(1, 2)))
     rounding = np.maximum(rounding, OPERATIONS * EPS * earlier[:, None, None])
     gap = np.abs(run.error[:both] - twin.error[:both])
-    clear = np.broadcast_to((rounding <= 0.1 * TWIN_TOLERANCE * size) & (size > 0.0), gap.shape)
+    comparable = np.broadcast_to(
+        (rounding <= 0.1 * TWIN_TOLERANCE * size) & (size > 0.0), gap.shape
+    )
     share = gap / np.where(size > 0.0, size, 1.0)
-    return float(np.nan_to_num(share[clear], nan=np.inf).max()) if clear.any() else math.nan
+    if not comparable.any():
+        return math.nan
+    # An error that is nan in one run only differs infinitely.
+    return float(np.nan_to_num(share[comparable], nan=np.inf).max())
 
 
 def _same_as_base(results: list[ReplicaResult], level: float) -> Finding:

@@ -90,8 +90,8 @@ class RunSamples:
         return float(np.trace(self.first_covariances, axis1=-2, axis2=-1).max())
 
     def largest_terms(self, P: FloatArray) -> FloatArray:
-        """Return the sizes (R, K, N) of the terms of covariances P (R, K, N, n, n), whose roundings
-        these have.
+        """Return the sizes (R, K, N) of the largest terms from which covariances P (R, K, N, n, n)
+        were computed: their roundings remain in P.
         """
         information = float(np.linalg.norm(self.scenario.node_infos[0].information, 2))
         return largest_terms(P, self.first_covariances, information)

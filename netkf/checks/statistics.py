@@ -50,9 +50,10 @@ class Interval(NamedTuple):
         return value - (self.value - self.low) / root, value + (self.high - self.value) / root
 
     def expected_high(self, factor: float) -> float:
-        """Return the upper limit of a distance with ``factor`` times the samples, if the distance
-        found is chance.
+        """Return the upper limit expected with ``factor`` times the samples, if the distance found
+        is sampling error.
         """
+        # Sampling error shrinks as 1 / sqrt(samples); a value of 0 or below is kept.
         value = self.value / math.sqrt(factor) if self.value > 0.0 else self.value
         return self.limits(value, factor)[1]
 

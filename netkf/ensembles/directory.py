@@ -96,7 +96,7 @@ def runs_to_directory(
     check_sources(scenario)
     pool = make_pool(runs, options.pool)
     try:
-        keeper = _begin(scenario, runs, out, options, engine_used.name, pool.width)
+        keeper = _make_keeper(scenario, runs, out, options, engine_used.name, pool.width)
         if keeper is None:
             return None
         try:
@@ -120,7 +120,7 @@ def runs_to_directory(
     return finished
 
 
-def _begin(
+def _make_keeper(
     scenario: Scenario,
     runs: int,
     out: Path | None,
@@ -128,19 +128,23 @@ def _begin(
     engine: str,
     width: int,
 ) -> _Keeper | None:
-    """Return the keeper of a new directory or of one to go on in, None if all is done there."""
+    """Return the keeper of a new directory, or of the one to resume; None if that is complete.
+
+    ``engine`` is the name of the engine, ``width`` the number of blocks that run at a time.
+    """
     size = block_size(runs, width)
-    size = min(size, MAX_TRACED_BLOCK) if options.trace == "full" else size
-    digest, seed = scenario_digest(scenario), scenario.seed
-    plan = RunIdentity(digest, seed, runs, options.trace, engine, installation(), size)
+    if options.trace == "full":
+        size = min(size, MAX_TRACED_BLOCK)
+    digest = scenario_digest(scenario)
+    plan = RunIdentity(digest, scenario.seed, runs, options.trace, engine, installation(), size)
     begun = ensemble_to_resume(out, scenario, plan) if options.resume else None
-    directory = new_directory(out, scenario.name) if begun is None else begun.directory
-    if begun is not None:
-        if begun.finished:
-            BlockCheckpoints(directory, scenario).remove()
-            return None
-        plan = replace(plan, block=begun.block)
-    return _Keeper(scenario, directory, plan)
+    if begun is None:
+        return _Keeper(scenario, new_directory(out, scenario.name), plan)
+    if begun.finished:
+        BlockCheckpoints(begun.directory, scenario).remove()
+        return None
+    # Blocks on disk are only of use to a plan with blocks of the same size.
+    return _Keeper(scenario, begun.directory, replace(plan, block=begun.block))
 
 
 def _write(

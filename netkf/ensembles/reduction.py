@@ -176,20 +176,19 @@ def reduction_scratch(filters: int, n: int, largest: int) -> ReductionScratch:
 
 
 class _ScratchCache(threading.local):
-    """The scratch of each thread for the batch before, which the next one may use again."""
+    """The scratch arrays that a thread used for its last batch, kept for the next one."""
 
     def __init__(self) -> None:
-        self._sizes, self._scratch = (0, 0, 0), reduction_scratch(1, 1, 1)
+        self._sizes = (0, 0, 0)
+        self._scratch = reduction_scratch(1, 1, 1)
 
     def of(self, filters: int, n: int, largest: int) -> ReductionScratch:
-        """Return scratch as ``reduction_scratch`` makes it, with anything in it."""
+        """Return scratch for at least these sizes (see ``reduction_scratch``), not cleared."""
         if filters * n * n > MAX_SCRATCH_ENTRIES:
             return reduction_scratch(filters, n, largest)
         if self._sizes[:2] != (filters, n) or self._sizes[2] < largest:
-            self._sizes, self._scratch = (
-                (filters, n, largest),
-                reduction_scratch(filters, n, largest),
-            )
+            self._sizes = (filters, n, largest)
+            self._scratch = reduction_scratch(filters, n, largest)
         return self._scratch
 
 
@@ -439,10 +438,17 @@ def reduce_sample(
         scratch.factor,
         scratch.z,
     )
-    n, filters = len(z), len(scratch.totals)
-    half, index, index_P = n * (n + 1) // 2, (s * filters + f) * n, (s * filters + f) * n * n
-    column = (s * filters + f) * (2 * half + 1)
-    last, square, trace = column + 2 * half, spread(lanes, 0.0), spread(lanes, 0.0)
+    n = len(z)
+    filters = len(scratch.totals)
+    # Columns of a sample of a filter: the upper triangles of P and of e e', and then NEES.
+    half = n * (n + 1) // 2
+    place = s * filters + f
+    index = place * n
+    index_P = place * n * n
+    column = place * (2 * half + 1)
+    last = column + 2 * half
+    square = spread(lanes, 0.0)
+    trace = spread(lanes, 0.0)
     for i in range(n):
         e = load(lanes, errors_of, index + i)
         store(lanes, z, i, e)
@@ -455,7 +461,7 @@ def reduce_sample(
             store(lanes, columns, half + column, e * load(lanes, errors_of, index + j))
             column += 1
     if any_lane(nees_of_lanes(lanes, scratch)):
-        # Singular or broken: alone, with a choice of pivots.
+        # A singular P needs pivoting, sample by sample.
         for q in range(active):
             if scratch.broken[q] > 0.0 and t < b.kept[first + q]:
                 nees_alone(b, sums, scratch, first + q, t, f, q)
@@ -469,7 +475,9 @@ def reduce_sample(
 
 @kernel(inlined=True)
 def add_total(lanes: Lanes, totals: FloatArray, f: int, a: int, number: Any) -> None:
-    """Add a number of each lane to a sum for the averages."""
+    """Add the value ``number`` of L lanes to ``totals[f, a]`` (L,): the sum over time of average a
+    of filter f.
+    """
     store(lanes, totals, f, a, load(lanes, totals, f, a) + number)
 
 
@@ -488,19 +496,22 @@ def nees_alone(
 def mark_averaged(
     b: Batch, sums: Sums, scratch: ReductionScratch, first: int, active: int, t: int
 ) -> None:
-    """Note in which runs sample ``t`` counts in the averages, by the rule of
-    ``runs.summary.averaged_samples``: in those of errors (``clear``), in that of P (``traced``).
+    """Mark the runs in whose averages sample ``t`` counts, by the rule of
+    ``runs.summary.averaged_samples``: ``clear`` for those of errors, ``traced`` for that of P.
     """
-    kept, diverged, times, start = b.kept, b.diverged, b.times, b.start
-    blurred_from, clears, traces = sums.rounding_from, scratch.clear, scratch.traced
+    # Arrays are taken from the structs once, and not in each step of the loop.
+    times, kept, diverged, rounding_from = b.times, b.kept, b.diverged, sums.rounding_from
+    clear_runs, traced_runs = scratch.clear, scratch.traced
     for q in range(active):
-        r, from_here = first + q, blurred_from[first + q]
-        begin = start if start < kept[r] else 0  # no sample after time 0: all there are
-        there = begin <= t < kept[r]
-        clear = there and times[t] < from_here
-        # Covariances have all their digits, but those of a run that diverges outgrow all bounds.
-        traced = clear or (there and not (diverged[r] and times[begin] < from_here))
-        clears[q], traces[q] = 1.0 if clear else 0.0, 1.0 if traced else 0.0
+        r = first + q
+        blurred_from = rounding_from[r]  # seconds; errors are mostly rounding from then on
+        begin = b.start if b.start < kept[r] else 0  # without samples after time 0, all count
+        exists = begin <= t < kept[r]
+        clear = exists and times[t] < blurred_from
+        # Rounding spares covariances, but those of a run that diverges outgrow all bounds.
+        traced = clear or (exists and not (diverged[r] and times[begin] < blurred_from))
+        clear_runs[q] = 1.0 if clear else 0.0
+        traced_runs[q] = 1.0 if traced else 0.0
 
 
 @kernel
@@ -520,12 +531,17 @@ def divide_averages(b: Batch, sums: Sums, r: int) -> None:
 
 @kernel(inlined=True)
 def nees_of_lanes(lanes: Lanes, scratch: ReductionScratch) -> Any:
-    """Write ``e' P^-1 e`` of L errors, and which P are not positive definite, or nan; return flags
-    of the latter.
+    """Write NEES ``e' P^-1 e`` of L samples, one in each lane, and return the lanes whose P is not
+    positive definite or not finite, which ``broken`` (L,) has as numbers.
+
+    On entry ``factor`` is P and ``z`` the error e; both are overwritten.
     """
-    # P = L D L', and e' P^-1 e = z' D^-1 z with L z = e; P becomes L, and the error z.
-    rest, error = scratch.factor, scratch.z
-    n, total, broken = len(error), spread(lanes, 0.0), spread(lanes, 0.0)
+    # P = G D G' with G unit lower triangular, and e' P^-1 e = z' D^-1 z with G z = e.
+    rest = scratch.factor
+    error = scratch.z
+    n = len(error)
+    total = spread(lanes, 0.0)
+    broken = spread(lanes, 0.0)
     for k in range(n):
         pivot, z = load(lanes, rest, k, k), load(lanes, error, k)
         broken += select(pivot > 0.0, 0.0, 1.0)

@@ -126,10 +126,10 @@ def _traced_run(
 
 
 class RunValues(NamedTuple):
-    """Values of R runs that statistics are over, and of K ``pieces`` of them.
+    """Values of R runs to be averaged, and the K ``pieces`` of them that are merged by themselves.
 
-    ``samples`` of each piece, the moments (T, F (2 u + 1)) of F filters, each for so many nodes
-    (``copies``: N where the filter is pooled, else 1); ``averages`` (R, N + 1, 3); ``messages``
+    ``samples`` of each piece, the moments (T, F (2 u + 1)) of F filters, each of which stands for
+    ``copies`` nodes (N for a pooled filter, else 1); ``averages`` (R, N + 1, 3); ``messages``
     (R, 5); ``events``, ``diverged`` and ``rounding_from`` (R,); ``sums`` (R, 2).
     """
 
@@ -178,25 +178,32 @@ def _mean_of_nodes(averages: FloatArray) -> FloatArray:
 
 def merge_runs(values: RunValues, piece: int) -> RunStatistics:
     """Return the statistics of one piece of the runs, merged by the tree over them."""
-    runs, found = values.pieces[piece], values.samples[piece]
-    averages, messages = values.averages[runs], values.messages[runs]
-    count, one = len(messages), np.ones((len(messages), 1))
+    runs = values.pieces[piece]
+    samples = values.samples[piece]
+    averages = values.averages[runs]
+    messages = values.messages[runs]
+    count = len(messages)
+    # One value per run: every run has size 1.
+    sizes = np.ones((count, 1))
+    # Moments of each conserved sum at the start and end, and its largest relative drift.
     conserved = {
         name: (
-            moments_of(np.array(sums[runs, None]), one.copy()),
+            moments_of(np.array(sums[runs, None]), sizes.copy()),
             float(max((sums[runs, 1] - sums[runs, 0]) / sums[runs, 0], key=abs)),
         )
         for name, sums in values.sums.items()
     }
     if values.copies > 1:
-        # All nodes show the same filter.
-        found = Moments(found.size, *(np.tile(v, values.copies) for v in (found.mean, found.M2)))
-    # Averages and messages in one call: columns do not see each other.
+        # All nodes have the estimate of one pooled filter.
+        mean, M2 = (np.tile(moment, values.copies) for moment in (samples.mean, samples.M2))
+        samples = Moments(samples.size, mean, M2)
+    # Averages and messages in one call, since columns are independent.
     both = np.concatenate([averages.reshape(count, -1), messages], axis=1)
-    size, mean, M2 = moments_of(both[:, None], one)
-    of_averages, of_messages = slice(0, -len(MESSAGES)), slice(-len(MESSAGES), None)
+    size, mean, M2 = moments_of(both[:, None], sizes)
+    of_averages = slice(0, -len(MESSAGES))
+    of_messages = slice(-len(MESSAGES), None)
     return RunStatistics(
-        found,
+        samples,
         Moments(size, mean[:, of_averages].copy(), M2[:, of_averages].copy()),
         Moments(size.copy(), mean[:, of_messages].copy(), M2[:, of_messages].copy()),
         np.array([values.events[runs].sum(), values.diverged[runs].sum()]),

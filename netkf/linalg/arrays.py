@@ -52,7 +52,7 @@ def square_root(matrix: FloatArray) -> FloatArray:
 
 
 def block_diagonal(blocks: Sequence[FloatArray]) -> FloatArray:
-    """The blocks, possibly rectangular or empty, along the diagonal of one matrix."""
+    """Return a matrix with ``blocks``, possibly rectangular or empty, along its diagonal."""
     rows = sum(b.shape[0] for b in blocks)
     columns = sum(b.shape[1] for b in blocks)
     # Blocks may have no rows or no columns: slices of zeros take them too.
@@ -60,7 +60,8 @@ def block_diagonal(blocks: Sequence[FloatArray]) -> FloatArray:
     row = column = 0
     for block in blocks:
         whole[row : row + block.shape[0], column : column + block.shape[1]] = block
-        row, column = row + block.shape[0], column + block.shape[1]
+        row += block.shape[0]
+        column += block.shape[1]
     return whole
 
 

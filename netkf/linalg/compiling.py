@@ -101,7 +101,7 @@ class Kernel:
         update_wrapper(self, loops)
 
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
-        """Compute, or compile first."""
+        """Call the compiled function; the first call compiles it or loads it from disk."""
         return self._called_from_python(*args, **kwargs)
 
     def __reduce__(self) -> str:
@@ -109,8 +109,8 @@ class Kernel:
 
     @property
     def _compiler(self) -> Any:
-        # Inlined kernels are small and run most often: of numba's own code LLVM knows more, which
-        # makes them up to 1.6 times faster.
+        # Inlined kernels are small and run most often. Numba's own lowering tells LLVM more than
+        # the lean one, which makes them up to 1.6 times faster.
         return kernel_compiler(lean=not self._options.get("forceinline", False))
 
     @property
@@ -120,12 +120,14 @@ class Kernel:
 
     @cached_property
     def _called_from_kernels(self) -> Any:
+        """The function as other kernels call it: never cached on disk by itself."""
         made = _numba().njit(pipeline_class=self._compiler, **self._options)(self._loops)
         _for_any_number(made)
         return made
 
     @cached_property
     def _called_from_python(self) -> Callable[..., Any]:
+        """The function as Python calls it: with everything it calls, cached on disk."""
         numba = _numba()
         config = numba.config
         before = config.CACHE_DIR

@@ -121,6 +121,7 @@ def _pointer(context: Any, builder: Any, sig: Any, args: Any, last: int) -> Any:
 
 
 def _as_vector(builder: Any, pointer: Any, element: Any, count: int) -> Any:
+    """Return ``pointer`` cast to that of a vector of ``count`` values of type ``element``."""
     kind = element if count == 1 else ir.VectorType(element, count)
     return builder.bitcast(pointer, kind.as_pointer())
 
@@ -132,7 +133,7 @@ def _load(lanes: Any, _array: Any, *_place: Any) -> Any:
 
 @lower_builtin(names.load, types.VarArg(types.Any))
 def lower_load(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-    """One load of all lanes."""
+    """Emit one vector load of all lanes."""
     pointer = _pointer(context, builder, sig, args, len(args))
     return builder.load(_as_vector(builder, pointer, DOUBLE, len(sig.args[0])), align=8)
 
@@ -144,7 +145,7 @@ def _store(_lanes: Any, _array: Any, *_place: Any) -> Any:
 
 @lower_builtin(names.store, types.VarArg(types.Any))
 def lower_store(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-    """One store of all lanes."""
+    """Emit one vector store of all lanes."""
     count = len(sig.args[0])
     pointer = _pointer(context, builder, sig, args, len(args) - 1)
     value = _spread(context, builder, args[-1], sig.args[-1], count)
@@ -169,7 +170,7 @@ def _scatter(*_: Any) -> Any:
 
 @lower_builtin(names.turn, types.BaseTuple, types.Array, types.Integer, types.Array)
 def lower_turn(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-    """A transposition by shuffles."""
+    """Emit a transposition of L x L entries by shuffles."""
     count = len(sig.args[0])
     rows, out = (_Matrix(context, builder, sig.args[k], args[k]) for k in (1, 3))
     begin = context.cast(builder, args[2], sig.args[2], types.intp)
@@ -183,7 +184,7 @@ def lower_turn(context: Any, builder: Any, sig: Any, args: Any) -> Any:
 
 @lower_builtin(names.gather, types.BaseTuple, types.Array, types.Array, types.Integer, types.Array)
 def lower_gather(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-    """A load for each place, turned."""
+    """Emit one load per lane from the row that its place names, and the transposition of these."""
     count = len(sig.args[0])
     array, out = (_Matrix(context, builder, sig.args[k], args[k]) for k in (1, 4))
     begin, zero = context.cast(builder, args[3], sig.args[3], types.intp), ir.Constant(I64, 0)
@@ -203,7 +204,7 @@ def lower_gather(context: Any, builder: Any, sig: Any, args: Any) -> Any:
     *(types.BaseTuple, types.Array, types.Integer, types.Array, types.Array, types.Integer),
 )
 def lower_scatter(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-    """A store for each place, of the entries that are wanted."""
+    """Emit a transposition and one store per lane into the row that its place names."""
     count = len(sig.args[0])
     rows, array = (_Matrix(context, builder, sig.args[k], args[k]) for k in (1, 3))
     begin, zero = context.cast(builder, args[2], sig.args[2], types.intp), ir.Constant(I64, 0)
@@ -385,12 +386,15 @@ def _pair_count(a: Any, b: Any) -> int:
 
 
 def _arithmetic(operation: Any, name: str) -> None:
+    """Register an operator of two values; ``name`` is the builder's method, such as fadd."""
+
     @_typed(operation)
     def result(*args: Any) -> Any:
         count = _pair_count(*args) if len(args) == 2 else 0
         return value_type(count) if count else None
 
     def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        """Emit the operation, with plain numbers copied to all lanes first."""
         count = _count(sig.return_type)
         pair = [_spread(context, builder, v, k, count) for v, k in zip(args, sig.args, strict=True)]
         return getattr(builder, name)(*pair)
@@ -400,12 +404,15 @@ def _arithmetic(operation: Any, name: str) -> None:
 
 
 def _comparison(operation: Any, sign: str) -> None:
+    """Register a comparison of two values; ``sign`` is LLVM's, such as ``<``."""
+
     @_typed(operation)
     def result(*args: Any) -> Any:
         count = _pair_count(*args) if len(args) == 2 else 0
         return flags_type(count) if count else None
 
     def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        """Emit the comparison, with plain numbers copied to all lanes first."""
         count = _count(sig.return_type)
         pair = [_spread(context, builder, v, k, count) for v, k in zip(args, sig.args, strict=True)]
         # As in C: comparisons with nan are false, but != is true.

@@ -243,20 +243,27 @@ def _no_context(*_: Any, **__: Any) -> _NoContext:
 
 
 def _variables_of() -> Callable[..., Any]:
-    """Return a search for the variables of an instruction that looks at each type once."""
+    """Return a search for the variables of an instruction, which classifies each type only once.
+
+    Numba's own asks ``isinstance`` of every part again.
+    """
     from numba.core import ir
 
     leaf, variable, instruction, entries, values = range(5)
     known: dict[type, int] = {}
 
     def role_of(part: Any) -> int:
+        """Return how variables are found in a part of this type."""
         if isinstance(part, ir.Var):
             return variable
         if isinstance(part, ir.Inst):
             return instruction
-        return entries if isinstance(part, list | tuple) else values * isinstance(part, dict)
+        if isinstance(part, list | tuple):
+            return entries
+        return values if isinstance(part, dict) else leaf
 
     def collect(part: Any, found: list[Any]) -> None:
+        """Append the variables of a part to ``found``."""
         role = known.get(type(part))
         if role is None:
             role = known[type(part)] = role_of(part)
@@ -269,6 +276,7 @@ def _variables_of() -> Callable[..., Any]:
                 collect(each, found)
 
     def variables(_: Any, part: Any) -> list[Any]:
+        """Return the variables of a part, as ``ir.Inst._rec_list_vars`` does."""
         found: list[Any] = []
         collect(part, found)
         return found

@@ -16,13 +16,16 @@ I128 = ir.IntType(128)
 
 @infer_global(high_word)
 class _HighWord(AbstractTemplate):
+    """The typing of ``high_word``."""
+
     def generic(self, _args: Any, _kws: Any) -> Any:
+        """Return the signature: the upper half of the product of two 64-bit words."""
         return signature(types.uint64, types.uint64, types.uint64)
 
 
 @lower_builtin(high_word, types.uint64, types.uint64)
 def lower_high_word(_context: Any, builder: Any, _sig: Any, args: Any) -> Any:
-    """The product of both, and its upper half."""
+    """Emit the product of both words in 128 bits, and take its upper half."""
     a, b = (builder.zext(word, I128) for word in args)
     upper = builder.lshr(builder.mul(a, b), ir.Constant(I128, 64))
     return builder.trunc(upper, ir.IntType(64))

@@ -905,13 +905,13 @@ def propagate_one(
 
 
 class _Scratches(threading.local):
-    """Of each thread, by the sizes that they depend on."""
+    """Scratch arrays of each thread, by the sizes that they depend on."""
 
     def __init__(self) -> None:
         self.known: dict[tuple[int, ...], FlowScratch] = {}
 
     def of(self, table: FlowTable) -> FlowScratch:
-        """Return scratch arrays for a table."""
+        """Return scratch arrays that fit ``table``, not cleared."""
         # Scratch holds no results, so tables of equal shapes may share it.
         sizes = table.series.shape[3], *table.seen.shape[1:]
         if sizes not in self.known:

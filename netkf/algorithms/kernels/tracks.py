@@ -184,7 +184,9 @@ def combine_tracks(
 
 @kernel
 def spread_tracks(joint: FloatArray, count: int, scratch: TrackScratch) -> None:
-    """Fill in the covariances of differences ``d_a = e_own - e_a``, and of e_own with them."""
+    """Write the covariance of the differences ``d_a = e_own - e_a`` into ``spread``, and that of
+    e_own with them into ``cross``.
+    """
     n = joint.shape[2]
     for a in range(count):
         for i in range(n):
@@ -199,30 +201,37 @@ def spread_tracks(joint: FloatArray, count: int, scratch: TrackScratch) -> None:
 
 @kernel
 def factor_differences(n: int, K: int, scratch: TrackScratch) -> int:
-    """Factor ``spread`` = factor factor' with the pivots in ``order``, each the largest relative to
-    its size, and write the covariance of the own error with what they are factors of into
-    ``parts``; return how many there are. Both ``spread`` and ``cross`` are used up.
+    """Factor the covariance of the differences, ``spread`` (K, K) = factor factor', by Cholesky
+    with pivoting, and return its numerical rank t.
+
+    The differences are ``d = factor u`` with white u (t,): ``parts`` (n, t) becomes the covariance
+    of the own error with u, and ``order`` (t,) the pivots. ``spread`` and ``cross`` are lost.
     """
     spread, factor = scratch.spread, scratch.factor
     for t in range(K):
-        q, best = -1, NEGLIGIBLE
+        # The pivot is the largest variance relative to the terms that it is the difference of: of
+        # equal tracks, such as those of two nodes without a sensor, only rounding remains.
+        q = -1
+        best = NEGLIGIBLE
         for index in range(K):
-            # Tracks that are the same, such as those of two blind nodes, leave nothing to choose.
             if spread[index, index] > best * scratch.sizes[index]:
-                q, best = index, spread[index, index] / scratch.sizes[index]
+                q = index
+                best = spread[index, index] / scratch.sizes[index]
         if q < 0:
             return t
-        scratch.order[t], pivot = q, math.sqrt(spread[q, q])
+        scratch.order[t] = q
+        pivot = math.sqrt(spread[q, q])
         for index in range(K):
             factor[index, t] = spread[index, q] / pivot
         for i in range(n):
             scratch.parts[i, t] = scratch.cross[i, q] / pivot
+        # The conditional covariances, given the pivot.
         for index in range(K):
             for other in range(K):
                 spread[index, other] -= factor[index, t] * factor[other, t]
             for i in range(n):
                 scratch.cross[i, index] -= scratch.parts[i, t] * factor[index, t]
-        # Exactly nothing is left of a pivot.
+        # Exactly 0, not rounding: a pivot is not chosen twice.
         spread[q, q] = 0.0
     return K
 

@@ -314,9 +314,10 @@ def _in_size(found: NoiseMoments, labels: list[str]) -> Iterator[tuple[float, fl
 
 
 def _correlations(products: FloatArray, one: FloatArray, other: FloatArray) -> FloatArray:
-    """Return correlations from sums of products and of the squares of both, of the same pairs: few
-    pairs may be larger than all noises are. 0 without any.
+    """Return correlations from the sums of products and of the squares of ``one`` and ``other``
+    over the same pairs; 0 without pairs.
     """
+    # Squares of other noises do not count: with them |correlation| could exceed 1.
     with np.errstate(invalid="ignore", divide="ignore"):
         return np.asarray(np.nan_to_num(products / np.sqrt(one * other)))
 

@@ -67,12 +67,16 @@ class BeliefRule(ErrorRule):
         return U, sum((stack.form(name) for name in known), np.zeros((n, stack.used)))
 
     def elapse(self, gap: float, columns: slice | None, noise: FloatArray | None) -> None:
-        """Let all evidence speak about the present state."""
+        """Predict all evidence over ``gap`` seconds."""
         if gap > 0.0:
             self._predict_evidence(np.asarray(scipy.linalg.expm(-gap * self.scenario.belief[0])))
 
     def _predict_evidence(self, back: FloatArray) -> None:
-        """Predict all evidence (U, s) to a later state: ``U <- back' U back``, ``s <- back' s``."""
+        """Predict all evidence (U, s) to a later state: ``U <- back' U back``, ``s <- back' s``.
+
+        ``back`` (n, n) is F^-1, which takes the later state to the earlier one that the evidence is
+        about. There is no term for process noise: evidence is kept only for plants without it.
+        """
         stack = self.errors.stack
         for name in self._evidence:
             U = stack.matrices[stack.index(name)]

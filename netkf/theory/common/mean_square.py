@@ -204,8 +204,9 @@ def _slot_map(system: SlotJumps) -> tuple[PositiveMap, FloatArray]:
 
 
 def _clock_map(system: ClockJumps) -> tuple[PositiveMap, FloatArray | None]:
-    """Return the map ``X -> S^-1(inflow(X))`` with ``S X = -(B X + X B')``, and ``S^-1(noise)``, or
-    None if some B is not stable: errors then grow even without what jumps add.
+    """Return the map ``X -> S^-1(inflow(X))`` with ``S X = -(B X + X B')``, and ``S^-1(noise)``.
+
+    The latter is None if some B is not stable: errors then grow even between jumps.
     """
     if max(np.linalg.eigvals(B).real.max() for B in system.flows) >= 0.0:
         return system.inflow, None

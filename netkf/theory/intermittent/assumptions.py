@@ -62,7 +62,8 @@ def _detectability_rows(scenario: Scenario) -> list[AssumptionRow]:
 
 def _arrival_rows(scenario: Scenario) -> list[AssumptionRow]:
     """Return the rows on independent and on sufficiently frequent arrivals."""
-    loss = scenario.network.channel.loss
+    channel = scenario.network.channel
+    loss = channel.loss
     # R (12) needs independent arrivals of positive probability.
     rates = [
         loss.mean_delivery(link, scenario.table_probability(link))
@@ -70,18 +71,17 @@ def _arrival_rows(scenario: Scenario) -> list[AssumptionRow]:
     ]
     known = [rate for rate in rates if np.isfinite(rate)]
     least = min(known, default=1.0)
+    holds: bool | None = loss.independent and len(known) == len(rates) and least > 0.0
+    evidence = f"delivery from {least:g}" if loss.independent else "losses come in bursts"
+    if is_recorded(channel):
+        # A recording has no probabilities: the assumption is neither true nor false.
+        holds, evidence = None, RECORDED_CHANNEL
     rows: list[AssumptionRow] = [
         (
             "arrivals are independent of each other and of the past, and not impossible",
             "R (12), Theorem 9",
-            None
-            if is_recorded(scenario.network.channel)
-            else loss.independent and len(known) == len(rates) and least > 0.0,
-            RECORDED_CHANNEL
-            if is_recorded(scenario.network.channel)
-            else f"delivery from {least:g}"
-            if loss.independent
-            else "losses come in bursts",
+            holds,
+            evidence,
         )
     ]
     if any(sensor.varying for sensor in scenario.sensors):
