@@ -115,13 +115,19 @@ def _draw_matchings(
     """Return which links (slots, L) are in the matching of each slot."""
     index = {link: k for k, link in enumerate(topology.links)}
     found = np.zeros((slots, len(index)), dtype=bool)
+    # Most matchings are drawn many times, and each is looked at once.
+    seen: dict[tuple[tuple[int, ...], ...], list[int]] = {}
     for slot in range(slots):
         pairs = part.draw(topology, random)
-        _demand_matching(where, pairs, slot)
-        for pair in pairs:
-            known = tuple(pair) in index
-            demand(known, where, "must pair the ends of links (i, j) with i < j", list(pair))
-            found[slot, index[tuple(pair)]] = True
+        key = tuple(map(tuple, pairs))
+        if key not in seen:
+            _demand_matching(where, pairs, slot)
+            for pair in pairs:
+                known = tuple(pair) in index
+                demand(known, where, "must pair the ends of links (i, j) with i < j", list(pair))
+            seen[key] = [index[pair] for pair in key]
+        for k in seen[key]:
+            found[slot, k] = True
     return found
 
 
