@@ -405,9 +405,13 @@ def merge_evidence(parts: Sequence[FloatArray]) -> FloatArray:
 def add_to_own_evidence(state: BeliefState, reading: Reading) -> FloatArray:
     """Return the evidence (n, n + 1) of a node's own readings together with a new one."""
     y, H = whiten_reading(reading.y, reading.H, reading.R)
-    n, total = len(state.xhat), np.array(state.own)[..., None]
-    whole, centre = (y.reshape(1, 1, 1, -1, 1), H.reshape(1, 1, 1, -1, n, 1)), np.array(state.xhat)
-    add_reading_single(*whole, centre.reshape(1, n, 1), total, np.empty(total.shape))
+    n = len(state.xhat)
+    # The kernel takes blocks, slots, nodes and lanes: one of each here.
+    y = y.reshape(1, 1, 1, -1, 1)
+    H = H.reshape(1, 1, 1, -1, n, 1)
+    centre = np.array(state.xhat).reshape(1, n, 1)
+    total = np.array(state.own)[..., None]
+    add_reading_single(y, H, centre, total, np.empty(total.shape))
     return np.ascontiguousarray(total[..., 0])
 
 

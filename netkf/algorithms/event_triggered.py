@@ -230,11 +230,15 @@ def combine_copies(
     s: int,
     h: int,
 ) -> None:
-    """Combine the estimate of filter ``h`` of a block with those that it hears, and with wider
-    copies of the last estimates of silent neighbours.
+    """Combine the estimate of filter ``h`` of block ``b`` with those that it hears in slot ``s``,
+    and with the last estimates of silent neighbours, whose covariances are enlarged.
     """
-    lanes, W, n = scratch.lanes, len(links.sender), nodes.xhat.shape[2]
-    own, heard = W + h, spread(lanes, 0.0)
+    lanes = scratch.lanes
+    n = nodes.xhat.shape[2]
+    # Of the stacks of estimates the first W are copies by link, then come those of the nodes.
+    W = len(links.sender)
+    own = W + h
+    heard = spread(lanes, 0.0)
     for m in range(links.first[h], links.first[h + 1]):
         arrived = load_flags(lanes, plan.up, b, s, 0, links.direction[m])
         copies = (arrays.x, arrays.root)
@@ -265,7 +269,7 @@ def combine_copies(
         arrived = load_flags(lanes, plan.up, b, s, 0, links.direction[m])
         known = load_flags(lanes, arrays.known, b, m)
         if any_lane(known):
-            # In place of a silent neighbour's pair there is a wider one.
+            # A silent neighbour counts less: its covariance is taken as 1 / share times as large.
             weight = select(arrived, links.weight[m], arrays.share * links.weight[m])
             weight = select(known, weight, 0.0)
             whiten(lanes, scratch.whitened, weight, arrays.inverse, arrays.mean, m, own)

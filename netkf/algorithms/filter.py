@@ -335,9 +335,11 @@ class Filter(Component):
         return True
 
     def payload_numbers(self, n: int, rows: int, phase: int) -> float:
-        """Return how many numbers a message holds that a node sends in exchange number ``phase`` of
-        a slot (-1 under clocks): n states, so many ``rows`` of readings of its own. Of a symmetric
-        matrix one triangle counts; by default a message is an estimate with its covariance.
+        """Return the size, in numbers of 64 bits, of a message that a node with ``rows`` rows of
+        readings sends about ``n`` states in exchange number ``phase`` of a slot (-1 under clocks).
+
+        Of a symmetric matrix one triangle counts; by default a message is an estimate with its
+        covariance.
         """
         return n + n * (n + 1) // 2
 

@@ -234,7 +234,7 @@ class InformationConsensus(Filter):
         return (ConsensusArrays(self.steps, *made, parts),)
 
     def payload_numbers(self, n: int, rows: int, phase: int) -> int:
-        """Return those of K pairs (Omega, q) in slots, of one pair under clocks."""
+        """Return the size of K pairs (Omega, q) in slots, and of one pair under clocks."""
         pairs = 1 if phase < 0 else len(self.recipe(2).shares)
         return pairs * (n + n * (n + 1) // 2)
 

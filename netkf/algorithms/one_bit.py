@@ -313,7 +313,7 @@ class OneBit(Filter):
         return (BitArrays(aligned((max(1, *(len(s.model.H) for s in states)), LANES))),)
 
     def payload_numbers(self, n: int, rows: int, phase: int) -> float:
-        """Return the numbers of a message: a bit for each row."""
+        """Return the size of a message in numbers of 64 bits: one bit for each row."""
         return rows / 64.0
 
     def init(self, model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo) -> OneBitState:

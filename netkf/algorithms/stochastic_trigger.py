@@ -587,13 +587,15 @@ def expect_slot(
 
 
 class TriggeredSlots:
-    """The kernel of a filter with a trigger: decisions, and the filter's own kernel with what is
-    sent, slot by slot.
+    """The kernel of a filter with a trigger: in each slot it decides which nodes send, and runs the
+    kernel of the ``inner`` filter with their messages.
     """
 
     def __init__(self, inner: Filter, order: TriggerPlan) -> None:
-        self._inner, self._kernel = inner, inner.slot_kernel
-        self._order, self._decides = order, inner.decides_in_slots()
+        self._inner = inner
+        self._kernel = inner.slot_kernel
+        self._order = order
+        self._decides = inner.decides_in_slots()
         self.__name__ = self._kernel.__name__
 
     def __call__(

@@ -120,14 +120,20 @@ def _least_roots(scenario: Scenario) -> FloatArray:
 
 
 def _summarise(scenario: Scenario, run: Run) -> IntermittentSummary:
-    """Return the summary of a run: exact errors, and P replayed along the arrivals."""
-    slots, n = list(check_slots(scenario)), scenario.plant.n
-    starts, least = initial_roots(scenario)[sampled_indices(scenario)], _least_roots(scenario)
-    table, sequences, _ = find_arrivals(scenario, run, slots[-1])
-    far = _roots_above(starts, np.nan_to_num(least))
+    """Return the summary of a run: exact errors, and P replayed along the arrivals.
+
+    P is replayed from P(0) and, to the last slot only, from 0 and from far above, which should end
+    close together, and from P*, which should end in the support of the invariant law.
+    """
+    slots = list(check_slots(scenario))
     last = slots[-1:]
+    table, sequences, _ = find_arrivals(scenario, run, slots[-1])
+    # Roots of the covariances at the start, (W, n, n) each.
+    starts = initial_roots(scenario)[sampled_indices(scenario)]
+    least = _least_roots(scenario)
+    far = _roots_above(starts, np.nan_to_num(least))
     above = table.covariances(far, sequences, last)[0]
-    below = table.covariances(np.zeros((len(starts), n, n)), sequences, last)[0]
+    below = table.covariances(np.zeros(starts.shape), sequences, last)[0]
     replayed = table.covariances(starts, sequences, slots)
     return IntermittentSummary(
         **vars(summarise_exactly(scenario, run)) | {"replayed": replayed},

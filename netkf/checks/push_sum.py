@@ -151,18 +151,19 @@ def _at_steady_state(samples: PushSumSamples, level: float) -> Finding:
     early = last > STEADY_TOLERANCE and last <= expected + REPLAY_TOLERANCE
     margin = STEADY_TOLERANCE - last
     message = f"largest relative distance at the end {last:.1e}"
-    horizon = samples.scenario.horizon * _decay_left(samples, limit) if early else math.nan
+    horizon = samples.scenario.horizon * _horizon_factor(samples, limit) if early else math.nan
     return Finding((margin, margin, margin), 0.0, message, early=early, horizon=horizon)
 
 
-def _decay_left(samples: PushSumSamples, limit: FloatArray) -> float:
-    """Return how many times longer the horizon must be for P to come to its limit, from the decay
+def _horizon_factor(samples: PushSumSamples, limit: FloatArray) -> float:
+    """Return the factor on the horizon with which P reaches its limit, extrapolated from the decay
     of its distance between half of the time and the end; nan if it does not decay.
     """
     P = samples.runs.replayed[~np.isnan(samples.runs.replayed[:, -1, 0, 0, 0])]
     half, last = (float(relative_difference(P[:, k], limit).max()) for k in (-2, -1))
     if not 0.0 < last < half < math.inf:
         return math.nan
+    # The distance falls by half / last in half the horizon; 20 % more for a decay that slows down.
     return 1.2 * (1.0 + 0.5 * math.log(last / STEADY_TOLERANCE) / math.log(half / last))
 
 

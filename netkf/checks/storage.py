@@ -82,14 +82,14 @@ def _save_verdict(directory: Path, scenario: Scenario, verdict: Verdict, text: s
 
 
 def clear_unfinished(directory: Path, scenario: Scenario) -> bool:
-    """Return True if a directory holds no verdict yet; remove what a check left that was stopped
-    while it wrote its first one.
+    """Remove the files of a check that was stopped while it wrote its first verdict; return True if
+    the directory holds no verdict.
 
-    Raises ScenarioError if that was a check of another scenario.
+    Raises ScenarioError if the files are of a check of another scenario.
     """
     if not directory.is_dir() or not any(directory.iterdir()):
         return True
-    # Without the files of a run: those of a finished one are not to be removed.
+    # Files of a run are not in the list: those of a finished run must not be removed.
     names = ["scenario.toml", *FILES, *copied_names(scenario)]
     if (directory / BLOCKS).exists() or not only_own(directory, [*names, f"{VERDICT}.part"]):
         return False

@@ -52,9 +52,10 @@ def merge_moments(a: Moments, b: Moments) -> Moments:
 
 
 def _stack_pair(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Return ``np.stack([a, b])``, which takes a multiple of the time for small arrays."""
+    """Return ``np.stack([a, b])``, several times faster than numpy for small arrays."""
     both = np.empty((2, *a.shape))
-    both[0], both[1] = a, b
+    both[0] = a
+    both[1] = b
     return both
 
 
@@ -95,18 +96,22 @@ def merge_leaves(
     for s in range(values.shape[1]):
         merge_row(size, values, work, s)
         for c in range(values.shape[2]):
-            mean[s, c], M2[s, c] = values[0, s, c], work[0, 0, c]
+            mean[s, c] = values[0, s, c]
+            M2[s, c] = work[0, 0, c]
 
 
 @kernel
 def merge_row(size: FloatArray, values: FloatArray, work: FloatArray, s: int) -> None:
-    """Merge row ``s`` of R observations into the first, whose M2 is that of ``work``; arrays as in
-    ``merge_leaves``.
+    """Merge row ``s`` of R observations into observation 0: its mean into ``values[0, s]``, its M2
+    into ``work[0, 0]``; arrays as in ``merge_leaves``.
     """
-    runs, stride = len(values), 1
+    runs = len(values)
+    # An observation alone has M2 = 0.
     for r in range(runs):
         for c in range(values.shape[2]):
             work[r, 0, c] = 0.0
+    # Level by level of the binary tree: a pair is ``stride`` observations apart.
+    stride = 1
     while stride < runs:
         for a in range(0, runs - stride, 2 * stride):
             merge_pair(size, values, work, a, a + stride, s, 0)

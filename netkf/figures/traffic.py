@@ -35,8 +35,8 @@ TIME_BINS = 30  # of time: each has enough messages for an interval
 
 
 def freshest(log: np.ndarray, node: int) -> tuple[FloatArray, FloatArray]:
-    """Return the times at which a node heard a message fresher than all before, and when those were
-    sent, in seconds.
+    """Return the times at which a node heard a message, and for each the time at which the freshest
+    message so far was sent, both (K,) in seconds.
     """
     heard = log[(log["kind"] == CODES["deliver"]) & (log["node"] == node)]
     sent = np.maximum.accumulate(heard["t"] - np.nan_to_num(heard["age"]))

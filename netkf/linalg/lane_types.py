@@ -315,7 +315,7 @@ def _store_flags(_lanes: Any, _array: Any, *_place: Any) -> Any:
 
 @lower_builtin(names.store_flags, types.VarArg(types.Any))
 def lower_store_flags(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-    """One store of all flags as bytes."""
+    """Emit one vector store of all flags as bytes."""
     count = len(sig.args[0])
     pointer = _pointer(context, builder, sig, args, len(args) - 1)
     kind = BYTE if count == 1 else ir.VectorType(BYTE, count)

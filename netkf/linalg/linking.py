@@ -101,6 +101,8 @@ def _patches() -> list[tuple[Any, str, Callable[..., Any]]]:
 
 
 def _count_depth(what: str, original: Callable[..., Any]) -> Callable[..., Any]:
+    """Return ``original`` with a count of its nested calls in the attribute ``what`` of _DEPTH."""
+
     def counted(*args: Any, **kwargs: Any) -> Any:
         # Threads have depths of their own; numba's compiler itself is locked.
         setattr(_DEPTH, what, getattr(_DEPTH, what) + 1)

@@ -19,9 +19,11 @@ OCTAVES, STEPS = 8, 4  # gaps that are tried: as many halves of the longest, in 
 
 
 def with_reach(series: FloatArray, longest: float) -> FloatArray:
-    """(terms, size + 1): ``sum_k gap^k series[k]`` of (terms, size), for gaps up to ``longest``
-    seconds, whose last column says for each k up to which gap what follows is below rounding. The
-    number of terms is made odd.
+    """Return a table (terms, size + 1) for ``sum_k gap^k series[k]`` with ``series`` (terms, size),
+    for gaps up to ``longest`` seconds.
+
+    The last column has for each k the longest gap, in seconds, for which all terms after k are
+    below rounding. The number of terms is made odd by a term of zeros.
     """
     # add_terms() takes two rows after the first at a time.
     if len(series) % 2 == 0:
@@ -36,9 +38,9 @@ def with_reach(series: FloatArray, longest: float) -> FloatArray:
     # Rounding is relative to each entry, with a floor relative to the largest, for entries that
     # vanish.
     most = ROUNDING * largest + NOTHING * largest.max(axis=1, initial=0.0)[:, None]
-    # Terms that a gap needs: those after which any entry still has more than rounding left.
+    # Number of terms after which the rest of some entry is still above rounding, for each gap.
     needed = (left > most[:, None]).any(axis=2).sum(axis=1)
-    # maximum.accumulate: a longer gap never needs fewer terms, whatever rounding says.
+    # maximum.accumulate: a longer gap must not need fewer terms because of rounding here.
     counts = np.searchsorted(np.maximum.accumulate(needed), np.arange(terms), side="right")
     reach = np.concatenate([[0.0], gaps])[counts]
     # The last row is always enough, so that loops end there.

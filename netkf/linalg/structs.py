@@ -169,7 +169,9 @@ def _rebuilt(cls: type[Derived], n: int | None, values: dict[str, Any]) -> Deriv
 
 
 def sized(n: int) -> Size:
-    """A ``size`` of n: a tuple if loops over it are unrolled, else an array."""
+    """Return a value of length n, of which only the length counts: a tuple if loops over it are to
+    be unrolled, else an array.
+    """
     return (0,) * n if n <= MAX_UNROLLED else np.zeros(n)
 
 

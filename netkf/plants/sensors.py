@@ -254,8 +254,9 @@ def cut(
 def divide(
     lanes: Lanes, first: FloatArray, rest: FloatArray, normals: FloatArray, u: Any, length: Any
 ) -> None:
-    """Cut in place: of ``rest`` (2, p, L) its first share goes to ``first``, and what is left
-    stays. With a share of 1 that is all, and nothing.
+    """Divide the moments ``rest`` (2, p, L) of an interval of ``length`` seconds into those of its
+    first part, a share ``u`` of the length, which are written to ``first`` (2, p, L), and those of
+    the remaining part, which stay in ``rest``. ``normals`` (2, p, L) are standard normal.
 
     Exact conditional law of four independent moments (variances g, g/3 on each part) given their
     two sums; written so that nothing cancels when a part is short.

@@ -54,15 +54,16 @@ def multiples(period: float | None, horizon: float) -> FloatArray:
 
 
 def origins(Phi: FloatArray, offsets: FloatArray) -> FloatArray:
-    """Return the absolute position (F + 1, n) of the origin of each frame at its start, 0 for the
-    first.
+    """Return the absolute state (F + 1, n) at the origin of each frame when the frame begins, 0 for
+    the first.
 
-    ``Phi`` (F, n, n) moves over the frame that each rebase ends, ``offsets`` (F, n) are its
-    results.
+    ``Phi`` (F, n, n) are the transitions over the frames that end by a rebase, ``offsets`` (F, n)
+    the local states that become the new origins.
     """
     found = np.zeros((len(offsets) + 1, offsets.shape[1]))
     with np.errstate(over="ignore", invalid="ignore"):
         for k, offset in enumerate(offsets):
+            # An origin at 0 stays there; the product would be nan if Phi has overflowed.
             found[k + 1] = apply(Phi[k], found[k]) + offset if found[k].any() else offset
     return found
 
@@ -70,15 +71,18 @@ def origins(Phi: FloatArray, offsets: FloatArray) -> FloatArray:
 def absolute_states(
     moves: Transitions, frame_times: FloatArray, offsets: FloatArray, t: FloatArray, x: FloatArray
 ) -> FloatArray:
-    """Return absolute states (K, n) at times ``t`` (K,), from local ones ``x`` (K, n) after any
-    rebase.
+    """Return absolute states (K, n) at times ``t`` (K,) from local states ``x`` (K, n).
+
+    A frame begins at 0 and at each of ``frame_times`` (F,), in seconds; ``offsets`` (F, n) are the
+    local states by which its origin was moved. At a frame time ``x`` is local to the new frame.
     """
     starts = np.concatenate([[0.0], frame_times])
-    at = origins(moves.transitions(np.diff(starts)), offsets)
+    at_start = origins(moves.transitions(np.diff(starts)), offsets)
     frame = np.searchsorted(frame_times, t, side="right")
     with np.errstate(over="ignore", invalid="ignore"):
-        shift = apply(moves.transitions(t - starts[frame]), at[frame])
-        shift[~at[frame].any(axis=1)] = 0.0
+        shift = apply(moves.transitions(t - starts[frame]), at_start[frame])
+        # An origin at 0 stays there; the product is nan where a transition has overflowed.
+        shift[~at_start[frame].any(axis=1)] = 0.0
         return np.asarray(x + shift)
 
 

@@ -134,9 +134,10 @@ def new_directory(wanted: Path | None, name: str) -> Path:
 
 
 def make_directory(path: Path, anew: bool = False) -> bool:
-    """Make a directory unless it is there and can be read; return False if ``anew`` and it is.
+    """Make a directory if there is none, and check that it can be read.
 
-    Raises ScenarioError if it cannot be made.
+    Return True, or False if ``anew`` and the directory exists already. Raises ScenarioError if it
+    cannot be made or read.
     """
     try:
         path.mkdir(parents=True, exist_ok=not anew)

@@ -60,15 +60,16 @@ class Expectations:
 
 
 def record_increments(algorithm: Filter, intervals: list[WhitenedInnovation]) -> Filter:
-    """Return the filter that does what it did, and notes the innovations of increments on the way.
+    """Return a filter with the same estimates that appends the whitened innovation of each
+    measured increment to ``intervals``.
 
-    Its states are those of the filter with the node and the time that they belong to.
+    Its states are those of ``algorithm`` with their node and time.
     """
     known: dict[int, tuple[Any, Expectations]] = {}
 
     def expectations(model: Any) -> Expectations:
-        """Return the expectations of a model, made once."""
-        # The model is kept too, so that no other one gets its id.
+        """Return the expectations of a model, computed once."""
+        # A reference to the model keeps its id from being used by another model.
         if id(model) not in known:
             known[id(model)] = model, Expectations(model)
         return known[id(model)][1]

@@ -304,11 +304,12 @@ def _check_believed_noise(scenario: DerivedScenario) -> None:
             "add or remove some",
         )
     for k, sensor in enumerate(sensors):
-        key, own = (
-            ("filter.model.R", R) if not isinstance(R, tuple) else (f"filter.model.R[{k}]", R[k])
-        )
         p = len(sensor.R)
-        demand_shape(key, own, (p, p), f"a reading of sensors[{k}] has {p} components")
+        reason = f"a reading of sensors[{k}] has {p} components"
+        if isinstance(R, tuple):
+            demand_shape(f"filter.model.R[{k}]", R[k], (p, p), reason)
+        else:
+            demand_shape("filter.model.R", R, (p, p), reason)
 
 
 def _check_degrees(scenario: DerivedScenario) -> None:

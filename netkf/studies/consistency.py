@@ -98,14 +98,14 @@ def _mean(values: FloatArray, lost: np.ndarray) -> FloatArray:
         return np.asarray(np.where(lost, 0.0, values).sum(axis=0) / np.where(count, count, np.nan))
 
 
-def _errors_of(scenario: Scenario) -> int:
+def _count_errors(scenario: Scenario) -> int:
     """Return the number of errors N n of all nodes."""
     return len(scenario.nodes) * scenario.plant.n
 
 
 def _exact_covariance(scenario: Scenario, run: Run) -> FloatArray | None:
     """Return Sigma (T, N, n, n) given the events; None where it is unknown or out of reach."""
-    if _errors_of(scenario) > MAX_ERRORS:
+    if _count_errors(scenario) > MAX_ERRORS:
         return None
     try:
         return error_covariance(scenario, run)
@@ -336,9 +336,9 @@ def judge_consistency(
     ]
     given, blurred_from = _covariance_given(runs), _blurred_from(runs)
     notes = () if given else (NO_COVARIANCE,)
-    if _errors_of(scenario) > MAX_ERRORS:
+    if _count_errors(scenario) > MAX_ERRORS:
         reason = (
-            f"what NEES should be is left out: the exact covariance of {_errors_of(scenario):,} "
+            f"what NEES should be is left out: the exact covariance of {_count_errors(scenario):,} "
             f"errors, more than {MAX_ERRORS}, takes long; netkf.theory.error_covariance computes it"
         )
         notes = (*notes, reason)

@@ -134,8 +134,8 @@ def _next_use(log: IntArray, rows: IntArray) -> IntArray:
 
 
 def _last_of_instant(used: IntArray, sender: IntArray, sent_row: IntArray) -> IntArray:
-    """Return a mask (K,) of the messages that count where a receiver takes one of those of an
-    instant.
+    """Return a mask (K,) of the messages used by receivers that take only one message an instant:
+    that of the sender with the largest id, and of these the last sent.
     """
     order = np.lexsort((sent_row, sender, used))
     last = np.ones(len(used), dtype=bool)
@@ -146,8 +146,8 @@ def _last_of_instant(used: IntArray, sender: IntArray, sent_row: IntArray) -> In
 
 
 def at_once(messages: Messages, log: IntArray) -> Messages:
-    """Return the messages as if those that were not used had been used at the instant of sending,
-    for a search that knows nothing of when they would have arrived.
+    """Return the messages as if those that were not used had been used at the instant of sending:
+    a lower bound for a search, since the time at which they would have arrived is unknown.
     """
     last = np.searchsorted(log["t"], messages.sent, side="right") - 1
     used = np.where(messages.outcome == USED, messages.used_row, last)
@@ -174,7 +174,7 @@ def _count_events(scenario: DerivedScenario, times: FloatArray, at: float) -> in
 class Flow:
     """The flow of information in a log: segments, and the messages that join them.
 
-    A segment is a stretch of rows of one node over which what it knows accumulates. It is the whole
+    A segment is an interval of rows over which the information of one node accumulates: the whole
     run for filters that combine, from one swap to the next for filters that swap, and one instant
     for the readings that a message carries. ``node`` and ``start`` (G,) are the node of each
     segment and its first row. Of each message, ``origin`` (M,) is the segment that its sender is
@@ -199,24 +199,26 @@ def find_flow(
 ) -> Flow:
     """Return the flow of information in a log with these messages.
 
-    ``used`` (M,) bool says which of them were used in the run that is asked about, by default those
-    that were used in this log; the others cost 1 each.
+    ``used`` (M,) bool marks the messages that were used in the original run, which the log may be a
+    replay of; by default those used in this log. The others cost 1 each.
     """
     used = messages.outcome == USED if used is None else used
     nodes = np.array(scenario.nodes)
-    combination, count = scenario.hosted.combination, len(messages)
+    combination = scenario.hosted.combination
     if combination == "swap":
         return _swap_flow(nodes, len(log), messages, np.asarray(used))
+    # One segment a node, the whole run: its number is the index of the node.
+    node = nodes
+    start = np.zeros(len(nodes), dtype=np.int64)
     origin = np.searchsorted(nodes, messages.sender)
-    node, start = nodes, np.zeros(len(nodes), dtype=np.int64)
     readings = _carry_readings(combination, messages)
     if readings.any():
-        # What such a message carries is the reading of its instant: a segment of its own, which
-        # nothing flows into.
+        # A message that carries only the reading of its instant comes from a segment of its own,
+        # which receives no messages.
         node = np.concatenate([nodes, messages.sender])
         index = np.searchsorted(log["t"], messages.sent, side="left")
         start = np.concatenate([start, index])
-        origin = np.where(readings, len(nodes) + np.arange(count), origin)
+        origin = np.where(readings, len(nodes) + np.arange(len(messages)), origin)
     return Flow(
         messages=messages,
         rows=len(log),
@@ -401,7 +403,9 @@ def _age_key(reading: float, known: float) -> tuple[float, float]:
 
 
 def route(reach: Reach, segment: int, budget: int) -> tuple[int, ...]:
-    """Return the nodes on the way from a segment to the node of the search."""
+    """Return the nodes through which information of ``segment`` reaches the node of the search, at
+    the cost of at most ``budget`` messages that were not used.
+    """
     passed: Iterable[int] = reach.messages_from(segment, budget)
     hops = [int(reach.flow.messages.receiver[m]) for m in passed]
     return (int(reach.flow.node[segment]), *hops)

@@ -214,8 +214,11 @@ class _Search:
 
 
 def _are_joined(needed: np.ndarray) -> np.ndarray:
-    """Return for sets (S, size) of what their members need, see Candidate, False (S,) if a member
-    cannot matter: too few others of the set lead to the node.
+    """Return a mask (S,) of the sets all of whose members can matter; ``needed`` (S, size) is
+    ``Candidate.needed`` of their members.
+
+    A member cannot matter if the set has too few other messages to carry it on to the node.
     """
-    # Whoever needs two others needs one of those that need one other.
+    # A message that needs k messages, itself included, needs one of each lower number: sorted, the
+    # numbers are at most 1, 2, 3, ...
     return np.asarray((np.sort(needed, axis=1) <= np.arange(1, needed.shape[1] + 1)).all(axis=1))

@@ -163,7 +163,7 @@ def _read_run(directory: str | Path, replica: int | None, trust: bool) -> Run:
 
 
 def _default_replays(events: int) -> int:
-    """Return how many replays take a time that a user waits for."""
+    """Return the default number of replays: fewer for long logs, to bound the time they take."""
     return min(MAX_REPLAYS, max(MIN_REPLAYS, MAX_EVENTS // max(1, events)))
 
 

@@ -113,12 +113,11 @@ def _check_apart(watched: Watched, entities: tuple[Entity, ...]) -> None:
     alone = {}
     with user_code(where):
         for k, entity in enumerate(entities):
-            random, position = (
-                RecordingGenerator(11, k),
-                ClockPosition(_draw_phase(part, entity, k)),
-            )
+            random = RecordingGenerator(11, k)
+            position = ClockPosition(_draw_phase(part, entity, k))
             alone[entity] = [tick for _, tick in _iterate_ticks(part, entity, position, random)]
         randoms = [RecordingGenerator(11, k) for k in range(len(entities))]
+        # The same streams again, with the ticks of all entities drawn in turn.
         running = [
             _iterate_ticks(part, entity, ClockPosition(_draw_phase(part, entity, k)), randoms[k])
             for k, entity in enumerate(entities)

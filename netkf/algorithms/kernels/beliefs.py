@@ -36,7 +36,7 @@ class BeliefScratch(NamedTuple):
 
 @kernel
 def clear_part(lanes: Lanes, part: FloatArray) -> None:
-    """Make evidence (n, n + 1, L) say nothing."""
+    """Set evidence (n, n + 1, L) to no information: zeros."""
     n = len(part)
     for i in range(n):
         for j in range(i + 1):

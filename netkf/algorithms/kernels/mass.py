@@ -34,11 +34,13 @@ def split_mass(
 def keep_share(
     lanes: Lanes, mass: FloatArray, b: int, h: int, share: FloatArray, times: Any, kept: Any
 ) -> None:
-    """Add to the mass of a node, which is what it received, its own share: once for itself and once
-    for each link of the node that failed, ``times`` in all; P (3)-(5) as they conserve sums. The
-    mass stays as it is in the lanes that are ``kept``.
+    """Add ``times`` times its own ``share`` to the mass that node ``h`` received, by P (3)-(5); the
+    lanes ``kept`` are not changed.
+
+    ``times`` is 1 for the node itself, and 1 more for each of its links that failed.
     """
-    # A share that could not be sent stays here: the network's sums of w, n~ and C~ stay conserved.
+    # A share that could not be sent stays here, so that the sums of w, n~ and C~ over the network
+    # are conserved.
     for i in range(mass.shape[2]):
         received = load(lanes, mass, b, h, i)
         mixed = times * load(lanes, share, h, i) + received

@@ -89,10 +89,12 @@ def correct_pseudo(
     z: FloatArray,
     corrected: FloatArray,
 ) -> None:
-    """Write ``yhat_h + sum_l B_hl (yhat_l - yhat_h) + M_h z`` into ``corrected[h]``, with the
-    estimates that filter ``h`` hears in the first step of slot ``s``.
+    """Write ``yhat_h + sum_l B_hl (yhat_l - yhat_h) + M_h z`` into ``corrected`` (H, n, L) at h,
+    with the estimates that filter ``h`` hears in the first step of slot ``s``.
 
-    ``B`` (W, n, n) in the order of ``links``, ``M`` (H, n, n), the innovation ``z`` (n, L).
+    ``y`` (blocks, H, n, L) are the estimates yhat, of which block ``b`` is corrected; ``up`` flags
+    the messages that arrive; ``B`` (W, n, n) in the order of ``links``, ``M`` (H, n, n), the
+    innovation ``z`` (n, L).
     """
     n = M.shape[1]
     # Into an array of its own: the other filters still hear the estimates from before.
@@ -102,7 +104,8 @@ def correct_pseudo(
             total += M[h, i, j] * load(lanes, z, j)
         store(lanes, corrected, h, i, total)
     for m in range(links.first[h], links.first[h + 1]):
-        arrived, sender = load_flags(lanes, up, b, s, 0, links.direction[m]), links.sender[m]
+        arrived = load_flags(lanes, up, b, s, 0, links.direction[m])
+        sender = links.sender[m]
         for i in range(n):
             total = spread(lanes, 0.0)
             for j in range(n):

@@ -450,7 +450,9 @@ def propagate_root(
     gap: float,
     scratch: FlowScratch,
 ) -> None:
-    """Move place ``k`` over ``gap`` seconds by model ``m``."""
+    """Propagate the root and the mean at place ``k`` of ``root`` (K, n, n) and ``x`` (K, n) over
+    ``gap`` seconds by model ``m`` of the table.
+    """
     # Beyond all cells: whole multiples of the first level that is longer than them.
     octaves = table.sizes[m, 4]
     if gap >= table.unit[m] * (1 << octaves):
@@ -576,8 +578,10 @@ def propagate_wide(
     gap: float,
     scratch: FlowScratch,
 ) -> None:
-    """Apply ``propagate_root`` over less than a unit for any P, however wide."""
-    # First the information of the whole gap, then F and Q_g: P (I + G P)^-1, then F . F' + Q_g.
+    """Apply ``propagate_root`` over a gap below ``table.unit[m]`` for any P, however large.
+
+    ``P_g = F P (I + G P)^-1 F' + Q_g``: first the readings of the whole gap, then the transition.
+    """
     use_readings(table, m, root, k, gap, scratch)
     n = len(scratch.size)
     # Without G_g, the last part of the series: Gamma has replaced it.

@@ -124,13 +124,16 @@ def _loss_interval(
 def _share_of_bounded_runs(
     excess: FloatArray, sent: np.ndarray, expected: float, level: float
 ) -> Interval:
-    """Return an interval for a lost share from what is lost in each run beyond the mean, (R,), of
-    so many messages ``sent`` (R,), by the bound of Hoeffding: of numbers from 0 to 1 and mean m, R
-    have the mean f with a probability of at most exp(-R KL(f, m)).
+    """Return an interval for the lost share of messages, which holds for every law of a run.
+
+    ``excess`` (R,) is the number of messages lost in each run less the expected one, of ``sent``
+    (R,), and ``expected`` the stated share. By Hoeffding's bound, R independent numbers in [0, 1]
+    with mean m have an average of f or beyond with a probability of at most exp(-R KL(f, m)).
     """
     runs, most = len(sent), float(sent.max())
+    # The numbers are lost messages over ``most``; their mean is the share over ``scale``.
     scale = most * runs / float(sent.sum())
-    # From 0 to 1 in each run, up to directions that lose unequal shares.
+    # Directions that lose unequal shares can take it slightly out of [0, 1].
     found = min(max(expected + float(excess.mean()) / most, 0.0), 1.0)
 
     def limits(value: float, factor: float) -> tuple[float, float]:
@@ -256,17 +259,23 @@ def _directions_apart(scenario: Scenario) -> bool:
 def _correlation_of_runs(
     excess: FloatArray, count: np.ndarray, scale: FloatArray, variance: FloatArray, level: float
 ) -> Interval | None:
-    """Return an interval for a correlation: how often both events of a pair happened beyond the
-    mean, (R, D), in ``count`` pairs (R, D) whose deviations have the product ``scale`` (D,).
+    """Return an interval for the correlation of the two events of a pair, from R independent runs;
+    None with too few.
 
-    Runs are independent. ``variance`` (D,) is that of each pair's count where nothing is
-    correlated, covariances with its neighbours included: few rare events spread less by chance.
+    excess   : (R, D) number of pairs in which both events happened, less its expected value if
+               they are independent
+    count    : (R, D) number of pairs
+    scale    : (D,) product of the standard deviations of both events
+    variance : (D,) variance of ``excess`` for each pair if all events are independent, covariances
+               with overlapping pairs included
     """
     weight = float((count * scale).sum())
     if not weight > 0.0 or len(excess) < MIN_RUNS:
         return None
     values = excess.sum(axis=1)
-    runs, least = len(values), float((count * variance).sum())
+    runs = len(values)
+    # Rare events may by chance vary less between runs than their law says.
+    least = float((count * variance).sum())
     spread = math.sqrt(max(float(values.var(ddof=1)) * runs, least, 1.0))
     estimate = float(values.sum()) / weight
     return deviation_interval(0.0, student_interval(estimate, spread / weight, runs, level))
@@ -403,11 +412,11 @@ def network_promises(samples: PartSamples) -> list[Promise]:
     drawn = samples.pairs is not None and scenario.hosted.talks
     if drawn and pair_probabilities(scenario) is not None:
         found.append(MATCHINGS)
-    # A delay of its own for each message may be the end of a message.
-    certain = not delay_depends_on_message(scenario.network.channel.delay)
+    # A delay that depends on the message may lose it (nan), which the law of losses does not state.
+    losses_are_stated = not delay_depends_on_message(scenario.network.channel.delay)
     recorded = isinstance(_stated_loss(scenario), RecordedLoss)
     sent = samples.fates is not None and samples.fates.sent.any()
-    if sent and certain and not recorded:
+    if sent and losses_are_stated and not recorded:
         q = loss_probabilities(scenario)
         if np.isfinite(q).all():
             found.append(LOSSES)

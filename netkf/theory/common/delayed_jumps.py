@@ -79,7 +79,7 @@ class DelayedJumps:
 
     @cached_property
     def _ways(self) -> Directions:
-        """The links with messages as senders, which are counted behind the N nodes."""
+        """The links, with messages under way as senders: message of node i has index N + i."""
         directions = self.instant.directions
         assert directions is not None
         return directions._replace(sender=directions.sender + self.nodes)
@@ -215,11 +215,11 @@ class DelayedJumps:
 
     @cached_property
     def _factors(self) -> dict[bool, Any]:
-        """LU factors of the problem without and with jumps, once they are known."""
+        """Cache of the LU factors of a small problem, by whether it has jumps."""
         return {}
 
     def _by_elimination(self, right: FloatArray, jumps: bool) -> FloatArray:
-        """Return the solution K (k + 1, M, M) of a small problem."""
+        """Return the solution K (k + 1, M, M) of a small problem by dense LU factors."""
         if jumps not in self._factors:
             units = np.eye(right.size).reshape(right.size, *right.shape)
             columns = [-self._residual(one, np.zeros_like(one), jumps).ravel() for one in units]

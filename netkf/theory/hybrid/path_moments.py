@@ -67,7 +67,10 @@ def _require_exact_model(scenario: Scenario) -> None:
 def _arrivals_in_order(
     scenario: Scenario, run: Run
 ) -> tuple[FloatArray, np.ndarray, np.ndarray, np.ndarray, FloatArray]:
-    """Return the instants of arrivals, where each begins, and receivers, senders and weights."""
+    """Return the arrivals of a run as arrays: the instants (T,) in seconds, the index (T + 1,) of
+    the first message of each instant and their end, and of the M messages the indices of receivers
+    and senders and the weights, (M,) each.
+    """
     rows = run.log[run.log["kind"] == CODES["deliver"]]
     index = scenario.topology.index
     index_of = np.zeros(max(index) + 1, dtype=np.int64)

@@ -41,7 +41,7 @@ class ReadingExchangeRule(ErrorRule):
         self._columns: Mapping[int, slice] = {}
 
     def sense(self, time: float, observations: EstimatorObservations) -> None:
-        """Update each version of each estimate by the readings that it will have got."""
+        """Update each version of each estimate by the readings that arrive before its end."""
         self._observations, self._columns = observations, self.errors.reading_noises(observations)
         for estimator in range(self.errors.estimators):
             self._branch(estimator, time)
@@ -52,15 +52,16 @@ class ReadingExchangeRule(ErrorRule):
                 self._update(("version", estimator, until), [estimator, *senders])
 
     def _branch(self, estimator: int, time: float) -> None:
-        """Start the versions for late readings of this instant."""
-        live = self._versions[estimator]
+        """Start the versions of an estimate that end when late readings of ``time`` arrive."""
+        arrivals = self._versions[estimator]
         for until in self._branches.get((estimator, time), ()):
-            # The version that ends last before this one has all readings that this one has so far.
-            before = [t for t in live if t < until]
-            source = ("version", estimator, max(before)) if before else estimator
+            # A version has all readings that arrive before its end: so far, those of the version
+            # that ends just before it.
+            earlier = [end for end in arrivals if end < until]
+            source = ("version", estimator, max(earlier)) if earlier else estimator
             self.errors.copy(source, ("version", estimator, until), estimator)
-            live.append(until)
-            live.sort()
+            arrivals.append(until)
+            arrivals.sort()
 
     def _update(self, name: Hashable, nodes: Sequence[int]) -> None:
         """Update an error by the readings of some nodes."""

@@ -20,13 +20,15 @@ from netkf.linalg.small import copy_matrix, solve_inplace
 
 @kernel
 def triangularise(parts: FloatArray, n: int, columns: int) -> None:
-    """Write lower triangular S (n, n) with ``S S' = parts parts'`` over the first n columns of
-    ``parts`` (n, at least n), of which ``columns`` count; the others become rubbish.
+    """Overwrite the first n columns of ``parts`` (n, at least n) by the lower triangular S (n, n)
+    with ``S S' = parts parts'``; the product is over the first ``columns`` columns.
+
+    Columns from n on hold no result afterwards.
     """
-    # Reflections from the right leave parts parts' as it is.
+    # Reflections from the right do not change parts parts'.
     for i in range(n):
         reflect(parts, i, n, columns)
-        # What is right of the diagonal, and what does not count.
+        # Exact zeros right of the diagonal, and in columns that are not part of the product.
         for c in range(min(i + 1, columns), max(n, columns)):
             parts[i, c] = 0.0
 
@@ -408,9 +410,17 @@ def flow_blocks(
 def flow_gramian(
     blocks: FloatArray, whitened: FloatArray, at: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return F (n, n) and Gamma (K p, n) of a gap, see :mod:`netkf.theory.numerics.prediction`."""
-    count, n, p = len(at), whitened.shape[1], whitened.shape[0]
-    F, Gamma, inverse = np.zeros((n, n)), np.empty((count * p, n)), np.empty((n, n))
+    """Return F (n, n) and Gamma (K p, n) of a gap, see :mod:`netkf.theory.numerics.prediction`.
+
+    ``blocks`` (K + 1, 4, n, n) are those of ``flow_blocks``, ``whitened`` (p, n) is R^-1/2 H, and
+    ``at`` (K,) has the square roots of the weights of the nodes in the gap.
+    """
+    count = len(at)
+    p, n = whitened.shape
+    F = np.zeros((n, n))
+    Gamma = np.empty((count * p, n))
+    inverse = np.empty((n, n))
+    # F = X(g)^-T, and block 0 is X^T.
     for i in range(n):
         F[i, i] = 1.0
     solve_inplace(blocks[count, 0].copy(), F, n)

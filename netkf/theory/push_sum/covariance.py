@@ -9,7 +9,7 @@ from netkf.linalg.arrays import FloatArray, symmetric
 from netkf.scenario.scenario import Scenario
 from netkf.theory.numerics.positive_maps import fixed_point
 from netkf.theory.push_sum.estimation_steps import EstimationSteps, estimation_steps
-from netkf.theory.push_sum.mean_square import mapping, push_sum_radius, radius
+from netkf.theory.push_sum.mean_square import push_sum_radius, radius, second_moment_map
 
 
 def push_sum_error_covariance(scenario: Scenario) -> FloatArray:
@@ -40,7 +40,7 @@ def _covariance(steps: EstimationSteps, found: float) -> FloatArray:
     every = np.tile(scale, N)
     # E[(M (x) I) cov(h) (M (x) I)'], the constant term of the equation
     noise = symmetric(steps.averaging.second_moment(steps.noise / np.outer(every, every)))
-    X = fixed_point(mapping(steps.averaging, steps.scaled), noise[None], found)[0]
+    X = fixed_point(second_moment_map(steps.averaging, steps.scaled), noise[None], found)[0]
     each = np.arange(N)
     blocks = X.reshape(N, n, N, n)[each, :, each]
     return symmetric(blocks * np.outer(scale, scale))

@@ -135,11 +135,13 @@ def _radius(law: Averaging, closed: FloatArray) -> float:
             f"mean squares of {size:,} errors that mix are {size:,}^2 numbers; they are computed "
             f"for at most {MAX_ROWS} errors, so take a smaller network"
         )
-    return spectral_radius(mapping(law, closed), (1, size, size))
+    return spectral_radius(second_moment_map(law, closed), (1, size, size))
 
 
-def mapping(law: Averaging, closed: FloatArray) -> PositiveMap:
-    """Return T as a function of stacks (1, N n, N n) of symmetric matrices."""
+def second_moment_map(law: Averaging, closed: FloatArray) -> PositiveMap:
+    """Return the map ``T(X) = E[M diag(A_j) X diag(A_j)' M']`` of stacks (1, N n, N n) of symmetric
+    matrices: one slot of filters with the closed loops A_j, ``closed`` (N, n, n), and averaging M.
+    """
     N, n, _ = closed.shape
 
     def left(X: FloatArray) -> FloatArray:
