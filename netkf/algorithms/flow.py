@@ -21,7 +21,7 @@ from netkf.algorithms.kernels.gains import gain_update
 from netkf.algorithms.kernels.riccati import propagate_riccati
 from netkf.algorithms.models import FlowModel, usable
 from netkf.core.fields import Component
-from netkf.linalg.arrays import FloatArray
+from netkf.linalg.arrays import FloatArray, as_kernel_array
 from netkf.linalg.compiling import kernel
 
 Reading = Increments
@@ -64,7 +64,9 @@ class FlowFilter(Component):
         """Return the state ``gap`` > 0 seconds later. Its covariance counts the readings of the gap
         already, its estimate does not yet.
         """
-        P, xhat = propagate_riccati(state.model.riccati, state.P, state.xhat, gap)
+        P, xhat = propagate_riccati(
+            state.model.riccati, as_kernel_array(state.P), as_kernel_array(state.xhat), gap
+        )
         return state._replace(xhat=xhat, P=P)
 
     def measure(self, state: Any, reading: Reading) -> Any:
@@ -117,5 +119,7 @@ def predict(model: FlowModel, payload: Payload, age: float) -> Payload:
     """Return a payload predicted ``age`` seconds ahead by the model, without readings."""
     if age <= 0.0:
         return payload
-    P, xhat = propagate_riccati(model.prediction, payload.P, payload.xhat, age)
+    P, xhat = propagate_riccati(
+        model.prediction, as_kernel_array(payload.P), as_kernel_array(payload.xhat), age
+    )
     return Payload(xhat, P)

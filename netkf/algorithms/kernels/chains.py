@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from netkf.algorithms.kernels.square_root import lower_triangular, step_root
-from netkf.linalg.arrays import FloatArray
+from netkf.linalg.arrays import FloatArray, as_kernel_array
 from netkf.linalg.compiling import kernel
 
 FEW = 4096  # chain steps for which threads do not pay
@@ -56,6 +56,7 @@ def move_roots(
     Works on all cores where there is enough to do.
     """
     moved = np.ascontiguousarray(lower_triangular(roots))
+    F = as_kernel_array(F)
     low_Q = np.ascontiguousarray(lower_triangular(root_Q))
     # One byte per mode where it suffices, an eighth of an int64.
     kind = np.uint8 if len(modes.rows) < 256 else np.int64
@@ -90,6 +91,7 @@ def trace_paths(
 ) -> Iterator[FloatArray]:
     """Yield the roots (T, n, n) of each of K chains after each mode of its sequence (K, T)."""
     lows = np.ascontiguousarray(lower_triangular(roots))
+    F = as_kernel_array(F)
     low_Q = np.ascontiguousarray(lower_triangular(root_Q))
     n = len(F)
     work = np.empty((modes.H.shape[1] + n, 2 * n + modes.H.shape[1]))
