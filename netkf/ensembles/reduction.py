@@ -284,7 +284,7 @@ def reduce_runs(
         divide_averages(b, sums, r)
 
 
-@kernel
+@kernel(compact=True)
 def join_nodes(scratch: ReductionScratch, depth: int, count: int) -> int:
     """Merge the last two of the nodes that wait; return how many there are then."""
     for s in range(count):
@@ -292,7 +292,7 @@ def join_nodes(scratch: ReductionScratch, depth: int, count: int) -> int:
     return depth - 1
 
 
-@kernel
+@kernel(compact=True)
 def add_node(
     lanes: Lanes, scratch: ReductionScratch, active: int, count: int, node: int, whole: bool
 ) -> None:
@@ -402,7 +402,7 @@ def reduce_group(
     return whole
 
 
-@kernel
+@kernel(compact=True)
 def mark_missing(
     b: Batch, scratch: ReductionScratch, first: int, active: int, t: int, count: int
 ) -> None:
@@ -481,7 +481,7 @@ def add_total(lanes: Lanes, totals: FloatArray, f: int, a: int, number: Any) -> 
     store(lanes, totals, f, a, load(lanes, totals, f, a) + number)
 
 
-@kernel
+@kernel(compact=True)
 def nees_alone(
     b: Batch, sums: Sums, scratch: ReductionScratch, r: int, t: int, f: int, q: int
 ) -> None:
@@ -492,7 +492,7 @@ def nees_alone(
     scratch.nees[q] = b.given[r, t, f] if b.known[r] else scratch.alone[0]
 
 
-@kernel
+@kernel(compact=True)
 def mark_averaged(
     b: Batch, sums: Sums, scratch: ReductionScratch, first: int, active: int, t: int
 ) -> None:
@@ -514,7 +514,7 @@ def mark_averaged(
         traced_runs[q] = 1.0 if traced else 0.0
 
 
-@kernel
+@kernel(compact=True)
 def divide_averages(b: Batch, sums: Sums, r: int) -> None:
     """Divide the sums of run ``r`` by the numbers of samples in them."""
     kept = b.kept[r]
@@ -594,7 +594,7 @@ def mark_blurred(
                 sums.rounding_from[r] = b.times[t]
 
 
-@kernel
+@kernel(compact=True)
 def is_blurred(b: Batch, r: int, t: int) -> bool:
     """Return True if rounding blurs, by the rule of ``trace.run.rounding_from``, sample ``t`` of
     run ``r``: x (n,), P (F, n, n), error (F, n).

@@ -54,7 +54,11 @@ def kernel(function: Function) -> Function: ...
 
 @overload
 def kernel(
-    *, allocates: bool = False, inlined: bool = False, fused: bool = False
+    *,
+    allocates: bool = False,
+    inlined: bool = False,
+    fused: bool = False,
+    compact: bool = False,
 ) -> Callable[[Function], Function]: ...
 
 
@@ -64,18 +68,20 @@ def kernel(
     allocates: bool = False,
     inlined: bool = False,
     fused: bool = False,
+    compact: bool = False,
 ) -> Any:
     """Mark a numerical function, written as loops over arrays, that is always run compiled.
 
     It may call kernels, works in place and makes no arrays, or is marked
     ``@kernel(allocates=True)``. It runs without the interpreter's lock. ``inlined``: its code
     becomes part of each kernel that calls it, which pays for steps of a few hundred flops.
-    ``fused``: a product and a sum may be one instruction, which rounds once.
+    ``fused``: a product and a sum may be one instruction, which rounds once. ``compact``: it is
+    called seldom, and its loops stay as they are written, which halves the time to compile it.
     """
     # ``@kernel(...)`` with arguments comes without the function.
     if function is None:
-        return lambda loops: _registered(loops, allocates, inlined, fused)
-    return _registered(function, allocates, inlined, fused)
+        return lambda loops: _registered(loops, allocates, inlined, fused, compact)
+    return _registered(function, allocates, inlined, fused, compact)
 
 
 def _numba() -> Any:
@@ -96,8 +102,10 @@ def _numba() -> Any:
 class Kernel:
     """A numerical function written as loops. Python and other kernels call it alike."""
 
-    def __init__(self, loops: Callable[..., Any], options: dict[str, Any]) -> None:
-        self._loops, self._options = loops, options
+    def __init__(
+        self, loops: Callable[..., Any], options: dict[str, Any], compact: bool = False
+    ) -> None:
+        self._loops, self._options, self._compact = loops, options, compact
         update_wrapper(self, loops)
 
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
@@ -111,7 +119,7 @@ class Kernel:
     def _compiler(self) -> Any:
         # Inlined kernels are small and run most often. Numba's own lowering tells LLVM more than
         # the lean one, which makes them up to 1.6 times faster.
-        return kernel_compiler(lean=not self._options.get("forceinline", False))
+        return kernel_compiler(not self._options.get("forceinline", False), self._compact)
 
     @property
     def _numba_type_(self) -> Any:
@@ -147,14 +155,14 @@ class Kernel:
 
 
 def _registered(
-    loops: Callable[..., Any], allocates: bool, inlined: bool, fused: bool
+    loops: Callable[..., Any], allocates: bool, inlined: bool, fused: bool, compact: bool
 ) -> Callable[..., Any]:
     options = {**_OPTIONS, "_nrt": allocates}
     if inlined:
         options["forceinline"] = True
     if fused:
         options["fastmath"] = {"contract"}
-    return Kernel(loops, options)
+    return Kernel(loops, options, compact)
 
 
 def _for_any_number(function: Any) -> None:

@@ -203,6 +203,29 @@ class KernelLowering(NativeLowering):
         return KernelLower
 
 
+class CompactLower(KernelLower):
+    """Writes the code of kernels that are called seldom: LLVM neither unrolls their loops nor turns
+    them into loops over vectors, which takes longer than all calls of such a kernel.
+    """
+
+    def pre_lower(self) -> None:
+        """Mark the function."""
+        super().pre_lower()
+        self.function.attributes.add("optsize")
+
+
+@register_pass(mutates_CFG=True, analysis_only=False)
+class CompactLowering(NativeLowering):
+    """The last step of numba's pipeline, with CompactLower."""
+
+    _name = "compact_lowering"
+
+    @property
+    def lowering_class(self) -> Any:
+        """The class that writes the code."""
+        return CompactLower
+
+
 @register_pass(mutates_CFG=False, analysis_only=True)
 class KernelLegalization(IRLegalization):
     """Says after which instruction a variable is no longer used only where references are counted:

@@ -51,14 +51,14 @@ def without_collection() -> Iterator[None]:
 
 
 @cache
-def kernel_compiler(lean: bool) -> Any:
+def kernel_compiler(lean: bool, compact: bool = False) -> Any:
     """Return numba's compiler without the passes that are not needed, and with short code for loops
-    and entries of arrays if ``lean``.
+    and entries of arrays if ``lean``; if ``compact`` LLVM keeps the code small.
     """
     from numba.core import config
     from numba.core.compiler import CompilerBase, DefaultPassBuilder
 
-    from netkf.linalg.lean_lowering import KernelLegalization, KernelLowering
+    from netkf.linalg.lean_lowering import CompactLowering, KernelLegalization, KernelLowering
 
     builder: Any = DefaultPassBuilder
     # Bounds are checked by numba's own code.
@@ -72,7 +72,7 @@ def kernel_compiler(lean: bool) -> Any:
             steps = [step for step in pipeline.passes if step[0].__name__ not in NOT_NEEDED]
             own: dict[str, Any] = {"IRLegalization": KernelLegalization}
             if short:
-                own["NativeLowering"] = KernelLowering
+                own["NativeLowering"] = CompactLowering if compact else KernelLowering
             pipeline.passes = [(own.get(step.__name__, step), said) for step, said in steps]
             pipeline.finalize()
             return [pipeline]
@@ -95,7 +95,7 @@ def shortcuts() -> list[Patch]:
         (PostProcessor, "run", _without_liveness(PostProcessor.run)),
         (BaseContext, "refresh", _if_anything_is_new(BaseContext.refresh)),
         (base, "_has_loc", cache(base._has_loc)),
-        (BaseContext, "get_abi_sizeof", _measured_once(BaseContext.get_abi_sizeof)),
+        (BaseContext, "get_abi_sizeof", _cache_sizes(BaseContext.get_abi_sizeof)),
         (BaseFunction, "get_call_type", _found_once(BaseFunction.get_call_type)),
         (event, "install_timer", _no_timer),
         (event, "start_event", _if_anyone_listens(event.start_event)),
@@ -131,7 +131,7 @@ def _found_once(find: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _run_pass(manager: Any, _: int, step: Any, state: Any) -> None:
-    """Run a pass without a description of it for whoever listens, and times that nobody reads."""
+    """Run a compiler pass, without numba's event notifications and measurements of time."""
     step.analysis = manager._analysis
     for part in (step.run_initialization, step.run_pass, step.run_finalizer):
         part(state)
@@ -179,8 +179,8 @@ def _without_liveness(run: Callable[..., Any]) -> Callable[..., Any]:
     return run_lightly
 
 
-def _measured_once(size_of: Callable[..., Any]) -> Callable[..., Any]:
-    """Remember the sizes of types: numba has LLVM read a module for each."""
+def _cache_sizes(size_of: Callable[..., Any]) -> Callable[..., Any]:
+    """Return ``size_of`` with a cache by type: numba has LLVM parse a module for each call."""
     known: dict[tuple[Any, str], int] = {}
 
     def size(context: Any, kind: Any) -> int:

@@ -209,7 +209,7 @@ class DiffusionPaths:
             pieces.start[row + 1 : stop] = time
 
 
-@kernel
+@kernel(compact=True)
 def split_pieces(
     rows: IntArray,
     stops: IntArray,
@@ -267,7 +267,7 @@ def split_pieces(
                 set_part(pieces, run, after, length - left, known, free)
 
 
-@kernel
+@kernel(compact=True)
 def add_response(
     out: FloatArray,
     given: FloatArray,
@@ -290,7 +290,7 @@ def add_response(
             out[m * n + i] = given[m * n + i] + sign * total
 
 
-@kernel
+@kernel(compact=True)
 def set_part(
     pieces: tuple[FloatArray, FloatArray, FloatArray, FloatArray],
     run: int,

@@ -6,11 +6,13 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numba
 import numpy as np
 import pytest
 
 import netkf
 from netkf.linalg.compiling import kernel
+from netkf.linalg.shortcuts import kernel_compiler
 
 PAIR = np.dtype([("number", np.int64), ("value", np.float64)])
 
@@ -117,8 +119,10 @@ def test_no_kernel_of_the_package_counts_from_the_end():
 
 
 CHECKED = """
+import numba
 import numpy as np
 from netkf.linalg.compiling import kernel
+from netkf.linalg.shortcuts import kernel_compiler
 @kernel(inlined=True)
 def inner(a, k):
     return a[k]
@@ -186,3 +190,22 @@ def test_arrays_that_are_not_contiguous_go_to_numba():
     a = np.arange(10.0)
     assert of_every_other(a[::2]) == 20.0
     assert of_every_other(a[::-1]) == 45.0
+
+
+def test_compact_kernels_compute_the_same_and_are_marked():
+    def sums(x, out):
+        for i in range(len(x)):
+            total = 0.0
+            for j in range(len(x)):
+                total += x[i] * x[j]
+            out[i] = total
+
+    x, found = np.arange(1.0, 30.0), []
+    for compact in (False, True):
+        made = numba.njit(pipeline_class=kernel_compiler(True, compact), _nrt=False)(sums)
+        found.append(np.empty_like(x))
+        made(x, found[-1])
+        (code,) = made.inspect_llvm().values()
+        assert ("optsize" in code) == compact
+    assert (found[0] == found[1]).all()
+    np.testing.assert_allclose(found[0], x * x.sum(), rtol=1e-15)
