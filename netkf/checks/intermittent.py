@@ -213,7 +213,7 @@ class IntermittentSamples(RunSamples):
         senders = sensing_neighbours(scenario)[node]
         random = Streams(self.seed).generator(purpose, node)
         probabilities = np.array(
-            [_delivery_probabilities(scenario, (sender, node)) for sender in senders]
+            [_delivery_probability(scenario, (sender, node)) for sender in senders]
         )
         arrived = random.random((samples, slots[-1], len(senders))) < probabilities
         # Only the sets of readings that occur become modes: there may be 2^len(senders).
@@ -236,7 +236,7 @@ class IntermittentSamples(RunSamples):
         return self._draw_arrivals("later arrivals", [slots // 2, slots], MIN_CHAINS // 4, 0)
 
 
-def _delivery_probabilities(scenario: Scenario, direction: Direction) -> float:
+def _delivery_probability(scenario: Scenario, direction: Direction) -> float:
     """Return the probability that a reading arrives in time; raises TheoryError if unknown."""
     channel = scenario.network.channel
     if not channel.loss.independent:
@@ -302,7 +302,7 @@ def _check_arrival_counts(samples: IntermittentSamples, level: float) -> Finding
     found = []
     for k, pair in enumerate(pairs):
         share = probability_interval(int(arrived[k]), int(sent[k]), level / len(pairs))
-        deviation = deviation_interval(_delivery_probabilities(samples.scenario, pair), share)
+        deviation = deviation_interval(_delivery_probability(samples.scenario, pair), share)
         found.append((deviation, f"from node {pair[0]} to {pair[1]}"))
     message = f"largest difference in {int(sent.sum()):,} messages"
     return find_largest(found, PROBABILITY_TOLERANCE, message)
@@ -378,8 +378,7 @@ def _outage_factors(scenario: Scenario) -> dict[int, float]:
             continue
         try:
             missed = [
-                1.0 - _delivery_probabilities(scenario, (sender, node))
-                for sender in neighbours[node]
+                1.0 - _delivery_probability(scenario, (sender, node)) for sender in neighbours[node]
             ]
         except TheoryError:
             continue
@@ -420,7 +419,7 @@ def _scalar_laws(scenario: Scenario) -> dict[int, ScalarLaw]:
         model = scenario.slot_models[scenario.topology.index[peers[0]]]
         F, Q = scenario.slot_belief
         try:
-            delivery = _delivery_probabilities(scenario, (peers[0], node))
+            delivery = _delivery_probability(scenario, (peers[0], node))
             laws[k] = scalar_law(F, Q, model.H, model.R, delivery)
         except TheoryError:
             continue
@@ -583,7 +582,7 @@ class IntermittentChecks(PaperChecks):
         try:
             known, why = True, "a known probability for each direction"
             for direction in _heard_directions(scenario):
-                _delivery_probabilities(scenario, direction)
+                _delivery_probability(scenario, direction)
         except TheoryError as error:
             known, why = False, str(error)
         # A derived class may choose its broadcasts in any way.

@@ -180,15 +180,9 @@ class KernelLower(Lower):
         for length in shape[1:]:
             items = builder.mul(items, length)
         data = builder.gep(builder.extract_value(array, DATA), [builder.mul(place, items)])
-        made = ir.Constant(self.context.get_value_type(resty), ir.Undefined)
-        for field in (MEMINFO, PARENT, ITEMSIZE):
-            made = builder.insert_value(made, builder.extract_value(array, field), field)
-        made = builder.insert_value(builder.insert_value(made, items, ITEMS), data, DATA)
-        for k, axis in enumerate(axes):
-            stride = builder.extract_value(array, [STRIDES, axis])
-            made = builder.insert_value(made, shape[k], [SHAPE, k])
-            made = builder.insert_value(made, stride, [STRIDES, k])
-        return made
+        itemsize = self.context.get_abi_sizeof(self.context.get_data_type(kind.dtype))
+        layout = self.context.get_value_type(resty)
+        return array_without_owner(builder, layout, data, shape, itemsize)
 
 
 @register_pass(mutates_CFG=True, analysis_only=False)
@@ -196,11 +190,7 @@ class KernelLowering(NativeLowering):
     """The last step of numba's pipeline, with KernelLower."""
 
     _name = "kernel_lowering"
-
-    @property
-    def lowering_class(self) -> Any:
-        """The class that writes the code."""
-        return KernelLower
+    lowering_class: Any = KernelLower
 
 
 class CompactLower(KernelLower):
@@ -215,15 +205,11 @@ class CompactLower(KernelLower):
 
 
 @register_pass(mutates_CFG=True, analysis_only=False)
-class CompactLowering(NativeLowering):
-    """The last step of numba's pipeline, with CompactLower."""
+class CompactLowering(KernelLowering):
+    """The same with CompactLower."""
 
     _name = "compact_lowering"
-
-    @property
-    def lowering_class(self) -> Any:
-        """The class that writes the code."""
-        return CompactLower
+    lowering_class = CompactLower
 
 
 @register_pass(mutates_CFG=False, analysis_only=True)

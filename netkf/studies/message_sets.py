@@ -183,27 +183,26 @@ class _Search:
         place = {key: k for k, key in enumerate(keys)}
         places = np.array([place[c.key] for c in ranked[:kept]], dtype=np.intp)
         members = np.sort(places[chosen], axis=1)
-        order = np.argsort(-self._expected(members, keys, alone), kind="stable")
+        order = np.argsort(-self._expected(members, place, alone), kind="stable")
         sets = (tuple(keys[k] for k in members[row].tolist()) for row in order.tolist())
         return sets, kept == len(ranked)
 
     def _expected(
         self,
         members: np.ndarray,
-        keys: Sequence[MessageKey],
+        place: Mapping[MessageKey, int],
         alone: Mapping[MessageKey, float],
     ) -> FloatArray:
-        """Return for sets ``members`` (S, size) of ``keys`` the sum (S,) of what their messages
-        gain alone, and of what pairs gain beyond that.
+        """Return the sum (S,) of what the messages of each set gain alone, and of what pairs gain
+        beyond that; ``members`` (S, size) are numbers of messages, as in ``place``.
         """
-        place = {key: k for k, key in enumerate(keys)}
         size = members.shape[1]
-        single = np.array([alone[key] for key in keys])
+        single = np.array([alone[key] for key in place])
         gain = np.zeros(len(members))
         for column in members.T:
             gain += single[column]
         if size > 2:
-            beyond = np.zeros((len(keys), len(keys)))
+            beyond = np.zeros((len(place), len(place)))
             for pair, together in self._gains.items():
                 if len(pair) == 2 and set(pair) <= place.keys():
                     a, b = pair

@@ -144,8 +144,8 @@ def global_randomness() -> tuple[Any, Any]:
         return _python_randomness(), repr(shared.state)
     # Its memory: numpy takes 0.1 ms to list the state, and this is asked before and after each
     # call of a user's method.
-    text = ctypes.string_at(shared.ctypes.state_address, MERSENNE_BYTES)
-    return _python_randomness(), (id(shared), text)
+    words = ctypes.string_at(shared.ctypes.state_address, MERSENNE_BYTES)
+    return _python_randomness(), (id(shared), words)
 
 
 def _python_randomness() -> Any:

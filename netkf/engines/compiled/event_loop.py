@@ -33,7 +33,7 @@ from netkf.engines.compiled.combination_state import (
 from netkf.engines.compiled.evidence import (
     absorb_evidence,
     add_samples,
-    predict_evidence,
+    predict_node_evidence,
     send_evidence,
 )
 from netkf.engines.compiled.increments import predict_with_increments
@@ -289,7 +289,7 @@ def predict(state: Simulation, combination: CombinationState | None, h: int, tim
     if combination is not None and combination.kind == PREDICTIONS:
         keep_prediction(state, combination, h)
     elif combination is not None and combination.kind == BELIEFS:
-        predict_evidence(combination.evidence, h, time - now)
+        predict_node_evidence(combination.evidence, h, time - now)
 
 
 @kernel

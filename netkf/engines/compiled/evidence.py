@@ -96,7 +96,7 @@ def more_evidence(evidence: EvidenceArrays, capacity: int) -> None:
 
 
 @kernel
-def predict_evidence(evidence: EvidenceArrays, h: int, gap: float) -> None:
+def predict_node_evidence(evidence: EvidenceArrays, h: int, gap: float) -> None:
     """Let all evidence of node ``h`` speak about the state ``gap`` seconds later."""
     fill_inverse_transition(evidence.A, gap, evidence.maps)
     back, total, work = evidence.maps[0], evidence.total, evidence.work
