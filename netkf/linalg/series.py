@@ -13,8 +13,8 @@ from netkf.linalg.lanes import LANES, MANY, load, store
 
 ROUNDING = 2.0**-56  # of the largest term of an entry: an eighth of what a double rounds
 NOTHING = 1e-30  # of the largest entry
-ORDER_8, ORDER_10, ORDER_12, ORDER_16 = (0,) * 8, (0,) * 10, (0,) * 12, (0,) * 16
-MANY_TERMS = (9, 11, 13)
+ORDER_7, ORDER_8, ORDER_9, ORDER_12, ORDER_16 = (0,) * 7, (0,) * 8, (0,) * 9, (0,) * 12, (0,) * 16
+MANY_TERMS = (8, 10)
 OCTAVES, STEPS = 8, 4  # gaps that are tried: as many halves of the longest, in steps of an octave
 
 
@@ -103,17 +103,16 @@ def add_terms(
 
 
 @kernel(inlined=True)
-def fill_row(out: FloatArray, row: int, series: FloatArray, m: int, cell: int, gap: float) -> None:
-    """Write the sums of the table ``series[m, cell]`` (terms, W), W a multiple of L, into a ``row``
-    of ``out``; as many terms as MANY_TERMS has are added up fastest.
+def fill_row(
+    out: FloatArray, row: int, series: FloatArray, terms: int, m: int, cell: int, gap: float
+) -> None:
+    """Write the sums of the first ``terms`` of the table ``series[m, cell]`` (terms, W), W a
+    multiple of L, into a ``row`` of ``out``; as many terms as MANY_TERMS has are added up fastest.
     """
-    terms = series.shape[2]
-    if terms == len(ORDER_8) + 1:
-        fill_blocks(ORDER_8, out, row, series, m, cell, gap)
-    elif terms == len(ORDER_10) + 1:
-        fill_blocks(ORDER_10, out, row, series, m, cell, gap)
-    elif terms == len(ORDER_12) + 1:
-        fill_blocks(ORDER_12, out, row, series, m, cell, gap)
+    if terms == len(ORDER_7) + 1:
+        fill_blocks(ORDER_7, out, row, series, m, cell, gap)
+    elif terms == len(ORDER_9) + 1:
+        fill_blocks(ORDER_9, out, row, series, m, cell, gap)
     else:
         for j in range(0, series.shape[3], LANES):
             total = load(MANY, series, m, cell, terms - 1, j)

@@ -23,16 +23,27 @@ from netkf.scenario.scenario import Scenario
 ROUNDING = 2.0**-52
 """Of the largest term of an entry, what may be left out."""
 
+PARTS, TABLE_BYTES = 4, 1 << 18
+"""Parts that a cell of FlowTable is divided into, since shorter cells need fewer terms; fewer parts
+where the table of a model would be larger than that.
+"""
+
+NEAR = 2
+"""Cells so near to 0, where entries vanish, that their series need more terms."""
+
 
 class LaneSeries(Struct):
-    """Power series around the middles of the cells of FlowTable: ``series`` (M, cells, terms, W) of
-    columns, with as many terms as the longest gap in any cell needs; entry e of the values is
-    column ``place[e]`` (E,). Model m of FlowTable is ``row[m]`` here.
+    """Power series in cells of ``unit`` (M,) seconds: ``series`` (M, cells, terms, W) of columns,
+    around 0 in cell 0 and around the middles of the others, of which those from NEAR on need
+    ``far_terms`` only. Entry e of the values is column ``place[e]`` (E,). Model m of FlowTable is
+    ``row[m]`` here.
     """
 
     series: FloatArray
+    unit: FloatArray
     place: IntArray
     row: IntArray
+    far_terms: int
 
 
 @once_per_scenario
@@ -116,7 +127,8 @@ def _united(series: FloatArray, unit: FloatArray, mine: np.ndarray) -> LaneSerie
     """The table of series (M, cells, terms, E), of the models that are ``mine``, with each column
     once and no more terms than cells of ``unit`` (M,) seconds need.
     """
-    terms = terms_needed(series, unit)
+    series, unit = divided(series, unit)
+    terms = terms_needed(series, unit, 0)
     series = series[:, :, :terms]
     found: dict[bytes, int] = {}
     # 0.0 and not -0.0: they are the same number.
@@ -127,16 +139,43 @@ def _united(series: FloatArray, unit: FloatArray, mine: np.ndarray) -> LaneSerie
     width = -(-len(first) // LANES) * LANES
     made: FloatArray = aligned((*series.shape[:2], terms, width))
     made[:, :, : series.shape[2], : len(first)] = np.moveaxis(columns[first], 0, -1)
-    return LaneSeries(series=made, place=place.astype(np.int64), row=np.cumsum(mine) - 1)
+    return LaneSeries(
+        series=made,
+        unit=unit,
+        place=place.astype(np.int64),
+        row=np.cumsum(mine) - 1,
+        far_terms=min(terms, terms_needed(series, unit, NEAR)),
+    )
 
 
-def terms_needed(series: FloatArray, unit: FloatArray) -> int:
-    """Number of terms after which no entry has more than rounding left at the ends of its cell, one
-    that ``series.fill_row`` adds up fast if there is one.
+def divided(series: FloatArray, unit: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the series (M, cells, terms, E) in shorter cells, and the seconds of these."""
+    models, cells, terms, entries = series.shape
+    parts = PARTS
+    while parts > 1 and cells * parts * MANY_TERMS[-1] * entries * series.itemsize > TABLE_BYTES:
+        parts //= 2
+    if parts == 1:
+        return series, unit
+    made = np.empty((models, cells, parts, terms, entries))
+    for k in range(models):
+        for part in range(parts):
+            share = (part + 0.5) / parts
+            # Series of cell 0 are around its start, and those of the others around their middles.
+            made[k, 0, part] = shifted(series[k, 0], share * unit[k] if part else 0.0)
+            rest = shifted(np.moveaxis(series[k, 1:], 1, 0), (share - 0.5) * unit[k])
+            made[k, 1:, part] = np.moveaxis(rest, 0, 1)
+    return made.reshape(models, cells * parts, terms, entries), unit / parts
+
+
+def terms_needed(series: FloatArray, unit: FloatArray, first: int) -> int:
+    """Return the number of terms after which no entry of cells from ``first`` on has more than
+    rounding left at the ends of its cell, one that ``series.fill_row`` adds up fast if there is
+    one.
     """
     # From its middle a cell reaches half a unit, but the first one reaches a whole unit.
     spans = np.repeat(0.5 * unit[:, None], series.shape[1], axis=1)
     spans[:, :1] *= 2.0
+    series, spans = series[:, first:], spans[:, first:]
     sizes = np.abs(series) * (spans[..., None] ** np.arange(series.shape[2]))[..., None]
     left = np.cumsum(sizes[:, :, ::-1], axis=2)[:, :, ::-1]
     largest = sizes.max(axis=2, keepdims=True)

@@ -41,6 +41,7 @@ from netkf.engines.compiled.lane_readings import (
     read_alone,
 )
 from netkf.engines.compiled.lane_series import (
+    NEAR,
     LaneSeries,
     most_moments,
 )
@@ -443,7 +444,7 @@ def predict_unobserved(state: Simulation, visits: Visits) -> None:
     visits.waiting = 0
     # What lanes do alone goes from lane to lane in short loops: a processor overlaps their turns.
     for q in range(count):
-        evaluate_series(state, visits, UNOBSERVED, q, visits.unobserved, visits.unobserved_rows)
+        evaluate_series(visits, UNOBSERVED, q, visits.unobserved, visits.unobserved_rows)
     gather_states(state, places, count, visits.x, visits.S)
     transpose_rows(visits.unobserved_rows, visits.columns)
     copy_columns(visits.columns, visits.unobserved.place, 0, width_of(n, False), visits.values)
@@ -457,7 +458,7 @@ def predict_sensing(state: Simulation, visits: Visits, count: int) -> None:
     places = visits.places[SENSING]
     for q in range(count):
         if places[q] != NO_NODE:
-            evaluate_series(state, visits, SENSING, q, visits.sensing, visits.sensing_rows)
+            evaluate_series(visits, SENSING, q, visits.sensing, visits.sensing_rows)
     read_increments_in_lanes(state, visits, count)
     transpose_rows(visits.sensing_rows, visits.columns)
     width = width_of(len(state.size), True)
@@ -472,12 +473,14 @@ def predict_sensing(state: Simulation, visits: Visits, count: int) -> None:
 
 @kernel
 def evaluate_series(
-    state: Simulation, visits: Visits, kind: int, q: int, series: LaneSeries, rows: FloatArray
+    visits: Visits, kind: int, q: int, series: LaneSeries, rows: FloatArray
 ) -> None:
     """Evaluate the series of the model in a lane at its gap, into row ``q``."""
     lane = visits.lanes[kind, q]
-    cell, since = cell_of(state.table.unit[lane.model], lane.end - lane.now)
-    fill_row(rows, q, series.series, series.row[lane.model], cell, since)
+    row = series.row[lane.model]
+    cell, since = cell_of(series.unit[row], lane.end - lane.now)
+    terms = series.series.shape[2] if cell < NEAR else series.far_terms
+    fill_row(rows, q, series.series, terms, row, cell, since)
 
 
 @kernel
