@@ -127,18 +127,18 @@ def _united(series: FloatArray, unit: FloatArray, mine: np.ndarray) -> LaneSerie
     """The table of series (M, cells, terms, E), of the models that are ``mine``, with each column
     once and no more terms than cells of ``unit`` (M,) seconds need.
     """
-    series, unit = divided(series, unit)
-    terms = terms_needed(series, unit, 0)
-    series = series[:, :, :terms]
     found: dict[bytes, int] = {}
     # 0.0 and not -0.0: they are the same number.
     columns = np.ascontiguousarray(np.moveaxis(series, -1, 0)) + 0.0
     place = np.array([found.setdefault(column.tobytes(), len(found)) for column in columns])
     first = np.unique(place, return_index=True)[1]
+    series, unit = divided(np.moveaxis(columns[first], 0, -1), unit)
+    terms = terms_needed(series, unit, 0)
+    series = series[:, :, :terms]
     # Whole lanes, see series.fill_row.
     width = -(-len(first) // LANES) * LANES
     made: FloatArray = aligned((*series.shape[:2], terms, width))
-    made[:, :, : series.shape[2], : len(first)] = np.moveaxis(columns[first], 0, -1)
+    made[:, :, : series.shape[2], : len(first)] = series
     return LaneSeries(
         series=made,
         unit=unit,
