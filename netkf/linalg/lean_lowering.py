@@ -1,8 +1,7 @@
 """Short code for what kernels do most: loops over ranges, and entries of C-contiguous arrays.
 
-numba writes 70 lines of LLVM's language for ``for i in range(n)`` and 40 for ``a[i, j]``, most of
-which LLVM removes again: writing and reading them is half of the time that compiling takes. The
-lines that are written here compute the same. Whatever is not met here goes to numba.
+numba writes 40 lines of LLVM's language for ``a[i, j]``, most of which LLVM removes again. The
+lines that are written here compute the same. Whatever is not met here goes to ``value_lowering``.
 """
 
 from __future__ import annotations
@@ -11,17 +10,25 @@ from typing import Any
 
 from llvmlite import ir
 from numba import types
-from numba.core import ir as numba_ir
 from numba.core.compiler_machinery import register_pass
-from numba.core.ir_utils import get_definition, guard
-from numba.core.lowering import Lower
-from numba.core.typed_passes import IRLegalization, NativeLowering
+from numba.core.typed_passes import IRLegalization
 from numba.np.arrayobj import load_item, store_item
 
-I64 = ir.IntType(64)
-ZERO, ONE = ir.Constant(I64, 0), ir.Constant(I64, 1)
-# Fields of numba's array structure, see tests/linalg/test_structs.py.
-MEMINFO, PARENT, ITEMS, ITEMSIZE, DATA, SHAPE, STRIDES = range(7)
+from netkf.linalg.value_lowering import (
+    DATA,
+    I64,
+    ITEMS,
+    ITEMSIZE,
+    MEMINFO,
+    ONE,
+    PARENT,
+    SHAPE,
+    STRIDES,
+    ZERO,
+    ValueLower,
+    ValueLowering,
+)
+
 ENTRIES = (types.Float, types.Integer, types.Boolean, types.Record)
 NUMBERS = (types.Float, types.Integer)
 
@@ -72,51 +79,15 @@ def is_in_order(place: Any) -> bool:
     return not isinstance(place, ir.Constant) or place.constant >= 0
 
 
-class KernelLower(Lower):
+class KernelLower(ValueLower):
     """Writes the code of kernels."""
 
-    def lower_expr(self, resty: Any, expr: Any) -> Any:
-        """Return the value of an expression."""
-        # Neither ``iternext`` nor ``shape``: what numba writes for them lets LLVM know more, and
-        # small kernels are a tenth slower without.
-        made = None
-        if expr.op == "getiter":
-            made = self._iterator(resty, expr)
-        elif expr.op in ("pair_first", "pair_second"):
-            value = self.loadvar(expr.value.name)
-            made = self.builder.extract_value(value, int(expr.op == "pair_second"))
-            self.incref(resty, made)
-        return super().lower_expr(resty, expr) if made is None else made
-
-    def lower_call(self, resty: Any, expr: Any) -> Any:
-        """Return the value of a call."""
-        if resty == types.range_state64_type:
-            signature = self.fndesc.calltypes[expr]
-            if signature.args in ((types.int64,), (types.int64,) * 2) and not expr.kws:
-                places = [self._cast_var(var, types.int64) for var in expr.args]
-                start, stop = places if len(places) == 2 else (ZERO, places[0])
-                return self._struct(resty, start, stop, ONE)
-        return super().lower_call(resty, expr)
-
-    def _struct(self, kind: Any, *fields: Any) -> Any:
-        made = ir.Constant(self.context.get_value_type(kind), ir.Undefined)
-        for k, value in enumerate(fields):
-            made = self.builder.insert_value(made, value, k)
-        return made
-
-    def _iterator(self, resty: Any, expr: Any) -> Any:
-        if self.typeof(expr.value.name) != types.range_state64_type:
-            return None
-        # Only steps of 1: of others the number is a division.
-        made = guard(get_definition, self.func_ir, expr.value)
-        if not (isinstance(made, numba_ir.Expr) and made.op == "call" and len(made.args) < 3):
-            return None
-        state, builder = self.loadvar(expr.value.name), self.builder
-        start, stop = (builder.extract_value(state, k) for k in range(2))
-        following, count = (self.alloca_lltype(name, I64) for name in ("following", "count"))
-        builder.store(start, following)
-        builder.store(builder.sub(stop, start), count)
-        return self._struct(resty, following, stop, ONE, count)
+    def _store_count(self, count: Any, difference: Any, step: Any) -> None:
+        """Store the number of steps, or something negative if there is none."""
+        if step.constant == 1:
+            self.builder.store(difference, count)
+        else:
+            super()._store_count(count, difference, step)
 
     def lower_getitem(self, resty: Any, expr: Any, value: Any, index: Any, signature: Any) -> Any:
         """Return ``value[index]``."""
@@ -186,7 +157,7 @@ class KernelLower(Lower):
 
 
 @register_pass(mutates_CFG=True, analysis_only=False)
-class KernelLowering(NativeLowering):
+class KernelLowering(ValueLowering):
     """The last step of numba's pipeline, with KernelLower."""
 
     _name = "kernel_lowering"

@@ -16,9 +16,6 @@ from typing import Any
 
 Patch = tuple[Any, str, Callable[..., Any]]
 
-FIRST_LEVEL = 1
-"""LLVM's level for single functions, which are all optimised once more when they are linked."""
-
 NOT_NEEDED = (
     *("WithLifting", "InlineClosureLikes", "RewriteDynamicRaises", "MakeFunctionToJitFunction"),
     *("InlineInlinables", "FindLiterallyCalls", "LiteralUnroll", "NopythonRewrites"),
@@ -59,6 +56,7 @@ def kernel_compiler(lean: bool, compact: bool = False) -> Any:
     from numba.core.compiler import CompilerBase, DefaultPassBuilder
 
     from netkf.linalg.lean_lowering import CompactLowering, KernelLegalization, KernelLowering
+    from netkf.linalg.value_lowering import ValueLowering
 
     builder: Any = DefaultPassBuilder
     # Bounds are checked by numba's own code.
@@ -71,6 +69,7 @@ def kernel_compiler(lean: bool, compact: bool = False) -> Any:
             pipeline = builder.define_nopython_pipeline(self.state)
             steps = [step for step in pipeline.passes if step[0].__name__ not in NOT_NEEDED]
             own: dict[str, Any] = {"IRLegalization": KernelLegalization}
+            own["NativeLowering"] = ValueLowering
             if short:
                 own["NativeLowering"] = CompactLowering if compact else KernelLowering
             pipeline.passes = [(own.get(step.__name__, step), said) for step, said in steps]
@@ -82,7 +81,7 @@ def kernel_compiler(lean: bool, compact: bool = False) -> Any:
 
 def shortcuts() -> list[Patch]:
     """Return replacements of numba's methods: owner, name, method."""
-    from numba.core import base, config, event, ir, lowering, typeinfer
+    from numba.core import base, event, imputils, ir, lowering, typeinfer
     from numba.core.base import BaseContext
     from numba.core.codegen import CPUCodeLibrary
     from numba.core.compiler_machinery import PassManager
@@ -90,11 +89,14 @@ def shortcuts() -> list[Patch]:
     from numba.core.types.functions import BaseFunction
     from numba.np import arrayobj
 
+    from netkf.linalg.value_lowering import call_without_errors
+
     return [
         (PassManager, "_runPass", _run_pass),
         (PostProcessor, "run", _without_liveness(PostProcessor.run)),
         (BaseContext, "refresh", _if_anything_is_new(BaseContext.refresh)),
         (base, "_has_loc", cache(base._has_loc)),
+        (base, "user_function", call_without_errors(imputils.user_function)),
         (BaseContext, "get_abi_sizeof", _cache_sizes(BaseContext.get_abi_sizeof)),
         (BaseFunction, "get_call_type", _found_once(BaseFunction.get_call_type)),
         (event, "install_timer", _no_timer),
@@ -104,11 +106,7 @@ def shortcuts() -> list[Patch]:
         (lowering, "new_error_context", _no_context),
         (typeinfer, "new_error_context", _no_context),
         (arrayobj, "fix_integer_index", _in_order(arrayobj.fix_integer_index)),
-        (
-            CPUCodeLibrary,
-            "_optimize_functions",
-            _at_first_level(CPUCodeLibrary._optimize_functions, config),
-        ),
+        (CPUCodeLibrary, "_optimize_functions", _keep_in_registers),
     ]
 
 
@@ -284,13 +282,17 @@ def _variables_of() -> Callable[..., Any]:
     return variables
 
 
-def _at_first_level(optimize: Callable[..., Any], config: Any) -> Callable[..., Any]:
-    def optimize_lightly(library: Any, module: Any) -> Any:
-        before = config.OPT
-        config.OPT = type(before)(FIRST_LEVEL)
-        try:
-            return optimize(library, module)
-        finally:
-            config.OPT = before
+def _keep_in_registers(library: Any, module: Any) -> None:
+    """Take variables out of memory: all else that numba does with single functions is done again
+    when they are linked.
+    """
+    from llvmlite.binding import create_new_function_pass_manager
 
-    return optimize_lightly
+    module.data_layout = library._codegen._data_layout
+    builder = library._codegen._pass_builder()
+    passes: Any = create_new_function_pass_manager()
+    passes.add_simplify_cfg_pass()
+    passes.add_sroa_pass()
+    for function in module.functions:
+        if not function.is_declaration:
+            passes.run(function, builder)
