@@ -19,7 +19,8 @@ from tests.algorithms.test_literature import (
     states,
     textbook,
 )
-from tests.theory.test_replay import close, engine_covariance
+from tests.engines.linearity import engine_covariance
+from tests.theory.test_replay import close
 
 BELIEF = {"kind": "belief-propagation"}
 BROADCAST = {"kind": "broadcast"}

@@ -15,7 +15,8 @@ from tests.algorithms.test_literature import (
     states,
     textbook,
 )
-from tests.theory.test_replay import close, engine_covariance
+from tests.engines.linearity import engine_covariance
+from tests.theory.test_replay import close
 
 FILTER = {"kind": "consensus-innovations"}
 SURE = {"graph": GRAPH, "activation": {"kind": "broadcast"}}

@@ -8,8 +8,8 @@ import netkf
 from netkf import theory
 from netkf.theory.common.errors import error_law
 from tests.algorithms.test_literature import clocked, heard_by_slot, scenario_of, textbook
-from tests.engines.linearity import engine_covariance as map_of_draws
-from tests.theory.test_replay import close, engine_covariance
+from tests.engines.linearity import engine_covariance
+from tests.theory.test_replay import close
 
 GAINS = [
     [[0.3], [0.1]],
@@ -57,7 +57,7 @@ def test_exact_errors_in_slots_and_of_samples(tmp_path):
     one = {"kind": "constant-gain", "gain": [[0.3], [0.2]]}
     under = {"horizon": 1.6, "probe": [0.4, 0.9, 1.5]}
     for scenario in (slots, clocked(one, tmp_path, nodes, sampling, **under)):
-        exact, run = engine_covariance(scenario)
+        exact, run = engine_covariance(scenario, "simpy")
         close(theory.error_covariance(scenario, run), exact, 1e-9)
         close(error_law(scenario, run).P, run.P, 1e-9)
         gap = run.P - theory.error_covariance(scenario, run)
@@ -91,7 +91,7 @@ def test_increments_against_the_lyapunov_equation_and_the_engine_s_own_map(ring)
         first = scenario.start(node)[1].reshape(-1)
         solved = scipy.integrate.solve_ivp(change, (0.0, 1.0), first, rtol=1e-11, atol=1e-12)
         np.testing.assert_allclose(run.P[1, node].reshape(-1), solved.y[:, -1], rtol=1e-8)
-    by_draws, again = map_of_draws(scenario)
+    by_draws, again = engine_covariance(scenario)
     size = np.linalg.norm(again.P, axis=(2, 3))
     assert (np.linalg.norm(by_draws - again.P, axis=(2, 3)) <= 1e-3 * size).all()
 

@@ -10,7 +10,8 @@ from netkf.scenario.reading import from_table
 from netkf.theory.common.errors import error_law
 from netkf.trace.schema import CODES
 from tests import reference
-from tests.theory.test_replay import close, engine_covariance
+from tests.engines.linearity import engine_covariance
+from tests.theory.test_replay import close
 
 GRAPH = {"kind": "edges", "edges": [[0, 1], [1, 2], [2, 3], [3, 4], [0, 2]]}
 LOSSY = {"loss": {"kind": "bernoulli", "delivery": 0.7}, "symmetric": False}
@@ -360,7 +361,7 @@ def test_exact_errors_of_the_kcf_under_clocks(at, tmp_path):
     sampling = {"kind": "periodic", "period": 0.4}
     settings = {"horizon": 1.6, "probe": [0.4, 0.9, 1.5], "network": network}
     scenario = clocked({"kind": "kcf", "epsilon": 0.5}, tmp_path, activation, sampling, **settings)
-    exact, run = engine_covariance(scenario)
+    exact, run = engine_covariance(scenario, "simpy")
     assert run.count("absorb") > 3
     close(theory.error_covariance(scenario, run), exact, 1e-9)
     close(error_law(scenario, run).P, run.P, 1e-9)

@@ -20,7 +20,8 @@ from tests.algorithms.test_literature import (
     scenario_of,
     textbook,
 )
-from tests.theory.test_replay import close, engine_covariance
+from tests.engines.linearity import engine_covariance
+from tests.theory.test_replay import close
 
 BEST = "ci"
 INVERSE = "ici"

@@ -9,7 +9,8 @@ import netkf
 from netkf.scenario.reading import from_table
 from netkf.theory.common.errors import error_law
 from tests.engines.agreement import assert_agree
-from tests.theory.test_replay import close, engine_covariance
+from tests.engines.linearity import engine_covariance
+from tests.theory.test_replay import close
 
 
 def scenario(rounds, loss, delay):
@@ -114,7 +115,7 @@ def test_both_engines_keep_the_same_totals_and_theory_follows_them():
     run = netkf.simulate(scenario)
     np.testing.assert_allclose(error_law(scenario, run).P, run.P, rtol=1e-9, atol=1e-12)
     again = in_slots(running_sums=True).replace({"horizon": 3.0, "probe": [0.0, 1.0, 2.0]})
-    exact, run = engine_covariance(again)
+    exact, run = engine_covariance(again, "simpy")
     close(netkf.theory.error_covariance(again, run), exact, 1e-9)
     assert fast.count("lost") > 50
 

@@ -4,18 +4,11 @@ import numpy as np
 import pytest
 
 from netkf.algorithms import models
-from netkf.plants import paths, sensors
 from netkf.theory import error_covariance
 
 from .linearity import engine_covariance
 
 STATED = 1e-3  # the docs promise this much at the default sensing period
-
-
-@pytest.fixture(autouse=True)
-def few_draws(monkeypatch):
-    monkeypatch.setattr(paths, "BLOCK", 1)
-    monkeypatch.setattr(sensors, "BLOCK", 1)
 
 
 def deviation(scenario):

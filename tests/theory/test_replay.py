@@ -6,10 +6,9 @@ import scipy.linalg
 
 import netkf
 from netkf import theory
-from netkf.plants import linear
 from netkf.scenario.reading import from_table
 from netkf.theory.common.errors import error_law
-from tests.engines.linearity import OneDraw, run
+from tests.engines.linearity import engine_covariance
 
 POISSON = {"kind": "poisson", "rate": 2.0}
 SAMPLED = [
@@ -101,24 +100,6 @@ def close(found, expected, tolerance):
     assert (np.abs(found - expected) <= tolerance * size).all()
 
 
-@pytest.fixture
-def few_draws(monkeypatch):
-    """No reading after the horizon is drawn."""
-    monkeypatch.setattr(linear, "BLOCK", 1)
-
-
-def engine_covariance(scenario):
-    """(T, N, n, n) of x - xhat, from one SimPy run for each Gaussian draw."""
-    silent = OneDraw(scenario.seed)
-    assert not run(scenario, silent).any()
-    total = 0.0
-    for name, unit in silent.made.items():
-        for place in range(unit.count):
-            e = run(scenario, OneDraw(scenario.seed, name, place))
-            total = total + np.einsum("tia,tib->tiab", e, e)
-    return total, netkf.simulate(scenario, engine="simpy")
-
-
 @pytest.mark.parametrize("channel", [{}, LOSSY, LATE], ids=["sure", "lossy", "late"])
 @pytest.mark.parametrize("sensors", [SAMPLED, MIXED], ids=["sampled", "mixed"])
 @pytest.mark.parametrize(("name", "at"), CASES, ids=["-".join(map(str, c)) for c in CASES])
@@ -137,19 +118,17 @@ def test_covariances_are_those_of_the_run(name, at, sensors, channel, tmp_path):
 
 @pytest.mark.parametrize("channel", [{}, LATE], ids=["sure", "late"])
 @pytest.mark.parametrize(("name", "at"), CASES, ids=["-".join(map(str, c)) for c in CASES])
-@pytest.mark.usefixtures("few_draws")
 def test_errors_are_the_linear_map_of_the_engine(name, at, channel, tmp_path):
     scenario = scenario_of(name, at, channel, SAMPLED, tmp_path, horizon=1.6, probe=[0.4, 0.9, 1.5])
-    expected, run = engine_covariance(scenario)
+    expected, run = engine_covariance(scenario, "simpy")
     close(theory.error_covariance(scenario, run), expected, 1e-9)
 
 
-@pytest.mark.usefixtures("few_draws")
 def test_filters_with_another_plant_and_other_noises(tmp_path):
     belief = {"A": [[-0.2, 0.4], [-0.6, 0.0]], "B": [[1.0, 0.0], [0.0, 1.0]], "R": [[[0.5]]] * 2}
     scenario = scenario_of("hybrid", "nodes", LATE, SAMPLED[:2], tmp_path)
     scenario = scenario.replace({"filter.model": belief, "horizon": 1.6, "probe": [0.4, 1.5]})
-    expected, run = engine_covariance(scenario)
+    expected, run = engine_covariance(scenario, "simpy")
     close(theory.error_covariance(scenario, run), expected, 1e-9)
     close(error_law(scenario, run).P, run.P, 1e-9)
 
