@@ -5,6 +5,7 @@ what they round does not matter in ``precisely()``: 200 digits, because a plant 
 over a gap costs 87 of them.
 """
 
+import math
 from decimal import Decimal, localcontext
 
 import numpy as np
@@ -56,11 +57,16 @@ def solve(left, right):
 
 
 def exponential(M, terms=36):
-    """exp(M) where no column of M sums to more than 2^-16 in size."""
-    total = term = identity(len(M), M)
-    for k in range(1, terms):
-        term = term @ M / k
-        total = total + term
+    """exp(M) where no column of M sums to more than 2^-16 in size: the power series, six terms at a
+    time, which takes 11 products instead of 36.
+    """
+    powers = [identity(len(M), M), M]
+    for _ in range(5):
+        powers.append(powers[-1] @ M)
+    total, one = 0 * M, powers[0].flat[0]
+    for first in range(terms - 6, -1, -6):
+        some = sum(powers[k] * (one / math.factorial(first + k)) for k in range(6))
+        total = some + powers[6] @ total
     return total
 
 
