@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -159,8 +159,7 @@ class GossipSamples(RunSamples):
     @cached_property
     def reference(self) -> ChainSamples:
         """Samples of the switched chain of G (20)."""
-        count = reference_count(self.scenario, 1)
-        return self._draw_paths("switched chain", list(check_slots(self.scenario)), count)
+        return _draw_reference(self.scenario, self.seed)
 
     def _draw_paths(self, purpose: str, slots: list[int], count: int) -> ChainSamples:
         """Return samples of the chain after the given numbers of slots."""
@@ -174,6 +173,13 @@ class GossipSamples(RunSamples):
     def later(self, slots: int) -> ChainSamples:
         """Return a few samples after half of ``slots`` and after all of them."""
         return self._draw_paths("later chain", [slots // 2, slots], MIN_CHAINS // 4)
+
+
+@lru_cache(maxsize=1)
+def _draw_reference(scenario: Scenario, seed: int) -> ChainSamples:
+    """Return ``GossipSamples.reference``, once for all verdicts on runs of one seed."""
+    samples, count = GossipSamples(scenario, None, seed), reference_count(scenario, 1)
+    return samples._draw_paths("switched chain", list(check_slots(scenario)), count)
 
 
 def _draw_chains(

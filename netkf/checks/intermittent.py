@@ -191,8 +191,7 @@ class IntermittentSamples(RunSamples):
     @cached_property
     def reference(self) -> ArrivalSamples:
         """Samples of filters with independent arrivals, R (12)."""
-        samples = reference_count(self.scenario, len(self.nodes))
-        return self._draw_arrivals("arrivals", list(check_slots(self.scenario)), samples, MAX_PATHS)
+        return _draw_reference(self.scenario, self.seed)
 
     def _draw_arrivals(
         self, purpose: str, slots: list[int], samples: int, paths: int
@@ -234,6 +233,14 @@ class IntermittentSamples(RunSamples):
     def later(self, slots: int) -> ArrivalSamples:
         """Return a few samples after half of ``slots`` and after all of them, without averages."""
         return self._draw_arrivals("later arrivals", [slots // 2, slots], MIN_CHAINS // 4, 0)
+
+
+@lru_cache(maxsize=1)
+def _draw_reference(scenario: Scenario, seed: int) -> ArrivalSamples:
+    """Return ``IntermittentSamples.reference``, once for all verdicts on runs of one seed."""
+    samples = IntermittentSamples(scenario, None, seed)
+    count = reference_count(scenario, len(samples.nodes))
+    return samples._draw_arrivals("arrivals", list(check_slots(scenario)), count, MAX_PATHS)
 
 
 def _delivery_probability(scenario: Scenario, direction: Direction) -> float:

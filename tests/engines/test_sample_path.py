@@ -13,7 +13,7 @@ STATED = 1e-3  # the docs promise this much at the default sensing period
 
 def deviation(scenario):
     """Largest relative deviation (Frobenius) over sample times and nodes."""
-    mine, run = engine_covariance(scenario)
+    mine, run = engine_covariance(scenario, "simpy")
     exact = error_covariance(scenario, run)
     size = np.maximum(np.linalg.norm(exact, axis=(-1, -2)), 1e-12)
     return (np.linalg.norm(mine - exact, axis=(-1, -2)) / size).max()

@@ -44,14 +44,22 @@ def test_a_worker_killed_while_it_writes_is_replaced(ring, tmp_path):
 
 
 def sleeps(scenario, seed, replica):
+    Path(scenario.claim, str(replica)).touch()
     time.sleep(60.0)
 
 
-def test_workers_are_killed_at_once(ring):
+def test_workers_are_killed_at_once(ring, tmp_path):
     began = time.monotonic()
-    threading.Timer(2.0, os.kill, (os.getpid(), signal.SIGINT)).start()
+
+    def interrupt():
+        while len(list(tmp_path.iterdir())) < 2 and time.monotonic() - began < 5.0:
+            time.sleep(0.01)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    threading.Thread(target=interrupt).start()
     with pytest.raises(KeyboardInterrupt):
-        replicate(sleeps, ring, 2, pool=PoolOptions(2))
+        replicate(sleeps, ring.replace({"claim": str(tmp_path)}), 2, pool=PoolOptions(2))
+    assert len(list(tmp_path.iterdir())) == 2
     assert time.monotonic() - began < 10.0
 
 

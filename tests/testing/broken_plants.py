@@ -36,7 +36,8 @@ class Changed(SlotReadings):
         self.change, self.drawn = change, []
 
     def noise(self, slots, x):
-        while len(self.drawn) <= max(slots):
+        last = max(slots)
+        while len(self.drawn) <= last:
             self.drawn.append(self._root @ self._noise.draw())
         return np.array(
             [self.change(self.drawn, slot, state) for slot, state in zip(slots, x, strict=True)]
