@@ -253,7 +253,8 @@ def _nees_of_irregular(batch: Batch, regular: np.ndarray) -> FloatArray:
     return nees
 
 
-@kernel
+# Compact with all that is inlined here: loops over lanes gain nothing from being unrolled.
+@kernel(compact=True)
 def reduce_runs(
     lanes: Lanes, b: Batch, bounds: np.ndarray, sums: Sums, scratch: ReductionScratch
 ) -> None:
