@@ -11,7 +11,7 @@ SWEEPS = 30
 ROUNDING = 2.0**-54
 
 
-@kernel
+@kernel(compact=True)
 def diagonalise(a: FloatArray, vectors: FloatArray) -> None:
     """Leave the eigenvalues of a symmetric ``a`` (n, n) on its diagonal and write its eigenvectors
     into the columns of ``vectors`` (n, n). Cyclic sweeps (Golub and Van Loan, section 8.5).

@@ -139,7 +139,7 @@ def fill_blocks(
         store(MANY, out, row, j, total)
 
 
-@kernel(allocates=True)
+@kernel(allocates=True, compact=True)
 def polynomial(series: FloatArray, gap: float) -> FloatArray:
     """Return the sum (size,) of a table (terms, size + 1)."""
     out = np.empty(series.shape[1] - 1)

@@ -115,7 +115,7 @@ class GridLaws:
         return gain, symmetric_root(symmetric(asked - product(gain, cross.T)))
 
 
-@kernel(allocates=True)
+@kernel(allocates=True, compact=True)
 def fill_impulses(
     out: FloatArray,
     row: int,
