@@ -88,7 +88,25 @@ class ValueLower(Lower):
         if never_fails(self.function):
             _NEVER_FAIL.add(self.function.name)
 
+    def lower_inst(self, inst: Any) -> None:
+        """Write a statement."""
+        # numba describes each in words first, for its own developers.
+        if isinstance(inst, numba_ir.Assign) and not self.context.enable_nrt:
+            target = inst.target.name
+            self.storevar(self.lower_assign(self.typeof(target), inst), target)
+        else:
+            super().lower_inst(inst)
+
     # Variables.
+
+    def storevar(self, value: Any, name: str, argidx: int | None = None) -> None:
+        """Give a variable a value."""
+        # numba reads the value before, to count its references.
+        if self.context.enable_nrt or name in self._singly_assigned_vars:
+            super().storevar(value, name, argidx)
+        else:
+            self._alloca_var(name, self.typeof(name))
+            self.builder.store(value, self.getvar(name))
 
     def _find_singly_assigned_variable(self) -> None:
         """Find the variables that are values."""
@@ -256,35 +274,23 @@ def remove_unread(function: Any) -> None:
     """Remove instructions without effect whose results nobody reads, and variables that are only
     written.
     """
-    readers: Counter[int] = Counter()
+    every = [each for block in function.blocks for each in block.instructions]
+    readers = Counter([id(value) for each in every for value in each.operands])
+    for each in every:
+        if isinstance(each, instructions.PhiInstr):
+            readers.update(id(value) for value, _ in each.incomings)
+    unread: set[int] = set()
+    # From the last to the first: what only unread ones read is unread as well.
+    for each in reversed(every):
+        # ``get``: a counter takes long to say that it does not have a number.
+        if type(each) in WITHOUT_EFFECT and not readers.get(id(each)):
+            unread.add(id(each))
+            for value in each.operands:
+                readers[id(value)] -= 1
+    stores = [each for each in every if type(each) is instructions.StoreInstr]
+    writers = Counter([id(each.operands[1]) for each in stores])
+    variables = {id(each) for each in every if type(each) is instructions.AllocaInstr}
+    unread |= {each for each in variables if readers.get(each) == writers.get(each)}
+    unread |= {id(each) for each in stores if id(each.operands[1]) in unread & variables}
     for block in function.blocks:
-        for each in block.instructions:
-            readers.update(map(id, each.operands))
-            if isinstance(each, instructions.PhiInstr):
-                readers.update(id(value) for value, _ in each.incomings)
-    writers: Counter[int] = Counter()
-    for block in reversed(function.blocks):
-        kept = []
-        for each in reversed(block.instructions):
-            kind = type(each)
-            if kind in WITHOUT_EFFECT and not readers[id(each)]:
-                readers.subtract(map(id, each.operands))
-                continue
-            if kind is instructions.StoreInstr:
-                writers[id(each.operands[1])] += 1
-            kept.append(each)
-        block.instructions[:] = kept[::-1]
-    unread = {
-        id(each)
-        for each in function.blocks[0].instructions
-        if isinstance(each, instructions.AllocaInstr) and readers[id(each)] == writers[id(each)]
-    }
-    if not unread:
-        return
-    for block in function.blocks:
-        block.instructions[:] = [
-            each
-            for each in block.instructions
-            if id(each) not in unread
-            and not (type(each) is instructions.StoreInstr and id(each.operands[1]) in unread)
-        ]
+        block.instructions[:] = [each for each in block.instructions if id(each) not in unread]
