@@ -18,6 +18,7 @@ from numba.extending import models, register_model
 
 from netkf.linalg import lanes as names
 from netkf.linalg.lean_lowering import entry_pointer
+from netkf.linalg.value_lowering import DATA, SHAPE, STRIDES
 
 DOUBLE, BYTE, BIT, I32 = ir.DoubleType(), ir.IntType(8), ir.IntType(1), ir.IntType(32)
 I64 = ir.IntType(64)
@@ -172,7 +173,7 @@ def _scatter(*_: Any) -> Any:
 def lower_turn(context: Any, builder: Any, sig: Any, args: Any) -> Any:
     """Emit a transposition of L x L entries by shuffles."""
     count = len(sig.args[0])
-    rows, out = (_Matrix(context, builder, sig.args[k], args[k]) for k in (1, 3))
+    rows, out = (_Matrix(builder, sig.args[k], args[k]) for k in (1, 3))
     begin = context.cast(builder, args[2], sig.args[2], types.intp)
     found = [
         builder.load(rows.place(ir.Constant(I64, k), begin, count), align=8) for k in range(count)
@@ -186,11 +187,11 @@ def lower_turn(context: Any, builder: Any, sig: Any, args: Any) -> Any:
 def lower_gather(context: Any, builder: Any, sig: Any, args: Any) -> Any:
     """Emit one load per lane from the row that its place names, and the transposition of these."""
     count = len(sig.args[0])
-    array, out = (_Matrix(context, builder, sig.args[k], args[k]) for k in (1, 4))
+    array, out = (_Matrix(builder, sig.args[k], args[k]) for k in (1, 4))
     begin, zero = context.cast(builder, args[3], sig.args[3], types.intp), ir.Constant(I64, 0)
     found = []
     for k in range(count):
-        place = _entry_of(context, builder, sig, args, 2, k)
+        place = _entry_of(builder, sig, args, 2, k)
         known = builder.select(builder.icmp_signed("<", place, zero), zero, place)
         found.append(builder.load(array.place(known, begin, count), align=8))
     for k, value in enumerate(_turned(builder, found)):
@@ -206,7 +207,7 @@ def lower_gather(context: Any, builder: Any, sig: Any, args: Any) -> Any:
 def lower_scatter(context: Any, builder: Any, sig: Any, args: Any) -> Any:
     """Emit a transposition and one store per lane into the row that its place names."""
     count = len(sig.args[0])
-    rows, array = (_Matrix(context, builder, sig.args[k], args[k]) for k in (1, 3))
+    rows, array = (_Matrix(builder, sig.args[k], args[k]) for k in (1, 3))
     begin, zero = context.cast(builder, args[2], sig.args[2], types.intp), ir.Constant(I64, 0)
     most = _splat(builder, context.cast(builder, args[5], sig.args[5], types.intp), count)
     wanted = builder.icmp_signed(
@@ -220,33 +221,28 @@ def lower_scatter(context: Any, builder: Any, sig: Any, args: Any) -> Any:
     name = f"llvm.masked.store.v{count}f64.p0v{count}f64"
     masked = cgutils.get_or_insert_function(builder.module, kinds, name)
     for k, value in enumerate(_turned(builder, found)):
-        place = _entry_of(context, builder, sig, args, 4, k)
+        place = _entry_of(builder, sig, args, 4, k)
         there = _splat(builder, builder.icmp_signed(">=", place, zero), count)
         where = array.place(place, begin, count)
         builder.call(masked, [value, where, I32(8), builder.and_(wanted, there)])
     return context.get_dummy_value()
 
 
-def _entry_of(context: Any, builder: Any, sig: Any, args: Any, which: int, k: int) -> Any:
+def _entry_of(builder: Any, sig: Any, args: Any, which: int, k: int) -> Any:
     """Entry k of an argument, an array of int64."""
-    kind = sig.args[which]
-    array = context.make_array(kind)(context, builder, args[which])
-    number = context.get_constant(types.intp, k)
-    return builder.load(
-        cgutils.get_item_pointer(context, builder, kind, array, [number], wraparound=False)
-    )
+    return builder.load(entry_pointer(builder, sig.args[which], args[which], [ir.Constant(I64, k)]))
 
 
 class _Matrix:
     """An array as a matrix, of the first axis and all others together, which are contiguous."""
 
-    def __init__(self, context: Any, builder: Any, kind: Any, value: Any) -> None:
-        array = context.make_array(kind)(context, builder, value)
-        shape = cgutils.unpack_tuple(builder, array.shape, kind.ndim)
-        self._data, self._builder, self._columns = array.data, builder, ir.Constant(I64, 1)
+    def __init__(self, builder: Any, kind: Any, value: Any) -> None:
+        shape = [builder.extract_value(value, [SHAPE, axis]) for axis in range(kind.ndim)]
+        self._data = builder.extract_value(value, DATA)
+        self._builder, self._columns = builder, ir.Constant(I64, 1)
         if kind.layout != "C":
             # A part of each row of an array: as far apart as these rows.
-            step = builder.extract_value(array.strides, 0)
+            step = builder.extract_value(value, [STRIDES, 0])
             self._columns = builder.sdiv(step, ir.Constant(I64, 8))
             return
         for size in shape[1:]:

@@ -68,6 +68,9 @@ class ValueBuilder(ir.IRBuilder):
     def extract_value(self, agg: Any, idx: Any, name: str = "") -> Any:
         """Return entry ``idx`` of an aggregate."""
         places = list(idx) if isinstance(idx, list | tuple) else [idx]
+        # An entry of an entry.
+        if isinstance(agg, instructions.ExtractValue):
+            agg, places = agg.aggregate, [*agg.indices, *places]
         value, rest = inserted_value(agg, places)
         return super().extract_value(value, rest, name) if rest else value
 
@@ -159,16 +162,26 @@ class ValueLower(Lower):
             value = self.loadvar(expr.value.name)
             made = self.builder.extract_value(value, int(expr.op == "pair_second"))
             self.incref(resty, made)
+        elif expr.op == "getattr" and expr.attr == "shape":
+            made = self._shape(expr)
         return super().lower_expr(resty, expr) if made is None else made
 
     def lower_call(self, resty: Any, expr: Any) -> Any:
         """Return the value of a call."""
         signature = self.fndesc.calltypes[expr]
+        called = getattr(self.typeof(expr.func.name), "typing_key", None)
+        if called is len and isinstance(signature.args[0], types.Array):
+            return self.builder.extract_value(self.loadvar(expr.args[0].name), [SHAPE, 0])
         if resty != types.range_state64_type or set(signature.args) != {types.int64} or expr.kws:
             return super().lower_call(resty, expr)
         places = [self._cast_var(var, types.int64) for var in expr.args]
         ranges = [ZERO, *places, ONE], [*places, ONE], places
         return self._struct(resty, *ranges[len(places) - 1])
+
+    def _shape(self, expr: Any) -> Any:
+        if not isinstance(self.typeof(expr.value.name), types.Array):
+            return None
+        return self.builder.extract_value(self.loadvar(expr.value.name), SHAPE)
 
     def _struct(self, kind: Any, *fields: Any) -> Any:
         made = ir.Constant(self.context.get_value_type(kind), ir.Undefined)
@@ -181,8 +194,8 @@ class ValueLower(Lower):
             return None
         state, builder = self.loadvar(expr.value.name), self.builder
         start, stop, step = (builder.extract_value(state, k) for k in range(3))
-        # Only steps that are known: numba asks others for their sign.
-        if not (isinstance(step, ir.Constant) and step.constant > 0):
+        # Only steps that are known: numba asks others whether they are 0.
+        if not (isinstance(step, ir.Constant) and step.constant):
             return None
         following, count = (self.alloca_lltype(name, I64) for name in ("following", "count"))
         builder.store(start, following)
@@ -193,7 +206,8 @@ class ValueLower(Lower):
         """Store the number of steps, at least 0."""
         builder = self.builder
         positive = builder.icmp_signed(">", difference, ZERO)
-        with builder.if_else(builder.not_(positive)) as (then, otherwise):
+        away = builder.not_(positive) if step.constant > 0 else positive
+        with builder.if_else(away) as (then, otherwise):
             with then:
                 builder.store(ZERO, count)
             with otherwise:
