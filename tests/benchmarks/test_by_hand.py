@@ -16,7 +16,7 @@ from numba.core.dispatcher import Dispatcher
 
 import netkf
 from netkf.linalg.linking import linked_once
-from netkf.linalg.shortcuts import without_collection
+from netkf.linalg.shortcuts import kernel_compiler, without_collection
 from tests.benchmarks import by_hand, cases, jobs, peers
 
 STANDARD_ERRORS, SHARE = 4.5, 0.004
@@ -28,12 +28,14 @@ CODE = Path(__file__).parent / "__pycache__" / "slower"
 @pytest.fixture
 def slower(monkeypatch):
     """The same loops, which compile in a quarter of the time: helpers are called where they would
-    be copied, and LLVM works at its first level. These tests ask for results, and not for times.
+    be copied, numba leaves out what netkf's kernels do not need, and LLVM works at its first level.
+    These tests ask for results, and not for times.
     """
     monkeypatch.setattr(config, "OPT", type(config.OPT)(1))
+    compiler = kernel_compiler(True)
     for name, kernel in list(vars(by_hand).items()):
         if isinstance(kernel, Dispatcher):
-            options = {**kernel.targetoptions, "forceinline": False}
+            options = {**kernel.targetoptions, "forceinline": False, "pipeline_class": compiler}
             monkeypatch.setattr(by_hand, name, numba.jit(**options)(kernel.py_func))
     with pytest.MonkeyPatch.context() as patch:  # netkf's own code stays where it is
         patch.setattr(config, "CACHE_DIR", str(CODE))

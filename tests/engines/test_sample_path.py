@@ -20,7 +20,7 @@ def deviation(scenario):
 
 
 def test_default_sensing_period_keeps_what_the_docs_state(ring):
-    assert deviation(ring.replace({"horizon": 3.0})) < STATED / 50
+    assert deviation(ring.replace({"horizon": 2.0})) < STATED / 50
 
 
 def test_the_error_has_fourth_order_in_the_sensing_period(ring, monkeypatch):
@@ -36,7 +36,7 @@ def test_the_error_has_fourth_order_in_the_sensing_period(ring, monkeypatch):
 
 def test_first_transient_needs_no_shorter_period(ring):
     wide = [[1e4, 0.0], [0.0, 1e4]]
-    changes = {"horizon": 1.0, "probe": 0.2, "plant.cov": wide, "filter.cov": wide}
+    changes = {"horizon": 0.6, "probe": 0.1, "plant.cov": wide, "filter.cov": wide}
     assert deviation(ring.replace(changes)) < STATED / 50
 
 
@@ -55,7 +55,7 @@ def test_samples_off_the_sensing_grid(ring):
 )
 def test_delays(ring, delay):
     changes = {
-        "horizon": 2.0,
+        "horizon": 1.5,
         "network.channel.delay": delay,
         "network.channel.symmetric": False,
         "network.activation.rate": 4.0,
@@ -69,7 +69,7 @@ def test_delays(ring, delay):
     ids=["A", "B", "R"],
 )
 def test_filters_that_believe_another_model(ring, model):
-    assert deviation(ring.replace({"horizon": 2.0, "filter.model": model})) < STATED / 20
+    assert deviation(ring.replace({"horizon": 1.5, "filter.model": model})) < STATED / 20
 
 
 @pytest.mark.parametrize("kind", ["local", "central"])
@@ -83,7 +83,7 @@ def test_several_sensors_on_a_node_and_rows_of_zeros(ring):
         {"nodes": [0, 3], "H": [[1.0, 0.0]], "R": [[0.25]]},
         {"nodes": [0, 1], "H": [[0.0, 1.0], [0.0, 0.0]], "R": [[0.5, 0.1], [0.1, 0.3]]},
     ]
-    assert deviation(ring.replace({"horizon": 1.5, "sensors": more})) < STATED / 20
+    assert deviation(ring.replace({"horizon": 1.0, "sensors": more})) < STATED / 20
 
 
 @pytest.mark.parametrize("seed", range(6))

@@ -220,7 +220,7 @@ def with_class(table, key, name):
 @pytest.mark.parametrize("name", WRONG)
 def test_wrong_parts_are_found(name):
     table, key, promise = WRONG[name]
-    rows = verdicts(with_class(table, key, name), 60 if name in SUBTLE else 25)
+    rows = verdicts(with_class(table, key, name), 60 if name in SUBTLE else 20)
     assert any(one.startswith(promise) for one in broken(rows))
 
 
