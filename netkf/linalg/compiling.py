@@ -41,6 +41,11 @@ ROOMS = (
 MOST_STATES = 4
 """Of the sources, whose compiled code is kept."""
 
+UNROLLED, UNROLLED_BY_NUMBA = 1000, 300
+"""Instructions that a loop of known length may have when it is unrolled: in kernels, so that loops
+over up to four states vanish however many are inside each other, and elsewhere.
+"""
+
 Function = TypeVar("Function", bound=Callable[..., Any])
 # Nobody calls a kernel from C: the wrapper would be a seventh of what is compiled.
 _OPTIONS: Any = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
@@ -186,7 +191,10 @@ def _for_any_number(function: Any) -> None:
 
 
 def _moderately_optimised(made: Any, config: Any) -> None:
-    """Let LLVM work at its level 2: level 3 takes a quarter longer and gains nothing here."""
+    """Let LLVM work at its level 2: level 3 takes a quarter longer and gains nothing here. But
+    loops whose length it knows are unrolled up to a larger size than at any level.
+    """
+    from llvmlite.binding import set_option
     from numba.core.errors import NumbaError as numba_error  # noqa: N813
 
     compile_for = made._compile_for_args
@@ -194,6 +202,7 @@ def _moderately_optimised(made: Any, config: Any) -> None:
     def moderately(*args: Any, **kwargs: Any) -> Any:
         before, began = config.OPT, time.perf_counter()
         config.OPT = type(before)(2)
+        set_option("netkf", f"-unroll-threshold={UNROLLED}")
         try:
             # One link step for the function and all that it calls, see linking.
             try:
@@ -205,6 +214,8 @@ def _moderately_optimised(made: Any, config: Any) -> None:
                 return compile_for(*args, **kwargs)
         finally:
             config.OPT = before
+            # LLVM cannot be told to forget it: this is what it takes for numba's own level.
+            set_option("netkf", f"-unroll-threshold={UNROLLED_BY_NUMBA}")
             made._cache.release()
             _spent.append(time.perf_counter() - began)
 

@@ -1,14 +1,17 @@
 """Kernels: called alike from Python and from kernels, compiled once for given types."""
 
 import pickle
+import re
 import stat
 
+import llvmlite.binding
 import numba
 import numpy as np
 import pytest
 
 from netkf.linalg import compiling
 from netkf.linalg.compiling import kernel
+from netkf.linalg.structs import sized
 
 
 @kernel
@@ -54,6 +57,38 @@ def test_a_kernel_is_compiled_once_for_all_constants(monkeypatch, tmp_path):
     # One without ``scale`` and one with it: the constants 2 and 3 are no types.
     assert len(signatures) == 2
     assert len({args[:2] for args in signatures}) == 1
+
+
+def cholesky(size, matrix):
+    """Make a matrix its lower triangular root."""
+    n = len(size)
+    for j in range(n):
+        for k in range(j):
+            for i in range(j, n):
+                matrix[i, j] -= matrix[i, k] * matrix[j, k]
+        matrix[j, j] = np.sqrt(matrix[j, j])
+        for i in range(j + 1, n):
+            matrix[i, j] /= matrix[j, j]
+
+
+def test_loops_over_few_states_are_unrolled_and_numba_works_on_as_before(monkeypatch, tmp_path):
+    monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path))
+    given, set_option = [], llvmlite.binding.set_option
+    monkeypatch.setattr(
+        llvmlite.binding, "set_option", lambda *told: given.append(told) or set_option(*told)
+    )
+    matrix = np.eye(4) + 1.0
+    expected, root = np.linalg.cholesky(matrix), kernel(cholesky)
+    root(sized(4), matrix)
+    np.testing.assert_allclose(np.tril(matrix), expected, rtol=1e-14)
+    (made,) = root._called_from_python.overloads.values()
+    # The function is the first one, before its wrapper for Python.
+    code = made.library.get_llvm_str().split("\n}")[0]
+    # A root for each state, and no loop is left.
+    assert len(re.findall(r"call double @(?:llvm\.)?sqrt", code)) == 4
+    assert " phi " not in code
+    # At numba's own level 3 LLVM unrolls up to 300 instructions.
+    assert given[-1] == ("netkf", "-unroll-threshold=300")
 
 
 def test_kernels_are_found_by_name():
