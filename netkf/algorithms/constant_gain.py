@@ -126,7 +126,15 @@ def correct_by_gain(
         store(lanes, nodes.xhat, b, h, i, total)
     # (I - L H) P (I - L H)' + L R L' has the form of a prediction.
     predict_root(
-        lanes, nodes.root, b, h, arrays.closed[h], arrays.noise[h], scratch.moved, scratch.noise
+        lanes,
+        scratch.size,
+        nodes.root,
+        b,
+        h,
+        arrays.closed[h],
+        arrays.noise[h],
+        scratch.moved,
+        scratch.noise,
     )
 
 

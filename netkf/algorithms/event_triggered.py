@@ -146,9 +146,17 @@ def predict_copies(
     lanes = scratch.lanes
     for k in range(arrays.x.shape[1]):
         if any_lane(load_flags(lanes, arrays.known, b, k)):
-            transform_mean(lanes, arrays.x, b, k, nodes.F, scratch.moved_mean)
+            transform_mean(lanes, scratch.size, arrays.x, b, k, nodes.F, scratch.moved_mean)
             predict_root(
-                lanes, arrays.root, b, k, nodes.F, nodes.root_Q, scratch.moved, scratch.noise
+                lanes,
+                scratch.size,
+                arrays.root,
+                b,
+                k,
+                nodes.F,
+                nodes.root_Q,
+                scratch.moved,
+                scratch.noise,
             )
 
 

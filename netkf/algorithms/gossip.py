@@ -53,7 +53,7 @@ def swap_pairs(
     """Replace the pair (xhat, P) of each node by the one that it hears; of several by the last
     sender's.
     """
-    lanes, n = scratch.lanes, nodes.xhat.shape[2]
+    lanes, n = scratch.lanes, len(scratch.size)
     # All payloads are from before the exchange.
     for h in range(len(nodes.rows)):
         for i in range(n):
@@ -74,7 +74,7 @@ def copy_pair(
 ) -> None:
     """Copy what ``sender`` sent to filter ``h`` in the lanes that ``heard`` it."""
     lanes = scratch.lanes
-    for i in range(nodes.xhat.shape[2]):
+    for i in range(len(scratch.size)):
         own, sent = load(lanes, nodes.xhat, b, h, i), load(lanes, scratch.xhat, sender, i)
         store(lanes, nodes.xhat, b, h, i, select(heard, sent, own))
         for j in range(i + 1):

@@ -259,7 +259,7 @@ def use_bit(
     for j in range(n):
         store(lanes, row, j, scale * load(lanes, row, j))
     # ``row`` is scaled to unit noise. The gain of a real observation is ``gains`` times ``over``.
-    over = rotate_lanes(lanes, root, b, h, row, gains)
+    over = rotate_lanes(lanes, row, root, b, h, row, gains)
     step = sign * over * scale * root_of(HALF_PI * (square + 1.0))
     for i in range(n):
         store(lanes, x, b, h, i, load(lanes, x, b, h, i) + load(lanes, gains, i) * step)

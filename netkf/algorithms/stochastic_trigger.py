@@ -301,7 +301,7 @@ def use_silence(
                 total += load(lanes, arrays.row, i) * load(lanes, nodes.root, b, h, i, j)
             store(lanes, scratch.row, j, select(silent, total, 0.0))
         gains = scratch.gains
-        step = innovation * rotate_lanes(lanes, nodes.root, b, h, scratch.row, gains)
+        step = innovation * rotate_lanes(lanes, scratch.size, nodes.root, b, h, scratch.row, gains)
         for i in range(n):
             x = load(lanes, nodes.xhat, b, h, i)
             store(lanes, nodes.xhat, b, h, i, x + load(lanes, gains, i) * step)
@@ -568,7 +568,7 @@ def expect_all(
                 x -= load(lanes, readings.local, b, s, i)
             store(lanes, arrays.x, b, h, i, x)
         if predicted:
-            transform_mean(lanes, arrays.x, b, h, nodes.F, scratch.moved_mean)
+            transform_mean(lanes, scratch.size, arrays.x, b, h, nodes.F, scratch.moved_mean)
         news = weigh_news(
             lanes, arrays.x, readings, (b, s, h), nodes.rows[h], arrays.trigger, arrays.z
         )

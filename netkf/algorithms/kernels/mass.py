@@ -116,7 +116,7 @@ def correct_root(
             store(lanes, scratch.row, j, total)
         # P <- P - P v v' P / (1 + v' P v) on the root. The state is not corrected here: P (8) does
         # that.
-        rotate_lanes(lanes, root, b, h, scratch.row, scratch.gains)
+        rotate_lanes(lanes, scratch.size, root, b, h, scratch.row, scratch.gains)
         # Deflate, rest -= v v'.
         for i in range(n):
             for j in range(n):

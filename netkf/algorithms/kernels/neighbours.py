@@ -177,4 +177,6 @@ def combine_convex_roots(
             gap = load(lanes, scratch.xhat, sender, i) - load(lanes, scratch.xhat, h, i)
             store(lanes, nodes.xhat, b, h, i, load(lanes, nodes.xhat, b, h, i) + weight * gap)
         for i in range(n):
-            write_root_column(lanes, nodes.root, b, h, i, scratch.moved, scratch.noise)
+            write_root_column(
+                lanes, scratch.size, nodes.root, b, h, i, scratch.moved, scratch.noise
+            )

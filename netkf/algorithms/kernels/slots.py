@@ -37,6 +37,8 @@ from netkf.linalg.lanes import (
     store,
     with_sign,
 )
+from netkf.linalg.local import local_lanes_matrix, local_lanes_vector
+from netkf.linalg.structs import Size, sized
 
 TINY = 1e-200  # far below any length that counts, yet above underflow
 
@@ -139,13 +141,14 @@ class SlotSamples(NamedTuple):
 
 
 class SlotScratch(NamedTuple):
-    """The ``lanes`` and scratch: ``row``, ``gains`` and ``moved_mean`` (n, L) of a reading and a
-    mean, ``moved`` and ``noise`` (n, n, L) of a prediction, ``whitened`` and ``total``
-    (n, n + 1, L) of an intersection, and copies of what is sent, (H, n, L) and (H, n, n, L). Of a
-    sample ``sampled_xhat`` and ``sampled_error`` (>= H n, L), ``sampled_P`` (>= H n n, L) and the
-    ``sample_rows`` (L,) of its runs.
+    """The ``size`` n of states, the ``lanes``, and scratch: ``row``, ``gains`` and ``moved_mean``
+    (n, L) of a reading and a mean, ``moved`` and ``noise`` (n, n, L) of a prediction, ``whitened``
+    and ``total`` (n, n + 1, L) of an intersection, and copies of what is sent, (H, n, L) and (H, n,
+    n, L). Of a sample ``sampled_xhat`` and ``sampled_error`` (>= H n, L), ``sampled_P`` (>= H n n,
+    L) and the ``sample_rows`` (L,) of its runs.
     """
 
+    size: Size
     lanes: Lanes
     row: FloatArray
     gains: FloatArray
@@ -170,7 +173,9 @@ def slot_scratch(H: int, n: int, lanes: Lanes = MANY) -> SlotScratch:
     # L entries are moved at a time, which goes beyond the last one.
     shapes += [(H * n + L, L), (H * n + L, L), (H * n * n + L, L)]
     scratch: list[Any] = [aligned(shape) for shape in shapes]
-    return SlotScratch._make([lanes, *scratch, np.zeros(L, dtype=np.int64)])
+    # Code of its own for each small n pays off for batches of runs alone, and not for one state.
+    size = sized(n) if n > 1 and lanes == MANY else np.zeros(n)
+    return SlotScratch._make([size, lanes, *scratch, np.zeros(L, dtype=np.int64)])
 
 
 def whiten_reading(y: FloatArray, H: FloatArray, R: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -297,7 +302,9 @@ def update_by_reading(
     """Update filter ``h`` of a block with the reading of filter ``sender`` in slot ``s``, in the
     lanes where it has ``arrived``.
     """
-    lanes, row, gains, n = scratch.lanes, scratch.row, scratch.gains, nodes.xhat.shape[2]
+    lanes, size, n = scratch.lanes, scratch.size, len(scratch.size)
+    row = local_lanes_vector(size, lanes, scratch.row)
+    gains = local_lanes_vector(size, lanes, scratch.gains)
     # H that is fixed has one block and one slot.
     c, t = min(b, readings.H.shape[0] - 1), min(s, readings.H.shape[1] - 1)
     for k in range(nodes.rows[sender]):
@@ -312,7 +319,7 @@ def update_by_reading(
             store(lanes, row, j, select(arrived, total, 0.0))
             weight = load(lanes, readings.H, c, t, sender, k, j)
             innovation -= weight * load(lanes, nodes.xhat, b, h, j)
-        step = innovation * rotate_lanes(lanes, nodes.root, b, h, row, gains)
+        step = innovation * rotate_lanes(lanes, size, nodes.root, b, h, row, gains)
         for i in range(n):
             x = load(lanes, nodes.xhat, b, h, i)
             store(lanes, nodes.xhat, b, h, i, x + load(lanes, gains, i) * step)
@@ -320,14 +327,20 @@ def update_by_reading(
 
 @kernel(inlined=True)
 def rotate_lanes(
-    lanes: Lanes, root: FloatArray, b: int, h: int, row: FloatArray, gains: FloatArray
+    lanes: Lanes,
+    size: Size,
+    root: FloatArray,
+    b: int,
+    h: int,
+    row: FloatArray,
+    gains: FloatArray,
 ) -> Any:
     """Use the scalar observation with ``h S = row`` (n, L) and unit noise; the gain is ``gains``
     (n, L) times the value that is returned, 1 over the standard deviation of the innovation.
 
     These are the rotations of ``root_update.rotate_out``; an entry of 0 turns nothing.
     """
-    n = root.shape[2]
+    n = len(size)
     for i in range(n):
         store(lanes, gains, i, 0.0)
     # [1, h S; 0, S] times rotations that empty h S from its end, so that S stays triangular.
@@ -355,22 +368,38 @@ def predict_all(nodes: SlotNodes, scratch: SlotScratch, b: int) -> None:
     for h in range(len(nodes.rows)):
         predict_mean(nodes, scratch, b, h)
         predict_root(
-            scratch.lanes, nodes.root, b, h, nodes.F, nodes.root_Q, scratch.moved, scratch.noise
+            scratch.lanes,
+            scratch.size,
+            nodes.root,
+            b,
+            h,
+            nodes.F,
+            nodes.root_Q,
+            scratch.moved,
+            scratch.noise,
         )
 
 
 @kernel(inlined=True)
 def predict_mean(nodes: SlotNodes, scratch: SlotScratch, b: int, h: int) -> None:
     """Move the estimate of a filter to the next slot, ``F xhat``."""
-    transform_mean(scratch.lanes, nodes.xhat, b, h, nodes.F, scratch.moved_mean)
+    transform_mean(scratch.lanes, scratch.size, nodes.xhat, b, h, nodes.F, scratch.moved_mean)
 
 
 @kernel(inlined=True)
 def transform_mean(
-    lanes: Lanes, x: FloatArray, b: int, h: int, F: FloatArray, moved_mean: FloatArray
+    lanes: Lanes,
+    size: Size,
+    x: FloatArray,
+    b: int,
+    h: int,
+    F: FloatArray,
+    mean_scratch: FloatArray,
 ) -> None:
-    """Multiply estimate [b, h] of ``x`` (B, H, n, L) by F; ``moved_mean`` (n, L) is scratch."""
-    n = x.shape[2]
+    """Multiply estimate [b, h] of ``x`` (B, H, n, L) by F; ``mean_scratch`` (n, L) is scratch of a
+    large n.
+    """
+    n, moved_mean = len(size), local_lanes_vector(size, lanes, mean_scratch)
     for i in range(n):
         total = spread(lanes, 0.0)
         for j in range(n):
@@ -384,18 +413,22 @@ def transform_mean(
 @kernel(inlined=True)
 def predict_root(
     lanes: Lanes,
+    size: Size,
     root: FloatArray,
     b: int,
     h: int,
     F: FloatArray,
     root_Q: FloatArray,
-    moved: FloatArray,
-    noise: FloatArray,
+    moved_scratch: FloatArray,
+    noise_scratch: FloatArray,
 ) -> None:
     """Make the lower triangular root S of filter ``h`` of a block that of ``F S S' F' + Q``;
-    ``root_Q`` (n, n) is lower triangular; ``moved`` and ``noise`` (n, n, L) are scratch.
+    ``root_Q`` (n, n) is lower triangular; ``moved_scratch`` and ``noise_scratch`` (n, n, L) are
+    scratch of a large n.
     """
-    n = len(F)
+    n = len(size)
+    moved = local_lanes_matrix(size, lanes, moved_scratch)
+    noise = local_lanes_matrix(size, lanes, noise_scratch)
     for i in range(n):
         # F S; S is lower triangular, so the sum begins at m = j.
         for j in range(n):
@@ -408,18 +441,25 @@ def predict_root(
             store(lanes, noise, i, j, root_Q[i, j])
     # Reflect [F S, root_Q] from the right, row by row, which leaves a lower triangular root.
     for i in range(n):
-        write_root_column(lanes, root, b, h, i, moved, noise)
+        write_root_column(lanes, size, root, b, h, i, moved, noise)
 
 
 @kernel(inlined=True)
 def write_root_column(
-    lanes: Lanes, root: FloatArray, b: int, h: int, i: int, moved: FloatArray, noise: FloatArray
+    lanes: Lanes,
+    size: Size,
+    root: FloatArray,
+    b: int,
+    h: int,
+    i: int,
+    moved: FloatArray,
+    noise: FloatArray,
 ) -> None:
     """Write column ``i`` of the triangular root of ``[moved, noise]``: the reflection that empties
     row ``i`` beyond its diagonal, applied to the rows below.
     """
     # The columns of root_Q right of i are still zero here.
-    n, pivot, beyond = len(moved), load(lanes, moved, i, i), spread(lanes, 0.0)
+    n, pivot, beyond = len(size), load(lanes, moved, i, i), spread(lanes, 0.0)
     for j in range(i + 1, n):
         entry = load(lanes, moved, i, j)
         beyond += entry * entry
@@ -458,7 +498,7 @@ def predict_root_single(
     root: FloatArray, F: FloatArray, root_Q: FloatArray, moved: FloatArray, noise: FloatArray
 ) -> None:
     """Apply ``predict_root`` to one filter with one lane, root (1, 1, n, n, 1)."""
-    predict_root(ONE, root, 0, 0, F, root_Q, moved, noise)
+    predict_root(ONE, F[0], root, 0, 0, F, root_Q, moved, noise)
 
 
 def predict_root_alone(root: FloatArray, F: FloatArray, root_Q: FloatArray) -> FloatArray:

@@ -224,6 +224,7 @@ def sample_with_gain(
     # (I - L H) P (I - L H)' + L R L' has the form of a prediction.
     predict_root(
         ONE,
+        state.size,
         combination.lanes,
         0,
         h,

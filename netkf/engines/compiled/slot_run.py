@@ -25,6 +25,7 @@ from netkf.algorithms.kernels.slots import (
     SlotSamples,
     slot_scratch,
 )
+from netkf.core.memory import LentMemory
 from netkf.engines.base import Progress
 from netkf.engines.compiled.samples import record_samples
 from netkf.engines.compiled.slot_events import SlotEvents
@@ -43,7 +44,7 @@ from netkf.engines.compiled.slot_messages import (
     draw_uniforms,
     make_rows,
 )
-from netkf.engines.compiled.slot_setup import AssignedSensor, SlotSetup, slot_setup
+from netkf.engines.compiled.slot_setup import BATCH_BYTES, AssignedSensor, SlotSetup, slot_setup
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.lanes import LANES, MANY, aligned, blocks_of, by_run, in_lanes, unset
 from netkf.linalg.portable import solve_lower
@@ -59,6 +60,7 @@ from netkf.trace.run import StateSamples
 from netkf.trace.schema import EVENT, KINDS
 
 NEVER = np.iinfo(np.int64).max
+_samples = LentMemory(BATCH_BYTES)
 
 
 class SampledStates(NamedTuple):
@@ -269,7 +271,7 @@ class SlotRuns:
         shapes = (runs, count, n), shape, (*shape, n), shape
         ends = np.cumsum([math.prod(each) for each in shapes])
         # One piece of memory: numpy asks for huge pages for large ones, which cost little to get.
-        parts = np.split(np.empty(int(ends[-1])), ends[:-1])
+        parts = np.split(_samples.array(int(ends[-1])), ends[:-1])
         return SampledStates(
             *(part.reshape(each) for part, each in zip(parts, shapes, strict=True))
         )
