@@ -25,7 +25,7 @@ from netkf.algorithms.kernels.slots import (
     SlotSamples,
     slot_scratch,
 )
-from netkf.core.memory import LentMemory
+from netkf.core.memory import LentMemory, keep_freed_memory
 from netkf.engines.base import Progress
 from netkf.engines.compiled.samples import record_samples
 from netkf.engines.compiled.slot_events import SlotEvents
@@ -539,6 +539,7 @@ def slot_batches(
     scenario: Scenario, seed: int, replicas: range, fingerprint: bool = False
 ) -> Iterator[RunBatch]:
     """Yield the runs of consecutive replicas in order, the first with its ``fingerprint``."""
+    keep_freed_memory()
     setup = slot_setup(scenario)
     # As many runs side by side as fit the memory.
     size = setup.batch_runs()
