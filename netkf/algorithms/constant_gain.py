@@ -26,8 +26,8 @@ from netkf.algorithms.kernels.slots import (
     SlotPlan,
     SlotSamples,
     SlotScratch,
+    move_root,
     predict_all,
-    predict_root,
     predict_root_alone,
     rebase,
     show,
@@ -125,17 +125,7 @@ def correct_by_gain(
         total = load(lanes, nodes.xhat, b, h, i) + load(lanes, scratch.moved_mean, i)
         store(lanes, nodes.xhat, b, h, i, total)
     # (I - L H) P (I - L H)' + L R L' has the form of a prediction.
-    predict_root(
-        lanes,
-        scratch.size,
-        nodes.root,
-        b,
-        h,
-        arrays.closed[h],
-        arrays.noise[h],
-        scratch.moved,
-        scratch.noise,
-    )
+    move_root(scratch, nodes.root, b, h, arrays.closed[h], arrays.noise[h])
 
 
 @built_in("constant-gain")

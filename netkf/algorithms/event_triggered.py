@@ -25,8 +25,8 @@ from netkf.algorithms.kernels.slots import (
     SlotSamples,
     SlotScratch,
     drop_silent,
+    move_root,
     predict_all,
-    predict_root,
     read_all,
     rebase,
     show,
@@ -146,18 +146,8 @@ def predict_copies(
     lanes = scratch.lanes
     for k in range(arrays.x.shape[1]):
         if any_lane(load_flags(lanes, arrays.known, b, k)):
-            transform_mean(lanes, scratch.size, arrays.x, b, k, nodes.F, scratch.moved_mean)
-            predict_root(
-                lanes,
-                scratch.size,
-                arrays.root,
-                b,
-                k,
-                nodes.F,
-                nodes.root_Q,
-                scratch.moved,
-                scratch.noise,
-            )
+            transform_mean(scratch, arrays.x, b, k, nodes.F)
+            move_root(scratch, arrays.root, b, k, nodes.F, nodes.root_Q)
 
 
 @kernel

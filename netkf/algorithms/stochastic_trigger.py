@@ -568,7 +568,7 @@ def expect_all(
                 x -= load(lanes, readings.local, b, s, i)
             store(lanes, arrays.x, b, h, i, x)
         if predicted:
-            transform_mean(lanes, scratch.size, arrays.x, b, h, nodes.F, scratch.moved_mean)
+            transform_mean(scratch, arrays.x, b, h, nodes.F)
         news = weigh_news(
             lanes, arrays.x, readings, (b, s, h), nodes.rows[h], arrays.trigger, arrays.z
         )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -31,6 +31,7 @@ from netkf.checks.mode_sequences import (
     MIN_CHAINS,
     gossip_modes,
     initial_roots,
+    kept_reference,
     pair_sources,
     reference_count,
     token_positions,
@@ -159,7 +160,14 @@ class GossipSamples(RunSamples):
     @cached_property
     def reference(self) -> ChainSamples:
         """Samples of the switched chain of G (20)."""
-        return _draw_reference(self.scenario, self.seed)
+        cls: Any = type(self)
+        found: ChainSamples = kept_reference(cls, self.scenario, self.seed)
+        return found
+
+    def draw_reference(self) -> ChainSamples:
+        """Return new samples of the switched chain, which do not depend on the runs."""
+        slots = list(check_slots(self.scenario))
+        return self._draw_paths("switched chain", slots, reference_count(self.scenario, 1))
 
     def _draw_paths(self, purpose: str, slots: list[int], count: int) -> ChainSamples:
         """Return samples of the chain after the given numbers of slots."""
@@ -173,13 +181,6 @@ class GossipSamples(RunSamples):
     def later(self, slots: int) -> ChainSamples:
         """Return a few samples after half of ``slots`` and after all of them."""
         return self._draw_paths("later chain", [slots // 2, slots], MIN_CHAINS // 4)
-
-
-@lru_cache(maxsize=1)
-def _draw_reference(scenario: Scenario, seed: int) -> ChainSamples:
-    """Return ``GossipSamples.reference``, once for all verdicts on runs of one seed."""
-    samples, count = GossipSamples(scenario, None, seed), reference_count(scenario, 1)
-    return samples._draw_paths("switched chain", list(check_slots(scenario)), count)
 
 
 def _draw_chains(

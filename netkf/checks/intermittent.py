@@ -37,6 +37,7 @@ from netkf.checks.mode_sequences import (
     find_arrivals,
     initial_roots,
     intermittent_modes,
+    kept_reference,
     reference_count,
     sensing_neighbours,
     with_horizon,
@@ -191,7 +192,14 @@ class IntermittentSamples(RunSamples):
     @cached_property
     def reference(self) -> ArrivalSamples:
         """Samples of filters with independent arrivals, R (12)."""
-        return _draw_reference(self.scenario, self.seed)
+        cls: Any = type(self)
+        found: ArrivalSamples = kept_reference(cls, self.scenario, self.seed)
+        return found
+
+    def draw_reference(self) -> ArrivalSamples:
+        """Return new samples of these filters, which do not depend on the runs."""
+        count = reference_count(self.scenario, len(self.nodes))
+        return self._draw_arrivals("arrivals", list(check_slots(self.scenario)), count, MAX_PATHS)
 
     def _draw_arrivals(
         self, purpose: str, slots: list[int], samples: int, paths: int
@@ -233,14 +241,6 @@ class IntermittentSamples(RunSamples):
     def later(self, slots: int) -> ArrivalSamples:
         """Return a few samples after half of ``slots`` and after all of them, without averages."""
         return self._draw_arrivals("later arrivals", [slots // 2, slots], MIN_CHAINS // 4, 0)
-
-
-@lru_cache(maxsize=1)
-def _draw_reference(scenario: Scenario, seed: int) -> ArrivalSamples:
-    """Return ``IntermittentSamples.reference``, once for all verdicts on runs of one seed."""
-    samples = IntermittentSamples(scenario, None, seed)
-    count = reference_count(scenario, len(samples.nodes))
-    return samples._draw_arrivals("arrivals", list(check_slots(scenario)), count, MAX_PATHS)
 
 
 def _delivery_probability(scenario: Scenario, direction: Direction) -> float:

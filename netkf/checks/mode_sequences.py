@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -59,6 +60,14 @@ def reference_count(scenario: Scenario, laws: int) -> int:
     budget = MAX_OPERATIONS if len(scenario.nodes) <= MAX_NODES else 0.1 * MAX_OPERATIONS
     wanted = budget / (laws * check_slots(scenario)[-1] * step)
     return int(np.clip(wanted, MIN_CHAINS, MAX_CHAINS))
+
+
+@lru_cache(maxsize=1)
+def kept_reference(samples: type[Any], scenario: Scenario, seed: int) -> Any:
+    """Return what a class of samples draws to compare runs with (``draw_reference``), once for all
+    verdicts on runs of one seed.
+    """
+    return samples(scenario, None, seed).draw_reference()
 
 
 def with_horizon(

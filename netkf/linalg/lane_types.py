@@ -18,10 +18,9 @@ from numba.extending import models, register_model
 
 from netkf.linalg import lanes as names
 from netkf.linalg.lean_lowering import entry_pointer
-from netkf.linalg.value_lowering import DATA, SHAPE, STRIDES
+from netkf.linalg.value_lowering import DATA, I64, SHAPE, STRIDES
 
 DOUBLE, BYTE, BIT, I32 = ir.DoubleType(), ir.IntType(8), ir.IntType(1), ir.IntType(32)
-I64 = ir.IntType(64)
 
 
 class LaneValue(types.Type):

@@ -1,4 +1,4 @@
-"""Short code for what kernels do most: loops over ranges, and entries of C-contiguous arrays.
+"""Short code for what kernels do most: reading and writing entries of C-contiguous arrays.
 
 numba writes 40 lines of LLVM's language for ``a[i, j]``, most of which LLVM removes again. The
 lines that are written here compute the same. Whatever is not met here goes to ``value_lowering``.

@@ -49,8 +49,8 @@ def without_collection() -> Iterator[None]:
 
 @cache
 def kernel_compiler(lean: bool, compact: bool = False) -> Any:
-    """Return numba's compiler without the passes that are not needed, and with short code for loops
-    and entries of arrays if ``lean``; if ``compact`` LLVM keeps the code small.
+    """Return numba's compiler without the passes that are not needed; with short code for entries
+    of arrays if ``lean``, which LLVM keeps small if it is ``compact`` too.
     """
     from numba.core import config
     from numba.core.compiler import CompilerBase, DefaultPassBuilder
@@ -59,8 +59,11 @@ def kernel_compiler(lean: bool, compact: bool = False) -> Any:
     from netkf.linalg.value_lowering import ValueLowering
 
     builder: Any = DefaultPassBuilder
+    lowering: Any = ValueLowering
     # Bounds are checked by numba's own code.
-    short = lean and not getattr(config, "BOUNDSCHECK", None)
+    if lean and not getattr(config, "BOUNDSCHECK", None):
+        lowering = CompactLowering if compact else KernelLowering
+    own: dict[str, Any] = {"IRLegalization": KernelLegalization, "NativeLowering": lowering}
 
     class KernelCompiler(CompilerBase):
         """Compiles kernels."""
@@ -68,10 +71,6 @@ def kernel_compiler(lean: bool, compact: bool = False) -> Any:
         def define_pipelines(self) -> list[Any]:
             pipeline = builder.define_nopython_pipeline(self.state)
             steps = [step for step in pipeline.passes if step[0].__name__ not in NOT_NEEDED]
-            own: dict[str, Any] = {"IRLegalization": KernelLegalization}
-            own["NativeLowering"] = ValueLowering
-            if short:
-                own["NativeLowering"] = CompactLowering if compact else KernelLowering
             pipeline.passes = [(own.get(step.__name__, step), said) for step, said in steps]
             pipeline.finalize()
             return [pipeline]

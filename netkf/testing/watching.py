@@ -76,31 +76,30 @@ _PLAIN = frozenset((str, bytes, bool, int, float, complex, type(None)))
 def leaves(value: Any) -> Leaves:
     """Return copies of every number, text and array that a value is made of, by their paths."""
     found: Leaves = {}
-    _add_leaves(value, "", set(), found)
+    _add_leaves([("", value)], "", set(), found)
     return found
 
 
-def _add_leaves(value: Any, path: str, whole: set[int], found: Leaves) -> None:
-    """Add the leaves of a value at a path; ``whole``: what it is a part of, by identity."""
-    if type(value) in _PLAIN:
-        found[path] = value
-    elif isinstance(value, np.ndarray):
-        found[path] = value.copy()
-    elif id(value) in whole or isinstance(value, np.random.Generator) or callable(value):
-        return
-    elif isinstance(value, (str, bytes, int, float, complex, np.generic)):
-        found[path] = value
-    else:
-        whole.add(id(value))
-        for name, item in _iterate_parts(value):
-            # Most parts are leaves: calls for each of them would take a third of a check.
-            if type(item) in _PLAIN:
-                found[path + name] = item
-            elif type(item) is np.ndarray:
-                found[path + name] = item.copy()
-            else:
-                _add_leaves(item, path + name, whole, found)
-        whole.discard(id(value))
+def _add_leaves(
+    parts: Iterable[tuple[str, Any]], path: str, whole: set[int], found: Leaves
+) -> None:
+    """Add the leaves of the parts of what is at a path; ``whole``: what they are parts of, by
+    identity.
+    """
+    # Most parts are leaves: calls for each of them would take a third of a check.
+    for name, part in parts:
+        if type(part) in _PLAIN:
+            found[path + name] = part
+        elif isinstance(part, np.ndarray):
+            found[path + name] = part.copy()
+        elif id(part) in whole or isinstance(part, np.random.Generator) or callable(part):
+            continue
+        elif isinstance(part, (str, bytes, int, float, complex, np.generic)):
+            found[path + name] = part
+        else:
+            whole.add(id(part))
+            _add_leaves(_iterate_parts(part), path + name, whole, found)
+            whole.discard(id(part))
 
 
 def _iterate_parts(value: Any) -> Iterable[tuple[str, Any]]:

@@ -7,6 +7,7 @@ import pytest
 import scipy.linalg
 
 import netkf
+from netkf.algorithms.kernels.root_flow import cell_of
 from netkf.engines.compiled import agenda, batches, flow, visits
 from netkf.engines.compiled.flow import Workspace
 from netkf.engines.compiled.lane_series import NEAR
@@ -110,8 +111,7 @@ def test_only_runs_whose_messages_take_no_time(ring):
 @kernel
 def summed(series, unit, far_terms, gap, out):
     """All columns of a table of one model at a gap."""
-    cell = int(gap / unit)
-    since = gap if cell == 0 else gap - (cell + 0.5) * unit
+    cell, since = cell_of(unit, gap)
     fill_row(out, 0, series, series.shape[2] if cell < NEAR else far_terms, 0, cell, since)
 
 

@@ -119,10 +119,8 @@ def test_no_kernel_of_the_package_counts_from_the_end():
 
 
 CHECKED = """
-import numba
 import numpy as np
 from netkf.linalg.compiling import kernel
-from netkf.linalg.shortcuts import kernel_compiler
 @kernel(inlined=True)
 def inner(a, k):
     return a[k]

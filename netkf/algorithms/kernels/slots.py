@@ -367,39 +367,20 @@ def predict_all(nodes: SlotNodes, scratch: SlotScratch, b: int) -> None:
     """Move all filters of a block to the next slot: ``F xhat`` and ``F P F' + Q``."""
     for h in range(len(nodes.rows)):
         predict_mean(nodes, scratch, b, h)
-        predict_root(
-            scratch.lanes,
-            scratch.size,
-            nodes.root,
-            b,
-            h,
-            nodes.F,
-            nodes.root_Q,
-            scratch.moved,
-            scratch.noise,
-        )
+        move_root(scratch, nodes.root, b, h, nodes.F, nodes.root_Q)
 
 
 @kernel(inlined=True)
 def predict_mean(nodes: SlotNodes, scratch: SlotScratch, b: int, h: int) -> None:
     """Move the estimate of a filter to the next slot, ``F xhat``."""
-    transform_mean(scratch.lanes, scratch.size, nodes.xhat, b, h, nodes.F, scratch.moved_mean)
+    transform_mean(scratch, nodes.xhat, b, h, nodes.F)
 
 
 @kernel(inlined=True)
-def transform_mean(
-    lanes: Lanes,
-    size: Size,
-    x: FloatArray,
-    b: int,
-    h: int,
-    F: FloatArray,
-    mean_scratch: FloatArray,
-) -> None:
-    """Multiply estimate [b, h] of ``x`` (B, H, n, L) by F; ``mean_scratch`` (n, L) is scratch of a
-    large n.
-    """
-    n, moved_mean = len(size), local_lanes_vector(size, lanes, mean_scratch)
+def transform_mean(scratch: SlotScratch, x: FloatArray, b: int, h: int, F: FloatArray) -> None:
+    """Multiply estimate [b, h] of ``x`` (B, H, n, L) by F."""
+    lanes, n = scratch.lanes, len(scratch.size)
+    moved_mean = local_lanes_vector(scratch.size, lanes, scratch.moved_mean)
     for i in range(n):
         total = spread(lanes, 0.0)
         for j in range(n):
@@ -408,6 +389,14 @@ def transform_mean(
     # F xhat needs all of the old xhat, hence the copy.
     for i in range(n):
         store(lanes, x, b, h, i, load(lanes, moved_mean, i))
+
+
+@kernel(inlined=True)
+def move_root(
+    scratch: SlotScratch, root: FloatArray, b: int, h: int, F: FloatArray, root_Q: FloatArray
+) -> None:
+    """Apply ``predict_root`` with ``scratch``."""
+    predict_root(scratch.lanes, scratch.size, root, b, h, F, root_Q, scratch.moved, scratch.noise)
 
 
 @kernel(inlined=True)

@@ -12,6 +12,7 @@ import math
 
 import numpy as np
 
+from netkf.algorithms.kernels.root_flow import CELL_BYTES
 from netkf.engines.compiled.kept import once_per_scenario
 from netkf.engines.compiled.state import Filters, filters_at_start
 from netkf.linalg.arrays import FloatArray, IntArray
@@ -23,9 +24,9 @@ from netkf.scenario.scenario import Scenario
 ROUNDING = 2.0**-52
 """Of the largest term of an entry, what may be left out."""
 
-PARTS, TABLE_BYTES = 4, 1 << 18
+PARTS = 4
 """Parts that a cell of FlowTable is divided into, since shorter cells need fewer terms; fewer parts
-where the table of a model would be larger than that.
+where the table of a model would be larger than CELL_BYTES.
 """
 
 NEAR = 2
@@ -133,7 +134,8 @@ def _united(series: FloatArray, unit: FloatArray, mine: np.ndarray) -> LaneSerie
     place = np.array([found.setdefault(column.tobytes(), len(found)) for column in columns])
     first = np.unique(place, return_index=True)[1]
     series, unit = divided(np.moveaxis(columns[first], 0, -1), unit)
-    terms = terms_needed(series, unit, 0)
+    needed = terms_needed(series, unit)
+    terms = number_of_terms(needed, series.shape[2])
     series = series[:, :, :terms]
     # Whole lanes, see series.fill_row.
     width = -(-len(first) // LANES) * LANES
@@ -144,7 +146,7 @@ def _united(series: FloatArray, unit: FloatArray, mine: np.ndarray) -> LaneSerie
         unit=unit,
         place=place.astype(np.int64),
         row=np.cumsum(mine) - 1,
-        far_terms=min(terms, terms_needed(series, unit, NEAR)),
+        far_terms=number_of_terms(needed[NEAR:], terms),
     )
 
 
@@ -152,7 +154,7 @@ def divided(series: FloatArray, unit: FloatArray) -> tuple[FloatArray, FloatArra
     """Return the series (M, cells, terms, E) in shorter cells, and the seconds of these."""
     models, cells, terms, entries = series.shape
     parts = PARTS
-    while parts > 1 and cells * parts * MANY_TERMS[-1] * entries * series.itemsize > TABLE_BYTES:
+    while parts > 1 and cells * parts * MANY_TERMS[-1] * entries * series.itemsize > CELL_BYTES:
         parts //= 2
     if parts == 1:
         return series, unit
@@ -167,18 +169,23 @@ def divided(series: FloatArray, unit: FloatArray) -> tuple[FloatArray, FloatArra
     return made.reshape(models, cells * parts, terms, entries), unit / parts
 
 
-def terms_needed(series: FloatArray, unit: FloatArray, first: int) -> int:
-    """Return the number of terms after which no entry of cells from ``first`` on has more than
-    rounding left at the ends of its cell, one that ``series.fill_row`` adds up fast if there is
-    one.
+def terms_needed(series: FloatArray, unit: FloatArray) -> IntArray:
+    """Return for each cell the number of terms after which no entry of any model has more than
+    rounding left at the ends of the cell.
     """
     # From its middle a cell reaches half a unit, but the first one reaches a whole unit.
     spans = np.repeat(0.5 * unit[:, None], series.shape[1], axis=1)
     spans[:, :1] *= 2.0
-    series, spans = series[:, first:], spans[:, first:]
     sizes = np.abs(series) * (spans[..., None] ** np.arange(series.shape[2]))[..., None]
     left = np.cumsum(sizes[:, :, ::-1], axis=2)[:, :, ::-1]
     largest = sizes.max(axis=2, keepdims=True)
     most = ROUNDING * largest + NOTHING * largest.max(axis=3, initial=0.0, keepdims=True)
-    needed = int((left > most).any(axis=(0, 1, 3)).sum())
-    return next((terms for terms in MANY_TERMS if terms >= needed), max(needed, series.shape[2]))
+    return np.asarray((left > most).any(axis=(0, 3)).sum(axis=1))
+
+
+def number_of_terms(needed: IntArray, most: int) -> int:
+    """Return how many terms to add up in cells that need so many, at most ``most``: a number that
+    ``series.fill_row`` adds up fast if there is one.
+    """
+    least = int(needed.max(initial=0))
+    return next((terms for terms in MANY_TERMS if terms >= least), most)
