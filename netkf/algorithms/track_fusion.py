@@ -51,7 +51,7 @@ from netkf.linalg.small import copy_matrix
 
 TRACE, DETERMINANT = "trace", "determinant"
 INTERSECTION = 'rule = "ci"'
-COMBINATIONS, MOST_BITS = 64, 62
+COMBINATIONS, MAX_DIRECTION_BITS = 64, 62
 """Combinations of tracks that are kept of a node in a slot, and directions that have a bit."""
 
 
@@ -345,7 +345,7 @@ def combine_heard(
             count += 1
             arrays.near[count] = links.sender[m]
             # The senders heard, as bits of a number: the key of the combination.
-            heard += 1 << min(m - links.first[h], MOST_BITS)
+            heard += 1 << min(m - links.first[h], MAX_DIRECTION_BITS)
     if count == 0:
         return
     k = combination_of(arrays, heard, count, links.first[h + 1] - links.first[h])
@@ -372,7 +372,7 @@ def combination_of(arrays: TrackArrays, heard: int, count: int, degree: int) -> 
     cache = arrays.cache
     k = (heard ^ (heard >> 6) ^ (heard >> 12)) % len(cache.key)
     # Directions beyond the bits of a number have no key of their own.
-    if degree > MOST_BITS or cache.key[k] != heard:
+    if degree > MAX_DIRECTION_BITS or cache.key[k] != heard:
         cache.key[k] = heard
         for a in range(count + 1):
             for b in range(count + 1):

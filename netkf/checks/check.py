@@ -29,7 +29,7 @@ from netkf.checks.evidence import (
 )
 from netkf.checks.exact import promised_filter, with_base_filter, with_promised_filter
 from netkf.checks.looks import (
-    MOST_RUNS,
+    MAX_LOOKED_RUNS,
     is_decided,
     keep_decisions,
     level_of_look,
@@ -287,7 +287,7 @@ def check(
     progress: Callable[[int, int], None] | None = None,
     *,
     until: str | None = None,
-    most: int = MOST_RUNS,
+    most: int = MAX_LOOKED_RUNS,
     earlier: Verdict | None = None,
 ) -> Verdict:
     """Compare all that is promised of the scenario's filter with ``runs`` replicas.

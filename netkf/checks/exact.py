@@ -64,7 +64,7 @@ where limits are promised to each node, rows about one node at one time need so 
 """
 MAX_ERRORS = 64
 """Errors of all nodes together for which the exact covariance (64, 64) is cheap."""
-LEAST_VARIANCE = 1e-8
+MIN_VARIANCE = 1e-8
 """Relative variance below which a direction is left out: rounding decides about its errors."""
 BOUND_TOLERANCE, BIAS_TOLERANCE = 1e-8, 0.5
 SINGULAR = 1e-12
@@ -138,7 +138,7 @@ def _replayed_summary(
     Sigma, replayed = diagonal_blocks(stacked, estimators), law.P
     centred = run.error[:, :estimators] - mean
     floor = np.maximum((BLUR * run.rounding) ** 2, _variance_floor(scenario))
-    whole = whiten_errors(centred[at], stacked[at], LEAST_VARIANCE, floor[at])
+    whole = whiten_errors(centred[at], stacked[at], MIN_VARIANCE, floor[at])
     joint, bias = _pool_times(centred, law.covariance, float(floor.max()))
     quadratic = _pool_nees(centred, run.P[:, :estimators], law)
     if estimators < nodes:  # all share one pooled filter
@@ -167,7 +167,7 @@ def _pool_times(
     scale = np.repeat(np.sqrt(np.diagonal(covariance).reshape(-1, size).max(axis=1)), size)
     scale = np.where(scale > 0.0, scale, 1.0)
     values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
-    used = (values > LEAST_VARIANCE * values[-1]) & (values > floor / scale.min() ** 2)
+    used = (values > MIN_VARIANCE * values[-1]) & (values > floor / scale.min() ** 2)
     white = (vectors / np.sqrt(np.where(used, values, np.inf))).T / scale
     z = white @ e.reshape(-1)
     # A constant bias b adds white X b, with X the identities of all estimates below each other.
@@ -320,7 +320,7 @@ def check_error_covariance(samples: RunSamples, level: float) -> Finding:
     alone = whiten_errors(
         e.reshape(-1, 1, n),
         Sigma.reshape(-1, n, n),
-        LEAST_VARIANCE,
+        MIN_VARIANCE,
         _variance_floor(scenario),
     ).reshape(len(e), -1, 2)
     both = np.concatenate([alone, whole], axis=1)

@@ -11,9 +11,9 @@ from collections.abc import Sequence
 
 from netkf.checks.evidence import BROKEN, UNDECIDED, Evidence
 
-MOST_RUNS = 20_000
+MAX_LOOKED_RUNS = 20_000
 """Runs after which a check until all is decided ends by default."""
-LEAST_GROWTH, MOST_GROWTH = 1.5, 6.0
+MIN_GROWTH, MAX_GROWTH = 1.5, 6.0
 """Factors by which the runs grow from one look to the next."""
 MARGIN = 1.1
 """Factor on the forecast: the next look spends less of the level, and has wider intervals."""
@@ -33,7 +33,7 @@ def next_runs(rows: Sequence[Evidence], runs: int, most: int) -> int:
     """Return the number of runs at which to look again, as the row that needs most of them asks."""
     needed = [row.needed for row in rows if row.verdict == UNDECIDED and row.needed is not None]
     wanted = MARGIN * max(needed, default=runs)
-    growth = min(max(wanted, LEAST_GROWTH * runs), MOST_GROWTH * runs)
+    growth = min(max(wanted, MIN_GROWTH * runs), MAX_GROWTH * runs)
     return min(most, math.ceil(growth))
 
 

@@ -22,7 +22,7 @@ from netkf.figures.style import (
     write,
 )
 
-LONGEST_LABEL = 72
+MAX_LABEL_LENGTH = 72
 FURTHEST = 3.0
 """Tolerances at which the axis ends."""
 
@@ -95,4 +95,4 @@ def _draw_row(axes: Any, height: int, row: Evidence) -> None:
 
 def _make_label(row: Evidence) -> str:
     """Return the statement of a promise, shortened to one line of the picture."""
-    return textwrap.shorten(row.promise, LONGEST_LABEL, placeholder=" ...")
+    return textwrap.shorten(row.promise, MAX_LABEL_LENGTH, placeholder=" ...")

@@ -9,7 +9,7 @@ from netkf.linalg.arrays import FloatArray, IntArray
 from netkf.scenario.scenario import Scenario
 
 HORIZON_SHARES = (0.125, 0.25, 0.5, 1.0)
-POOLED_ERRORS, MOST_POOLED = 192, 24
+POOLED_ERRORS, MAX_POOLED = 192, 24
 """Errors of all nodes at all times of a run that are whitened together, and times of a run at which
 they are looked at: many times of one run say as much about a covariance as many runs.
 """
@@ -54,7 +54,7 @@ def probe_times(scenario: Scenario) -> list[float]:
     evenly over the horizon at which only all errors together are looked at.
     """
     checked = check_times(scenario)
-    count = min(MOST_POOLED, POOLED_ERRORS // errors_at_once(scenario))
+    count = min(MAX_POOLED, POOLED_ERRORS // errors_at_once(scenario))
     even = np.linspace(0.0, checked[-1], max(count, 0) + 1)[1:].tolist()
     if scenario.slotted:
         period = scenario.slot_plant.period

@@ -21,7 +21,7 @@ from netkf.checks.evidence import (
     gaussian_test,
 )
 from netkf.checks.exact import (
-    LEAST_VARIANCE,
+    MIN_VARIANCE,
     check_bias,
     check_error_covariance,
     few_errors,
@@ -100,7 +100,7 @@ class PushSumSamples(RunSamples):
         """
         Sigma, e = self.runs.Sigma[self.followed, -1], self.runs.e[self.followed, -1]
         values, vectors = np.linalg.eigh(Sigma)
-        least = LEAST_VARIANCE * values[..., -1:]
+        least = MIN_VARIANCE * values[..., -1:]
         along = np.einsum("rnab,rna->rnb", vectors, e)
         return np.asarray(along / np.sqrt(np.maximum(values, least)))
 

@@ -96,7 +96,7 @@ def _check(scenario: Scenario, options: argparse.Namespace) -> int:
 def _run_check(scenario: Scenario, options: argparse.Namespace, earlier: Verdict | None) -> Verdict:
     """Return the verdict on --runs runs, those of an ``earlier`` one included."""
     from netkf.checks.check import check
-    from netkf.checks.looks import MOST_RUNS
+    from netkf.checks.looks import MAX_LOOKED_RUNS
 
     with _explain_interrupt(options, earlier), ProgressLine() as line:
         return check(
@@ -107,7 +107,7 @@ def _run_check(scenario: Scenario, options: argparse.Namespace, earlier: Verdict
             scheduler=options.scheduler,
             progress=line.counter("runs"),
             until=options.until,
-            most=options.most or MOST_RUNS,
+            most=options.most or MAX_LOOKED_RUNS,
             earlier=earlier,
         )
 

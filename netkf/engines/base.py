@@ -40,7 +40,7 @@ class Rank(IntEnum):
     PROBE = 6
 
 
-SHORTEST_SHARE, LONGER = 1e-9, 1.02
+MIN_GAP_SHARE, LONGER = 1e-9, 1.02
 """The least part of a gap whose readings are used at once, however short the interval, and by what
 it grows from one interval to the next: a covariance beyond all bounds, which no reading shrinks as
 it should, takes a thousand of them and not a billion.

@@ -38,7 +38,7 @@ ROOMS = (
 )
 """Whose code and numbers compiled functions may hold."""
 
-MOST_STATES = 4
+MAX_CACHED_STATES = 4
 """Of the sources, whose compiled code is kept."""
 
 UNROLLED, UNROLLED_BY_NUMBA = 1000, 300
@@ -292,5 +292,5 @@ def _make_room(folder: Path) -> None:
     """Remove what was compiled from sources that are long gone."""
     found = [path for path in folder.glob("netkf-*") if path.is_dir()]
     # The newest states stay: switching between a few branches does not compile anew.
-    for old in sorted(found, key=lambda path: path.stat().st_mtime)[: -MOST_STATES + 1]:
+    for old in sorted(found, key=lambda path: path.stat().st_mtime)[: -MAX_CACHED_STATES + 1]:
         shutil.rmtree(old, ignore_errors=True)

@@ -15,7 +15,7 @@ import numpy as np
 from netkf.linalg.arrays import FloatArray, square_root, symmetric
 from netkf.linalg.jacobi import diagonalise
 
-LARGEST = 40
+MAX_REFINED_STATES = 40
 """States up to which eigenvectors are refined here; above, they are those of LAPACK."""
 SAME = 0.9
 """Least cosine between an eigenvector and that of LAPACK which it stands for."""
@@ -110,7 +110,7 @@ def noise_root(matrix: FloatArray) -> FloatArray:
     ``square_root``.
     """
     given = square_root(matrix)
-    if len(matrix) > LARGEST:
+    if len(matrix) > MAX_REFINED_STATES:
         return given
     values, vectors = eigenvectors(matrix)
     lengths = np.sqrt(product(given.T, given).diagonal())

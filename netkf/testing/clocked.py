@@ -24,7 +24,7 @@ GAPS = ((1e-3, 0.02), (0.3, 0.5), (1.0, 2.0))
 COMPOSES = 1e-6  # relative: above the rounding of any way to solve the Riccati equation
 # The truth is shifted late, when messages of all kinds are under way.
 ROUNDS, SHIFTED = 6, 4
-LONGEST_SAMPLE_GAP, LONGEST_INCREMENT_GAP = 0.5, 0.05
+MAX_SAMPLE_GAP, MAX_INCREMENT_GAP = 0.5, 0.05
 SAMPLED = 0.8  # probability that a node samples: some rounds go without
 # More than enough for e^{A s} within one gap.
 POINTS, WEIGHTS = np.polynomial.legendre.leggauss(12)
@@ -121,9 +121,9 @@ class ClockTrial(Trial):
 
     def _pass_time(self, shift: bool) -> None:
         """Let time pass: the truth may be shifted, and sensors are sampled."""
-        longest = LONGEST_SAMPLE_GAP
+        longest = MAX_SAMPLE_GAP
         if self._increments:
-            longest = min(LONGEST_INCREMENT_GAP, *(model.interval for model in self.models))
+            longest = min(MAX_INCREMENT_GAP, *(model.interval for model in self.models))
         gap = longest * self.random.uniform(0.5, 1.0)
         start, self.offset = self.offset, scipy.linalg.expm(gap * self._A) @ self.offset
         self._time += gap

@@ -15,7 +15,7 @@ from netkf.testing.parents import check_parent
 from netkf.testing.shifts import all_trials, check_shift
 from netkf.testing.watching import Watched, demand, make_part
 
-MOST_LINKS = 8  # weights are checked for all pairs of degrees up to this
+MAX_DEGREE = 8  # weights are checked for all pairs of degrees up to this
 PHASES = ("predict", "sense", "exchange")
 FLAGS = (
     *("predicts", "pairwise", "one_way", "inverts", "talks", "pooled"),
@@ -138,7 +138,7 @@ def _check_weights(watched: Watched) -> None:
     given = part.pair_weights
     if given is not None:
         return _check_given_weights(watched, np.asarray(given))
-    degrees = range(1, int(min(most, MOST_LINKS)) + 1)
+    degrees = range(1, int(min(most, MAX_DEGREE)) + 1)
     for degree in degrees:
         found = [watched.call("weight", degree, peer) for peer in degrees]
         for peer, weight in zip(degrees, found, strict=True):

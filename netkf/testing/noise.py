@@ -20,7 +20,7 @@ LAGS = (1, 2, 3, 7)
 PARTS = 4
 NEGLIGIBLE = 1e-8
 """Share of a standard deviation that counts as rounding."""
-FEWEST = 1000
+MIN_VALUES = 1000
 """Values below which the normal law of a mean cannot be relied on so far out."""
 
 
@@ -37,7 +37,7 @@ def standard_errors(count: int) -> float:
     return float(-ndtri(0.5 * LEVEL / (FAMILIES * max(count, 1))))
 
 
-def largest_deviation(values: FloatArray, fewest: int = FEWEST) -> Deviation | None:
+def largest_deviation(values: FloatArray, fewest: int = MIN_VALUES) -> Deviation | None:
     """Return the mean of ``values`` (N, ...) over the first axis that is significantly not zero,
     the most significant one, or None (always with less than ``fewest`` values). Values must be
     uncorrelated along the first axis.

@@ -39,7 +39,7 @@ SHORT = 40
 TIMES_RUNS, SAMPLES = 400, 50.0
 ROUNDING = 1e-9
 DERIVATIVE_STEP, DERIVATIVE_TOLERANCE = 1e-5, 1e-6
-MOST_STATES = 12
+MAX_STATES = 12
 """Components of a state that a nonlinear sensor is tried with."""
 
 
@@ -397,11 +397,11 @@ def _check_nonlinear(sensor: NonlinearSensor, name: str, seed: int) -> None:
 
 
 def _states_read(sensor: NonlinearSensor, name: str) -> int:
-    """Return the smallest number of components, up to MOST_STATES, of a state that h can read."""
-    for n in range(1, MOST_STATES + 1):
+    """Return the smallest number of components, up to MAX_STATES, of a state that h can read."""
+    for n in range(1, MAX_STATES + 1):
         if _can_read(sensor, n):
             return n
-    return fail(name, f"h and jacobian must read a state of at most {MOST_STATES} components")
+    return fail(name, f"h and jacobian must read a state of at most {MAX_STATES} components")
 
 
 def _can_read(sensor: NonlinearSensor, n: int) -> bool:

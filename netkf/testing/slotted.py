@@ -9,14 +9,14 @@ from netkf.algorithms.models import SlotModel
 from netkf.testing.trials import Trial
 
 # Few, since every method is called for every node and step.
-SLOTS, MOST_STEPS, MOST_WAIT = 5, 5, 20
+SLOTS, MAX_STEPS, MAX_WAIT = 5, 5, 20
 SHIFTED = 3  # slots before the end: enough for every kind of message after the shift
 PERIOD = 1.0
 
 
 def slots_of(part: Any) -> int:
     """Return the number of slots of a trial: some with exchanges."""
-    return min(int(part.first_slot), MOST_WAIT) + SLOTS
+    return min(int(part.first_slot), MAX_WAIT) + SLOTS
 
 
 class SlotTrial(Trial):
@@ -47,7 +47,7 @@ class SlotTrial(Trial):
         for kind in part.schedule:
             if kind == "exchange":
                 if part.talks and slot >= part.first_slot:
-                    for step in range(min(part.exchange_steps(phase), MOST_STEPS)):
+                    for step in range(min(part.exchange_steps(phase), MAX_STEPS)):
                         self._exchange(Exchange(PERIOD * slot, phase, step, slot), lost)
                 phase += 1
             elif slot > 0 or part.predicts:  # a filtered one starts from before any reading

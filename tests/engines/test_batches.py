@@ -63,12 +63,12 @@ def assert_alone(scenario, engine, seed, replicas, fingerprint=False):
 @pytest.mark.parametrize("largest", [256, 3])
 @pytest.mark.parametrize("name", CASES)
 def test_runs_drawn_together_are_what_they_are_alone(ring, monkeypatch, name, largest):
-    monkeypatch.setattr(batches, "LARGEST_BATCH", largest)
+    monkeypatch.setattr(batches, "MAX_BATCH_RUNS", largest)
     assert_alone(ring.replace({"horizon": 15.0, **CASES[name]}), CompiledEngine(), 7, range(1, 6))
 
 
 def test_a_batch_of_one_where_memory_is_short(ring, monkeypatch):
-    monkeypatch.setattr(batches, "MOST_BYTES", 1 << 12)
+    monkeypatch.setattr(batches, "MAX_BATCH_BYTES", 1 << 12)
     assert batches.batch_size(ring) == 1
     assert_alone(ring.replace({"horizon": 2.0}), CompiledEngine(), 7, range(2))
 

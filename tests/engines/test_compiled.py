@@ -74,7 +74,7 @@ SLOTS = {
 @pytest.mark.parametrize("rows", [1 << 15, 50])
 def test_slots_made_together_agree(monkeypatch, name, rows):
     """Also where few are made at once."""
-    monkeypatch.setattr("netkf.engines.compiled.slot_run.MOST_ROWS", rows)
+    monkeypatch.setattr("netkf.engines.compiled.slot_run.MAX_EVENT_ROWS", rows)
     file, changes = SLOTS[name]
     scenario = netkf.load(SCENARIOS / f"{file}.toml")
     assert_agree(scenario.replace({"horizon": 12.0 * scenario.slot_plant.period, **changes}))
@@ -322,7 +322,7 @@ def test_many_lots_of_slots_are_one_run(monkeypatch, stop):
     ring = netkf.load(SCENARIOS / "push_sum_planar.toml").replace({"horizon": 10.0})
     ring = ring.replace({"filter.stop": stop, "filter.tolerance": 1e-3})
     whole = netkf.simulate(ring, engine="compiled")
-    monkeypatch.setattr("netkf.engines.compiled.slot_run.MOST_ROWS", 100)
+    monkeypatch.setattr("netkf.engines.compiled.slot_run.MAX_EVENT_ROWS", 100)
     pieces = netkf.simulate(ring, engine="compiled")
     assert pieces.fingerprint == whole.fingerprint
     assert pieces.sums == whole.sums
@@ -371,14 +371,14 @@ def test_windows_rows_visits_and_mail_end_anywhere(ring, monkeypatch, delay):
     monkeypatch.setattr("netkf.trace.recorder.BLOCK", 7)
     monkeypatch.setattr(f"{module}.flow.FIRST_ROWS", 6)
     monkeypatch.setattr(f"{module}.flow.FIRST_MESSAGES", 2)
-    monkeypatch.setattr(f"{module}.flow.MOST_SAMPLES", 2)
+    monkeypatch.setattr(f"{module}.flow.MAX_BUFFERED_SAMPLES", 2)
     for room in ("plants.paths", "engines.compiled.draws", "engines.compiled.flow"):
         monkeypatch.setattr(f"netkf.{room}.BLOCK", 3)
-    monkeypatch.setattr(f"{module}.draws.MOST_BLOCKS", 1)
-    monkeypatch.setattr(f"{module}.visits.MOST_VISITS", 1)
+    monkeypatch.setattr(f"{module}.draws.MAX_STEP_BLOCKS", 1)
+    monkeypatch.setattr(f"{module}.visits.MAX_VISITS", 1)
     monkeypatch.setattr(f"{module}.poisson.TICKS", 5)
     monkeypatch.setattr(f"{module}.poisson.TICKS_A_LINK", 0)
-    monkeypatch.setattr(f"{module}.schedule.LEAST_TICKS", 5)
+    monkeypatch.setattr(f"{module}.schedule.MIN_WINDOW_TICKS", 5)
     monkeypatch.setattr(f"{module}.schedule.TICKS_A_LINK", 1)
     pieces = netkf.simulate(busy, engine="compiled")
     assert pieces.fingerprint == whole.fingerprint
@@ -402,7 +402,7 @@ def test_messages_and_history_that_need_more_room(ring, monkeypatch, kind):
     )
     for name in ("FIRST_MESSAGES", "FIRST_PAST"):
         monkeypatch.setattr(f"netkf.engines.compiled.flow.{name}", 1)
-    monkeypatch.setattr("netkf.engines.compiled.schedule.MOST_TICKS", 30)
+    monkeypatch.setattr("netkf.engines.compiled.schedule.MAX_WINDOW_TICKS", 30)
     assert assert_agree(case).count("absorb") > 50
 
 

@@ -85,10 +85,10 @@ def test_company_does_not_matter(ring, monkeypatch, name):
     case = ring.replace({"horizon": 8.0, **CASES[name]})
     (whole,) = batches.flow_batches(case, 5, range(20))
     for places, most, largest in ((1, 1 << 14, 256), (400, 1, 256), (20, 50, 7)):
-        monkeypatch.setattr(agenda, "MOST_PLACES", places)
+        monkeypatch.setattr(agenda, "MAX_FILTERS", places)
         for module in (agenda, visits):
-            monkeypatch.setattr(module, "MOST_VISITS", most)
-        monkeypatch.setattr(batches, "LARGEST_BATCH", largest)
+            monkeypatch.setattr(module, "MAX_VISITS", most)
+        monkeypatch.setattr(batches, "MAX_BATCH_RUNS", largest)
         again = case.replace({})  # nothing is kept of the runs before
         parts = list(batches.flow_batches(again, 5, range(20)))
         for field in ("xhat", "P", "counts"):

@@ -71,7 +71,7 @@ def test_summary_is_what_the_states_say(ring, finished):
 def test_tables_are_written_in_pieces(ring, tmp_path, monkeypatch, engine):
     monkeypatch.setattr("netkf.trace.recorder.BLOCK", 100)
     monkeypatch.setattr("netkf.engines.compiled.flow.FIRST_ROWS", 100)
-    monkeypatch.setattr("netkf.engines.compiled.flow.MOST_SAMPLES", 10)
+    monkeypatch.setattr("netkf.engines.compiled.flow.MAX_BUFFERED_SAMPLES", 10)
     monkeypatch.setattr("netkf.runs.parquet_files.ROWS", 50)
     import pyarrow.parquet as pq
 
@@ -87,7 +87,7 @@ def test_tables_are_written_in_pieces(ring, tmp_path, monkeypatch, engine):
 
 @pytest.mark.parametrize("engine", [SimpyEngine(), "compiled"], ids=str)
 def test_an_interrupted_run_keeps_what_it_had(ring, tmp_path, monkeypatch, engine):
-    monkeypatch.setattr("netkf.engines.compiled.flow.MOST_SAMPLES", 5)
+    monkeypatch.setattr("netkf.engines.compiled.flow.MAX_BUFFERED_SAMPLES", 5)
 
     def impatient(time):
         if time >= 7.0:

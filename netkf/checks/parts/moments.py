@@ -31,7 +31,7 @@ CELLS, SHARE_TOLERANCE = 16, 0.02
 """Cells of equal probability into which numbers of a known law are sorted, and the tolerated error
 of the share of one.
 """
-LEAST = 1e-10
+MIN_VARIANCE_SHARE = 1e-10
 """Share of the largest variance below which a direction has no noise."""
 FURTHER, PARTS = 3, 4
 """Lags beyond the first at which each entry is compared with itself, and parts of a series in which
@@ -137,7 +137,7 @@ def total(many: NoiseMoments) -> NoiseMoments:
 def whitening_matrix(covariance: FloatArray) -> FloatArray:
     """Return a matrix (d, n) that makes a noise with this covariance white; d is its rank."""
     values, vectors = np.linalg.eigh(covariance)
-    used = values > LEAST * max(values[-1], 0.0)
+    used = values > MIN_VARIANCE_SHARE * max(values[-1], 0.0)
     return np.asarray((vectors[:, used] / np.sqrt(values[used])).T)
 
 

@@ -42,7 +42,7 @@ from netkf.engines.compiled.schedule import delay_is_zero
 from netkf.engines.compiled.senders import senders_of
 from netkf.engines.compiled.state import LINKS, NODES, Simulation
 from netkf.engines.compiled.visits import (
-    MOST_VISITS,
+    MAX_VISITS,
     Visits,
     append_visit,
     process_visits,
@@ -58,10 +58,10 @@ from netkf.scenario.scenario import Scenario
 PAUSE, FULL = -1, -2
 """Why the agenda stopped, beside WANT_...: the time it goes to, or no space for visits."""
 
-MOST_WAYS = 62
+MAX_LINKS_OF_CLOCK = 62
 """Directed links that one clock sends on, each of which is a bit."""
 
-MOST_PLACES = 200
+MAX_FILTERS = 200
 """Filters that are simulated together, unless one run has more."""
 
 _POSITIONS = (
@@ -90,13 +90,13 @@ def is_immediate(scenario: Scenario) -> bool:
         and type(network.activation) is Poisson
         and delay_is_zero(network.channel)
         and getattr(hosted, "max_age", math.inf) >= 0.0
-        and int(np.diff(senders_of(scenario).first).max(initial=0)) <= MOST_WAYS
+        and int(np.diff(senders_of(scenario).first).max(initial=0)) <= MAX_LINKS_OF_CLOCK
     )
 
 
 def together(nodes: int, runs: int) -> int:
     """Return how many of several runs are simulated together."""
-    return max(1, min(runs, MOST_PLACES // nodes))
+    return max(1, min(runs, MAX_FILTERS // nodes))
 
 
 def pause_of(state: Simulation, ticks: int, count: int) -> float:
@@ -106,7 +106,7 @@ def pause_of(state: Simulation, ticks: int, count: int) -> float:
     nodes = len(state.nodes)
     each = ticks + len(state.path.grid) * len(state.sensing.index) + nodes * len(state.probes)
     # Some visits less than there is space for.
-    return state.horizon * 0.7 * MOST_VISITS / max(1.0, count * each)
+    return state.horizon * 0.7 * MAX_VISITS / max(1.0, count * each)
 
 
 def simulate_together(state: Simulation, visits: Visits, batch: BatchArrays, group: int) -> None:

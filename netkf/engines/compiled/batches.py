@@ -37,10 +37,10 @@ from netkf.trace.batch import COMPLETE, DIVERGED, RunBatch
 from netkf.trace.recorder import Recorder
 from netkf.trace.schema import KINDS
 
-LARGEST_BATCH = 512
+MAX_BATCH_RUNS = 512
 QUICK_VISITS = 1 << 17
 """Visits of nodes that take some ten milliseconds: to prepare a batch takes one or two."""
-MOST_BYTES = 1 << 25
+MAX_BATCH_BYTES = 1 << 25
 """Bytes that are drawn for a batch, and that its samples take."""
 
 
@@ -160,8 +160,8 @@ def batch_size(scenario: Scenario) -> int:
     samples = len(scenario.times) * filters * n * (n + 2)
     # At least one run, however large it is. Statistics take L runs side by side: as long for some
     # as for all.
-    size = max(1, int(min(LARGEST_BATCH, MOST_BYTES / (8.0 * (drawn + samples)))))
-    return min(LARGEST_BATCH, -(-size // LANES) * LANES) if size > LANES // 2 else size
+    size = max(1, int(min(MAX_BATCH_RUNS, MAX_BATCH_BYTES / (8.0 * (drawn + samples)))))
+    return min(MAX_BATCH_RUNS, -(-size // LANES) * LANES) if size > LANES // 2 else size
 
 
 @once_per_scenario
@@ -184,7 +184,7 @@ def _expected_ticks(scenario: Scenario) -> float:
         return 0.0
     entities = clock.entities(scenario.topology)
     ticks = sum(clock.mean_rate(entity) for entity in entities) * scenario.horizon
-    return ticks if ticks < MOST_BYTES else MOST_BYTES / 64.0
+    return ticks if ticks < MAX_BATCH_BYTES else MAX_BATCH_BYTES / 64.0
 
 
 class BatchDraws:

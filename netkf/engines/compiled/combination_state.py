@@ -25,7 +25,7 @@ from netkf.algorithms.kernels.root_flow import (
 )
 from netkf.algorithms.kernels.slots import predict_root
 from netkf.algorithms.models import usable
-from netkf.engines.base import LONGER, SHORTEST_SHARE
+from netkf.engines.base import LONGER, MIN_GAP_SHARE
 from netkf.engines.compiled.evidence import EvidenceArrays, empty_evidence
 from netkf.engines.compiled.increments import fill_readings
 from netkf.engines.compiled.late_readings import copy_state, use_instant
@@ -180,7 +180,7 @@ def predict_with_gain(
     gain can follow.
     """
     piece, m, longest = state.piece, combination.model[h], usable(combination.rate[h])
-    least = SHORTEST_SHARE * (time - now)
+    least = MIN_GAP_SHARE * (time - now)
     while now < time:
         end = time
         if longest < time - now:

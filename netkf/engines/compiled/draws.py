@@ -24,8 +24,8 @@ from netkf.rng.streams import ReplicaStreams, Streams
 from netkf.scenario.model import PlacedSensor
 from netkf.scenario.scenario import Scenario
 
-MOST_BLOCKS = 16  # of steps that are drawn at once
-MOST_NORMALS = 1 << 20  # of all sensors
+MAX_STEP_BLOCKS = 16  # of steps that are drawn at once
+MAX_NORMALS = 1 << 20  # of all sensors
 COURSES = 16
 """Pieces of a run whose courses are kept at a time, a power of two: nodes are at much the same
 time, and all of them would not fit the processor's cache.
@@ -61,8 +61,8 @@ def blocks_at_once(scenario: Scenario) -> int:
         len(scenario.sensors[placed_sensor.entry].R) for _, placed_sensor in increments(scenario)
     ]
     # Two moments for each row of each sensor and step share the budget of normals.
-    share = MOST_NORMALS // max(2 * sum(rows), 1)
-    return min(MOST_BLOCKS, max(1, share // BLOCK), blocks_to_the_end(scenario))
+    share = MAX_NORMALS // max(2 * sum(rows), 1)
+    return min(MAX_STEP_BLOCKS, max(1, share // BLOCK), blocks_to_the_end(scenario))
 
 
 class Paths:

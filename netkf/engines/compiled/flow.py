@@ -73,7 +73,7 @@ from netkf.trace.run import StateSamples
 from netkf.trace.schema import EVENT
 
 FIRST_MESSAGES, FIRST_ROWS, FIRST_PAST = 64, 4096, 256
-MOST_SAMPLES, SAMPLES_ROOM = 256, 1 << 18
+MAX_BUFFERED_SAMPLES, SAMPLES_ROOM = 256, 1 << 18
 AT_START = (
     *(
         "run",
@@ -191,7 +191,7 @@ class Workspace:
         # Terms of conserved sums: weights held, totals sent and totals heard.
         terms = 2 * size + len(self._senders.directions) if kind == SUMS else 0
         # Space for many samples, within a budget of floats.
-        scratch = max(1, min(MOST_SAMPLES, SAMPLES_ROOM // (size * n * n)))
+        scratch = max(1, min(MAX_BUFFERED_SAMPLES, SAMPLES_ROOM // (size * n * n)))
         self._buffer = empty_samples((1, scratch, size, n), terms)
         self._visits: Visits | None = None
         # Code for each n makes runs of filters that combine estimates 1.5 times faster. Filters of

@@ -5,7 +5,7 @@ from __future__ import annotations
 from netkf.algorithms.flow import interval_end
 from netkf.algorithms.kernels.root_flow import gain_root, information_rate, propagate_root
 from netkf.algorithms.models import usable
-from netkf.engines.base import LONGER, SHORTEST_SHARE
+from netkf.engines.base import LONGER, MIN_GAP_SHARE
 from netkf.engines.compiled.state import PathBlock, Sensing, Simulation
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
@@ -155,7 +155,7 @@ def next_interval(rate: float, now: float, time: float, least: float) -> tuple[f
         # A lower bound that is set once per gap, otherwise an exploding P asks for ever shorter
         # intervals.
         if least == 0.0:
-            least = SHORTEST_SHARE * (time - now)
+            least = MIN_GAP_SHARE * (time - now)
         end = interval_end(now, time, max(interval, least))
     # The bound grows geometrically, so that a gap takes about a thousand intervals at most.
     return end, LONGER * least

@@ -29,7 +29,7 @@ from netkf.rng.draws import StreamBatch, Ziggurat, exponential_of, next_unit, zi
 from netkf.rng.streams import ReplicaStreams, Streams
 from netkf.scenario.scenario import Scenario
 
-TICKS, TICKS_A_LINK, MOST_TICKS = 1 << 15, 4, 1 << 20
+TICKS, TICKS_A_LINK, MAX_WINDOW_TICKS = 1 << 15, 4, 1 << 20
 """In a window: what they take fits the processor's cache, unless there are so many links that what
 one costs is to be spread over some ticks.
 """
@@ -311,7 +311,7 @@ class PoissonSchedules:
         if self._rate > 0.0:
             entities = len(senders.entities)
             # A window of some thousand ticks, more of them where there are many links.
-            self._length = max(TICKS, min(TICKS_A_LINK * entities, MOST_TICKS)) / self._rate
+            self._length = max(TICKS, min(TICKS_A_LINK * entities, MAX_WINDOW_TICKS)) / self._rate
         self._end, self._found = 0.0, _room(0, 0)
 
     def following(self) -> Window:

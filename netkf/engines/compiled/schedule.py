@@ -33,9 +33,9 @@ from netkf.rng.streams import ReplicaStreams, Streams
 from netkf.scenario.scenario import Scenario
 
 # Ticks drawn at once for an entity, doubling: slow clocks draw few in vain.
-FIRST_BLOCK, LONGEST_BLOCK = 8, 1024
+FIRST_BLOCK, MAX_BLOCK_SLOTS = 8, 1024
 TICKS_A_LINK = 256  # in a window, so that what a clock costs is spread over them
-MOST_TICKS, LEAST_TICKS = 1 << 20, 1 << 12
+MAX_WINDOW_TICKS, MIN_WINDOW_TICKS = 1 << 20, 1 << 12
 LOST = -1.0  # no delay is negative
 
 
@@ -334,7 +334,9 @@ class EntityDraws:
         self._outcomes = Outcomes(scenario, streams, senders)
         self.sizes = self._outcomes.sizes
         # Longer blocks cost less for each tick, but must not make too many at once.
-        self._longest = min(LONGEST_BLOCK, max(FIRST_BLOCK, 4 * MOST_TICKS // max(self.count, 1)))
+        self._longest = min(
+            MAX_BLOCK_SLOTS, max(FIRST_BLOCK, 4 * MAX_WINDOW_TICKS // max(self.count, 1))
+        )
         self._block = np.full(self.count, FIRST_BLOCK)
 
     @property
@@ -371,7 +373,7 @@ class Schedule:
         senders = senders_of(scenario) if senders is None else senders
         self._draws = draws = EntityDraws(scenario, streams, senders)
         # About so many ticks in a window.
-        wanted = min(max(TICKS_A_LINK * draws.count, LEAST_TICKS), MOST_TICKS)
+        wanted = min(max(TICKS_A_LINK * draws.count, MIN_WINDOW_TICKS), MAX_WINDOW_TICKS)
         self._horizon, self._end = scenario.horizon, 0.0
         self._known = draws.more(np.arange(draws.count)) if draws.count else NO_TICKS
         # The rate of the first blocks decides the length of all windows.
@@ -420,10 +422,10 @@ class ReadingsSchedule:
     def following(self) -> Window:
         """Return the next window; the last one ends at infinity."""
         begin, sizes = self._begin, self._outcomes.sizes
-        # As many instants as have about MOST_TICKS messages; a node without receivers counts as
-        # one.
+        # As many instants as have about MAX_WINDOW_TICKS messages; a node without receivers counts
+        # as one.
         sent = np.cumsum(np.maximum(sizes[self._index[begin:]], 1))
-        stop = begin + int(np.searchsorted(sent, MOST_TICKS))
+        stop = begin + int(np.searchsorted(sent, MAX_WINDOW_TICKS))
         while 0 < stop < len(self._t) and self._t[stop] == self._t[stop - 1]:
             stop += 1  # an instant is in one window
         self._begin = stop

@@ -511,7 +511,7 @@ def _record_block(
 ) -> bool:
     """Simulate and record some slots; return True if all estimates are sound."""
     # A block of about so many rows: memory does not grow with the run.
-    block = runs.following(MOST_ROWS)
+    block = runs.following(MAX_EVENT_ROWS)
     rows, before = runs.events(block)
     if len(block.sampled):
         sums = runs.conserved()
@@ -531,7 +531,7 @@ def _record_block(
     return fine
 
 
-MOST_ROWS = 1 << 15
+MAX_EVENT_ROWS = 1 << 15
 """Rows of events that are made at once."""
 
 

@@ -334,15 +334,15 @@ class SlotSetup:
         samples = max(1, 8 * len(self.samples) * self.estimators * (2 + self.n) * self.n)
         # A power of two, a node of the tree over runs, unless not even a block of lanes fits.
         together = min(BATCH_BYTES // samples, BLOCK_BYTES // (8 * self.bytes_of_slot()))
-        whole = 1 << max(0, int(min(together, MOST_RUNS)).bit_length() - 1)
-        return int(min(max(whole, LANES), max(1, MOST_BATCH_BYTES // samples)))
+        whole = 1 << max(0, int(min(together, MAX_BATCH_RUNS)).bit_length() - 1)
+        return int(min(max(whole, LANES), max(1, MAX_BATCH_BYTES // samples)))
 
     def quick_runs(self) -> int:
         """Return a number of runs, a power of two and at least a block of lanes, that takes some
         ten milliseconds.
         """
         flops = self.estimators * (50 + 4 * self.n**3) + 10 * len(self.fresh) * len(self.directions)
-        runs = min(QUICK_FLOPS // (max(1, self.slots) * flops), MOST_RUNS)
+        runs = min(QUICK_FLOPS // (max(1, self.slots) * flops), MAX_BATCH_RUNS)
         return int(max(LANES, 1 << (runs.bit_length() - 1) if runs else 0))
 
 
@@ -350,7 +350,7 @@ BLOCK_BYTES = 1 << 24
 """Of what is drawn for one call of a filter's kernel. Kernels go through it once, in order: that it
 leaves the caches of a core costs less than more calls would.
 """
-BATCH_BYTES, MOST_BATCH_BYTES, MOST_RUNS = 1 << 26, 1 << 29, 1024
+BATCH_BYTES, MAX_BATCH_BYTES, MAX_BATCH_RUNS = 1 << 26, 1 << 29, 1024
 """Of the samples of a batch, those of a block of lanes, and the largest number of runs."""
 QUICK_FLOPS = 1 << 25
 """Of runs that are worth doing together from the first one on: some ten milliseconds."""

@@ -53,7 +53,7 @@ from netkf.linalg.local import local_lanes_matrix, local_lanes_vector
 from netkf.linalg.series import fill_row
 from netkf.linalg.structs import Struct
 
-MOST_VISITS = 1 << 14
+MAX_VISITS = 1 << 14
 """Visits that wait: their records fit the processor's cache."""
 
 NO_NODE, ALL_NODES, NOT_HEARD, HAS_SENSORS, UNKNOWN = -1, -2, -1, -1, -1
@@ -154,7 +154,7 @@ def empty_visits(
     """Return an empty queue for filters at so many ``places``; ``weights`` (W,) of directed links,
     ``series`` of nodes without sensors and with them.
     """
-    n, most = filters.xhat.shape[1], max(MOST_VISITS, 4 * places)
+    n, most = filters.xhat.shape[1], max(MAX_VISITS, 4 * places)
     # Networks have few distinct weights: lanes look them up in a table, roots included.
     distinct, weight_row = np.unique(weights, return_inverse=True)
     own, table = np.maximum(0.0, 1.0 - distinct), filters.table

@@ -9,7 +9,7 @@ import simpy
 
 from netkf.algorithms.filter import Exchange, Filter, Increments, Message, NodeInfo, Reading
 from netkf.algorithms.flow import interval_end
-from netkf.engines.base import LONGER, SHORTEST_SHARE, Rank
+from netkf.engines.base import LONGER, MIN_GAP_SHARE, Rank
 from netkf.engines.simpy.timeline import Timeline
 from netkf.linalg.arrays import FloatArray, block_diagonal
 from netkf.trace.recorder import NAN, Recorder
@@ -113,7 +113,7 @@ class ClockedNode(Node):
             self._now = time
             return
         # Without a lower bound, an exploding covariance would ask for ever shorter intervals.
-        least = SHORTEST_SHARE * (time - self._now)
+        least = MIN_GAP_SHARE * (time - self._now)
         while self._now < time:
             end = time
             interval = self.algorithm.max_measurement_interval(self.state)
