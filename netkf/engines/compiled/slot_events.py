@@ -89,7 +89,7 @@ class SlotEvents:
             Direction(scenario, streams, ends, k) for k, ends in enumerate(setup.directions)
         ]
         self._indices = {direction.ends: direction.index for direction in self._directions}
-        each, own = setup.directions_per_link, setup.streams
+        each, own = setup.directions_per_link, setup.streams_per_link
         # Directions of a link are neighbours; a directed graph has one of them.
         pairs = [direction.ends for direction in self._directions[::each]]
         self._by_link = {

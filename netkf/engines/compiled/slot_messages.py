@@ -1,8 +1,9 @@
-"""Messages in slots, compiled: which nodes exchange, what arrives, and the events of all that.
+"""Messages in slots, compiled: draw the matchings and losses, write or count their events.
 
 Every link draws from streams of its own, so that messages of many slots and runs are drawn before
-any estimate is computed. ``up`` (B, S, E, W, L) holds 1 where a message arrives on a direction in
-one of the E steps of a slot's exchanges, in B blocks of L runs side by side (``linalg.lanes``).
+any estimate is computed. Dimensions: B blocks of L runs side by side (``linalg.lanes``; R <= B L
+runs), S slots, E steps of a slot's exchanges, W directed links, N nodes. Their indices are b, q
+(lane), r, s, e, w. ``up`` (B, S, E, W, L) is 1 where a message arrives.
 """
 
 from __future__ import annotations
@@ -36,14 +37,14 @@ NAN = np.nan
 
 
 class Matchings(NamedTuple):
-    """How pairs are drawn.
+    """The matching protocol of a network, and the random streams that it draws from.
 
     protocol : index in PROTOCOLS, -1: all links exchange
-    probability : lazy or p
-    states : random streams (R, 6)
-    first, members : for node-wakeup the links of each node in the order of its peers, for
-                     uniform-maximal the links of each matching
-    order, busy : (L,) and (N,), scratch
+    probability : parameter ``lazy`` or ``p`` of the protocol
+    states : states (R, 6) of the random streams
+    first, members : list k of links is ``members[first[k]:first[k + 1]]``; for node-wakeup the
+                     links of node k in the order of its peers, for uniform-maximal matching k
+    order, busy : scratch, an entry for each link and for each node
     """
 
     protocol: int
@@ -56,29 +57,33 @@ class Matchings(NamedTuple):
 
 
 class Channels(NamedTuple):
-    """Properties and draws of messages on L links with so many directions each (``ends`` (L, 2) are
-    indices of nodes; direction 2 l goes from the first to the second).
+    """Loss model of all links, its random streams, and what they drew last.
 
-    ``delivery`` (2, W): probability of a direction in the good and the bad state of its link.
-    Streams ``states`` and ``state_draws`` (B, K, 4, L) of K links or directions, empty where
-    nothing is drawn; the last uniform numbers ``drawn`` and ``state_drawn`` and state ``bad`` (B,
-    K, L; -1 at first) of each; probabilities ``to_bad``, ``to_good``. ``talks`` (E, W): whether the
-    sender has something to send in a step. A link has
-    ``directions_per_link`` (1 or 2) and so many ``streams`` of its own.
+    K = links x ``streams_per_link``: a symmetric channel has one stream for both directions.
+
+    ends : (links, 2), indices of nodes; direction 2 l goes from the first to the second
+    delivery : (2, W), delivery probabilities in the good and the bad state of the link
+    loss_streams, state_streams : (B, K, 4, L), random streams of losses and of the chain of
+                                  channel states; empty where nothing is drawn
+    loss_uniform, state_uniform : (B, K, L), the last uniform numbers drawn from them, -1 at first
+    bad : (B, K, L), state of the channel (1: bad), -1 at first
+    to_bad, to_good : transition probabilities of the chain
+    talks : (E, W), 1 if the sender of a direction has something to send in a step
+    directions_per_link, streams_per_link : 1 or 2
     """
 
     ends: np.ndarray
     delivery: FloatArray
-    states: np.ndarray
-    state_draws: np.ndarray
-    drawn: FloatArray
-    state_drawn: FloatArray
+    loss_streams: np.ndarray
+    state_streams: np.ndarray
+    loss_uniform: FloatArray
+    state_uniform: FloatArray
     bad: np.ndarray
     to_bad: float
     to_good: float
     talks: np.ndarray
     directions_per_link: int
-    streams: int
+    streams_per_link: int
 
 
 @kernel
@@ -97,29 +102,30 @@ def draw_matching(m: Matchings, ends: np.ndarray, r: int, active: np.ndarray) ->
         return 0 if lazy else 1
     if m.protocol == NODE_WAKEUP:
         node = next_integer(m.states, r, len(m.busy))
-        share = next_unit(m.states, r)
+        uniform = next_unit(m.states, r)
         peers = m.first[node + 1] - m.first[node]
-        # Both numbers are drawn before this, so that isolated nodes take as many as others.
+        # An isolated node takes both numbers too: what follows in the stream does not depend on it.
         if peers == 0:
             return 0
-        active[0] = m.members[m.first[node] + int(share * peers)]
+        active[0] = m.members[m.first[node] + int(uniform * peers)]
         return 1
     if m.protocol == UNIFORM_MAXIMAL:
-        which = next_integer(m.states, r, len(m.first) - 1)
-        for k in range(m.first[which], m.first[which + 1]):
-            active[k - m.first[which]] = m.members[k]
-        return int(m.first[which + 1] - m.first[which])
+        matching = next_integer(m.states, r, len(m.first) - 1)
+        for k in range(m.first[matching], m.first[matching + 1]):
+            active[k - m.first[matching]] = m.members[k]
+        return int(m.first[matching + 1] - m.first[matching])
     return _free_links(m, ends, r, active)
 
 
 @kernel
 def _free_links(m: Matchings, ends: np.ndarray, r: int, active: np.ndarray) -> int:
-    """Move the links of a matching of run ``r`` to the front of ``active`` and return their number.
+    """Write the links of a matching of run ``r`` to the front of ``active``; return their number.
 
-    Maximal matchings take links in random order if both ends are free; of independent links those
-    that meet no other are kept.
+    MAXIMAL visits the links in random order and takes each one whose ends are both free.
+    INDEPENDENT wakes each link with a probability and takes those that share no node with another
+    link that is awake.
     """
-    count, found = len(ends), 0
+    count, pairs = len(ends), 0
     for h in range(len(m.busy)):
         m.busy[h] = 0
     if m.protocol == MAXIMAL:
@@ -127,14 +133,15 @@ def _free_links(m: Matchings, ends: np.ndarray, r: int, active: np.ndarray) -> i
         shuffle(m.states, r, m.order, count)
         for k in range(count):
             i, j = ends[m.order[k], 0], ends[m.order[k], 1]
-            # Without a branch, which nobody could predict.
+            # Without a branch: its outcome is random, so the processor would mispredict it. If the
+            # link is not free, the entry behind the last pair is written again with its own value.
             free = (m.busy[i] | m.busy[j]) ^ 1
-            index = min(found, len(active) - 1)
+            index = min(pairs, len(active) - 1)
             active[index] += free * (m.order[k] - active[index])
             m.busy[i], m.busy[j] = m.busy[i] | free, m.busy[j] | free
-            found += free
-        return found
-    # Independent: each link wakes with the probability, and busy counts its ends.
+            pairs += free
+        return pairs
+    # INDEPENDENT: ``order`` is 1 for links that are awake, ``busy`` counts those at each node.
     for k in range(count):
         m.order[k] = 1 if next_unit(m.states, r) < m.probability else 0
         m.busy[ends[k, 0]] += m.order[k]
@@ -142,40 +149,44 @@ def _free_links(m: Matchings, ends: np.ndarray, r: int, active: np.ndarray) -> i
     # A link that meets no other is the only one at both of its ends.
     for k in range(count):
         if m.order[k] == 1 and m.busy[ends[k, 0]] == 1 and m.busy[ends[k, 1]] == 1:
-            active[found] = k
-            found += 1
-    return found
+            active[pairs] = k
+            pairs += 1
+    return pairs
 
 
 @kernel
 def draw_link(
     lanes: Lanes, c: Channels, b: int, link: int, fresh: bool, up: np.ndarray, s: int, e: int
 ) -> None:
-    """Decide about the messages of one activation of a link in all runs of a block, in step ``e``
-    of slot ``s`` of ``up``; links that are not ``fresh`` keep their last numbers.
+    """Draw which messages of one activation of a link arrive, in step ``e`` of slot ``s``, in all
+    runs of block ``b``; write them into ``up``. Links that are not ``fresh`` keep their last draws.
     """
     for d in range(c.directions_per_link):
         # With one stream per link (symmetric) both directions use it.
-        k = link * c.streams + min(d, c.streams - 1)
-        # Held links keep their number; -1 marks one that has none yet.
-        if d < c.streams and len(c.states) > 0 and (fresh or c.drawn[b, k, 0] < 0.0):
-            next_units(lanes, c.states, b, k, c.drawn)
-            # A chain of states takes one step for each activation.
-            if len(c.state_draws) > 0:
-                next_units(lanes, c.state_draws, b, k, c.state_drawn)
+        k = link * c.streams_per_link + min(d, c.streams_per_link - 1)
+        # A held link keeps its uniform number; -1 marks a link that has none yet.
+        if (
+            d < c.streams_per_link
+            and len(c.loss_streams) > 0
+            and (fresh or c.loss_uniform[b, k, 0] < 0.0)
+        ):
+            next_units(lanes, c.loss_streams, b, k, c.loss_uniform)
+            # The channel state (Gilbert-Elliott) takes one step for each activation.
+            if len(c.state_streams) > 0:
+                next_units(lanes, c.state_streams, b, k, c.state_uniform)
                 for q in range(len(lanes)):
                     c.bad[b, k, q] = next_state(
-                        c.bad[b, k, q], c.state_drawn[b, k, q], c.to_bad, c.to_good
+                        c.bad[b, k, q], c.state_uniform[b, k, q], c.to_bad, c.to_good
                     )
         w = link * c.directions_per_link + d
         if c.talks[e, w] == 1:
-            number = load(lanes, c.drawn, b, k)
-            if len(c.state_draws) == 0:
-                store_flags(lanes, up, b, s, e, w, number < c.delivery[0, w])
+            uniform = load(lanes, c.loss_uniform, b, k)
+            if len(c.state_streams) == 0:
+                store_flags(lanes, up, b, s, e, w, uniform < c.delivery[0, w])
                 continue
             for q in range(len(lanes)):
                 probability = c.delivery[1, w] if c.bad[b, k, q] == 1 else c.delivery[0, w]
-                up[b, s, e, w, q] = c.drawn[b, k, q] < probability
+                up[b, s, e, w, q] = c.loss_uniform[b, k, q] < probability
 
 
 @kernel
@@ -184,23 +195,27 @@ def draw_link_of_lane(
 ) -> None:
     """Draw one link for the run of lane ``q`` alone, as ``draw_link`` does for all lanes."""
     for d in range(c.directions_per_link):
-        k = link * c.streams + min(d, c.streams - 1)
-        if d < c.streams and len(c.states) > 0 and (fresh or c.drawn[b, k, q] < 0.0):
-            c.drawn[b, k, q] = next_unit_of_lane(c.states, b, k, q)
-            if len(c.state_draws) > 0:
-                u = next_unit_of_lane(c.state_draws, b, k, q)
+        k = link * c.streams_per_link + min(d, c.streams_per_link - 1)
+        if (
+            d < c.streams_per_link
+            and len(c.loss_streams) > 0
+            and (fresh or c.loss_uniform[b, k, q] < 0.0)
+        ):
+            c.loss_uniform[b, k, q] = next_unit_of_lane(c.loss_streams, b, k, q)
+            if len(c.state_streams) > 0:
+                u = next_unit_of_lane(c.state_streams, b, k, q)
                 c.bad[b, k, q] = next_state(c.bad[b, k, q], u, c.to_bad, c.to_good)
         w = link * c.directions_per_link + d
         if c.talks[e, w] == 1:
-            # A channel without a state has -1 there.
+            # A channel without states keeps bad = -1.
             probability = c.delivery[1, w] if c.bad[b, k, q] == 1 else c.delivery[0, w]
-            up[b, s, e, w, q] = c.drawn[b, k, q] < probability
+            up[b, s, e, w, q] = c.loss_uniform[b, k, q] < probability
 
 
 @kernel
 def next_state(bad: int, u: float, to_bad: float, to_good: float) -> int:
-    """Return the next state of the Gilbert-Elliott chain by the uniform number ``u``; the first
-    one, after ``bad`` < 0, has the stationary law.
+    """Return the next state (1: bad) of the Gilbert-Elliott chain, decided by the uniform number
+    ``u``. The first state, after ``bad`` = -1, has the stationary law.
     """
     if bad < 0:
         return 1 if u < to_bad / (to_bad + to_good) else 0
@@ -213,8 +228,9 @@ def next_state(bad: int, u: float, to_bad: float, to_good: float) -> int:
 def draw_broadcasts(
     lanes: Lanes, c: Channels, exchanged: np.ndarray, fresh: np.ndarray, up: np.ndarray
 ) -> None:
-    """Fill ``up`` (B, S, E, W, L), zeros before, in the slots that are ``exchanged`` (S,), where
-    every link is used in every step; links draw anew in steps that are ``fresh`` (E,).
+    """Draw the messages of broadcasts, which use every link in every step, into ``up`` (B, S, E, W,
+    L), which holds zeros before. Slots that are not ``exchanged`` (S,) stay 0; links draw anew in
+    the steps that are ``fresh`` (E,).
     """
     for b in range(up.shape[0]):
         for s in range(up.shape[1]):
@@ -232,15 +248,16 @@ def draw_matched(
     fresh: np.ndarray,
     up: np.ndarray,
     active: np.ndarray,
-    count: np.ndarray,
+    pair_count: np.ndarray,
 ) -> None:
-    """Draw the messages of matchings, as ``draw_broadcasts`` does for all links: ``active`` (R, S,
-    E, A) gets the paired links in their order and ``count`` (R, S, E) their number.
+    """Draw matchings and the messages on their links into ``up``, as ``draw_broadcasts`` does for
+    all links. ``active`` (R, S, E, A) gets the paired links in order, ``pair_count`` (R, S, E)
+    their number.
     """
     for b in range(up.shape[0]):
         for s in range(up.shape[1]):
             for e in range(up.shape[2] if exchanged[s] else 0):
-                draw_pairs(lanes, c, m, fresh[e], up, active, count, b, s, e)
+                draw_pairs(lanes, c, m, fresh[e], up, active, pair_count, b, s, e)
 
 
 @kernel
@@ -251,24 +268,26 @@ def draw_pairs(
     fresh: bool,
     up: np.ndarray,
     active: np.ndarray,
-    count: np.ndarray,
+    pair_count: np.ndarray,
     b: int,
     s: int,
     e: int,
 ) -> None:
     """Draw the matchings of a step in all runs of a block, and their messages."""
     first = b * len(lanes)
-    for q in range(min(len(lanes), len(count) - first)):
+    for q in range(min(len(lanes), len(pair_count) - first)):
         r = first + q
-        found = draw_matching(m, c.ends, r, active[r, s, e])
-        count[r, s, e] = found
-        for k in range(found):
+        pairs = draw_matching(m, c.ends, r, active[r, s, e])
+        pair_count[r, s, e] = pairs
+        for k in range(pairs):
             draw_link_of_lane(c, b, active[r, s, e, k], fresh, up, s, e, q)
 
 
 @kernel
-def ask_all(lanes: Lanes, c: Channels, exchanged: np.ndarray, sent: np.ndarray) -> None:
-    """Write 1 into ``sent`` (B, S, E, N, L) for all nodes with links where they exchange."""
+def mark_all_senders(lanes: Lanes, c: Channels, exchanged: np.ndarray, sent: np.ndarray) -> None:
+    """Write 1 into ``sent`` (B, S, E, N, L) for all nodes with links, in the slots that are
+    ``exchanged`` (S,): broadcasts ask each of them for a message.
+    """
     for b in range(sent.shape[0]):
         for s in range(sent.shape[1]):
             for e in range(sent.shape[2] if exchanged[s] else 0):
@@ -279,16 +298,16 @@ def ask_all(lanes: Lanes, c: Channels, exchanged: np.ndarray, sent: np.ndarray) 
 
 
 @kernel
-def ask_pairs(
-    lanes: Lanes, c: Channels, active: np.ndarray, count: np.ndarray, sent: np.ndarray
+def mark_paired_senders(
+    lanes: Lanes, c: Channels, active: np.ndarray, pair_count: np.ndarray, sent: np.ndarray
 ) -> None:
-    """Mark the nodes that are asked for a message, as ``ask_all`` does, for matchings: the ends of
-    the first ``count`` links of ``active``, see Drawn.
+    """Write 1 into ``sent`` (B, S, E, N, L) for both ends of all paired links: matchings ask each
+    of them for a message. ``active``, ``pair_count``: see SlotMessages.
     """
-    for r in range(count.shape[0]):
-        for s in range(count.shape[1]):
-            for e in range(count.shape[2]):
-                for a in range(count[r, s, e]):
+    for r in range(pair_count.shape[0]):
+        for s in range(pair_count.shape[1]):
+            for e in range(pair_count.shape[2]):
+                for a in range(pair_count[r, s, e]):
                     for end in range(2):
                         node = c.ends[active[r, s, e, a], end]
                         sent[r // len(lanes), s, e, node, r % len(lanes)] = 1
@@ -296,8 +315,8 @@ def ask_pairs(
 
 @kernel
 def draw_uniforms(states: np.ndarray, sent: np.ndarray, uniform: FloatArray) -> None:
-    """Write the next number of each node that is asked into ``uniform`` (B, S, E, N, L), in the
-    order of steps, from the streams ``states`` (B, N, 4, L).
+    """Draw a uniform number for each node that is asked for a message (``sent``) into ``uniform``
+    (B, S, E, N, L), in the order of steps, from the streams ``states`` (B, N, 4, L).
     """
     for b in range(sent.shape[0]):
         for s in range(sent.shape[1]):
@@ -309,12 +328,12 @@ def draw_uniforms(states: np.ndarray, sent: np.ndarray, uniform: FloatArray) -> 
 
 
 class Stages(NamedTuple):
-    """What happens in a slot, K stages in order.
+    """The K stages of a slot in order: readings, and steps of exchanges.
 
-    step : (K,), step of an exchange, -1 where nodes read
-    phase : (K,)
+    step : (K,), number of the exchange step in the slot, -1 where sensors are read
+    phase : (K,), number of the exchange that the step belongs to, -1 where sensors are read
     end : (K,), seconds after the slot begins
-    stopping : step in which nodes may stop for good, -1: none
+    stopping : step in which nodes may stop exchanging for good, -1: none
     """
 
     step: np.ndarray
@@ -326,10 +345,10 @@ class Stages(NamedTuple):
 class SlotTimes(NamedTuple):
     """When S slots begin and what happens in them.
 
-    first, start : number of the first slot, and the times (S,)
-    noted, sensed, exchanged : (S,), whether events are recorded, nodes read, nodes exchange
-    sample : (S,), index of the sample, -1: none
-    predicts : whether samples come first in a slot
+    first, start : number of the first slot, and the times (S,) at which slots begin
+    noted, sensed, exchanged : (S,), whether events are recorded, sensors are read, nodes exchange
+    sample : (S,), index of the slot's sample among those of the block or run, -1: none
+    predicts : whether filters predict, so that they are sampled at the beginning of a slot
     """
 
     first: int
@@ -341,11 +360,11 @@ class SlotTimes(NamedTuple):
     predicts: bool
 
 
-class Hearing(NamedTuple):
-    """Nodes and links of a recorded run.
+class TracedNodes(NamedTuple):
+    """Nodes and incoming links, for the kernels that write or count events.
 
     nodes, sensing : ids of all nodes (N,) and of those with sensors
-    first, sender, direction : directions by receiver, see ``SlotLinks``
+    first, sender, direction : directed links by receiver, see ``SlotLinks``
     sent : number of messages so far (W,)
     stopped : slot in which each node stopped (B, N, L)
     """
@@ -360,7 +379,9 @@ class Hearing(NamedTuple):
 
 
 class Rows(NamedTuple):
-    """Columns of the events of one run, and how many there are at each sample (T,)."""
+    """Columns of the event table of one run (trace.schema), and the number of rows before each
+    sample, ``before_sample`` (T,).
+    """
 
     t: FloatArray
     kind: np.ndarray
@@ -369,29 +390,29 @@ class Rows(NamedTuple):
     message: np.ndarray
     phase: np.ndarray
     age: FloatArray
-    at_sample: np.ndarray
+    before_sample: np.ndarray
 
 
-class Drawn(NamedTuple):
+class SlotMessages(NamedTuple):
     """Messages of S slots with E steps each.
 
-    up : (B, S, E, W, L), whether a message arrives
-    active, pairs : paired links (R, S, E, A) and their number (R, S, E)
-    sent : who sends (B, S, E, N, L), empty where filters do not decide that
+    up : (B, S, E, W, L), 1 where a message arrives
+    active, pair_count : paired links (R, S, E, A) and their number (R, S, E); empty for broadcasts
+    sent : (B, S, E, N, L), 1 where a node sends; empty where every node sends that is asked
     """
 
     up: np.ndarray
     active: np.ndarray
-    pairs: np.ndarray
+    pair_count: np.ndarray
     sent: np.ndarray
 
 
-class Moment(NamedTuple):
-    """The circumstances of events.
+class Stage(NamedTuple):
+    """One stage of one slot, in which events happen.
 
-    slot, s : number of the slot, and its index in the block
-    step, phase : of the exchange, -1 where nodes read
-    t : seconds
+    slot, s : number of the slot, and its index among the S slots
+    step, phase : as in Stages
+    t : time of its events, seconds
     """
 
     slot: int
@@ -403,12 +424,12 @@ class Moment(NamedTuple):
 
 @kernel
 def write_row(
-    rows: Rows, m: Moment, kind: int, node: int, peer: int, message: int, age: float, at: int
+    rows: Rows, stage: Stage, kind: int, node: int, peer: int, message: int, age: float, row: int
 ) -> int:
-    """Write one event into row ``at``; return the next row."""
-    rows.t[at], rows.kind[at], rows.node[at], rows.peer[at] = m.t, kind, node, peer
-    rows.message[at], rows.phase[at], rows.age[at] = message, m.phase, age
-    return at + 1
+    """Write one event into ``row`` of ``rows``; return the index of the next row."""
+    rows.t[row], rows.kind[row], rows.node[row], rows.peer[row] = stage.t, kind, node, peer
+    rows.message[row], rows.phase[row], rows.age[row] = message, stage.phase, age
+    return row + 1
 
 
 @kernel
@@ -416,35 +437,35 @@ def make_rows(
     stages: Stages,
     times: SlotTimes,
     c: Channels,
-    h: Hearing,
-    d: Drawn,
+    h: TracedNodes,
+    d: SlotMessages,
     pairwise: bool,
     first: int,
     stop: int,
     rows: Rows,
 ) -> int:
-    """Write the events of the first run in the slots from index ``first`` up to ``stop`` in their
-    order; return how many there are.
+    """Write the events of the first run in the slots with indices ``first`` to ``stop`` - 1, in the
+    order of time; return their number.
     """
-    at = 0
+    row = 0
     for s in range(first, stop):
         # Filters that predict are sampled before anything happens in the slot.
         if times.predicts:
-            mark_sample(times, s, rows, at)
+            mark_sample(times, s, rows, row)
         # At the horizon nothing is recorded but the sample.
         if times.noted[s]:
-            at = _slot_rows(stages, times, c, h, d, pairwise, rows, s, at)
+            row = _slot_rows(stages, times, c, h, d, pairwise, rows, s, row)
         if not times.predicts:
-            mark_sample(times, s, rows, at)
-    return at
+            mark_sample(times, s, rows, row)
+    return row
 
 
 @kernel
-def mark_sample(times: SlotTimes, s: int, rows: Rows, at: int) -> None:
-    """Keep how many rows come before the sample of a slot, if it has one."""
+def mark_sample(times: SlotTimes, s: int, rows: Rows, row: int) -> None:
+    """Store the number of rows before the sample of slot ``s``, if it has one."""
     k = times.sample[s]
     if k >= 0:
-        rows.at_sample[k] = at
+        rows.before_sample[k] = row
 
 
 @kernel
@@ -452,93 +473,105 @@ def _slot_rows(
     stages: Stages,
     times: SlotTimes,
     c: Channels,
-    h: Hearing,
-    d: Drawn,
+    h: TracedNodes,
+    d: SlotMessages,
     pairwise: bool,
     rows: Rows,
     s: int,
-    at: int,
+    row: int,
 ) -> int:
-    """Write the events of one slot; return the row."""
+    """Write the events of slot ``s`` from ``row`` on; return the index of the next row."""
     now = times.start[s]
     for k in range(len(stages.step)):
-        m = Moment(times.first + s, s, stages.step[k], stages.phase[k], now)
-        if m.step < 0:
+        stage = Stage(times.first + s, s, stages.step[k], stages.phase[k], now)
+        if stage.step < 0:
             if times.sensed[s]:
                 for node in h.sensing:
-                    at = write_row(rows, m, SENSE, node, -1, -1, NAN, at)
+                    row = write_row(rows, stage, SENSE, node, -1, -1, NAN, row)
         elif times.exchanged[s]:
-            at = _write_sends(c, h, d, rows, m, pairwise, at)
+            row = _write_sends(c, h, d, rows, stage, pairwise, row)
             # Absorptions happen at the end of the step, when its inboxes close.
             now = times.start[s] + stages.end[k]
-            closing = Moment(m.slot, s, m.step, m.phase, now)
-            at = _write_step_end(h, d, rows, closing, pairwise, stages.stopping, at)
-    return at
+            closing = Stage(stage.slot, s, stage.step, stage.phase, now)
+            row = _write_step_end(h, d, rows, closing, pairwise, stages.stopping, row)
+    return row
 
 
 @kernel
 def _write_sends(
-    c: Channels, h: Hearing, d: Drawn, rows: Rows, m: Moment, pairwise: bool, at: int
+    c: Channels, h: TracedNodes, d: SlotMessages, rows: Rows, stage: Stage, pairwise: bool, row: int
 ) -> int:
-    """Write the messages sent in a step, after the tick of each pair or one round; return the next
-    row.
+    """Write the messages sent in a step: after the tick of each pair, or after one "round" for
+    broadcasts; return the index of the next row.
     """
     if not pairwise:
-        at = write_row(rows, m, ROUND, -1, -1, -1, NAN, at)
-    links = d.pairs[0, m.s, m.step] if pairwise else len(c.ends)
+        row = write_row(rows, stage, ROUND, -1, -1, -1, NAN, row)
+    links = d.pair_count[0, stage.s, stage.step] if pairwise else len(c.ends)
     for a in range(links):
-        link = d.active[0, m.s, m.step, a] if pairwise else a
+        link = d.active[0, stage.s, stage.step, a] if pairwise else a
         if pairwise:
             i, j = h.nodes[c.ends[link, 0]], h.nodes[c.ends[link, 1]]
-            at = write_row(rows, m, TICK, i, j, -1, NAN, at)
-        at = _link_rows(c, h, d, rows, m, link, at)
-    return at
+            row = write_row(rows, stage, TICK, i, j, -1, NAN, row)
+        row = _link_rows(c, h, d, rows, stage, link, row)
+    return row
 
 
 @kernel
-def _link_rows(c: Channels, h: Hearing, d: Drawn, rows: Rows, m: Moment, link: int, at: int) -> int:
-    """Write the messages sent on a link, each followed by its arrival or loss; return the row."""
+def _link_rows(
+    c: Channels, h: TracedNodes, d: SlotMessages, rows: Rows, stage: Stage, link: int, row: int
+) -> int:
+    """Write the messages sent on a link, each followed by its arrival or loss; return the index of
+    the next row.
+    """
     for end in range(c.directions_per_link):
         w, i = link * c.directions_per_link + end, c.ends[link, end]
-        if c.talks[m.step, w] == 0 or is_silent(d, 0, m, i, 0):
+        if c.talks[stage.step, w] == 0 or is_silent(d, 0, stage, i, 0):
             continue
         # Messages of a direction are numbered from 0, lost ones included.
         number, sender, receiver = h.sent[w], h.nodes[i], h.nodes[c.ends[link, 1 - end]]
         h.sent[w] = number + 1
-        at = write_row(rows, m, SEND, sender, receiver, number, NAN, at)
-        if d.up[0, m.s, m.step, w, 0] == 1:
-            at = write_row(rows, m, DELIVER, receiver, sender, number, 0.0, at)
+        row = write_row(rows, stage, SEND, sender, receiver, number, NAN, row)
+        if d.up[0, stage.s, stage.step, w, 0] == 1:
+            row = write_row(rows, stage, DELIVER, receiver, sender, number, 0.0, row)
         else:
-            at = write_row(rows, m, LOST, sender, receiver, number, NAN, at)
-    return at
+            row = write_row(rows, stage, LOST, sender, receiver, number, NAN, row)
+    return row
 
 
 @kernel
-def is_silent(d: Drawn, b: int, m: Moment, node: int, q: int) -> bool:
-    """Return True if the node of an index sends nothing in a step, in the run of a lane."""
-    return len(d.sent) > 0 and d.sent[b, m.s, m.step, node, q] == 0
+def is_silent(d: SlotMessages, b: int, stage: Stage, node: int, q: int) -> bool:
+    """Return True if ``node`` (an index) sends nothing in a step, in lane ``q`` of block ``b``."""
+    return len(d.sent) > 0 and d.sent[b, stage.s, stage.step, node, q] == 0
 
 
 @kernel
 def _write_step_end(
-    h: Hearing, d: Drawn, rows: Rows, m: Moment, pairwise: bool, stopping: int, at: int
+    h: TracedNodes,
+    d: SlotMessages,
+    rows: Rows,
+    stage: Stage,
+    pairwise: bool,
+    stopping: int,
+    row: int,
 ) -> int:
-    """Write who absorbs when a step ends, and who stops learning; return the row."""
+    """Write which nodes absorb or swap when a step ends, and which stop; return the index of the
+    next row.
+    """
     for i in range(len(h.nodes)):
         heard = False
         for k in range(h.first[i], h.first[i + 1]):
-            if d.up[0, m.s, m.step, h.direction[k], 0] == 1:
+            if d.up[0, stage.s, stage.step, h.direction[k], 0] == 1:
                 heard = True
                 if pairwise:
                     # The message of this step is the last one that was numbered.
                     peer, number = h.nodes[h.sender[k]], h.sent[h.direction[k]] - 1
-                    at = write_row(rows, m, SWAP, h.nodes[i], peer, number, 0.0, at)
+                    row = write_row(rows, stage, SWAP, h.nodes[i], peer, number, 0.0, row)
         if heard and not pairwise:
-            at = write_row(rows, m, ABSORB, h.nodes[i], -1, -1, 0.0, at)
+            row = write_row(rows, stage, ABSORB, h.nodes[i], -1, -1, 0.0, row)
         # A node that stops in this slot does so after it absorbed.
-        if m.step == stopping and h.stopped[0, i, 0] == m.slot:
-            at = write_row(rows, m, STOP, h.nodes[i], -1, -1, NAN, at)
-    return at
+        if stage.step == stopping and h.stopped[0, i, 0] == stage.slot:
+            row = write_row(rows, stage, STOP, h.nodes[i], -1, -1, NAN, row)
+    return row
 
 
 @kernel
@@ -547,14 +580,14 @@ def count_events(
     stages: Stages,
     times: SlotTimes,
     c: Channels,
-    h: Hearing,
-    d: Drawn,
+    h: TracedNodes,
+    d: SlotMessages,
     pairwise: bool,
     scratch: FloatArray,
     counts: np.ndarray,
 ) -> None:
-    """Add the events of R runs by kind to ``counts`` (R, KINDS), as ``make_rows`` would write them;
-    ``scratch`` (KINDS, L).
+    """Add to ``counts`` (R, KINDS) the number of events of each kind that ``make_rows`` would
+    write; ``scratch`` (KINDS, L).
     """
     for b in range(d.up.shape[0]):
         for kind in range(len(scratch)):
@@ -565,8 +598,8 @@ def count_events(
                 if e < 0 and times.sensed[s]:
                     add_count(lanes, scratch, SENSE, 1.0 * len(h.sensing))
                 elif e >= 0 and times.exchanged[s]:
-                    m = Moment(times.first + s, s, e, stages.phase[k], 0.0)
-                    count_step(lanes, c, h, d, m, pairwise, stages.stopping, scratch, counts, b)
+                    stage = Stage(times.first + s, s, e, stages.phase[k], 0.0)
+                    count_step(lanes, c, h, d, stage, pairwise, stages.stopping, scratch, counts, b)
         first = b * len(lanes)
         for q in range(min(len(lanes), len(counts) - first)):
             for kind in range(len(scratch)):
@@ -583,63 +616,67 @@ def add_count(lanes: Lanes, scratch: FloatArray, kind: int, number: Any) -> None
 def count_step(
     lanes: Lanes,
     c: Channels,
-    h: Hearing,
-    d: Drawn,
-    m: Moment,
+    h: TracedNodes,
+    d: SlotMessages,
+    stage: Stage,
     pairwise: bool,
     stopping: int,
     scratch: FloatArray,
     counts: np.ndarray,
     b: int,
 ) -> None:
-    """Count the events of one step of an exchange in the runs of a block."""
-    stops = m.step == stopping
+    """Count the events of one step of an exchange in the runs of block ``b``: in ``scratch``, but
+    stops in ``counts``.
+    """
+    stops = stage.step == stopping
     if pairwise:
-        count_matched_pairs(lanes, c, d, m, scratch, counts, b)
+        count_matched_pairs(lanes, c, d, stage, scratch, counts, b)
     else:
         add_count(lanes, scratch, ROUND, 1.0)
         sent = 0
         for w in range(d.up.shape[3]):
-            sent += c.talks[m.step, w]
+            sent += c.talks[stage.step, w]
         add_count(lanes, scratch, SEND, 1.0 * sent)
         add_count(lanes, scratch, LOST, 1.0 * sent)
         if len(d.sent) > 0:
-            count_silent(lanes, c, d, m, scratch, b)
-    # Each message that arrives is one that was not lost.
-    absorbed = came = spread(lanes, 0.0)
+            count_silent(lanes, c, d, stage, scratch, b)
+    # LOST was counted as if all were lost: each delivery takes one off.
+    absorbed = delivered = spread(lanes, 0.0)
     for i in range(len(h.nodes)):
         heard = spread(lanes, 0.0)
         for k in range(h.first[i], h.first[i + 1]):
-            up = load_flags(lanes, d.up, b, m.s, m.step, h.direction[k])
+            up = load_flags(lanes, d.up, b, stage.s, stage.step, h.direction[k])
             heard += select(up, 1.0, 0.0)
-        came += heard
+        delivered += heard
         absorbed += select(heard > 0.0, 1.0, 0.0)
-    add_count(lanes, scratch, DELIVER, came)
-    add_count(lanes, scratch, LOST, -came)
-    add_count(lanes, scratch, SWAP if pairwise else ABSORB, came if pairwise else absorbed)
+    add_count(lanes, scratch, DELIVER, delivered)
+    add_count(lanes, scratch, LOST, -delivered)
+    add_count(lanes, scratch, SWAP if pairwise else ABSORB, delivered if pairwise else absorbed)
     if stops:
-        count_stops(lanes, h, m, counts, b)
+        count_stops(lanes, h, stage, counts, b)
 
 
 @kernel
 def count_matched_pairs(
     lanes: Lanes,
     c: Channels,
-    d: Drawn,
-    m: Moment,
+    d: SlotMessages,
+    stage: Stage,
     scratch: FloatArray,
     counts: np.ndarray,
     b: int,
 ) -> None:
-    """Count the pairs of a step in the runs of a block, and their messages."""
+    """Count the ticks of pairs in a step, and their messages, all as lost for now, in the runs of
+    block ``b``.
+    """
     first = b * len(lanes)
     for r in range(first, min(first + len(lanes), len(counts))):
-        pairs, sent = d.pairs[r, m.s, m.step], 0
+        pairs, sent = d.pair_count[r, stage.s, stage.step], 0
         for a in range(pairs):
-            link = d.active[r, m.s, m.step, a]
+            link = d.active[r, stage.s, stage.step, a]
             for direction in range(c.directions_per_link):
-                if not is_silent(d, b, m, c.ends[link, direction], r - first):
-                    sent += c.talks[m.step, link * c.directions_per_link + direction]
+                if not is_silent(d, b, stage, c.ends[link, direction], r - first):
+                    sent += c.talks[stage.step, link * c.directions_per_link + direction]
         scratch[TICK, r - first] += pairs
         scratch[SEND, r - first] += sent
         scratch[LOST, r - first] += sent
@@ -647,18 +684,18 @@ def count_matched_pairs(
 
 @kernel
 def count_silent(
-    lanes: Lanes, c: Channels, d: Drawn, m: Moment, scratch: FloatArray, b: int
+    lanes: Lanes, c: Channels, d: SlotMessages, stage: Stage, scratch: FloatArray, b: int
 ) -> None:
-    """Take off the messages that nodes do not send."""
+    """Subtract the messages of silent nodes from SEND and LOST."""
     silent = spread(lanes, 0.0)
     for w in range(len(c.ends) * c.directions_per_link):
-        if c.talks[m.step, w] == 1:
+        if c.talks[stage.step, w] == 1:
             sends = load_flags(
                 lanes,
                 d.sent,
                 b,
-                m.s,
-                m.step,
+                stage.s,
+                stage.step,
                 c.ends[w // c.directions_per_link, w % c.directions_per_link],
             )
             silent += select(sends, 0.0, 1.0)
@@ -667,9 +704,9 @@ def count_silent(
 
 
 @kernel
-def count_stops(lanes: Lanes, h: Hearing, m: Moment, counts: np.ndarray, b: int) -> None:
+def count_stops(lanes: Lanes, h: TracedNodes, stage: Stage, counts: np.ndarray, b: int) -> None:
     """Count the nodes that stop in a slot."""
     first = b * len(lanes)
     for r in range(first, min(first + len(lanes), len(counts))):
         for i in range(len(h.nodes)):
-            counts[r, STOP] += h.stopped[b, i, r - first] == m.slot
+            counts[r, STOP] += h.stopped[b, i, r - first] == stage.slot

@@ -1,8 +1,8 @@
-"""Runs in slots: messages, truth and readings of many slots are drawn, then the filters follow.
+"""Runs in slots: draw the messages, truth and readings of many slots, then simulate the filters.
 
-A call of a kernel takes S slots of R runs at a time, which are side by side in B blocks of L lanes
-(linalg.lanes). Where channels or clocks are a user's own, or messages take time, the messages of
-one run are made in Python (engines.compiled.slot_events).
+A call of a kernel takes S slots of R runs, which are side by side in B blocks of L lanes
+(linalg.lanes). Where channels or clocks are a user's own, or messages take time, Python makes the
+messages of one run at a time (engines.compiled.slot_events).
 """
 
 from __future__ import annotations
@@ -31,18 +31,18 @@ from netkf.engines.compiled.samples import record_samples
 from netkf.engines.compiled.slot_events import SlotEvents
 from netkf.engines.compiled.slot_messages import (
     Channels,
-    Drawn,
-    Hearing,
     Matchings,
     Rows,
+    SlotMessages,
     SlotTimes,
-    ask_all,
-    ask_pairs,
+    TracedNodes,
     count_events,
     draw_broadcasts,
     draw_matched,
     draw_uniforms,
     make_rows,
+    mark_all_senders,
+    mark_paired_senders,
 )
 from netkf.engines.compiled.slot_setup import BATCH_BYTES, AssignedSensor, SlotSetup, slot_setup
 from netkf.linalg.arrays import FloatArray
@@ -64,10 +64,10 @@ _samples = LentMemory(BATCH_BYTES)
 
 
 class SampledStates(NamedTuple):
-    """Samples of R runs in the coordinates of the plant.
+    """T samples of R runs with H filters each, in the coordinates of the plant.
 
-    x : (R, T, n)
-    xhat, error : (R, T, H, n)
+    x : (R, T, n), states of the plant
+    xhat, error : (R, T, H, n), estimates and x - xhat
     P : (R, T, H, n, n)
     """
 
@@ -78,21 +78,23 @@ class SampledStates(NamedTuple):
 
 
 class SlotBlock(NamedTuple):
-    """Results of S slots of R runs: the slots that are ``sampled`` (T,), and what was ``reported``
-    there.
+    """Results of S slots of R runs: indices ``sampled`` (T,) of the slots with a sample, the
+    ``samples`` of these slots or of all slots so far, times and messages.
     """
 
     sampled: np.ndarray
-    reported: SampledStates
+    samples: SampledStates
     times: SlotTimes
-    drawn: Drawn
+    messages: SlotMessages
 
 
 class SlotRuns:
-    """R runs of one scenario, side by side."""
+    """R runs of one scenario, simulated side by side, some slots at a time. ``store_all``: keep the
+    samples of all slots, for the results of a batch.
+    """
 
     def __init__(
-        self, scenario: Scenario, streams: Streams | ReplicaStreams, whole: bool = False
+        self, scenario: Scenario, streams: Streams | ReplicaStreams, store_all: bool = False
     ) -> None:
         self.setup: SlotSetup = slot_setup(scenario)
         self._scenario, self._streams = scenario, streams
@@ -101,8 +103,8 @@ class SlotRuns:
         self.runs = 1 if isinstance(streams, Streams) else streams.count
         self._slot = 0
         setup, runs = self.setup, self.runs
-        # Samples of the whole runs if so many are wanted at once, else those of a block.
-        self.reported = self._empty_samples(len(setup.samples)) if whole else None
+        # A batch stores the samples of the whole runs, a single run those of a block at a time.
+        self.samples = self._empty_samples(len(setup.samples)) if store_all else None
         self._blocks = blocks = blocks_of(runs)
         self._total = aligned((blocks, LANES))
         self._nodes = SlotNodes(
@@ -112,9 +114,9 @@ class SlotRuns:
             setup.root_Q,
             setup.rows,
         )
-        self._room = slot_scratch(setup.estimators, setup.n)
-        self._extra = setup.algorithm.slot_arrays(setup.states, setup.infos, runs)
-        # No slot reaches it: a node that never stops.
+        self._scratch = slot_scratch(setup.estimators, setup.n)
+        self._filter_arrays = setup.algorithm.slot_arrays(setup.states, setup.infos, runs)
+        # NEVER: a slot that no run reaches, for a node that never stops.
         self._stopped = np.full((blocks, setup.estimators, LANES), NEVER)
         self._conserved = aligned((blocks, setup.estimators, 2, LANES))
         self._sent = np.zeros(len(setup.directions), dtype=np.int64)
@@ -125,7 +127,7 @@ class SlotRuns:
         self._begin_messages()
 
     def _begin_truth(self) -> None:
-        """Draw the first states of all runs, or make the recorded truth."""
+        """Draw the initial states of the plant in all runs, or load the recorded truth."""
         plant, setup = self._scenario.slot_plant, self.setup
         self._truth: Any = None
         self._path: Path | None = None
@@ -135,7 +137,7 @@ class SlotRuns:
             return
         self._plant_states = StreamBatch(self._streams, "plant", [()]).states
         x, origin = (aligned((self._blocks, setup.n, LANES)) for _ in range(2))
-        # Arrays of one kind, whatever the plant, for which kernels are compiled once.
+        # C-contiguous copies, whatever the plant gives: kernels are compiled for one memory layout.
         mean, F, root, noise = (
             np.array(part, order="C")
             for part in (plant.start_mean, plant.F, plant.start_root, plant.noise_root)
@@ -145,7 +147,7 @@ class SlotRuns:
         self._path = Path(F, noise, setup.frame, x, origin)
 
     def _begin_readings(self) -> None:
-        """Make the random streams and paths from which readings are drawn."""
+        """Create the random streams and regressor paths from which readings are drawn."""
         setup, streams = self.setup, self._streams
         entities = [(s.node, s.placed_sensor.ordinal) for s in setup.drawn]
         # One stream for each drawn sensor of each run.
@@ -163,12 +165,12 @@ class SlotRuns:
         ]
 
     def _begin_messages(self) -> None:
-        """Make the channels and matchings of all runs, and their random streams."""
+        """Create the channels and matchings of all runs, with their random streams."""
         setup, streams, links = self.setup, self._streams, len(self.setup.ends)
         # Empty arrays tell the kernels to draw nothing.
-        nothing = np.zeros((0, 0, 4, LANES), dtype=np.uint64)
-        drawn = setup.is_drawn and links > 0
-        loss = drawn and not setup.loss.deterministic
+        no_streams = np.zeros((0, 0, 4, LANES), dtype=np.uint64)
+        is_drawn = setup.is_drawn and links > 0
+        random_loss = is_drawn and not setup.loss.deterministic
         shape = self._blocks, len(setup.entities), LANES
         chain: Any = setup.loss if setup.is_chain else None
         to_bad, to_good = chain.transitions if chain is not None else (0.0, 1.0)
@@ -176,9 +178,9 @@ class SlotRuns:
         self._channels = Channels(
             setup.ends,
             setup.delivery,
-            self._in_lanes("loss", entities) if loss else nothing,
-            self._in_lanes("weather", entities) if loss and setup.is_chain else nothing,
-            # -1 marks numbers that are not drawn yet and states without a past.
+            self._in_lanes("loss", entities) if random_loss else no_streams,
+            self._in_lanes("weather", entities) if random_loss and setup.is_chain else no_streams,
+            # -1: nothing drawn yet, and no channel state yet.
             np.full(shape, -1.0),
             np.full(shape, -1.0),
             np.full(shape, -1, dtype=np.int64),
@@ -186,13 +188,13 @@ class SlotRuns:
             to_good,
             setup.talks,
             setup.directions_per_link,
-            setup.streams,
+            setup.streams_per_link,
         )
         protocol, probability, first, members = setup.matching
-        # numpy's generator keeps half a 64-bit draw for small integers: two words more than the
-        # state.
+        # Two words more than the state of a generator: for small integers numpy keeps half of a
+        # 64-bit draw for the next call.
         states = np.zeros((self.runs, 6), dtype=np.uint64)
-        if drawn and protocol >= 0:
+        if is_drawn and protocol >= 0:
             states[:, :4] = StreamBatch(streams, "matching", [()]).states
         if setup.algorithm.randomised:
             nodes = StreamBatch(streams, "trigger", [(node,) for node in setup.nodes.tolist()])
@@ -206,149 +208,153 @@ class SlotRuns:
 
     @property
     def over(self) -> bool:
-        """Return True if all slots are done."""
+        """Return True if all slots have been simulated."""
         return self._slot >= self.setup.slots
 
-    def following(self, rows: int, timed: bool = True) -> SlotBlock:
-        """Simulate the next slots, about ``rows`` events at most (0: any number); events need slots
-        that are ``timed``.
+    def following(self, max_events: int, timed: bool = True) -> SlotBlock:
+        """Simulate the next slots, with about ``max_events`` events at most (0: no limit), and
+        return their results; ``timed``: compute the times of slots, which event rows need.
         """
         setup = self.setup
-        times, drawn = self._next_messages(rows, timed)
+        times, messages = self._next_messages(max_events, timed)
         local, absolute, rebased = self._next_states(len(times.start))
         readings = self._draw_readings(times, local, rebased)
         sampled = np.flatnonzero(times.sample >= 0)
-        reported = self.reported if self.reported is not None else self._empty_samples(len(sampled))
-        # Blocks without a sample have empty arrays, of which reshape cannot tell the last length.
+        samples = self.samples if self.samples is not None else self._empty_samples(len(sampled))
+        # Explicit lengths: reshape(-1) fails for the empty arrays of a block without a sample.
         x, xhat, P, error = (
-            part.reshape(*part.shape[:2], math.prod(part.shape[2:])) for part in reported
+            part.reshape(*part.shape[:2], math.prod(part.shape[2:])) for part in samples
         )
-        samples = SlotSamples(
+        kernel_samples = SlotSamples(
             x, xhat, P, error, self._stopped, self._conserved, absolute, local, setup.frame > 0,
             self._total,
         )  # fmt: skip
         plan = SlotPlan(
-            self._slot, times.sensed, times.exchanged, times.sample, drawn.up, drawn.sent,
-            self._draw_uniforms(drawn.sent), WHOLE,
+            self._slot, times.sensed, times.exchanged, times.sample, messages.up, messages.sent,
+            self._draw_uniforms(messages.sent), WHOLE,
         )  # fmt: skip
         count, algorithm = len(times.start), setup.algorithm
-        extra = algorithm.slot_gains(setup.states, self._extra, self._slot, count)
-        given, kernel = (setup.links, samples, self._room, *extra), algorithm.slot_kernel
-        unread = self._missed_readings(drawn, count)
+        extra = algorithm.slot_gains(setup.states, self._filter_arrays, self._slot, count)
+        kernel_arguments, slot_kernel = (
+            (setup.links, kernel_samples, self._scratch, *extra),
+            algorithm.slot_kernel,
+        )
+        unread = self._missed_readings(messages, count)
         if self._events is not None and setup.decides:
-            kernel(self._nodes, readings, plan._replace(part=SENDING), *given)
-            drawn.sent[:, unread] = 0
-            _, up = self._events.following(rows, drawn.sent[0, 0, :, :, 0])
-            drawn.up[..., 0], plan = up, plan._replace(part=ARRIVING)
-        kernel(self._nodes, readings, plan, *given)
-        if len(drawn.sent):
-            # Only now: filters decide for all nodes that are asked.
-            drawn.sent[:, unread] = 0
+            slot_kernel(self._nodes, readings, plan._replace(part=SENDING), *kernel_arguments)
+            messages.sent[:, unread] = 0
+            _, up = self._events.following(max_events, messages.sent[0, 0, :, :, 0])
+            messages.up[..., 0], plan = up, plan._replace(part=ARRIVING)
+        slot_kernel(self._nodes, readings, plan, *kernel_arguments)
+        if len(messages.sent):
+            # Only now, since the kernel decides for all nodes that are asked, readings or not.
+            messages.sent[:, unread] = 0
         self._slot += count
-        return SlotBlock(sampled, reported, times, drawn)
+        return SlotBlock(sampled, samples, times, messages)
 
-    def _next_messages(self, rows: int, timed: bool) -> tuple[SlotTimes, Drawn]:
-        """Return the next slots, up to about ``rows`` events, and their messages."""
+    def _next_messages(self, max_events: int, timed: bool) -> tuple[SlotTimes, SlotMessages]:
+        """Return the times and messages of the next slots, with about ``max_events`` events at most
+        (0: no limit).
+        """
         setup, events = self.setup, self._events
         if events is None:
             # The kernels draw the messages of many slots and runs at once.
-            count = min(setup.block_slots(self.runs, rows), setup.slots - self._slot)
+            count = min(setup.block_slots(self.runs, max_events), setup.slots - self._slot)
             times = self._next_times(count, timed)
             return times, self._draw_messages(times)
         if setup.decides:
-            # One slot, and the filters say who sends before Python makes the messages.
+            # One slot at a time: the filters decide who sends before Python makes the messages.
             sent = events.asked()
             up = np.zeros((1, 1, len(sent), len(setup.directions)), dtype=np.uint8)
             return self._next_times(1, True), _pack_messages(up, sent[None, None])
-        # As many slots as gave about so many rows.
-        count, up = events.following(rows, None)
+        count, up = events.following(max_events, None)
         return self._next_times(count, True), _pack_messages(up, np.zeros((0,) * 4, dtype=np.uint8))
 
     def _empty_samples(self, count: int) -> SampledStates:
         """Return empty arrays for ``count`` samples."""
         runs, estimators, n = self.runs, self.setup.estimators, self.setup.n
-        shape = runs, count, estimators, n
-        shapes = (runs, count, n), shape, (*shape, n), shape
-        ends = np.cumsum([math.prod(each) for each in shapes])
-        # One piece of memory: numpy asks for huge pages for large ones, which cost little to get.
-        parts = np.split(_samples.array(int(ends[-1])), ends[:-1])
+        filter_shape = runs, count, estimators, n
+        shapes = (runs, count, n), filter_shape, (*filter_shape, n), filter_shape
+        offsets = np.cumsum([math.prod(shape) for shape in shapes])
+        # One allocation for all: numpy requests huge pages for large ones, which are cheap to get.
+        arrays = np.split(_samples.array(int(offsets[-1])), offsets[:-1])
         return SampledStates(
-            *(part.reshape(each) for part, each in zip(parts, shapes, strict=True))
+            *(part.reshape(shape) for part, shape in zip(arrays, shapes, strict=True))
         )
 
     @property
     def broken(self) -> np.ndarray:
-        """(R,) bool: runs whose estimates or covariances have grown beyond all numbers, or whose
-        sum has.
+        """(R,) bool: runs with an estimate or covariance that is not finite (or their
+        sum is not).
         """
         return np.asarray(~np.isfinite(by_run(self._total, self.runs)))
 
-    def _next_times(self, count: int, wanted: bool) -> SlotTimes:
-        """Return flags, samples and, if ``wanted``, start times of the next ``count`` slots."""
+    def _next_times(self, count: int, timed: bool) -> SlotTimes:
+        """Return flags, samples and, if ``timed``, start times of the next ``count`` slots."""
         setup, algorithm, plant = self.setup, self.setup.algorithm, self._scenario.slot_plant
         slots = np.arange(self._slot, self._slot + count)
         noted = slots < setup.last
-        # At the horizon a filter that predicts shows what it predicted, and does nothing else.
-        acts = noted | (not algorithm.predicts)
-        # Filters that do not predict begin with their start, before any reading.
-        sensed = acts & ((slots > 0) | algorithm.predicts)
-        exchanged = acts & (slots >= algorithm.first_slot) & algorithm.talks
+        # At the horizon a filter that predicts is only sampled: its prediction is the result.
+        active = noted | (not algorithm.predicts)
+        # Filters that do not predict use no reading in slot 0: its sample is their initial state.
+        sensed = active & ((slots > 0) | algorithm.predicts)
+        exchanged = active & (slots >= algorithm.first_slot) & algorithm.talks
         sample = np.full(count, -1, dtype=np.int64)
         first, last = np.searchsorted(setup.samples, (self._slot, self._slot + count))
-        # Counted from the first sample of the run, or of these slots.
-        here = np.arange(first, last) - (first if self.reported is None else 0)
-        sample[setup.samples[first:last] - self._slot] = here
+        # Indices count from the first sample of the run, or of these slots.
+        indices = np.arange(first, last) - (first if self.samples is None else 0)
+        sample[setup.samples[first:last] - self._slot] = indices
         start = np.zeros(count)
-        # Times are computed only if rows are wanted: a batch has none.
-        if wanted:
+        # Only event rows need the times: a batch without them saves the loop.
+        if timed:
             start = np.array([plant.slot_time(slot) for slot in slots.tolist()])
         return SlotTimes(self._slot, start, noted, sensed, exchanged, sample, algorithm.predicts)
 
-    def _draw_messages(self, times: SlotTimes) -> Drawn:
-        """Return the pairs and messages of a block of slots, drawn for all runs."""
+    def _draw_messages(self, times: SlotTimes) -> SlotMessages:
+        """Draw and return the matchings and messages of a block of slots for all runs."""
         setup = self.setup
-        steps, pairs = (len(times.start), len(setup.fresh)), setup.most_pairs
-        masked = setup.decides or setup.may_miss
-        # Without matchings nobody looks at pairs.
+        shape, pairs = (len(times.start), len(setup.fresh)), setup.max_pairs
+        decided = setup.decides or setup.may_miss
+        # Without matchings the arrays of pairs stay empty.
         matched = self.runs if setup.matching[0] >= 0 else 0
-        drawn = Drawn(
-            np.zeros((self._blocks, *steps, len(setup.directions), LANES), dtype=np.uint8),
-            np.empty((matched, *steps, pairs), dtype=np.int64),
-            np.zeros((matched, *steps), dtype=np.int64),
+        messages = SlotMessages(
+            np.zeros((self._blocks, *shape, len(setup.directions), LANES), dtype=np.uint8),
+            np.empty((matched, *shape, pairs), dtype=np.int64),
+            np.zeros((matched, *shape), dtype=np.int64),
             np.zeros(
-                (self._blocks, *steps, len(setup.nodes), LANES) if masked else (0,) * 5,
+                (self._blocks, *shape, len(setup.nodes), LANES) if decided else (0,) * 5,
                 dtype=np.uint8,
             ),
         )
         if not len(setup.directions):
-            return drawn
+            return messages
         channels, exchanged, fresh = self._channels, times.exchanged, setup.fresh
-        # Two kernels: a run compiles only the one that it needs.
+        # Separate kernels, so that a run compiles only the one that it needs.
         if matched:
-            draw_matched(MANY, channels, self._matchings, exchanged, fresh, *drawn[:3])
+            draw_matched(MANY, channels, self._matchings, exchanged, fresh, *messages[:3])
         else:
-            draw_broadcasts(MANY, channels, exchanged, fresh, drawn.up)
-        if masked and matched:
-            ask_pairs(MANY, channels, drawn.active, drawn.pairs, drawn.sent)
-        elif masked:
-            ask_all(MANY, channels, exchanged, drawn.sent)
-        return drawn
+            draw_broadcasts(MANY, channels, exchanged, fresh, messages.up)
+        if decided and matched:
+            mark_paired_senders(MANY, channels, messages.active, messages.pair_count, messages.sent)
+        elif decided:
+            mark_all_senders(MANY, channels, exchanged, messages.sent)
+        return messages
 
-    def _missed_readings(self, drawn: Drawn, count: int) -> np.ndarray:
-        """Take the messages of nodes that have no reading to send in the next slots out of ``up``;
-        return who they are, (S, E, N).
+    def _missed_readings(self, messages: SlotMessages, count: int) -> np.ndarray:
+        """Return (S, E, N) bool: nodes that send nothing in the next ``count`` slots because they
+        have no reading; their messages are removed from ``up``.
         """
         setup = self.setup
         if not setup.may_miss:
             return np.zeros((count, len(setup.fresh), len(setup.nodes)), dtype=bool)
         unread = setup.unread(self._slot, count)
         senders = setup.ends[:, : setup.directions_per_link].reshape(-1)
-        drawn.up[:, unread[:, :, senders]] = 0
+        messages.up[:, unread[:, :, senders]] = 0
         return unread
 
     def _draw_uniforms(self, sent: np.ndarray) -> FloatArray:
-        """Return uniform numbers (B, S, E, N, L) of the nodes that are asked, empty if the filter
-        needs none.
+        """Return a uniform number (B, S, E, N, L) for each node that is asked for a message; empty
+        if the filter needs none.
         """
         if not self.setup.algorithm.randomised or not self.setup.decides:
             return np.zeros((0,) * 5)
@@ -357,15 +363,15 @@ class SlotRuns:
         return uniform
 
     def _next_states(self, count: int) -> tuple[FloatArray, FloatArray, np.ndarray]:
-        """Return local and absolute states (B, S, n, L) of the next slots, and where the origin
-        moves (S,).
+        """Return the states of the next slots relative to the moving origin and absolute, (B, S, n,
+        L) each, and the slots (S,) bool in which the origin moves.
         """
         setup = self.setup
         slots = range(self._slot, self._slot + count)
         rebased = np.zeros(count, dtype=bool)
         if self._path is None:
             x = np.stack([self._truth.state(slot) for slot in slots])
-            # One truth for all runs.
+            # A recorded truth is the same in all runs.
             x = in_lanes(x, self._blocks)
             return x, x, rebased
         # At the end of a frame the origin moves to the state.
@@ -381,14 +387,18 @@ class SlotRuns:
     def _draw_path(
         self, path: Path, states: np.ndarray, local: FloatArray, absolute: FloatArray
     ) -> None:
-        """Draw a block of a path into ``local`` and ``absolute`` (B, S, n, L)."""
+        """Draw the next slots of a path into ``local`` and ``absolute`` (B, S, n, L), from the
+        random streams ``states``.
+        """
         scratch = aligned((2, max(path.root.shape), LANES))
         draw_paths(MANY, path, states, normal_ziggurat(), self._slot, scratch, local, absolute)
 
     def _draw_readings(
         self, times: SlotTimes, local: FloatArray, rebased: np.ndarray
     ) -> ReadingBlock:
-        """Return the readings of a block of slots at the states ``local`` (B, S, n, L)."""
+        """Draw and return the whitened readings of a block of slots at the states ``local`` (B, S,
+        n, L).
+        """
         setup, count = self.setup, local.shape[1]
         shape = self._blocks, count, setup.estimators, setup.p
         y: FloatArray = unset((*shape, LANES))
@@ -397,46 +407,53 @@ class SlotRuns:
             H = unset((*shape, setup.n, LANES))
             H[:] = setup.H
         x = local
-        if rebased.any() and setup.algorithm.predicts:  # read in the frame that begins there
+        if rebased.any() and setup.algorithm.predicts:
+            # The origin moves before the reading: the state in the new frame is 0.
             x = local.copy()
             x[:, rebased] = 0.0
         k = setup.sensors.C.shape[2]
-        driven: FloatArray = unset((len(self._regressors), self._blocks, count, k, LANES))
-        for path, (steps, states) in zip(driven, self._regressors, strict=True):
+        regressor_states: FloatArray = unset((len(self._regressors), self._blocks, count, k, LANES))
+        for path, (steps, states) in zip(regressor_states, self._regressors, strict=True):
             self._draw_path(steps, states, path, path)
         noise, scratch = self._noise, np.zeros((setup.p, LANES))
-        draw_readings(MANY, setup.sensors, noise, normal_ziggurat(), x, driven, scratch, y, H)
+        draw_readings(
+            MANY, setup.sensors, noise, normal_ziggurat(), x, regressor_states, scratch, y, H
+        )
         if not self._recorded or not times.sensed.any():
             return ReadingBlock(y, H, local, rebased)
         slots = (self._slot + np.flatnonzero(times.sensed)).tolist()
         for s, path in self._recorded:
-            some = slice(s.row, s.row + len(s.root))
+            rows = slice(s.row, s.row + len(s.root))
             values, matrices = path.several(slots, x[0, times.sensed, :, 0])
-            # Whitened with the R that filters believe; all runs read the same.
-            white = solve_lower(s.root, values.T).T, solve_lower(s.root, matrices)
-            y[:, times.sensed, s.estimator, some] = white[0][..., None]
-            H[:, times.sensed, s.estimator, some] = white[1][..., None]
+            # L^-1 y and L^-1 H, with the R = L L' that filters believe; all runs read the same.
+            whitened_y, whitened_H = solve_lower(s.root, values.T).T, solve_lower(s.root, matrices)
+            y[:, times.sensed, s.estimator, rows] = whitened_y[..., None]
+            H[:, times.sensed, s.estimator, rows] = whitened_H[..., None]
         return ReadingBlock(y, H, local, rebased)
 
     def events(self, block: SlotBlock) -> tuple[np.ndarray, np.ndarray]:
-        """Return the EVENT rows of a block of one run, and the number before each sample."""
+        """Return the EVENT rows of a block of one run, and the number of rows before each sample
+        (T,).
+        """
         if self._events is not None:
             return self._events.rows(self._stopped[0, :, 0])
-        at_sample = np.zeros(len(block.sampled), dtype=np.int64)
-        return self._rows(block, 0, len(block.times.start), at_sample), at_sample
+        before_sample = np.zeros(len(block.sampled), dtype=np.int64)
+        return self._rows(block, 0, len(block.times.start), before_sample), before_sample
 
     def first_events(self, block: SlotBlock) -> Iterator[np.ndarray]:
-        """Yield the EVENT rows of the first run of a batch, of some slots at a time."""
+        """Yield the EVENT rows of the first run of a batch, for some slots at a time."""
         size = max(1, LONG // max(1, self.setup.rows_of(1)))
         # Samples of a batch are counted from the first of the run.
-        at_sample = np.zeros(len(self.setup.samples), dtype=np.int64)
+        before_sample = np.zeros(len(self.setup.samples), dtype=np.int64)
         count = len(block.times.start)
         for first in range(0, count, size):
-            yield self._rows(block, first, min(first + size, count), at_sample)
+            yield self._rows(block, first, min(first + size, count), before_sample)
 
-    def _rows(self, block: SlotBlock, first: int, stop: int, at_sample: np.ndarray) -> np.ndarray:
+    def _rows(
+        self, block: SlotBlock, first: int, stop: int, before_sample: np.ndarray
+    ) -> np.ndarray:
         """Return the EVENT rows of the first run in the slots ``first`` to ``stop`` of a block;
-        write the number of rows before each sample into ``at_sample`` (T,).
+        write the number of rows before each sample into ``before_sample`` (T,).
         """
         setup = self.setup
         # Space for the largest number of rows.
@@ -444,8 +461,8 @@ class SlotRuns:
         # Kernels write the columns where the records have them.
         columns: Any = [table[name] for name in ROW_COLUMNS]
         count = make_rows(
-            setup.stages, block.times, self._channels, self._make_hearing(), block.drawn,
-            setup.algorithm.pairwise, first, stop, Rows._make([*columns, at_sample]),
+            setup.stages, block.times, self._channels, self._traced_nodes(), block.messages,
+            setup.algorithm.pairwise, first, stop, Rows._make([*columns, before_sample]),
         )  # fmt: skip
         return table[:count]
 
@@ -453,41 +470,43 @@ class SlotRuns:
         """Add the events of a block to ``counts``."""
         setup = self.setup
         count_events(
-            MANY, setup.stages, block.times, self._channels, self._make_hearing(), block.drawn,
+            MANY, setup.stages, block.times, self._channels, self._traced_nodes(), block.messages,
             setup.algorithm.pairwise, aligned((len(KINDS), LANES)), self.counts,
         )  # fmt: skip
 
-    def _make_hearing(self) -> Hearing:
-        """Return the links and nodes as the kernels of messages need them."""
-        setup, heard = self.setup, self.setup.links
-        return Hearing(
-            setup.nodes, setup.sensing, heard.first, heard.sender, heard.direction, self._sent,
+    def _traced_nodes(self) -> TracedNodes:
+        """Return the nodes and incoming links, for the kernels that write or count events."""
+        setup, links = self.setup, self.setup.links
+        return TracedNodes(
+            setup.nodes, setup.sensing, links.first, links.sender, links.direction, self._sent,
             self._stopped,
         )  # fmt: skip
 
     def conserved(self) -> dict[str, FloatArray]:
-        """Return the sums over all nodes that exchanges conserve, (R, 2) at the start and the last
-        sample.
+        """Return by name the sums over all nodes that exchanges conserve: (R, 2), their values at
+        the start and at the last sample.
         """
-        given: list[Any] = [self.setup.algorithm.conserved(s) for s in self.setup.states]
-        found, sums = {}, by_run(self._conserved, self.runs)
-        for k, name in enumerate(given[0]):
-            # fsum: the check is of the exchanges, and not of its own rounding.
-            start = math.fsum(np.concatenate([np.atleast_1d(values[name]) for values in given]))
+        start_values: list[Any] = [self.setup.algorithm.conserved(s) for s in self.setup.states]
+        conserved, sums = {}, by_run(self._conserved, self.runs)
+        for k, name in enumerate(start_values[0]):
+            # fsum, so that the sums add no rounding of their own to that of the exchanges.
+            start = math.fsum(
+                np.concatenate([np.atleast_1d(values[name]) for values in start_values])
+            )
             now = [math.fsum(column) for column in sums[:, :, k].tolist()]
-            found[name] = np.array([[start, value] for value in now])
-        return found
+            conserved[name] = np.array([[start, value] for value in now])
+        return conserved
 
 
-def _pack_messages(up: np.ndarray, sent: np.ndarray) -> Drawn:
-    """Return the messages (1, S, E, W) of one run, which Python made, and who sends, as kernels
-    need them.
+def _pack_messages(up: np.ndarray, sent: np.ndarray) -> SlotMessages:
+    """Return the messages ``up`` (1, S, E, W) and senders ``sent`` (1, S, E, N) of one run, which
+    Python made, in lane 0 of the arrays that kernels expect.
     """
-    wide = [np.zeros((*part.shape, LANES), dtype=np.uint8) for part in (up, sent)]
-    for lanes, part in zip(wide, (up, sent), strict=True):
-        lanes[..., 0] = part
+    lane_arrays = [np.zeros((*values.shape, LANES), dtype=np.uint8) for values in (up, sent)]
+    for lanes, values in zip(lane_arrays, (up, sent), strict=True):
+        lanes[..., 0] = values
     active, pairs = (np.zeros((0,) * d, dtype=np.int64) for d in (4, 3))
-    return Drawn(wide[0], active, pairs, wide[1])
+    return SlotMessages(lane_arrays[0], active, pairs, lane_arrays[1])
 
 
 ROW_COLUMNS = ("t", "kind", "node", "peer", "message", "phase", "age")
@@ -509,44 +528,45 @@ def run_slots(scenario: Scenario, streams: Streams, recorder: Recorder, progress
 def _record_block(
     scenario: Scenario, runs: SlotRuns, recorder: Recorder, progress: Progress
 ) -> bool:
-    """Simulate and record some slots; return True if all estimates are sound."""
-    # A block of about so many rows: memory does not grow with the run.
+    """Simulate and record the next slots; return True if all estimates are finite and valid."""
+    # A limited number of rows at a time: memory does not grow with the length of the run.
     block = runs.following(MAX_EVENT_ROWS)
-    rows, before = runs.events(block)
+    rows, rows_before = runs.events(block)
     if len(block.sampled):
         sums = runs.conserved()
         recorder.sums = {name: (float(v[0, 0]), float(v[0, 1])) for name, v in sums.items()}
-    x, xhat, P, error = (part[0] for part in block.reported)
+    x, xhat, P, error = (values[0] for values in block.samples)
     times = block.times.start[block.sampled]
 
     def pass_rows_on(k: int) -> None:
-        """Pass on the rows up to sample ``k``, the first one that is not finite."""
-        # The rows up to the first broken sample, if there is one.
-        recorder.extend(rows[: before[k]])
+        """Record the events before sample ``k``, the first one that is not finite."""
+        recorder.extend(rows[: rows_before[k]])
 
     samples = StateSamples(times, x, xhat, P, error)
-    fine = record_samples(scenario, recorder, progress, samples, pass_rows_on)
-    if fine:
+    sound = record_samples(scenario, recorder, progress, samples, pass_rows_on)
+    if sound:
         recorder.extend(rows)
-    return fine
+    return sound
 
 
 MAX_EVENT_ROWS = 1 << 15
-"""Rows of events that are made at once."""
+"""Rows of events of a block of slots, about."""
 
 
 def slot_batches(
     scenario: Scenario, seed: int, replicas: range, fingerprint: bool = False
 ) -> Iterator[RunBatch]:
-    """Yield the runs of consecutive replicas in order, the first with its ``fingerprint``."""
+    """Yield batches of consecutive replicas in order; ``fingerprint``: with the hash of the events
+    of the first run.
+    """
     keep_freed_memory()
     setup = slot_setup(scenario)
     # As many runs side by side as fit the memory.
     size = setup.batch_runs()
     for first in range(replicas.start, replicas.stop, size):
         count = min(size, replicas.stop - first)
-        recorded = fingerprint and first == replicas.start
-        yield slot_batch(scenario, seed, range(first, first + count), recorded)
+        with_fingerprint = fingerprint and first == replicas.start
+        yield slot_batch(scenario, seed, range(first, first + count), with_fingerprint)
 
 
 def slot_batch(
@@ -555,17 +575,17 @@ def slot_batch(
     """Simulate consecutive replicas side by side; a run that diverges goes on to the end with
     invalid numbers, which ``with_ends`` replaces.
     """
-    runs = SlotRuns(scenario, ReplicaStreams(seed, replicas.start, len(replicas)), whole=True)
-    assert runs.reported is not None
-    # That of trace.recorder: the rows of one run only pass by.
-    passed = hashlib.sha256()
+    runs = SlotRuns(scenario, ReplicaStreams(seed, replicas.start, len(replicas)), store_all=True)
+    assert runs.samples is not None
+    # The hash that trace.recorder computes: the rows of the first run are hashed, not stored.
+    events_hash = hashlib.sha256()
     while not runs.over:
         with np.errstate(over="ignore", invalid="ignore"):
             block = runs.following(0, timed=fingerprint)
         runs.count_events(block)
         for rows in runs.first_events(block) if fingerprint else ():
-            passed.update(rows.data)
-    x, xhat, P, error = runs.reported
+            events_hash.update(rows.data)
+    x, xhat, P, error = runs.samples
     return RunBatch(
         replicas=replicas,
         times=runs.setup.sample_times,
@@ -578,22 +598,23 @@ def slot_batch(
         status=np.where(runs.broken, DIVERGED, COMPLETE),
         sums=runs.conserved(),
         exact_errors=scenario.exact_errors,
-        fingerprint=passed.hexdigest() if fingerprint else "",
+        fingerprint=events_hash.hexdigest() if fingerprint else "",
     )
 
 
 def with_ends(batch: RunBatch, alone: Callable[[range, bool], Iterator[RunBatch]]) -> RunBatch:
-    """Return the batch in which every run that diverges is replaced by the same run ``alone``, up
-    to its end; that takes replicas and whether their fingerprint is wanted.
+    """Return the batch with every run that diverges replaced by the same run simulated ``alone``, a
+    function of replicas and of whether their fingerprint is computed.
+
+    In a batch a run that diverges goes on with invalid numbers; alone it ends where it diverges.
     """
-    # A run that diverges goes on in a batch; its true end is that of the run alone.
     for r in np.flatnonzero(batch.diverged).tolist():
         fingerprint = r == 0 and bool(batch.fingerprint)
-        (one,) = alone(batch.replicas[r : r + 1], fingerprint)
+        (single,) = alone(batch.replicas[r : r + 1], fingerprint)
         if fingerprint:
-            batch = replace(batch, fingerprint=one.fingerprint)
+            batch = replace(batch, fingerprint=single.fingerprint)
         for name in ("x", "xhat", "P", "error", "lengths", "counts", "status"):
-            getattr(batch, name)[r] = getattr(one, name)[0]
+            getattr(batch, name)[r] = getattr(single, name)[0]
         for name, values in batch.sums.items():
-            values[r] = one.sums[name][0]
+            values[r] = single.sums[name][0]
     return batch

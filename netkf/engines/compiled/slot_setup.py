@@ -1,4 +1,4 @@
-"""What all runs of a scenario in slots share, as arrays for the kernels."""
+"""Arrays that all runs of a scenario in slots share: stages, links, sensors, initial states."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from netkf.scenario.scenario import Scenario
 
 
 def slot_setup(scenario: Scenario) -> SlotSetup:
-    """Return the arrays of a scenario, made once and kept with it like its cached properties."""
+    """Return the arrays of a scenario, computed at the first call and stored with the scenario."""
     # The scenario is frozen: its dictionary is where its cached properties are kept, too.
     if "_slot_setup" not in vars(scenario):
         vars(scenario)["_slot_setup"] = SlotSetup(scenario)
@@ -83,7 +83,7 @@ class SlotSetup:
     def _set_slots(self, scenario: Scenario) -> None:
         """Set the slots of a run; the last one, at the horizon, exists only if it is sampled."""
         plant, last = scenario.slot_plant, 0
-        # A guess below the last slot; the plant itself decides which is over.
+        # A guess below the last slot: the plant itself decides, free of this division's rounding.
         last = max(0, int(scenario.horizon / plant.period) - 2)
         while not plant.over(last, scenario.horizon):
             last += 1
@@ -94,8 +94,8 @@ class SlotSetup:
         self.sample_times = np.array([plant.slot_time(slot) for slot in self.samples.tolist()])
 
     def _set_stages(self, scenario: Scenario) -> None:
-        """Set the stages of a slot (readings and exchange steps), with phase and end in seconds of
-        each.
+        """Set the stages of a slot (readings and exchange steps), each with its phase and its end
+        in seconds after the slot begins.
         """
         algorithm, phase, step = self.algorithm, 0, 0
         length = scenario.phase_length if algorithm.talks else 0.0
@@ -125,7 +125,9 @@ class SlotSetup:
         self.phases = [phase for step, phase, _ in stages if step >= 0]
 
     def _set_sensors(self, scenario: Scenario) -> None:
-        """Assign the readings of each sensor: one filter reads those of one node, or of all."""
+        """Assign each sensor to a filter and to its rows there. A pooled filter reads the sensors
+        of all nodes.
+        """
         pooled = self.algorithm.pooled
         self.estimators = 1 if pooled else len(scenario.nodes)
         rows = np.zeros(self.estimators, dtype=np.int64)
@@ -136,8 +138,7 @@ class SlotSetup:
             for placed_sensor in scenario.placed[node]:
                 R = scenario.noise(placed_sensor.entry, believed=True)
                 root = cholesky(R)
-                # A filter stacks the readings of its sensors: each begins where the one before
-                # ends.
+                # A filter stacks the readings of its sensors, one below the other.
                 self.placed.append(
                     AssignedSensor(node, placed_sensor, estimator, int(rows[estimator]), root)
                 )
@@ -153,17 +154,19 @@ class SlotSetup:
         self._set_drawn(scenario)
 
     def _set_drawn(self, scenario: Scenario) -> None:
-        """Set the arrays of all drawn sensors: whitened H and noise factors, by filter and row."""
+        """Set the whitened H = L_b^-1 H and noise factors L_b^-1 L of all sensors that kernels
+        read, and the processes of random regressors.
+        """
         count, p, n = len(self.drawn), self.p, self.n
         H, noise = np.zeros((count, p, n)), np.zeros((count, p, p))
         driven = np.full(count, -1, dtype=np.int64)
         for m, s in enumerate(self.drawn):
             sensor = scenario.sensors[s.placed_sensor.entry]
             rows = len(s.root)
-            true = cholesky(sensor.R)
+            true_root = cholesky(sensor.R)
             # Noise L_b^-1 L of a whitened reading, with the believed R = L_b L_b' and the true R =
             # L L'.
-            noise[m, :rows, :rows] = solve_lower(s.root, true)
+            noise[m, :rows, :rows] = solve_lower(s.root, true_root)
             if isinstance(sensor, RegressorSensor):
                 # A regressor's one row is random: H holds the whitening factor alone.
                 driven[m], H[m, 0, 0] = self.driven.index(s), 1.0 / s.root[0, 0]
@@ -182,7 +185,7 @@ class SlotSetup:
             root = sensor.drive
             A[:size, :size], drive[:size, : root.shape[1]] = sensor.A, root
             C[d, :, :size], start[:size] = sensor.C, sensor.start
-            # Columns of noise are not padded: each takes as many numbers as it does alone.
+            # Columns of noise are not padded: a padded one would draw numbers from the stream.
             self.regressors.append((A, np.ascontiguousarray(drive[:, : root.shape[1]]), start))
         self.sensors = SlotSensors(
             np.array([s.estimator for s in self.drawn], dtype=np.int64),
@@ -211,15 +214,17 @@ class SlotSetup:
         self.root = np.stack([state.root for state in self.states])
 
     def _make_links(self, scenario: Scenario) -> SlotLinks:
-        """Return the directed links by receiver, with weights, as kernels need them."""
+        """Return the directed links sorted by receiver, with their weights."""
         index = scenario.topology.index
-        # By receiver and sender: the order in which a filter adds what it hears.
-        heard = sorted(
+        # By receiver and sender: the order in which a filter adds the messages it receives.
+        incoming = sorted(
             (index[receiver], index[sender], direction, scenario.weight(receiver, sender))
             for direction, (sender, receiver) in enumerate(self.directions)
         )
-        # zip() of nothing gives no columns.
-        receivers, senders, directions, weights = zip(*heard, strict=True) if heard else [()] * 4
+        # zip() of an empty list has no columns to unpack.
+        receivers, senders, directions, weights = (
+            zip(*incoming, strict=True) if incoming else [()] * 4
+        )
         first = np.searchsorted(np.array(receivers, dtype=np.int64), np.arange(self.estimators + 1))
         return SlotLinks(
             np.asarray(first, dtype=np.int64),
@@ -229,13 +234,13 @@ class SlotSetup:
         )
 
     def _set_channel(self, scenario: Scenario) -> None:
-        """Set the delivery probabilities of directions, and the entities whose streams decide about
-        messages.
+        """Set the delivery probabilities of directed links, the streams that losses are drawn from,
+        and which directions send in which step.
         """
         channel, each = scenario.network.channel, self.directions_per_link
         self.loss, bad = channel.loss, (False, True)
         self.is_chain = type(self.loss) is GilbertElliott
-        # Channels of a user's own have probabilities that only Python can ask for.
+        # The probabilities of a user's own loss model are computed in Python, message by message.
         self.has_known_probabilities = identical_per_link(self.loss) or self.is_chain
         self.delivery = np.ones((2, len(self.directions)))
         if self.has_known_probabilities:
@@ -244,37 +249,39 @@ class SlotSetup:
                 self.delivery[:, w] = [
                     self.loss.delivery_probability(direction, 0, b, table) for b in bad
                 ]
-        self.streams = 1 if channel.symmetric else each
+        self.streams_per_link = 1 if channel.symmetric else each
         # Streams belong to the first direction of each link, or to each direction.
         self.entities = [
-            direction for w, direction in enumerate(self.directions) if w % each < self.streams
+            direction
+            for w, direction in enumerate(self.directions)
+            if w % each < self.streams_per_link
         ]
-        # By phase: with asymptotic gains no mass is sent, and nodes without a sensor have no
-        # reading.
+        # Some filters send nothing in some phases (push-sum with asymptotic gains: no mass), or
+        # only from nodes that have sensors.
         sends = self.algorithm.sends_in_slots
         talks = [
             [sends(phase, direction[0] in scenario.placed) for direction in self.directions]
             for phase in self.phases
         ]
         self.talks = np.array(talks, dtype=np.uint8).reshape(len(talks), len(self.directions))
-        # Steps in which nodes send what they have read, and those that may have read nothing.
-        self.of_readings = np.array(
+        # Steps in which nodes send their readings; in some slots a node may have none.
+        self.sends_readings = np.array(
             [sends(phase, True) and not sends(phase, False) for phase in self.phases], dtype=bool
         )
-        self._recorded_slots = self._slots_with_rows(scenario) if self.of_readings.any() else {}
+        self._recorded_slots = self._slots_with_rows(scenario) if self.sends_readings.any() else {}
 
     def _slots_with_rows(self, scenario: Scenario) -> dict[int, set[int]]:
-        """Return the slots in which nodes with recorded sensors only have readings, by index of the
-        node.
+        """Return, by index of the node, the slots with a reading, for nodes all of whose sensors
+        are recorded: only these may lack one.
         """
-        found: dict[int, set[int]] = {}
+        slots: dict[int, set[int]] = {}
         for s in self.recorded:
             sensor: Any = scenario.sensors[s.placed_sensor.entry]
-            rows = sensor.table(s.node, scenario.slot_plant.period)
-            found.setdefault(scenario.topology.index[s.node], set()).update(rows)
+            recorded_slots = sensor.table(s.node, scenario.slot_plant.period)
+            slots.setdefault(scenario.topology.index[s.node], set()).update(recorded_slots)
         for s in self.drawn:
-            found.pop(scenario.topology.index[s.node], None)
-        return found
+            slots.pop(scenario.topology.index[s.node], None)
+        return slots
 
     @property
     def may_miss(self) -> bool:
@@ -282,30 +289,30 @@ class SlotSetup:
         return bool(self._recorded_slots)
 
     def unread(self, first: int, count: int) -> np.ndarray:
-        """Return (S, E, N) which nodes send nothing in the steps of slots ``first`` to ``first +
-        count - 1`` because they have no reading.
+        """Return (S, E, N) bool: nodes that send nothing in a step, because it sends readings and
+        they have none. S = ``count`` slots from ``first`` on.
         """
         missed = np.zeros((count, len(self.nodes)), dtype=bool)
         for index, slots in self._recorded_slots.items():
             missed[:, index] = [slot not in slots for slot in range(first, first + count)]
-        unread: np.ndarray = missed[:, None] & self.of_readings[:, None]
+        unread: np.ndarray = missed[:, None] & self.sends_readings[:, None]
         return unread
 
     def _draws_everything(self, scenario: Scenario) -> bool:
-        """Return True if kernels can draw all messages, else they are made one by one."""
+        """Return True if kernels can draw all messages; otherwise Python makes them one by one."""
         network = scenario.network
         # Kernels know broadcasts and matchings without delay, with the built-in losses.
         exchanges = type(network.activation) in (Matching, Broadcast) or not self.algorithm.talks
         return self.has_known_probabilities and network.channel.delay.fixed == 0.0 and exchanges
 
     @property
-    def most_pairs(self) -> int:
+    def max_pairs(self) -> int:
         """The largest number of pairs in a matching, 0 without matchings."""
         return min(len(self.nodes) // 2, len(self.ends)) if self.matching[0] >= 0 else 0
 
     def rows_of(self, slots: int) -> int:
-        """Return the largest number of events in ``slots`` slots."""
-        pairs = self.most_pairs
+        """Return an upper bound of the number of events in ``slots`` slots."""
+        pairs = self.max_pairs
         sends = self.directions_per_link * (pairs if self.matching[0] >= 0 else len(self.ends))
         # A send and its outcome for each direction, a tick for each pair, a round, and one
         # absorption per node.
@@ -313,33 +320,36 @@ class SlotSetup:
         return slots * (len(self.sensing) + steps + len(self.nodes))
 
     def bytes_of_slot(self) -> int:
-        """Return the bytes that are drawn for one slot of one run."""
+        """Return the bytes of states, readings and messages that are drawn for one slot
+        of one run.
+        """
         floats = self.estimators * self.p * (1 + self.varies * self.n) + 3 * self.n
-        messages = len(self.fresh) * (len(self.directions) + 8 * self.most_pairs + 8)
+        messages = len(self.fresh) * (len(self.directions) + 8 * self.max_pairs + 8)
         mask = self.decides or self.may_miss
         asked = len(self.nodes) * (mask + 8 * self.algorithm.randomised)
         return 8 * floats + messages + len(self.fresh) * asked
 
-    def block_slots(self, runs: int, rows: int) -> int:
-        """Return the slots of ``runs`` that one call simulates, up to about ``rows`` events if that
-        is not 0.
+    def block_slots(self, runs: int, max_events: int) -> int:
+        """Return the number of slots of ``runs`` runs that one call simulates, with about
+        ``max_events`` events at most (0: no limit).
         """
         slots = BLOCK_BYTES // (blocks_of(runs) * LANES * self.bytes_of_slot())
-        if rows:
-            slots = min(slots, rows // max(1, self.rows_of(1)))
+        if max_events:
+            slots = min(slots, max_events // max(1, self.rows_of(1)))
         return max(1, int(slots))
 
     def batch_runs(self) -> int:
         """Return the number of runs that are simulated side by side."""
-        samples = max(1, 8 * len(self.samples) * self.estimators * (2 + self.n) * self.n)
-        # A power of two, a node of the tree over runs, unless not even a block of lanes fits.
-        together = min(BATCH_BYTES // samples, BLOCK_BYTES // (8 * self.bytes_of_slot()))
-        whole = 1 << max(0, int(min(together, MAX_BATCH_RUNS)).bit_length() - 1)
-        return int(min(max(whole, LANES), max(1, MAX_BATCH_BYTES // samples)))
+        sample_bytes = max(1, 8 * len(self.samples) * self.estimators * (2 + self.n) * self.n)
+        # A power of two, so that a batch is one node of the merge tree; at least a block of lanes,
+        # unless not even that fits.
+        runs_in_memory = min(BATCH_BYTES // sample_bytes, BLOCK_BYTES // (8 * self.bytes_of_slot()))
+        power = 1 << max(0, int(min(runs_in_memory, MAX_BATCH_RUNS)).bit_length() - 1)
+        return int(min(max(power, LANES), max(1, MAX_BATCH_BYTES // sample_bytes)))
 
     def quick_runs(self) -> int:
-        """Return a number of runs, a power of two and at least a block of lanes, that takes some
-        ten milliseconds.
+        """Return the number of runs that take some ten milliseconds: a power of two, and at least
+        a block of lanes.
         """
         flops = self.estimators * (50 + 4 * self.n**3) + 10 * len(self.fresh) * len(self.directions)
         runs = min(QUICK_FLOPS // (max(1, self.slots) * flops), MAX_BATCH_RUNS)
@@ -347,18 +357,18 @@ class SlotSetup:
 
 
 BLOCK_BYTES = 1 << 24
-"""Of what is drawn for one call of a filter's kernel. Kernels go through it once, in order: that it
-leaves the caches of a core costs less than more calls would.
+"""Bytes drawn for one call of a filter's kernel. They exceed the caches of a core, but kernels read
+them once and in order, which costs less than more calls would.
 """
 BATCH_BYTES, MAX_BATCH_BYTES, MAX_BATCH_RUNS = 1 << 26, 1 << 29, 1024
-"""Of the samples of a batch, those of a block of lanes, and the largest number of runs."""
+"""Limits of a batch: bytes of its samples, the same if it is only a block of lanes, and runs."""
 QUICK_FLOPS = 1 << 25
-"""Of runs that are worth doing together from the first one on: some ten milliseconds."""
+"""Floating-point operations that take some ten milliseconds."""
 
 
 def matching_lists(scenario: Scenario) -> tuple[int, float, np.ndarray, np.ndarray]:
-    """Return the index of the protocol in PROTOCOLS (-1: no matching), its probability, and the
-    lists that ``slot_messages.Matchings`` describes.
+    """Return the first two fields of ``slot_messages.Matchings`` (protocol, probability) and its
+    lists ``first``, ``members``.
     """
     activation, topology = scenario.network.activation, scenario.topology
     if not isinstance(activation, Matching):
@@ -366,19 +376,19 @@ def matching_lists(scenario: Scenario) -> tuple[int, float, np.ndarray, np.ndarr
     protocol, links = PROTOCOLS.index(activation.protocol), topology.links
     lists: list[list[int]] = []
     if protocol == NODE_WAKEUP:
-        peers: dict[int, dict[int, int]] = {node: {} for node in topology.nodes}
-        # A dictionary for each node: its peers, in ascending order, choose among its links.
+        links_of: dict[int, dict[int, int]] = {node: {} for node in topology.nodes}
+        # The links of each node, in ascending order of the peer at the other end.
         for k, (i, j) in enumerate(links):
-            peers[i][j] = peers[j][i] = k
-        lists = [[here[peer] for peer in sorted(here)] for here in peers.values()]
+            links_of[i][j] = links_of[j][i] = k
+        lists = [[link_to[peer] for peer in sorted(link_to)] for link_to in links_of.values()]
     if protocol == UNIFORM_MAXIMAL:
-        number = {link: k for k, link in enumerate(links)}
-        lists = [[number[link] for link in some] for some in maximal_matchings(links)]
+        index = {link: k for k, link in enumerate(links)}
+        lists = [[index[link] for link in members] for members in maximal_matchings(links)]
     probability = {ONE_EDGE: activation.lazy, INDEPENDENT: activation.p}.get(protocol) or 0.0
     first = np.cumsum([0, *map(len, lists)], dtype=np.int64)
     return (
         protocol,
         probability,
         first,
-        np.array([k for some in lists for k in some], dtype=np.int64),
+        np.array([k for members in lists for k in members], dtype=np.int64),
     )
