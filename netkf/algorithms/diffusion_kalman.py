@@ -11,7 +11,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 
 from netkf.algorithms.filter import Exchange, Filter, Message, NodeInfo, Reading
-from netkf.algorithms.kernels.neighbours import add_to_estimate, fuse_readings, move_towards
+from netkf.algorithms.kernels.neighbours import add_to_estimate, fuse_readings, sum_differences
 from netkf.algorithms.kernels.slots import (
     ReadingBlock,
     SlotLinks,
@@ -74,7 +74,7 @@ def diffusion_kalman_slots(
                     fuse_readings(nodes, readings, plan, links, scratch, True, b, s, h)
                 # All differences before any estimate moves: the combination is simultaneous.
                 for h in range(len(nodes.rows)):
-                    move_towards(
+                    sum_differences(
                         scratch.lanes, nodes.xhat, b, h, links, plan.up, s, 1, True, scratch.xhat
                     )
                 for h in range(len(nodes.rows)):
@@ -85,8 +85,8 @@ def diffusion_kalman_slots(
 
 @kernel
 def move_towards_single(x: FloatArray, links: SlotLinks, up: Any, moved: FloatArray) -> None:
-    """Apply ``move_towards`` to one node, the first of x (1, H, n, 1), with one lane."""
-    move_towards(ONE, x, 0, 0, links, up, 0, 0, True, moved)
+    """Apply ``sum_differences`` to one node, the first of x (1, H, n, 1), with one lane."""
+    sum_differences(ONE, x, 0, 0, links, up, 0, 0, True, moved)
 
 
 @built_in("diffusion-kalman")

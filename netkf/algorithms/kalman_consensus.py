@@ -14,8 +14,8 @@ from netkf.algorithms.filter import Exchange, Filter, Message, NodeInfo, Reading
 from netkf.algorithms.kernels.neighbours import (
     add_to_estimate,
     fuse_readings,
-    move_towards,
     scale_by_covariance,
+    sum_differences,
 )
 from netkf.algorithms.kernels.slots import (
     ReadingBlock,
@@ -90,7 +90,7 @@ def kcf_slots(
                 predict_all(nodes, scratch, b)
                 # Consensus is on predictions and their covariances: before any reading is used.
                 for h in range(len(nodes.rows)):
-                    move_towards(
+                    sum_differences(
                         scratch.lanes, nodes.xhat, b, h, links, plan.up, s, 0, False, scratch.xhat
                     )
                     scale_by_covariance(
@@ -114,7 +114,7 @@ def consensus_term_single(
     work: FloatArray,
 ) -> None:
     """Write the consensus term of one node, the first of x (1, H, n, 1), with one lane."""
-    move_towards(ONE, x, 0, 0, links, up, 0, 0, False, moved)
+    sum_differences(ONE, x, 0, 0, links, up, 0, 0, False, moved)
     scale_by_covariance(ONE, root, 0, 0, epsilon, moved, work)
 
 

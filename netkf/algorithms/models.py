@@ -132,7 +132,7 @@ class FlowModel:
 
     def max_interval(self, root: FloatArray) -> float:
         """Return the longest measurement interval, see ``Filter.max_measurement_interval``."""
-        HS = self.flow.seen[0] @ root
+        HS = self.flow.whitened_H[0] @ root
         return usable(float((HS * HS).sum()))
 
 

@@ -208,8 +208,8 @@ def test_models_side_by_side_are_what_they_are_alone():
             assert np.array_equal(np.tril(roots[m]), np.tril(alone[0]))
             assert np.array_equal(means[m], alone[1])
             P = np.tril(roots[m]) @ np.tril(roots[m]).T
-            G = table.seen[0].T @ table.seen[0]
-            rate = information_rate(ONE, scratch.size, stack.seen[m], roots[m])
+            G = table.whitened_H[0].T @ table.whitened_H[0]
+            rate = information_rate(ONE, scratch.size, stack.whitened_H[m], roots[m])
             assert rate == pytest.approx((P * G).sum(), rel=1e-12)
 
 

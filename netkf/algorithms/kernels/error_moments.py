@@ -1,14 +1,15 @@
-"""Covariances of all errors of coupled Kalman-Bucy filters, integrated along one run.
+"""Covariances of the errors of all coupled Kalman-Bucy filters, integrated along one run.
 
 Between messages every node has the covariance P_i and the error e_i = x - xhat_i with
 
     dP_i/dt = A P_i + P_i A' + Q - P_i G_i P_i,
     d cov(e_i, e_j)/dt = K_i cov + cov K_j' + Qt + (P_i Gt_i P_i where i = j),   K_i = A - P_i G_i,
 
-where G_i is the information per second that the filter assumes, H_i' R_i^-1 H_i, and Gt_i that of
-the true noise through the same gain, H_i' R_i^-1 Rt_i R_i^-1 H_i. At an instant of messages both
-are mixed with the weights of H (7), (9). The classical Runge-Kutta method of order 4 takes steps
-short against all rates, so that its error is far below what sizing and tables need.
+where G_i = H_i' R_i^-1 H_i is the information per second that the filter assumes, and Gt_i =
+H_i' R_i^-1 Rt_i R_i^-1 H_i that of the true noise Rt_i through the same gain; Qt is the true Q. At
+an instant of messages both are mixed with the weights of H (7), (9). The integrator is the
+classical Runge-Kutta method of order 4, with steps short against all rates, so that its error is
+far below what sizing and tables need.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from netkf.linalg.compiling import kernel
 def covariance_slope(
     P: FloatArray, A: FloatArray, Q: FloatArray, G: FloatArray, K: FloatArray, dP: FloatArray
 ) -> None:
-    """Write K_i = A - P_i G_i and dP_i/dt, (N, n, n) each."""
+    """Write K_i = A - P_i G_i and dP_i/dt = K_i P_i + P_i A' + Q for all nodes, (N, n, n) each."""
     N, n = len(P), len(A)
     for i in range(N):
         for a in range(n):
@@ -32,7 +33,7 @@ def covariance_slope(
                 for c in range(n):
                     total -= P[i, a, c] * G[i, c, b]
                 K[i, a, b] = total
-        # dP = K P + P A' + Q, since K P = A P - P G P
+        # dP = K P + P A' + Q, since K P = A P - P G P.
         for a in range(n):
             for b in range(n):
                 total = Q[a, b]
@@ -43,8 +44,10 @@ def covariance_slope(
 
 @kernel
 def error_slope(S: FloatArray, K: FloatArray, true_Q: FloatArray, dS: FloatArray) -> None:
-    """Write d cov(e_i, e_j)/dt (N, N, n, n) without the noise of the sensors."""
-    # dS_ij = K_i S_ij + S_ij K_j' + Q: all errors share the plant's noise. S_ji is S_ij'.
+    """Write dS_ij/dt = K_i S_ij + S_ij K_j' + Qt (N, N, n, n) of S_ij = cov(e_i, e_j), without the
+    noise of the sensors.
+    """
+    # All errors share the noise of the plant. S_ji = S_ij' is filled from the same entry.
     N, n = len(S), len(true_Q)
     for i in range(N):
         for j in range(i + 1):
@@ -59,8 +62,8 @@ def error_slope(S: FloatArray, K: FloatArray, true_Q: FloatArray, dS: FloatArray
 
 @kernel
 def add_sensor_noise(P: FloatArray, true_G: FloatArray, dS: FloatArray) -> None:
-    """Add P_i Gt_i P_i to the derivative of cov(e_i), in place."""
-    # The gain P H' R^-1 times the sensors' noise; sensors of different nodes are independent.
+    """Add P_i Gt_i P_i, the noise of the sensors, to the derivatives dS_ii/dt, in place."""
+    # Only in dS_ii: the noises of different nodes are independent.
     for i in range(len(P)):
         n = P.shape[1]
         for a in range(n):
@@ -82,8 +85,9 @@ def mix(
     P0: FloatArray,
     S0: FloatArray,
 ) -> None:
-    """Apply one reset, H (7), (9): each receiver in ``rows`` moves by its weight towards the sender
-    in ``columns``, all from values before the reset. P0 and S0 are scratch.
+    """Apply one reset, H (7) and (9), in place to P (N, n, n) and S (N, N, n, n): message k moves
+    node ``rows[k]`` by ``weights[k]`` towards node ``columns[k]``, all from the values before the
+    reset. P0 and S0 are scratch.
     """
     P0[:] = P
     S0[:] = S
@@ -91,7 +95,7 @@ def mix(
         i, j, w = rows[k], columns[k], weights[k]
         P[i] += w * (P0[j] - P0[i])
         S[i] += w * (S0[j] - S0[i])
-    # The rows are those of the errors after the reset; the columns follow in the same way.
+    # S <- M S M' for the mixing matrix M: the rows are done, the columns follow in the same way.
     S0[:] = S
     for k in range(len(rows)):
         i, j, w = rows[k], columns[k], weights[k]
@@ -110,19 +114,20 @@ def run_moments(
     weights: FloatArray,
     times: FloatArray,
     step: float,
-    found: FloatArray,
+    traces: FloatArray,
 ) -> None:
-    """Integrate P (N, n, n) and S (N, N, n, n) in place and write the traces ``found`` (T, N) of
-    cov(e_i) at ``times``, after the messages of the same instant.
+    """Integrate P (N, n, n) and S (N, N, n, n) in place and write the traces (T, N) of cov(e_i) at
+    ``times`` (T,), after the messages of the same instant, with steps of at most ``step`` seconds.
 
-    Message k of instant m, with ``ends[m] <= k < ends[m + 1]``, is from ``columns[k]`` to
-    ``rows[k]`` with a weight. ``model`` is (A, Q, true Q, G, true G).
+    ``model`` is (A, Q, Qt, G, Gt). The messages at ``instants[m]`` are those with numbers
+    ``ends[m]`` to ``ends[m + 1]`` - 1; message k goes from node ``columns[k]`` to ``rows[k]`` with
+    ``weights[k]``.
     """
     A, Q, true_Q, G, true_G = model
     K, P0, S0 = np.empty_like(P), np.empty_like(P), np.empty_like(S)
     dP, dS = np.empty((4, *P.shape)), np.empty((4, *S.shape))
     now, m, t = 0.0, 0, 0
-    # From event to event: the next message, or the next time that is asked for.
+    # From event to event: the next messages, or the next of ``times``.
     while t < len(times):
         until = times[t]
         if m < len(instants) and instants[m] <= until:
@@ -132,7 +137,7 @@ def run_moments(
             h = (until - now) / count
             P0[:] = P
             S0[:] = S
-            # The classical Runge-Kutta method of order 4.
+            # Runge-Kutta of order 4: the slopes at 0, h / 2 (twice) and h.
             for s in range(4):
                 if s > 0:
                     share = h if s == 3 else 0.5 * h
@@ -145,10 +150,10 @@ def run_moments(
             S += h / 6.0 * (dS[0] + 2.0 * dS[1] + 2.0 * dS[2] + dS[3])
         now = until
         if m < len(instants) and instants[m] == until:
-            a, b = ends[m], ends[m + 1]
-            mix(P, S, rows[a:b], columns[a:b], weights[a:b], P0, S0)
+            first, last = ends[m], ends[m + 1]
+            mix(P, S, rows[first:last], columns[first:last], weights[first:last], P0, S0)
             m += 1
         else:
             for i in range(len(P)):
-                found[t, i] = np.trace(S[i, i])
+                traces[t, i] = np.trace(S[i, i])
             t += 1

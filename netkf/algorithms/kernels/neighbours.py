@@ -1,4 +1,5 @@
-"""Neighbours in kernels: their readings, the consensus term of the KCF, convex combinations.
+"""Kernels that use the messages of neighbours: readings, the consensus term of the KCF, convex
+combinations.
 
 Filter ``h`` of a block has index ``[b, h]`` of stacks with lanes (``netkf.linalg.lanes``):
 estimates (B, H, n, L), lower triangular roots (B, H, n, n, L).
@@ -32,7 +33,7 @@ from netkf.linalg.lanes import (
 
 
 @kernel
-def move_towards(
+def sum_differences(
     lanes: Lanes,
     x: FloatArray,
     b: int,
@@ -42,10 +43,11 @@ def move_towards(
     s: int,
     e: int,
     weighted: bool,
-    moved: FloatArray,
+    differences: FloatArray,
 ) -> None:
-    """Write the sum of the differences of the estimates that filter ``h`` hears to its own into
-    ``moved[h]``, each times the weight of its link where ``weighted``.
+    """Write into ``differences[h]`` (n, L) the sum of x_j - x_h over the estimates x_j that filter
+    ``h`` hears (``up`` in step ``e`` of slot ``s``), each times the weight of its link if
+    ``weighted``.
     """
     for i in range(x.shape[2]):
         own, total = load(lanes, x, b, h, i), spread(lanes, 0.0)
@@ -54,7 +56,7 @@ def move_towards(
             difference = load(lanes, x, b, links.sender[m], i) - own
             factor = links.weight[m] if weighted else 1.0
             total += select(arrived, factor * difference, 0.0)
-        store(lanes, moved, h, i, total)
+        store(lanes, differences, h, i, total)
 
 
 @kernel
@@ -64,11 +66,12 @@ def scale_by_covariance(
     b: int,
     h: int,
     epsilon: float,
-    moved: FloatArray,
+    differences: FloatArray,
     work: FloatArray,
 ) -> None:
-    """Multiply ``moved[h]`` by ``epsilon / (1 + |P|) P`` with the Frobenius norm of P = S S', the
-    consensus gain of the KCF; ``work`` (n, L) is scratch.
+    """Multiply ``differences[h]`` (n, L) by the consensus gain of the Kalman consensus filter (KCF,
+    Olfati-Saber 2007), ``epsilon / (1 + |P|) P`` with the Frobenius norm; ``work`` (n, L) is
+    scratch.
     """
     n, square = root.shape[2], spread(lanes, 0.0)
     # |P|^2 is the sum of the squares of the entries of S S'.
@@ -77,27 +80,27 @@ def scale_by_covariance(
             total = spread(lanes, 0.0)
             for m in range(j + 1):
                 total += load(lanes, root, b, h, i, m) * load(lanes, root, b, h, j, m)
-            # Entries off the diagonal stand for two.
+            # An entry off the diagonal counts twice.
             square += total * total if i == j else 2.0 * total * total
     gain = epsilon / (1.0 + root_of(square))
-    # S' d, then S times that: P itself is not kept.
+    # P d = S (S' d): P itself is not stored.
     for j in range(n):
         total = spread(lanes, 0.0)
         for i in range(j, n):
-            total += load(lanes, root, b, h, i, j) * load(lanes, moved, h, i)
+            total += load(lanes, root, b, h, i, j) * load(lanes, differences, h, i)
         store(lanes, work, j, total)
     for i in range(n):
         total = spread(lanes, 0.0)
         for j in range(i + 1):
             total += load(lanes, root, b, h, i, j) * load(lanes, work, j)
-        store(lanes, moved, h, i, gain * total)
+        store(lanes, differences, h, i, gain * total)
 
 
 @kernel(inlined=True)
-def add_to_estimate(lanes: Lanes, x: FloatArray, b: int, h: int, moved: FloatArray) -> None:
-    """Add ``moved[h]`` (n, L) to the estimate of a filter."""
+def add_to_estimate(lanes: Lanes, x: FloatArray, b: int, h: int, term: FloatArray) -> None:
+    """Add ``term[h]`` (n, L) to the estimate of filter ``h`` of block ``b``."""
     for i in range(x.shape[2]):
-        store(lanes, x, b, h, i, load(lanes, x, b, h, i) + load(lanes, moved, h, i))
+        store(lanes, x, b, h, i, load(lanes, x, b, h, i) + load(lanes, term, h, i))
 
 
 @kernel
@@ -112,22 +115,24 @@ def fuse_readings(
     s: int,
     h: int,
 ) -> None:
-    """Update filter ``h`` of a block with its own reading and, where they ``share`` them, those
-    that arrive in the first step of the slot.
+    """Update filter ``h`` of block ``b`` with its own reading of slot ``s`` and, if nodes ``share``
+    readings, with those that arrive in the first step of the slot.
     """
     update_by_reading(nodes, readings, scratch, b, s, h, h, True)
     if not share:
         return
     for m in range(links.first[h], links.first[h + 1]):
         arrived = load_flags(scratch.lanes, plan.up, b, s, 0, links.direction[m])
-        # Saves the update where no run of the block has the message.
+        # Skip the update if the message arrives in no run of the block.
         if any_lane(arrived):
             update_by_reading(nodes, readings, scratch, b, s, h, links.sender[m], arrived)
 
 
 @kernel
 def copy_pairs(nodes: SlotNodes, scratch: SlotScratch, b: int) -> None:
-    """Copy the pairs (xhat, root) of all filters of a block, which they send, to ``scratch``."""
+    """Copy (xhat, root) of all filters of block ``b`` to ``scratch``: the messages that
+    they send.
+    """
     for h in range(len(nodes.rows)):
         for i in range(nodes.xhat.shape[2]):
             store(scratch.lanes, scratch.xhat, h, i, load(scratch.lanes, nodes.xhat, b, h, i))
@@ -146,36 +151,38 @@ def combine_convex_roots(
     s: int,
     h: int,
 ) -> None:
-    """Reset filter ``h`` of a block to the convex combination of its pair (xhat, P) and those that
-    it hears, H (7) and (9), from the copies of all pairs in ``scratch``; the weight of what does
-    not arrive stays with its own.
+    """Replace (xhat, P) of filter ``h`` of block ``b`` by the convex combination of it and those
+    that arrive, H (7) and (9), from the copies of all in ``scratch``. The weights of messages that
+    do not arrive go to the own one.
     """
     lanes, n = scratch.lanes, nodes.xhat.shape[2]
-    heard = spread(lanes, 0.0)
+    received_weight = spread(lanes, 0.0)
     for m in range(links.first[h], links.first[h + 1]):
         arrived = load_flags(lanes, plan.up, b, s, 0, links.direction[m])
-        heard += select(arrived, links.weight[m], 0.0)
+        received_weight += select(arrived, links.weight[m], 0.0)
     # Rounding may leave the own weight a little below 0, which has no root.
-    own = 1.0 - heard
-    size = root_of(select(own > 0.0, own, 0.0))
+    own = 1.0 - received_weight
+    factor = root_of(select(own > 0.0, own, 0.0))
     for i in range(n):
         for j in range(i + 1):
-            store(lanes, nodes.root, b, h, i, j, size * load(lanes, scratch.root, h, i, j))
+            store(lanes, nodes.root, b, h, i, j, factor * load(lanes, scratch.root, h, i, j))
     for m in range(links.first[h], links.first[h + 1]):
         arrived = load_flags(lanes, plan.up, b, s, 0, links.direction[m])
         if not any_lane(arrived):
             continue
         sender, weight = links.sender[m], select(arrived, links.weight[m], 0.0)
-        size = root_of(weight)
-        # [S, sqrt(w) S_j] is reflected into one triangle.
+        factor = root_of(weight)
+        # P + w P_j = A A' with A = [S, sqrt(w) S_j], made triangular by reflections.
         for i in range(n):
             for j in range(n):
                 store(lanes, scratch.moved, i, j, 0.0)
             for j in range(i + 1):
                 store(lanes, scratch.moved, i, j, load(lanes, nodes.root, b, h, i, j))
-                store(lanes, scratch.noise, i, j, size * load(lanes, scratch.root, sender, i, j))
-            gap = load(lanes, scratch.xhat, sender, i) - load(lanes, scratch.xhat, h, i)
-            store(lanes, nodes.xhat, b, h, i, load(lanes, nodes.xhat, b, h, i) + weight * gap)
+                store(lanes, scratch.noise, i, j, factor * load(lanes, scratch.root, sender, i, j))
+            difference = load(lanes, scratch.xhat, sender, i) - load(lanes, scratch.xhat, h, i)
+            store(
+                lanes, nodes.xhat, b, h, i, load(lanes, nodes.xhat, b, h, i) + weight * difference
+            )
         for i in range(n):
             write_root_column(
                 lanes, scratch.size, nodes.root, b, h, i, scratch.moved, scratch.noise

@@ -1,14 +1,15 @@
-"""Fusion of two estimates whose correlation is not known, with the best weight, in kernels.
+"""Kernels that fuse two estimates of unknown correlation, with the optimal weight.
 
 With ``P_a = W W'`` and ``P_b = W diag(b) W'`` both covariances are diagonal in one basis W, and so
-is what becomes of them. The weight w minimises trace or determinant of
+is the fused one. The weight w minimises the trace or determinant of
 
 * covariance intersection (Julier and Uhlmann, ACC 1997): ``P^-1 = w P_a^-1 + (1 - w) P_b^-1``;
 * inverse covariance intersection (Noack, Sijs, Reinhardt and Hanebeck, Automatica 79, 2017):
   ``P^-1 = P_a^-1 + P_b^-1 - (w P_a + (1 - w) P_b)^-1``.
 
-Each entry of P in that basis is convex in w, its logarithm too, so that the minimum is where the
-derivative changes its sign: found by bisection, to the last digits and not to their square root.
+In that basis each entry of P and its logarithm are convex in w, so that the minimum is where the
+derivative changes its sign. Bisection of the derivative finds w to full precision; a search for the
+least value itself would find only half of the digits.
 """
 
 from __future__ import annotations
@@ -25,8 +26,8 @@ SWEEPS, BISECTIONS = 40, 60
 ORTHOGONAL = 1e-15
 """Cosine of columns that count as orthogonal."""
 EQUAL = 1e-9
-"""Relative difference of all variances below which both covariances are the same: w is then 1/2,
-which nothing else would decide but rounding.
+"""Relative difference of all variances up to which both covariances count as the same. Then w is
+1/2, since rounding would decide otherwise.
 """
 
 
@@ -76,8 +77,12 @@ def orthogonalise(T: FloatArray) -> float:
             largest = max(largest, cosine)
             if cosine <= ORTHOGONAL:
                 continue
-            half = 0.5 * (qq - pp) / pq
-            tangent = math.copysign(1.0, half) / (abs(half) + math.sqrt(1.0 + half * half))
+            # The Jacobi rotation that makes columns p and q orthogonal: cotangent is that of twice
+            # its angle.
+            cotangent = 0.5 * (qq - pp) / pq
+            tangent = math.copysign(1.0, cotangent) / (
+                abs(cotangent) + math.sqrt(1.0 + cotangent * cotangent)
+            )
             c = 1.0 / math.sqrt(1.0 + tangent * tangent)
             s = c * tangent
             for i in range(n):
@@ -89,7 +94,9 @@ def orthogonalise(T: FloatArray) -> float:
 
 @kernel(inlined=True)
 def fused_variance(w: float, b: float, inverse: bool) -> float:
-    """Return the variance that weight ``w`` of 1 and ``1 - w`` of ``b`` makes of both."""
+    """Return the fused variance of two estimates with variances 1 (weight ``w``) and ``b``
+    (weight 1 - w).
+    """
     if inverse:
         mixed = w + (1.0 - w) * b
         return b * mixed / ((1.0 + b) * mixed - b)
@@ -98,35 +105,39 @@ def fused_variance(w: float, b: float, inverse: bool) -> float:
 
 @kernel
 def slope(w: float, W: FloatArray, b: FloatArray, inverse: bool, trace: bool) -> float:
-    """Return the derivative of the criterion (trace, or logarithm of the determinant) by w."""
+    """Return the derivative by ``w`` of the criterion: the trace of P, or the logarithm of its
+    determinant.
+    """
     total = 0.0
     for k in range(len(b)):
         p = fused_variance(w, b[k], inverse)
         if inverse:
             # p = b m / ((1 + b) m - b) with m = w + (1 - w) b, so that dp/dm = -(p / m)^2.
             ratio = p / (w + (1.0 - w) * b[k])
-            rate = -ratio * ratio * (1.0 - b[k])
+            dp = -ratio * ratio * (1.0 - b[k])
         else:
-            rate = p * p * (1.0 - b[k]) / b[k]
+            # p = b / (w b + 1 - w).
+            dp = p * p * (1.0 - b[k]) / b[k]
+        # trace(P) = sum |W_k|^2 p_k, log det(P) = const + sum log p_k.
         if trace:
-            length = 0.0
+            square = 0.0
             for i in range(len(b)):
-                length += W[i, k] * W[i, k]
-            total += length * rate
+                square += W[i, k] * W[i, k]
+            total += square * dp
         else:
-            total += rate / p
+            total += dp / p
     return total
 
 
 @kernel
 def best_weight(W: FloatArray, b: FloatArray, inverse: bool, trace: bool) -> float:
-    """Return the weight of the first covariance that minimises the criterion."""
-    apart = 0.0
+    """Return the weight w of the first estimate that minimises the criterion, see ``slope``."""
+    difference = 0.0
     for k in range(len(b)):
-        apart = max(apart, abs(b[k] - 1.0))
-    if apart <= EQUAL:
+        difference = max(difference, abs(b[k] - 1.0))
+    if difference <= EQUAL:
         return 0.5
-    # The criterion is convex: its minimum is at an end where the slope does not change its sign.
+    # The criterion is convex: without a change of sign in (0, 1) its minimum is at an end.
     if slope(0.0, W, b, inverse, trace) >= 0.0:
         return 0.0
     if slope(1.0, W, b, inverse, trace) <= 0.0:
@@ -151,30 +162,30 @@ def fuse_pair(
     trace: bool,
     work: FloatArray,
 ) -> None:
-    """Fuse an estimate x (n,) with lower triangular root (n, n), in place, with another one.
+    """Fuse an estimate x (n,) with lower triangular ``root`` (n, n), in place, with another one.
 
     ``inverse``: inverse covariance intersection, else covariance intersection; ``trace``: the
     weight minimises the trace of P, else its determinant. ``work`` (2 n + 2, n) is scratch.
     """
     n = len(x)
-    U, W, b, moved = work[:n], work[n : 2 * n], work[2 * n], work[2 * n + 1]
+    U, W, b, whitened = work[:n], work[n : 2 * n], work[2 * n], work[2 * n + 1]
     common_basis(root, other, U, W, b)
     w = best_weight(W, b, inverse, trace)
-    # moved = root^-1 (other_x - x)
+    # whitened = root^-1 (other_x - x).
     for i in range(n):
         value = other_x[i] - x[i]
         for m in range(i):
-            value -= root[i, m] * moved[m]
-        moved[i] = value / root[i, i]
-    # x + W diag(gain) U' moved, since W^-1 = U' root^-1
+            value -= root[i, m] * whitened[m]
+        whitened[i] = value / root[i, i]
+    # x += W diag(gain) W^-1 (other_x - x), with W^-1 = U' root^-1.
     for k in range(n):
-        along = 0.0
+        component = 0.0
         for i in range(n):
-            along += U[i, k] * moved[i]
+            component += U[i, k] * whitened[i]
         p = fused_variance(w, b[k], inverse)
-        along *= other_share(p, w, b[k], inverse)
+        component *= other_gain(p, w, b[k], inverse)
         for i in range(n):
-            x[i] += W[i, k] * along
+            x[i] += W[i, k] * component
             W[i, k] *= math.sqrt(p)
     # W diag(p)^1/2 is a root of P: reflections make it lower triangular, with a diagonal >= 0.
     for i in range(n):
@@ -186,9 +197,9 @@ def fuse_pair(
 
 
 @kernel(inlined=True)
-def other_share(p: float, w: float, b: float, inverse: bool) -> float:
-    """Return the gain of the other estimate in a direction where the variances are 1 and ``b``, and
-    ``p`` after both are fused.
+def other_gain(p: float, w: float, b: float, inverse: bool) -> float:
+    """Return the gain of the other estimate in a direction in which the variances are 1 (own),
+    ``b`` (other) and ``p`` (fused).
     """
     if inverse:
         return p * (1.0 / b - (1.0 - w) / (w + (1.0 - w) * b))
@@ -201,9 +212,11 @@ def fuse_tracks(
     inverse: bool,
     trace: bool,
 ) -> tuple[FloatArray, FloatArray]:
-    """Return estimate (n,) and lower triangular root (n, n) of two estimates with their roots."""
-    x, root = (np.array(part, dtype=np.float64) for part in first)
+    """Return the fused estimate (n,) and lower triangular root (n, n) of two estimates, each given
+    with its root; see ``fuse_pair``.
+    """
+    x, root = (np.array(values, dtype=np.float64) for values in first)
     n = len(x)
-    other_x, other = (np.ascontiguousarray(part) for part in second)
+    other_x, other = (np.ascontiguousarray(values) for values in second)
     fuse_pair(x, root, other_x, other, inverse, trace, np.empty((2 * n + 2, n)))
     return x, root

@@ -1,30 +1,31 @@
-"""The Riccati flow on roots: covariances ``P = S S'`` that stay right however wide they are.
+"""The Riccati flow on roots: covariances ``P = S S'`` stay accurate however large they are.
 
-Over a gap g, ``P(g) = Q_g + F P (I + G_g P)^-1 F'`` and ``x(g) = exp(A g) x``. With
-``G_g = Gamma' Gamma`` and ``Q_g = T T'`` the root moves in three steps that subtract nothing:
-each row of Gamma is a scalar observation of unit noise (root_update.rotate_out), F moves the root,
-and one elimination adds the columns of T.
+Over a gap g, ``P(g) = Q_g + F P (I + G_g P)^-1 F'`` and ``x(g) = exp(A g) x``, where G_g is the
+information that the sensors give during the gap. With ``G_g = Gamma' Gamma`` and ``Q_g = T T'``
+the root moves in three steps that subtract nothing: each row of Gamma is a scalar observation of
+unit noise (root_update.rotate_out), F multiplies the root, and one elimination adds the columns
+of T.
 
-The rounding of G times a P of 1e12 would be information that no sensor gave, so Gamma is not a
-root of a computed G. ``dG/dg = F(s)' H' R^-1 H F(s)``, hence with the coefficients c_j of
+If P is 1e12, rounding errors of G times P would act like information that no sensor gave. So Gamma
+is not computed as a root of G. ``dG/dg = F(s)' H' R^-1 H F(s)``, hence with the coefficients c_j of
 ``R^-1/2 H F(s)`` in the Legendre polynomials of [0, g],
 
     Gamma = sqrt(g) [c_0; c_1 / sqrt(3); c_2 / sqrt(5); ...],   c_j of order g^j.
 
-c_j is a power series in g, and as many of them are used as P and g need. Where the size of P and
-G says that this rounding cannot matter, which is nearly always, a gap takes one step instead: with
+c_j is a power series in g, and as many of them are used as P and g need. If P G is small enough
+for this rounding to be harmless, which is nearly always so, a gap takes one step instead: with
 ``I + S' G_g S = V V'`` and V upper triangular, S V^-T is triangular and a root of
-``P (I + G_g P)^-1``. Q_g, F and G_g are power series around the middle of the ``cell`` of length
-unit that the gap lies in.
+``P (I + G_g P)^-1``. Gaps are divided into cells of length ``unit``; Q_g, F and G_g are power
+series around the middle of the cell that the gap lies in.
 
 API. :func:`flow_table` tabulates one model, :func:`stack_tables` puts the tables of several
-models side by side (a table is a stack of one), and m says which of a stack is meant. Kernels
-work in place on place ``k`` of root (K, n, n) (lower triangular, nothing above the diagonal is
-read or written) and x (K, n), with room from :func:`flow_scratch`:
+models side by side (a table is a stack of one); m is the index of a model in the stack. Kernels
+work in place on entry ``k`` of root (K, n, n) (lower triangular, nothing above the diagonal is
+read or written) and x (K, n), with scratch arrays from :func:`flow_scratch`:
 
     propagate_root(table, m, root, x, k, gap, scratch)            any gap > 0
-    information_rate(lanes, size, seen, S) -> trace(P G)  1/s, see flow.stretch
-    gain_root(moments, series, root, x, k, gap, values)   readings of a gap, see gains.py
+    information_rate(lanes, size, whitened_H, S)                  trace(P G) in 1/s
+    gain_root(size, moments, series, ...)                         readings of a gap, see gains.py
 
 and for Python, one node at a time, ``flow_root(table, root, x, gap)`` and
 ``gain_update_root(gains, root, x, moments, gap)``.
@@ -55,8 +56,8 @@ NARROW = 64.0  # trace(P) trace(G) of a gap up to which rounding of G is harmles
 TERMS = 27  # of the power series: enough for |M| unit <= UNIT, odd
 CELL_TERMS = 13  # about as many as a cell needs
 UNIT = 0.125
-BLOCKS = 13  # Legendre coefficients at most: what is left is below 1e-40 of the first
-UNSEEN = 1e-18  # trace(P dG) of information that may be left out
+BLOCKS = 13  # Legendre coefficients at most: the next one is below 1e-40 of the first
+NEGLIGIBLE = 1e-18  # trace(P dG) of information that may be left out
 GROWTH = 2.0**8  # of F over one level at most, where something is observed
 PIVOT = 2.0**-48  # least pivot of Q_g, relative to its diagonal
 
@@ -64,20 +65,20 @@ WIDE = np.longdouble
 
 
 class FlowTable(Struct):
-    """All that depends on M models and not on P or the gap, side by side.
+    """Tables of M models: everything that depends neither on P nor on the gap.
 
-    unit   : (M,) gap that the series cover, seconds
+    unit   : (M,) length of a cell, seconds
     sizes  : (M, 5) rows q of a block of Gamma, number of blocks (0: nothing is observed), whether
              there is noise, number of levels, and that of the first one longer than all cells
     size   : (M,) trace of G, 1/s
     reach  : (M, cells, terms, 1) up to which gap the terms so far are enough, see linalg/series
     series : (M, cells, terms, width) Taylor coefficients: Q_g (lower triangle by rows), exp(A g)
-             and, where something is observed, F and G_g; then zeros up to whole lanes
+             and, if something is observed, F and G_g; then zeros up to a multiple of the lanes
     gamma  : (M, blocks, terms, 1 + q n) the reach of ``c_j / (g^j sqrt(2 j + 1))``, and its terms
     bound  : (M, blocks) bounds of ``|row block j of Gamma|^2 / g^(2 j + 1)``
     levels : (M, levels, 4, n, n) ``exp(A g)``, F, Gamma (upper) and T (lower triangular) for
              ``g = unit 2^level``
-    seen   : (M, q, n) ``R^-1/2 H``, whose square is G
+    whitened_H : (M, q, n) ``R^-1/2 H``, so that ``G = whitened_H' whitened_H``
     """
 
     unit: FloatArray
@@ -88,12 +89,13 @@ class FlowTable(Struct):
     gamma: FloatArray
     bound: FloatArray
     levels: FloatArray
-    seen: FloatArray
+    whitened_H: FloatArray
 
 
 class FlowScratch(Struct):
-    """The ``size`` n of states, and scratch arrays: values of the series, ``S``, ``wide`` and ``T``
-    (n, n), ``mean`` and ``moved`` (n,), rows (q, n), an observation (1, n), its gain (1, n).
+    """The ``size`` n of states, and scratch arrays: ``values`` of the series at a gap; ``S``,
+    ``wide`` and ``T`` (n, n); ``mean`` and ``moved`` (n,); ``rows`` (q n,) of Gamma; ``observed``
+    (1, n), a row of Gamma times S, and its ``gain`` (1, n).
     """
 
     size: Size
@@ -109,13 +111,12 @@ class FlowScratch(Struct):
 
 
 def flow_scratch(table: FlowTable, unrolled: bool = False) -> FlowScratch:
-    """Return scratch arrays for all models of a table; where ``unrolled`` kernels are compiled for
-    its n, if it is small.
+    """Return scratch arrays for all models of a table. ``unrolled``: kernels that take them are
+    compiled for this n, if it is small.
     """
-    n, q = table.levels.shape[-1], table.seen.shape[1]
+    n, q = table.levels.shape[-1], table.whitened_H.shape[1]
     cls = FlowScratch.of_size(n) if unrolled else FlowScratch
-    # Rows of the series hold Q_g, exp(A g) and perhaps F and G_g; a level needs less room than
-    # that.
+    # ``values`` also takes the n n entries of a level, which are fewer.
     return cls(
         size=sized(n) if unrolled else np.zeros(n),
         values=np.zeros(table.series.shape[3]),
@@ -136,76 +137,76 @@ def flow_scratch(table: FlowTable, unrolled: bool = False) -> FlowScratch:
 def flow_table(
     A: FloatArray, Q: FloatArray, H: FloatArray, R: FloatArray, longest: float
 ) -> FlowTable:
-    """Tabulate one model for gaps up to ``longest`` seconds (longer ones take longer).
+    """Tabulate one model: ``A, Q`` (n, n), ``H`` (p, n), ``R`` (p, p); p may be 0.
 
-    ``A, Q`` (n, n), ``H`` (p, n), ``R`` (p, p); p may be 0.
+    The table is fast for gaps up to ``longest`` seconds; longer ones take several steps.
     """
     n = len(A)
-    seen = whitened(H, R)
-    M, scale = hamiltonian(A, Q, seen.T @ seen)
+    whitened_H = whiten_observation(H, R)
+    M, scale = hamiltonian(A, Q, whitened_H.T @ whitened_H)
     size = np.abs(A)
     norm = float(size.sum(axis=0).max() + size.sum(axis=1).max())  # exp(A s) Q exp(A' s)
-    if len(seen):
+    if len(whitened_H):
         norm = max(norm, float(np.abs(M).sum(axis=0).max()))
     # A power of two, so that multiples of the unit and its halves are exact.
     unit = 2.0 ** np.floor(np.log2(min(UNIT / max(norm, 1e-300), longest)))
-    E, F, grown, G = transition_series(A, Q, seen, np.zeros(1))
-    blocks, bound = information_blocks(seen, F[0], unit)
+    E, F, Q_g, G = transition_series(A, Q, whitened_H, np.zeros(1))
+    blocks, bound = information_blocks(whitened_H, F[0], unit)
     # The reach comes first: a table that is padded to a common width still has it there.
     gamma = [np.roll(with_reach(block.astype(np.float64), unit), 1, axis=1) for block in blocks]
     # Binary digits of the longest gap in units.
     count = max(1, int(longest / unit).bit_length())
-    levels = doubled(E[0], F[0], grown[0], blocks, scale, unit, count)
+    levels = double_levels(E[0], F[0], Q_g[0], blocks, scale, unit, count)
     # Entries of a packed Q_g and exp(A g), and of F and a packed G_g where something is observed.
-    width = n * (n + 1) // 2 * (1 + (len(seen) > 0)) + n * n * (1 + (len(seen) > 0))
+    width = n * (n + 1) // 2 * (1 + (len(whitened_H) > 0)) + n * n * (1 + (len(whitened_H) > 0))
     # As many cells as fit the cache budget, and none beyond the longest level.
-    most = min(CELLS, CELL_BYTES // (8 * CELL_TERMS * width), 2 ** (len(levels) - 1))
-    octaves = max(0, most.bit_length() - 1)
+    max_cells = min(CELLS, CELL_BYTES // (8 * CELL_TERMS * width), 2 ** (len(levels) - 1))
+    octaves = max(0, max_cells.bit_length() - 1)
     if octaves:
         # Cell k covers [k, k + 1) units around its middle. The first is expanded at 0, where Q_g =
         # 0 and short gaps lose no digits.
         middles = unit * (np.arange(2**octaves) + 0.5)
         middles[0] = 0.0
-        E, F, grown, G = transition_series(A, Q, seen, middles)
-    cells = packed(E, F, grown, G, len(seen) > 0)
+        E, F, Q_g, G = transition_series(A, Q, whitened_H, middles)
+    cell_series = pack_series(E, F, Q_g, G, len(whitened_H) > 0)
     # From its middle a cell reaches half a unit, but the first one reaches a whole unit.
     series = np.stack(
-        [with_reach(cell, unit if k == 0 else 0.5 * unit) for k, cell in enumerate(cells)]
+        [with_reach(cell, unit if k == 0 else 0.5 * unit) for k, cell in enumerate(cell_series)]
     )
     series, reach = series[:, :, :-1], series[:, :, -1]
-    # Terms behind the last that a gap in any cell needs would only take memory.
-    last = max(int(np.searchsorted(row[:-1], row[:-1].max(initial=0.0))) for row in reach)
-    last += last % 2  # two terms at a time, see linalg/series
-    reach[:, last] = np.inf
-    sizes = (len(seen), len(blocks), int(bool(np.any(Q))), len(levels), octaves)
+    # Drop the terms that no gap in any cell needs.
+    last_term = max(int(np.searchsorted(row[:-1], row[:-1].max(initial=0.0))) for row in reach)
+    last_term += last_term % 2  # two terms at a time, see linalg/series
+    reach[:, last_term] = np.inf
+    sizes = (len(whitened_H), len(blocks), int(bool(np.any(Q))), len(levels), octaves)
     return FlowTable(
         unit=np.array([unit]),
         sizes=np.array([sizes], dtype=np.int64),
-        size=np.array([float((seen * seen).sum())]),
-        reach=reach[None, :, : last + 1, None].copy(),
-        series=series[None, :, : last + 1].copy(),
-        gamma=np.array(gamma).reshape(1, len(gamma), TERMS, len(seen) * n + 1),
+        size=np.array([float((whitened_H * whitened_H).sum())]),
+        reach=reach[None, :, : last_term + 1, None].copy(),
+        series=series[None, :, : last_term + 1].copy(),
+        gamma=np.array(gamma).reshape(1, len(gamma), TERMS, len(whitened_H) * n + 1),
         bound=bound[None],
         levels=levels[None],
-        seen=seen[None].copy(),
+        whitened_H=whitened_H[None].copy(),
     )
 
 
-def packed(
-    E: FloatArray, F: FloatArray, grown: FloatArray, G: FloatArray, observed: bool
+def pack_series(
+    E: FloatArray, F: FloatArray, Q_g: FloatArray, G: FloatArray, observed: bool
 ) -> FloatArray:
     """Return the series (C, terms, width) of a FlowTable from those of exp(A g), F, Q_g and G_g."""
     rows, columns = np.tril_indices(E.shape[2])
-    parts = [grown[:, :, rows, columns], E.reshape(*E.shape[:2], -1)]
+    parts = [Q_g[:, :, rows, columns], E.reshape(*E.shape[:2], -1)]
     if observed:
         parts += [F.reshape(*F.shape[:2], -1), G[:, :, rows, columns]]
-    # Rows of whole blocks of lanes, see series.fill_row.
-    spare = -sum(part.shape[2] for part in parts) % LANES
-    parts.append(wide_zeros(*parts[0].shape[:2], spare))
+    # Zeros up to a multiple of the lanes, see series.fill_row.
+    padding = -sum(part.shape[2] for part in parts) % LANES
+    parts.append(wide_zeros(*parts[0].shape[:2], padding))
     return np.concatenate(parts, axis=2).astype(np.float64)
 
 
-def whitened(H: FloatArray, R: FloatArray) -> FloatArray:
+def whiten_observation(H: FloatArray, R: FloatArray) -> FloatArray:
     """Return ``R^-1/2 H`` as at most n rows (q, n)."""
     p, n = H.shape
     if p == 0:
@@ -216,7 +217,7 @@ def whitened(H: FloatArray, R: FloatArray) -> FloatArray:
 
 
 def transition_series(
-    A: FloatArray, Q: FloatArray, seen: FloatArray, middles: FloatArray
+    A: FloatArray, Q: FloatArray, whitened_H: FloatArray, middles: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Return Taylor coefficients of exp(A g), F, Q_g and G_g around gaps ``middles`` (C,), in
     extended precision: (C, TERMS, n, n) each.
@@ -224,61 +225,63 @@ def transition_series(
     ``dF = (A - Q_g G) F``, ``dQ_g = A Q_g + Q_g A' + Q - Q_g G Q_g`` and ``dG_g = F' G F``.
     """
     n, count = len(A), len(middles)
-    A, Q, seen = A.astype(WIDE), Q.astype(WIDE), seen.astype(WIDE)
-    E, F, grown, G, drain = (wide_zeros(count, TERMS, n, n) for _ in range(5))
-    rows = wide_zeros(count, TERMS, len(seen), n)
-    E[:, 0], F[:, 0], grown[:, 0], G[:, 0] = transitions_at(A, Q, seen, middles)
+    A, Q, whitened_H = A.astype(WIDE), Q.astype(WIDE), whitened_H.astype(WIDE)
+    E, F, Q_g, G, Q_g_G = (wide_zeros(count, TERMS, n, n) for _ in range(5))
+    rows = wide_zeros(count, TERMS, len(whitened_H), n)
+    E[:, 0], F[:, 0], Q_g[:, 0], G[:, 0] = transitions_at(A, Q, whitened_H, middles)
     # Power-series recursion: the coefficient k + 1 follows from coefficient k of the right-hand
     # side, and products of series are Cauchy products.
     for k in range(TERMS - 1):
-        drain[:, k] = (grown[:, k] @ seen.T) @ seen  # Q_g G
-        rows[:, k] = seen @ F[:, k]
-        moved = A @ grown[:, k]
+        Q_g_G[:, k] = (Q_g[:, k] @ whitened_H.T) @ whitened_H
+        rows[:, k] = whitened_H @ F[:, k]
+        A_Q_g = A @ Q_g[:, k]
         # Q is constant: it enters the coefficient of g^0 only.
-        change = moved + np.swapaxes(moved, 1, 2) + (Q if k == 0 else 0.0)
-        grown[:, k + 1] = symmetric(change - _convolved(drain, grown, k)) / (k + 1)
-        F[:, k + 1] = (A @ F[:, k] - _convolved(drain, F, k)) / (k + 1)
+        derivative = A_Q_g + np.swapaxes(A_Q_g, 1, 2) + (Q if k == 0 else 0.0)
+        Q_g[:, k + 1] = symmetric(derivative - _convolved(Q_g_G, Q_g, k)) / (k + 1)
+        F[:, k + 1] = (A @ F[:, k] - _convolved(Q_g_G, F, k)) / (k + 1)
         # dG/dg = F' G F = rows' rows, with rows = R^-1/2 H F.
         G[:, k + 1] = _convolved(np.swapaxes(rows, 2, 3), rows, k) / (k + 1)
         E[:, k + 1] = A @ E[:, k] / (k + 1)
-    return E, F, grown, G
+    return E, F, Q_g, G
 
 
 def _convolved(a: FloatArray, b: FloatArray, k: int) -> FloatArray:
-    # Coefficient k of the product of two power series.
+    """Return coefficient ``k`` of the product of two power series."""
     return np.asarray((a[:, : k + 1] @ b[:, k::-1]).sum(axis=1))
 
 
 def transitions_at(
-    A: FloatArray, Q: FloatArray, seen: FloatArray, middles: FloatArray
+    A: FloatArray, Q: FloatArray, whitened_H: FloatArray, middles: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Return exp(A g), F, Q_g and G_g (C, n, n) at g = 0 and 3/2, 5/2, ... of a unit, from the flow
-    of the Hamiltonian.
+    """Return exp(A g), F, Q_g and G_g (C, n, n) at the ``middles`` g = 0 and 3/2, 5/2, ... units of
+    C cells, from the exponential exp(M g) of the Hamiltonian M.
     """
     n, count = len(A), len(middles)
-    E, F, grown, G = wide_zeros(4, count, n, n)
+    E, F, Q_g, G = wide_zeros(4, count, n, n)
     E[0] = F[0] = np.eye(n)
     # A single cell is expanded at 0, whose values are already there.
     if count == 1:
-        return E, F, grown, G
-    M, scale = hamiltonian(A, Q, seen.T @ seen)
-    # A third of the first middle, 3/2 unit, is half a unit: all middles are odd multiples of it.
+        return E, F, Q_g, G
+    M, scale = hamiltonian(A, Q, whitened_H.T @ whitened_H)
+    # exp over half a unit, which is a third of the first middle (3/2 units): all middles are odd
+    # multiples of it.
     powers = (middles[1] / WIDE(3.0)) ** np.arange(TERMS)
-    half, step = (
+    half_unit, half_unit_A = (
         np.tensordot(powers, exponential_series(matrix.astype(WIDE), TERMS), 1) for matrix in (M, A)
     )
-    moved, E[1:] = half, step
-    # Each middle is two halves of a unit after the one before it; the first step leads from 1/2 to
-    # 3/2.
+    E_M, E[1:] = half_unit, half_unit_A
+    # Each middle is two halves of a unit after the one before it; the first step goes from 1/2 to
+    # 3/2 units.
     for k in range(1, count):
-        moved = half @ half @ moved
-        E[k] = step @ step @ (E[k - 1] if k > 1 else step)
-        inverse = wide_inverse(moved[:n, :n])
-        # [X; Y] = E [I; P]: F = X^-T, G = X^-1 E12 and Q_g = E21 X^-1, with the scale of P undone.
+        E_M = half_unit @ half_unit @ E_M
+        E[k] = half_unit_A @ half_unit_A @ (E[k - 1] if k > 1 else half_unit_A)
+        inverse = wide_inverse(E_M[:n, :n])
+        # P(g) = Y X^-1 with [X; Y] = E_M [I; P] gives, from the blocks of E_M = exp(M g),
+        # F = E11^-T, G_g = E11^-1 E12 and Q_g = E21 E11^-1. M belongs to P / scale: undo that.
         F[k] = inverse.T
-        G[k] = inverse @ moved[:n, n:] / scale
-        grown[k] = moved[n:, :n] @ inverse * scale
-    return E, F, symmetric(grown), symmetric(G)
+        G[k] = inverse @ E_M[:n, n:] / scale
+        Q_g[k] = E_M[n:, :n] @ inverse * scale
+    return E, F, symmetric(Q_g), symmetric(G)
 
 
 def wide_zeros(*shape: int) -> Any:
@@ -296,15 +299,16 @@ def wide_inverse(matrix: FloatArray) -> FloatArray:
 
 
 def information_blocks(
-    seen: FloatArray, F: FloatArray, unit: float
+    whitened_H: FloatArray, F: FloatArray, unit: float
 ) -> tuple[list[FloatArray], FloatArray]:
-    """Return blocks (TERMS, q n) of the series of ``c_j / (g^j sqrt(2 j + 1))``, and
-    their bounds.
+    """Return the power series (TERMS, q n) of ``c_j / (g^j sqrt(2 j + 1))``, one block for each j,
+    and bounds of their squared norms for gaps up to ``unit``. ``F`` (TERMS, n, n) is the series
+    around 0.
     """
-    q, n = seen.shape
+    q, n = whitened_H.shape
     blocks: list[FloatArray] = []
     bounds: list[float] = []
-    rows = seen.astype(WIDE) @ F  # (TERMS, q, n)
+    rows = whitened_H.astype(WIDE) @ F  # (TERMS, q, n)
     # No sensor: no block, and nothing is observed.
     for j in range(min(BLOCKS, TERMS) if q else 0):
         block = np.zeros((TERMS, q * n), dtype=WIDE)
@@ -324,24 +328,26 @@ def legendre_moment(k: int, j: int) -> float:
     return value / (math.factorial(k - j) * math.factorial(k + j + 1))
 
 
-def doubled(
+def double_levels(
     E: FloatArray,
     F: FloatArray,
-    grown: FloatArray,
+    Q_g: FloatArray,
     blocks: list[FloatArray],
     scale: float,
     unit: float,
     levels: int,
 ) -> FloatArray:
-    """Return exp(A g) (levels, 4, n, n), F, Gamma and T over ``unit 2^level`` seconds.
+    """Return exp(A g), F, Gamma and T (levels, 4, n, n) for ``g = unit 2^level`` seconds, from the
+    series around 0 of exp(A g), F, Q_g and Gamma (``blocks``).
 
-    Doubling also doubles relative errors, so it works in extended precision, and on roots, so that
-    what is not observed stays so.
+    Each level follows from the one below by the doubling formulas (Anderson 1978). Doubling also
+    doubles relative errors, so it works in extended precision, and on roots, so that directions
+    that are not observed keep exactly no information.
     """
     n = E.shape[1]
     powers = WIDE(unit) ** np.arange(TERMS)
     # exp(A unit), F and Q_g over one unit, from the series around 0.
-    jump, move, Q = (np.tensordot(powers, part, 1) for part in (E, F, grown))
+    transition, F_level, Q = (np.tensordot(powers, part, 1) for part in (E, F, Q_g))
     # Gamma by blocks: sqrt(g) g^j times the series of c_j / (g^j sqrt(2 j + 1)).
     rows = [WIDE(unit) ** (j + WIDE(0.5)) * (powers @ block) for j, block in enumerate(blocks)]
     gamma = upper_root(np.concatenate([row.reshape(-1, n) for row in rows] or [np.zeros((0, n))]))
@@ -352,38 +358,36 @@ def doubled(
     table = np.zeros((levels, 4, n, n))
     with np.errstate(over="ignore", invalid="ignore"):  # an unstable plant overflows late
         for level in range(levels):
-            table[level] = jump, move, gamma / root_scale, T * root_scale
-            # upper upper' = I + T' G T, so middle = T upper^-T is a root of Q (I + G Q)^-1.
-            cross = gamma @ T
-            upper = upper_root(np.concatenate([eye, cross])).T
-            middle, share = substitute(upper, T.T).T, substitute(upper, cross.T)
-            # A root of G (I + Q G)^-1: the information of the second half that the noise of the
-            # first half leaves about the start.
-            lost = substitute(upper_root(np.concatenate([eye, cross.T])).T, gamma)
+            table[level] = transition, F_level, gamma / root_scale, T * root_scale
+            # With U U' = I + T' G T, middle = T U^-T is a root of Q (I + G Q)^-1.
+            gamma_T = gamma @ T
+            U = upper_root(np.concatenate([eye, gamma_T])).T
+            middle, gain = substitute(U, T.T).T, substitute(U, gamma_T.T)
+            # Z' Z = G (I + Q G)^-1: the information of the second half, less what the noise of the
+            # first half takes from it.
+            Z = substitute(upper_root(np.concatenate([eye, gamma_T.T])).T, gamma)
             # Q <- Q + F Q (I + G Q)^-1 F' as one triangularisation.
-            T = upper_root(np.concatenate([(move @ middle).T, T.T])).T
+            T = upper_root(np.concatenate([(F_level @ middle).T, T.T])).T
             # F (I + Q G)^-1 F without an inverse: Q G may be 1e9 beside the I.
-            move, closed = move @ (move - middle @ (share @ (gamma @ move))), move
+            F_level, F_half = F_level @ (F_level - middle @ (gain @ (gamma @ F_level))), F_level
             # G <- G + F' G (I + Q G)^-1 F, with the F of half the gap.
-            gamma = upper_root(np.concatenate([gamma, lost @ closed]))
-            jump = jump @ jump
-            # What F magnifies, rounding in the middle included, the readings of the same level can
-            # not reduce again: go in steps of the last level then.
-            if gamma.any() and not np.abs(move).max() < GROWTH:
+            gamma = upper_root(np.concatenate([gamma, Z @ F_half]))
+            transition = transition @ transition
+            # If F grows, it magnifies rounding errors that the readings of the same level do not
+            # reduce: end the table here, so that longer gaps take steps of this level.
+            if gamma.any() and not np.abs(F_level).max() < GROWTH:
                 return table[: level + 1].copy()
     return table
 
 
 def upper_root(rows: FloatArray) -> FloatArray:
-    """Return U (n, n), upper triangular with ``U' U = rows' rows``, in the precision of
-    ``rows``.
-    """
+    """Return U (n, n), upper triangular with ``U' U = rows' rows``, in extended precision."""
     n = rows.shape[1]
     work = np.concatenate([rows, np.zeros((n, n))]).astype(WIDE)
     for i in range(n):
         # Row pivoting keeps rows of very different sizes apart.
-        best = i + int(np.argmax(np.abs(work[i:, i])))
-        work[[i, best]] = work[[best, i]]
+        pivot_row = i + int(np.argmax(np.abs(work[i:, i])))
+        work[[i, pivot_row]] = work[[pivot_row, i]]
         column = work[i:, i].copy()
         length = np.sqrt((column * column).sum())
         if not length > 0.0:
@@ -400,7 +404,7 @@ def upper_root(rows: FloatArray) -> FloatArray:
 
 
 def cholesky_root(Q: FloatArray) -> FloatArray:
-    """Return the lower triangular root of Q (n, n); pivots that are rounding count as 0."""
+    """Return the lower triangular root of Q (n, n); pivots at the level of rounding count as 0."""
     n = len(Q)
     L = np.zeros_like(Q)
     for j in range(n):
@@ -419,7 +423,7 @@ def substitute(lower: FloatArray, right: FloatArray) -> FloatArray:
 
 
 def stack_tables(tables: Sequence[FlowTable]) -> FlowTable:
-    """Return one table for all models, in their order."""
+    """Return one table of all models of ``tables``, in their order."""
 
     def padded(parts: list[FloatArray], fill: float) -> FloatArray:
         # The padding is never read: ``sizes`` and the infinite last reach end every loop before it.
@@ -450,10 +454,10 @@ def propagate_root(
     gap: float,
     scratch: FlowScratch,
 ) -> None:
-    """Propagate the root and the mean at place ``k`` of ``root`` (K, n, n) and ``x`` (K, n) over
+    """Propagate the root and the mean in entry ``k`` of ``root`` (K, n, n) and ``x`` (K, n) over
     ``gap`` seconds by model ``m`` of the table.
     """
-    # Beyond all cells: whole multiples of the first level that is longer than them.
+    # A gap beyond all cells: first take whole steps of the first level that is longer than these.
     octaves = table.sizes[m, 4]
     if gap >= table.unit[m] * (1 << octaves):
         gap = propagate_by_levels(table, m, octaves, root, x, k, gap, scratch)
@@ -462,7 +466,7 @@ def propagate_root(
     if is_narrow(table, m, gap, trace_of(scratch.size, table, m, root, k)):
         propagate_narrow(table, m, root, x, k, gap, scratch)
         return
-    # Wide P: whole units by levels, and the rest row by row of Gamma.
+    # P is wide: take whole units by levels, and use the rest of the gap row by row of Gamma.
     gap = propagate_by_levels(table, m, 0, root, x, k, gap, scratch)
     if gap > 0.0:
         propagate_wide(table, m, root, x, k, gap, scratch)
@@ -470,30 +474,30 @@ def propagate_root(
 
 @kernel
 def trace_of(size: Size, table: FlowTable, m: int, root: FloatArray, k: int) -> float:
-    """Return ``trace(P)`` at place ``k`` as ``is_narrow`` asks for it, 0 where it does not."""
-    # Where nothing is observed G is 0, and any P is narrow.
+    """Return ``trace(P)`` of entry ``k`` for ``is_narrow``, or 0 if the model observes nothing."""
+    # Without observation G = 0, and any P is narrow: the trace need not be computed.
     return 0.0 if table.sizes[m, 1] == 0 else float(trace_of_root(ONE, size, root[k]))
 
 
 @kernel(inlined=True)
 def is_narrow(table: FlowTable, m: int, gap: float, trace: float) -> bool:
-    """Return True if one step inside a cell suffices for a P of this trace: rounding of G_g times P
+    """Return True if P of this ``trace`` takes one step inside a cell: the rounding of G_g times P
     is harmless.
     """
-    # A P that is not a number is not wide.
+    # ``not >=``: a nan counts as narrow, so that it takes the short way.
     return not table.size[m] * gap * trace >= NARROW
 
 
 @kernel(inlined=True)
 def takes_one_step(table: FlowTable, m: int, gap: float, trace: float) -> bool:
-    """Return True if ``propagate_root`` takes one step inside a cell."""
+    """Return True if ``propagate_root`` moves a P of this ``trace`` in one step inside a cell."""
     longest = table.unit[m] * (1 << table.sizes[m, 4])
     return bool(gap < longest and is_narrow(table, m, gap, trace))
 
 
 @kernel(inlined=True)
 def trace_of_root(lanes: Lanes, size: Size, S: FloatArray) -> Any:
-    """Return ``trace(P)`` of roots S (n, n, L)."""
+    """Return ``trace(P)`` (L,) of roots S (n, n, L)."""
     total = spread(lanes, 0.0)
     # |S|_F^2 = trace(S S').
     for i in range(len(size)):
@@ -513,17 +517,20 @@ def propagate_by_levels(
     gap: float,
     scratch: FlowScratch,
 ) -> float:
-    """Move over the multiple of ``unit 2^level`` seconds in a gap; returns the seconds left."""
+    """Propagate over the whole multiples of ``unit 2^level`` seconds in a gap; return the rest of
+    the gap, seconds.
+    """
     length, levels = table.unit[m] * (1 << level), table.sizes[m, 3]
-    whole = int(gap / length)
-    rest: float = gap - whole * length
-    while whole > 0:
-        # A binary digit of the number of steps, or one of many steps of the last level.
-        if whole & 1 or level == levels - 1:
+    steps = int(gap / length)
+    rest: float = gap - steps * length
+    while steps > 0:
+        # A step for each binary digit of their number that is 1; steps beyond the highest level
+        # are taken one by one.
+        if steps & 1 or level == levels - 1:
             propagate_level(table, m, level, root, x, k, scratch)
-            whole -= 1
+            steps -= 1
         if level < levels - 1:
-            whole >>= 1
+            steps >>= 1
             level += 1
     return rest
 
@@ -549,16 +556,16 @@ def propagate_level(
                     total += levels[m, level, 2, r, i] * root[k, i, j]
                 observed[0, j] = total
             rotate_out(scratch.size, root, k, observed, 0, scratch.gain, 1.0)
-    # exp(A g) where nothing is observed, else F.
+    # Without observation F = exp(A g).
     flow = 0 if table.sizes[m, 1] == 0 else 1
-    # A copy: transform_root() uses T up.
+    # A copy, since transform_root() overwrites T.
     for i in range(n):
         for j in range(i + 1):
             T[i, j] = levels[m, level, 3, i, j]
         for j in range(n):
             scratch.values[i * n + j] = levels[m, level, flow, i, j]
     transform_root(ONE, scratch.size, root[k], scratch.values, 0, scratch.wide, T)
-    # The estimate moves open loop, by exp(A g): gain_root() corrects it when the readings are used.
+    # The estimate moves by exp(A g), without readings: gain_root() adds these later.
     for i in range(n):
         total = 0.0
         for j in range(n):
@@ -582,9 +589,9 @@ def propagate_wide(
 
     ``P_g = F P (I + G P)^-1 F' + Q_g``: first the readings of the whole gap, then the transition.
     """
-    use_readings(table, m, root, k, gap, scratch)
+    use_information(table, m, root, k, gap, scratch)
     n = len(scratch.size)
-    # Without G_g, the last part of the series: Gamma has replaced it.
+    # Q_g, exp(A g) and F only, not G_g: Gamma has replaced it.
     width = n * (n + 1) // 2 + 2 * n * n
     fill_series(scratch.values, width, table.series[m, 0], table.reach[m, 0], 0, gap)
     propagate_by_series(table, m, root, x, k, False, scratch)
@@ -600,16 +607,14 @@ def propagate_narrow(
     gap: float,
     scratch: FlowScratch,
 ) -> None:
-    """Apply ``propagate_root`` over a gap inside a cell, where nothing is observed or P is not
-    too wide.
-    """
+    """Apply ``propagate_root`` over a gap inside a cell, if P is narrow or nothing is observed."""
     fill_values(scratch.values, table, m, gap)
     propagate_by_series(table, m, root, x, k, True, scratch)
 
 
 @kernel
 def fill_values(out: FloatArray, table: FlowTable, m: int, gap: float) -> None:
-    """Write Q_g, exp(A g) and, where something is observed, F and G_g for a gap inside a cell."""
+    """Write Q_g, exp(A g) and, if something is observed, F and G_g for a gap inside a cell."""
     cell, since = cell_of(table.unit[m], gap)
     width = width_of(table.levels.shape[4], table.sizes[m, 1] > 0)
     fill_series(out, width, table.series[m, cell], table.reach[m, cell], 0, since)
@@ -617,7 +622,9 @@ def fill_values(out: FloatArray, table: FlowTable, m: int, gap: float) -> None:
 
 @kernel(inlined=True)
 def cell_of(unit: float, gap: float) -> tuple[int, float]:
-    """Return the cell that a gap lies in, and the gap as its series counts it."""
+    """Return the index of the cell that a gap lies in, and the gap minus the point that its series
+    is expanded at, seconds.
+    """
     # Cell 0 is expanded at 0 and the others at their middles.
     cell = int(gap / unit)
     return cell, gap if cell == 0 else gap - (cell + 0.5) * unit
@@ -625,7 +632,7 @@ def cell_of(unit: float, gap: float) -> tuple[int, float]:
 
 @kernel(inlined=True)
 def width_of(n: int, observed: bool) -> int:
-    """Return the number of values for n states."""
+    """Return the number of entries of Q_g and exp(A g) and, if ``observed``, F and G_g."""
     width = n * (n + 1) // 2 + n * n
     return 2 * width if observed else width
 
@@ -640,8 +647,8 @@ def propagate_by_series(
     reads: bool,
     scratch: FlowScratch,
 ) -> None:
-    """Apply ``propagate_root`` with what is in ``values``; the readings of the gap are used already
-    where it does not read.
+    """Apply ``propagate_root`` with Q_g, exp(A g), F and G_g in ``scratch.values``. ``reads``: use
+    the information G_g first; otherwise the caller has done so.
     """
     size, n, observed = scratch.size, len(scratch.size), table.sizes[m, 1] > 0
     S, mean = local_matrix(size, scratch.S), local_vector(size, scratch.mean)
@@ -658,7 +665,7 @@ def propagate_by_series(
         condition_root(ONE, size, S, scratch.values, V)
     propagate_mean(ONE, size, mean, scratch.values, moved)
     cholesky_in_lanes(ONE, size, T, scratch.values)
-    transform_root(ONE, size, S, scratch.values, place_of_flow(n, observed), V, T)
+    transform_root(ONE, size, S, scratch.values, offset_of_F(n, observed), V, T)
     for i in range(n):
         x[k, i] = mean[i]
         for j in range(i + 1):
@@ -666,8 +673,8 @@ def propagate_by_series(
 
 
 @kernel(inlined=True)
-def place_of_flow(n: int, observed: bool) -> int:
-    """Return where F begins in ``values``."""
+def offset_of_F(n: int, observed: bool) -> int:
+    """Return the index at which F begins in ``values``."""
     # Without sensors F = exp(A g), and the series holds it once.
     return n * (n + 1) // 2 + (n * n if observed else 0)
 
@@ -691,8 +698,9 @@ def propagate_mean(
 def condition_root(
     lanes: Lanes, size: Size, S: FloatArray, values: FloatArray, V: FloatArray
 ) -> None:
-    """Make S (n, n, L) the root of ``P (I + G P)^-1``, where G is packed by rows of its lower
-    triangle behind Q_g, exp(A g) and F in ``values``; V (n, n, L) is scratch.
+    """Replace S (n, n, L), a root of P, by a root of ``P (I + G P)^-1``: the update with
+    information G. ``values`` holds the lower triangle of G by rows, behind Q_g, exp(A g) and F; V
+    (n, n, L) is scratch.
     """
     n = len(size)
     begin = n * (n + 1) // 2 + 2 * n * n
@@ -710,7 +718,7 @@ def condition_root(
             for r in range(i, n):
                 total += load(lanes, S, r, i) * load(lanes, V, r, j)
             store(lanes, V, i, j, total)
-    # V V' from the last column on, V upper triangular.
+    # Factor it in place into V V' with V upper triangular, from the last column on.
     for j in range(n - 1, -1, -1):
         # The reciprocal is stored on the diagonal: the substitution below multiplies by it.
         pivot = 1.0 / root_of(load(lanes, V, j, j))
@@ -721,7 +729,7 @@ def condition_root(
             for r in range(i + 1):
                 product = load(lanes, V, r, j) * load(lanes, V, i, j)
                 store(lanes, V, r, i, load(lanes, V, r, i) - product)
-    # S V^-T by rows.
+    # S <- S V^-T row by row: (S V^-T) (S V^-T)' = S (I + S' G S)^-1 S' = P (I + G P)^-1.
     for i in range(n):
         for j in range(i, -1, -1):
             total = load(lanes, S, i, j)
@@ -731,17 +739,17 @@ def condition_root(
 
 
 @kernel
-def use_readings(
+def use_information(
     table: FlowTable, m: int, root: FloatArray, k: int, gap: float, scratch: FlowScratch
 ) -> None:
-    """Use the information Gamma' Gamma of a gap of less than a unit."""
+    """Update the root of entry ``k`` with the information Gamma' Gamma of a gap below a unit."""
     n, q, rows, observed = len(scratch.size), table.sizes[m, 0], scratch.rows, scratch.observed
     gamma, width = table.gamma, q * n
     trace = trace_of_root(ONE, scratch.size, root[k])
     factor = math.sqrt(gap)
     for block in range(table.sizes[m, 1]):
-        # Later blocks shrink with g^(2 j + 1): their information is below rounding from here on.
-        if table.bound[m, block] * factor * factor * trace < UNSEEN:
+        # The information of block j shrinks with g^(2 j + 1): stop when it is below rounding.
+        if table.bound[m, block] * factor * factor * trace < NEGLIGIBLE:
             break
         for j in range(width):
             rows[j] = gamma[m, block, 0, j + 1]
@@ -762,14 +770,14 @@ def use_readings(
                     total += rows[r * n + i] * root[k, i, j]
                 observed[0, j] = factor * total
             rotate_out(scratch.size, root, k, observed, 0, scratch.gain, 1.0)
-        # g^(j + 1/2) of the next block.
+        # sqrt(g) g^j for the next j.
         factor *= gap
 
 
 @kernel(inlined=True, fused=True)
 def cholesky_in_lanes(lanes: Lanes, size: Size, T: FloatArray, packed: FloatArray) -> None:
-    """Write Cholesky's root T (n, n, L) of a lower triangle packed by rows; pivots that are
-    rounding count as 0.
+    """Write the Cholesky factor T (n, n, L) of the symmetric matrices whose lower triangles are
+    ``packed`` by rows; pivots at the level of rounding count as 0.
     """
     n = len(size)
     for j in range(n):
@@ -795,22 +803,24 @@ def transform_root(
     wide: FloatArray,
     T: FloatArray,
 ) -> None:
-    """Make S (n, n, L) the lower triangular root of ``F P F' + T T'``; F lies by rows from
-    ``begin`` on, T (n, n, L) is lower triangular and used up; ``wide`` (n, n, L) is scratch.
+    """Replace S (n, n, L) by the lower triangular root of ``F S S' F' + T T'``. F is given by rows
+    from index ``begin`` on; T (n, n, L), lower triangular, is overwritten; ``wide`` (n, n, L) is
+    scratch.
     """
     n = len(size)
-    # F S; S is lower triangular, so the sum begins at r = j.
+    # wide = F S; S is lower triangular, so the sum begins at r = j.
     for i in range(n):
         for j in range(n):
             total = spread(lanes, 0.0)
             for r in range(j, n):
                 total += load(lanes, F, begin + i * n + r) * load(lanes, S, r, j)
             store(lanes, wide, i, j, total)
+    # Triangularise [F S, T] from the right by one Householder reflection for each row.
     for i in range(n):
         square = spread(lanes, 0.0)
         for j in range(i, n):
             square += load(lanes, wide, i, j) * load(lanes, wide, i, j)
-        # Columns of T beyond i do not reach row i yet.
+        # T is lower triangular: its columns beyond i are 0 in row i.
         for j in range(i + 1):
             square += load(lanes, T, i, j) * load(lanes, T, i, j)
         # A zero row needs no reflection.
@@ -820,17 +830,17 @@ def transform_root(
 
 
 @kernel(inlined=True, fused=True)
-def information_rate(lanes: Lanes, size: Size, seen: FloatArray, S: FloatArray) -> Any:
-    """Return ``trace(P G)`` in 1/s of roots S (n, n, L) and ``seen`` (q, n, L), which is
-    R^-1/2 H.
+def information_rate(lanes: Lanes, size: Size, whitened_H: FloatArray, S: FloatArray) -> Any:
+    """Return the rate of information ``trace(P G)`` (L,) in 1/s, of roots S (n, n, L) and of
+    ``whitened_H`` (q, n, L) = R^-1/2 H.
     """
     # |R^-1/2 H S|_F^2 = trace(S' G S).
     n, rate = len(size), spread(lanes, 0.0)
-    for r in range(len(seen)):
+    for r in range(len(whitened_H)):
         for j in range(n):
             total = spread(lanes, 0.0)
             for i in range(j, n):
-                total += load(lanes, seen, r, i) * load(lanes, S, i, j)
+                total += load(lanes, whitened_H, r, i) * load(lanes, S, i, j)
             rate += total * total
     return rate
 
@@ -848,9 +858,11 @@ def gain_root(
     gap: float,
     values: FloatArray,
 ) -> None:
-    """Use the ``moments`` (2p,) of the readings of a gap, which become innovations, at its end:
-    ``x += (U + S S' W) innovations``. ``series`` is that of a GainTable, its reach is in a
-    ``column`` of ``reach``, and ``values`` is room for a row.
+    """Correct the prediction ``x[k]`` at the end of a gap by the ``moments`` (2 p,) of its
+    readings, which are overwritten with the innovations: ``x += (U + S S' W) innovations``.
+
+    U, W and C are power series in the gap, the rows of ``series`` of a GainTable; their reach is
+    ``reach[:, column]``. ``values`` (>= row length) is scratch.
     """
     fill_series(values, 3 * len(size) * len(moments), series, reach, column, gap)
     use_moments(ONE, size, root[k], x[k], values, moments)
@@ -865,8 +877,8 @@ def use_moments(
     values: FloatArray,
     moments: FloatArray,
 ) -> None:
-    """Apply ``gain_root`` to S (n, n, L), x (n, L), moments (q, L) and what ``values`` of the gap
-    the series has: U and W (n, q), C (q, n); C is used up.
+    """Apply ``gain_root`` to S (n, n, L), x (n, L) and moments (q, L): ``x += (U + S S' W)
+    (moments - C x)``. ``values`` holds U and W (n, q) and C (q, n) at the gap; C is overwritten.
     """
     n, q = len(size), len(moments)
     # Innovations: the moments minus C x.
@@ -875,7 +887,7 @@ def use_moments(
         for j in range(n):
             total -= load(lanes, values, (2 * q + m) * n + j) * load(lanes, x, j)
         store(lanes, moments, m, total)
-    # C is not needed any more, and q >= 1: its room holds W innovations, and S' times that.
+    # C is not needed any more, and q >= 1: its memory takes w = W innovations, then S' w.
     first = 2 * q * n
     for i in range(n):
         mean, total = load(lanes, x, i), spread(lanes, 0.0)
@@ -884,7 +896,8 @@ def use_moments(
             total += load(lanes, values, (n + i) * q + m) * load(lanes, moments, m)
         store(lanes, x, i, mean)
         store(lanes, values, first + i, total)
-    for j in range(n):  # S' w: place j is not read again
+    # S' w in place: entry j is not read again.
+    for j in range(n):
         total = spread(lanes, 0.0)
         for i in range(j, n):
             total += load(lanes, S, i, j) * load(lanes, values, first + i)
@@ -912,15 +925,15 @@ class _Scratches(threading.local):
     """Scratch arrays of each thread, by the sizes that they depend on."""
 
     def __init__(self) -> None:
-        self.known: dict[tuple[int, ...], FlowScratch] = {}
+        self.scratches: dict[tuple[int, ...], FlowScratch] = {}
 
     def of(self, table: FlowTable) -> FlowScratch:
         """Return scratch arrays that fit ``table``, not cleared."""
         # Scratch holds no results, so tables of equal shapes may share it.
-        sizes = table.series.shape[3], *table.seen.shape[1:]
-        if sizes not in self.known:
-            self.known[sizes] = flow_scratch(table)
-        return self.known[sizes]
+        sizes = table.series.shape[3], *table.whitened_H.shape[1:]
+        if sizes not in self.scratches:
+            self.scratches[sizes] = flow_scratch(table)
+        return self.scratches[sizes]
 
 
 _scratches = _Scratches()

@@ -5,7 +5,7 @@ here inverts a covariance or subtracts one from another: samples are used by Giv
 columns, which keep columns of very different sizes apart (a first covariance of 1e12 beside a
 sensor of 1e-9), and combinations are one orthogonal elimination.
 
-Kernels work in place on place ``k`` of stacks, root (K, n, n) and x (K, n), and take their scratch
+Kernels work in place on entry ``k`` of stacks, root (K, n, n) and x (K, n), and take their scratch
 from :func:`update_scratch`; wrappers for Python take one node and return new arrays:
 
 =================================  ============================================================
@@ -13,8 +13,8 @@ from :func:`update_scratch`; wrappers for Python take one node and return new ar
 ``update_with_sample``             the same for Python
 ``scale_root``, ``add_root``       kernels: ``sum w_j P_j`` and ``sum w_j x_j``, term by term
 ``combine_roots``                  the same for Python
-``begin_intersection``,            kernels: covariance intersection, term by term, read off at
-``add_to_intersection``,           the end
+``begin_intersection``,            kernels: covariance intersection, term by term; the last one
+``add_to_intersection``,           writes the result
 ``end_intersection``
 ``intersect_roots``                the same for Python
 ``lower_root``                     for Python: the triangular root of any root (n, c), c >= n
@@ -36,10 +36,10 @@ from netkf.linalg.local import local_matrix
 from netkf.linalg.structs import Size, Struct, sized
 
 SINGULAR = 2.0**-25
-"""Least pivot of a root that counts in an intersection, relative to the length of its row: the
-square root of what a covariance would be known to.
+"""Least pivot of a root that is inverted, relative to the length of its row: the square root of
+2^-50, at which a pivot of the covariance itself would be rounding.
 """
-NEGLIGIBLE = 1e-40  # of the square of a pivot: what cannot move it, nor the rows below it
+NEGLIGIBLE = 1e-40  # share of a squared pivot that changes neither it nor the rows below it
 TINY = 1e-200
 
 
@@ -75,16 +75,16 @@ def update_scratch(n: int, p: int, unrolled: bool = False) -> UpdateScratch:
 
 
 class _Scratches(threading.local):
-    """Of each thread, for calls from Python, by n and p."""
+    """Scratch arrays of each thread, by n and p, for calls from Python."""
 
     def __init__(self) -> None:
-        self.known: dict[tuple[int, int], UpdateScratch] = {}
+        self.scratches: dict[tuple[int, int], UpdateScratch] = {}
 
     def of(self, n: int, p: int) -> UpdateScratch:
         """Return scratch arrays for n states and samples of p rows."""
-        if (n, p) not in self.known:
-            self.known[n, p] = update_scratch(n, p)
-        return self.known[n, p]
+        if (n, p) not in self.scratches:
+            self.scratches[n, p] = update_scratch(n, p)
+        return self.scratches[n, p]
 
 
 _scratches = _Scratches()
@@ -109,23 +109,27 @@ def lower_root(root: FloatArray) -> FloatArray:
 def rotate_out(
     size: Size, root: FloatArray, k: int, row: FloatArray, m: int, gains: FloatArray, pivot: float
 ) -> float:
-    """Use the scalar observation with ``h S = row[m]`` and noise variance ``pivot``^2; the gain is
-    ``gains[m]`` (n,) over the value that is returned, the standard deviation of the innovation.
+    """Update the root S = ``root[k]`` with the scalar observation ``h x + v``, where ``h S`` is
+    ``row[m]`` and v has the variance ``pivot``^2.
+
+    Return the standard deviation of the innovation; the gain is ``gains[m]`` (n,) over it.
     """
-    # [pivot, h S; 0, S] times rotations that empty h S from its end, so that S stays triangular.
+    # Multiply [pivot, h S; 0, S] from the right by Givens rotations that zero h S from its last
+    # entry on, so that S stays lower triangular.
     n = len(size)
     for i in range(n):
         gains[m, i] = 0.0
-    square = pivot * pivot  # summed up, so that no square root waits for another
+    # The square of the pivot is a plain sum: no square root has to wait for the one before.
+    square = pivot * pivot
     # From the last column on: rotation j touches rows i >= j only, where S has entries.
     for j in range(n - 1, -1, -1):
         entry = row[m, j]
         if entry != 0.0:
             square += entry * entry
-            whole = math.sqrt(square)
-            inverse = 1.0 / whole
+            length = math.sqrt(square)
+            inverse = 1.0 / length
             c, s = pivot * inverse, entry * inverse
-            pivot = whole
+            pivot = length
             # Rotate column j of [h S; S] into the column of the gain.
             for i in range(j, n):
                 old, gain = root[k, i, j], gains[m, i]
@@ -144,31 +148,33 @@ def sample_root(
     root_R: FloatArray,
     scratch: UpdateScratch,
 ) -> None:
-    """Use the sample ``y = H x + v``: y (p,), H (p, n), ``root_R`` (p, p) lower triangular
-    and regular.
+    """Update ``x[k]`` and ``root[k]`` with the sample ``y = H x + v``: y (p,), H (p, n), ``root_R``
+    (p, p) lower triangular and regular.
 
-    ``y`` is overwritten with the normalised innovation: its squares sum to the NIS, and its entries
-    are independent standard normals where the filter is consistent.
+    ``y`` is overwritten with the normalised innovation ``C^-1 (y - H x)``, C C' = H P H' + R. Its
+    squares sum to the NIS; its entries are independent standard normals if the filter is
+    consistent.
     """
-    # [root_R, H S; 0, S] is made lower triangular, [C, 0; gains', S+], row by row of H.
+    # Rotations from the right make [root_R, H S; 0, S] lower triangular, [C, 0; gains', S+], one
+    # row of H after the other.
     p, n, size = len(y), len(scratch.size), scratch.size
     C, HS, gains = scratch.C, scratch.HS, scratch.gains
     for r in range(p):
         # rotate_rows() changes C below the diagonal, so it starts from a fresh copy of root_R.
         for m in range(r + 1):
             C[r, m] = root_R[r, m]
-        seen = 0.0
+        predicted = 0.0
         for j in range(n):
             total = 0.0
             for i in range(j, n):
                 total += H[r, i] * root[k, i, j]
             HS[r, j] = total
             # H x, for the innovation y - H x with the x before any row is used.
-            seen += H[r, j] * x[k, j]
-        y[r] -= seen
+            predicted += H[r, j] * x[k, j]
+        y[r] -= predicted
     # Row by row, C becomes the root of H P H' + R.
     for r in range(p):
-        # The last row has no rows below it to turn.
+        # The last row has no rows below it to rotate along.
         if r == p - 1:
             C[r, r] = rotate_out(size, root, k, HS, r, gains, C[r, r])
         else:
@@ -187,24 +193,24 @@ def sample_root(
 def rotate_rows(
     root: FloatArray, k: int, C: FloatArray, HS: FloatArray, gains: FloatArray, r: int, p: int
 ) -> None:
-    """Apply ``rotate_out`` to row ``r`` of p, which turns the rows of the observation
-    below it too.
+    """Apply ``rotate_out`` to row ``r`` of an observation with p rows, and the same rotations to
+    the rows of C and HS below it.
     """
     n = root.shape[1]
     for i in range(n):
         gains[r, i] = 0.0
     for j in range(n - 1, -1, -1):
-        size = HS[r, j]
-        if size != 0.0:
-            whole = math.sqrt(C[r, r] * C[r, r] + size * size)
-            c, s = C[r, r] / whole, size / whole
-            C[r, r] = whole
-            # Rows of the observation that are still to be used turn along.
+        entry = HS[r, j]
+        if entry != 0.0:
+            length = math.sqrt(C[r, r] * C[r, r] + entry * entry)
+            c, s = C[r, r] / length, entry / length
+            C[r, r] = length
+            # The rows of the observation that are used later.
             for i in range(r + 1, p):
                 old, gain = HS[i, j], C[i, r]
                 HS[i, j] = c * old - s * gain
                 C[i, r] = s * old + c * gain
-            # Column j of S and the gain turn last; S stays lower triangular.
+            # Column j of S and the gain; S stays lower triangular.
             for i in range(j, n):
                 old, gain = root[k, i, j], gains[r, i]
                 root[k, i, j] = c * old - s * gain
@@ -214,7 +220,9 @@ def rotate_rows(
 def update_with_sample(
     root: FloatArray, x: FloatArray, y: FloatArray, H: FloatArray, root_R: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return root (n, n), x (n,) and normalised innovation (p,) once the sample y (p,) is used."""
+    """Return the root (n, n) and x (n,) after an update with the sample y (p,), and the normalised
+    innovation (p,), see ``sample_root``.
+    """
     n = len(x)
     roots, means, innovation = root.reshape(1, n, n).copy(), x.reshape(1, n).copy(), y.copy()
     sample_root(roots, means, 0, innovation, H, root_R, _scratches.of(n, len(y)))
@@ -226,7 +234,7 @@ def update_with_sample(
 
 @kernel(inlined=True)
 def scale_root(size: Size, root: FloatArray, x: FloatArray, k: int, weight: float) -> None:
-    """Weigh place ``k`` alone: ``weight`` >= 0 times P and x."""
+    """Multiply P and x of entry ``k`` by ``weight`` >= 0."""
     # sqrt(w) S is a root of w P.
     n, factor = len(size), math.sqrt(weight)
     for i in range(n):
@@ -246,9 +254,11 @@ def add_root(
     m: int,
     scratch: UpdateScratch,
 ) -> None:
-    """Add ``weight`` >= 0 times P and x of place ``m`` of ``other`` (M, n, n), ``other_x``."""
+    """Add to P and x of entry ``k`` ``weight`` >= 0 times those of entry ``m`` of ``other`` (M, n,
+    n) and ``other_x`` (M, n): one term of H (7) and (9).
+    """
     size, n, factor = scratch.size, len(scratch.size), math.sqrt(weight)
-    # [S, sqrt(w) S_m]: the convex combination of H (7), one term at a time.
+    # P + w P_m = A A' with A = [S, sqrt(w) S_m], made triangular from the right.
     S, wide = local_matrix(size, scratch.S), local_matrix(size, scratch.wide)
     for i in range(n):
         x[k, i] += weight * other_x[m, i]
@@ -262,15 +272,15 @@ def add_root(
 
 @kernel(inlined=True, fused=True)
 def absorb_columns(lanes: Lanes, size: Size, S: FloatArray, wide: FloatArray) -> None:
-    """Make S (n, n, L) the root of ``S S' + wide wide'``; both are lower triangular, and ``wide``
-    is used up.
+    """Replace S (n, n, L) by the root of ``S S' + wide wide'``; both are lower triangular, and
+    ``wide`` is overwritten.
     """
     for i in range(len(size)):
         pivot, below = load(lanes, S, i, i), spread(lanes, 0.0)
         for j in range(i + 1):
             below += load(lanes, wide, i, j) * load(lanes, wide, i, j)
         square = pivot * pivot
-        # Column i of S with the columns of ``wide`` that reach row i.
+        # Reflect column i of S and the columns of ``wide`` that are not 0 in row i.
         active = below > NEGLIGIBLE * square + TINY
         reflect_row(lanes, size, i, i + 1, S, wide, square + below, active)
 
@@ -294,8 +304,7 @@ def combine_roots(
 
 @kernel(inlined=True)
 def begin_intersection(scratch: UpdateScratch) -> None:
-    """Forget what was intersected before."""
-    # Zero information: Z = 0.
+    """Set the information in ``scratch.total`` to zero."""
     total = scratch.total
     for i in range(total.shape[0]):
         for j in range(total.shape[1]):
@@ -312,8 +321,8 @@ def add_to_intersection(
     m: int,
     scratch: UpdateScratch,
 ) -> None:
-    """Add ``weight`` times the information of place ``k``; means count from ``centre[m]``, which
-    must be the same for all terms of one intersection.
+    """Add ``weight`` times the information of entry ``k`` to ``scratch.total``, one term of D (8).
+    Means are relative to ``centre[m]``, the same for all terms of one intersection.
     """
     whitened, total, n = scratch.whitened, scratch.total, x.shape[1]
     if weight <= 0.0:
@@ -331,10 +340,11 @@ def add_to_intersection(
 
 @kernel(inlined=True)
 def merge_information(total: FloatArray, whitened: FloatArray) -> None:
-    """Make ``total`` (n, n + 1) the root of both informations, means in the last column;
-    ``whitened`` (n, n + 1) is used up.
+    """Replace ``total`` (n, n + 1), a root [Z, z] of information, by a root of the sum of it and
+    ``whitened`` (n, n + 1), which is overwritten. z is Z times the mean.
     """
-    # Both are lower triangular, and stay so when columns are emptied from the last one on.
+    # Reflections from the left zero the columns of ``whitened`` from the last one on, so that both
+    # stay lower triangular.
     n = len(total)
     for j in range(n - 1, -1, -1):
         below = 0.0
@@ -362,18 +372,20 @@ def merge_information(total: FloatArray, whitened: FloatArray) -> None:
 
 @kernel(inlined=True)
 def invert_root(out: FloatArray, root: FloatArray, k: int, factor: float) -> None:
-    """Write ``factor`` times the inverse of place ``k`` into ``out`` (n, >= n), lower triangular.
+    """Write ``factor`` times the inverse of the root in entry ``k`` into ``out`` (n, >= n), lower
+    triangular.
 
-    Soon after a start from 0 the noise has reached some combinations of states only to rounding:
-    pivots are at least SINGULAR of their row, which makes P no smaller.
+    Soon after a start from P = 0 some combinations of states have almost no noise yet, and pivots
+    are rounding. They are raised to SINGULAR times the length of their row, which makes P no
+    smaller.
     """
     # The floor grows with the whole root, so that a zero row is not inverted on its own scale.
-    n, least = root.shape[1], TINY
+    n, floor = root.shape[1], TINY
     for i in range(n):
         for j in range(i + 1):
-            least += NEGLIGIBLE * root[k, i, j] * root[k, i, j]
+            floor += NEGLIGIBLE * root[k, i, j] * root[k, i, j]
     for i in range(n):
-        row = least
+        row = floor
         for j in range(i + 1):
             row += root[k, i, j] * root[k, i, j]
         pivot = max(abs(root[k, i, i]), SINGULAR * math.sqrt(row))
@@ -391,7 +403,9 @@ def invert_root(out: FloatArray, root: FloatArray, k: int, factor: float) -> Non
 def end_intersection(
     root: FloatArray, x: FloatArray, k: int, centre: FloatArray, m: int, scratch: UpdateScratch
 ) -> None:
-    """Write the intersection into place ``k``; nan where nothing was added."""
+    """Write the intersection, ``P = (Z' Z)^-1`` and its mean, into entry ``k``; nan if nothing was
+    added.
+    """
     total, whitened, n = scratch.total, scratch.whitened, x.shape[1]
     # S = Z^-1: the total is lower triangular, so P = Z^-1 Z^-T has the lower root Z^-1.
     for i in range(n):
@@ -407,15 +421,16 @@ def end_intersection(
             root[k, i, j] = whitened[i, j]
             mean += whitened[i, j] * total[j, n]
         whitened[i, n] = mean
-    for i in range(n):  # ``centre`` may be x itself
+    # Last, since ``centre`` may be x itself.
+    for i in range(n):
         x[k, i] = whitened[i, n]
 
 
 def intersect_roots(
     weights: FloatArray, means: FloatArray, roots: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Estimate (n,) and root (n, n) of D (8), (9), for weights (k,), means (k, n) and roots
-    (k, n, n).
+    """Return the estimate (n,) and root (n, n) of D (8) and (9), for weights (k,), means (k, n) and
+    roots (k, n, n).
     """
     x, root = means[:1].copy(), np.zeros_like(roots[:1])
     scratch = _scratches.of(means.shape[1], 1)

@@ -1,10 +1,11 @@
-"""Tracks of several nodes in kernels: how their errors are correlated, and their best combination.
+"""Kernels for track fusion: the joint covariance of the errors of tracks, and their best
+combination.
 
-The covariances ``P_ij = E[e_i e_j']`` of the errors of tracks, each of which uses the readings of
-its own sensors, are ``joint`` (K, n, n) for K ``pairs`` of tracks (K, 2): the common process noise
-and the common start correlate them (Bar-Shalom and Campo 1986). Each is computed from itself and
-the own covariances of the two tracks alone, so that its bits do not depend on which other pairs are
-there; pairs of a track with itself are.
+A track is the estimate of a node from its own sensors. The common process noise and the common
+initial error correlate the errors e_i of tracks (Bar-Shalom and Campo 1986). ``joint`` (K, n, n)
+holds ``P_ij = E[e_i e_j']`` for K ``pairs`` (i, j) of tracks (K, 2), among them all pairs (i, i).
+P_ij is computed from itself, P_ii and P_jj alone, so that its bits do not depend on which other
+pairs there are.
 """
 
 from __future__ import annotations
@@ -18,24 +19,28 @@ from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
 
 NEGLIGIBLE = 1e-12
-"""Variance of a difference of tracks, relative to those of its terms, that is rounding."""
+"""Variance of a difference of two tracks, relative to the sum of both variances, at the level of
+rounding.
+"""
 
 
 class TrackScratch(NamedTuple):
-    """Scratch for k tracks beside a node's own one.
+    """Scratch for the fusion of a node's own track with k others.
 
-    spread, factor : (k n, k n), covariance of their differences to it, and its factor
-    cross, parts : (n, k n), covariance of the own error with both
-    sizes, order : (k n,), pivots
-    weights : (n, (k + 1) n), of all errors
+    difference_cov, factor : (k n, k n), covariance of the differences d_a = e_own - e_a of errors,
+                             and its factor, d = factor u
+    cross_cov, white_cov : (n, k n), covariances of e_own with d and with u
+    variance_scale, order : (k n,), sum of the variances of e_own and e_a for each entry of d, and
+                            the order of pivots
+    weights : (n, (k + 1) n), of the errors of all tracks in that of the combination
     work : (n, n)
     """
 
-    spread: FloatArray
+    difference_cov: FloatArray
     factor: FloatArray
-    cross: FloatArray
-    parts: FloatArray
-    sizes: FloatArray
+    cross_cov: FloatArray
+    white_cov: FloatArray
+    variance_scale: FloatArray
     order: np.ndarray
     weights: FloatArray
     work: FloatArray
@@ -45,14 +50,18 @@ def track_scratch(k: int, n: int) -> TrackScratch:
     """Return scratch for at most k tracks of n states."""
     K = max(k, 1) * n
     shapes = [(K, K), (K, K), (n, K), (n, K), (K,), (n, K + n), (n, n)]
-    spread, factor, cross, parts, sizes, weights, work = (np.zeros(shape) for shape in shapes)
+    difference_cov, factor, cross_cov, white_cov, variance_scale, weights, work = (
+        np.zeros(shape) for shape in shapes
+    )
     order = np.zeros(K, dtype=np.int64)
-    return TrackScratch(spread, factor, cross, parts, sizes, order, weights, work)
+    return TrackScratch(
+        difference_cov, factor, cross_cov, white_cov, variance_scale, order, weights, work
+    )
 
 
 @kernel
 def predict_joint(joint: FloatArray, F: FloatArray, Q: FloatArray, work: FloatArray) -> None:
-    """Move all tracks to the next slot, ``F P_ij F' + Q``; ``work`` (n, n) is scratch."""
+    """Predict all pairs of tracks, ``P_ij <- F P_ij F' + Q``; ``work`` (n, n) is scratch."""
     for k in range(len(joint)):
         multiply_both(F, joint[k], F, work)
         for a in range(len(Q)):
@@ -62,7 +71,7 @@ def predict_joint(joint: FloatArray, F: FloatArray, Q: FloatArray, work: FloatAr
 
 @kernel(inlined=True)
 def multiply_both(left: FloatArray, P: FloatArray, right: FloatArray, work: FloatArray) -> None:
-    """Make P (n, n) ``left P right'``; ``work`` (n, n) is scratch."""
+    """Replace P (n, n) by ``left P right'``; ``work`` (n, n) is scratch."""
     n = len(P)
     for a in range(n):
         for c in range(n):
@@ -87,10 +96,11 @@ def update_joint(
     closed: FloatArray,
     work: FloatArray,
 ) -> None:
-    """Let each of m tracks use a reading of its own sensors, ``P_ij+ = C_i P_ij C_j'``, with
-    ``C_i = I - K_i H_i`` written into ``closed`` (m, n, n).
+    """Update the covariances of m tracks, each by a reading of its own sensors:
+    ``P_ij <- C_i P_ij C_j'`` for i != j, with ``C_i = I - K_i H_i`` written into ``closed`` (m, n,
+    n).
 
-    ``H`` (m, p, n) are whitened and have so many ``rows`` (m,); ``work`` (n, n) is scratch.
+    ``H`` (m, p, n) is whitened, and ``rows`` (m,) of its rows count; ``work`` (n, n) is scratch.
     """
     for k in range(len(joint)):
         i, j = pairs[k, 0], pairs[k, 1]
@@ -98,7 +108,7 @@ def update_joint(
             close_track(joint[k], H[i], rows[i], closed[i], work)
     for k in range(len(joint)):
         i, j = pairs[k, 0], pairs[k, 1]
-        # Noises of different nodes are independent. Blind nodes close nothing.
+        # Noises of different nodes are independent and add nothing. Without rows C_i = I.
         if i != j and rows[i] + rows[j] > 0:
             multiply_both(closed[i], joint[k], closed[j], work)
 
@@ -107,8 +117,8 @@ def update_joint(
 def close_track(
     P: FloatArray, H: FloatArray, rows: int, closed: FloatArray, work: FloatArray
 ) -> None:
-    """Update P (n, n) by a reading of whitened ``rows`` H (p, n); write ``I - K H`` into ``closed``
-    (n, n).
+    """Update P (n, n) by a reading with ``rows`` whitened rows H (p, n); write ``I - K H`` into
+    ``closed`` (n, n).
     """
     n = len(P)
     for i in range(n):
@@ -120,33 +130,34 @@ def close_track(
 
 @kernel
 def close_row(P: FloatArray, h: FloatArray, closed: FloatArray, k: FloatArray) -> None:
-    """Update P by one whitened row h (n,), and multiply ``closed`` by ``I - k h``; ``k`` (n,) is
-    scratch for the gain ``P h' / (h P h' + 1)``.
+    """Update P (n, n) by one whitened row h (n,), ``P <- (I - k h) P (I - k h)' + k k'`` with the
+    gain ``k = P h' / (h P h' + 1)``, and multiply ``closed`` by ``I - k h`` from the left. ``k``
+    (n,) is scratch.
     """
-    n, size = len(P), 1.0
+    n, variance = len(P), 1.0
     for i in range(n):
         k[i] = 0.0
         for j in range(n):
             k[i] += P[i, j] * h[j]
-        size += h[i] * k[i]
+        variance += h[i] * k[i]
     for i in range(n):
-        k[i] /= size
-    # (I - k h) from the left of both.
+        k[i] /= variance
+    # (I - k h) P and (I - k h) closed.
     for j in range(n):
-        Ph = known = 0.0
+        h_P = h_closed = 0.0
         for i in range(n):
-            Ph += h[i] * P[i, j]
-            known += h[i] * closed[i, j]
+            h_P += h[i] * P[i, j]
+            h_closed += h[i] * closed[i, j]
         for i in range(n):
-            P[i, j] -= k[i] * Ph
-            closed[i, j] -= k[i] * known
-    # P (I - k h)' + k k', row by row, and the symmetric part of it.
+            P[i, j] -= k[i] * h_P
+            closed[i, j] -= k[i] * h_closed
+    # P (I - k h)' + k k' row by row: subtract (P h' - k) k'. Then the symmetric part.
     for i in range(n):
-        Ph = -k[i]
+        factor = -k[i]
         for j in range(n):
-            Ph += P[i, j] * h[j]
+            factor += P[i, j] * h[j]
         for j in range(n):
-            P[i, j] -= Ph * k[j]
+            P[i, j] -= factor * k[j]
             if j < i:
                 P[i, j] = P[j, i] = 0.5 * (P[i, j] + P[j, i])
 
@@ -155,84 +166,86 @@ def close_row(P: FloatArray, h: FloatArray, closed: FloatArray, k: FloatArray) -
 def combine_tracks(
     joint: FloatArray, count: int, scratch: TrackScratch, gain: FloatArray, root: FloatArray
 ) -> int:
-    """Write the gain (n, >= k n) by which the differences of ``count`` = k tracks to the own one
-    correct it with the least covariance, and the lower triangular ``root`` (n, n) of that; return
-    the number of differences that were used. If it is 0 all tracks are the same.
+    """Write the optimal combination of a node's own track with ``count`` = k others: the ``gain``
+    (n, >= k n) of their differences to the own one, and the lower triangular ``root`` (n, n) of the
+    least covariance. Return the rank of the differences; 0 means that all tracks are the same.
 
-    ``joint`` (>= k + 1, >= k + 1, n, n) has the covariances of the own track, index 0, and the
-    others. For one other it is ``(P_i - P_ij) (P_i + P_j - P_ij - P_ji)^-1`` of Bar-Shalom and
-    Campo.
+    ``joint`` (>= k + 1, >= k + 1, n, n) holds the covariances of the own track, index 0, and the
+    others. For k = 1 the gain is ``(P_i - P_ij) (P_i + P_j - P_ij - P_ji)^-1`` of Bar-Shalom and
+    Campo; for any k it is E[e_own d'] E[d d']^-1.
     """
     n = len(root)
-    spread_tracks(joint, count, scratch)
-    used = factor_differences(n, count * n, scratch)
+    fill_difference_covariances(joint, count, scratch)
+    rank = factor_differences(n, count * n, scratch)
     for q in range(count * n):
         for i in range(n):
             gain[i, q] = 0.0
-    # e_i is sum_t parts_t u_t, with d = factor u: the gain solves gain factor = parts.
-    for t in range(used - 1, -1, -1):
+    # With d = factor u and white u the gain solves gain factor = E[e_own u'] = white_cov, by back
+    # substitution over the pivots.
+    for t in range(rank - 1, -1, -1):
         q = scratch.order[t]
         for i in range(n):
-            total = scratch.parts[i, t]
-            for later in range(t + 1, used):
+            total = scratch.white_cov[i, t]
+            for later in range(t + 1, rank):
                 index = scratch.order[later]
                 total -= gain[i, index] * scratch.factor[index, t]
             gain[i, q] = total / scratch.factor[q, t]
     write_combined_root(joint, count, gain, scratch, root)
-    return used
+    return rank
 
 
 @kernel
-def spread_tracks(joint: FloatArray, count: int, scratch: TrackScratch) -> None:
-    """Write the covariance of the differences ``d_a = e_own - e_a`` into ``spread``, and that of
-    e_own with them into ``cross``.
+def fill_difference_covariances(joint: FloatArray, count: int, scratch: TrackScratch) -> None:
+    """Write E[d d'] of the differences ``d_a = e_own - e_a`` into ``difference_cov``, E[e_own d']
+    into ``cross_cov``, and the sum of both variances of each entry into ``variance_scale``.
     """
     n = joint.shape[2]
     for a in range(count):
         for i in range(n):
-            scratch.sizes[a * n + i] = joint[0, 0, i, i] + joint[1 + a, 1 + a, i, i]
+            scratch.variance_scale[a * n + i] = joint[0, 0, i, i] + joint[1 + a, 1 + a, i, i]
             for j in range(n):
-                scratch.cross[i, a * n + j] = joint[0, 0, i, j] - joint[0, 1 + a, i, j]
+                scratch.cross_cov[i, a * n + j] = joint[0, 0, i, j] - joint[0, 1 + a, i, j]
                 for b in range(count):
                     first = joint[0, 0, i, j] - joint[0, 1 + b, i, j]
                     second = joint[1 + a, 0, i, j] - joint[1 + a, 1 + b, i, j]
-                    scratch.spread[a * n + i, b * n + j] = first - second
+                    scratch.difference_cov[a * n + i, b * n + j] = first - second
 
 
 @kernel
 def factor_differences(n: int, K: int, scratch: TrackScratch) -> int:
-    """Factor the covariance of the differences, ``spread`` (K, K) = factor factor', by Cholesky
-    with pivoting, and return its numerical rank t.
+    """Factor ``difference_cov`` (K, K) = factor factor' by Cholesky with pivoting; return its
+    numerical rank t.
 
-    The differences are ``d = factor u`` with white u (t,): ``parts`` (n, t) becomes the covariance
-    of the own error with u, and ``order`` (t,) the pivots. ``spread`` and ``cross`` are lost.
+    The differences are ``d = factor u`` with white u (t,); ``white_cov`` (n, t) becomes E[e_own u']
+    and ``order`` (t,) the pivots. ``difference_cov`` and ``cross_cov`` are overwritten.
     """
-    spread, factor = scratch.spread, scratch.factor
+    difference_cov, factor = scratch.difference_cov, scratch.factor
     for t in range(K):
-        # The pivot is the largest variance relative to the terms that it is the difference of: of
-        # equal tracks, such as those of two nodes without a sensor, only rounding remains.
+        # The pivot is the difference with the largest variance, relative to the variances of its
+        # two tracks. For equal tracks, such as those of two nodes without a sensor, only rounding
+        # remains: these are left out.
         q = -1
-        best = NEGLIGIBLE
+        largest = NEGLIGIBLE
         for index in range(K):
-            if spread[index, index] > best * scratch.sizes[index]:
+            if difference_cov[index, index] > largest * scratch.variance_scale[index]:
                 q = index
-                best = spread[index, index] / scratch.sizes[index]
+                largest = difference_cov[index, index] / scratch.variance_scale[index]
         if q < 0:
             return t
         scratch.order[t] = q
-        pivot = math.sqrt(spread[q, q])
+        pivot = math.sqrt(difference_cov[q, q])
         for index in range(K):
-            factor[index, t] = spread[index, q] / pivot
+            factor[index, t] = difference_cov[index, q] / pivot
         for i in range(n):
-            scratch.parts[i, t] = scratch.cross[i, q] / pivot
-        # The conditional covariances, given the pivot.
+            scratch.white_cov[i, t] = scratch.cross_cov[i, q] / pivot
+        # Covariances of what remains given the pivot: subtract the outer products.
         for index in range(K):
             for other in range(K):
-                spread[index, other] -= factor[index, t] * factor[other, t]
+                difference_cov[index, other] -= factor[index, t] * factor[other, t]
             for i in range(n):
-                scratch.cross[i, index] -= scratch.parts[i, t] * factor[index, t]
+                scratch.cross_cov[i, index] -= scratch.white_cov[i, t] * factor[index, t]
         # Exactly 0, not rounding: a pivot is not chosen twice.
-        spread[q, q] = 0.0
+        difference_cov[q, q] = 0.0
     return K
 
 
@@ -240,8 +253,8 @@ def factor_differences(n: int, K: int, scratch: TrackScratch) -> int:
 def write_combined_root(
     joint: FloatArray, count: int, gain: FloatArray, scratch: TrackScratch, root: FloatArray
 ) -> None:
-    """Write the root of the covariance of ``e_own - gain d``, as a product of errors, so that it
-    stays positive semidefinite for any gain.
+    """Write the lower triangular ``root`` of cov(e_own - gain d) = W joint W', with the weights W
+    of all errors. In this form it is positive semidefinite for any gain, rounding included.
     """
     n, weights, P = len(root), scratch.weights, scratch.work
     for i in range(n):
@@ -253,7 +266,7 @@ def write_combined_root(
     for a in range(count + 1):
         for j in range(n):
             for i in range(n):
-                # Row i of the weights times the column of error j of track a.
+                # (W joint) for row i and error j of track a; then times W'.
                 total = 0.0
                 for b in range(count + 1):
                     for k in range(n):
@@ -265,16 +278,16 @@ def write_combined_root(
 
 @kernel
 def fill_cholesky(P: FloatArray, root: FloatArray) -> None:
-    """Write the lower triangular root (n, n) of P, of which the lower triangle is read; where P is
-    singular columns of zeros.
+    """Write the Cholesky ``root`` (n, n) of P, of which only the lower triangle is read; columns in
+    which P is singular become 0.
     """
     n = len(P)
     for j in range(n):
-        size = P[j, j]
+        square = P[j, j]
         for k in range(j):
-            size -= root[j, k] * root[j, k]
+            square -= root[j, k] * root[j, k]
         # Nothing but rounding is left where P is singular.
-        pivot = math.sqrt(size) if size > 0.0 else 0.0
+        pivot = math.sqrt(square) if square > 0.0 else 0.0
         root[j, j] = pivot
         for i in range(j + 1, n):
             total = P[i, j]

@@ -1,4 +1,4 @@
-"""Event triggers in kernels: how much news a reading brings, and whether a copy is near enough.
+"""Kernels of event triggers: the news in a reading, and whether a copy is near enough.
 
 Filter ``h`` of a block has index ``[b, h]`` of stacks with lanes (``netkf.linalg.lanes``):
 estimates (B, H, n, L), lower triangular roots (B, H, n, n, L).
@@ -14,7 +14,7 @@ from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
 from netkf.linalg.lanes import Lanes, load, magnitude, select, spread, store
 
-NO_READING = -1.0  # z' Y z is never negative, so that this cannot be the news of a reading
+NO_READING = -1.0  # not the news of any reading, since z' Y z is never negative
 
 
 @kernel
@@ -35,9 +35,10 @@ def weigh_news(
     Y: FloatArray,
     z: FloatArray,
 ) -> Any:
-    """Return ``z' Y z`` with the innovation z = y - H x of the whitened reading of so many ``rows``
-    at ``index`` [b, s, h] and x (B, H, n, L); Y (H, p, p) is for whitened rows. NO_READING where
-    there is none. ``z`` (p, L) is scratch.
+    """Return the news ``z' Y z`` (L,) of a whitened reading with ``rows`` rows at ``index`` [b, s,
+    h], with its innovation z = y - H x; NO_READING in lanes without a reading.
+
+    x (B, H, n, L) are the estimates, Y (H, p, p) is for whitened rows, ``z`` (p, L) is scratch.
     """
     b, s, h = index
     # H that is fixed has one block and one slot.
@@ -54,7 +55,7 @@ def weigh_news(
     for k in range(rows):
         for j in range(rows):
             news += Y[h, k, j] * load(lanes, z, k) * load(lanes, z, j)
-    # Rows that a recorded sensor lacks are zeros.
+    # A slot in which a recorded sensor has no row holds zeros: no reading.
     return select(size > 0.0, select(news > 0.0, news, 0.0), NO_READING)
 
 
@@ -70,37 +71,38 @@ def is_near(
     ratio: FloatArray,
     work: FloatArray,
 ) -> Any:
-    """Return the flags of ``|S^-1 (x - xbar)|^2 < alpha``, ``P < (1 + delta) Pbar`` and
-    ``Pbar < (1 + delta) P`` with ``bounds`` alpha and 1 + delta.
+    """Return flags (L,): the copy is near the estimate, ``|S^-1 (x - xbar)|^2 < alpha`` and
+    ``P < (1 + delta) Pbar`` and ``Pbar < (1 + delta) P``, for ``bounds`` (alpha, 1 + delta).
 
-    x and the root S of P are those of ``index`` [b, h, k], xbar and the root of Pbar the copy at
-    ``[b, k]``; ``ratio`` (n, n + 1, L) and ``work`` (n, n, L) are scratch.
+    ``index`` is [b, h, k]: x and the root S of P are those of filter h of block b, xbar and the
+    root of Pbar are copy k of the block. ``ratio`` (n, n + 1, L) and ``work`` (n, n, L) are
+    scratch.
     """
     (b, h, k), n = index, x.shape[2]
     distance = spread(lanes, 0.0)
     # S^-1 [Sbar, x - xbar] by forward substitution; both roots are lower triangular.
     for i in range(n):
         inverse = 1.0 / load(lanes, root, b, h, i, i)
-        gap = load(lanes, x, b, h, i) - load(lanes, copies_x, b, k, i)
+        distance_row = load(lanes, x, b, h, i) - load(lanes, copies_x, b, k, i)
         for j in range(i + 1):
             value = load(lanes, copies_root, b, k, i, j)
             for m in range(j, i):
                 value -= load(lanes, root, b, h, i, m) * load(lanes, ratio, m, j)
             store(lanes, ratio, i, j, value * inverse)
         for m in range(i):
-            gap -= load(lanes, root, b, h, i, m) * load(lanes, ratio, m, n)
-        gap *= inverse
-        store(lanes, ratio, i, n, gap)
-        distance += gap * gap
+            distance_row -= load(lanes, root, b, h, i, m) * load(lanes, ratio, m, n)
+        distance_row *= inverse
+        store(lanes, ratio, i, n, distance_row)
+        distance += distance_row * distance_row
     near = select(distance < bounds[0], 1.0, 0.0)
-    # P^-1 Pbar has the eigenvalues of M M', the product of the ratio and its transpose.
+    # With M = S^-1 Sbar, P^-1 Pbar has the eigenvalues of M M'. Both bounds on P mean that a matrix
+    # is positive definite: (1 + delta) M M' - I, then (1 + delta) I - M M'.
     for sign in (-1.0, 1.0):
         for i in range(n):
             for j in range(i + 1):
                 total = spread(lanes, 0.0)
                 for m in range(j + 1):
                     total += load(lanes, ratio, i, m) * load(lanes, ratio, j, m)
-                # (1 + delta) M M' - I and (1 + delta) I - M M'.
                 entry = bounds[1] * total if sign < 0.0 else -total
                 if i == j:
                     entry += -1.0 if sign < 0.0 else bounds[1]
@@ -111,17 +113,17 @@ def is_near(
 
 @kernel(inlined=True)
 def is_positive(lanes: Lanes, work: FloatArray) -> Any:
-    """Return the flags of the symmetric matrices (n, n, L), given by their lower triangles, that
-    are positive definite; works in place.
+    """Return flags (L,) of the symmetric matrices ``work`` (n, n, L), given by their lower
+    triangles, that are positive definite: L D L' elimination in place has positive pivots only.
     """
-    n, least = len(work), spread(lanes, math.inf)
+    n, smallest_pivot = len(work), spread(lanes, math.inf)
     for k in range(n):
         pivot = load(lanes, work, k, k)
-        # Once a pivot is not positive those that follow mean nothing.
-        least = select(pivot < least, pivot, least)
+        # A pivot that is not positive decides; the ones after it do not matter.
+        smallest_pivot = select(pivot < smallest_pivot, pivot, smallest_pivot)
         for i in range(k + 1, n):
             factor = load(lanes, work, i, k) / pivot
             for j in range(k + 1, i + 1):
                 entry = load(lanes, work, i, j) - factor * load(lanes, work, j, k)
                 store(lanes, work, i, j, entry)
-    return least > 0.0
+    return smallest_pivot > 0.0

@@ -183,7 +183,7 @@ def predict_with_increments(
     state: Simulation, run: int, h: int, k: int, piece: int, now: float, time: float
 ) -> None:
     """Predict node ``h`` up to ``time`` with its increments, in as many intervals as P asks for."""
-    seen, least = state.table.seen[state.nodes[h].model], 0.0
+    seen, least = state.table.whitened_H[state.nodes[h].model], 0.0
     while now < time:
         # How much of the gap may be used at once depends on the rate of information, trace(P G).
         rate = information_rate(ONE, state.size, seen, state.root[k])

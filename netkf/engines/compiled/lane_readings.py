@@ -74,7 +74,7 @@ def empty_readings(filters: Filters) -> LaneReadings:
     names = ("rate", "trace", "gap", "left", "first", "share")
     shapes = {
         "moments": (q, LANES),
-        "seen": (*filters.table.seen.shape[1:], LANES),
+        "seen": (*filters.table.whitened_H.shape[1:], LANES),
         "H": (1, p, n, LANES),
         "root": (1, p, p, LANES),
         **dict.fromkeys(names, (1, LANES)),

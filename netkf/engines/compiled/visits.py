@@ -20,7 +20,7 @@ from netkf.algorithms.kernels.root_flow import (
     cholesky_in_lanes,
     condition_root,
     information_rate,
-    place_of_flow,
+    offset_of_F,
     propagate_mean,
     propagate_root,
     takes_one_step,
@@ -351,7 +351,7 @@ def fill_rates(state: Simulation, visits: Visits, count: int) -> None:
         interval = visits.intervals[ring_index(visits, visits.begun + q)]
         visit = visits.records[interval.visit]
         h = node_at(state, visit.run, interval.place)
-        load_model(readings, q, state.nodes[h].model, state.table.seen)
+        load_model(readings, q, state.nodes[h].model, state.table.whitened_H)
     # Both are found for all lanes at once, before each lane decides how far it goes.
     store(MANY, readings.rate, 0, information_rate(MANY, size, readings.seen, visits.S))
     store(MANY, readings.trace, 0, trace_of_root(MANY, size, visits.S))
@@ -521,7 +521,7 @@ def predict_lanes(state: Simulation, visits: Visits, reads: bool) -> None:
     moved = local_lanes_vector(size, MANY, visits.moved)
     propagate_mean(MANY, size, visits.x, values, moved)
     cholesky_in_lanes(MANY, size, T, values)
-    transform_root(MANY, size, S, values, place_of_flow(n, reads), V, T)
+    transform_root(MANY, size, S, values, offset_of_F(n, reads), V, T)
     for i in range(n):
         for j in range(i + 1):
             store(MANY, visits.S, i, j, load(MANY, S, i, j))
