@@ -12,7 +12,7 @@ from netkf.linalg.compiling import kernel
 from netkf.linalg.lanes import LANES, MANY, load, store
 
 ROUNDING = 2.0**-56  # of the largest term of an entry: an eighth of what a double rounds
-FLOOR = 1e-30  # of the largest entry
+NOTHING = 1e-30  # of the largest entry
 ORDER_7, ORDER_8, ORDER_9, ORDER_12, ORDER_16 = (0,) * 7, (0,) * 8, (0,) * 9, (0,) * 12, (0,) * 16
 MANY_TERMS = (8, 10)
 OCTAVES, STEPS = 8, 4  # gaps that are tried: as many halves of the longest, in steps of an octave
@@ -37,7 +37,7 @@ def with_reach(series: FloatArray, longest: float) -> FloatArray:
     largest = sizes.max(axis=1)
     # Rounding is relative to each entry, with a floor relative to the largest, for entries that
     # vanish.
-    most = ROUNDING * largest + FLOOR * largest.max(axis=1, initial=0.0)[:, None]
+    most = ROUNDING * largest + NOTHING * largest.max(axis=1, initial=0.0)[:, None]
     # Number of terms after which the rest of some entry is still above rounding, for each gap.
     needed = (left > most[:, None]).any(axis=2).sum(axis=1)
     # maximum.accumulate: a longer gap must not need fewer terms because of rounding here.
