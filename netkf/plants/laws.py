@@ -179,14 +179,14 @@ def course_width(n: int) -> int:
 
 
 def course_table(to_end: FloatArray, n: int, longest: float) -> FloatArray:
-    """Return the table (D, n + 4, W) of what ``paths.fill_course`` multiplies with the state at the
+    """Return the table (D, 5 n, W) of what ``paths.fill_course`` multiplies with the state at the
     start of a piece of at most so many seconds, by powers of its length, and with the four Legendre
-    coefficients of its cubic. Columns are those of the course.
+    coefficients of its cubic, (4, n) in row-major order. Columns are those of the course.
     """
     # Terms beyond are below rounding, see linalg/series.
     needed = int(np.searchsorted(to_end[:-1, -1], longest)) + 1
     terms = max(needed, 4)  # those of a cubic
-    table = np.zeros((terms, n + 4, course_width(n)))
+    table = np.zeros((terms, 5 * n, course_width(n)))
     # Integrals of u^d and of u u^d over the share u of a piece.
     plain, tilted = 1.0 / np.arange(1, terms + 1), 1.0 / np.arange(2, terms + 2)
     response = np.zeros((terms, n, n))
@@ -194,8 +194,8 @@ def course_table(to_end: FloatArray, n: int, longest: float) -> FloatArray:
     table[:, :n, :n] = np.swapaxes(response, 1, 2) * plain[:, None, None]
     table[:, :n, n : 2 * n] = np.swapaxes(response, 1, 2) * tilted[:, None, None]
     for i in range(n):
-        table[:4, n:, i] = LEGENDRE * plain[:4, None]
-        table[:4, n:, n + i] = LEGENDRE * tilted[:4, None]
+        table[:4, n + i :: n, i] = LEGENDRE * plain[:4, None]
+        table[:4, n + i :: n, n + i] = LEGENDRE * tilted[:4, None]
     return table
 
 

@@ -506,34 +506,30 @@ def state_moments(laws: GridLaws, step: PathStep, start: float, end: float) -> F
         return step.moments
     since, gap, length = start - step.start, end - start, step.end - step.start
     table = laws.course_table
-    out, course = np.empty((2, n)), np.empty((len(table), table.shape[2]))
-    path, scratch = (step.x_start[None], step.cubic[None]), np.zeros(4 * course.shape[1])
-    fill_course(course, table, length, *path, 0, scratch)
-    fill_state_moments(np.zeros(n), out, course, since, gap, length, scratch)
+    size, out, course = np.zeros(n), np.empty((2, n)), np.empty((len(table), table.shape[2]))
+    fill_course(size, course, table, length, step.x_start[None], step.cubic[None], 0)
+    fill_state_moments(size, out, course, since, gap, length, np.zeros(2 * course.shape[1]))
     return out
 
 
 @kernel(fused=True)
 def fill_course(
+    size: Size,
     out: FloatArray,
     table: FloatArray,
     length: float,
     x_start: FloatArray,
     cubic: FloatArray,
     k: int,
-    scratch: FloatArray,
 ) -> None:
     """Write piece ``k`` of ``length`` seconds as a polynomial in the share u of the piece:
     coefficients (D, W >= 2 n) such that ``u sum_d u^d out[d, :n]`` is the integral of x up to
     there, and ``u^2 sum_d u^d out[d, n : 2 n]`` that of x times the share; ``table`` is
-    GridLaws.course_table, ``scratch`` has 4 W entries.
+    GridLaws.course_table.
     """
-    n, width, power = x_start.shape[1], out.shape[1], length
-    for c in range(4):
-        for i in range(n):
-            scratch[c * width + i] = scratch[c * width + n + i] = length * cubic[k, c, i]
+    n, power = len(size), length
     for d in range(len(out)):
-        for j in range(0, width, LANES):
+        for j in range(0, out.shape[1], LANES):
             # The response to the state at the start: exp(A s) x by powers of s = u length.
             total = spread(MANY, 0.0)
             for i in range(n):
@@ -542,7 +538,9 @@ def fill_course(
             # What noise adds is a cubic.
             if d < 4:
                 for c in range(4):
-                    total += load(MANY, table, d, n + c, j) * load(MANY, scratch, c * width + j)
+                    for i in range(n):
+                        row = load(MANY, table, d, (1 + c) * n + i, j)
+                        total += row * (length * cubic[k, c, i])
             store(MANY, out, d, j, total)
         power *= length
 

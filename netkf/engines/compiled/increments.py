@@ -74,9 +74,9 @@ def find_course(state: Simulation, run: int, piece: int) -> int:
     # The same for all nodes that read a part of the piece.
     if path.known[k, place] != piece:
         path.known[k, place] = piece
-        length, values = path.stop[piece] - path.start[piece], state.scratch.values
-        x_start, cubic, course = path.x_start[run], path.cubic[run], path.course[k, place]
-        fill_course(course, path.table, length, x_start, cubic, piece, values)
+        length, course = path.stop[piece] - path.start[piece], path.course[k, place]
+        x_start, cubic = path.x_start[run], path.cubic[run]
+        fill_course(state.size, course, path.table, length, x_start, cubic, piece)
     return place
 
 

@@ -417,8 +417,8 @@ def scratch_arrays(
         cut=np.zeros((2, most // 2)),
         state_moments=np.zeros((2, n)),
         total=np.zeros((2, n)),
-        # fill_course() needs four rows of a course, and fill_seen() two.
-        values=np.zeros(max(width, 4 * course_width(n))),
+        # fill_state_moments() needs two rows of a course.
+        values=np.zeros(max(width, 2 * course_width(n))),
         y=np.zeros(q),
         H=np.zeros((q, n)),
         root_R=np.zeros((q, q)),
