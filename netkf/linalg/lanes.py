@@ -13,6 +13,7 @@ L neighbours from ``array[place]`` on; with one lane that is the entry itself.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -45,10 +46,12 @@ def unset(shape: tuple[int, ...]) -> Any:
     return memory[start : start + math.prod(shape)].reshape(shape)
 
 
-def with_spare(shape: tuple[int, ...]) -> Any:
-    """Zeros as ``aligned``, with memory for a block of L by L behind them."""
+def with_spare(shape: tuple[int, ...], make: Callable[[tuple[int, ...]], Any] = aligned) -> Any:
+    """An array that ``make`` (``aligned`` or ``unset``) makes, with memory for a block of L by L
+    behind it.
+    """
     entries = math.prod(shape)
-    return aligned((entries + LANES * LANES,))[:entries].reshape(shape)
+    return make((entries + LANES * LANES,))[:entries].reshape(shape)
 
 
 def blocks_of(runs: int, lanes: int = LANES) -> int:

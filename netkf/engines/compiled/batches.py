@@ -244,12 +244,11 @@ class RunDraws:
         self._batch, self._run, self.instants = batch, run, batch.instants
         self.states: States = PathStates(scenario, batch.paths.frame_times)
         shared, count = batch.sensing, len(batch.sensing.rows)
-        one, streams = slice(run, run + 1), slice(run * count, (run + 1) * count)
-        mine = {name: getattr(shared, name)[streams] for name in ("rest", "step", "cuts")}
-        fixed = ("rows", "kind", "H", "root", "height", "width", "inside", "index", "node")
-        self.sensing = Sensing(
-            **{name: getattr(shared, name) for name in fixed}, **mine, noise=shared.noise[one]
-        )
+        fields = {name: getattr(shared, name) for name in Sensing.struct_fields}
+        # Streams are in the order of the runs.
+        fields["cuts"] = shared.cuts[run * count :][:count]
+        fields["noise"] = shared.noise[run * count * shared.steps :][: count * shared.steps]
+        self.sensing = Sensing(**fields)
 
     def window(self) -> Window:
         """All ticks."""

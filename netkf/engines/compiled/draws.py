@@ -12,7 +12,7 @@ from netkf.engines.compiled.kept import once_per_scenario
 from netkf.engines.compiled.state import PathBlock, Sensing
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
-from netkf.linalg.lanes import aligned, with_spare
+from netkf.linalg.lanes import aligned, unset, with_spare
 from netkf.linalg.portable import cholesky
 from netkf.plants.diffusion import NO_TIMES
 from netkf.plants.laws import course_width, grid_time
@@ -201,23 +201,21 @@ class Noise:
         self.sensing = Sensing(
             **shared,
             # Rows that a sensor does not have stay 0.
-            noise=(np.empty if even else np.zeros)((runs, count, steps, 2, most)),
-            rest=with_spare((runs * count, 2, most)),
-            step=np.full(runs * count, -1, dtype=np.int64),
+            noise=with_spare((runs * count * steps, 2, most), unset if even else aligned),
+            steps=steps,
             cuts=cuts.states,
             **ziggurat._asdict(),
         )
 
     def following(self) -> None:
         """Draw the noise of the next block."""
-        sensing, shape = self.sensing, self.sensing.noise.shape
+        sensing = self.sensing
         # Streams of all runs and sensors, run by run.
-        normals = sensing.noise.reshape(shape[0] * shape[1], *shape[2:])
+        shape = len(sensing.cuts), sensing.steps, *sensing.noise.shape[1:]
+        normals = sensing.noise.reshape(shape)
         # Standard normals become moments of white noise over one step: variances h and h / 3.
         scales = step_noise(np.ones((2, 1)), self._period)[:, 0]
         fill_noise(self._noise.states, sensing.rows, normal_ziggurat(), scales, normals)
-        # No sensor has begun a step of this block.
-        sensing.step[:] = -1
 
 
 @kernel

@@ -27,7 +27,7 @@ def read_increments(
     x, H, root, row = state.scratch.state_moments, sensing.H, sensing.root, 0
     step, last = state.path.step[piece], state.path.last[piece]
     for s in range(state.nodes[h].sensor, state.nodes[h].sensors):
-        noise = sensing.rest[begin_step(sensing, run, s, step)]
+        noise = sensing.noise[noise_index(sensing, run, s, step)]
         # A part of the step: divide its noise exactly, and keep the rest for the next call.
         if end < last:
             draw_cut(sensing, run, s, state.scratch.cut)
@@ -39,17 +39,9 @@ def read_increments(
 
 
 @kernel(inlined=True)
-def begin_step(sensing: Sensing, run: int, s: int, step: int) -> int:
-    """Return the index of the remaining noise of sensor ``s`` in a step; the first reading of the
-    step copies it.
-    """
-    # Streams are numbered run by run, sensor by sensor.
-    k = run * len(sensing.rows) + s
-    # The first reading of a step takes over the noise of that step.
-    if sensing.step[k] != step:
-        sensing.step[k] = step
-        copy_matrix(sensing.rest[k], sensing.noise[run, s, step])
-    return k
+def noise_index(sensing: Sensing, run: int, s: int, step: int) -> int:
+    """Return the index in ``sensing.noise`` of sensor ``s`` in a step of a run."""
+    return (run * len(sensing.rows) + s) * sensing.steps + step
 
 
 @kernel

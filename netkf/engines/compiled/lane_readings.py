@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 
 from netkf.engines.compiled.increments import (
-    begin_step,
     draw_cut,
     fill_moments,
     fill_readings,
     find_course,
+    noise_index,
     piece_of,
 )
 from netkf.engines.compiled.state import Filters, Sensing, Simulation
@@ -160,7 +160,7 @@ def begin_reading(
     """
     path, sensing, s = state.path, state.sensing, state.nodes[h].sensor
     load_sensor(readings, q, sensing, s)
-    readings.stream[q] = begin_step(sensing, run, s, path.step[piece])
+    readings.stream[q] = noise_index(sensing, run, s, path.step[piece])
     last, normals = path.last[piece], state.scratch.cut
     readings.gap[0, q], readings.left[0, q] = end - now, last - now
     # The whole rest needs none: what a lane has is multiplied by 0.
@@ -202,11 +202,11 @@ def end_readings(state: Simulation, readings: LaneReadings) -> None:
         turn(MANY, r.rows, j, r.integrals)
     first, share = load(MANY, r.first, 0), load(MANY, r.share, 0)
     fill_moments_between(MANY, size, r.x, r.integrals, r.rows.shape[1] // 2, first, share)
-    rest, streams = state.sensing.rest, r.stream
+    noise, places = state.sensing.noise, r.stream
     for j in range(0, 2 * p, LANES):
-        gather(MANY, rest, streams, j, r.rest)
+        gather(MANY, noise, places, j, r.rest)
     left = load(MANY, r.left, 0)
     divide(MANY, r.early, r.rest, r.normals, load(MANY, r.gap, 0) / left, left)
     for j in range(0, 2 * p, LANES):
-        scatter(MANY, r.rest, j, rest, streams, 2 * p - j)
+        scatter(MANY, r.rest, j, noise, places, 2 * p - j)
     fill_reading(MANY, size, r.moments, 0, p, r.x, r.H, r.early, r.root, 0)

@@ -117,8 +117,8 @@ class Sensing(Struct):
 
     rows, kind : (S,), number of rows; sensors of one kind have the same H and R
     H, root : (S, p, n) and the root of R (S, p, p)
-    noise : of the steps (R, S, steps, 2, p)
-    rest, step : noise left of the present step (R S, 2, p), and its number (R S,)
+    noise : (R S steps, 2, p), run by run and sensor by sensor: what is left of the noise of each of
+        so many ``steps``, since a reading of a part of a step takes its share of the noise away
     cuts : streams (R S, 4) of normals for parts of a step
     height, width, inside : numpy's ziggurat table for these
     index, node : (K,), index and id of the nodes that wake at a grid point, in order
@@ -129,8 +129,7 @@ class Sensing(Struct):
     H: FloatArray
     root: FloatArray
     noise: FloatArray
-    rest: FloatArray
-    step: IntArray
+    steps: int
     cuts: np.ndarray
     height: FloatArray
     width: FloatArray
