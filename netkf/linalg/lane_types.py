@@ -279,6 +279,28 @@ def _exchanged(builder: Any, a: Any, b: Any, half: int) -> tuple[Any, Any]:
     return first, second
 
 
+@_typed(names.prefetch)
+def _prefetch(_array: Any, *_place: Any) -> Any:
+    return types.none
+
+
+@lower_builtin(names.prefetch, types.VarArg(types.Any))
+def lower_prefetch(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+    """Emit the instruction that asks for a line of memory."""
+    kind = sig.args[0]
+    places = [
+        context.cast(builder, value, number, types.intp)
+        for value, number in zip(args[1:], sig.args[1:], strict=True)
+    ]
+    places += [ir.Constant(I64, 0)] * (kind.ndim - len(places))
+    pointer = builder.bitcast(entry_pointer(builder, kind, args[0], places), cgutils.voidptr_t)
+    kinds = ir.FunctionType(ir.VoidType(), [cgutils.voidptr_t, I32, I32, I32])
+    asked = cgutils.get_or_insert_function(builder.module, kinds, "llvm.prefetch.p0")
+    # LLVM's arguments: to be read (0), kept in all caches (3), data (1).
+    builder.call(asked, [pointer, I32(0), I32(3), I32(1)])
+    return context.get_dummy_value()
+
+
 @_typed(names.spread)
 def _spread_type(lanes: Any, _number: Any) -> Any:
     return value_type(len(lanes))

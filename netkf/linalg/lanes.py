@@ -107,6 +107,13 @@ def store(lanes: Lanes, array: FloatArray, *place_and_value: Any) -> None:
     raise _only_in_kernels()
 
 
+def prefetch(array: np.ndarray, *place: int) -> None:
+    """Ask the processor for the line of memory where ``array[place]`` begins, before it is needed.
+    Nothing happens if there is none.
+    """
+    raise _only_in_kernels()
+
+
 def spread(lanes: Lanes, number: float) -> Any:
     """Return a number in all lanes as one value."""
     raise _only_in_kernels()

@@ -18,6 +18,7 @@ from netkf.linalg.lanes import (
     load,
     load_flags,
     magnitude,
+    prefetch,
     root_of,
     scatter,
     select,
@@ -140,3 +141,23 @@ def test_rows_go_into_lanes_and_back(shape):
     expected[known] = array[known]
     np.testing.assert_array_equal(out, expected)
     np.testing.assert_array_equal(turned, rows.T)
+
+
+@kernel
+def add_while_fetching(rows, out):
+    """Sums of rows, each asked for while the one before is added up; the last asks for none."""
+    for i in range(len(rows)):
+        prefetch(rows, i + 1)
+        out[i] = 0.0
+        for j in range(rows.shape[1]):
+            out[i] += rows[i, j]
+
+
+def test_asking_for_memory_changes_nothing():
+    rows, out = np.random.default_rng(6).normal(size=(40, 300)), np.empty(40)
+    kept = rows.copy()
+    add_while_fetching(rows, out)
+    np.testing.assert_allclose(out, kept.sum(axis=1), rtol=1e-12)
+    np.testing.assert_equal(rows, kept)
+    (code,) = add_while_fetching._called_from_python.inspect_llvm().values()
+    assert "call void @llvm.prefetch" in code

@@ -31,7 +31,7 @@ from netkf.algorithms.kernels.root_flow import (
 )
 from netkf.algorithms.kernels.root_update import absorb_columns
 from netkf.engines.compiled.event_loop import store_sample
-from netkf.engines.compiled.increments import advance_over_interval, next_interval
+from netkf.engines.compiled.increments import advance_over_interval, next_interval, noise_index
 from netkf.engines.compiled.lane_readings import (
     LaneReadings,
     begin_reading,
@@ -48,7 +48,7 @@ from netkf.engines.compiled.lane_series import (
 from netkf.engines.compiled.state import Filters, Simulation
 from netkf.linalg.arrays import FloatArray, IntArray
 from netkf.linalg.compiling import kernel
-from netkf.linalg.lanes import LANES, MANY, gather, load, scatter, store, turn, with_spare
+from netkf.linalg.lanes import LANES, MANY, gather, load, prefetch, scatter, store, turn, with_spare
 from netkf.linalg.local import local_lanes_matrix, local_lanes_vector
 from netkf.linalg.series import fill_row
 from netkf.linalg.structs import Struct
@@ -261,6 +261,8 @@ def process_level(state: Simulation, visits: Visits, first: int) -> None:
     v, pairs = first, 0
     while v != -1:
         visit = visits.records[v]
+        # Records of a level are far apart: the next one comes while this one is processed.
+        prefetch(visits.records, max(visit.next, 0))
         if visit.second == ALL_NODES:
             store_sample(state, visit.run, visit.first, visit.piece)
         else:
@@ -289,7 +291,7 @@ def queue_prediction(state: Simulation, visits: Visits, v: int, place: int) -> N
     state.now[place] = visit.time
     m, gap = visits.model[place], visit.time - now
     if m == HAS_SENSORS:
-        queue_interval(visits, place, v, now, 0.0)
+        queue_interval(state, visits, place, v, now, 0.0)
         return
     # Without sensors one step is exact for any P, if the gap lies inside the table of series.
     if not gap < visits.longest[m]:
@@ -315,7 +317,9 @@ def ring_index(visits: Visits, number: int) -> int:
 
 
 @kernel
-def queue_interval(visits: Visits, place: int, v: int, now: float, least: float) -> None:
+def queue_interval(
+    state: Simulation, visits: Visits, place: int, v: int, now: float, least: float
+) -> None:
     """Queue a sensing node, predicted up to ``now`` so far, for the next interval on its way to
     visit ``v``.
     """
@@ -323,6 +327,21 @@ def queue_interval(visits: Visits, place: int, v: int, now: float, least: float)
     interval = visits.intervals[ring_index(visits, visits.added)]
     interval.place, interval.visit, interval.now, interval.least = place, v, now, least
     visits.added += 1
+    prefetch_path_and_noise(state, visits, v, place)
+
+
+@kernel
+def prefetch_path_and_noise(state: Simulation, visits: Visits, v: int, place: int) -> None:
+    """Prefetch the path and the noise in the piece of visit ``v``, from which the node at a place
+    will read.
+    """
+    # Each run has its own path and noise, far from each other: waiting for them took 4 % of a run.
+    path, visit = state.path, visits.records[v]
+    run, piece = visit.run, visit.piece
+    s = state.nodes[node_at(state, run, place)].sensor
+    prefetch(path.x_start, run, piece)
+    prefetch(path.cubic, run, piece)
+    prefetch(state.sensing.noise, noise_index(state.sensing, run, s, path.step[piece]))
 
 
 @kernel
@@ -376,7 +395,7 @@ def begin_interval(state: Simulation, visits: Visits, q: int) -> None:
         advance_over_interval(state, visit.run, h, place, visit.piece, now, end)
     # The rest of the gap waits for its turn, with the covariance that this interval leaves.
     if end < time:
-        queue_interval(visits, place, v, end, least)
+        queue_interval(state, visits, place, v, end, least)
 
 
 @kernel(inlined=True)
