@@ -17,7 +17,7 @@ from netkf.algorithms.kernels.slots import (
     predict_all,
     read_all,
     rebase,
-    show,
+    store_sample_of_slot,
 )
 from netkf.algorithms.registry import built_in
 from netkf.linalg.compiling import kernel
@@ -38,7 +38,7 @@ def local_slots(
             if plan.sensed[s]:
                 predict_all(nodes, scratch, b)
                 read_all(nodes, readings, scratch, b, s)
-            show(nodes, plan, samples, scratch, b, s)
+            store_sample_of_slot(nodes, plan, samples, scratch, b, s)
             rebase(nodes, readings, scratch, b, s)
 
 

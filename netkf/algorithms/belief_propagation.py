@@ -42,7 +42,7 @@ from netkf.algorithms.kernels.slots import (
     predict_all,
     predict_mean,
     rebase,
-    show,
+    store_sample_of_slot,
     whiten_reading,
 )
 from netkf.algorithms.models import SlotModel, first_root
@@ -162,7 +162,7 @@ def belief_slots(
                         )
                 for h in range(len(nodes.rows)):
                     update_beliefs(nodes, links, scratch, arrays, b, h)
-            show(nodes, plan, samples, scratch, b, s)
+            store_sample_of_slot(nodes, plan, samples, scratch, b, s)
             # Evidence counts from the estimate, and moves along.
             rebase(nodes, readings, scratch, b, s)
 

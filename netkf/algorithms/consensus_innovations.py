@@ -31,7 +31,7 @@ from netkf.algorithms.filter import Exchange, Filter, Message, NodeInfo, Reading
 from netkf.algorithms.kernels.pseudo_states import (
     correct_pseudo,
     correct_state,
-    innovate,
+    fill_pseudo_innovation,
     predict_pseudo,
     shift_pseudo,
 )
@@ -46,8 +46,8 @@ from netkf.algorithms.kernels.slots import (
     block_of_reading,
     predict_mean,
     rebase,
-    show,
     star_of,
+    store_sample_of_slot,
     whiten_reading,
 )
 from netkf.algorithms.registry import built_in
@@ -371,7 +371,7 @@ def pseudo_slots(
                     )  # fmt: skip
                     predict_mean(nodes, scratch, b, h)
                 correct_all(nodes, readings, plan, links, scratch, arrays, b, s)
-            show(nodes, plan, samples, scratch, b, s)
+            store_sample_of_slot(nodes, plan, samples, scratch, b, s)
             rebase(nodes, readings, scratch, b, s)
             shift_pseudo(scratch.lanes, arrays.yhat, readings, arrays.pseudo.G, b, s)
 
@@ -390,7 +390,7 @@ def correct_all(
     """Correct all filters of a block by their readings and what they hear in slot ``s``."""
     lanes, k = scratch.lanes, arrays.table_row[s]
     for h in range(len(nodes.rows)):
-        innovate(
+        fill_pseudo_innovation(
             lanes, arrays.yhat, b, h, nodes.rows[h], arrays.pseudo.inverse, readings, s,
             arrays.state, arrays.z,
         )  # fmt: skip
@@ -428,7 +428,7 @@ def correct_single(
     """Correct one node, the first of ``arrays.yhat`` (1, H, n, 1), with one lane."""
     gains, pseudo = arrays.gains, arrays.pseudo
     y, state, z = arrays.yhat, arrays.state, arrays.z
-    innovate(ONE, y, 0, 0, readings.y.shape[3], pseudo.inverse, readings, 0, state, z)
+    fill_pseudo_innovation(ONE, y, 0, 0, readings.y.shape[3], pseudo.inverse, readings, 0, state, z)
     correct_pseudo(ONE, y, 0, 0, links, up, 0, gains.B[0], gains.M[0], z, arrays.corrected)
     correct_state(ONE, x, y, 0, 0, gains.K[0], pseudo.G, arrays.corrected, state)
 

@@ -30,7 +30,7 @@ from netkf.algorithms.kernels.slots import (
     predict_all,
     predict_root_alone,
     rebase,
-    show,
+    store_sample_of_slot,
 )
 from netkf.algorithms.models import FlowModel, SlotModel, first_root, usable
 from netkf.algorithms.pairs import weighted_pairs
@@ -94,7 +94,7 @@ def constant_gain_slots(
                 copy_pairs(nodes, scratch, b)
                 for h in range(len(nodes.rows)):
                     combine_convex_roots(nodes, plan, links, scratch, b, s, h)
-            show(nodes, plan, samples, scratch, b, s)
+            store_sample_of_slot(nodes, plan, samples, scratch, b, s)
             rebase(nodes, readings, scratch, b, s)
 
 

@@ -27,7 +27,7 @@ from netkf.algorithms.kernels.slots import (
     predict_all,
     read_all,
     rebase,
-    show,
+    store_sample_of_slot,
 )
 from netkf.algorithms.models import first_root
 from netkf.algorithms.pairs import pairs_now
@@ -105,7 +105,7 @@ def diffusion_slots(
     for b in range(plan.up.shape[0]):
         for s in range(plan.up.shape[1]):
             # Samples show predictions: before the reading of the slot.
-            show(nodes, plan, samples, scratch, b, s)
+            store_sample_of_slot(nodes, plan, samples, scratch, b, s)
             rebase(nodes, readings, scratch, b, s)
             if plan.sensed[s]:
                 read_all(nodes, readings, scratch, b, s)

@@ -21,8 +21,8 @@ from netkf.algorithms.kernels.slots import (
     SlotScratch,
     predict_all,
     rebase,
-    show,
     star_of,
+    store_sample_of_slot,
 )
 from netkf.algorithms.models import first_root, sample_update
 from netkf.algorithms.registry import built_in
@@ -79,7 +79,7 @@ def diffusion_kalman_slots(
                     )
                 for h in range(len(nodes.rows)):
                     add_to_estimate(scratch.lanes, nodes.xhat, b, h, scratch.xhat)
-            show(nodes, plan, samples, scratch, b, s)
+            store_sample_of_slot(nodes, plan, samples, scratch, b, s)
             rebase(nodes, readings, scratch, b, s)
 
 

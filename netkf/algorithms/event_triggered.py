@@ -29,7 +29,7 @@ from netkf.algorithms.kernels.slots import (
     predict_all,
     read_all,
     rebase,
-    show,
+    store_sample_of_slot,
     transform_mean,
 )
 from netkf.algorithms.kernels.triggers import is_near
@@ -132,7 +132,7 @@ def triggered_ci_slots(
                 if plan.exchanged[s]:
                     for h in range(len(nodes.rows)):
                         combine_copies(nodes, plan, links, scratch, arrays, b, s, h)
-                show(nodes, plan, samples, scratch, b, s)
+                store_sample_of_slot(nodes, plan, samples, scratch, b, s)
                 rebase(nodes, readings, scratch, b, s)
                 if readings.rebased[s]:
                     rebase_copies(readings, scratch.lanes, arrays, b, s)

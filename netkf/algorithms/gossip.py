@@ -17,7 +17,7 @@ from netkf.algorithms.kernels.slots import (
     predict_all,
     read_all,
     rebase,
-    show,
+    store_sample_of_slot,
 )
 from netkf.algorithms.registry import built_in
 from netkf.linalg.compiling import kernel
@@ -37,7 +37,7 @@ def gossip_slots(
     for b in range(plan.up.shape[0]):
         for s in range(plan.up.shape[1]):
             # Samples show predictions: before the reading of the slot.
-            show(nodes, plan, samples, scratch, b, s)
+            store_sample_of_slot(nodes, plan, samples, scratch, b, s)
             rebase(nodes, readings, scratch, b, s)
             if plan.exchanged[s]:
                 swap_pairs(nodes, plan, links, scratch, b, s)

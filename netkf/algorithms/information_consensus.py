@@ -24,7 +24,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 
 from netkf.algorithms.filter import Estimate, Exchange, Filter, Message, NodeInfo, Reading
-from netkf.algorithms.kernels.information import begin_part, mix_parts, read_off
+from netkf.algorithms.kernels.information import begin_part, mix_parts, write_estimate
 from netkf.algorithms.kernels.intersection import invert_lanes
 from netkf.algorithms.kernels.root_update import intersect_roots
 from netkf.algorithms.kernels.slots import (
@@ -37,9 +37,9 @@ from netkf.algorithms.kernels.slots import (
     block_of_reading,
     predict_all,
     rebase,
-    show,
     slot_scratch,
     star_of,
+    store_sample_of_slot,
     whiten_reading,
 )
 from netkf.algorithms.models import SlotModel, first_root
@@ -136,11 +136,11 @@ def consensus_slots(
                             scratch.xhat, scratch.total, scratch.whitened,
                         )  # fmt: skip
                 for h in range(len(nodes.rows)):
-                    read_off(
+                    write_estimate(
                         scratch.lanes, nodes.root, nodes.xhat, b, h, arrays.parts, arrays.steps % 2,
                         arrays.counts, scratch.root, scratch.xhat, scratch.total, scratch.whitened,
                     )  # fmt: skip
-            show(nodes, plan, samples, scratch, b, s)
+            store_sample_of_slot(nodes, plan, samples, scratch, b, s)
             rebase(nodes, readings, scratch, b, s)
 
 
@@ -193,9 +193,9 @@ def read_off_single(
     centre: FloatArray,
     work: FloatArray,
 ) -> None:
-    """Apply ``read_off`` to one node with one lane, root (1, 1, n, n, 1), x (1, 1, n, 1)."""
+    """Apply ``write_estimate`` to one node with one lane, root (1, 1, n, n, 1), x (1, 1, n, 1)."""
     invert_lanes(ONE, inverse, root, 0, 0)
-    read_off(ONE, root, x, 0, 0, parts, 0, counts, inverse, centre, work[0], work[1])
+    write_estimate(ONE, root, x, 0, 0, parts, 0, counts, inverse, centre, work[0], work[1])
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,7 +18,7 @@ from netkf.algorithms.kernels.slots import (
     SlotScratch,
     predict_all,
     rebase,
-    show,
+    store_sample_of_slot,
 )
 from netkf.algorithms.models import first_root, sample_update
 from netkf.algorithms.registry import built_in
@@ -89,7 +89,7 @@ def intermittent_slots(
     for b in range(plan.up.shape[0]):
         for s in range(plan.up.shape[1]):
             # Samples show predictions: before the reading of the slot.
-            show(nodes, plan, samples, scratch, b, s)
+            store_sample_of_slot(nodes, plan, samples, scratch, b, s)
             rebase(nodes, readings, scratch, b, s)
             if plan.sensed[s]:
                 for h in range(len(nodes.rows)):

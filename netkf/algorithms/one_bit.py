@@ -27,7 +27,7 @@ from netkf.algorithms.kernels.slots import (
     predict_all,
     rebase,
     rotate_lanes,
-    show,
+    store_sample_of_slot,
     whiten_reading,
 )
 from netkf.algorithms.models import first_root
@@ -111,7 +111,7 @@ def one_bit_slots(
             if plan.sensed[s]:
                 predict_all(nodes, scratch, b)
                 share_bits(nodes, readings, plan, links, scratch, arrays, turn, b, s)
-            show(nodes, plan, samples, scratch, b, s)
+            store_sample_of_slot(nodes, plan, samples, scratch, b, s)
             rebase(nodes, readings, scratch, b, s)
 
 

@@ -40,9 +40,9 @@ from netkf.algorithms.kernels.slots import (
     predict_all,
     predict_mean,
     rebase,
-    show,
     slot_scratch,
     star_of,
+    store_sample_of_slot,
     whiten_reading,
 )
 from netkf.algorithms.kernels.stopping import NEVER, PAPER, RULES, has_stopped
@@ -213,7 +213,7 @@ def push_sum_slots(
                     )  # fmt: skip
             if plan.sample[s] >= 0:
                 keep_sums(arrays, links, samples, scratch, b)
-            show(nodes, plan, samples, scratch, b, s)
+            store_sample_of_slot(nodes, plan, samples, scratch, b, s)
             rebase(nodes, readings, scratch, b, s)
 
 

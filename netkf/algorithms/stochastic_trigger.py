@@ -30,7 +30,7 @@ from netkf.algorithms.kernels.slots import (
     predict_all,
     rebase,
     rotate_lanes,
-    show,
+    store_sample_of_slot,
     transform_mean,
     update_by_reading,
     whiten_reading,
@@ -180,7 +180,7 @@ def scheduled_slots(
                 if plan.exchanged[s]:
                     for h in range(len(nodes.rows)):
                         update_by_sensors(nodes, readings, plan, links, scratch, arrays, b, s, h)
-                show(nodes, plan, samples, scratch, b, s)
+                store_sample_of_slot(nodes, plan, samples, scratch, b, s)
                 rebase(nodes, readings, scratch, b, s)
 
 

@@ -29,7 +29,7 @@ from netkf.algorithms.kernels.slots import (
     predict_all,
     read_all,
     rebase,
-    show,
+    store_sample_of_slot,
     whiten_reading,
 )
 from netkf.algorithms.kernels.tracks import (
@@ -92,7 +92,7 @@ def fusion_slots(
                 for h in range(len(nodes.rows)):
                     for q in range(len(scratch.lanes)):
                         fuse_heard(nodes, plan, links, scratch, arrays, (b, s, h, q))
-            show(nodes, plan, samples, scratch, b, s)
+            store_sample_of_slot(nodes, plan, samples, scratch, b, s)
             rebase(nodes, readings, scratch, b, s)
 
 
@@ -310,7 +310,7 @@ def track_slots(
                     for q in range(len(scratch.lanes)):
                         combine_heard(nodes, plan, links, arrays, (b, s, h, q))
         for b in range(plan.up.shape[0]):
-            show(nodes, plan, samples, scratch, b, s)
+            store_sample_of_slot(nodes, plan, samples, scratch, b, s)
             rebase(nodes, readings, scratch, b, s)
             rebase(tracks, readings, scratch, b, s)
 

@@ -1,10 +1,10 @@
-"""Belief propagation in kernels: evidence about the state, by who sent it.
+"""Kernels of belief propagation: sums of evidence about the state, kept apart by sender.
 
-Evidence is a pair of information as its root (Z, z), n by n + 1, see ``kernels.information``: Z is
-lower triangular, and z counts from a centre c (n,), ``Z (x - c) = z + v`` with cov(v) = I. Of a
-block of runs filter ``h`` has own readings ``own[h]`` (H, n, n + 1, L), and direction m of
-``SlotLinks`` has the evidence that its sender sent last, ``received[m]`` (W, n, n + 1, L), both
-counted from the centre of the filter that holds them.
+Evidence is an information pair as a root (Z, z), n by n + 1, see ``kernels.information``: Z is
+lower triangular, and z is relative to a centre c (n,), ``Z (x - c) = z + v`` with cov(v) = I. In a
+block of runs filter ``h`` holds the evidence of its own readings, ``own[h]`` (H, n, n + 1, L), and
+for each direction m of ``SlotLinks`` the evidence that its sender sent last, ``received[m]``
+(W, n, n + 1, L), both relative to its own centre. A ``part`` is one such array (n, n + 1, L).
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ from netkf.linalg.lanes import ONE, Lanes, any_lane, load, load_flags, select, s
 class BeliefScratch(NamedTuple):
     """Evidence (n, n + 1, L) that nodes send, and scratch.
 
-    every : all that each of H nodes has
-    others : for each of W directions, all of its receiver but what came from its sender
-    behind : (D + 1,) sums from the last of D directions on
+    all : (H, ...), sum of all evidence of each node
+    others : (W, ...), for each direction the evidence of its receiver without that of its sender
+    suffix : (D + 1, ...), entry k is the sum of the evidence of directions k to D - 1
     total, work : scratch
     """
 
-    every: FloatArray
+    all: FloatArray
     others: FloatArray
-    behind: FloatArray
+    suffix: FloatArray
     total: FloatArray
     work: FloatArray
 
@@ -56,7 +56,7 @@ def copy_part(lanes: Lanes, source: FloatArray, target: FloatArray) -> None:
 
 @kernel
 def add_part(lanes: Lanes, total: FloatArray, part: FloatArray, work: FloatArray) -> None:
-    """Add independent evidence to ``total``; ``work`` is scratch."""
+    """Add the independent evidence ``part`` to ``total``; ``work`` is scratch."""
     copy_part(lanes, part, work)
     merge_lanes(lanes, total, work)
 
@@ -65,8 +65,8 @@ def add_part(lanes: Lanes, total: FloatArray, part: FloatArray, work: FloatArray
 def recentre_part(
     lanes: Lanes, part: FloatArray, before: FloatArray, after: FloatArray, out: FloatArray
 ) -> None:
-    """Write evidence that counts from ``before`` (n, L) into ``out`` as it counts from ``after``;
-    both may be the same array.
+    """Move the centre of evidence from ``before`` (n, L) to ``after``: write it into ``out``, which
+    may be ``part`` itself.
     """
     n = len(part)
     for i in range(n):
@@ -83,13 +83,14 @@ def recentre_part(
 def predict_part(
     lanes: Lanes, part: FloatArray, back: FloatArray, total: FloatArray, work: FloatArray
 ) -> None:
-    """Turn evidence into that about a later state, from which ``back`` (n, n) leads to the earlier
-    one; the centre moves along. ``total`` and ``work`` are scratch.
+    """Predict evidence to a later state of a plant without noise, in place: ``Z <- Z back``, where
+    ``back`` (n, n) is the inverse transition, made triangular again. The caller predicts the
+    centre. ``total`` and ``work`` are scratch.
     """
     n = len(part)
     clear_part(lanes, total)
     for k in range(n):
-        # A row [Z back, z] is the last one of a lower triangular root.
+        # Merge row k of [Z back, z], as the last row of a lower triangular root.
         clear_part(lanes, work)
         for j in range(n):
             entry = spread(lanes, 0.0)
@@ -103,7 +104,9 @@ def predict_part(
 
 @kernel
 def write_prior(lanes: Lanes, root: FloatArray, b: int, h: int, part: FloatArray) -> None:
-    """Write an estimate with the regular ``root[b, h]`` as evidence that counts from itself."""
+    """Write the prior with the regular root S = ``root[b, h]`` as evidence: Z = S^-1, and z = 0
+    relative to its own mean.
+    """
     n = len(part)
     for i in range(n):
         inverse = 1.0 / load(lanes, root, b, h, i, i)
@@ -119,7 +122,7 @@ def write_prior(lanes: Lanes, root: FloatArray, b: int, h: int, part: FloatArray
 
 @kernel
 def write_prior_single(roots: FloatArray, h: int, part: FloatArray) -> None:
-    """Apply ``write_prior`` to one of the ``roots`` (1, H, n, n, 1) with one lane."""
+    """Apply ``write_prior`` to filter ``h`` of ``roots`` (1, H, n, n, 1) with one lane."""
     write_prior(ONE, roots, 0, h, part)
 
 
@@ -133,21 +136,20 @@ def gather_evidence(
     h: int,
     scratch: BeliefScratch,
 ) -> None:
-    """Add up what node ``h`` knows, from its own readings and what was received on directions from
-    ``first`` up to ``last``: all of it into ``every[h]``, and all but what came on direction m into
-    ``others[m]`` (``scratch`` is BeliefScratch).
+    """Sum the evidence of node ``h``, its own and that received on directions ``first`` to ``last``
+    - 1: all of it into ``all[h]``, and all but that of direction m into ``others[m]``.
     """
     D = last - first
-    # Sums from both ends leave one out in the middle without taking it away again.
-    clear_part(lanes, scratch.behind[D])
+    # The sum without direction k is a prefix sum plus a suffix sum: nothing is subtracted.
+    clear_part(lanes, scratch.suffix[D])
     for k in range(D - 1, 0, -1):
-        copy_part(lanes, scratch.behind[k + 1], scratch.behind[k])
-        add_part(lanes, scratch.behind[k], received[first + k], scratch.work)
-    copy_part(lanes, own[h], scratch.every[h])
+        copy_part(lanes, scratch.suffix[k + 1], scratch.suffix[k])
+        add_part(lanes, scratch.suffix[k], received[first + k], scratch.work)
+    copy_part(lanes, own[h], scratch.all[h])
     for k in range(D):
-        copy_part(lanes, scratch.every[h], scratch.others[first + k])
-        add_part(lanes, scratch.others[first + k], scratch.behind[k + 1], scratch.work)
-        add_part(lanes, scratch.every[h], received[first + k], scratch.work)
+        copy_part(lanes, scratch.all[h], scratch.others[first + k])
+        add_part(lanes, scratch.others[first + k], scratch.suffix[k + 1], scratch.work)
+        add_part(lanes, scratch.all[h], received[first + k], scratch.work)
 
 
 @kernel
@@ -161,8 +163,8 @@ def receive_evidence(
     centre: FloatArray,
     scratch: BeliefScratch,
 ) -> None:
-    """Replace the evidence from senders that node ``h`` hears, where ``up`` (at ``index`` [b, s,
-    e]) says that a message arrived.
+    """Replace the evidence of each sender to node ``h`` whose message arrives: ``up`` at ``index``
+    [b, s, e].
     """
     b, s, e = index
     n = received.shape[1]
@@ -172,7 +174,7 @@ def receive_evidence(
             continue
         # The sender leaves out the evidence of the receiver, which would otherwise come back and
         # count twice; in a directed graph it may not hear the receiver at all.
-        source = scratch.every[sender]
+        source = scratch.all[sender]
         for k in range(links.first[sender], links.first[sender + 1]):
             if links.sender[k] == h:
                 source = scratch.others[k]
@@ -180,5 +182,8 @@ def receive_evidence(
         for i in range(n):
             for j in range(n + 1):
                 if j <= i or j == n:
-                    before, now = load(lanes, received, m, i, j), load(lanes, scratch.work, i, j)
-                    store(lanes, received, m, i, j, select(arrived, now, before))
+                    former, replacement = (
+                        load(lanes, received, m, i, j),
+                        load(lanes, scratch.work, i, j),
+                    )
+                    store(lanes, received, m, i, j, select(arrived, replacement, former))

@@ -1,6 +1,6 @@
 """Random Riccati recursions of many chains side by side, in square-root form.
 
-A mode says which of several readings a chain gets in a slot: ``f_m(P) = F P F' + Q - F P H_m'
+In each slot a mode m selects one of several readings for a chain: ``f_m(P) = F P F' + Q - F P H_m'
 (H_m P H_m' + R_m)^-1 H_m P F'``, R (17) and G (11); a reading of no rows is ``f_0``, R (16).
 """
 
@@ -18,7 +18,7 @@ from netkf.algorithms.kernels.square_root import lower_triangular, step_root
 from netkf.linalg.arrays import FloatArray, as_kernel_array
 from netkf.linalg.compiling import kernel
 
-FEW = 4096  # chain steps for which threads do not pay
+FEW = 4096  # chain steps below which threads cost more than they save
 
 
 class ReadingModes(NamedTuple):
@@ -32,35 +32,35 @@ class ReadingModes(NamedTuple):
 
 
 def reading_modes(readings: Sequence[tuple[FloatArray, FloatArray]], n: int) -> ReadingModes:
-    """Return the modes of readings ``(H, R)``, each (p, n) and (p, p) with a p of its
-    own, also 0.
-    """
-    most = max((len(H) for H, _ in readings), default=0)
+    """Return the modes of readings ``(H, R)``, (p, n) and (p, p), each with its own p >= 0."""
+    max_rows = max((len(H) for H, _ in readings), default=0)
     rows = np.array([len(H) for H, _ in readings], dtype=np.int64)
-    H_, root_R = np.zeros((len(readings), most, n)), np.zeros((len(readings), most, most))
+    padded_H, root_R = (
+        np.zeros((len(readings), max_rows, n)),
+        np.zeros((len(readings), max_rows, max_rows)),
+    )
     for m, (H, R) in enumerate(readings):
         # Padding with zero rows keeps one array for all modes; kernels read the first rows[m]
         # only.
-        H_[m, : len(H)] = H
+        padded_H[m, : len(H)] = H
         if len(H):
             root_R[m, : len(H), : len(H)] = np.linalg.cholesky(R)
-    return ReadingModes(H_, root_R, rows)
+    return ReadingModes(padded_H, root_R, rows)
 
 
 def move_roots(
     roots: FloatArray, sequences: np.ndarray, F: FloatArray, root_Q: FloatArray, modes: ReadingModes
 ) -> FloatArray:
-    """Return roots (K, n, n) after each chain's sequence: row k of ``sequences`` (K, T), first mode
-    first.
+    """Return the roots (K, n, n) of K chains after T slots with the modes ``sequences`` (K, T).
 
-    Works on all cores where there is enough to do.
+    Uses all cores if there is enough to do.
     """
     moved = np.ascontiguousarray(lower_triangular(roots))
     F = as_kernel_array(F)
     low_Q = np.ascontiguousarray(lower_triangular(root_Q))
     # One byte per mode where it suffices, an eighth of an int64.
-    kind = np.uint8 if len(modes.rows) < 256 else np.int64
-    sequences = np.ascontiguousarray(sequences, dtype=kind)
+    mode_type = np.uint8 if len(modes.rows) < 256 else np.int64
+    sequences = np.ascontiguousarray(sequences, dtype=mode_type)
     # More threads than chains or cores would only wait.
     workers = min(os.cpu_count() or 1, len(roots))
     if sequences.size < FEW or workers < 2:
@@ -113,7 +113,9 @@ def run_path(
     work: FloatArray,
     path: FloatArray,
 ) -> None:
-    """Move one root (1, n, n) in place along its sequence (T,) and keep every step in ``path``."""
+    """Move one root (1, n, n) in place along its mode ``sequence`` (T,); store each step in
+    ``path`` (T, n, n).
+    """
     for step in range(len(sequence)):
         step_root(roots, 0, sequence[step], F, root_Q, H, root_R, rows, work)
         for i in range(len(F)):
@@ -131,10 +133,8 @@ def run_sequences(
     root_R: FloatArray,
     rows: np.ndarray,
 ) -> None:
-    """Move the roots (K, n, n) in place along their sequences; roots and root_Q are lower
-    triangular.
-
-    square_root's triangularisation without its zeros: some 300 operations a step at n = 4.
+    """Move the roots (K, n, n) of K chains in place along their mode ``sequences`` (K, T); roots
+    and root_Q are lower triangular.
     """
     # The pre-array [[H S, root_R, 0], [F S, 0, root_Q]] of the largest reading, reused by all
     # steps.

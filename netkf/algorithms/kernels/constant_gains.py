@@ -1,7 +1,8 @@
-"""Filters with constant gains in kernels: how increments over a gap move an estimate.
+"""Kernels of filters with constant gains: corrections by increments over a gap, and by samples.
 
-The weight e^{(A - L H)(b - s)} L of dy(s) is projected on the Legendre polynomials P_0 and P_1, of
-which the moments of a reading are given (``linalg.legendre``).
+Over a gap from a to b such a filter gives dy(s) the weight e^{(A - L H)(b - s)} L. It is projected
+on the Legendre polynomials P_0 and P_1 of the gap, since a reading is given by the moments of dy
+with these two (``linalg.legendre``).
 """
 
 from __future__ import annotations
@@ -14,66 +15,70 @@ TERMS = 18  # of the exponential, for a norm of at most 1/2
 
 
 @kernel
-def fill_moments_of(
-    M: FloatArray, sign: float, gap: float, first: FloatArray, second: FloatArray, work: FloatArray
+def fill_legendre_integrals(
+    M: FloatArray, sign: float, gap: float, J_1: FloatArray, second: FloatArray, work: FloatArray
 ) -> None:
-    """Write ``int_0^g e^{M u} P_j(1 - 2 u / g) du`` (n, n) for the polynomials P_0 and P_1 into
-    ``first`` and ``second``, of ``sign`` times M; ``work`` (4, n, n) is scratch.
+    """Write ``int_0^g e^{sign M u} P_j(1 - 2 u / g) du`` (n, n) for the Legendre polynomials P_0
+    and P_1 into ``J_1`` and ``second``; ``work`` (4, n, n) is scratch.
     """
-    n, norm, later = len(M), 0.0, work[3]
+    n, norm, J_2 = len(M), 0.0, work[3]
     for i in range(n):
         row = 0.0
         for j in range(n):
             row += abs(M[i, j]) * gap
         norm = max(norm, row)
-    # Scaling: power series for a part of the gap, which is doubled.
+    # Scaling: power series for a part of the gap of norm at most 1/2, then doubling.
     doublings, step = 0, gap
     while norm > 0.5:
         norm, step, doublings = 0.5 * norm, 0.5 * step, doublings + 1
-    fill_exponential_integrals(M, sign, step, first, work)
+    fill_exponential_integrals(M, sign, step, J_1, work)
     for _ in range(doublings):
-        double_gap(step, first, work)
+        double_gap(step, J_1, work)
         step *= 2.0
+    # P_1(1 - 2 u / g) = 1 - 2 u / g = 2 (g - u) / g - 1.
     for i in range(n):
         for j in range(n):
-            second[i, j] = 2.0 * later[i, j] / gap - first[i, j]
+            second[i, j] = 2.0 * J_2[i, j] / gap - J_1[i, j]
 
 
 @kernel
 def fill_exponential_integrals(
-    M: FloatArray, sign: float, step: float, first: FloatArray, work: FloatArray
+    M: FloatArray, sign: float, step: float, J_1: FloatArray, work: FloatArray
 ) -> None:
-    """Write ``J_1 = int_0^s e^{M u} du`` into ``first``, and e^{M s} and
-    ``J_2 = int_0^s (s - u) e^{M u} du`` into the first and the last of ``work``, by power series.
+    """Write ``J_1 = int_0^s e^{M u} du``, and e^{M s} and ``J_2 = int_0^s (s - u) e^{M u} du`` into
+    the first and the last of ``work`` (4, n, n), by power series; M is multiplied by ``sign``.
     """
-    n, E, term, moved, later = len(M), work[0], work[1], work[2], work[3]
+    n, E, term, moved, J_2 = len(M), work[0], work[1], work[2], work[3]
     for i in range(n):
         for j in range(n):
             one = 1.0 if i == j else 0.0
             E[i, j] = term[i, j] = one
-            first[i, j], later[i, j] = step * one, 0.5 * step * step * one
+            J_1[i, j], J_2[i, j] = step * one, 0.5 * step * step * one
+    # (M s)^k / k!, integrated once and twice.
     for k in range(1, TERMS):
         multiply_square(moved, term, M)
         for i in range(n):
             for j in range(n):
                 term[i, j] = sign * moved[i, j] * step / k
                 E[i, j] += term[i, j]
-                first[i, j] += term[i, j] * step / (k + 1)
-                later[i, j] += term[i, j] * step * step / ((k + 1) * (k + 2))
+                J_1[i, j] += term[i, j] * step / (k + 1)
+                J_2[i, j] += term[i, j] * step * step / ((k + 1) * (k + 2))
 
 
 @kernel
-def double_gap(step: float, first: FloatArray, work: FloatArray) -> None:
-    """Make what ``fill_exponential_integrals`` wrote for a step that of two steps."""
-    n, E, moved, later = len(first), work[0], work[2], work[3]
-    multiply_square(moved, E, later)
+def double_gap(step: float, J_1: FloatArray, work: FloatArray) -> None:
+    """Double the step of the integrals that ``fill_exponential_integrals`` wrote for ``step``:
+    J_2 <- J_2 + s J_1 + E J_2, J_1 <- J_1 + E J_1 and E <- E E.
+    """
+    n, E, moved, J_2 = len(J_1), work[0], work[2], work[3]
+    multiply_square(moved, E, J_2)
     for i in range(n):
         for j in range(n):
-            later[i, j] += step * first[i, j] + moved[i, j]
-    multiply_square(moved, E, first)
+            J_2[i, j] += step * J_1[i, j] + moved[i, j]
+    multiply_square(moved, E, J_1)
     for i in range(n):
         for j in range(n):
-            first[i, j] += moved[i, j]
+            J_1[i, j] += moved[i, j]
     multiply_square(moved, E, E)
     for i in range(n):
         for j in range(n):
@@ -83,7 +88,7 @@ def double_gap(step: float, first: FloatArray, work: FloatArray) -> None:
 @kernel
 def fill_inverse_transition(A: FloatArray, gap: float, maps: FloatArray) -> None:
     """Write ``e^{-A g}`` (n, n) into the first of ``maps`` (6, n, n); the others are scratch."""
-    fill_moments_of(A, -1.0, gap, maps[4], maps[5], maps[:4])
+    fill_legendre_integrals(A, -1.0, gap, maps[4], maps[5], maps[:4])
 
 
 @kernel
@@ -98,42 +103,43 @@ def correct_by_moments(
     gap: float,
     work: FloatArray,
 ) -> None:
-    """Move the prediction ``x[k]`` (n,) at the end of a gap by the ``moments`` (2 p,) of what was
-    read in it, of which these are used up, with gain L (>= n, >= p) and H (>= p, n); ``closed`` is
-    A - L H, and ``work`` (6, n, n) is scratch.
+    """Correct the open-loop prediction ``x[k]`` (n,) at the end of a gap by the ``moments`` (2 p,)
+    of the increments of the gap, with gain L (>= n, >= p) and H (>= p, n). ``closed`` is A - L H;
+    the moments are overwritten with the innovations; ``work`` (6, n, n) is scratch.
     """
     n, p = len(A), len(moments) // 2
-    first, second, some = work[4], work[5], work[:4]
-    # Moments that the prediction says they should have: dy = H e^{A (s - b)} x(b) ds.
-    fill_moments_of(A, -1.0, gap, first, second, some)
+    first, second, integrals_work = work[4], work[5], work[:4]
+    # Innovations: subtract the moments of the predicted reading, dy = H e^{A (s - b)} x(b) ds.
+    fill_legendre_integrals(A, -1.0, gap, first, second, integrals_work)
     for i in range(p):
         for j in range(n):
             for m in range(n):
                 moments[i] -= H[i, j] * first[j, m] * x[k, m]
                 moments[p + i] -= H[i, j] * second[j, m] * x[k, m]
-    fill_moments_of(closed, 1.0, gap, first, second, some)
+    fill_legendre_integrals(closed, 1.0, gap, first, second, integrals_work)
+    # x += sum over j = 0, 1 of (2 j + 1) / g int e^{(A - L H) u} P_j du L m_j.
     for j in range(n):
-        step, turn = 0.0, 0.0
+        L_m0, L_m1 = 0.0, 0.0
         for i in range(p):
-            step += L[j, i] * moments[i]
-            turn += L[j, i] * moments[p + i]
+            L_m0 += L[j, i] * moments[i]
+            L_m1 += L[j, i] * moments[p + i]
         for i in range(n):
-            x[k, i] += (first[i, j] * step + 3.0 * second[i, j] * turn) / gap
+            x[k, i] += (first[i, j] * L_m0 + 3.0 * second[i, j] * L_m1) / gap
 
 
 @kernel
 def correct_by_innovation(
-    x: FloatArray, k: int, H: FloatArray, L: FloatArray, y: FloatArray, moved: FloatArray
+    x: FloatArray, k: int, H: FloatArray, L: FloatArray, y: FloatArray, updated: FloatArray
 ) -> None:
-    """Add ``L (y - H x)`` to ``x[k]`` (n,) for a sample y (p,); ``moved`` (n,) is scratch."""
+    """Add ``L (y - H x)`` to ``x[k]`` (n,) for a sample y (p,); ``updated`` (n,) is scratch."""
     n = x.shape[1]
     for i in range(n):
-        moved[i] = x[k, i]
+        updated[i] = x[k, i]
     for r in range(len(y)):
         innovation = y[r]
         for j in range(n):
             innovation -= H[r, j] * x[k, j]
         for i in range(n):
-            moved[i] += L[i, r] * innovation
+            updated[i] += L[i, r] * innovation
     for i in range(n):
-        x[k, i] = moved[i]
+        x[k, i] = updated[i]

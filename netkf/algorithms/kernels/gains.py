@@ -1,12 +1,12 @@
-"""How a Kalman-Bucy filter uses the two moments of a reading (the gains that end an interval).
+"""The gains of a Kalman-Bucy filter for the two moments of a reading of an interval [a, b].
 
-Exactly, ``xhat(b) = exp(A g) xhat(a) + int k(s) (dy - H xhat_open(s) ds)`` with the weight
-``k(s) = Phi(b, s) P(s) H' R^-1`` and the open-loop prediction ``xhat_open``. Since the Hamiltonian
-flow is symplectic, ``k(s) = Y(s)' H' R^-1`` with ``[X; Y](s) = exp(-M (b - s)) [I; P(b)]``: the
-weight is *affine in the covariance at the end*. Projecting it on the Legendre polynomials
-``P_0, P_1`` of the interval gives gains ``K_j = U_j(g) + P(b) W_j(g)`` for the two moments of dy,
-with U and W power series in g; what is left out has fourth order in g. The estimate enters
-through the innovation only, so the error never depends on the state itself.
+Exactly, ``xhat(b) = exp(A g) xhat(a) + int k(s) (dy - H xhat_open(s) ds)`` with the weight ``k(s) =
+Phi(b, s) P(s) H' R^-1`` and the open-loop prediction ``xhat_open``. Since the Hamiltonian flow is
+symplectic, ``k(s) = Y(s)' H' R^-1`` with ``[X; Y](s) = exp(-M (b - s)) [I; P(b)]``: the weight is
+*affine in the covariance at the end*. Projecting it on the Legendre polynomials ``P_0, P_1`` of the
+interval gives gains ``K_j = U_j(g) + P(b) W_j(g)`` for the two moments of dy, with U and W power
+series in g = b - a; the error of the projection has fourth order in g. The estimate enters through
+the innovation only, so the error never depends on the state itself.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from netkf.linalg.legendre import MOMENTS, backward_coefficients
 from netkf.linalg.series import polynomial, with_reach
 from netkf.linalg.small import add_matmul, matvec
 
-MAX_INTERVAL = 8.0  # |M| g beyond which two moments say too little about a reading
+MAX_INTERVAL = 8.0  # |M| g beyond which two moments do not describe a reading well enough
 
 
 class GainTable(NamedTuple):
@@ -89,9 +89,9 @@ def longest_interval_for(A: FloatArray, Q: FloatArray, G: FloatArray) -> float:
 def _count_terms(size: float) -> int:
     """Return how many terms of the power series of exp(M) are needed for a norm ``size`` of M."""
     # Until size^k / k!, the next term of the exponential series, is below double rounding.
-    terms, last = 1, 1.0
-    while last > 1e-18 or terms < 8:
-        last *= size / terms
+    terms, term = 1, 1.0
+    while term > 1e-18 or terms < 8:
+        term *= size / terms
         terms += 1
     return terms
 

@@ -1,9 +1,9 @@
-"""Consensus on information in kernels: weighted sums of information pairs, carried as roots.
+"""Kernels of consensus on information: weighted sums of information pairs, carried as roots.
 
-A pair (Omega, q) of information about the state is a root (Z, z), n by n + 1, with ``Omega = Z' Z``
-and ``q = Omega c + Z' z``: Z is lower triangular, and z counts from a centre c (n,), the estimate
-of the node that holds the pair, so that differences of near states lose no digits. Omega may be
-singular, as that of a single reading is.
+An information pair (Omega, q), with Omega = P^-1 and q = P^-1 x for an estimate x, is stored as a
+root (Z, z), n by n + 1, with ``Omega = Z' Z`` and ``q = Omega c + Z' z``. Z is lower triangular,
+and z is relative to a centre c (n,), the estimate of the node that holds the pair, so that
+differences of near states lose no digits. Omega may be singular, as that of a single reading is.
 
 Stacks ``parts`` (2, K, H, n, n + 1, L) hold K pairs of each of H nodes, before and after a step.
 """
@@ -32,15 +32,15 @@ from netkf.linalg.lanes import (
 def write_information(
     lanes: Lanes, out: FloatArray, share: float, inverse: FloatArray, h: int
 ) -> None:
-    """Write the root of ``share`` times ``P^-1`` of node ``h``, whose root S has the inverse
-    ``inverse[h]``, into ``out`` (n, n + 1, L); the centre is the node's estimate.
+    """Write the root of ``share`` times the information ``P^-1`` of node ``h`` into ``out`` (n, n +
+    1, L), relative to the node's estimate; ``inverse[h]`` is S^-1 for P = S S'.
     """
     # P^-1 = S^-T S^-1, whose root is the inverse of S, lower triangular like S.
-    n, size = len(out), share**0.5
+    n, factor = len(out), share**0.5
     for i in range(n):
         for j in range(i + 1):
-            store(lanes, out, i, j, size * load(lanes, inverse, h, i, j))
-        # An estimate that counts from itself has the mean 0.
+            store(lanes, out, i, j, factor * load(lanes, inverse, h, i, j))
+        # Relative to itself an estimate has the mean 0.
         store(lanes, out, i, n, 0.0)
 
 
@@ -56,17 +56,17 @@ def add_reading_pair(
     centre: FloatArray,
     work: FloatArray,
 ) -> None:
-    """Add ``share`` times the information ``H' H`` and ``H' y`` of a whitened reading to ``total``
-    (n, n + 1, L).
+    """Add ``share`` times the information pair ``(H' H, H' y)`` of a whitened reading to ``total``
+    (n, n + 1, L), relative to ``centre[h]``.
 
     The reading has ``rows`` rows at ``index`` [b, s, h] of y and H; ``work`` is scratch.
     """
     b, s, h = index
-    n, size = len(total), share**0.5
+    n, factor = len(total), share**0.5
     # H that is fixed has one block and one slot.
     d, t = min(b, H.shape[0] - 1), min(s, H.shape[1] - 1)
     for k in range(rows):
-        # A row [H, y - H c] is the last one of a lower triangular root.
+        # Merge a row [H, y - H c], as the last row of a lower triangular root.
         for i in range(n - 1):
             for j in range(i + 1):
                 store(lanes, work, i, j, 0.0)
@@ -75,8 +75,8 @@ def add_reading_pair(
         for j in range(n):
             entry = load(lanes, H, d, t, h, k, j)
             innovation -= entry * load(lanes, centre, h, j)
-            store(lanes, work, n - 1, j, size * entry)
-        store(lanes, work, n - 1, n, size * innovation)
+            store(lanes, work, n - 1, j, factor * entry)
+        store(lanes, work, n - 1, n, factor * innovation)
         merge_lanes(lanes, total, work)
 
 
@@ -90,26 +90,26 @@ def weigh_part(
     centre: FloatArray,
     h: int,
 ) -> None:
-    """Write the root of ``weight`` times the pair at ``index`` [t, k, sender] of ``parts`` into
-    ``out`` (n, n + 1, L), counted from the centre of node ``h``.
+    """Write the root of ``weight`` times the pair ``parts[t, k, sender]`` into ``out`` (n, n + 1,
+    L), relative to the centre of node ``h``; ``index`` is [t, k, sender].
     """
     t, k, sender = index
-    n, size = len(out), root_of(weight)
+    n, factor = len(out), root_of(weight)
     for i in range(n):
         mean = load(lanes, parts, t, k, sender, i, n)
         for j in range(i + 1):
             entry = load(lanes, parts, t, k, sender, i, j)
             # Z (x - c_h) = Z (x - c_j) + Z (c_j - c_h).
             mean += entry * (load(lanes, centre, sender, j) - load(lanes, centre, h, j))
-            store(lanes, out, i, j, size * entry)
-        store(lanes, out, i, n, size * mean)
+            store(lanes, out, i, j, factor * entry)
+        store(lanes, out, i, n, factor * mean)
 
 
 @kernel(inlined=True)
 def store_part(
     lanes: Lanes, parts: FloatArray, index: tuple[int, int, int], total: FloatArray
 ) -> None:
-    """Copy ``total`` (n, n + 1, L) to ``index`` [t, k, h] of ``parts``."""
+    """Copy ``total`` (n, n + 1, L) into ``parts[t, k, h]``; ``index`` is [t, k, h]."""
     t, k, h = index
     n = len(total)
     for i in range(n):
@@ -133,8 +133,8 @@ def begin_part(
     total: FloatArray,
     work: FloatArray,
 ) -> None:
-    """Begin part ``k`` of the node of ``index`` [b, s, h]: ``shares[k]`` (2,) times the information
-    of its prediction and of its reading.
+    """Write the initial pair ``k`` of node h: ``shares[k, 0]`` times the information of its
+    prediction plus ``shares[k, 1]`` times that of its reading; ``index`` is [b, s, h].
     """
     write_information(lanes, total, shares[k, 0], inverse, index[2])
     if shares[k, 1] > 0.0:
@@ -155,18 +155,19 @@ def mix_parts(
     total: FloatArray,
     work: FloatArray,
 ) -> None:
-    """Take a consensus step of node ``h``: the convex combination of its pairs and those that it
-    hears, ``up`` at ``index`` [b, s, e]; the weight of what does not arrive stays with its own.
+    """Do consensus step number ``step`` of node ``h``: replace each of its pairs by the convex
+    combination of it and those that arrive (``up`` at ``index`` [b, s, e]). The weights of messages
+    that do not arrive go to the own pair.
     """
     b, s, e = index
-    # Two copies take turns: all nodes read the one and write the other.
+    # Two copies alternate: all nodes read from copy t and write to copy 1 - t.
     t = step % 2
-    heard = spread(lanes, 0.0)
+    received_weight = spread(lanes, 0.0)
     for m in range(links.first[h], links.first[h + 1]):
         arrived = load_flags(lanes, up, b, s, e, links.direction[m])
-        heard += select(arrived, links.weight[m], 0.0)
+        received_weight += select(arrived, links.weight[m], 0.0)
     # Rounding may leave the own weight a little below 0, which has no root.
-    own = 1.0 - heard
+    own = 1.0 - received_weight
     own = select(own > 0.0, own, 0.0)
     for k in range(parts.shape[1]):
         weigh_part(lanes, total, own, parts, (t, k, h), centre, h)
@@ -181,7 +182,7 @@ def mix_parts(
 
 
 @kernel
-def read_off(
+def write_estimate(
     lanes: Lanes,
     root: FloatArray,
     xhat: FloatArray,
@@ -195,10 +196,10 @@ def read_off(
     total: FloatArray,
     work: FloatArray,
 ) -> None:
-    """Write the estimate of filter ``h`` of a block and the root of its P from ``counts`` (K + 1,)
-    times its pairs after the steps, ``parts[t]``, and its prediction.
+    """Write the estimate and root of filter ``h`` of block ``b`` from the sum of information:
+    ``counts[K]`` times that of its prediction plus ``counts[k]`` times each of its K pairs after
+    the consensus steps, ``parts[t]``.
     """
-    # Information adds up: that of the prediction first, then that of each pair.
     K = parts.shape[1]
     write_information(lanes, total, float(counts[K]), inverse, h)
     for k in range(K):

@@ -1,6 +1,6 @@
-"""Covariance intersection, D (8) and (9), of filters in slots: values of lanes, in place.
+"""Kernels of covariance intersection, D (8) and (9), for filters in slots, on lanes.
 
-Information is a root too, ``P^-1 = Z' Z``; the formulas are those of ``root_update``.
+Information is carried as a root too, ``P^-1 = Z' Z``; the formulas are those of ``root_update``.
 """
 
 from __future__ import annotations
@@ -15,17 +15,17 @@ from netkf.linalg.lanes import Lanes, load, magnitude, root_of, select, spread, 
 
 @kernel(inlined=True)
 def invert_lanes(lanes: Lanes, out: FloatArray, root: FloatArray, b: int, h: int) -> None:
-    """Write the inverse of the root of filter ``h`` of a block into ``out[h]``, with pivots of at
-    least SINGULAR of their row; see ``root_update.invert_root``.
+    """Write the inverse of the root of filter ``h`` of block ``b`` into ``out[h]`` (n, n, L).
+    Pivots are raised to SINGULAR times the length of their row, see ``root_update.invert_root``.
     """
     # The floor grows with the whole root, so that a zero row is not inverted on its own scale.
-    n, least = root.shape[2], spread(lanes, TINY)
+    n, smallest = root.shape[2], spread(lanes, TINY)
     for i in range(n):
         for j in range(i + 1):
             entry = load(lanes, root, b, h, i, j)
-            least += NEGLIGIBLE * entry * entry
+            smallest += NEGLIGIBLE * entry * entry
     for i in range(n):
-        row = least
+        row = smallest
         for j in range(i + 1):
             entry = load(lanes, root, b, h, i, j)
             row += entry * entry
@@ -51,15 +51,15 @@ def whiten(
     sender: int,
     h: int,
 ) -> None:
-    """Write the root of ``weight`` times the information that ``sender`` sends, ``inverse``
-    (H, n, n, L), into ``out`` (n, n + 1, L); means, in its last column, count from ``xhat[h]``.
+    """Write ``sqrt(weight) [Z, Z (x - xhat[h])]`` of the estimate of ``sender`` into ``out`` (n,
+    n + 1, L): a root of its information, with Z = S^-1 = ``inverse[sender]`` (H, n, n, L).
     """
-    n, size = inverse.shape[1], root_of(weight)
+    n, factor = inverse.shape[1], root_of(weight)
     for i in range(n):
         mean = spread(lanes, 0.0)
         # sqrt(w) S^-1, a root of w P^-1.
         for j in range(i + 1):
-            entry = size * load(lanes, inverse, sender, i, j)
+            entry = factor * load(lanes, inverse, sender, i, j)
             store(lanes, out, i, j, entry)
             mean += entry * (load(lanes, xhat, sender, j) - load(lanes, xhat, h, j))
         store(lanes, out, i, n, mean)
@@ -67,17 +67,18 @@ def whiten(
 
 @kernel(inlined=True)
 def merge_lanes(lanes: Lanes, total: FloatArray, whitened: FloatArray) -> None:
-    """Make ``total`` (n, n + 1, L) the root of both informations, means in the last column;
-    ``whitened`` (n, n + 1, L) is used up.
+    """Replace ``total`` (n, n + 1, L), a root [Z, z] of information, by a root of the sum of it and
+    ``whitened`` (n, n + 1, L), which is overwritten; as ``root_update.merge_information``.
     """
-    # Both are lower triangular, and stay so when columns are emptied from the last one on.
+    # Reflections from the left zero the columns of ``whitened`` from the last one on, so that both
+    # stay lower triangular.
     n = len(total)
     for j in range(n - 1, -1, -1):
         pivot, below = load(lanes, total, j, j), spread(lanes, 0.0)
         for r in range(j, n):
             entry = load(lanes, whitened, r, j)
             below += entry * entry
-        # Lanes in which there is nothing to empty stay as they are.
+        # Lanes whose column is zero already do not change.
         idle = below <= NEGLIGIBLE * pivot * pivot + TINY
         length = root_of(pivot * pivot + below)
         # pivot - length without cancellation: pivots of ``total`` are never negative.
@@ -107,12 +108,11 @@ def finish_lanes(
     centre: FloatArray,
     total: FloatArray,
     whitened: FloatArray,
-    kept: Any,
+    unchanged: Any,
 ) -> None:
-    """Write the intersection ``total`` (n, n + 1, L) into filter ``h`` of a block; means count from
-    ``centre[h]``.
-
-    Lanes that are ``kept`` stay unchanged.
+    """Write the estimate of the information ``total`` (n, n + 1, L), [Z, z] relative to
+    ``centre[h]``, into filter ``h`` of block ``b``: root Z^-1 and ``xhat = centre + Z^-1 z``. Lanes
+    with the flag ``unchanged`` keep their estimate; ``whitened`` is scratch.
     """
     # S = Z^-1: the total is lower triangular, so P = Z^-1 Z^-T has the lower root Z^-1.
     n = len(total)
@@ -130,5 +130,5 @@ def finish_lanes(
         for j in range(i + 1):
             entry = load(lanes, whitened, i, j)
             mean += entry * load(lanes, total, j, n)
-            store(lanes, root, b, h, i, j, select(kept, load(lanes, root, b, h, i, j), entry))
-        store(lanes, xhat, b, h, i, select(kept, load(lanes, xhat, b, h, i), mean))
+            store(lanes, root, b, h, i, j, select(unchanged, load(lanes, root, b, h, i, j), entry))
+        store(lanes, xhat, b, h, i, select(unchanged, load(lanes, xhat, b, h, i), mean))

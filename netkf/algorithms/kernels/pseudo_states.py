@@ -1,4 +1,4 @@
-"""Consensus plus innovations in kernels: estimates yhat of the pseudo-state ``y = G x``.
+"""Kernels of consensus plus innovations: estimates yhat of the pseudo-state ``y = G x``.
 
 Filter ``h`` of a block has index ``[b, h]`` of stacks with lanes (``netkf.linalg.lanes``):
 estimates of states and of pseudo-states (B, H, n, L).
@@ -22,25 +22,25 @@ def predict_pseudo(
     b: int,
     h: int,
     A: FloatArray,
-    rest: FloatArray,
-    moved: FloatArray,
+    coupling: FloatArray,
+    predicted: FloatArray,
 ) -> None:
-    """Move the estimate of the pseudo-state to the next slot, ``A yhat + rest xhat``, before that
-    of the state moves; ``moved`` (n, L) is scratch.
+    """Predict the estimate of the pseudo-state of filter ``h`` to the next slot, ``A yhat +
+    coupling xhat``, with xhat of the present slot; ``predicted`` (n, L) is scratch.
     """
     n = len(A)
     for i in range(n):
         total = spread(lanes, 0.0)
         for j in range(n):
-            total += A[i, j] * load(lanes, y, b, h, j) + rest[i, j] * load(lanes, x, b, h, j)
-        store(lanes, moved, i, total)
+            total += A[i, j] * load(lanes, y, b, h, j) + coupling[i, j] * load(lanes, x, b, h, j)
+        store(lanes, predicted, i, total)
     # All rows need the old yhat, hence the copy.
     for i in range(n):
-        store(lanes, y, b, h, i, load(lanes, moved, i))
+        store(lanes, y, b, h, i, load(lanes, predicted, i))
 
 
 @kernel
-def innovate(
+def fill_pseudo_innovation(
     lanes: Lanes,
     y: FloatArray,
     b: int,
@@ -52,13 +52,14 @@ def innovate(
     state: FloatArray,
     z: FloatArray,
 ) -> None:
-    """Write ``H' R^-1 (reading - H G^+ yhat)`` into ``z`` (n, L), for the reading of slot ``s``
-    with ``rows`` whitened rows; ``state`` (n, L) is scratch for ``G^+ yhat``.
+    """Write the pseudo-innovation ``H' R^-1 (reading - H G^+ yhat)`` of filter ``h`` into ``z`` (n,
+    L), for the reading of slot ``s`` with ``rows`` whitened rows; ``inverse`` (n, n) is G^+ and
+    ``state`` (n, L) scratch for ``G^+ yhat``.
     """
     n = len(inverse)
     # H that is fixed has one block and one slot.
     c, t = min(b, readings.H.shape[0] - 1), min(s, readings.H.shape[1] - 1)
-    # G^+ yhat is the state that the pseudo-state stands for.
+    # state = G^+ yhat.
     for i in range(n):
         total = spread(lanes, 0.0)
         for j in range(n):
@@ -89,15 +90,14 @@ def correct_pseudo(
     z: FloatArray,
     corrected: FloatArray,
 ) -> None:
-    """Write ``yhat_h + sum_l B_hl (yhat_l - yhat_h) + M_h z`` into ``corrected`` (H, n, L) at h,
-    with the estimates that filter ``h`` hears in the first step of slot ``s``.
+    """Write ``yhat_h + sum_l B_hl (yhat_l - yhat_h) + M_h z`` into ``corrected[h]`` (n, L), summed
+    over the estimates yhat_l that arrive in the first step of slot ``s``.
 
-    ``y`` (blocks, H, n, L) are the estimates yhat, of which block ``b`` is corrected; ``up`` flags
-    the messages that arrive; ``B`` (W, n, n) in the order of ``links``, ``M`` (H, n, n), the
-    innovation ``z`` (n, L).
+    ``y`` (blocks, H, n, L) are the estimates yhat; ``up`` flags the messages that arrive; ``B``
+    (W, n, n) are in the order of ``links``, ``M`` (H, n, n); ``z`` (n, L) is the pseudo-innovation.
     """
     n = M.shape[1]
-    # Into an array of its own: the other filters still hear the estimates from before.
+    # Into a separate array: the other filters still need yhat_h from before the step.
     for i in range(n):
         total = load(lanes, y, b, h, i)
         for j in range(n):
@@ -126,11 +126,11 @@ def correct_state(
     corrected: FloatArray,
     difference: FloatArray,
 ) -> None:
-    """Take ``corrected[h]`` as the estimate of the pseudo-state and move that of the state towards
-    it, ``xhat + K_h (yhat - G xhat)``; ``K`` (H, n, n), ``difference`` (n, L) is scratch.
+    """Set yhat of filter ``h`` to ``corrected[h]`` and correct the state by it, ``xhat += K_h (yhat
+    - G xhat)``; ``K`` (H, n, n), ``difference`` (n, L) is scratch.
     """
     n = len(G)
-    # The whole difference first: it needs all of the old xhat.
+    # difference = yhat - G xhat, complete before xhat changes.
     for i in range(n):
         total = load(lanes, corrected, h, i)
         store(lanes, y, b, h, i, total)
@@ -148,8 +148,8 @@ def correct_state(
 def shift_pseudo(
     lanes: Lanes, y: FloatArray, readings: ReadingBlock, G: FloatArray, b: int, s: int
 ) -> None:
-    """Count the pseudo-states of a block from that of the state of slot ``s``, where a frame of
-    coordinates begins.
+    """Move the origin of the pseudo-states of block ``b`` to G x of slot ``s``, if a frame begins
+    there.
     """
     if readings.rebased[s]:
         n = len(G)

@@ -1,15 +1,15 @@
 """The flow of the Riccati equation dP = A P + P A' + Q - P G P over gaps of any length.
 
-The flow is the linear-fractional action of ``exp(M gap)`` with the Hamiltonian
-``M = [[-A', G], [Q, A]]``: if ``[X; Y] = exp(M gap) [I; P]`` then ``P(gap) = Y X^-1``.
-One exponential over a long gap loses every digit, so a gap is cut into whole units, in which
-``|M| unit <= 1``, and a rest. The rest uses a Taylor series whose coefficients are tabulated;
-the whole units use their binary digits: the flow over ``unit * 2^k`` is tabulated as the triple
-``(F, G, Q)`` with ``P -> Q + F P (I + G P)^-1 F'``, and a triple follows from the one before it by
-the doubling formulas (Davison and Maki 1973; Anderson 1978), which only add positive terms.
+The flow is the linear-fractional action of ``exp(M gap)`` with the Hamiltonian ``M = [[-A', G], [Q,
+A]]``: if ``[X; Y] = exp(M gap) [I; P]`` then ``P(gap) = Y X^-1``. One exponential over a long gap
+loses every digit, so a gap is cut into whole units, in which ``|M| unit <= 1``, and a rest. The
+rest uses a Taylor series whose coefficients are tabulated; the number of whole units is written in
+binary digits: the flow over ``unit * 2^k`` is tabulated as the triple ``(F, G, Q)`` with ``P -> Q +
+F P (I + G P)^-1 F'``, and a triple follows from the one before it by the doubling formulas (Davison
+and Maki 1973; Anderson 1978), which only add positive terms.
 
-Where there are no readings, ``G = 0``, the rest needs no inverse: ``P(gap) = e P e' + W`` with
-``e = exp(A gap)`` and the covariance W of what the noise added.
+Without readings, ``G = 0``, the rest needs no inverse: ``P(gap) = e P e' + W`` with
+``e = exp(A gap)`` and the covariance W of the noise of the gap.
 """
 
 from __future__ import annotations
@@ -57,7 +57,9 @@ def exponential_series(M: FloatArray, terms: int) -> FloatArray:
 
 
 def lyapunov_series(A: FloatArray, Q: FloatArray, terms: int) -> FloatArray:
-    """Return (terms, n, n), those of ``W`` with ``dW = A W + W A' + Q`` from W = 0 on."""
+    """Return the power series (terms, n, n) of W(g) with ``dW/dg = A W + W A' + Q`` and
+    W(0) = 0.
+    """
     series = np.zeros((terms, *A.shape))
     series[1] = Q
     for k in range(2, terms):
@@ -75,10 +77,10 @@ def hamiltonian(A: FloatArray, Q: FloatArray, G: FloatArray) -> tuple[FloatArray
     if size_Q > 0.0 and size_G > 0.0:
         # Equal sizes of Q / s and G s keep |M| small and with it the number of units.
         scale = (size_Q / size_G) ** 0.5
-    elif size_Q > 0.0 or size_G > 0.0:  # one of them may be made as small as A
+    elif size_Q > 0.0 or size_G > 0.0:  # scale the one that is not 0 to the size of A
         scale = size_Q / size_A if size_Q > 0.0 else size_A / size_G
     else:
-        # Nothing drives P and nothing is observed: any scale is right.
+        # Q = G = 0: any scale is right.
         scale = 1.0
     return np.block([[-A.T, G * scale], [Q / scale, A]]), scale
 
@@ -87,9 +89,9 @@ def riccati_table(A: FloatArray, Q: FloatArray, G: FloatArray, longest: float) -
     """Tabulate the flow for gaps up to ``longest`` seconds; ``A, Q, G`` are (n, n)."""
     n = len(A)
     M, scale = hamiltonian(A, Q, G)
-    norm, size, unobserved = float(np.abs(M).sum(axis=0).max()), np.abs(A), not G.any()
+    norm, abs_A, unobserved = float(np.abs(M).sum(axis=0).max()), np.abs(A), not G.any()
     if unobserved:  # W grows by A from both sides
-        norm = max(norm, float(size.sum(axis=0).max() + size.sum(axis=1).max()))
+        norm = max(norm, float(abs_A.sum(axis=0).max() + abs_A.sum(axis=1).max()))
     # A power of two, so that a whole number of units is exact.
     unit = 2.0 ** np.floor(np.log2(min(1.0 / max(norm, 1e-300), longest)))
     blocks = exponential_series(M, TAYLOR_TERMS)
@@ -97,16 +99,23 @@ def riccati_table(A: FloatArray, Q: FloatArray, G: FloatArray, longest: float) -
     blocks[:, :n, n:] /= scale
     blocks[:, n:, :n] *= scale
     transition = exponential_series(A, TAYLOR_TERMS)
-    series, short = _side_by_side(unit, blocks, transition), np.zeros((0, 2 * n * n + 1))
+    series, unobserved_series = (
+        _side_by_side(unit, blocks, transition),
+        np.zeros((0, 2 * n * n + 1)),
+    )
     if unobserved:
-        short = _side_by_side(unit, transition, lyapunov_series(A, Q, TAYLOR_TERMS))
+        unobserved_series = _side_by_side(unit, transition, lyapunov_series(A, Q, TAYLOR_TERMS))
     # Binary digits of the largest number of whole units.
     levels = max(1, int(longest / unit).bit_length())
-    return RiccatiTable(n, unit, series, short, *_doubling_tables(M, scale, A, unit, levels))
+    return RiccatiTable(
+        n, unit, series, unobserved_series, *_doubling_tables(M, scale, A, unit, levels)
+    )
 
 
 def _side_by_side(unit: float, *parts: FloatArray) -> FloatArray:
-    """Return coefficients (terms, ...) of matrices as rows (terms, size + 1)."""
+    """Return the coefficients (terms, ...) of matrices as rows (terms, size + 1), with
+    their reach.
+    """
     rows = np.concatenate([part.reshape(len(part), -1) for part in parts], axis=1)
     return with_reach(rows, unit)
 
@@ -114,8 +123,8 @@ def _side_by_side(unit: float, *parts: FloatArray) -> FloatArray:
 def _doubling_tables(
     M: FloatArray, scale: float, A: FloatArray, unit: float, levels: int
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Return F, G, Q and exp(A t), each (levels, n, n), of the flow over 1, 2, 4, ... units: ``P(t)
-    = Q + F P (I + G P)^-1 F'``, by doubling.
+    """Return exp(A t), F, G and Q, each (levels, n, n), over t = 1, 2, 4, ... units: ``P(t) = Q +
+    F P (I + G P)^-1 F'``, by doubling.
     """
     # Doubling also doubles the relative error, so it works in extended precision (where the
     # machine has it): after 2^14 units a table in double would have lost 1e-12.
@@ -125,24 +134,31 @@ def _doubling_tables(
     E = np.tensordot(wide(unit) ** np.arange(24), exponential_series(M.astype(wide), 24), 1)
     inverse = _invert_extended(E[:n, :n])
     F, G, Q = inverse.T, inverse @ E[:n, n:], E[n:, :n] @ inverse
-    move = np.tensordot(wide(unit) ** np.arange(24), exponential_series(A.astype(wide), 24), 1)
+    transition = np.tensordot(
+        wide(unit) ** np.arange(24), exponential_series(A.astype(wide), 24), 1
+    )
     tables = tuple(np.empty((levels, n, n)) for _ in range(4))
     with np.errstate(over="ignore", invalid="ignore"):  # an unstable blind plant overflows late
         for level in range(levels):
             # Symmetry would drift by rounding, and doubling would amplify the drift.
             G, Q = symmetric(G), symmetric(Q)
-            for table, value in zip(tables, (move, F, G / scale, Q * scale), strict=True):
+            for table, value in zip(tables, (transition, F, G / scale, Q * scale), strict=True):
                 table[level] = value
             # Two equal gaps in a row: W = (I + G Q)^-1 joins the noise of the first with the
             # information of the second.
             W = _invert_extended(np.eye(n) + G @ Q)
-            move, F, G, Q = move @ move, F @ W.T @ F, G + F.T @ W @ G @ F, Q + F @ Q @ W @ F.T
+            transition, F, G, Q = (
+                transition @ transition,
+                F @ W.T @ F,
+                G + F.T @ W @ G @ F,
+                Q + F @ Q @ W @ F.T,
+            )
     return tables  # type: ignore[return-value]
 
 
 def _invert_extended(matrix: FloatArray) -> FloatArray:
-    """Return the inverse in the precision of ``matrix``, by Newton's iteration from double; nan
-    where it is singular, as when all modes of an unstable plant have been forgotten.
+    """Return the inverse in the precision of ``matrix``, by Newton's iteration from double; nan if
+    it is singular or not finite, as for very long gaps of an unstable plant.
     """
     if not np.isfinite(matrix).all():
         return np.full_like(matrix, np.nan)
@@ -183,11 +199,11 @@ def propagate_riccati(
     table: RiccatiTable, P: FloatArray, x: FloatArray, gap: float
 ) -> tuple[FloatArray, FloatArray]:
     """Return P (n, n) moved by the flow over ``gap`` seconds and x (n,) by ``exp(A gap)``."""
-    P, x = P.copy(), x.copy()  # of one layout, whatever the caller's
-    # The binary digits of the number of whole units, each with its tabulated triple.
-    whole, level = int(gap / table.unit), 0
-    while whole >> level:
-        if whole >> level & 1:  # Q + F P (I + G P)^-1 F' over 2^level units
+    P, x = P.copy(), x.copy()  # C-contiguous, so that one version of this code is compiled
+    # One step for each binary digit 1 of the number of whole units, with its tabulated triple.
+    units, level = int(gap / table.unit), 0
+    while units >> level:
+        if units >> level & 1:  # Q + F P (I + G P)^-1 F' over 2^level units
             F = table.F[level]
             # P (I + G P)^-1 = (I + P G)^-1 P.
             middle = solve(add_matmul(np.eye(table.n), P, table.G[level]), P)
@@ -195,7 +211,7 @@ def propagate_riccati(
             x = matvec(table.transition[level], x)
         level += 1
     # The rest, less than a unit, by the power series.
-    rest = gap - whole * table.unit
+    rest = gap - units * table.unit
     if rest <= 0.0:
         return P, x
     return substep(table, P, x, rest)

@@ -1,14 +1,14 @@
-"""Filters in slots, compiled: what the kernels of all of them share.
+"""Structs and kernels that all compiled filters in slots share.
 
-A filter's kernel (``Filter.slot_kernel``) carries H filters through S slots of R runs in one call.
-It is given :class:`SlotNodes` (the state), :class:`ReadingBlock` and :class:`SlotPlan` (what was
-drawn for these slots), :class:`SlotLinks` (who hears whom), :class:`SlotSamples` (what it fills in)
-and :class:`SlotScratch` (scratch), and works in place.
+A filter's kernel (``Filter.slot_kernel``) simulates H filters over S slots of R runs in one call,
+in place. Its arguments are :class:`SlotNodes` (states of the filters), :class:`ReadingBlock` and
+:class:`SlotPlan` (readings and messages drawn for these slots), :class:`SlotLinks` (the network),
+:class:`SlotSamples` (output) and :class:`SlotScratch`.
 
-Runs are side by side in blocks of L lanes (``netkf.linalg.lanes``): what belongs to filter ``h`` of
-run ``b L + q`` is ``[b, ..., h, ..., q]``, and kernels compute all lanes of a filter at once. Where
-R is no multiple of L, the last lanes of the last block are idle: they hold harmless numbers and are
-not sampled.
+Runs are side by side in blocks of L lanes (``netkf.linalg.lanes``): an entry of filter ``h`` of run
+``b L + q`` has the indices ``[b, ..., h, ..., q]``, and kernels compute all lanes of a filter at
+once. If R is no multiple of L, the last lanes of the last block are idle: they hold harmless
+numbers and are not sampled. ``s`` is the index of a slot, ``e`` of a step of its exchanges.
 
 Readings are whitened: with ``R = L L'`` as the filters believe it, ``L^-1 y`` and ``L^-1 H`` stand
 for y and H, so that the noise of each row has variance 1 and rows are used one after the other.
@@ -48,7 +48,7 @@ class SlotNodes(NamedTuple):
 
     xhat, root : (B, H, n, L) and lower triangular (B, H, n, n, L)
     F, root_Q : (n, n), the root lower triangular
-    rows : number of rows (H,) that each filter reads
+    rows : number of rows (H,) of each filter's reading
     """
 
     xhat: FloatArray
@@ -74,22 +74,27 @@ class ReadingBlock(NamedTuple):
 
 
 WHOLE, SENDING, ARRIVING = range(3)
-"""Parts of a slot that a call of a kernel does."""
+"""The part of a slot that a call of a kernel simulates, see SlotPlan."""
 
 
 class SlotPlan(NamedTuple):
-    """Number of the ``first`` of S slots; whether nodes read and predict (``sensed``), whether they
-    exchange, which sample a slot is or -1 (S, each); ``up`` (B, S, E, W, L): whether a message
-    arrives on a direction in each of the E steps of the exchanges of a slot.
+    """What happens in S slots.
 
-    The rest is for filters whose nodes may be silent (``Filter.decides_in_slots``). ``sent``
-    (B, S, E, H, L) is 1 where a node is asked for a message; their kernel writes 0 where it sends
-    none, and takes those out of ``up`` (``drop_silent``). ``uniform`` (B, S, E, H, L): the number
-    that a ``randomised`` filter is given when it is asked. Of other filters both are empty.
+    first : number of the first slot
+    sensed, exchanged : (S,), whether nodes read and predict, and whether they exchange
+    sample : (S,), index of the slot's sample, -1: none
+    up : (B, S, E, W, L), 1 if a message arrives on a direction in a step of the exchanges
+    sent : (B, S, E, H, L), 1 if a node is asked for a message
+    uniform : (B, S, E, H, L), uniform number for the decision of a node that is asked
+    part : WHOLE, SENDING or ARRIVING
 
-    Where messages are made one by one, who sends must be known before anything arrives. A kernel is
-    then called twice for each slot, and does the ``part`` up to what is sent, SENDING, without
-    ``up``, and the rest, ARRIVING; else the WHOLE slot.
+    ``sent`` is empty unless nodes may be silent (``Filter.decides_in_slots``); then the kernel
+    writes 0 where a node sends nothing, and removes these messages from ``up`` (``drop_silent``).
+    ``uniform`` is empty unless the filter is ``randomised``.
+
+    If Python makes the messages one by one, it must know who sends before anything arrives. Then a
+    kernel is called twice for each slot: for the part up to sending, SENDING, without ``up``, and
+    for the rest, ARRIVING. Otherwise one call simulates the WHOLE slot.
     """
 
     first: int
@@ -103,12 +108,12 @@ class SlotPlan(NamedTuple):
 
 
 class SlotLinks(NamedTuple):
-    """Directed links by receiver: filter h hears those from ``first[h]`` up to ``first[h + 1]``.
+    """Directed links by receiver: those to filter h are ``first[h]`` to ``first[h + 1]`` - 1.
 
     first : (H + 1,)
     sender : index (W,) of the sender
     direction : index (W,) in ``up``
-    weight : (W,) that the receiver gives
+    weight : (W,) that the receiver gives to the sender
     """
 
     first: np.ndarray
@@ -118,14 +123,17 @@ class SlotLinks(NamedTuple):
 
 
 class SlotSamples(NamedTuple):
-    """States x (R, T, n), xhat (R, T, H n) and P (R, T, H n n) in the coordinates of the plant, and
-    errors (R, T, H n), all filters side by side; the slot in which each filter stopped learning for
-    good, ``stopped`` (B, H, L), and what it holds of K conserved sums at the last sample,
-    ``conserved`` (B, H, K, L).
+    """Samples that a kernel writes, and the true states that they need.
 
-    Of the slots, the states ``absolute`` and ``local`` (B, S, n, L), the latter in the coordinates
-    of the estimates, which are the plant's unless they are ``framed``. ``total`` (B, L): the sum of
-    all that was shown of xhat and P so far, finite where all of it is.
+    x, xhat, P : (R, T, n), (R, T, H n) and (R, T, H n n) in the coordinates of the plant, with all
+                 filters side by side
+    error : (R, T, H n), x - xhat
+    stopped : (B, H, L), slot in which each filter permanently froze its network estimate
+    conserved : (B, H, K, L), its shares of K conserved sums at the last sample
+    absolute, local : (B, S, n, L), true states in all slots, in the coordinates of the plant and
+                      relative to the moving origin that estimates refer to
+    framed : whether the origin moves; otherwise both are the same
+    total : (B, L), sum of all samples of xhat and P so far: finite if all of them are
     """
 
     x: FloatArray
@@ -141,11 +149,14 @@ class SlotSamples(NamedTuple):
 
 
 class SlotScratch(NamedTuple):
-    """The ``size`` n of states, the ``lanes``, and scratch: ``row``, ``gains`` and ``moved_mean``
-    (n, L) of a reading and a mean, ``moved`` and ``noise`` (n, n, L) of a prediction, ``whitened``
-    and ``total`` (n, n + 1, L) of an intersection, and copies of what is sent, (H, n, L) and (H, n,
-    n, L). Of a sample ``sampled_xhat`` and ``sampled_error`` (>= H n, L), ``sampled_P`` (>= H n n,
-    L) and the ``sample_rows`` (L,) of its runs.
+    """The ``size`` n of states, the ``lanes``, and scratch arrays.
+
+    row, gains, moved_mean : (n, L), for updates by a row of a reading, and for means
+    moved, noise : (n, n, L), for predictions of roots
+    whitened, total : (n, n + 1, L), for intersections
+    xhat, root : (H, n, L) and (H, n, n, L), copies of the states that filters send
+    sampled_xhat, sampled_error, sampled_P : (>= H n, L), (>= H n, L) and (>= H n n, L), a sample
+    sample_rows : (L,), the run of each lane, -1 if it is idle
     """
 
     size: Size
@@ -170,10 +181,11 @@ def slot_scratch(H: int, n: int, lanes: Lanes = MANY) -> SlotScratch:
     L = len(lanes)
     shapes: list[tuple[int, ...]] = [*[(n, L)] * 3, *[(n, n, L)] * 2, *[(n, n + 1, L)] * 2]
     shapes += [(H, n, L), (H, n, n, L)]
-    # L entries are moved at a time, which goes beyond the last one.
+    # L entries are copied at a time, so that the last copy may go beyond the last entry.
     shapes += [(H * n + L, L), (H * n + L, L), (H * n * n + L, L)]
     scratch: list[Any] = [aligned(shape) for shape in shapes]
-    # Code of its own for each small n pays off for batches of runs alone, and not for one state.
+    # Compile for each small n separately only for batches of runs, where it pays off; not for n =
+    # 1.
     size = sized(n) if n > 1 and lanes == MANY else np.zeros(n)
     return SlotScratch._make([size, lanes, *scratch, np.zeros(L, dtype=np.int64)])
 
@@ -181,12 +193,14 @@ def slot_scratch(H: int, n: int, lanes: Lanes = MANY) -> SlotScratch:
 def whiten_reading(y: FloatArray, H: FloatArray, R: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return a reading y (p,) and its H (p, n) times ``L^-1``, with ``L L' = R``."""
     # One solve for y and H together.
-    made = np.linalg.solve(np.linalg.cholesky(R), np.column_stack([y, H]))
-    return np.ascontiguousarray(made[:, 0]), np.ascontiguousarray(made[:, 1:])
+    whitened = np.linalg.solve(np.linalg.cholesky(R), np.column_stack([y, H]))
+    return np.ascontiguousarray(whitened[:, 0]), np.ascontiguousarray(whitened[:, 1:])
 
 
 def block_of_reading(y: FloatArray, H: FloatArray) -> ReadingBlock:
-    """Return a whitened reading y (p,), H (p, n) as that of one filter in one slot, one lane."""
+    """Return a whitened reading y (p,), H (p, n) as a block of one filter, one slot and
+    one lane.
+    """
     n = H.shape[1]
     return ReadingBlock(
         np.ascontiguousarray(y).reshape(1, 1, 1, -1, 1),
@@ -197,8 +211,8 @@ def block_of_reading(y: FloatArray, H: FloatArray) -> ReadingBlock:
 
 
 def star_of(weights: Sequence[float]) -> tuple[SlotLinks, np.ndarray]:
-    """Return the links of one receiver, index 0, that hears senders 1, 2, ... with
-    these ``weights``, and messages (1, 1, 1, W, 1) that all arrive.
+    """Return the links from senders 1, 2, ... to the one receiver 0, with these ``weights``, and
+    the array ``up`` (1, 1, 1, W, 1) of messages that all arrive.
     """
     count = len(weights)
     indices = np.arange(count)
@@ -209,10 +223,10 @@ def star_of(weights: Sequence[float]) -> tuple[SlotLinks, np.ndarray]:
 
 
 @kernel
-def show(
+def store_sample_of_slot(
     nodes: SlotNodes, plan: SlotPlan, samples: SlotSamples, scratch: SlotScratch, b: int, s: int
 ) -> None:
-    """Fill in the samples of a block in slot ``s``, where it is one."""
+    """Write the sample of slot ``s``, if it has one, for all runs of block ``b``."""
     k, lanes = plan.sample[s], scratch.lanes
     if k < 0:
         return
@@ -221,7 +235,7 @@ def show(
     for h in range(len(nodes.rows)):
         for i in range(n):
             x = load(lanes, nodes.xhat, b, h, i)
-            # In the coordinates of the estimates: a difference of large states loses digits.
+            # Relative to the moving origin: a difference of large absolute states loses digits.
             local = load(lanes, samples.local, b, s, i)
             store(lanes, scratch.sampled_error, h * n + i, local - x)
             if samples.framed:
@@ -240,27 +254,31 @@ def show(
                 sum_of_all += total
     store(lanes, samples.total, b, sum_of_all)
     for q in range(len(lanes)):
-        # The last block may have more lanes than runs are left.
+        # The last block may have more lanes than there are runs left.
         used = first + q < len(samples.x)
         scratch.sample_rows[q] = first + q if used else -1
         for i in range(n if used else 0):
             samples.x[first + q, k, i] = samples.absolute[b, s, i, q]
-    hand_out(lanes, scratch.sampled_xhat, samples.xhat[:, k], scratch.sample_rows)
-    hand_out(lanes, scratch.sampled_error, samples.error[:, k], scratch.sample_rows)
-    hand_out(lanes, scratch.sampled_P, samples.P[:, k], scratch.sample_rows)
+    scatter_sample(lanes, scratch.sampled_xhat, samples.xhat[:, k], scratch.sample_rows)
+    scatter_sample(lanes, scratch.sampled_error, samples.error[:, k], scratch.sample_rows)
+    scatter_sample(lanes, scratch.sampled_P, samples.P[:, k], scratch.sample_rows)
 
 
 @kernel
-def hand_out(lanes: Lanes, lines: FloatArray, samples: FloatArray, indices: np.ndarray) -> None:
-    """Write the first C ``lines`` (>= C, L) of a block into the ``samples`` (R, C) of its runs."""
+def scatter_sample(
+    lanes: Lanes, values: FloatArray, samples: FloatArray, indices: np.ndarray
+) -> None:
+    """Write the first C rows of ``values`` (>= C, L) into the ``samples`` (R, C) of the runs with
+    these ``indices`` (L,); -1: no run.
+    """
     count = samples.shape[1]
     for c in range(0, count, len(lanes)):
-        scatter(lanes, lines, c, samples, indices, min(count - c, len(lanes)))
+        scatter(lanes, values, c, samples, indices, min(count - c, len(lanes)))
 
 
 @kernel
 def drop_silent(plan: SlotPlan, links: SlotLinks, b: int, s: int, e: int) -> None:
-    """Take the messages of nodes that send none in a step out of ``up``."""
+    """Set ``up`` to 0 for the messages of nodes that send nothing in step ``e`` of slot ``s``."""
     for m in range(len(links.sender)):
         for q in range(plan.up.shape[4]):
             if plan.sent[b, s, e, links.sender[m], q] == 0:
@@ -269,7 +287,7 @@ def drop_silent(plan: SlotPlan, links: SlotLinks, b: int, s: int, e: int) -> Non
 
 @kernel
 def rebase(nodes: SlotNodes, readings: ReadingBlock, scratch: SlotScratch, b: int, s: int) -> None:
-    """Count estimates from the state of slot ``s``, where a frame of coordinates begins."""
+    """Move the origin of all estimates to the state of slot ``s``, if a frame begins there."""
     # Only the mean moves: a covariance does not depend on the origin.
     if readings.rebased[s]:
         for h in range(len(nodes.rows)):
@@ -283,7 +301,7 @@ def rebase(nodes: SlotNodes, readings: ReadingBlock, scratch: SlotScratch, b: in
 def read_all(
     nodes: SlotNodes, readings: ReadingBlock, scratch: SlotScratch, b: int, s: int
 ) -> None:
-    """Update all filters of a block with their own readings of slot ``s``."""
+    """Update all filters of block ``b`` with their own readings of slot ``s``."""
     for h in range(len(nodes.rows)):
         update_by_reading(nodes, readings, scratch, b, s, h, h, True)
 
@@ -299,8 +317,8 @@ def update_by_reading(
     sender: int,
     arrived: Any,
 ) -> None:
-    """Update filter ``h`` of a block with the reading of filter ``sender`` in slot ``s``, in the
-    lanes where it has ``arrived``.
+    """Update filter ``h`` of block ``b`` with the reading of filter ``sender`` in slot ``s``, in
+    the lanes where it has ``arrived``: row by row ``x += P h' (h P h' + 1)^-1 (y - h x)``.
     """
     lanes, size, n = scratch.lanes, scratch.size, len(scratch.size)
     row = local_lanes_vector(size, lanes, scratch.row)
@@ -315,7 +333,7 @@ def update_by_reading(
             for i in range(j, n):
                 weight = load(lanes, readings.H, c, t, sender, k, i)
                 total += weight * load(lanes, nodes.root, b, h, i, j)
-            # A row of zeros changes nothing.
+            # In lanes without the message a row of zeros, which changes nothing.
             store(lanes, row, j, select(arrived, total, 0.0))
             weight = load(lanes, readings.H, c, t, sender, k, j)
             innovation -= weight * load(lanes, nodes.xhat, b, h, j)
@@ -335,10 +353,10 @@ def rotate_lanes(
     row: FloatArray,
     gains: FloatArray,
 ) -> Any:
-    """Use the scalar observation with ``h S = row`` (n, L) and unit noise; the gain is ``gains``
-    (n, L) times the value that is returned, 1 over the standard deviation of the innovation.
+    """Update root [b, h] with the scalar observation ``h S = row`` (n, L) of unit noise. Return 1
+    over the standard deviation of the innovation; the gain is ``gains`` (n, L) times it.
 
-    These are the rotations of ``root_update.rotate_out``; an entry of 0 turns nothing.
+    These are the rotations of ``root_update.rotate_out``; an entry of 0 rotates nothing.
     """
     n = len(size)
     for i in range(n):
@@ -348,12 +366,12 @@ def rotate_lanes(
     for j in range(n - 1, -1, -1):
         entry = load(lanes, row, j)
         square += entry * entry
-        whole = root_of(square)
-        inverse = 1.0 / whole
+        length = root_of(square)
+        inverse = 1.0 / length
         # Exactly 1 for an entry of 0, so that not even rounding touches the root.
         idle = entry == 0.0
         c, s = select(idle, 1.0, pivot * inverse), entry * inverse
-        pivot, over_pivot = select(idle, pivot, whole), select(idle, over_pivot, inverse)
+        pivot, over_pivot = select(idle, pivot, length), select(idle, over_pivot, inverse)
         # Rotate column j of [h S; S] into the column of the gain.
         for i in range(j, n):
             old, gain = load(lanes, root, b, h, i, j), load(lanes, gains, i)
@@ -364,7 +382,7 @@ def rotate_lanes(
 
 @kernel
 def predict_all(nodes: SlotNodes, scratch: SlotScratch, b: int) -> None:
-    """Move all filters of a block to the next slot: ``F xhat`` and ``F P F' + Q``."""
+    """Predict all filters of block ``b`` to the next slot: ``F xhat`` and ``F P F' + Q``."""
     for h in range(len(nodes.rows)):
         predict_mean(nodes, scratch, b, h)
         move_root(scratch, nodes.root, b, h, nodes.F, nodes.root_Q)
@@ -372,7 +390,7 @@ def predict_all(nodes: SlotNodes, scratch: SlotScratch, b: int) -> None:
 
 @kernel(inlined=True)
 def predict_mean(nodes: SlotNodes, scratch: SlotScratch, b: int, h: int) -> None:
-    """Move the estimate of a filter to the next slot, ``F xhat``."""
+    """Predict the estimate of filter ``h`` to the next slot, ``F xhat``."""
     transform_mean(scratch, nodes.xhat, b, h, nodes.F)
 
 
@@ -395,7 +413,7 @@ def transform_mean(scratch: SlotScratch, x: FloatArray, b: int, h: int, F: Float
 def move_root(
     scratch: SlotScratch, root: FloatArray, b: int, h: int, F: FloatArray, root_Q: FloatArray
 ) -> None:
-    """Apply ``predict_root`` with ``scratch``."""
+    """Apply ``predict_root`` with the arrays of ``scratch``."""
     predict_root(scratch.lanes, scratch.size, root, b, h, F, root_Q, scratch.moved, scratch.noise)
 
 
@@ -411,9 +429,9 @@ def predict_root(
     moved_scratch: FloatArray,
     noise_scratch: FloatArray,
 ) -> None:
-    """Make the lower triangular root S of filter ``h`` of a block that of ``F S S' F' + Q``;
-    ``root_Q`` (n, n) is lower triangular; ``moved_scratch`` and ``noise_scratch`` (n, n, L) are
-    scratch of a large n.
+    """Replace the lower triangular root S of filter ``h`` of block ``b`` by that of
+    ``F S S' F' + Q``; ``root_Q`` (n, n) is lower triangular. ``moved_scratch`` and
+    ``noise_scratch`` (n, n, L) are used if n is too large for registers.
     """
     n = len(size)
     moved = local_lanes_matrix(size, lanes, moved_scratch)
@@ -425,7 +443,7 @@ def predict_root(
             for m in range(j, n):
                 total += F[i, m] * load(lanes, root, b, h, m, j)
             store(lanes, moved, i, j, total)
-        # A fresh root of Q per lane: the reflections use it up.
+        # A copy of the root of Q in each lane, since the reflections overwrite it.
         for j in range(i + 1):
             store(lanes, noise, i, j, root_Q[i, j])
     # Reflect [F S, root_Q] from the right, row by row, which leaves a lower triangular root.
@@ -444,22 +462,22 @@ def write_root_column(
     moved: FloatArray,
     noise: FloatArray,
 ) -> None:
-    """Write column ``i`` of the triangular root of ``[moved, noise]``: the reflection that empties
-    row ``i`` beyond its diagonal, applied to the rows below.
+    """Write column ``i`` of the triangular root of ``[moved, noise]`` into ``root[b, h]``: apply
+    the Householder reflection that zeroes row ``i`` right of its diagonal to the rows below.
     """
     # The columns of root_Q right of i are still zero here.
-    n, pivot, beyond = len(size), load(lanes, moved, i, i), spread(lanes, 0.0)
+    n, pivot, square = len(size), load(lanes, moved, i, i), spread(lanes, 0.0)
     for j in range(i + 1, n):
         entry = load(lanes, moved, i, j)
-        beyond += entry * entry
+        square += entry * entry
     for j in range(i + 1):
         entry = load(lanes, noise, i, j)
-        beyond += entry * entry
-    length = root_of(pivot * pivot + beyond)
-    # pivot and its length with one sign: nothing cancels.
+        square += entry * entry
+    length = root_of(pivot * pivot + square)
+    # head = pivot + sign(pivot) length: nothing cancels.
     sign = with_sign(spread(lanes, 1.0), pivot)
     head = pivot + sign * length
-    # Columns are flipped so that the diagonal stays nonnegative.
+    # The sign of the column is chosen so that its diagonal is nonnegative.
     store(lanes, root, b, h, i, i, length)
     if i == n - 1:
         return
@@ -491,7 +509,9 @@ def predict_root_single(
 
 
 def predict_root_alone(root: FloatArray, F: FloatArray, root_Q: FloatArray) -> FloatArray:
-    """Return the lower triangular root (n, n) of ``F S S' F' + Q``, of lower triangular roots."""
+    """Return the lower triangular root (n, n) of ``F S S' F' + Q``, for lower triangular ``root`` S
+    and ``root_Q``.
+    """
     n = len(F)
     moved = np.array(root).reshape(1, 1, n, n, 1)
     predict_root_single(moved, F, root_Q, np.empty((n, n, 1)), np.empty((n, n, 1)))

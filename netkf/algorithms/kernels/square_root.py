@@ -1,4 +1,4 @@
-"""Covariance recursions in square-root form, which survive covariances of 1e14 and far beyond.
+"""Covariance recursions in square-root form, which stay accurate for covariances beyond 1e14.
 
 For ``P = S S'`` one orthogonal triangularisation of ``[[H S, root(R), 0], [F S, 0, root(Q)]]``
 gives the innovation's root, the gain and the root of the next covariance: nothing is subtracted, so
@@ -26,20 +26,20 @@ def lower_triangular(array: FloatArray) -> FloatArray:
 
 @kernel
 def reflect(work: FloatArray, i: int, rows: int, columns: int) -> None:
-    """Apply Householder's reflection of the first ``columns`` that leaves row ``i`` nothing right
-    of its diagonal, in place, for the rows from ``i`` up to ``rows``. What is right of the diagonal
-    in row ``i`` itself is rubbish then, to be taken for zeros.
+    """Apply, from the right and in place, the Householder reflection of the columns below
+    ``columns`` that zeroes row ``i`` right of its diagonal, to the rows ``i`` to ``rows`` - 1. In
+    row ``i`` itself the entries right of the diagonal are not cleared: read them as zeros.
     """
-    size = 0.0
+    square = 0.0
     for j in range(i, columns):
-        size += work[i, j] * work[i, j]
+        square += work[i, j] * work[i, j]
     # A zero row is triangular already.
-    if size == 0.0:
+    if square == 0.0:
         return
     # The sign opposite to the pivot's, so that the difference below does not cancel.
-    pivot = -math.copysign(math.sqrt(size), work[i, i])
-    # Half the squared length of the reflection's vector: v v' / scale is its projector times two.
-    scale = size - work[i, i] * pivot
+    pivot = -math.copysign(math.sqrt(square), work[i, i])
+    # With v = row i - pivot e_i, scale = v'v / 2 and the reflection is I - v v' / scale.
+    scale = square - work[i, i] * pivot
     work[i, i] -= pivot
     for r in range(i + 1, rows):
         total = 0.0
@@ -62,10 +62,11 @@ def reflect_row(
     square: Any,
     active: Any,
 ) -> None:
-    """Apply the reflection from the right that leaves row ``i`` of [wide, T] its diagonal alone, to
-    the rows from ``i`` on, in the lanes that are ``active``; row ``i`` has the length squared
-    ``square``, and in ``wide`` entries from column ``i`` up to ``end``; T is lower triangular, and
-    both are (n, n, L). Entry (i, i) becomes nonnegative.
+    """Apply the Householder reflection from the right that zeroes row ``i`` of [wide, T] except its
+    diagonal entry, which becomes nonnegative, to the rows from ``i`` on, in the ``active`` lanes.
+
+    wide and T are (n, n, L), T lower triangular. Row ``i`` has the squared length ``square``; in
+    ``wide`` its entries are in columns ``i`` to ``end`` - 1.
     """
     n, pivot = len(size), load(lanes, wide, i, i)
     length = root_of(select(active, square, 1.0))
@@ -104,9 +105,11 @@ def step_root(
     rows: np.ndarray,
     work: FloatArray,
 ) -> None:
-    """Move one root by ``f_m``: update with reading ``m`` and predict."""
+    """Replace root ``chain`` of ``roots`` (K, n, n) by that of f_m(P), R (17): update with reading
+    ``m`` and predict. ``work`` (>= p + n, >= 2 n + p) is scratch.
+    """
     n, p = len(F), rows[m]
-    # [[H S, root_R, 0], [F S, 0, root_Q]]
+    # The pre-array [[H S, root_R, 0], [F S, 0, root_Q]].
     for i in range(p + n):
         for j in range(n):
             total = 0.0
@@ -117,8 +120,8 @@ def step_root(
             work[i, n + j] = root_R[m, i, j] if i < p else 0.0
         for j in range(n):
             work[i, n + p + j] = root_Q[i - p, j] if i >= p else 0.0
-    # Householder's reflections of the columns make it lower triangular, row by row; right of the
-    # end there are zeros, because root_Q is lower triangular.
+    # Reflections of the columns make it lower triangular, row by row. Row i is zero right of column
+    # n + p + (i - p), because root_Q is lower triangular.
     for i in range(p + n):
         reflect(work, i, p + n, n + p + max(0, i - p + 1))
     # The post-array is [[C, 0], [K C, S+]]: its lower right block is the root of f_m(P).

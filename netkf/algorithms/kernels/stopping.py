@@ -1,6 +1,6 @@
-"""When a node of the push-sum filter stops learning: P step 2.3 and a safe form of it.
+"""When a node of the push-sum filter freezes its network estimate: P step 2.3 and a safe form.
 
-Both engines call these kernels, since the same rounding must stop a node in the same slot.
+Both engines call these kernels, so that rounding is the same and a node stops in the same slot.
 """
 
 from __future__ import annotations
@@ -21,28 +21,28 @@ def has_stopped(
     mass: FloatArray,
     k: int,
     before: FloatArray,
-    whole: bool,
+    all_up: bool,
     information: FloatArray,
     number: FloatArray,
     former: FloatArray,
     former_number: FloatArray,
     work: FloatArray,
 ) -> bool:
-    """Return True if a node stops by ``rule`` (its index in RULES).
+    """Return True if a node stops by ``rule`` (its index in RULES) with this ``tolerance``.
 
-    Its mass (2 + n n,) became that of index ``k`` from ``before``; what it makes of it became the
-    first entry of ``information`` (1, n, n) and ``number`` (1,) from entry ``k`` of the ``former``
-    ones. ``whole``: all links of the node were up. ``work`` (n, n) is scratch.
+    In this step its mass (2 + n n,) changed from ``before`` to ``mass[k]``, and its estimates of
+    the network, P (6), from ``former[k]`` (n, n) and ``former_number[k]`` to ``information[0]`` and
+    ``number[0]``. ``all_up``: all links of the node were up. ``work`` (n, n) is scratch.
     """
     if rule == PAPER:
-        # P step 2.3 waits until information has reached the node: mass of zero does not move
-        # either.
+        # P step 2.3 waits until information has reached the node, since a mass of zero does not
+        # change either.
         has_mass = False
         for i in range(2, mass.shape[1]):
             has_mass = has_mass or mass[k, i] != 0.0
         return has_mass and moved_within(mass, k, before, tolerance, work)
-    # SAFE trusts a step only if all links were up: an outage also makes the estimate stand still.
-    if rule == SAFE and whole and mass[k, 0] > 0.0:
+    # SAFE trusts a step only if all links were up: in an outage estimates do not change either.
+    if rule == SAFE and all_up and mass[k, 0] > 0.0:
         return has_converged(information, number[0], former, k, former_number[k], tolerance)
     return False
 
@@ -51,17 +51,15 @@ def has_stopped(
 def moved_within(
     mass: FloatArray, k: int, before: FloatArray, bound: float, work: FloatArray
 ) -> bool:
-    """Return True if the information of entry ``k`` moved from ``before`` by a symmetric D of
-    spectral norm below ``bound``: ``bound I - D`` and ``bound I + D`` have positive pivots only.
+    """Return True if the change D of the information, from ``before`` to ``mass[k]``, has a
+    spectral norm below ``bound``: both ``bound I - D`` and ``bound I + D`` are positive definite.
     """
     n = len(work)
-    # |D_ii| < bound is necessary, costs n comparisons only and saves an elimination where it fails.
-    # ``not <`` rejects nan.
+    # |D_ii| < bound is necessary and cheap to test first. ``not <`` rejects nan.
     for i in range(n):
         index = 2 + i * n + i
         if not abs(mass[k, index] - before[index]) < bound:
             return False
-    # Spectral norm below bound if and only if bound I - D and bound I + D are positive definite.
     for sign in (-1.0, 1.0):
         for i in range(n):
             for j in range(n):
@@ -100,17 +98,18 @@ def has_converged(
     former_number: float,
     tolerance: float,
 ) -> bool:
-    """Return True if G^(i) (1, n, n; Frobenius norm) and N^(i) moved by less than ``tolerance``,
-    relative to what they are, from entry ``k`` of the ``former`` ones.
+    """Return True if N^(i) and G^(i) changed by less than ``tolerance``, relative to their present
+    values: from ``former_number`` to ``number``, and from ``former[k]`` to ``information[0]`` (n,
+    n) in the Frobenius norm.
     """
     if not abs(number - former_number) < tolerance * number:
         return False
     n = information.shape[1]
-    moved = size = 0.0
+    change = size = 0.0
     for i in range(n):
         for j in range(n):
             step = information[0, i, j] - former[k, i, j]
-            moved += step * step
+            change += step * step
             # The Frobenius norm of the new G, by which the step is scaled.
             size += information[0, i, j] * information[0, i, j]
-    return math.sqrt(moved) <= tolerance * math.sqrt(size)
+    return math.sqrt(change) <= tolerance * math.sqrt(size)
