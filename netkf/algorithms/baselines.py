@@ -32,7 +32,7 @@ def local_slots(
     samples: SlotSamples,
     scratch: SlotScratch,
 ) -> None:
-    """Carry filters that never talk through the slots of a plan: predict, then update."""
+    """Simulate filters that never talk over the slots of a plan: predict, then update."""
     for b in range(plan.up.shape[0]):
         for s in range(plan.up.shape[1]):
             if plan.sensed[s]:

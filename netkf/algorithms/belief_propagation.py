@@ -58,18 +58,18 @@ SLOT, ALL = "slot", "all"
 
 
 class HeardEvidence(NamedTuple):
-    """What a neighbour said last: its ``evidence`` (n, n + 1); ``sent`` at that time, seconds."""
+    """The ``evidence`` (n, n + 1) that a neighbour sent last, at the time ``sent``, seconds."""
 
     evidence: FloatArray
     sent: float
 
 
 class BeliefState(NamedTuple):
-    """The state of a node; evidence (n, n + 1) counts from ``xhat``, see kernels.beliefs.
+    """The state of a node; evidence (n, n + 1) is relative to ``xhat``, see kernels.beliefs.
 
     xhat, root : the belief (n,) and the lower triangular root (n, n) of its covariance
     model : of the plant and the node's sensors
-    prior : evidence of the estimate before all readings that are kept
+    prior : evidence of the estimate before the readings in ``own`` and ``received``
     own : evidence of the node's own readings
     senders, received : ids of neighbours, and the evidence that each sent last
     node : the node's id
@@ -91,7 +91,7 @@ class BeliefState(NamedTuple):
 
 
 class Beliefs(NamedTuple):
-    """A payload; evidence counts from ``xhat``, and a receiver leaves out what it sent itself.
+    """A payload; evidence is relative to ``xhat``, and a receiver leaves out its own in ``heard``.
 
     xhat : the sender's belief (n,)
     own : evidence (n, n + 1) of the sender's own readings
@@ -133,7 +133,7 @@ def belief_slots(
     scratch: SlotScratch,
     arrays: BeliefArrays,
 ) -> None:
-    """Carry filters by belief propagation through the slots of a plan."""
+    """Simulate filters by belief propagation over the slots of a plan."""
     for b in range(plan.up.shape[0]):
         k, lanes = min(b, arrays.own.shape[0] - 1), scratch.lanes
         own, received = arrays.own[k], arrays.received[k]
@@ -163,15 +163,15 @@ def belief_slots(
                 for h in range(len(nodes.rows)):
                     update_beliefs(nodes, links, scratch, arrays, b, h)
             store_sample_of_slot(nodes, plan, samples, scratch, b, s)
-            # Evidence counts from the estimate, and moves along.
+            # Evidence is relative to the estimate: it needs no shift.
             rebase(nodes, readings, scratch, b, s)
 
 
 @kernel
 def predict_beliefs(nodes: SlotNodes, scratch: SlotScratch, arrays: BeliefArrays, b: int) -> None:
-    """Move all filters of a block to the next slot: evidence that is kept speaks about the present
-    state; else the belief is the prior, and nothing is known besides. Evidence counts from the
-    predictions, which are copied to ``scratch``.
+    """Predict all filters of block ``b`` to the next slot. If messages are kept, all evidence is
+    predicted; else the predicted belief is the prior, and all other evidence is cleared. Evidence
+    is relative to the predictions, which are copied to ``scratch.xhat``.
     """
     lanes, beliefs, k = scratch.lanes, arrays.scratch, min(b, arrays.own.shape[0] - 1)
     if not arrays.keeps:
@@ -202,8 +202,8 @@ def update_beliefs(
     b: int,
     h: int,
 ) -> None:
-    """Make the belief of filter ``h`` of a block from its prior and all evidence, which counts from
-    the belief then if it is kept.
+    """Compute the belief of filter ``h`` of block ``b``, the sum of its prior and all evidence. If
+    messages are kept, move the centre of the evidence to the new belief.
     """
     lanes, beliefs, k = scratch.lanes, arrays.scratch, min(b, arrays.own.shape[0] - 1)
     copy_part(lanes, arrays.prior[k, h], beliefs.total)
@@ -288,7 +288,7 @@ class BeliefPropagation(Filter):
     def slot_arrays(
         self, states: Sequence[Any], infos: Sequence[NodeInfo], runs: int
     ) -> tuple[BeliefArrays]:
-        """Return the evidence that nodes begin with, and scratch."""
+        """Return the initial evidence of all nodes, and scratch."""
         keeps, H, n = self.memory == ALL, len(states), len(states[0].xhat)
         W, D = sum(info.degree for info in infos), max(info.degree for info in infos)
         blocks = blocks_of(runs) if keeps else 1
@@ -338,18 +338,18 @@ class BeliefPropagation(Filter):
     def init(self, model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo) -> BeliefState:
         """Return the first state, in which nothing was read or heard."""
         root = first_root(cov)
-        prior, nothing = evidence_of(root), np.zeros((len(mean), len(mean) + 1))
-        return BeliefState(mean, root, model, prior, nothing, (), (), node.node)
+        prior, no_evidence = evidence_of(root), np.zeros((len(mean), len(mean) + 1))
+        return BeliefState(mean, root, model, prior, no_evidence, (), (), node.node)
 
     def predict(self, state: BeliefState, gap: float) -> BeliefState:
-        """Predict the belief; evidence that is kept speaks about the present state."""
+        """Predict the belief, and the evidence if messages are kept."""
         xhat, root = state.model.predict(state.xhat, state.root, gap)
         state = state._replace(xhat=xhat, root=root)
         if isinstance(state.model, SlotModel) and self.memory == SLOT:
-            nothing = np.zeros_like(state.own)
-            return state._replace(prior=evidence_of(root), own=nothing, senders=(), received=())
+            no_evidence = np.zeros_like(state.own)
+            return state._replace(prior=evidence_of(root), own=no_evidence, senders=(), received=())
         back = backward(state.model, gap)
-        return with_all(state, lambda evidence: predict_evidence(evidence, back))
+        return map_evidence(state, lambda evidence: predict_evidence(evidence, back))
 
     def update(self, state: BeliefState, reading: Reading) -> BeliefState:
         """Add a reading to the own ones."""
@@ -368,23 +368,23 @@ class BeliefPropagation(Filter):
         """Replace the earlier evidence of each sender, unless that was sent later."""
         if not messages:
             return state
-        known = dict(zip(state.senders, state.received, strict=True))
+        received = dict(zip(state.senders, state.received, strict=True))
         for message in messages:
             sent = exchange.time - message.age
-            if message.sender in known and known[message.sender].sent > sent:
+            if message.sender in received and received[message.sender].sent > sent:
                 continue
             evidence = evidence_for(state.node, message.payload)
             if message.age > 0.0 and not isinstance(state.model, SlotModel):
                 evidence = predict_evidence(evidence, backward(state.model, message.age))
             centre, _ = state.model.extrapolate(message.payload.xhat, state.root, message.age)
             evidence = recentre_evidence(evidence, centre, state.xhat)
-            known[message.sender] = HeardEvidence(evidence, sent)
-        senders = tuple(sorted(known))
+            received[message.sender] = HeardEvidence(evidence, sent)
+        senders = tuple(sorted(received))
         return compute_belief(
-            state._replace(senders=senders, received=tuple(known[j] for j in senders))
+            state._replace(senders=senders, received=tuple(received[j] for j in senders))
         )
 
-    shift = Filter.shift  # evidence counts from the belief
+    shift = Filter.shift  # evidence is relative to the belief
     shift_payload = Filter.shift_payload
 
 
@@ -396,14 +396,14 @@ def is_forest(scenario: Any) -> bool:
 
 
 def merge_evidence(parts: Sequence[FloatArray]) -> FloatArray:
-    """Return independent pieces of evidence (n, n + 1) together."""
+    """Return the sum (n, n + 1) of independent evidence."""
     stack = np.stack(parts)[..., None]
     add_part_single(stack[1:], stack[0], np.empty(stack.shape[1:]))
     return np.ascontiguousarray(stack[0, ..., 0])
 
 
 def add_to_own_evidence(state: BeliefState, reading: Reading) -> FloatArray:
-    """Return the evidence (n, n + 1) of a node's own readings together with a new one."""
+    """Return the evidence (n, n + 1) of a node's own readings plus that of a new one."""
     y, H = whiten_reading(reading.y, reading.H, reading.R)
     n = len(state.xhat)
     # The kernel takes blocks, slots, nodes and lanes: one of each here.
@@ -416,13 +416,13 @@ def add_to_own_evidence(state: BeliefState, reading: Reading) -> FloatArray:
 
 
 def evidence_for(node: int, payload: Beliefs) -> FloatArray:
-    """Return the evidence of a payload for one receiver: all but that of the receiver itself."""
+    """Return the evidence of a payload for the receiver ``node``: all but the receiver's own."""
     others = zip(payload.senders, payload.heard, strict=True)
     return merge_evidence([payload.own, *(one for sender, one in others if sender != node)])
 
 
 def evidence_of(root: FloatArray) -> FloatArray:
-    """Return an estimate with the root (n, n) of its covariance as evidence that counts from it."""
+    """Return an estimate with the root (n, n) of its covariance as evidence relative to itself."""
     n = len(root)
     part = np.zeros((n, n + 1, 1))
     write_prior_single(np.array(root).reshape(1, 1, n, n, 1), 0, part)
@@ -431,17 +431,18 @@ def evidence_of(root: FloatArray) -> FloatArray:
 
 def compute_belief(state: BeliefState) -> BeliefState:
     """Return the state with the belief that follows from its prior and all evidence."""
-    # Not an update of the prior, which on an unstable plant is so far off that digits are lost.
+    # From all evidence, and not as an update of the old belief: on an unstable plant that may be so
+    # far off that digits are lost.
     total = merge_evidence([state.prior, state.own, *(one.evidence for one in state.received)])
     n, before = len(total), state.xhat
     x, root, centre = np.zeros((1, 1, n, 1)), np.zeros((1, 1, n, n, 1)), np.array(before)
     finish_single(root, x, centre.reshape(1, n, 1), total[..., None], np.empty((n, n + 1, 1)))
     state = state._replace(xhat=x.reshape(n), root=root.reshape(n, n))
-    return with_all(state, lambda evidence: recentre_evidence(evidence, before, state.xhat))
+    return map_evidence(state, lambda evidence: recentre_evidence(evidence, before, state.xhat))
 
 
-def with_all(state: BeliefState, change: Callable[[FloatArray], FloatArray]) -> BeliefState:
-    """Return the state with all its evidence changed."""
+def map_evidence(state: BeliefState, change: Callable[[FloatArray], FloatArray]) -> BeliefState:
+    """Return the state with ``change`` applied to all its evidence."""
     received = tuple(one._replace(evidence=change(one.evidence)) for one in state.received)
     return state._replace(prior=change(state.prior), own=change(state.own), received=received)
 
@@ -457,15 +458,15 @@ def backward(model: Any, gap: float) -> FloatArray:
 
 
 def predict_evidence(evidence: FloatArray, back: FloatArray) -> FloatArray:
-    """Return evidence about a later state, from which ``back`` (n, n) leads to the earlier one."""
-    moved = np.array(evidence)[..., None]
+    """Return evidence predicted to a later state; ``back`` (n, n) is the inverse transition."""
+    predicted = np.array(evidence)[..., None]
     back = np.ascontiguousarray(back)
-    predict_part_single(moved, back, np.empty(moved.shape), np.empty(moved.shape))
-    return np.ascontiguousarray(moved[..., 0])
+    predict_part_single(predicted, back, np.empty(predicted.shape), np.empty(predicted.shape))
+    return np.ascontiguousarray(predicted[..., 0])
 
 
 def recentre_evidence(evidence: FloatArray, before: FloatArray, after: FloatArray) -> FloatArray:
-    """Return evidence that counts from ``before`` (n,) as it counts from ``after``."""
-    moved, old, new = (np.array(part)[..., None] for part in (evidence, before, after))
+    """Return evidence with its centre moved from ``before`` (n,) to ``after``."""
+    moved, old, new = (np.array(values)[..., None] for values in (evidence, before, after))
     recentre_part_single(moved, old, new)
     return np.ascontiguousarray(moved[..., 0])

@@ -113,13 +113,14 @@ class PseudoStates(NamedTuple):
 
     G : information of all sensors together
     inverse : its pseudo-inverse G^+
-    A, rest : of the prediction, ``A = G F G^+`` and ``rest = G F (I - G^+ G)``
+    A, coupling : of the prediction ``A yhat + coupling xhat``: ``A = G F G^+`` and
+                  ``coupling = G F (I - G^+ G)``
     """
 
     G: FloatArray
     inverse: FloatArray
     A: FloatArray
-    rest: FloatArray
+    coupling: FloatArray
 
 
 def pseudo_states(F: FloatArray, information: FloatArray) -> PseudoStates:
@@ -135,10 +136,11 @@ def pseudo_states(F: FloatArray, information: FloatArray) -> PseudoStates:
 
 
 class GainSequence:
-    """The gains of all nodes from slot 1 on, computed when they are asked for.
+    """The gains of all nodes from slot 1 on, computed on demand.
 
-    Errors are rows of factors of independent inputs, those of ``x - xhat_i`` of all nodes and then
-    those of ``y - yhat_i``: differences of nearly equal estimates keep their digits.
+    The errors ``x - xhat_i`` of all nodes, then ``y - yhat_i``, are linear in independent inputs of
+    variance 1: ``_errors`` (2 N n, inputs) holds the coefficients, so that covariances are products
+    of its rows, and differences of nearly equal estimates lose no digits.
     """
 
     def __init__(self, design: Design) -> None:
@@ -148,23 +150,23 @@ class GainSequence:
         self._F = np.frombuffer(design.F).reshape(n, n)
         self._information = np.frombuffer(design.information).reshape(N, n, n)
         self._pseudo = pseudo_states(self._F, self._information.sum(axis=0))
-        # Columns of zeros, as of nodes without a sensor, cost as much as others and add no noise.
+        # Columns of zeros, as of nodes without a sensor, add no noise: leave them out.
         self._noises = [without_zeros(square_root(matrix)) for matrix in self._information]
-        # x and w enter every xhat alike, and every yhat by G: (2 N n, n).
+        # x and w enter all errors of xhat by I, and all errors of yhat by G: (2 N n, n).
         stacked = np.concatenate([np.tile(np.eye(n), (N, 1)), np.tile(self._pseudo.G, (N, 1))])
         # All nodes start from the same mean: only x(0) - mean makes errors, as does w later.
         self._errors = stacked @ square_root(np.frombuffer(design.cov).reshape(n, n))
         self._driven = stacked @ square_root(np.frombuffer(design.Q).reshape(n, n))
-        self._found: list[tuple[NodeGains, ...]] = []
+        self._gains: list[tuple[NodeGains, ...]] = []
         self._converged = False
 
     def at(self, slot: int) -> tuple[NodeGains, ...]:
         """Return the gains of all nodes in a slot, counted from 1."""
-        # Gains do not depend on readings: they are computed once, as far as they are asked for.
-        while len(self._found) < slot and not self._converged:
-            self._found.append(self._advance_slot())
-            self._converged = len(self._found) > 1 and self._has_converged(*self._found[-2:])
-        return self._found[min(slot, len(self._found)) - 1]
+        # Gains do not depend on readings: each slot is computed once.
+        while len(self._gains) < slot and not self._converged:
+            self._gains.append(self._advance_slot())
+            self._converged = len(self._gains) > 1 and self._has_converged(*self._gains[-2:])
+        return self._gains[min(slot, len(self._gains)) - 1]
 
     def table(self, first: int, count: int) -> tuple[np.ndarray, SlotGains]:
         """Return the table rows (count,) of slots ``first`` to ``first + count - 1``, and the
@@ -175,16 +177,16 @@ class GainSequence:
         """
         slots = np.maximum(np.arange(first, first + count), 1)
         self.at(int(slots[-1]))
-        slots = np.minimum(slots, len(self._found))
-        found = self._found[slots[0] - 1 : slots[-1]]
-        every = [one for gains in found for one in gains]
-        K, N, n = len(found), len(self._heard), self._n
+        slots = np.minimum(slots, len(self._gains))
+        slot_gains = self._gains[slots[0] - 1 : slots[-1]]
+        node_gains = [one for gains in slot_gains for one in gains]
+        K, N, n = len(slot_gains), len(self._heard), self._n
         B, *rest = (
-            np.concatenate([getattr(one, name).reshape(-1, n, n) for one in every])
+            np.concatenate([getattr(one, name).reshape(-1, n, n) for one in node_gains])
             for name in SlotGains._fields
         )
-        made = SlotGains(B.reshape(K, -1, n, n), *(part.reshape(K, N, n, n) for part in rest))
-        return slots - slots[0], made
+        table = SlotGains(B.reshape(K, -1, n, n), *(part.reshape(K, N, n, n) for part in rest))
+        return slots - slots[0], table
 
     @staticmethod
     def _has_converged(before: tuple[NodeGains, ...], now: tuple[NodeGains, ...]) -> bool:
@@ -194,13 +196,13 @@ class GainSequence:
         return bool(np.abs(new - old).max() <= CONVERGED * np.abs(new).max())
 
     def _advance_slot(self) -> tuple[NodeGains, ...]:
-        """Carry the errors through a slot, and return its gains."""
+        """Advance the errors by one slot, and return its gains."""
         nodes = range(len(self._heard))
         self._errors = np.hstack([self._predict(), self._driven])
         predicted = [self._covariance_root(i) for i in nodes]
         gains = self._correct_pseudo_states()
         K = [self._correct_state(i) for i in nodes]
-        # Only products of rows count: as many inputs as rows are enough.
+        # Only products of rows matter: QR reduces the inputs to as many as there are rows.
         self._errors = np.asarray(np.linalg.qr(self._errors.T, mode="r")).T
         return tuple(
             NodeGains(B, M, K[i], predicted[i], self._covariance_root(i))
@@ -209,9 +211,9 @@ class GainSequence:
 
     def _predict(self) -> FloatArray:
         """Return the errors after F, (2 N n, inputs): those of all xhat, and then of all yhat."""
-        # e_x <- F e_x and e_y <- rest e_x + A e_y, with the plant's noise added by the caller.
+        # e_x <- F e_x and e_y <- coupling e_x + A e_y, with the plant's noise added by the caller.
         x, y = self._errors.reshape(2, len(self._heard), self._n, -1)
-        predicted = np.stack([self._F @ x, self._pseudo.rest @ x + self._pseudo.A @ y])
+        predicted = np.stack([self._F @ x, self._pseudo.coupling @ x + self._pseudo.A @ y])
         return predicted.reshape(self._errors.shape)
 
     def _state_error(self, i: int) -> FloatArray:
@@ -273,15 +275,15 @@ def variances(errors: FloatArray) -> FloatArray:
 
 def optimal_gain(e: FloatArray, theta: FloatArray, terms: FloatArray) -> FloatArray:
     """Return the gain ``E[e theta'] E[theta theta']^+`` (n, k) that corrects errors e (n, inputs)
-    by differences theta (k, inputs), whose terms have the variances ``terms`` (k,).
+    by differences theta (k, inputs); ``terms`` (k,) are the sums of the variances of their terms.
     """
-    # The difference of equal estimates is rounding, and counts as 0.
+    # Relative to its terms the difference of equal estimates is rounding, and counts as 0 below.
     scale = np.divide(1.0, np.sqrt(terms), out=np.zeros_like(terms), where=terms > 0.0)
     # E[e theta'] = e theta' for errors given by independent unit inputs; the pseudo-inverse comes
     # from the singular values of theta, which has half the condition of E[theta theta'].
     U, S, V = np.linalg.svd(scale[:, None] * theta, full_matrices=False)
-    used = S > NEGLIGIBLE
-    return np.asarray((e @ V[used].T / S[used]) @ (U[:, used].T * scale))
+    significant = S > NEGLIGIBLE
+    return np.asarray((e @ V[significant].T / S[significant]) @ (U[:, significant].T * scale))
 
 
 @lru_cache(maxsize=8)
@@ -360,14 +362,14 @@ def pseudo_slots(
     scratch: SlotScratch,
     arrays: PseudoArrays,
 ) -> None:
-    """Carry filters by consensus plus innovations through the slots of a plan."""
+    """Simulate filters by consensus plus innovations over the slots of a plan."""
     for b in range(plan.up.shape[0]):
         for s in range(plan.up.shape[1]):
             if plan.sensed[s]:
                 for h in range(len(nodes.rows)):
                     predict_pseudo(
                         scratch.lanes, nodes.xhat, arrays.yhat, b, h, arrays.pseudo.A,
-                        arrays.pseudo.rest, scratch.moved_mean,
+                        arrays.pseudo.coupling, scratch.moved_mean,
                     )  # fmt: skip
                     predict_mean(nodes, scratch, b, h)
                 correct_all(nodes, readings, plan, links, scratch, arrays, b, s)
@@ -387,7 +389,7 @@ def correct_all(
     b: int,
     s: int,
 ) -> None:
-    """Correct all filters of a block by their readings and what they hear in slot ``s``."""
+    """Correct all filters of block ``b`` by their readings and messages of slot ``s``."""
     lanes, k = scratch.lanes, arrays.table_row[s]
     for h in range(len(nodes.rows)):
         fill_pseudo_innovation(
@@ -398,7 +400,7 @@ def correct_all(
             lanes, arrays.yhat, b, h, links, plan.up, s, arrays.gains.B[k], arrays.gains.M[k],
             arrays.z, arrays.corrected,
         )  # fmt: skip
-    # Everyone has heard the estimates from before the exchange.
+    # Only after all filters have used the estimates from before the exchange.
     for h in range(len(nodes.rows)):
         correct_state(
             lanes, nodes.xhat, arrays.yhat, b, h, arrays.gains.K[k], arrays.pseudo.G,
@@ -411,10 +413,10 @@ def correct_all(
 
 @kernel
 def predict_pseudo_single(
-    x: FloatArray, y: FloatArray, A: FloatArray, rest: FloatArray, moved: FloatArray
+    x: FloatArray, y: FloatArray, A: FloatArray, coupling: FloatArray, work: FloatArray
 ) -> None:
     """Apply ``predict_pseudo`` to one node with one lane, x and y (1, 1, n, 1)."""
-    predict_pseudo(ONE, x, y, 0, 0, A, rest, moved)
+    predict_pseudo(ONE, x, y, 0, 0, A, coupling, work)
 
 
 @kernel
@@ -498,7 +500,7 @@ class ConsensusInnovations(Filter):
         xhat, yhat = state.xhat, state.yhat.reshape(1, 1, n, 1).copy()
         for _ in range(round(gap / state.model.period)):
             x = np.array(xhat).reshape(1, 1, n, 1)
-            predict_pseudo_single(x, yhat, state.pseudo.A, state.pseudo.rest, np.empty((n, 1)))
+            predict_pseudo_single(x, yhat, state.pseudo.A, state.pseudo.coupling, np.empty((n, 1)))
             xhat, slot = state.model.F @ xhat, slot + 1
         state = state._replace(xhat=xhat, yhat=yhat.reshape(n), slot=slot, reading=None)
         return state._replace(root=state.gains.predicted)
@@ -521,9 +523,9 @@ class ConsensusInnovations(Filter):
         """
         gains, order = state.gains, state.design.heard[state.node_index]
         senders = [order.index(message.payload.node_index) for message in messages]
-        chosen = gains._replace(B=gains.B[senders])
+        received_gains = gains._replace(B=gains.B[senders])
         heard = [message.payload.yhat for message in messages]
-        xhat, yhat = correct_estimates(state, chosen, heard)
+        xhat, yhat = correct_estimates(state, received_gains, heard)
         return state._replace(xhat=xhat, yhat=yhat, root=gains.root)
 
     def shift(self, state: PseudoState, offset: FloatArray) -> PseudoState:
@@ -549,8 +551,8 @@ def correct_estimates(
     n, y = len(state.xhat), np.stack([state.yhat, *heard])[None, :, :, None]
     links, up = star_of([1.0] * len(heard))
     readings = block_of_reading(*(state.reading or (np.zeros(0), np.zeros((0, n)))))
-    one = SlotGains(*(np.array(getattr(gains, name)) for name in SlotGains._fields))
-    table = SlotGains(one.B[None], *(part[None, None] for part in one[1:]))
+    gain_arrays = SlotGains(*(np.array(getattr(gains, name)) for name in SlotGains._fields))
+    table = SlotGains(gain_arrays.B[None], *(part[None, None] for part in gain_arrays[1:]))
     x = np.array(state.xhat).reshape(1, 1, n, 1)
     scratch = np.empty((1, n, 1)), np.empty((n, 1)), np.empty((n, 1))
     arrays = PseudoArrays(state.pseudo, table, np.zeros(1, dtype=np.int64), y, *scratch)

@@ -64,8 +64,11 @@ class ConstantGainState(NamedTuple):
 
 
 class ConstantGainArrays(NamedTuple):
-    """Of each filter, for whitened readings: ``closed`` (H, n, n), I - L H; ``noise`` (H, n, n),
-    the lower triangular root of L R L'; ``gain`` (H, n, p). Scratch: ``step`` (n, L).
+    """Constant matrices of H filters, for whitened readings.
+
+    closed : (H, n, n), I - L H
+    noise : (H, n, n), lower triangular root of L R L'
+    gain : (H, n, p), L times the root of R
     """
 
     closed: FloatArray
@@ -83,7 +86,7 @@ def constant_gain_slots(
     scratch: SlotScratch,
     arrays: ConstantGainArrays,
 ) -> None:
-    """Carry filters with constant gains through the slots of a plan."""
+    """Simulate filters with constant gains over the slots of a plan."""
     for b in range(plan.up.shape[0]):
         for s in range(plan.up.shape[1]):
             if plan.sensed[s]:
@@ -108,9 +111,11 @@ def correct_by_gain(
     s: int,
     h: int,
 ) -> None:
-    """Use the reading of filter ``h`` of a block: ``xhat + L (y - H xhat)`` and P."""
+    """Update filter ``h`` of block ``b`` by its reading of slot ``s``: ``xhat += L (y - H xhat)``
+    and ``P = (I - L H) P (I - L H)' + L R L'``.
+    """
     lanes, n = scratch.lanes, nodes.xhat.shape[2]
-    # All innovations refer to the estimate before the reading: the gain is that of the whole of it.
+    # All innovations refer to the estimate before the reading, since L is the gain of all its rows.
     for i in range(n):
         store(lanes, scratch.moved_mean, i, 0.0)
     for k in range(nodes.rows[h]):
@@ -119,8 +124,8 @@ def correct_by_gain(
             weight = load(lanes, readings.H, 0, 0, h, k, j)
             innovation -= weight * load(lanes, nodes.xhat, b, h, j)
         for i in range(n):
-            moved = load(lanes, scratch.moved_mean, i) + arrays.gain[h, i, k] * innovation
-            store(lanes, scratch.moved_mean, i, moved)
+            correction = load(lanes, scratch.moved_mean, i) + arrays.gain[h, i, k] * innovation
+            store(lanes, scratch.moved_mean, i, correction)
     for i in range(n):
         total = load(lanes, nodes.xhat, b, h, i) + load(lanes, scratch.moved_mean, i)
         store(lanes, nodes.xhat, b, h, i, total)
@@ -159,9 +164,9 @@ class ConstantGain(Filter):
     ) -> tuple[ConstantGainArrays]:
         """Return the gains for whitened readings and what follows from them."""
         n = len(states[0].xhat)
-        most = max(1, *(state.gain.shape[1] for state in states))
+        max_rows = max(1, *(state.gain.shape[1] for state in states))
         closed, noise = np.zeros((len(states), n, n)), np.zeros((len(states), n, n))
-        gain = np.zeros((len(states), n, most))
+        gain = np.zeros((len(states), n, max_rows))
         for k, state in enumerate(states):
             p = len(state.model.H)
             if p:

@@ -59,8 +59,8 @@ class DiffusionState(NamedTuple):
 
 
 class DiffusionWeights(NamedTuple):
-    """What filters give themselves when all messages arrive, ``own`` (H,), and whether they keep
-    the weight of messages that do not.
+    """The weights ``own`` (H,) that filters give to themselves when all messages arrive;
+    ``keep_own``: whether the weights of lost messages are added to them.
     """
 
     own: FloatArray
@@ -68,27 +68,27 @@ class DiffusionWeights(NamedTuple):
 
 
 @kernel(inlined=True)
-def applied_weights(lanes: Lanes, own: float, heard: Any, keep_own: bool) -> tuple[Any, Any]:
-    """Return the own weight and the divisor of the others, so that all of them sum to 1.
+def applied_weights(lanes: Lanes, own: float, received: Any, keep_own: bool) -> tuple[Any, Any]:
+    """Return the own weight that is applied and the divisor of the other weights, so that all of
+    them sum to 1, see ``DiffusionFilter.on_loss``.
 
-    ``own`` and ``heard`` are the nominal own weight and the sum of those of the messages that
-    arrived, see ``DiffusionFilter.on_loss``.
+    ``own`` is the nominal own weight, ``received`` the sum of those of the messages that arrived.
     """
-    total, rest = own + heard, 1.0 - heard
-    rest = select(rest > 0.0, rest, 0.0)
-    # "keep-own", or no weight at all: the own weight is what the others leave.
-    nothing = total == 0.0
-    divisor = select(nothing, spread(lanes, 1.0), total)
+    total, remainder = own + received, 1.0 - received
+    remainder = select(remainder > 0.0, remainder, 0.0)
+    # "keep-own", or weights that are all 0: the own weight is 1 minus the others.
+    is_zero = total == 0.0
+    divisor = select(is_zero, spread(lanes, 1.0), total)
     if keep_own:
-        return rest, spread(lanes, 1.0)
-    return select(nothing, rest, own / divisor), divisor
+        return remainder, spread(lanes, 1.0)
+    return select(is_zero, remainder, own / divisor), divisor
 
 
 @kernel
-def applied_weights_single(own: float, heard: float, keep_own: bool) -> tuple[float, float]:
+def applied_weights_single(own: float, received: float, keep_own: bool) -> tuple[float, float]:
     """Return ``applied_weights`` of one filter with one lane."""
-    found: tuple[float, float] = applied_weights(ONE, own, heard, keep_own)
-    return found
+    weights: tuple[float, float] = applied_weights(ONE, own, received, keep_own)
+    return weights
 
 
 @kernel
@@ -101,7 +101,7 @@ def diffusion_slots(
     scratch: SlotScratch,
     weights: DiffusionWeights,
 ) -> None:
-    """Carry diffusion filters through the slots of a plan, D (6)-(9)."""
+    """Simulate diffusion filters over the slots of a plan, D (6)-(9)."""
     for b in range(plan.up.shape[0]):
         for s in range(plan.up.shape[1]):
             # Samples show predictions: before the reading of the slot.
@@ -111,8 +111,8 @@ def diffusion_slots(
                 read_all(nodes, readings, scratch, b, s)
                 predict_all(nodes, scratch, b)
             if plan.exchanged[s]:
-                # Everyone combines what was sent: estimates and inverse roots, once for each sender
-                # however many hear it.
+                # Copies of all estimates and the inverses of their roots, computed once for each
+                # sender: they are the messages.
                 for h in range(len(nodes.rows)):
                     for i in range(nodes.xhat.shape[2]):
                         store(
@@ -138,16 +138,18 @@ def combine_senders(
     s: int,
     h: int,
 ) -> None:
-    """Intersect the estimate of filter ``h`` of a block with those that it hears, D (8) and (9)."""
-    lanes, heard = scratch.lanes, spread(scratch.lanes, 0.0)
+    """Combine filter ``h`` of block ``b`` with the messages that arrive in slot ``s``, D (8) and
+    (9).
+    """
+    lanes, received = scratch.lanes, spread(scratch.lanes, 0.0)
     for m in range(links.first[h], links.first[h + 1]):
         arrived = load_flags(lanes, plan.up, b, s, 0, links.direction[m])
-        heard += select(arrived, links.weight[m], 0.0)
-    own, divisor = applied_weights(lanes, weights.own[h], heard, weights.keep_own)
-    # Weight 1: nothing heard counts, and the estimate stays to the last bit.
+        received += select(arrived, links.weight[m], 0.0)
+    own, divisor = applied_weights(lanes, weights.own[h], received, weights.keep_own)
+    # With own weight 1 the estimate stays to the last bit.
     if not any_lane(own != 1.0):
         return
-    # The own term needs no merging: it is the first.
+    # sum w_j P_j^-1 as roots: the own term first, then the others are merged into it.
     whiten(lanes, scratch.total, own, scratch.root, scratch.xhat, h, h)
     for m in range(links.first[h], links.first[h + 1]):
         arrived = load_flags(lanes, plan.up, b, s, 0, links.direction[m])
@@ -227,12 +229,12 @@ class DiffusionFilter(Filter):
         self, state: DiffusionState, messages: Sequence[Message], exchange: Exchange
     ) -> DiffusionState:
         """Combine, D (8) and (9)."""
-        own, heard = self.share(state.own, [message.weight for message in messages])
-        # Nothing to combine, or all weight at home.
+        own, shares = self.share(state.own, [message.weight for message in messages])
+        # Nothing to combine, or all weight is the node's own.
         if own == 1.0 or not messages:
             return state
         means, roots = pairs_now(state, messages)
-        xhat, root = intersect_roots(np.array([own, *heard]), means, roots)
+        xhat, root = intersect_roots(np.array([own, *shares]), means, roots)
         return state._replace(xhat=xhat, root=root)
 
     shift = Filter.shift  # affine: the weights sum to one
@@ -242,5 +244,7 @@ class DiffusionFilter(Filter):
         nominal ones.
         """
         # fsum: the sum must not depend on the order of messages.
-        kept, divisor = applied_weights_single(own, math.fsum(arrived), self.on_loss == "keep-own")
-        return kept, [weight / divisor for weight in arrived]
+        own_weight, divisor = applied_weights_single(
+            own, math.fsum(arrived), self.on_loss == "keep-own"
+        )
+        return own_weight, [weight / divisor for weight in arrived]

@@ -65,7 +65,7 @@ def diffusion_kalman_slots(
     samples: SlotSamples,
     scratch: SlotScratch,
 ) -> None:
-    """Carry diffusion Kalman filters through the slots of a plan."""
+    """Simulate diffusion Kalman filters over the slots of a plan."""
     for b in range(plan.up.shape[0]):
         for s in range(plan.up.shape[1]):
             if plan.sensed[s]:
@@ -84,9 +84,11 @@ def diffusion_kalman_slots(
 
 
 @kernel
-def move_towards_single(x: FloatArray, links: SlotLinks, up: Any, moved: FloatArray) -> None:
+def sum_differences_single(
+    x: FloatArray, links: SlotLinks, up: Any, differences: FloatArray
+) -> None:
     """Apply ``sum_differences`` to one node, the first of x (1, H, n, 1), with one lane."""
-    sum_differences(ONE, x, 0, 0, links, up, 0, 0, True, moved)
+    sum_differences(ONE, x, 0, 0, links, up, 0, 0, True, differences)
 
 
 @built_in("diffusion-kalman")
@@ -161,8 +163,8 @@ class DiffusionKalman(Filter):
             return state._replace(xhat=combine_estimates(state.xhat, messages))
         xhat, root = state.xhat, state.root
         for message in messages:
-            one = message.payload
-            xhat, root = sample_update(xhat, root, one.y, one.H, one.R)
+            reading = message.payload
+            xhat, root = sample_update(xhat, root, reading.y, reading.H, reading.R)
         return state._replace(xhat=xhat, root=root)
 
     shift = Filter.shift  # affine: the weights sum to one
@@ -178,6 +180,6 @@ def combine_estimates(psi: FloatArray, messages: Sequence[Message]) -> FloatArra
     """Return ``sum_l c_l psi_l`` (n,) with the weights of the messages and the rest for psi."""
     n, x = len(psi), np.stack([psi, *(m.payload for m in messages)])[None, :, :, None]
     links, up = star_of([message.weight for message in messages])
-    moved = np.empty((1, n, 1))
-    move_towards_single(x, links, up, moved)
-    return np.asarray(psi + moved.reshape(n))
+    differences = np.empty((1, n, 1))
+    sum_differences_single(x, links, up, differences)
+    return np.asarray(psi + differences.reshape(n))

@@ -53,9 +53,9 @@ from netkf.linalg.lanes import (
 )
 
 
-class Heard(NamedTuple):
-    """The last estimate that a neighbour sent, predicted to now: ``xhat`` (n,), ``root`` (n, n);
-    the ``weight`` of its messages.
+class NeighbourCopy(NamedTuple):
+    """The last estimate that a neighbour sent, predicted to now: ``xhat`` (n,) and ``root`` (n, n);
+    and the ``weight`` of its messages.
     """
 
     xhat: FloatArray
@@ -68,8 +68,8 @@ class TriggeredState(NamedTuple):
 
     xhat, root : estimate (n,) and root (n, n) of its covariance
     model : of the plant and the node's sensors
-    sent : the estimate that the neighbours have of this node, None before the first message
-    senders, heard : ids of neighbours, and the estimate of each
+    sent : the neighbours' copy of this node's estimate, None before the first message
+    senders, copies : ids of neighbours, and the copy of the estimate of each
     """
 
     xhat: FloatArray
@@ -77,7 +77,7 @@ class TriggeredState(NamedTuple):
     model: Any
     sent: Estimate | None = None
     senders: tuple[int, ...] = ()
-    heard: tuple[Heard, ...] = ()
+    copies: tuple[NeighbourCopy, ...] = ()
 
     @property
     def P(self) -> FloatArray:
@@ -86,13 +86,15 @@ class TriggeredState(NamedTuple):
 
 
 class TriggeredCiArrays(NamedTuple):
-    """Arrays for B blocks of runs; W + 2 H copies of estimates: W heard, H sent now, H sent last.
+    """Arrays for B blocks of runs of H nodes and W directed links, with C = W + 2 H copies of
+    estimates: those received last on each link, then what each node sends now, then what it sent
+    last.
 
     alpha : threshold of the mean
     ratio : 1 + delta, threshold of the covariance
     share : share of a silent neighbour's information that counts
-    x, root : the copies (B, W + 2 H, n, L) and roots (B, W + 2 H, n, n, L)
-    known : which copies there are (B, W + 2 H, L)
+    x, root : the copies (B, C, n, L) and their roots (B, C, n, n, L)
+    has_copy : (B, C, L), 1 once there is a copy
     mean, inverse : (W + H, n, L) and (W + H, n, n, L), scratch
     """
 
@@ -101,7 +103,7 @@ class TriggeredCiArrays(NamedTuple):
     share: float
     x: FloatArray
     root: FloatArray
-    known: np.ndarray
+    has_copy: np.ndarray
     mean: FloatArray
     inverse: FloatArray
 
@@ -116,7 +118,7 @@ def triggered_ci_slots(
     scratch: SlotScratch,
     arrays: TriggeredCiArrays,
 ) -> None:
-    """Carry filters by event-triggered consensus through the slots of a plan."""
+    """Simulate filters by event-triggered consensus over the slots of a plan."""
     for b in range(plan.up.shape[0]):
         for s in range(plan.up.shape[1]):
             # A part of the plan: up to the decisions to send, or from the arrivals on.
@@ -142,10 +144,10 @@ def triggered_ci_slots(
 def predict_copies(
     nodes: SlotNodes, scratch: SlotScratch, arrays: TriggeredCiArrays, b: int
 ) -> None:
-    """Predict all copies of estimates, as those who sent them do."""
+    """Predict all copies of estimates in block ``b``, as their senders do."""
     lanes = scratch.lanes
     for k in range(arrays.x.shape[1]):
-        if any_lane(load_flags(lanes, arrays.known, b, k)):
+        if any_lane(load_flags(lanes, arrays.has_copy, b, k)):
             transform_mean(scratch, arrays.x, b, k, nodes.F)
             move_root(scratch, arrays.root, b, k, nodes.F, nodes.root_Q)
 
@@ -154,7 +156,7 @@ def predict_copies(
 def rebase_copies(
     readings: ReadingBlock, lanes: Lanes, arrays: TriggeredCiArrays, b: int, s: int
 ) -> None:
-    """Count copies from the state of slot ``s``, where a frame of coordinates begins."""
+    """Move the origin of all copies to the state of slot ``s``, where a frame begins."""
     for k in range(arrays.x.shape[1]):
         for i in range(arrays.x.shape[2]):
             origin = load(lanes, readings.local, b, s, i)
@@ -164,23 +166,26 @@ def rebase_copies(
 @kernel(inlined=True)
 def copy_estimate(
     lanes: Lanes,
-    to: tuple[FloatArray, FloatArray],
+    target: tuple[FloatArray, FloatArray],
     index: int,
     x: FloatArray,
     root: FloatArray,
     sender: int,
     b: int,
-    wanted: Any,
+    flags: Any,
 ) -> None:
-    """Write the pair of ``sender`` of a block to an ``index`` of other pairs, in the lanes where it
-    is ``wanted``.
+    """Copy estimate ``sender`` of ``x`` and ``root`` in block ``b`` to entry ``index`` of
+    ``target`` (estimates, roots), in the lanes with ``flags``.
     """
     for i in range(x.shape[2]):
-        before, now = load(lanes, to[0], b, index, i), load(lanes, x, b, sender, i)
-        store(lanes, to[0], b, index, i, select(wanted, now, before))
+        former, present = load(lanes, target[0], b, index, i), load(lanes, x, b, sender, i)
+        store(lanes, target[0], b, index, i, select(flags, present, former))
         for j in range(i + 1):
-            before, now = load(lanes, to[1], b, index, i, j), load(lanes, root, b, sender, i, j)
-            store(lanes, to[1], b, index, i, j, select(wanted, now, before))
+            former, present = (
+                load(lanes, target[1], b, index, i, j),
+                load(lanes, root, b, sender, i, j),
+            )
+            store(lanes, target[1], b, index, i, j, select(flags, present, former))
 
 
 @kernel
@@ -194,7 +199,9 @@ def decide_estimate(
     s: int,
     h: int,
 ) -> None:
-    """Decide whether node ``h`` sends its estimate, and keep a copy of the one that was sent."""
+    """Decide whether node ``h`` sends its estimate in slot ``s``; update the copy of what it sent
+    last.
+    """
     lanes, copies = scratch.lanes, (arrays.x, arrays.root)
     # Copies in order: those heard on each link, what each node sends now, what it sent last.
     own = len(links.sender) + h
@@ -205,14 +212,14 @@ def decide_estimate(
     )  # fmt: skip
     store(lanes, scratch.row, 0, select(near, 1.0, 0.0))
     for q in range(len(lanes)):
-        # The first estimate is sent in any case.
-        if scratch.row[0, q] == 1.0 and arrays.known[b, last, q] == 1:
+        # Silent if the copy is near; the first estimate is always sent.
+        if scratch.row[0, q] == 1.0 and arrays.has_copy[b, last, q] == 1:
             plan.sent[b, s, 0, h, q] = 0
         if plan.sent[b, s, 0, h, q] == 1:
-            arrays.known[b, last, q] = 1
+            arrays.has_copy[b, last, q] = 1
     sent = load_flags(lanes, plan.sent, b, s, 0, h)
     copy_estimate(lanes, copies, last, nodes.xhat, nodes.root, h, b, sent)
-    # What all others hear, while estimates change one after the other.
+    # The payload of this exchange: estimates change one after the other while nodes combine.
     everyone = spread(lanes, 1.0) > 0.0
     copy_estimate(lanes, copies, own, nodes.xhat, nodes.root, h, b, everyone)
 
@@ -228,15 +235,15 @@ def combine_copies(
     s: int,
     h: int,
 ) -> None:
-    """Combine the estimate of filter ``h`` of block ``b`` with those that it hears in slot ``s``,
-    and with the last estimates of silent neighbours, whose covariances are enlarged.
+    """Combine the estimate of filter ``h`` of block ``b`` with those that arrive in slot ``s`` and
+    with the copies of silent neighbours' estimates, whose covariances are enlarged: D (8) and (9).
     """
     lanes = scratch.lanes
     n = nodes.xhat.shape[2]
-    # Of the stacks of estimates the first W are copies by link, then come those of the nodes.
+    # Copies 0 to W - 1 are those of links, W to W + H - 1 what each node sends now.
     W = len(links.sender)
     own = W + h
-    heard = spread(lanes, 0.0)
+    copied_weight = spread(lanes, 0.0)
     for m in range(links.first[h], links.first[h + 1]):
         arrived = load_flags(lanes, plan.up, b, s, 0, links.direction[m])
         copies = (arrays.x, arrays.root)
@@ -245,15 +252,15 @@ def combine_copies(
             copy_estimate(lanes, copies, m, arrays.x, arrays.root, sender, b, arrived)
         for q in range(len(lanes)):
             if plan.up[b, s, 0, links.direction[m], q] == 1:
-                arrays.known[b, m, q] = 1
-        # Silent neighbours count too: silence says that their estimate is near the copy.
-        heard += select(load_flags(lanes, arrays.known, b, m), links.weight[m], 0.0)
+                arrays.has_copy[b, m, q] = 1
+        # A silent neighbour counts too: its estimate is near its copy.
+        copied_weight += select(load_flags(lanes, arrays.has_copy, b, m), links.weight[m], 0.0)
         invert_lanes(lanes, arrays.inverse, arrays.root, b, m)
         for i in range(n):
             store(lanes, arrays.mean, m, i, load(lanes, arrays.x, b, m, i))
-    # A node that knows no neighbour's estimate keeps its own, without rounding.
-    alone = heard == 0.0
-    if not any_lane(heard > 0.0):
+    # A node without any copy keeps its estimate, without rounding.
+    has_no_copy = copied_weight == 0.0
+    if not any_lane(copied_weight > 0.0):
         return
     invert_lanes(lanes, arrays.inverse, arrays.root, b, own)
     for i in range(n):
@@ -261,19 +268,27 @@ def combine_copies(
         store(lanes, arrays.mean, own, i, x)
         store(lanes, scratch.xhat, h, i, x)
     # Covariance intersection: sum_j w_j P_j^-1, as roots that are merged one after the other.
-    rest = select(heard < 1.0, 1.0 - heard, 0.0)
-    whiten(lanes, scratch.total, rest, arrays.inverse, arrays.mean, own, own)
+    own_weight = select(copied_weight < 1.0, 1.0 - copied_weight, 0.0)
+    whiten(lanes, scratch.total, own_weight, arrays.inverse, arrays.mean, own, own)
     for m in range(links.first[h], links.first[h + 1]):
         arrived = load_flags(lanes, plan.up, b, s, 0, links.direction[m])
-        known = load_flags(lanes, arrays.known, b, m)
-        if any_lane(known):
-            # A silent neighbour counts less: its covariance is taken as 1 / share times as large.
+        has_copy = load_flags(lanes, arrays.has_copy, b, m)
+        if any_lane(has_copy):
+            # The covariance of a silent neighbour's copy is enlarged by 1 / share.
             weight = select(arrived, links.weight[m], arrays.share * links.weight[m])
-            weight = select(known, weight, 0.0)
+            weight = select(has_copy, weight, 0.0)
             whiten(lanes, scratch.whitened, weight, arrays.inverse, arrays.mean, m, own)
             merge_lanes(lanes, scratch.total, scratch.whitened)
     finish_lanes(
-        lanes, nodes.root, nodes.xhat, b, h, scratch.xhat, scratch.total, scratch.whitened, alone
+        lanes,
+        nodes.root,
+        nodes.xhat,
+        b,
+        h,
+        scratch.xhat,
+        scratch.total,
+        scratch.whitened,
+        has_no_copy,
     )
 
 
@@ -347,7 +362,7 @@ class EventTriggeredCi(Filter):
     def slot_arrays(
         self, states: Sequence[Any], infos: Sequence[NodeInfo], runs: int
     ) -> tuple[TriggeredCiArrays]:
-        """Return the copies of estimates, none so far."""
+        """Return the arrays of thresholds and of copies, without any copy yet."""
         (H, n), blocks = (len(states), len(states[0].xhat)), blocks_of(runs)
         W, alpha = sum(info.degree for info in infos), self.thresholds[0]
         entries = W + 2 * H
@@ -389,15 +404,15 @@ class EventTriggeredCi(Filter):
         return TriggeredState(mean, first_root(cov), model)
 
     def predict(self, state: TriggeredState, gap: float) -> TriggeredState:
-        """Predict the estimate, and all copies of estimates as those who sent them do."""
+        """Predict the estimate, and all copies of estimates as their senders do."""
         xhat, root = state.model.predict(state.xhat, state.root, gap)
-        sent, heard = state.sent, []
+        sent, copies = state.sent, []
         if sent is not None:
             sent = Estimate(*state.model.predict(sent.xhat, sent.root, gap))
-        for one in state.heard:
-            x, S = state.model.predict(one.xhat, one.root, gap)
-            heard.append(Heard(x, S, one.weight))
-        return state._replace(xhat=xhat, root=root, sent=sent, heard=tuple(heard))
+        for copy in state.copies:
+            x, S = state.model.predict(copy.xhat, copy.root, gap)
+            copies.append(NeighbourCopy(x, S, copy.weight))
+        return state._replace(xhat=xhat, root=root, sent=sent, copies=tuple(copies))
 
     def emit(
         self, state: TriggeredState, exchange: Exchange
@@ -419,24 +434,27 @@ class EventTriggeredCi(Filter):
     def absorb(
         self, state: TriggeredState, messages: Sequence[Message], exchange: Exchange
     ) -> TriggeredState:
-        """Combine with the pairs heard, and with the copies of those who are silent."""
-        known = dict(zip(state.senders, state.heard, strict=True))
-        fresh = {m.sender: Heard(m.payload.xhat, m.payload.root, m.weight) for m in messages}
-        known.update(fresh)
-        if not known:
+        """Combine with the estimates received, and with the copies of silent neighbours."""
+        copies = dict(zip(state.senders, state.copies, strict=True))
+        received = {
+            m.sender: NeighbourCopy(m.payload.xhat, m.payload.root, m.weight) for m in messages
+        }
+        copies.update(received)
+        if not copies:
             return state
-        senders = tuple(sorted(known))
-        wider = self.widening
+        senders = tuple(sorted(copies))
+        widening = self.widening
         pairs = [(state.xhat, state.root)]
         pairs += [
-            (known[j].xhat, known[j].root if j in fresh else wider * known[j].root) for j in senders
+            (copies[j].xhat, copies[j].root if j in received else widening * copies[j].root)
+            for j in senders
         ]
-        heard = [known[j].weight for j in senders]
-        weights = np.array([max(0.0, 1.0 - math.fsum(heard)), *heard])
+        link_weights = [copies[j].weight for j in senders]
+        weights = np.array([max(0.0, 1.0 - math.fsum(link_weights)), *link_weights])
         means, roots = (np.stack(part) for part in zip(*pairs, strict=True))
         xhat, root = intersect_roots(weights, means, roots)
         return state._replace(
-            xhat=xhat, root=root, senders=senders, heard=tuple(known[j] for j in senders)
+            xhat=xhat, root=root, senders=senders, copies=tuple(copies[j] for j in senders)
         )
 
     def shift(self, state: TriggeredState, offset: FloatArray) -> TriggeredState:
@@ -444,5 +462,5 @@ class EventTriggeredCi(Filter):
         sent = state.sent
         if sent is not None:
             sent = sent._replace(xhat=sent.xhat + offset)
-        heard = tuple(one._replace(xhat=one.xhat + offset) for one in state.heard)
-        return state._replace(xhat=state.xhat + offset, sent=sent, heard=heard)
+        copies = tuple(copy._replace(xhat=copy.xhat + offset) for copy in state.copies)
+        return state._replace(xhat=state.xhat + offset, sent=sent, copies=copies)

@@ -197,7 +197,7 @@ class Filter(Component):
     inverts   covariances must never be singular
     talks     nodes exchange messages
     pooled    one filter reads the sensors of all nodes at once
-    needs_samples  increment sensors mean nothing to it
+    needs_samples  it cannot use increment sensors
     slot_kernel    the compiled form of the filter in slots (algorithms.kernels.slots), of its own
               class only; None: it runs in the SimPy engine
     newest_only    of several messages of one sender at one instant the newest counts
@@ -238,9 +238,9 @@ class Filter(Component):
             if name in cls.__dict__:
                 raise TypeError(f"{cls.__name__}.{name} is now {present}, see netkf.parts.Filter")
         for name in ("init", "emit", "absorb"):
-            wanted = list(inspect.signature(getattr(Filter, name)).parameters)
-            if not _accepts(getattr(cls, name), len(wanted)):
-                raise TypeError(f"{cls.__name__}.{name} must take ({', '.join(wanted[1:])})")
+            expected = list(inspect.signature(getattr(Filter, name)).parameters)
+            if not _accepts(getattr(cls, name), len(expected)):
+                raise TypeError(f"{cls.__name__}.{name} must take ({', '.join(expected[1:])})")
 
     def init(self, model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo) -> Any:
         """Return the state at time 0 from ``mean`` (n,) and ``cov`` (n, n)."""

@@ -33,7 +33,7 @@ def gossip_slots(
     samples: SlotSamples,
     scratch: SlotScratch,
 ) -> None:
-    """Carry gossip filters through the slots of a plan, G (10)."""
+    """Simulate gossip filters over the slots of a plan, G (10)."""
     for b in range(plan.up.shape[0]):
         for s in range(plan.up.shape[1]):
             # Samples show predictions: before the reading of the slot.
@@ -50,8 +50,8 @@ def gossip_slots(
 def swap_pairs(
     nodes: SlotNodes, plan: SlotPlan, links: SlotLinks, scratch: SlotScratch, b: int, s: int
 ) -> None:
-    """Replace the pair (xhat, P) of each node by the one that it hears; of several by the last
-    sender's.
+    """Replace the pair (xhat, P) of each node by the one that arrives in slot ``s``; if several
+    arrive, by that of the last sender.
     """
     lanes, n = scratch.lanes, len(scratch.size)
     # All payloads are from before the exchange.
@@ -63,7 +63,7 @@ def swap_pairs(
     for h in range(len(nodes.rows)):
         for m in range(links.first[h], links.first[h + 1]):
             heard = load_flags(lanes, plan.up, b, s, 0, links.direction[m])
-            # Most links are idle in a matching of a single run.
+            # Skip idle links: in a single run a matching uses few.
             if any_lane(heard):
                 copy_pair(nodes, scratch, b, h, links.sender[m], heard)
 
@@ -72,7 +72,7 @@ def swap_pairs(
 def copy_pair(
     nodes: SlotNodes, scratch: SlotScratch, b: int, h: int, sender: int, heard: Any
 ) -> None:
-    """Copy what ``sender`` sent to filter ``h`` in the lanes that ``heard`` it."""
+    """Copy the pair that ``sender`` sent to filter ``h``, in the lanes that ``heard`` it."""
     lanes = scratch.lanes
     for i in range(len(scratch.size)):
         own, sent = load(lanes, nodes.xhat, b, h, i), load(lanes, scratch.xhat, sender, i)

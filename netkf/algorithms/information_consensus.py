@@ -56,7 +56,7 @@ INFORMATION, MEASUREMENTS, HYBRID = "information", "measurements", "hybrid"
 
 
 class Recipe(NamedTuple):
-    """What K pairs of a node begin with and how its estimate is made of them in the end.
+    """How the K pairs of a node begin, and how its estimate follows from them after the last step.
 
     shares (K, 2): multiples of the information of the prediction and of the reading; counts
     (K + 1,): multiples of each pair after the last step, and of the node's own prediction.
@@ -95,7 +95,7 @@ class ConsensusState(NamedTuple):
 
 
 class Pairs(NamedTuple):
-    """A payload: roots of K pairs (K, n, n + 1) that count from ``xhat`` (n,)."""
+    """A payload: roots (K, n, n + 1) of K pairs, relative to ``xhat`` (n,)."""
 
     xhat: FloatArray
     parts: FloatArray
@@ -122,7 +122,7 @@ def consensus_slots(
     scratch: SlotScratch,
     arrays: ConsensusArrays,
 ) -> None:
-    """Carry filters by consensus on information through the slots of a plan."""
+    """Simulate filters by consensus on information over the slots of a plan."""
     for b in range(plan.up.shape[0]):
         for s in range(plan.up.shape[1]):
             # Slot 0 has no reading and no exchange: it shows the start.
@@ -153,7 +153,7 @@ def begin_all(
     b: int,
     s: int,
 ) -> None:
-    """Begin the pairs of all filters of a block from their predictions and readings."""
+    """Write the initial pairs of all filters of block ``b``, from predictions and readings."""
     for h in range(len(nodes.rows)):
         for i in range(nodes.xhat.shape[2]):
             store(scratch.lanes, scratch.xhat, h, i, load(scratch.lanes, nodes.xhat, b, h, i))
@@ -184,7 +184,7 @@ def mix_parts_single(
 
 
 @kernel
-def read_off_single(
+def write_estimate_single(
     root: FloatArray,
     x: FloatArray,
     parts: FloatArray,
@@ -200,7 +200,7 @@ def read_off_single(
 
 @dataclass(frozen=True, eq=False)
 class InformationConsensus(Filter):
-    """Consensus on pairs of information; a class says by ``recipe`` which.
+    """Consensus on information pairs; ``recipe`` of a derived class says which ones.
 
     The weights are Metropolis', ``1 / (1 + max degree)`` for each link; the weight of a message
     that does not come stays with the node itself, so that weights always sum to one.
@@ -228,10 +228,10 @@ class InformationConsensus(Filter):
         self, states: Sequence[Any], infos: Sequence[NodeInfo], runs: int
     ) -> tuple[ConsensusArrays]:
         """Return steps, recipe and scratch for the pairs of all nodes."""
-        made = self.recipe(infos[0].nodes)
-        n, K = len(states[0].xhat), len(made.shares)
+        recipe = self.recipe(infos[0].nodes)
+        n, K = len(states[0].xhat), len(recipe.shares)
         parts: FloatArray = aligned((2, K, len(states), n, n + 1, LANES))
-        return (ConsensusArrays(self.steps, *made, parts),)
+        return (ConsensusArrays(self.steps, *recipe, parts),)
 
     def payload_numbers(self, n: int, rows: int, phase: int) -> int:
         """Return the size of K pairs (Omega, q) in slots, and of one pair under clocks."""
@@ -258,7 +258,7 @@ class InformationConsensus(Filter):
     def absorb(
         self, state: ConsensusState, messages: Sequence[Message], exchange: Exchange
     ) -> ConsensusState:
-        """Take a consensus step; after the last one of a slot make the estimate."""
+        """Do a consensus step; after the last one of a slot compute the estimate."""
         if exchange.slot < 0:
             return self._intersect(state, messages)
         assert state.parts is not None
@@ -274,7 +274,7 @@ class InformationConsensus(Filter):
         xhat, root = intersect_roots(weights, means, roots)
         return state._replace(xhat=xhat, root=root)
 
-    shift = Filter.shift  # affine: pairs count from the estimate
+    shift = Filter.shift  # affine: pairs are relative to the estimate
     shift_payload = Filter.shift_payload
 
 
@@ -392,5 +392,5 @@ def estimate_of(state: ConsensusState, parts: FloatArray) -> tuple[FloatArray, F
     x, root = state.xhat.reshape(1, 1, n, 1).copy(), state.root.reshape(1, 1, n, n, 1).copy()
     inverse, work = np.zeros((1, n, n, 1)), np.empty((2, n, n + 1, 1))
     centre = state.xhat.reshape(1, n, 1).copy()
-    read_off_single(root, x, stack, state.recipe.counts, inverse, centre, work)
+    write_estimate_single(root, x, stack, state.recipe.counts, inverse, centre, work)
     return x.reshape(n), np.tril(root.reshape(n, n))

@@ -27,14 +27,16 @@ from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
 
 SLACK = 1.0 + 1e-6
-"""Ages are rounded."""
+"""Factor of the time span that is remembered, since ages are rounded."""
 
 TIME_TOLERANCE = 1e-14
-"""Times that differ by less, relative to now, are one: a state's own time is a sum of gaps."""
+"""Relative difference up to which times count as equal, since the time of a state is a
+sum of gaps.
+"""
 
 
 class Past(NamedTuple):
-    """One event in the past of a node.
+    """One event in the past of a node, to repeat when a late reading arrives.
 
     time : in seconds
     reading : the reading that was used, or None
@@ -58,8 +60,8 @@ class IntermittentState(NamedTuple):
     model : of the plant and the node's sensors
     unsent : own reading of this instant that has not been sent yet, or None
     time : seconds that the state refers to
-    past : events as far back as a late reading may reach
-    lag : that far, in seconds; 0: no past is kept
+    past : the newest event, linked to those before it, as far back as a late reading may reach
+    lag : length of that past in seconds; 0: none is stored
     """
 
     xhat: FloatArray
@@ -85,7 +87,7 @@ def intermittent_slots(
     samples: SlotSamples,
     scratch: SlotScratch,
 ) -> None:
-    """Carry intermittent filters through the slots of a plan, R (15)-(18)."""
+    """Simulate intermittent filters over the slots of a plan, R (15)-(18)."""
     for b in range(plan.up.shape[0]):
         for s in range(plan.up.shape[1]):
             # Samples show predictions: before the reading of the slot.
@@ -93,7 +95,7 @@ def intermittent_slots(
             rebase(nodes, readings, scratch, b, s)
             if plan.sensed[s]:
                 for h in range(len(nodes.rows)):
-                    # One after the other: with independent noise that equals one update.
+                    # Readings one after the other: with independent noise that equals one update.
                     fuse_readings(nodes, readings, plan, links, scratch, True, b, s, h)
                 predict_all(nodes, scratch, b)
 
@@ -150,7 +152,7 @@ class Intermittent(Filter):
 
     def history_span(self, max_delay: float) -> float:
         """Return the seconds of its past that a node must keep for late readings."""
-        # No message is older than the longest delay, so nothing older is kept.
+        # No message is older than the longest delay.
         return SLACK * min(self.max_age, max_delay)
 
     def predict(self, state: IntermittentState, gap: float) -> IntermittentState:
@@ -159,7 +161,7 @@ class Intermittent(Filter):
         return state._replace(xhat=xhat, root=root, time=state.time + gap, unsent=None)
 
     def update(self, state: IntermittentState, reading: Reading) -> IntermittentState:
-        """Use the reading, R (15)-(18), and keep the reading to be sent."""
+        """Use the reading, R (15)-(18), and store it to be sent."""
         return _use_reading(state, reading)._replace(unsent=reading if len(reading.y) else None)
 
     def emit(
@@ -200,8 +202,8 @@ class Intermittent(Filter):
 
 
 def _use_reading(state: IntermittentState, reading: Reading) -> IntermittentState:
-    """Update with a reading of now."""
-    # A reading without rows says nothing, and is not kept.
+    """Return the state after a reading of the present instant."""
+    # A reading without rows changes nothing.
     if not len(reading.y):
         return state
     xhat, root = sample_update(state.xhat, state.root, reading.y, reading.H, reading.R)
@@ -209,24 +211,27 @@ def _use_reading(state: IntermittentState, reading: Reading) -> IntermittentStat
     if state.lag <= 0.0:
         return state
     time, past = reading.time, state.past
-    if time // state.lag > past.time // state.lag:  # now and then, so that it costs little
+    # Once in each interval of length lag, so that dropping old events costs little.
+    if time // state.lag > past.time // state.lag:
         past = _drop_old(past, time - state.lag)
     return state._replace(time=time, past=Past(time, reading, None, xhat, root, past))
 
 
 def _use_late(state: IntermittentState, reading: Reading, now: float) -> IntermittentState:
-    """Go back to before the reading's time, use it, and do again what came after it."""
-    again: list[Past] = []
+    """Return the state as if a late reading had come in time: go back to the event before it, use
+    it, and repeat all later events.
+    """
+    later_events: list[Past] = []
     past = state.past
     # Entries after the reading's time are taken off; times that differ by rounding count as equal.
     while past.time > reading.time + TIME_TOLERANCE * now and past.before is not None:
-        again.append(past)
+        later_events.append(past)
         past = past.before
     model = state.model
     # The late reading, with the state before it, takes its place in time.
-    later = Past(reading.time, reading, None, *past[3:5], None)
+    late_event = Past(reading.time, reading, None, *past[3:5], None)
     # Forward again: predict to each event, and repeat it.
-    for event in [later, *reversed(again)]:
+    for event in [late_event, *reversed(later_events)]:
         xhat, root = past.xhat, past.root
         if event.time > past.time:
             xhat, root = model.predict(xhat, root, event.time - past.time)
@@ -245,22 +250,22 @@ def _use_late(state: IntermittentState, reading: Reading, now: float) -> Intermi
 
 
 def _drop_old(past: Past, since: float) -> Past:
-    """Return the past without what no late reading can reach: all after ``since``, and one before
-    it.
+    """Return the past without the events that no late reading can reach: those after ``since``
+    stay, and one before it.
     """
-    kept: list[Past] = []
+    recent: list[Past] = []
     event: Past | None = past
     while event is not None:
-        kept.append(event)
+        recent.append(event)
         # One entry before ``since`` stays: a reading of that time starts from it.
         if event.time < since:
             break
         event = event.before
     else:
-        # Everything is recent: no copy.
+        # All events are recent: no copy.
         return past
-    trimmed = kept[-1]._replace(before=None)
+    trimmed = recent[-1]._replace(before=None)
     # Entries are immutable, so the list is built anew from its oldest entry.
-    for event in reversed(kept[:-1]):
+    for event in reversed(recent[:-1]):
         trimmed = event._replace(before=trimmed)
     return trimmed

@@ -83,7 +83,7 @@ def kcf_slots(
     scratch: SlotScratch,
     arrays: KcfArrays,
 ) -> None:
-    """Carry Kalman-consensus filters through the slots of a plan."""
+    """Simulate Kalman-consensus filters over the slots of a plan."""
     for b in range(plan.up.shape[0]):
         for s in range(plan.up.shape[1]):
             if plan.sensed[s]:
@@ -110,12 +110,12 @@ def consensus_term_single(
     up: Any,
     root: FloatArray,
     epsilon: float,
-    moved: FloatArray,
+    term: FloatArray,
     work: FloatArray,
 ) -> None:
     """Write the consensus term of one node, the first of x (1, H, n, 1), with one lane."""
-    sum_differences(ONE, x, 0, 0, links, up, 0, 0, False, moved)
-    scale_by_covariance(ONE, root, 0, 0, epsilon, moved, work)
+    sum_differences(ONE, x, 0, 0, links, up, 0, 0, False, term)
+    scale_by_covariance(ONE, root, 0, 0, epsilon, term, work)
 
 
 @built_in("kcf")
@@ -183,15 +183,15 @@ class Kcf(Filter):
         xhat, root = state.xhat, state.root
         for message in messages:
             reading = message.payload.reading
-            # A late one belongs to another instant.
+            # A late reading belongs to another instant.
             if reading is not None and (exchange.slot >= 0 or message.age <= 0.0):
                 xhat, root = sample_update(xhat, root, reading.y, reading.H, reading.R)
-        # Only the means are used: the consensus term has the node's own P as its gain.
-        heard = [
+        # Only the means are needed: the gain of the consensus term is the node's own P.
+        predictions = [
             state.model.extrapolate(message.payload.xhat, state.root, message.age)[0]
             for message in messages
         ]
-        term = consensus_term(state.prior, state.prior_root, heard, self.epsilon)
+        term = consensus_term(state.prior, state.prior_root, predictions, self.epsilon)
         return state._replace(xhat=xhat + term, root=root)
 
     def shift(self, state: KcfState, offset: FloatArray) -> KcfState:
@@ -205,6 +205,6 @@ def consensus_term(
     """Return ``gamma P sum_j (xbar_j - xbar)`` (n,) for the predictions that were heard."""
     n, x = len(prior), np.stack([prior, *heard])[None, :, :, None]
     links, up = star_of([1.0] * len(heard))
-    moved, S = np.empty((1, n, 1)), np.ascontiguousarray(root).reshape(1, 1, n, n, 1)
-    consensus_term_single(x, links, up, S, epsilon, moved, np.empty((n, 1)))
-    return moved.reshape(n)
+    term, S = np.empty((1, n, 1)), np.ascontiguousarray(root).reshape(1, 1, n, n, 1)
+    consensus_term_single(x, links, up, S, epsilon, term, np.empty((n, 1)))
+    return term.reshape(n)

@@ -19,9 +19,9 @@ from netkf.linalg.arrays import FloatArray, square_root, symmetric
 from netkf.linalg.compiling import kernel
 
 MAX_RELATIVE_GAIN = 1.0
-"""Largest integral of trace(P G) over readings that are used at once: see ``usable``."""
+"""Largest integral of trace(P G) over increments that are used in one update, see ``usable``."""
 TABLES = 32
-"""Tables of flows that are kept, at most 256 KiB each."""
+"""Flow tables in the cache, at most 256 KiB each."""
 
 
 class Backward(NamedTuple):
@@ -36,13 +36,15 @@ class Backward(NamedTuple):
 def _shared_flow_table(
     A: FloatArray, Q: FloatArray, H: FloatArray, R: FloatArray, longest: float
 ) -> FlowTable:
-    """Return the table of a flow, which equal models share: it takes some 30 ms to make."""
+    """Return the flow table of a model; equal models share it, since it takes some 30 ms to
+    compute.
+    """
     parts = (np.asarray(part, dtype=np.float64).tobytes() for part in (A, Q, H, R))
-    return _known_flow_table(len(A), tuple(parts), longest)
+    return _cached_flow_table(len(A), tuple(parts), longest)
 
 
 @lru_cache(maxsize=TABLES)
-def _known_flow_table(n: int, parts: tuple[bytes, ...], longest: float) -> FlowTable:
+def _cached_flow_table(n: int, parts: tuple[bytes, ...], longest: float) -> FlowTable:
     """Return the flow table of a model whose A, Q, H and R come as bytes, the keys of the cache."""
     A, Q, H, R = (np.frombuffer(part) for part in parts)
     p = len(H) // n
@@ -187,8 +189,8 @@ class SlotModel:
 
 @kernel
 def usable(rate: float) -> float:
-    """Return the seconds of readings that may be used at once for ``rate = trace(P G)``, see
-    ``Filter.max_measurement_interval``.
+    """Return the longest interval (seconds) of increments for one update, for ``rate = trace(P G)``
+    in 1/s: P changes on the time scale 1 / rate, see ``Filter.max_measurement_interval``.
     """
     return MAX_RELATIVE_GAIN / rate if rate > 0.0 else math.inf
 

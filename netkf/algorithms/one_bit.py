@@ -98,7 +98,7 @@ def one_bit_slots(
     scratch: SlotScratch,
     arrays: BitArrays,
 ) -> None:
-    """Carry sign-of-innovations filters through the slots of a plan."""
+    """Simulate sign-of-innovations filters over the slots of a plan."""
     for b in range(plan.up.shape[0]):
         for s in range(plan.up.shape[1]):
             # One node a slot: its bits refer to an estimate that all nodes share.
@@ -119,8 +119,8 @@ def one_bit_slots(
 def silence_others(
     plan: SlotPlan, readings: ReadingBlock, rows: np.ndarray, turn: int, b: int, s: int
 ) -> None:
-    """Let all nodes be silent but the one whose ``turn`` it is, and that one where it has not read
-    anything.
+    """Write 0 into ``sent`` for all nodes but the one whose ``turn`` it is, and for that one too if
+    it has no reading in slot ``s``.
     """
     for h in range(plan.sent.shape[3]):
         if h != turn or not has_read(readings, rows[h], b, s, h):
@@ -130,8 +130,8 @@ def silence_others(
 
 @kernel
 def has_read(readings: ReadingBlock, rows: int, b: int, s: int, h: int) -> bool:
-    """Return True if filter ``h`` has a reading in slot ``s``, the same in all runs: of a recorded
-    sensor without a row y and H are zero.
+    """Return True if filter ``h`` has a reading in slot ``s``, the same in all runs: y and H are
+    zero if a recorded sensor has no row.
     """
     # H that is fixed has one block and one slot.
     c, t = min(b, readings.H.shape[0] - 1), min(s, readings.H.shape[1] - 1)
@@ -146,11 +146,11 @@ def has_read(readings: ReadingBlock, rows: int, b: int, s: int, h: int) -> bool:
 
 @kernel
 def has_links(links: SlotLinks, h: int) -> bool:
-    """Return True if filter ``h`` hears someone or is heard; others are not asked for messages."""
-    found = links.first[h] < links.first[h + 1]
+    """Return True if a link begins or ends at filter ``h``; others are never asked for messages."""
+    linked = links.first[h] < links.first[h + 1]
     for m in range(len(links.sender)):
-        found |= links.sender[m] == h
-    return bool(found)
+        linked |= links.sender[m] == h
+    return bool(linked)
 
 
 @kernel
@@ -169,7 +169,7 @@ def share_bits(
     them, in block ``b`` of runs.
     """
     lanes, rows = scratch.lanes, nodes.rows[turn]
-    # ``sent`` is not asked: a node uses its own bits even if it is kept from sending them.
+    # ``sent`` does not matter: a node uses its own bits even if a trigger keeps it silent.
     if not has_links(links, turn) or not has_read(readings, rows, b, s, turn):
         return
     send_bits(
@@ -258,9 +258,10 @@ def use_bit(
     scale = 1.0 / root_of((HALF_PI - 1.0) * square + HALF_PI)
     for j in range(n):
         store(lanes, row, j, scale * load(lanes, row, j))
-    # ``row`` is scaled to unit noise. The gain of a real observation is ``gains`` times ``over``.
-    over = rotate_lanes(lanes, row, root, b, h, row, gains)
-    step = sign * over * scale * root_of(HALF_PI * (square + 1.0))
+    # ``row`` is scaled to unit noise; the Kalman gain of such an observation is ``gains`` times
+    # ``inverse_deviation``.
+    inverse_deviation = rotate_lanes(lanes, row, root, b, h, row, gains)
+    step = sign * inverse_deviation * scale * root_of(HALF_PI * (square + 1.0))
     for i in range(n):
         store(lanes, x, b, h, i, load(lanes, x, b, h, i) + load(lanes, gains, i) * step)
 

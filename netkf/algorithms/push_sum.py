@@ -77,8 +77,8 @@ MAX_SPREAD = 1e14
 
 
 class NetworkInformation(NamedTuple):
-    """What a node takes the whole network to be: ``information`` (n, n) of all sensors, G^(i) of
-    P (6), the ``number`` of nodes, N^(i), and the ``root`` of P_inf where the gains are the limits.
+    """A node's estimate of the network: the mean ``information`` (n, n), G^(i) of P (6), and the
+    ``number`` of nodes, N^(i); with asymptotic gains the ``root`` of P_inf.
     """
 
     information: FloatArray
@@ -123,15 +123,20 @@ class PushSumState(NamedTuple):
 
 
 class PushSumArrays(NamedTuple):
-    """Mass (B, H, m, L) and nominal ``degree`` (H,) of the nodes; what they take the network to be,
-    ``information`` (B, H, n, n, L) and ``number`` (B, H, L); the information of a node ``alone``
-    (H, n, n); the settings, and the root of P_inf, ``limit`` (n, n), with asymptotic gains.
+    """Arrays and settings of H nodes for B blocks of runs; a mass has m = 2 + n n numbers.
 
-    Where sums are ``running``: the totals that each node has ``offered`` (B, H, m, L), and those
-    last ``heard`` on each direction (B, W, m, L).
-
-    Scratch: ``share`` (H, m, L), ``before`` (m, L), ``found`` (n, n, L), ``found_number`` (1, L),
-    ``silent`` (L,); of one lane ``stop``.
+    mass, degree : (B, H, m, L) masses, and nominal degrees (H,)
+    information, number : estimates of the network, G^(i) (B, H, n, n, L) and N^(i) (B, H, L)
+    alone : (H, n, n), information of each node's own sensors
+    rule, tolerance, delta, gamma, asymptotic : settings; ``rule`` is an index in RULES
+    limit : (n, n), root of P_inf, with asymptotic gains
+    running : whether masses are exchanged by running sums
+    offered, heard : then the totals that each node has offered (B, H, m, L), and those last heard on
+                     each direction (B, W, m, L)
+    share, before : scratch, shares (H, m, L) that nodes send, and a mass (m, L) before a step
+    new_information, new_number : scratch, P (6) of this slot (n, n, L) and (1, L)
+    silent : scratch (L,), 1 where a node has stopped in an earlier slot
+    stop : scratch of the stop rule, for one lane
     """
 
     mass: FloatArray
@@ -147,8 +152,8 @@ class PushSumArrays(NamedTuple):
     limit: FloatArray
     share: FloatArray
     before: FloatArray
-    found: FloatArray
-    found_number: FloatArray
+    new_information: FloatArray
+    new_number: FloatArray
     silent: np.ndarray
     stop: StopScratch
     running: bool
@@ -157,17 +162,17 @@ class PushSumArrays(NamedTuple):
 
 
 class StopScratch(NamedTuple):
-    """What ``has_stopped`` compares, for one lane.
+    """The arguments of ``has_stopped``, for one lane.
 
     mass, before : (1, m) and (m,), the mass now and before the step
-    found, former : information (1, n, n) that the mass gives now and gave before
-    number, former_number : number of nodes (1,), likewise
+    information, former : G^(i) (1, n, n) of P (6), now and before
+    number, former_number : N^(i) (1,), now and before
     work : (n, n), scratch
     """
 
     mass: FloatArray
     before: FloatArray
-    found: FloatArray
+    information: FloatArray
     number: FloatArray
     former: FloatArray
     former_number: FloatArray
@@ -184,7 +189,7 @@ def push_sum_slots(
     scratch: SlotScratch,
     arrays: PushSumArrays,
 ) -> None:
-    """Carry push-sum filters through the slots of a plan, P Fig. 1."""
+    """Simulate push-sum filters over the slots of a plan, P Fig. 1."""
     for b in range(plan.up.shape[0]):
         for s in range(plan.up.shape[1]):
             # Nodes that have stopped send no mass.
@@ -198,7 +203,7 @@ def push_sum_slots(
             # predicted.
             if plan.sensed[s] and not arrays.asymptotic:
                 predict_all(nodes, scratch, b)
-            # Step 2 before the correction, so that the gain uses what the mass of this slot says.
+            # Step 2 before the correction, so that the gain uses the mass of this slot.
             if plan.exchanged[s] and not arrays.asymptotic:
                 exchange_mass(arrays, plan, links, samples, scratch, b, s)
             if plan.sensed[s]:
@@ -212,17 +217,17 @@ def push_sum_slots(
                         1.0 / arrays.delta,
                     )  # fmt: skip
             if plan.sample[s] >= 0:
-                keep_sums(arrays, links, samples, scratch, b)
+                write_conserved_sums(arrays, links, samples, scratch, b)
             store_sample_of_slot(nodes, plan, samples, scratch, b, s)
             rebase(nodes, readings, scratch, b, s)
 
 
 @kernel
-def keep_sums(
+def write_conserved_sums(
     arrays: PushSumArrays, links: SlotLinks, samples: SlotSamples, scratch: SlotScratch, b: int
 ) -> None:
-    """Write the conserved sums that the nodes hold: of the weight (exactly 1) and of n~ (exactly
-    N); with running sums also those under way.
+    """Write each node's part of the conserved sums, of the weight w (total 1) and of n~ (total N),
+    into ``samples.conserved``; with running sums including what is under way to it.
     """
     for h in range(len(arrays.degree)):
         for k in range(2):
@@ -247,7 +252,7 @@ def exchange_mass(
 ) -> None:
     """Exchange mass once, P steps 2.1 to 2.3."""
     H, slot = len(arrays.degree), plan.first + s
-    # All shares before any mass changes: everyone sends what it had at the start of the exchange.
+    # All shares are computed before any mass changes.
     for h in range(H):
         split_mass(scratch.lanes, arrays.mass, b, h, arrays.degree[h], arrays.share)
     if arrays.running:
@@ -257,7 +262,7 @@ def exchange_mass(
             arrays.silent[q] = samples.stopped[b, h, q] < slot
         if arrays.running:
             receive_totals(arrays, plan, links, scratch, b, s, h)
-            # Without a stop rule nobody asks how many shares came.
+            # Running sums have no stop rule: the number of shares does not matter.
             learn(arrays, samples, scratch, b, h, spread(scratch.lanes, 0.0), slot)
         else:
             received = mix_mass(arrays, plan, links, scratch, b, s, h)
@@ -266,7 +271,9 @@ def exchange_mass(
 
 @kernel
 def silence_stopped(plan: SlotPlan, samples: SlotSamples, b: int, s: int) -> None:
-    """Let nodes that stopped in an earlier slot send no mass, P step 2.3."""
+    """Write 0 into ``sent`` for nodes that stopped in an earlier slot: they send no mass, P step
+    2.3.
+    """
     for h in range(plan.sent.shape[3]):
         for q in range(plan.sent.shape[4]):
             if samples.stopped[b, h, q] < plan.first + s:
@@ -321,7 +328,9 @@ def mix_mass(
     s: int,
     h: int,
 ) -> Any:
-    """Take the mass that node ``h`` keeps and receives, P (3)-(5); return how many shares came."""
+    """Set the mass of node ``h`` to the shares that it keeps and receives, P (3)-(5); return the
+    number (L,) of shares that arrived.
+    """
     lanes, mass, received = scratch.lanes, arrays.mass, spread(scratch.lanes, 0.0)
     # The mass before is kept for the stop rule.
     for i in range(mass.shape[2]):
@@ -333,19 +342,19 @@ def mix_mass(
         for i in range(mass.shape[2]):
             share = select(arrived, load(lanes, arrays.share, links.sender[m], i), 0.0)
             store(lanes, mass, b, h, i, load(lanes, mass, b, h, i) + share)
-    # By the paper's rule a stopped node leaves the exchange altogether; its mass stays with it. The
-    # safe rule goes on mixing, since other nodes still need its mass.
-    gone = load_flags(lanes, arrays.silent)
-    if arrays.rule == PAPER and any_lane(gone):
+    # By the paper's rule a stopped node leaves the exchange and keeps its mass. By the safe rule it
+    # goes on mixing, since other nodes still need its mass.
+    has_stopped_before = load_flags(lanes, arrays.silent)
+    if arrays.rule == PAPER and any_lane(has_stopped_before):
         for i in range(mass.shape[2]):
-            now, before = load(lanes, mass, b, h, i), load(lanes, arrays.before, i)
-            store(lanes, mass, b, h, i, select(gone, before, now))
-    # Its own share, once for itself and once for each share that did not come.
+            mixed, before = load(lanes, mass, b, h, i), load(lanes, arrays.before, i)
+            store(lanes, mass, b, h, i, select(has_stopped_before, before, mixed))
+    # Its own share, once for itself and once for each neighbour whose share did not arrive.
     times = (arrays.degree[h] + 1.0) - received
     if arrays.rule != PAPER:
         keep_share(lanes, mass, b, h, arrays.share, times, False)
     else:
-        keep_share(lanes, mass, b, h, arrays.share, times, gone)
+        keep_share(lanes, mass, b, h, arrays.share, times, has_stopped_before)
     return received
 
 
@@ -359,43 +368,48 @@ def learn(
     received: Any,
     slot: int,
 ) -> None:
-    """Apply P (6) to the mass of node ``h``, which ``received`` that many shares; record whether it
-    stops.
+    """Update the network estimate of node ``h`` from its mass, P (6), and apply the stop rule;
+    ``received`` (L,) is the number of shares that arrived in this slot.
     """
-    lanes, found = scratch.lanes, arrays.found
-    learn_network(lanes, arrays.mass, b, h, arrays.alone, found, arrays.found_number)
+    lanes, information = scratch.lanes, arrays.new_information
+    learn_network(lanes, arrays.mass, b, h, arrays.alone, information, arrays.new_number)
     # The stop rule compares with the former G and N, so they are replaced only afterwards.
     if arrays.rule != NEVER:
         store(lanes, scratch.row, 0, received)
         for q in range(len(lanes)):
-            whole = scratch.row[0, q] == arrays.degree[h]
-            if arrays.silent[q] == 0 and stops(arrays, b, h, q, whole):
+            all_up = scratch.row[0, q] == arrays.degree[h]
+            if arrays.silent[q] == 0 and stops(arrays, b, h, q, all_up):
                 samples.stopped[b, h, q] = slot
-    # A node that stopped before learns no more.
+    # A node that stopped in an earlier slot keeps its network estimate.
     frozen = load_flags(lanes, arrays.silent)
-    n = found.shape[0]
+    n = information.shape[0]
     for i in range(n):
         for j in range(n):
-            before, now = load(lanes, arrays.information, b, h, i, j), load(lanes, found, i, j)
-            store(lanes, arrays.information, b, h, i, j, select(frozen, before, now))
-    before, now = load(lanes, arrays.number, b, h), load(lanes, arrays.found_number, 0)
-    store(lanes, arrays.number, b, h, select(frozen, before, now))
+            former, present = (
+                load(lanes, arrays.information, b, h, i, j),
+                load(lanes, information, i, j),
+            )
+            store(lanes, arrays.information, b, h, i, j, select(frozen, former, present))
+    former, present = load(lanes, arrays.number, b, h), load(lanes, arrays.new_number, 0)
+    store(lanes, arrays.number, b, h, select(frozen, former, present))
 
 
 @kernel
-def stops(arrays: PushSumArrays, b: int, h: int, q: int, whole: bool) -> bool:
-    """Return True if node ``h`` of the run of lane ``q`` stops in this slot."""
-    one, n = arrays.stop, arrays.found.shape[0]
+def stops(arrays: PushSumArrays, b: int, h: int, q: int, all_up: bool) -> bool:
+    """Return True if node ``h`` stops in this slot, in lane ``q`` of block ``b``; ``all_up``: all
+    its links were up.
+    """
+    stop, n = arrays.stop, arrays.new_information.shape[0]
     for i in range(arrays.mass.shape[2]):
-        one.mass[0, i], one.before[i] = arrays.mass[b, h, i, q], arrays.before[i, q]
+        stop.mass[0, i], stop.before[i] = arrays.mass[b, h, i, q], arrays.before[i, q]
     for i in range(n):
         for j in range(n):
-            one.found[0, i, j] = arrays.found[i, j, q]
-            one.former[0, i, j] = arrays.information[b, h, i, j, q]
-    one.number[0], one.former_number[0] = arrays.found_number[0, q], arrays.number[b, h, q]
+            stop.information[0, i, j] = arrays.new_information[i, j, q]
+            stop.former[0, i, j] = arrays.information[b, h, i, j, q]
+    stop.number[0], stop.former_number[0] = arrays.new_number[0, q], arrays.number[b, h, q]
     return has_stopped(
-        arrays.rule, arrays.tolerance, one.mass, 0, one.before, whole, one.found, one.number,
-        one.former, one.former_number, one.work,
+        arrays.rule, arrays.tolerance, stop.mass, 0, stop.before, all_up, stop.information,
+        stop.number, stop.former, stop.former_number, stop.work,
     )  # fmt: skip
 
 
@@ -466,10 +480,10 @@ def learn_network_single(
 
 @kernel
 def correct_root_single(
-    root: FloatArray, information: FloatArray, rest: FloatArray, scratch: SlotScratch
+    root: FloatArray, information: FloatArray, remainder: FloatArray, scratch: SlotScratch
 ) -> None:
     """Apply ``correct_root`` to one filter with one lane, root (1, 1, n, n, 1)."""
-    correct_root(root, 0, 0, information, rest, scratch)
+    correct_root(root, 0, 0, information, remainder, scratch)
 
 
 @built_in("push-sum")
@@ -542,11 +556,11 @@ class PushSum(Filter):
         self, states: Sequence[Any], infos: Sequence[NodeInfo], runs: int
     ) -> tuple[PushSumArrays]:
         """Return the arrays of all nodes of all runs at the start."""
-        known = [state.network for state in states]
+        network_estimates = [state.network for state in states]
         alone = np.stack([state.model.information for state in states])
         (H, n), blocks = alone.shape[:2], blocks_of(runs)
         # Unused without asymptotic gains, but kernels need an array of the right shape.
-        limit = np.zeros((n, n)) if known[0].root is None else known[0].root
+        limit = np.zeros((n, n)) if network_estimates[0].root is None else network_estimates[0].root
         mass = np.stack([state.mass for state in states])
         m, running = mass.shape[1], self._keeps_totals
         W = sum(info.degree for info in infos) if running else 0
@@ -555,8 +569,12 @@ class PushSum(Filter):
             PushSumArrays(
                 mass=in_lanes(mass, blocks),
                 degree=np.array([state.degree for state in states], dtype=np.int64),
-                information=in_lanes(np.stack([k.information for k in known]), blocks),
-                number=in_lanes(np.array([k.number for k in known], dtype=np.float64), blocks),
+                information=in_lanes(
+                    np.stack([one.information for one in network_estimates]), blocks
+                ),
+                number=in_lanes(
+                    np.array([one.number for one in network_estimates], dtype=np.float64), blocks
+                ),
                 alone=alone,
                 rule=RULES.index(self.stop),
                 tolerance=self.tolerance,
@@ -567,8 +585,8 @@ class PushSum(Filter):
                 limit=np.ascontiguousarray(limit),
                 share=aligned((H, m, LANES)),
                 before=aligned((m, LANES)),
-                found=aligned((n, n, LANES)),
-                found_number=aligned((1, LANES)),
+                new_information=aligned((n, n, LANES)),
+                new_number=aligned((1, LANES)),
                 silent=np.zeros(LANES, dtype=np.uint8),
                 stop=StopScratch(*(np.zeros(shape) for shape in shapes)),
                 running=running,
@@ -588,13 +606,15 @@ class PushSum(Filter):
         # P step 1: w is 1 at the leader and 0 elsewhere, n~ = 1, C~ = the node's own information.
         weight = 1.0 if node.node == self.leader else 0.0
         mass = np.concatenate([[weight, 1.0], information.reshape(-1)])
-        known = NetworkInformation(information, 1.0)
-        # Everyone knows the whole network from the start.
+        network_estimate = NetworkInformation(information, 1.0)
+        # Every node knows the whole network from the start.
         if self.asymptotic:
             root = asymptotic_root(model.F, model.Q, node.information)
-            known = NetworkInformation(node.information, float(node.nodes), root)
+            network_estimate = NetworkInformation(node.information, float(node.nodes), root)
         sums = NodeSums(np.zeros(mass.shape), {}) if self._keeps_totals else None
-        return PushSumState(mean, first_root(cov), model, mass, known, False, node.degree, sums)
+        return PushSumState(
+            mean, first_root(cov), model, mass, network_estimate, False, node.degree, sums
+        )
 
     @property
     def _keeps_totals(self) -> bool:
@@ -647,29 +667,29 @@ class PushSum(Filter):
             )
         # P steps 2.2, (3)-(5), and 2.3, (6) with the stop rule.
         mass = conserve_mass(state.mass, received, state.degree)
-        whole = len(received) == state.degree
-        return self._learn_network(state._replace(mass=mass), state.mass, whole)
+        all_up = len(received) == state.degree
+        return self._learn_network(state._replace(mass=mass), state.mass, all_up)
 
-    def _learn_network(self, state: PushSumState, before: FloatArray, whole: bool) -> PushSumState:
-        """Apply P (6) and the stop rule; ``whole``: all links of the node were up."""
-        # Frozen by the safe rule: the mass was mixed, but is not read any more.
+    def _learn_network(self, state: PushSumState, before: FloatArray, all_up: bool) -> PushSumState:
+        """Apply P (6) and the stop rule; ``all_up``: all links of the node were up."""
+        # Frozen by the safe rule: the mass was mixed, but the estimate is not updated any more.
         if state.stopped:
             return state
-        found, former = network(state.mass, state.model), state.network
+        estimate, former = network(state.mass, state.model), state.network
         stopped = has_stopped(
             RULES.index(self.stop),
             self.tolerance,
             state.mass[None],
             0,
             before,
-            whole,
-            found.information[None],
-            np.array([found.number]),
+            all_up,
+            estimate.information[None],
+            np.array([estimate.number]),
             former.information[None],
             np.array([former.number]),
-            np.empty(found.information.shape),
+            np.empty(estimate.information.shape),
         )
-        return state._replace(network=found, stopped=stopped)
+        return state._replace(network=estimate, stopped=stopped)
 
     def update(self, state: Any, reading: Reading) -> Any:
         """Use a reading by steps 3 and 4 after the prediction, P (7) and (8)."""
@@ -772,9 +792,11 @@ class PushSum(Filter):
         """
         if not scenario.slotted:
             fields = dataclasses.fields(self)
-            given = [f"filter.{f.name}" for f in fields if getattr(self, f.name) != f.default]
+            changed_settings = [
+                f"filter.{f.name}" for f in fields if getattr(self, f.name) != f.default
+            ]
             reason = "not used under clocks, where push-sum keeps running sums"
-            return (f"{', '.join(given)}: {reason}",) if given else ()
+            return (f"{', '.join(changed_settings)}: {reason}",) if changed_settings else ()
         # Contraction is enough to run; the theorems ask for more.
         radius = scenario.topology.laplacian_radius
         if self.delta >= radius:
@@ -847,12 +869,12 @@ def network(mass: FloatArray, model: SlotModel) -> NetworkInformation:
 
 
 def correct_root_alone(root: FloatArray, information: FloatArray) -> FloatArray:
-    """Return root of ``(P^-1 + G)^-1 = P (I + G P)^-1``, P (7), for the lower triangular root of P,
-    possibly singular, and the information G (n, n).
+    """Return the root of ``(P^-1 + G)^-1 = P (I + G P)^-1``, P (7), for the lower triangular root
+    of P, possibly singular, and the information G (n, n).
     """
     n = len(root)
-    result, known = (np.array(a).reshape(1, 1, n, n, 1) for a in (root, information))
-    correct_root_single(result, known, np.empty((n, n, 1)), slot_scratch(1, n, ONE))
+    result, information_lanes = (np.array(a).reshape(1, 1, n, n, 1) for a in (root, information))
+    correct_root_single(result, information_lanes, np.empty((n, n, 1)), slot_scratch(1, n, ONE))
     return np.asarray(result.reshape(n, n))
 
 
@@ -865,7 +887,7 @@ def average_estimates(z: FloatArray, received: Sequence[FloatArray], delta: floa
 
 
 def asymptotic_root(F: FloatArray, Q: FloatArray, information: FloatArray) -> FloatArray | None:
-    """Return root of P_inf (n, n), P (12): the steady covariance of a filter that has all the
+    """Return the root of P_inf (n, n), P (12): the steady covariance of a filter that has all the
     information (n, n) in each slot, after its reading; None if there is none.
 
     By structure-preserving doubling: k steps give the covariance of 2^k slots (Chu, Fan, Lin and
@@ -882,11 +904,11 @@ def asymptotic_root(F: FloatArray, Q: FloatArray, information: FloatArray) -> Fl
                 return None
             left, right = solved[:, : len(F)], solved[:, len(F) :]
             # P grows towards the steady predicted covariance; it overflows if there is none.
-            following = symmetric(P + A.T @ P @ left)
-            if not np.isfinite(following).all():
+            next_P = symmetric(P + A.T @ P @ left)
+            if not np.isfinite(next_P).all():
                 return None
             # Rounding would make G and P unsymmetric, and doubling would amplify that.
-            A, G, step, P = A @ left, symmetric(G + A @ right @ A.T), following - P, following
+            A, G, step, P = A @ left, symmetric(G + A @ right @ A.T), next_P - P, next_P
             if np.abs(step).max() <= 1e-15 * np.abs(P).max():
                 # Without a steady state P doubles until rounding of G stops it: not a solution.
                 if np.abs(G).max() * np.abs(P).max() > MAX_SPREAD:

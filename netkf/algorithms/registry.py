@@ -80,8 +80,8 @@ def base_filter(algorithm: Filter) -> Filter:
     known = built_in_class(algorithm)
     if known is None:
         raise TypeError(f"{type(algorithm).__name__} derives from no built-in filter")
-    made: Filter = as_class(algorithm, known)
-    return made
+    base: Filter = as_class(algorithm, known)
+    return base
 
 
 def own_attributes(algorithm: object) -> list[str]:
@@ -111,9 +111,9 @@ def overridden(algorithm: object, known: type | None = None) -> list[str]:
     Theorems about the built-in class (``known``) do not hold for it.
     """
     known = known or built_in_class(algorithm)
-    mine = type(algorithm)
+    cls = type(algorithm)
     return [
         name
         for name in (*STEPS, *WEIGHING, *TRAITS)
-        if hasattr(known, name) and getattr(mine, name, None) is not getattr(known, name)
+        if hasattr(known, name) and getattr(cls, name, None) is not getattr(known, name)
     ]

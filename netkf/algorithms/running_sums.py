@@ -7,10 +7,10 @@ which starts at 1, and with N nodes its share of the information is ``(w_i / N) 
 node predicts its own estimate and covariance.
 
 A round offers each of the d nodes that can hear the share 1 / (d + 1) of all mass. What travels
-is not the share but the total ``sent`` that was ever offered; a hearer gains the difference to
-the last total it ``heard``, so a lost message only postpones, and the weight in nodes and under
-way stays N (running-sum push-sum; P has no such form). As rounds get fast every node is the
-central filter.
+is not the share but the total ``sent`` of all shares so far; a receiver gains the difference to
+the last total that it ``heard``. So a lost message only delays mass, and the weight in nodes and
+under way stays N (running-sum push-sum; P has no such form). In the limit of fast rounds every node
+is the central filter.
 
 Totals refer to an instant: as time passes they are predicted with the plant, without its noise,
 ``U -> s Phi^-T U Phi^-1`` and ``u -> s Phi^-T u`` with Phi = e^{A gap}. All totals are predicted
@@ -33,7 +33,9 @@ from netkf.algorithms.models import Backward, first_root, sample_update
 from netkf.linalg.arrays import FloatArray
 
 MIN_ACCURACY = 1e-4
-"""Relative accuracy with which a total must grow by what is offered, else nothing is offered."""
+"""Relative accuracy with which a total must grow by a share in floating point; otherwise the node
+offers nothing.
+"""
 
 
 class Offer(NamedTuple):
@@ -121,8 +123,9 @@ def offer(state: RunningSums) -> tuple[RunningSums, Offer | None]:
     U = (state.weight / state.nodes) * (inverse.T @ inverse)
     mass = np.concatenate([[state.weight], U.reshape(-1), U @ state.xhat])
     sent = state.sent + mass / (state.receivers + 1)
-    # The node gives up exactly what its total grew by, for each receiver. A node that hears nobody
-    # has less and less; what its total cannot show for rounding, it keeps, and says what it said.
+    # The node gives up exactly the amount by which its total grew, for each receiver. The mass of a
+    # node that receives nothing shrinks with each round, until the total no longer grows in
+    # floating point: then it keeps its mass, and sends the same total again.
     grown, share = float(sent[0] - state.sent[0]), float(mass[0]) / (state.receivers + 1)
     if abs(grown - share) > MIN_ACCURACY * share:
         return state._replace(rounds=state.rounds + 1), Offer(state.rounds, state.sent)
@@ -138,19 +141,21 @@ def absorb_totals(state: RunningSums, messages: Sequence[Message]) -> RunningSum
     """
     gained, heard = np.zeros_like(state.sent), dict(state.heard)
     for message in messages:
-        news: Offer = message.payload
+        new_offer: Offer = message.payload
         if message.age > 0.0:
-            news = predict_offer(news, state.model.backward(message.age))
-        last = heard.get(message.sender)
-        if last is not None and news.number <= last.number:
+            new_offer = predict_offer(new_offer, state.model.backward(message.age))
+        last_offer = heard.get(message.sender)
+        if last_offer is not None and new_offer.number <= last_offer.number:
             continue
-        gained = gained + (news.total if last is None else news.total - last.total)
-        heard[message.sender] = news
+        gained = gained + (
+            new_offer.total if last_offer is None else new_offer.total - last_offer.total
+        )
+        heard[message.sender] = new_offer
     if not gained[0] > 0.0:
         return state
     n, weight = len(state.xhat), state.weight + float(gained[0])
     U, u = gained[1 : 1 + n * n].reshape(n, n), gained[1 + n * n :]
-    # P^-1 <- (w P^-1 + N U) / w+ in roots; what has been gained cannot be less than nothing.
+    # P^-1 <- (w P^-1 + N U) / w+ in roots; eigenvalues below 1 would be negative information.
     scaled = np.sqrt(weight / state.weight) * state.root
     share = state.nodes / weight
     values, vectors = np.linalg.eigh(np.eye(n) + 0.5 * share * (scaled.T @ (U + U.T) @ scaled))
@@ -160,8 +165,8 @@ def absorb_totals(state: RunningSums, messages: Sequence[Message]) -> RunningSum
 
 
 def update_sums(state: RunningSums, reading: Reading) -> RunningSums:
-    """Use a reading: ``U += H' R^-1 H`` and ``u += H' R^-1 y``: N / w times that in terms
-    of P^-1.
+    """Use a reading: ``U += H' R^-1 H`` and ``u += H' R^-1 y``, that is N / w times as much in
+    P^-1, or a reading with noise R w / N.
     """
     if not len(reading.y):
         return state

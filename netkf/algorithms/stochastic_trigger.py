@@ -65,7 +65,7 @@ from netkf.linalg.lanes import (
 )
 
 NOWHERE = np.zeros(1, dtype=bool)
-"""Of a block of one slot: it is not there."""
+"""Flags of a block of one slot: not in this slot."""
 
 
 def trigger_matrix(Y: float | FloatArray, rows: int) -> FloatArray:
@@ -76,7 +76,7 @@ def trigger_matrix(Y: float | FloatArray, rows: int) -> FloatArray:
 
 
 def entries_at(scenario: Any, node: int) -> list[int]:
-    """Return the entries of the sensors of a node."""
+    """Return the indices, in the scenario, of the sensors of a node."""
     return [placed_sensor.entry for placed_sensor in scenario.placed.get(node, ())]
 
 
@@ -87,7 +87,7 @@ def whitened_trigger(Y: float | FloatArray, R: FloatArray) -> FloatArray:
 
 
 def silence_noise(R: FloatArray, Y: float | FloatArray) -> FloatArray:
-    """Return ``R + Y^-1`` (p, p), the noise of the reading that silence stands for."""
+    """Return ``R + Y^-1`` (p, p), the noise of the reading that silence is equivalent to."""
     return np.asarray(R + np.linalg.inv(trigger_matrix(Y, len(R))))
 
 
@@ -120,30 +120,31 @@ def whitened_triggers(models: Sequence[Any], Y: float | FloatArray) -> FloatArra
     return weights
 
 
-def silence_root(weight: FloatArray) -> FloatArray:
-    """Return C^-1 with the lower triangular ``C C' = I + W^-1``, by which whitened rows have noise
-    of variance 1 again when they stand for silence; W = ``weight`` (p, p), zeros beyond its rows.
+def silence_whitening(weight: FloatArray) -> FloatArray:
+    """Return C^-1 (p, p) with the Cholesky factor C of ``I + W^-1``, the noise of whitened rows
+    that stand for silence: C^-1 whitens them again. W = ``weight`` (p, p), zeros beyond its rows.
     """
     # A trigger is positive definite: zeros on the diagonal are rows that the node does not have.
-    rows, made = int((weight.diagonal() > 0.0).sum()), np.zeros(weight.shape)
+    rows, inverse = int((weight.diagonal() > 0.0).sum()), np.zeros(weight.shape)
     noise = np.eye(rows) + np.linalg.inv(weight[:rows, :rows])
-    made[:rows, :rows] = np.linalg.inv(np.linalg.cholesky(noise))
-    return made
+    inverse[:rows, :rows] = np.linalg.inv(np.linalg.cholesky(noise))
+    return inverse
 
 
 class ScheduledArrays(NamedTuple):
-    """Sensors and predictions for B blocks of runs; W + H sensors: W heard of, H own.
+    """Sensors and predictions for B blocks of runs of H nodes: W + H sensors, those of the sender
+    of each of W directions as its receiver knows them, then the own one of each node.
 
     trigger : (H, p, p), for whitened rows
-    wider : (H, p, p), see ``silence_root``
+    silence : (H, p, p), see ``silence_whitening``
     H : whitened rows (B, W + H, p, n, L)
-    known : which sensors are known (B, W + H, L)
+    known : (B, W + H, L), 1 once a reading of the sensor has arrived
     prior : predictions of a slot (B, H, n, L)
     z, row : (p, L) and (n, L), scratch
     """
 
     trigger: FloatArray
-    wider: FloatArray
+    silence: FloatArray
     H: FloatArray
     known: np.ndarray
     prior: FloatArray
@@ -161,7 +162,7 @@ def scheduled_slots(
     scratch: SlotScratch,
     arrays: ScheduledArrays,
 ) -> None:
-    """Carry filters that broadcast readings through the slots of a plan, Han et al. (2015)."""
+    """Simulate filters that broadcast readings over the slots of a plan, Han et al. (2015)."""
     for b in range(plan.up.shape[0]):
         for s in range(plan.up.shape[1]):
             # A part of the plan: up to the decisions to send, or from the arrivals on.
@@ -196,15 +197,17 @@ def schedule_reading(
     s: int,
     h: int,
 ) -> None:
-    """Decide if node ``h`` sends its reading."""
+    """Decide whether node ``h`` sends its reading of slot ``s``: with probability 1 - exp(-z' Y z /
+    2).
+    """
     lanes = scratch.lanes
     news = weigh_news(
         lanes, arrays.prior, readings, (b, s, h), nodes.rows[h], arrays.trigger, arrays.z
     )
-    # Through memory, because each run decides by itself.
+    # Through memory, since each lane (run) decides by itself.
     store(lanes, scratch.row, 0, news)
     for q in range(len(lanes)):
-        # The first reading is sent in any case.
+        # The first reading is always sent.
         probability = silence_probability(scratch.row[0, q])
         known = arrays.known[b, len(links.sender) + h, q] == 1
         silent = known and plan.uniform[b, s, 0, h, q] < probability
@@ -224,8 +227,8 @@ def update_by_sensors(
     s: int,
     h: int,
 ) -> None:
-    """Update filter ``h`` of a block with the readings that were sent, its own first, and the
-    silence of the other sensors that it knows.
+    """Update filter ``h`` of block ``b`` with the readings that arrive in slot ``s``, its own
+    first, and with the silence of the other sensors that it knows.
     """
     sent = load_flags(scratch.lanes, plan.sent, b, s, 0, h)
     own = len(links.sender) + h
@@ -248,21 +251,21 @@ def update_by_sensor(
     index: int,
     arrived: Any,
 ) -> None:
-    """Update filter ``h`` of a block with what ``sender`` says, at an ``index`` of the sensors that
-    are known: its reading where that has ``arrived``, else its silence.
+    """Update filter ``h`` of block ``b`` by the sensor of ``sender``, entry ``index`` of the known
+    sensors: with its reading in the lanes where that has ``arrived``, else with its silence.
     """
     lanes, rows = scratch.lanes, nodes.rows[sender]
     known = load_flags(lanes, arrays.known, b, index)
     if any_lane(arrived):
         d, t = min(b, readings.H.shape[0] - 1), min(s, readings.H.shape[1] - 1)
-        # H is remembered: later silence is about a reading with it.
+        # Store H: later silence is equivalent to a reading with it.
         for k in range(rows):
             for i in range(nodes.xhat.shape[2]):
-                before = load(lanes, arrays.H, b, index, k, i)
-                now = load(lanes, readings.H, d, t, sender, k, i)
-                store(lanes, arrays.H, b, index, k, i, select(arrived, now, before))
+                former = load(lanes, arrays.H, b, index, k, i)
+                present = load(lanes, readings.H, d, t, sender, k, i)
+                store(lanes, arrays.H, b, index, k, i, select(arrived, present, former))
         update_by_reading(nodes, readings, scratch, b, s, h, sender, arrived)
-    # A sensor that was never heard of may not exist: its silence says nothing.
+    # A sensor without any reading so far may not exist: its silence has no meaning.
     silent = select(arrived, 0.0, select(known, 1.0, 0.0)) > 0.0
     if any_lane(silent):
         use_silence(nodes, scratch, arrays, b, h, sender, index, silent)
@@ -280,21 +283,21 @@ def use_silence(
     index: int,
     silent: Any,
 ) -> None:
-    """Update filter ``h`` of a block with the reading ``H xbar`` with noise ``R + Y^-1``, in the
-    lanes where the ``sender`` is ``silent``.
+    """Update filter ``h`` of block ``b`` with a reading ``H xbar`` of noise ``R + Y^-1``, in the
+    lanes where ``sender`` is ``silent``; entry ``index`` of the known sensors holds its whitened H.
     """
     lanes, n = scratch.lanes, nodes.xhat.shape[2]
     for k in range(nodes.rows[sender]):
         innovation = spread(lanes, 0.0)
         for i in range(n):
-            # C^-1 H has noise of variance 1 again, where C C' is the noise of whitened silence.
+            # Row k of C^-1 H, which has noise of variance 1, see silence_whitening.
             total = spread(lanes, 0.0)
             for j in range(k + 1):
-                total += arrays.wider[sender, k, j] * load(lanes, arrays.H, b, index, j, i)
+                total += arrays.silence[sender, k, j] * load(lanes, arrays.H, b, index, j, i)
             store(lanes, arrays.row, i, total)
-            # No innovation with respect to the prediction.
-            gap = load(lanes, arrays.prior, b, h, i) - load(lanes, nodes.xhat, b, h, i)
-            innovation += total * gap
+            # The innovation H xbar - H xhat: zero until other readings of the slot move xhat.
+            difference = load(lanes, arrays.prior, b, h, i) - load(lanes, nodes.xhat, b, h, i)
+            innovation += total * difference
         for j in range(n):
             total = spread(lanes, 0.0)
             for i in range(j, n):
@@ -367,7 +370,7 @@ class ScheduledReadings(Filter):
         return (
             ScheduledArrays(
                 weights,
-                np.stack([silence_root(one) for one in weights]),
+                np.stack([silence_whitening(one) for one in weights]),
                 aligned((blocks, entries, p, n, LANES)),
                 np.zeros((blocks, entries, LANES), dtype=np.uint8),
                 aligned((blocks, H, n, LANES)),
@@ -390,7 +393,7 @@ class ScheduledReadings(Filter):
         return state._replace(xhat=xhat, root=root, prior=xhat, reading=None, sent=False)
 
     def update(self, state: ScheduledState, reading: Reading) -> ScheduledState:
-        """Keep the reading for the exchange of the slot."""
+        """Store the reading for the exchange of the slot."""
         return state._replace(reading=reading if len(reading.y) else None)
 
     def emit(
@@ -400,7 +403,7 @@ class ScheduledReadings(Filter):
         reading = state.reading
         if reading is None:
             return state, None
-        # The sender is known from its first message on: that is sent in any case.
+        # -1, the node itself, is among the known sensors once it has sent its first reading.
         if -1 in state.senders:
             probability = silence_probability(news_of(reading, state.prior, self.Y))
             if exchange.uniform < probability:
@@ -422,11 +425,11 @@ class ScheduledReadings(Filter):
                 xhat, root = sample_update(xhat, root, arrived[sender].y, H, R)
             else:
                 # No innovation with respect to the prediction.
-                wider = silence_noise(R, self.Y)
-                xhat, root = sample_update(xhat, root, H @ state.prior, H, wider)
-        known = tuple(sorted(sensors))
+                noise = silence_noise(R, self.Y)
+                xhat, root = sample_update(xhat, root, H @ state.prior, H, noise)
+        senders = tuple(sorted(sensors))
         return state._replace(
-            xhat=xhat, root=root, senders=known, sensors=tuple(sensors[j] for j in known)
+            xhat=xhat, root=root, senders=senders, sensors=tuple(sensors[j] for j in senders)
         )
 
     def shift(self, state: ScheduledState, offset: FloatArray) -> ScheduledState:
@@ -445,10 +448,10 @@ class TriggerArrays(NamedTuple):
     """Decisions of the nodes for B blocks of runs.
 
     trigger : (H, p, p), for whitened rows
-    news : z' Y z of the last reading (B, H, L)
-    undecided : whether it is open if that is sent (B, H, L)
-    silent : the decision not to send (B, H, L)
-    begun : whether a node has begun to send after readings (B, H, L)
+    news : (B, H, L), z' Y z of the last reading
+    undecided : (B, H, L), 1 until it is decided whether the node sends after this reading
+    silent : (B, H, L), 1 if it sends nothing until the next reading
+    has_sent : (B, H, L), 1 once the node has sent after a reading
     x, z : predictions (B, H, n, L) and (p, L), scratch
     """
 
@@ -456,7 +459,7 @@ class TriggerArrays(NamedTuple):
     news: FloatArray
     undecided: np.ndarray
     silent: np.ndarray
-    begun: np.ndarray
+    has_sent: np.ndarray
     x: FloatArray
     z: FloatArray
 
@@ -469,19 +472,20 @@ def trigger_arrays(models: Sequence[Any], Y: float | FloatArray, runs: int) -> T
         np.full((*shape, LANES), NO_READING),
         undecided=np.ones((*shape, LANES), dtype=np.uint8),
         silent=np.zeros((*shape, LANES), dtype=np.uint8),
-        begun=np.zeros((*shape, LANES), dtype=np.uint8),
+        has_sent=np.zeros((*shape, LANES), dtype=np.uint8),
         x=aligned((*shape, len(models[0].F), LANES)),
         z=aligned((trigger.shape[1], LANES)),
     )
 
 
 class TriggerPlan(NamedTuple):
-    """How the slots of a wrapped filter go.
+    """The order of events in the slots of a wrapped filter.
 
-    first : first step of an exchange after the reading
-    predicted : estimates are predicted before the reading
-    framed : moving frames begin before the reading
-    split : an exchange before the reading moves estimates, so that it is simulated apart
+    first : index of the first exchange step after the reading
+    predicted : whether estimates are predicted before the reading
+    framed : whether the origin moves before the reading
+    split : whether an exchange before the reading changes estimates; it is then simulated by a call
+            of its own
     """
 
     first: int
@@ -498,7 +502,8 @@ def trigger_plan(inner: Filter) -> TriggerPlan | None:
     before = schedule[: schedule.index("sense")]
     early = before.count("exchange")
     moves = any(inner.moves_estimates(phase) for phase in range(early))
-    # The exchanges of a slot are split from the rest by leaving one of both out.
+    # A slot is split into its exchanges and the rest by calling the kernel twice, with one of both
+    # left out. That fails if exchanges or a prediction are on both sides of the reading.
     if moves and (early < schedule.count("exchange") or "predict" in before):
         return None
     first = sum(inner.exchange_steps(phase) for phase in range(early))
@@ -516,12 +521,14 @@ def decide_senders(
     order: TriggerPlan,
     s: int,
 ) -> None:
-    """Decide who sends in slot ``s``: before the reading by the last one, then by this."""
+    """Decide who sends in slot ``s``: in steps before the reading by the last reading, then by this
+    one.
+    """
     for b in range(plan.sent.shape[0]):
         for e in range(order.first):
             decide_step(plan, arrays, b, s, e)
         if plan.sensed[s] and not order.split:
-            expect_all(nodes, readings, arrays, scratch, b, s, order.predicted, order.framed)
+            store_news(nodes, readings, arrays, scratch, b, s, order.predicted, order.framed)
         for e in range(order.first, plan.sent.shape[2]):
             decide_step(plan, arrays, b, s, e)
         for e in range(plan.sent.shape[2]):
@@ -530,24 +537,26 @@ def decide_senders(
 
 @kernel
 def decide_step(plan: SlotPlan, arrays: TriggerArrays, b: int, s: int, e: int) -> None:
-    """Decide for all nodes of a block that are asked in a step."""
+    """Decide which of the nodes that are asked in step ``e`` send, in block ``b``: a decision holds
+    until the next reading.
+    """
     for h in range(plan.sent.shape[3]):
         for q in range(plan.sent.shape[4]):
             if plan.sent[b, s, e, h, q] == 0:
                 continue
             if arrays.undecided[b, h, q] == 1:
-                # After the first reading a node sends in any case.
+                # After its first reading a node always sends.
                 news, u = arrays.news[b, h, q], plan.uniform[b, s, e, h, q]
-                silent = arrays.begun[b, h, q] == 1 and u < silence_probability(news)
+                silent = arrays.has_sent[b, h, q] == 1 and u < silence_probability(news)
                 arrays.undecided[b, h, q], arrays.silent[b, h, q] = 0, silent
                 if news >= 0.0:
-                    arrays.begun[b, h, q] = 1
+                    arrays.has_sent[b, h, q] = 1
             if arrays.silent[b, h, q] == 1:
                 plan.sent[b, s, e, h, q] = 0
 
 
 @kernel
-def expect_all(
+def store_news(
     nodes: SlotNodes,
     readings: ReadingBlock,
     arrays: TriggerArrays,
@@ -557,8 +566,9 @@ def expect_all(
     predicted: bool,
     framed: bool,
 ) -> None:
-    """Keep the news of the readings of all nodes of a block in slot ``s``; estimates are still to
-    be ``predicted``, or counted from the origin that begins with the slot (``framed``).
+    """Store the news ``z' Y z`` of the readings of all nodes of block ``b`` in slot ``s``, with
+    respect to the estimates after the steps that precede the reading: a move of the origin
+    (``framed``) and a prediction (``predicted``).
     """
     lanes = scratch.lanes
     for h in range(len(nodes.rows)):
@@ -578,12 +588,12 @@ def expect_all(
 
 
 @kernel
-def expect_slot(
+def store_news_of_slot(
     nodes: SlotNodes, readings: ReadingBlock, arrays: TriggerArrays, scratch: SlotScratch
 ) -> None:
-    """Apply ``expect_all`` to a block of one slot in which only the reading is left."""
+    """Apply ``store_news`` to all blocks of one slot whose steps before the reading are done."""
     for b in range(nodes.xhat.shape[0]):
-        expect_all(nodes, readings, arrays, scratch, b, 0, False, False)
+        store_news(nodes, readings, arrays, scratch, b, 0, False, False)
 
 
 class TriggeredSlots:
@@ -610,61 +620,63 @@ class TriggeredSlots:
         states: Sequence[Any],
         *more: Any,
     ) -> None:
-        """Carry the filters through the slots of a plan."""
-        carried = nodes._replace(xhat=self._inner.carried_estimates(nodes.xhat, more))
+        """Simulate the filters over the slots of a plan."""
+        carried_nodes = nodes._replace(xhat=self._inner.carried_estimates(nodes.xhat, more))
         for s in range(plan.up.shape[1]):
             asked = plan.sent[:, s : s + 1].copy()
             if plan.part != ARRIVING:
-                decide_senders(carried, readings, plan, links, scratch, arrays, self._order, s)
+                decide_senders(
+                    carried_nodes, readings, plan, links, scratch, arrays, self._order, s
+                )
             if plan.part == SENDING and not self._decides:
                 continue
-            here, one, slot_samples = slot_alone(readings, plan, samples, s)
+            slot_readings, slot_plan, slot_samples = single_slot(readings, plan, samples, s)
             if self._decides:
                 # The filter decides by itself, whatever the trigger says.
-                one = one._replace(sent=asked, part=plan.part)
-            given = (
+                slot_plan = slot_plan._replace(sent=asked, part=plan.part)
+            arguments = (
                 links,
                 slot_samples,
                 scratch,
                 *self._inner.slot_gains(states, more, plan.first + s, 1),
             )
             if self._order.split:
-                self._kernel(nodes, here, one._replace(sensed=NOWHERE), *given)
+                self._kernel(nodes, slot_readings, slot_plan._replace(sensed=NOWHERE), *arguments)
                 if plan.sensed[s]:
-                    expect_slot(carried, here, arrays, scratch)
+                    store_news_of_slot(carried_nodes, slot_readings, arrays, scratch)
                 # The sample and the new origin come with the exchange.
-                here, never = here._replace(rebased=NOWHERE), np.full(1, -1)
-                one = one._replace(exchanged=NOWHERE, sample=never)
-            self._kernel(nodes, here, one, *given)
+                slot_readings, no_sample = slot_readings._replace(rebased=NOWHERE), np.full(1, -1)
+                slot_plan = slot_plan._replace(exchanged=NOWHERE, sample=no_sample)
+            self._kernel(nodes, slot_readings, slot_plan, *arguments)
             if self._decides:
-                plan.sent[:, s : s + 1] &= one.sent
-                plan.up[:, s : s + 1] = one.up
+                plan.sent[:, s : s + 1] &= slot_plan.sent
+                plan.up[:, s : s + 1] = slot_plan.up
 
 
-def slot_alone(
+def single_slot(
     readings: ReadingBlock, plan: SlotPlan, samples: SlotSamples, s: int
 ) -> tuple[ReadingBlock, SlotPlan, SlotSamples]:
     """Return readings, plan and samples of slot ``s`` alone, for a kernel whose filters do not
     decide who sends.
     """
-    here = slice(s, s + 1)
+    at = slice(s, s + 1)
 
     def at_slot(values: Any) -> Any:
         """Return the part of the values of a block at this slot."""
-        return np.ascontiguousarray(values[:, here])
+        return np.ascontiguousarray(values[:, at])
 
     local, fixed = at_slot(readings.local), readings.H.shape[1] == 1
     H = readings.H if fixed else at_slot(readings.H)
-    alone = ReadingBlock(at_slot(readings.y), H, local, readings.rebased[here])
+    alone = ReadingBlock(at_slot(readings.y), H, local, readings.rebased[at])
     nothing = np.zeros((0,) * 5, dtype=np.uint8), np.zeros((0,) * 5)
-    one = SlotPlan(
-        plan.first + s, plan.sensed[here], plan.exchanged[here], plan.sample[here],
+    slot_plan = SlotPlan(
+        plan.first + s, plan.sensed[at], plan.exchanged[at], plan.sample[at],
         at_slot(plan.up), *nothing, WHOLE,
     )  # fmt: skip
     slot_samples = samples._replace(
         absolute=at_slot(samples.absolute), local=at_slot(samples.local)
     )
-    return alone, one, slot_samples
+    return alone, slot_plan, slot_samples
 
 
 class WrappedState(NamedTuple):
@@ -672,13 +684,13 @@ class WrappedState(NamedTuple):
 
     inner : state of the wrapped filter
     news : z' Y z of the last reading, NO_READING without one
-    begun : whether the node has begun to send after readings
+    has_sent : whether the node has sent after a reading
     silent : whether it sends nothing until the next reading, None before that is decided
     """
 
     inner: Any
     news: float = NO_READING
-    begun: bool = False
+    has_sent: bool = False
     silent: bool | None = None
 
     @property
@@ -707,7 +719,7 @@ class TriggeredMessages(Filter):
     randomised: ClassVar[bool] = True
     paper: ClassVar[str] = ""
     combination: ClassVar[str] = ""
-    # Who is heard depends on data.
+    # Which messages are sent depends on data, so that no comparison is proved.
     P_by_design: ClassVar[tuple[str, str]] = ("", "")
 
     @property
@@ -719,9 +731,9 @@ class TriggeredMessages(Filter):
     def slot_kernel(self) -> TriggeredSlots | None:
         """The slots of the filter with the trigger, where the filter is compiled."""
         inner, plan = self.inner, trigger_plan(self.inner)
-        # Of derived classes the kernel knows nothing.
-        known = type(inner) in built_in_filters().values() and inner.slot_kernel is not None
-        return TriggeredSlots(inner, plan) if known and plan is not None else None
+        # A kernel is that of its own class only: it ignores what a derived class changes.
+        is_compiled = type(inner) in built_in_filters().values() and inner.slot_kernel is not None
+        return TriggeredSlots(inner, plan) if is_compiled and plan is not None else None
 
     def decides_in_slots(self) -> bool:
         """Return True."""
@@ -754,16 +766,16 @@ class TriggeredMessages(Filter):
         news = NO_READING
         if len(reading.y):
             news = news_of(reading, self.inner.estimate(state.inner)[0], self.Y)
-        return WrappedState(self.inner.update(state.inner, reading), news, state.begun)
+        return WrappedState(self.inner.update(state.inner, reading), news, state.has_sent)
 
     def emit(self, state: WrappedState, exchange: Exchange) -> tuple[WrappedState, Any]:
         """Send the payload of the wrapped filter, or nothing until the next reading."""
         silent = state.silent
         if silent is None:
-            # After the first reading a node sends in any case.
-            silent = state.begun and exchange.uniform < silence_probability(state.news)
-            begun = state.begun or state.news >= 0.0
-            state = state._replace(silent=silent, begun=begun)
+            # After its first reading a node always sends.
+            silent = state.has_sent and exchange.uniform < silence_probability(state.news)
+            has_sent = state.has_sent or state.news >= 0.0
+            state = state._replace(silent=silent, has_sent=has_sent)
         # As if the message were lost: the filter has sent it.
         inner, payload = self.inner.emit(state.inner, exchange)
         return state._replace(inner=inner), None if silent else payload

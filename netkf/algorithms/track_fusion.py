@@ -52,12 +52,12 @@ from netkf.linalg.small import copy_matrix
 TRACE, DETERMINANT = "trace", "determinant"
 INTERSECTION = 'rule = "ci"'
 COMBINATIONS, MAX_DIRECTION_BITS = 64, 62
-"""Combinations of tracks that are kept of a node in a slot, and directions that have a bit."""
+"""Combinations of tracks in the cache of a node, and directions that have a bit of their own."""
 
 
 class FusionArrays(NamedTuple):
-    """How pairs are fused, and scratch: ``pair`` (2 n + 2, n), an estimate (n,) with its root
-    (n, n), and those of another node.
+    """The rule of fusion, ``inverse`` and ``trace`` as in ``fuse_pair``, and scratch: its ``pair``
+    (2 n + 2, n); an estimate ``x`` (n,) with ``root`` (n, n), and ``other_x``, ``other``.
     """
 
     inverse: bool
@@ -79,25 +79,25 @@ def fusion_slots(
     scratch: SlotScratch,
     arrays: FusionArrays,
 ) -> None:
-    """Carry filters that fuse pairs of estimates through the slots of a plan."""
+    """Simulate filters that fuse pairs of estimates over the slots of a plan."""
     for b in range(plan.up.shape[0]):
         for s in range(plan.up.shape[1]):
             if plan.sensed[s]:
                 predict_all(nodes, scratch, b)
                 read_all(nodes, readings, scratch, b, s)
             if plan.exchanged[s]:
-                # What was sent: all estimates from before the exchange.
+                # The messages: copies of all estimates from before the exchange.
                 copy_pairs(nodes, scratch, b)
                 # Run by run: the best weight is found by iterations that differ from run to run.
                 for h in range(len(nodes.rows)):
                     for q in range(len(scratch.lanes)):
-                        fuse_heard(nodes, plan, links, scratch, arrays, (b, s, h, q))
+                        fuse_received(nodes, plan, links, scratch, arrays, (b, s, h, q))
             store_sample_of_slot(nodes, plan, samples, scratch, b, s)
             rebase(nodes, readings, scratch, b, s)
 
 
 @kernel
-def fuse_heard(
+def fuse_received(
     nodes: SlotNodes,
     plan: SlotPlan,
     links: SlotLinks,
@@ -105,23 +105,25 @@ def fuse_heard(
     arrays: FusionArrays,
     index: tuple[int, int, int, int],
 ) -> None:
-    """Fuse filter h of lane q, at ``index`` [b, s, h, q], with all that it hears, one by one."""
+    """Fuse filter h of block b in lane q with all estimates that arrive in slot s, one after the
+    other; ``index`` is [b, s, h, q].
+    """
     b, s, h, q = index
-    n, heard = nodes.xhat.shape[2], False
+    n, has_received = nodes.xhat.shape[2], False
     for m in range(links.first[h], links.first[h + 1]):
         if not plan.up[b, s, 0, links.direction[m], q]:
             continue
-        # The weight of a link is not used: whoever is heard counts by its covariance.
+        # The weight of a link is not used: the covariances decide.
         sender = links.sender[m]
-        if not heard:
+        if not has_received:
             copy_track(arrays.x, arrays.root, scratch.xhat, scratch.root, h, q)
-            heard = True
+            has_received = True
         copy_track(arrays.other_x, arrays.other, scratch.xhat, scratch.root, sender, q)
         fuse_pair(
             arrays.x, arrays.root, arrays.other_x, arrays.other, arrays.inverse, arrays.trace,
             arrays.pair,
         )  # fmt: skip
-    if heard:
+    if has_received:
         for i in range(n):
             nodes.xhat[b, h, i, q] = arrays.x[i]
             for j in range(i + 1):
@@ -240,15 +242,15 @@ class TrackState(NamedTuple):
 
 
 class CombinationCache(NamedTuple):
-    """Known combinations of one node in one slot, C at most.
+    """Combinations that were computed for one node in one slot, C at most.
 
-    key : (C,), directions that were heard as bits, -1 for a free entry
-    used : (C,), number of differences that count
-    gain, root : (C, n, k n) and (C, n, n)
+    key : (C,), a bit for each direction on which a track arrived, -1 for a free entry
+    rank : (C,), rank of the differences of the tracks
+    gain, root : (C, n, k n) and (C, n, n), see ``combine_tracks``
     """
 
     key: np.ndarray
-    used: np.ndarray
+    rank: np.ndarray
     gain: FloatArray
     root: FloatArray
 
@@ -261,7 +263,8 @@ class TrackArrays(NamedTuple):
     joint, pairs : covariances (K, n, n) of the pairs (K, 2) of tracks that some node may combine
     first : (H + 1,), pairs of track i begin at ``first[i]``
     closed : (H, n, n), scratch
-    near, block : tracks (D + 1,) and their covariances (D + 1, D + 1, n, n), scratch
+    tracks, block : scratch, indices (D + 1,) of the tracks to combine, the own one first, and their
+                    joint covariance (D + 1, D + 1, n, n)
     """
 
     xhat: FloatArray
@@ -272,7 +275,7 @@ class TrackArrays(NamedTuple):
     pairs: np.ndarray
     first: np.ndarray
     closed: FloatArray
-    near: np.ndarray
+    tracks: np.ndarray
     block: FloatArray
     scratch: TrackScratch
     cache: CombinationCache
@@ -288,7 +291,7 @@ def track_slots(
     scratch: SlotScratch,
     arrays: TrackArrays,
 ) -> None:
-    """Carry filters that combine tracks through the slots of a plan."""
+    """Simulate filters that combine tracks over the slots of a plan."""
     tracks = SlotNodes(arrays.xhat, arrays.root, nodes.F, nodes.root_Q, nodes.rows)
     work = arrays.scratch.work
     # Slot by slot: the covariances of tracks are the same in all runs.
@@ -301,14 +304,14 @@ def track_slots(
             for b in range(plan.up.shape[0]):
                 predict_all(tracks, scratch, b)
                 read_all(tracks, readings, scratch, b, s)
-                show_tracks(nodes, tracks, scratch, b)
+                copy_tracks(nodes, tracks, scratch, b)
             # Runs in which a node hears the same nodes share the combination of this slot.
             for h in range(len(nodes.rows)):
                 for k in range(len(arrays.cache.key)):
                     arrays.cache.key[k] = -1
                 for b in range(plan.up.shape[0]):
                     for q in range(len(scratch.lanes)):
-                        combine_heard(nodes, plan, links, arrays, (b, s, h, q))
+                        combine_received(nodes, plan, links, arrays, (b, s, h, q))
         for b in range(plan.up.shape[0]):
             store_sample_of_slot(nodes, plan, samples, scratch, b, s)
             rebase(nodes, readings, scratch, b, s)
@@ -316,8 +319,10 @@ def track_slots(
 
 
 @kernel
-def show_tracks(nodes: SlotNodes, tracks: SlotNodes, scratch: SlotScratch, b: int) -> None:
-    """Report the own track as the estimate of every node of a block."""
+def copy_tracks(nodes: SlotNodes, tracks: SlotNodes, scratch: SlotScratch, b: int) -> None:
+    """Copy the own tracks of all nodes of block ``b`` to ``nodes``, the estimates that
+    they report.
+    """
     for h in range(len(nodes.rows)):
         for i in range(nodes.xhat.shape[2]):
             store(scratch.lanes, nodes.xhat, b, h, i, load(scratch.lanes, tracks.xhat, b, h, i))
@@ -327,58 +332,59 @@ def show_tracks(nodes: SlotNodes, tracks: SlotNodes, scratch: SlotScratch, b: in
 
 
 @kernel
-def combine_heard(
+def combine_received(
     nodes: SlotNodes,
     plan: SlotPlan,
     links: SlotLinks,
     arrays: TrackArrays,
     index: tuple[int, int, int, int],
 ) -> None:
-    """Report the combination of the tracks that filter h of lane q, at ``index`` [b, s, h, q],
-    hears.
+    """Replace the reported estimate of filter h of block b in lane q by the combination of its
+    track with those that arrive in slot s; ``index`` is [b, s, h, q].
     """
     b, s, h, q = index
-    n, count, heard = nodes.xhat.shape[2], 0, 0
-    arrays.near[0] = h
+    n, count, key = nodes.xhat.shape[2], 0, 0
+    arrays.tracks[0] = h
     for m in range(links.first[h], links.first[h + 1]):
         if plan.up[b, s, 0, links.direction[m], q]:
             count += 1
-            arrays.near[count] = links.sender[m]
-            # The senders heard, as bits of a number: the key of the combination.
-            heard += 1 << min(m - links.first[h], MAX_DIRECTION_BITS)
+            arrays.tracks[count] = links.sender[m]
+            # The key of the combination has a bit for each direction on which a track arrives.
+            key += 1 << min(m - links.first[h], MAX_DIRECTION_BITS)
     if count == 0:
         return
-    k = combination_of(arrays, heard, count, links.first[h + 1] - links.first[h])
+    k = combination_of(arrays, key, count, links.first[h + 1] - links.first[h])
     gain, root = arrays.cache.gain[k], arrays.cache.root[k]
-    # The others know no more than the node itself: its own track stays to the last bit.
-    if arrays.cache.used[k] == 0:
+    # Rank 0: all tracks are the same, and the own one stays to the last bit.
+    if arrays.cache.rank[k] == 0:
         return
     # xhat = x_h + sum_a G_a (x_a - x_h): the gains are those of differences to the own track.
     for a in range(count):
         for j in range(n):
-            gap = arrays.xhat[b, arrays.near[1 + a], j, q] - arrays.xhat[b, h, j, q]
+            difference = arrays.xhat[b, arrays.tracks[1 + a], j, q] - arrays.xhat[b, h, j, q]
             for i in range(n):
-                nodes.xhat[b, h, i, q] += gain[i, a * n + j] * gap
+                nodes.xhat[b, h, i, q] += gain[i, a * n + j] * difference
     for i in range(n):
         for j in range(i + 1):
             nodes.root[b, h, i, j, q] = root[i, j]
 
 
 @kernel
-def combination_of(arrays: TrackArrays, heard: int, count: int, degree: int) -> int:
-    """Return the cache index of the combination with ``count`` tracks ``near``, after it is
-    computed if it is not known; ``heard`` has a bit for each of the ``degree`` directions.
+def combination_of(arrays: TrackArrays, key: int, count: int, degree: int) -> int:
+    """Return the index in the cache of the combination of the own track with ``count`` others,
+    ``arrays.tracks``; compute it if the cache lacks it. ``key`` has a bit for each of ``degree``
+    directions.
     """
     cache = arrays.cache
-    k = (heard ^ (heard >> 6) ^ (heard >> 12)) % len(cache.key)
-    # Directions beyond the bits of a number have no key of their own.
-    if degree > MAX_DIRECTION_BITS or cache.key[k] != heard:
-        cache.key[k] = heard
+    k = (key ^ (key >> 6) ^ (key >> 12)) % len(cache.key)
+    # With more directions than bits a key is not unique: always compute.
+    if degree > MAX_DIRECTION_BITS or cache.key[k] != key:
+        cache.key[k] = key
         for a in range(count + 1):
             for b in range(count + 1):
-                pair = pair_of(arrays, arrays.near[a], arrays.near[b])
+                pair = pair_of(arrays, arrays.tracks[a], arrays.tracks[b])
                 copy_matrix(arrays.block[a, b], arrays.joint[pair])
-        cache.used[k] = combine_tracks(
+        cache.rank[k] = combine_tracks(
             arrays.block, count, arrays.scratch, cache.gain[k], cache.root[k]
         )
     return k
@@ -386,7 +392,7 @@ def combination_of(arrays: TrackArrays, heard: int, count: int, degree: int) -> 
 
 @kernel
 def pair_of(arrays: TrackArrays, i: int, j: int) -> int:
-    """Return the index of a pair of tracks; pairs are in the order of the second track."""
+    """Return the index in ``arrays.pairs`` of the pair (i, j) of tracks, which is among them."""
     # Bisection: pairs of track i are sorted by the second track.
     low, high = arrays.first[i], arrays.first[i + 1] - 1
     while low < high:
@@ -423,7 +429,7 @@ class BarShalomCampo(Filter):
     ) -> tuple[TrackArrays]:
         """Return the tracks with their covariances, and scratch."""
         H, n, start = len(states), len(states[0].xhat), states[0].start
-        most = max(info.degree for info in infos)
+        max_degree = max(info.degree for info in infos)
         xhat, root = (
             in_lanes(np.stack([getattr(state, name) for state in states]), blocks_of(runs))
             for name in ("xhat", "root")
@@ -431,7 +437,7 @@ class BarShalomCampo(Filter):
         cache = CombinationCache(
             np.full(COMBINATIONS, -1),
             np.zeros(COMBINATIONS, dtype=np.int64),
-            np.zeros((COMBINATIONS, n, max(most, 1) * n)),
+            np.zeros((COMBINATIONS, n, max(max_degree, 1) * n)),
             np.zeros((COMBINATIONS, n, n)),
         )
         sensors, _ = stacked_sensors([state.sensors[0] for state in states])
@@ -447,9 +453,9 @@ class BarShalomCampo(Filter):
                 pairs,
                 first,
                 np.zeros((H, n, n)),
-                np.zeros(most + 1, dtype=np.int64),
-                np.zeros((most + 1, most + 1, n, n)),
-                track_scratch(most, n),
+                np.zeros(max_degree + 1, dtype=np.int64),
+                np.zeros((max_degree + 1, max_degree + 1, n, n)),
+                track_scratch(max_degree, n),
                 cache,
             ),
         )
@@ -507,10 +513,10 @@ class BarShalomCampo(Filter):
         if not messages:
             return state
         state = with_senders(state, messages)
-        near = [0, *(state.senders.index(message.sender) for message in messages)]
-        gaps = np.concatenate([message.payload.xhat - state.xhat for message in messages])
-        gain, root = best_combination(state.joint, near, state.root)
-        return state._replace(fused=state.xhat + gain @ gaps, fused_root=root)
+        tracks = [0, *(state.senders.index(message.sender) for message in messages)]
+        differences = np.concatenate([message.payload.xhat - state.xhat for message in messages])
+        gain, root = best_combination(state.joint, tracks, state.root)
+        return state._replace(fused=state.xhat + gain @ differences, fused_root=root)
 
     def estimate(self, state: TrackState) -> tuple[FloatArray, FloatArray]:
         """Return the combination."""
@@ -539,11 +545,11 @@ def stacked_sensors(sensors: Sequence[FloatArray]) -> tuple[FloatArray, np.ndarr
 
 
 def combined_pairs(infos: Sequence[NodeInfo]) -> np.ndarray:
-    """Return the pairs of tracks (K, 2) of which some node may have both, in their order."""
+    """Return the pairs (K, 2) of tracks that some node may combine, in lexical order."""
     network, N = infos[0].network, len(infos)
     assert network is not None
-    near = [np.array([h, *heard]) for h, heard in enumerate(network.heard)]
-    codes = np.unique(np.concatenate([np.add.outer(N * one, one).reshape(-1) for one in near]))
+    tracks = [np.array([h, *heard]) for h, heard in enumerate(network.heard)]
+    codes = np.unique(np.concatenate([np.add.outer(N * one, one).reshape(-1) for one in tracks]))
     return np.ascontiguousarray(np.stack(np.divmod(codes, N), axis=1))
 
 
@@ -551,21 +557,21 @@ def predicted_joint(joint: FloatArray, model: SlotModel) -> FloatArray:
     """Return the covariances (m, m, n, n) of the errors of m tracks one slot later: all of them
     have the same process noise.
     """
-    moved, F, Q = (np.array(part, order="C") for part in (joint, model.F, model.Q))
-    predict_joint(moved.reshape(-1, *F.shape), F, Q, np.empty(F.shape))
-    return moved
+    predicted, F, Q = (np.array(part, order="C") for part in (joint, model.F, model.Q))
+    predict_joint(predicted.reshape(-1, *F.shape), F, Q, np.empty(F.shape))
+    return predicted
 
 
 def updated_joint(joint: FloatArray, sensors: Sequence[FloatArray]) -> FloatArray:
     """Return the covariances (m, m, n, n) of the errors of m tracks after each has used a reading
     of its own whitened ``sensors``, ``P_ij+ = (I - K_i H_i) P_ij (I - K_j H_j)'``.
     """
-    found, (H, rows) = np.array(joint, order="C"), stacked_sensors(sensors)
+    updated, (H, rows) = np.array(joint, order="C"), stacked_sensors(sensors)
     m, n = len(H), H.shape[2]
     pairs = np.ascontiguousarray(np.indices((m, m)).reshape(2, -1).T)
     work = np.empty((m, n, n)), np.empty((n, n))
-    update_joint(found.reshape(-1, n, n), pairs, H, rows, *work)
-    return found
+    update_joint(updated.reshape(-1, n, n), pairs, H, rows, *work)
+    return updated
 
 
 def with_senders(state: TrackState, messages: Sequence[Message]) -> TrackState:
@@ -575,7 +581,7 @@ def with_senders(state: TrackState, messages: Sequence[Message]) -> TrackState:
         return state
     senders = (*state.senders, *(message.sender for message in new))
     sensors = (*state.sensors, *(message.payload.H for message in new))
-    # Nothing of the joint covariance depends on data: it is made up for from the start on.
+    # The joint covariance does not depend on data: recompute it from slot 0 with the new tracks.
     joint = np.tile(state.start, (len(senders), len(senders), 1, 1))
     for _ in range(state.slot):
         joint = updated_joint(predicted_joint(joint, state.model), sensors)
@@ -583,16 +589,16 @@ def with_senders(state: TrackState, messages: Sequence[Message]) -> TrackState:
 
 
 def best_combination(
-    joint: FloatArray, near: Sequence[int], own_root: FloatArray
+    joint: FloatArray, tracks: Sequence[int], own_root: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the gain (n, k n) by which the differences of k tracks to the own one correct it with
-    the least covariance, and the root (n, n) of that covariance, ``own_root`` if they are the same.
+    """Return the optimal gain (n, k n) of the differences of k tracks to the own one, and the root
+    (n, n) of the covariance of the combination, ``own_root`` if all tracks are the same.
 
-    ``joint`` (m, m, n, n) are the covariances of the errors of tracks, ``near`` the indices of the
-    own one and of the k others.
+    ``joint`` (m, m, n, n) is the joint covariance of the errors of all tracks; ``tracks`` are the
+    indices of the own one and of the k others.
     """
-    n, k = joint.shape[2], len(near) - 1
+    n, k = joint.shape[2], len(tracks) - 1
     gain, root = np.zeros((n, k * n)), np.zeros((n, n))
-    block = np.ascontiguousarray(joint[np.ix_(near, near)])
-    used = combine_tracks(block, k, track_scratch(k, n), gain, root)
-    return gain, root if used else own_root
+    block = np.ascontiguousarray(joint[np.ix_(tracks, tracks)])
+    rank = combine_tracks(block, k, track_scratch(k, n), gain, root)
+    return gain, root if rank else own_root

@@ -137,7 +137,7 @@ def test_samples_show_the_covariance_and_frames_move_estimates(seed, n, framed):
     nothing = np.zeros((0,) * 5, dtype=np.uint8), np.zeros((0,) * 5), slots.WHOLE
     plan = slots.SlotPlan(0, flags, flags, np.array([0]), up, *nothing)
     room = slots.slot_scratch(2, n)
-    slots.show(nodes, plan, samples, room, 0, 0)
+    slots.store_sample_of_slot(nodes, plan, samples, room, 0, 0)
     xhat, error = (v.reshape(runs, 2, n) for v in (samples.xhat, samples.error))
     P, before = samples.P.reshape(runs, 2, n, n), nodes.xhat.copy()
     slots.rebase(nodes, readings, room, 0, 0)
