@@ -42,23 +42,28 @@ from netkf.scenario.scenario import Scenario
 
 RATE_TOLERANCE, DISPERSION_TOLERANCE = 0.05, 0.25
 FIRST_TICK, SPREAD = 1.0, 2.0
-"""Ticks by which a clock that is not memoryless may be off its rate in a run, because it has begun
-with it; and factor on what the spread of its counts says of that, where its law is not known.
+"""Slack, in ticks of one run, for the transient of a renewal clock that starts with the run; and
+safety factor on the dispersion index of its counts, which replaces c^2 of an unknown gap law.
 """
 WANTED_RATE = 0.02
-"""Error of the rate of one clock that should be found."""
+"""Relative error of the rate of one clock that the test should detect."""
 ENOUGH_TICKS, MAX_DRAWN, MAX_DRAWN_TICKS, DRAWN_PER_RUN = 80_000, 20_000, 3e6, 4
-"""Ticks of one clock in which that error shows; the most times that a clock is drawn for a replica
-beyond those of the runs, in all and for each run, and the most ticks of all of them.
+"""Ticks of one clock that reveal an error of WANTED_RATE. Limits on the extra replicas in which
+only the clocks are drawn: clocks times replicas, ticks of all clocks, and replicas for each run.
 """
 MAX_CLOCKS = 60
-"""Clocks of which all pairs are compared."""
+"""Columns of counts of which all pairs are compared."""
 LATTICE_TOLERANCE = 1e-9
 """Seconds, for each second of the run, by which rounding may move a tick."""
 
 
 class ClockSamples(NamedTuple):
-    """Clocks of one kind, the counts of their ticks in all runs, and how more are drawn."""
+    """The tick counts of one group of clocks in R runs.
+
+    counts : TickCounts with a first axis of length R
+    draw   : function of (scenario, seed, replica) that returns the ticks (E,) of all clocks in a
+             replica of which nothing else is simulated
+    """
 
     scenario: Scenario
     seed: int
@@ -109,84 +114,103 @@ def _drawn_counts(
 
 
 def _counts_of_each(clocks: ClockSamples) -> np.ndarray:
-    """Return the ticks (R', E) of each clock in the runs, and in as many further replicas, of which
-    only the clocks are drawn, as it takes to find that one rate is off by WANTED_RATE.
+    """Return the ticks (R', E) of each clock in the R runs and in R' - R further replicas.
+
+    Clocks are cheap to draw without the rest of a run. There are as many further replicas as a rate
+    that is off by WANTED_RATE takes to be detected, within the limits of :func:`_number_drawn`.
     """
     counts = clocks.counts.ticks.sum(axis=1)
     runs = len(counts)
-    wanted = _number_drawn(clocks, runs)
-    if not wanted:
+    further_replicas = _number_drawn(clocks, runs)
+    if not further_replicas:
         return np.asarray(counts)
-    more = _drawn_counts(clocks.draw, clocks.scenario, clocks.seed, runs, wanted)
-    return np.concatenate([counts, more])
+    further_counts = _drawn_counts(
+        clocks.draw, clocks.scenario, clocks.seed, runs, further_replicas
+    )
+    return np.concatenate([counts, further_counts])
 
 
 def _number_drawn(clocks: ClockSamples, runs: float) -> int:
-    """Return the number of replicas of which the clocks are drawn beside those of the runs."""
-    rates = clocks.rates * clocks.scenario.horizon
-    wanted = min(
-        math.ceil(ENOUGH_TICKS / rates.min() - runs),
+    """Return the number of further replicas in which only the clocks are drawn."""
+    ticks_per_run = clocks.rates * clocks.scenario.horizon
+    further_replicas = min(
+        math.ceil(ENOUGH_TICKS / ticks_per_run.min() - runs),
         int(DRAWN_PER_RUN * runs),
-        int(MAX_DRAWN / len(rates)),
-        int(MAX_DRAWN_TICKS / rates.sum()),
+        int(MAX_DRAWN / len(ticks_per_run)),
+        int(MAX_DRAWN_TICKS / ticks_per_run.sum()),
     )
-    return int(max(wanted, 0))
+    return int(max(further_replicas, 0))
 
 
 def _check_rates(group: Group, samples: PartSamples, level: float) -> Finding:
-    """Compare the ticks of all runs with the rates: all clocks together, also in parts of the run,
-    and one by one.
+    """Test the null hypothesis that clocks tick at their stated rates.
+
+    Compared with rate times horizon are the total ticks, for Poisson clocks also those in each
+    window of the run, and the ticks of each clock; each of the three groups gets level / 3, shared
+    by Bonferroni within the group.
     """
     clocks = group(samples)
-    windows, each = clocks.counts.ticks, _counts_of_each(clocks)
+    windows, counts = clocks.counts.ticks, _counts_of_each(clocks)
     expected, poisson = clocks.rates * clocks.scenario.horizon, clocks.poisson
     total = windows.sum(axis=(1, 2))
-    begun = _ticks_of_start(clocks, each)
+    start_slack = _ticks_of_start(clocks, counts)
     intervals = [
         (
-            _count_interval(total, float(expected.sum()), level / 3.0, poisson, begun.sum()),
+            _count_interval(total, float(expected.sum()), level / 3.0, poisson, start_slack.sum()),
             "all clocks together",
         )
     ]
     if poisson:
         intervals += _rates_by_window(windows, float(expected.sum()), level / 3.0)
-    share = level / (3.0 * len(expected))
+    single_level = level / (3.0 * len(expected))
     runs = len(windows)
 
-    def drawn(factor: float) -> float:
-        """Return the factor on the times that a clock is drawn, for a factor on the runs."""
-        return (factor * runs + _number_drawn(clocks, factor * runs)) / len(each)
+    def sample_factor(factor: float) -> float:
+        """Return the factor on the number of counts of a clock for a factor on the runs."""
+        return (factor * runs + _number_drawn(clocks, factor * runs)) / len(counts)
 
     singles = [
-        with_drawn(_count_interval(each[:, k], float(expected[k]), share, poisson, begun[k]), drawn)
+        with_drawn(
+            _count_interval(
+                counts[:, k], float(expected[k]), single_level, poisson, start_slack[k]
+            ),
+            sample_factor,
+        )
         for k in range(len(expected))
     ]
     intervals += zip(singles, clocks.group.labels, strict=True)
     message = f"{total.sum():,.0f} ticks, relative difference from the rates,"
     finding = with_best(intervals, RATE_TOLERANCE, message)
-    note = _limit_of_one_clock(clocks, each, singles, level)
+    note = _limit_of_one_clock(clocks, counts, singles, level)
     return finding._replace(message=finding.message + note)
 
 
 def _ticks_of_start(clocks: ClockSamples, counts: np.ndarray) -> FloatArray:
-    """Return by how many ticks (E,) the mean count of each clock in a run may be off its rate.
+    """Return the slack (E,) in ticks between the mean count of each clock in a run and rate T.
 
-    A renewal process that begins with a run has between rate T - 1 and rate T + c^2 ticks in T
-    seconds, c the standard deviation of its gaps over their mean (Lorden 1970). Of other clocks c^2
-    is known from the spread of their counts (R, E) alone.
+    A renewal process that starts with the run has a mean number of ticks between rate T - 1 and
+    rate T + c^2 in T seconds, with c the coefficient of variation of its gaps (Lorden 1970). Where
+    the law of the gaps is unknown, c^2 is estimated by the dispersion index (variance over mean) of
+    the ``counts`` (R, E), which tends to c^2 for long runs.
     """
-    spread = SPREAD * counts.var(axis=0, ddof=1) / np.maximum(counts.mean(axis=0), 1e-300)
-    known = np.array([relative_variance(stated) for stated in clocks.group.stated])
-    return np.asarray(np.maximum(np.where(np.isnan(known), spread, known), FIRST_TICK))
+    from_counts = SPREAD * counts.var(axis=0, ddof=1) / np.maximum(counts.mean(axis=0), 1e-300)
+    stated_variance = np.array([relative_variance(stated) for stated in clocks.group.stated])
+    return np.asarray(
+        np.maximum(np.where(np.isnan(stated_variance), from_counts, stated_variance), FIRST_TICK)
+    )
 
 
 def _rates_by_window(windows: np.ndarray, mean: float, level: float) -> list[tuple[Interval, str]]:
-    """Return how far the ticks (R, W, E) of all clocks are from the rates in each window."""
-    parts = windows.sum(axis=2)
-    count = parts.shape[1]
+    """Return labelled intervals for the relative error of the total rate in each window.
+
+    ``windows`` (R, W, E) are ticks and ``mean`` is the stated mean total of a run; no intervals if
+    there is only one window, since that is the whole run.
+    """
+    window_ticks = windows.sum(axis=2)
+    count = window_ticks.shape[1]
     return [
         (
-            _count_interval(parts[:, k], mean / count, level / count, True, 0.0),
+            _count_interval(window_ticks[:, k], mean / count, level / count, True, 0.0),
             f"all clocks in part {k + 1} of {count} of the run",
         )
         for k in range(count if count > 1 else 0)
@@ -194,60 +218,67 @@ def _rates_by_window(windows: np.ndarray, mean: float, level: float) -> list[tup
 
 
 def _limit_of_one_clock(
-    clocks: ClockSamples, each: np.ndarray, singles: list[Interval], level: float
+    clocks: ClockSamples, counts: np.ndarray, singles: list[Interval], level: float
 ) -> str:
-    """Return what no test could find at one clock, where that is more than WANTED_RATE.
+    """Return a note on the smallest detectable rate error of one clock, empty if that is at most
+    WANTED_RATE.
 
-    The estimate of a rate from N ticks of a Poisson process has at least the relative standard
-    deviation 1 / sqrt(N), by the bound of Cramer and Rao.
+    The note tells a reader that more ticks are needed, not a better test: by the Cramer-Rao bound
+    an estimate of a rate from N ticks of a Poisson process has at least the relative standard
+    deviation 1 / sqrt(N).
     """
-    worst = max(range(len(singles)), key=lambda k: singles[k].detectable)
-    if singles[worst].detectable <= WANTED_RATE or not clocks.poisson:
+    least_precise = max(range(len(singles)), key=lambda k: singles[k].detectable)
+    if singles[least_precise].detectable <= WANTED_RATE or not clocks.poisson:
         return ""
-    ticks = float(clocks.rates[worst]) * clocks.scenario.horizon * len(each)
+    ticks = float(clocks.rates[least_precise]) * clocks.scenario.horizon * len(counts)
     quantiles = scipy.special.ndtri(1.0 - level) + scipy.special.ndtri(POWER)
-    least = float(quantiles) / math.sqrt(ticks)
+    smallest_error = float(quantiles) / math.sqrt(ticks)
     return (
-        f"; of one clock, no test at this level finds less than {least:.2g} in {ticks:,.0f} ticks"
+        f"; of one clock, no test at this level finds less than {smallest_error:.2g} in "
+        f"{ticks:,.0f} ticks"
     )
 
 
 def _count_interval(
     values: np.ndarray, mean: float, level: float, poisson: bool, first_ticks: float
 ) -> Interval:
-    """Return an interval for how far counts (R,) are from ``mean`` in a run, relative to it.
+    """Return an interval for |E(count) / mean - 1|, from the counts ``values`` (R,) of R runs.
 
-    Sums of Poisson counts are Poisson, with exact limits; other clocks are judged by the spread of
-    their counts, and a difference of ``first_ticks`` says nothing.
+    Sums of Poisson counts are Poisson and have exact limits. For other clocks Student's interval
+    uses the spread of the counts, and ``first_ticks``, the slack for the transient at the start of
+    a run, is subtracted from the distance.
     """
     total, runs = float(values.sum()), len(values)
-    whole = runs * mean
+    expected_total = runs * mean
     if poisson:
-        return deviation_interval(1.0, _poisson_interval(total, whole, level))
-    slack = first_ticks / mean
+        return deviation_interval(1.0, _poisson_interval(total, expected_total, level))
+    relative_slack = first_ticks / mean
+    # Few integer counts may be all equal: at least the variance of two values with equal odds.
     spread = math.sqrt(max(float(values.var(ddof=1)), 0.25) * runs)
-    apart = deviation_interval(1.0, student_interval(total / whole, spread / whole, runs, level))
+    distance = deviation_interval(
+        1.0, student_interval(total / expected_total, spread / expected_total, runs, level)
+    )
 
     def limits(value: float, factor: float) -> tuple[float, float]:
         """Return both ends for another value and ``factor`` times the runs."""
-        low, high = apart.limits(value, factor)
-        return max(0.0, low - slack), max(0.0, high - slack)
+        low, high = distance.limits(value, factor)
+        return max(0.0, low - relative_slack), max(0.0, high - relative_slack)
 
-    value, low, high = (max(0.0, end - slack) for end in apart[:3])
-    found = apart._replace(value=value, low=low, high=high, again=limits)
-    return found._replace(detectable=apart.detectable + slack)
+    value, low, high = (max(0.0, end - relative_slack) for end in distance[:3])
+    reduced = distance._replace(value=value, low=low, high=high, again=limits)
+    return reduced._replace(detectable=distance.detectable + relative_slack)
 
 
 def _poisson_interval(total: float, mean: float, level: float) -> Interval:
-    """Return an interval for the mean of a Poisson number of which ``total`` was seen, relative to
-    ``mean``.
+    """Return the exact (Garwood 1936) interval for the mean of a Poisson variable, in units of
+    ``mean``, from one observation ``total``.
     """
 
     def limits(ratio: float, factor: float) -> tuple[float, float]:
         """Return both ends for another ratio and ``factor`` times the runs."""
-        seen, expected = ratio * mean * factor, mean * factor
-        low = float(scipy.special.gammaincinv(seen, level / 2.0)) if seen else 0.0
-        high = float(scipy.special.gammaincinv(seen + 1.0, 1.0 - level / 2.0))
+        count, expected = ratio * mean * factor, mean * factor
+        low = float(scipy.special.gammaincinv(count, level / 2.0)) if count else 0.0
+        high = float(scipy.special.gammaincinv(count + 1.0, 1.0 - level / 2.0))
         return low / expected, high / expected
 
     detectable = detectable_shift(1.0 / math.sqrt(mean), level)
@@ -255,73 +286,89 @@ def _poisson_interval(total: float, mean: float, level: float) -> Interval:
 
 
 def _check_gaps(group: Group, samples: PartSamples, level: float) -> Finding:
-    """Compare gaps with the law of their clock, cell by cell, and with the gap before."""
+    """Test the null hypothesis that gaps follow the stated law and are independent.
+
+    Under it the gaps, as uniform numbers, fill CELLS cells of equal probability evenly, and
+    neighbouring gaps, as normal numbers, have correlation 0; each test gets half of the level.
+    """
     counts = group(samples).counts
-    found = compare_cells(counts.cells.sum(axis=0), ["all clocks"], level / 2.0, "gaps")
+    finding = compare_cells(counts.cells.sum(axis=0), ["all clocks"], level / 2.0, "gaps")
     products = counts.products.sum(axis=0)
     if products[2] < 10 * CELLS:
-        return found
-    related = correlation_interval(float(products[0] / products[1]), products[2], level / 2.0)
-    apart = deviation_interval(0.0, related)
-    if apart.low > 0.0 and not found.margin[2] < 0.0:
+        return finding
+    correlation = correlation_interval(float(products[0] / products[1]), products[2], level / 2.0)
+    distance = deviation_interval(0.0, correlation)
+    if distance.low > 0.0 and not finding.margin[2] < 0.0:
         label = "neighbouring gaps"
-        return find_largest([(apart, label)], found.tolerance, "largest correlation")
-    text = f"; correlation of neighbouring gaps {related.value:.2g}"
-    return found._replace(message=f"{found.message}{text}, {apart.detectable:.2g} would be seen")
+        return find_largest([(distance, label)], finding.tolerance, "largest correlation")
+    text = f"; correlation of neighbouring gaps {correlation.value:.2g}"
+    return finding._replace(
+        message=f"{finding.message}{text}, {distance.detectable:.2g} would be seen"
+    )
 
 
 def _check_lattice(group: Group, samples: PartSamples, level: float) -> Finding:
-    """Compare ticks of clocks without randomness with where they should be."""
+    """Compare the times of ticks of deterministic clocks with the stated times."""
     counts, horizon = group(samples).counts, samples.scenario.horizon
-    off, ticks = float(counts.off.max()), counts.ticks.sum()
+    largest_error, ticks = float(counts.off.max()), counts.ticks.sum()
     message = f"{ticks:,.0f} ticks, times in units of the length of a run"
-    return find_identity(off / horizon, LATTICE_TOLERANCE, message)
+    return find_identity(largest_error / horizon, LATTICE_TOLERANCE, message)
 
 
 def _clocks_apart(group: Group, samples: PartSamples, level: float) -> Finding:
-    """Compare the spread of all ticks of a run with that of independent Poisson clocks."""
+    """Test the null hypothesis that the clocks are independent Poisson processes.
+
+    Under it the total count of a window is Poisson, so that its variance equals its mean, and no
+    two clocks have correlated counts; each test gets half of the level.
+    """
     clocks = group(samples)
     ticks = clocks.counts.ticks
     counts = ticks.reshape(-1, ticks.shape[2])
     mean = float((clocks.rates * samples.scenario.horizon).sum()) / ticks.shape[1]
     values = counts.sum(axis=1) - mean
-    # A squared Poisson count has a little more spread than a squared normal one.
+    # (x - m)^2 of a Poisson x with mean m has the variance 2 m^2 + m instead of 2 m^2 as for a
+    # normal one: the sum is treated as chi-square with correspondingly fewer degrees of freedom.
     freedom = len(values) / (1.0 + 0.5 / mean)
     ratio = scale_interval(freedom * float((values**2).mean()) / mean, freedom, level / 2.0)
-    apart = deviation_interval(1.0, ratio)
-    intervals = [(apart, "variance of all ticks at once over that of independent clocks")]
+    distance = deviation_interval(1.0, ratio)
+    intervals = [(distance, "variance of all ticks at once over that of independent clocks")]
     pairs = largest_correlation(counts - counts.mean(axis=0), level / 2.0)
     if pairs is not None:
-        value, (a, b) = pairs
+        correlation, (a, b) = pairs
         labels = clocks.group.labels
-        intervals.append((value, f"correlation of {labels[a]} and {labels[b]}"))
+        intervals.append((correlation, f"correlation of {labels[a]} and {labels[b]}"))
     return find_largest(intervals, DISPERSION_TOLERANCE, "largest difference")
 
 
 def largest_correlation(
     values: FloatArray, level: float
 ) -> tuple[Interval, tuple[int, int]] | None:
-    """Return an interval for the largest correlation of two columns of values (K, L) of mean 0, by
-    the spread of their products over the K independent rows.
+    """Return an interval for the largest |correlation| of two columns, and their indices.
+
+    ``values`` (K, L) have mean 0 and independent rows; the products of two standardised columns are
+    averaged by Student's interval, with Bonferroni's correction for all pairs. None with fewer than
+    two varying columns or 100 rows.
     """
-    some = values[:, :MAX_CLOCKS]
-    kept = np.flatnonzero(some.var(axis=0) > 0.0)
-    runs = len(some)
-    if len(kept) < 2 or runs < 100:
+    compared = values[:, :MAX_CLOCKS]
+    varying = np.flatnonzero(compared.var(axis=0) > 0.0)
+    runs = len(compared)
+    if len(varying) < 2 or runs < 100:
         return None
-    z = some[:, kept] / some[:, kept].std(axis=0)
-    related = z.T @ z / runs
-    upper = np.triu_indices(len(kept), 1)
-    worst = int(np.argmax(np.abs(related[upper])))
-    a, b = int(upper[0][worst]), int(upper[1][worst])
+    z = compared[:, varying] / compared[:, varying].std(axis=0)
+    correlations = z.T @ z / runs
+    upper = np.triu_indices(len(varying), 1)
+    largest = int(np.argmax(np.abs(correlations[upper])))
+    a, b = int(upper[0][largest]), int(upper[1][largest])
     products = z[:, a] * z[:, b]
     spread = max(float(products.std(ddof=1)), 1.0) / math.sqrt(runs)
-    found = student_interval(float(related[upper][worst]), spread, runs, level / len(upper[0]))
-    return deviation_interval(0.0, found), (int(kept[a]), int(kept[b]))
+    interval = student_interval(
+        float(correlations[upper][largest]), spread, runs, level / len(upper[0])
+    )
+    return deviation_interval(0.0, interval), (int(varying[a]), int(varying[b]))
 
 
 def _promises(clocks: ClockSamples, group: Group, sentences: dict[str, str]) -> list[Promise]:
-    """Return the promises about one group of clocks, with a sentence for each test."""
+    """Return the promises about a group of clocks; ``sentences`` states each test by its name."""
     rows: list[tuple[str, Callable[..., Finding], bool]] = [("rates", _check_rates, False)]
     if clocks.poisson:
         rows += [("exponential", _check_gaps, False), ("apart", _clocks_apart, False)]
@@ -352,8 +399,8 @@ SAMPLING_SENTENCES = {
 
 
 def clock_promises(samples: PartSamples) -> list[Promise]:
-    """Return the promises about clocks that have a stated law and were seen in the runs."""
-    found: list[Promise] = []
+    """Return the promises about clocks whose law is stated and that the runs can test."""
+    promises: list[Promise] = []
     for counts, group, sentences in (
         (samples.ticks, _network_clocks, NETWORK_SENTENCES),
         (samples.sampling, _sampling_clocks, SAMPLING_SENTENCES),
@@ -361,5 +408,5 @@ def clock_promises(samples: PartSamples) -> list[Promise]:
         if counts is not None:
             clocks = group(samples)
             if np.isfinite(clocks.rates).all():
-                found += _promises(clocks, group, sentences)
-    return found
+                promises += _promises(clocks, group, sentences)
+    return promises

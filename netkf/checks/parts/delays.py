@@ -34,10 +34,12 @@ MEAN_TOLERANCE = 0.05
 
 
 class DelayCounts(NamedTuple):
-    """Delays of one run as uniform numbers: how many fall into each of the ``cells`` (CELLS, 1),
-    ``products`` (3,) of neighbouring ones as in TickCounts, and of D directions their number and
-    the sum of what they are above 1/2, ``sums`` (2, D); ``off`` () seconds by which a delay is
-    furthest from a stated constant.
+    """Delays of the messages of one run over D directions, as uniform numbers u.
+
+    cells    : (CELLS, 1) numbers in cells of equal probability
+    products : (3,) sums over neighbouring delays of a direction, as in TickCounts
+    sums     : (2, D) of each direction the number of delays and the sum of u - 1/2
+    off      : () largest distance in seconds of a delay from a stated constant
     """
 
     cells: FloatArray
@@ -48,14 +50,12 @@ class DelayCounts(NamedTuple):
 
 @lru_cache(maxsize=8)
 def stated_delay(scenario: Scenario) -> Any:
-    """Return the built-in delay that the scenario's delay is, or derives from."""
+    """Return the delay that states the law of the scenario's delay; see :func:`stated_part`."""
     return stated_part(scenario.network.channel.delay, "delay")
 
 
 def delay_law(delay: Any, seconds: FloatArray) -> FloatArray | None:
-    """Return the probability that a delay is at most ``seconds`` (K,); None without a law that is
-    known and has a density.
-    """
+    """Return P(delay <= ``seconds``) (K,); None if the law is unknown or has no density."""
     seconds = np.maximum(seconds, 0.0)
     # By exact type: a class with statements of its own has a law of its own.
     if type(delay) is ExponentialDelay:
@@ -72,9 +72,8 @@ def delay_law(delay: Any, seconds: FloatArray) -> FloatArray | None:
 def count_delays(scenario: Scenario, run: Run) -> DelayCounts | None:
     """Return the counts of a run; None without links or a stated law of the delays.
 
-    A message is seen if it arrives before the run ends. Of those sent at one time this is a matter
-    of their own delay alone, so that the delay of one that was seen has the stated law up to the
-    end of the run.
+    Only messages that arrive before the run ends are in the log. So the law of a delay is
+    conditioned on its being at most the time from sending to the end of the run.
     """
     delay, indices = stated_delay(scenario), direction_indices(scenario)
     rows = run.log[np.isin(run.log["kind"], (CODES["deliver"], CODES["late"]))]
@@ -82,61 +81,77 @@ def count_delays(scenario: Scenario, run: Run) -> DelayCounts | None:
         return None
     ages, fixed = rows["age"], delay.fixed
     if fixed is not None:
-        off = np.abs(ages - fixed).max(initial=0.0)
-        none = np.zeros((CELLS, 1)), np.zeros(3), np.zeros((2, len(indices)))
-        return DelayCounts(*none, np.array(off))
+        largest_error = np.abs(ages - fixed).max(initial=0.0)
+        zeros = np.zeros((CELLS, 1)), np.zeros(3), np.zeros((2, len(indices)))
+        return DelayCounts(*zeros, np.array(largest_error))
     law = delay_law(delay, ages)
     if law is None:
         return None
     # The receiver of a message comes first in the row of its arrival.
-    which = in_direction(rows["peer"], rows["node"], indices)
+    directions = in_direction(rows["peer"], rows["node"], indices)
     with np.errstate(invalid="ignore", divide="ignore"):
-        whole = delay_law(delay, scenario.horizon - (rows["t"] - ages))
-        assert whole is not None
-        uniform = np.clip(law / whole, 0.0, 1.0)
+        probability_until_end = delay_law(delay, scenario.horizon - (rows["t"] - ages))
+        assert probability_until_end is not None
+        uniform = np.clip(law / probability_until_end, 0.0, 1.0)
     # Where both directions of a link share their draws, one stands for both.
-    known = np.isfinite(uniform) & ~shares_draws(scenario)[which]
-    order = np.lexsort((rows["message"][known], which[known]))
-    u, which = uniform[known][order], which[known][order]
-    first = np.ones(len(u), dtype=bool)
-    first[1:] = which[1:] != which[:-1]
-    sums = [np.bincount(which, weights, len(indices)) for weights in (np.ones(len(u)), u - 0.5)]
-    cells = count_cells(u[:, None], np.ones((len(u), 1), dtype=bool))
-    return DelayCounts(cells, correlate_neighbours(u, first), np.array(sums), np.array(0.0))
+    counted = np.isfinite(uniform) & ~shares_draws(scenario)[directions]
+    order = np.lexsort((rows["message"][counted], directions[counted]))
+    ranks, directions = uniform[counted][order], directions[counted][order]
+    first = np.ones(len(ranks), dtype=bool)
+    first[1:] = directions[1:] != directions[:-1]
+    sums = [
+        np.bincount(directions, weights, len(indices))
+        for weights in (np.ones(len(ranks)), ranks - 0.5)
+    ]
+    cells = count_cells(ranks[:, None], np.ones((len(ranks), 1), dtype=bool))
+    return DelayCounts(cells, correlate_neighbours(ranks, first), np.array(sums), np.array(0.0))
 
 
 def _check_fixed(samples: Any, level: float) -> Finding:
-    """Compare all delays with the constant that they should be."""
-    off, horizon = float(samples.delays.off.max()), samples.scenario.horizon
-    return find_identity(off / horizon, FIXED_TOLERANCE, "delays in units of the length of a run")
+    """Compare all delays with the stated constant."""
+    largest_error, horizon = float(samples.delays.off.max()), samples.scenario.horizon
+    return find_identity(
+        largest_error / horizon, FIXED_TOLERANCE, "delays in units of the length of a run"
+    )
 
 
 def _check_law(samples: Any, level: float) -> Finding:
-    """Compare delays with their law, cell by cell, of each direction by their mean rank, and with
-    those of the message before.
+    """Test the null hypothesis that delays follow their stated law and are independent.
+
+    Under it the uniform numbers of :class:`DelayCounts` fill the cells evenly, have the mean 1/2 in
+    each direction, and are not correlated with those of the message before; each of the three
+    tests gets a third of the level.
     """
     counts = samples.delays
-    found = compare_cells(counts.cells.sum(axis=0), ["all"], level / 3.0, "delays")
+    finding = compare_cells(counts.cells.sum(axis=0), ["all"], level / 3.0, "delays")
     number, excess = counts.sums.sum(axis=0)
-    used = np.flatnonzero(number >= MIN_COUNT)
+    frequent = np.flatnonzero(number >= MIN_COUNT)
     intervals: list[tuple[Interval, str]] = []
-    for k in used.tolist():
+    for k in frequent.tolist():
         sender, receiver = samples.scenario.topology.directions[k]
         # The mean of numbers that are uniform has the variance 1 / (12 N).
-        reach = detectable_shift(1.0 / np.sqrt(12.0 * number[k]), level / (3.0 * len(used)))
-        apart = _mean_interval(excess[k] / number[k], number[k], level / (3.0 * len(used)))
-        intervals.append((apart._replace(detectable=reach), f"from {sender} to {receiver}"))
+        detectable = detectable_shift(
+            1.0 / np.sqrt(12.0 * number[k]), level / (3.0 * len(frequent))
+        )
+        distance = _mean_interval(excess[k] / number[k], number[k], level / (3.0 * len(frequent)))
+        intervals.append((distance._replace(detectable=detectable), f"from {sender} to {receiver}"))
     products = counts.products.sum(axis=0)
     if products[2] >= 10 * CELLS:
-        related = correlation_interval(float(products[0] / products[1]), products[2], level / 3.0)
-        intervals.append((deviation_interval(0.0, related), "neighbouring ones, their correlation"))
-    if found.margin[2] < 0.0 or not any(apart.low > 0.0 for apart, _ in intervals):
-        return found
+        correlation = correlation_interval(
+            float(products[0] / products[1]), products[2], level / 3.0
+        )
+        intervals.append(
+            (deviation_interval(0.0, correlation), "neighbouring ones, their correlation")
+        )
+    if finding.margin[2] < 0.0 or not any(distance.low > 0.0 for distance, _ in intervals):
+        return finding
     return find_largest(intervals, MEAN_TOLERANCE, "largest difference of a mean rank from 1/2")
 
 
 def _mean_interval(mean: float, count: float, level: float) -> Interval:
-    """Return an interval for how far the mean of ``count`` uniform numbers is from 1/2."""
+    """Return an interval for |E u - 1/2| of ``count`` uniform numbers u in [0, 1] (normal limits);
+    ``mean`` is that of u - 1/2.
+    """
     reach = -float(scipy.special.ndtri(level / 2.0)) / np.sqrt(12.0 * count)
     return deviation_interval(0.5, Interval(0.5 + mean, 0.5 + mean - reach, 0.5 + mean + reach))
 
@@ -153,7 +168,7 @@ LAW = Promise(
 
 
 def delay_promises(samples: Any) -> list[Promise]:
-    """Return the promise about delays that have a stated law and were seen in the runs."""
+    """Return the promise about delays, if they have a stated law and messages were sent."""
     if samples.delays is None or not samples.fates.sent.any():
         return []
     return [LAW if stated_delay(samples.scenario).fixed is None else FIXED]

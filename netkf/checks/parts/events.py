@@ -15,10 +15,13 @@ from netkf.trace.schema import CODES
 
 
 class LossCounts(NamedTuple):
-    """Of D directions: messages ``sent`` and ``lost`` (W, D) in the windows of one run;
-    ``followed`` (D,) losses that another message followed, ``repeated`` (D,) losses of a message
-    and of the one before it, and ``both`` (D,) losses of a message and of the one with the same
-    number in the other direction.
+    """Counts of the messages of one run over D directions.
+
+    sent, lost : (W, D) messages in each of W equal windows of the run
+    followed   : (D,) losses after which another message was sent
+    repeated   : (D,) pairs of consecutive messages that were both lost
+    both       : (D,) messages lost together with the message of the same number in the opposite
+                 direction
     """
 
     sent: np.ndarray
@@ -29,8 +32,11 @@ class LossCounts(NamedTuple):
 
 
 class PairCounts(NamedTuple):
-    """Of L links: slots in which they were ``paired`` (L,) and also in the slot before,
-    ``repeated`` (L,), and the number of ``slots`` ().
+    """Counts of the matchings of one run over L links.
+
+    paired   : (L,) slots in which the link was in the matching
+    repeated : (L,) slots in which it was in the matchings of this slot and of the one before
+    slots    : () number of slots with a matching
     """
 
     paired: np.ndarray
@@ -59,16 +65,16 @@ def count_losses(scenario: Scenario, run: Run) -> LossCounts | None:
     # One number for each message, with a gap after the last of each direction.
     width = int(sends["message"].max(initial=0)) + 2
     keys = lost_at * width + number
-    after = np.isin(keys - 1, keys) & (number > 0)
-    back = reversed_directions(scenario)[lost_at]
-    both = np.isin(back * width + number, keys) & (back >= 0)
+    after_loss = np.isin(keys - 1, keys) & (number > 0)
+    opposite = reversed_directions(scenario)[lost_at]
+    both_lost = np.isin(opposite * width + number, keys) & (opposite >= 0)
     followed = number + 1 < sent.sum(axis=0)[lost_at]
     return LossCounts(
         sent,
         lost,
         np.bincount(lost_at[followed], minlength=size),
-        np.bincount(lost_at[after], minlength=size),
-        np.bincount(lost_at[both], minlength=size),
+        np.bincount(lost_at[after_loss], minlength=size),
+        np.bincount(lost_at[both_lost], minlength=size),
     )
 
 
@@ -82,8 +88,9 @@ def in_direction(
 
 @lru_cache(maxsize=8)
 def shares_draws(scenario: Scenario) -> np.ndarray:
-    """Return (D,) bool: the messages of this direction share all draws with those of the other
-    direction of its link, which stands for both.
+    """Return (D,) bool: True for the second of two opposite directions that share all draws.
+
+    Statistics count such pairs once, by the first direction.
     """
     clock = scenario.network.activation
     at_once = getattr(clock, "at", "links") == "links"
@@ -95,7 +102,7 @@ def shares_draws(scenario: Scenario) -> np.ndarray:
 
 @lru_cache(maxsize=8)
 def reversed_directions(scenario: Scenario) -> np.ndarray:
-    """Return the index of the opposite direction of each, -1 without one."""
+    """Return the index (D,) of the opposite of each direction, -1 without one."""
     indices = direction_indices(scenario)
     return np.array([indices.get((j, i), -1) for i, j in indices], dtype=np.int64)
 
@@ -108,12 +115,12 @@ def count_pairs(scenario: Scenario, run: Run) -> PairCounts | None:
     rows = run.log[run.log["kind"] == CODES["tick"]]
     slots = scenario.slot_plant.slots_of(rows["t"])
     ids = zip(rows["node"].tolist(), rows["peer"].tolist(), strict=True)
-    which = np.array([links[min(e), max(e)] for e in ids], dtype=np.int64)
-    count = np.bincount(which, minlength=len(links))
-    keys = slots * len(links) + which
-    again = np.isin(keys - len(links), keys)
+    link_of_row = np.array([links[min(e), max(e)] for e in ids], dtype=np.int64)
+    count = np.bincount(link_of_row, minlength=len(links))
+    keys = slots * len(links) + link_of_row
+    repeated = np.isin(keys - len(links), keys)
     first = scenario.hosted.first_slot
     total = int(np.ceil(scenario.horizon / scenario.slot_plant.period - 1e-9)) - first
     return PairCounts(
-        count, np.bincount(which[again], minlength=len(links)), np.array(float(total))
+        count, np.bincount(link_of_row[repeated], minlength=len(links)), np.array(float(total))
     )

@@ -1,7 +1,7 @@
 """Moments of noises that should be standard normal and white, and their tests.
 
-A noise is whitened by the covariance that the scenario states. What is left then has the moments of
-independent standard normal numbers, whatever the scenario, and runs only add up their sums.
+Noises are whitened by the covariance that the scenario states. The results then have the moments of
+independent standard normal numbers, whatever the scenario, so that sums over runs can be added.
 """
 
 from __future__ import annotations
@@ -28,36 +28,38 @@ from netkf.linalg.arrays import FloatArray
 VARIANCE_TOLERANCE, MEAN_TOLERANCE, CORRELATION_TOLERANCE = 0.1, 0.1, 0.2
 """Tolerated relative error of a variance, mean in standard deviations, and correlation."""
 CELLS, SHARE_TOLERANCE = 16, 0.02
-"""Cells of equal probability into which numbers of a known law are sorted, and the tolerated error
-of the share of one.
-"""
+"""Number of cells of equal probability, and tolerated error of the share of numbers in a cell."""
 MIN_VARIANCE_SHARE = 1e-10
 """Share of the largest variance below which a direction has no noise."""
 FURTHER, PARTS = 3, 4
-"""Lags beyond the first at which each entry is compared with itself, and parts of a series in which
-all variances together are.
+"""Number of lags (2, 3, ...) of the autocorrelation of each entry, and of equal parts of a series
+in which the pooled variance is tested.
 """
 MIN_RUNS = 10
 """Runs from whose spread an interval is computed."""
 MIN_COUNT, MIN_COUNT_OF_ANY_LAW = 20, 200
-"""Numbers from which means and variances are judged; of the latter if the law is not known."""
+"""Values from which means and variances are tested, and variances of numbers of an unknown law."""
 
 
 class NoiseMoments(NamedTuple):
-    """Sums over whitened noises z of d entries, some of which may be missing: how often two entries
-    were there ``together`` (d, d), sums of z (d,), of z z' (d, d), and of z z' with the z
-    before it (d, d), of which there are ``pairs`` (d, d); how many of each lie in the ``cells``
-    (CELLS, d), which standard normal numbers fill evenly; and sums of z^4, ``fourth`` (d,).
+    """Sums over a series of whitened noises z_t (d,), some entries of which may be missing.
 
-    squares  : (3, d, d) sums of z_i^2 where z_j was there too; of z_i^2 where z_j was there before;
-        and of that z_j^2
-    further  : (FURTHER, 4, d) number and sum of products of each entry with itself two and more
-        noises before, and of the squares of both
-    sizes    : (5, d) number of pairs of neighbours, and sums over them of r, of the r before, of
-        r^2 and of their products, r the rank of |z| among those of standard normal numbers
-    variance : (PARTS, 2) number and sum of z^2 of all entries in each part of the series
-    states   : (4, n, d) products of z with n numbers that tell the state which a noise is added to:
-        how many there are, their sum in a run, its square, and 1 for the run if there are any
+    together : (d, d) number of t at which entries i and j are both present
+    first    : (d,) sums of z_i
+    second   : (d, d) sums of z_i z_j
+    lagged   : (d, d) sums of z_i(t) z_j(t - 1)
+    pairs    : (d, d) number of terms of ``lagged``
+    cells    : (CELLS, d) numbers of z_i in cells of equal probability under the normal law
+    fourth   : (d,) sums of z_i^4
+    squares  : (3, d, d) sums of z_i^2 over the terms of ``second``, of z_i(t)^2 over those of
+               ``lagged``, and of z_j(t - 1)^2 over these
+    further  : (FURTHER, 4, d) for lags k = 2, 3, ...: number of terms, and sums of
+               z_i(t) z_i(t - k), of z_i(t)^2 and of z_i(t - k)^2
+    sizes    : (5, d) with the rank r = P(|normal| <= |z_i|): number of neighbouring pairs, and
+               sums over them of r(t), r(t - 1), r(t)^2 and r(t) r(t - 1)
+    variance : (PARTS, 2) number and sum of squares of all entries in each part of the series
+    states   : (4, n, d) of the products of z_i with the n states it is added to, in one run: their
+               number, their sum, the square of that sum, and 1 if there are any
     """
 
     together: FloatArray
@@ -75,15 +77,17 @@ class NoiseMoments(NamedTuple):
 
 
 def moments(z: FloatArray, states: FloatArray | None = None) -> NoiseMoments:
-    """Return the sums over a series z (S, d), in which missing entries are nan, and with numbers
-    ``states`` (S, n, d) that tell the state to which each was added.
+    """Return the sums over a series z (S, d), in which missing entries are nan.
+
+    ``states`` (S, n, d) are the states, in units of their root mean square, to which each noise was
+    added; 0 where none is known.
     """
-    known = np.isfinite(z)
-    there = known.astype(float)
-    z = np.where(known, z, 0.0)
-    rank = np.where(known, 2.0 * scipy.special.ndtr(np.abs(z)) - 1.0, 0.0)
+    present = np.isfinite(z)
+    there = present.astype(float)
+    z = np.where(present, z, 0.0)
+    rank = np.where(present, 2.0 * scipy.special.ndtr(np.abs(z)) - 1.0, 0.0)
     square = z**2
-    later = [
+    lagged_terms = [
         [
             there[k:] * there[:-k],
             z[k:] * z[:-k],
@@ -92,9 +96,9 @@ def moments(z: FloatArray, states: FloatArray | None = None) -> NoiseMoments:
         ]
         for k in range(2, FURTHER + 2)
     ]
-    parts = zip(np.array_split(there, PARTS), np.array_split(z, PARTS), strict=True)
+    pieces = zip(np.array_split(there, PARTS), np.array_split(z, PARTS), strict=True)
     known_states = np.zeros((len(z), 0, z.shape[1])) if states is None else np.nan_to_num(states)
-    number, added = (
+    number, state_products = (
         (there[:, None] * (known_states != 0.0)).sum(axis=0),
         (z[:, None] * known_states).sum(axis=0),
     )
@@ -104,10 +108,10 @@ def moments(z: FloatArray, states: FloatArray | None = None) -> NoiseMoments:
         z.T @ z,
         z[1:].T @ z[:-1],
         there[1:].T @ there[:-1],
-        count_cells(scipy.special.ndtr(z), known),
+        count_cells(scipy.special.ndtr(z), present),
         (z**4).sum(axis=0),
         np.array([square.T @ there, square[1:].T @ there[:-1], there[1:].T @ square[:-1]]),
-        np.array([[sums.sum(axis=0) for sums in lag] for lag in later]),
+        np.array([[sums.sum(axis=0) for sums in lag] for lag in lagged_terms]),
         np.array(
             [
                 (there[1:] * there[:-1]).sum(axis=0),
@@ -117,78 +121,87 @@ def moments(z: FloatArray, states: FloatArray | None = None) -> NoiseMoments:
                 (rank[1:] * rank[:-1]).sum(axis=0),
             ]
         ),
-        np.array([[number.sum(), (part**2).sum()] for number, part in parts]),
-        np.array([number, added, added**2, number > 0.0]),
+        np.array([[number.sum(), (part**2).sum()] for number, part in pieces]),
+        np.array([number, state_products, state_products**2, number > 0.0]),
     )
 
 
-def count_cells(u: FloatArray, known: np.ndarray) -> FloatArray:
-    """Return how many of the ``known`` numbers u (S, d) in [0, 1] lie in each cell, (CELLS, d)."""
+def count_cells(u: FloatArray, present: np.ndarray) -> FloatArray:
+    """Return the counts (CELLS, d) of the ``present`` numbers u (S, d) in [0, 1] in each cell."""
     index = np.minimum((CELLS * u).astype(np.int64), CELLS - 1) * u.shape[1] + np.arange(u.shape[1])
-    counts = np.bincount(index[known], minlength=CELLS * u.shape[1])
+    counts = np.bincount(index[present], minlength=CELLS * u.shape[1])
     return counts.reshape(CELLS, u.shape[1]).astype(float)
 
 
-def total(many: NoiseMoments) -> NoiseMoments:
-    """Return the sums over all runs, from stacked ones."""
-    return NoiseMoments(*(part.sum(axis=0) for part in many))
+def total(stacked: NoiseMoments) -> NoiseMoments:
+    """Return the sums over all runs from sums with a first axis over the runs."""
+    return NoiseMoments(*(part.sum(axis=0) for part in stacked))
 
 
 def whitening_matrix(covariance: FloatArray) -> FloatArray:
-    """Return a matrix (d, n) that makes a noise with this covariance white; d is its rank."""
+    """Return W (d, n) with W C W' = I for a covariance C (n, n) of numerical rank d."""
     values, vectors = np.linalg.eigh(covariance)
-    used = values > MIN_VARIANCE_SHARE * max(values[-1], 0.0)
-    return np.asarray((vectors[:, used] / np.sqrt(values[used])).T)
+    varying = values > MIN_VARIANCE_SHARE * max(values[-1], 0.0)
+    return np.asarray((vectors[:, varying] / np.sqrt(values[varying])).T)
 
 
 def compare_variances(
-    found: NoiseMoments, labels: list[str], level: float, what: str, gaussian: bool = True
+    sums: NoiseMoments, labels: list[str], level: float, noun: str, gaussian: bool = True
 ) -> Finding:
-    """Test that all entries together, and each of them, have the variance 1; numbers that need not
-    be Gaussian are judged by their own fourth moment.
+    """Test the null hypothesis that every entry has variance 1: all entries pooled, all in each
+    part of a run, and one by one, with level / 3 for each of the three.
+
+    Sums of squares of Gaussian numbers are chi-square. Otherwise (``gaussian`` false) the degrees
+    of freedom of the chi-square law are those that match the variance of the sum, from the sample
+    kurtosis. ``noun`` names the entries in messages.
     """
-    counts, squares = np.diagonal(found.together), np.diagonal(found.second)
-    least = MIN_COUNT if gaussian else MIN_COUNT_OF_ANY_LAW
-    if counts.max() < least:
+    counts, squares = np.diagonal(sums.together), np.diagonal(sums.second)
+    min_count = MIN_COUNT if gaussian else MIN_COUNT_OF_ANY_LAW
+    if counts.max() < min_count:
         return nothing_to_see(VARIANCE_TOLERANCE)
 
-    def interval(square: float, fourth: float, count: float, part: float) -> Interval:
-        """Return the interval of a variance relative to the stated one, at level ``part``."""
-        # The freedom of a chi-square variable whose variance is that of the sum of squares.
+    def interval(square: float, fourth: float, count: float, level_part: float) -> Interval:
+        """Return the interval of a variance relative to the stated one, at level ``level_part``."""
+        # The relative variance of a sum of squares is (kurtosis - 1) / count, that of chi-square
+        # with f degrees of freedom 2 / f: hence f = 2 count / (kurtosis - 1), kurtosis - 1 being
+        # 2 + excess. A sample excess below 0 counts as 0, which widens the interval.
         excess = 0.0 if gaussian else count * fourth / square**2 - 3.0
         freedom = 2.0 * count / max(2.0 + excess, 2.0)
-        scale = scale_interval(freedom * square / count, freedom, part)
+        scale = scale_interval(freedom * square / count, freedom, level_part)
         return deviation_interval(1.0, scale)
 
-    sums = float(squares.sum()), float(found.fourth.sum()), float(counts.sum())
-    intervals = [(interval(*sums, level / 3.0), f"all {what} together")]
-    for k, (count, square) in enumerate(found.variance.tolist()):
-        if count >= least:
-            # The fourth moment is that of all parts.
-            part = square, sums[1] * count / sums[2] * (square / count * sums[2] / sums[0]) ** 2
-            label = f"all {what} in part {k + 1} of {PARTS} of a run"
-            intervals.append((interval(*part, count, level / (3.0 * PARTS)), label))
+    totals = float(squares.sum()), float(sums.fourth.sum()), float(counts.sum())
+    intervals = [(interval(*totals, level / 3.0), f"all {noun} together")]
+    for k, (count, square) in enumerate(sums.variance.tolist()):
+        if count >= min_count:
+            # Each part is too short for a fourth moment: it gets the kurtosis of the whole series.
+            fourth = totals[1] * count / totals[2] * (square / count * totals[2] / totals[0]) ** 2
+            label = f"all {noun} in part {k + 1} of {PARTS} of a run"
+            intervals.append((interval(square, fourth, count, level / (3.0 * PARTS)), label))
     share = level / (3.0 * len(squares))
     for k, label in enumerate(labels):
         if counts[k] >= MIN_COUNT:
-            one = float(squares[k]), float(found.fourth[k]), float(counts[k])
-            intervals.append((interval(*one, share), label))
+            entry_sums = float(squares[k]), float(sums.fourth[k]), float(counts[k])
+            intervals.append((interval(*entry_sums, share), label))
     message = f"variances over the stated ones, {counts.sum():,.0f} values,"
     return with_best(intervals, VARIANCE_TOLERANCE, message)
 
 
-def compare_means(found: NoiseMoments, labels: list[str], level: float) -> Finding:
-    """Test that every entry has the mean 0, whatever the state is: none is correlated with it."""
-    counts = np.diagonal(found.together)
+def compare_means(sums: NoiseMoments, labels: list[str], level: float) -> Finding:
+    """Test the null hypothesis that every entry has mean 0 and is uncorrelated with the state.
+
+    The mean of ``count`` entries of variance 1 is taken to be normal with variance 1 / count. Means
+    and correlations with states get half of the level each, if states are known.
+    """
+    counts = np.diagonal(sums.together)
     if counts.max() < MIN_COUNT:
         return nothing_to_see(MEAN_TOLERANCE)
-    states = _with_states(found, labels, level / 2.0)
+    states = _with_states(sums, labels, level / 2.0)
     share, intervals = level / ((2.0 if states else 1.0) * len(labels)), []
-    for total_, count, label in zip(found.first.tolist(), counts.tolist(), labels, strict=True):
+    for entry_sum, count, label in zip(sums.first.tolist(), counts.tolist(), labels, strict=True):
         if count < MIN_COUNT:
             continue
-        # The mean of standard normal numbers is normal, with a variance that is known.
-        value, deviation = total_ / count, 1.0 / math.sqrt(count)
+        value, deviation = entry_sum / count, 1.0 / math.sqrt(count)
         reach = deviation * -float(scipy.special.ndtri(share / 2.0))
         mean = Interval(value, value - reach, value + reach, detectable_shift(deviation, share))
         intervals.append((deviation_interval(0.0, mean), label))
@@ -197,30 +210,33 @@ def compare_means(found: NoiseMoments, labels: list[str], level: float) -> Findi
     return find_largest([*intervals, *states], MEAN_TOLERANCE, message)
 
 
-def _with_states(
-    found: NoiseMoments, labels: list[str], level: float
-) -> list[tuple[Interval, str]]:
-    """Return correlations and labels of all entries with the states that they are added to.
+def _with_states(sums: NoiseMoments, labels: list[str], level: float) -> list[tuple[Interval, str]]:
+    """Return labelled intervals for the correlations of entries with the states they are added to.
 
-    States of one run may be much alike, so that runs are what is independent.
+    States within a run are correlated, so that the independent values are the sums of the products
+    over each run; their mean under the null hypothesis is 0, which makes the sum of their squares
+    an estimate of the variance.
     """
-    counts, sums, squares, runs = found.states
-    used = np.argwhere((runs >= MIN_RUNS) & (squares > 0.0)).tolist()
+    counts, products, squares, runs = sums.states
+    comparable = np.argwhere((runs >= MIN_RUNS) & (squares > 0.0)).tolist()
     intervals = []
-    for j, i in used:
+    for j, i in comparable:
         count, spread = float(counts[j, i]), math.sqrt(squares[j, i])
-        related = student_interval(
-            float(sums[j, i]) / count, spread / count, int(runs[j, i]), level / len(used)
+        correlation = student_interval(
+            float(products[j, i]) / count, spread / count, int(runs[j, i]), level / len(comparable)
         )
-        intervals.append((deviation_interval(0.0, related), f"{labels[i]} and state {j}"))
+        intervals.append((deviation_interval(0.0, correlation), f"{labels[i]} and state {j}"))
     return intervals
 
 
-def compare_correlations(found: NoiseMoments, labels: list[str], level: float) -> Finding:
-    """Test that different entries are not correlated, none with any entry just before, nor with
-    itself before that, and that large ones do not follow large or small ones.
+def compare_correlations(sums: NoiseMoments, labels: list[str], level: float) -> Finding:
+    """Test the null hypothesis that the noise is white.
+
+    Under it there are no correlations between entries, with any entry one step before, of an entry
+    with itself 2 to FURTHER + 1 steps before, and of |entry| with itself one step before (which
+    would show a varying variance). All comparisons share the level (Bonferroni).
     """
-    entries = [*_between(found, labels), *_in_time(found, labels), *_in_size(found, labels)]
+    entries = [*_between(sums, labels), *_in_time(sums, labels), *_in_size(sums, labels)]
     entries = [entry for entry in entries if entry[1] >= MIN_COUNT]
     if not entries:
         return nothing_to_see(CORRELATION_TOLERANCE)
@@ -232,9 +248,12 @@ def compare_correlations(found: NoiseMoments, labels: list[str], level: float) -
     return find_largest(intervals, CORRELATION_TOLERANCE, "largest correlation")
 
 
-def compare_cells(cells: FloatArray, labels: list[str], level: float, what: str) -> Finding:
-    """Test that numbers counted in ``cells`` (CELLS, d) fill all cells evenly, those of all columns
-    together and each column.
+def compare_cells(cells: FloatArray, labels: list[str], level: float, noun: str) -> Finding:
+    """Test the null hypothesis that numbers are uniform in [0, 1), from their counts in ``cells``
+    (CELLS, d): of all d columns together, and of each column, with half of the level each.
+
+    Cells have equal probability, so that a count is binomial with probability 1 / CELLS (interval
+    of Clopper and Pearson). ``noun`` names the numbers in the message.
     """
     counts = cells.sum(axis=0)
     if counts.sum() < 10 * CELLS:
@@ -247,9 +266,9 @@ def compare_cells(cells: FloatArray, labels: list[str], level: float, what: str)
     for column, label in enumerate(labels if len(labels) > 1 else ()):
         if counts[column] >= 10 * CELLS:
             for k, count in enumerate(cells[:, column].tolist()):
-                apart = _cell_interval(count, counts[column], share)
-                intervals.append((apart, f"{label}, {_cell_label(k)}"))
-    message = f"{counts.sum():,.0f} {what}, largest difference of a share from 1/{CELLS}"
+                distance = _cell_interval(count, counts[column], share)
+                intervals.append((distance, f"{label}, {_cell_label(k)}"))
+    message = f"{counts.sum():,.0f} {noun}, largest difference of a share from 1/{CELLS}"
     return with_best(intervals, SHARE_TOLERANCE, message, CELLS)
 
 
@@ -264,8 +283,8 @@ def _cell_label(k: int) -> str:
 
 
 def correlation_interval(value: float, count: float, level: float) -> Interval:
-    """Return an interval for the correlation of two normal numbers of which ``count`` pairs were
-    seen, by Fisher's transformation.
+    """Return an interval for the correlation of two normal variables by Fisher's transformation:
+    atanh of the estimate ``value`` from ``count`` pairs has the variance 1 / (count - 3).
     """
     spread = 1.0 / math.sqrt(max(count - 3.0, 1.0))
     reach = -spread * float(scipy.special.ndtri(level / 2.0))
@@ -280,65 +299,77 @@ def correlation_interval(value: float, count: float, level: float) -> Interval:
     return Interval(value, *limits(value, 1.0), detectable, again=limits)
 
 
-def _between(found: NoiseMoments, labels: list[str]) -> Iterator[tuple[float, float, str]]:
+def _between(sums: NoiseMoments, labels: list[str]) -> Iterator[tuple[float, float, str]]:
     """Yield correlation, count and label of all pairs of entries."""
-    related = _correlations(found.second, found.squares[0], found.squares[0].T)
+    correlations = _correlations(sums.second, sums.squares[0], sums.squares[0].T)
     for i in range(len(labels)):
         for j in range(i):
-            yield float(related[i, j]), float(found.together[i, j]), f"{labels[j]} and {labels[i]}"
+            yield (
+                float(correlations[i, j]),
+                float(sums.together[i, j]),
+                f"{labels[j]} and {labels[i]}",
+            )
 
 
-def _in_time(found: NoiseMoments, labels: list[str]) -> Iterator[tuple[float, float, str]]:
+def _in_time(sums: NoiseMoments, labels: list[str]) -> Iterator[tuple[float, float, str]]:
     """Yield correlation, count and label of all entries with all entries just before."""
-    related = _correlations(found.lagged, *found.squares[1:])
+    correlations = _correlations(sums.lagged, *sums.squares[1:])
     for i, label in enumerate(labels):
-        for j, before in enumerate(labels):
-            pairs = float(found.pairs[i, j])
-            yield float(related[i, j]), pairs, f"{label} and {before} just before"
+        for j, earlier_label in enumerate(labels):
+            pairs = float(sums.pairs[i, j])
+            yield float(correlations[i, j]), pairs, f"{label} and {earlier_label} just before"
 
 
-def _in_size(found: NoiseMoments, labels: list[str]) -> Iterator[tuple[float, float, str]]:
-    """Yield correlation, count and label of each entry with itself some noises before, and of its
-    size with that just before.
+def _in_size(sums: NoiseMoments, labels: list[str]) -> Iterator[tuple[float, float, str]]:
+    """Yield correlation, count and label of each entry with itself 2 to FURTHER + 1 steps before,
+    and of the rank of |entry| with that one step before.
     """
-    count, *sums = np.moveaxis(found.further, 1, 0)
-    related = _correlations(*sums)
+    count, *lag_sums = np.moveaxis(sums.further, 1, 0)
+    correlations = _correlations(*lag_sums)
     for i, label in enumerate(labels):
         for k in range(FURTHER):
-            yield float(related[k, i]), float(count[k, i]), f"{label} and itself {k + 2} before"
-        pairs, after, before, square_, products = found.sizes[:, i].tolist()
-        spread = pairs * square_ - after**2
+            yield (
+                float(correlations[k, i]),
+                float(count[k, i]),
+                f"{label} and itself {k + 2} before",
+            )
+        pairs, rank_sum, earlier_sum, square_sum, product_sum = sums.sizes[:, i].tolist()
+        spread = pairs * square_sum - rank_sum**2
         if pairs >= MIN_COUNT_OF_ANY_LAW and spread > 0.0:
-            value = (pairs * products - after * before) / spread
+            value = (pairs * product_sum - rank_sum * earlier_sum) / spread
             yield float(value), pairs, f"the size of {label} and of that just before"
 
 
-def _correlations(products: FloatArray, one: FloatArray, other: FloatArray) -> FloatArray:
-    """Return correlations from the sums of products and of the squares of ``one`` and ``other``
-    over the same pairs; 0 without pairs.
+def _correlations(
+    products: FloatArray, first_squares: FloatArray, second_squares: FloatArray
+) -> FloatArray:
+    """Return correlations from sums of products and squares over the same pairs; 0 without pairs.
+
+    With squares summed over other terms than the products, |correlation| could exceed 1.
     """
-    # Squares of other noises do not count: with them |correlation| could exceed 1.
     with np.errstate(invalid="ignore", divide="ignore"):
-        return np.asarray(np.nan_to_num(products / np.sqrt(one * other)))
+        return np.asarray(np.nan_to_num(products / np.sqrt(first_squares * second_squares)))
 
 
 def with_best(
-    intervals: list[tuple[Interval, str]], tolerance: float, message: str, whole: int = 1
+    intervals: list[tuple[Interval, str]], tolerance: float, message: str, overall_count: int = 1
 ) -> Finding:
-    """Return the finding of intervals over everything, the ``whole`` first ones, and of its parts.
+    """Return the finding of labelled intervals for deviations that should be 0.
 
-    A part that is off is the finding; else what is known of everything, which is more precise.
+    The first ``overall_count`` ones are over all values, the others over parts of them. If any
+    deviation is significant the finding is the most significant one; otherwise it is that of all
+    values, which is more precise, and the message adds the largest deviation of a part.
     """
-    finding = find_largest(intervals[:whole], tolerance, message)
-    if any(apart.low > 0.0 for apart, _ in intervals):
+    finding = find_largest(intervals[:overall_count], tolerance, message)
+    if any(distance.low > 0.0 for distance, _ in intervals):
         everything = finding.detectable
         return find_largest(intervals, tolerance, message)._replace(detectable=everything)
-    if len(intervals) == whole:
+    if len(intervals) == overall_count:
         return finding
-    worst, label = max(intervals[whole:], key=lambda item: item[0].value)
-    text = f"{finding.message}; furthest off {label}: {worst.value:.3g}"
-    if math.isfinite(worst.detectable):
-        text += f", {worst.detectable:.2g} would have been seen"
+    largest, label = max(intervals[overall_count:], key=lambda item: item[0].value)
+    text = f"{finding.message}; furthest off {label}: {largest.value:.3g}"
+    if math.isfinite(largest.detectable):
+        text += f", {largest.detectable:.2g} would have been seen"
     return finding._replace(message=text)
 
 

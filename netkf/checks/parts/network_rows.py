@@ -39,7 +39,7 @@ from netkf.scenario.scenario import Scenario
 
 PROBABILITY_TOLERANCE = 0.05
 MIN_EVENTS = 20
-"""Runs in which something has to happen before their spread is used."""
+"""Runs with at least one event (a loss, a delivery) from which their sample variance is used."""
 
 
 def _stated_loss(scenario: Scenario) -> Any:
@@ -51,8 +51,8 @@ def _stated_loss(scenario: Scenario) -> Any:
 def loss_probabilities(scenario: Scenario) -> FloatArray:
     """Return the stated long-run loss (D,) of each direction; nan if unknown before a run."""
     loss, directions = _stated_loss(scenario), scenario.topology.directions
-    kept = [loss.mean_delivery(d, scenario.table_probability(d)) for d in directions]
-    return 1.0 - np.array(kept)
+    delivery = [loss.mean_delivery(d, scenario.table_probability(d)) for d in directions]
+    return 1.0 - np.array(delivery)
 
 
 def _direction_label(scenario: Scenario, k: int) -> str:
@@ -62,23 +62,27 @@ def _direction_label(scenario: Scenario, k: int) -> str:
 
 
 def _check_losses(samples: PartSamples, level: float) -> Finding:
-    """Compare lost shares with the stated ones, all directions together and one by one."""
+    """Test the null hypothesis that each direction loses its stated share of messages.
+
+    Three groups of comparisons get level / 3 each: all directions together, the same in each window
+    of the run, and every direction.
+    """
     scenario, counts = samples.scenario, samples.fates
     q = loss_probabilities(scenario)
     sent, lost = counts.sent.sum(axis=1), counts.lost.sum(axis=1)
-    used = np.flatnonzero(sent.sum(axis=0) > 0)
-    intervals = [(_loss_interval(scenario, sent, lost, q, used, level / 3.0), "all directions")]
+    in_use = np.flatnonzero(sent.sum(axis=0) > 0)
+    intervals = [(_loss_interval(scenario, sent, lost, q, in_use, level / 3.0), "all directions")]
     windows = np.flatnonzero(counts.sent.sum(axis=(0, 2)) > 0)
     for w in windows.tolist() if counts.sent.shape[1] > 1 else ():
-        part = counts.sent[:, w], counts.lost[:, w]
-        found = _loss_interval(scenario, *part, q, used, level / (3.0 * len(windows)))
+        window_counts = counts.sent[:, w], counts.lost[:, w]
+        interval = _loss_interval(scenario, *window_counts, q, in_use, level / (3.0 * len(windows)))
         label = f"all directions in part {w + 1} of {counts.sent.shape[1]} of the run"
-        intervals.append((found, label))
-    share = level / (3.0 * max(len(used), 1))
-    for k in used.tolist():
-        one = np.array([k])
-        found = _loss_interval(scenario, sent, lost, q, one, share)
-        intervals.append((found, _direction_label(scenario, k)))
+        intervals.append((interval, label))
+    single_level = level / (3.0 * max(len(in_use), 1))
+    for k in in_use.tolist():
+        direction = np.array([k])
+        interval = _loss_interval(scenario, sent, lost, q, direction, single_level)
+        intervals.append((interval, _direction_label(scenario, k)))
     message = f"{sent.sum():,.0f} messages, difference of the lost share"
     return with_best(intervals, PROBABILITY_TOLERANCE, message)
 
@@ -88,33 +92,40 @@ def _loss_interval(
     sent: np.ndarray,
     lost: np.ndarray,
     q: FloatArray,
-    which: np.ndarray,
+    directions: np.ndarray,
     level: float,
 ) -> Interval:
-    """Return an interval for the distance of the lost share from the stated one.
+    """Return an interval for the distance between the lost and the stated share of messages.
 
-    Independent losses of one direction have exact limits. Otherwise runs are: what is lost of the
-    messages of a run beyond their expected loss has the mean 0. Where few runs lost any, or few
-    delivered any, their spread says little: limits are those of independent messages if that is
-    what is stated, else they hold for every law of a run.
+    ``sent`` and ``lost`` (R, D) are counts of R runs, ``q`` (D,) stated probabilities of loss; only
+    ``directions`` (indices) count. Independent losses of one direction have the exact limits of
+    Clopper and Pearson. Otherwise the R runs are the independent values: losses of a run less their
+    expected number have mean 0, and Student's interval applies. Where losses (or deliveries) occur
+    in fewer than MIN_EVENTS runs, their sample variance is unreliable: limits are then those of
+    independent messages if independence is stated, else those of :func:`_share_of_bounded_runs`.
     """
-    total, runs = float(sent[:, which].sum()), len(sent)
-    excess = (lost[:, which] - sent[:, which] * q[which]).sum(axis=1)
-    expected = float((sent[:, which] * q[which]).sum()) / total
-    if len(which) == 1 and _is_independent(scenario):
-        found = probability_interval(int(lost[:, which].sum()), int(total), level)
-        return deviation_interval(expected, found)
-    some = lost[:, which].sum(axis=1), (sent[:, which] - lost[:, which]).sum(axis=1)
-    few = min(np.count_nonzero(part) for part in some) < MIN_EVENTS
-    if few and _is_independent(scenario):
+    total, runs = float(sent[:, directions].sum()), len(sent)
+    excess = (lost[:, directions] - sent[:, directions] * q[directions]).sum(axis=1)
+    expected = float((sent[:, directions] * q[directions]).sum()) / total
+    if len(directions) == 1 and _is_independent(scenario):
+        limits = probability_interval(int(lost[:, directions].sum()), int(total), level)
+        return deviation_interval(expected, limits)
+    outcomes = (
+        lost[:, directions].sum(axis=1),
+        (sent[:, directions] - lost[:, directions]).sum(axis=1),
+    )
+    rare = min(np.count_nonzero(outcome) for outcome in outcomes) < MIN_EVENTS
+    if rare and _is_independent(scenario):
         # The sum of independent losses of unequal probabilities has lighter tails than that of
         # equal ones (Hoeffding 1956). Both directions of a link may share one loss.
-        each = 2 if scenario.network.channel.symmetric else 1
-        found = probability_interval(int(some[0].sum()) // each, int(total) // each, level)
-        return deviation_interval(expected, found)
-    if few:
-        found = _share_of_bounded_runs(excess, sent[:, which].sum(axis=1), expected, level)
-        return deviation_interval(expected, found)
+        messages_per_draw = 2 if scenario.network.channel.symmetric else 1
+        limits = probability_interval(
+            int(outcomes[0].sum()) // messages_per_draw, int(total) // messages_per_draw, level
+        )
+        return deviation_interval(expected, limits)
+    if rare:
+        limits = _share_of_bounded_runs(excess, sent[:, directions].sum(axis=1), expected, level)
+        return deviation_interval(expected, limits)
     # A spread of at least one message of all: a few rare losses may show none.
     spread = math.sqrt(max(float(excess.var(ddof=1)) * runs, 1.0))
     estimate = expected + float(excess.sum()) / total
@@ -124,46 +135,51 @@ def _loss_interval(
 def _share_of_bounded_runs(
     excess: FloatArray, sent: np.ndarray, expected: float, level: float
 ) -> Interval:
-    """Return an interval for the lost share of messages, which holds for every law of a run.
+    """Return an interval for the lost share of messages that holds for every law of a run.
 
-    ``excess`` (R,) is the number of messages lost in each run less the expected one, of ``sent``
-    (R,), and ``expected`` the stated share. By Hoeffding's bound, R independent numbers in [0, 1]
-    with mean m have an average of f or beyond with a probability of at most exp(-R KL(f, m)).
+    ``excess`` (R,) is the number of messages lost in each run less the expected number, ``sent``
+    (R,) the number of messages, ``expected`` the stated share. By Hoeffding's bound (1963, Theorem
+    1) the average of R independent numbers in [0, 1] with mean m is f, or further from m, with a
+    probability of at most exp(-R KL(f, m)), KL the Kullback-Leibler divergence of Bernoulli laws.
     """
-    runs, most = len(sent), float(sent.max())
-    # The numbers are lost messages over ``most``; their mean is the share over ``scale``.
-    scale = most * runs / float(sent.sum())
+    runs, max_sent = len(sent), float(sent.max())
+    # The numbers are lost messages over ``max_sent``; their mean is the share over ``scale``.
+    scale = max_sent * runs / float(sent.sum())
     # Directions that lose unequal shares can take it slightly out of [0, 1].
-    found = min(max(expected + float(excess.mean()) / most, 0.0), 1.0)
+    mean = min(max(expected + float(excess.mean()) / max_sent, 0.0), 1.0)
 
     def limits(value: float, factor: float) -> tuple[float, float]:
         """Return both ends for another share and ``factor`` times the runs."""
-        near = min(max(expected + (value - expected) / scale, 0.0), 1.0)
+        centre = min(max(expected + (value - expected) / scale, 0.0), 1.0)
         limit = math.log(2.0 / level) / (factor * runs)
-        low, high = (_share_at(near, end, limit) for end in (0.0, 1.0))
+        low, high = (_share_at(centre, end, limit) for end in (0.0, 1.0))
         return expected + scale * (low - expected), expected + scale * (high - expected)
 
-    value = expected + scale * (found - expected)
+    value = expected + scale * (mean - expected)
     low, high = limits(value, 1.0)
     return Interval(value, low, high, max(expected - low, high - expected), again=limits)
 
 
-def _share_at(found: float, end: float, limit: float) -> float:
-    """Return the mean from ``found`` towards ``end``, 0 or 1, whose divergence is ``limit``."""
-    near, far = found, end
+def _share_at(centre: float, end: float, limit: float) -> float:
+    """Return the m between ``centre`` and ``end`` (0 or 1) with KL(centre, m) = ``limit``, by
+    bisection; m is ``end`` if the divergence stays below the limit.
+    """
+    inner, outer = centre, end
     for _ in range(60):
-        middle = 0.5 * (near + far)
-        parts = scipy.special.rel_entr([found, 1.0 - found], [middle, 1.0 - middle])
-        if float(parts.sum()) > limit:
-            far = middle
+        middle = 0.5 * (inner + outer)
+        divergence = scipy.special.rel_entr([centre, 1.0 - centre], [middle, 1.0 - middle])
+        if float(divergence.sum()) > limit:
+            outer = middle
         else:
-            near = middle
-    return near
+            inner = middle
+    return inner
 
 
 def _is_independent(scenario: Scenario) -> bool:
-    """Return True if messages are lost independently of each other: by what is stated, and because
-    each has an outcome of its own; a filter may hold those of a link for several exchanges.
+    """Return True if messages are lost independently of each other.
+
+    The loss must state so, and every exchange must redraw the links: a filter may keep the outcome
+    of a link for several exchanges of a slot.
     """
     filter_ = scenario.hosted
     if scenario.slotted:
@@ -175,29 +191,36 @@ def _is_independent(scenario: Scenario) -> bool:
 
 
 def _losses_apart(samples: PartSamples, level: float) -> Finding:
-    """Test that losses are independent from message to message, between both directions where they
-    do not share one fate, and between links.
+    """Test the null hypothesis that messages are lost independently of each other.
+
+    Under it consecutive messages of a direction, messages of the same number in opposite directions
+    (unless both share one draw), and different links have uncorrelated losses; each of the three
+    tests gets a third of the level.
     """
     scenario, counts = samples.scenario, samples.fates
     q, sent = loss_probabilities(scenario), counts.sent.sum(axis=1)
     pairs = np.maximum(sent - 1, 0)
-    # Where both directions of a link share one fate, each is counted twice.
-    repeated = _neighbours_variance(q) * (2.0 if scenario.network.channel.symmetric else 1.0)
-    jobs = [("a message and the one before", counts.repeated, pairs, q, repeated)]
+    # Where both directions of a link share one draw, each event is counted twice.
+    repeated_variance = _neighbours_variance(q) * (
+        2.0 if scenario.network.channel.symmetric else 1.0
+    )
+    jobs = [("a message and the one before", counts.repeated, pairs, q, repeated_variance)]
     if _directions_apart(scenario):
-        # In each of two directions of a link the same pairs are counted: messages of one number.
-        back = reversed_directions(scenario)
-        pairs = np.where(back >= 0, np.minimum(sent, sent[:, back]), 0)
-        joint = q * q[back]
+        # A pair is two messages of the same number in opposite directions of a link.
+        opposite = reversed_directions(scenario)
+        pairs = np.where(opposite >= 0, np.minimum(sent, sent[:, opposite]), 0)
+        joint = q * q[opposite]
         # Each pair is counted in both directions.
         variance = 2.0 * joint * (1.0 - joint)
-        jobs.append(("both directions of a link", counts.both, pairs, q[back], variance))
+        jobs.append(("both directions of a link", counts.both, pairs, q[opposite], variance))
     intervals = []
-    for label, both, count, other, variance in jobs:
-        scale = np.sqrt(q * (1.0 - q) * other * (1.0 - other))
-        found = _correlation_of_runs(both - count * q * other, count, scale, variance, level / 3.0)
-        if found is not None:
-            intervals.append((found, f"correlation of {label}"))
+    for label, observed, count, other_q, variance in jobs:
+        scale = np.sqrt(q * (1.0 - q) * other_q * (1.0 - other_q))
+        interval = _correlation_of_runs(
+            observed - count * q * other_q, count, scale, variance, level / 3.0
+        )
+        if interval is not None:
+            intervals.append((interval, f"correlation of {label}"))
     intervals += _links_apart(samples, level / 3.0)
     if not intervals:
         return nothing_to_see(CORRELATION_TOLERANCE)
@@ -205,31 +228,35 @@ def _losses_apart(samples: PartSamples, level: float) -> Finding:
 
 
 def _check_bursts(samples: PartSamples, level: float) -> Finding:
-    """Compare how often a message is lost after another loss with the chain that is stated."""
+    """Test the null hypothesis that losses follow the stated two-state (Gilbert-Elliott) chain.
+
+    Compared is the probability that the message after a lost one is lost too, by Student's interval
+    over the runs.
+    """
     scenario, counts = samples.scenario, samples.fates
     loss, q = _stated_loss(scenario), loss_probabilities(scenario)
     runs, followed = len(counts.sent), counts.followed.sum(axis=1)
     total = float(followed.sum())
     if total < MIN_COUNT or np.count_nonzero(followed) < MIN_EVENTS:
         return nothing_to_see(PROBABILITY_TOLERANCE)
-    again = loss_twice(loss) / float(q.mean())
-    excess = counts.repeated.sum(axis=1) - again * followed
-    # At least the spread of independent pairs: a few rare ones may show none.
-    least = max(total * again * (1.0 - again), 1.0)
-    spread = math.sqrt(max(float(excess.var(ddof=1)) * runs, least)) / total
-    estimate = again + float(excess.sum()) / total
-    apart = deviation_interval(again, student_interval(estimate, spread, runs, level))
+    probability = loss_twice(loss) / float(q.mean())
+    excess = counts.repeated.sum(axis=1) - probability * followed
+    # At least the variance of independent pairs: a few rare losses may show no variance.
+    min_variance = max(total * probability * (1.0 - probability), 1.0)
+    spread = math.sqrt(max(float(excess.var(ddof=1)) * runs, min_variance)) / total
+    estimate = probability + float(excess.sum()) / total
+    distance = deviation_interval(probability, student_interval(estimate, spread, runs, level))
     message = f"{total:,.0f} losses, after which the next message is lost with a probability off"
-    return find_largest([(apart, "all directions")], PROBABILITY_TOLERANCE, message)
+    return find_largest([(distance, "all directions")], PROBABILITY_TOLERANCE, message)
 
 
 def loss_twice(chain: GilbertElliott) -> float:
-    """Return the probability that two messages in a row are lost, by the chain of the losses."""
+    """Return the probability that two consecutive messages are lost, in the stationary chain."""
     to_bad, to_good = chain.transitions
     start = np.array([to_good, to_bad]) / (to_bad + to_good)
     step = np.array([[1.0 - to_bad, to_bad], [to_good, 1.0 - to_good]])
-    kept = [chain.delivery_probability((0, 1), 0, bad, 1.0) for bad in (False, True)]
-    lost = 1.0 - np.array(kept)
+    delivery = [chain.delivery_probability((0, 1), 0, bad, 1.0) for bad in (False, True)]
+    lost = 1.0 - np.array(delivery)
     return float((start * lost) @ step @ lost)
 
 
@@ -243,14 +270,16 @@ def _one_step_a_message(scenario: Scenario) -> bool:
 
 
 def _neighbours_variance(p: Any) -> Any:
-    """Return the variance for each pair of the number of pairs of neighbours in a long row of
-    independent events of probability p that both happened; neighbouring pairs share an event.
+    """Return the variance, divided by the number of pairs, of the number of neighbouring pairs in
+    which both events occur, in a long series of independent events of probability p.
+
+    It is Var(x_k x_{k+1}) + 2 Cov(x_k x_{k+1}, x_{k+1} x_{k+2}): overlapping pairs share an event.
     """
     return p**2 * (1.0 - p**2) + 2.0 * p**3 * (1.0 - p)
 
 
 def _directions_apart(scenario: Scenario) -> bool:
-    """Return True if both directions of a link have messages at once and fates of their own."""
+    """Return True if both directions of a link carry messages at once but draw their own losses."""
     clock = scenario.network.activation
     at_once = getattr(clock, "at", "links") == "links"
     return at_once and not scenario.network.channel.symmetric
@@ -260,7 +289,7 @@ def _correlation_of_runs(
     excess: FloatArray, count: np.ndarray, scale: FloatArray, variance: FloatArray, level: float
 ) -> Interval | None:
     """Return an interval for the correlation of the two events of a pair, from R independent runs;
-    None with too few.
+    None with fewer than MIN_RUNS runs.
 
     excess   : (R, D) number of pairs in which both events happened, less its expected value if
                they are independent
@@ -274,19 +303,19 @@ def _correlation_of_runs(
         return None
     values = excess.sum(axis=1)
     runs = len(values)
-    # Rare events may by chance vary less between runs than their law says.
-    least = float((count * variance).sum())
-    spread = math.sqrt(max(float(values.var(ddof=1)) * runs, least, 1.0))
+    # At least the variance under independence: rare events may vary less by chance.
+    min_variance = float((count * variance).sum())
+    spread = math.sqrt(max(float(values.var(ddof=1)) * runs, min_variance, 1.0))
     estimate = float(values.sum()) / weight
     return deviation_interval(0.0, student_interval(estimate, spread / weight, runs, level))
 
 
 def _links_apart(samples: PartSamples, level: float) -> list[tuple[Interval, str]]:
-    """Return the correlations of losses between links: those that are largest, from the counts of
-    runs.
+    """Return labelled intervals for the largest and for the mean correlation of losses of two
+    links, from their counts in the windows of all runs.
     """
     scenario, counts = samples.scenario, samples.fates
-    # One direction of a link stands for both, which may share their fates.
+    # One direction of a link stands for both, which may share their draws.
     estimate: dict[tuple[int, int], int] = {}
     for k, (i, j) in enumerate(scenario.topology.directions):
         estimate.setdefault((min(i, j), max(i, j)), k)
@@ -295,46 +324,51 @@ def _links_apart(samples: PartSamples, level: float) -> list[tuple[Interval, str
         -1, counts.sent.shape[2]
     )
     excess = excess[:, columns]
-    found = largest_correlation(excess, level / 2.0)
-    if found is None:
+    largest = largest_correlation(excess, level / 2.0)
+    if largest is None:
         return []
-    interval, (a, b) = found
+    interval, (a, b) = largest
     first, second = (_direction_label(scenario, int(columns[k])) for k in (a, b))
     intervals = [(interval, f"correlation of losses {first} and {second}")]
     mean = _mean_correlation(excess, _loss_variances(samples)[:, columns], level / 2.0)
     if mean is not None:
-        # Correlations of some pairs cancel others only by design; a common cause adds up.
+        # A common cause of losses correlates all pairs a little, which shows best in the mean.
         intervals.append((deviation_interval(0.0, mean), "mean correlation of losses of all links"))
     return intervals
 
 
 def _loss_variances(samples: PartSamples) -> FloatArray:
-    """Return the variance (K, D) of the losses of each direction in a part of a run, given how many
-    messages were sent in it.
+    """Return the variance (K, D) of the number of losses of each direction in each of K windows of
+    runs, given how many messages were sent in it.
     """
     sent, q = samples.fates.sent, loss_probabilities(samples.scenario)
     return np.asarray((sent * (q * (1.0 - q))).reshape(-1, sent.shape[2]))
 
 
 def _mean_correlation(excess: FloatArray, variance: FloatArray, level: float) -> Interval | None:
-    """Return an interval for the correlation of losses of two links, the same for all of them, from
-    ``excess`` (K, L) over the means in K parts of runs; None if no part has losses of two links.
+    """Return an interval for the mean correlation of the losses of two links; None if too few
+    windows have losses of two links.
 
-    Given what was sent products of two independent links have mean 0 and the variance that those of
-    the links have as product: a part in which little was sent says little.
+    ``excess`` (K, L) are the losses of L links in K windows of runs less their expected numbers,
+    and ``variance`` (K, L) their variances under independence. The estimate is the sum over windows
+    and pairs of links of the products of two excesses, each of mean 0 under independence, over the
+    sum of the products of their standard deviations.
     """
     deviation = np.sqrt(variance)
+    # The sum of x_i x_j over all pairs i < j is ((sum x)^2 - sum x^2) / 2.
     products = (excess.sum(axis=1) ** 2 - (excess**2).sum(axis=1)) / 2.0
     scale = float((deviation.sum(axis=1) ** 2 - variance.sum(axis=1)).sum()) / 2.0
     spreads = (variance.sum(axis=1) ** 2 - (variance**2).sum(axis=1)) / 2.0
     total = float(spreads.sum())
-    # As many parts as there would be if all said the same.
-    parts = total**2 / float((spreads**2).sum()) if total > 0.0 else 0.0
-    if not parts >= MIN_RUNS:
+    # The effective number of windows, those with few messages counting less.
+    effective_count = total**2 / float((spreads**2).sum()) if total > 0.0 else 0.0
+    if not effective_count >= MIN_RUNS:
         return None
-    # Losses of links that are related spread more than the stated ones.
+    # Correlated losses have products of larger variance than independent ones.
     spread = math.sqrt(max(total, float((products**2).sum())))
-    return student_interval(float(products.sum()) / scale, spread / scale, int(parts), level)
+    return student_interval(
+        float(products.sum()) / scale, spread / scale, int(effective_count), level
+    )
 
 
 @lru_cache(maxsize=8)
@@ -352,37 +386,42 @@ def pair_probabilities(scenario: Scenario) -> FloatArray | None:
 
 
 def _check_matchings(samples: PartSamples, level: float) -> Finding:
-    """Compare how often links are paired with the mean matching, in all slots and in two
-    neighbouring ones.
+    """Test the null hypothesis that matchings have their stated mean and are independent.
+
+    Compared with the mean matching are the number of pairs in a slot (Student's interval over the
+    runs) and the probability that each link is paired (Clopper and Pearson); and a link that is
+    paired in one slot must not be correlated with itself in the next.
     """
     scenario, pairs = samples.scenario, samples.pairs
     p = pair_probabilities(scenario)
     assert p is not None
     slots, runs = float(pairs.slots[0]), len(pairs.paired)
-    share = level / (3.0 * len(p))
-    # A few rare pairs may show no spread: there is at least that of one pair in all runs.
-    number = pairs.paired.sum(axis=1) / slots
-    spread = max(float(number.std(ddof=1)) / math.sqrt(runs), 1.0 / (runs * slots))
-    together = student_interval(float(number.mean()), spread, runs, level / 3.0)
-    intervals = [(deviation_interval(float(p.sum()), together), "pairs in a slot, of all links")]
+    single_level = level / (3.0 * len(p))
+    # At least the deviation of one pair in all slots of all runs: rare pairs may show none.
+    pairs_per_slot = pairs.paired.sum(axis=1) / slots
+    spread = max(float(pairs_per_slot.std(ddof=1)) / math.sqrt(runs), 1.0 / (runs * slots))
+    mean_pairs = student_interval(float(pairs_per_slot.mean()), spread, runs, level / 3.0)
+    intervals = [(deviation_interval(float(p.sum()), mean_pairs), "pairs in a slot, of all links")]
     for k, link in enumerate(scenario.topology.links):
         label = f"link {link[0]}-{link[1]}"
-        found = probability_interval(int(pairs.paired[:, k].sum()), int(runs * slots), share)
-        intervals.append((deviation_interval(float(p[k]), found), label))
-        again = pairs.repeated[:, k].astype(float)
+        limits = probability_interval(
+            int(pairs.paired[:, k].sum()), int(runs * slots), single_level
+        )
+        intervals.append((deviation_interval(float(p[k]), limits), label))
+        repeated = pairs.repeated[:, k].astype(float)
         if slots < 2.0 or not 0.0 < p[k] < 1.0:
             continue
-        # The pairs of neighbouring slots overlap, and the runs do not.
-        excess = (again - (slots - 1.0) * p[k] ** 2)[:, None]
-        related = _correlation_of_runs(
+        # Neighbouring pairs of slots overlap, so that only runs are independent values.
+        excess = (repeated - (slots - 1.0) * p[k] ** 2)[:, None]
+        correlation = _correlation_of_runs(
             excess,
             np.full((runs, 1), slots - 1.0),
             np.array([p[k] * (1.0 - p[k])]),
             np.array([_neighbours_variance(float(p[k]))]),
-            share,
+            single_level,
         )
-        if related is not None:
-            intervals.append((related, f"{label} and the slot before, their correlation"))
+        if correlation is not None:
+            intervals.append((correlation, f"{label} and the slot before, their correlation"))
     message = f"{runs * slots:,.0f} slots, largest difference of a share"
     return with_best(intervals, PROBABILITY_TOLERANCE, message)
 
@@ -406,12 +445,12 @@ MATCHINGS = Promise(
 
 
 def network_promises(samples: PartSamples) -> list[Promise]:
-    """Return the promises about the network that have a stated law and were seen in the runs."""
-    found = clock_promises(samples)
+    """Return the promises about the network whose law is stated and that the runs can test."""
+    promises = clock_promises(samples)
     scenario = samples.scenario
     drawn = samples.pairs is not None and scenario.hosted.talks
     if drawn and pair_probabilities(scenario) is not None:
-        found.append(MATCHINGS)
+        promises.append(MATCHINGS)
     # A delay that depends on the message may lose it (nan), which the law of losses does not state.
     losses_are_stated = not delay_depends_on_message(scenario.network.channel.delay)
     recorded = isinstance(_stated_loss(scenario), RecordedLoss)
@@ -419,9 +458,9 @@ def network_promises(samples: PartSamples) -> list[Promise]:
     if sent and losses_are_stated and not recorded:
         q = loss_probabilities(scenario)
         if np.isfinite(q).all():
-            found.append(LOSSES)
+            promises.append(LOSSES)
             if _is_independent(scenario) and ((q > 0.0) & (q < 1.0)).any():
-                found.append(LOSSES_APART)
+                promises.append(LOSSES_APART)
             if type(_stated_loss(scenario)) is GilbertElliott and _one_step_a_message(scenario):
-                found.append(BURSTS)
-    return found + delay_promises(samples)
+                promises.append(BURSTS)
+    return promises + delay_promises(samples)

@@ -1,7 +1,8 @@
 """Noises of the plant and of the sensors, drawn again from the streams of a run, and whitened.
 
-The plant and the sensors draw from streams of their own, whatever the filters and the network do.
-What they give is compared here with the matrices in the scenario, with plain formulas.
+The plant and the sensors draw from streams of their own, so that their noises can be drawn again
+without simulating filters or network. They are compared with the matrices of the scenario by plain
+formulas that share no code with the plant.
 """
 
 from __future__ import annotations
@@ -26,17 +27,21 @@ from netkf.scenario.model import PlacedSensor, takes_samples
 from netkf.scenario.scenario import Scenario
 
 MAX_STEPS = 64
-"""Steps of a path, and readings of a sensor, that are looked at in one run."""
+"""Steps of a path, and readings of a sensor, that are tested in one run."""
 MAX_ROWS = 24
-"""Rows of readings, of all sensors together, that are looked at."""
+"""Rows of readings of all sensors together that are tested."""
 VISIBLE = 1e-5
-"""Standard deviation of a noise over the size of the state below which rounding hides it."""
+"""Largest rounding error of a state, relative to the deviation of the noise, for a usable step."""
 
 
 class PathLaw(NamedTuple):
-    """Times (S + 1,) in seconds of the states that are compared, and the law of what each step
-    adds: ``x(t + gap) = Phi x(t) + w``, and the matrix (d, n) that whitens w; ``sizes`` (S, n) are
-    the root mean squares of the states before the steps.
+    """The law of S steps ``x(t + gap) = Phi x(t) + w`` of a path.
+
+    times     : (S + 1,) seconds of the states
+    Phi       : (n, n)
+    white     : (d, n) matrix that whitens w, which has rank d
+    deviation : largest standard deviation of an entry of w
+    sizes     : (S, n) root mean squares of the states before the steps
     """
 
     times: FloatArray
@@ -48,7 +53,7 @@ class PathLaw(NamedTuple):
 
 @lru_cache(maxsize=8)
 def path_law(scenario: Scenario) -> PathLaw | None:
-    """Return the law of the path by the matrices of the scenario; None without a drawn one."""
+    """Return the law of the path by the matrices of the scenario; None for recorded states."""
     if not scenario.plant.is_random:
         return None
     stated: Any = stated_part(scenario.plant, "plant")
@@ -59,42 +64,46 @@ def path_law(scenario: Scenario) -> PathLaw | None:
     else:
         times = np.linspace(0.0, scenario.horizon * (1.0 - 1e-9), MAX_STEPS + 1)
         Phi, W = _discretise(stated.A, stated.B, float(times[1]))
-    size = float(np.sqrt(np.diagonal(W).max()))
-    return PathLaw(times, Phi, whitening_matrix(W), size, _sizes(stated, Phi, W, len(times) - 1))
+    deviation = float(np.sqrt(np.diagonal(W).max()))
+    return PathLaw(
+        times, Phi, whitening_matrix(W), deviation, _sizes(stated, Phi, W, len(times) - 1)
+    )
 
 
 def _sizes(plant: Any, Phi: FloatArray, W: FloatArray, steps: int) -> FloatArray:
     """Return the root mean squares (steps, n) of the states before each step."""
-    mean, covariance, found = plant.start_mean, plant.start_cov, []
+    mean, covariance, sizes = plant.start_mean, plant.start_cov, []
     for _ in range(steps):
-        found.append(np.sqrt(np.diagonal(covariance) + mean**2))
+        sizes.append(np.sqrt(np.diagonal(covariance) + mean**2))
         mean, covariance = Phi @ mean, Phi @ covariance @ Phi.T + W
-    return np.array(found).reshape(steps, len(W))
+    return np.array(sizes).reshape(steps, len(W))
 
 
 def _discretise(A: FloatArray, B: FloatArray, gap: float) -> tuple[FloatArray, FloatArray]:
-    """Return ``exp(A gap)`` and the covariance of the noise over a gap, by Van Loan's formula."""
+    """Return ``exp(A gap)`` (n, n) and the covariance ``int_0^gap e^{A s} B B' e^{A' s} ds``
+    (n, n) of the noise over a gap in seconds (Van Loan 1978).
+    """
     n = len(A)
     blocks = np.block([[-A, B @ B.T], [np.zeros((n, n)), A.T]])
-    moved = scipy.linalg.expm(blocks * gap)
-    Phi = moved[n:, n:].T
-    W = Phi @ moved[:n, n:]
+    exponential = scipy.linalg.expm(blocks * gap)
+    Phi = exponential[n:, n:].T
+    W = Phi @ exponential[:n, n:]
     return Phi, 0.5 * (W + W.T)
 
 
 def plant_moments(scenario: Scenario, streams: Streams) -> NoiseMoments | None:
-    """Return the moments of the noise of one path, step by step; None without noise or path."""
+    """Return the moments of the noise in the steps of one path; None without noise or path law."""
     law = path_law(scenario)
     if law is None or not len(law.white):
         return None
     x = _states(scenario, streams, law)
-    w = x[1:] - x[:-1] @ law.Phi.T
-    # Differences of states that have grown far beyond the noise are rounding.
+    noise = x[1:] - x[:-1] @ law.Phi.T
+    # Where the state has outgrown the noise, x(t + gap) - Phi x(t) is mostly rounding.
     accurate = np.abs(x[1:]).max(axis=1) * np.finfo(float).eps < VISIBLE * law.deviation
-    kept = len(accurate) if accurate.all() else int(np.argmin(accurate))
-    z = w[:kept] @ law.white.T
-    states = _standardise(x[:kept], law.sizes[:kept])
-    return moments(z, np.repeat(states[:, :, None], z.shape[1], axis=2))
+    steps = len(accurate) if accurate.all() else int(np.argmin(accurate))
+    whitened = noise[:steps] @ law.white.T
+    states = _standardise(x[:steps], law.sizes[:steps])
+    return moments(whitened, np.repeat(states[:, :, None], whitened.shape[1], axis=2))
 
 
 def _standardise(x: FloatArray, sizes: FloatArray) -> FloatArray:
@@ -103,7 +112,7 @@ def _standardise(x: FloatArray, sizes: FloatArray) -> FloatArray:
 
 
 def _states(scenario: Scenario, streams: Streams, law: PathLaw) -> FloatArray:
-    """Return the states (S + 1, n) of one run."""
+    """Return the states (S + 1, n) of one run at ``law.times``."""
     if scenario.slotted:
         truth = scenario.slot_plant.truth(streams.generator("plant"))
         return np.array([truth.absolute(slot) for slot in range(len(law.times))])
@@ -122,23 +131,26 @@ def _choose_times(scenario: Scenario) -> Scenario:
 
 def start_states(scenario: Scenario, seed: int, count: int) -> FloatArray:
     """Return x(0) (count, n) of replicas 0 to count - 1."""
-    # Ours are drawn together, with the same numbers; a class of a user draws as it does.
+    # Built-in classes draw all replicas in one call, with the same numbers as one by one.
     if type(scenario.plant) in (LinearPlant, Diffusion):
-        text = ReplicaStreams(seed, 0, count).seed_words("plant", [()])
-        return scenario.plant.starts(StreamNormals(text))
-    drawn = []
+        seed_words = ReplicaStreams(seed, 0, count).seed_words("plant", [()])
+        return scenario.plant.starts(StreamNormals(seed_words))
+    starts = []
     for replica in range(count):
         random = Streams(seed, replica).generator("plant")
         plant: Any = scenario.plant
         if isinstance(plant, LinearPlant):
-            drawn.append(plant.truth(random).absolute(0))
+            starts.append(plant.truth(random).absolute(0))
         else:
-            drawn.append(scenario.truth.start(random))
-    return np.array(drawn)
+            starts.append(scenario.truth.start(random))
+    return np.array(starts)
 
 
 class SensorLaw(NamedTuple):
-    """One sensor on one node: H (p, n), the root (p, p) of R, and how it gives readings."""
+    """One sensor on one node: H (p, n), None if it varies, and the Cholesky factor (p, p) of R.
+
+    ``sampled`` is True for a sensor that takes samples under a continuous plant.
+    """
 
     label: str
     node: int
@@ -150,8 +162,8 @@ class SensorLaw(NamedTuple):
 
 @lru_cache(maxsize=8)
 def sensor_laws(scenario: Scenario) -> tuple[SensorLaw, ...]:
-    """Return the drawn sensors that are looked at; all of them unless they have many rows."""
-    found: list[SensorLaw] = []
+    """Return the laws of the sensors with drawn noise, up to MAX_ROWS rows in all."""
+    laws: list[SensorLaw] = []
     rows = 0
     for node, placed_sensors in scenario.placed.items():
         for placed_sensor in placed_sensors:
@@ -161,8 +173,8 @@ def sensor_laws(scenario: Scenario) -> tuple[SensorLaw, ...]:
             stated: Any = stated_part(sensor, "sensor")
             rows += len(stated.R)
             if rows > MAX_ROWS:
-                return tuple(found)
-            # The row of a regressor is random, and travels with its reading.
+                return tuple(laws)
+            # A random regressor comes with each reading.
             H = None if stated.varying else np.asarray(stated.H)
             label = (
                 f"sensor {placed_sensor.ordinal} of node {node}"
@@ -171,8 +183,8 @@ def sensor_laws(scenario: Scenario) -> tuple[SensorLaw, ...]:
             )
             root = np.linalg.cholesky(stated.R)
             sampled = not scenario.slotted and takes_samples(sensor)
-            found.append(SensorLaw(label, node, placed_sensor, H, root, sampled))
-    return tuple(found)
+            laws.append(SensorLaw(label, node, placed_sensor, H, root, sampled))
+    return tuple(laws)
 
 
 def reading_labels(scenario: Scenario) -> list[str]:
@@ -185,11 +197,10 @@ def reading_labels(scenario: Scenario) -> list[str]:
 
 
 def reading_moments(scenario: Scenario, streams: Streams) -> NoiseMoments | None:
-    """Return the moments of the noises of all readings; None if no sensor is drawn.
+    """Return the moments of the noises of all readings; None without drawn sensors.
 
-    Sensors are shown states of a usual size that are drawn here, because a sensor has no say in
-    what it is shown. Noise number k of all sensors counts as one vector, in which those that have
-    given fewer readings are missing.
+    Sensors read states drawn here, of typical size, since their noise must not depend on the state.
+    The k-th noises of all sensors form one vector; entries of sensors with fewer readings are nan.
     """
     laws = sensor_laws(scenario)
     if not laws:
@@ -198,20 +209,23 @@ def reading_moments(scenario: Scenario, streams: Streams) -> NoiseMoments | None
     length = max(len(z) for z, _ in columns)
     n = scenario.plant.n
     z = np.full((length, sum(z.shape[1] for z, _ in columns)), np.nan)
-    given_states = np.zeros((length, n, z.shape[1]))
-    index = 0
+    shown_states = np.zeros((length, n, z.shape[1]))
+    first_entry = 0
     for noises, states in columns:
-        among = slice(index, index + noises.shape[1])
-        z[: len(noises), among], given_states[: len(noises), :, among] = noises, states[:, :, None]
-        index = among.stop
-    return moments(z, given_states)
+        entries = slice(first_entry, first_entry + noises.shape[1])
+        z[: len(noises), entries], shown_states[: len(noises), :, entries] = (
+            noises,
+            states[:, :, None],
+        )
+        first_entry = entries.stop
+    return moments(z, shown_states)
 
 
 def _whitened_noises(
     scenario: Scenario, streams: Streams, law: SensorLaw
 ) -> tuple[FloatArray, FloatArray]:
     """Return the whitened noises (S, p) of a sensor's first readings in one run, and the states
-    (S, n) that it was shown, in units of their root mean squares.
+    (S, n) that it read, in units of their root mean squares.
     """
     random = streams.generator("check readings", law.node, law.placed_sensor.ordinal)
     if scenario.slotted:
@@ -223,9 +237,9 @@ def _whitened_noises(
         path = scenario.sample_path(streams, law.node, law.placed_sensor)
     else:
         # A run may be shorter than one step of the sensor, and then has no reading.
-        nothing = np.empty((0, len(law.root))), np.empty((0, scenario.plant.n))
-        pieces = [nothing, *_increment_noises(scenario, streams, law, random)]
-        noises, states = (np.concatenate(part) for part in zip(*pieces, strict=True))
+        empty = np.empty((0, len(law.root))), np.empty((0, scenario.plant.n))
+        steps = [empty, *_increment_noises(scenario, streams, law, random)]
+        noises, states = (np.concatenate(part) for part in zip(*steps, strict=True))
         return noises, states
     x = _typical_states(scenario, random, count)
     if not count:
@@ -236,26 +250,28 @@ def _whitened_noises(
 
 
 def _typical_states(scenario: Scenario, random: np.random.Generator, count: int) -> FloatArray:
-    """Return states (count, n) of the size of the first ones and of what some steps add."""
+    """Return Gaussian states (count, n) with the covariance of :func:`_typical_covariance`."""
     root = square_root(_typical_covariance(scenario))
     plant: Any = scenario.plant
     return np.asarray(plant.start_mean + random.standard_normal((count, len(root))) @ root.T)
 
 
 def _typical_covariance(scenario: Scenario) -> FloatArray:
-    """Return a covariance (n, n) of the size of x(0) and of the noise of ten steps."""
+    """Return the covariance (n, n) of x(0) plus the noise of ten steps."""
     plant: Any = scenario.plant
     return np.asarray(plant.start_cov + 10.0 * np.asarray(plant.Q))
 
 
 def _state_sizes(scenario: Scenario, x: FloatArray) -> FloatArray:
-    """Return the root mean squares of the states x (S, n) that sensors are shown, (S, n)."""
+    """Return the root mean squares (S, n) of states x (S, n) from :func:`_typical_states`."""
     sizes = np.sqrt(np.diagonal(_typical_covariance(scenario)) + scenario.plant.start_mean**2)
     return np.asarray(np.broadcast_to(sizes, x.shape))
 
 
 class _Grid(NamedTuple):
-    """The part of a path that a sensor of increments asks: the period and the present step."""
+    """Stand-in for the path that a sensor of increments reads: sensing period and end of the
+    present step in seconds.
+    """
 
     period: float
     end: float
@@ -268,9 +284,10 @@ class _Grid(NamedTuple):
 def _increment_noises(
     scenario: Scenario, streams: Streams, law: SensorLaw, random: np.random.Generator
 ) -> Iterator[tuple[FloatArray, FloatArray]]:
-    """Yield whitened noises (2, p), of some steps whole, of others cut in two, and states (2, n).
+    """Yield whitened noises (2, p) of increments, and the two states (2, n) they were added to.
 
-    Each part of a step has two moments, with the variances R length and R length / 3.
+    Every other step is cut in two, which the sensor samples by a bridge. Each piece of a step has
+    two moments, of variances R length and R length / 3 over its length in seconds.
     """
     sensor: Any = scenario.sensors[law.placed_sensor.entry]
     node, ordinal = law.node, law.placed_sensor.ordinal
@@ -281,18 +298,18 @@ def _increment_noises(
     for k in range(min(MAX_STEPS // 4, int(scenario.horizon / period))):
         start, end = k * period, (k + 1) * period
         # Whole steps and cut ones take turns.
-        cuts = [end] if k % 2 else [start + 0.3 * period, end]
-        for stop in cuts:
+        ends = [end] if k % 2 else [start + 0.3 * period, end]
+        for piece_end in ends:
             x = _typical_states(scenario, random, 2)
-            x_integral = x * (stop - start)
-            dy = path.moments(_Grid(period, end), x_integral, start, stop)
-            scale = np.sqrt((stop - start) * np.array([[1.0], [1.0 / 3.0]]))
+            x_integral = x * (piece_end - start)
+            dy = path.moments(_Grid(period, end), x_integral, start, piece_end)
+            scale = np.sqrt((piece_end - start) * np.array([[1.0], [1.0 / 3.0]]))
             noises = np.linalg.solve(law.root, ((dy - x_integral @ law.H.T) / scale).T).T
             yield noises, _standardise(x, _state_sizes(scenario, x))
-            start = stop
+            start = piece_end
 
 
 def whitened_starts(scenario: Scenario, x: FloatArray) -> FloatArray:
-    """Return x(0) (R, n) of many runs, whitened by the stated mean and covariance, (R, d)."""
+    """Return x(0) ``x`` (R, n) of R runs less the stated mean and whitened, (R, d)."""
     plant: Any = scenario.plant
     return np.asarray((x - plant.start_mean) @ whitening_matrix(plant.start_cov).T)

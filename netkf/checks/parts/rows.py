@@ -24,47 +24,47 @@ from netkf.linalg.arrays import FloatArray
 from netkf.scenario.scenario import Scenario
 
 STARTS = 10_000
-"""States x(0) that are drawn: each run has only one."""
+"""States x(0) that are drawn for the tests, since each run has only one."""
 LAW_LEVEL = 0.05
-"""Level at which a noise of a user's class is found not to be Gaussian."""
+"""Level at which the noise of a user's class is tested for being Gaussian."""
 
 
-def _number_labels(what: str, count: int) -> list[str]:
-    """Return numbered labels."""
-    return [f"{what} {k}" for k in range(count)]
+def _number_labels(noun: str, count: int) -> list[str]:
+    """Return the labels "noun 0", "noun 1", ... of ``count`` entries."""
+    return [f"{noun} {k}" for k in range(count)]
 
 
 @lru_cache(maxsize=4)
 def _start_moments(scenario: Scenario, seed: int) -> NoiseMoments:
-    """Return the moments of whitened first states."""
+    """Return the moments of STARTS whitened initial states."""
     return moments(whitened_starts(scenario, start_states(scenario, seed, STARTS)))
 
 
 def _start_variance(samples: PartSamples, level: float) -> Finding:
-    """Compare the variances of the first states with the stated covariance."""
-    found = _start_moments(samples.scenario, samples.seed)
-    labels = _number_labels("direction", len(found.first))
+    """Compare the variances of the initial states with the stated covariance."""
+    sums = _start_moments(samples.scenario, samples.seed)
+    labels = _number_labels("direction", len(sums.first))
     gaussian = not is_own_class(samples.scenario.plant, "plant")
-    return compare_variances(found, labels, level, "directions of x(0)", gaussian)
+    return compare_variances(sums, labels, level, "directions of x(0)", gaussian)
 
 
 def _start_mean(samples: PartSamples, level: float) -> Finding:
-    """Compare the means of the first states with the stated ones."""
-    found = _start_moments(samples.scenario, samples.seed)
-    return compare_means(found, _number_labels("direction", len(found.first)), level)
+    """Compare the means of the initial states with the stated ones."""
+    sums = _start_moments(samples.scenario, samples.seed)
+    return compare_means(sums, _number_labels("direction", len(sums.first)), level)
 
 
 def _step_moments(samples: PartSamples) -> tuple[NoiseMoments, list[str]]:
     """Return the moments of the plant's noise and their labels."""
-    found = total(samples.steps)
-    return found, _number_labels("direction", len(found.first))
+    sums = total(samples.steps)
+    return sums, _number_labels("direction", len(sums.first))
 
 
 def _step_variance(samples: PartSamples, level: float) -> Finding:
     """Compare the variances of the plant's noise with the stated ones."""
-    found, labels = _step_moments(samples)
+    sums, labels = _step_moments(samples)
     gaussian = not is_own_class(samples.scenario.plant, "plant")
-    return compare_variances(found, labels, level, "directions of the noise", gaussian)
+    return compare_variances(sums, labels, level, "directions of the noise", gaussian)
 
 
 def _step_mean(samples: PartSamples, level: float) -> Finding:
@@ -102,23 +102,24 @@ def _own_sensors(scenario: Scenario) -> bool:
 def gaussian_noises(samples: PartSamples) -> Assumption:
     """Return the assumption that all noises are Gaussian, which rows about squared errors need.
 
-    What is stated of a noise is its covariance, so that a class of a user may have another law.
+    Built-in noises are Gaussian; those of a user's class, which states only a covariance, are
+    tested by their counts in cells.
     """
-    scenario, found = samples.scenario, []
+    scenario, tested = samples.scenario, []
     if is_own_class(scenario.plant, "plant"):
         if samples.steps is not None:
-            found.append((total(samples.steps).cells, "the noise of the plant"))
+            tested.append((total(samples.steps).cells, "the noise of the plant"))
         if scenario.plant.is_random and np.any(scenario.plant.start_cov):
-            found.append((_start_moments(scenario, samples.seed).cells, "the law of x(0)"))
+            tested.append((_start_moments(scenario, samples.seed).cells, "the law of x(0)"))
     if _own_sensors(scenario) and samples.readings is not None:
-        found.append((total(samples.readings).cells, "the noise of the sensors"))
-    off = [what for cells, what in found if not _fills_evenly(cells)]
-    evidence = f"{' and '.join(off)} is not" if off else "none is found that is not"
-    return Assumption(GAUSSIAN, "the scenario", not off, evidence)
+        tested.append((total(samples.readings).cells, "the noise of the sensors"))
+    rejected = [noun for cells, noun in tested if not _fills_evenly(cells)]
+    evidence = f"{' and '.join(rejected)} is not" if rejected else "none is found that is not"
+    return Assumption(GAUSSIAN, "the scenario", not rejected, evidence)
 
 
 def _fills_evenly(cells: FloatArray) -> bool:
-    """Return False if numbers counted in ``cells`` (CELLS, d) are not Gaussian at LAW_LEVEL."""
+    """Return False if the test of ``cells`` (CELLS, d) rejects the Gaussian law at LAW_LEVEL."""
     finding = compare_cells(cells, [""] * cells.shape[1], LAW_LEVEL, "")
     return not finding.margin[2] < 0.0
 
@@ -145,13 +146,13 @@ SENSOR_ROWS = (
 
 
 def part_promises(samples: PartSamples) -> tuple[Promise, ...]:
-    """Return the promises about the parts that these samples can be held to."""
+    """Return the promises about the parts of the scenario that these samples can test."""
     scenario = samples.scenario
-    found: list[Promise] = []
+    promises: list[Promise] = []
     if scenario.plant.is_random and np.any(scenario.plant.start_cov):
-        found += START_ROWS
+        promises += START_ROWS
     if samples.steps is not None and path_law(scenario) is not None:
-        found += PLANT_ROWS
+        promises += PLANT_ROWS
     if samples.readings is not None:
-        found += SENSOR_ROWS
-    return (*found, *network_promises(samples))
+        promises += SENSOR_ROWS
+    return (*promises, *network_promises(samples))

@@ -1,4 +1,4 @@
-"""What runs show of the parts of a scenario: sums and counts, stacked over runs."""
+"""Statistics of the parts of a scenario: sums and counts of each run, stacked over runs."""
 
 from __future__ import annotations
 
@@ -24,7 +24,13 @@ from netkf.trace.run import Run
 
 
 class PartSummary(NamedTuple):
-    """What one run shows of each part; None where the scenario has no such part."""
+    """Counts and sums of one run for each part; None where the scenario has no such part.
+
+    ticks, sampling : ticks of the clocks of the network and of sampled sensors
+    fates, delays   : losses and delays of messages
+    pairs           : matchings of slots
+    steps, readings : noises of the plant and of the sensors
+    """
 
     ticks: TickCounts | None
     fates: LossCounts | None
@@ -63,8 +69,9 @@ def summarise_parts(scenario: Scenario, run: Run) -> PartSummary:
 
 @dataclass(frozen=True)
 class PartSamples:
-    """The summaries of R runs, every field of which has a first axis of length R, and the seed of
-    the runs.
+    """The summaries of R runs of one seed; their fields have a first axis of length R.
+
+    See :class:`PartSummary` for the fields; a part that the scenario lacks is None.
     """
 
     scenario: Scenario
@@ -79,14 +86,14 @@ class PartSamples:
 
 
 def stack_parts(scenario: Scenario, seed: int, summaries: Sequence[PartSummary]) -> PartSamples:
-    """Return the samples of all runs; a part that is missing in one run is missing."""
+    """Return the samples of all runs, for each part of the runs that have it."""
     columns = {}
     for name in PartSummary._fields:
-        parts = [getattr(one, name) for one in summaries]
-        kept = [part for part in parts if part is not None]
+        parts = [getattr(summary, name) for summary in summaries]
+        present = [part for part in parts if part is not None]
         columns[name] = (
-            type(kept[0])(*(np.array(column) for column in zip(*kept, strict=True)))
-            if kept
+            type(present[0])(*(np.array(column) for column in zip(*present, strict=True)))
+            if present
             else None
         )
     return PartSamples(scenario, seed, **columns)

@@ -1,8 +1,8 @@
-"""The built-in part that a part of a scenario says that it is.
+"""The part whose stated law a part of a scenario is tested against.
 
-A user's class is held to the built-in class that it derives from, with the same fields; a class
-that derives from a contract alone, or that defines a statement of its base anew, is held to what it
-states about itself.
+A user's class is tested against the built-in class it derives from, with the same fields. A class
+that derives from an abstract base only, or that overrides a statement such as ``mean_rate``, is
+tested against its own statements.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ STATEMENTS = {
     "delay": ("fixed", "longest"),
     "slot activation": ("mean",),
 }
-"""By which methods and properties a part states its law."""
+"""Methods and properties by which the parts of each family state their law."""
 
 
 def is_own_class(part: Any, family: str) -> bool:
@@ -29,13 +29,15 @@ def is_own_class(part: Any, family: str) -> bool:
 
 
 def stated_part(part: Any, family: str) -> Any:
-    """Return the part that states the law: the part itself if its class is built in, derives from
-    a contract alone or has a statement of its own, else one of the built-in class that it derives
-    from, with the same fields.
+    """Return the part that states the law of ``part``.
+
+    It is the part itself if its class is built in, derives from no built-in class, or overrides one
+    of the STATEMENTS of its family; otherwise an instance of the built-in base class with the same
+    fields.
     """
-    known, order = set(KINDS[family].values()), type(part).__mro__
-    index = next((k for k, cls in enumerate(order) if cls in known), 0)
-    own = {name for cls in order[:index] for name in vars(cls)}
-    if index == 0 or own.intersection(STATEMENTS.get(family, ())):
+    built_in, ancestors = set(KINDS[family].values()), type(part).__mro__
+    index = next((k for k, cls in enumerate(ancestors) if cls in built_in), 0)
+    own_names = {name for cls in ancestors[:index] for name in vars(cls)}
+    if index == 0 or own_names.intersection(STATEMENTS.get(family, ())):
         return part
-    return as_class(part, order[index])
+    return as_class(part, ancestors[index])

@@ -1,7 +1,8 @@
-"""Counts of the ticks of clocks in one run: of the network's, and of those at which sensors sample.
+"""Counts of ticks in one run: of the clocks of the network, and of those of sampled sensors.
 
-What a clock states about its gaps makes each of them a uniform number, whatever the clock and
-however short the run, so that ticks of all clocks and runs add up in a few cells.
+The distribution function of a clock's gaps maps each gap to a uniform number (the probability
+integral transform), whatever the clock and the length of the run. So gaps of all clocks and runs
+can be counted in the same few cells.
 """
 
 from __future__ import annotations
@@ -28,10 +29,13 @@ WINDOWS, MAX_WINDOWED = 8, 600
 
 
 class TickCounts(NamedTuple):
-    """Of E clocks: ``ticks`` (W, E) in the windows of one run; how many gaps, as uniform numbers,
-    fall into each of the ``cells`` (CELLS, 1); ``products`` (3,): sums of u u' and of u^2 over
-    neighbouring gaps, and their number, where u is a gap as a standard normal number; ``off`` (),
-    the seconds by which a tick is furthest from where a clock without randomness ticks.
+    """Counts of the ticks of E clocks in one run.
+
+    ticks    : (W, E) ticks in each of W equal windows of the run
+    cells    : (CELLS, 1) gaps, as uniform numbers, in cells of equal probability
+    products : (3,) over pairs of neighbouring gaps, as standard normal numbers u and v: the sum of
+               u v, the sum of (u^2 + v^2) / 2, and the number of pairs
+    off      : () largest distance in seconds of a tick from the times of a deterministic clock
     """
 
     ticks: np.ndarray
@@ -41,7 +45,9 @@ class TickCounts(NamedTuple):
 
 
 class ClockGroup(NamedTuple):
-    """Clocks of one kind of a scenario: who has one, what each states, and their labels."""
+    """E clocks of a scenario: the entity (node or link) of each, the clock object whose law it
+    states, and a label.
+    """
 
     entities: tuple[Entity, ...]
     stated: tuple[Any, ...]
@@ -50,7 +56,9 @@ class ClockGroup(NamedTuple):
 
 @lru_cache(maxsize=8)
 def network_clocks(scenario: Scenario) -> ClockGroup:
-    """Return the clocks of the network; none where no clock is drawn."""
+    """Return the clocks of the network; empty if no messages are sent or nothing random decides
+    when.
+    """
     clock = scenario.network.activation
     silent = not scenario.filter.algorithm.talks
     if silent or not isinstance(clock, LinkClock) or isinstance(clock, OnReadings):
@@ -63,7 +71,7 @@ def network_clocks(scenario: Scenario) -> ClockGroup:
 
 @lru_cache(maxsize=8)
 def sampling_clocks(scenario: Scenario) -> ClockGroup:
-    """Return the clocks at which sensors sample; none where a sensor has no such clock."""
+    """Return the clocks at which sensors sample; empty unless every sampled sensor has one."""
     entities, stated, labels = [], [], []
     for node, placed_sensors in scenario.sampled_sensors.items():
         for placed_sensor in placed_sensors:
@@ -88,8 +96,10 @@ def count_ticks(scenario: Scenario, run: Run) -> TickCounts | None:
     columns = ("node",) if clock.at == "nodes" else ("node", "peer")
     ids = zip(*(rows[name].tolist() for name in columns), strict=True)
     ordered = clock.at == "links"
-    which = np.array([index[tuple(sorted(e)) if ordered else e] for e in ids], dtype=np.int64)
-    return _count_in_windows(group, rows["t"], which, scenario.horizon)
+    clock_of_tick = np.array(
+        [index[tuple(sorted(e)) if ordered else e] for e in ids], dtype=np.int64
+    )
+    return _count_in_windows(group, rows["t"], clock_of_tick, scenario.horizon)
 
 
 def count_samples(scenario: Scenario, streams: Streams) -> TickCounts | None:
@@ -98,9 +108,9 @@ def count_samples(scenario: Scenario, streams: Streams) -> TickCounts | None:
     if not group.entities:
         return None
     times = scenario.sample_times(streams)
-    found = [times[entity] for entity in group.entities]
-    which = np.repeat(np.arange(len(found)), [len(t) for t in found])
-    return _count_in_windows(group, np.concatenate(found), which, scenario.horizon)
+    times_of_clock = [times[entity] for entity in group.entities]
+    clock_of_tick = np.repeat(np.arange(len(times_of_clock)), [len(t) for t in times_of_clock])
+    return _count_in_windows(group, np.concatenate(times_of_clock), clock_of_tick, scenario.horizon)
 
 
 def count_drawn_ticks(scenario: Scenario, seed: int, replica: int) -> np.ndarray:
@@ -127,50 +137,65 @@ def draw_samples(scenario: Scenario, seed: int, replica: int) -> np.ndarray:
 
 
 def count_by_window(
-    scenario: Scenario, times: np.ndarray, which: np.ndarray, size: int
+    scenario: Scenario, times: np.ndarray, indices: np.ndarray, size: int
 ) -> np.ndarray:
-    """Return how often each of ``size`` indices occurs in each of the windows, (W, size)."""
-    return _by_window(times, which, size, scenario.horizon)
+    """Return how often each of ``size`` indices occurs in each window of a run, (W, size).
+
+    ``times`` (K,) in seconds and ``indices`` (K,) are those of K events.
+    """
+    return _by_window(times, indices, size, scenario.horizon)
 
 
-def _by_window(times: np.ndarray, which: np.ndarray, size: int, horizon: float) -> np.ndarray:
-    """Return the counts of :func:`count_by_window`.
+def _by_window(times: np.ndarray, indices: np.ndarray, size: int, horizon: float) -> np.ndarray:
+    """Return the counts (W, size) of :func:`count_by_window` in equal parts of [0, ``horizon``].
 
-    Windows are equal parts of the run. Counts of different windows are independent as those of
-    different runs are, so that correlations between clocks show in fewer runs.
+    Counts of different windows are independent, as those of different runs are, so that
+    correlations between clocks can be detected in fewer runs.
     """
     windows = WINDOWS if size <= MAX_WINDOWED else 1
-    index = np.minimum((times * (windows / horizon)).astype(np.int64), windows - 1)
-    counts = np.bincount(index * size + which, minlength=windows * size)
+    flat_index = np.minimum((times * (windows / horizon)).astype(np.int64), windows - 1)
+    counts = np.bincount(flat_index * size + indices, minlength=windows * size)
     return counts.reshape(windows, size)
 
 
 def _count_in_windows(
-    group: ClockGroup, times: np.ndarray, which: np.ndarray, horizon: float
+    group: ClockGroup, times: np.ndarray, clock_of_tick: np.ndarray, horizon: float
 ) -> TickCounts:
-    """Return the counts of ticks at ``times`` (K,) of the clocks ``which`` (K,)."""
+    """Return the counts of ticks at ``times`` (K,) of the clocks ``clock_of_tick`` (K,)."""
     size = len(group.entities)
-    windows = _by_window(times, which, size, horizon)
-    order = np.lexsort((times, which))
-    t, e = times[order], which[order]
-    first = np.ones(len(t), dtype=bool)
-    first[1:] = e[1:] != e[:-1]
-    total = np.bincount(e, minlength=size)
-    number = np.arange(len(t)) - np.concatenate([[0], np.cumsum(total)])[e]
-    uniform, off = np.full(len(t), np.nan), 0.0
+    windows = _by_window(times, clock_of_tick, size, horizon)
+    order = np.lexsort((times, clock_of_tick))
+    sorted_times, sorted_clocks = times[order], clock_of_tick[order]
+    first = np.ones(len(sorted_times), dtype=bool)
+    first[1:] = sorted_clocks[1:] != sorted_clocks[:-1]
+    ticks_of_clock = np.bincount(sorted_clocks, minlength=size)
+    number = (
+        np.arange(len(sorted_times))
+        - np.concatenate([[0], np.cumsum(ticks_of_clock)])[sorted_clocks]
+    )
+    uniform, largest_error = np.full(len(sorted_times), np.nan), 0.0
     for clock in dict.fromkeys(group.stated):
-        mine = np.array([one is clock for one in group.stated])[e]
-        ticks = TickSample(t[mine], number[mine], total[e[mine]], first[mine])
-        uniform[mine] = _as_uniform(clock, ticks, horizon)
-        off = max(off, distance_from_lattice(clock, ticks))
-    known = np.isfinite(uniform)
-    cells = count_cells(np.where(known, uniform, 0.0)[:, None], known[:, None])
-    return TickCounts(windows, cells, correlate_neighbours(uniform, first), np.array(off))
+        of_clock = np.array([stated is clock for stated in group.stated])[sorted_clocks]
+        ticks = TickSample(
+            sorted_times[of_clock],
+            number[of_clock],
+            ticks_of_clock[sorted_clocks[of_clock]],
+            first[of_clock],
+        )
+        uniform[of_clock] = _as_uniform(clock, ticks, horizon)
+        largest_error = max(largest_error, distance_from_lattice(clock, ticks))
+    present = np.isfinite(uniform)
+    cells = count_cells(np.where(present, uniform, 0.0)[:, None], present[:, None])
+    return TickCounts(windows, cells, correlate_neighbours(uniform, first), np.array(largest_error))
 
 
 class TickSample(NamedTuple):
-    """Times (K,) of ticks, clock by clock, the number of each on its clock from 0, how many its
-    clock has in all, and whether it is the first.
+    """K ticks of one run, clock by clock and in order of time.
+
+    times  : (K,) seconds
+    number : (K,) index of the tick on its clock, from 0
+    total  : (K,) number of ticks of its clock in the run
+    first  : (K,) bool, the tick is the first of its clock
     """
 
     times: np.ndarray
@@ -186,23 +211,23 @@ class TickSample(NamedTuple):
 
 
 def _as_uniform(clock: Any, ticks: TickSample, horizon: float) -> np.ndarray:
-    """Return a number for each tick that is uniform in [0, 1), and independent of those before it,
-    if the clock keeps its law; nan where it has no law that is known here.
+    """Return the gap before each tick as a number (K,) that is uniform in [0, 1) and independent of
+    those before it under the stated law; nan where no law is known.
 
-    Runs that end hide long gaps. Given how many ticks a Poisson clock has in a run, they lie there
-    like independent uniform times: with m of them still to come in the rest of the run, a gap is
-    longer than a share v of that rest with probability (1 - v)^m. Of other clocks with independent
-    gaps, a gap that was seen is one of those that end before the run does.
+    The end of a run censors long gaps, which the transform must allow for. Given the number of
+    ticks in a run, those of a Poisson clock are independent uniform times: with m ticks still to
+    come in the remaining time, a gap exceeds a share v of it with probability (1 - v)^m. For other
+    renewal clocks the law of a gap is conditioned on its end being before that of the run.
     """
-    gaps, rest = ticks.times - ticks.before, horizon - ticks.before
+    gaps, remaining = ticks.times - ticks.before, horizon - ticks.before
     if clock.memoryless:
-        return np.asarray(-np.expm1((ticks.total - ticks.number) * np.log1p(-gaps / rest)))
+        return np.asarray(-np.expm1((ticks.total - ticks.number) * np.log1p(-gaps / remaining)))
     if type(clock) is Renewal:
         with np.errstate(invalid="ignore", divide="ignore"):
-            return np.asarray(gap_law(clock, gaps) / gap_law(clock, rest))
+            return np.asarray(gap_law(clock, gaps) / gap_law(clock, remaining))
     if type(clock) is Periodic and clock.jitter > 0.0 and not isinstance(clock.phase, str):
         share = (ticks.times - _lattice_times(clock, ticks.number)) / clock.jitter
-        # Those before the end of the run only: the last tick may be beyond it.
+        # The last tick is left out: jitter could have moved it beyond the end of the run.
         return np.where(ticks.number < ticks.total - 1, np.clip(share, 0.0, 1.0), np.nan)
     if type(clock) is Periodic and isinstance(clock.phase, str) and clock.period <= horizon:
         phases = np.clip(ticks.times / clock.period, 0.0, 1.0)
@@ -211,8 +236,8 @@ def _as_uniform(clock: Any, ticks: TickSample, horizon: float) -> np.ndarray:
 
 
 def gap_law(clock: Any, gaps: np.ndarray) -> np.ndarray:
-    """Return the probability that a gap is at most as long as ``gaps`` (K,); nan where gaps vary by
-    nothing, or the law is not known.
+    """Return P(gap <= ``gaps``) (K,) of a renewal clock, ``gaps`` in seconds; nan where gaps are
+    constant or their law is unknown.
     """
     if type(clock) is not Renewal:
         return np.full(len(gaps), np.nan)
@@ -230,7 +255,7 @@ def gap_law(clock: Any, gaps: np.ndarray) -> np.ndarray:
 
 
 def relative_variance(clock: Any) -> float:
-    """Return the variance of gaps over the square of their mean; nan if their law is not known."""
+    """Return the squared coefficient of variation of the gaps; nan if their law is unknown."""
     if ticks_on_lattice(clock):
         return 0.0
     if type(clock) is not Renewal:
@@ -247,7 +272,9 @@ def relative_variance(clock: Any) -> float:
 
 
 def _lattice_times(clock: Any, number: np.ndarray) -> np.ndarray:
-    """Return the times (K,) of ticks number ``number`` (K,) without jitter and random phase."""
+    """Return the times (K,) in seconds of the ticks with indices ``number`` (K,), without jitter
+    and random phase.
+    """
     if isinstance(clock, Renewal):
         return np.asarray((number + 1) / clock.mean_rate(()))
     phase = 0.0 if isinstance(clock.phase, str) else clock.phase
@@ -255,16 +282,17 @@ def _lattice_times(clock: Any, number: np.ndarray) -> np.ndarray:
 
 
 def ticks_on_lattice(clock: Any) -> bool:
-    """Return True if a clock ticks at times that it states, up to one phase and a jitter."""
+    """Return True if the times of all ticks are stated, up to one random phase and jitter."""
     # By exact type: a class with statements of its own has a law of its own.
     constant = type(clock) is Renewal and clock.distribution == "constant"
     return constant or type(clock) is Periodic
 
 
 def distance_from_lattice(clock: Any, ticks: TickSample) -> float:
-    """Return the largest distance in seconds of a tick from where it may be, 0 without a lattice.
+    """Return the largest distance in seconds of a tick from its allowed times; 0 for clocks that
+    are not on a lattice.
 
-    Clocks with a random phase may all be early or late by one time.
+    All ticks of a clock with a random phase may be shifted by one common time.
     """
     if not ticks_on_lattice(clock) or not len(ticks.times):
         return 0.0
@@ -273,14 +301,16 @@ def distance_from_lattice(clock: Any, ticks: TickSample) -> float:
     if isinstance(getattr(clock, "phase", None), str):
         starts = np.flatnonzero(ticks.first)
         spread = np.maximum.reduceat(late, starts) - np.minimum.reduceat(late, starts)
-        beyond = late[starts] - (clock.period + jitter)
-        return float(max(spread.max() - jitter, beyond.max(), 0.0))
+        excess = late[starts] - (clock.period + jitter)
+        return float(max(spread.max() - jitter, excess.max(), 0.0))
     return float(max(-late.min(), late.max() - jitter, 0.0))
 
 
 def correlate_neighbours(uniform: np.ndarray, first: np.ndarray) -> FloatArray:
-    """Return the ``products`` (3,) of :class:`TickCounts` of a series ``uniform`` (K,), in which
-    the ``first`` ones (K,) have none before them; nan where a number is missing.
+    """Return the ``products`` (3,) of :class:`TickCounts` for a series ``uniform`` (K,).
+
+    Numbers that are nan, and the pairs of a number marked as ``first`` (K,) of its clock with the
+    one before it, are left out.
     """
     normal = scipy.special.ndtri(np.clip(uniform, 1e-12, 1.0 - 1e-12))
     pairs = ~first[1:] & np.isfinite(normal[1:]) & np.isfinite(normal[:-1])
