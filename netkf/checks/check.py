@@ -69,9 +69,11 @@ TWIN_TOLERANCE = 1e-6
 class Verdict(NotebookTable):
     """Evidence for every promise; true if none is broken.
 
-    ``confidence``: all intervals of all rows, of earlier looks too, hold together with at least
-    this probability. ``results`` are what the runs gave, to which others can be added; ``looks``
-    is how often rows were judged, and ``spent`` what that took of the level.
+    confidence : lower bound on the probability that all intervals of all rows hold jointly, those
+                 of earlier looks included
+    results    : results of the replicas, to which more can be added
+    looks      : number of times the rows were judged
+    spent      : part of the error probability that these looks used up
     """
 
     scenario: str
@@ -93,8 +95,8 @@ class Verdict(NotebookTable):
 
     def __repr__(self) -> str:
         counts = Counter(row.verdict for row in self.rows)
-        told = ", ".join(f"{counts[name]} {name}" for name in VERDICTS if counts[name])
-        return f"<netkf verdict on {self.scenario!r}: {told or 'no row'}; {self.runs:,} runs>"
+        counts_text = ", ".join(f"{counts[name]} {name}" for name in VERDICTS if counts[name])
+        return f"<netkf verdict on {self.scenario!r}: {counts_text or 'no row'}; {self.runs:,} runs>"
 
     @property
     def table(self) -> pd.DataFrame:
@@ -126,14 +128,14 @@ def with_check_times(scenario: Scenario) -> Scenario:
 
 
 class ReplicaResult(NamedTuple):
-    """One replica.
+    """The result of one replica.
 
-    summary    : None if it diverged
-    difference : largest difference of its errors from those of the built-in filter of a user's
-                 class, on the same readings and messages, nan if that was not run or rounding hides
-                 it
-    expected   : it diverged, and so does the built-in filter
-    parts      : what it shows of the parts of the scenario
+    summary    : values that the promises of the paper are about; None if the run diverged
+    difference : largest difference of the errors from those of the built-in base of a user's
+                 filter class, on the same readings and messages, in standard deviations; nan if the
+                 base was not run or rounding hides the difference
+    expected   : a divergence is no surprise, because the built-in filter diverges too
+    parts      : statistics of the parts of the scenario
     """
 
     summary: ReplicaSummary | None
@@ -164,16 +166,16 @@ def run_replica(
 
 
 def _error_difference(run: Run, twin: Run) -> float:
-    """Return the largest difference of the errors of two runs with the same true state, in standard
-    deviations; nan if rounding is nowhere small against TWIN_TOLERANCE.
+    """Return the largest difference between the errors of two runs with the same true state, in
+    units of sqrt(tr P) of ``twin``; nan if rounding always exceeds 0.1 TWIN_TOLERANCE.
     """
-    both = min(len(run.times), len(twin.times))
-    size = np.sqrt(np.trace(twin.P[:both], axis1=-2, axis2=-1))[..., None]
-    rounding = np.maximum(run.rounding[:both], twin.rounding[:both])[:, None, None]
+    common = min(len(run.times), len(twin.times))
+    size = np.sqrt(np.trace(twin.P[:common], axis1=-2, axis2=-1))[..., None]
+    rounding = np.maximum(run.rounding[:common], twin.rounding[:common])[:, None, None]
     # Roundings of errors that were larger at earlier times are still in the estimates.
-    earlier = np.maximum.accumulate(np.nan_to_num(np.abs(twin.error[:both])).max(axis=(1, 2)))
+    earlier = np.maximum.accumulate(np.nan_to_num(np.abs(twin.error[:common])).max(axis=(1, 2)))
     rounding = np.maximum(rounding, OPERATIONS * EPS * earlier[:, None, None])
-    gap = np.abs(run.error[:both] - twin.error[:both])
+    gap = np.abs(run.error[:common] - twin.error[:common])
     comparable = np.broadcast_to(
         (rounding <= 0.1 * TWIN_TOLERANCE * size) & (size > 0.0), gap.shape
     )
@@ -190,9 +192,9 @@ def _same_as_base(results: list[ReplicaResult], level: float) -> Finding:
     if np.isnan(differences).all():
         return find_nothing(0.0)
     message = f"{min(TWIN_RUNS, len(results))} runs beside those of the filter that it should be"
-    found = find_identity(float(np.nanmax(differences)), TWIN_TOLERANCE, message)
-    off = np.flatnonzero(np.nan_to_num(differences) > TWIN_TOLERANCE).tolist()
-    return found._replace(replica=off[0] if off else None)
+    finding = find_identity(float(np.nanmax(differences)), TWIN_TOLERANCE, message)
+    departing = np.flatnonzero(np.nan_to_num(differences) > TWIN_TOLERANCE).tolist()
+    return finding._replace(replica=departing[0] if departing else None)
 
 
 def _none_diverged(results: list[ReplicaResult], level: float) -> Finding:
@@ -225,14 +227,16 @@ def judge_replicas(
 
     Raises TheoryError if there are no covariances with which promises could be compared.
     """
-    checks, found = find_checks(scenario), list(results)
-    _require_covariances(scenario, found)
-    finish = partial(Verdict, scenario.name, len(found), seed, confidence)
-    if any(result.diverged for result in found):
-        return finish(tuple(judge([NONE_DIVERGED], found, [], len(found), 1.0)))
-    stacked = stack_summaries([one.summary for one in found if one.summary is not None])
+    checks, replicas = find_checks(scenario), list(results)
+    _require_covariances(scenario, replicas)
+    make_verdict = partial(Verdict, scenario.name, len(replicas), seed, confidence)
+    if any(result.diverged for result in replicas):
+        return make_verdict(tuple(judge([NONE_DIVERGED], replicas, [], len(replicas), 1.0)))
+    stacked = stack_summaries([result.summary for result in replicas if result.summary is not None])
     promised = with_promised_filter(scenario)
-    parts = stack_parts(scenario, seed, [one.parts for one in found if one.parts is not None])
+    parts = stack_parts(
+        scenario, seed, [result.parts for result in replicas if result.parts is not None]
+    )
     rows = judge(
         checks.promises(scenario),
         checks.collect(scenario, stacked, seed),
@@ -241,26 +245,27 @@ def judge_replicas(
             *checks.assumptions(scenario),
             gaussian_noises(parts),
         ],
-        len(found),
+        len(replicas),
         0.5 * (1.0 - confidence),
     )
-    rows += judge(part_promises(parts), parts, [], len(found), 0.5 * (1.0 - confidence))
-    return finish((*_judge_base(scenario, found), *rows))
+    rows += judge(part_promises(parts), parts, [], len(replicas), 0.5 * (1.0 - confidence))
+    return make_verdict((*_judge_base(scenario, replicas), *rows))
 
 
 def _judge_base(scenario: Scenario, results: list[ReplicaResult]) -> list[Evidence]:
-    """Return the row about a user's class beside the built-in one that it derives from.
+    """Return the row that compares a user's filter class with its built-in base; empty for a
+    built-in class.
 
-    A class whose only own attributes are weights of links differs by design, if it does.
+    A class that overrides only weights of links may differ by design: then nothing is promised.
     """
-    own = own_attributes(scenario.filter.algorithm)
-    if not own:
+    overridden = own_attributes(scenario.filter.algorithm)
+    if not overridden:
         return []
     (row,) = judge([SAME_AS_BASE], results, [], len(results), 1.0)
-    listed = ", ".join(own)
-    if row.verdict == BROKEN and set(own) <= set(LINK_WEIGHTS):
-        why = f"it differs by design: {listed} is its own; {row.evidence}"
-        return [dataclasses.replace(row, verdict=NOT_PROMISED, assumptions=why)]
+    listed = ", ".join(overridden)
+    if row.verdict == BROKEN and set(overridden) <= set(LINK_WEIGHTS):
+        reason = f"it differs by design: {listed} is its own; {row.evidence}"
+        return [dataclasses.replace(row, verdict=NOT_PROMISED, assumptions=reason)]
     return [dataclasses.replace(row, evidence=f"{row.evidence}; its own: {listed}")]
 
 
@@ -290,7 +295,7 @@ def check(
     most: int = MAX_LOOKED_RUNS,
     earlier: Verdict | None = None,
 ) -> Verdict:
-    """Compare all that is promised of the scenario's filter with ``runs`` replicas.
+    """Test all promises about the scenario's filter with ``runs`` replicas.
 
     The state is sampled at the times that the promises need, whatever ``probe`` says. A user's
     class is held to the promises of the filter that it derives from. ``workers``, ``executor``,
@@ -316,17 +321,17 @@ def check(
     chosen = with_check_times(scenario)
     verdict, last = earlier, max(count, most if until else count)
     while True:
-        found = list(verdict.results) if verdict is not None else []
-        found += replicate(
+        results = list(verdict.results) if verdict is not None else []
+        results += replicate(
             partial(run_replica, engine=choose_engine("auto", chosen)),
             chosen,
-            count - len(found),
+            count - len(results),
             root,
-            first=len(found),
+            first=len(results),
             pool=PoolOptions(workers, executor, scheduler),
             progress=progress,
         )
-        verdict = _look_again(chosen, verdict, found, root, confident, bool(until))
+        verdict = _look_again(chosen, verdict, results, root, confident, bool(until))
         if not until or not verdict or verdict.is_decided or count >= last:
             return verdict
         count = next_runs(verdict.rows, count, last)
@@ -334,20 +339,24 @@ def check(
 
 def _look_again(
     scenario: Scenario,
-    before: Verdict | None,
+    earlier: Verdict | None,
     results: list[ReplicaResult],
     seed: int,
     confidence: float,
-    again: bool,
+    may_continue: bool,
 ) -> Verdict:
-    """Return the verdict on all results so far, with what looks before it have decided."""
-    look, level = (before.looks if before is not None else 0) + 1, 1.0 - confidence
+    """Return the verdict on all results so far, with the decisions of ``earlier`` looks kept.
+
+    ``may_continue``: further looks are planned, so that this one may spend only its share of the
+    error probability 1 - ``confidence`` (alpha spending).
+    """
+    look, level = (earlier.looks if earlier is not None else 0) + 1, 1.0 - confidence
     # A single look may spend the whole level, unless others are planned.
-    share = level_of_look(level, look) if again or before is not None else level
-    spent = (before.spent if before is not None else 0.0) + share
+    share = level_of_look(level, look) if may_continue or earlier is not None else level
+    spent = (earlier.spent if earlier is not None else 0.0) + share
     verdict = judge_replicas(scenario, results, seed, 1.0 - share)
-    rows = keep_decisions(before.rows, verdict.rows) if before is not None else verdict.rows
-    confident = 1.0 - max(spent, level) if again else 1.0 - spent
+    rows = keep_decisions(earlier.rows, verdict.rows) if earlier is not None else verdict.rows
+    confident = 1.0 - max(spent, level) if may_continue else 1.0 - spent
     return dataclasses.replace(
         verdict, rows=rows, confidence=confident, results=tuple(results), looks=look, spent=spent
     )

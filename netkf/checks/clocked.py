@@ -33,8 +33,8 @@ MASS_TOLERANCE = 1e-9  # drift of the total, relative: rounding of many exchange
 
 @dataclass(frozen=True, eq=False)
 class ClockedSummary(ReplicaSummary):
-    """Adds ``drift``: the largest relative drift of a sum over all nodes that exchanges should
-    conserve, 0 if there is none.
+    """Adds ``drift``: the largest relative drift of the sums over all nodes that exchanges should
+    conserve; 0 for filters without such sums.
     """
 
     drift: float
@@ -44,14 +44,14 @@ def _mass_conserved(samples: RunSamples, level: float) -> Finding:
     """Compare the sums at the end with those at the start, messages in flight included."""
     drift, scenario = np.abs(samples.runs.drift), samples.scenario
     message = f"drift of the total weight in {samples.count} runs"
-    # Running totals grow with every broadcast, and a weight is the difference of two of them.
+    # Running totals grow with every broadcast, and their rounding remains in their differences.
     clock, rate = scenario.network.activation, 0.0
     if isinstance(clock, LinkClock):
         rate = sum(clock.mean_rate(entity) for entity in clock.entities(scenario.topology))
     terms = 1.0 + scenario.horizon * float(np.nan_to_num(rate))
     limits = np.ones_like(drift), terms, MASS_TOLERANCE
-    found = compare_identities(drift, *limits, message)
-    return found._replace(replica=first_wrong(drift, *limits))
+    finding = compare_identities(drift, *limits, message)
+    return finding._replace(replica=first_wrong(drift, *limits))
 
 
 REACH, START = "exact errors are within reach", "the filters start"
@@ -93,15 +93,15 @@ UPPER_BOUND = Promise(
 
 
 class ClockedChecks(PaperChecks):
-    """Equations of slot filters under clocks."""
+    """Promises about the equations of slot filters under clocks."""
 
     summary_type = ClockedSummary
 
     def summarise(self, scenario: Scenario, run: Run) -> ClockedSummary:
         """Return the summary of a run whose samples are at ``check_times``."""
         drift = [abs(total - start) / abs(start) for start, total in run.sums.values()]
-        found = vars(summarise_exactly(scenario, run))
-        return ClockedSummary(**found, drift=max(drift, default=0.0))
+        fields = vars(summarise_exactly(scenario, run))
+        return ClockedSummary(**fields, drift=max(drift, default=0.0))
 
     def assumptions(self, scenario: Scenario) -> list[Assumption]:
         """Return the assumptions of the tests."""

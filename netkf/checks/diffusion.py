@@ -35,11 +35,11 @@ from netkf.theory.diffusion.information import MAX_REGRESSORS, few_regressors
 from netkf.trace.run import Run
 
 ALONE = MIN_REPLAYED
-"""Runs that are repeated without cooperation: the comparison is of exact mean squares."""
+"""Number of runs repeated without cooperation; few suffice to compare exact mean squares."""
 PASTS = 400
-"""Pasts of the regressors from which the level of D (19) is computed."""
+"""Number of drawn pasts of the regressors from which the level of D (19) is estimated."""
 DRAWS = 20
-"""Errors that are drawn for each exact covariance."""
+"""Number of errors drawn from each exact covariance."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,13 +58,13 @@ def _without_cooperation(scenario: Scenario) -> Scenario:
 
 
 def _sensors_excite(samples: RunSamples, level: float) -> Finding:
-    """Compute the level of D (19)."""
-    table = information_level(samples.scenario, PASTS, samples.seed)
-    network = table[table["node"] == -1].iloc[0]
-    alone = float(table.loc[table["node"] != -1, "level"].max())
+    """Compute the excitation level of D (19) for the network, which must be positive."""
+    levels = information_level(samples.scenario, PASTS, samples.seed)
+    network = levels[levels["node"] == -1].iloc[0]
+    best_sensor = float(levels.loc[levels["node"] != -1, "level"].max())
     message = (
         f"computed, not simulated: least level over the pasts looked at {network['level']:.3g} "
-        f"with windows of {int(network['window'])} slots; the best sensor alone {alone:.3g}"
+        f"with windows of {int(network['window'])} slots; the best sensor alone {best_sensor:.3g}"
     )
     if not network["low"] > 0.0:  # what is computed about a scenario cannot break a promise
         return find_unknown(message)
@@ -73,14 +73,15 @@ def _sensors_excite(samples: RunSamples, level: float) -> Finding:
 
 
 def _cooperation_helps(samples: RunSamples, level: float) -> Finding:
-    """Compare exact mean squares at the end, with and without neighbours, on the same truth."""
+    """Compare exact mean-square errors at the end with those without cooperation, of the same runs.
+    """
     Sigma, Sigma_alone = samples.runs.Sigma[:ALONE, -1], samples.runs.alone[:ALONE]
-    together = np.trace(Sigma, axis1=-2, axis2=-1).mean(axis=0)
-    alone = np.trace(Sigma_alone, axis1=-2, axis2=-1).mean(axis=0)
-    margin = 1.0 - float(together.max() / alone.max())
+    cooperative = np.trace(Sigma, axis1=-2, axis2=-1).mean(axis=0)
+    separate = np.trace(Sigma_alone, axis1=-2, axis2=-1).mean(axis=0)
+    margin = 1.0 - float(cooperative.max() / separate.max())
     message = (
-        f"exact mean-square errors at the end {together.min():.4g} .. {together.max():.4g} "
-        f"together and {alone.min():.4g} .. {alone.max():.4g} alone"
+        f"exact mean-square errors at the end {cooperative.min():.4g} .. {cooperative.max():.4g} "
+        f"together and {separate.min():.4g} .. {separate.max():.4g} alone"
     )
     return Finding((margin, margin, margin), 0.0, message, early=margin < 0.0)
 
@@ -99,12 +100,12 @@ def _errors_bounded(samples: RunSamples, level: float) -> Finding:
         pairs.append(Pair(f"node {node}", square[:, 0, i], square[:, 1, i]))
         half, end = (_draw_squares(Sigma[:, k, i], random) for k in (0, 1))
         expected.append((half, end) if np.isfinite(Sigma[:, :, i]).all() else None)
-    found = compare_growth(pairs, expected, level)
-    message = found.message.replace("P(P > ", "P(e^2 > ")
+    finding = compare_growth(pairs, expected, level)
+    message = finding.message.replace("P(P > ", "P(e^2 > ")
     with contextlib.suppress(TheoryError):
         sigma = tracking_level(samples.scenario).sigma
         message += f"; sigma_p of D (29) is {sigma:.3g} for p = 2"
-    return found._replace(message=message)
+    return finding._replace(message=message)
 
 
 def _draw_squares(Sigma: FloatArray, random: np.random.Generator) -> FloatArray:
@@ -196,20 +197,20 @@ class DiffusionChecks(PaperChecks):
 
     def assumptions(self, scenario: Scenario) -> list[Assumption]:
         """Return the assumptions of the tests beyond those of D."""
-        same = scenario.filters_know_the_truth
+        models_agree = scenario.filters_know_the_truth
         try:
             _require_few_regressors(scenario)
             levels = information_level(scenario, 100, 0)
-            best = float(levels.loc[levels["node"] != -1, "level"].max())
-            lost, why = best <= 0.0, f"the best sensor alone has level {best:.3g} of D (5)"
+            highest = float(levels.loc[levels["node"] != -1, "level"].max())
+            needs_others, evidence = highest <= 0.0, f"the best sensor alone has level {highest:.3g} of D (5)"
         except TheoryError as error:
-            lost, why = False, str(error)
-        model = "same F, Q and R" if same else "filter.model differs from the truth"
+            needs_others, evidence = False, str(error)
+        model = "same F, Q and R" if models_agree else "filter.model differs from the truth"
         return [
-            Assumption("the filters know the plant and the sensors", "D Algorithm 1", same, model),
+            Assumption("the filters know the plant and the sensors", "D Algorithm 1", models_agree, model),
             exact_start(scenario),
             few_errors(scenario),
-            Assumption("no sensor would do alone", "D VI", lost, why),
+            Assumption("no sensor would do alone", "D VI", needs_others, evidence),
         ]
 
     def promises(self, scenario: Scenario) -> tuple[Promise, ...]:

@@ -16,26 +16,27 @@ from netkf.scenario.scenario import Scenario
 
 
 def check_nees_bound(samples: RunSamples, level: float) -> Finding:
-    """Test that the mean of NEES / n is at most 1 at every time and node.
+    """Test the null hypothesis that the mean of NEES / n is at most 1 at every time and node.
 
-    Decisions depend on data, so that errors given the events are not Gaussian: means over runs.
+    Decisions to send depend on the data, so that errors given the events are not Gaussian: Student's
+    interval for the mean over the runs is used, with the level shared by all points.
     """
     n, nees = samples.scenario.plant.n, samples.runs.nees.reshape(samples.count, -1)
-    known = np.flatnonzero(np.isfinite(nees).all(axis=0))
-    if not len(known):
+    finite = np.flatnonzero(np.isfinite(nees).all(axis=0))
+    if not len(finite):
         return find_nothing(NEES_TOLERANCE)
-    ratios, share = nees[:, known] / n, level / len(known)
+    ratios, share = nees[:, finite] / n, level / len(finite)
     means, spreads = ratios.mean(axis=0), ratios.std(axis=0, ddof=1) / math.sqrt(samples.count)
     k = int(np.argmax(means + 2.0 * spreads))
-    found = [
+    intervals = [
         student_interval(float(mean), float(spread), samples.count, share)
         for mean, spread in zip(means, spreads, strict=True)
     ]
-    highest = max(one.high for one in found)
-    # A promise is broken if some interval lies above 1 as a whole.
-    lowest = max(one.low for one in found)
-    label = samples.point_labels[int(known[k])]
-    message = f"NEES / n, at most 1, the largest of {len(known)} points at {label}"
+    highest = max(interval.high for interval in intervals)
+    # The promise is broken if the lower limit of some point is above 1.
+    lowest = max(interval.low for interval in intervals)
+    label = samples.point_labels[int(finite[k])]
+    message = f"NEES / n, at most 1, the largest of {len(finite)} points at {label}"
     message += samples.blurred_note
     margin = 1.0 - float(means[k]), 1.0 - highest, 1.0 - lowest
     return Finding(margin, NEES_TOLERANCE, message, seen=float(means[k]), expected=1.0)
@@ -50,7 +51,7 @@ BOUND = Promise(
 
 
 class TriggeredChecks(PaperChecks):
-    """That P bounds the errors, whatever the thresholds."""
+    """The promise that P bounds the mean-square error for any thresholds."""
 
     slots_only: ClassVar[bool] = True
 

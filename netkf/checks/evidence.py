@@ -1,4 +1,4 @@
-"""Verdicts on promises: a margin with its interval, and what follows from it."""
+"""Verdicts on promises, derived from the interval of a margin."""
 
 from __future__ import annotations
 
@@ -12,29 +12,29 @@ from netkf.core.errors import TheoryError
 HOLDS, BROKEN, UNDECIDED, NOT_PROMISED = "holds", "broken", "undecided", "not promised"
 VERDICTS = (HOLDS, UNDECIDED, NOT_PROMISED, BROKEN)
 MAX_RUNS = 1e9
-"""Number of runs beyond which ``Evidence.needed`` gives none."""
+"""Number of runs beyond which ``Evidence.needed`` is None."""
 FORECAST_MARGIN = 1.1
-"""Factor on the number of runs that decides a row on average."""
+"""Safety factor on the forecast number of runs, which decides a row only on average."""
 GAUSSIAN = "noises are Gaussian"
-"""Name of the assumption of tests that take squared errors for chi-square variables."""
+"""Name of the assumption of tests that treat squared errors as chi-square variables."""
 
 
 @dataclass(frozen=True)
 class Evidence:
     """The verdict on one promise.
 
-    margin, low, high : distance of the promise from being broken (negative if it is broken), with
-        an interval that covers all comparisons of the row at once
+    margin, low, high : distance of the promise from being broken (negative if it is broken), and
+        its confidence interval, simultaneous for all comparisons of the row
     tolerance : distance below 0 that the interval may reach for the verdict ``holds``
     verdict   : broken if the whole interval is below 0, holds if it stays above ``-tolerance``,
         undecided if it is too wide, not promised if an assumption fails
     needed    : estimated number of runs that would decide an undecided promise, or None
-    seen, expected : the value that was found where it was furthest off, and what it should be; nan
-        where the promise is no equation of two values
-    off       : distance of the two (relative for covariances and rates)
-    detectable : error that would have been found with probability 0.9
+    seen, expected : measured and promised value of the comparison with the largest deviation; nan
+        if the promise does not equate two values
+    off       : their distance (relative for covariances and rates)
+    detectable : error that would have been detected with probability 0.9
     runs_needed : ``needed``
-    replica   : number of a run that shows a broken promise, None if it takes many runs
+    replica   : number of a run that alone shows the promise to be broken, else None
     """
 
     promise: str
@@ -56,15 +56,16 @@ class Evidence:
 
 
 class Finding(NamedTuple):
-    """The result of a test: a margin (value, low, high), the distance below 0 that is tolerable,
-    and a sentence about it.
+    """The result of a test: a margin (value, low, high), the tolerated distance below 0, and a
+    message about it.
 
     early   : the promise is about a limit and the horizon is too short to tell
     blurred : rounding of a large state has left no errors to judge by
-    horizon : seconds after which the limit would be reached, nan if that is not known
-    most_runs : number of runs after which further ones leave the interval as it is
-    forecast : upper limit of the distance from the promise with so many times the runs, if what is
-        seen of it now is chance; by default it shrinks as 1 / sqrt(runs)
+    horizon : estimated seconds until the limit is reached, nan if unknown
+    most_runs : number of runs beyond which further runs do not narrow the interval
+    forecast : function of a factor on the runs that returns the upper limit of the distance from
+        the promise, if the distance measured now is sampling error; by default it shrinks as
+        1 / sqrt(runs)
     seen, expected, off, detectable, replica : see :class:`Evidence`; ``off`` is by default how far
         the margin is below 0
     """
@@ -88,9 +89,9 @@ class Finding(NamedTuple):
 class Promise:
     """A statement with its source (paper, number), the assumptions that it needs, and its test.
 
-    ``needs`` are parts of the names or sources of rows in the table of assumptions. A test takes
-    the samples of all runs and a level; the interval of its Finding misses with at most that
-    probability. ``exact`` tests compare paths, not laws, and spend none of the level.
+    ``needs`` are substrings of names or sources in the table of assumptions. A test takes the
+    samples of all runs and a level; the interval of its Finding misses the truth with at most that
+    probability. ``exact`` tests compare paths, not laws, and use none of the level.
     """
 
     statement: str
@@ -101,11 +102,11 @@ class Promise:
 
 
 GAUSSIAN_TESTS: set[Callable[[Any, float], Finding]] = set()
-"""Tests that assume GAUSSIAN."""
+"""Tests marked by :func:`gaussian_test`."""
 
 
 def gaussian_test(test: Callable[[Any, float], Finding]) -> Callable[[Any, float], Finding]:
-    """Mark a test that assumes GAUSSIAN."""
+    """Mark a test as valid only if all noises are Gaussian, and return it."""
     GAUSSIAN_TESTS.add(test)
     return test
 
@@ -126,29 +127,33 @@ def judge(
     runs: int,
     level: float,
 ) -> list[Evidence]:
-    """Return the evidence for each promise; all intervals together miss with at most ``level``."""
+    """Return the evidence for each promise.
+
+    With probability 1 - ``level`` at least, all intervals contain the truth: tests that are not
+    exact share the level equally (Bonferroni). A promise with a failing assumption is not tested.
+    """
     failing = [
         [row for row in assumptions if _is_needed(promise, row) and not row.holds]
         for promise in promises
     ]
     # Bonferroni: the statistical tests share the level, exact ones and void promises need none.
     statistical = sum(not p.exact and not rows for p, rows in zip(promises, failing, strict=True))
-    found = []
+    evidence = []
     for promise, rows in zip(promises, failing, strict=True):
         if rows:
-            why = "; ".join(
+            reason = "; ".join(
                 f"it assumes that {row.assumption} [{row.source}]: {row.evidence}" for row in rows
             )
-            found.append(_unpromised_row(promise, why))
+            evidence.append(_unpromised_row(promise, reason))
         else:
-            found.append(
+            evidence.append(
                 _judge(promise, _run_test(promise, samples, level / max(statistical, 1)), runs)
             )
-    return found
+    return evidence
 
 
 def _run_test(promise: Promise, samples: Any, level: float) -> Finding:
-    """Return the finding of a test; it is unknown if theory cannot compute what to compare with."""
+    """Return the finding of a test; undecided if theory cannot compute the expected value."""
     try:
         return promise.test(samples, level)
     except TheoryError as error:
@@ -175,10 +180,10 @@ def _judge(promise: Promise, finding: Finding, runs: int) -> Evidence:
         verdict = HOLDS
     else:
         verdict = UNDECIDED
-        used = min(runs, finding.most_runs)
-        wanted = FORECAST_MARGIN * used * _factor_needed(finding, MAX_RUNS / used)
-        needed = math.ceil(wanted) if wanted < min(MAX_RUNS, finding.most_runs) else None
-        if wanted > finding.most_runs:
+        runs_used = min(runs, finding.most_runs)
+        forecast_runs = FORECAST_MARGIN * runs_used * _factor_needed(finding, MAX_RUNS / runs_used)
+        needed = math.ceil(forecast_runs) if forecast_runs < min(MAX_RUNS, finding.most_runs) else None
+        if forecast_runs > finding.most_runs:
             message = (
                 f"{message}; exact covariances are those of {finding.most_runs:,} runs at most, "
                 "too few to decide it"
@@ -203,50 +208,51 @@ def _judge(promise: Promise, finding: Finding, runs: int) -> Evidence:
     )
 
 
-def _factor_needed(finding: Finding, most: float) -> float:
-    """Return the factor on the runs at which a promise that holds is decided; inf above ``most``.
+def _factor_needed(finding: Finding, max_factor: float) -> float:
+    """Return the factor on the runs at which the verdict ``holds`` is expected if the promise holds;
+    inf if it exceeds ``max_factor``.
 
-    What is seen of a distance that is 0 is chance, which shrinks as 1 / sqrt(runs); limits shrink
-    as the finding says.
+    The measured distance is taken to be sampling error. Without a forecast the limit shrinks as
+    1 / sqrt(runs); otherwise the factor is found by bisection on a logarithmic scale.
     """
     low, tolerance = finding.margin[1], finding.tolerance
     if not tolerance > 0.0:
         return math.inf
     if finding.forecast is None:
         return (low / tolerance) ** 2
-    if not finding.forecast(most) <= tolerance:
+    if not finding.forecast(max_factor) <= tolerance:
         return math.inf
-    near, far = 1.0, most
-    while far > 1.01 * near:
-        middle = math.sqrt(near * far)
-        near, far = (near, middle) if finding.forecast(middle) <= tolerance else (middle, far)
-    return far
+    lower, upper = 1.0, max_factor
+    while upper > 1.01 * lower:
+        middle = math.sqrt(lower * upper)
+        lower, upper = (lower, middle) if finding.forecast(middle) <= tolerance else (middle, upper)
+    return upper
 
 
 def _describe_horizon(seconds: float) -> str:
-    """Return the remedy for a limit that the horizon does not reach."""
+    """Return advice on the horizon for a limit that is not reached; ``seconds`` would suffice."""
     if math.isfinite(seconds):
         return f"not reached in this horizon, one of about {seconds:.3g} s would do"
     return "not reached in this horizon, lengthen it"
 
 
-def _unpromised_row(promise: Promise, why: str) -> Evidence:
-    """Return the row of a promise that is not made here, with the reason."""
+def _unpromised_row(promise: Promise, reason: str) -> Evidence:
+    """Return the row of a promise whose assumptions fail, with the reason."""
     nan = math.nan
     return Evidence(
-        promise.statement, promise.source, why, nan, nan, nan, nan, NOT_PROMISED, None, ""
+        promise.statement, promise.source, reason, nan, nan, nan, nan, NOT_PROMISED, None, ""
     )
 
 
 def find_identity(deviation: float, allowed: float, message: str) -> Finding:
     """Return the finding on paths that should be equal up to rounding.
 
-    ``deviation`` is their largest relative deviation, ``allowed`` what rounding explains.
+    ``deviation`` is their largest relative deviation, ``allowed`` the bound on that from rounding.
     """
     margin = allowed - deviation
     text = f"largest relative deviation {deviation:.1e}, rounding explains {allowed:.0e}; {message}"
-    found = Finding((margin, margin, margin), 0.0, text)
-    return found._replace(seen=deviation, expected=0.0, off=deviation, detectable=allowed)
+    finding = Finding((margin, margin, margin), 0.0, text)
+    return finding._replace(seen=deviation, expected=0.0, off=deviation, detectable=allowed)
 
 
 def find_nothing(tolerance: float) -> Finding:
@@ -259,7 +265,7 @@ def find_nothing(tolerance: float) -> Finding:
     return Finding((nan, nan, nan), tolerance, message, blurred=True)
 
 
-def find_unknown(why: str, tolerance: float = 0.0) -> Finding:
+def find_unknown(reason: str, tolerance: float = 0.0) -> Finding:
     """Return the finding of a test that has nothing to compare: undecided, with the reason."""
     nan = math.nan
-    return Finding((nan, nan, nan), tolerance, why, blurred=True)
+    return Finding((nan, nan, nan), tolerance, reason, blurred=True)

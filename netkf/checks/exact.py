@@ -1,5 +1,7 @@
-"""Runs against their exact covariances: theory computes from the events of a run what P and the
-covariance of the errors must be, without the engine.
+"""Comparison of runs with exact covariances.
+
+Given the events of a run (ticks, losses, delays) the errors are Gaussian. Theory computes their
+covariance, and P, from the events alone, without the engine.
 """
 
 from __future__ import annotations
@@ -54,32 +56,31 @@ from netkf.trace.nees import errors
 from netkf.trace.run import BLUR, Run, blurred_samples
 
 MAX_REPLAYED, MIN_REPLAYED, MAX_REPLAYED_STEPS = 1000, 20, 250_000
-"""Replicas whose exact covariances are computed, fewer (but at least 20) where there are many slots
-or errors are integrated in many short steps; the others show their errors only. A step takes a
-tenth of a millisecond.
+"""Limits on the number of replicas whose exact covariances are computed (the others give errors
+only), and on their total number of slots or integration steps, of a tenth of a millisecond each.
 """
 ENOUGH_ERRORS, ENOUGH_RUNS = 24_000, 400
-"""Errors with which a covariance that is wrong by 5 % is found; more are not replayed. In slots,
-where limits are promised to each node, rows about one node at one time need so many runs.
+"""Number of errors that reveal a covariance that is wrong by 5 %, beyond which no more runs are
+replayed; and the number of runs that tests of one node at one slot need.
 """
 MAX_ERRORS = 64
-"""Errors of all nodes together for which the exact covariance (64, 64) is cheap."""
+"""Largest number of errors of all nodes for which the joint covariance is computed."""
 MIN_VARIANCE = 1e-8
-"""Relative variance below which a direction is left out: rounding decides about its errors."""
+"""Relative variance below which a direction is left out, because its errors are rounding."""
 BOUND_TOLERANCE, BIAS_TOLERANCE = 1e-8, 0.5
 SINGULAR = 1e-12
-"""Relative size of an eigenvalue below which a covariance has no inverse to judge by."""
+"""Ratio of smallest to largest eigenvalue below which a covariance counts as singular."""
 
 
 def summarise_exactly(scenario: Scenario, run: Run) -> ReplicaSummary:
     """Return the summary of a run at the sampled nodes, with exact covariances if the errors of all
     nodes are few enough.
     """
-    at, sampled = checked_samples(scenario, run.times), sampled_indices(scenario)
+    time_indices, sampled = checked_samples(scenario, run.times), sampled_indices(scenario)
     _, nees = errors(run.error, run.P)
     e = np.where(blurred_samples(run, run.P)[..., None], np.nan, run.error)
     nees = np.where(np.isnan(e).any(axis=-1) | _nearly_singular(run.P), np.nan, nees)
-    P, e, nees = run.P[at][:, sampled], e[at][:, sampled], nees[at][:, sampled]
+    P, e, nees = run.P[time_indices][:, sampled], e[time_indices][:, sampled], nees[time_indices][:, sampled]
     if run.replica < max_replayed(scenario) and few_errors(scenario).holds:
         try:
             law = error_law(with_promised_filter(scenario), run)
@@ -90,20 +91,26 @@ def summarise_exactly(scenario: Scenario, run: Run) -> ReplicaSummary:
 
 
 def max_replayed(scenario: Scenario) -> int:
-    """Return the number of replicas whose exact covariances are computed."""
+    """Return the number of replicas whose exact covariances are computed.
+
+    It is what ENOUGH_ERRORS (and in slots ENOUGH_RUNS) take, within the limits of MAX_REPLAYED,
+    MIN_REPLAYED and MAX_REPLAYED_STEPS.
+    """
     per_run = len(probe_times(scenario)) * errors_at_once(scenario)
-    steps, least = integration_steps(scenario), 0
+    steps, min_replicas = integration_steps(scenario), 0
     if scenario.slotted:
-        steps, least = check_slots(scenario)[-1], ENOUGH_RUNS
+        steps, min_replicas = check_slots(scenario)[-1], ENOUGH_RUNS
     affordable = MAX_REPLAYED_STEPS // max(steps, 1)
-    enough = max(math.ceil(ENOUGH_ERRORS / per_run), least)
-    return max(MIN_REPLAYED, min(MAX_REPLAYED, enough, affordable))
+    needed = max(math.ceil(ENOUGH_ERRORS / per_run), min_replicas)
+    return max(MIN_REPLAYED, min(MAX_REPLAYED, needed, affordable))
 
 
 def _summary_without_replay(
     P: FloatArray, e: FloatArray, nees: FloatArray, size: int
 ) -> ReplicaSummary:
-    """Return a summary without exact covariances; ``size`` is the number of all errors."""
+    """Return a summary of P (K, N, n, n), errors and NEES without exact covariances; ``size`` is
+    the number of errors at all sample times.
+    """
     times, n = len(P), P.shape[-1]
     unknown, pair = np.full(P.shape, np.nan), np.full(2, np.nan)
     return ReplicaSummary(
@@ -123,8 +130,12 @@ def _summary_without_replay(
 def _replayed_summary(
     scenario: Scenario, run: Run, law: ErrorLaw, e: FloatArray, nees: FloatArray
 ) -> ReplicaSummary:
-    """Return the summary of a run with the exact law of its errors."""
-    at, sampled = checked_samples(scenario, run.times), sampled_indices(scenario)
+    """Return the summary of a run with the exact law of its errors.
+
+    ``e`` and ``nees`` are those at the checked times and sampled nodes; they become nan where the
+    rounding of large states exceeds the exact deviation of the errors.
+    """
+    time_indices, sampled = checked_samples(scenario, run.times), sampled_indices(scenario)
     nodes, times, estimators, n = (
         len(scenario.nodes),
         len(run.times),
@@ -132,75 +143,79 @@ def _replayed_summary(
         scenario.plant.n,
     )
     size = estimators * n
-    # Blocks on the diagonal: the covariance at each time.
+    # The covariance (times, size, size) at each time is a diagonal block of that over all times.
     stacked = np.einsum("kakb->kab", law.covariance.reshape(times, size, times, size))
     mean = law.mean.reshape(times, estimators, n)
     Sigma, replayed = diagonal_blocks(stacked, estimators), law.P
     centred = run.error[:, :estimators] - mean
     floor = np.maximum((BLUR * run.rounding) ** 2, _variance_floor(scenario))
-    whole = whiten_errors(centred[at], stacked[at], MIN_VARIANCE, floor[at])
+    squares = whiten_errors(centred[time_indices], stacked[time_indices], MIN_VARIANCE, floor[time_indices])
     joint, bias = _pool_times(centred, law.covariance, float(floor.max()))
     quadratic = _pool_nees(centred, run.P[:, :estimators], law)
     if estimators < nodes:  # all share one pooled filter
         mean, Sigma, replayed = (np.repeat(part, nodes, axis=1) for part in (mean, Sigma, replayed))
-    lost = blurred_samples(run, Sigma)[at][:, sampled]
-    if lost.any():
+    blurred = blurred_samples(run, Sigma)[time_indices][:, sampled]
+    if blurred.any():
         quadratic = np.full_like(quadratic, np.nan)
-    e = np.where(lost[..., None], np.nan, e)
+    e = np.where(blurred[..., None], np.nan, e)
     nees = np.where(np.isnan(e).any(axis=-1), np.nan, nees)
-    replayed, mean, Sigma = (part[at][:, sampled] for part in (replayed, mean, Sigma))
-    P = run.P[at][:, sampled]
-    return ReplicaSummary(P, e, nees, replayed, mean, Sigma, whole, joint, quadratic, bias)
+    replayed, mean, Sigma = (part[time_indices][:, sampled] for part in (replayed, mean, Sigma))
+    P = run.P[time_indices][:, sampled]
+    return ReplicaSummary(P, e, nees, replayed, mean, Sigma, squares, joint, quadratic, bias)
 
 
 def _pool_times(
     e: FloatArray, covariance: FloatArray, floor: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the squared errors of all times together with their degrees of freedom (2,), and what
-    they say about a bias that all of them have, (n, n + 1).
+    """Return the fields ``joint`` (2,) and ``bias`` (n, n + 1) of ReplicaSummary.
 
-    ``e`` is (K, M, n) less its mean, ``covariance`` (K M n, K M n); on directions that are left out
-    see :func:`whiten_errors`.
+    ``e`` (K, M, n) are the errors of M estimators at K times less their mean, ``covariance``
+    (K M n, K M n) is their joint covariance. Directions of variance below ``floor`` are left out,
+    as in :func:`whiten_errors`.
     """
     size, n = e[0].size, e.shape[-1]
-    # Errors of different times differ in size by far: each is compared with that of its own time.
+    # Variances may differ by orders of magnitude between times: each time is scaled to size 1.
     scale = np.repeat(np.sqrt(np.diagonal(covariance).reshape(-1, size).max(axis=1)), size)
     scale = np.where(scale > 0.0, scale, 1.0)
     values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
-    used = (values > MIN_VARIANCE * values[-1]) & (values > floor / scale.min() ** 2)
-    white = (vectors / np.sqrt(np.where(used, values, np.inf))).T / scale
-    z = white @ e.reshape(-1)
-    # A constant bias b adds white X b, with X the identities of all estimates below each other.
-    design = white.reshape(len(white), -1, n).sum(axis=1)
+    varying = (values > MIN_VARIANCE * values[-1]) & (values > floor / scale.min() ** 2)
+    whitening = (vectors / np.sqrt(np.where(varying, values, np.inf))).T / scale
+    z = whitening @ e.reshape(-1)
+    # A constant bias b shifts all errors by X b, X the stacked identities (K M n, n). The design
+    # matrix of z is whitening X: D' D is the information and D' z the information vector of b.
+    design = whitening.reshape(len(whitening), -1, n).sum(axis=1)
     bias = np.concatenate([design.T @ design, (design.T @ z)[:, None]], axis=1)
-    return np.array([z @ z, used.sum()]), bias
+    return np.array([z @ z, varying.sum()]), bias
 
 
 def _pool_nees(e: FloatArray, P: FloatArray, law: ErrorLaw) -> FloatArray:
-    """Return the sum of ``e' P^-1 e`` over all times and estimators, each in units of its expected
-    value over n, and its weights given the events, (1 + K M n,); all nan if some P has no inverse.
+    """Return the field ``quadratic`` (1 + K M n,) of ReplicaSummary; nan if some P is singular.
 
-    ``e`` is (K, M, n) less its mean, ``P`` (K, M, n, n) that of the run; expected values and
-    weights are those for the P that the events should give. In these units a node that is far too
-    sure for a moment does not outweigh all others.
+    The sum is over ``e' P^-1 e`` at all times and estimators, each scaled to the expected value n,
+    so that a moment of a far too small P does not outweigh all others. ``e`` (K, M, n) are errors
+    less their mean and ``P`` (K, M, n, n) covariances of the run; expected values and weights use
+    the exact covariance of the errors and the P that the events should give.
     """
     if _nearly_singular(P).any() or _nearly_singular(law.P).any():
         return np.full(1 + e.size, np.nan)
     n = e.shape[-1]
-    # e' D e with D = L L' has the weights of the eigenvalues of L' C L.
+    # e' D e with D = L' L is a sum of squares of standard normal numbers, weighted by the
+    # eigenvalues of L C L'; here L' L = P^-1.
     L = np.linalg.inv(np.linalg.cholesky(law.P)).reshape(-1, n, n)
     blocks = law.covariance.reshape(len(L), n, len(L), n)
-    share = nees_shares(np.einsum("iab,ibic,idc->iad", L, blocks, L, optimize=True))
-    each = np.einsum("kia,kia->ki", e, np.linalg.solve(P, e[..., None])[..., 0])
-    total = (share * each.ravel()).sum()
-    L = np.sqrt(share)[:, None, None] * L
-    moved = np.einsum("iab,ibjc,jdc->iajd", L, blocks, L, optimize=True).reshape(e.size, e.size)
-    return np.append(total, np.maximum(np.linalg.eigvalsh(moved), 0.0))
+    scales = nees_shares(np.einsum("iab,ibic,idc->iad", L, blocks, L, optimize=True))
+    nees = np.einsum("kia,kia->ki", e, np.linalg.solve(P, e[..., None])[..., 0])
+    total = (scales * nees.ravel()).sum()
+    L = np.sqrt(scales)[:, None, None] * L
+    quadratic_form = np.einsum("iab,ibjc,jdc->iajd", L, blocks, L, optimize=True).reshape(e.size, e.size)
+    return np.append(total, np.maximum(np.linalg.eigvalsh(quadratic_form), 0.0))
 
 
 def nees_shares(whitened: FloatArray) -> FloatArray:
-    """Return n over the expected NEES (K,), the traces of ``whitened`` (K, n, n); 0 where that is
-    0.
+    """Return the scales (K,) that bring NEES to the expected value n.
+
+    The expected NEES is the trace of ``whitened`` (K, n, n), L Sigma L' with L' L = P^-1; the scale
+    is 0 where that is 0.
     """
     expected = np.trace(whitened, axis1=-2, axis2=-1)
     return np.asarray(
@@ -209,53 +224,54 @@ def nees_shares(whitened: FloatArray) -> FloatArray:
 
 
 def _nearly_singular(P: FloatArray) -> np.ndarray:
-    """Return (K, N) bool: rounding decides about the inverses of covariances (K, N, n, n)."""
+    """Return (K, N) bool: True for covariances (K, N, n, n) that are not finite, or whose smallest
+    eigenvalue is at most SINGULAR times the largest.
+    """
     finite = np.asarray(np.isfinite(P).all(axis=(-1, -2)))
     values = np.linalg.eigvalsh(np.where(finite[..., None, None], P, 0.0))
     return np.asarray(~(values[..., 0] > SINGULAR * values[..., -1]))
 
 
 def _variance_floor(scenario: Scenario) -> float:
-    """Return the variance below which errors are rounding, from the start and the steady
-    covariance.
+    """Return the variance below which errors are rounding: (OPERATIONS EPS)^2 times the sum of
+    tr P(0) and the covariance that one reading gives.
     """
     information = float(np.linalg.norm(scenario.node_infos[0].information, 2))
-    left = 1.0 / information if information > 0.0 else 0.0
-    return (OPERATIONS * EPS) ** 2 * (left + float(np.trace(scenario.plant.start_cov)))
+    reading_variance = 1.0 / information if information > 0.0 else 0.0
+    return (OPERATIONS * EPS) ** 2 * (reading_variance + float(np.trace(scenario.plant.start_cov)))
 
 
 def few_errors(scenario: Scenario) -> Assumption:
-    """Return the assumption that the exact covariance of all errors together can be computed."""
+    """Return the assumption that the joint covariance of the errors of all nodes can be computed.
+    """
     size = len(scenario.nodes) * scenario.plant.n
     evidence = f"{size} errors of all nodes together, at most {MAX_ERRORS}"
     return Assumption("exact errors are within reach", "netkf", size <= MAX_ERRORS, evidence)
 
 
 def whiten_errors(
-    e: FloatArray, stacked: FloatArray, least: float, floor: FloatArray | float = 0.0
+    e: FloatArray, stacked: FloatArray, min_variance: float, floor: FloatArray | float = 0.0
 ) -> FloatArray:
-    """Return ``e' Sigma^-1 e`` of all nodes together and its degrees of freedom, (K, 2).
+    """Return ``e' Sigma^-1 e`` of the errors of all nodes and its degrees of freedom, (K, 2).
 
-    ``e`` is (K, N, n) and ``stacked`` (K, N n, N n). Directions count if their variance is at least
-    ``least`` times the largest one and above ``floor`` (K,), which rounding reaches. Those with
-    small variances show how far the nodes disagree.
+    ``e`` (K, N, n) are errors, ``stacked`` (K, N n, N n) joint covariances. Eigenvectors count if
+    their variance is above ``min_variance`` times the largest one and above ``floor`` (K,), the
+    variance of rounding errors. Small variances matter: they are those of the differences between
+    nodes.
     """
-    known = np.asarray(np.isfinite(stacked).all(axis=(-1, -2)))
-    values, vectors = np.linalg.eigh(np.where(known[:, None, None], stacked, 0.0))
-    used = (values > least * values[:, -1:]) & (values > np.reshape(floor, (-1, 1)))
-    along = np.einsum("kab,ka->kb", vectors, e.reshape(len(e), -1))
-    square = np.where(used, along**2 / np.where(used, values, 1.0), 0.0).sum(axis=1)
-    return np.stack([square, used.sum(axis=1)], axis=1)
+    finite = np.asarray(np.isfinite(stacked).all(axis=(-1, -2)))
+    values, vectors = np.linalg.eigh(np.where(finite[:, None, None], stacked, 0.0))
+    counted = (values > min_variance * values[:, -1:]) & (values > np.reshape(floor, (-1, 1)))
+    components = np.einsum("kab,ka->kb", vectors, e.reshape(len(e), -1))
+    square = np.where(counted, components**2 / np.where(counted, values, 1.0), 0.0).sum(axis=1)
+    return np.stack([square, counted.sum(axis=1)], axis=1)
 
 
 def with_promised_filter(scenario: Scenario) -> Scenario:
-    """Return the scenario with the filter that its promises are about.
-
-    For a user's class that defines anything but weights anew this is the built-in class it derives
-    from.
+    """Return the scenario with the filter that its promises are about; see :func:`promised_filter`.
     """
-    own = promised_filter(scenario.filter.algorithm) is scenario.filter.algorithm
-    return scenario if own else with_base_filter(scenario)
+    is_promised = promised_filter(scenario.filter.algorithm) is scenario.filter.algorithm
+    return scenario if is_promised else with_base_filter(scenario)
 
 
 @lru_cache(maxsize=8)
@@ -269,23 +285,24 @@ def with_base_filter(scenario: Scenario) -> Scenario:
 
 
 def promised_filter(algorithm: Any) -> Any:
-    """Return the built-in filter whose promises are checked: the given one, or one of the class
-    that it derives from, with the same parameters.
+    """Return the filter whose promises are checked.
 
-    Raises TheoryError for a class that derives from none: nothing is promised of it; and for one
-    that declares not to talk although its base does, since promises about its base are about what
-    nodes hear.
+    It is the given one if its class is built in or overrides only weights of links; otherwise one
+    of the built-in class that it derives from, with the same parameters.
+
+    Raises TheoryError for a class that derives from no built-in one, and for one that declares
+    ``talks = False`` although its base talks, since promises about the base are about messages.
     """
-    known, name = built_in_class(algorithm), type(algorithm).__name__
-    if known is None:
+    built_in, name = built_in_class(algorithm), type(algorithm).__name__
+    if built_in is None:
         raise TheoryError(
             f"nothing is promised of {name}: derive it from a filter of netkf.parts to say which "
             "one it should be"
         )
-    if known.talks and not algorithm.talks:
+    if built_in.talks and not algorithm.talks:
         raise TheoryError(
             f"nothing is promised of {name}: it declares talks = False, and what is promised of "
-            f"{known.__name__} is about exchanges; derive it from netkf.parts.Local"
+            f"{built_in.__name__} is about exchanges; derive it from netkf.parts.Local"
         )
     if set(own_attributes(algorithm)) <= set(LINK_WEIGHTS):
         return algorithm
@@ -293,50 +310,55 @@ def promised_filter(algorithm: Any) -> Any:
 
 
 def check_upper_bound(samples: RunSamples, level: float) -> Finding:
-    """Check that P - Sigma has no negative eigenvalue; Sigma is the exact covariance of errors."""
-    most = max_replayed(samples.scenario)
-    P, Sigma = samples.runs.P[:most], samples.runs.Sigma[:most]
+    """Check P >= Sigma, the exact covariance of the errors, by the least eigenvalue of P - Sigma."""
+    max_runs = max_replayed(samples.scenario)
+    P, Sigma = samples.runs.P[:max_runs], samples.runs.Sigma[:max_runs]
     size = np.trace(Sigma, axis1=-2, axis2=-1)
     gap = np.nan_to_num(P - Sigma, nan=-1e300, posinf=1e300, neginf=-1e300)
-    below = np.maximum(-np.linalg.eigvalsh(gap)[..., 0], 0.0)
-    message = f"least eigenvalue of P - Sigma relative to its trace in {below.size:,} covariances"
-    limits = size, samples.largest_terms(samples.runs.replayed[:most]), BOUND_TOLERANCE
-    found = compare_identities(below, *limits, message)
-    return with_departure(found, samples, below, limits)
+    shortfall = np.maximum(-np.linalg.eigvalsh(gap)[..., 0], 0.0)
+    message = f"least eigenvalue of P - Sigma relative to its trace in {shortfall.size:,} covariances"
+    limits = size, samples.largest_terms(samples.runs.replayed[:max_runs]), BOUND_TOLERANCE
+    finding = compare_identities(shortfall, *limits, message)
+    return with_departure(finding, samples, shortfall, limits)
 
 
 @gaussian_test
 def check_error_covariance(samples: RunSamples, level: float) -> Finding:
-    """Test that errors whitened by their exact covariance are chi-square at every node and time,
-    and for all nodes together.
+    """Test the null hypothesis that errors have their exact mean and covariance Sigma.
+
+    Under it the sum of e' Sigma^-1 e over the runs is chi-square, at every node and time and for
+    all nodes at a time (half of the level together), and for all errors of all times (the other
+    half).
     """
     runs, scenario = samples.runs, samples.scenario
-    n, most = scenario.plant.n, max_replayed(scenario)
-    Sigma, whole = runs.Sigma[:most], runs.whole[:most]
-    e = runs.e[:most] - runs.mean[:most]
+    n, max_runs = scenario.plant.n, max_replayed(scenario)
+    Sigma, all_nodes = runs.Sigma[:max_runs], runs.whole[:max_runs]
+    e = runs.e[:max_runs] - runs.mean[:max_runs]
     if np.isnan(e).all():
         return find_nothing(NEES_TOLERANCE)
-    # Each error is whitened by itself; directions without any variance are left out of the freedom.
-    alone = whiten_errors(
+    # Each node and time by itself: N = 1. Directions without variance have no degree of freedom.
+    single = whiten_errors(
         e.reshape(-1, 1, n),
         Sigma.reshape(-1, n, n),
         MIN_VARIANCE,
         _variance_floor(scenario),
     ).reshape(len(e), -1, 2)
-    both = np.concatenate([alone, whole], axis=1)
-    freedom = np.nan_to_num(both[..., 1]).sum(axis=0)
+    squares = np.concatenate([single, all_nodes], axis=1)
+    freedom = np.nan_to_num(squares[..., 1]).sum(axis=0)
     with np.errstate(invalid="ignore", divide="ignore"):
-        ratios = both[..., 0] * (len(e) / freedom)
+        ratios = squares[..., 0] * (len(e) / freedom)
     labels = [*samples.point_labels, *(f"{time}, all nodes" for time in samples.time_labels)]
-    # A part of the level for each point, as much for all of them together, which see far less.
-    found = compare_chi_square(ratios, freedom.tolist(), labels, level / 2.0, "e' Sigma^-1 e")
-    pooled = _compare_pooled(runs.joint[:most], level / 2.0)
-    found = pool(found, pooled, EVERYTHING)
-    return found._replace(message=found.message + samples.blurred_note, most_runs=most)
+    # Half of the level for the points, half for all of them pooled, which is far more sensitive.
+    finding = compare_chi_square(ratios, freedom.tolist(), labels, level / 2.0, "e' Sigma^-1 e")
+    pooled = _compare_pooled(runs.joint[:max_runs], level / 2.0)
+    finding = pool(finding, pooled, EVERYTHING)
+    return finding._replace(message=finding.message + samples.blurred_note, most_runs=max_runs)
 
 
 def _compare_pooled(joint: FloatArray, level: float) -> Interval:
-    """Return an interval for the relative difference of all errors from their covariance."""
+    """Return an interval for the relative difference between the pooled squared errors and their
+    degrees of freedom, both summed over the rows of ``joint`` (R, 2).
+    """
     total, freedom = joint[np.isfinite(joint).all(axis=1)].sum(axis=0).tolist()
     if not freedom > 0.0:
         return Interval(math.nan, 0.0, math.inf)
@@ -344,14 +366,14 @@ def _compare_pooled(joint: FloatArray, level: float) -> Interval:
 
 
 def check_bias(samples: RunSamples, level: float) -> Finding:
-    """Test that errors less their exact mean have no bias that is the same at all nodes and times,
-    by generalised least squares.
+    """Test the null hypothesis that errors less their exact mean have no constant bias, the same at
+    all nodes and times.
 
-    The distance is that of the bias from 0 in standard deviations of an error: those of the mean
-    covariance of all nodes and times.
+    The bias is estimated by generalised least squares. Its length is in standard deviations of an
+    error: it is whitened by the mean covariance of all nodes and times.
     """
-    most = max_replayed(samples.scenario)
-    bias, Sigma = samples.runs.bias[:most], samples.runs.Sigma[:most]
+    max_runs = max_replayed(samples.scenario)
+    bias, Sigma = samples.runs.bias[:max_runs], samples.runs.Sigma[:max_runs]
     bias = bias[np.isfinite(bias).all(axis=(1, 2))]
     n = bias.shape[1]
     if not len(bias) or not np.abs(bias).any():
@@ -359,109 +381,115 @@ def check_bias(samples: RunSamples, level: float) -> Finding:
     information, vector = bias[:, :, :n].sum(axis=0), bias[:, :, n].sum(axis=0)
     values, vectors = np.linalg.eigh(information)
     varying = values > 1e-10 * values[-1]
-    # z is standard normal without a bias, and the bias is spread z.
+    # z is standard normal without a bias, and the whitened estimate of the bias is spread @ z.
     z = (vectors.T @ vector)[varying] / np.sqrt(values[varying])
     covariances = Sigma.reshape(-1, n, n)
     typical = covariances[np.isfinite(covariances).all(axis=(1, 2))].mean(axis=0)
     spread = whitening_matrix(typical) @ (vectors[:, varying] / np.sqrt(values[varying]))
-    apart = _length_interval(spread, z, level)
+    length = _length_interval(spread, z, level)
     message = "bias that all errors share, in standard deviations of an error,"
-    found = find_largest([(apart, "all nodes and times")], BIAS_TOLERANCE, message)
-    return found._replace(most_runs=most)
+    finding = find_largest([(length, "all nodes and times")], BIAS_TOLERANCE, message)
+    return finding._replace(most_runs=max_runs)
 
 
 def _length_interval(spread: FloatArray, z: FloatArray, level: float) -> Interval:
-    """Return an interval for the length of ``spread`` (d, k) times the mean of Gaussian numbers z
-    (k,) with variance 1, which is above 0 if and only if the mean is not 0 at this level.
+    """Return an interval for |spread m|, where ``z`` (k,) is normal with mean m and covariance I
+    and ``spread`` is (d, k). It excludes 0 if and only if |z|^2 exceeds its chi-square quantile.
     """
     reach = math.sqrt(2.0 * float(scipy.special.gammainccinv(len(z) / 2.0, level)))
     sizes = np.linalg.svd(spread, compute_uv=False)
-    least = float(sizes[-1]) if len(sizes) == len(z) else 0.0
-    value, wide = float(np.linalg.norm(spread @ z)), reach * float(sizes[0])
-    # The mean is within ``reach`` of z.
+    smallest = float(sizes[-1]) if len(sizes) == len(z) else 0.0
+    value, max_reach = float(np.linalg.norm(spread @ z)), reach * float(sizes[0])
+    # The mean is within ``reach`` of z, so that |spread m| >= (|z| - reach) smallest.
     excess = float(np.linalg.norm(z)) - reach
-    low = max(value - wide, excess * max(least, 1e-9 * float(sizes[0])), 0.0)
-    find = wide + float(scipy.special.ndtri(POWER)) * float(sizes[0])
-    return Interval(value, low if excess > 0.0 else 0.0, value + wide, find, value, 0.0)
+    low = max(value - max_reach, excess * max(smallest, 1e-9 * float(sizes[0])), 0.0)
+    detectable = max_reach + float(scipy.special.ndtri(POWER)) * float(sizes[0])
+    return Interval(value, low if excess > 0.0 else 0.0, value + max_reach, detectable, value, 0.0)
 
 
 @gaussian_test
 def check_expected_nees(samples: RunSamples, level: float) -> Finding:
-    """Compare the NEES with its expected value given the events of each run.
+    """Test the null hypothesis that NEES has its expected value given the events of each run.
 
-    NEES is then a quadratic form of Gaussian errors, whose weights are the eigenvalues of
-    P^-1 Sigma, and so is its sum over runs: nothing is estimated. Errors that have a mean count
-    less that mean. Sums are in units of the expected values, which may differ widely.
+    Given the events NEES is a quadratic form of Gaussian errors (less their exact mean): a sum of
+    squares of standard normal numbers weighted by the eigenvalues of P^-1 Sigma. So is its sum over
+    runs, and no variance has to be estimated. Each NEES is scaled to the expected value n, since
+    expected values may differ widely between runs.
     """
     runs, n = samples.runs, samples.scenario.plant.n
-    most = max_replayed(samples.scenario)
-    P, Sigma = runs.replayed[:most], runs.Sigma[:most]
-    inverse, m = np.linalg.pinv(P), runs.mean[:most]
+    max_runs = max_replayed(samples.scenario)
+    P, Sigma = runs.replayed[:max_runs], runs.Sigma[:max_runs]
+    inverse, m = np.linalg.pinv(P), runs.mean[:max_runs]
     weights = np.linalg.eigvals(inverse @ Sigma).real
     weights = np.maximum(weights, 0.0).reshape(len(P), -1, n)
     mean = weights.sum(axis=(0, 2))
-    nees = runs.nees[:most]
+    nees = runs.nees[:max_runs]
     if np.nan_to_num(m).any():
-        e = runs.e[:most] - m
+        e = runs.e[:max_runs] - m
         nees = np.einsum("rkna,rknab,rknb->rkn", e, inverse, e)
     nees = nees.reshape(len(P), -1)
-    known = np.flatnonzero(np.isfinite(nees).all(axis=0) & (mean > 0.0))
-    if np.isnan(runs.e[:most]).all():
+    tested = np.flatnonzero(np.isfinite(nees).all(axis=0) & (mean > 0.0))
+    if np.isnan(runs.e[:max_runs]).all():
         return find_nothing(NEES_TOLERANCE)
-    if not len(known):
+    if not len(tested):
         return find_unknown("NEES does not exist: P is singular or not finite", NEES_TOLERANCE)
-    found, sizes = [], weights.sum(axis=2, keepdims=True)
+    intervals, sizes = [], weights.sum(axis=2, keepdims=True)
     units = np.divide(n, sizes, out=np.zeros(sizes.shape), where=sizes > 0.0)
-    for k in known.tolist():
-        total, share = float((units[:, k, 0] * nees[:, k]).sum()), 0.5 * level / len(known)
+    for k in tested.tolist():
+        total, share = float((units[:, k, 0] * nees[:, k]).sum()), 0.5 * level / len(tested)
         ratio = quadratic_interval(total, (units * weights)[:, k].ravel(), share)
-        found.append((deviation_interval(1.0, ratio), f"at {samples.point_labels[k]}"))
+        intervals.append((deviation_interval(1.0, ratio), f"at {samples.point_labels[k]}"))
     message = (
-        f"mean NEES {nees[:, known].mean():.4g}, exact errors say "
-        f"{mean[known].mean() / len(P):.4g}, n is {n}; largest relative difference"
+        f"mean NEES {nees[:, tested].mean():.4g}, exact errors say "
+        f"{mean[tested].mean() / len(P):.4g}, n is {n}; largest relative difference"
     )
-    together = _expected_together(runs.quadratic[:most], 0.5 * level)
+    pooled = _expected_together(runs.quadratic[:max_runs], 0.5 * level)
     finding = pool(
-        find_largest(found, NEES_TOLERANCE, message), together, EVERYTHING, NEES_TOLERANCE
+        find_largest(intervals, NEES_TOLERANCE, message), pooled, EVERYTHING, NEES_TOLERANCE
     )
-    return finding._replace(message=finding.message + samples.blurred_note, most_runs=most)
+    return finding._replace(message=finding.message + samples.blurred_note, most_runs=max_runs)
 
 
 def _expected_together(quadratic: FloatArray, level: float) -> Interval:
-    """Return an interval for the relative difference of the NEES of all times, nodes and runs from
-    what is expected of it, from stacked sums with their weights (R, 1 + S).
+    """Return an interval for the relative difference between the NEES pooled over times, nodes and
+    runs and its expected value; ``quadratic`` (R, 1 + S) stacks the fields of ReplicaSummary.
     """
-    known = quadratic[np.isfinite(quadratic).all(axis=1)]
-    ratio = quadratic_interval(float(known[:, 0].sum()), known[:, 1:].ravel(), level)
-    return deviation_interval(1.0, ratio) if len(known) else ratio
+    finite = quadratic[np.isfinite(quadratic).all(axis=1)]
+    ratio = quadratic_interval(float(finite[:, 0].sum()), finite[:, 1:].ravel(), level)
+    return deviation_interval(1.0, ratio) if len(finite) else ratio
 
 
 @gaussian_test
 def check_nees(samples: RunSamples, level: float) -> Finding:
-    """Test NEES / n for mean 1: given the exchanges, errors are Gaussian with covariance P."""
+    """Test the null hypothesis that errors are Gaussian with covariance P, given the exchanges.
+
+    Under it NEES is chi-square with n degrees of freedom at every point, and so is its sum over
+    runs.
+    """
     n, nees = samples.scenario.plant.n, samples.runs.nees.reshape(samples.count, -1)
     if np.isnan(samples.runs.e).all():
         return find_nothing(NEES_TOLERANCE)
     freedom = [n * len(nees)] * nees.shape[1]
-    found = compare_chi_square(nees / n, freedom, samples.point_labels, level / 2.0, "NEES")
-    known = nees[:, np.isfinite(nees).all(axis=0)]
-    if known.size:
-        exactly = np.full(known.shape, float(n))
-        found = pool(
-            found,
-            pooled_nees(known, exactly, exactly, level / 2.0),
+    finding = compare_chi_square(nees / n, freedom, samples.point_labels, level / 2.0, "NEES")
+    finite = nees[:, np.isfinite(nees).all(axis=0)]
+    if finite.size:
+        expected = np.full(finite.shape, float(n))
+        finding = pool(
+            finding,
+            pooled_nees(finite, expected, expected, level / 2.0),
             EVERYTHING,
             NEES_TOLERANCE,
         )
-    return found._replace(message=found.message + samples.blurred_note)
+    return finding._replace(message=finding.message + samples.blurred_note)
 
 
 def pooled_nees(nees: FloatArray, mean: FloatArray, square: FloatArray, level: float) -> Interval:
-    """Return an interval for the relative difference of all NEES (R, K) together from their exact
-    means (R, K); ``square`` (R, K) is half of their variances.
+    """Return an interval for the relative difference between the sum of all NEES (R, K) and that of
+    their exact means (R, K); ``square`` (R, K) is half of their variances.
 
-    The runs are independent. However the points of one run are related, the standard deviation of
-    their sum is at most the sum of theirs.
+    Runs are independent. For the K points of a run, which are correlated in an unknown way, the
+    standard deviation of their sum is at most the sum of their standard deviations. The chi-square
+    law with the mean and this variance gives the limits.
     """
     spread = np.sqrt(2.0 * square).sum(axis=1)
     expected = float(mean.sum())

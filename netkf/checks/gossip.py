@@ -57,26 +57,26 @@ from netkf.theory.gossip.matchings import effective_matching
 from netkf.trace.run import Run
 
 WINDOW = 40
-"""Last readings of a pair from which its bound is computed."""
+"""Number of last readings of a pair from which its bound is computed."""
 UNKNOWN = 1e9
-"""Root of a covariance that is above all others: nothing is known of the state."""
+"""Standard deviation of each state that stands for an unknown state."""
 FAR_START = 30.0
-"""Factor of the roots of P(0) in the other start, about a thousand times the covariance."""
+"""Factor on the roots of P(0) in a second start, whose covariance is about 1000 times larger."""
 MIN_TOKENS = 100
-"""Chains that start at one node below which their law is not compared."""
-BOUND_TOLERANCE = 1e-8  # of P, relative: roundings of a long product
+"""Number of chains that start at one node below which their law is not compared."""
+BOUND_TOLERANCE = 1e-8  # of P, relative: rounding of a long product
 PROBABILITY_TOLERANCE = 0.05  # of a probability: smaller errors change no conclusion
 
 
 @dataclass(frozen=True, eq=False)
 class GossipSummary(ReplicaSummary):
-    """Adds values at the K slots and at the last one; ``replayed`` is what G (10) makes of the
-    swaps.
+    """Adds values at the K slots and at the last one; ``replayed`` is the recursion G (10) along
+    the swaps of the run.
 
-    bounds    : (K, N, n, n) bounds by the last readings of each pair, for any state before them
+    bounds    : (K, N, n, n) covariances from the last WINDOW readings of each pair alone
     tokens    : (N, n, n) covariance of each token at the last slot; arbitrary if pairs were copied
-    moves     : number of slots, from slot 1 on, in which j handed its pair to i, for each pair of
-                ``_pairs_to_count``
+    moves     : number of slots, from slot 1 on, in which j handed its pair to i, for each (i, j) of
+                :func:`_pairs_to_count`
     slots     : number of slots counted in ``moves``
     """
 
@@ -125,21 +125,24 @@ def _pairs_to_count(scenario: Scenario) -> tuple[IntArray, IntArray]:
 
 
 def _count_moves(scenario: Scenario, sources: np.ndarray) -> np.ndarray:
-    """Return the number of slots (rows of ``sources``) in which j handed its pair to i."""
+    """Return the number of slots in which j handed its pair to i, for each (i, j) of
+    :func:`_pairs_to_count`; ``sources`` (slots, N) as :func:`pair_sources` returns it.
+    """
     size = len(scenario.nodes)
     codes, counts = np.unique(np.arange(size) * size + sources, return_counts=True)
     i, j = _pairs_to_count(scenario)
     if not len(codes):
         return np.zeros(len(i), dtype=int)
-    found = np.minimum(np.searchsorted(codes, i * size + j), len(codes) - 1)
-    return np.where(codes[found] == i * size + j, counts[found], 0)
+    positions = np.minimum(np.searchsorted(codes, i * size + j), len(codes) - 1)
+    return np.where(codes[positions] == i * size + j, counts[positions], 0)
 
 
 class ChainSamples(NamedTuple):
-    """S switched chains of G (20).
+    """S simulations of the switched chain of G (20): a pair whose node is a Markov chain with
+    transition matrix Abar, and whose covariance that node's reading updates.
 
     P         : (K, S, n, n) covariances at the K slots
-    restarted : (S, n, n) covariances at the last slot from another start
+    restarted : (S, n, n) covariances at the last slot from a start about 1000 times larger
     positions : (S, slots) node of each chain in each slot
     """
 
@@ -150,33 +153,35 @@ class ChainSamples(NamedTuple):
 
 @dataclass(frozen=True)
 class GossipSamples(RunSamples):
-    """Adds samples of the switched chain, with which the laws of the runs are compared."""
+    """Adds samples of the switched chain, the reference for the laws of the runs."""
 
     @cached_property
     def matching(self) -> FloatArray:
-        """Abar (N, N) with the losses of the channel."""
+        """Mean matching Abar (N, N), with the losses of the channel."""
         return effective_matching(self.scenario)
 
     @cached_property
     def reference(self) -> ChainSamples:
         """Samples of the switched chain of G (20)."""
         cls: Any = type(self)
-        found: ChainSamples = kept_reference(cls, self.scenario, self.seed)
-        return found
+        chains: ChainSamples = kept_reference(cls, self.scenario, self.seed)
+        return chains
 
     def draw_reference(self) -> ChainSamples:
-        """Return new samples of the switched chain, which do not depend on the runs."""
+        """Return the samples of :attr:`reference`, drawn from a stream of their own."""
         slots = list(check_slots(self.scenario))
         return self._draw_paths("switched chain", slots, reference_count(self.scenario, 1))
 
     def _draw_paths(self, purpose: str, slots: list[int], count: int) -> ChainSamples:
-        """Return samples of the chain after the given numbers of slots."""
+        """Return ``count`` chains after the given numbers of ``slots``; ``purpose`` names their
+        stream.
+        """
         starts, random = initial_roots(self.scenario), Streams(self.seed).generator(purpose)
         positions = _draw_chains(self.matching, slots[-1], count, random)
-        table, first = gossip_modes(self.scenario), starts[positions[:, 0]]
-        far = FAR_START * first + np.eye(first.shape[-1])
-        restarted = table.covariances(far, positions, slots[-1:])[0]
-        return ChainSamples(table.covariances(first, positions, slots), restarted, positions)
+        table, start_roots = gossip_modes(self.scenario), starts[positions[:, 0]]
+        larger_roots = FAR_START * start_roots + np.eye(start_roots.shape[-1])
+        restarted = table.covariances(larger_roots, positions, slots[-1:])[0]
+        return ChainSamples(table.covariances(start_roots, positions, slots), restarted, positions)
 
     def later(self, slots: int) -> ChainSamples:
         """Return a few samples after half of ``slots`` and after all of them."""
@@ -186,56 +191,63 @@ class GossipSamples(RunSamples):
 def _draw_chains(
     matching: FloatArray, slots: int, count: int, random: np.random.Generator
 ) -> np.ndarray:
-    """Return positions (count, slots) of stationary Markov chains with transition matrix Abar."""
-    rows = np.cumsum(matching, axis=1)
+    """Return positions (count, slots) of stationary Markov chains with transition matrix
+    ``matching`` (N, N), by inversion of its cumulative rows.
+    """
+    cumulative = np.cumsum(matching, axis=1)
     positions = np.empty((count, slots), dtype=int)
     # Abar is doubly stochastic, so the uniform law is stationary.
     positions[:, 0] = random.integers(len(matching), size=count)
     for t in range(1, slots):
-        draws = random.random(count)[:, None]
-        after = (draws >= rows[positions[:, t - 1]]).sum(axis=1)
-        positions[:, t] = np.minimum(after, len(matching) - 1)
+        uniforms = random.random(count)[:, None]
+        next_node = (uniforms >= cumulative[positions[:, t - 1]]).sum(axis=1)
+        positions[:, t] = np.minimum(next_node, len(matching) - 1)
     return positions
 
 
 def _walks_bound(samples: GossipSamples, level: float) -> Finding:
-    """Compare P with its bound by the last readings of the pair, G Lemma 14."""
+    """Check P <= bound, the covariance from the last WINDOW readings of the pair, G Lemma 14."""
     P, bound = samples.runs.P, samples.runs.bounds
     size = np.trace(bound, axis1=-2, axis2=-1)
     with np.errstate(invalid="ignore"):
         gap = np.where(np.isfinite(P), bound - P, -np.inf)
         finite = np.isfinite(gap).all(axis=(-1, -2))
-    below = np.full(finite.shape, np.inf)
-    below[finite] = np.maximum(-np.linalg.eigvalsh(gap[finite])[..., 0], 0.0)
+    shortfall = np.full(finite.shape, np.inf)
+    shortfall[finite] = np.maximum(-np.linalg.eigvalsh(gap[finite])[..., 0], 0.0)
     detected = size < UNKNOWN
     largest = f"{size[detected].max():.4g}" if detected.any() else "none"
     message = (
         f"in {detected.mean():.0%} of all cases the last {WINDOW} readings detect the state; "
         f"largest trace of the bounds that they give: {largest}"
     )
-    # The root of the bound is computed from one of size UNKNOWN, and has the roundings of that.
+    # The root of the bound is computed from one of size UNKNOWN, whose rounding errors it inherits.
     terms = np.maximum(UNKNOWN * np.sqrt(size), samples.largest_terms(P))
     limits = size, terms, BOUND_TOLERANCE
-    found = compare_identities(below, *limits, message)
-    return with_departure(found, samples, below, limits)
+    finding = compare_identities(shortfall, *limits, message)
+    return with_departure(finding, samples, shortfall, limits)
 
 
 def _tokens_move(samples: GossipSamples, level: float) -> Finding:
-    """Compare counts of moves with Abar; slots are independent, so counts are binomial."""
+    """Test the null hypothesis that j hands its pair to i with probability Abar_ij, independently
+    in each slot: then the numbers of moves are binomial.
+    """
     i, j = _pairs_to_count(samples.scenario)
     trials, totals = int(np.sum(samples.runs.slots)), samples.runs.moves.sum(axis=0)
     nodes = samples.scenario.nodes
-    found = []
+    intervals = []
     for a, b, total in zip(i.tolist(), j.tolist(), totals, strict=True):
-        moved = probability_interval(int(total), trials, level / len(i))
-        deviation = deviation_interval(samples.matching[a, b], moved)
-        found.append((deviation, f"from node {nodes[b]} to {nodes[a]}"))
+        probability = probability_interval(int(total), trials, level / len(i))
+        distance = deviation_interval(samples.matching[a, b], probability)
+        intervals.append((distance, f"from node {nodes[b]} to {nodes[a]}"))
     message = f"largest difference from Abar over {trials:,} slots"
-    return find_largest(found, PROBABILITY_TOLERANCE, message)
+    return find_largest(intervals, PROBABILITY_TOLERANCE, message)
 
 
 def _random_sensor(samples: GossipSamples, level: float) -> Finding:
-    """Compare a sensor of each run, drawn for each slot, with the switched chain, G (67)."""
+    """Compare the law of P at a random sensor with that of the switched chain, G (67).
+
+    The sensor is drawn anew for each run and slot, so that each run gives one independent value.
+    """
     random = Streams(samples.seed).generator("random sensor")
     runs, nodes = np.arange(samples.count), len(samples.scenario.nodes)
     picks = random.integers(nodes, size=(len(check_slots(samples.scenario)), samples.count))
@@ -260,28 +272,29 @@ def _each_sensor(samples: GossipSamples, level: float) -> Finding:
 
 
 def _sensors_together(samples: GossipSamples, level: float) -> Finding:
-    """Compare P(tr P_n >= x) at all sensors with the switched chain, at every time and for all x.
+    """Compare P(tr P_n >= x) at all sensors n with the switched chain, at every time and for all x.
 
-    Their mean over the sensors is that of the chain, G (67), which gives (28) and (29) in the
-    limit; so none exceeds N times that of the chain, (27).
+    Its mean over the sensors equals that of the chain, G (67), which gives (28) and (29) in the
+    limit; hence it exceeds N times that of the chain at no sensor, (27). Both comparisons use bands
+    around empirical distribution functions (:func:`band_width`).
     """
     traces = np.trace(samples.runs.P, axis1=-2, axis2=-1)
     expected = np.trace(samples.reference.P, axis1=-2, axis2=-1)
     N, share = traces.shape[2], level / (2 * traces.shape[1])
     widths = band_width(len(traces), share / N), band_width(expected.shape[1], share)
-    found = []
+    intervals = []
     for k, slot in enumerate(check_slots(samples.scenario)):
         points = round_digits(np.concatenate([traces[:, k].ravel(), expected[k]]))
         law = _share_from(expected[k], points)
-        each = np.array([_share_from(traces[:, k, i], points) for i in range(N)])
-        together = float(np.abs(each.mean(axis=0) - law).max())
-        most = float(np.maximum(each / N - law, 0.0).max())
+        shares = np.array([_share_from(traces[:, k, i], points) for i in range(N)])
+        mean_distance = float(np.abs(shares.mean(axis=0) - law).max())
+        largest_excess = float(np.maximum(shares / N - law, 0.0).max())
         for value, width, name in (
-            (together, sum(widths), "all sensors together"),
-            (most, widths[0] / N + widths[1], "one sensor's over N"),
+            (mean_distance, sum(widths), "all sensors together"),
+            (largest_excess, widths[0] / N + widths[1], "one sensor's over N"),
         ):
-            found.append((band_around(value, width), f"at slot {slot}, {name}"))
-    return find_largest(found, LAW_TOLERANCE, "largest excess of P(tr P_n >= x)")
+            intervals.append((band_around(value, width), f"at slot {slot}, {name}"))
+    return find_largest(intervals, LAW_TOLERANCE, "largest excess of P(tr P_n >= x)")
 
 
 def _share_from(values: FloatArray, points: FloatArray) -> FloatArray:
@@ -291,56 +304,60 @@ def _share_from(values: FloatArray, points: FloatArray) -> FloatArray:
 
 
 def _check_tokens(samples: GossipSamples, level: float) -> Finding:
-    """Compare each token at the end with the stationary switched chain, and to see if the horizon
-    is too short with the chain that starts where the token does.
+    """Compare the law of each token at the end with that of the stationary switched chain.
+
+    Chains that start where the token does have the exact law at this time; their distance from the
+    stationary one tells whether the horizon is long enough.
     """
     last, pairs = len(check_slots(samples.scenario)) - 1, []
-    everywhere, origin = samples.reference.P[last], samples.reference.positions[:, 0]
+    chain, origin = samples.reference.P[last], samples.reference.positions[:, 0]
     for i, node in enumerate(samples.nodes):
-        own = samples.runs.tokens[:, i]
-        pairs.append(Pair(f"token {node}", own, everywhere, everywhere[origin == i]))
-    found = compare_laws(pairs, level, samples.first_trace)
-    return with_horizon(samples, found, _token_memory, LAW_TOLERANCE) if found.early else found
+        token_covariances = samples.runs.tokens[:, i]
+        pairs.append(Pair(f"token {node}", token_covariances, chain, chain[origin == i]))
+    finding = compare_laws(pairs, level, samples.first_trace)
+    return with_horizon(samples, finding, _token_memory, LAW_TOLERANCE) if finding.early else finding
 
 
 def _check_initial_condition(samples: GossipSamples, level: float) -> Finding:
-    """Compare each sensor at the end with the chain that is there and started a thousand times
-    larger.
+    """Compare the law at each sensor at the end with that of chains at this sensor that started
+    with a covariance about 1000 times larger.
     """
     P, restarted, positions = samples.reference
     pairs = []
     for i, node in enumerate(samples.nodes):
         here = positions[:, -1] == i
         pairs.append(Pair(f"node {node}", samples.runs.P[:, -1, i], restarted[here], P[-1, here]))
-    found = compare_laws(pairs, level, samples.first_trace)
-    return with_horizon(samples, found, _start_memory, LAW_TOLERANCE) if found.early else found
+    finding = compare_laws(pairs, level, samples.first_trace)
+    return with_horizon(samples, finding, _start_memory, LAW_TOLERANCE) if finding.early else finding
 
 
 def _check_bounded(samples: GossipSamples, level: float) -> Finding:
-    """Compare the growth of the law of P at each sensor with that of the chain that is there."""
-    runs, (drawn, _, positions) = samples.runs.P, samples.reference
+    """Compare the growth of the law of P at each sensor with that of the chains at this sensor."""
+    runs, (chain, _, positions) = samples.runs.P, samples.reference
     half = check_slots(samples.scenario)[-2]
     pairs, expected = [], []
     for i, node in enumerate(samples.nodes):
         pairs.append(Pair(f"node {node}", runs[:, -2, i], runs[:, -1, i]))
-        before, after = positions[:, half - 1] == i, positions[:, -1] == i
-        expected.append((drawn[-2, before], drawn[-1, after]))
-    found = compare_growth(pairs, expected, level)
-    return with_horizon(samples, found, _growth_of, LAW_TOLERANCE) if found.early else found
+        at_half, at_end = positions[:, half - 1] == i, positions[:, -1] == i
+        expected.append((chain[-2, at_half], chain[-1, at_end]))
+    finding = compare_growth(pairs, expected, level)
+    return with_horizon(samples, finding, _growth_of, LAW_TOLERANCE) if finding.early else finding
 
 
 def _growth_of(chain: ChainSamples) -> float:
-    """Return the growth of the law at a random sensor."""
+    """Return the growth of the law of the chain between the last two numbers of slots."""
     return max(interval.value for interval in growth(chain.P[-2], chain.P[-1], 0.5))
 
 
 def _start_memory(chain: ChainSamples) -> float:
-    """Return the distance of the law at a random sensor from that of another start."""
+    """Return the distance between the laws of the chain at the last slot from the two starts."""
     return float(diagonal_distances(chain.P[-1], chain.restarted).max())
 
 
 def _token_memory(chain: ChainSamples) -> float:
-    """Return the largest distance of the law of a token from that of all."""
+    """Return the largest distance between the law of chains that start at one node and that of all
+    chains, at the last slot; nan if all nodes have fewer than MIN_TOKENS chains.
+    """
     last, origin = chain.P[-1], chain.positions[:, 0]
     starts = [start for start in np.unique(origin) if (origin == start).sum() >= MIN_TOKENS]
     return max(
@@ -449,11 +466,11 @@ class GossipChecks(PaperChecks):
         """Return the assumptions of the tests beyond those of G."""
         try:
             effective_matching(scenario)
-            known, why = True, "drawn afresh in each slot, and lost with a known probability"
+            is_known, evidence = True, "drawn afresh in each slot, and lost with a known probability"
         except TheoryError as error:
-            known, why = False, str(error)
+            is_known, evidence = False, str(error)
         return [
-            Assumption("slots are independent and Abar is known", "G II-A", known, why),
+            Assumption("slots are independent and Abar is known", "G II-A", is_known, evidence),
             exact_start(scenario),
             few_errors(scenario),
             all_sampled(scenario),

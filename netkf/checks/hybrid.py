@@ -43,15 +43,15 @@ from netkf.theory.numerics.matrices import undetectable_mode
 BOUND_TOLERANCE, SLOPE_TOLERANCE = 0.1, 0.3
 """Tolerated relative excess over the bound, and error of the exponent of the distance to S."""
 DISTANCE_TOLERANCE = 1e-7
-"""Relative distance of the steady bound from S to which both are computed."""
+"""Relative accuracy of the distance between the steady bound and S."""
 STEADY_TOLERANCE, MAX_TIME = 0.01, 1e5
-"""Relative distance from the steady bound that counts as reached, and seconds to wait for it."""
-
+"""Relative distance from the steady bound that counts as reached, and largest factor on the
+horizon.
+"""
 GAIN_TOLERANCE = 1e-6
-"""Relative distance below zero that the numerical integration of two bounds explains."""
-
+"""Relative error of the difference of two bounds from their numerical integration."""
 MAX_DENSE = 200
-"""Nodes up to which all eigenvalues of the coupling are computed."""
+"""Largest number of nodes for which all eigenvalues of the coupling are computed."""
 
 
 @dataclass(frozen=True)
@@ -62,12 +62,15 @@ class HybridSamples(RunSamples):
     def bound(self) -> FloatArray:
         """The bound (K, N, n, n) of H (12) at the sampled nodes."""
         times = np.array(check_times(self.scenario))
-        whole = covariance_bound(with_promised_filter(self.scenario), times)
-        return whole[:, sampled_indices(self.scenario)]
+        all_nodes = covariance_bound(with_promised_filter(self.scenario), times)
+        return all_nodes[:, sampled_indices(self.scenario)]
 
 
 def _variance_exists(scenario: Scenario) -> Assumption:
-    """Return the assumption that P has a variance, without which no interval for its mean holds."""
+    """Return the assumption that P has a variance, without which no interval for its mean holds.
+
+    It holds if every node detects the state alone, and otherwise if second moments of P decay.
+    """
     name, source = "the covariance has a variance", "derived"
     unobserved = [
         node
@@ -75,8 +78,8 @@ def _variance_exists(scenario: Scenario) -> Assumption:
         if undetectable_mode(model.A, model.H.T @ np.linalg.solve(model.R, model.H)) is not None
     ]
     if not unobserved:
-        why = "every node detects the state by itself, so P is bounded"
-        return Assumption(name, source, True, why)
+        evidence = "every node detects the state by itself, so P is bounded"
+        return Assumption(name, source, True, evidence)
     problem = (
         f"node {unobserved[0]} is blind to a mode that grows, and without a variance no interval "
         "holds"
@@ -85,54 +88,57 @@ def _variance_exists(scenario: Scenario) -> Assumption:
         rate = second_moment_rate(scenario)
     except TheoryError as error:
         return Assumption(name, source, None, f"not decided: {error}; {problem}")
-    why = f"second moments change at rate {rate:.3g} per second"
-    return Assumption(name, source, rate < 0.0, why if rate < 0.0 else f"{why}; {problem}")
+    evidence = f"second moments change at rate {rate:.3g} per second"
+    return Assumption(name, source, rate < 0.0, evidence if rate < 0.0 else f"{evidence}; {problem}")
 
 
 def _mean_below_bound(samples: HybridSamples, level: float) -> Finding:
-    """Compare the mean of P with H (12), in all directions at once and relative to the bound."""
+    """Test E[P] <= calP of H (12): at each point the largest eigenvalue of the mean of P relative
+    to the bound is at most 1. Points share the level.
+    """
     P, bound = samples.runs.P, samples.bound
     _, times, nodes = P.shape[:3]
     share = level / (times * nodes)
-    found = []
+    intervals = []
     for k in range(times):
         for i in range(nodes):
             excess = _relative_excess(P[:, k, i], bound[k, i], share)
             if excess is not None:
-                found.append((excess, f"at {samples.point_labels[k * nodes + i]}"))
-    if not found:
+                intervals.append((excess, f"at {samples.point_labels[k * nodes + i]}"))
+    if not intervals:
         return Finding((0.0, 0.0, 0.0), BOUND_TOLERANCE, "the bound is singular everywhere")
     message = "largest excess of the mean of P over the bound, relative,"
-    return find_largest(found, BOUND_TOLERANCE, message)
+    return find_largest(intervals, BOUND_TOLERANCE, message)
 
 
 def _relative_excess(P: FloatArray, bound: FloatArray, level: float) -> Interval | None:
-    """Return an interval for the largest eigenvalue of E[P] relative to ``bound``, less 1; P is
-    (R, n, n). None if the bound is singular.
+    """Return an interval for the largest eigenvalue of E[P] relative to ``bound`` (n, n), less 1,
+    from samples ``P`` (R, n, n); None if the bound is singular.
     """
     values, vectors = np.linalg.eigh(bound)
     if not values[0] > 1e-12 * values[-1]:
         return None
     white = vectors / np.sqrt(values)
     ratio = eigenvalue_interval(white.T @ P @ white, level)
-    # A reset that so few runs have not shown may take P to 0; it is as rare as this.
+    # An event of probability up to log(1 / level) / R may have occurred in no run. It could bring P
+    # down to 0, so that the lower limit of E[P] is reduced by this share.
     unseen = min(1.0, math.log(1.0 / level) / len(P))
     return affine(ratio, 1.0, -1.0)._replace(low=ratio.low * (1.0 - unseen) - 1.0)
 
 
 def _bound_settles(samples: HybridSamples, level: float) -> Finding:
-    """Compare the bound of H (12) after ever longer times with its steady solution."""
+    """Compute the bound of H (12) at 10, 100, ... horizons and compare it with its steady state."""
     promised = with_promised_filter(samples.scenario)
-    steady_bound, apart, factor = steady_covariance_bound(promised), np.inf, 1.0
-    while apart > STEADY_TOLERANCE and factor < MAX_TIME:
+    steady_bound, distance, factor = steady_covariance_bound(promised), np.inf, 1.0
+    while distance > STEADY_TOLERANCE and factor < MAX_TIME:
         factor *= 10.0
-        late = covariance_bound(promised, np.array([factor * samples.scenario.horizon]))[0]
-        apart = float(np.abs(late - steady_bound).max() / np.abs(steady_bound).max())
+        bound = covariance_bound(promised, np.array([factor * samples.scenario.horizon]))[0]
+        distance = float(np.abs(bound - steady_bound).max() / np.abs(steady_bound).max())
     message = (
         f"computed, not simulated: the bound at {factor:g} horizons differs from its steady state "
-        f"by {apart:.1e} of the largest entry"
+        f"by {distance:.1e} of the largest entry"
     )
-    margin = STEADY_TOLERANCE - apart
+    margin = STEADY_TOLERANCE - distance
     return Finding((margin, margin, margin), 0.0, message, early=margin < 0.0)
 
 
@@ -140,23 +146,23 @@ def _bound_approaches_limit(samples: HybridSamples, level: float) -> Finding:
     """Compute the exponent of the distance between the steady bound and S: -1 for fast links."""
     promised = with_promised_filter(samples.scenario)
     S, first = limit_covariance(promised), _mixing_factor(promised)
-    apart = []
+    distances = []
     for factor in (first, 10.0 * first):
         bound = steady_covariance_bound(_with_faster_links(promised, factor))
-        apart.append(float(np.linalg.norm(bound - S, axis=(1, 2)).max()))
+        distances.append(float(np.linalg.norm(bound - S, axis=(1, 2)).max()))
     size = float(np.linalg.norm(S, axis=(-2, -1)).max())
-    if apart[-1] <= DISTANCE_TOLERANCE * size:
+    if distances[-1] <= DISTANCE_TOLERANCE * size:
         message = (
             f"computed, not simulated: with rates {first:.3g} and {10.0 * first:.3g} times larger "
-            f"the distance is {apart[0]:.1e} and {apart[1]:.1e}, no more than S is known to"
+            f"the distance is {distances[0]:.1e} and {distances[1]:.1e}, no more than S is known to"
         )
         return Finding((0.0, 0.0, 0.0), SLOPE_TOLERANCE, message)
-    slope = float(np.log10(apart[1] / apart[0]))
-    # The distance is at most a constant over the rate: it may well vanish faster.
+    slope = float(np.log10(distances[1] / distances[0]))
+    # The theorem bounds the distance by a constant over the rate: faster decay is allowed.
     margin = -max(0.0, slope + 1.0)
     message = (
         f"computed, not simulated: with rates {first:.3g} and {10.0 * first:.3g} times larger the "
-        f"distance is {apart[0]:.3g} and {apart[1]:.3g}, exponent {slope:.3f}"
+        f"distance is {distances[0]:.3g} and {distances[1]:.3g}, exponent {slope:.3f}"
     )
     if margin < -SLOPE_TOLERANCE:  # no run shows it, so that no filter can have broken it
         return find_unknown(f"{message}: the exponent is that of faster links", SLOPE_TOLERANCE)
@@ -164,24 +170,27 @@ def _bound_approaches_limit(samples: HybridSamples, level: float) -> Finding:
 
 
 def _constant_gains_are_worse(samples: HybridSamples, level: float) -> Finding:
-    """Compare the bound of H (12) with the bound for the constant gains of its steady state."""
+    """Check that H (12) is at most the bound for the constant gains of its steady state."""
     promised, times = (
         with_promised_filter(samples.scenario),
         np.array(check_times(samples.scenario)),
     )
-    ours, constant = covariance_bound(promised, times), constant_gain_bound(promised, times)
-    size = np.trace(ours, axis1=-2, axis2=-1)
-    least = np.linalg.eigvalsh(constant - ours)[..., 0] / np.maximum(size, 1e-300)
-    more = np.trace(constant, axis1=-2, axis2=-1) / np.maximum(size, 1e-300) - 1.0
+    time_varying, constant = covariance_bound(promised, times), constant_gain_bound(promised, times)
+    size = np.trace(time_varying, axis1=-2, axis2=-1)
+    smallest_eigenvalue = np.linalg.eigvalsh(constant - time_varying)[..., 0] / np.maximum(size, 1e-300)
+    trace_excess = np.trace(constant, axis1=-2, axis2=-1) / np.maximum(size, 1e-300) - 1.0
     message = (
-        f"computed, not simulated: constant gains have a trace larger by up to {more.max():.2%} "
+        f"computed, not simulated: constant gains have a trace larger by up to {trace_excess.max():.2%} "
         "at the times looked at, and the same steady state"
     )
-    return find_identity(float(max(0.0, -least.min())), GAIN_TOLERANCE, message)
+    return find_identity(float(max(0.0, -smallest_eigenvalue.min())), GAIN_TOLERANCE, message)
 
 
 def _mixing_factor(scenario: Scenario) -> float:
-    """Return a factor of the rates that makes mixing 100 times faster than all else."""
+    """Return a factor on the rates of links that makes mixing 100 times faster than the filters.
+
+    The speed (1/s) of a filter is bounded by |A| + |S| |H' V^-1 H|.
+    """
     S, slowest = limit_covariance(scenario), _slowest_mixing(coupling(scenario))
     models = {id(model): model for model in scenario.models}.values()  # nodes share them
     speeds = [
@@ -212,8 +221,8 @@ def _slowest_mixing(mixing: scipy.sparse.csr_array) -> float:
 
 @lru_cache(maxsize=8)
 def _with_faster_links(scenario: Scenario, factor: float) -> Scenario:
-    """Return the scenario with all rates of links multiplied, the same object for each call: its
-    tables take time. Raises TheoryError without rates.
+    """Return the scenario with all rates of links multiplied by ``factor``; cached, because its
+    tables take time. Raises TheoryError if the clocks have no rate.
     """
     clock = scenario.network.activation
     if not isinstance(clock, (Poisson, Renewal)) or clock.rate is None:
@@ -299,9 +308,9 @@ class HybridChecks(PaperChecks):
     def assumptions(self, scenario: Scenario) -> list[Assumption]:
         """Return the assumptions of the tests beyond those of H."""
         promised = with_promised_filter(scenario)
-        why = reason_without_bound(promised)
+        reason = reason_without_bound(promised)
         return [
-            Assumption("H(12) speaks about the scenario", "H (12)", why is None, why or "it does"),
+            Assumption("H(12) speaks about the scenario", "H (12)", reason is None, reason or "it does"),
             exact_start(scenario),
             few_errors(scenario),
             _variance_exists(promised),
@@ -323,27 +332,27 @@ class HybridChecks(PaperChecks):
 
 
 def _settling_rows(scenario: Scenario) -> list[Assumption]:
-    """Return the assumption that H(12) has a steady state, or nothing if that is not known."""
+    """Return the assumption that H(12) has a steady state; empty if that cannot be decided."""
     try:
         settles = has_steady_state(scenario)
     except TheoryError:
         return []
-    why = "links are fast enough"
+    evidence = "links are fast enough"
     if not settles:
         try:
             steady_covariance_bound(scenario)
         except TheoryError as error:
-            why = f"H Proposition 4 is false here: {error}"
-    return [Assumption("H(12) has a steady state", "H (12), (16)", settles, why)]
+            evidence = f"H Proposition 4 is false here: {error}"
+    return [Assumption("H(12) has a steady state", "H (12), (16)", settles, evidence)]
 
 
 def _require_known_steadiness(scenario: Scenario) -> None:
-    """Raise TheoryError if it is not known whether the bound has a steady state."""
+    """Raise TheoryError if it cannot be decided whether the bound has a steady state."""
     has_steady_state(scenario)
 
 
 def _constant_gains(scenario: Scenario) -> None:
-    """Raise TheoryError if there is no bound with constant gains to compare with."""
+    """Raise TheoryError if there is no bound with constant gains other than H (12) itself."""
     if not scenario.filter.algorithm.talks:
         raise TheoryError("without messages the gains are those of Kalman-Bucy filters")
     if has_steady_state(scenario):

@@ -65,26 +65,26 @@ from netkf.trace.run import Run
 from netkf.trace.schema import CODES
 
 FAR_START = 30.0
-"""Factor of the roots of P(0) in the other start, about a thousand times the covariance."""
+"""Factor on the roots of P(0) in a second start, whose covariance is about 1000 times larger."""
 BOUND_TOLERANCE, SUPPORT_TOLERANCE = 1e-8, 1e-6
 PROBABILITY_TOLERANCE = 0.05
 MAX_PATHS = 2000
-"""Paths with independent arrivals whose averages over the slots are compared."""
+"""Number of reference paths whose averages over the slots are compared with those of the runs."""
 CELLS = 12
-"""Cells between the holes of the scalar law that are counted; longer outages are one cell."""
+"""Number of cells between holes of the scalar law; all longer outages form one further cell."""
 Direction = tuple[int, int]
 
 
 @dataclass(frozen=True, eq=False)
 class IntermittentSummary(ReplicaSummary):
-    """Adds values at the last slot and counts of the D directions that can carry readings;
-    ``replayed`` is what R (15)-(18) makes of the arrivals.
+    """Adds values at the last slot, and counts for the D directions that can carry readings.
 
-    in_support : (N, n, n) P by the same arrivals from P* of each node
-    spread     : (N,) trace of the difference between P by the same arrivals from a start above all
-                 others and from 0: every other start leads between these two
-    averages   : (N,) averages of 1 / (1 + tr P) over the second half of the slots, by the same
-                 arrivals
+    ``replayed`` is the recursion R (15)-(18) along the arrivals of the run. Along the same arrivals:
+
+    in_support : (N, n, n) P from the start P* of each node: a point of the support, R Theorem 10
+    spread     : (N,) trace of the difference between P from a very large start and P from 0; the
+                 recursion is monotone, so that any other start ends between these two
+    averages   : (N,) averages of 1 / (1 + tr P) over the second half of the slots
     sent, arrived : (D,) readings sent and delivered in time
     """
 
@@ -121,25 +121,26 @@ def _least_roots(scenario: Scenario) -> FloatArray:
 
 
 def _summarise(scenario: Scenario, run: Run) -> IntermittentSummary:
-    """Return the summary of a run: exact errors, and P replayed along the arrivals.
+    """Return the summary of a run: exact errors, and P replayed along its arrivals.
 
-    P is replayed from P(0) and, to the last slot only, from 0 and from far above, which should end
-    close together, and from P*, which should end in the support of the invariant law.
+    P is replayed from P(0) to all checked slots. To the last slot only it is also replayed from 0
+    and from a very large start, which should converge, and from P*, which stays in the support of
+    the invariant law.
     """
     slots = list(check_slots(scenario))
     last = slots[-1:]
     table, sequences, _ = find_arrivals(scenario, run, slots[-1])
     # Roots of the covariances at the start, (W, n, n) each.
     starts = initial_roots(scenario)[sampled_indices(scenario)]
-    least = _least_roots(scenario)
-    far = _roots_above(starts, np.nan_to_num(least))
-    above = table.covariances(far, sequences, last)[0]
-    below = table.covariances(np.zeros(starts.shape), sequences, last)[0]
+    steady_roots = _least_roots(scenario)
+    larger_roots = _roots_above(starts, np.nan_to_num(steady_roots))
+    from_above = table.covariances(larger_roots, sequences, last)[0]
+    from_zero = table.covariances(np.zeros(starts.shape), sequences, last)[0]
     replayed = table.covariances(starts, sequences, slots)
     return IntermittentSummary(
         **vars(summarise_exactly(scenario, run)) | {"replayed": replayed},
-        in_support=table.covariances(least, sequences, last)[0],
-        spread=np.trace(above - below, axis1=-2, axis2=-1),
+        in_support=table.covariances(steady_roots, sequences, last)[0],
+        spread=np.trace(from_above - from_zero, axis1=-2, axis2=-1),
         averages=_path_averages(table, starts, sequences),
         sent=_count_messages(scenario, run, "send", slots[-1]),
         arrived=_count_messages(scenario, run, "deliver", slots[-1]),
@@ -147,14 +148,14 @@ def _summarise(scenario: Scenario, run: Run) -> IntermittentSummary:
 
 
 def _roots_above(*roots: FloatArray) -> FloatArray:
-    """Return roots (W, n, n) of covariances that are larger than those of all given roots."""
+    """Return roots (W, n, n) of FAR_START^2 times the sum of the given covariances, plus I."""
     total = sum(root @ np.swapaxes(root, -1, -2) for root in roots)
     above = FAR_START**2 * total + np.eye(roots[0].shape[-1])
     return np.asarray(np.linalg.cholesky(above), dtype=np.float64)
 
 
 def _count_messages(scenario: Scenario, run: Run, kind: str, slots: int) -> np.ndarray:
-    """Return the number of events of a kind in each direction, (D,)."""
+    """Return the number (D,) of events of a kind in each direction in the first ``slots`` slots."""
     # A message is sent by the node of its row, and delivered to it.
     sender, receiver = ("node", "peer") if kind == "send" else ("peer", "node")
     rows = run.log[run.log["kind"] == CODES[kind]]
@@ -164,20 +165,24 @@ def _count_messages(scenario: Scenario, run: Run, kind: str, slots: int) -> np.n
 
 
 def _path_averages(table: ModeTable, roots: FloatArray, sequences: np.ndarray) -> FloatArray:
-    """Return the averages (K,) of ``1 / (1 + tr P)``, a bounded function with a mean for every law,
-    over the second half of the slots, along each of K sequences of modes.
+    """Return the averages (K,) of ``1 / (1 + tr P)`` over the second half of the slots along each
+    of K sequences of modes (K, slots), from start ``roots`` (K, n, n).
+
+    The function is bounded, so that its mean exists for every law of P.
     """
-    first, found = sequences.shape[1] // 2, []
-    for whole in trace_paths(roots, sequences, *table):
-        path = whole[first:]
-        found.append(float((1.0 / (1.0 + np.einsum("tab,tab->t", path, path))).mean()))
-    return np.array(found)
+    first, averages = sequences.shape[1] // 2, []
+    for all_slots in trace_paths(roots, sequences, *table):
+        path = all_slots[first:]
+        averages.append(float((1.0 / (1.0 + np.einsum("tab,tab->t", path, path))).mean()))
+    return np.array(averages)
 
 
 class ArrivalSamples(NamedTuple):
-    """S filters of each node with arrivals drawn by the stated probabilities: ``P`` (N, K, S, n, n)
-    and ``restarted`` (N, S, n, n) at the last slot from another start, ``averages`` (N, S') over
-    the slots.
+    """S simulated filters of each of N nodes, with arrivals drawn by the stated probabilities.
+
+    P         : (N, K, S, n, n) covariances at the K slots
+    restarted : (N, S, n, n) covariances at the last slot from a start about 1000 times larger
+    averages  : (N, S') averages over the slots of the first S' filters
     """
 
     P: FloatArray
@@ -187,34 +192,34 @@ class ArrivalSamples(NamedTuple):
 
 @dataclass(frozen=True)
 class IntermittentSamples(RunSamples):
-    """Adds filters with independent arrivals, with which the laws of the runs are compared."""
+    """Adds simulated filters with independent arrivals, the reference for the laws of the runs."""
 
     @cached_property
     def reference(self) -> ArrivalSamples:
         """Samples of filters with independent arrivals, R (12)."""
         cls: Any = type(self)
-        found: ArrivalSamples = kept_reference(cls, self.scenario, self.seed)
-        return found
+        arrivals: ArrivalSamples = kept_reference(cls, self.scenario, self.seed)
+        return arrivals
 
     def draw_reference(self) -> ArrivalSamples:
-        """Return new samples of these filters, which do not depend on the runs."""
+        """Return the samples of :attr:`reference`, drawn from streams of their own."""
         count = reference_count(self.scenario, len(self.nodes))
         return self._draw_arrivals("arrivals", list(check_slots(self.scenario)), count, MAX_PATHS)
 
     def _draw_arrivals(
         self, purpose: str, slots: list[int], samples: int, paths: int
     ) -> ArrivalSamples:
-        """Return samples of all nodes after the given numbers of slots, of which the averages over
-        the slots are those of the first ``paths``.
+        """Return ``samples`` filters of each node after the given numbers of ``slots``, with
+        averages over the slots of the first ``paths``; ``purpose`` names their stream.
         """
         sampled = sampled_indices(self.scenario).tolist()
-        found = [self._draw_node(purpose, k, slots, samples, paths) for k in sampled]
-        return ArrivalSamples(*(np.array(values) for values in zip(*found, strict=True)))
+        per_node = [self._draw_node(purpose, k, slots, samples, paths) for k in sampled]
+        return ArrivalSamples(*(np.array(values) for values in zip(*per_node, strict=True)))
 
     def _draw_node(
         self, purpose: str, k: int, slots: list[int], samples: int, paths: int
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return samples (K, S, n, n), (S, n, n) and (S',) of the k-th node."""
+        """Return the fields of ArrivalSamples for the k-th node: (K, S, n, n), (S, n, n), (S',)."""
         scenario = self.scenario
         node = scenario.nodes[k]
         senders = sensing_neighbours(scenario)[node]
@@ -223,20 +228,21 @@ class IntermittentSamples(RunSamples):
             [_delivery_probability(scenario, (sender, node)) for sender in senders]
         )
         arrived = random.random((samples, slots[-1], len(senders))) < probabilities
-        # Only the sets of readings that occur become modes: there may be 2^len(senders).
+        # A set of readings is coded as a bit mask over the senders. Only sets that occur become
+        # modes, since there may be 2^len(senders).
         codes = arrived @ (1 << np.arange(len(senders)))
-        used, sequences = np.unique(codes, return_inverse=True)
-        own = (node,) if node in scenario.placed else ()
+        occurring, sequences = np.unique(codes, return_inverse=True)
+        own_reading = (node,) if node in scenario.placed else ()
         sets = [
-            (*own, *(sender for bit, sender in enumerate(senders) if code >> bit & 1))
-            for code in used.tolist()
+            (*own_reading, *(sender for bit, sender in enumerate(senders) if code >> bit & 1))
+            for code in occurring.tolist()
         ]
         table, sequences = intermittent_modes(scenario, sets), sequences.reshape(codes.shape)
-        first = np.repeat(initial_roots(scenario)[k : k + 1], samples, axis=0)
-        far = FAR_START * first + np.eye(first.shape[-1])
-        restarted = table.covariances(far, sequences, slots[-1:])[0]
-        averages = _path_averages(table, first[:paths], sequences[:paths])
-        return table.covariances(first, sequences, slots), restarted, averages
+        start_roots = np.repeat(initial_roots(scenario)[k : k + 1], samples, axis=0)
+        larger_roots = FAR_START * start_roots + np.eye(start_roots.shape[-1])
+        restarted = table.covariances(larger_roots, sequences, slots[-1:])[0]
+        averages = _path_averages(table, start_roots[:paths], sequences[:paths])
+        return table.covariances(start_roots, sequences, slots), restarted, averages
 
     def later(self, slots: int) -> ArrivalSamples:
         """Return a few samples after half of ``slots`` and after all of them, without averages."""
@@ -256,67 +262,69 @@ def _delivery_probability(scenario: Scenario, direction: Direction) -> float:
 
 
 def _above_least(samples: IntermittentSamples, level: float) -> Finding:
-    """Compare P with the path without losses, which converges to P*: no path is below it."""
+    """Check that no P is below that of the path without losses, which converges to P*."""
     slots = list(check_slots(samples.scenario))
     table, sequences, _ = all_arrivals(samples.scenario, slots[-1])
     starts = initial_roots(samples.scenario)[sampled_indices(samples.scenario)]
-    least = table.covariances(starts, sequences, slots)
+    without_loss = table.covariances(starts, sequences, slots)
     size = np.trace(samples.runs.P, axis1=-2, axis2=-1)
     with np.errstate(invalid="ignore"):
-        gap = np.linalg.eigvalsh(np.nan_to_num(samples.runs.P - least, nan=-np.inf, posinf=-1e300))
-    below = np.maximum(-gap[..., 0], 0.0)
+        gap = np.linalg.eigvalsh(np.nan_to_num(samples.runs.P - without_loss, nan=-np.inf, posinf=-1e300))
+    shortfall = np.maximum(-gap[..., 0], 0.0)
     message = f"{size.size:,} covariances against the path without losses"
     limits = np.nan_to_num(size), samples.largest_terms(samples.runs.P), BOUND_TOLERANCE
-    found = compare_identities(below, *limits, message)
-    return with_departure(found, samples, below, limits)
+    finding = compare_identities(shortfall, *limits, message)
+    return with_departure(finding, samples, shortfall, limits)
 
 
 def _in_support(samples: IntermittentSamples, level: float) -> Finding:
-    """Compare P at the end with the point of the support that its own arrivals lead to.
+    """Compare P at the end with the point of the support to which the same arrivals lead from P*.
 
-    Both lie between what the same arrivals make of a start above all others and of 0, and may
-    differ by the spread of these, which vanishes once the arrivals have made P independent of its
-    start.
+    Both lie between the paths from a very large start and from 0, and may differ by the spread of
+    these two, which vanishes once P has become independent of its start. If no spread has vanished
+    yet, the horizon that would do is extrapolated from the rate at which the median spread decays.
     """
     P, point, spread = samples.runs.P[:, -1], samples.runs.in_support, samples.runs.spread
-    known = np.isfinite(point).all(axis=(0, -1, -2))
-    size = np.trace(point, axis1=-2, axis2=-1)[:, known]
-    converged = spread[:, known] < SUPPORT_TOLERANCE * size
+    finite = np.isfinite(point).all(axis=(0, -1, -2))
+    size = np.trace(point, axis1=-2, axis2=-1)[:, finite]
+    converged = spread[:, finite] < SUPPORT_TOLERANCE * size
     message = (
         f"{converged.sum() / max(1, spread.size):.0%} of the covariances at the end have forgotten "
         "their start and are points of the support"
     )
-    gap = np.maximum(np.abs(P - point).max(axis=(-1, -2)) - np.maximum(spread, 0.0), 0.0)[:, known]
-    least = np.nan_to_num(_least_roots(samples.scenario))
+    gap = np.maximum(np.abs(P - point).max(axis=(-1, -2)) - np.maximum(spread, 0.0), 0.0)[:, finite]
+    steady_roots = np.nan_to_num(_least_roots(samples.scenario))
     starts = initial_roots(samples.scenario)[sampled_indices(samples.scenario)]
-    terms = np.sum(_roots_above(starts, least)[known] ** 2, axis=(-2, -1))
+    terms = np.sum(_roots_above(starts, steady_roots)[finite] ** 2, axis=(-2, -1))
     limits = size, terms, SUPPORT_TOLERANCE
-    found = compare_identities(gap, *limits, message)
-    found = found._replace(replica=first_wrong(gap, *limits))
-    if converged.any() or found.margin[0] < 0.0:
-        return found
+    finding = compare_identities(gap, *limits, message)
+    finding = finding._replace(replica=first_wrong(gap, *limits))
+    if converged.any() or finding.margin[0] < 0.0:
+        return finding
     end = samples.scenario.horizon
     with np.errstate(divide="ignore", invalid="ignore"):
-        left = np.log(FAR_START**2 / np.median(spread[:, known] / size)) if known.any() else 0.0
-    share = math.log(FAR_START**2 / SUPPORT_TOLERANCE) / left if left > 0.0 else math.inf
-    return found._replace(early=True, horizon=1.2 * share * end)
+        log_decay = np.log(FAR_START**2 / np.median(spread[:, finite] / size)) if finite.any() else 0.0
+    share = math.log(FAR_START**2 / SUPPORT_TOLERANCE) / log_decay if log_decay > 0.0 else math.inf
+    return finding._replace(early=True, horizon=1.2 * share * end)
 
 
 def _check_arrival_counts(samples: IntermittentSamples, level: float) -> Finding:
-    """Compare counts of arrivals with R (12); slots are independent, so counts are binomial."""
+    """Test the null hypothesis that readings arrive independently with the stated probability,
+    R (12): then their numbers are binomial.
+    """
     pairs = _heard_directions(samples.scenario)
     sent, arrived = samples.runs.sent.sum(axis=0), samples.runs.arrived.sum(axis=0)
-    found = []
+    intervals = []
     for k, pair in enumerate(pairs):
         share = probability_interval(int(arrived[k]), int(sent[k]), level / len(pairs))
         deviation = deviation_interval(_delivery_probability(samples.scenario, pair), share)
-        found.append((deviation, f"from node {pair[0]} to {pair[1]}"))
+        intervals.append((deviation, f"from node {pair[0]} to {pair[1]}"))
     message = f"largest difference in {int(sent.sum()):,} messages"
-    return find_largest(found, PROBABILITY_TOLERANCE, message)
+    return find_largest(intervals, PROBABILITY_TOLERANCE, message)
 
 
 def _law_of_arrivals(samples: IntermittentSamples, level: float) -> Finding:
-    """Compare each node at each time with filters that have independent arrivals."""
+    """Compare the law of P at each node and time with that of filters with independent arrivals."""
     pairs = [
         Pair(f"slot {slot}, node {node}", samples.runs.P[:, k, i], samples.reference.P[i, k])
         for k, slot in enumerate(check_slots(samples.scenario))
@@ -327,13 +335,13 @@ def _law_of_arrivals(samples: IntermittentSamples, level: float) -> Finding:
 
 def _check_bounded(samples: IntermittentSamples, level: float) -> Finding:
     """Compare the growth of the law of P with that of filters with independent arrivals."""
-    runs, drawn = samples.runs.P, samples.reference.P
+    runs, reference_P = samples.runs.P, samples.reference.P
     pairs = [
         Pair(f"node {node}", runs[:, -2, i], runs[:, -1, i]) for i, node in enumerate(samples.nodes)
     ]
-    expected = [(drawn[i, -2], drawn[i, -1]) for i in range(len(pairs))]
-    found = compare_growth(pairs, expected, level)
-    return with_horizon(samples, found, _growth_of, LAW_TOLERANCE) if found.early else found
+    expected = [(reference_P[i, -2], reference_P[i, -1]) for i in range(len(pairs))]
+    finding = compare_growth(pairs, expected, level)
+    return with_horizon(samples, finding, _growth_of, LAW_TOLERANCE) if finding.early else finding
 
 
 def _check_initial_condition(samples: IntermittentSamples, level: float) -> Finding:
@@ -343,25 +351,25 @@ def _check_initial_condition(samples: IntermittentSamples, level: float) -> Find
         Pair(f"node {node}", samples.runs.P[:, -1, i], restarted[i], P[i, -1])
         for i, node in enumerate(samples.nodes)
     ]
-    found = compare_laws(pairs, level, samples.first_trace)
-    return with_horizon(samples, found, _memory_of, LAW_TOLERANCE) if found.early else found
+    finding = compare_laws(pairs, level, samples.first_trace)
+    return with_horizon(samples, finding, _memory_of, LAW_TOLERANCE) if finding.early else finding
 
 
-def _growth_of(drawn: ArrivalSamples) -> float:
-    """Return the largest growth of a law from the last but one to the last number of slots."""
-    return max(g.value for P in drawn.P for g in growth(P[-2], P[-1], 0.5))
+def _growth_of(reference: ArrivalSamples) -> float:
+    """Return the largest growth (see :func:`growth`) between the last two numbers of slots."""
+    return max(g.value for P in reference.P for g in growth(P[-2], P[-1], 0.5))
 
 
-def _memory_of(drawn: ArrivalSamples) -> float:
-    """Return the largest distance of a law from that of another start."""
-    pairs = zip(drawn.P, drawn.restarted, strict=True)
+def _memory_of(reference: ArrivalSamples) -> float:
+    """Return the largest distance between the laws at the last slot from the two starts."""
+    pairs = zip(reference.P, reference.restarted, strict=True)
     return max(float(diagonal_distances(P[-1], restarted).max()) for P, restarted in pairs)
 
 
 def _averages_of_paths(samples: IntermittentSamples, level: float) -> Finding:
     """Compare averages over the slots of one path with those of paths with independent arrivals."""
     averages, expected = samples.runs.averages, samples.reference.averages
-    found = [
+    intervals = [
         (
             law_distance(averages[:, i], expected[i], level / len(samples.nodes)),
             f"at node {node}",
@@ -373,11 +381,15 @@ def _averages_of_paths(samples: IntermittentSamples, level: float) -> Finding:
         f"{averages.std(axis=0).mean():.2g} in the runs, {expected.mean():.4g} +- "
         f"{expected.std(axis=1).mean():.2g} by the stated law; distance of their laws"
     )
-    return find_largest(found, LAW_TOLERANCE, message)
+    return find_largest(intervals, LAW_TOLERANCE, message)
 
 
 def _outage_factors(scenario: Scenario) -> dict[int, float]:
-    """Return for each sampled node the factor (1 - g) alpha^2 by which outages let E[P] grow."""
+    """Return the factor (1 - g) alpha^2 per slot of each sampled node without a sensor, with g the
+    probability that any reading arrives and alpha the spectral radius of F.
+
+    E[P] diverges if it is 1 or more, R (29), (31): outages alone make it grow by this factor.
+    """
     factors, neighbours = {}, sensing_neighbours(scenario)
     alpha = float(np.abs(np.linalg.eigvals(scenario.slot_belief[0])).max())
     for node in sampled_nodes(scenario):
@@ -394,7 +406,9 @@ def _outage_factors(scenario: Scenario) -> dict[int, float]:
 
 
 def _mean_diverges(samples: IntermittentSamples, level: float) -> Finding:
-    """Compute the lower bound on E[P] of the node that misses most, at the horizon and later."""
+    """Compute the lower bound on E[P] of the node with the largest outage factor, at the horizon
+    and at twice the horizon, and check that it grows.
+    """
     scenario, factors = samples.scenario, _outage_factors(samples.scenario)
     node = max(factors, key=lambda k: factors[k])
     F, Q = scenario.slot_belief
@@ -415,8 +429,8 @@ def _mean_diverges(samples: IntermittentSamples, level: float) -> Finding:
 
 
 def _scalar_laws(scenario: Scenario) -> dict[int, ScalarLaw]:
-    """Return the exact law of P for each sampled node of a scalar scenario that gets its only
-    reading over one link, by the number of the node among the sampled ones.
+    """Return the exact law of P, by index of the sampled node, for the nodes of a scalar scenario
+    that get their only reading over one link.
     """
     laws, neighbours = {}, sensing_neighbours(scenario)
     for k, node in enumerate(sampled_nodes(scenario)):
@@ -434,12 +448,14 @@ def _scalar_laws(scenario: Scenario) -> dict[int, ScalarLaw]:
 
 
 def _outage_counts(samples: IntermittentSamples, level: float) -> Finding:
-    """Compare counts of P between the holes of the support with the exact probabilities.
+    """Test the null hypothesis that P at the end falls between the holes of its support with the
+    exact probabilities.
 
-    An outage of k slots has probability g (1 - g)^k, R Proposition 24; after few slots from a start
-    below P* the law of P at that time says how often P lies in which cell.
+    After an outage of k slots, of probability g (1 - g)^k, P lies between the k-th and the next
+    hole, R Proposition 24. The exact law at the last slot gives the probabilities also when the
+    start still matters. Counts of a cell are binomial; Pearson's p-value is added to the message.
     """
-    laws, found, tests = _scalar_laws(samples.scenario), [], []
+    laws, intervals, tests = _scalar_laws(samples.scenario), [], []
     share = level / (len(laws) * (CELLS + 1))
     for k, law in laws.items():
         edges = _outage_edges(law)
@@ -449,11 +465,11 @@ def _outage_counts(samples: IntermittentSamples, level: float) -> Finding:
         for cell, probability in enumerate(np.diff(below).tolist()):
             interval = probability_interval(int(counts[cell]), int(counts.sum()), share)
             label = f"{cell} slots without a reading, node {samples.nodes[k]}"
-            found.append((deviation_interval(probability, interval), label))
-        p, used = pearson_test(counts, np.diff(below))
-        tests.append(f"chi-square of {used} cells at node {samples.nodes[k]}: p = {p:.3g}")
+            intervals.append((deviation_interval(probability, interval), label))
+        p, cell_count = pearson_test(counts, np.diff(below))
+        tests.append(f"chi-square of {cell_count} cells at node {samples.nodes[k]}: p = {p:.3g}")
     message = f"{'; '.join(tests[:3])}; largest difference of a share from its probability"
-    return find_largest(found, PROBABILITY_TOLERANCE * 2, message)
+    return find_largest(intervals, PROBABILITY_TOLERANCE * 2, message)
 
 
 def _law_at_end(
@@ -478,12 +494,12 @@ def _outage_edges(law: ScalarLaw) -> FloatArray:
 def _scalar_law_exact(samples: IntermittentSamples, level: float) -> Finding:
     """Compare P at the end with its exact distribution function at that time."""
     laws = _scalar_laws(samples.scenario)
-    found = []
+    intervals = []
     for k, law in laws.items():
         cdf, P = _law_at_end(samples, k, law), samples.runs.P[:, -1, k, 0, 0]
-        apart = distance_to_law(cdf, P, level / len(laws))
-        found.append((apart, f"at node {samples.nodes[k]}"))
-    return find_largest(found, LAW_TOLERANCE, "distance from the exact distribution function")
+        distance = distance_to_law(cdf, P, level / len(laws))
+        intervals.append((distance, f"at node {samples.nodes[k]}"))
+    return find_largest(intervals, LAW_TOLERANCE, "distance from the exact distribution function")
 
 
 FRESH, KNOWN = ("readings arrive independently",), ("the filters know", "the filters start")
@@ -587,17 +603,17 @@ class IntermittentChecks(PaperChecks):
     def assumptions(self, scenario: Scenario) -> list[Assumption]:
         """Return the assumptions of the tests beyond those of R."""
         try:
-            known, why = True, "a known probability for each direction"
+            is_known, evidence = True, "a known probability for each direction"
             for direction in _heard_directions(scenario):
                 _delivery_probability(scenario, direction)
         except TheoryError as error:
-            known, why = False, str(error)
+            is_known, evidence = False, str(error)
         # A derived class may choose its broadcasts in any way.
         if type(scenario.network.activation) is not Broadcast:
-            known, why = False, "links are up as recorded"
+            is_known, evidence = False, "links are up as recorded"
         stated = "readings arrive independently, as often as stated"
         return [
-            Assumption(stated, "R (12)", known, why),
+            Assumption(stated, "R (12)", is_known, evidence),
             exact_start(scenario),
             few_errors(scenario),
         ]
@@ -605,8 +621,8 @@ class IntermittentChecks(PaperChecks):
     def promises(self, scenario: Scenario) -> tuple[Promise, ...]:
         """Return the promises about a scenario; more if the exact law of a node is known."""
         grows = max(_outage_factors(scenario).values(), default=0.0) >= 1.0
-        more = (DIVERGES,) if grows else ()
-        return PROMISES + more + (SCALAR if _scalar_laws(scenario) else ())
+        divergence = (DIVERGES,) if grows else ()
+        return PROMISES + divergence + (SCALAR if _scalar_laws(scenario) else ())
 
 
 CHECKS = IntermittentChecks()

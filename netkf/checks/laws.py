@@ -26,11 +26,12 @@ GROWTH = 4.0
 
 
 class Pair(NamedTuple):
-    """Two samples of covariances (S, n, n) and (S', n, n) that should have one law.
+    """Two samples of covariances (S, n, n) and (S', n, n) that should have the same law.
 
-    They may depend on each other. If the promise is about a limit, ``expected`` (S'', n, n) is a
-    sample of the law that ``one`` must have at its own time: only a difference from that breaks
-    the promise, while its distance from ``other`` says how far the limit still is.
+    They may depend on each other. If the promise is about a limit, ``other`` is a sample of the
+    limit law, and ``expected`` (S'', n, n) one of the law that ``one`` should have at its own time.
+    Then only a difference between ``one`` and ``expected`` breaks the promise; the distance of
+    ``expected`` from ``other`` tells whether the limit is reached.
     """
 
     label: str
@@ -42,8 +43,10 @@ class Pair(NamedTuple):
 def find_largest(
     distances: Sequence[tuple[Interval, str]], tolerance: float, message: str
 ) -> Finding:
-    """Return the finding on distances that should all be 0, each with a label and an interval at
-    its share of the level.
+    """Return the finding on labelled distances that should all be 0.
+
+    The reported one has the largest lower limit. The intervals must hold jointly: each at its share
+    of the level.
     """
     chosen, label = max(distances, key=lambda item: (item[0].low, item[0].value))
     widest = max(interval.high for interval, _ in distances)
@@ -51,13 +54,13 @@ def find_largest(
     number = "1 comparison" if len(distances) == 1 else f"{len(distances)} comparisons"
     text = f"{message} in {number}, {label}"
     margin = -chosen.value, -widest, -chosen.low
-    found = Finding(margin, tolerance, text, detectable=detectable)
+    finding = Finding(margin, tolerance, text, detectable=detectable)
 
     def forecast(factor: float) -> float:
         """Return the expected upper end of the largest distance with ``factor`` times the runs."""
         return max(interval.expected_high(factor) for interval, _ in distances)
 
-    return found._replace(seen=chosen.seen, expected=chosen.expected, forecast=forecast)
+    return finding._replace(seen=chosen.seen, expected=chosen.expected, forecast=forecast)
 
 
 EVERYTHING = "all times, nodes and runs together"
@@ -68,13 +71,14 @@ POOLED_TOLERANCE = 0.1
 def pool(
     single: Finding, pooled: Interval, what: str, tolerance: float = POOLED_TOLERANCE
 ) -> Finding:
-    """Return the finding of a row from its single comparisons and one of all of them together.
+    """Return the finding of a row from its single comparisons and one of all values pooled.
 
-    Both have their share of the level. A single comparison that is off is the finding; otherwise
-    the pooled one is, because it says far more precisely how much could be wrong.
+    Each has its share of the level. If only a single comparison is significant, it is the finding;
+    otherwise the pooled one is, whose interval is far narrower. ``what`` describes the pooled
+    values.
     """
-    off = single.margin[2] < 0.0 and not pooled.low > 0.0
-    if off or not pooled.value >= 0.0:
+    single_decides = single.margin[2] < 0.0 and not pooled.low > 0.0
+    if single_decides or not pooled.value >= 0.0:
         return single
     margin = -pooled.value, -pooled.high, -pooled.low
     text = f"{what}; one by one: {single.message}: {max(0.0, -single.margin[0]):.3g}"
@@ -90,33 +94,36 @@ def pool(
 
 
 def _rounding_of(P: FloatArray, start: float) -> float:
-    """Return the size of rounding in entries of covariances P (S, n, n) that were computed from
-    others with traces up to ``start``.
+    """Return the size of rounding errors in entries of covariances P (S, n, n) that were computed
+    from covariances with traces up to ``start``.
     """
     return OPERATIONS * EPS * max(start, float(np.median(np.trace(P, axis1=-2, axis2=-1))))
 
 
 def compare_laws(pairs: Sequence[Pair], level: float, start: float = 0.0) -> Finding:
-    """Compare the laws of pairs of samples, entry by entry of the diagonal: ranks need no moments
-    of the covariances. ``start`` is the largest trace at time 0, of which roundings remain.
+    """Test the null hypothesis that both samples of each pair have the same law.
+
+    Diagonal entries are compared one by one by :func:`law_distance`, which needs no moments, at
+    equal shares of the level. ``start`` is the largest trace at time 0, whose rounding errors
+    remain in P.
     """
     share, early = level / sum(pair.one.shape[-1] for pair in pairs), False
-    found = []
+    intervals = []
     for pair in pairs:
         for k in range(pair.one.shape[-1]):
             one, other = pair.one[:, k, k], pair.other[:, k, k]
             blur = _rounding_of(pair.one, start)
             if pair.expected is None:
-                apart = law_distance(one, other, share, blur)
+                distance = law_distance(one, other, share, blur)
             else:
-                known = pair.expected[:, k, k]
-                low = law_distance(one, known, share / 2.0, blur).low
-                apart = law_distance(one, other, share / 2.0, blur)
-                apart = apart._replace(low=low, high=max(apart.high, low))
-                early |= law_distance(known, other, 0.5).value > LAW_TOLERANCE
-            found.append((apart, f"at {pair.label}, entry {k}"))
-    finding = find_largest(found, LAW_TOLERANCE, "largest distance of distribution functions")
-    differs = any(apart.low > 0.0 for apart, _ in found)
+                limit_law = pair.expected[:, k, k]
+                low = law_distance(one, limit_law, share / 2.0, blur).low
+                distance = law_distance(one, other, share / 2.0, blur)
+                distance = distance._replace(low=low, high=max(distance.high, low))
+                early |= law_distance(limit_law, other, 0.5).value > LAW_TOLERANCE
+            intervals.append((distance, f"at {pair.label}, entry {k}"))
+    finding = find_largest(intervals, LAW_TOLERANCE, "largest distance of distribution functions")
+    differs = any(distance.low > 0.0 for distance, _ in intervals)
     return finding._replace(early=early and not differs)
 
 
@@ -129,12 +136,12 @@ def diagonal_distances(one: FloatArray, other: FloatArray) -> FloatArray:
     )
 
 
-def growth(before: FloatArray, after: FloatArray, level: float) -> list[Interval]:
-    """Return intervals for how far the law of each diagonal entry of ``after`` (S', n, n) exceeds
-    GROWTH times that of ``before`` (S, n, n): largest P(after > GROWTH x) - P(before > x).
+def growth(earlier: FloatArray, later: FloatArray, level: float) -> list[Interval]:
+    """Return an interval for each diagonal entry of two samples of covariances (S, n, n) and
+    (S', n, n): the largest P(later > GROWTH x) - P(earlier > x) over all x.
     """
     return [
-        law_excess(GROWTH * before[:, k, k], after[:, k, k], level) for k in range(before.shape[-1])
+        law_excess(GROWTH * earlier[:, k, k], later[:, k, k], level) for k in range(earlier.shape[-1])
     ]
 
 
@@ -143,57 +150,58 @@ def compare_growth(
     expected: Sequence[tuple[FloatArray, FloatArray] | None],
     level: float,
 ) -> Finding:
-    """Test that the later sample of each pair is stochastically at most GROWTH times the earlier
-    one.
+    """Test the null hypothesis that covariances stay stochastically bounded.
 
-    ``expected``: samples of the laws that both must have, since laws may still grow in a short
-    horizon: only what grows faster than these breaks the promise; None if they are not known, and
-    then nothing does.
+    Under it the later sample of each pair is stochastically at most GROWTH times the earlier one.
+    In a short horizon laws may still grow, so that ``expected`` has samples of the laws that both
+    should have: only faster growth than theirs breaks the promise. Where it is None, growth leaves
+    the row undecided.
     """
     share, early = 0.5 * level / sum(pair.one.shape[-1] for pair in pairs), False
-    found = []
+    intervals = []
     for pair, laws in zip(pairs, expected, strict=True):
         growths = growth(pair.one, pair.other, share)
-        known = growth(*laws, share) if laws is not None else [None] * len(growths)
-        for k, (run, law) in enumerate(zip(growths, known, strict=True)):
+        expected_growths = growth(*laws, share) if laws is not None else [None] * len(growths)
+        for k, (run, law) in enumerate(zip(growths, expected_growths, strict=True)):
             low = max(0.0, run.low - law.high) if law is not None else 0.0
             early |= (law.value if law is not None else run.low) > LAW_TOLERANCE
-            found.append((run._replace(low=low), f"at {pair.label}, entry {k}"))
+            intervals.append((run._replace(low=low), f"at {pair.label}, entry {k}"))
     message = f"largest excess of P(P > {GROWTH:g} J) at the end over P(P > J) at half of the time"
-    finding = find_largest(found, LAW_TOLERANCE, message)
-    differs = any(apart.low > 0.0 for apart, _ in found)
+    finding = find_largest(intervals, LAW_TOLERANCE, message)
+    differs = any(interval.low > 0.0 for interval, _ in intervals)
     return finding._replace(early=early and not differs)
 
 
 def compare_chi_square(
     ratios: FloatArray, freedom: Sequence[float], labels: Sequence[str], level: float, name: str
 ) -> Finding:
-    """Test that squares over their degrees of freedom (R, K) have mean 1.
+    """Test the null hypothesis that squares over their degrees of freedom (R, K) have mean 1.
 
-    The squares of column k, all runs together, are chi-square with ``freedom[k]`` degrees.
+    Under it the sum of the squares of column k over all runs is chi-square with ``freedom[k]``
+    degrees of freedom. Columns that are not finite are left out, and the others share the level.
     """
-    kept = np.flatnonzero(np.isfinite(ratios).all(axis=0))
-    if not len(kept):
+    finite = np.flatnonzero(np.isfinite(ratios).all(axis=0))
+    if not len(finite):
         return find_unknown(f"{name} does not exist: singular or not finite", NEES_TOLERANCE)
-    found = []
-    for k in kept.tolist():
+    intervals = []
+    for k in finite.tolist():
         total = float(ratios[:, k].mean()) * freedom[k]
-        ratio = scale_interval(total, freedom[k], level / len(kept))
-        found.append((deviation_interval(1.0, ratio), f"at {labels[k]}"))
+        ratio = scale_interval(total, freedom[k], level / len(finite))
+        intervals.append((deviation_interval(1.0, ratio), f"at {labels[k]}"))
     message = f"largest relative difference of the mean {name} from its freedom"
-    return find_largest(found, NEES_TOLERANCE, message)
+    return find_largest(intervals, NEES_TOLERANCE, message)
 
 
 def exact_start(scenario: Scenario) -> Assumption:
     """Return the assumption that every filter starts with the mean and the covariance of x(0)."""
     plant = scenario.plant
-    off = [
+    different = [
         node
         for node in scenario.nodes
         for mean, cov in [scenario.start(node)]
         if not (np.array_equal(mean, plant.start_mean) and np.array_equal(cov, plant.start_cov))
     ]
     evidence = "mean and covariance are the plant's"
-    if off:
-        evidence = f"node {off[0]}{' and others' if off[1:] else ''}: not the plant's"
-    return Assumption("the filters start with the law of x(0)", "G (10), R (15)", not off, evidence)
+    if different:
+        evidence = f"node {different[0]}{' and others' if different[1:] else ''}: not the plant's"
+    return Assumption("the filters start with the law of x(0)", "G (10), R (15)", not different, evidence)

@@ -1,7 +1,7 @@
-"""Verdicts that stay valid however often one looks at them, and forecasts of the runs they need.
+"""Verdicts that stay valid under repeated looks at growing samples, and forecasts of their runs.
 
-Look number k spends ``2^-k`` of what the confidence leaves, so that the intervals of all looks hold
-together, whenever one stops.
+Look number k = 1, 2, ... may spend ``2^-k`` of the error probability 1 - confidence (alpha
+spending), so that the intervals of all looks hold jointly, whenever one stops.
 """
 
 from __future__ import annotations
@@ -12,11 +12,11 @@ from collections.abc import Sequence
 from netkf.checks.evidence import BROKEN, UNDECIDED, Evidence
 
 MAX_LOOKED_RUNS = 20_000
-"""Runs after which a check until all is decided ends by default."""
+"""Default limit on the runs of a check with ``until = "decided"``."""
 MIN_GROWTH, MAX_GROWTH = 1.5, 6.0
-"""Factors by which the runs grow from one look to the next."""
+"""Limits of the factor by which the runs grow from one look to the next."""
 MARGIN = 1.1
-"""Factor on the forecast: the next look spends less of the level, and has wider intervals."""
+"""Factor on the forecast number of runs: the next look has a smaller level and wider intervals."""
 
 
 def level_of_look(level: float, look: int) -> float:
@@ -29,24 +29,26 @@ def is_decided(rows: Sequence[Evidence]) -> bool:
     return not any(row.verdict == UNDECIDED and row.needed is not None for row in rows)
 
 
-def next_runs(rows: Sequence[Evidence], runs: int, most: int) -> int:
-    """Return the number of runs at which to look again, as the row that needs most of them asks."""
+def next_runs(rows: Sequence[Evidence], runs: int, max_runs: int) -> int:
+    """Return the number of runs at which to look again, up to ``max_runs``: the largest forecast of
+    an undecided row, within the limits of growth.
+    """
     needed = [row.needed for row in rows if row.verdict == UNDECIDED and row.needed is not None]
-    wanted = MARGIN * max(needed, default=runs)
-    growth = min(max(wanted, MIN_GROWTH * runs), MAX_GROWTH * runs)
-    return min(most, math.ceil(growth))
+    forecast = MARGIN * max(needed, default=runs)
+    growth = min(max(forecast, MIN_GROWTH * runs), MAX_GROWTH * runs)
+    return min(max_runs, math.ceil(growth))
 
 
-def keep_decisions(before: Sequence[Evidence], rows: Sequence[Evidence]) -> tuple[Evidence, ...]:
-    """Return the rows of a look, where those that are undecided now keep an earlier decision.
+def keep_decisions(earlier: Sequence[Evidence], rows: Sequence[Evidence]) -> tuple[Evidence, ...]:
+    """Return the rows of a look, in which undecided rows are replaced by an earlier decision.
 
-    The interval of an earlier look is as valid as that of the present one. A promise that was
+    All looks hold jointly, so that an earlier decision is as valid as a new one. A promise that was
     broken at any look stays broken.
     """
-    known = {(row.promise, row.source): row for row in before}
-    kept = []
+    earlier_rows = {(row.promise, row.source): row for row in earlier}
+    decisions = []
     for row in rows:
-        old = known.get((row.promise, row.source), row)
+        old = earlier_rows.get((row.promise, row.source), row)
         undecided = row.verdict == UNDECIDED and old.verdict != UNDECIDED
-        kept.append(old if undecided or old.verdict == BROKEN else row)
-    return tuple(kept)
+        decisions.append(old if undecided or old.verdict == BROKEN else row)
+    return tuple(decisions)

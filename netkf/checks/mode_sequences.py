@@ -1,9 +1,9 @@
-"""Switched Riccati recursions: which readings were used in which slot, along one run.
+"""Switched Riccati recursions: which readings updated a covariance in each slot of a run.
 
-A mode is a set of readings that a covariance can get in one slot. A covariance of a gossip filter
-has met the nodes that its pair visited, one of an intermittent filter the sets of readings that
-arrived: both are sequences of modes, and :func:`netkf.algorithms.kernels.chains.move_roots` applies
-them to a start covariance.
+A mode is a set of readings that can update a covariance in one slot. The covariance of a gossip
+filter is updated by the nodes that its pair (estimate, covariance) visits, that of an intermittent
+filter by the readings that arrive. Both are sequences of modes, which
+:func:`netkf.algorithms.kernels.chains.move_roots` applies to a start covariance.
 """
 
 from __future__ import annotations
@@ -24,32 +24,35 @@ from netkf.trace.run import Run
 from netkf.trace.schema import CODES
 
 MAX_CHAINS, MIN_CHAINS = 20_000, 4_000
+"""Limits on the number of simulated chains of a reference sample."""
 MAX_OPERATIONS = 1e10
 """Floating-point operations that a reference sample may take, about a few seconds."""
 
 
 class ModeTable(NamedTuple):
-    """``F``, ``root_Q`` (n, n) and the modes of a scenario's filters."""
+    """The plant of a scenario's filters, ``F`` and ``root_Q`` (n, n) with Q = root_Q root_Q', and
+    their modes. Covariances P are represented by roots S (n, n) with P = S S'.
+    """
 
     F: FloatArray
     root_Q: FloatArray
     modes: ReadingModes
 
     def apply(self, roots: FloatArray, sequences: np.ndarray) -> FloatArray:
-        """Return the roots (K, n, n) after mode sequences (K, T), one per row."""
+        """Return the roots (K, n, n) after K mode sequences (K, T) of T slots."""
         return move_roots(roots, sequences, self.F, self.root_Q, self.modes)
 
     def covariances(
         self, roots: FloatArray, sequences: np.ndarray, lengths: list[int]
     ) -> FloatArray:
-        """Return the covariances (L, K, n, n) after the first ``lengths`` modes of each sequence;
-        lengths increase.
+        """Return the covariances (L, K, n, n) after the first ``lengths`` (L increasing numbers) of
+        the modes of each sequence (K, T), from start ``roots`` (K, n, n).
         """
-        found, done = [], 0
+        results, applied = [], 0
         for length in lengths:
-            roots, done = self.apply(roots, sequences[:, done:length]), length
-            found.append(roots @ np.swapaxes(roots, -1, -2))
-        return np.array(found)
+            roots, applied = self.apply(roots, sequences[:, applied:length]), length
+            results.append(roots @ np.swapaxes(roots, -1, -2))
+        return np.array(results)
 
 
 def reference_count(scenario: Scenario, laws: int) -> int:
@@ -58,48 +61,50 @@ def reference_count(scenario: Scenario, laws: int) -> int:
     """
     step = (3 * scenario.plant.n) ** 3
     budget = MAX_OPERATIONS if len(scenario.nodes) <= MAX_NODES else 0.1 * MAX_OPERATIONS
-    wanted = budget / (laws * check_slots(scenario)[-1] * step)
-    return int(np.clip(wanted, MIN_CHAINS, MAX_CHAINS))
+    affordable = budget / (laws * check_slots(scenario)[-1] * step)
+    return int(np.clip(affordable, MIN_CHAINS, MAX_CHAINS))
 
 
 @lru_cache(maxsize=1)
 def kept_reference(samples: type[Any], scenario: Scenario, seed: int) -> Any:
-    """Return what a class of samples draws to compare runs with (``draw_reference``), once for all
-    verdicts on runs of one seed.
+    """Return ``samples.draw_reference()``, the sample that runs are compared with; cached, so that
+    all looks at runs of one seed share it.
     """
     return samples(scenario, None, seed).draw_reference()
 
 
 def with_horizon(
-    samples: Any, found: Finding, apart: Callable[[Any], float], tolerance: float
+    samples: Any, finding: Finding, distance: Callable[[Any], float], tolerance: float
 ) -> Finding:
-    """Return a finding with the horizon at which a law has settled: ``apart`` is its distance from
-    its limit in chains of ``samples.later``, a number of slots.
+    """Return the finding with the horizon in seconds at which a law is close to its limit.
+
+    ``distance`` is a function of the chains that ``samples.later`` draws for a number of slots; it
+    returns the distance of their law from its limit, which is to become half of ``tolerance``.
     """
     scenario = samples.scenario
-    enough = slots_until(
-        lambda count: apart(samples.later(count)),
+    slots = slots_until(
+        lambda count: distance(samples.later(count)),
         check_slots(scenario)[-1],
         scenario.plant.n,
         tolerance,
     )
-    return found._replace(horizon=enough * scenario.slot_plant.period)
+    return finding._replace(horizon=slots * scenario.slot_plant.period)
 
 
-def slots_until(apart: Callable[[int], float], slots: int, n: int, tolerance: float) -> float:
-    """Return a number of slots after which ``apart`` is at most half of ``tolerance``, found by
-    doubling; nan if chains of n states that long would take seconds.
+def slots_until(distance: Callable[[int], float], slots: int, n: int, tolerance: float) -> float:
+    """Return a number of slots after which ``distance`` is at most half of ``tolerance``.
 
-    ``apart`` takes a number of slots and draws about MIN_CHAINS / 4 chains.
+    The number is doubled from ``slots`` on; nan if chains of n states would take too long.
+    ``distance`` takes a number of slots and draws about MIN_CHAINS / 4 chains.
     """
-    spent, longer = 0.0, slots
+    operations, count = 0.0, slots
     while True:
-        longer *= 2
-        spent += 0.25 * MIN_CHAINS * longer * (3 * n) ** 3
-        if spent > 0.1 * MAX_OPERATIONS:
+        count *= 2
+        operations += 0.25 * MIN_CHAINS * count * (3 * n) ** 3
+        if operations > 0.1 * MAX_OPERATIONS:
             return math.nan
-        if apart(longer) <= 0.5 * tolerance:
-            return float(longer)
+        if distance(count) <= 0.5 * tolerance:
+            return float(count)
 
 
 def initial_roots(scenario: Scenario) -> FloatArray:
@@ -108,10 +113,10 @@ def initial_roots(scenario: Scenario) -> FloatArray:
 
 
 class TokenHistory(NamedTuple):
-    """Where the pair that each node holds at the start of a slot has been.
+    """The history of the pairs (estimate, covariance) that the N nodes hold at the start of a slot.
 
-    ``origin`` (N,): index of the node where it started; ``path`` (N, slot): indices of the nodes
-    whose readings it took, in order.
+    origin : (N,) index of the node at which the pair started
+    path   : (N, slot) indices of the nodes whose readings updated it in slots 0, 1, ...
     """
 
     origin: np.ndarray
@@ -126,10 +131,10 @@ def pair_sources(scenario: Scenario, run: Run, slots: int) -> np.ndarray:
     sources = np.tile(np.arange(len(index)), (slots, 1))
     swaps = run.log[run.log["kind"] == CODES["swap"]]
     slot = scenario.slot_plant.slots_of(swaps["t"])
-    used = slot < slots
+    in_time = slot < slots
     nodes, peers = (np.array([index[k] for k in swaps[name].tolist()]) for name in ("node", "peer"))
-    if used.any():
-        sources[slot[used], nodes[used]] = peers[used]
+    if in_time.any():
+        sources[slot[in_time], nodes[in_time]] = peers[in_time]
     return sources
 
 
@@ -165,8 +170,9 @@ def gossip_modes(scenario: Scenario) -> ModeTable:
 
 
 class Arrivals(NamedTuple):
-    """The readings that each sampled node used: ``sequences`` (W, slots) of modes, where mode m is
-    the set ``sets[m]`` of nodes.
+    """The readings that W sampled nodes used in each slot.
+
+    ``sequences`` (W, slots) are indices of modes; mode m is the readings of the nodes ``sets[m]``.
     """
 
     table: ModeTable
@@ -175,13 +181,13 @@ class Arrivals(NamedTuple):
 
 
 def sensing_neighbours(scenario: Scenario) -> dict[int, tuple[int, ...]]:
-    """Return for each node the neighbours that have readings to send."""
-    sensing, near = set(scenario.sensing), dict[int, list[int]]()
+    """Return the neighbours of each node that have sensors, in order."""
+    sensing, senders = set(scenario.sensing), dict[int, list[int]]()
     for i, j in scenario.topology.links:
-        for sender, receiver in ((i, j), (j, i)):
-            if sender in sensing:
-                near.setdefault(receiver, []).append(sender)
-    return {node: tuple(sorted(near.get(node, ()))) for node in scenario.nodes}
+        for source, receiver in ((i, j), (j, i)):
+            if source in sensing:
+                senders.setdefault(receiver, []).append(source)
+    return {node: tuple(sorted(senders.get(node, ()))) for node in scenario.nodes}
 
 
 def intermittent_modes(scenario: Scenario, sets: list[tuple[int, ...]]) -> ModeTable:
@@ -197,33 +203,35 @@ def intermittent_modes(scenario: Scenario, sets: list[tuple[int, ...]]) -> ModeT
 
 
 def find_arrivals(scenario: Scenario, run: Run, slots: int) -> Arrivals:
-    """Return the readings that were used in a run, from the deliveries in its trace."""
+    """Return the readings that were used in the first ``slots`` slots of a run: a node's own, and
+    those delivered by the trace.
+    """
     delivered = run.log[run.log["kind"] == CODES["deliver"]]
     # A reading belongs to the slot in which it was sent, not to that of its arrival.
     slot = scenario.slot_plant.slots_of(delivered["t"] - np.nan_to_num(delivered["age"]))
-    used: dict[tuple[int, int], list[int]] = {}
+    arrived: dict[tuple[int, int], list[int]] = {}
     columns = (slot.tolist(), delivered["node"].tolist(), delivered["peer"].tolist())
     for t, node, peer in zip(*columns, strict=True):
-        used.setdefault((node, t), []).append(peer)
+        arrived.setdefault((node, t), []).append(peer)
     modes: dict[tuple[int, ...], int] = {}
     sampled = sampled_nodes(scenario)
     sequences = np.empty((len(sampled), slots), dtype=int)
     for k, node in enumerate(sampled):
-        own = (node,) if node in scenario.placed else ()
+        own_reading = (node,) if node in scenario.placed else ()
         for t in range(slots):
-            nodes = tuple(sorted((*own, *used.get((node, t), ()))))
+            nodes = tuple(sorted((*own_reading, *arrived.get((node, t), ()))))
             sequences[k, t] = modes.setdefault(nodes, len(modes))
     return Arrivals(intermittent_modes(scenario, list(modes)), sequences, list(modes))
 
 
 def all_arrivals(scenario: Scenario, slots: int) -> Arrivals:
-    """Return the readings that are used if none is lost."""
+    """Return the readings that would be used in each slot if none were lost."""
     neighbours = sensing_neighbours(scenario)
     modes: dict[tuple[int, ...], int] = {}
     sampled = sampled_nodes(scenario)
     sequences = np.empty((len(sampled), slots), dtype=int)
     for k, node in enumerate(sampled):
-        own = (node,) if node in scenario.placed else ()
-        nodes = tuple(sorted((*own, *neighbours[node])))
+        own_reading = (node,) if node in scenario.placed else ()
+        nodes = tuple(sorted((*own_reading, *neighbours[node])))
         sequences[k] = modes.setdefault(nodes, len(modes))
     return Arrivals(intermittent_modes(scenario, list(modes)), sequences, list(modes))

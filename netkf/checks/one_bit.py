@@ -25,21 +25,23 @@ WORTH = Promise(
 
 
 class BitChecks(PaperChecks):
-    """Covariances. Errors are not Gaussian, and that P is theirs is the paper's approximation."""
+    """The promise about covariances; there is none about errors, which are not Gaussian and whose
+    covariance P only approximates.
+    """
 
     slots_only: ClassVar[bool] = True
 
     def summarise(self, scenario: Scenario, run: Run) -> ReplicaSummary:
         """Return the summary of a run whose samples are at ``check_times``."""
-        found = summarise_exactly(scenario, run)
+        summary = summarise_exactly(scenario, run)
         if run.replica >= max_replayed(scenario):
-            return found
+            return summary
         at, sampled = checked_samples(scenario, run.times), sampled_indices(scenario)
         try:
             P = bit_covariances(scenario, run)[at][:, sampled]
         except TheoryError:  # H differs from slot to slot: the row says that nothing was replayed
-            return found
-        return dataclasses.replace(found, replayed=P)
+            return summary
+        return dataclasses.replace(summary, replayed=P)
 
     def assumptions(self, scenario: Scenario) -> list[Assumption]:
         """Return no assumptions: P depends on nothing but the bits that arrived."""

@@ -1,4 +1,4 @@
-"""The picture of a verdict: how far off each promise is, and what would have been seen."""
+"""The picture of a verdict: the deviation and the detectable error of each promise."""
 
 from __future__ import annotations
 

@@ -10,22 +10,23 @@ from netkf.scenario.scenario import Scenario
 
 HORIZON_SHARES = (0.125, 0.25, 0.5, 1.0)
 POOLED_ERRORS, MAX_POOLED = 192, 24
-"""Errors of all nodes at all times of a run that are whitened together, and times of a run at which
-they are looked at: many times of one run say as much about a covariance as many runs.
+"""Largest number of errors (nodes times states times sample times) of a run that are whitened
+together, and largest number of sample times. Many times of one run tell as much about a covariance
+as many runs.
 """
 MAX_NODES = 60
-"""Nodes of a network of which all samples are kept."""
+"""Largest network of which the samples of all nodes are kept."""
 MIN_SAMPLED, MAX_SAMPLED = 20, 50
-"""Nodes that are sampled in a larger network."""
+"""Number of nodes that are sampled in a larger network."""
 MAX_ENTRIES = 6400
 """Entries of the covariances that are kept of one sample of a larger network."""
 
 
 def check_slots(scenario: Scenario) -> tuple[int, ...]:
-    """Return the slots at which promises are checked: small ones, half of the horizon and its end.
+    """Return the slots at which promises are checked: 2, 5, half of the horizon and its last slot.
 
-    A filtered estimate at the horizon itself has seen exchanges that are not in the trace, so its
-    last slot is the one before.
+    For filters whose estimate is filtered (not predicted) the last slot is one earlier, because the
+    estimate at the horizon includes exchanges that the trace does not record.
     """
     period = scenario.slot_plant.period
     last = max(1, int(np.floor(scenario.horizon / period + 1e-9)))
@@ -44,14 +45,16 @@ def check_times(scenario: Scenario) -> list[float]:
 
 
 def errors_at_once(scenario: Scenario) -> int:
-    """Return the number of errors of all filters together at one time."""
+    """Return the number of scalar errors of all filters at one time."""
     filters = 1 if scenario.filter.algorithm.pooled else len(scenario.nodes)
     return filters * scenario.plant.n
 
 
 def probe_times(scenario: Scenario) -> list[float]:
-    """Return the times at which runs are sampled: those of :func:`check_times`, and others spread
-    evenly over the horizon at which only all errors together are looked at.
+    """Return the times in seconds at which runs are sampled.
+
+    They are those of :func:`check_times`, and further ones spread evenly over the horizon that only
+    tests of all errors pooled use.
     """
     checked = check_times(scenario)
     count = min(MAX_POOLED, POOLED_ERRORS // errors_at_once(scenario))
@@ -59,7 +62,7 @@ def probe_times(scenario: Scenario) -> list[float]:
     if scenario.slotted:
         period = scenario.slot_plant.period
         even = [round(period * max(1, round(time / period)), 12) for time in even]
-    # Further times replace none of those that rows are about.
+    # Further times come in addition to the checked ones, and are thinned evenly to ``count``.
     others = sorted(set(even) - set(checked))
     spare = min(max(count - len(checked), 0), len(others))
     chosen = np.linspace(0, len(others) - 1, spare).round().astype(int).tolist()
@@ -67,16 +70,16 @@ def probe_times(scenario: Scenario) -> list[float]:
 
 
 def checked_samples(scenario: Scenario, times: FloatArray) -> IntArray:
-    """Return the indices of :func:`check_times` among the ``times`` of a run."""
-    wanted = np.array(check_times(scenario))
-    return np.asarray(np.argmin(np.abs(times[None] - wanted[:, None]), axis=1), dtype=np.int64)
+    """Return the indices (K,) of :func:`check_times` in the sample ``times`` of a run."""
+    targets = np.array(check_times(scenario))
+    return np.asarray(np.argmin(np.abs(times[None] - targets[:, None]), axis=1), dtype=np.int64)
 
 
 def sampled_indices(scenario: Scenario) -> IntArray:
     """Return the indices (W,) of the nodes whose samples are kept.
 
-    They are all nodes of a small network, and evenly chosen ones of a network with more than
-    MAX_NODES, fewer if covariances are large.
+    These are all nodes of a network of up to MAX_NODES nodes; of a larger one between MIN_SAMPLED
+    and MAX_SAMPLED evenly spaced indices, fewer the larger the covariances are.
     """
     nodes, n = len(scenario.nodes), scenario.plant.n
     if nodes <= MAX_NODES:

@@ -67,42 +67,44 @@ STEADY_TOLERANCE = 0.01
 SQUARE_TOLERANCE, BIAS_TOLERANCE = 0.3, 0.45
 """Tolerated relative difference of mean squares, and bias in standard deviations of an error."""
 HEAVY_TAILS = 0.885
-"""Mean-square radius from which the sample mean of squares has no useful variance."""
+"""Mean-square radius above which squared errors have too heavy tails for a test of their mean."""
 MAX_CERTIFIED = 20
+"""Largest gamma up to which the exact minimum is searched."""
 MAX_STEPS = 4096
 """Averaging steps up to which errors are compared with those of the central filter."""
 
 
 @dataclass(frozen=True, eq=False)
 class PushSumSummary(ReplicaSummary):
-    """Adds ``drift`` (2,): the relative drift of the totals of weight and number."""
+    """Adds ``drift`` (2,): the relative drift of the totals of the push-sum variables w and n~,
+    which exchanges should conserve.
+    """
 
     drift: FloatArray
 
 
 @dataclass(frozen=True)
 class PushSumSamples(RunSamples):
-    """Adds errors at the end, with the covariance that they have then given the links that failed.
-
-    Only replicas whose errors were followed exactly are in these.
+    """Adds errors at the end and their exact covariance given the links that failed, for the R'
+    replicas whose exact covariances were computed.
     """
 
     @cached_property
     def followed(self) -> np.ndarray:
-        """Replicas (R',) whose exact covariances at the end are known."""
+        """Indices (R',) of the replicas whose exact covariances at the end are finite."""
         Sigma = self.runs.Sigma[:, -1]
         return np.flatnonzero(np.isfinite(Sigma).all(axis=(1, 2, 3)))
 
     @cached_property
     def standardised(self) -> FloatArray:
-        """Errors (R', N, n) at the end, whitened by their own covariance: each is standard Gaussian
-        at every time, and its mean a bias.
+        """Errors (R', N, n) at the end, each whitened by its exact covariance: standard normal
+        unless there is a bias.
         """
         Sigma, e = self.runs.Sigma[self.followed, -1], self.runs.e[self.followed, -1]
         values, vectors = np.linalg.eigh(Sigma)
-        least = MIN_VARIANCE * values[..., -1:]
-        along = np.einsum("rnab,rna->rnb", vectors, e)
-        return np.asarray(along / np.sqrt(np.maximum(values, least)))
+        floor = MIN_VARIANCE * values[..., -1:]
+        components = np.einsum("rnab,rna->rnb", vectors, e)
+        return np.asarray(components / np.sqrt(np.maximum(values, floor)))
 
     @cached_property
     def steady_root(self) -> FloatArray:
@@ -113,9 +115,10 @@ class PushSumSamples(RunSamples):
 
     @cached_property
     def ratios(self) -> tuple[FloatArray, FloatArray]:
-        """Mean squares (R', N) of the errors in units of the steady covariance, and the eigenvalues
-        (R', N, n) of their covariances given the links: each square is a sum of n squares of
-        standard Gaussian numbers with these weights, divided by n.
+        """Mean squares |W e|^2 / n (R', N) of the errors e in units of the steady covariance, and
+        the eigenvalues (R', N, n) of W Sigma W', their covariance given the links.
+
+        Each |W e|^2 is a sum of squares of n standard normal numbers with these weights.
         """
         W, Sigma = self.steady_root, self.runs.Sigma[self.followed, -1]
         e = np.einsum("iab,rib->ria", W, self.runs.e[self.followed, -1])
@@ -128,36 +131,40 @@ def _mass_conserved(samples: PushSumSamples, level: float) -> Finding:
     drift = np.abs(samples.runs.drift)
     message = f"drift of the totals of weight and number in {len(samples.runs.P)} runs"
     limits = np.ones_like(drift), _count_exchanges(samples), 1e-9
-    found = compare_identities(drift, *limits, message)
-    return found._replace(replica=first_wrong(drift, *limits))
+    finding = compare_identities(drift, *limits, message)
+    return finding._replace(replica=first_wrong(drift, *limits))
 
 
 def _count_exchanges(samples: PushSumSamples) -> float:
-    """Return the number of sums in which a total takes part, each of which rounds."""
+    """Return the number of additions (slots times nodes) whose rounding a total may carry."""
     return float(check_slots(samples.scenario)[-1] * len(samples.scenario.nodes))
 
 
 def _at_steady_state(samples: PushSumSamples, level: float) -> Finding:
-    """Compare P of every node at the end with P_inf, and with the P that the links of these runs
-    give.
+    """Compare P of every node at the end with P_inf.
+
+    The row is undecided where the replay along the links of these runs is as far from P_inf: then
+    the horizon is too short.
     """
     limit = push_sum_limits(with_promised_filter(samples.scenario)).P
-    known = ~np.isnan(samples.runs.replayed[:, -1, 0, 0, 0])
-    P, replayed = samples.runs.P[known, -1], samples.runs.replayed[known, -1]
+    was_replayed = ~np.isnan(samples.runs.replayed[:, -1, 0, 0, 0])
+    P, replayed = samples.runs.P[was_replayed, -1], samples.runs.replayed[was_replayed, -1]
     if not len(P):
         return find_unknown("no run could be replayed")
-    last, expected = (float(relative_difference(one, limit).max()) for one in (P, replayed))
-    # What the steps themselves give at this time cannot break a promise about later times.
-    early = last > STEADY_TOLERANCE and last <= expected + REPLAY_TOLERANCE
-    margin = STEADY_TOLERANCE - last
-    message = f"largest relative distance at the end {last:.1e}"
+    distance, replayed_distance = (float(relative_difference(covariances, limit).max()) for covariances in (P, replayed))
+    # A distance that the equations themselves have at this time breaks no promise about the limit.
+    early = distance > STEADY_TOLERANCE and distance <= replayed_distance + REPLAY_TOLERANCE
+    margin = STEADY_TOLERANCE - distance
+    message = f"largest relative distance at the end {distance:.1e}"
     horizon = samples.scenario.horizon * _horizon_factor(samples, limit) if early else math.nan
     return Finding((margin, margin, margin), 0.0, message, early=early, horizon=horizon)
 
 
 def _horizon_factor(samples: PushSumSamples, limit: FloatArray) -> float:
-    """Return the factor on the horizon with which P reaches its limit, extrapolated from the decay
-    of its distance between half of the time and the end; nan if it does not decay.
+    """Return the factor on the horizon at which P is within STEADY_TOLERANCE of ``limit`` (n, n).
+
+    It is extrapolated from the decay of the distance between half of the time and the end; nan if
+    the distance does not decay.
     """
     P = samples.runs.replayed[~np.isnan(samples.runs.replayed[:, -1, 0, 0, 0])]
     half, last = (float(relative_difference(P[:, k], limit).max()) for k in (-2, -1))
@@ -168,23 +175,25 @@ def _horizon_factor(samples: PushSumSamples, limit: FloatArray) -> float:
 
 
 def _check_unbiased(samples: PushSumSamples, level: float) -> Finding:
-    """Test that the mean of the whitened errors at the end is 0, in all directions at once."""
+    """Test the null hypothesis that errors at the end have mean 0, in all directions at once.
+
+    Under it the mean of R' whitened errors is normal with covariance I / R' at every node.
+    """
     if not len(samples.followed):
         return find_unknown("no run has errors that were followed exactly", BIAS_TOLERANCE)
     if not np.isfinite(samples.standardised).all():
         return find_nothing(BIAS_TOLERANCE)
-    nodes, found = samples.nodes, []
+    nodes, intervals = samples.nodes, []
     count, n = len(samples.followed), samples.scenario.plant.n
-    most = max_replayed(samples.scenario)
-    # The mean of R standard Gaussian vectors is Gaussian with covariance I / R.
-    wide = _gaussian_radius(level / len(nodes), n) / math.sqrt(count)
+    max_runs = max_replayed(samples.scenario)
+    radius = _gaussian_radius(level / len(nodes), n) / math.sqrt(count)
     for i, node in enumerate(nodes):
-        size = float(np.linalg.norm(samples.standardised[:, i].mean(axis=0)))
-        find = wide + float(scipy.special.ndtri(POWER)) / math.sqrt(count)
-        distance = Interval(size, max(0.0, size - wide), size + wide, find, size, 0.0)
-        found.append((distance, f"at node {node}"))
+        bias = float(np.linalg.norm(samples.standardised[:, i].mean(axis=0)))
+        detectable = radius + float(scipy.special.ndtri(POWER)) / math.sqrt(count)
+        distance = Interval(bias, max(0.0, bias - radius), bias + radius, detectable, bias, 0.0)
+        intervals.append((distance, f"at node {node}"))
     message = "largest bias, in standard deviations of an error,"
-    return find_largest(found, BIAS_TOLERANCE, message)._replace(most_runs=most)
+    return find_largest(intervals, BIAS_TOLERANCE, message)._replace(most_runs=max_runs)
 
 
 def _gaussian_radius(level: float, n: int) -> float:
@@ -194,34 +203,37 @@ def _gaussian_radius(level: float, n: int) -> float:
 
 @gaussian_test
 def _mean_square(samples: PushSumSamples, level: float) -> Finding:
-    """Compare mean squares of the errors at the end, in units of the exact steady ones, with 1, and
-    with what the steps give for the links of these runs.
+    """Test the null hypothesis that mean squares of the errors at the end are the exact steady ones.
+
+    Given the links of a run, |W e|^2 is a quadratic form of normal numbers; summed over the runs it
+    gives an interval for the factor on its expected value. The promise is broken only if mean
+    squares differ from those expected for the links of these runs; the upper limit is for their
+    distance from the steady ones.
     """
     if not len(samples.followed):
         return find_unknown("no run has errors that were followed exactly", SQUARE_TOLERANCE)
     squares, weights = samples.ratios
     if not (np.isfinite(squares).all() and np.isfinite(weights).all()):
         return find_nothing(SQUARE_TOLERANCE)
-    nodes, n, found = samples.nodes, samples.scenario.plant.n, []
+    nodes, n, intervals = samples.nodes, samples.scenario.plant.n, []
     expected = weights.mean(axis=(0, 2))
     for i, node in enumerate(nodes):
-        # Given the links the sum is exactly a quadratic form; c is what it is multiplied by.
         scale = quadratic_interval(
             float(squares[:, i].sum()) * n, weights[:, i].ravel(), level / len(nodes)
         )
-        off = deviation_interval(1.0, scale)
-        far = deviation_interval(1.0, affine(scale, float(expected[i]), 0.0))
-        found.append((far._replace(low=off.low), f"at node {node}"))
+        from_replay = deviation_interval(1.0, scale)
+        from_limit = deviation_interval(1.0, affine(scale, float(expected[i]), 0.0))
+        intervals.append((from_limit._replace(low=from_replay.low), f"at node {node}"))
     message = "largest relative difference of mean squares from the exact ones"
-    most = max_replayed(samples.scenario)
-    finding = find_largest(found, SQUARE_TOLERANCE, message)._replace(most_runs=most)
+    max_runs = max_replayed(samples.scenario)
+    finding = find_largest(intervals, SQUARE_TOLERANCE, message)._replace(most_runs=max_runs)
     off_limit = float(np.abs(expected - 1.0).max())
-    early = off_limit > SQUARE_TOLERANCE and not any(off.low > 0.0 for off, _ in found)
+    early = off_limit > SQUARE_TOLERANCE and not any(from_replay.low > 0.0 for from_replay, _ in intervals)
     return finding._replace(early=early)
 
 
 def _gamma_certified(samples: PushSumSamples, level: float) -> Finding:
-    """Compare the gamma that Theorem 6 certifies with the exact one, which is far smaller."""
+    """Check that the gamma that Theorem 6 certifies is at least the exact minimum."""
     scenario = with_promised_filter(samples.scenario)
     gamma, needed = minimum_gamma(scenario, "mean-square"), exact_minimum_gamma(scenario)
     margin = float(gamma - needed)
@@ -230,7 +242,9 @@ def _gamma_certified(samples: PushSumSamples, level: float) -> Finding:
 
 
 def _many_steps(samples: PushSumSamples, level: float) -> Finding:
-    """Compute errors and noise for ever more averaging steps, and compare them with the limits."""
+    """Compute error covariances and averaging noise for gamma = 1, 2, 4, ... and compare them with
+    their limits, until they agree to STEADY_TOLERANCE or gamma exceeds MAX_STEPS.
+    """
     scenario = with_promised_filter(samples.scenario)
     limits, gamma, size = large_gamma_limits(scenario), 1, np.inf
     noisy = float(np.abs(limits.noise).max())
@@ -254,7 +268,7 @@ def _many_steps(samples: PushSumSamples, level: float) -> Finding:
 
 
 def _relative_distance(P: FloatArray, limit: FloatArray) -> float:
-    """Return the largest entry of P (N, n, n) less its limit, relative to the limit's."""
+    """Return the largest entry of |P - limit|, P (N, n, n), over the largest entry of |limit|."""
     return float(np.abs(P - limit).max() / np.abs(limit).max())
 
 
@@ -351,12 +365,12 @@ class PushSumChecks(PaperChecks):
         try:
             radius = push_sum_radius(with_promised_filter(scenario))
             light = radius <= HEAVY_TAILS
-            why = f"mean-square radius {radius:.4g}, light tails below {HEAVY_TAILS}"
+            evidence = f"mean-square radius {radius:.4g}, light tails below {HEAVY_TAILS}"
         except TheoryError as error:
-            light, why = False, str(error)
+            light, evidence = False, str(error)
         return [
             _every_slot(scenario),
-            Assumption("mean squares have a variance", "derived", light, why),
+            Assumption("mean squares have a variance", "derived", light, evidence),
             exact_start(scenario),
             few_errors(scenario),
         ]
@@ -364,33 +378,33 @@ class PushSumChecks(PaperChecks):
     def promises(self, scenario: Scenario) -> tuple[Promise, ...]:
         """Return the promises about a scenario; one on the certified gamma if it exists."""
         promised = with_promised_filter(scenario)
-        found: tuple[Promise, ...] = PROMISES
+        promises: tuple[Promise, ...] = PROMISES
         if getattr(promised.filter.algorithm, "running_sums", False):
             # Running sums conserve mass whatever is lost.
-            found = (dataclasses.replace(PROMISES[0], needs=()), *PROMISES[1:])
+            promises = (dataclasses.replace(PROMISES[0], needs=()), *PROMISES[1:])
         if not searches_gamma(promised):
-            return found
+            return promises
         with contextlib.suppress(TheoryError):
             large_gamma_limits(promised)
-            found = (*found, LIMIT)
+            promises = (*promises, LIMIT)
         try:
             minimum_gamma(promised, "mean-square")
             exact_minimum_gamma(promised, most=MAX_CERTIFIED)
         except TheoryError:
-            return found
-        return (*found, CERTIFIED)
+            return promises
+        return (*promises, CERTIFIED)
 
 
 def _every_slot(scenario: Scenario) -> Assumption:
-    """Return the assumption that the run follows steps 2 and 3 of P in every slot."""
+    """Return the assumption that the filter follows steps 2 and 3 of P in every slot."""
     algorithm = with_promised_filter(scenario).filter.algorithm
     holds = algorithm.stop == "never" and not algorithm.asymptotic  # type: ignore[union-attr]
-    why = "exchanged for ever" if holds else "gains are frozen or taken from the limit"
+    evidence = "exchanged for ever" if holds else "gains are frozen or taken from the limit"
     if not np.array_equal(scenario.slot_belief[0], scenario.slot_plant.F):
-        holds, why = False, "exchanged, but the filters' F is not the plant's"
+        holds, evidence = False, "exchanged, but the filters' F is not the plant's"
     if any(sensor.varying for sensor in scenario.sensors):
-        holds, why = False, "exchanged, but H differs from slot to slot"
-    return Assumption("mass is exchanged in every slot", "P step 2", holds, why)
+        holds, evidence = False, "exchanged, but H differs from slot to slot"
+    return Assumption("mass is exchanged in every slot", "P step 2", holds, evidence)
 
 
 CHECKS = PushSumChecks()

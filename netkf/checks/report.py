@@ -27,8 +27,10 @@ PAPERS = {
 
 
 def verdict_text(verdict: Verdict, claim: str = "", command: str = "") -> str:
-    """Return the text of ``netkf check``: broken rows first and once more at the end, then how many
-    rows there are of each verdict. ``command`` replays a run: the number of the run follows it.
+    """Return the text of ``netkf check``.
+
+    Broken rows come first; then all others, the counts of the verdicts, and the broken rows once
+    more in short. ``command`` followed by the number of a run replays that run.
     """
     lines = [f"{verdict.scenario}: {claim}" if claim else verdict.scenario, ""]
     broken = [row for row in verdict.rows if row.verdict == BROKEN]
@@ -42,8 +44,8 @@ def verdict_text(verdict: Verdict, claim: str = "", command: str = "") -> str:
 
 
 def _legend_lines(verdict: Verdict) -> list[str]:
-    """Return a line for each paper whose letter stands in a source."""
-    # A letter is a paper's at the beginning of a source or of one of its parts.
+    """Return a line for each paper whose letter occurs in a source."""
+    # A letter stands for a paper only at the beginning of a source or of one of its parts.
     sources = "; ".join(row.source for row in verdict.rows)
     return [
         f"[{letter} ...]: {title}"
@@ -57,8 +59,8 @@ def _summary_line(verdict: Verdict) -> list[str]:
     counts = Counter(row.verdict for row in verdict.rows)
     counted_verdicts = ", ".join(f"{counts[v]} {v}" for v in VERDICTS if counts[v])
     looks = f" at all of {verdict.looks} looks" if verdict.looks > 1 else ""
-    together = f"all intervals{looks} hold together with probability {verdict.confidence:.6g}"
-    lines = [f"{counted_verdicts}; {verdict.runs:,} runs, {together}"]
+    joint = f"all intervals{looks} hold together with probability {verdict.confidence:.6g}"
+    lines = [f"{counted_verdicts}; {verdict.runs:,} runs, {joint}"]
     needed = [row.needed for row in verdict.rows if row.needed is not None]
     if needed:
         lines.append(
@@ -84,8 +86,8 @@ def _broken_again(broken: list[Evidence], command: str) -> list[str]:
 
 
 def _describe_row(row: Evidence) -> str:
-    """Return how far off a row is and what would have been seen, then its evidence; or the
-    assumptions that fail.
+    """Return the deviation, tolerance and detectable error of a row, then its evidence; or the
+    failing assumptions.
     """
     if row.verdict == NOT_PROMISED:
         return row.assumptions
@@ -101,10 +103,10 @@ def _describe_row(row: Evidence) -> str:
 
 def _describe_limits(row: Evidence) -> str:
     """Return the tolerance and the detectable error of a row in brackets, or an empty text."""
-    found = [f"{row.tolerance:g} is tolerated"] if row.tolerance else []
+    limits = [f"{row.tolerance:g} is tolerated"] if row.tolerance else []
     if row.detectable > 0.0:
-        found.append(f"an error of {row.detectable:.2g} would have been seen")
-    return f" ({'; '.join(found)})" if found else ""
+        limits.append(f"an error of {row.detectable:.2g} would have been seen")
+    return f" ({'; '.join(limits)})" if limits else ""
 
 
 def verdict_json(verdict: Verdict) -> dict[str, Any]:

@@ -21,22 +21,22 @@ REPLAY_TOLERANCE = 1e-7  # of P, relative: two ways to compute it differ by roun
 
 @dataclass(frozen=True, eq=False)
 class ReplicaSummary:
-    """One run reduced to its values at K times and N sampled nodes; nan if it was not replayed.
+    """The statistics of one run at K times and N sampled nodes.
 
     P, e       : (K, N, n, n), (K, N, n) covariances and errors, nan if rounding blurs them
-    nees       : (K, N) e' P^-1 e
+    nees       : (K, N) normalised estimation error squared, e' P^-1 e
     replayed   : (K, N, n, n) P by the equations of the filter, from the events of the run
     mean, Sigma : (K, N, n), (K, N, n, n) mean and covariance of the errors given the events
-    whole      : (K, 2) squared errors of all nodes together, whitened by their covariance given the
-                 events, and their degrees of freedom
-    joint      : (2,) the same of all times together, also those between the K ones
-    quadratic  : (1 + S,) the NEES of all of them together, and its S weights: given the events it
-                 is a sum of squares of standard normal numbers with these weights
-    bias       : (n, n + 1) information on a constant bias of all errors, and that information times
-                 its estimate
+    whole      : (K, 2) squared norm of the errors of all nodes, whitened by their joint covariance
+                 given the events, and its degrees of freedom
+    joint      : (2,) the same for the errors of all sample times, also those between the K ones
+    quadratic  : (1 + S,) the sum of the NEES of all nodes and sample times, and its S weights: given
+                 the events it is a sum of squares of standard normal numbers with these weights
+    bias       : (n, n + 1) information matrix of a constant bias of all errors, and the information
+                 vector (that matrix times the estimate of the bias)
 
-    Papers add fields of their own. Summaries of R runs are stacked: every field gets a first axis
-    of length R
+    Fields after ``nees`` are nan for a run that is not replayed. Papers add fields of their own.
+    Summaries of R runs are stacked: every field gets a first axis of length R.
     """
 
     P: FloatArray
@@ -57,7 +57,7 @@ Summary = TypeVar("Summary", bound=ReplicaSummary)
 def stack_summaries(summaries: Sequence[Summary]) -> Summary:
     """Return one summary whose fields have a first axis over the replicas."""
     names = [field.name for field in dataclasses.fields(summaries[0])]
-    columns = {name: np.array([getattr(one, name) for one in summaries]) for name in names}
+    columns = {name: np.array([getattr(summary, name) for summary in summaries]) for name in names}
     return type(summaries[0])(**columns)
 
 
@@ -112,7 +112,7 @@ class RunSamples:
     def blurred_note(self) -> str:
         """Text on the times at which rounding blurs some errors, or empty."""
         lost = np.isnan(self.runs.e).any(axis=(0, 2, 3))
-        times = ", ".join(t for t, some in zip(self.time_labels, lost, strict=True) if some)
+        times = ", ".join(t for t, is_lost in zip(self.time_labels, lost, strict=True) if is_lost)
         return f"; errors that rounding blurs are left out ({times})" if times else ""
 
 
@@ -125,16 +125,16 @@ def check_replay(samples: RunSamples, level: float) -> Finding:
     with np.errstate(invalid="ignore"):
         gap = np.abs(P - expected).max(axis=(-1, -2))
         size = np.abs(expected).max(axis=(-1, -2))
-    off = relative_difference(P, expected).max(axis=(-1, -2))
-    run, time, node = np.unravel_index(int(np.argmax(off)), off.shape)
+    differences = relative_difference(P, expected).max(axis=(-1, -2))
+    run, time, node = np.unravel_index(int(np.argmax(differences)), differences.shape)
     label = samples.point_labels[int(time) * len(samples.nodes) + int(node)]
     message = (
         f"{gap.size:,} covariances replayed from the events of their runs; the worst in run "
         f"{np.flatnonzero(replayed)[run]} at {label}"
     )
     limits = size, samples.largest_terms(expected), REPLAY_TOLERANCE
-    found = compare_identities(gap, *limits, message)
-    return with_departure(found, samples, gap, limits, np.flatnonzero(replayed))
+    finding = compare_identities(gap, *limits, message)
+    return with_departure(finding, samples, gap, limits, np.flatnonzero(replayed))
 
 
 def with_departure(
@@ -144,11 +144,11 @@ def with_departure(
     limits: tuple[FloatArray, ArrayLike, float],
     replicas: IntArray | None = None,
 ) -> Finding:
-    """Return the finding on deviations ``gap`` (R, K', N) with the run, time and node at which they
-    first exceed what rounding explains; ``limits`` are those of ``allowed_deviation``.
+    """Return the finding with the run, time and node at which a path first departs.
 
-    The K' times are the last ones of those that are looked at, and the R runs are ``replicas``, by
-    default the first ones.
+    ``gap`` (R, K', N) are absolute deviations at the last K' checked times, ``limits`` the
+    arguments of :func:`allowed_deviation`, and ``replicas`` (R,) the numbers of the runs, 0 to
+    R - 1 by default. The finding is returned unchanged if rounding explains all deviations.
     """
     wrong = ~(gap <= allowed_deviation(*limits))
     if not wrong.any():
@@ -163,7 +163,9 @@ def with_departure(
 
 
 def relative_difference(P: FloatArray, expected: FloatArray) -> FloatArray:
-    """Return |P - expected| over the largest entry of each expected matrix; inf if not finite."""
+    """Return |P - expected| over the largest entry of each expected matrix, in the shape of P; inf
+    where that is not finite.
+    """
     size = np.abs(expected).max(axis=(-1, -2), keepdims=True)
     with np.errstate(invalid="ignore", divide="ignore"):
         gap = np.abs(P - expected)
@@ -172,13 +174,14 @@ def relative_difference(P: FloatArray, expected: FloatArray) -> FloatArray:
 
 
 def check_growth(samples: RunSamples, level: float) -> Finding:
-    """Compare the growth of the law of P from half of the horizon to its end with that of P by the
-    equations, along the events of the same runs.
+    """Compare the growth of the law of P from half of the horizon to its end with that of replayed P.
+
+    See :func:`compare_growth`.
     """
     P, replayed = samples.runs.P, samples.runs.replayed
-    known = replayed[~np.isnan(replayed).all(axis=(1, 2, 3, 4))]
+    known_replays = replayed[~np.isnan(replayed).all(axis=(1, 2, 3, 4))]
     pairs, expected = [], []
     for i, node in enumerate(samples.nodes):
         pairs.append(Pair(f"node {node}", P[:, -2, i], P[:, -1, i]))
-        expected.append((known[:, -2, i], known[:, -1, i]) if len(known) else None)
+        expected.append((known_replays[:, -2, i], known_replays[:, -1, i]) if len(known_replays) else None)
     return compare_growth(pairs, expected, level)

@@ -1,7 +1,8 @@
-"""Intervals that hold at a stated level for every number of samples.
+"""Confidence intervals that hold at a stated level for every number of samples.
 
-All samples are independent replicas, one value each. Covariances enter through indicators and
-ranks, never through means: their means need not exist.
+All samples are independent replicas, one value each. A level is the probability with which an
+interval may miss the truth. Laws of covariances are compared by indicators and ranks, never by
+means, which need not exist.
 """
 
 from __future__ import annotations
@@ -19,19 +20,19 @@ DIGITS = 9
 """Significant digits to which covariances are compared."""
 MIN_EXPECTED = 5.0
 """Expected count of a cell below which Pearson's statistic is not chi-square."""
-
-
 POWER = 0.9
-"""Probability with which an error of the size that a row calls detectable is found."""
+"""Probability with which a deviation of the detectable size is detected."""
 
 
 class Interval(NamedTuple):
     """An estimate and an interval that misses the truth with at most the stated probability.
 
-    ``detectable``: the distance of the truth from its expected value at which the interval leaves
-    the expected value out with probability POWER. An interval for a distance knows the two values
-    that are apart, ``seen`` and ``expected``. ``again``: the two limits around another value with a
-    factor of that many times the samples; by default their distance shrinks as 1 / sqrt(factor).
+    value, low, high : estimate and limits
+    detectable : distance of the truth from its expected value at which the interval excludes the
+        expected value with probability POWER
+    seen, expected : of an interval for a distance, the estimate and the expected value
+    again : function (value, factor) that returns the limits around another value with ``factor``
+        times the samples; by default their distance shrinks as 1 / sqrt(factor)
     """
 
     value: float
@@ -59,15 +60,15 @@ class Interval(NamedTuple):
 
 
 def detectable_shift(deviation: float, level: float) -> float:
-    """Return the shift that a two-sided test at ``level`` finds with probability POWER, where the
-    estimate is about normal with this standard deviation.
+    """Return the shift that a two-sided test at ``level`` detects with probability POWER, for a
+    normal estimate with standard deviation ``deviation``.
     """
     return deviation * float(_normal_quantile(1.0 - level / 2.0) + _normal_quantile(POWER))
 
 
 def student_interval(value: float, deviation: float, count: int, level: float) -> Interval:
-    """Return Student's interval for an estimate whose standard deviation comes from ``count``
-    independent values.
+    """Return Student's t interval for an estimate ``value``, whose standard ``deviation`` was
+    estimated from ``count`` independent values.
     """
 
     def limits(value: float, factor: float) -> tuple[float, float]:
@@ -86,7 +87,9 @@ def _normal_quantile(probability: float) -> float:
 
 
 def probability_interval(successes: int, trials: int, level: float) -> Interval:
-    """Return the interval of Clopper and Pearson, exact for independent trials."""
+    """Return the exact interval of Clopper and Pearson (1934) for the probability of a success in
+    independent trials.
+    """
     low = high = detectable = math.nan
 
     def limits(share: float, factor: float) -> tuple[float, float]:
@@ -99,52 +102,52 @@ def probability_interval(successes: int, trials: int, level: float) -> Interval:
 
     if trials:
         low, high = limits(successes / trials, 1.0)
-        # At least one half of a trial on either side: a fraction of 0 or 1 has a spread too.
+        # Half a success and half a failure are added: a fraction of 0 or 1 has a variance too.
         p = (successes + 0.5) / (trials + 1.0)
         detectable = detectable_shift(math.sqrt(p * (1.0 - p) / trials), level)
     return Interval(successes / max(trials, 1), low, high, detectable, again=limits)
 
 
-def affine(found: Interval, scale: float, shift: float) -> Interval:
+def affine(interval: Interval, scale: float, shift: float) -> Interval:
     """Return the interval of ``scale`` times a quantity plus ``shift``; the scale is positive."""
 
     def limits(value: float, factor: float) -> tuple[float, float]:
         """Return both ends for another value and ``factor`` times the samples."""
-        low, high = found.limits((value - shift) / scale, factor)
+        low, high = interval.limits((value - shift) / scale, factor)
         return scale * low + shift, scale * high + shift
 
-    value, low, high = (scale * end + shift for end in found[:3])
-    return Interval(value, low, high, scale * found.detectable, again=limits)
+    value, low, high = (scale * end + shift for end in interval[:3])
+    return Interval(value, low, high, scale * interval.detectable, again=limits)
 
 
-def with_drawn(found: Interval, drawn: Callable[[float], float]) -> Interval:
-    """Return the interval of samples that do not grow with the runs: a factor on the runs is one of
-    ``drawn(factor)`` on them.
+def with_drawn(interval: Interval, sample_factor: Callable[[float], float]) -> Interval:
+    """Return the interval of an estimate whose samples do not grow in proportion to the runs:
+    ``factor`` times the runs mean ``sample_factor(factor)`` times the samples.
     """
 
     def limits(value: float, factor: float) -> tuple[float, float]:
-        """Return both ends for ``factor`` times the runs, of which fewer may be drawn."""
-        more = drawn(factor)
-        # The value has been taken for one that shrinks with the runs.
-        return found.limits(value * math.sqrt(factor / more), more)
+        """Return both ends for ``factor`` times the runs."""
+        actual = sample_factor(factor)
+        # The caller has divided the value by sqrt(factor); it shrinks by sqrt(actual) only.
+        return interval.limits(value * math.sqrt(factor / actual), actual)
 
-    return found._replace(again=limits)
+    return interval._replace(again=limits)
 
 
-def deviation_interval(expected: float, found: Interval) -> Interval:
-    """Return an interval for the distance of a quantity from its expected value."""
-    inside = found.low <= expected <= found.high
-    ends = abs(found.low - expected), abs(found.high - expected)
-    low = 0.0 if inside else min(ends)
-    apart = abs(found.value - expected)
-    side = math.copysign(1.0, found.value - expected)
+def deviation_interval(expected: float, interval: Interval) -> Interval:
+    """Return an interval for |quantity - expected| from one for the quantity."""
+    covers = interval.low <= expected <= interval.high
+    ends = abs(interval.low - expected), abs(interval.high - expected)
+    low = 0.0 if covers else min(ends)
+    distance = abs(interval.value - expected)
+    side = math.copysign(1.0, interval.value - expected)
 
     def limits(value: float, factor: float) -> tuple[float, float]:
         """Return 0 and the largest distance for another value and ``factor`` times the samples."""
-        ends = found.limits(expected + side * value, factor)
+        ends = interval.limits(expected + side * value, factor)
         return 0.0, max(abs(end - expected) for end in ends)
 
-    return Interval(apart, low, max(ends), found.detectable, found.value, expected, limits)
+    return Interval(distance, low, max(ends), interval.detectable, interval.value, expected, limits)
 
 
 def band_width(samples: int, level: float) -> float:
@@ -162,40 +165,44 @@ def round_digits(values: FloatArray) -> FloatArray:
 
 
 def law_distance(
-    one: FloatArray, other: FloatArray, level: float, rounding: float = 0.0
+    first: FloatArray, second: FloatArray, level: float, rounding: float = 0.0
 ) -> Interval:
-    """Return an interval for the largest difference between the distribution functions behind two
-    samples (S,) and (S',), which may depend on each other; further runs add to the first one.
+    """Return an interval for sup |F - G| of the distribution functions F and G of two samples (S,)
+    and (S',): the two-sample Kolmogorov-Smirnov statistic, with a band around each sample.
 
-    Values that differ by less than ``rounding``, or in the last of DIGITS digits, count as equal.
+    The samples may depend on each other, since each band holds on its own. Further runs add to the
+    first sample only. Values that differ by less than ``rounding``, or in the last of DIGITS
+    digits, count as equal.
     """
-    gaps = np.abs(_ecdf_gaps(one, other, rounding))
-    return _band_interval(gaps, len(one), len(other), level, grow=False)
+    gaps = np.abs(_ecdf_gaps(first, second, rounding))
+    return _band_interval(gaps, len(first), len(second), level, grow=False)
 
 
-def law_excess(one: FloatArray, other: FloatArray, level: float, rounding: float = 0.0) -> Interval:
-    """Return an interval for the largest ``P(other > x) - P(one > x)`` over all x; see
+def law_excess(first: FloatArray, second: FloatArray, level: float, rounding: float = 0.0) -> Interval:
+    """Return an interval for the largest ``P(second > x) - P(first > x)`` over all x; see
     :func:`law_distance` for ``rounding``. Further runs add to both samples.
     """
-    gaps = _ecdf_gaps(one, other, rounding)
-    return _band_interval(gaps, len(one), len(other), level, grow=True)
+    gaps = _ecdf_gaps(first, second, rounding)
+    return _band_interval(gaps, len(first), len(second), level, grow=True)
 
 
-def _ecdf_gaps(one: FloatArray, other: FloatArray, rounding: float) -> FloatArray:
-    """Return the difference of two empirical distribution functions above each distinct value."""
-    a, b = np.sort(one), np.sort(other)
+def _ecdf_gaps(first: FloatArray, second: FloatArray, rounding: float) -> FloatArray:
+    """Return the differences (V,) of two empirical distribution functions at the V distinct values
+    of both samples.
+    """
+    a, b = np.sort(first), np.sort(second)
     points = np.sort(np.concatenate([a, b]))
-    # Neighbours that only rounding parts are one value: the gap is that above the last of them.
+    # Neighbours that differ by rounding only are one value, represented by the largest of them.
     with np.errstate(invalid="ignore"):
-        apart = np.diff(points) > np.maximum(rounding, 10.0 ** (1 - DIGITS) * np.abs(points[1:]))
-    points = points[np.append(apart, True)]
+        distinct = np.diff(points) > np.maximum(rounding, 10.0 ** (1 - DIGITS) * np.abs(points[1:]))
+    points = points[np.append(distinct, True)]
     ranks = [np.searchsorted(sample, points, "right") / len(sample) for sample in (a, b)]
     return np.asarray(ranks[0] - ranks[1])
 
 
 def _band_interval(gaps: FloatArray, a: int, b: int, level: float, grow: bool) -> Interval:
-    """Return the interval of the largest difference of two distribution functions of a and b
-    samples.
+    """Return the interval of the largest of the ``gaps`` (V,) between two empirical distribution
+    functions of ``a`` and ``b`` samples; ``grow``: further runs add to the second sample too.
     """
     value = max(0.0, float(gaps.max()))
     widths = band_width(a, level / 2.0), band_width(b, level / 2.0)
@@ -207,7 +214,7 @@ def _band_interval(gaps: FloatArray, a: int, b: int, level: float, grow: bool) -
         reach = first + (second / math.sqrt(factor) if grow else second)
         return value - reach, value + reach
 
-    # At one point the difference of the two has at most this deviation.
+    # At any one point the variance of the difference is at most 1/(4a) + 1/(4b).
     spread = 0.5 * math.sqrt(1.0 / a + 1.0 / b)
     detectable = min(1.0, width + _normal_quantile(POWER) * spread)
     ends = max(0.0, value - width), min(1.0, value + width)
@@ -217,16 +224,16 @@ def _band_interval(gaps: FloatArray, a: int, b: int, level: float, grow: bool) -
 def distance_to_law(
     cdf: Callable[[FloatArray], FloatArray], values: FloatArray, level: float
 ) -> Interval:
-    """Return an interval for the largest difference between ``cdf`` and the distribution function
-    behind a sample (S,).
+    """Return an interval for the largest difference between the exact distribution function ``cdf``
+    and that of a sample (S,): the one-sample Kolmogorov-Smirnov statistic with its DKW band.
     """
     points = np.unique(round_digits(values))
     slack = 10.0 ** (1 - DIGITS) * np.maximum(np.abs(points), 1e-300)
     ranks = np.searchsorted(np.sort(round_digits(values)), points, "right") / len(values)
-    before = np.searchsorted(np.sort(round_digits(values)), points, "left") / len(values)
-    # A point stands for an interval of rounding: the law's mass may be at either end of it.
+    ranks_below = np.searchsorted(np.sort(round_digits(values)), points, "left") / len(values)
+    # A rounded value stands for an interval: an atom of the law may lie anywhere in it.
     above = np.maximum(ranks - cdf(points + slack), 0.0)
-    below = np.maximum(cdf(points - slack) - before, 0.0)
+    below = np.maximum(cdf(points - slack) - ranks_below, 0.0)
     value = float(max(above.max(), below.max()))
     width = band_width(len(values), level)
     spread = 0.5 / math.sqrt(len(values))
@@ -235,7 +242,7 @@ def distance_to_law(
 
 
 def band_around(value: float, width: float, detectable: float = math.nan) -> Interval:
-    """Return the interval for a difference of probabilities that is off by at most ``width``."""
+    """Return the interval ``value`` +- ``width``, clipped to [0, 1], for a distance of laws."""
 
     def limits(value: float, factor: float) -> tuple[float, float]:
         """Return both ends for another distance and ``factor`` times the samples."""
@@ -247,8 +254,8 @@ def band_around(value: float, width: float, detectable: float = math.nan) -> Int
 
 
 def scale_interval(total: float, freedom: float, level: float) -> Interval:
-    """Return an interval for c if ``total`` is c times a chi-square variable with ``freedom``
-    degrees of freedom.
+    """Return the interval for c if ``total`` is c times a chi-square variable with ``freedom``
+    degrees of freedom; its estimate is total / freedom.
     """
 
     def quantiles(freedom: float) -> tuple[float, float]:
@@ -259,12 +266,12 @@ def scale_interval(total: float, freedom: float, level: float) -> Interval:
 
     def limits(value: float, factor: float) -> tuple[float, float]:
         """Return both ends for another variance and ``factor`` times the samples."""
-        more = factor * freedom
-        upper, lower = quantiles(more)
-        return value * more / upper, value * more / lower
+        total_freedom = factor * freedom
+        upper, lower = quantiles(total_freedom)
+        return value * total_freedom / upper, value * total_freedom / lower
 
     upper, lower = quantiles(freedom)
-    # c times a chi-square variable leaves the interval with probability POWER.
+    # The c above (and below) 1 at which the interval excludes 1 with probability POWER.
     up = upper / (2.0 * float(scipy.special.gammaincinv(freedom / 2.0, 1.0 - POWER)))
     down = lower / (2.0 * float(scipy.special.gammaincinv(freedom / 2.0, POWER)))
     detectable = max(up - 1.0, 1.0 - down)
@@ -272,12 +279,12 @@ def scale_interval(total: float, freedom: float, level: float) -> Interval:
 
 
 def quadratic_interval(total: float, weights: FloatArray, level: float) -> Interval:
-    """Return an interval for c if ``total`` is c times a sum of squares of independent standard
-    Gaussian numbers with ``weights`` (K,), at least 0.
+    """Return the interval for c if ``total`` is c times sum_k weights_k z_k^2 with independent
+    standard normal z_k; ``weights`` (K,) are at least 0.
 
-    Its ends are quantiles of the sum by the saddle-point formula of Lugannani and Rice, whose
-    relative error in the tails is a few per cent for any weights; it is exact where all are equal,
-    since the sum is then taken for the chi-square variable that it is.
+    Its ends are quantiles of that sum by the saddle-point formula of Lugannani and Rice (1980),
+    whose relative error in the tails is a few per cent for any weights. For equal weights the sum
+    is a multiple of a chi-square variable, whose exact quantiles are used.
     """
     weights = weights[weights > 1e-12 * weights.max(initial=0.0)]
     if not len(weights):
@@ -299,20 +306,21 @@ def quadratic_interval(total: float, weights: FloatArray, level: float) -> Inter
 
 
 def _quadratic_quantile(weights: FloatArray, tail: float, upper: bool) -> float:
-    """Return the value that the sum of :func:`quadratic_interval` exceeds (``upper``), or stays
+    """Return the quantile that the sum of :func:`quadratic_interval` exceeds (``upper``), or stays
     below, with probability ``tail``.
     """
-    # K'(s) = sum w / (1 - 2 s w) grows with s, which therefore stands for the value in the search.
-    far = 0.5 / float(weights.max())
-    wanted = math.log(tail)
-    low, high = (0.0, far) if upper else (-1e12 * far, 0.0)
+    # The saddle point of a value x solves K'(s) = sum w / (1 - 2 s w) = x, with K the cumulant
+    # generating function. K' increases up to its pole, so that bisection over s finds the quantile.
+    pole = 0.5 / float(weights.max())
+    log_target = math.log(tail)
+    low, high = (0.0, pole) if upper else (-1e12 * pole, 0.0)
     for _ in range(200):
         if upper:
             middle = 0.5 * (low + high)
         else:  # over many orders of magnitude
-            middle = -math.sqrt(max(-low, 1e-300) * max(-high, 1e-12 * far))
-        inside = _log_tail(weights, middle) > wanted
-        if inside == upper:
+            middle = -math.sqrt(max(-low, 1e-300) * max(-high, 1e-12 * pole))
+        is_above = _log_tail(weights, middle) > log_target
+        if is_above == upper:
             low = middle
         else:
             high = middle
@@ -322,8 +330,10 @@ def _quadratic_quantile(weights: FloatArray, tail: float, upper: bool) -> float:
 
 
 def _log_tail(weights: FloatArray, s: float) -> float:
-    """Return the logarithm of the probability beyond K'(s), above it for s > 0 and below for
-    s < 0, by Lugannani and Rice.
+    """Return log P(sum > K'(s)) for s > 0, log P(sum < K'(s)) for s < 0 (Lugannani and Rice 1980).
+
+    With r = sqrt(2 (s K'(s) - K(s))) and u = |s| sqrt(K''(s)) it is log(1 - N(r) + n(r) (1/u - 1/r)),
+    N and n the normal distribution and density; near s = 0, where 1/u - 1/r cancels, log(1/2).
     """
     shrunk = 1.0 - 2.0 * s * weights
     value, curvature = float((weights / shrunk).sum()), float((2.0 * (weights / shrunk) ** 2).sum())
@@ -338,38 +348,41 @@ def _log_tail(weights: FloatArray, s: float) -> float:
 
 
 def eigenvalue_interval(samples: FloatArray, level: float) -> Interval:
-    """Return an interval for the largest eigenvalue of the mean of symmetric samples (R, n, n) with
-    a variance: all directions at once, by Scheffe's method for the n (n + 1) / 2 entries, with
-    Student's law of a mean of R samples for each.
+    """Return an interval for the largest eigenvalue of the mean of symmetric samples (R, n, n).
+
+    Scheffe's method covers all directions at once: Hotelling's T^2 bounds the mean of the
+    n (n + 1) / 2 distinct entries, estimated from R samples, which must have a variance.
     """
     count, n = len(samples), samples.shape[-1]
     mean = samples.mean(axis=0)
     values, vectors = np.linalg.eigh(mean)
     entries = n * (n + 1) // 2
-    # Hotelling's T squared allows for variances that are estimated from few samples.
+    # T^2 = p (R - 1) / (R - p) F(p, R - p) for p entries; /R for the mean.
     freedom = max(count - entries, 1)
     ratio = float(scipy.special.fdtri(entries, freedom, 1.0 - level))
     reach = math.sqrt(entries * (count - 1) / freedom * ratio / count)
-    # Any direction bounds the largest eigenvalue from below, here the eigenvectors of the mean.
-    along = np.einsum("ia,rij,ja->ra", vectors, samples, vectors).std(axis=0, ddof=1)
-    low = float((values - reach * along).max())
-    # From above it takes the direction in which the samples vary most.
+    # v' M v of any unit vector v bounds the largest eigenvalue from below: v are the eigenvectors.
+    deviations = np.einsum("ia,rij,ja->ra", vectors, samples, vectors).std(axis=0, ddof=1)
+    low = float((values - reach * deviations).max())
+    # The upper limit needs every direction: the largest standard deviation of any is used.
     flat = samples.reshape(count, -1)
     covariance = np.atleast_2d(np.cov(flat, rowvar=False))
     widest = math.sqrt(max(float(np.linalg.eigvalsh(covariance)[-1]), 0.0))
-    spread = float(along[-1]) / math.sqrt(count)
-    detectable = reach * float(along.max()) + _normal_quantile(POWER) * spread
+    spread = float(deviations[-1]) / math.sqrt(count)
+    detectable = reach * float(deviations.max()) + _normal_quantile(POWER) * spread
     return Interval(float(values[-1]), low, float(values[-1]) + reach * widest, detectable)
 
 
 def pearson_test(counts: np.ndarray, probabilities: FloatArray) -> tuple[float, int]:
-    """Return the p-value of Pearson's test and its number of cells; rare cells at the end are
-    pooled.
+    """Return the p-value of Pearson's chi-square test and its number of cells.
+
+    ``counts`` and ``probabilities`` are those of the cells in decreasing order of probability; the
+    last cells, with expected counts below MIN_EXPECTED, are pooled.
     """
     expected = probabilities * counts.sum()
-    kept = max(1, int((expected >= MIN_EXPECTED).sum()))
-    expected = np.append(expected[: kept - 1], counts.sum() - expected[: kept - 1].sum())
-    pooled = np.append(counts[: kept - 1], counts[kept - 1 :].sum())
+    frequent = max(1, int((expected >= MIN_EXPECTED).sum()))
+    expected = np.append(expected[: frequent - 1], counts.sum() - expected[: frequent - 1].sum())
+    pooled = np.append(counts[: frequent - 1], counts[frequent - 1 :].sum())
     if len(pooled) < 2:
         return 1.0, len(pooled)
     statistic = float(((pooled - expected) ** 2 / expected).sum())

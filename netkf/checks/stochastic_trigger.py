@@ -25,14 +25,18 @@ RATE_TOLERANCE = 0.05  # of the share of slots with a message
 
 @dataclass(frozen=True, eq=False)
 class TriggerSummary(ReplicaSummary):
-    """Adds how often nodes sent and how often they should have, given the past, ``sends`` (2,)."""
+    """Adds ``sends`` (2,): the number of messages sent, and the sum of the probabilities of sending
+    given the past.
+    """
 
     sends: np.ndarray
 
 
 def check_rate(samples: RunSamples, level: float) -> Finding:
-    """Compare how often nodes sent with the sum of their probabilities: differences have mean 0
-    whatever happened before, and runs are independent.
+    """Test the null hypothesis that nodes send with their stated probability given the past.
+
+    Under it the number of messages of a run less the sum of the probabilities is a martingale with
+    mean 0; Student's interval is over the independent runs.
     """
     sent, expected = samples.runs.sends.T
     total = float(expected.mean())
@@ -40,10 +44,10 @@ def check_rate(samples: RunSamples, level: float) -> Finding:
         return find_unknown("no node has a slot in which it decides", RATE_TOLERANCE)
     difference = (sent - expected) / total
     spread = float(difference.std(ddof=1)) / np.sqrt(len(difference))
-    found = student_interval(1.0 + float(difference.mean()), spread, len(difference), level)
-    apart = deviation_interval(1.0, found)
+    ratio = student_interval(1.0 + float(difference.mean()), spread, len(difference), level)
+    distance = deviation_interval(1.0, ratio)
     text = f"messages sent over those expected given the past, {sent.sum():,.0f} sent"
-    return find_largest([(apart, "all nodes and slots")], RATE_TOLERANCE, text)
+    return find_largest([(distance, "all nodes and slots")], RATE_TOLERANCE, text)
 
 
 NEEDS = ("the filters know", "every node hears", "the filters start", REACH)
@@ -57,7 +61,10 @@ RATE = Promise(
 
 
 class TriggerChecks(EquationChecks):
-    """Equations, the covariance of silent slots and the rate, where silence is no loss."""
+    """Promises about the equations, about P after silent slots, and about the rate of messages.
+
+    They need a network without losses, in which silence is information.
+    """
 
     summary_type = TriggerSummary
 
@@ -69,10 +76,10 @@ class TriggerChecks(EquationChecks):
         return TriggerSummary(**vars(summarise_exactly(scenario, run)), sends=sends)
 
     def promises(self, scenario: Scenario) -> tuple[Promise, ...]:
-        """Return the promises about a scenario; the equations too are about sure messages."""
+        """Return the promises about a scenario; all assume that no message is lost."""
         equations = [
-            dataclasses.replace(one, needs=(*one.needs, "every node hears", "the filters know"))
-            for one in PROMISES
+            dataclasses.replace(promise, needs=(*promise.needs, "every node hears", "the filters know"))
+            for promise in PROMISES
         ]
         return (*equations[:1], SILENCE, RATE, *equations[1:])
 

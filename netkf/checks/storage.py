@@ -1,7 +1,8 @@
-"""What a check leaves in a directory, so that runs can be added later.
+"""The directory of a check, to which runs can be added later.
 
-``results.npz`` holds the summaries of all replicas as plain arrays, which execute nothing when they
-are read; ``verdict.json`` the verdict and what it belongs to.
+``results.npz`` holds the summaries of all replicas as plain arrays, so that reading a file of
+unknown origin executes no code (no pickles); ``verdict.json`` holds the verdict, with digests of
+the scenario and the results.
 """
 
 from __future__ import annotations
@@ -44,12 +45,12 @@ RESULTS, VERDICT, PICTURE = "results.npz", "verdict.json", "verdict.png"
 FILES = (RESULTS, "verdict.csv", "verdict.txt", PICTURE)
 """Files that a check writes before the verdict itself."""
 NUMBERS = ("margin", "low", "high", "tolerance", "seen", "expected", "off", "detectable")
-"""Numbers of a row, which may be nan or infinite."""
+"""Fields of a row that may be nan or infinite, which JSON cannot express."""
 
 
 def save_verdict(directory: Path, scenario: Scenario, verdict: Verdict, text: str = "") -> None:
     """Write scenario.toml, verdict.json, verdict.csv, verdict.txt and results.npz."""
-    with defer_signals():  # the verdict has the digest of the results
+    with defer_signals():  # an interrupt must not leave a verdict that does not match its results
         _save_verdict(directory, scenario, verdict, text or verdict_text(verdict, scenario.claim))
 
 
@@ -65,7 +66,7 @@ def _save_verdict(directory: Path, scenario: Scenario, verdict: Verdict, text: s
     with write_atomically(directory / "verdict.csv") as part:
         verdict.table.to_csv(part, index=False)
     write_text(directory / "verdict.txt", text + "\n")
-    # A picture of fewer runs is none of this verdict.
+    # A picture of an earlier verdict with fewer runs is out of date.
     with writing(directory / PICTURE):
         (directory / PICTURE).unlink(missing_ok=True)
     document = verdict_json(verdict)
@@ -74,7 +75,7 @@ def _save_verdict(directory: Path, scenario: Scenario, verdict: Verdict, text: s
         "versions": versions(),
         "looks": verdict.looks,
         "spent": verdict.spent,
-        "infinite": _restore_infinite(verdict),
+        "infinite": _infinite_numbers(verdict),
         "machine": machine(),
         "files": file_digests(directory, [RESULTS, "scenario.toml"]),
     }
@@ -104,36 +105,35 @@ def load_verdict(directory: Path, scenario: Scenario, seed: int) -> Verdict:
     """
     remedy = "give a directory that netkf check --out has written"
     try:
-        found = read_document(directory / VERDICT)
+        document = read_document(directory / VERDICT)
         same = {
-            "scenario": (found["digest"], scenario_digest(scenario)),
-            "seed": (found["seed"], seed),
-            "versions": (found["versions"], versions()),
-            "machine": (found["machine"], machine()),
+            "scenario": (document["digest"], scenario_digest(scenario)),
+            "seed": (document["seed"], seed),
+            "versions": (document["versions"], versions()),
+            "machine": (document["machine"], machine()),
         }
-        check_seal(found)
-        check_files(directory, found)
-        looks, spent = int(found["looks"]), float(found["spent"])
-        rows = _read_rows(found)
+        check_seal(document)
+        check_files(directory, document)
+        looks, spent = int(document["looks"]), float(document["spent"])
+        rows = _read_rows(document)
         results = _read_results(directory / RESULTS, scenario)
-        count, confidence = int(found["runs"]), float(found["confidence"])
-    except Exception as error:  # whatever is in the files, which may be anybody's
+        count, confidence = int(document["runs"]), float(document["confidence"])
+    except Exception as error:  # the files may hold anything
         reason = str(error) if isinstance(error, DamagedError) else type(error).__name__
         problem = f"has no verdict that can be read: {reason}"
         raise ScenarioError("--resume", problem, str(directory), remedy) from None
-    for name, (kept, wanted) in same.items():
-        if kept != wanted:
+    for name, (stored, present) in same.items():
+        if stored != present:
             problem = f"{directory} holds a verdict of another {name.removesuffix('s')}"
-            raise ScenarioError("--resume", problem, kept, "start a new directory")
+            raise ScenarioError("--resume", problem, stored, "start a new directory")
     if len(results) != count:
         problem = f"{directory} holds {len(results)} results of {count} runs"
         raise ScenarioError("--resume", problem, str(directory), "start a new directory")
     return Verdict(scenario.name, count, seed, confidence, rows, tuple(results), looks, spent)
 
 
-def _restore_infinite(verdict: Verdict) -> list[tuple[int, str, bool]]:
-    """Return which numbers of which rows are infinite, and if they are positive: in JSON they are
-    null, as those that do not exist.
+def _infinite_numbers(verdict: Verdict) -> list[tuple[int, str, bool]]:
+    """Return (row, field, is positive) of all infinite numbers; JSON has null for them, as for nan.
     """
     values = (
         (k, name, getattr(row, name)) for k, row in enumerate(verdict.rows) for name in NUMBERS
@@ -141,12 +141,12 @@ def _restore_infinite(verdict: Verdict) -> list[tuple[int, str, bool]]:
     return [(k, name, bool(value > 0.0)) for k, name, value in values if np.isinf(value)]
 
 
-def _read_rows(found: dict[str, Any]) -> tuple[Evidence, ...]:
+def _read_rows(document: dict[str, Any]) -> tuple[Evidence, ...]:
     """Return the rows of a document."""
-    rows = [dict(row) for row in found["rows"]]
+    rows = [dict(row) for row in document["rows"]]
     for row in rows:
         row |= {name: np.nan for name in NUMBERS if row[name] is None}
-    for k, name, positive in found.get("infinite", ()):
+    for k, name, positive in document.get("infinite", ()):
         rows[k][str(name)] = np.inf if positive else -np.inf
     return tuple(Evidence(**row) for row in rows)
 
@@ -154,18 +154,18 @@ def _read_rows(found: dict[str, Any]) -> tuple[Evidence, ...]:
 def _result_columns(results: tuple[ReplicaResult, ...]) -> dict[str, np.ndarray]:
     """Return all results as arrays with a first axis over the replicas."""
     columns = {
-        "difference": np.array([one.difference for one in results]),
-        "expected": np.array([one.expected for one in results]),
-        "diverged": np.array([one.diverged for one in results]),
+        "difference": np.array([result.difference for result in results]),
+        "expected": np.array([result.expected for result in results]),
+        "diverged": np.array([result.diverged for result in results]),
     }
-    whole = [one for one in results if one.summary is not None]
-    if not whole:
+    completed = [result for result in results if result.summary is not None]
+    if not completed:
         return columns
-    for name in vars(whole[0].summary):
-        columns[f"summary.{name}"] = np.array([getattr(one.summary, name) for one in whole])
-    for part, first in zip(PartSummary._fields, whole[0].parts or (), strict=False):
+    for name in vars(completed[0].summary):
+        columns[f"summary.{name}"] = np.array([getattr(result.summary, name) for result in completed])
+    for part, first in zip(PartSummary._fields, completed[0].parts or (), strict=False):
         for name in first._fields if first is not None else ():
-            values = [getattr(getattr(one.parts, part), name) for one in whole]
+            values = [getattr(getattr(result.parts, part), name) for result in completed]
             columns[f"{part}.{name}"] = np.array(values)
     return columns
 
@@ -182,10 +182,10 @@ def _read_results(path: Path, scenario: Scenario) -> list[ReplicaResult]:
         if diverged:
             results.append(ReplicaResult(None, difference, expected))
             continue
-        at = {name: values[index] for name, values in columns.items() if "." in name}
-        summary = summary_type(**_select_fields(at, "summary"))
+        values_of_replica = {name: values[index] for name, values in columns.items() if "." in name}
+        summary = summary_type(**_select_fields(values_of_replica, "summary"))
         parts = {
-            part: cls(**_select_fields(at, part)) if _select_fields(at, part) else None
+            part: cls(**_select_fields(values_of_replica, part)) if _select_fields(values_of_replica, part) else None
             for part, cls in PART_TYPES.items()
         }
         results.append(ReplicaResult(summary, difference, expected, PartSummary(**parts)))
@@ -194,7 +194,7 @@ def _read_results(path: Path, scenario: Scenario) -> list[ReplicaResult]:
 
 
 def _select_fields(values: dict[str, Any], prefix: str) -> dict[str, Any]:
-    """Return the values whose names begin with ``prefix`` and a dot, without these."""
+    """Return the values named ``prefix.name``, by ``name``."""
     return {
         name.split(".", 1)[1]: value
         for name, value in values.items()

@@ -20,16 +20,18 @@ from netkf.theory.track_fusion.steady_errors import tracks_in_slots
 
 EXACT_TOLERANCE = 1e-8
 START_FACTOR, STEADY_TOLERANCE = 10.0, 1e-3
-"""What a start may matter beyond its size and the radius, and how little of it is called steady."""
+"""Safety factor on the effect of the start, radius^slots times its size; and the relative effect
+below which P counts as steady.
+"""
 
 
 def check_exact_covariance(samples: RunSamples, level: float) -> Finding:
-    """Compare P with the exact covariance of the error."""
-    most = max_replayed(samples.scenario)
-    P, Sigma = samples.runs.P[:most], samples.runs.Sigma[:most]
+    """Compare P with the exact covariance Sigma of the error, up to rounding."""
+    max_runs = max_replayed(samples.scenario)
+    P, Sigma = samples.runs.P[:max_runs], samples.runs.Sigma[:max_runs]
     size = np.trace(Sigma, axis1=-2, axis2=-1)
     gap = np.nan_to_num(np.abs(P - Sigma).max(axis=(-1, -2)), nan=1e300, posinf=1e300)
-    limits = size, samples.largest_terms(samples.runs.replayed[:most]), EXACT_TOLERANCE
+    limits = size, samples.largest_terms(samples.runs.replayed[:max_runs]), EXACT_TOLERANCE
     message = f"largest entry of P - Sigma relative to its trace in {gap.size:,} covariances"
     return with_departure(compare_identities(gap, *limits, message), samples, gap, limits)
 
@@ -44,22 +46,25 @@ EXACT = Promise(
 
 
 def check_steady(samples: RunSamples, level: float) -> Finding:
-    """Compare P at the end of the runs with that of steady tracks."""
+    """Compare P at the end of the runs with that of steady tracks.
+
+    The row is undecided, with the horizon that would do, while the start may still matter.
+    """
     radius, steady = tracks_in_slots(samples.scenario)
     expected = steady[sampled_indices(samples.scenario)]
-    # What is left of the start shrinks by the radius in each slot.
-    left = radius ** check_slots(samples.scenario)[-1]
+    # The effect of the start shrinks by the spectral radius in each slot.
+    remaining = radius ** check_slots(samples.scenario)[-1]
     gap = np.abs(samples.runs.P[:, -1] - expected).max(axis=(-1, -2))
     size = np.trace(expected, axis1=-2, axis2=-1)
     terms = samples.first_trace + float(np.trace(steady, axis1=-2, axis2=-1).max())
-    allowed = EXACT_TOLERANCE + START_FACTOR * left * terms / float(size.min())
+    allowed = EXACT_TOLERANCE + START_FACTOR * remaining * terms / float(size.min())
     message = f"P at the end of {samples.count} runs"
-    found = find_identity(float((gap / size).max()), allowed, message)
+    finding = find_identity(float((gap / size).max()), allowed, message)
     if allowed < STEADY_TOLERANCE:
-        return found
-    wanted = STEADY_TOLERANCE * float(size.min()) / (2.0 * START_FACTOR * terms)
-    slots = math.log(wanted) / math.log(radius)
-    return found._replace(early=True, horizon=slots * samples.scenario.slot_plant.period)
+        return finding
+    allowed_remainder = STEADY_TOLERANCE * float(size.min()) / (2.0 * START_FACTOR * terms)
+    slots = math.log(allowed_remainder) / math.log(radius)
+    return finding._replace(early=True, horizon=slots * samples.scenario.slot_plant.period)
 
 
 STEADY = Promise(
@@ -73,14 +78,16 @@ BY_COMBINATION = {"best intersection": (UPPER_BOUND,), "tracks": (EXACT, STEADY)
 
 
 class FusionChecks(EquationChecks):
-    """Equations, and what P says of the error."""
+    """Promises about the equations, and about P as bound or covariance of the error."""
 
     def promises(self, scenario: Scenario) -> tuple[Promise, ...]:
-        """Return the promises about a scenario; of inverse intersection only the equations, since
-        its authors promise P for one fusion of tracks and not for a network.
+        """Return the promises about a scenario.
+
+        Inverse covariance intersection has only the equations: its authors claim that P is a bound
+        for one fusion of two tracks, not for a network.
         """
-        more = BY_COMBINATION.get(with_promised_filter(scenario).hosted.combination, ())
-        return (*PROMISES[:1], *more, *PROMISES[1:])
+        about_errors = BY_COMBINATION.get(with_promised_filter(scenario).hosted.combination, ())
+        return (*PROMISES[:1], *about_errors, *PROMISES[1:])
 
 
 CHECKS = FusionChecks()
