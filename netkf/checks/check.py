@@ -96,7 +96,9 @@ class Verdict(NotebookTable):
     def __repr__(self) -> str:
         counts = Counter(row.verdict for row in self.rows)
         counts_text = ", ".join(f"{counts[name]} {name}" for name in VERDICTS if counts[name])
-        return f"<netkf verdict on {self.scenario!r}: {counts_text or 'no row'}; {self.runs:,} runs>"
+        return (
+            f"<netkf verdict on {self.scenario!r}: {counts_text or 'no row'}; {self.runs:,} runs>"
+        )
 
     @property
     def table(self) -> pd.DataFrame:

@@ -73,7 +73,9 @@ def _sensors_excite(samples: RunSamples, level: float) -> Finding:
 
 
 def _cooperation_helps(samples: RunSamples, level: float) -> Finding:
-    """Compare exact mean-square errors at the end with those without cooperation, of the same runs.
+    """Compare exact mean-square errors at the end with those of the same runs without cooperation.
+
+    The node with the largest error counts in both cases.
     """
     Sigma, Sigma_alone = samples.runs.Sigma[:ALONE, -1], samples.runs.alone[:ALONE]
     cooperative = np.trace(Sigma, axis1=-2, axis2=-1).mean(axis=0)
@@ -202,12 +204,17 @@ class DiffusionChecks(PaperChecks):
             _require_few_regressors(scenario)
             levels = information_level(scenario, 100, 0)
             highest = float(levels.loc[levels["node"] != -1, "level"].max())
-            needs_others, evidence = highest <= 0.0, f"the best sensor alone has level {highest:.3g} of D (5)"
+            needs_others, evidence = (
+                highest <= 0.0,
+                f"the best sensor alone has level {highest:.3g} of D (5)",
+            )
         except TheoryError as error:
             needs_others, evidence = False, str(error)
         model = "same F, Q and R" if models_agree else "filter.model differs from the truth"
         return [
-            Assumption("the filters know the plant and the sensors", "D Algorithm 1", models_agree, model),
+            Assumption(
+                "the filters know the plant and the sensors", "D Algorithm 1", models_agree, model
+            ),
             exact_start(scenario),
             few_errors(scenario),
             Assumption("no sensor would do alone", "D VI", needs_others, evidence),

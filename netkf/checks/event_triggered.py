@@ -18,8 +18,8 @@ from netkf.scenario.scenario import Scenario
 def check_nees_bound(samples: RunSamples, level: float) -> Finding:
     """Test the null hypothesis that the mean of NEES / n is at most 1 at every time and node.
 
-    Decisions to send depend on the data, so that errors given the events are not Gaussian: Student's
-    interval for the mean over the runs is used, with the level shared by all points.
+    Decisions to send depend on the data, so that errors given the events are not Gaussian. Hence
+    Student's interval for the mean over the runs is used, with the level shared by all points.
     """
     n, nees = samples.scenario.plant.n, samples.runs.nees.reshape(samples.count, -1)
     finite = np.flatnonzero(np.isfinite(nees).all(axis=0))

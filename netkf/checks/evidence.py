@@ -182,7 +182,9 @@ def _judge(promise: Promise, finding: Finding, runs: int) -> Evidence:
         verdict = UNDECIDED
         runs_used = min(runs, finding.most_runs)
         forecast_runs = FORECAST_MARGIN * runs_used * _factor_needed(finding, MAX_RUNS / runs_used)
-        needed = math.ceil(forecast_runs) if forecast_runs < min(MAX_RUNS, finding.most_runs) else None
+        needed = (
+            math.ceil(forecast_runs) if forecast_runs < min(MAX_RUNS, finding.most_runs) else None
+        )
         if forecast_runs > finding.most_runs:
             message = (
                 f"{message}; exact covariances are those of {finding.most_runs:,} runs at most, "
@@ -209,8 +211,8 @@ def _judge(promise: Promise, finding: Finding, runs: int) -> Evidence:
 
 
 def _factor_needed(finding: Finding, max_factor: float) -> float:
-    """Return the factor on the runs at which the verdict ``holds`` is expected if the promise holds;
-    inf if it exceeds ``max_factor``.
+    """Return the factor on the runs at which a promise that holds is expected to be decided; inf if
+    it exceeds ``max_factor``.
 
     The measured distance is taken to be sampling error. Without a forecast the limit shrinks as
     1 / sqrt(runs); otherwise the factor is found by bisection on a logarithmic scale.

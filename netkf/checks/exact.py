@@ -80,7 +80,11 @@ def summarise_exactly(scenario: Scenario, run: Run) -> ReplicaSummary:
     _, nees = errors(run.error, run.P)
     e = np.where(blurred_samples(run, run.P)[..., None], np.nan, run.error)
     nees = np.where(np.isnan(e).any(axis=-1) | _nearly_singular(run.P), np.nan, nees)
-    P, e, nees = run.P[time_indices][:, sampled], e[time_indices][:, sampled], nees[time_indices][:, sampled]
+    P, e, nees = (
+        run.P[time_indices][:, sampled],
+        e[time_indices][:, sampled],
+        nees[time_indices][:, sampled],
+    )
     if run.replica < max_replayed(scenario) and few_errors(scenario).holds:
         try:
             law = error_law(with_promised_filter(scenario), run)
@@ -149,7 +153,9 @@ def _replayed_summary(
     Sigma, replayed = diagonal_blocks(stacked, estimators), law.P
     centred = run.error[:, :estimators] - mean
     floor = np.maximum((BLUR * run.rounding) ** 2, _variance_floor(scenario))
-    squares = whiten_errors(centred[time_indices], stacked[time_indices], MIN_VARIANCE, floor[time_indices])
+    squares = whiten_errors(
+        centred[time_indices], stacked[time_indices], MIN_VARIANCE, floor[time_indices]
+    )
     joint, bias = _pool_times(centred, law.covariance, float(floor.max()))
     quadratic = _pool_nees(centred, run.P[:, :estimators], law)
     if estimators < nodes:  # all share one pooled filter
@@ -207,7 +213,9 @@ def _pool_nees(e: FloatArray, P: FloatArray, law: ErrorLaw) -> FloatArray:
     nees = np.einsum("kia,kia->ki", e, np.linalg.solve(P, e[..., None])[..., 0])
     total = (scales * nees.ravel()).sum()
     L = np.sqrt(scales)[:, None, None] * L
-    quadratic_form = np.einsum("iab,ibjc,jdc->iajd", L, blocks, L, optimize=True).reshape(e.size, e.size)
+    quadratic_form = np.einsum("iab,ibjc,jdc->iajd", L, blocks, L, optimize=True).reshape(
+        e.size, e.size
+    )
     return np.append(total, np.maximum(np.linalg.eigvalsh(quadratic_form), 0.0))
 
 
@@ -242,8 +250,7 @@ def _variance_floor(scenario: Scenario) -> float:
 
 
 def few_errors(scenario: Scenario) -> Assumption:
-    """Return the assumption that the joint covariance of the errors of all nodes can be computed.
-    """
+    """Return the assumption that the joint error covariance of all nodes can be computed."""
     size = len(scenario.nodes) * scenario.plant.n
     evidence = f"{size} errors of all nodes together, at most {MAX_ERRORS}"
     return Assumption("exact errors are within reach", "netkf", size <= MAX_ERRORS, evidence)
@@ -268,8 +275,7 @@ def whiten_errors(
 
 
 def with_promised_filter(scenario: Scenario) -> Scenario:
-    """Return the scenario with the filter that its promises are about; see :func:`promised_filter`.
-    """
+    """Return the scenario with the filter of :func:`promised_filter`."""
     is_promised = promised_filter(scenario.filter.algorithm) is scenario.filter.algorithm
     return scenario if is_promised else with_base_filter(scenario)
 
@@ -310,13 +316,15 @@ def promised_filter(algorithm: Any) -> Any:
 
 
 def check_upper_bound(samples: RunSamples, level: float) -> Finding:
-    """Check P >= Sigma, the exact covariance of the errors, by the least eigenvalue of P - Sigma."""
+    """Check P >= Sigma, the exact error covariance, by the least eigenvalue of P - Sigma."""
     max_runs = max_replayed(samples.scenario)
     P, Sigma = samples.runs.P[:max_runs], samples.runs.Sigma[:max_runs]
     size = np.trace(Sigma, axis1=-2, axis2=-1)
     gap = np.nan_to_num(P - Sigma, nan=-1e300, posinf=1e300, neginf=-1e300)
     shortfall = np.maximum(-np.linalg.eigvalsh(gap)[..., 0], 0.0)
-    message = f"least eigenvalue of P - Sigma relative to its trace in {shortfall.size:,} covariances"
+    message = (
+        f"least eigenvalue of P - Sigma relative to its trace in {shortfall.size:,} covariances"
+    )
     limits = size, samples.largest_terms(samples.runs.replayed[:max_runs]), BOUND_TOLERANCE
     finding = compare_identities(shortfall, *limits, message)
     return with_departure(finding, samples, shortfall, limits)

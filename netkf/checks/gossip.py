@@ -315,7 +315,9 @@ def _check_tokens(samples: GossipSamples, level: float) -> Finding:
         token_covariances = samples.runs.tokens[:, i]
         pairs.append(Pair(f"token {node}", token_covariances, chain, chain[origin == i]))
     finding = compare_laws(pairs, level, samples.first_trace)
-    return with_horizon(samples, finding, _token_memory, LAW_TOLERANCE) if finding.early else finding
+    return (
+        with_horizon(samples, finding, _token_memory, LAW_TOLERANCE) if finding.early else finding
+    )
 
 
 def _check_initial_condition(samples: GossipSamples, level: float) -> Finding:
@@ -328,7 +330,9 @@ def _check_initial_condition(samples: GossipSamples, level: float) -> Finding:
         here = positions[:, -1] == i
         pairs.append(Pair(f"node {node}", samples.runs.P[:, -1, i], restarted[here], P[-1, here]))
     finding = compare_laws(pairs, level, samples.first_trace)
-    return with_horizon(samples, finding, _start_memory, LAW_TOLERANCE) if finding.early else finding
+    return (
+        with_horizon(samples, finding, _start_memory, LAW_TOLERANCE) if finding.early else finding
+    )
 
 
 def _check_bounded(samples: GossipSamples, level: float) -> Finding:
@@ -466,7 +470,10 @@ class GossipChecks(PaperChecks):
         """Return the assumptions of the tests beyond those of G."""
         try:
             effective_matching(scenario)
-            is_known, evidence = True, "drawn afresh in each slot, and lost with a known probability"
+            is_known, evidence = (
+                True,
+                "drawn afresh in each slot, and lost with a known probability",
+            )
         except TheoryError as error:
             is_known, evidence = False, str(error)
         return [

@@ -89,7 +89,9 @@ def _variance_exists(scenario: Scenario) -> Assumption:
     except TheoryError as error:
         return Assumption(name, source, None, f"not decided: {error}; {problem}")
     evidence = f"second moments change at rate {rate:.3g} per second"
-    return Assumption(name, source, rate < 0.0, evidence if rate < 0.0 else f"{evidence}; {problem}")
+    return Assumption(
+        name, source, rate < 0.0, evidence if rate < 0.0 else f"{evidence}; {problem}"
+    )
 
 
 def _mean_below_bound(samples: HybridSamples, level: float) -> Finding:
@@ -177,11 +179,13 @@ def _constant_gains_are_worse(samples: HybridSamples, level: float) -> Finding:
     )
     time_varying, constant = covariance_bound(promised, times), constant_gain_bound(promised, times)
     size = np.trace(time_varying, axis1=-2, axis2=-1)
-    smallest_eigenvalue = np.linalg.eigvalsh(constant - time_varying)[..., 0] / np.maximum(size, 1e-300)
+    smallest_eigenvalue = np.linalg.eigvalsh(constant - time_varying)[..., 0] / np.maximum(
+        size, 1e-300
+    )
     trace_excess = np.trace(constant, axis1=-2, axis2=-1) / np.maximum(size, 1e-300) - 1.0
     message = (
-        f"computed, not simulated: constant gains have a trace larger by up to {trace_excess.max():.2%} "
-        "at the times looked at, and the same steady state"
+        "computed, not simulated: constant gains have a trace larger by up to "
+        f"{trace_excess.max():.2%} at the times looked at, and the same steady state"
     )
     return find_identity(float(max(0.0, -smallest_eigenvalue.min())), GAIN_TOLERANCE, message)
 
@@ -310,7 +314,9 @@ class HybridChecks(PaperChecks):
         promised = with_promised_filter(scenario)
         reason = reason_without_bound(promised)
         return [
-            Assumption("H(12) speaks about the scenario", "H (12)", reason is None, reason or "it does"),
+            Assumption(
+                "H(12) speaks about the scenario", "H (12)", reason is None, reason or "it does"
+            ),
             exact_start(scenario),
             few_errors(scenario),
             _variance_exists(promised),

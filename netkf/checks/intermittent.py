@@ -79,7 +79,7 @@ Direction = tuple[int, int]
 class IntermittentSummary(ReplicaSummary):
     """Adds values at the last slot, and counts for the D directions that can carry readings.
 
-    ``replayed`` is the recursion R (15)-(18) along the arrivals of the run. Along the same arrivals:
+    ``replayed`` is the recursion R (15)-(18) along the arrivals of the run, from P(0). Along them:
 
     in_support : (N, n, n) P from the start P* of each node: a point of the support, R Theorem 10
     spread     : (N,) trace of the difference between P from a very large start and P from 0; the
@@ -269,7 +269,9 @@ def _above_least(samples: IntermittentSamples, level: float) -> Finding:
     without_loss = table.covariances(starts, sequences, slots)
     size = np.trace(samples.runs.P, axis1=-2, axis2=-1)
     with np.errstate(invalid="ignore"):
-        gap = np.linalg.eigvalsh(np.nan_to_num(samples.runs.P - without_loss, nan=-np.inf, posinf=-1e300))
+        gap = np.linalg.eigvalsh(
+            np.nan_to_num(samples.runs.P - without_loss, nan=-np.inf, posinf=-1e300)
+        )
     shortfall = np.maximum(-gap[..., 0], 0.0)
     message = f"{size.size:,} covariances against the path without losses"
     limits = np.nan_to_num(size), samples.largest_terms(samples.runs.P), BOUND_TOLERANCE
@@ -303,7 +305,9 @@ def _in_support(samples: IntermittentSamples, level: float) -> Finding:
         return finding
     end = samples.scenario.horizon
     with np.errstate(divide="ignore", invalid="ignore"):
-        log_decay = np.log(FAR_START**2 / np.median(spread[:, finite] / size)) if finite.any() else 0.0
+        log_decay = (
+            np.log(FAR_START**2 / np.median(spread[:, finite] / size)) if finite.any() else 0.0
+        )
     share = math.log(FAR_START**2 / SUPPORT_TOLERANCE) / log_decay if log_decay > 0.0 else math.inf
     return finding._replace(early=True, horizon=1.2 * share * end)
 

@@ -141,7 +141,8 @@ def growth(earlier: FloatArray, later: FloatArray, level: float) -> list[Interva
     (S', n, n): the largest P(later > GROWTH x) - P(earlier > x) over all x.
     """
     return [
-        law_excess(GROWTH * earlier[:, k, k], later[:, k, k], level) for k in range(earlier.shape[-1])
+        law_excess(GROWTH * earlier[:, k, k], later[:, k, k], level)
+        for k in range(earlier.shape[-1])
     ]
 
 
@@ -204,4 +205,6 @@ def exact_start(scenario: Scenario) -> Assumption:
     evidence = "mean and covariance are the plant's"
     if different:
         evidence = f"node {different[0]}{' and others' if different[1:] else ''}: not the plant's"
-    return Assumption("the filters start with the law of x(0)", "G (10), R (15)", not different, evidence)
+    return Assumption(
+        "the filters start with the law of x(0)", "G (10), R (15)", not different, evidence
+    )

@@ -151,7 +151,9 @@ def _at_steady_state(samples: PushSumSamples, level: float) -> Finding:
     P, replayed = samples.runs.P[was_replayed, -1], samples.runs.replayed[was_replayed, -1]
     if not len(P):
         return find_unknown("no run could be replayed")
-    distance, replayed_distance = (float(relative_difference(covariances, limit).max()) for covariances in (P, replayed))
+    distance, replayed_distance = (
+        float(relative_difference(covariances, limit).max()) for covariances in (P, replayed)
+    )
     # A distance that the equations themselves have at this time breaks no promise about the limit.
     early = distance > STEADY_TOLERANCE and distance <= replayed_distance + REPLAY_TOLERANCE
     margin = STEADY_TOLERANCE - distance
@@ -203,7 +205,7 @@ def _gaussian_radius(level: float, n: int) -> float:
 
 @gaussian_test
 def _mean_square(samples: PushSumSamples, level: float) -> Finding:
-    """Test the null hypothesis that mean squares of the errors at the end are the exact steady ones.
+    """Test the null hypothesis that mean-square errors at the end are the exact steady ones.
 
     Given the links of a run, |W e|^2 is a quadratic form of normal numbers; summed over the runs it
     gives an interval for the factor on its expected value. The promise is broken only if mean
@@ -228,7 +230,9 @@ def _mean_square(samples: PushSumSamples, level: float) -> Finding:
     max_runs = max_replayed(samples.scenario)
     finding = find_largest(intervals, SQUARE_TOLERANCE, message)._replace(most_runs=max_runs)
     off_limit = float(np.abs(expected - 1.0).max())
-    early = off_limit > SQUARE_TOLERANCE and not any(from_replay.low > 0.0 for from_replay, _ in intervals)
+    early = off_limit > SQUARE_TOLERANCE and not any(
+        from_replay.low > 0.0 for from_replay, _ in intervals
+    )
     return finding._replace(early=early)
 
 

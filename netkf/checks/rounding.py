@@ -52,7 +52,9 @@ def compare_identities(
     worst_index = int(np.argmax(share))
     # Relative to the size of the result or, if that is 0, of the terms.
     unit = float(scale[worst_index] or largest[worst_index] or 1.0)
-    return find_identity(float(deviations[worst_index]) / unit, float(limit[worst_index]) / unit, message)
+    return find_identity(
+        float(deviations[worst_index]) / unit, float(limit[worst_index]) / unit, message
+    )
 
 
 def largest_terms(P: FloatArray, start: FloatArray, information: float = 0.0) -> FloatArray:

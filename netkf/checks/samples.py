@@ -30,8 +30,8 @@ class ReplicaSummary:
     whole      : (K, 2) squared norm of the errors of all nodes, whitened by their joint covariance
                  given the events, and its degrees of freedom
     joint      : (2,) the same for the errors of all sample times, also those between the K ones
-    quadratic  : (1 + S,) the sum of the NEES of all nodes and sample times, and its S weights: given
-                 the events it is a sum of squares of standard normal numbers with these weights
+    quadratic  : (1 + S,) the sum of the NEES of all nodes and sample times, and its S weights: it
+                 is, given the events, a sum of squares of standard normal numbers times these
     bias       : (n, n + 1) information matrix of a constant bias of all errors, and the information
                  vector (that matrix times the estimate of the bias)
 
@@ -174,14 +174,15 @@ def relative_difference(P: FloatArray, expected: FloatArray) -> FloatArray:
 
 
 def check_growth(samples: RunSamples, level: float) -> Finding:
-    """Compare the growth of the law of P from half of the horizon to its end with that of replayed P.
-
-    See :func:`compare_growth`.
+    """Compare the growth of the law of P in the second half of the horizon with that of P replayed
+    by the equations; see :func:`compare_growth`.
     """
     P, replayed = samples.runs.P, samples.runs.replayed
     known_replays = replayed[~np.isnan(replayed).all(axis=(1, 2, 3, 4))]
     pairs, expected = [], []
     for i, node in enumerate(samples.nodes):
         pairs.append(Pair(f"node {node}", P[:, -2, i], P[:, -1, i]))
-        expected.append((known_replays[:, -2, i], known_replays[:, -1, i]) if len(known_replays) else None)
+        expected.append(
+            (known_replays[:, -2, i], known_replays[:, -1, i]) if len(known_replays) else None
+        )
     return compare_growth(pairs, expected, level)

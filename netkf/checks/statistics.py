@@ -178,7 +178,9 @@ def law_distance(
     return _band_interval(gaps, len(first), len(second), level, grow=False)
 
 
-def law_excess(first: FloatArray, second: FloatArray, level: float, rounding: float = 0.0) -> Interval:
+def law_excess(
+    first: FloatArray, second: FloatArray, level: float, rounding: float = 0.0
+) -> Interval:
     """Return an interval for the largest ``P(second > x) - P(first > x)`` over all x; see
     :func:`law_distance` for ``rounding``. Further runs add to both samples.
     """
@@ -332,8 +334,9 @@ def _quadratic_quantile(weights: FloatArray, tail: float, upper: bool) -> float:
 def _log_tail(weights: FloatArray, s: float) -> float:
     """Return log P(sum > K'(s)) for s > 0, log P(sum < K'(s)) for s < 0 (Lugannani and Rice 1980).
 
-    With r = sqrt(2 (s K'(s) - K(s))) and u = |s| sqrt(K''(s)) it is log(1 - N(r) + n(r) (1/u - 1/r)),
-    N and n the normal distribution and density; near s = 0, where 1/u - 1/r cancels, log(1/2).
+    With r = sqrt(2 (s K'(s) - K(s))) and u = |s| sqrt(K''(s)) the probability is
+    1 - N(r) + n(r) (1/u - 1/r), N and n the normal distribution and density; near s = 0, where
+    1/u - 1/r cancels, 1/2.
     """
     shrunk = 1.0 - 2.0 * s * weights
     value, curvature = float((weights / shrunk).sum()), float((2.0 * (weights / shrunk) ** 2).sum())

@@ -78,7 +78,9 @@ class TriggerChecks(EquationChecks):
     def promises(self, scenario: Scenario) -> tuple[Promise, ...]:
         """Return the promises about a scenario; all assume that no message is lost."""
         equations = [
-            dataclasses.replace(promise, needs=(*promise.needs, "every node hears", "the filters know"))
+            dataclasses.replace(
+                promise, needs=(*promise.needs, "every node hears", "the filters know")
+            )
             for promise in PROMISES
         ]
         return (*equations[:1], SILENCE, RATE, *equations[1:])

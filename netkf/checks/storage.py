@@ -133,8 +133,7 @@ def load_verdict(directory: Path, scenario: Scenario, seed: int) -> Verdict:
 
 
 def _infinite_numbers(verdict: Verdict) -> list[tuple[int, str, bool]]:
-    """Return (row, field, is positive) of all infinite numbers; JSON has null for them, as for nan.
-    """
+    """Return (row, field, is positive) of all infinite numbers, which JSON stores as null."""
     values = (
         (k, name, getattr(row, name)) for k, row in enumerate(verdict.rows) for name in NUMBERS
     )
@@ -162,7 +161,9 @@ def _result_columns(results: tuple[ReplicaResult, ...]) -> dict[str, np.ndarray]
     if not completed:
         return columns
     for name in vars(completed[0].summary):
-        columns[f"summary.{name}"] = np.array([getattr(result.summary, name) for result in completed])
+        columns[f"summary.{name}"] = np.array(
+            [getattr(result.summary, name) for result in completed]
+        )
     for part, first in zip(PartSummary._fields, completed[0].parts or (), strict=False):
         for name in first._fields if first is not None else ():
             values = [getattr(getattr(result.parts, part), name) for result in completed]
@@ -185,7 +186,9 @@ def _read_results(path: Path, scenario: Scenario) -> list[ReplicaResult]:
         values_of_replica = {name: values[index] for name, values in columns.items() if "." in name}
         summary = summary_type(**_select_fields(values_of_replica, "summary"))
         parts = {
-            part: cls(**_select_fields(values_of_replica, part)) if _select_fields(values_of_replica, part) else None
+            part: cls(**_select_fields(values_of_replica, part))
+            if _select_fields(values_of_replica, part)
+            else None
             for part, cls in PART_TYPES.items()
         }
         results.append(ReplicaResult(summary, difference, expected, PartSummary(**parts)))

@@ -55,18 +55,20 @@ def block_diagonal(blocks: Sequence[FloatArray]) -> FloatArray:
     """Return a matrix with ``blocks``, possibly rectangular or empty, along its diagonal."""
     rows = sum(b.shape[0] for b in blocks)
     columns = sum(b.shape[1] for b in blocks)
-    # Blocks may have no rows or no columns: slices of zeros take them too.
-    whole = np.zeros((rows, columns))
+    # Empty slices assign blocks without rows or columns correctly.
+    matrix = np.zeros((rows, columns))
     row = column = 0
     for block in blocks:
-        whole[row : row + block.shape[0], column : column + block.shape[1]] = block
+        matrix[row : row + block.shape[0], column : column + block.shape[1]] = block
         row += block.shape[0]
         column += block.shape[1]
-    return whole
+    return matrix
 
 
 def as_kernel_array(matrix: FloatArray) -> FloatArray:
-    """Return a matrix of the one layout for which kernels are compiled."""
+    """Return the matrix, or a copy, as a writable C-contiguous array, the only layout for which
+    kernels are compiled.
+    """
     if matrix.flags.c_contiguous and matrix.flags.writeable:
         return matrix
     return np.array(matrix, order="C")

@@ -1,7 +1,7 @@
-"""Compiled code on disk that several processes use: one compiles it, the others wait for it.
+"""A cache of compiled code on disk for several processes: one compiles, the others wait.
 
-Without this, processes that start side by side would all compile the same kernels, and numba would
-lose entries of its index, which it reads, changes and writes without a lock.
+Without it, processes that start side by side would all compile the same kernels, and numba would
+lose entries of its index file, which it reads, changes and writes without a lock.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ from pathlib import Path
 from typing import Any
 
 MAX_WAIT, POLL = 60.0, 0.02
-"""Seconds that a process waits for another one that compiles, several times what that takes; and
-after which it looks again.
+"""Longest wait in seconds for another process that compiles (several times the usual compile time),
+and interval at which the lock is tried.
 """
 
 
 class SharedCache:
-    """The cache of a numba dispatcher, with locks between processes; the other attributes are
-    those of numba's own cache.
+    """The cache of a numba dispatcher with locks between processes; all other attributes are those
+    of numba's own cache.
     """
 
     def __init__(self, cache: Any, name: str) -> None:
@@ -34,43 +34,46 @@ class SharedCache:
         return getattr(self._cache, name)
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
-        """Return the kept code for a signature. None: the caller compiles it, saves it, and calls
-        :meth:`release`; other processes wait for that.
+        """Return the cached code for a signature, or None.
+
+        After None this process holds the lock of the signature: it compiles and saves the code, and
+        must call :meth:`release`, for which other processes wait.
         """
-        found = self._cache.load_overload(sig, target_context)
-        if found is not None:
-            return found
-        # A lock for each signature: those who need another one need not wait.
+        code = self._cache.load_overload(sig, target_context)
+        if code is not None:
+            return code
+        # A lock for each signature: processes that need another signature do not wait.
         signature = hashlib.sha256(str(sig).encode()).hexdigest()[:16]
         self._waiting.enter_context(self._locked(f"{self._name}-{signature}.lock"))
         # Another process may have compiled it while this one was waiting.
         return self._cache.load_overload(sig, target_context)
 
     def save_overload(self, sig: Any, data: Any) -> None:
-        """Keep compiled code."""
-        # The index file holds all signatures of a function.
+        """Save compiled code for a signature."""
+        # All signatures of a function share one index file, which needs its own lock.
         with self._locked(f"{self._name}.lock"):
             self._cache.save_overload(sig, data)
 
     def release(self) -> None:
-        """Let other processes go on, whether or not anything was compiled."""
+        """Release the lock of :meth:`load_overload`, whether or not anything was compiled."""
         self._waiting.close()
 
     @contextmanager
     def _locked(self, name: str) -> Iterator[None]:
+        """Hold the lock file ``name`` of the cache folder; without a lock if that is impossible."""
         try:
             folder = Path(self._cache.cache_path)
             folder.mkdir(parents=True, exist_ok=True)
             opened = os.open(folder / name, os.O_RDWR | os.O_CREAT, 0o600)
         except OSError:
-            # A full disk, say: compiling twice is better than not at all.
+            # A full or read-only disk, for instance: compiling twice is better than failing.
             yield
             return
         try:
             _wait_for(opened)
             yield
         finally:
-            # The lock would end with the file, were that not open in a process forked meanwhile.
+            # Closing alone is not enough: a process forked meanwhile has the file open too.
             _unlock(opened)
             os.close(opened)
 
@@ -87,8 +90,8 @@ else:
     import fcntl
 
     def _wait_for(opened: int) -> None:
-        """Lock the file, once no other process has it locked; some file systems have no locks. A
-        process that was stopped while it compiled is not waited for: MAX_WAIT seconds at most.
+        """Lock the open file, or give up after MAX_WAIT seconds (its owner may be suspended) or if
+        the file system has no locks.
         """
         end = time.monotonic() + MAX_WAIT
         while time.monotonic() < end:
@@ -102,6 +105,6 @@ else:
                 return
 
     def _unlock(opened: int) -> None:
-        """Let other processes have the file."""
+        """Unlock the open file."""
         with suppress(OSError):
             fcntl.flock(opened, fcntl.LOCK_UN)

@@ -36,21 +36,21 @@ ROOMS = (
     "ensembles",
     "theory/numerics",
 )
-"""Whose code and numbers compiled functions may hold."""
+"""Rooms of netkf whose functions and constants can become part of compiled code."""
 
 MAX_CACHED_STATES = 4
-"""Of the sources, whose compiled code is kept."""
+"""Number of states of the sources for which compiled code is kept on disk."""
 
 UNROLLED, UNROLLED_BY_NUMBA = 1000, 300
-"""Instructions that a loop of known length may have when it is unrolled: in kernels, so that loops
-over up to four states vanish however many are inside each other, and elsewhere.
+"""Largest number of instructions of an unrolled loop (LLVM's unroll-threshold): in kernels, so that
+nested loops over up to four states are unrolled completely, and in other functions.
 """
 
 Function = TypeVar("Function", bound=Callable[..., Any])
-# Nobody calls a kernel from C: the wrapper would be a seventh of what is compiled.
+# Kernels are not called from C: the wrapper would be a seventh of the compiled code.
 _OPTIONS: Any = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
-_said: set[Callable[..., Any]] = set()
-_spent: list[float] = []
+_announced: set[Callable[..., Any]] = set()
+_compile_times: list[float] = []
 
 
 @overload
@@ -77,21 +77,24 @@ def kernel(
 ) -> Any:
     """Mark a numerical function, written as loops over arrays, that is always run compiled.
 
-    It may call kernels, works in place and makes no arrays, or is marked
-    ``@kernel(allocates=True)``. It runs without the interpreter's lock. ``inlined``: its code
-    becomes part of each kernel that calls it, which pays for steps of a few hundred flops.
-    ``fused``: a product and a sum may be one instruction, which rounds once. ``compact``: it is
-    called seldom, and its loops stay as they are written, which halves the time to compile it.
+    It may call kernels, and runs without the interpreter's lock.
+
+    allocates : it creates arrays; otherwise it works in place
+    inlined   : its code becomes part of each kernel that calls it, which pays off for functions of
+                up to a few hundred flops
+    fused     : a product and a sum may become one instruction (FMA), which rounds once
+    compact   : it is called seldom: its loops are not unrolled or vectorised, which halves the
+                compile time
     """
-    # ``@kernel(...)`` with arguments comes without the function.
+    # ``@kernel(...)`` with arguments is called without the function.
     if function is None:
-        return lambda loops: _registered(loops, allocates, inlined, fused, compact)
-    return _registered(function, allocates, inlined, fused, compact)
+        return lambda loops: _make_kernel(loops, allocates, inlined, fused, compact)
+    return _make_kernel(function, allocates, inlined, fused, compact)
 
 
 def _numba() -> Any:
-    """Return numba, which knows all that kernels use."""
-    # Imported with the first call: importing netkf must not import numba.
+    """Return the module numba, with the types that kernels use registered."""
+    # Imported by the first call of a kernel: importing netkf must not import numba.
     import numba
 
     from netkf.linalg import (  # noqa: F401 - register types
@@ -115,53 +118,56 @@ class Kernel:
 
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
         """Call the compiled function; the first call compiles it or loads it from disk."""
-        return self._called_from_python(*args, **kwargs)
+        return self._python_dispatcher(*args, **kwargs)
 
     def __reduce__(self) -> str:
         return self._loops.__qualname__
 
     @property
     def _compiler(self) -> Any:
-        # Inlined kernels are small and run most often. Numba's own lowering tells LLVM more than
-        # the lean one, which makes them up to 1.6 times faster.
+        """The numba compiler class of this kernel."""
+        # numba's own lowering tells LLVM more than the lean one, which makes inlined kernels, small
+        # and called most often, up to 1.6 times faster.
         return kernel_compiler(not self._options.get("forceinline", False), self._compact)
 
     @property
     def _numba_type_(self) -> Any:
-        """Numba asks a name that compiled code uses for this attribute."""
-        return self._called_from_kernels._numba_type_
+        """The numba type of the function; numba reads this attribute of names in kernels."""
+        return self._kernel_dispatcher._numba_type_
 
     @cached_property
-    def _called_from_kernels(self) -> Any:
-        """The function as other kernels call it: never cached on disk by itself."""
-        made = _numba().njit(pipeline_class=self._compiler, **self._options)(self._loops)
-        _for_any_number(made)
-        return made
+    def _kernel_dispatcher(self) -> Any:
+        """The numba dispatcher for calls by other kernels; not cached on disk by itself."""
+        dispatcher = _numba().njit(pipeline_class=self._compiler, **self._options)(self._loops)
+        _widen_arguments(dispatcher)
+        return dispatcher
 
     @cached_property
-    def _called_from_python(self) -> Callable[..., Any]:
-        """The function as Python calls it: with everything it calls, cached on disk."""
+    def _python_dispatcher(self) -> Callable[..., Any]:
+        """The numba dispatcher for calls by Python; cached on disk with all its callees."""
         numba = _numba()
         config = numba.config
-        before = config.CACHE_DIR
-        # numba looks at the file of the function alone, and what it calls may have changed.
-        config.CACHE_DIR = str(_folder(before))
+        cache_dir = config.CACHE_DIR
+        # numba invalidates its cache by the file of the function alone, while callees may change:
+        # hence a folder for each state of all sources.
+        config.CACHE_DIR = str(_cache_folder(cache_dir))
         try:
-            made: Any = numba.njit(cache=True, pipeline_class=self._compiler, **self._options)(
-                self._loops
-            )
+            dispatcher: Any = numba.njit(
+                cache=True, pipeline_class=self._compiler, **self._options
+            )(self._loops)
         finally:
-            config.CACHE_DIR = before
-        # Of processes that start side by side one compiles, and the others wait for it.
-        made._cache = SharedCache(made._cache, self._loops.__name__)
-        # numba's level is global: it is set while this function compiles.
-        _moderately_optimised(made, config)
-        return cast(Callable[..., Any], made)
+            config.CACHE_DIR = cache_dir
+        # Of several processes that need the same code one compiles, and the others wait.
+        dispatcher._cache = SharedCache(dispatcher._cache, self._loops.__name__)
+        _use_compile_settings(dispatcher, config)
+        return cast(Callable[..., Any], dispatcher)
 
 
-def _registered(
+def _make_kernel(
     loops: Callable[..., Any], allocates: bool, inlined: bool, fused: bool, compact: bool
 ) -> Callable[..., Any]:
+    """Return the Kernel of a function, with numba's options for the arguments of :func:`kernel`."""
+    # "_nrt": without numba's runtime there is no reference counting, and no allocation.
     options = {**_OPTIONS, "_nrt": allocates}
     if inlined:
         options["forceinline"] = True
@@ -170,9 +176,9 @@ def _registered(
     return Kernel(loops, options, compact)
 
 
-def _for_any_number(function: Any) -> None:
-    """Compile a function once for the types of its arguments, whatever constants it is given, and
-    however many bits integers have.
+def _widen_arguments(function: Any) -> None:
+    """Make calls by other kernels share one compiled version: literal types become their general
+    types and all signed integers int64, where numba would compile the function for each.
     """
     from numba.core import types
 
@@ -180,7 +186,7 @@ def _for_any_number(function: Any) -> None:
 
     def widened(kind: Any) -> Any:
         kind = kinds.unliteral(kind)
-        # Fields of records may be narrow.
+        # Fields of records may be int8 or int32.
         return kinds.int64 if isinstance(kind, kinds.Integer) and kind.signed else kind
 
     def for_types(args: Any, kws: Any) -> Any:
@@ -190,18 +196,20 @@ def _for_any_number(function: Any) -> None:
     function.get_call_template = for_types
 
 
-def _moderately_optimised(made: Any, config: Any) -> None:
-    """Let LLVM work at its level 2: level 3 takes a quarter longer and gains nothing here. But
-    loops whose length it knows are unrolled up to a larger size than at any level.
+def _use_compile_settings(dispatcher: Any, config: Any) -> None:
+    """Make a dispatcher compile at LLVM's optimisation level 2 and with a larger unroll threshold.
+
+    Level 3 takes a quarter longer and gains nothing here. Both settings are global, so that they
+    are set around the compilation of this function only. Its duration is added to _compile_times.
     """
     from llvmlite.binding import set_option
     from numba.core.errors import NumbaError as numba_error  # noqa: N813
 
-    compile_for = made._compile_for_args
+    compile_for = dispatcher._compile_for_args
 
     def moderately(*args: Any, **kwargs: Any) -> Any:
-        before, began = config.OPT, time.perf_counter()
-        config.OPT = type(before)(2)
+        level, started = config.OPT, time.perf_counter()
+        config.OPT = type(level)(2)
         set_option("netkf", f"-unroll-threshold={UNROLLED}")
         try:
             # One link step for the function and all that it calls, see linking.
@@ -209,38 +217,37 @@ def _moderately_optimised(made: Any, config: Any) -> None:
                 with linked_once(), without_collection():
                     return compile_for(*args, **kwargs)
             except numba_error:
-                # Once more as numba does it, to be told where in the function the error is.
-                made._cache.release()
+                # Once more without the replacements, for an error message with the source line.
+                dispatcher._cache.release()
                 return compile_for(*args, **kwargs)
         finally:
-            config.OPT = before
-            # LLVM cannot be told to forget it: this is what it takes for numba's own level.
+            config.OPT = level
+            # LLVM options cannot be unset: this is the value that numba's own level implies.
             set_option("netkf", f"-unroll-threshold={UNROLLED_BY_NUMBA}")
-            made._cache.release()
-            _spent.append(time.perf_counter() - began)
+            dispatcher._cache.release()
+            _compile_times.append(time.perf_counter() - started)
 
-    made._compile_for_args = moderately
+    dispatcher._compile_for_args = moderately
 
 
 def seconds_spent() -> float:
-    """On compiling, or loading what is kept, in this process so far."""
-    return sum(_spent)
+    """Return the seconds this process has spent on compiling, or loading code from disk."""
+    return sum(_compile_times)
 
 
 def announce(function: Callable[..., Any]) -> None:
-    """Say that a function will be compiled first, where its code is not kept on disk."""
-    # Once per function and process.
-    if function in _said:
+    """Print a note, once per function and process, if the code of a function is not on disk yet."""
+    if function in _announced:
         return
-    _said.add(function)
-    folder = _folder(os.environ.get("NUMBA_CACHE_DIR", ""))
+    _announced.add(function)
+    folder = _cache_folder(os.environ.get("NUMBA_CACHE_DIR", ""))
     if not any(folder.rglob(f"*.{function.__name__}-*.nbi")):
         words = "netkf: compiling, once after an installation (5 to 15 s) ..."
         print(words, file=sys.stderr, flush=True)
 
 
 def source_digest(*rooms: str) -> str:
-    """Return 16 hexadecimal digits of the digest of netkf's modules, or of those of ``rooms``."""
+    """Return 16 hexadecimal digits of the SHA-256 of netkf's modules, or of those of ``rooms``."""
     digest = hashlib.sha256()
     files = [file for room in rooms or ("",) for file in (ROOT / room).rglob("*.py")]
     for file in sorted(files):
@@ -250,29 +257,30 @@ def source_digest(*rooms: str) -> str:
 
 
 @cache
-def _folder(chosen: str) -> Path:
+def _cache_folder(chosen: str) -> Path:
     """Return the folder of compiled code: one for each state of the sources."""
-    # A kernel may hold constants and kernels of any of these rooms, and a change of any byte makes
-    # a new folder: compiled code is never out of date.
+    # A kernel may contain constants and kernels of any of these rooms; any change of their sources
+    # gives a new folder, so that compiled code is never out of date.
     name = f"netkf-{source_digest(*ROOMS)}"
-    kept = _cache_folder_for(chosen, ROOT)
-    if not (kept / name).exists():
-        _make_room(kept)
-    return kept / name
+    parent = _first_writable(chosen, ROOT)
+    if not (parent / name).exists():
+        _remove_old_folders(parent)
+    return parent / name
 
 
-def _cache_folder_for(chosen: str, root: Path) -> Path:
-    """Return the first folder of these that can be written: numba's if it was set, else one beside
-    the sources and that of the user's cache; then one of this process alone.
+def _first_writable(chosen: str, root: Path) -> Path:
+    """Return the first writable folder: ``chosen`` if it is not empty, else ``__pycache__`` of
+    ``root`` or the user's cache folder; else a temporary one of this process.
     """
     home = Path(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache"))
-    # The user's choice, NUMBA_CACHE_DIR. An installation may be read-only.
+    # ``chosen`` is NUMBA_CACHE_DIR. An installation may be read-only.
     places = [Path(chosen)] if chosen else [root / "__pycache__", home / "netkf"]
-    # numba would look for a folder of its own, where code may be out of date.
+    # Never numba's own default folder, whose code may be out of date.
     return next((place for place in places if _is_writable(place)), None) or _folder_of_process()
 
 
 def _is_writable(folder: Path) -> bool:
+    """Return True if the folder exists, or can be made, and can be written."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         return os.access(folder, os.R_OK | os.W_OK | os.X_OK)
@@ -281,16 +289,16 @@ def _is_writable(folder: Path) -> bool:
 
 
 def _folder_of_process() -> Path:
-    """Return a new folder, which is removed when the process ends."""
-    # Kept code is executed when it is read: a folder with a fixed name could be another user's.
-    made = Path(tempfile.mkdtemp(prefix="netkf-"))
-    atexit.register(shutil.rmtree, made, ignore_errors=True)
-    return made
+    """Return a new temporary folder, which is removed when the process ends."""
+    # Cached code is executed: a fixed name in a shared folder could be another user's.
+    folder = Path(tempfile.mkdtemp(prefix="netkf-"))
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    return folder
 
 
-def _make_room(folder: Path) -> None:
-    """Remove what was compiled from sources that are long gone."""
-    found = [path for path in folder.glob("netkf-*") if path.is_dir()]
-    # The newest states stay: switching between a few branches does not compile anew.
-    for old in sorted(found, key=lambda path: path.stat().st_mtime)[: -MAX_CACHED_STATES + 1]:
+def _remove_old_folders(folder: Path) -> None:
+    """Remove the folders of all but the newest states of the sources."""
+    folders = [path for path in folder.glob("netkf-*") if path.is_dir()]
+    # A few are kept, so that switching between branches does not compile anew.
+    for old in sorted(folders, key=lambda path: path.stat().st_mtime)[: -MAX_CACHED_STATES + 1]:
         shutil.rmtree(old, ignore_errors=True)

@@ -25,8 +25,8 @@ def diagonalise(a: FloatArray, vectors: FloatArray) -> None:
         turned = False
         for p in range(n):
             for q in range(p + 1, n):
-                # What does not change the diagonal any more is rounding. Relative to both diagonal
-                # entries, so that small eigenvalues are accurate too.
+                # An entry too small to change the diagonal is set to 0. The criterion is relative
+                # to both diagonal entries, so that small eigenvalues are accurate too.
                 if abs(a[p, q]) <= ROUNDING * math.sqrt(abs(a[p, p]) * abs(a[q, q])):
                     a[p, q] = a[q, p] = 0.0
                 else:
@@ -38,19 +38,19 @@ def diagonalise(a: FloatArray, vectors: FloatArray) -> None:
 
 @kernel
 def rotate(a: FloatArray, vectors: FloatArray, p: int, q: int) -> None:
-    """Turn rows and columns p and q so that ``a[p, q]`` becomes 0."""
-    # The smaller of both angles: |t| <= 1. A tilt beyond all bounds is an angle of 0.
+    """Apply the Jacobi rotation a <- J' a J, V <- V J in the plane (p, q) that makes a[p, q] 0."""
+    # t = tan(angle), the smaller of both solutions: |t| <= 1. An infinite tilt is an angle of 0.
     n, tilt = len(a), (a[q, q] - a[p, p]) / (2.0 * a[p, q])
     t = math.copysign(1.0, tilt) / (abs(tilt) + math.sqrt(1.0 + tilt * tilt))
     c = 1.0 / math.sqrt(1.0 + t * t)
     s = t * c
     for k in range(n):
-        one, other = a[p, k], a[q, k]
-        a[p, k], a[q, k] = c * one - s * other, s * one + c * other
-    # Then the columns: a <- J' a J.
+        first, second = a[p, k], a[q, k]
+        a[p, k], a[q, k] = c * first - s * second, s * first + c * second
+    # Then the columns, and those of V.
     for k in range(n):
-        one, other = a[k, p], a[k, q]
-        a[k, p], a[k, q] = c * one - s * other, s * one + c * other
-        one, other = vectors[k, p], vectors[k, q]
-        vectors[k, p], vectors[k, q] = c * one - s * other, s * one + c * other
+        first, second = a[k, p], a[k, q]
+        a[k, p], a[k, q] = c * first - s * second, s * first + c * second
+        first, second = vectors[k, p], vectors[k, q]
+        vectors[k, p], vectors[k, q] = c * first - s * second, s * first + c * second
     a[p, q] = a[q, p] = 0.0

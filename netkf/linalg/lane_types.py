@@ -1,6 +1,8 @@
-"""How numba sees the values of :mod:`netkf.linalg.lanes`: vectors of LLVM.
+"""The numba types of the SIMD values of :mod:`netkf.linalg.lanes`: vectors of LLVM.
 
 Imported before the first kernel is compiled. A value of one lane is a float, and its flags a bool.
+Each function of ``lanes`` has a typing (:func:`_register_type`), which returns the type of its
+result, and a lowering ``lower_...``, which emits its LLVM instructions.
 """
 
 from __future__ import annotations
@@ -24,7 +26,7 @@ DOUBLE, BYTE, BIT, I32 = ir.DoubleType(), ir.IntType(8), ir.IntType(1), ir.IntTy
 
 
 class LaneValue(types.Type):
-    """``count`` float64 side by side."""
+    """The numba type of a vector of ``count`` float64."""
 
     def __init__(self, count: int) -> None:
         self.count = count
@@ -32,7 +34,7 @@ class LaneValue(types.Type):
 
 
 class LaneFlags(types.Type):
-    """A truth value for each of ``count`` lanes."""
+    """The numba type of a vector of ``count`` truth values."""
 
     def __init__(self, count: int) -> None:
         self.count = count
@@ -56,26 +58,27 @@ class FlagsModel(models.PrimitiveModel):
 
 
 def value_type(count: int) -> Any:
-    """The numba type of a value."""
+    """Return the numba type of a value of ``count`` lanes."""
     return types.float64 if count == 1 else LaneValue(count)
 
 
 def flags_type(count: int) -> Any:
-    """The numba type of flags."""
+    """Return the numba type of the flags of ``count`` lanes."""
     return types.boolean if count == 1 else LaneFlags(count)
 
 
 def _count(kind: Any) -> int:
-    """Lanes of a value or of flags."""
+    """Return the number of lanes of a type of values or flags; 1 for plain numbers."""
     return kind.count if isinstance(kind, LaneValue | LaneFlags) else 1
 
 
 def _is_number(kind: Any) -> bool:
+    """Return True for plain numbers, which count as one lane."""
     return isinstance(kind, types.Float | types.Integer | types.Boolean)
 
 
-def _spread(context: Any, builder: Any, value: Any, kind: Any, count: int) -> Any:
-    """A value of ``count`` lanes from one or from a number."""
+def _broadcast(context: Any, builder: Any, value: Any, kind: Any, count: int) -> Any:
+    """Emit a value of ``count`` lanes from such a value (unchanged) or from a plain number."""
     if isinstance(kind, LaneValue):
         return value
     number = context.cast(builder, value, kind, types.float64)
@@ -83,21 +86,24 @@ def _spread(context: Any, builder: Any, value: Any, kind: Any, count: int) -> An
 
 
 def _splat(builder: Any, number: Any, count: int) -> Any:
+    """Emit a vector of ``count`` copies of a number."""
     vector = ir.VectorType(number.type, count)
     first = builder.insert_element(ir.Constant(vector, ir.Undefined), number, I32(0))
     zeros = ir.Constant(ir.VectorType(I32, count), [0] * count)
     return builder.shuffle_vector(first, ir.Constant(vector, ir.Undefined), zeros)
 
 
-def _typed(function: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Register ``result(*args)``, the type of a call or None, as the typing of a function."""
+def _register_type(function: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """Return a decorator that registers ``result(*args)``, which returns the type of the call from
+    the types of its arguments (None if they do not fit), as the typing of ``function``.
+    """
 
     def register(result: Callable[..., Any]) -> Callable[..., Any]:
         @infer_global(function)
         class Typing(AbstractTemplate):
             def generic(self, args: Any, _kws: Any) -> Any:
-                found = result(*args)
-                return None if found is None else signature(found, *args)
+                result_type = result(*args)
+                return None if result_type is None else signature(result_type, *args)
 
         return result
 
@@ -108,16 +114,19 @@ def _typed(function: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
 
 
 def _pointer(context: Any, builder: Any, sig: Any, args: Any, last: int) -> Any:
-    """Address of the first lane: args are lanes, the array, and its indices up to ``last``."""
+    """Emit the address of the first lane of a value in memory.
+
+    ``args`` are (lanes, array, indices ...); the indices end before argument ``last``.
+    """
     kind = sig.args[1]
-    places = [
+    indices = [
         context.cast(builder, value, number, types.intp)
         for value, number in zip(args[2:last], sig.args[2:last], strict=True)
     ]
-    # The last axis is that of the lanes, unless places name an entry.
-    if len(places) < kind.ndim:
-        places.append(context.get_constant(types.intp, 0))
-    return entry_pointer(builder, kind, args[1], places)
+    # The last axis is that of the lanes, from its start unless an index is given for it.
+    if len(indices) < kind.ndim:
+        indices.append(context.get_constant(types.intp, 0))
+    return entry_pointer(builder, kind, args[1], indices)
 
 
 def _as_vector(builder: Any, pointer: Any, element: Any, count: int) -> Any:
@@ -126,7 +135,7 @@ def _as_vector(builder: Any, pointer: Any, element: Any, count: int) -> Any:
     return builder.bitcast(pointer, kind.as_pointer())
 
 
-@_typed(names.load)
+@_register_type(names.load)
 def _load(lanes: Any, _array: Any, *_place: Any) -> Any:
     return value_type(len(lanes))
 
@@ -138,7 +147,7 @@ def lower_load(context: Any, builder: Any, sig: Any, args: Any) -> Any:
     return builder.load(_as_vector(builder, pointer, DOUBLE, len(sig.args[0])), align=8)
 
 
-@_typed(names.store)
+@_register_type(names.store)
 def _store(_lanes: Any, _array: Any, *_place: Any) -> Any:
     return types.none
 
@@ -148,52 +157,54 @@ def lower_store(context: Any, builder: Any, sig: Any, args: Any) -> Any:
     """Emit one vector store of all lanes."""
     count = len(sig.args[0])
     pointer = _pointer(context, builder, sig, args, len(args) - 1)
-    value = _spread(context, builder, args[-1], sig.args[-1], count)
+    value = _broadcast(context, builder, args[-1], sig.args[-1], count)
     builder.store(value, _as_vector(builder, pointer, DOUBLE, count), align=8)
     return context.get_dummy_value()
 
 
-@_typed(names.turn)
+@_register_type(names.turn)
 def _turn(_lanes: Any, _rows: Any, _column: Any, _out: Any) -> Any:
     return types.none
 
 
-@_typed(names.gather)
+@_register_type(names.gather)
 def _gather(_lanes: Any, _array: Any, _places: Any, _first: Any, _out: Any) -> Any:
     return types.none
 
 
-@_typed(names.scatter)
+@_register_type(names.scatter)
 def _scatter(*_: Any) -> Any:
     return types.none
 
 
 @lower_builtin(names.turn, types.BaseTuple, types.Array, types.Integer, types.Array)
 def lower_turn(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-    """Emit a transposition of L x L entries by shuffles."""
+    """Emit the transposition of L x L entries of ``rows``, from a column on, into ``out``."""
     count = len(sig.args[0])
     rows, out = (_Matrix(builder, sig.args[k], args[k]) for k in (1, 3))
     begin = context.cast(builder, args[2], sig.args[2], types.intp)
-    found = [
+    vectors = [
         builder.load(rows.place(ir.Constant(I64, k), begin, count), align=8) for k in range(count)
     ]
-    for k, value in enumerate(_turned(builder, found)):
+    for k, value in enumerate(_transposed(builder, vectors)):
         builder.store(value, out.line(builder.add(begin, ir.Constant(I64, k)), count), align=8)
     return context.get_dummy_value()
 
 
 @lower_builtin(names.gather, types.BaseTuple, types.Array, types.Array, types.Integer, types.Array)
 def lower_gather(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-    """Emit one load per lane from the row that its place names, and the transposition of these."""
+    """Emit one vector load per lane, from the row of ``array`` with the lane's index, and the
+    transposition of these; a negative index (no row) reads row 0.
+    """
     count = len(sig.args[0])
     array, out = (_Matrix(builder, sig.args[k], args[k]) for k in (1, 4))
     begin, zero = context.cast(builder, args[3], sig.args[3], types.intp), ir.Constant(I64, 0)
-    found = []
+    vectors = []
     for k in range(count):
-        place = _entry_of(builder, sig, args, 2, k)
-        known = builder.select(builder.icmp_signed("<", place, zero), zero, place)
-        found.append(builder.load(array.place(known, begin, count), align=8))
-    for k, value in enumerate(_turned(builder, found)):
+        index = _entry_of(builder, sig, args, 2, k)
+        row_index = builder.select(builder.icmp_signed("<", index, zero), zero, index)
+        vectors.append(builder.load(array.place(row_index, begin, count), align=8))
+    for k, value in enumerate(_transposed(builder, vectors)):
         row = builder.add(begin, ir.Constant(I64, k))
         builder.store(value, out.line(row, count), align=8)
     return context.get_dummy_value()
@@ -204,43 +215,47 @@ def lower_gather(context: Any, builder: Any, sig: Any, args: Any) -> Any:
     *(types.BaseTuple, types.Array, types.Integer, types.Array, types.Array, types.Integer),
 )
 def lower_scatter(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-    """Emit a transposition and one store per lane into the row that its place names."""
+    """Emit a transposition and one masked store per lane, into the row of ``array`` with the lane's
+    index; lanes with a negative index store nothing.
+    """
     count = len(sig.args[0])
     rows, array = (_Matrix(builder, sig.args[k], args[k]) for k in (1, 3))
     begin, zero = context.cast(builder, args[2], sig.args[2], types.intp), ir.Constant(I64, 0)
-    most = _splat(builder, context.cast(builder, args[5], sig.args[5], types.intp), count)
-    wanted = builder.icmp_signed(
-        "<", ir.Constant(ir.VectorType(I64, count), list(range(count))), most
+    used_lanes = _splat(builder, context.cast(builder, args[5], sig.args[5], types.intp), count)
+    is_used = builder.icmp_signed(
+        "<", ir.Constant(ir.VectorType(I64, count), list(range(count))), used_lanes
     )
     lines = [rows.line(builder.add(begin, ir.Constant(I64, k)), count) for k in range(count)]
-    found = [builder.load(line, align=8) for line in lines]
-    vector = found[0].type
+    vectors = [builder.load(line, align=8) for line in lines]
+    vector = vectors[0].type
     flags = ir.VectorType(BIT, count)
     kinds = ir.FunctionType(ir.VoidType(), [vector, vector.as_pointer(), I32, flags])
     name = f"llvm.masked.store.v{count}f64.p0v{count}f64"
     masked = cgutils.get_or_insert_function(builder.module, kinds, name)
-    for k, value in enumerate(_turned(builder, found)):
-        place = _entry_of(builder, sig, args, 4, k)
-        there = _splat(builder, builder.icmp_signed(">=", place, zero), count)
-        where = array.place(place, begin, count)
-        builder.call(masked, [value, where, I32(8), builder.and_(wanted, there)])
+    for k, value in enumerate(_transposed(builder, vectors)):
+        index = _entry_of(builder, sig, args, 4, k)
+        is_present = _splat(builder, builder.icmp_signed(">=", index, zero), count)
+        pointer = array.place(index, begin, count)
+        builder.call(masked, [value, pointer, I32(8), builder.and_(is_used, is_present)])
     return context.get_dummy_value()
 
 
-def _entry_of(builder: Any, sig: Any, args: Any, which: int, k: int) -> Any:
-    """Entry k of an argument, an array of int64."""
-    return builder.load(entry_pointer(builder, sig.args[which], args[which], [ir.Constant(I64, k)]))
+def _entry_of(builder: Any, sig: Any, args: Any, argument: int, k: int) -> Any:
+    """Emit the load of entry k of an argument, an array of int64."""
+    return builder.load(
+        entry_pointer(builder, sig.args[argument], args[argument], [ir.Constant(I64, k)])
+    )
 
 
 class _Matrix:
-    """An array as a matrix, of the first axis and all others together, which are contiguous."""
+    """An array as a matrix: rows are the first axis, columns all others, which are contiguous."""
 
     def __init__(self, builder: Any, kind: Any, value: Any) -> None:
         shape = [builder.extract_value(value, [SHAPE, axis]) for axis in range(kind.ndim)]
         self._data = builder.extract_value(value, DATA)
         self._builder, self._columns = builder, ir.Constant(I64, 1)
         if kind.layout != "C":
-            # A part of each row of an array: as far apart as these rows.
+            # A slice of the columns of a C array: rows are one stride of the first axis apart.
             step = builder.extract_value(value, [STRIDES, 0])
             self._columns = builder.sdiv(step, ir.Constant(I64, 8))
             return
@@ -248,29 +263,32 @@ class _Matrix:
             self._columns = builder.mul(self._columns, size)
 
     def place(self, row: Any, column: Any, count: int) -> Any:
-        """Address of ``count`` neighbours in a row."""
+        """Emit the address of ``count`` neighbouring entries in a row."""
         offset = self._builder.add(self._builder.mul(row, self._columns), column)
         return _as_vector(self._builder, self._builder.gep(self._data, [offset]), DOUBLE, count)
 
     def line(self, row: Any, count: int) -> Any:
-        """Address of the row, if rows have ``count`` entries."""
+        """Emit the address of a row of an array whose rows have ``count`` entries."""
         offset = self._builder.mul(row, ir.Constant(I64, count))
         return _as_vector(self._builder, self._builder.gep(self._data, [offset]), DOUBLE, count)
 
 
-def _turned(builder: Any, rows: list[Any]) -> list[Any]:
-    """The transposed matrix: blocks of half the size change places, then half of that."""
+def _transposed(builder: Any, rows: list[Any]) -> list[Any]:
+    """Emit the transposition of L x L entries, L a power of 2, from a list of row vectors.
+
+    Off-diagonal blocks of half the size are exchanged, then those of a quarter, down to entries.
+    """
     rows, half = list(rows), len(rows) // 2
     while half > 0:
         for k in range(len(rows)):
             if not k & half:
-                rows[k], rows[k + half] = _exchanged(builder, rows[k], rows[k + half], half)
+                rows[k], rows[k + half] = _exchange_blocks(builder, rows[k], rows[k + half], half)
         half //= 2
     return rows
 
 
-def _exchanged(builder: Any, a: Any, b: Any, half: int) -> tuple[Any, Any]:
-    """Rows ``a`` and ``b``, ``half`` apart, with the blocks off the diagonal exchanged."""
+def _exchange_blocks(builder: Any, a: Any, b: Any, half: int) -> tuple[Any, Any]:
+    """Emit rows ``a`` and ``b``, ``half`` apart, with their off-diagonal blocks exchanged."""
     count = a.type.count
     upper = [q if not q & half else count + q - half for q in range(count)]
     lower = [q + half if not q & half else count + q for q in range(count)]
@@ -279,53 +297,53 @@ def _exchanged(builder: Any, a: Any, b: Any, half: int) -> tuple[Any, Any]:
     return first, second
 
 
-@_typed(names.prefetch)
+@_register_type(names.prefetch)
 def _prefetch(_array: Any, *_place: Any) -> Any:
     return types.none
 
 
 @lower_builtin(names.prefetch, types.VarArg(types.Any))
 def lower_prefetch(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-    """Emit the instruction that asks for a line of memory."""
+    """Emit a prefetch of the cache line at the given indices of an array."""
     kind = sig.args[0]
-    places = [
+    indices = [
         context.cast(builder, value, number, types.intp)
         for value, number in zip(args[1:], sig.args[1:], strict=True)
     ]
-    places += [ir.Constant(I64, 0)] * (kind.ndim - len(places))
-    pointer = builder.bitcast(entry_pointer(builder, kind, args[0], places), cgutils.voidptr_t)
+    indices += [ir.Constant(I64, 0)] * (kind.ndim - len(indices))
+    pointer = builder.bitcast(entry_pointer(builder, kind, args[0], indices), cgutils.voidptr_t)
     kinds = ir.FunctionType(ir.VoidType(), [cgutils.voidptr_t, I32, I32, I32])
-    asked = cgutils.get_or_insert_function(builder.module, kinds, "llvm.prefetch.p0")
+    prefetch = cgutils.get_or_insert_function(builder.module, kinds, "llvm.prefetch.p0")
     # LLVM's arguments: to be read (0), kept in all caches (3), data (1).
-    builder.call(asked, [pointer, I32(0), I32(3), I32(1)])
+    builder.call(prefetch, [pointer, I32(0), I32(3), I32(1)])
     return context.get_dummy_value()
 
 
-@_typed(names.spread)
+@_register_type(names.spread)
 def _spread_type(lanes: Any, _number: Any) -> Any:
     return value_type(len(lanes))
 
 
 @lower_builtin(names.spread, types.BaseTuple, types.Any)
 def lower_spread(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-    """A number in all lanes."""
-    return _spread(context, builder, args[1], sig.args[1], _count(sig.return_type))
+    """Emit a number in all lanes."""
+    return _broadcast(context, builder, args[1], sig.args[1], _count(sig.return_type))
 
 
-@_typed(names.load_flags)
+@_register_type(names.load_flags)
 def _load_flags(lanes: Any, _array: Any, *_place: Any) -> Any:
     return flags_type(len(lanes))
 
 
 @lower_builtin(names.load_flags, types.VarArg(types.Any))
 def lower_load_flags(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-    """One load of all bytes, each compared with 0."""
+    """Emit one vector load of bytes, compared with 0."""
     pointer = _pointer(context, builder, sig, args, len(args))
-    found = builder.load(_as_vector(builder, pointer, BYTE, len(sig.args[0])), align=1)
-    return builder.icmp_unsigned("!=", found, ir.Constant(found.type, None))
+    flags = builder.load(_as_vector(builder, pointer, BYTE, len(sig.args[0])), align=1)
+    return builder.icmp_unsigned("!=", flags, ir.Constant(flags.type, None))
 
 
-@_typed(names.store_flags)
+@_register_type(names.store_flags)
 def _store_flags(_lanes: Any, _array: Any, *_place: Any) -> Any:
     return types.none
 
@@ -336,57 +354,57 @@ def lower_store_flags(context: Any, builder: Any, sig: Any, args: Any) -> Any:
     count = len(sig.args[0])
     pointer = _pointer(context, builder, sig, args, len(args) - 1)
     kind = BYTE if count == 1 else ir.VectorType(BYTE, count)
-    found = builder.zext(args[-1], kind)
-    builder.store(found, _as_vector(builder, pointer, BYTE, count), align=1)
+    flags = builder.zext(args[-1], kind)
+    builder.store(flags, _as_vector(builder, pointer, BYTE, count), align=1)
     return context.get_dummy_value()
 
 
 # Choices
 
 
-@_typed(names.select)
+@_register_type(names.select)
 def _select(flags: Any, chosen: Any, other: Any) -> Any:
-    known = isinstance(flags, LaneFlags | types.Boolean)
+    are_flags = isinstance(flags, LaneFlags | types.Boolean)
     count = max(_count(flags), _count(chosen), _count(other))
-    return value_type(count) if known else None
+    return value_type(count) if are_flags else None
 
 
 @lower_builtin(names.select, types.Any, types.Any, types.Any)
 def lower_select(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-    """A selection without a branch."""
+    """Emit a selection per lane, without a branch."""
     count = _count(sig.return_type)
-    pair = [_spread(context, builder, args[k], sig.args[k], count) for k in (1, 2)]
+    pair = [_broadcast(context, builder, args[k], sig.args[k], count) for k in (1, 2)]
     return builder.select(args[0], *pair)
 
 
-@_typed(names.any_lane)
+@_register_type(names.any_lane)
 def _any_lane(_flags: Any) -> Any:
     return types.boolean
 
 
 @lower_builtin(names.any_lane, types.Any)
 def lower_any_lane(_context: Any, builder: Any, sig: Any, args: Any) -> Any:
-    """The bits as one integer, compared with 0."""
+    """Emit the flags as one integer, compared with 0."""
     bits = builder.bitcast(args[0], ir.IntType(_count(sig.args[0])))
     return builder.icmp_unsigned("!=", bits, ir.Constant(bits.type, 0))
 
 
 for _operation in (operator.and_, operator.or_):
 
-    @_typed(_operation)
+    @_register_type(_operation)
     def _combine_flags(a: Any, b: Any) -> Any:
         return a if isinstance(a, LaneFlags) and a == b else None
 
 
 @lower_builtin(operator.and_, LaneFlags, LaneFlags)
 def lower_and(_context: Any, builder: Any, _sig: Any, args: Any) -> Any:
-    """Both flags."""
+    """Emit the conjunction of flags."""
     return builder.and_(*args)
 
 
 @lower_builtin(operator.or_, LaneFlags, LaneFlags)
 def lower_or(_context: Any, builder: Any, _sig: Any, args: Any) -> Any:
-    """One of the flags at least."""
+    """Emit the disjunction of flags."""
     return builder.or_(*args)
 
 
@@ -394,7 +412,9 @@ def lower_or(_context: Any, builder: Any, _sig: Any, args: Any) -> Any:
 
 
 def _pair_count(a: Any, b: Any) -> int:
-    """Lanes of an operation of two values, one of which may be a number; 0: not one of ours."""
+    """Return the lanes of an operation of two values, one of which may be a plain number; 0 if
+    neither is a LaneValue.
+    """
     if not (isinstance(a, LaneValue) or isinstance(b, LaneValue)):
         return 0
     if not all(isinstance(kind, LaneValue) or _is_number(kind) for kind in (a, b)):
@@ -405,7 +425,7 @@ def _pair_count(a: Any, b: Any) -> int:
 def _arithmetic(operation: Any, name: str) -> None:
     """Register an operator of two values; ``name`` is the builder's method, such as fadd."""
 
-    @_typed(operation)
+    @_register_type(operation)
     def result(*args: Any) -> Any:
         count = _pair_count(*args) if len(args) == 2 else 0
         return value_type(count) if count else None
@@ -413,7 +433,9 @@ def _arithmetic(operation: Any, name: str) -> None:
     def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         """Emit the operation, with plain numbers copied to all lanes first."""
         count = _count(sig.return_type)
-        pair = [_spread(context, builder, v, k, count) for v, k in zip(args, sig.args, strict=True)]
+        pair = [
+            _broadcast(context, builder, v, k, count) for v, k in zip(args, sig.args, strict=True)
+        ]
         return getattr(builder, name)(*pair)
 
     for kinds in ((LaneValue, LaneValue), (LaneValue, types.Number), (types.Number, LaneValue)):
@@ -423,7 +445,7 @@ def _arithmetic(operation: Any, name: str) -> None:
 def _comparison(operation: Any, sign: str) -> None:
     """Register a comparison of two values; ``sign`` is LLVM's, such as ``<``."""
 
-    @_typed(operation)
+    @_register_type(operation)
     def result(*args: Any) -> Any:
         count = _pair_count(*args) if len(args) == 2 else 0
         return flags_type(count) if count else None
@@ -431,7 +453,9 @@ def _comparison(operation: Any, sign: str) -> None:
     def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         """Emit the comparison, with plain numbers copied to all lanes first."""
         count = _count(sig.return_type)
-        pair = [_spread(context, builder, v, k, count) for v, k in zip(args, sig.args, strict=True)]
+        pair = [
+            _broadcast(context, builder, v, k, count) for v, k in zip(args, sig.args, strict=True)
+        ]
         # As in C: comparisons with nan are false, but != is true.
         compare = builder.fcmp_unordered if sign == "!=" else builder.fcmp_ordered
         return compare(sign, *pair)
@@ -459,14 +483,14 @@ for _operation, _name in (
     _comparison(_operation, _name)
 
 
-@_typed(operator.neg)
+@_register_type(operator.neg)
 def _negative(value: Any) -> Any:
     return value if isinstance(value, LaneValue) else None
 
 
 @lower_builtin(operator.neg, LaneValue)
 def lower_negative(_context: Any, builder: Any, _sig: Any, args: Any) -> Any:
-    """Flip the signs."""
+    """Emit the negated value."""
     return builder.fneg(args[0])
 
 
@@ -474,22 +498,24 @@ def lower_negative(_context: Any, builder: Any, _sig: Any, args: Any) -> Any:
 
 
 def _instruction(function: Any, name: str, arguments: int) -> None:
-    @_typed(function)
+    """Register a function as the LLVM intrinsic ``llvm.name`` of that many ``arguments``."""
+
+    @_register_type(function)
     def result(*args: Any) -> Any:
-        known = all(isinstance(kind, LaneValue) or _is_number(kind) for kind in args)
-        return value_type(max(map(_count, args))) if known else None
+        are_values = all(isinstance(kind, LaneValue) or _is_number(kind) for kind in args)
+        return value_type(max(map(_count, args))) if are_values else None
 
     @lower_builtin(function, *[types.Any] * arguments)
     def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         count = _count(sig.return_type)
-        found = [
-            _spread(context, builder, v, k, count) for v, k in zip(args, sig.args, strict=True)
+        values = [
+            _broadcast(context, builder, v, k, count) for v, k in zip(args, sig.args, strict=True)
         ]
-        kind = found[0].type
+        value_kind = values[0].type
         full = f"llvm.{name}.{'f64' if count == 1 else f'v{count}f64'}"
-        kinds = ir.FunctionType(kind, [kind] * arguments)
+        kinds = ir.FunctionType(value_kind, [value_kind] * arguments)
         instruction = cgutils.get_or_insert_function(builder.module, kinds, full)
-        return builder.call(instruction, found)
+        return builder.call(instruction, values)
 
 
 _instruction(names.root_of, "sqrt", 1)

@@ -1,7 +1,7 @@
-"""Short code for what kernels do most: reading and writing entries of C-contiguous arrays.
+"""Lowering of reads and writes of entries of C-contiguous arrays to little LLVM IR.
 
-numba writes 40 lines of LLVM's language for ``a[i, j]``, most of which LLVM removes again. The
-lines that are written here compute the same. Whatever is not met here goes to ``value_lowering``.
+numba emits 40 lines of IR for ``a[i, j]``, most of which LLVM removes again. The few emitted here
+compute the same address. All other operations are left to ``value_lowering``.
 """
 
 from __future__ import annotations
@@ -30,25 +30,29 @@ from netkf.linalg.value_lowering import (
 )
 
 ENTRIES = (types.Float, types.Integer, types.Boolean, types.Record)
+"""Types of entries that are read here."""
 NUMBERS = (types.Float, types.Integer)
+"""Types of entries that are written here."""
 
 
-def entry_pointer(builder: Any, kind: Any, array: Any, places: Any) -> Any:
-    """Return the address of an entry of a C-contiguous array, from as many ``places`` as it has
-    axes, which are not negative.
+def entry_pointer(builder: Any, kind: Any, array: Any, indices: Any) -> Any:
+    """Emit the address of an entry of a C-contiguous array of numba type ``kind``; ``indices`` are
+    one nonnegative integer for each axis.
     """
     assert kind.layout == "C", f"{kind} is not contiguous"
-    # A sum of products, of which LLVM takes those of outer loops out of inner ones.
-    at, step = places[-1], ONE
+    # A sum of products (and not Horner's scheme): LLVM hoists the terms of outer loops.
+    offset, step = indices[-1], ONE
     for axis in range(kind.ndim - 1, 0, -1):
         length = builder.extract_value(array, [SHAPE, axis])
         step = length if step is ONE else builder.mul(step, length)
-        at = builder.add(builder.mul(places[axis - 1], step), at)
-    return builder.gep(builder.extract_value(array, DATA), [at], inbounds=True)
+        offset = builder.add(builder.mul(indices[axis - 1], step), offset)
+    return builder.gep(builder.extract_value(array, DATA), [offset], inbounds=True)
 
 
 def array_without_owner(builder: Any, kind: Any, data: Any, shape: Any, itemsize: int) -> Any:
-    """Return a C-contiguous array, whose references nobody counts, of LLVM's type ``kind``."""
+    """Emit a C-contiguous array structure of LLVM type ``kind`` without owner, and hence without
+    reference counting.
+    """
     strides = [ir.Constant(I64, itemsize)]
     # Row-major strides, from the last axis to the first.
     for length in reversed(shape[1:]):
@@ -56,101 +60,104 @@ def array_without_owner(builder: Any, kind: Any, data: Any, shape: Any, itemsize
     items = shape[0]
     for length in shape[1:]:
         items = builder.mul(items, length)
-    parts: list[tuple[Any, Any]] = [
+    fields: list[tuple[Any, Any]] = [
         (ITEMS, items),
         (ITEMSIZE, ir.Constant(I64, itemsize)),
         (DATA, data),
     ]
-    parts += [(field, ir.Constant(kind.elements[field], None)) for field in (MEMINFO, PARENT)]
-    parts += [((SHAPE, axis), length) for axis, length in enumerate(shape)]
-    parts += [((STRIDES, axis), stride) for axis, stride in enumerate(strides)]
-    made = ir.Constant(kind, ir.Undefined)
-    for field, value in parts:
-        made = builder.insert_value(made, value, field)
-    return made
+    fields += [(field, ir.Constant(kind.elements[field], None)) for field in (MEMINFO, PARENT)]
+    fields += [((SHAPE, axis), length) for axis, length in enumerate(shape)]
+    fields += [((STRIDES, axis), stride) for axis, stride in enumerate(strides)]
+    array = ir.Constant(kind, ir.Undefined)
+    for field, value in fields:
+        array = builder.insert_value(array, value, field)
+    return array
 
 
-def is_in_order(place: Any) -> bool:
-    """Return True if a place counts from the start of an axis: places that are computed always do.
+def is_nonnegative(index: Any) -> bool:
+    """Return True unless an index is a negative constant, which counts from the end of its axis.
 
-    To ask each of them takes a tenth of the time of the event loop. With NUMBA_BOUNDSCHECK=1, and a
-    NUMBA_CACHE_DIR of its own, kernels ask, and raise IndexError.
+    Computed indices must not be negative in kernels: testing each takes a tenth of the time of the
+    event loop. With NUMBA_BOUNDSCHECK=1, and a NUMBA_CACHE_DIR of its own, kernels test them and
+    raise IndexError.
     """
-    return not isinstance(place, ir.Constant) or place.constant >= 0
+    return not isinstance(index, ir.Constant) or index.constant >= 0
 
 
 class KernelLower(ValueLower):
-    """Writes the code of kernels."""
+    """ValueLower with short code for entries and rows of C-contiguous arrays."""
 
     def _store_count(self, count: Any, difference: Any, step: Any) -> None:
-        """Store the number of steps, or something negative if there is none."""
+        """Store the number of steps of a range; none if it is 0 or negative."""
         if step.constant == 1:
             self.builder.store(difference, count)
         else:
             super()._store_count(count, difference, step)
 
     def lower_getitem(self, resty: Any, expr: Any, value: Any, index: Any, signature: Any) -> Any:
-        """Return ``value[index]``."""
-        kind, places = self.typeof(value.name), self._indices(value, index)
-        if places is None or not isinstance(kind.dtype, ENTRIES):
+        """Return ``value[index]``: an entry, or a row (the first index only) as a view."""
+        kind, indices = self.typeof(value.name), self._indices(value, index)
+        if indices is None or not isinstance(kind.dtype, ENTRIES):
             return super().lower_getitem(resty, expr, value, index, signature)
         array = self.loadvar(value.name)
-        if len(places) < kind.ndim:
-            return self._row(resty, kind, array, places[0])
-        pointer = entry_pointer(self.builder, kind, array, places)
-        found = load_item(self.context, self.builder, kind, pointer)
-        return self.context.cast(self.builder, found, kind.dtype, resty)
+        if len(indices) < kind.ndim:
+            return self._row(resty, kind, array, indices[0])
+        pointer = entry_pointer(self.builder, kind, array, indices)
+        entry = load_item(self.context, self.builder, kind, pointer)
+        return self.context.cast(self.builder, entry, kind.dtype, resty)
 
     def lower_setitem(self, target_var: Any, index_var: Any, value_var: Any, signature: Any) -> Any:
-        """Write ``target[index] = value``."""
-        kind, given = self.typeof(target_var.name), self.typeof(value_var.name)
-        places = self._indices(target_var, index_var)
-        known = places is not None and isinstance(kind.dtype, NUMBERS)
-        if not (known and len(places) == kind.ndim and isinstance(given, NUMBERS)):
+        """Emit ``target[index] = value`` for a number."""
+        kind, value_type = self.typeof(target_var.name), self.typeof(value_var.name)
+        indices = self._indices(target_var, index_var)
+        has_indices = indices is not None and isinstance(kind.dtype, NUMBERS)
+        if not (has_indices and len(indices) == kind.ndim and isinstance(value_type, NUMBERS)):
             return super().lower_setitem(target_var, index_var, value_var, signature)
         array, value = self.loadvar(target_var.name), self.loadvar(value_var.name)
-        number = self.context.cast(self.builder, value, given, kind.dtype)
-        pointer = entry_pointer(self.builder, kind, array, places)
+        number = self.context.cast(self.builder, value, value_type, kind.dtype)
+        pointer = entry_pointer(self.builder, kind, array, indices)
         return store_item(self.context, self.builder, kind, number, pointer)
 
     def _indices(self, array: Any, index: Any) -> Any:
-        """Indices as integers that are not negative: one for each axis, or the first one alone.
-        None where they are something else.
+        """Return the nonnegative integer indices of an entry (one for each axis) or of a row (one);
+        None for slices, other layouts and all else that numba's own code handles.
         """
         kind: Any = self.typeof(array.name)
-        given: Any = self.typeof(index.name)
+        index_type: Any = self.typeof(index.name)
         if not isinstance(kind, types.Array) or kind.layout != "C":
             return None
-        kinds: Any = given if isinstance(given, types.BaseTuple) else (given,)
-        if not all(isinstance(each, types.Integer) for each in kinds):
+        kinds: Any = index_type if isinstance(index_type, types.BaseTuple) else (index_type,)
+        if not all(isinstance(integer_type, types.Integer) for integer_type in kinds):
             return None
-        # A row of an array that somebody owns would have to be counted.
+        # With reference counting the view of a row would need an owner.
         if len(kinds) != kind.ndim and (len(kinds) > 1 or self.context.enable_nrt):
             return None
-        value, owner, places = self.loadvar(index.name), self.loadvar(array.name), []
-        for axis, each in enumerate(kinds):
-            part = self.builder.extract_value(value, axis) if kinds is given else value
-            place = self.context.cast(self.builder, part, each, types.intp)
-            places.append(self._wrapped(place, owner, axis) if each.signed else place)
-        return places
+        value, owner, indices = self.loadvar(index.name), self.loadvar(array.name), []
+        for axis, integer_type in enumerate(kinds):
+            part = self.builder.extract_value(value, axis) if kinds is index_type else value
+            position = self.context.cast(self.builder, part, integer_type, types.intp)
+            indices.append(
+                self._wrapped(position, owner, axis) if integer_type.signed else position
+            )
+        return indices
 
-    def _wrapped(self, place: Any, array: Any, axis: int) -> Any:
-        """Return a place; written as negative numbers, as in Python, they count from the end."""
+    def _wrapped(self, index: Any, array: Any, axis: int) -> Any:
+        """Return an index; as in Python a negative constant counts from the end of its axis."""
         builder = self.builder
-        if is_in_order(place):
-            return place
+        if is_nonnegative(index):
+            return index
         length = builder.extract_value(array, [SHAPE, axis])
-        below = builder.icmp_signed("<", place, ZERO)
-        return builder.select(below, builder.add(place, length), place)
+        below = builder.icmp_signed("<", index, ZERO)
+        return builder.select(below, builder.add(index, length), index)
 
-    def _row(self, resty: Any, kind: Any, array: Any, place: Any) -> Any:
-        """Return ``array[place]`` of an array that has more axes, and no owner."""
+    def _row(self, resty: Any, kind: Any, array: Any, index: Any) -> Any:
+        """Return the view ``array[index]`` of an array with more axes, without an owner."""
         builder, axes = self.builder, range(1, kind.ndim)
         shape = [builder.extract_value(array, [SHAPE, axis]) for axis in axes]
         items = shape[0]
         for length in shape[1:]:
             items = builder.mul(items, length)
-        data = builder.gep(builder.extract_value(array, DATA), [builder.mul(place, items)])
+        data = builder.gep(builder.extract_value(array, DATA), [builder.mul(index, items)])
         itemsize = self.context.get_abi_sizeof(self.context.get_data_type(kind.dtype))
         layout = self.context.get_value_type(resty)
         return array_without_owner(builder, layout, data, shape, itemsize)
@@ -158,26 +165,26 @@ class KernelLower(ValueLower):
 
 @register_pass(mutates_CFG=True, analysis_only=False)
 class KernelLowering(ValueLowering):
-    """The last step of numba's pipeline, with KernelLower."""
+    """numba's lowering pass with KernelLower."""
 
     _name = "kernel_lowering"
     lowering_class: Any = KernelLower
 
 
 class CompactLower(KernelLower):
-    """Writes the code of kernels that are called seldom: LLVM neither unrolls their loops nor turns
-    them into loops over vectors, which takes longer than all calls of such a kernel.
+    """KernelLower for kernels that are called seldom: LLVM optimises them for size, that is without
+    unrolling or vectorising loops, which would take longer than all calls of such a kernel.
     """
 
     def pre_lower(self) -> None:
-        """Mark the function."""
+        """Mark the function with LLVM's attribute optsize."""
         super().pre_lower()
         self.function.attributes.add("optsize")
 
 
 @register_pass(mutates_CFG=True, analysis_only=False)
 class CompactLowering(KernelLowering):
-    """The same with CompactLower."""
+    """numba's lowering pass with CompactLower."""
 
     _name = "compact_lowering"
     lowering_class = CompactLower
@@ -185,12 +192,12 @@ class CompactLowering(KernelLowering):
 
 @register_pass(mutates_CFG=False, analysis_only=True)
 class KernelLegalization(IRLegalization):
-    """Says after which instruction a variable is no longer used only where references are counted:
-    elsewhere nothing would happen there, and LLVM would have to find that out.
+    """numba's pass that inserts ``del`` statements after the last use of each variable, skipped for
+    kernels without reference counting, where they have no effect but take time.
     """
 
     _name = "kernel_legalization"
 
     def run_pass(self, state: Any) -> bool:
-        """Add what is missing to numba's language."""
+        """Run numba's pass if references are counted; return True if it changed anything."""
         return bool(state.flags.nrt and super().run_pass(state))

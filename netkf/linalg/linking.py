@@ -1,11 +1,11 @@
-"""One piece of machine code for a compiled function and all that it calls.
+"""Machine code only for the outermost function of a compilation, with all callees linked in.
 
-numba compiles each function to machine code of its own, with all that it calls linked in, although
-a function that is called by another compiled one alone is only ever linked into that. Of many small
-functions each is optimised over and over again so, which takes several times as long as the rest.
-Here, while the outermost function is compiled, those that it calls stay as they are until they are
-linked into it, each once. This relies on names of numba that are not public (see pyproject.toml for
-its versions, and tests/linalg/test_linking.py).
+numba links all callees of a function into it, optimises the result and generates machine code; it
+does so for every function, also for one that only other compiled functions call. A small function
+is thereby optimised again in each of its direct and indirect callers, which takes most of the time.
+Here inner functions stay unoptimised LLVM modules while the outermost function is compiled, and are
+linked into it once. This replaces private methods of numba (see pyproject.toml for its versions,
+and tests/linalg/test_linking.py).
 """
 
 from __future__ import annotations
@@ -22,47 +22,48 @@ from netkf.linalg.shortcuts import shortcuts
 
 
 class _Depth(threading.local):
-    """How deep a thread is in compiling, loading and finalizing."""
+    """Depths of nested calls, per thread, of numba's compile, get_executable and finalize."""
 
     def __init__(self) -> None:
         self.compile = self.load = self.finalize = 0
 
 
 _DEPTH = _Depth()
-_INNER: set[str] = set()
-"""Names of functions that are linked into others."""
-_BARE: weakref.WeakSet[Any] = weakref.WeakSet()
-"""Their libraries, which do not contain what they call."""
-_WHOLE: weakref.WeakKeyDictionary[Any, Any] = weakref.WeakKeyDictionary()
-"""Modules of such libraries with all that they call."""
-_ONE_AT_A_TIME = threading.RLock()
-"""numba's methods are replaced for the whole process, so threads compile one after the other."""
+_INNER_NAMES: set[str] = set()
+"""LLVM names of the functions of inner libraries."""
+_UNLINKED: weakref.WeakSet[Any] = weakref.WeakSet()
+"""Inner libraries, which do not contain their callees."""
+_LINKED_MODULES: weakref.WeakKeyDictionary[Any, Any] = weakref.WeakKeyDictionary()
+"""Modules of inner libraries with all their callees linked in, made on demand."""
+_COMPILE_LOCK = threading.RLock()
+"""Held while numba's methods are replaced, since that affects all threads of the process."""
 
 
 @contextmanager
 def linked_once() -> Iterator[None]:
-    """Inside, only the outermost function that is compiled gets machine code. With a numba that has
-    other names everything is compiled as numba does it.
+    """Within this context only the outermost compiled function gets machine code.
+
+    If this version of numba lacks one of the replaced names, it compiles in its own way.
     """
-    with _ONE_AT_A_TIME, _replaced():
+    with _COMPILE_LOCK, _patched_numba():
         yield
 
 
 @contextmanager
-def _replaced() -> Iterator[None]:
+def _patched_numba() -> Iterator[None]:
+    """Replace numba's methods within this context: all of them, or none if one is missing."""
     try:
         patches = [*_patches(), *shortcuts()]
-        # All originals are looked up before the first is replaced: a numba without one of them is
-        # left as it is.
-        before = [(owner, name, owner.__dict__[name]) for owner, name, _ in patches]
+        # All originals are looked up before the first is replaced.
+        originals = [(owner, name, owner.__dict__[name]) for owner, name, _ in patches]
     except (AttributeError, ImportError, KeyError):
-        patches, before = [], []
+        patches, originals = [], []
     for owner, name, patch in patches:
         setattr(owner, name, patch)
     try:
         yield
     finally:
-        for owner, name, original in before:
+        for owner, name, original in originals:
             setattr(owner, name, original)
 
 
@@ -74,96 +75,98 @@ def _patches() -> list[tuple[Any, str, Callable[..., Any]]]:
 
     library: Any = CPUCodeLibrary
     return [
-        # Depths tell the outermost function from those compiled on its way.
+        # Depths tell the outermost function from the inner ones compiled on the way.
         (Dispatcher, "compile", _count_depth("compile", Dispatcher.compile)),
-        (library, "finalize", _count_depth("finalize", _linked_flat(library.finalize))),
+        (library, "finalize", _count_depth("finalize", _link_once(library.finalize))),
         (
             CPUContext,
             "get_executable",
             _only_outermost("compile", _count_depth("load", CPUContext.get_executable), _stub),
         ),
         *(
-            (CPUContext, name, _only_outermost("compile", getattr(CPUContext, name), _nothing))
+            (CPUContext, name, _only_outermost("compile", getattr(CPUContext, name), _skip))
             for name in ("create_cpython_wrapper", "create_cfunc_wrapper")
         ),
         (
             library,
             "_optimize_final_module",
-            _only_outermost("finalize", _private(library._optimize_final_module), _nothing),
+            _only_outermost("finalize", _internalise(library._optimize_final_module), _skip),
         ),
-        # An inner library keeps its functions as they are, and their names for _private().
+        # An inner library keeps its unoptimised functions, and their names for _internalise().
         (
             library,
             "_finalize_final_module",
-            _only_outermost("finalize", library._finalize_final_module, _keep_as_it_is),
+            _only_outermost("finalize", library._finalize_final_module, _finalize_without_code),
         ),
     ]
 
 
-def _count_depth(what: str, original: Callable[..., Any]) -> Callable[..., Any]:
-    """Return ``original`` with a count of its nested calls in the attribute ``what`` of _DEPTH."""
+def _count_depth(stage: str, original: Callable[..., Any]) -> Callable[..., Any]:
+    """Return ``original`` with a count of its nested calls in the attribute ``stage`` of _DEPTH."""
 
     def counted(*args: Any, **kwargs: Any) -> Any:
-        # Threads have depths of their own; numba's compiler itself is locked.
-        setattr(_DEPTH, what, getattr(_DEPTH, what) + 1)
+        setattr(_DEPTH, stage, getattr(_DEPTH, stage) + 1)
         try:
             return original(*args, **kwargs)
         finally:
-            setattr(_DEPTH, what, getattr(_DEPTH, what) - 1)
+            setattr(_DEPTH, stage, getattr(_DEPTH, stage) - 1)
 
     return counted
 
 
 def _only_outermost(
-    what: str, original: Callable[..., Any], inner: Callable[..., Any]
+    stage: str, original: Callable[..., Any], inner: Callable[..., Any]
 ) -> Callable[..., Any]:
+    """Return a function that calls ``original`` for the outermost function, else ``inner``."""
+
     def choose(*args: Any, **kwargs: Any) -> Any:
-        return (inner if _is_linked(what) else original)(*args, **kwargs)
+        return (inner if _is_linked(stage) else original)(*args, **kwargs)
 
     return choose
 
 
-def _is_linked(what: str) -> bool:
-    """Return True if what is compiled or finalized now is linked into something else."""
-    # What is linked is finalized too, while its caller is lowered or finalized. What was kept on
-    # disk is loaded without being finalized again.
-    depth: int = getattr(_DEPTH, what)
-    return depth > 1 or (what == "finalize" and depth > _DEPTH.load)
+def _is_linked(stage: str) -> bool:
+    """Return True if the function that is now in ``stage`` is an inner one."""
+    # The outermost library is finalized inside get_executable; a finalize outside of it, or nested
+    # in another one, is that of a callee. Code loaded from disk is not finalized again.
+    depth: int = getattr(_DEPTH, stage)
+    return depth > 1 or (stage == "finalize" and depth > _DEPTH.load)
 
 
 def _stub(_: Any, library: Any, fndesc: Any, env: Any) -> Any:
-    """Stands for a function that is linked in, and never called from Python (it would raise)."""
+    """Return the Python object of an inner function, which Python never calls (it would raise)."""
     from numba import _dynfunc  # type: ignore[attr-defined]
 
-    # Any function that raises will do, because nobody calls the stub.
+    # numba needs some address: that of a C function that raises.
     raising = ctypes.cast(ctypes.pythonapi.PyErr_NoMemory, ctypes.c_void_p).value
     module, name = fndesc.lookup_module(), fndesc.qualname.split(".")[-1]
     return _dynfunc.make_function(module, name, "linked in", raising, env, (library,))
 
 
-def _nothing(*_: Any, **__: Any) -> None:
-    """Leave out wrappers for Python and optimisation of a function that is linked in."""
+def _skip(*_: Any, **__: Any) -> None:
+    """Do nothing: an inner function needs neither wrappers for Python nor optimisation."""
 
 
-def _private(optimize: Callable[..., Any]) -> Callable[..., Any]:
-    """Nobody else calls what was linked in, so its unused arguments and copies may go."""
+def _internalise(optimize: Callable[..., Any]) -> Callable[..., Any]:
+    """Wrap ``optimize`` so that linked inner functions have internal linkage.
+
+    LLVM may then drop a function after inlining it, and change its signature.
+    """
 
     def optimize_all(library: Any) -> Any:
         for function in library._final_module.functions:
-            if function.name in _INNER and not function.is_declaration:
-                # "internal": LLVM may drop the function after inlining it, and need not keep its
-                # signature.
+            if function.name in _INNER_NAMES and not function.is_declaration:
                 function.linkage = "internal"
-            # Machine code would call an address that nobody knows.
-            if function.name in _INNER and function.is_declaration:
+            # An unlinked inner function has no machine code: calling it would crash.
+            if function.name in _INNER_NAMES and function.is_declaration:
                 raise AssertionError(f"numba has not linked {function.name}")
         return optimize(library)
 
     return optimize_all
 
 
-class _Part:
-    """A library without what it calls, as numba links it."""
+class _OwnCode:
+    """A library as numba links it, reduced to its own functions without its callees."""
 
     def __init__(self, library: Any) -> None:
         self._library = library
@@ -172,66 +175,68 @@ class _Part:
         return getattr(self._library, name)
 
     def _get_module_for_linking(self) -> Any:
-        # The method of the class: that of a bare library returns all that it calls, too.
+        # The method of the class: an inner library overrides it to include its callees.
         return type(self._library)._get_module_for_linking(self._library)
 
 
-def _linked_flat(finalize: Callable[..., Any]) -> Callable[..., Any]:
-    """Link all that is called, however deep, into the outermost library, and nothing into others.
+def _link_once(finalize: Callable[..., Any]) -> Callable[..., Any]:
+    """Wrap ``finalize`` so that all direct and indirect callees are linked into the outermost
+    library at once, and none into inner libraries.
 
-    numba copies what a function calls into it, and then both into its caller, and so on.
+    numba links callees at each level, so that inner functions are copied many times.
     """
 
     def finalize_flat(library: Any) -> Any:
-        called = library._linking_libraries
+        direct_callees = library._linking_libraries
         library._linking_libraries = [] if _is_linked("finalize") else _all_called(library)
         try:
             return finalize(library)
         finally:
-            library._linking_libraries = called
+            library._linking_libraries = direct_callees
 
     return finalize_flat
 
 
-def _all_called(library: Any) -> list[_Part]:
-    """Return the libraries that a library calls, and those which they call, each once.
+def _all_called(library: Any) -> list[_OwnCode]:
+    """Return the libraries of all direct and indirect callees, each once.
 
-    Callers come before what they call: LLVM links a function only where it is called already.
+    Callers come before callees, because LLVM links a function only if the module already calls it.
     """
-    done: list[_Part] = []
-    found: set[Any] = set()
+    ordered: list[_OwnCode] = []
+    visited: set[Any] = set()
 
     def visit(caller: Any) -> None:
-        for called in reversed(list(caller._linking_libraries)):
-            if called not in found:
-                found.add(called)
-                # Others have all that they call inside them.
-                if called in _BARE:
-                    visit(called)
-                done.append(_Part(called))
+        for callee in reversed(list(caller._linking_libraries)):
+            if callee not in visited:
+                visited.add(callee)
+                # Libraries that numba finalized contain their callees.
+                if callee in _UNLINKED:
+                    visit(callee)
+                ordered.append(_OwnCode(callee))
 
     visit(library)
-    return done[::-1]
+    return ordered[::-1]
 
 
 def _with_all_called(library: Any) -> Any:
-    """Return the module of a bare library and all that it calls, for numba as it is."""
-    if library not in _WHOLE:
-        module = _Part(library)._get_module_for_linking().clone()
-        for called in _all_called(library):
-            module.link_in(called._get_module_for_linking(), preserve=True)
-        _WHOLE[library] = module
-    return _WHOLE[library]
+    """Return the module of an inner library with all its callees linked in, as numba's own linking
+    expects it.
+    """
+    if library not in _LINKED_MODULES:
+        module = _OwnCode(library)._get_module_for_linking().clone()
+        for callee in _all_called(library):
+            module.link_in(callee._get_module_for_linking(), preserve=True)
+        _LINKED_MODULES[library] = module
+    return _LINKED_MODULES[library]
 
 
-def _keep_as_it_is(library: Any) -> None:
-    """Finalize a library as numba does, without machine code."""
+def _finalize_without_code(library: Any) -> None:
+    """Finalize an inner library: like numba's method, but without optimising or machine code."""
     defined = library._final_module.functions
-    _INNER.update(f.name for f in defined if not f.is_declaration)
-    _BARE.add(library)
-    # Functions of numba itself may be called by others later, which link them in as numba does.
+    _INNER_NAMES.update(f.name for f in defined if not f.is_declaration)
+    _UNLINKED.add(library)
+    # Later callers that numba finalizes in its own way expect all callees in the module.
     library._get_module_for_linking = partial(_with_all_called, library)
-    # What ``finalize`` does without optimising and generating code: the outermost library will do
-    # both. What is called is not linked yet, so that it is not verified either.
+    # The remaining steps of ``finalize``; verification would fail while callees are not linked.
     library._finalize_dynamic_globals()
     library._finalized = True

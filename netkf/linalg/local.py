@@ -1,9 +1,8 @@
-"""Scratch arrays of kernels that live in registers where n is known when a kernel is compiled.
+"""Scratch arrays that the compiler can keep in registers, for an n known at compile time.
 
-Loops over a :func:`netkf.linalg.structs.sized` n are unrolled, and then the compiler keeps each
-entry of such an array in a register: nothing else can point to it. An array in memory may overlap
-any other, so that each entry is stored and loaded again. For a larger n the array in memory is
-used.
+Loops over a :func:`netkf.linalg.structs.sized` n are unrolled, so that each entry of an array on
+the stack becomes a register: no other pointer can refer to it. An array in memory might overlap any
+other, so that each entry is stored and loaded again. For larger n the given array is used.
 """
 
 from __future__ import annotations
@@ -14,8 +13,10 @@ from netkf.linalg.structs import Size
 
 
 def local_matrix(size: Size, scratch: FloatArray) -> FloatArray:  # noqa: ARG001
-    """Return, in kernels, an uninitialised (n, n) for the kernel that calls: ``scratch`` where
-    ``size`` is an array. Python raises TypeError.
+    """Return, in kernels, an uninitialised array (n, n), valid until the calling kernel returns.
+
+    It is on the stack if ``size`` is a tuple, and ``scratch`` if ``size`` is an array. Called from
+    Python it raises TypeError.
     """
     raise TypeError("local_matrix is for kernels")
 

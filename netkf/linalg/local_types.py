@@ -1,6 +1,7 @@
-"""How numba compiles :mod:`netkf.linalg.local`: an array on the stack, of a constant shape.
+"""The numba implementation of :mod:`netkf.linalg.local`: arrays of constant shape on the stack.
 
-Typed as functions of their own, and not as overloads: the array belongs to the kernel that calls.
+They are emitted inline (``lower_builtin``) and not as overloads, which would be functions whose
+stack ends when they return.
 """
 
 from __future__ import annotations
@@ -27,14 +28,17 @@ from netkf.linalg.value_lowering import DATA, I64
 
 
 def _register(function: Callable[..., Any], dimensions: int, lanes: bool) -> None:
-    """Tell numba about one of them: n appears ``dimensions`` times in the shape."""
+    """Register one function of ``local`` with numba.
+
+    n appears ``dimensions`` times in the shape of the array, followed by L with ``lanes``.
+    """
 
     @type_callable(function)
     def _typer(_: Any) -> Callable[..., Any]:
-        def typed(size: Any, *rest: Any) -> Any:
+        def typed(size: Any, *others: Any) -> Any:
             if isinstance(size, types.BaseTuple):
                 return types.Array(types.float64, dimensions + lanes, "C")
-            return rest[-1]
+            return others[-1]
 
         def with_lanes(size: Any, lanes: Any, scratch: Any) -> Any:
             return typed(size, lanes, scratch)
@@ -44,9 +48,9 @@ def _register(function: Callable[..., Any], dimensions: int, lanes: bool) -> Non
 
         return with_lanes if lanes else without
 
-    between = (types.BaseTuple,) if lanes else ()
+    lane_types = (types.BaseTuple,) if lanes else ()
 
-    @lower_builtin(function, types.BaseTuple, *between, types.Array)
+    @lower_builtin(function, types.BaseTuple, *lane_types, types.Array)
     def _on_stack(context: Any, builder: Any, sig: Any, _args: Any) -> Any:
         n, kind = len(sig.args[0]), sig.return_type
         shape = [n] * dimensions + [len(part) for part in sig.args[1:-1]]
@@ -58,7 +62,7 @@ def _register(function: Callable[..., Any], dimensions: int, lanes: bool) -> Non
         lengths = [ir.Constant(I64, length) for length in shape]
         return array_without_owner(builder, array, data, lengths, WORD)
 
-    @lower_builtin(function, types.Array, *between, types.Array)
+    @lower_builtin(function, types.Array, *lane_types, types.Array)
     def _in_memory(_context: Any, _builder: Any, _sig: Any, args: Any) -> Any:
         return args[-1]
 

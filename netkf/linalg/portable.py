@@ -1,7 +1,7 @@
-"""Products and factors whose last bits do not depend on the loops that BLAS chooses for the CPU.
+"""Products and factorisations with the same bits on every CPU, unlike those of BLAS and LAPACK.
 
-All sums are added in the order of the index, entry by entry, by operations that IEEE 754 rounds
-correctly. The truth, the readings and the factors of their noise are made of these.
+Sums are added in the order of the index, by operations that IEEE 754 rounds correctly. True states,
+readings and the factors of their noises are computed with these.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ from netkf.linalg.arrays import FloatArray, square_root, symmetric
 from netkf.linalg.jacobi import diagonalise
 
 MAX_REFINED_STATES = 40
-"""States up to which eigenvectors are refined here; above, they are those of LAPACK."""
+"""Largest n for which :func:`noise_root` computes its own eigenvectors instead of LAPACK's."""
 SAME = 0.9
-"""Least cosine between an eigenvector and that of LAPACK which it stands for."""
+"""Smallest |cosine| between an eigenvector and that of LAPACK which it is matched with."""
 
 
 def product(a: FloatArray, b: FloatArray) -> FloatArray:
@@ -26,7 +26,7 @@ def product(a: FloatArray, b: FloatArray) -> FloatArray:
     if a.shape[-1] == 0:
         shape = np.broadcast_shapes(a.shape[:-2], b.shape[:-2])
         return np.zeros((*shape, a.shape[-2], b.shape[-1]))
-    # A sum begins with 0, whose sign a first term of -0 must not change.
+    # + 0.0: a sum starts with 0, so that a first term of -0 gives +0.
     total: FloatArray = a[..., :, 0, None] * b[..., None, 0, :] + 0.0
     for k in range(1, a.shape[-1]):
         total += a[..., :, k, None] * b[..., None, k, :]
@@ -70,7 +70,7 @@ def solve_lower(L: FloatArray, right: FloatArray) -> FloatArray:
 def eigenvectors(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return eigenvalues (n,), increasing, and eigenvectors (n, n) of a symmetric matrix."""
     A, V = np.ascontiguousarray(symmetric(matrix)), np.eye(len(matrix))
-    # Diagonal ones, which are frequent, compile nothing.
+    # Diagonal matrices, which are frequent, need no compiled kernel.
     if np.count_nonzero(A - np.diag(A.diagonal())):
         diagonalise(A, V)
     order = np.argsort(np.diag(A), kind="stable")
@@ -84,15 +84,17 @@ def _spectral(matrix: FloatArray, function: Callable[[FloatArray], FloatArray]) 
 
 
 def symmetric_root(matrix: FloatArray) -> FloatArray:
-    """Return the square root that is symmetric itself: it moves little where the matrix does, while
-    the vectors that :func:`noise_root` is made of may turn round.
+    """Return the symmetric square root (n, n) of a positive semidefinite matrix.
+
+    It is a continuous function of the matrix, unlike :func:`noise_root`, whose eigenvectors may
+    change abruptly.
     """
     return _spectral(matrix, lambda values: np.sqrt(np.maximum(values, 0.0)))
 
 
 def pseudo_inverse(matrix: FloatArray, rcond: float) -> FloatArray:
-    """Return the inverse of a symmetric matrix on the space of the eigenvalues above ``rcond``
-    times the largest.
+    """Return the pseudo-inverse of a symmetric matrix, in which eigenvalues of size up to ``rcond``
+    times the largest count as 0.
     """
 
     def invert(values: FloatArray) -> FloatArray:
@@ -103,32 +105,37 @@ def pseudo_inverse(matrix: FloatArray, rcond: float) -> FloatArray:
 
 
 def noise_root(matrix: FloatArray) -> FloatArray:
-    """Return the factor ``S`` (n, n) with ``S S' = matrix`` of ``square_root``, to rounding.
+    """Return a factor ``S`` (n, n) with ``S S' = matrix``, equal to ``square_root`` up to rounding
+    but with the same bits on every CPU.
 
-    The order and the signs of its columns are those of LAPACK. Where an eigenvalue is multiple and
-    its vectors are no others than LAPACK's turned round, and for many states, it is
-    ``square_root``.
+    The order and signs of its columns are those of LAPACK. Where the eigenvectors cannot be matched
+    with LAPACK's (multiple eigenvalues have arbitrary ones), and for more than MAX_REFINED_STATES
+    states, the result is ``square_root``, with the bits of LAPACK.
     """
-    given = square_root(matrix)
+    lapack_root = square_root(matrix)
     if len(matrix) > MAX_REFINED_STATES:
-        return given
+        return lapack_root
     values, vectors = eigenvectors(matrix)
-    lengths = np.sqrt(product(given.T, given).diagonal())
-    cosines = product(vectors.T, np.divide(given, lengths, out=0.0 * given, where=lengths > 0.0))
-    taken, clear = np.abs(cosines).argmax(axis=0), np.abs(cosines).max(axis=0) > SAME
-    # Columns that are zero but for rounding have no direction to compare.
-    void = ~clear & (lengths <= 1e-7 * lengths.max(initial=0.0))
-    rest = [k for k in range(len(matrix)) if k not in taken[~void]]
-    if not (clear | void).all() or len(rest) != void.sum():
-        return given
-    taken[void] = rest
-    signs = np.where(cosines[taken, np.arange(len(matrix))] < 0.0, -1.0, 1.0)
-    return np.asarray(vectors[:, taken] * (signs * np.sqrt(np.maximum(values, 0.0))[taken]))
+    lengths = np.sqrt(product(lapack_root.T, lapack_root).diagonal())
+    cosines = product(
+        vectors.T, np.divide(lapack_root, lengths, out=0.0 * lapack_root, where=lengths > 0.0)
+    )
+    matches, is_clear = np.abs(cosines).argmax(axis=0), np.abs(cosines).max(axis=0) > SAME
+    # Columns that are zero up to rounding have no direction: they get the unused eigenvectors.
+    is_zero = ~is_clear & (lengths <= 1e-7 * lengths.max(initial=0.0))
+    unused = [k for k in range(len(matrix)) if k not in matches[~is_zero]]
+    if not (is_clear | is_zero).all() or len(unused) != is_zero.sum():
+        return lapack_root
+    matches[is_zero] = unused
+    signs = np.where(cosines[matches, np.arange(len(matrix))] < 0.0, -1.0, 1.0)
+    return np.asarray(vectors[:, matches] * (signs * np.sqrt(np.maximum(values, 0.0))[matches]))
 
 
 @cache
 def gauss_legendre(count: int) -> tuple[FloatArray, FloatArray]:
-    """Return nodes and weights of Gauss quadrature on [0, 1], each (count,), correctly rounded."""
+    """Return nodes and weights of Gauss-Legendre quadrature on [0, 1], each (count,), correctly
+    rounded: Newton's method for the roots of the Legendre polynomial in 40 digits.
+    """
     nodes, weights = [], []
     with localcontext() as context:
         context.prec = 40
@@ -145,7 +152,7 @@ def gauss_legendre(count: int) -> tuple[FloatArray, FloatArray]:
 
 def _legendre(count: int, x: Decimal) -> tuple[Decimal, Decimal]:
     """Return the Legendre polynomial of degree ``count`` at x, and its derivative."""
-    before, value = Decimal(1), x
+    previous, value = Decimal(1), x
     for k in range(2, count + 1):
-        before, value = value, ((2 * k - 1) * x * value - (k - 1) * before) / k
-    return value, count * (x * value - before) / (x * x - 1)
+        previous, value = value, ((2 * k - 1) * x * value - (k - 1) * previous) / k
+    return value, count * (x * value - previous) / (x * x - 1)

@@ -1,6 +1,7 @@
-"""Power series of matrices in a gap, summed as far as the gap needs.
+"""Power series of matrices in a gap, summed up to as many terms as the gap needs.
 
-The last column of a table (terms, size + 1) says up to which gap its rows so far are enough.
+A table (terms, size + 1) has the coefficients of ``size`` series in its rows; the last column has
+the longest gap in seconds for which the rows up to this one suffice.
 """
 
 from __future__ import annotations
@@ -11,11 +12,11 @@ from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
 from netkf.linalg.lanes import LANES, MANY, load, store
 
-ROUNDING = 2.0**-56  # of the largest term of an entry: an eighth of what a double rounds
-NOTHING = 1e-30  # of the largest entry
+ROUNDING = 2.0**-56  # negligible remainder, relative to the largest term of an entry (eps / 16)
+NOTHING = 1e-30  # the same relative to the largest entry, for entries that vanish
 ORDER_7, ORDER_8, ORDER_9, ORDER_12, ORDER_16 = (0,) * 7, (0,) * 8, (0,) * 9, (0,) * 12, (0,) * 16
 MANY_TERMS = (8, 10)
-OCTAVES, STEPS = 8, 4  # gaps that are tried: as many halves of the longest, in steps of an octave
+OCTAVES, STEPS = 8, 4  # gaps that are tried: halvings of the longest, and steps for each halving
 
 
 def with_reach(series: FloatArray, longest: float) -> FloatArray:
@@ -33,13 +34,13 @@ def with_reach(series: FloatArray, longest: float) -> FloatArray:
     gaps = longest * 2.0 ** (-np.arange(OCTAVES * STEPS + 1)[::-1] / STEPS)
     sizes = np.abs(series) * (gaps[:, None] ** np.arange(terms))[:, :, None]
     # Sum of the sizes of all later terms, for each gap, term and entry.
-    left = np.cumsum(sizes[:, ::-1], axis=1)[:, ::-1] - sizes
+    remainder = np.cumsum(sizes[:, ::-1], axis=1)[:, ::-1] - sizes
     largest = sizes.max(axis=1)
     # Rounding is relative to each entry, with a floor relative to the largest, for entries that
     # vanish.
-    most = ROUNDING * largest + NOTHING * largest.max(axis=1, initial=0.0)[:, None]
+    limit = ROUNDING * largest + NOTHING * largest.max(axis=1, initial=0.0)[:, None]
     # Number of terms after which the rest of some entry is still above rounding, for each gap.
-    needed = (left > most[:, None]).any(axis=2).sum(axis=1)
+    needed = (remainder > limit[:, None]).any(axis=2).sum(axis=1)
     # maximum.accumulate: a longer gap must not need fewer terms because of rounding here.
     counts = np.searchsorted(np.maximum.accumulate(needed), np.arange(terms), side="right")
     reach = np.concatenate([[0.0], gaps])[counts]
@@ -58,11 +59,13 @@ def fill_polynomial(out: FloatArray, series: FloatArray, gap: float) -> None:
 def fill_series(
     out: FloatArray, width: int, series: FloatArray, reach: FloatArray, column: int, gap: float
 ) -> None:
-    """Write the first ``width`` entries of ``sum_k gap^k series[k]`` into ``out``; this ``column``
-    of ``reach`` (terms, ...) says up to which abs(gap) the terms so far are enough.
+    """Write the first ``width`` entries of ``sum_k gap^k series[k]`` into ``out``.
+
+    ``reach`` (terms, ...) has in ``column`` the longest abs(gap) for which the terms up to each k
+    suffice.
     """
     terms, distance = len(reach), abs(gap)
-    # Numbers of terms that are known when this is compiled: sums of entries stay in registers.
+    # A number of terms known at compile time keeps the sums of entries in registers.
     if terms > 8 and distance <= reach[8, column]:
         horner(ORDER_8, out, width, series, gap)
     elif terms > 12 and distance <= reach[12, column]:
@@ -77,8 +80,8 @@ def fill_series(
 def horner(
     order: tuple[int, ...], out: FloatArray, width: int, series: FloatArray, gap: float
 ) -> None:
-    """``fill_series`` with the terms up to ``len(order)``."""
-    # Entries are the outer loop, which becomes a loop over vectors.
+    """Write ``sum_{k <= K} gap^k series[k]`` into ``out`` (width,), K = len(order): Horner."""
+    # Entries are the outer loop, which LLVM vectorises.
     for j in range(width):
         total = series[len(order), j]
         for k in range(len(order) - 1, -1, -1):
@@ -90,11 +93,13 @@ def horner(
 def add_terms(
     out: FloatArray, width: int, series: FloatArray, reach: FloatArray, column: int, gap: float
 ) -> None:
-    """``fill_series`` with as many terms as ``reach`` asks for."""
+    """Write ``sum_k gap^k series[k]`` into ``out`` (width,), with as many terms as ``reach`` in
+    this ``column`` requires for the gap.
+    """
     for j in range(width):
         out[j] = series[0, j]
     k, even = 0, 1.0
-    while abs(gap) > reach[k, column]:  # two rows at a time: ``out`` is gone through half as often
+    while abs(gap) > reach[k, column]:  # two rows at a time, which halves the passes over ``out``
         odd = even * gap
         even = odd * gap
         for j in range(width):
@@ -106,8 +111,10 @@ def add_terms(
 def fill_row(
     out: FloatArray, row: int, series: FloatArray, terms: int, m: int, cell: int, gap: float
 ) -> None:
-    """Write the sums of the first ``terms`` of the table ``series[m, cell]`` (terms, W), W a
-    multiple of L, into a ``row`` of ``out``; as many terms as MANY_TERMS has are added up fastest.
+    """Write the sum of ``gap^k series[m, cell, k]`` over k < ``terms`` into a ``row`` of ``out``.
+
+    The width W of ``series`` (., cells, K, W) is a multiple of L lanes. The numbers of terms
+    in MANY_TERMS have unrolled loops.
     """
     if terms == len(ORDER_7) + 1:
         fill_blocks(ORDER_7, out, row, series, m, cell, gap)
@@ -131,7 +138,9 @@ def fill_blocks(
     cell: int,
     gap: float,
 ) -> None:
-    """``horner`` for whole blocks of L entries, each of which is one value of lanes."""
+    """Write ``sum_k gap^k series[m, cell, k]`` over k <= len(order) into a ``row`` of ``out``, by
+    Horner's scheme for blocks of L entries at a time.
+    """
     for j in range(0, series.shape[3], LANES):
         total = load(MANY, series, m, cell, len(order), j)
         for k in range(len(order) - 1, -1, -1):
@@ -141,7 +150,7 @@ def fill_blocks(
 
 @kernel(allocates=True, compact=True)
 def polynomial(series: FloatArray, gap: float) -> FloatArray:
-    """Return the sum (size,) of a table (terms, size + 1)."""
+    """Return ``sum_k gap^k series[k]`` (size,) of a table (terms, size + 1) from with_reach()."""
     out = np.empty(series.shape[1] - 1)
     fill_polynomial(out, series, gap)
     return out

@@ -1,9 +1,9 @@
-"""What numba does while it compiles and kernels do not need, left out.
+"""Replacements of parts of numba that take compile time and that kernels do not need.
 
-numba is written in Python, and most of its time goes to the steps before LLVM. Here: no garbage
-collection, the types of a call found once, no timers, a light first optimisation, and a pipeline
-without the passes for closures, array expressions and annotations, which kernels do not have. The
-pipeline is a public extension of numba; the others are replaced methods, see ``linking``.
+numba is written in Python, and most of its compile time is spent before LLVM. Saved here are
+garbage collections, repeated look-ups of the types of a call, timers and events, most of the first
+optimisation by LLVM, and the passes for closures, array expressions and annotations. The pipeline
+of passes is a public extension point of numba; the rest replaces private methods, see ``linking``.
 """
 
 from __future__ import annotations
@@ -21,17 +21,17 @@ NOT_NEEDED = (
     *("InlineInlinables", "FindLiterallyCalls", "LiteralUnroll", "NopythonRewrites"),
     *("LiteralPropagationSubPipelinePass", "AnnotateTypes", "DumpParforDiagnostics"),
 )
-"""Passes of numba for what kernels do not contain."""
-
-
-MANY = 10_000
-"""Objects that are worth to be passed over by the collector, see without_collection."""
+"""Passes of numba for language features that kernels do not use."""
+MIN_FROZEN = 10_000
+"""Number of new objects above which without_collection() makes all objects old ones."""
 
 
 @contextmanager
 def without_collection() -> Iterator[None]:
-    """Inside, no garbage is collected: the compiler makes many objects, hardly any of which become
-    garbage, and each collection looks at all of them. It costs some 100 MB of memory meanwhile.
+    """Disable the garbage collector within this context.
+
+    The compiler allocates many objects that live long, and each collection would visit all of them.
+    It costs some 100 MB of memory meanwhile.
     """
     enabled = gc.isenabled()
     gc.disable()
@@ -39,9 +39,10 @@ def without_collection() -> Iterator[None]:
         yield
     finally:
         if enabled:
-            # All objects become old ones, unlooked at: the next collection would visit each. What
-            # is only loaded makes few, and to count the frozen ones takes long where there are any.
-            if gc.get_count()[0] > MANY and not gc.get_freeze_count():
+            # freeze() and unfreeze() move all objects to the oldest generation without visiting
+            # them, so that the next collection of young objects does not either. A mere load from
+            # disk makes too few; and unfreeze() must not undo a freeze of the program.
+            if gc.get_count()[0] > MIN_FROZEN and not gc.get_freeze_count():
                 gc.freeze()
                 gc.unfreeze()
             gc.enable()
@@ -49,8 +50,10 @@ def without_collection() -> Iterator[None]:
 
 @cache
 def kernel_compiler(lean: bool, compact: bool = False) -> Any:
-    """Return numba's compiler without the passes that are not needed; with short code for entries
-    of arrays if ``lean``, which LLVM keeps small if it is ``compact`` too.
+    """Return numba's compiler class without the passes NOT_NEEDED, and with ValueLowering.
+
+    ``lean``: with KernelLowering, which emits less IR for entries of arrays. ``compact``: with
+    CompactLowering, for which LLVM does not unroll loops either.
     """
     from numba.core import config
     from numba.core.compiler import CompilerBase, DefaultPassBuilder
@@ -60,18 +63,24 @@ def kernel_compiler(lean: bool, compact: bool = False) -> Any:
 
     builder: Any = DefaultPassBuilder
     lowering: Any = ValueLowering
-    # Bounds are checked by numba's own code.
+    # With NUMBA_BOUNDSCHECK numba's own code for entries is needed, which checks indices.
     if lean and not getattr(config, "BOUNDSCHECK", None):
         lowering = CompactLowering if compact else KernelLowering
-    own: dict[str, Any] = {"IRLegalization": KernelLegalization, "NativeLowering": lowering}
+    replacements: dict[str, Any] = {
+        "IRLegalization": KernelLegalization,
+        "NativeLowering": lowering,
+    }
 
     class KernelCompiler(CompilerBase):
-        """Compiles kernels."""
+        """numba's compiler with another pipeline."""
 
         def define_pipelines(self) -> list[Any]:
+            """Return numba's pipeline with passes removed and replaced."""
             pipeline = builder.define_nopython_pipeline(self.state)
             steps = [step for step in pipeline.passes if step[0].__name__ not in NOT_NEEDED]
-            pipeline.passes = [(own.get(step.__name__, step), said) for step, said in steps]
+            pipeline.passes = [
+                (replacements.get(step.__name__, step), description) for step, description in steps
+            ]
             pipeline.finalize()
             return [pipeline]
 
@@ -79,7 +88,7 @@ def kernel_compiler(lean: bool, compact: bool = False) -> Any:
 
 
 def shortcuts() -> list[Patch]:
-    """Return replacements of numba's methods: owner, name, method."""
+    """Return the replacements of numba's methods: (class or module, name, new function)."""
     from numba.core import base, event, imputils, ir, lowering, typeinfer
     from numba.core.base import BaseContext
     from numba.core.codegen import CPUCodeLibrary
@@ -93,36 +102,38 @@ def shortcuts() -> list[Patch]:
     return [
         (PassManager, "_runPass", _run_pass),
         (PostProcessor, "run", _without_liveness(PostProcessor.run)),
-        (BaseContext, "refresh", _if_anything_is_new(BaseContext.refresh)),
+        (BaseContext, "refresh", _refresh_if_changed(BaseContext.refresh)),
         (base, "_has_loc", cache(base._has_loc)),
         (base, "user_function", call_without_errors(imputils.user_function)),
         (BaseContext, "get_abi_sizeof", _cache_sizes(BaseContext.get_abi_sizeof)),
-        (BaseFunction, "get_call_type", _found_once(BaseFunction.get_call_type)),
+        (BaseFunction, "get_call_type", _cache_call_types(BaseFunction.get_call_type)),
         (event, "install_timer", _no_timer),
-        (event, "start_event", _if_anyone_listens(event.start_event)),
-        (event, "end_event", _if_anyone_listens(event.end_event)),
-        (ir.Inst, "_rec_list_vars", _variables_of()),
+        (event, "start_event", _only_with_listeners(event.start_event)),
+        (event, "end_event", _only_with_listeners(event.end_event)),
+        (ir.Inst, "_rec_list_vars", _variable_collector()),
         (lowering, "new_error_context", _no_context),
         (typeinfer, "new_error_context", _no_context),
-        (arrayobj, "fix_integer_index", _in_order(arrayobj.fix_integer_index)),
-        (CPUCodeLibrary, "_optimize_functions", _keep_in_registers),
+        (arrayobj, "fix_integer_index", _skip_sign_test(arrayobj.fix_integer_index)),
+        (CPUCodeLibrary, "_optimize_functions", _promote_variables),
     ]
 
 
-def _found_once(find: Callable[..., Any]) -> Callable[..., Any]:
-    """Remember the signatures of calls of functions that numba knows: it tries all of their
-    definitions, which are dozens for an operator, at each call.
+def _cache_call_types(find: Callable[..., Any]) -> Callable[..., Any]:
+    """Cache the signature of a call by function and argument types.
+
+    numba resolves it anew for each call, by trying all definitions of the function (dozens for an
+    operator).
     """
-    known: dict[Any, Any] = {}
+    signatures: dict[Any, Any] = {}
 
     def found(function: Any, context: Any, args: Any, kws: Any) -> Any:
         if kws:
             return find(function, context, args, kws)
-        # Definitions may be added, but are never taken away.
+        # Definitions are only ever added: their number is part of the key.
         call = function, context, tuple(args), len(function.templates)
-        if call not in known:
-            known[call] = find(function, context, args, kws)
-        return known[call]
+        if call not in signatures:
+            signatures[call] = find(function, context, args, kws)
+        return signatures[call]
 
     return found
 
@@ -134,95 +145,100 @@ def _run_pass(manager: Any, _: int, step: Any, state: Any) -> None:
         part(state)
 
 
-def _if_anything_is_new(refresh: Callable[..., Any]) -> Callable[..., Any]:
-    """Look for new definitions only if there are some: numba imports thirty modules each time."""
-    known: dict[int, int] = {}
+def _refresh_if_changed(refresh: Callable[..., Any]) -> Callable[..., Any]:
+    """Refresh numba's tables of definitions only if definitions were added: each refresh imports
+    thirty modules.
+    """
+    known_sizes: dict[int, int] = {}
 
     def size_of(context: Any) -> int:
         registries = [*context._registries, *context.typing_context._registries]
         lists = ("functions", "getattrs", "setattrs", "casts", "constants", "attributes", "globals")
-        return sum(len(getattr(each, name, ())) for each in registries for name in lists)
+        return sum(len(getattr(registry, name, ())) for registry in registries for name in lists)
 
     def refresh_if_new(context: Any) -> None:
-        # Contexts of single functions share what they know.
+        # numba makes a context for each function, and they share these registries.
         key = id(context._registries)
-        if known.get(key) != size_of(context):
+        if known_sizes.get(key) != size_of(context):
             refresh(context)
-            known[key] = size_of(context)
+            known_sizes[key] = size_of(context)
 
     return refresh_if_new
 
 
 def _without_liveness(run: Callable[..., Any]) -> Callable[..., Any]:
-    """Leave out which variables are alive where blocks begin, which numba finds after each of six
-    passes: generators and functions of Python objects need it, and kernels are neither.
+    """Skip the analysis of live variables at the start of blocks, which numba repeats after each of
+    six passes; only generators and object mode need it.
     """
     from numba.core import postproc, transforms
 
-    lifetime: Any = postproc.VariableLifetime
-    in_order: Any = transforms.canonicalize_cfg
+    VariableLifetime: Any = postproc.VariableLifetime
+    canonicalize: Any = transforms.canonicalize_cfg
 
-    def run_lightly(self: Any, emit_dels: bool = False, **how: Any) -> None:
+    def run_lightly(self: Any, emit_dels: bool = False, **options: Any) -> None:
         function = self.func_ir
         if function.is_generator:
-            run(self, emit_dels, **how)
+            run(self, emit_dels, **options)
             return
-        function.blocks = in_order(function.blocks)
-        function.variable_lifetime = lifetime(function.blocks)
+        function.blocks = canonicalize(function.blocks)
+        function.variable_lifetime = VariableLifetime(function.blocks)
         function.generator_info = None
         if emit_dels:
-            self._insert_var_dels(**how)
+            self._insert_var_dels(**options)
 
     return run_lightly
 
 
 def _cache_sizes(size_of: Callable[..., Any]) -> Callable[..., Any]:
-    """Return ``size_of`` with a cache by type: numba has LLVM parse a module for each call."""
-    known: dict[tuple[Any, str], int] = {}
+    """Return ``size_of`` with a cache by type: numba lets LLVM parse a module for each call."""
+    sizes: dict[tuple[Any, str], int] = {}
 
-    def size(context: Any, kind: Any) -> int:
-        key = context, str(kind)
-        if key not in known:
-            known[key] = size_of(context, kind)
-        return known[key]
+    def size(context: Any, llvm_type: Any) -> int:
+        key = context, str(llvm_type)
+        if key not in sizes:
+            sizes[key] = size_of(context, llvm_type)
+        return sizes[key]
 
     return size
 
 
-def _in_order(wrapped: Callable[..., Any]) -> Callable[..., Any]:
-    """Ask of no place that is computed if it is negative, see ``lean_lowering.is_in_order``."""
+def _skip_sign_test(original: Callable[..., Any]) -> Callable[..., Any]:
+    """Do not test computed indices for being negative, see ``lean_lowering.is_nonnegative``."""
     from numba import types
 
-    from netkf.linalg.lean_lowering import is_in_order
+    from netkf.linalg.lean_lowering import is_nonnegative
 
-    def place_of(context: Any, builder: Any, kind: Any, place: Any, size: Any) -> Any:
-        if is_in_order(place):
-            return context.cast(builder, place, kind, types.intp)
-        return wrapped(context, builder, kind, place, size)
+    def place_of(context: Any, builder: Any, index_type: Any, index: Any, size: Any) -> Any:
+        if is_nonnegative(index):
+            return context.cast(builder, index, index_type, types.intp)
+        return original(context, builder, index_type, index, size)
 
     return place_of
 
 
 def _no_timer(*_: Any) -> AbstractContextManager[None]:
-    """Each function that is being compiled would time each call of LLVM for its statistics."""
+    """Return a context that does nothing instead of numba's timer of each call of LLVM."""
     return nullcontext()
 
 
-def _if_anyone_listens(tell: Callable[..., Any]) -> Callable[..., Any]:
-    """Tell of no event if nobody listens: each call of LLVM is two."""
+def _only_with_listeners(notify: Callable[..., Any]) -> Callable[..., Any]:
+    """Skip numba's event notifications, two for each call of LLVM, if there is no listener."""
     from numba.core import event
 
     listeners: Any = event._registered
 
     def told(*args: Any, **kwargs: Any) -> None:
         if any(listeners.values()):
-            tell(*args, **kwargs)
+            notify(*args, **kwargs)
 
     return told
 
 
 class _NoContext:
-    """Adds nothing to an error: ``compiling`` asks numba for the whole message if there is one."""
+    """A context that adds nothing to an error.
+
+    After an error ``compiling`` compiles once more without these replacements, for numba's message.
+    """
 
     def __enter__(self) -> None:
         pass
@@ -235,22 +251,24 @@ _NO_CONTEXT = _NoContext()
 
 
 def _no_context(*_: Any, **__: Any) -> _NoContext:
-    """Errors would be told where they happen, for each instruction."""
+    """Return a context that does nothing instead of numba's, which adds the position in the source
+    to errors and is entered for each instruction.
+    """
     return _NO_CONTEXT
 
 
-def _variables_of() -> Callable[..., Any]:
-    """Return a search for the variables of an instruction, which classifies each type only once.
+def _variable_collector() -> Callable[..., Any]:
+    """Return a replacement of ``ir.Inst._rec_list_vars``, which lists the variables of a statement.
 
-    Numba's own asks ``isinstance`` of every part again.
+    It classifies each type once, where numba repeats ``isinstance`` for every part.
     """
     from numba.core import ir
 
     leaf, variable, instruction, entries, values = range(5)
-    known: dict[type, int] = {}
+    roles: dict[type, int] = {}
 
     def role_of(part: Any) -> int:
-        """Return how variables are found in a part of this type."""
+        """Return the role of a part of a statement: how variables are listed in it."""
         if isinstance(part, ir.Var):
             return variable
         if isinstance(part, ir.Inst):
@@ -261,9 +279,9 @@ def _variables_of() -> Callable[..., Any]:
 
     def collect(part: Any, found: list[Any]) -> None:
         """Append the variables of a part to ``found``."""
-        role = known.get(type(part))
+        role = roles.get(type(part))
         if role is None:
-            role = known[type(part)] = role_of(part)
+            role = roles[type(part)] = role_of(part)
         if role == variable:
             found.append(part)
         elif role == instruction:
@@ -281,9 +299,10 @@ def _variables_of() -> Callable[..., Any]:
     return variables
 
 
-def _keep_in_registers(library: Any, module: Any) -> None:
-    """Take variables out of memory: all else that numba does with single functions is done again
-    when they are linked.
+def _promote_variables(library: Any, module: Any) -> None:
+    """Promote stack variables of each function to registers (simplify-cfg and SROA only).
+
+    It replaces numba's optimisation of single functions, which is repeated after linking anyway.
     """
     from llvmlite.binding import create_new_function_pass_manager
 

@@ -56,20 +56,19 @@ def symmetrize(P: FloatArray) -> FloatArray:
 
 @kernel
 def solve_inplace(L: FloatArray, out: FloatArray, n: int) -> None:
-    """Write ``L^-1 out`` over ``out`` (n, c), and rubbish over the first ``n`` rows of L (., n).
-
-    ``out`` is nan where L is singular. Gauss with the largest pivot of each column, as in LAPACK.
+    """Replace ``out`` (n, c) by ``L^-1 out``, by Gaussian elimination with partial pivoting as in
+    LAPACK; the first ``n`` rows of L (., n) are overwritten. ``out`` is nan if L is singular.
     """
     columns = out.shape[1]
     for k in range(n):
-        best = largest_pivot(L, k, n)
-        # An exact zero only: a tiny pivot is an ill-conditioned matrix, and not an error.
-        if L[best, k] == 0.0:
+        pivot = largest_pivot(L, k, n)
+        # Only an exact zero is singular: a tiny pivot means an ill-conditioned matrix.
+        if L[pivot, k] == 0.0:
             out[:n] = np.nan
             return
-        if best != k:
-            swap_rows(L, k, best, k, n)
-            swap_rows(out, k, best, 0, columns)
+        if pivot != k:
+            swap_rows(L, k, pivot, k, n)
+            swap_rows(out, k, pivot, 0, columns)
         # Forward elimination of column k, in L and in the right-hand side alike.
         for i in range(k + 1, n):
             factor = L[i, k] / L[k, k]
@@ -89,11 +88,11 @@ def solve_inplace(L: FloatArray, out: FloatArray, n: int) -> None:
 @kernel
 def largest_pivot(L: FloatArray, k: int, n: int) -> int:
     """Return the row, from k to n - 1, with the largest entry in column k."""
-    best = k
+    pivot = k
     for i in range(k + 1, n):
-        if abs(L[i, k]) > abs(L[best, k]):
-            best = i
-    return best
+        if abs(L[i, k]) > abs(L[pivot, k]):
+            pivot = i
+    return pivot
 
 
 @kernel
@@ -113,8 +112,8 @@ def solve(left: FloatArray, right: FloatArray) -> FloatArray:
 
 @kernel
 def copy_matrix(target: FloatArray, source: FloatArray) -> None:
-    """Write a matrix into another of its size."""
-    # A compiled assignment of arrays brings messages about shapes: seconds of compiling.
+    """Copy ``source`` into ``target`` of the same shape."""
+    # ``target[:] = source`` would compile broadcasting and its errors: seconds of compile time.
     for i in range(source.shape[0]):
         for j in range(source.shape[1]):
             target[i, j] = source[i, j]

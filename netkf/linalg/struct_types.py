@@ -1,7 +1,7 @@
-"""How numba sees a :class:`netkf.linalg.structs.Struct`: an address, and loads and stores from it.
+"""The numba types of :class:`netkf.linalg.structs.Struct`: an address with loads and stores.
 
-Imported before the first kernel is compiled; only public names of ``numba.extending`` and the
-layout of numba's own array structure (tests/linalg/test_structs.py).
+Imported before the first kernel is compiled. Uses public names of ``numba.extending``, and the
+layout of numba's array structure (tests/linalg/test_structs.py).
 """
 
 from __future__ import annotations
@@ -39,18 +39,22 @@ class StructType(types.Type):
 
     def __init__(self, name: str, fields: tuple[tuple[str, int, Any], ...]) -> None:
         self.fields = fields
-        # numba hashes types at every call: a text knows its hash, a tree of types does not.
+        # numba hashes a type, by its name, at every call: short text hashes faster than a tree.
         layout = hashlib.sha256(str(fields).encode()).hexdigest()[:16]
         super().__init__(f"{name}.{layout}")
 
     def field(self, name: str) -> tuple[int, Any]:
-        """Offset and type of a field."""
-        return next((offset, kind) for known, offset, kind in self.fields if known == name)
+        """Return offset in bytes and numba type of a field."""
+        return next(
+            (offset, field_type)
+            for field_name, offset, field_type in self.fields
+            if field_name == name
+        )
 
 
 register_model(StructType)(models.OpaqueModel)
-# One numba type per class: a type made anew would compile every kernel again.
-_known: dict[type[Struct], StructType] = {}
+# One numba type per class: another instance would make numba compile every kernel again.
+_struct_types: dict[type[Struct], StructType] = {}
 
 
 @typeof_impl.register(Struct)
@@ -61,16 +65,17 @@ def type_of(value: Struct, _: Any) -> StructType:
 
 def struct_type(cls: type[Struct]) -> StructType:
     """Return the numba type of a derived class that has instances."""
-    if cls not in _known:
+    if cls not in _struct_types:
         fields = tuple(
             (name, WORD * cls.struct_offsets[name], _field_type(cls.struct_kinds[name]))
             for name in cls.struct_fields
         )
-        _known[cls] = StructType(cls.__name__, fields)
-    return _known[cls]
+        _struct_types[cls] = StructType(cls.__name__, fields)
+    return _struct_types[cls]
 
 
 def _field_type(kind: Any) -> Any:
+    """Return the numba type of a field from its entry in ``struct_kinds``."""
     if isinstance(kind, tuple):
         # "C": strides follow from the shape, so that only the shape is stored.
         return types.Array(from_dtype(kind[0]), kind[1], "C")
@@ -84,8 +89,7 @@ def _field_type(kind: Any) -> Any:
 
 @unbox(StructType)
 def unbox_struct(_: StructType, value: Any, c: Any) -> Any:
-    """Return the address of a struct."""
-    # The address is read from the object at each call.
+    """Convert a struct of Python to its address, read from the attribute at each call."""
     number = c.pyapi.object_getattr_string(value, "address")
     address = c.pyapi.long_as_voidptr(number)
     c.pyapi.decref(number)
@@ -94,24 +98,25 @@ def unbox_struct(_: StructType, value: Any, c: Any) -> Any:
 
 @infer_getattr
 class Fields(AttributeTemplate):
-    """The types of fields."""
+    """The template by which numba types the expression ``struct.name`` in kernels."""
 
-    # numba resolves ``struct.name`` in kernels by this template.
     key = StructType
 
     def generic_resolve(self, struct: StructType, name: str) -> Any:
         """Return the type of a field, or None."""
-        return next((kind for known, _, kind in struct.fields if known == name), None)
+        return next(
+            (field_type for field_name, _, field_type in struct.fields if field_name == name), None
+        )
 
 
-def _field_pointer(builder: Any, address: Any, offset: int, kind: Any) -> Any:
-    place = builder.gep(address, [ir.Constant(I64, offset)])
-    return builder.bitcast(place, ir.PointerType(kind))
+def _field_pointer(builder: Any, address: Any, offset: int, llvm_type: Any) -> Any:
+    pointer = builder.gep(address, [ir.Constant(I64, offset)])
+    return builder.bitcast(pointer, ir.PointerType(llvm_type))
 
 
 @lower_getattr_generic(StructType)
 def load_field(context: Any, builder: Any, struct: StructType, address: Any, name: str) -> Any:
-    """Load a number, an address, or an array without an owner."""
+    """Emit ``struct.name``: load a number or an address, or build an array without an owner."""
     offset, kind = struct.field(name)
     # The values of a sized tuple are never read, only its length.
     if isinstance(kind, types.BaseTuple):
@@ -126,13 +131,13 @@ def load_field(context: Any, builder: Any, struct: StructType, address: Any, nam
     data = builder.load(_field_pointer(builder, address, offset, array.elements[DATA]))
     first = _field_pointer(builder, address, offset + WORD, I64)
     shape = [builder.load(builder.gep(first, [ir.Constant(I64, k)])) for k in range(kind.ndim)]
-    # No owner: Python keeps the array alive.
+    # No owner, hence no reference counting: the Struct of Python keeps the array alive.
     return array_without_owner(builder, array, data, shape, itemsize)
 
 
 @lower_setattr_generic(StructType)
 def store_field(context: Any, builder: Any, sig: Any, args: Any, name: str) -> None:
-    """Store a number; arrays are put into place by Python."""
+    """Emit ``struct.name = number``; arrays can be assigned in Python only."""
     struct, (address, value) = sig.args[0], args
     offset, kind = struct.field(name)
     # numba may have typed the value as another number: convert it to the field's type.
@@ -141,7 +146,7 @@ def store_field(context: Any, builder: Any, sig: Any, args: Any, name: str) -> N
 
 
 class ClassType(types.Type):
-    """A derived class itself, which kernels name."""
+    """The numba type of a derived class itself, which kernels pass to ``struct_at``."""
 
     def __init__(self, struct: StructType) -> None:
         self.struct = struct
@@ -158,14 +163,15 @@ def type_of_class(value: type[Struct], _: Any) -> ClassType:
 
 
 @lower_constant(ClassType)
-def nothing(context: Any, *_: Any) -> Any:
-    """A class has no value in compiled code."""
+def lower_class_constant(context: Any, *_: Any) -> Any:
+    """Emit a dummy: a class has no value in compiled code."""
     return context.get_dummy_value()
 
 
 @intrinsic
-def _at(_: Any, memory: Any, cls: ClassType) -> Any:
-    # The first word of the memory is where the struct begins.
+def _struct_from_memory(_: Any, memory: Any, cls: ClassType) -> Any:
+    """Type and emit the struct at the first word of ``memory``."""
+
     def take_address(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         array = context.make_array(sig.args[0])(context, builder, args[0])
         return builder.bitcast(array.data, cgutils.voidptr_t)
@@ -175,4 +181,4 @@ def _at(_: Any, memory: Any, cls: ClassType) -> Any:
 
 @overload(struct_at, inline="always")
 def _struct_at(memory, cls):  # noqa: ANN001, ANN202, ARG001
-    return lambda memory, cls: _at(memory, cls)  # noqa: PLW0108 - of the same parameter names
+    return lambda memory, cls: _struct_from_memory(memory, cls)  # noqa: PLW0108 - of the same parameter names

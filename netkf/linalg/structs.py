@@ -1,8 +1,8 @@
-"""Structures of named arrays and numbers that kernels take as one address.
+"""Structures of named arrays and numbers that are passed to kernels as one address.
 
-numba passes a named tuple by value: ten machine words for each array in it, to each function that
-is called, and it converts each array whenever Python calls. A :class:`Struct` is one address of
-memory that holds its numbers, and where its arrays are. Kernels read ``state.xhat`` and write
+numba passes a named tuple by value: ten machine words for each array in it, in each call, and it
+converts each array whenever Python calls. A :class:`Struct` is one block of memory that holds its
+numbers and the addresses and shapes of its arrays. Kernels read ``state.xhat`` and write
 ``state.piece += 1`` as Python does, and see what Python wrote::
 
     class Walk(Struct):
@@ -11,15 +11,15 @@ memory that holds its numbers, and where its arrays are. Kernels read ``state.xh
 
     walk = Walk(position=np.zeros((2, 3)), steps=0)
 
-A field ``size`` may be :func:`sized`: the tuple's length is part of the type, so that loops over
-``range(len(size))`` have a length that is known when they are compiled. Structs of other sizes are
-of other types then, ``cls.of_size(n)``.
+A field ``size`` may be :func:`sized`: the length of the tuple is part of the type, so that loops
+over ``range(len(size))`` have a constant length for the compiler. Each size then has a class of its
+own, ``cls.of_size(n)``.
 
-Annotations say what is a number (``int`` or ``float``); everything else is a C-contiguous array or
-another struct, whose types all instances of a class share. A struct keeps its arrays alive.
+Annotations ``int`` and ``float`` are numbers; all other fields are C-contiguous arrays or other
+structs, whose types are the same for all instances of a class. A struct keeps its arrays alive.
 
-numba takes 7 us to find out the type of a struct, and 0.2 us for an array: kernels that Python
-calls often are given ``struct.memory``, and begin with ``struct = struct_at(memory, Walk)``.
+numba needs 7 us to determine the type of a struct, and 0.2 us for an array: kernels that Python
+calls often take ``struct.memory``, and begin with ``struct = struct_at(memory, Walk)``.
 """
 
 from __future__ import annotations
@@ -33,13 +33,13 @@ FloatArray = NDArray[np.float64]
 NUMBERS = {"int": np.int64, "float": np.float64}
 WORD = 8  # bytes
 MAX_UNROLLED = 4
-"""Largest n for which kernels are compiled for that n alone: they are half as fast again."""
+"""Largest n for which kernels are compiled specially, with unrolled loops: 1.5 times as fast."""
 
 Size = tuple[int, ...] | FloatArray
 
 
 class StructClass(type):
-    """The type of Struct and of its derived classes, so that numba knows them by it."""
+    """The metaclass of Struct, by which numba recognises its derived classes."""
 
 
 @dataclass_transform(kw_only_default=True)
@@ -50,14 +50,14 @@ class Struct(metaclass=StructClass):
     struct_offsets: ClassVar[dict[str, int]] = {}
     """First word of each field: a number; a pointer; or a pointer and a shape."""
     struct_kinds: ClassVar[dict[str, Any]] = {}
-    """``np.int64``, ``np.float64``, a derived class, or the (dtype, dimensions) of an array; known
-    once there is an instance.
+    """Kind of each field: ``np.int64``, ``np.float64``, a derived class, the (dtype, dimensions) of
+    an array, or the length n of a sized tuple. Empty before the first instance.
     """
 
     memory: np.ndarray
-    """int64 words."""
+    """The block of memory, as int64 words."""
     address: int
-    """Where the memory begins."""
+    """Address of the first byte of ``memory``."""
 
     def __init_subclass__(cls) -> None:
         cls.struct_fields = tuple(cls.__annotations__)
@@ -65,25 +65,27 @@ class Struct(metaclass=StructClass):
 
     @classmethod
     def of_size(cls, n: int) -> Any:
-        """The class of structs for loops over n, which are unrolled if n is small."""
+        """Return the class of structs with a ``size`` of length n: a derived class of its own for n
+        up to MAX_UNROLLED, else this class.
+        """
         # Larger states share one compiled kernel, whatever their n.
         if n > MAX_UNROLLED:
             return cls
-        known = _sized_classes.get((cls, n))
-        if known is None:
+        sized_class = _sized_classes.get((cls, n))
+        if sized_class is None:
             # The same annotations, but a class of its own: its layout has the size in the type.
             body = {"__annotations__": cls.__annotations__, "__module__": cls.__module__}
-            made = StructClass(f"{cls.__name__}{n}", (cls,), body)
-            # setdefault, because threads may make the same class at one time.
-            known = _sized_classes.setdefault((cls, n), made)
-        return known
+            new_class = StructClass(f"{cls.__name__}{n}", (cls,), body)
+            # setdefault, because two threads may make the same class at once.
+            sized_class = _sized_classes.setdefault((cls, n), new_class)
+        return sized_class
 
     def __init__(self, **values: Any) -> None:
         """Raises TypeError where fields are missing, unknown, or of another type."""
         cls = type(self)
         if values.keys() != set(cls.struct_fields):
             raise TypeError(f"{cls.__name__} has the fields {', '.join(cls.struct_fields)}")
-        # The first instance decides the types of fields.
+        # The first instance determines the types of the fields.
         if not cls.struct_offsets:
             cls._lay_out(values)
         object.__setattr__(self, "memory", np.zeros(cls.struct_size(), dtype=np.int64))
@@ -93,7 +95,7 @@ class Struct(metaclass=StructClass):
 
     @classmethod
     def struct_size(cls) -> int:
-        """Words of memory."""
+        """Return the number of int64 words of a struct."""
         last = cls.struct_fields[-1]
         kind = cls.struct_kinds[last]
         if isinstance(kind, int):
@@ -102,14 +104,15 @@ class Struct(metaclass=StructClass):
 
     @classmethod
     def _lay_out(cls, values: dict[str, Any]) -> None:
+        """Set ``struct_kinds`` and ``struct_offsets`` from the annotations and the first values."""
         word, offsets = 0, dict[str, int]()
         kinds = dict[str, Any]()
         for name in cls.struct_fields:
-            value, said = values[name], cls.__annotations__[name]
-            said = getattr(said, "__name__", said)
+            value, annotation = values[name], cls.__annotations__[name]
+            annotation = getattr(annotation, "__name__", annotation)
             offsets[name] = word
-            if said in NUMBERS:
-                kinds[name] = NUMBERS[said]
+            if annotation in NUMBERS:
+                kinds[name] = NUMBERS[annotation]
             elif isinstance(value, Struct):
                 kinds[name] = type(value)
             elif isinstance(value, tuple):
@@ -151,7 +154,7 @@ class Struct(metaclass=StructClass):
         return _rebuilt, (base, n, {name: getattr(self, name) for name in self.struct_fields})
 
     def __getattr__(self, name: str) -> Any:
-        # Numbers are not in the dictionary: kernels change them.
+        # Numbers are read from the memory, where kernels may have changed them.
         kind = self.struct_kinds.get(name)
         if kind is not np.int64 and kind is not np.float64:
             raise AttributeError(name)
@@ -165,16 +168,17 @@ _sized_classes: dict[tuple[type[Struct], int], Any] = {}
 
 
 def _rebuilt(cls: type[Derived], n: int | None, values: dict[str, Any]) -> Derived:
+    """Return an unpickled struct; ``n`` is the size for a class made by ``of_size``."""
     return (cls if n is None else cls.of_size(n))(**values)
 
 
 def sized(n: int) -> Size:
-    """Return a value of length n, of which only the length counts: a tuple if loops over it are to
-    be unrolled, else an array.
+    """Return an object of length n, of which only the length matters: a tuple, whose length is part
+    of its type, if loops over it are to be unrolled, else an array.
     """
     return (0,) * n if n <= MAX_UNROLLED else np.zeros(n)
 
 
 def struct_at(memory: np.ndarray, cls: type[Derived]) -> Derived:  # noqa: ARG001
-    """Return, in kernels, the struct of a class that has this memory; Python raises TypeError."""
+    """Return, in kernels, the struct of class ``cls`` with this memory; Python raises TypeError."""
     raise TypeError("struct_at is for kernels; Python has the struct itself")

@@ -1,11 +1,15 @@
-"""Kernels in few lines of LLVM's language: numba's own are several times as many.
+"""A replacement of numba's lowering (its translation to LLVM IR) that emits several times less IR.
 
-Reading these lines and simplifying them takes LLVM longer than all that follows. numba keeps
-variables that several blocks use in memory, arrays with all their ten fields; it asks after each
-call whether there was an error; and it writes what nobody reads. Here a variable that is assigned
-once, before all of its uses, is a value; what was inserted into a structure is taken from there;
-functions that never fail are not asked; and lines without readers go. LLVM makes the same machine
-code of both.
+LLVM spends most of the compile time on parsing and simplifying IR. numba's lowering keeps every
+variable that several basic blocks use on the stack, arrays with all their ten fields; tests each
+call for an exception; and emits values that nothing reads. Here, instead,
+
+- a variable with one assignment that precedes all its uses becomes an SSA value,
+- a field that was inserted into a structure is taken from the inserted value,
+- calls of functions that never raise are not tested, and
+- instructions without readers are removed.
+
+LLVM generates the same machine code from both.
 """
 
 from __future__ import annotations
@@ -40,60 +44,60 @@ WITHOUT_EFFECT = {
     instructions.LoadInstr,
     instructions.SelectInstr,
 }
-"""Instructions that may go where nobody reads their result."""
+"""Instructions without side effects, which may be removed if nothing reads their result."""
 
 _NEVER_FAIL: set[str] = set()
-"""Names of compiled functions that return no error."""
+"""LLVM names of compiled functions that never raise."""
 
 
-def inserted_value(aggregate: Any, place: list[int]) -> tuple[Any, list[int]]:
-    """Return a value and a place in it (empty: the value itself) that hold what is at ``place`` of
-    an aggregate, found among what was inserted there.
+def inserted_value(aggregate: Any, indices: list[int]) -> tuple[Any, list[int]]:
+    """Return (value, indices in it) for the entry at ``indices`` of an aggregate, as far as the
+    chain of ``insertvalue`` instructions tells: empty indices if the entry is the value itself.
     """
-    while place and isinstance(aggregate, instructions.InsertValue):
-        known = list(aggregate.indices)
-        if known == place[: len(known)]:
-            aggregate, place = aggregate.value, place[len(known) :]
-        elif place == known[: len(place)]:
-            # Only a part of the entry was inserted here.
+    while indices and isinstance(aggregate, instructions.InsertValue):
+        inserted_at = list(aggregate.indices)
+        if inserted_at == indices[: len(inserted_at)]:
+            aggregate, indices = aggregate.value, indices[len(inserted_at) :]
+        elif indices == inserted_at[: len(indices)]:
+            # Only a part of the entry was inserted here: the entry is no single inserted value.
             break
         else:
             aggregate = aggregate.aggregate
-    return aggregate, place
+    return aggregate, indices
 
 
 class ValueBuilder(ir.IRBuilder):
-    """Takes entries of structures from where they were inserted."""
+    """An IR builder that reads entries of structures from the values that were inserted."""
 
     def extract_value(self, agg: Any, idx: Any, name: str = "") -> Any:
-        """Return entry ``idx`` of an aggregate."""
-        places = list(idx) if isinstance(idx, list | tuple) else [idx]
-        # An entry of an entry.
+        """Return entry ``idx`` of an aggregate, without an instruction if it was inserted."""
+        indices = list(idx) if isinstance(idx, list | tuple) else [idx]
+        # An entry of an entry is one extraction from the outer aggregate.
         if isinstance(agg, instructions.ExtractValue):
-            agg, places = agg.aggregate, [*agg.indices, *places]
-        value, rest = inserted_value(agg, places)
-        return super().extract_value(value, rest, name) if rest else value
+            agg, indices = agg.aggregate, [*agg.indices, *indices]
+        value, remaining_indices = inserted_value(agg, indices)
+        return super().extract_value(value, remaining_indices, name) if remaining_indices else value
 
 
 class ValueLower(Lower):
-    """Writes the code of kernels in few lines."""
+    """numba's lowering of one function, with the overridden methods that the module describes."""
 
     def setup_function(self, fndesc: Any) -> None:
-        """Begin the function."""
+        """Set up the function with a ValueBuilder instead of numba's builder."""
         super().setup_function(fndesc)
         self.builder = ValueBuilder(self.entry_block)
         self.call_helper = self.call_conv.init_call_helper(self.builder)
 
     def lower_normal_function(self, fndesc: Any) -> None:
-        """Write the function."""
+        """Lower the function, remove unread instructions, and note if it never raises."""
         super().lower_normal_function(fndesc)
         remove_unread(self.function)
         if never_fails(self.function):
             _NEVER_FAIL.add(self.function.name)
 
     def lower_inst(self, inst: Any) -> None:
-        """Write a statement."""
-        # numba describes each in words first, for its own developers.
+        """Lower a statement."""
+        # Assignments directly: numba first formats each statement as a comment for debugging.
         if isinstance(inst, numba_ir.Assign) and not self.context.enable_nrt:
             target = inst.target.name
             self.storevar(self.lower_assign(self.typeof(target), inst), target)
@@ -103,8 +107,9 @@ class ValueLower(Lower):
     # Variables.
 
     def storevar(self, value: Any, name: str, argidx: int | None = None) -> None:
-        """Give a variable a value."""
-        # numba reads the value before, to count its references.
+        """Assign ``value`` to the variable ``name``."""
+        # numba loads the old value first to decrease its reference count, which kernels without
+        # reference counting (enable_nrt) do not need.
         if self.context.enable_nrt or name in self._singly_assigned_vars:
             super().storevar(value, name, argidx)
         else:
@@ -112,8 +117,8 @@ class ValueLower(Lower):
             self.builder.store(value, self.getvar(name))
 
     def _find_singly_assigned_variable(self) -> None:
-        """Find the variables that are values."""
-        # Where references are counted, variables end with their blocks.
+        """Decide which variables become SSA values; numba's own choice is limited to one block."""
+        # With reference counting numba decreases counts at the ends of blocks: keep its choice.
         if self.context.enable_nrt or self.func_ir.func_id.is_generator:
             super()._find_singly_assigned_variable()
             return
@@ -121,123 +126,141 @@ class ValueLower(Lower):
         self._blk_local_varmap: dict[str, Any] = {}
 
     def _assigned_before_use(self) -> set[str]:
-        """Return the names of variables with one assignment, which comes before all uses, on each
-        way and in the order in which blocks are written.
+        """Return the names of variables with a single assignment that precedes all uses: in the
+        order in which blocks are lowered, and on every path (its block dominates theirs).
         """
-        count: dict[str, int] = defaultdict(int)
-        home: dict[str, int] = {}
-        early: set[str] = set()
-        users: dict[str, set[int]] = defaultdict(set)
+        assignments: dict[str, int] = defaultdict(int)
+        block_of: dict[str, int] = {}
+        used_early: set[str] = set()
+        using_blocks: dict[str, set[int]] = defaultdict(set)
         for offset, block in sorted(self.blocks.items()):
             for statement in block.body:
-                used = statement.value if isinstance(statement, numba_ir.Assign) else statement
-                read = used.list_vars() if isinstance(used, numba_ir.Inst) else [used]
-                for name in [each.name for each in read if isinstance(each, numba_ir.Var)]:
-                    if name not in home:
-                        early.add(name)
-                    elif home[name] != offset:
-                        users[name].add(offset)
-                if used is not statement:
-                    count[statement.target.name] += 1
-                    home[statement.target.name] = offset
-        found = {name for name, times in count.items() if times == 1 and name not in early}
-        others = [name for name in found if home[name] != self.firstblk and name in users]
-        if others:
-            above = compute_cfg_from_blocks(self.blocks).dominators()
-            found -= {
-                name for name in others if any(home[name] not in above[at] for at in users[name])
+                source = statement.value if isinstance(statement, numba_ir.Assign) else statement
+                operands = source.list_vars() if isinstance(source, numba_ir.Inst) else [source]
+                for name in [
+                    variable.name for variable in operands if isinstance(variable, numba_ir.Var)
+                ]:
+                    if name not in block_of:
+                        used_early.add(name)
+                    elif block_of[name] != offset:
+                        using_blocks[name].add(offset)
+                if source is not statement:
+                    assignments[statement.target.name] += 1
+                    block_of[statement.target.name] = offset
+        names = {
+            name for name, number in assignments.items() if number == 1 and name not in used_early
+        }
+        crossing = [
+            name for name in names if block_of[name] != self.firstblk and name in using_blocks
+        ]
+        if crossing:  # used in other blocks than the one that assigns it
+            dominators = compute_cfg_from_blocks(self.blocks).dominators()
+            names -= {
+                name
+                for name in crossing
+                if any(block_of[name] not in dominators[user] for user in using_blocks[name])
             }
-        return found
+        return names
 
     # Loops.
 
     def lower_expr(self, resty: Any, expr: Any) -> Any:
-        """Return the value of an expression."""
-        made = None
+        """Return the value of an expression; loops over ``range`` and shapes in less IR."""
+        result = None
         if expr.op == "getiter":
-            made = self._iterator(resty, expr)
+            result = self._iterator(resty, expr)
         elif expr.op == "iternext":
-            made = self._next(resty, expr)
+            result = self._next(resty, expr)
         elif expr.op in ("pair_first", "pair_second"):
             value = self.loadvar(expr.value.name)
-            made = self.builder.extract_value(value, int(expr.op == "pair_second"))
-            self.incref(resty, made)
+            result = self.builder.extract_value(value, int(expr.op == "pair_second"))
+            self.incref(resty, result)
         elif expr.op == "getattr" and expr.attr == "shape":
-            made = self._shape(expr)
-        return super().lower_expr(resty, expr) if made is None else made
+            result = self._shape(expr)
+        return super().lower_expr(resty, expr) if result is None else result
 
     def lower_call(self, resty: Any, expr: Any) -> Any:
-        """Return the value of a call."""
+        """Return the value of a call; ``len`` of an array and ``range`` of int64 in less IR."""
         signature = self.fndesc.calltypes[expr]
-        called = getattr(self.typeof(expr.func.name), "typing_key", None)
-        if called is len and isinstance(signature.args[0], types.Array):
+        callee = getattr(self.typeof(expr.func.name), "typing_key", None)
+        if callee is len and isinstance(signature.args[0], types.Array):
             return self.builder.extract_value(self.loadvar(expr.args[0].name), [SHAPE, 0])
         if resty != types.range_state64_type or set(signature.args) != {types.int64} or expr.kws:
             return super().lower_call(resty, expr)
-        places = [self._cast_var(var, types.int64) for var in expr.args]
-        ranges = [ZERO, *places, ONE], [*places, ONE], places
-        return self._struct(resty, *ranges[len(places) - 1])
+        arguments = [self._cast_var(var, types.int64) for var in expr.args]
+        # (start, stop, step) of range(stop), range(start, stop) and range(start, stop, step).
+        ranges = [ZERO, *arguments, ONE], [*arguments, ONE], arguments
+        return self._struct(resty, *ranges[len(arguments) - 1])
 
     def _shape(self, expr: Any) -> Any:
+        """Return the shape of an array; None for other types."""
         if not isinstance(self.typeof(expr.value.name), types.Array):
             return None
         return self.builder.extract_value(self.loadvar(expr.value.name), SHAPE)
 
     def _struct(self, kind: Any, *fields: Any) -> Any:
-        made = ir.Constant(self.context.get_value_type(kind), ir.Undefined)
+        """Return a structure of numba type ``kind`` with these fields."""
+        struct = ir.Constant(self.context.get_value_type(kind), ir.Undefined)
         for k, value in enumerate(fields):
-            made = self.builder.insert_value(made, value, k)
-        return made
+            struct = self.builder.insert_value(struct, value, k)
+        return struct
 
     def _iterator(self, resty: Any, expr: Any) -> Any:
+        """Return the iterator of a range of int64 with a constant step; None for others.
+
+        Its state is on the stack, as in numba: the next value and the number of steps to go.
+        """
         if self.typeof(expr.value.name) != types.range_state64_type:
             return None
         state, builder = self.loadvar(expr.value.name), self.builder
         start, stop, step = (builder.extract_value(state, k) for k in range(3))
-        # Only steps that are known: numba asks others whether they are 0.
+        # Other steps are left to numba, which raises an error if they are 0.
         if not (isinstance(step, ir.Constant) and step.constant):
             return None
-        following, count = (self.alloca_lltype(name, I64) for name in ("following", "count"))
-        builder.store(start, following)
+        next_value, count = (self.alloca_lltype(name, I64) for name in ("following", "count"))
+        builder.store(start, next_value)
         self._store_count(count, builder.sub(stop, start), step)
-        return self._struct(resty, following, stop, step, count)
+        return self._struct(resty, next_value, stop, step, count)
 
     def _store_count(self, count: Any, difference: Any, step: Any) -> None:
-        """Store the number of steps, at least 0."""
+        """Store the number of steps of a range, at least 0, from ``difference`` = stop - start."""
         builder = self.builder
         positive = builder.icmp_signed(">", difference, ZERO)
-        away = builder.not_(positive) if step.constant > 0 else positive
-        with builder.if_else(away) as (then, otherwise):
+        is_empty = builder.not_(positive) if step.constant > 0 else positive
+        with builder.if_else(is_empty) as (then, otherwise):
             with then:
                 builder.store(ZERO, count)
             with otherwise:
-                rest = builder.srem(difference, step)
-                rest = builder.select(positive, rest, builder.neg(rest))
-                one = builder.select(builder.icmp_signed(">", rest, ZERO), ONE, ZERO)
-                builder.store(builder.add(builder.sdiv(difference, step), one), count)
+                remainder = builder.srem(difference, step)
+                remainder = builder.select(positive, remainder, builder.neg(remainder))
+                extra_step = builder.select(builder.icmp_signed(">", remainder, ZERO), ONE, ZERO)
+                builder.store(builder.add(builder.sdiv(difference, step), extra_step), count)
 
     def _next(self, resty: Any, expr: Any) -> Any:
+        """Return the pair (current value, True while there are more) of a range iterator, and
+        advance it; None for other iterators.
+        """
         if self.typeof(expr.value.name) != types.range_iter64_type:
             return None
         state, builder = self.loadvar(expr.value.name), self.builder
-        following, step, left = (builder.extract_value(state, k) for k in (0, 2, 3))
-        count = builder.load(left)
+        next_value, step, remaining = (builder.extract_value(state, k) for k in (0, 2, 3))
+        count = builder.load(remaining)
         valid = builder.icmp_signed(">", count, ZERO)
-        before = builder.block
+        outside = builder.block
         with builder.if_then(valid):
-            value = builder.load(following)
-            builder.store(builder.sub(count, ONE, flags=["nsw"]), left)
-            builder.store(builder.add(value, step), following)
-            inside = builder.block
-        found = builder.phi(I64)
-        found.add_incoming(value, inside)
-        found.add_incoming(ZERO, before)
-        return self._struct(resty, found, valid)
+            value = builder.load(next_value)
+            builder.store(builder.sub(count, ONE, flags=["nsw"]), remaining)
+            builder.store(builder.add(value, step), next_value)
+            in_loop = builder.block
+        current = builder.phi(I64)
+        current.add_incoming(value, in_loop)
+        current.add_incoming(ZERO, outside)
+        return self._struct(resty, current, valid)
 
 
 @register_pass(mutates_CFG=True, analysis_only=False)
 class ValueLowering(NativeLowering):
-    """The last step of numba's pipeline, with ValueLower."""
+    """numba's lowering pass with ValueLower."""
 
     _name = "value_lowering"
     lowering_class: Any = ValueLower
@@ -247,64 +270,86 @@ class ValueLowering(NativeLowering):
 
 
 def never_fails(function: Any) -> bool:
-    """Return True if all ways out of a function of LLVM return no error."""
+    """Return True if every return of an LLVM function has the status 0 (no exception)."""
     ends = [block.terminator for block in function.blocks]
     returned = [end.return_value for end in ends if isinstance(end, instructions.Ret)]
     return all(isinstance(code, ir.Constant) and code.constant == 0 for code in returned)
 
 
 def call_without_errors(user_function: Callable[..., Any]) -> Callable[..., Any]:
-    """Return numba's ``user_function``, which writes the calls of compiled functions, for functions
-    that never fail: nobody asks them.
+    """Wrap numba's ``user_function``, which emits calls of compiled functions, so that calls of
+    functions that never raise are not followed by a test of their status.
     """
 
     def function(fndesc: Any, libs: Any) -> Any:
-        checked = user_function(fndesc, libs)
+        checking_call = user_function(fndesc, libs)
 
         def call(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-            plain = not isinstance(sig.return_type, types.Optional)
-            if not (plain and fndesc.llvm_func_name in _NEVER_FAIL):
-                return checked(context, builder, sig, args)
+            is_plain = not isinstance(sig.return_type, types.Optional)
+            if not (is_plain and fndesc.llvm_func_name in _NEVER_FAIL):
+                return checking_call(context, builder, sig, args)
             convention = context.call_conv
-            called = context.declare_function(builder.module, fndesc)
-            kind = called.args[0].type.pointee
-            # The function always writes its result, and never an error.
-            result = cgutils.alloca_once(builder, kind)
+            callee = context.declare_function(builder.module, fndesc)
+            result_type = callee.args[0].type.pointee
+            # The callee always writes its result and never its error argument.
+            result = cgutils.alloca_once(builder, result_type)
             error = convention._get_excinfo_argument(builder.function)
-            packed = convention._get_arg_packer(fndesc.argtypes).as_arguments(builder, args)
-            builder.call(called, [result, error, *packed])
+            packed_args = convention._get_arg_packer(fndesc.argtypes).as_arguments(builder, args)
+            builder.call(callee, [result, error, *packed_args])
             return context.get_returned_value(builder, fndesc.restype, builder.load(result))
 
-        call.signature, call.libs = checked.signature, checked.libs  # type: ignore[attr-defined]
+        call.signature, call.libs = checking_call.signature, checking_call.libs  # type: ignore[attr-defined]
         return call
 
     return function
 
 
-# What nobody reads.
+# Dead code.
 
 
 def remove_unread(function: Any) -> None:
-    """Remove instructions without effect whose results nobody reads, and variables that are only
-    written.
+    """Remove instructions without side effects whose results are not read, and stack variables that
+    are only written, from an LLVM function.
     """
-    every = [each for block in function.blocks for each in block.instructions]
-    readers = Counter([id(value) for each in every for value in each.operands])
-    for each in every:
-        if isinstance(each, instructions.PhiInstr):
-            readers.update(id(value) for value, _ in each.incomings)
+    all_instructions = [
+        instruction for block in function.blocks for instruction in block.instructions
+    ]
+    readers = Counter(
+        [id(value) for instruction in all_instructions for value in instruction.operands]
+    )
+    for instruction in all_instructions:
+        if isinstance(instruction, instructions.PhiInstr):
+            readers.update(id(value) for value, _ in instruction.incomings)
     unread: set[int] = set()
-    # From the last to the first: what only unread ones read is unread as well.
-    for each in reversed(every):
-        # ``get``: a counter takes long to say that it does not have a number.
-        if type(each) in WITHOUT_EFFECT and not readers.get(id(each)):
-            unread.add(id(each))
-            for value in each.operands:
+    # Backwards, so that an instruction read only by removed ones is removed too.
+    for instruction in reversed(all_instructions):
+        # ``get``, since indexing a Counter with a missing key is slow.
+        if type(instruction) in WITHOUT_EFFECT and not readers.get(id(instruction)):
+            unread.add(id(instruction))
+            for value in instruction.operands:
                 readers[id(value)] -= 1
-    stores = [each for each in every if type(each) is instructions.StoreInstr]
-    writers = Counter([id(each.operands[1]) for each in stores])
-    variables = {id(each) for each in every if type(each) is instructions.AllocaInstr}
-    unread |= {each for each in variables if readers.get(each) == writers.get(each)}
-    unread |= {id(each) for each in stores if id(each.operands[1]) in unread & variables}
+    stores = [
+        instruction
+        for instruction in all_instructions
+        if type(instruction) is instructions.StoreInstr
+    ]
+    writers = Counter([id(instruction.operands[1]) for instruction in stores])
+    variables = {
+        id(instruction)
+        for instruction in all_instructions
+        if type(instruction) is instructions.AllocaInstr
+    }
+    unread |= {
+        instruction
+        for instruction in variables
+        if readers.get(instruction) == writers.get(instruction)
+    }
+    unread |= {
+        id(instruction)
+        for instruction in stores
+        if id(instruction.operands[1]) in unread & variables
+    }
     for block in function.blocks:
-        block.instructions[:] = [each for each in block.instructions if id(each) not in unread]
+        block.instructions[:] = [
+            instruction for instruction in block.instructions if id(instruction) not in unread
+        ]

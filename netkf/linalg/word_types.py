@@ -1,4 +1,4 @@
-"""How numba compiles :mod:`netkf.linalg.words`: one instruction, of two words of 128 bits."""
+"""The numba implementation of :mod:`netkf.linalg.words`: one multiplication of 128 bits."""
 
 from __future__ import annotations
 

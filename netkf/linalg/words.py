@@ -1,4 +1,4 @@
-"""Words of 64 bits, which kernels multiply as a processor does."""
+"""The 128-bit product of 64-bit words, which Python and NumPy lack, for kernels."""
 
 from __future__ import annotations
 

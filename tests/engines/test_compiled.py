@@ -505,16 +505,16 @@ def test_the_first_start_says_that_it_compiles(ring, monkeypatch, capsys, tmp_pa
     for scenario in (ring, gossip):
         netkf.simulate(scenario, engine="compiled")
     capsys.readouterr()
-    monkeypatch.setattr(compiling, "_said", set())
+    monkeypatch.setattr(compiling, "_announced", set())
     for scenario in (ring, gossip):
         netkf.simulate(scenario, engine="compiled")
     assert capsys.readouterr().err == ""  # what is kept on disk is not compiled again
-    monkeypatch.setattr(compiling, "_said", set())
-    monkeypatch.setattr(compiling, "_folder", lambda chosen: tmp_path)
+    monkeypatch.setattr(compiling, "_announced", set())
+    monkeypatch.setattr(compiling, "_cache_folder", lambda chosen: tmp_path)
     for scenario in (ring, gossip, ring):
         netkf.simulate(scenario, engine="compiled")
     assert capsys.readouterr().err.count("netkf: compiling, once") == 2
-    monkeypatch.setattr(compiling, "_said", set())
+    monkeypatch.setattr(compiling, "_announced", set())
     netkf.simulate(ring, engine="simpy")
     assert capsys.readouterr().err == ""
 
@@ -560,7 +560,7 @@ def test_code_compiled_from_sources_long_gone_is_removed(tmp_path):
         (tmp_path / f"netkf-{k}").mkdir()
         os.utime(tmp_path / f"netkf-{k}", (k, k))
     (tmp_path / "other").mkdir()
-    folder = compiling._folder.__wrapped__(str(tmp_path))
+    folder = compiling._cache_folder.__wrapped__(str(tmp_path))
     assert folder.parent == tmp_path
     assert sorted(path.name for path in tmp_path.iterdir()) == [
         *(f"netkf-{k}" for k in range(3, 6)),

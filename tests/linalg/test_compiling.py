@@ -53,7 +53,7 @@ def test_a_kernel_is_compiled_once_for_all_constants(monkeypatch, tmp_path):
     # What is loaded from the disk has no signatures here.
     monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path))
     kernel(sum_of_powers._loops)(np.ones(2))
-    signatures = power._called_from_kernels.signatures
+    signatures = power._kernel_dispatcher.signatures
     # One without ``scale`` and one with it: the constants 2 and 3 are no types.
     assert len(signatures) == 2
     assert len({args[:2] for args in signatures}) == 1
@@ -81,7 +81,7 @@ def test_loops_over_few_states_are_unrolled_and_numba_works_on_as_before(monkeyp
     expected, root = np.linalg.cholesky(matrix), kernel(cholesky)
     root(sized(4), matrix)
     np.testing.assert_allclose(np.tril(matrix), expected, rtol=1e-14)
-    (made,) = root._called_from_python.overloads.values()
+    (made,) = root._python_dispatcher.overloads.values()
     # The function is the first one, before its wrapper for Python.
     code = made.library.get_llvm_str().split("\n}")[0]
     # A root for each state, and no loop is left.
@@ -102,7 +102,7 @@ def test_compiled_code_is_kept_where_it_can_be_written_or_by_the_process_alone(
 ):
     file = tmp_path / "file"
     file.touch()
-    find = compiling._cache_folder_for
+    find = compiling._first_writable
     assert find(str(tmp_path / "mine"), tmp_path) == tmp_path / "mine"
     assert find("", tmp_path) == tmp_path / "__pycache__"
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))

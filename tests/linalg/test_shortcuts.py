@@ -11,7 +11,7 @@ from numba.core.errors import TypingError
 
 from netkf.linalg.compiling import kernel
 from netkf.linalg.linking import linked_once
-from netkf.linalg.shortcuts import MANY, shortcuts, without_collection
+from netkf.linalg.shortcuts import MIN_FROZEN, shortcuts, without_collection
 
 
 @kernel
@@ -62,7 +62,7 @@ def test_garbage_is_collected_later_and_what_was_frozen_stays(frozen):
         count = gc.get_freeze_count()
         with without_collection():
             assert not gc.isenabled()
-            many = [[] for _ in range(0 if frozen else 2 * MANY)]
+            many = [[] for _ in range(0 if frozen else 2 * MIN_FROZEN)]
             node = Node()
             node.itself = node
             gone = weakref.ref(node)
