@@ -126,12 +126,12 @@ def _judge_observability(scenario: Scenario) -> tuple[bool | None, str]:
     if hidden is not None:
         evidence = f"the mode with eigenvalue {hidden:.6g} is not seen"
         return judge_plant(scenario, False, evidence)
-    alone = sum(
+    observing = sum(
         count
         for entries, count in counts.items()
         if unobservable_mode(A, information_by_sensors[entries]) is None
     )
-    evidence = f"every mode is seen; {alone} of {len(scenario.nodes)} nodes see all alone"
+    evidence = f"every mode is seen; {observing} of {len(scenario.nodes)} nodes see all alone"
     return judge_plant(scenario, True, evidence)
 
 

@@ -42,21 +42,21 @@ MAX_DENSE, MAX_DENSE_MEAN = 1200, 600
 """Unknowns up to which the boundary value problem, and the map of means over d, are matrices."""
 KRYLOV_VECTORS, MAX_ROUNDS = 40, 10
 FIRST_TOLERANCE, TOLERANCE, CORRECTION = 1e-7, 1e-12, 1e-3
-"""Relative, of the first solution of the boundary value problem, of the last one, and of what is
-added to refine it."""
+"""Relative tolerances of the first solution of the boundary value problem, of the refined one, and
+of each correction that refines it."""
 PROOF_TOLERANCE = 1e-9
-"""Relative, of what rounding may leave of a semidefinite matrix."""
+"""Relative size of a negative eigenvalue that rounding of a semidefinite matrix explains."""
 
 
 @dataclass(frozen=True, eq=False)
 class DelayedJumps:
     """A filter whose clocks are Poisson processes and whose messages take ``delay`` seconds.
 
-    instant : the system as if messages took no time, of one mode
-    A, Q    : (n, n) drift and noise a second of the plant
+    instant : the system with the same clocks and messages without delay, of one mode
+    A, Q    : (n, n) drift of the plant, and covariance of its noise per second
     delay   : seconds, positive
 
-    Raises TheoryError if the errors change too often during a delay
+    Raises TheoryError if the errors change too much during a delay for MAX_POINTS.
     """
 
     instant: ClockJumps
@@ -78,29 +78,29 @@ class DelayedJumps:
         return self.instant.shape
 
     @cached_property
-    def _ways(self) -> Directions:
-        """The links, with messages under way as senders: message of node i has index N + i."""
+    def _message_directions(self) -> Directions:
+        """The links, with messages under way as senders: that of node i has the index N + i."""
         directions = self.instant.directions
         assert directions is not None
         return directions._replace(sender=directions.sender + self.nodes)
 
     @cached_property
     def _mean(self) -> tuple[FloatArray, FloatArray]:
-        """B and G (M, M)."""
+        """B and G (M, M), the mean effects of the errors and of the messages that arrive."""
         N, M = self.nodes, len(self.instant.drift)
-        moved = np.zeros((M, 2 * M))
-        moved[:, :M] = self.instant.drift
+        mean_drift = np.zeros((M, 2 * M))
+        mean_drift[:, :M] = self.instant.drift
         for node, rate, lost in self.instant.samples:
-            own = slice(node * len(self.A), (node + 1) * len(self.A))
-            moved[own, own] -= rate * lost
-        for rate, among in self.instant.ticks:
-            moved += rate * self._ways.mean(2 * N, among)[0, :M]
-        return moved[:, :M], moved[:, M:]
+            rows = slice(node * len(self.A), (node + 1) * len(self.A))
+            mean_drift[rows, rows] -= rate * lost
+        for rate, tick_directions in self.instant.ticks:
+            mean_drift += rate * self._message_directions.mean(2 * N, tick_directions)[0, :M]
+        return mean_drift[:, :M], mean_drift[:, M:]
 
     @cached_property
     def points(self) -> int:
         """The number k of intervals between collocation points."""
-        B, G = (float(np.linalg.norm(one, 2)) for one in self._mean)
+        B, G = (float(np.linalg.norm(matrix, 2)) for matrix in self._mean)
         growth = float(np.linalg.norm(self.A, 2))
         changes = self.delay * (B + growth + G * np.exp(growth * self.delay))
         # The Chebyshev series of e^{c x} over [0, 1] falls like (c / 4)^k / k!.
@@ -118,39 +118,41 @@ class DelayedJumps:
         return self.delay * chebyshev_integrals(self.points)
 
     @cached_property
-    def _own(self) -> FloatArray:
-        """The blocks (N, n, n) of B, which has no others."""
+    def _drift_blocks(self) -> FloatArray:
+        """The diagonal blocks (N, n, n) of B, which is block diagonal."""
         N, n = self.nodes, len(self.A)
         return self._mean[0].reshape(N, n, N, n)[np.arange(N), :, np.arange(N)]
 
     @cached_property
     def _coupling(self) -> scipy.sparse.csr_array:
-        """H (M, M)."""
-        return scipy.sparse.csr_array(self._mean[1] @ self._late)
+        """H = G e^{A d} (M, M), sparse: the mean effect of errors one delay ago."""
+        return scipy.sparse.csr_array(self._mean[1] @ self._delay_transition)
 
     @cached_property
-    def _late(self) -> FloatArray:
-        """Transition (M, M) of the errors of all nodes over the delay, e^{A d} for each."""
+    def _delay_transition(self) -> FloatArray:
+        """Transition (M, M) of all messages over the delay: e^{A d} for each node."""
         return np.asarray(np.kron(np.eye(self.nodes), scipy.linalg.expm(self.delay * self.A)))
 
     @cached_property
-    def _moves(self) -> FloatArray:
-        """The inverse (N, (k + 1) n, (k + 1) n) of ``y -> y - integral B_i y``, which carries a
-        node's error over the delay.
+    def _propagators(self) -> FloatArray:
+        """The inverses (N, (k + 1) n, (k + 1) n) of ``y -> y - integral B_i y`` at the points: they
+        solve dy/ds = B_i y over the delay.
         """
         size = (self.points + 1) * len(self.A)
-        coupled = np.einsum("kl,aij->akilj", self._integral, self._own).reshape(-1, size, size)
+        coupled = np.einsum("kl,aij->akilj", self._integral, self._drift_blocks).reshape(
+            -1, size, size
+        )
         return np.linalg.inv(np.eye(size) - coupled)
 
     def _apply_inverse(self, y: FloatArray) -> FloatArray:
-        """Apply the inverse to y (k + 1, M, columns)."""
+        """Return the ``_propagators`` applied to y (k + 1, M, columns), node by node."""
         N, (K, M, columns) = self.nodes, y.shape
         by_node = y.reshape(K, N, -1, columns).swapaxes(0, 1).reshape(N, -1, columns)
-        found = (self._moves @ by_node).reshape(N, K, -1, columns)
-        return np.asarray(found.swapaxes(0, 1).reshape(K, M, columns))
+        solution = (self._propagators @ by_node).reshape(N, K, -1, columns)
+        return np.asarray(solution.swapaxes(0, 1).reshape(K, M, columns))
 
     @cached_property
-    def _common(self) -> tuple[FloatArray, FloatArray]:
+    def _message_noise(self) -> tuple[FloatArray, FloatArray]:
         """F (k + 1, n, M) of one message, all of which have the same noise, and Q_d (n, n).
 
         An impulse of the plant's noise moves errors by h, ``dh/ds = B h + G e^{U s}``, and messages
@@ -162,9 +164,9 @@ class DelayedJumps:
         repeated = np.tile(E, (1, N, 1))
         start = np.tile(np.eye(n), (N, 1))
         h = self._apply_inverse(start + np.tensordot(self._integral, G @ repeated, 1))
-        both = np.tensordot(self._integral, E @ self.Q @ np.swapaxes(h, 1, 2), 1)
+        covariance = np.tensordot(self._integral, E @ self.Q @ np.swapaxes(h, 1, 2), 1)
         noise = np.tensordot(self._integral, E @ self.Q @ np.swapaxes(E, 1, 2), 1)
-        return E @ both[::-1], symmetric(noise[-1])
+        return E @ covariance[::-1], symmetric(noise[-1])
 
     def _heard_products(self, K: FloatArray) -> FloatArray:
         """Return H K(d - s)' (k + 1, M, M) at the points, which lie symmetrically."""
@@ -173,34 +175,38 @@ class DelayedJumps:
         return np.asarray((self._coupling @ columns).reshape(M, k, M).swapaxes(0, 1))
 
     def _driven_by(self, Phi: FloatArray) -> FloatArray:
-        """Return the inhomogeneous part (k + 1, M, M) of the problem, see ``_residual``, for white
-        noise Phi (M, M) a second.
+        """Return the right-hand side (k + 1, M, M) of the problem of ``_residual`` for white noise
+        of covariance Phi (M, M) per second.
         """
-        found = np.zeros((self.points + 1, *Phi.shape))
-        found[0] = Phi
-        return found
+        right = np.zeros((self.points + 1, *Phi.shape))
+        right[0] = Phi
+        return right
 
     def _driven_by_noises(self) -> FloatArray:
-        """Return the same for the noises of plant and readings, and what jumps make of them."""
-        heard = self._mean[1] @ np.tile(self._common[0], (1, self.nodes, 1))
-        found = np.tensordot(self._integral, heard, 1)
-        added = self._inflow(self._moments(np.zeros_like(found), True))
-        found[0] = self.instant.noise + 2.0 * symmetric(heard[0]) + added
-        return np.asarray(found)
+        """Return the right-hand side (k + 1, M, M) for the noises of plant and readings, with the
+        part of Phi that is due to the noise in messages.
+        """
+        heard = self._mean[1] @ np.tile(self._message_noise[0], (1, self.nodes, 1))
+        right = np.tensordot(self._integral, heard, 1)
+        jump_noise = self._inflow(self._moments(np.zeros_like(right), True))
+        right[0] = self.instant.noise + 2.0 * symmetric(heard[0]) + jump_noise
+        return np.asarray(right)
 
     def _residual(self, K: FloatArray, right: FloatArray, jumps: bool) -> FloatArray:
-        """Return the residuals (k + 1, M, M) of the problem: that of its second equation, and those
-        of the integrated first one. With ``jumps`` Phi is what they make of the unknowns.
+        """Return the residuals (k + 1, M, M) of the boundary value problem for given K.
+
+        Entry 0 is the residual of its second equation, the others are those of the first equation
+        integrated from 0 to each point. With ``jumps`` Phi is the inflow computed from K.
         """
         k, M, _ = K.shape
-        driven = (self._own @ K.reshape(k, self.nodes, -1, M)).reshape(K.shape)
+        driven = (self._drift_blocks @ K.reshape(k, self.nodes, -1, M)).reshape(K.shape)
         heard = self._heard_products(K)
-        found = right + K[0] - K + np.tensordot(self._integral, driven + heard, 1)
-        # Its antisymmetric part says that K(0) is symmetric.
-        found[0] = right[0] + 2.0 * symmetric(driven[0] + heard[0]) + 0.5 * (K[0].T - K[0])
+        residual = right + K[0] - K + np.tensordot(self._integral, driven + heard, 1)
+        # The antisymmetric part of this entry is the condition K(0) = K(0)'.
+        residual[0] = right[0] + 2.0 * symmetric(driven[0] + heard[0]) + 0.5 * (K[0].T - K[0])
         if jumps:
-            found[0] += self._inflow(self._moments(K, False))
-        return np.asarray(found)
+            residual[0] += self._inflow(self._moments(K, False))
+        return np.asarray(residual)
 
     @cached_property
     def _lyapunov(self) -> LyapunovInverse:
@@ -208,7 +214,7 @@ class DelayedJumps:
         return LyapunovInverse(self._mean[0][None])
 
     def _solve_without_messages(self, right: FloatArray) -> FloatArray:
-        """Return the solution K (k + 1, M, M) for nodes that hear nothing."""
+        """Return the solution K (k + 1, M, M) without the terms of messages, the preconditioner."""
         equation = symmetric(right[:1])
         first = 2.0 * (right[:1] - equation) + self._lyapunov(equation)
         return self._apply_inverse(np.concatenate([first, right[1:] + first]))
@@ -222,7 +228,7 @@ class DelayedJumps:
         """Return the solution K (k + 1, M, M) of a small problem by dense LU factors."""
         if jumps not in self._factors:
             units = np.eye(right.size).reshape(right.size, *right.shape)
-            columns = [-self._residual(one, np.zeros_like(one), jumps).ravel() for one in units]
+            columns = [-self._residual(unit, np.zeros_like(unit), jumps).ravel() for unit in units]
             self._factors[jumps] = scipy.linalg.lu_factor(np.stack(columns, axis=1))
         return np.asarray(
             scipy.linalg.lu_solve(self._factors[jumps], right.ravel()).reshape(right.shape)
@@ -232,24 +238,24 @@ class DelayedJumps:
         """Return the solution K (k + 1, M, M) of the problem to a relative ``tolerance``."""
         if right.size <= MAX_DENSE:
             return self._by_elimination(right, jumps)
-        none = np.zeros_like(right)
+        zeros = np.zeros_like(right)
 
         def apply(x: FloatArray) -> FloatArray:
             """Return the residual of the unknowns ``x``, preconditioned."""
             return -self._solve_without_messages(
-                self._residual(x.reshape(right.shape), none, jumps)
+                self._residual(x.reshape(right.shape), zeros, jumps)
             ).ravel()
 
-        whole = scipy.sparse.linalg.LinearOperator((right.size, right.size), matvec=apply)
+        operator = scipy.sparse.linalg.LinearOperator((right.size, right.size), matvec=apply)
         start = self._solve_without_messages(right).ravel()
-        found, _ = scipy.sparse.linalg.gmres(
-            whole, start, rtol=tolerance, atol=0.0, restart=KRYLOV_VECTORS, maxiter=5
+        solution, _ = scipy.sparse.linalg.gmres(
+            operator, start, rtol=tolerance, atol=0.0, restart=KRYLOV_VECTORS, maxiter=5
         )
-        return np.asarray(found).reshape(right.shape)
+        return np.asarray(solution).reshape(right.shape)
 
     def _autocovariances(self, right: FloatArray, jumps: bool) -> FloatArray:
-        """Return K (k + 1, M, M) at the points for an inhomogeneous part, with or without what
-        jumps add. Raises TheoryError if it is not found.
+        """Return K (k + 1, M, M) at the points for a right-hand side, with or without the inflow of
+        jumps, by iterative refinement. Raises TheoryError if that does not converge.
         """
         K = self._solve(right, jumps, FIRST_TOLERANCE)
         for _ in range(MAX_ROUNDS):
@@ -260,24 +266,30 @@ class DelayedJumps:
         raise TheoryError(f"delayed mean squares were solved to {size:.1e} only")
 
     def _moments(self, K: FloatArray, noise: bool) -> FloatArray:
-        """Return E[(E, m) (E, m)'] (2 M, 2 M) of K (k + 1, M, M)."""
-        late, X = self._late, symmetric(K[0])
+        """Return E[(E, m) (E, m)'] (2 M, 2 M) from K (k + 1, M, M); ``noise`` adds the part of the
+        plant's noise in messages.
+        """
+        late, X = self._delay_transition, symmetric(K[0])
         across = K[-1] @ late.T
         sent = late @ X @ late.T
         if noise:
-            F, Q = self._common
+            F, Q = self._message_noise
             across = across + np.tile(F[0].T, (1, self.nodes))
             sent = sent + np.tile(Q, (self.nodes, self.nodes))
         return np.block([[X, across], [across.T, symmetric(sent)]])
 
     def _inflow(self, moments: FloatArray) -> FloatArray:
-        """Return the Phi (M, M) that jumps make of moments (2 M, 2 M)."""
+        """Return the white noise Phi (M, M) per second that jumps cause, from the moments
+        (2 M, 2 M) of errors and messages.
+        """
         M, Z = len(moments) // 2, moments[None]
-        heard = self._ways.products(*self.instant.all_pairs, Z)[:, :M, :M]
+        heard = self._message_directions.products(*self.instant.all_pairs, Z)[:, :M, :M]
         return np.asarray(symmetric(self.instant.sampled(Z[:, :M, :M]) + heard)[0])
 
     def apply_jumps(self, Phi: FloatArray) -> FloatArray:
-        """Return the Phi (1, M, M) that jumps make of errors driven by one, a positive map."""
+        """Return T(Phi) (1, M, M): the Phi that jumps cause in errors driven by white noise Phi; T
+        is a positive map.
+        """
         K = self._autocovariances(self._driven_by(Phi[0]), False)
         return self._inflow(self._moments(K, False))[None]
 
@@ -291,8 +303,8 @@ class DelayedJumps:
             moments = self._moments(self._autocovariances(unit, True), False)
         except TheoryError:  # near 1, or above it
             return False
-        added = np.linalg.eigvalsh(self._inflow(moments))
-        return bool(added[0] >= -PROOF_TOLERANCE * max(1.0, added[-1]))
+        eigenvalues = np.linalg.eigvalsh(self._inflow(moments))
+        return bool(eigenvalues[0] >= -PROOF_TOLERANCE * max(1.0, eigenvalues[-1]))
 
     @cached_property
     def covariance(self) -> FloatArray:
@@ -307,18 +319,20 @@ class DelayedJumps:
         """
         K, M = self.points + 1, len(self.instant.drift)
 
-        def ahead(y: FloatArray) -> FloatArray:
-            """Return the means one step later, after those of K steps in the past."""
+        def next_means(y: FloatArray) -> FloatArray:
+            """Return the means (K M,) at the points of the next delay from those of the last."""
             past = y.reshape(K, M)
             heard = self._integral @ (self._coupling @ past.T).T
             return self._apply_inverse((past[-1] + heard)[:, :, None]).ravel()
 
         size = K * M
         if size <= MAX_DENSE_MEAN:
-            values = np.linalg.eigvals(np.stack([ahead(one) for one in np.eye(size)], axis=1))
+            values = np.linalg.eigvals(
+                np.stack([next_means(unit) for unit in np.eye(size)], axis=1)
+            )
         else:
-            whole = scipy.sparse.linalg.LinearOperator((size, size), matvec=ahead)
-            values = scipy.sparse.linalg.eigs(whole, k=4, return_eigenvectors=False)
+            operator = scipy.sparse.linalg.LinearOperator((size, size), matvec=next_means)
+            values = scipy.sparse.linalg.eigs(operator, k=4, return_eigenvectors=False)
         return bool(np.abs(values).max() < 1.0)
 
 
@@ -333,5 +347,5 @@ def chebyshev_integrals(K: int) -> FloatArray:
     """
     x = 2.0 * chebyshev_points(K) - 1.0
     coefficients = np.linalg.inv(np.polynomial.chebyshev.chebvander(x, K))
-    whole = np.polynomial.chebyshev.chebint(coefficients, lbnd=-1.0, axis=0)
-    return np.asarray(0.5 * np.polynomial.chebyshev.chebval(x, whole).T)
+    integrals = np.polynomial.chebyshev.chebint(coefficients, lbnd=-1.0, axis=0)
+    return np.asarray(0.5 * np.polynomial.chebyshev.chebval(x, integrals).T)

@@ -1,9 +1,9 @@
 """Second moments of errors with constant gains, over random losses and clocks.
 
-The stacked error e (M,), M = N n, of such a filter is a linear system that jumps when something
-happens, and jumps do not depend on it: its second moment obeys a linear recursion (slots) or a
-linear differential equation (Poisson clocks), a generalised Lyapunov equation. With bursty links
-the moments are those in each joint state (mode) of the links.
+The stacked error e (M,), M = N n, of such a filter is a linear system with jumps at events, which
+are independent of e. So its second moment obeys a linear recursion (slots) or a linear differential
+equation (Poisson clocks), a generalised Lyapunov equation. With bursty links there is one second
+moment for each joint state (mode) of the links.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ class SlotJumps:
     """A filter in slots: all nodes predict, use readings, and exchange once.
 
     F, Q     : (n, n) of the plant, which the filters know
-    closed   : (N, n, n) what readings make of the errors of predictions, I - K_i H_i
-    noise    : (M, M) covariance that they add
-    directions     : the links, None where nothing is sent
-    on_predictions : the exchange moves errors along differences of predictions, else along those of
-                     the estimates after readings
+    closed   : (N, n, n) I - K_i H_i, by which readings multiply the errors of predictions
+    noise    : (M, M) covariance that readings add
+    directions     : the links, None if nothing is sent
+    on_predictions : the exchange uses differences of predictions, else those of the estimates after
+                     readings
     """
 
     F: FloatArray
@@ -68,7 +68,7 @@ class SlotJumps:
         return self.directions.mean(self.nodes, self._all)
 
     def step(self, X: FloatArray, noise: bool = False) -> FloatArray:
-        """Return the second moments (S, M, M) one slot later, with or without the noises' part."""
+        """Return the second moments (S, M, M) one slot later, with or without the noises."""
         N = self.nodes
         weight = self.directions.stationary if self.directions else np.ones(1)
         share = (weight if noise else 0.0 * weight)[:, None, None]
@@ -82,31 +82,33 @@ class SlotJumps:
         """Return the second moments (S, M, M) after the exchange."""
         directions, mean = self.directions, self._mean
         assert directions is not None
-        moved, cross = updated, updated
+        source, cross = updated, updated
         if self.on_predictions:
-            moved = predicted
+            source = predicted
             cross = block_diagonal(list(self.closed)) @ predicted
         first, second = self._pairs
         spread = (
             directions.joint(first, second)
             - directions.delivery[:, first] * directions.delivery[:, second]
         )
-        # E[(u + D s)(u + D s)'] with E[D] and the covariances of who hears whom.
-        along = cross @ np.swapaxes(mean, 1, 2)
-        fluctuation = directions.products(first, second, spread, moved)
-        both = mean @ moved @ np.swapaxes(mean, 1, 2)
-        return symmetric(updated + 2.0 * symmetric(along) + both + fluctuation)
+        # E[(u + D s)(u + D s)'], u the updated and s the source errors, from E[D] and the
+        # covariances of the deliveries.
+        cross_terms = cross @ np.swapaxes(mean, 1, 2)
+        fluctuation = directions.products(first, second, spread, source)
+        mean_terms = mean @ source @ np.swapaxes(mean, 1, 2)
+        return symmetric(updated + 2.0 * symmetric(cross_terms) + mean_terms + fluctuation)
 
 
 @dataclass(frozen=True, eq=False)
 class ClockJumps:
     """A filter in continuous time whose clocks are all Poisson processes.
 
-    drift   : (M, M) of the errors between events
-    noise   : (M, M) covariance per second, of readings too
-    samples : (node, rate per second, I - closed) of nodes that take samples
-    directions    : the links, None where nothing is sent
-    ticks   : (rate per second, its ways) of each clock that makes nodes transmit
+    nodes      : N
+    drift      : (M, M) of the errors between events
+    noise      : (M, M) covariance per second, that of readings included
+    samples    : (node, rate per second, L H) of nodes that take samples
+    directions : the links, None if nothing is sent
+    ticks      : (rate per second, indices of directions) of each clock at which nodes transmit
     """
 
     nodes: int
@@ -123,34 +125,38 @@ class ClockJumps:
 
     @cached_property
     def _chains(self) -> list[IntArray]:
-        """Channels that take a step at each kind of tick."""
+        """Channels (chains of the losses) that make a step at the ticks of each clock."""
         assert self.directions is not None
-        return [np.unique(self.directions.source[among]) for _, among in self.ticks]
+        return [
+            np.unique(self.directions.source[tick_directions]) for _, tick_directions in self.ticks
+        ]
 
     @cached_property
     def flows(self) -> FloatArray:
-        """The mean drift (S, M, M) of errors while the mode stays, see ``inflow``."""
-        found, eye = np.tile(self.drift, (self.shape[0], 1, 1)), np.eye(len(self.drift))
+        """B (S, M, M) of ``inflow``: the mean drift of errors while the mode stays."""
+        drifts, eye = np.tile(self.drift, (self.shape[0], 1, 1)), np.eye(len(self.drift))
         for node, rate, lost in self.samples:
-            _block_slice(found, self.nodes, node)[...] -= rate * lost
-        for k, (rate, among) in enumerate(self.ticks):
+            _block_slice(drifts, self.nodes, node)[...] -= rate * lost
+        for k, (rate, tick_directions) in enumerate(self.ticks):
             assert self.directions is not None
             stay = self.directions.stay(self._chains[k])[:, None, None]
-            found += (
-                rate * stay * self.directions.mean(self.nodes, among)
+            drifts += (
+                rate * stay * self.directions.mean(self.nodes, tick_directions)
                 - 0.5 * rate * (1.0 - stay) * eye
             )
-        return found
+        return drifts
 
     @cached_property
     def _pairs(self) -> list[tuple[IntArray, IntArray, FloatArray]]:
-        """Return for each tick pairs of its ways, and the rates (S, P) at which both arrive."""
+        """For each clock all pairs of its directions, and the rates (S, P) at which both messages
+        arrive.
+        """
         assert self.directions is not None
-        found = []
-        for rate, among in self.ticks:
-            first, second = (part.ravel() for part in np.meshgrid(among, among))
-            found.append((first, second, rate * self.directions.joint(first, second)))
-        return found
+        pairs = []
+        for rate, tick_directions in self.ticks:
+            first, second = (part.ravel() for part in np.meshgrid(tick_directions, tick_directions))
+            pairs.append((first, second, rate * self.directions.joint(first, second)))
+        return pairs
 
     @cached_property
     def all_pairs(self) -> tuple[IntArray, IntArray, FloatArray]:
@@ -160,35 +166,37 @@ class ClockJumps:
 
     @cached_property
     def _means(self) -> list[FloatArray]:
-        """The mean change (S, M, M) by each tick."""
+        """The mean change E[D] (S, M, M) of the errors at a tick of each clock."""
         assert self.directions is not None
-        return [self.directions.mean(self.nodes, among) for _, among in self.ticks]
+        return [
+            self.directions.mean(self.nodes, tick_directions) for _, tick_directions in self.ticks
+        ]
 
     def sampled(self, X: FloatArray) -> FloatArray:
         """Return the part of ``inflow`` (S, M, M) that samples add."""
-        found = np.zeros_like(X)
+        inflow = np.zeros_like(X)
         for node, rate, lost in self.samples:
-            own = _block_slice(X, self.nodes, node)
-            _block_slice(found, self.nodes, node)[...] += rate * lost @ own @ lost.T
-        return found
+            block = _block_slice(X, self.nodes, node)
+            _block_slice(inflow, self.nodes, node)[...] += rate * lost @ block @ lost.T
+        return inflow
 
     def inflow(self, X: FloatArray) -> FloatArray:
-        """Return what jumps add to the second moments (S, M, M) per second beyond the mean drift
-        ``flows``, a positive map: ``dX/dt = B X + X B' + inflow(X) + noise``.
+        """Return the rate (S, M, M) at which jumps increase the second moments X beyond the mean
+        drift B of ``flows``: ``dX/dt = B X + X B' + inflow(X) + noise``. It is a positive map.
         """
-        found = self.sampled(X)
+        total = self.sampled(X)
         if self.directions is None or not self.ticks:
-            return found
+            return total
         if self.directions.steps is None:
-            return np.asarray(found + self.directions.products(*self.all_pairs, X))
+            return np.asarray(total + self.directions.products(*self.all_pairs, X))
         for k, (rate, _) in enumerate(self.ticks):
             chains, (first, second, rates) = self._chains[k], self._pairs[k]
             stepped = self.directions.advance(X, chains)
             # The part in which the mode stays and errors move by their mean is in ``flows``.
-            rest = rate * (stepped - self.directions.stay(chains)[:, None, None] * X)
-            found += rest + 2.0 * symmetric(self._means[k] @ rest)
-            found += self.directions.products(first, second, rates, stepped)
-        return found
+            change = rate * (stepped - self.directions.stay(chains)[:, None, None] * X)
+            total += change + 2.0 * symmetric(self._means[k] @ change)
+            total += self.directions.products(first, second, rates, stepped)
+        return total
 
 
 def _block_slice(X: FloatArray, nodes: int, i: int) -> FloatArray:
@@ -201,21 +209,21 @@ def _multiply_blocks(maps: FloatArray, X: FloatArray, nodes: int) -> FloatArray:
     """Return ``C X C'`` (S, M, M) for the block diagonal C of N ``maps`` (N, n, n), or of one."""
     S, M, _ = X.shape
     n = M // nodes
-    left = (maps @ X.reshape(S, nodes, n, M)).reshape(S, M, M)
-    turned = np.ascontiguousarray(np.swapaxes(left, 1, 2)).reshape(S, nodes, n, M)
-    return np.asarray((maps @ turned).reshape(S, M, M))
+    CX = (maps @ X.reshape(S, nodes, n, M)).reshape(S, M, M)
+    transposed = np.ascontiguousarray(np.swapaxes(CX, 1, 2)).reshape(S, nodes, n, M)
+    return np.asarray((maps @ transposed).reshape(S, M, M))
 
 
 class LyapunovInverse:
     """The inverse of ``X -> -(B X + X B')`` for stable matrices B (S, M, M), by Schur forms."""
 
     def __init__(self, B: FloatArray) -> None:
-        self._forms = [scipy.linalg.schur(one)[:2] for one in B]
+        self._forms = [scipy.linalg.schur(matrix)[:2] for matrix in B]
 
     def __call__(self, Y: FloatArray) -> FloatArray:
         """Return X (S, M, M) with ``B X + X B' + Y = 0``."""
         return np.stack(
-            [self._solve(T, U, one) for (T, U), one in zip(self._forms, Y, strict=True)]
+            [self._solve(T, U, matrix) for (T, U), matrix in zip(self._forms, Y, strict=True)]
         )
 
     @staticmethod

@@ -25,21 +25,23 @@ from netkf.theory.common.replay import require_known_filter
 from netkf.theory.numerics.positive_maps import PositiveMap, fixed_point, spectral_radius
 
 MAX_ERRORS = 200
-"""Errors of all nodes together: a step takes some milliseconds then, and a solution seconds."""
+"""Largest number of errors of all nodes; a step then takes milliseconds, a solution seconds."""
 MAX_NUMBERS, QUICK_NUMBERS = 4_000_000, 40_000
-"""Numbers of second moments in all modes together: at most, and up to which they take seconds."""
+"""Largest number of entries of the second moments of all modes, and that up to which a solution
+takes a second.
+"""
 
 LinearErrors = SlotJumps | ClockJumps | DelayedJumps
 
 
 def mean_square_radius(scenario: Scenario) -> float:
-    """Return the spectral radius that decides if errors stay bounded in the mean square: they do if
-    it is below 1.
+    """Return the spectral radius of the mean-square dynamics, which is below 1 if and only if
+    errors stay bounded in the mean square.
 
-    In slots the second moments grow by it from slot to slot. In continuous time it is that of the
-    map from second moments to those that their jumps maintain, which says no more than the side of
-    1 that it is on; inf where errors already grow between jumps, or in their mean. Raises
-    TheoryError where the scenario's filter has no constant gains or its network no such law.
+    In slots it is the growth factor of second moments per slot. In continuous time it is that of
+    the map from second moments to those that their jumps maintain, of which only the comparison
+    with 1 has a meaning; inf if errors grow between jumps, or in the mean. Raises TheoryError if
+    the gains are not constant or the network has no known law.
     """
     if _choose_solver(scenario) is None:
         system = _make_system(scenario)
@@ -78,8 +80,8 @@ def steady_error_covariance(scenario: Scenario) -> FloatArray:
 
 @lru_cache(maxsize=8)
 def _solve(scenario: Scenario) -> tuple[float, FloatArray | None]:
-    """Return the radius, and the covariances (N, n, n) if it is below 1; with delays a radius of 0
-    stands for one that is only proved to be.
+    """Return the radius, and the covariances (N, n, n) if it is below 1; with delays the radius is
+    0 if it is only proved to be below 1.
     """
     solve = _choose_solver(scenario)
     if solve is not None:
@@ -88,7 +90,7 @@ def _solve(scenario: Scenario) -> tuple[float, FloatArray | None]:
         return solved
     system = _make_system(scenario)
     if isinstance(system, DelayedJumps):
-        # The radius takes many times as long as the covariance, which proves that it is below 1.
+        # The radius takes many times as long as the covariance, whose existence proves it below 1.
         radius = (
             0.0 if system.mean_is_stable and system.is_bounded else mean_square_radius(scenario)
         )
@@ -102,9 +104,9 @@ def _solve(scenario: Scenario) -> tuple[float, FloatArray | None]:
             return float(radius), None
         X = fixed_point(T, Q, radius)
     X = X.sum(axis=0)
-    found = diagonal_blocks(X[None], system.nodes)[0]
+    covariances = diagonal_blocks(X[None], system.nodes)[0]
     # Nodes that share one filter share its error.
-    return radius, np.repeat(found, len(scenario.nodes) // system.nodes, axis=0)
+    return radius, np.repeat(covariances, len(scenario.nodes) // system.nodes, axis=0)
 
 
 @lru_cache(maxsize=8)
@@ -116,20 +118,20 @@ def _make_system(scenario: Scenario) -> LinearErrors:
 
 
 def linear_errors(scenario: Scenario) -> LinearErrors:
-    """Return the errors of a scenario's filter as a linear system with jumps; raises TheoryError
-    where they are not.
+    """Return the errors of a scenario's filter as a linear system with jumps; raises TheoryError if
+    they are none.
     """
     _require_known_law(scenario)
     make = _system_maker(scenario)
     if make is None:
-        given = kind_name(scenario.filter.algorithm)
+        filter_name = kind_name(scenario.filter.algorithm)
         raise TheoryError(
-            f"exact steady mean squares are not known for the {given} filter "
+            f"exact steady mean squares are not known for the {filter_name} filter "
             f"{'in slots' if scenario.slotted else 'under clocks'}, whose gains follow what "
             "happens"
         )
-    made: LinearErrors = make(scenario)
-    return made
+    system: LinearErrors = make(scenario)
+    return system
 
 
 def _require_known_law(scenario: Scenario) -> None:
@@ -147,7 +149,7 @@ def _require_known_law(scenario: Scenario) -> None:
 
 
 def has_linear_errors(scenario: Scenario) -> bool:
-    """Return True if the class of the filter is one whose gains are constant in some scenarios."""
+    """Return True if filters of this class have constant gains in some scenarios."""
     return _system_maker(scenario) is not None or _choose_solver(scenario) is not None
 
 
@@ -157,7 +159,7 @@ def is_quickly_solved(scenario: Scenario) -> bool:
         return len(scenario.nodes) * scenario.plant.n <= MAX_ERRORS
     system = linear_errors(scenario)
     S, M, _ = system.shape
-    # Where messages are under way, moments between two times are solved for.
+    # With delays, moments between errors at all collocation points of the delay are solved for.
     times = system.points + 1 if isinstance(system, DelayedJumps) else 1
     return S * M * M * times <= QUICK_NUMBERS
 
@@ -165,11 +167,11 @@ def is_quickly_solved(scenario: Scenario) -> bool:
 def _choose_solver(
     scenario: Scenario,
 ) -> Callable[[Scenario], tuple[float, FloatArray | None]] | None:
-    """Return the function of a paper that solves for radius and covariances itself, if any."""
-    found: Callable[[Scenario], tuple[float, FloatArray | None]] | None = paper_function(
+    """Return the paper's own function for radius and covariances in slots, None without one."""
+    solver: Callable[[Scenario], tuple[float, FloatArray | None]] | None = paper_function(
         scenario, "steady_errors", f"{scenario.hosted.combination}_in_slots".replace(" ", "_")
     )
-    return found if scenario.slotted else None
+    return solver if scenario.slotted else None
 
 
 def _system_maker(scenario: Scenario) -> Callable[[Scenario], LinearErrors] | None:
@@ -177,10 +179,10 @@ def _system_maker(scenario: Scenario) -> Callable[[Scenario], LinearErrors] | No
     if scenario.hosted.combination == "none":
         return silent_jumps if scenario.slotted else None
     name = "slot_jumps" if scenario.slotted else "clock_jumps"
-    made: Callable[[Scenario], LinearErrors] | None = paper_function(
+    maker: Callable[[Scenario], LinearErrors] | None = paper_function(
         scenario, "linear_errors", name
     )
-    return made
+    return maker
 
 
 def _require_size(shape: tuple[int, int, int]) -> None:

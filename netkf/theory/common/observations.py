@@ -46,20 +46,20 @@ def _noises(scenario: Scenario) -> list[tuple[FloatArray, FloatArray]]:
 def increment_observations(scenario: Scenario) -> list[Observation]:
     """Return the continuous readings of each estimator; p is 0 for estimators without any.
 
-    Hosts with the sensors of the same ``[[sensors]]`` entries share one object.
+    Estimators with sensors of the same ``[[sensors]]`` entries share one object.
     """
     placed, n = scenario.increment_sensors, scenario.plant.n
-    used = {sensor.entry for sensors in placed.values() for sensor in sensors}
+    entries_in_use = {sensor.entry for sensors in placed.values() for sensor in sensors}
     noises = _noises(scenario)
-    single = {k: Observation(scenario.sensors[k].H, *noises[k]) for k in used}
+    single = {k: Observation(scenario.sensors[k].H, *noises[k]) for k in entries_in_use}
     stacked: dict[tuple[int, ...], Observation] = {}
-    found = []
+    observations = []
     for nodes in nodes_by_estimator(scenario):
         entries = tuple(sensor.entry for node in nodes for sensor in placed.get(node, ()))
         if entries not in stacked:
             stacked[entries] = stack_observations([single[k] for k in entries], n)
-        found.append(stacked[entries])
-    return found
+        observations.append(stacked[entries])
+    return observations
 
 
 def slot_observations(scenario: Scenario, run: Run) -> Callable[[int], EstimatorObservations]:
@@ -77,15 +77,15 @@ def slot_observations(scenario: Scenario, run: Run) -> Callable[[int], Estimator
 
     def observe(slot: int) -> EstimatorObservations:
         """Return the readings of a slot by estimator."""
-        found = {}
+        observations = {}
         for estimator, paths in enumerate(estimators):
             if not paths:
                 continue
             rows = [(sensor, path.matrix(slot)) for sensor, path in paths]
             # A sensor without a reading in this slot has a matrix without rows.
             readings = [Observation(H, *noises[sensor.entry]) for sensor, H in rows if len(H)]
-            found[estimator] = stack_observations(readings, n)
-        return found
+            observations[estimator] = stack_observations(readings, n)
+        return observations
 
     return observe
 
@@ -98,7 +98,7 @@ def timed_observations(scenario: Scenario, run: Run) -> dict[float, EstimatorObs
     streams, n = Streams(run.seed, run.replica), scenario.plant.n
     by_node, noises = scenario.sampled_sensors, _noises(scenario)
     times = sample_times(scenario, streams)
-    found: dict[float, dict[int, list[Observation]]] = {}
+    observations: dict[float, dict[int, list[Observation]]] = {}
     for estimator, nodes in enumerate(nodes_by_estimator(scenario)):
         for node in nodes:
             for placed_sensor in by_node.get(node, ()):
@@ -110,7 +110,7 @@ def timed_observations(scenario: Scenario, run: Run) -> dict[float, EstimatorObs
                 )
                 for k, time in enumerate(times[node, placed_sensor.ordinal].tolist()):
                     H = path.reading(k, np.zeros(n))[1] if path is not None else sensor.H
-                    at_time = found.setdefault(time, {})
+                    at_time = observations.setdefault(time, {})
                     at_time.setdefault(estimator, []).append(
                         Observation(H, *noises[placed_sensor.entry])
                     )
@@ -118,5 +118,5 @@ def timed_observations(scenario: Scenario, run: Run) -> dict[float, EstimatorObs
         time: {
             estimator: stack_observations(readings, n) for estimator, readings in at_time.items()
         }
-        for time, at_time in found.items()
+        for time, at_time in observations.items()
     }

@@ -12,13 +12,13 @@ from netkf.theory.intermittent.riccati import undetectable_slot_mode
 def slot_plant_rows(scenario: Scenario) -> list[AssumptionRow]:
     """Return rows about F and Q: stabilisable, Q definite, true model (G S.1, R Theorem 9)."""
     plant = scenario.slot_plant
-    least = float(np.linalg.eigvalsh(plant.Q)[0])
+    smallest = float(np.linalg.eigvalsh(plant.Q)[0])
     # (F, Q^1/2) is stabilisable if and only if (F', Q^1/2) is detectable.
     idle = undetectable_slot_mode(plant.F.T, plant.Q)
     evidence = "every mode that does not decay is driven by the noise"
     if idle is not None:
         evidence = f"the mode with eigenvalue {idle:.6g} is not driven"
-    positive = f"least eigenvalue {least:.3g}; sufficient for the uniqueness of the limit law"
+    positive = f"least eigenvalue {smallest:.3g}; sufficient for the uniqueness of the limit law"
     return [
         (
             "(F, Q^1/2) is stabilisable",
@@ -28,7 +28,7 @@ def slot_plant_rows(scenario: Scenario) -> list[AssumptionRow]:
         (
             "Q is positive definite",
             "G II-A, R Theorem 9",
-            *judge_plant(scenario, least > 0.0, positive),
+            *judge_plant(scenario, smallest > 0.0, positive),
         ),
         true_model_row(scenario, "G (10), R (15)", "same F, Q and R"),
     ]
@@ -36,20 +36,20 @@ def slot_plant_rows(scenario: Scenario) -> list[AssumptionRow]:
 
 def start_rows(scenario: Scenario, source: str) -> list[AssumptionRow]:
     """Return one row: each P_i(0) is at least the second moment of the node's first error."""
-    plant, worst = scenario.plant, np.inf
+    plant, smallest = scenario.plant, np.inf
     starts = (scenario.start(node) for node in scenario.nodes)
     # Most networks have one start for all nodes.
     for mean, cov in {(id(mean), id(cov)): (mean, cov) for mean, cov in starts}.values():
         # E[(x - xhat)(x - xhat)'] = cov of x(0) + the square of the difference of the means
         offset = plant.start_mean - mean
         gap = cov - plant.start_cov - np.outer(offset, offset)
-        worst = min(worst, float(np.linalg.eigvalsh(gap)[0]) / max(1.0, np.abs(cov).max()))
+        smallest = min(smallest, float(np.linalg.eigvalsh(gap)[0]) / max(1.0, np.abs(cov).max()))
     return [
         (
             "P_i(0) >= E[(x(0) - xhat_i(0))(x(0) - xhat_i(0))']",
             source,
             *judge_plant(
-                scenario, worst >= -1e-12, f"least eigenvalue of the difference {worst:.3g}"
+                scenario, smallest >= -1e-12, f"least eigenvalue of the difference {smallest:.3g}"
             ),
         )
     ]

@@ -1,4 +1,4 @@
-"""The law of who hears whom: directed links with their weights, and the moments of one exchange.
+"""The law of deliveries: directed links with their weights, and the moments of one exchange.
 
 A message on direction k moves the error of its receiver i towards that of its sender j by W_k,
 ``e_i + W_k (s_j - s_i)``, where s are estimates or predictions. With delta_k = 1 if it arrives an
@@ -28,11 +28,12 @@ class Directions(NamedTuple):
 
     sender, receiver : (K,) indices of nodes
     weight           : (K, n, n) the matrices W_k
-    source           : (K,) number of the draw, and of the chain, that decides on a direction;
-                       directions with one source share it
+    source           : (K,) index of the draw (and of the Gilbert-Elliott chain) that decides on
+                       delivery; directions that fail together have the same source
     delivery         : (S, K) probability that a message arrives, by mode
-    steps            : (to_bad, to_good) of a chain that makes a step at each activation; None if
-                       there is one mode only. Bit c of a mode says if chain c is bad
+    steps            : transition probabilities (to_bad, to_good) of each chain, which makes a step
+                       at each activation; None if there is one mode only. Bit c of the index of a
+                       mode is 1 if chain c is in its bad state
     """
 
     sender: IntArray
@@ -54,10 +55,10 @@ class Directions(NamedTuple):
             return np.ones(1)
         to_bad, to_good = self.steps
         bad = to_bad / (to_bad + to_good)
-        found = np.ones(1)
+        probabilities = np.ones(1)
         for _ in range(int(np.log2(self.modes))):
-            found = np.concatenate([found * (1.0 - bad), found * bad])
-        return found
+            probabilities = np.concatenate([probabilities * (1.0 - bad), probabilities * bad])
+        return probabilities
 
     def advance(self, X: FloatArray, chains: IntArray) -> FloatArray:
         """Return second moments (S, M, M) by mode after the given ``chains`` made a step."""
@@ -76,20 +77,20 @@ class Directions(NamedTuple):
         if self.steps is None:
             return np.ones(1)
         to_bad, to_good = self.steps
-        modes, found = np.arange(self.modes), np.ones(self.modes)
+        modes, probability = np.arange(self.modes), np.ones(self.modes)
         for chain in chains.tolist():
-            found *= np.where(modes >> chain & 1, 1.0 - to_good, 1.0 - to_bad)
-        return found
+            probability *= np.where(modes >> chain & 1, 1.0 - to_good, 1.0 - to_bad)
+        return probability
 
-    def mean(self, nodes: int, among: IntArray) -> FloatArray:
-        """Return E[D] (S, N n, N n) of the directions ``among``, by mode."""
+    def mean(self, nodes: int, directions: IntArray) -> FloatArray:
+        """Return E[D] (S, N n, N n) of the directions ``directions``, by mode."""
         n = self.weight.shape[-1]
-        found = np.zeros((self.modes, nodes, nodes, n, n))
-        parts = self.delivery[:, among, None, None] * self.weight[among]
-        receiver, sender = self.receiver[among], self.sender[among]
-        _add_blocks(found, receiver, sender, parts)
-        _add_blocks(found, receiver, receiver, -parts)
-        return _join_blocks(found)
+        blocks = np.zeros((self.modes, nodes, nodes, n, n))
+        terms = self.delivery[:, directions, None, None] * self.weight[directions]
+        receiver, sender = self.receiver[directions], self.sender[directions]
+        _add_blocks(blocks, receiver, sender, terms)
+        _add_blocks(blocks, receiver, receiver, -terms)
+        return _join_blocks(blocks)
 
     def products(
         self, first: IntArray, second: IntArray, factor: FloatArray, Z: FloatArray
@@ -105,16 +106,16 @@ class Directions(NamedTuple):
         gap = blocks[:, j, m] - blocks[:, j, k] - blocks[:, i, m] + blocks[:, i, k]
         turned = np.swapaxes(self.weight[second], 1, 2)
         terms = factor[:, :, None, None] * (self.weight[first] @ gap @ turned)
-        found = np.zeros_like(blocks)
-        _add_blocks(found, i, k, terms)
-        return _join_blocks(found)
+        blocks_out = np.zeros_like(blocks)
+        _add_blocks(blocks_out, i, k, terms)
+        return _join_blocks(blocks_out)
 
     def joint(self, first: IntArray, second: IntArray) -> FloatArray:
-        """Return the probability (S, P) that messages on both of two ways arrive in one activation,
-        by mode, for P pairs of directions.
+        """Return the probability (S, P) that the messages of both directions arrive in one
+        activation, by mode, for P pairs of directions.
         """
         p, q = self.delivery[:, first], self.delivery[:, second]
-        # Directions of one source are decided by one uniform number, which is below both.
+        # Directions of one source share one uniform draw: both arrive if it is below min(p, q).
         same = self.source[first] == self.source[second]
         return np.asarray(np.where(same, np.minimum(p, q), p * q))
 
@@ -134,10 +135,10 @@ def _join_blocks(blocks: FloatArray) -> FloatArray:
 def directions_of(
     scenario: Scenario, weights: dict[tuple[int, int], FloatArray], wait: float
 ) -> Directions:
-    """Return the directions of a scenario with ``weights`` (n, n) for each (sender, receiver);
-    messages of more than ``wait`` seconds are late, and lost.
+    """Return the directions of a scenario with ``weights`` (n, n) for each (sender, receiver).
 
-    Raises TheoryError where losses or delays have no law that can be used here.
+    Messages that take more than ``wait`` seconds count as lost. Raises TheoryError if losses or
+    delays have no law that is known here.
     """
     _require_law(scenario)
     loss, delay = scenario.network.channel.loss, scenario.network.channel.delay.fixed
@@ -173,7 +174,7 @@ def all_messages_arrive(scenario: Scenario) -> bool:
 
 
 def _require_law(scenario: Scenario) -> None:
-    """Raise TheoryError where losses or delays have no law that can be used here."""
+    """Raise TheoryError if losses or delays have no law that is known here."""
     channel = scenario.network.channel
     if is_recorded(channel):
         raise TheoryError("losses or delays are recorded: their law is not known")
@@ -186,8 +187,8 @@ def _require_law(scenario: Scenario) -> None:
 def _deliveries(
     scenario: Scenario, links: list[tuple[int, int]], source: IntArray, chains: int
 ) -> FloatArray:
-    """Return the probabilities (S, K) that a message arrives on each of ``links``, by mode; bit c
-    of a mode says if chain c of ``chains`` is bad. Raises TheoryError for too many chains.
+    """Return the delivery probabilities (S, K) of each of ``links``, by mode (see Directions), for
+    the given number of ``chains``. Raises TheoryError for more than MAX_CHAINS.
     """
     loss = scenario.network.channel.loss
     if isinstance(loss, GilbertElliott) and loss.independent:
@@ -210,12 +211,14 @@ def _deliveries(
 
 
 def _source_of(scenario: Scenario, link: tuple[int, int]) -> tuple[int, int]:
-    """Return the link whose draw decides on a direction: both share it if they are symmetric."""
+    """Return the link whose draw decides on a direction; both directions have the same if they
+    fail together.
+    """
     return min(link, link[::-1]) if _fail_together(scenario) else link
 
 
 def _all_sources(scenario: Scenario, links: list[tuple[int, int]]) -> list[tuple[int, int]]:
-    """Return the links whose channels have states of their own."""
+    """Return the links with draws (and channel states) of their own, in order."""
     return list(dict.fromkeys(_source_of(scenario, link) for link in links))
 
 
@@ -228,22 +231,27 @@ def _fail_together(scenario: Scenario) -> bool:
 def poisson_ticks(
     scenario: Scenario, links: list[tuple[int, int]]
 ) -> tuple[tuple[float, IntArray], ...]:
-    """Return rate (1/s) and directions (indices in ``links``) of each clock that makes nodes
+    """Return rate (1/s) and directions (indices in ``links``) of each clock at which nodes
     transmit; raises TheoryError unless clocks are Poisson processes.
     """
     clock = scenario.network.activation
     assert isinstance(clock, LinkClock)
     if clock.at == "readings" or not clock.memoryless:
         raise TheoryError("nodes do not transmit by Poisson clocks of their own")
-    entities, index = clock.entities(scenario.topology), {one: k for k, one in enumerate(links)}
-    found = []
+    entities, index = (
+        clock.entities(scenario.topology),
+        {direction: k for k, direction in enumerate(links)},
+    )
+    ticks = []
     for entity in entities:
         if clock.at == "nodes":
-            among = [k for link, k in index.items() if link[0] == entity[0]]
+            tick_directions = [k for link, k in index.items() if link[0] == entity[0]]
         else:
             ends = (entity[0], entity[1])
-            both = (ends, ends[::-1]) if clock.at == "links" else (ends,)
-            among = [index[link] for link in both if link in index]
-        if among:
-            found.append((float(clock.mean_rate(entity)), np.array(among, dtype=np.int64)))
-    return tuple(found)
+            directions = (ends, ends[::-1]) if clock.at == "links" else (ends,)
+            tick_directions = [index[link] for link in directions if link in index]
+        if tick_directions:
+            ticks.append(
+                (float(clock.mean_rate(entity)), np.array(tick_directions, dtype=np.int64))
+            )
+    return tuple(ticks)

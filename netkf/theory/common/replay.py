@@ -38,9 +38,9 @@ def replay_covariances(scenario: Scenario, run: Run) -> FloatArray:
     """
     errors = _stacked_errors(scenario)
     # The generator stops at each sample, when the errors have their values of that time.
-    found = [errors.covariance() for _ in _replay(scenario, run, errors)]
+    covariances = [errors.covariance() for _ in _replay(scenario, run, errors)]
     size = errors.estimators * errors.n
-    return np.array(found).reshape(-1, size, size)
+    return np.array(covariances).reshape(-1, size, size)
 
 
 class ErrorLaw(NamedTuple):
@@ -85,10 +85,10 @@ def require_known_filter(scenario: Scenario) -> None:
         raise TheoryError(NONLINEAR)
     if not scenario.hosted.combination:
         raise TheoryError(f"no exact error covariance for {name}")
-    own = overridden(algorithm)
-    if own:
+    overridden_names = overridden(algorithm)
+    if overridden_names:
         raise TheoryError(
-            f"the exact error covariance is not known: {name} defines {own[0]} itself"
+            f"the exact error covariance is not known: {name} defines {overridden_names[0]} itself"
         )
 
 
@@ -105,13 +105,13 @@ def delivered_messages(scenario: Scenario, run: Run) -> list[SentMessage]:
         )
     )
     rows = log[log["kind"] == CODES["deliver"]]
-    found = []
+    messages = []
     for t, node, peer, message in zip(
         *(rows[c].tolist() for c in ("t", "node", "peer", "message")), strict=True
     ):
         sent = sent_at.get((peer, node, message), t)
-        found.append(SentMessage(index[peer], index[node], message, sent, t))
-    return found
+        messages.append(SentMessage(index[peer], index[node], message, sent, t))
+    return messages
 
 
 def _replay_instants(scenario: Scenario, run: Run, errors: StackedErrors) -> Iterator[None]:
@@ -141,21 +141,21 @@ def _exchanged_messages(scenario: Scenario, run: Run) -> dict[tuple[int, int], l
     """Return the messages that arrived in time, by slot and number of the exchange."""
     rows, index = run.log[run.log["kind"] == CODES["deliver"]], scenario.topology.index
     slots = scenario.slot_plant.slots_of(rows["t"])
-    found: dict[tuple[int, int], list[SentMessage]] = {}
+    messages: dict[tuple[int, int], list[SentMessage]] = {}
     columns = (slots, *(rows[c] for c in ("phase", "node", "peer", "message")))
     for slot, phase, node, peer, message in zip(*(c.tolist() for c in columns), strict=True):
         # Within a slot the order of phases decides, and not the time of arrival.
         sent = SentMessage(index[peer], index[node], message, slot, slot)
-        found.setdefault((slot, max(phase, 0)), []).append(sent)
-    return found
+        messages.setdefault((slot, max(phase, 0)), []).append(sent)
+    return messages
 
 
 def _group_by_time(messages: list[SentMessage], column: int) -> dict[float, list[SentMessage]]:
     """Return the messages by the time in their field number ``column``."""
-    found: dict[float, list[SentMessage]] = {}
+    groups: dict[float, list[SentMessage]] = {}
     for message in messages:
-        found.setdefault(message[column], []).append(message)
-    return found
+        groups.setdefault(message[column], []).append(message)
+    return groups
 
 
 def _make_rule(
@@ -164,8 +164,8 @@ def _make_rule(
     """Return the error rule of the filter's paper, or that of filters without messages."""
     if not scenario.hosted.paper:
         return ErrorRule(scenario, errors)
-    made: ErrorRule = paper_module(scenario, "errors").error_rule(scenario, errors, run, messages)
-    return made
+    rule: ErrorRule = paper_module(scenario, "errors").error_rule(scenario, errors, run, messages)
+    return rule
 
 
 def _replay_slots(scenario: Scenario, run: Run, errors: StackedErrors) -> Iterator[None]:
@@ -181,12 +181,12 @@ def _replay_slots(scenario: Scenario, run: Run, errors: StackedErrors) -> Iterat
     rule = _make_rule(scenario, errors, run, [])
     observe = slot_observations(scenario, run)
     arrivals = _exchanged_messages(scenario, run) if rule.takes_messages else {}
-    done = 0
+    processed = 0
     for until in np.round(run.times / plant.period).astype(int).tolist():
-        while done < until:
-            slot = done if scenario.hosted.predicts else done + 1
+        while processed < until:
+            slot = processed if scenario.hosted.predicts else processed + 1
             _replay_slot(rule, prediction, phases, slot, observe(slot), arrivals)
-            done += 1
+            processed += 1
         yield
 
 

@@ -88,11 +88,11 @@ class StackedErrors:
             offsets[STATE] = start
         if not any(offset.any() for offset in offsets.values()):
             return
-        one = self.stack.inputs(1)
+        column = self.stack.inputs(1)
         self.stack.put(OFFSET, np.zeros((n, 0)))
-        self.stack.add(OFFSET, one, np.eye(n, 1))
+        self.stack.add(OFFSET, column, np.eye(n, 1))
         for name, offset in offsets.items():
-            self.stack.add(name, one, offset[:, None])
+            self.stack.add(name, column, offset[:, None])
 
     def keep(self) -> None:
         """Keep the present errors of all estimators, for ``law``."""
@@ -104,19 +104,19 @@ class StackedErrors:
         """
         rows, width = self.estimators * self.n, self.stack.used
         forms = np.zeros((len(self._kept), rows, width))
-        for k, kept in enumerate(self._kept):
-            forms[k, :, : kept.shape[2]] = kept.reshape(rows, -1)
+        for k, snapshot in enumerate(self._kept):
+            forms[k, :, : snapshot.shape[2]] = snapshot.reshape(rows, -1)
         return self._mean_and_covariance(forms.reshape(-1, width))
 
     def _mean_and_covariance(self, forms: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the mean (K,) and the covariance (K, K) of errors with the forms (K, inputs)."""
         if OFFSET not in self.stack:
             return np.zeros(len(forms)), np.asarray(forms @ forms.T)
-        one = self.stack.form(OFFSET)[0]
-        mean = np.asarray(forms @ one)
+        constant_input = self.stack.form(OFFSET)[0]
+        mean = np.asarray(forms @ constant_input)
         # What is left is random: the part along the input that is a number is taken out first.
-        rest = forms - np.outer(mean, one)
-        return mean, np.asarray(rest @ rest.T)
+        random_part = forms - np.outer(mean, constant_input)
+        return mean, np.asarray(random_part @ random_part.T)
 
     def covariance(self) -> FloatArray:
         """Return the joint covariance (M n, M n) of the errors of the estimators."""
@@ -140,9 +140,9 @@ class StackedErrors:
         for name in names:
             del self.owner[name]
 
-    def replace(self, name: Hashable, other: Hashable) -> None:
-        """Move estimate ``name`` to ``other``, which keeps its owner."""
-        self.stack.rename(name, other)
+    def replace(self, name: Hashable, form: Hashable) -> None:
+        """Move estimate ``name`` to ``form``, which keeps its owner."""
+        self.stack.rename(name, form)
         del self.owner[name]
 
     def reading_noises(self, observations: Mapping[int, Observation]) -> dict[int, slice]:
@@ -277,17 +277,17 @@ class ErrorPropagator:
         # The plant's noise at the 8 nodes of the quadrature enters all errors; the noises of the
         # increments take n inputs for each estimate that uses some.
         n, common = errors.n, 8 * flows.plant[1].shape[1]
-        own = [n * len(names) if flow.observes else 0 for flow, names in groups]
-        columns = errors.stack.inputs(common + sum(own))
+        noise_counts = [n * len(names) if flow.observes else 0 for flow, names in groups]
+        columns = errors.stack.inputs(common + sum(noise_counts))
         first = columns.start + common
         if not errors.follows:
-            for (flow, names), count in zip(groups, own, strict=True):
+            for (flow, names), count in zip(groups, noise_counts, strict=True):
                 flow.move(errors.stack, names, gap, (columns.start, first))
                 first += count
             return
         x = errors.stack.form(STATE)
         shared = slice(columns.start, first)
-        for (flow, names), count in zip(groups, own, strict=True):
+        for (flow, names), count in zip(groups, noise_counts, strict=True):
             self._step_with_state(flow, names, x, gap, (shared, first))
             first += count
         F, response = propagate_state(flows.plant, gap)
@@ -304,14 +304,16 @@ class ErrorPropagator:
     ) -> None:
         """Propagate estimates with one flow whose errors depend on the state's form x."""
         errors, (shared, column) = self._errors, columns
-        moved = flow.transition(np.stack([errors.roots[name] for name in names]), gap)
-        forms = moved.transition @ errors.stack.forms(names) + moved.follow @ x
-        forms[:, :, shared] += moved.response
+        flow_step = flow.transition(np.stack([errors.roots[name] for name in names]), gap)
+        forms = flow_step.transition @ errors.stack.forms(names) + flow_step.follow @ x
+        forms[:, :, shared] += flow_step.response
         for k, name in enumerate(names):
             if flow.observes:
-                forms[k, :, column : column + moved.own.shape[2]] += moved.own[k]
+                forms[k, :, column : column + flow_step.reading_noise.shape[2]] += (
+                    flow_step.reading_noise[k]
+                )
                 column += errors.n
-            errors.roots[name] = moved.root[k]
+            errors.roots[name] = flow_step.root[k]
         errors.stack.put_all(dict(zip(names, forms, strict=True)))
 
 
@@ -336,15 +338,15 @@ def _increment_flows(scenario: Scenario, estimators: int) -> IncrementFlows | No
     A, Q = scenario.belief
     plant = (scenario.truth.A, scenario.truth.B)
     B = plant[1] if np.array_equal(plant[1] @ plant[1].T, Q) else square_root(Q)
-    made: dict[bytes, ErrorFlow] = {}
+    flows: dict[bytes, ErrorFlow] = {}
 
     def flow(observation: Observation) -> ErrorFlow:
         """Return the flow of errors with these sensors."""
         # Estimators with equal sensors share a flow, and are then propagated together.
         key = b"|".join(part.tobytes() for part in observation)
-        if key not in made:
-            made[key] = ErrorFlow(A, B, observation.H, observation.R, observation.root, plant)
-        return made[key]
+        if key not in flows:
+            flows[key] = ErrorFlow(A, B, observation.H, observation.R, observation.root, plant)
+        return flows[key]
 
     empty = np.zeros((0, 0))
     unobserved = flow(Observation(np.zeros((0, scenario.plant.n)), empty, empty))

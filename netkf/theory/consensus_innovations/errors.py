@@ -56,24 +56,24 @@ class PseudoStateRule(ErrorRule):
         columns = errors.reading_noises(self._observations)
         states = [errors.stack.form(estimator) for estimator in estimators]
         # The error of yhat: what is stored is that of yhat - G xhat.
-        before = [errors.stack.form(_difference_name(i)) + G @ states[i] for i in estimators]
-        after = [form.copy() for form in before]
+        old_estimates = [errors.stack.form(_difference_name(i)) + G @ states[i] for i in estimators]
+        new_estimates = [form.copy() for form in old_estimates]
         gains = gain_sequence(self._design).at(self._slot)
         # e_i+ = e_i + sum_j B_ij (e_j - e_i): the true pseudo-state cancels.
         for message in messages:
             i, j = message.receiver, message.sender
             B = gains[i].B[self._design.heard[i].index(j)]
-            after[i] += B @ (before[j] - before[i])
+            new_estimates[i] += B @ (old_estimates[j] - old_estimates[i])
         for i, observation in self._observations.items():
             weighted = np.linalg.solve(observation.R, observation.H).T
             weighted_H = weighted @ observation.H
             # Innovation H' R^-1 (y - H G^+ yhat), with y = H x + v.
-            after[i] -= gains[i].M @ weighted_H @ self._pseudo.inverse @ before[i]
-            after[i][:, columns[i]] -= gains[i].M @ weighted @ observation.root
+            new_estimates[i] -= gains[i].M @ weighted_H @ self._pseudo.inverse @ old_estimates[i]
+            new_estimates[i][:, columns[i]] -= gains[i].M @ weighted @ observation.root
         for i in estimators:
             # xhat+ = xhat + K (yhat+ - G xhat), in errors.
-            e = states[i] - gains[i].K @ (G @ states[i] - after[i])
-            self._set_errors(i, e, after[i] - G @ e)
+            e = states[i] - gains[i].K @ (G @ states[i] - new_estimates[i])
+            self._set_errors(i, e, new_estimates[i] - G @ e)
             errors.roots[i] = gains[i].root
 
     def _set_errors(self, estimator: int, e: FloatArray, u: FloatArray) -> None:

@@ -33,11 +33,13 @@ def slot_jumps(scenario: Scenario) -> SlotJumps:
     closed = [np.eye(n) - L @ H for L, (H, _) in zip(gains, sensors, strict=True)]
     noise = block_diagonal([L @ R @ L.T for L, (_, R) in zip(gains, sensors, strict=True)])
     plant = scenario.slot_plant
-    return SlotJumps(plant.F, plant.Q, np.stack(closed), noise, slot_ways(scenario))
+    return SlotJumps(plant.F, plant.Q, np.stack(closed), noise, broadcast_directions(scenario))
 
 
-def slot_ways(scenario: Scenario) -> Directions | None:
-    """Return the links of a scenario with broadcasts in slots, None if there is none."""
+def broadcast_directions(scenario: Scenario) -> Directions | None:
+    """Return the directed links of a scenario with broadcasts in slots, None without links; raises
+    TheoryError for recorded exchanges.
+    """
     if not isinstance(scenario.network.activation, Broadcast):
         raise TheoryError("the exchanges are recorded: one outcome, not a law")
     weights = link_weights(scenario)
@@ -45,54 +47,63 @@ def slot_ways(scenario: Scenario) -> Directions | None:
 
 
 class JointErrorFlow(NamedTuple):
-    """Errors between ticks: ``drift`` (N, n, n) of each node's, ``noise`` (N n, N n) a second."""
+    """The errors between ticks: the ``drift`` A - L H (N, n, n) of each node, and the covariance
+    ``noise`` (N n, N n) per second of all.
+    """
 
     drift: FloatArray
     noise: FloatArray
 
 
 class SampledNode(NamedTuple):
-    """A sensor that takes samples: the node's index, its ``clock`` and index among the node's
-    sensors, ``lost`` = L H (n, n) of the error, and the covariance ``noise`` (n, n) that it adds.
+    """A sensor that takes samples.
+
+    node       : index of its node
+    clock      : its sampling clock, None if the times are recorded
+    entity     : (node id, index among the node's sensors), by which the clock knows it
+    correction : (n, n) L H: a sample multiplies the error by I - L H
+    noise      : (n, n) L R L', the covariance that a sample adds
     """
 
     node: int
     clock: Clock | None
     entity: tuple[int, int]
-    lost: FloatArray
+    correction: FloatArray
     noise: FloatArray
 
 
 def clock_jumps(scenario: Scenario) -> ClockJumps | DelayedJumps | SlotJumps:
-    """Return the system under Poisson clocks of links, directions or nodes, or that from tick to
-    tick of clocks that all tick together.
+    """Return the linear system of the errors in continuous time.
 
-    Raises TheoryError where clocks are others, delays random or, for bursts under Poisson clocks,
-    not 0.
+    Clocks are Poisson processes of links, directions or nodes, or periodic and all tick together;
+    then the system is that from tick to tick. Raises TheoryError for other clocks, random delays,
+    and delays together with bursts under Poisson clocks.
     """
     flow, samples, weights = _error_flow(scenario), _sampled_nodes(scenario), link_weights(scenario)
     clock = scenario.network.activation
     talks = bool(weights) and isinstance(clock, LinkClock)
     delay = scenario.network.channel.delay.fixed if talks else 0.0
     if isinstance(clock, Periodic) and talks and delay is not None:
-        together = directions_of(scenario, weights, clock.period)
-        return _from_tick_to_tick(clock, flow, samples, together, delay)
+        directions_of_tick = directions_of(scenario, weights, clock.period)
+        return _from_tick_to_tick(clock, flow, samples, directions_of_tick, delay)
     directions = directions_of(scenario, weights, math.inf) if talks else None
     if delay and directions is not None and directions.modes > 1:
         raise TheoryError(
             "exact mean squares of bursts under Poisson clocks are known if messages take no time"
         )
     N, n = len(scenario.nodes), scenario.plant.n
-    noise, found = flow.noise.copy(), []
-    for one in samples:
-        if one.clock is None or not one.clock.memoryless:
-            raise TheoryError(f"node {scenario.nodes[one.node]} does not sample by a Poisson clock")
-        rate, own = float(one.clock.mean_rate(one.entity)), _node_slice(one.node, n)
-        noise[own, own] += rate * one.noise
-        found.append((one.node, rate, one.lost))
+    noise, sampled_nodes = flow.noise.copy(), []
+    for sensor in samples:
+        if sensor.clock is None or not sensor.clock.memoryless:
+            raise TheoryError(
+                f"node {scenario.nodes[sensor.node]} does not sample by a Poisson clock"
+            )
+        rate, rows = float(sensor.clock.mean_rate(sensor.entity)), _node_slice(sensor.node, n)
+        noise[rows, rows] += rate * sensor.noise
+        sampled_nodes.append((sensor.node, rate, sensor.correction))
     drift = block_diagonal(list(flow.drift))
     ticks = poisson_ticks(scenario, list(weights)) if talks else ()
-    instant = ClockJumps(N, drift, noise, tuple(found), directions, ticks)
+    instant = ClockJumps(N, drift, noise, tuple(sampled_nodes), directions, ticks)
     if not delay or not ticks:
         return instant
     return DelayedJumps(instant, scenario.truth.A, scenario.truth.B @ scenario.truth.B.T, delay)
@@ -104,7 +115,7 @@ def _node_slice(k: int, n: int) -> slice:
 
 
 def _error_flow(scenario: Scenario) -> JointErrorFlow:
-    """Return the errors between events; increments are used all the time."""
+    """Return the dynamics of the errors between events, with the correction by increments."""
     gains, truth = _node_gains(scenario), scenario.truth
     N, n = len(gains), len(truth.A)
     drift, noise = np.tile(truth.A, (N, 1, 1)), np.tile(truth.B @ truth.B.T, (N, N))
@@ -117,15 +128,15 @@ def _error_flow(scenario: Scenario) -> JointErrorFlow:
 
 
 def _sampled_nodes(scenario: Scenario) -> list[SampledNode]:
-    """Return the sensors that take samples."""
-    gains, found = _node_gains(scenario), []
+    """Return the sensors that take samples, node by node."""
+    gains, sampled_nodes = _node_gains(scenario), []
     for k, node in enumerate(scenario.nodes):
         for placed_sensor in scenario.sampled_sensors.get(node, ()):
             sensor, L = scenario.sensors[placed_sensor.entry], gains[k]
             clock, entity = sampling_clock(sensor), (node, placed_sensor.ordinal)
             noise = L @ sensor.R @ L.T
-            found.append(SampledNode(k, clock, entity, L @ sensor.H, noise))
-    return found
+            sampled_nodes.append(SampledNode(k, clock, entity, L @ sensor.H, noise))
+    return sampled_nodes
 
 
 def _from_tick_to_tick(
@@ -135,11 +146,12 @@ def _from_tick_to_tick(
     directions: Directions,
     delay: float,
 ) -> SlotJumps:
-    """Return the system from one exchange of clocks that all tick together to the next.
+    """Return the system from one exchange to the next, for periodic clocks that tick together.
 
-    Messages that take ``delay`` seconds are predicted to their arrival. Where no node reads in
-    between its error is then that of the message, as if it had been sent there. Raises TheoryError
-    where clocks are apart, sensors do not sample at the ticks, or that is not so.
+    Messages take ``delay`` seconds and are predicted over them. If no node has increments, a
+    predicted message has the error that the sender has at the arrival, as if it had been sent then.
+    Raises TheoryError if clocks differ, sensors do not sample at the ticks, the delay is not below
+    the period, or nodes have increments beside a delay.
     """
     _require_one_clock(clock, samples)
     N, n, _ = flow.drift.shape
@@ -148,23 +160,23 @@ def _from_tick_to_tick(
             "periodic clocks with a delay are known where it is below the period and sensors take "
             "samples"
         )
-    closed, added = np.tile(np.eye(n), (N, 1, 1)), np.zeros_like(flow.noise)
-    for one in samples:
-        closed[one.node] -= one.lost
-        added[_node_slice(one.node, n), _node_slice(one.node, n)] += one.noise
-    # To the tick, its samples, and to the arrival of what was sent at it.
-    (before, noise), (after, rest) = (
+    closed, sample_noise = np.tile(np.eye(n), (N, 1, 1)), np.zeros_like(flow.noise)
+    for sensor in samples:
+        closed[sensor.node] -= sensor.correction
+        sample_noise[_node_slice(sensor.node, n), _node_slice(sensor.node, n)] += sensor.noise
+    # From the last arrival to the tick, its samples, and from there to the arrival of its messages.
+    (to_tick, noise), (to_arrival, arrival_noise) = (
         _move_errors(flow, gap) for gap in (clock.period - delay, delay)
     )
     C = block_diagonal(list(closed))
-    noise = after @ (C @ noise @ C.T + added) @ after.T + rest
-    whole = after @ C @ before
-    steps = np.stack([whole[_node_slice(k, n), _node_slice(k, n)] for k in range(N)])
+    noise = to_arrival @ (C @ noise @ C.T + sample_noise) @ to_arrival.T + arrival_noise
+    transition = to_arrival @ C @ to_tick
+    steps = np.stack([transition[_node_slice(k, n), _node_slice(k, n)] for k in range(N)])
     return SlotJumps(np.eye(n), np.zeros((n, n)), steps, symmetric(noise), directions)
 
 
 def all_equal(drift: FloatArray) -> bool:
-    """Return True if the errors of all nodes (N, n, n) move alike."""
+    """Return True if all nodes have the same drift (N, n, n) of the error."""
     return bool((drift == drift[0]).all())
 
 
@@ -172,22 +184,24 @@ def _require_one_clock(clock: Periodic, samples: list[SampledNode]) -> None:
     """Raise TheoryError unless all links tick together, and sensors sample then."""
     if clock.jitter or isinstance(clock.phase, str):
         raise TheoryError("periodic clocks are known where all tick together, without jitter")
-    for one in samples:
-        other, same_clock = one.clock, False
-        if isinstance(other, Periodic) and not other.jitter:
-            same_clock = (other.period, other.phase) == (clock.period, clock.phase)
+    for sensor in samples:
+        sensor_clock, same_clock = sensor.clock, False
+        if isinstance(sensor_clock, Periodic) and not sensor_clock.jitter:
+            same_clock = (sensor_clock.period, sensor_clock.phase) == (clock.period, clock.phase)
         if not same_clock:
             raise TheoryError("sensors do not sample at the ticks of the network's periodic clock")
 
 
 def _move_errors(flow: JointErrorFlow, gap: float) -> tuple[FloatArray, FloatArray]:
-    """Return the transition (N n, N n) of errors over a gap, and the covariance that it adds."""
+    """Return the transition (N n, N n) of errors over ``gap`` seconds, and the covariance of the
+    noise over it, by Van Loan's formula (1978).
+    """
     drift = block_diagonal(list(flow.drift))
     M = len(drift)
     # exp [[-D, N], [0, D']] g has the blocks e^{-D g} N_g and e^{D' g} on the right, Van Loan 1978.
     E = scipy.linalg.expm(gap * np.block([[-drift, flow.noise], [np.zeros_like(drift), drift.T]]))
-    moved = E[M:, M:].T
-    return moved, symmetric(moved @ E[:M, M:])
+    transition = E[M:, M:].T
+    return transition, symmetric(transition @ E[:M, M:])
 
 
 def _node_gains(scenario: Scenario) -> list[FloatArray]:

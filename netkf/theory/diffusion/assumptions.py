@@ -35,12 +35,12 @@ def sparse_weights(scenario: Scenario) -> scipy.sparse.csr_array:
 
     These are the weights if all messages arrive.
     """
-    index, own = scenario.topology.index, scenario.own_weights
+    index, own_weights = scenario.topology.index, scenario.own_weights
     size, directions = len(scenario.nodes), scenario.topology.directions
     rows = [*range(size), *(index[sender] for sender, _ in directions)]
     columns = [*range(size), *(index[receiver] for _, receiver in directions)]
     # Columns sum to 1: a node divides one unit of weight among itself and its neighbours.
-    values = [own[node] for node in scenario.nodes]
+    values = [own_weights[node] for node in scenario.nodes]
     values += [scenario.weight(receiver, sender) for sender, receiver in directions]
     matrix = scipy.sparse.coo_array((values, (rows, columns)), shape=(size, size))
     return scipy.sparse.csr_array(matrix)
@@ -51,8 +51,8 @@ def _weight_rows(scenario: Scenario) -> list[AssumptionRow]:
     W = sparse_weights(scenario)
     W.eliminate_zeros()
     unbalanced = float(np.abs(W.sum(axis=1) - 1.0).max())
-    parts, _ = scipy.sparse.csgraph.connected_components(W, connection="strong")
-    connected: bool | None = parts == 1
+    component_count, _ = scipy.sparse.csgraph.connected_components(W, connection="strong")
+    connected: bool | None = component_count == 1
     evidence = "some node never hears of another one; each part runs by itself"
     if connected:
         connected, evidence = _judge_mixing(W)
@@ -84,18 +84,18 @@ def _judge_mixing(W: scipy.sparse.csr_array) -> tuple[bool | None, str]:
     distances = scipy.sparse.csgraph.shortest_path(graph, method="D", unweighted=True)
     # D needs W^l > 0 for some l; with positive own weights the diameter suffices.
     diameter = int(distances.max())
-    least = float(np.linalg.matrix_power(W.toarray(), max(diameter, 1)).min())
-    evidence = f"diameter {diameter}; least entry of the weights to that power {least:.3g}"
-    if not least > 0.0:
+    smallest = float(np.linalg.matrix_power(W.toarray(), max(diameter, 1)).min())
+    evidence = f"diameter {diameter}; least entry of the weights to that power {smallest:.3g}"
+    if not smallest > 0.0:
         evidence += ": D Remark 3.3 needs weights of one's own"
-    return least > 0.0, evidence
+    return smallest > 0.0, evidence
 
 
 def _plant_rows(scenario: Scenario) -> list[AssumptionRow]:
     """Return the rows on the random walk and on Q and r of the filters."""
     plant = scenario.slot_plant
     F, Q = scenario.slot_belief
-    least = float(np.linalg.eigvalsh(Q)[0])
+    smallest = float(np.linalg.eigvalsh(Q)[0])
     random_walk = bool(np.array_equal(plant.F, np.eye(plant.n)) and np.array_equal(F, plant.F))
     same = scenario.filters_know_the_truth
     return [
@@ -113,13 +113,13 @@ def _plant_rows(scenario: Scenario) -> list[AssumptionRow]:
         (
             "the filters' Q and r are positive definite",
             "D Algorithm 1",
-            least > 0.0,
-            f"least eigenvalue of Q {least:.3g}; they are the true ones"
+            smallest > 0.0,
+            f"least eigenvalue of Q {smallest:.3g}; they are the true ones"
             if same
-            else f"least eigenvalue of Q {least:.3g}; {UNKNOWN_LAW}"
+            else f"least eigenvalue of Q {smallest:.3g}; {UNKNOWN_LAW}"
             if not scenario.is_random
-            else f"least eigenvalue of Q {least:.3g}; they differ from the true ones, as D allows: "
-            "stable all the same, but P need not be the errors' covariance",
+            else f"least eigenvalue of Q {smallest:.3g}; they differ from the true ones, as D "
+            "allows: stable all the same, but P need not be the errors' covariance",
         ),
     ]
 
@@ -134,17 +134,17 @@ def _information_row(scenario: Scenario) -> AssumptionRow:
         table = information_level(scenario)
     except TheoryError as error:
         return (name, "D Assumption 3.2", None, f"not decided: {error}")
-    whole, alone = table.iloc[0], table.iloc[1:]
-    enough = int((alone["level"] > 0.0).sum())
+    network, sensors = table.iloc[0], table.iloc[1:]
+    sufficient_count = int((sensors["level"] > 0.0).sum())
     evidence = (
-        f"least level of D (19) over the pasts examined {whole['level']:.3g}, in the mean "
-        f"{whole['mean']:.3g}, with windows of {int(whole['window'])}; "
-        f"{enough} of {len(alone)} sensors would do alone"
+        f"least level of D (19) over the pasts examined {network['level']:.3g}, in the mean "
+        f"{network['mean']:.3g}, with windows of {int(network['window'])}; "
+        f"{sufficient_count} of {len(sensors)} sensors would do alone"
     )
-    if whole["level"] == 0.0 and whole["mean"] > 0.0:
+    if network["level"] == 0.0 and network["mean"] > 0.0:
         evidence += "; some pasts say nothing about the next window: "
         evidence += "the mean decides, which is not examined"
-    return (name, "D Assumption 3.2", bool(whole["level"] > 0.0), evidence)
+    return (name, "D Assumption 3.2", bool(network["level"] > 0.0), evidence)
 
 
 def _arrival_row(scenario: Scenario) -> AssumptionRow:
@@ -159,9 +159,14 @@ def _arrival_row(scenario: Scenario) -> AssumptionRow:
     in_time = fixed is not None and fixed < scenario.phase_length
     if is_recorded(channel):
         return ("every message arrives", "D (8)", None, RECORDED_CHANNEL)
-    whole = in_time and all(rate == 1.0 for rate in rates)
+    all_arrive = in_time and all(rate == 1.0 for rate in rates)
     policy = getattr(scenario.filter.algorithm, "on_loss", "")
     evidence = f"a message may be lost or late; weights then change ({policy}): P stays consistent"
-    if not whole:
+    if not all_arrive:
         evidence += ", but D's theorems are about fixed weights"
-    return ("every message arrives", "D (8)", whole, "every one in time" if whole else evidence)
+    return (
+        "every message arrives",
+        "D (8)",
+        all_arrive,
+        "every one in time" if all_arrive else evidence,
+    )

@@ -61,11 +61,11 @@ def information_level(
     window = None if window is None else as_whole("window", window, 1)
     sources = _make_sources(scenario)
     past = _draw_pasts(scenario, sources, runs, Streams(seed).generator("past"))
-    whole = (-1, sources, past)
+    network = (-1, sources, past)
     if window is None:
         longest = 2 * scenario.plant.n
-        window = next((h for h in range(1, longest) if _make_row(*whole, h)[2] > 0.0), longest)
-    rows = [_make_row(*whole, window)]
+        window = next((h for h in range(1, longest) if _make_row(*network, h)[2] > 0.0), longest)
+    rows = [_make_row(*network, window)]
     rows += _sensor_rows(sources, past, window)
     names = ["node", "window", "level", "low", "high", "mean", "mean_low", "mean_high"]
     return pd.DataFrame(rows, columns=names)
@@ -97,22 +97,24 @@ def few_regressors(scenario: Scenario) -> bool:
 
 def _make_sources(scenario: Scenario) -> list[_Source]:
     """Return the scalar readings of all nodes; raises TheoryError for recorded sensors."""
-    found = []
+    sources = []
     for node in scenario.sensing:
         for placed_sensor in scenario.placed[node]:
             sensor = scenario.sensors[placed_sensor.entry]
             if isinstance(sensor, RegressorSensor):
                 drive = sensor.B @ sensor.xi_cov @ sensor.B.T
-                found.append(_Source(node, sensor.A, sensor.C, sensor.start, drive))
+                sources.append(_Source(node, sensor.A, sensor.C, sensor.start, drive))
             elif isinstance(sensor, LinearSensor):
                 # A fixed row H is a regressor with the constant state 1 and no noise.
-                still = (np.ones(1), np.zeros((0, 0)))
-                found += [_Source(node, np.eye(1), row[:, None], *still) for row in sensor.H]
+                fixed_state = (np.ones(1), np.zeros((0, 0)))
+                sources += [
+                    _Source(node, np.eye(1), row[:, None], *fixed_state) for row in sensor.H
+                ]
             else:
                 raise TheoryError(f"the sensor of node {node} is a record, which has no law")
-    if not found:
+    if not sources:
         raise TheoryError("no node has a sensor")
-    return found
+    return sources
 
 
 def _draw_pasts(
@@ -126,16 +128,16 @@ def _draw_pasts(
 
 def _draw_states(source: _Source, slots: np.ndarray, random: np.random.Generator) -> FloatArray:
     """Return the states (K, m) of a source at K slots, drawn from their Gaussian law."""
-    drawn = random.standard_normal((len(slots), len(source.start)))
+    normals = random.standard_normal((len(slots), len(source.start)))
     if not source.drive.size:
         return np.ones((len(slots), 1))
-    states, mean, cov = np.empty_like(drawn), source.start, np.zeros_like(source.A)
+    states, mean, cov = np.empty_like(normals), source.start, np.zeros_like(source.A)
     for slot in range(int(slots.max()) + 1):
         chosen = slots == slot
         if not np.isfinite(cov).all():
             raise TheoryError(f"the state of a regressor sensor overflows up to slot {slot}")
         if chosen.any():
-            states[chosen] = mean + drawn[chosen] @ square_root(cov).T
+            states[chosen] = mean + normals[chosen] @ square_root(cov).T
         with np.errstate(over="ignore", invalid="ignore"):
             mean, cov = source.A @ mean, source.A @ cov @ source.A.T + source.drive
     return states
@@ -167,13 +169,13 @@ def _search_least(
 ) -> float:
     """Return the least level found: by drawing, at states 0, and by a search from both."""
     # The least level may be attained far from all pasts drawn.
-    best = int(np.argmin(values))
+    lowest = int(np.argmin(values))
     # A fixed regressor has no state that could differ.
     resting = [np.zeros_like(s.start) if s.drive.size else s.start for s in sources]
-    found = [float(values[best])]
-    for start in ([p[best] for p in past], resting):
-        found += _search(sources, past, start, window)
-    return min(found)
+    levels = [float(values[lowest])]
+    for start in ([p[lowest] for p in past], resting):
+        levels += _search(sources, past, start, window)
+    return min(levels)
 
 
 def _search(
@@ -198,16 +200,16 @@ def _search(
         return float(_levels(sources, states, window)[0])
 
     x = np.concatenate([np.zeros(0), *(start[k] for k in moving)])
-    found = [level(x)]
-    if 0 < len(x) <= MAX_SEARCHED and found[0] > 0.0:
+    levels = [level(x)]
+    if 0 < len(x) <= MAX_SEARCHED and levels[0] > 0.0:
         # It takes 0.3 s to import.
         import scipy.optimize
 
         search = scipy.optimize.minimize(
             level, x, method="Nelder-Mead", bounds=bounds, options={"maxfev": MAX_EVALUATIONS}
         )
-        found.append(float(search.fun))
-    return found
+        levels.append(float(search.fun))
+    return levels
 
 
 def _levels(sources: list[_Source], past: list[FloatArray], window: int) -> FloatArray:
@@ -218,14 +220,14 @@ def _levels(sources: list[_Source], past: list[FloatArray], window: int) -> Floa
         source, fixed = sources[group[0]], not sources[group[0]].drive.size
         for start in range(0, 1 if fixed else len(group), MAX_STACKED):
             # Fixed sensors of one kind have one past, which counts as often as there are sensors.
-            some = group[:1] if fixed else group[start : start + MAX_STACKED]
-            states = np.concatenate([past[k][:1] if fixed else past[k] for k in some])
-            found = _window_excitation(source, states, window).reshape(len(some), -1, n, n)
-            total = total + found.sum(axis=0) * (len(group) if fixed else 1)
+            stacked = group[:1] if fixed else group[start : start + MAX_STACKED]
+            states = np.concatenate([past[k][:1] if fixed else past[k] for k in stacked])
+            excitation = _window_excitation(source, states, window).reshape(len(stacked), -1, n, n)
+            total = total + excitation.sum(axis=0) * (len(group) if fixed else 1)
     values = np.linalg.eigvalsh(symmetric(total))
     # D (19): the mean over sensors, and h terms over h + 1.
-    least = values[:, 0] / (len(sources) * (window + 1))
-    return np.where(values[:, 0] > EIGENVALUE_TOLERANCE * values.sum(axis=1), least, 0.0)
+    smallest = values[:, 0] / (len(sources) * (window + 1))
+    return np.where(values[:, 0] > EIGENVALUE_TOLERANCE * values.sum(axis=1), smallest, 0.0)
 
 
 def _group_by_kind(sources: list[_Source]) -> list[list[int]]:

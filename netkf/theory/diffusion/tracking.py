@@ -57,13 +57,13 @@ def _draw_noises(scenario: Scenario, samples: int, random: np.random.Generator) 
     """Return draws (samples,) of xi; raises TheoryError if a noise is recorded."""
     if not scenario.slotted or not scenario.is_random:
         raise TheoryError("D (29) needs noises in slots with a law, not a record")
-    variance = np.zeros(samples)
+    squares = np.zeros(samples)
     for node in scenario.sensing:
         for placed_sensor in scenario.placed[node]:
             root = square_root(scenario.noise(placed_sensor.entry, believed=False))
-            variance += ((random.standard_normal((samples, len(root))) @ root.T) ** 2).sum(axis=1)
+            squares += ((random.standard_normal((samples, len(root))) @ root.T) ** 2).sum(axis=1)
     root = square_root(scenario.slot_plant.Q)
     increment = random.standard_normal((samples, len(root))) @ root.T
     # Delta stacks one copy of the increment for each node, D III-A.
-    moved = math.sqrt(len(scenario.nodes)) * np.linalg.norm(increment, axis=1)
-    return np.asarray(np.sqrt(variance) + moved)
+    increment_norm = math.sqrt(len(scenario.nodes)) * np.linalg.norm(increment, axis=1)
+    return np.asarray(np.sqrt(squares) + increment_norm)

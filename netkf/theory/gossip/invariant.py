@@ -69,17 +69,20 @@ def switched_samples(scenario: Scenario, samples: int, seed: int) -> SwitchedSam
 def _draw_before(
     rows: FloatArray, following: np.ndarray, slots: int, random: np.random.Generator
 ) -> np.ndarray:
-    """Return the positions (K, slots) before those in ``following`` (K, S), with cumulated
-    transition probabilities ``rows`` (N, N); uniform at the end if S is 0.
+    """Return the positions (K, slots) of K chains in the slots before those in ``following``
+    (K, S), drawn backwards in time.
+
+    ``rows`` (N, N) are cumulative transition probabilities of the reversed chain. If S is 0 the
+    last position is drawn from the uniform law.
     """
     count, N = len(following), len(rows)
-    found = np.empty((count, slots), dtype=following.dtype)
-    where = following[:, 0] if following.shape[1] else None
+    positions = np.empty((count, slots), dtype=following.dtype)
+    node = following[:, 0] if following.shape[1] else None
     for t in range(slots - 1, -1, -1):
-        draws = random.random(count)
-        if where is None:
-            where = np.minimum((draws * N).astype(np.int64), N - 1)
+        uniforms = random.random(count)
+        if node is None:
+            node = np.minimum((uniforms * N).astype(np.int64), N - 1)
         else:
-            where = np.minimum((draws[:, None] >= rows[where]).sum(axis=1), N - 1)
-        found[:, t] = where
-    return found
+            node = np.minimum((uniforms[:, None] >= rows[node]).sum(axis=1), N - 1)
+        positions[:, t] = node
+    return positions

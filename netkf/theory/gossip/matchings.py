@@ -78,17 +78,18 @@ def _recorded_mean(scenario: Scenario, activation: RecordedSlots) -> FloatArray:
 
 
 def primitive(matrix: FloatArray) -> tuple[bool, bool, int]:
-    """Return if a nonnegative matrix (N, N) is irreducible, if it is also aperiodic, its period.
+    """Return (is irreducible, is also aperiodic, period) of a nonnegative matrix (N, N).
 
-    Both are decided on the graph of its positive entries: the period is the greatest common divisor
-    of the lengths of its cycles.
+    The period is the greatest common divisor of the lengths of the cycles in the graph of positive
+    entries; 0 if the matrix is reducible.
     """
     import networkx
 
     graph = networkx.from_numpy_array((matrix > 1e-15).astype(int), create_using=networkx.DiGraph)
     if not networkx.is_strongly_connected(graph):
         return False, False, 0
-    # Every cycle is a sum of terms d(i) + 1 - d(j) over its edges, d the distance from node 0.
+    # With d(i) the distance of i from node 0, the length of a cycle is the sum of
+    # d(i) + 1 - d(j) over its edges (i, j): the gcd of these terms is the period.
     levels = networkx.single_source_shortest_path_length(graph, 0)
     period = 0
     for i, j in graph.edges:
@@ -128,11 +129,11 @@ def detecting_walk(scenario: Scenario) -> list[int] | None:
     return None
 
 
-def _extend_basis(known: FloatArray, rows: FloatArray) -> FloatArray:
-    """Return an orthonormal basis, as rows, of the span of ``known`` and of ``rows``."""
+def _extend_basis(basis: FloatArray, rows: FloatArray) -> FloatArray:
+    """Return an orthonormal basis, as rows, of the span of ``basis`` and of ``rows``."""
     size = np.abs(rows).max(initial=0.0)
     if size == 0.0:
-        return known
+        return basis
     # Scaled rows, so that the threshold for the rank does not depend on units.
-    _, values, vectors = np.linalg.svd(np.concatenate([known, rows / size]))
+    _, values, vectors = np.linalg.svd(np.concatenate([basis, rows / size]))
     return np.asarray(vectors[: int((values > 1e-9).sum())])

@@ -175,12 +175,12 @@ class _PiecewiseSolution:
         self._append(end, lambda _: start.reshape(-1))  # first guess: constant
         last = np.inf
         for _ in range(MAX_ROUNDS):
-            before = np.array([self(t).reshape(-1) for t in probes])
+            old_values = np.array([self(t).reshape(-1) for t in probes])
             self._first = start
             self._outputs[-1], _ = self._integrate(begin, end, slope)
             self._first = self._outputs[-1](end).reshape(start.shape)
-            after = np.array([self(t).reshape(-1) for t in probes])
-            change = float(np.abs(after - before).max() / np.abs(after).max())
+            values = np.array([self(t).reshape(-1) for t in probes])
+            change = float(np.abs(values - old_values).max() / np.abs(values).max())
             # The solver's choice of steps differs between rounds, which leaves a small change.
             if change <= TOLERANCE or (0.5 * last < change <= ROUND_TOLERANCE):
                 return
@@ -211,8 +211,8 @@ class _PiecewiseSolution:
         solution has grown by a factor ``growth``; raises TheoryError if its defect is too large.
         """
         refused: TheoryError | None = None
-        for parts in PARTS:  # shorter steps reduce the error of the dense output between them
-            max_step = (end - begin) / parts if parts > 1 else np.inf
+        for step_count in PARTS:  # shorter steps reduce the error of the dense output between them
+            max_step = (end - begin) / step_count if step_count > 1 else np.inf
             solved = self._integrate_piece(begin, end, slope, max_step, growth)
             if not solved.success:
                 raise TheoryError(f"H(12) could not be integrated to {end:g} s: {solved.message}")
@@ -346,8 +346,8 @@ class _SampleJumps:
         if equations.delay > 0.0:
             sent = packed.predict(sent)
         # H (9) in the mean: P_i <- (1 - sum_j w_ij) P_i + sum_j w_ij P_j.
-        own = 1.0 - weights.sum(axis=1)
-        return np.asarray(own[:, None] * Y + weights @ sent)
+        own_weight = 1.0 - weights.sum(axis=1)
+        return np.asarray(own_weight[:, None] * Y + weights @ sent)
 
 
 def _joseph_update(P: FloatArray, observation: Observation) -> FloatArray:

@@ -45,15 +45,15 @@ def constant_gain_bound(
     # An entry that stays 1 makes the constant term part of a linear map.
     above = scipy.sparse.hstack([A, scipy.sparse.csr_array(right[:, None])])
     below = scipy.sparse.csr_array((1, len(right) + 1))
-    whole = scipy.sparse.csc_array(scipy.sparse.vstack([above, below]))
-    y, found = np.append(start.reshape(-1), 1.0), []
+    all_times = scipy.sparse.csc_array(scipy.sparse.vstack([above, below]))
+    y, bounds = np.append(start.reshape(-1), 1.0), []
     for gap in np.diff(moments, prepend=0.0):
-        if whole.shape[0] <= MAX_DENSE:
-            y = scipy.linalg.expm(whole.toarray() * gap) @ y
+        if all_times.shape[0] <= MAX_DENSE:
+            y = scipy.linalg.expm(all_times.toarray() * gap) @ y
         elif gap > 0.0:
-            y = scipy.sparse.linalg.expm_multiply(whole * gap, y)
-        found.append(symmetric(y[:-1].reshape(N, n, n)))
-    return np.array(found)
+            y = scipy.sparse.linalg.expm_multiply(all_times * gap, y)
+        bounds.append(symmetric(y[:-1].reshape(N, n, n)))
+    return np.array(bounds)
 
 
 def _linear_equation(

@@ -100,9 +100,10 @@ def reason_without_bound(scenario: Scenario) -> str | None:
         return (
             f"H(12) is about the hybrid filter in continuous time, not about {kind_name(algorithm)}"
         )
-    own = overridden(algorithm)  # built-in resets by intersection give no larger P
-    if own:
-        return f"not promised: H(12) is about the hybrid filter, and {name} defines {own[0]} itself"
+    overridden_names = overridden(algorithm)  # built-in resets by intersection give no larger P
+    if overridden_names:
+        own = f"{name} defines {overridden_names[0]} itself"
+        return f"not promised: H(12) is about the hybrid filter, and {own}"
     assert isinstance(network.activation, LinkClock)
     if not transmits_at_samples(scenario) and not network.activation.memoryless:
         return (
@@ -142,12 +143,16 @@ def increment_informations(scenario: Scenario) -> FloatArray:
     A pooled filter has the same G, of all sensors, at every node.
     """
     observations, n = increment_observations(scenario), scenario.plant.n
-    distinct = {id(one): one for one in observations}  # nodes with equal sensors share one
-    found = {
-        key: one.H.T @ np.linalg.solve(one.R, one.H) if len(one.H) else np.zeros((n, n))
-        for key, one in distinct.items()
+    distinct = {
+        id(observation): observation for observation in observations
+    }  # nodes with equal sensors share one
+    information = {
+        key: observation.H.T @ np.linalg.solve(observation.R, observation.H)
+        if len(observation.H)
+        else np.zeros((n, n))
+        for key, observation in distinct.items()
     }
-    informations = [found[id(one)] for one in observations]
+    informations = [information[id(observation)] for observation in observations]
     if scenario.filter.algorithm.pooled:
         informations = informations * len(scenario.nodes)
     return np.stack(informations)
@@ -273,9 +278,9 @@ def _stationary(c: scipy.sparse.csr_array) -> FloatArray:
     leaving = np.asarray(c.sum(axis=1)).reshape(-1)
     transposed = scipy.sparse.csc_array(scipy.sparse.diags_array(leaving) - c).T
     # The weight of the first node is set to 1, the others follow from their own equations.
-    rest = scipy.sparse.csc_array(scipy.sparse.csr_array(transposed)[1:])
+    equations = scipy.sparse.csc_array(scipy.sparse.csr_array(transposed)[1:])
     w = np.ones(size)
-    w[1:] = scipy.sparse.linalg.spsolve(rest[:, 1:], -rest[:, [0]].toarray().reshape(-1))
+    w[1:] = scipy.sparse.linalg.spsolve(equations[:, 1:], -equations[:, [0]].toarray().reshape(-1))
     w = np.maximum(w, 0.0) / np.maximum(w, 0.0).sum()
     if not np.abs(transposed @ w).max() <= RESIDUAL_TOLERANCE * leaving.max():
         raise TheoryError("the messages that arrive do not join all nodes")

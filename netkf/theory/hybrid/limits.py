@@ -58,10 +58,10 @@ def _require_limit(scenario: Scenario) -> None:
         return
     if scenario.hosted.combination != "convex":
         raise TheoryError(f"H(13) is about the hybrid filter, not about {kind_name(algorithm)}")
-    if own := overridden(algorithm):
+    if overridden_names := overridden(algorithm):
         name = kind_name(algorithm)
         if ":" in name_of("filter", algorithm):
-            name = f"{type(algorithm).__name__}, which defines {own[0]} itself"
+            name = f"{type(algorithm).__name__}, which defines {overridden_names[0]} itself"
         raise TheoryError(f"H(13) is about the hybrid filter, not about {name}")
     if transmits_at_samples(scenario):
         raise TheoryError("S is the limit of fast links, and nodes transmit when they sample")

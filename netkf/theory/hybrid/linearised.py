@@ -37,10 +37,10 @@ def solve_linearised(
     rounding lets it be. Raises TheoryError if neither method can solve for so many unknowns.
     """
     linear = packed.linear(P)
-    few = right.size <= FEW_UNKNOWNS or packed.eliminates_cheaply
+    eliminates = right.size <= FEW_UNKNOWNS or packed.eliminates_cheaply
     with np.errstate(all="ignore"):
-        X = None if few else _solve_by_gmres(linear, right, tolerance)
-        if X is None and not few and right.size > MAX_ELIMINATED:
+        X = None if eliminates else _solve_by_gmres(linear, right, tolerance)
+        if X is None and not eliminates and right.size > MAX_ELIMINATED:
             raise TheoryError(
                 f"not computed: GMRES did not converge for {right.size:,} unknowns, and the "
                 "network has no small cuts to eliminate them by"
@@ -83,8 +83,8 @@ def _solve_by_gmres(
 
     def precondition(x: FloatArray) -> FloatArray:
         """Return an approximate solution: the mean over nodes exactly, then each node alone."""
-        together = np.tile(x.reshape(right.shape).mean(axis=0) @ coarse, len(right))
-        return together + solve_alone(x - apply(together))
+        shared = np.tile(x.reshape(right.shape).mean(axis=0) @ coarse, len(right))
+        return shared + solve_alone(x - apply(shared))
 
     shape = (right.size, right.size)
     operator = scipy.sparse.linalg.LinearOperator(shape, matvec=apply, dtype=np.float64)
@@ -92,11 +92,11 @@ def _solve_by_gmres(
         shape, matvec=precondition, dtype=np.float64
     )
     # Iterative refinement: each round solves for the residual that the last one left.
-    x, left, size = np.zeros(right.size), -right.reshape(-1), float(np.linalg.norm(right))
+    x, residual, size = np.zeros(right.size), -right.reshape(-1), float(np.linalg.norm(right))
     for _ in range(ROUNDS):
         step, failed = scipy.sparse.linalg.gmres(
             operator,
-            left,
+            residual,
             rtol=max(ROUND_TOLERANCE, tolerance),
             M=preconditioner,
             restart=RESTART,
@@ -105,7 +105,7 @@ def _solve_by_gmres(
         if failed or not np.isfinite(step).all():
             return None
         x = x + step
-        left = -right.reshape(-1) - apply(x)
-        if np.linalg.norm(left) <= tolerance * size:
+        residual = -right.reshape(-1) - apply(x)
+        if np.linalg.norm(residual) <= tolerance * size:
             break
     return np.asarray(x).reshape(right.shape)

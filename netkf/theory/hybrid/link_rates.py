@@ -65,10 +65,10 @@ def link_rate_for(scenario: Scenario, delta: float) -> LinkRate:
 
     def excess(log_factor: float) -> float:
         """Return the logarithm of distance over ``delta`` with all rates times a factor."""
-        apart = _distance(equations, S, math.exp(log_factor))
-        if apart is None:
+        distance = _distance(equations, S, math.exp(log_factor))
+        if distance is None:
             return NO_STEADY_STATE
-        return math.log(max(apart, 1e-300) / delta)
+        return math.log(max(distance, 1e-300) / delta)
 
     step, low, high = math.log(4.0), 0.0, 0.0
     while excess(high) > 0.0:

@@ -61,15 +61,15 @@ class PackedRiccati:
 
         Arrays that depend on the network alone are shared.
         """
-        other = copy.copy(self)
-        other.equations = self.equations._replace(A=A, Q=Q)
-        other._set_drift(A, Q)
-        return other
+        shifted = copy.copy(self)
+        shifted.equations = self.equations._replace(A=A, Q=Q)
+        shifted._set_drift(A, Q)
+        return shifted
 
     def _set_drift(self, A: FloatArray, Q: FloatArray) -> None:
         """Set the terms A P + P A' and Q of each node."""
         drift = A @ self._basis
-        self._own = self.pack(drift + np.swapaxes(drift, 1, 2))
+        self._drift_map = self.pack(drift + np.swapaxes(drift, 1, 2))
         self._Q = self.pack(Q)
 
     @cached_property
@@ -105,9 +105,9 @@ class PackedRiccati:
     def slope(self, Y: FloatArray, sent: FloatArray | None = None) -> FloatArray:
         """Return dY/dt (N, m); ``sent`` (N, m) is Y a delay ago, and Y itself if None."""
         if sent is None:
-            change = self._exchange @ Y + Y @ self._own + self._Q
+            change = self._exchange @ Y + Y @ self._drift_map + self._Q
         else:
-            change = Y @ self._own + self._Q - self.leaving[:, None] * Y
+            change = Y @ self._drift_map + self._Q - self.leaving[:, None] * Y
             change += self.equations.coupling @ self.predict(sent)
         # - P G P = - (P C)(P C)' at the nodes with a sensor
         M = self.unpack(Y[self._sensed]) @ self._C
@@ -144,21 +144,23 @@ class PackedRiccati:
         # P G P is the sum of M_i M_j' over i + j = k with M = P C. Nodes come last, so that numpy
         # runs along them; the half with i <= j and its transpose are enough.
         n, r, sensed = self._across.shape
-        every = np.empty((order, n, r, sensed))
+        products = np.empty((order, n, r, sensed))
         for k in range(order):
             change = self._exchange @ series[k]
-            change += series[k] @ self._own
+            change += series[k] @ self._drift_map
             if k == 0:
                 change += self._Q
             if sensed:
                 rows = np.ascontiguousarray(series[k, self._sensed].T)
                 P = rows[self._indices].reshape(n, n, sensed)
-                np.einsum("ijs,jrs->irs", P, self._across, out=every[k])
-                before = (k + 1) // 2
-                half = np.einsum("kirs,kjrs->ijs", every[:before], every[k : k - before : -1])
+                np.einsum("ijs,jrs->irs", P, self._across, out=products[k])
+                half_count = (k + 1) // 2
+                half = np.einsum(
+                    "kirs,kjrs->ijs", products[:half_count], products[k : k - half_count : -1]
+                )
                 square = half[self._i, self._j] + half[self._j, self._i]
                 if k % 2 == 0:
-                    middle = every[k // 2]
+                    middle = products[k // 2]
                     square += np.einsum("irs,jrs->ijs", middle, middle)[self._i, self._j]
                 change[self._sensed] -= square.T
             np.multiply(change, span / (k + 1), out=series[k + 1])
@@ -170,10 +172,10 @@ class PackedRiccati:
         P minimises the right-hand side over gains, so that their change has no first-order effect.
         """
         # (A - P G) X + X (A - P G)' without the arrivals, as a matrix on rows
-        blocks = np.tile(self._own, (len(P), 1, 1))
+        blocks = np.tile(self._drift_map, (len(P), 1, 1))
         # In parts: the products of all nodes take 278 MB at 1000 nodes and n = 16.
-        parts = -(-len(self._sensed) * self._basis.size // MAX_PRODUCTS)
-        for nodes in np.array_split(self._sensed, max(1, parts)):
+        chunk_count = -(-len(self._sensed) * self._basis.size // MAX_PRODUCTS)
+        for nodes in np.array_split(self._sensed, max(1, chunk_count)):
             K = P[nodes] @ self.equations.G[nodes]
             change = -(K[:, None] @ self._basis)
             blocks[nodes] += self.pack(change + np.swapaxes(change, -1, -2))

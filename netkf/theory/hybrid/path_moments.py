@@ -42,12 +42,12 @@ def expected_squares(scenario: Scenario, run: Run) -> FloatArray:
     fastest = max(float(np.abs(p @ g).max()) for p in P for g in G) + float(np.abs(A).max())
     plain = [np.ascontiguousarray(x, dtype=np.float64) for x in (A, Q, scenario.truth.Q)]
     model = (*plain, G, true_G)
-    found = np.empty((len(run.times), len(nodes)))
+    squares = np.empty((len(run.times), len(nodes)))
     step = STEP / max(fastest, 1e-9)
-    run_moments(P, S, model, instants, ends, rows, columns, weights, run.times, step, found)
-    if not np.isfinite(found).all():
+    run_moments(P, S, model, instants, ends, rows, columns, weights, run.times, step, squares)
+    if not np.isfinite(squares).all():
         raise TheoryError("the mean squares grow too fast for their quadrature")
-    return found
+    return squares
 
 
 def _require_exact_model(scenario: Scenario) -> None:
@@ -75,11 +75,11 @@ def _arrivals_in_order(
     index = scenario.topology.index
     index_of = np.zeros(max(index) + 1, dtype=np.int64)
     index_of[list(index)] = list(index.values())
-    pairs, which = np.unique(
+    pairs, order = np.unique(
         np.stack([rows["node"], rows["peer"]], axis=1), axis=0, return_inverse=True
     )
     table = np.array([scenario.weight(int(i), int(j)) for i, j in pairs], dtype=np.float64)
     instants, starts = np.unique(rows["t"], return_index=True)
     ends = np.append(starts, len(rows)).astype(np.int64)
-    weights = table[which.reshape(-1)] if len(pairs) else np.zeros(0)
+    weights = table[order.reshape(-1)] if len(pairs) else np.zeros(0)
     return instants, ends, index_of[rows["node"]], index_of[rows["peer"]], weights

@@ -54,11 +54,11 @@ class PoissonSamples(NamedTuple):
 
     def restrict(self, node: int) -> PoissonSamples:
         """Return the sensors of one node as those of a network of one node."""
-        mine = self.nodes == node
-        count = int(mine.sum())
+        at_node = self.nodes == node
+        count = int(at_node.sum())
         silent = scipy.sparse.csr_array((1, count))
         return PoissonSamples(
-            np.zeros(count, dtype=int), self.H[mine], self.R[mine], self.rate[mine], silent
+            np.zeros(count, dtype=int), self.H[at_node], self.R[at_node], self.rate[at_node], silent
         )
 
 
@@ -124,7 +124,7 @@ def poisson_samples(scenario: Scenario) -> tuple[PoissonSamples, ...]:
     """Return all sensors with Poisson clocks, in groups of equal numbers of rows."""
     index, size = scenario.topology.index, len(scenario.nodes)
     pooled = scenario.filter.algorithm.pooled
-    found: dict[int, list[tuple[int, FloatArray, FloatArray, float, int]]] = {}
+    entries_by_rows: dict[int, list[tuple[int, FloatArray, FloatArray, float, int]]] = {}
     for node, placed_sensor in randomly_sampled_sensors(scenario):
         sensor = scenario.sensors[placed_sensor.entry]
         clock = sampling_clock(sensor)
@@ -136,9 +136,9 @@ def poisson_samples(scenario: Scenario) -> tuple[PoissonSamples, ...]:
         # All nodes have the covariance of a pooled filter, which uses the readings of each.
         for reader in range(size) if pooled else [index[node]]:
             entry = (reader, np.asarray(sensor.H), R, rate, index[node])
-            found.setdefault(len(R), []).append(entry)
+            entries_by_rows.setdefault(len(R), []).append(entry)
     groups = []
-    for entries in found.values():
+    for entries in entries_by_rows.values():
         nodes, H, R, rates = (np.array([entry[k] for entry in entries]) for k in range(4))
         senders = [entry[4] for entry in entries]
         groups.append(PoissonSamples(nodes, H, R, rates, _arrival_rates(scenario, senders, rates)))
@@ -161,8 +161,8 @@ def sample_jumps(scenario: Scenario) -> tuple[SampleJump, ...]:
     """Return the samples at known times below the horizon, in the order of time."""
     placed_sensors = {
         (node, placed_sensor.ordinal): placed_sensor
-        for node, some in scenario.sampled_sensors.items()
-        for placed_sensor in some
+        for node, sensors_of_node in scenario.sampled_sensors.items()
+        for placed_sensor in sensors_of_node
         if has_known_times(scenario.sensors[placed_sensor.entry])
     }
     if not placed_sensors:
@@ -179,7 +179,7 @@ def sample_jumps(scenario: Scenario) -> tuple[SampleJump, ...]:
             H = sensor.H if path is None else path.reading(k, np.zeros(n))[1]
             by_time.setdefault(time, {}).setdefault(index[node], []).append(Observation(H, R, R))
     everyone = range(len(scenario.nodes))
-    found = []
+    jumps = []
     for time in sorted(by_time):
         observations = {
             node: stack_observations(readings, n) for node, readings in by_time[time].items()
@@ -188,8 +188,8 @@ def sample_jumps(scenario: Scenario) -> tuple[SampleJump, ...]:
         if scenario.filter.algorithm.pooled:
             joint = stack_observations(list(itertools.chain(*by_time[time].values())), n)
             observations = dict.fromkeys(everyone, joint)
-        found.append(SampleJump(time, observations, weights))
-    return tuple(found)
+        jumps.append(SampleJump(time, observations, weights))
+    return tuple(jumps)
 
 
 def _sent_weights(scenario: Scenario, senders: list[int]) -> FloatArray | None:

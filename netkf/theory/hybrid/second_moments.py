@@ -70,7 +70,7 @@ class _SecondMomentEquation:
             for P, model in zip(bound, scenario.models, strict=True)
         ]
         # vec of d P_i / dt = (A - P G) P_i + P_i (A - P G)' between events.
-        self._own = np.array([np.kron(M, eye) + np.kron(eye, M) for M in closed])
+        self._drift_maps = np.array([np.kron(M, eye) + np.kron(eye, M) for M in closed])
         self._mixing = np.zeros((len(index), len(index)))
         self._outcomes: list[tuple[int, int, float, float, float]] = []
         for i, j in scenario.topology.links:
@@ -85,25 +85,25 @@ class _SecondMomentEquation:
         to_j = loss.mean_delivery((i, j), scenario.table_probability((i, j)))
         to_i = loss.mean_delivery((j, i), scenario.table_probability((j, i)))
         # Symmetric losses are lost together, others independently.
-        both = min(to_i, to_j) if channel.symmetric else to_i * to_j
+        kron = min(to_i, to_j) if channel.symmetric else to_i * to_j
         at_i, at_j = scenario.weight(i, j), scenario.weight(j, i)
         for x, y, probability, weight in ((a, b, to_i, at_i), (b, a, to_j, at_j)):
             self._mixing[x, y] += rate * probability * weight
             self._mixing[x, x] -= rate * probability * weight
         self._outcomes += [
-            (a, b, rate * (to_i - both), at_i, 0.0),
-            (a, b, rate * (to_j - both), 0.0, at_j),
-            (a, b, rate * both, at_i, at_j),
+            (a, b, rate * (to_i - kron), at_i, 0.0),
+            (a, b, rate * (to_j - kron), 0.0, at_j),
+            (a, b, rate * kron, at_i, at_j),
         ]
 
     def __call__(self, flat: FloatArray) -> FloatArray:
         Y = np.asarray(flat, dtype=np.float64).reshape(self._shape)
         # L Y + Y L'
-        half = np.einsum("aij,ajbk->aibk", self._own, Y)
-        half += np.einsum("ac,cibk->aibk", self._mixing, Y)
-        other = np.einsum("bkl,aibl->aibk", self._own, Y)
-        other += np.einsum("bc,aick->aibk", self._mixing, Y)
-        result = half + other
+        change = np.einsum("aij,ajbk->aibk", self._drift_maps, Y)
+        change += np.einsum("ac,cibk->aibk", self._mixing, Y)
+        transposed_change = np.einsum("bkl,aibl->aibk", self._drift_maps, Y)
+        transposed_change += np.einsum("bc,aick->aibk", self._mixing, Y)
+        result = change + transposed_change
         for a, b, rate, at_a, at_b in self._outcomes:
             if rate == 0.0:
                 continue

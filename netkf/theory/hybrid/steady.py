@@ -69,9 +69,9 @@ def steady_by_node(scenario: Scenario) -> FloatArray:
     equations = coupled_riccati(scenario)
     if equations.talks:
         raise TheoryError("the nodes hear each other: their steady state is one for all")
-    every = [steady_state(equations.restrict(i)) for i in range(len(equations.G))]
-    nothing = np.full_like(equations.A, np.nan)
-    return np.stack([nothing if P is None else P[0] for P in every])
+    states = [steady_state(equations.restrict(i)) for i in range(len(equations.G))]
+    no_state = np.full_like(equations.A, np.nan)
+    return np.stack([no_state if P is None else P[0] for P in states])
 
 
 def steady_state(equations: CoupledRiccati) -> FloatArray | None:
@@ -84,8 +84,8 @@ def steady_state(equations: CoupledRiccati) -> FloatArray | None:
         raise TheoryError("samples at known times lead to a cycle, not to a steady state")
     if equations.coupling.nnz:
         # A necessary rate is cheap to compute; where the links are slower no search can succeed.
-        least = _necessary_factor(equations)
-        if least is None or least > 1.0 + 1e-9:
+        margin = _necessary_factor(equations)
+        if margin is None or margin > 1.0 + 1e-9:
             return None
     packed = PackedRiccati(equations)
     P = _find_stabilising(packed)
@@ -93,14 +93,14 @@ def steady_state(equations: CoupledRiccati) -> FloatArray | None:
         return None
     # Newton's method converges monotonically from stabilising gains, quadratically in the end,
     # until rounding moves P to and fro.
-    before = np.inf
+    previous = np.inf
     for _ in range(60):
         following = _newton(packed, P)
         change = float(np.abs(following - P).max() / np.abs(following).max())
         P = following
-        if change <= 1e-13 or (change <= 1e-9 and change >= 0.5 * before):
+        if change <= 1e-13 or (change <= 1e-9 and change >= 0.5 * previous):
             break
-        before = change
+        previous = change
     Y = packed.pack(P)
     residual = np.abs(packed.slope(Y, Y)).max()
     sizes = [np.abs(x).max() for x in (equations.Q, P @ equations.G @ P, equations.A @ P)]
@@ -203,11 +203,11 @@ def threshold_factor(equations: CoupledRiccati) -> float | None:
         if high > MAX_FACTOR:
             return None
     fine = 1e-6 if equations.start.size <= FEW_UNKNOWNS else 1e-3
-    known, guesses = [(high, 1.0 / float(np.abs(P).max()))], 0
+    points, guesses = [(high, 1.0 / float(np.abs(P).max()))], 0
     while high / low > 1.0 + fine:
         factor = float(np.sqrt(low * high))
-        if len(known) > 1 and guesses < 2:
-            factor, guesses = _guess(known, low, high, fine), guesses + 1
+        if len(points) > 1 and guesses < 2:
+            factor, guesses = _guess(points, low, high, fine), guesses + 1
         else:
             guesses = 0
         # The covariances for faster links are close to those that are looked for.
@@ -216,7 +216,7 @@ def threshold_factor(equations: CoupledRiccati) -> float | None:
             low = factor
         else:
             high, P = factor, following
-            known.append((high, 1.0 / float(np.abs(P).max())))
+            points.append((high, 1.0 / float(np.abs(P).max())))
     return high
 
 
@@ -232,22 +232,22 @@ def _steady_at(
     if P is None:
         return None
     for _ in range(NEWTON_STEPS):
-        before, P = P, _newton(packed, P)
-        if np.abs(P - before).max() <= 1e-4 * np.abs(P).max():
+        previous, P = P, _newton(packed, P)
+        if np.abs(P - previous).max() <= 1e-4 * np.abs(P).max():
             break
     return P
 
 
-def _guess(known: list[tuple[float, float]], low: float, high: float, fine: float) -> float:
+def _guess(points: list[tuple[float, float]], low: float, high: float, fine: float) -> float:
     """Return a factor close to the threshold, extrapolated from (factor, 1 / max P) of two others.
 
     The inverse of the covariances falls to 0 at the threshold, linearly in the end.
     """
-    (f, inverse), (g, following) = known[-2:]
-    index = g - following * (f - g) / (inverse - following) if inverse != following else high
-    above = index * (1.0 + 0.4 * fine)
+    (f, inverse), (g, following) = points[-2:]
+    root = g - following * (f - g) / (inverse - following) if inverse != following else high
+    above = root * (1.0 + 0.4 * fine)
     # From two points above, the guess lies above too: the next one is as far below it.
-    factor = above if above < 0.5 * (index + high) else 2.0 * index - high
+    factor = above if above < 0.5 * (root + high) else 2.0 * root - high
     return factor if low < factor < high else float(np.sqrt(low * high))
 
 
@@ -295,9 +295,9 @@ def _longest_lag(M: scipy.sparse.csc_array) -> float | None:
         y = factors.solve(x)
         if not (np.isfinite(y).all() and y.min() > 0.0):
             return None
-        least = np.full(part.max() + 1, np.inf)
-        np.minimum.at(least, part, y / x)
-        lag = max(lag, float(least.max()))
+        smallest_ratio = np.full(part.max() + 1, np.inf)
+        np.minimum.at(smallest_ratio, part, y / x)
+        lag = max(lag, float(smallest_ratio.max()))
         x = y / y.max()
         if x.min() < 1e-200:
             break

@@ -36,28 +36,28 @@ def solve_by_taylor_series(
     """
     Y, now = packed.start, 0.0
     out = np.empty((len(times), *Y.shape))
-    done = int(np.searchsorted(times, 0.0, side="right"))
-    out[:done] = Y
+    count = int(np.searchsorted(times, 0.0, side="right"))
+    out[:count] = Y
     slope = packed.slope(Y)
     # Time is measured in spans, over which the solution changes by about its own size.
     span = float(np.abs(Y).max() + scale) / max(float(np.abs(slope).max()), 1e-300)
     orders = 0
-    while done < len(times):
+    while count < len(times):
         orders += ORDER
         if orders > max_orders:
             raise StiffError
-        left = float(times[-1]) - now
-        span = min(span, left)
+        remaining = float(times[-1]) - now
+        span = min(span, remaining)
         # Coefficients in powers of t / span, so that they neither overflow nor underflow.
         series = packed.series(Y, span, ORDER)
-        step = min(_step_length(series, np.abs(Y).max(axis=1) + FLOOR * scale), left / span)
+        step = min(_step_length(series, np.abs(Y).max(axis=1) + FLOOR * scale), remaining / span)
         for _ in range(MAX_TRIES):  # until the polynomial satisfies the equation at the end
-            last = step * span >= left
+            last = step * span >= remaining
             following = float(times[-1]) if last else now + step * span
             until = int(np.searchsorted(times, following, side="right"))
-            fractions = np.append((times[done:until] - now) / span, step)
-            found = _evaluate(series, fractions)
-            end, derivative = found[-2:]
+            fractions = np.append((times[count:until] - now) / span, step)
+            solution = _evaluate(series, fractions)
+            end, derivative = solution[-2:]
             defect = np.abs(derivative - span * packed.slope(end)).max(axis=1)
             if (
                 step * defect <= DEFECT_TOLERANCE * (np.abs(end).max(axis=1) + FLOOR * scale)
@@ -66,8 +66,8 @@ def solve_by_taylor_series(
             step *= STEP_REDUCTION
         else:
             raise StiffError
-        out[done:until] = found[:-2]
-        Y, now, span, done = end, following, step * span, until
+        out[count:until] = solution[:-2]
+        Y, now, span, count = end, following, step * span, until
         if not np.abs(Y).max() < limit:
             raise TheoryError(f"H(12) grows beyond {limit:g} before {now:g} s")
     return out

@@ -35,12 +35,12 @@ def slot_rows(scenario: Scenario) -> list[AssumptionRow]:
 def _reachable_readings(scenario: Scenario) -> dict[int, FloatArray]:
     """Return by node the stacked H (p, n) of all readings that can reach it."""
     # Readings travel one link only: R relays nothing.
-    near: dict[int, set[int]] = {node: {node} for node in scenario.nodes}
+    neighbours: dict[int, set[int]] = {node: {node} for node in scenario.nodes}
     for i, j in scenario.topology.directions:
-        near[j].add(i)
+        neighbours[j].add(i)
     return {
         node: np.concatenate([scenario.observation(peer)[0] for peer in sorted(peers)])
-        for node, peers in near.items()
+        for node, peers in neighbours.items()
     }
 
 
@@ -69,10 +69,10 @@ def _arrival_rows(scenario: Scenario) -> list[AssumptionRow]:
         loss.mean_delivery(link, scenario.table_probability(link))
         for link in scenario.topology.directions
     ]
-    known = [rate for rate in rates if np.isfinite(rate)]
-    least = min(known, default=1.0)
-    holds: bool | None = loss.independent and len(known) == len(rates) and least > 0.0
-    evidence = f"delivery from {least:g}" if loss.independent else "losses come in bursts"
+    finite_rates = [rate for rate in rates if np.isfinite(rate)]
+    smallest = min(finite_rates, default=1.0)
+    holds: bool | None = loss.independent and len(finite_rates) == len(rates) and smallest > 0.0
+    evidence = f"delivery from {smallest:g}" if loss.independent else "losses come in bursts"
     if is_recorded(channel):
         # A recording has no probabilities: the assumption is neither true nor false.
         holds, evidence = None, RECORDED_CHANNEL
@@ -86,7 +86,7 @@ def _arrival_rows(scenario: Scenario) -> list[AssumptionRow]:
     ]
     if any(sensor.varying for sensor in scenario.sensors):
         return rows
-    if loss.independent and len(known) == len(rates):
+    if loss.independent and len(finite_rates) == len(rates):
         rows.append(_bounded_mean_row(scenario))
     return rows
 
@@ -94,11 +94,11 @@ def _arrival_rows(scenario: Scenario) -> list[AssumptionRow]:
 def _bounded_mean_row(scenario: Scenario) -> AssumptionRow:
     """Return the row on R (32), for the node at which arrivals are least sufficient."""
     F, sensing = scenario.slot_plant.F, set(scenario.sensing)
-    worst: tuple[float, int, list[float]] | None = None
+    least_sufficient: tuple[float, int, list[float]] | None = None
     for node, H in _reachable_readings(scenario).items():
-        own, _ = scenario.observation(node)
+        own_H, _ = scenario.observation(node)
         # Nodes that need no message, and those that no message can help, say nothing about (32).
-        if undetectable_slot_mode(F, own) is None or undetectable_slot_mode(F, H) is not None:
+        if undetectable_slot_mode(F, own_H) is None or undetectable_slot_mode(F, H) is not None:
             continue
         heard = [(i, j) for i, j in scenario.topology.directions if j == node and i in sensing]
         if len(heard) > MAX_HEARD:
@@ -108,12 +108,12 @@ def _bounded_mean_row(scenario: Scenario) -> AssumptionRow:
                 None,
                 f"not decided: node {node} hears {len(heard)} sensors",
             )
-        radius = contraction_radius(F, _arrival_sets(scenario, own, heard))
-        if worst is None or radius > worst[0]:
-            worst = radius, node, _deliveries(scenario, heard)
-    if worst is None:
+        radius = contraction_radius(F, _arrival_sets(scenario, own_H, heard))
+        if least_sufficient is None or radius > least_sufficient[0]:
+            least_sufficient = radius, node, _deliveries(scenario, heard)
+    if least_sufficient is None:
         return (BOUNDED_MEAN, "R (32)", True, "every node sees enough by itself")
-    radius, node, deliveries = worst
+    radius, node, deliveries = least_sufficient
     evidence = (
         f"node {node}: the best gains multiply mean squares by {radius:.6g} a slot (below 1 is "
         f"sufficient), delivery from {min(deliveries):g}"
@@ -132,15 +132,15 @@ def _deliveries(scenario: Scenario, heard: list[tuple[int, int]]) -> list[float]
 
 
 def _arrival_sets(
-    scenario: Scenario, own: FloatArray, heard: list[tuple[int, int]]
+    scenario: Scenario, own_H: FloatArray, heard: list[tuple[int, int]]
 ) -> list[tuple[float, FloatArray]]:
     """Return the probability and the stacked H of every set of readings that may arrive."""
-    found, probabilities = [], _deliveries(scenario, heard)
+    sets, probabilities = [], _deliveries(scenario, heard)
     # All 2^k outcomes of the k links, which fail independently.
     for arrived in itertools.product((False, True), repeat=len(heard)):
         p = np.prod([g if up else 1.0 - g for g, up in zip(probabilities, arrived, strict=True)])
-        parts = [
+        arrived_H = [
             scenario.observation(i)[0] for (i, _), up in zip(heard, arrived, strict=True) if up
         ]
-        found.append((float(p), np.concatenate([own, *parts])))
-    return found
+        sets.append((float(p), np.concatenate([own_H, *arrived_H])))
+    return sets

@@ -22,8 +22,8 @@ from netkf.theory.intermittent.riccati import (
 )
 from netkf.theory.numerics.matrices import as_covariance, as_whole
 
-BATCHES = 50  # of a path, whose averages are nearly independent
-MAX_ENTRIES = 2_000_000  # of the covariances that are kept at once
+BATCHES = 50  # parts of a path (batch means), whose averages are nearly independent
+MAX_ENTRIES = 2_000_000  # entries of the covariances in memory at once
 
 
 class PathAverage(NamedTuple):
@@ -65,8 +65,8 @@ def path_average(
     P = steady_covariance(*system) if start is None else as_covariance("start", start, n)
     arrived = Streams(seed).generator("arrivals").random(slots) < g
     values = np.concatenate(list(_evaluate(function, system, covariance_root(P), arrived)))
-    parts = [float(part.mean()) for part in np.array_split(values, BATCHES)]
-    error = float(np.std(parts, ddof=1)) / float(np.sqrt(BATCHES))
+    batch_means = [float(part.mean()) for part in np.array_split(values, BATCHES)]
+    error = float(np.std(batch_means, ddof=1)) / float(np.sqrt(BATCHES))
     return PathAverage(float(values.mean()), error, slots)
 
 
@@ -79,20 +79,20 @@ def _evaluate(
     """Return the values of the function at P_0, P_1, ..., in pieces of limited size."""
     F, Q, H, R = system
     modes, root_Q = reading_modes([(H[:0], R[:0, :0]), (H, R)], len(F)), square_root(Q)
-    piece, found = max(1, MAX_ENTRIES // len(F) ** 2), []
+    piece, values_of_pieces = max(1, MAX_ENTRIES // len(F) ** 2), []
     for first in range(0, len(arrived), piece):
         word = arrived[first : first + piece].astype(np.uint8)
         roots = trace_path(root, word, F, root_Q, modes)
         # R (140) averages over P_0 .. P_{t-1}: each covariance before its own slot.
-        before = np.concatenate([root[None], roots[:-1]])
-        P, root = before @ np.swapaxes(before, 1, 2), roots[-1]
+        roots_before = np.concatenate([root[None], roots[:-1]])
+        P, root = roots_before @ np.swapaxes(roots_before, 1, 2), roots[-1]
         values = np.asarray(function(P), dtype=np.float64)
         if values.shape != (len(P),):
             raise TheoryError(
                 f"the function must give one number per covariance, not {values.shape}"
             )
-        found.append(values)
-    return found
+        values_of_pieces.append(values)
+    return values_of_pieces
 
 
 class MeanBounds(NamedTuple):

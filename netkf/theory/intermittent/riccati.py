@@ -176,8 +176,8 @@ def critical_probability(F: ArrayLike, H: ArrayLike) -> tuple[float, float]:
     contract. Policy iteration over K inside a root search over g finds it to about 1e-12. Raises
     TheoryError if (F, H) is not detectable: then no probability suffices.
     """
-    found = critical_certificate(F, H)
-    return found.lower, found.upper
+    bounds = critical_certificate(F, H)
+    return bounds.lower, bounds.upper
 
 
 def critical_certificate(F: ArrayLike, H: ArrayLike) -> CriticalProbability:
@@ -250,8 +250,8 @@ class _GainSearch:
         self._F, self._readings = F, readings
         n = len(F)
         rows, columns = np.triu_indices(n)
-        # vec(X) of a symmetric X from its upper triangle, and the indices of the triangle in
-        # vec(X).
+        # The matrix that maps the upper triangle of a symmetric X to vec(X), and the indices of
+        # the triangle in vec(X).
         self._expand = np.zeros((n * n, len(rows)))
         self._expand[rows * n + columns, np.arange(len(rows))] = 1.0
         self._expand[columns * n + rows, np.arange(len(rows))] = 1.0
@@ -262,36 +262,37 @@ class _GainSearch:
         n = len(self._F)
         gains = self._improve([np.zeros((n, len(H))) for H in self._readings], np.eye(n))
         gains = self._first_gains(probabilities, gains)
-        best, X = self._perron(probabilities, gains)
+        radius, X = self._perron(probabilities, gains)
         for _ in range(500):
             following = self._improve(gains, X)
             rho, X_new = self._perron(probabilities, following)
-            if not rho < best * (1.0 - 1e-15):
+            if not rho < radius * (1.0 - 1e-15):
                 break
-            best, X, gains = rho, X_new, following
-        return best, gains, X
+            radius, X, gains = rho, X_new, following
+        return radius, gains, X
 
     def _first_gains(
         self, probabilities: Sequence[float], gains: list[FloatArray]
     ) -> list[FloatArray]:
-        """Return gains near the best ones, from any first ones.
+        """Return gains close to the best ones, starting from any ``gains``.
 
-        Policy iteration with the resolvent ``X = (s - L)^-1 I``, s above the radius of L, in place
-        of the Perron matrix, which may be singular and then determines no gain in some direction.
-        X > 0, so that each step lowers the radius below s.
+        Policy iteration with the resolvent ``X = (s - L)^-1 I``, s above the radius of L, instead
+        of the Perron matrix, which may be singular and then leaves gains undetermined in some
+        direction. Since X > 0, the radius of the improved gains is below s, which is lowered step
+        by step.
         """
-        best = self._perron(probabilities, gains)[0]
+        radius = self._perron(probabilities, gains)[0]
         for excess in (1.0, 0.3, 0.1, 0.03, 0.01, 1e-3, 1e-4, 1e-5, 1e-6, 1e-8):
             for _ in range(MAX_POLICIES):
-                X = self._resolvent(probabilities, gains, best * (1.0 + excess) + 1e-300)
+                X = self._resolvent(probabilities, gains, radius * (1.0 + excess) + 1e-300)
                 if X is None:
                     break
                 following = self._improve(gains, X)
                 rho = self._perron(probabilities, following)[0]
-                if not rho < best:
+                if not rho < radius:
                     break
-                gains, before, best = following, best, rho
-                if best > before * (1.0 - 0.01 * excess):
+                gains, previous, radius = following, radius, rho
+                if radius > previous * (1.0 - 0.01 * excess):
                     break
         return gains
 
@@ -311,18 +312,18 @@ class _GainSearch:
         matrix = symmetric(X.reshape(n, n))
         if not np.isfinite(matrix).all() or not np.linalg.eigvalsh(matrix)[0] > 0.0:
             return None
-        # Of gains that make L = 0 it is 1e300, whose products with H would overflow.
+        # With gains that make L = 0, X is about 1e300, and its products with H would overflow.
         return np.asarray(np.ldexp(matrix, -np.frexp(np.trace(matrix))[1]))
 
     def _improve(self, gains: list[FloatArray], X: FloatArray) -> list[FloatArray]:
         """Return the gains ``K = -F X H' (H X H')^-1``, which minimise L(X)."""
         # In the kernel of H X H' any gain is optimal: the pseudo-inverse keeps the present one.
-        found = []
+        improved = []
         for K, H in zip(gains, self._readings, strict=True):
             S = H @ X @ H.T
             change = -(self._F @ X @ H.T) - K @ S
-            found.append(np.asarray(K + change @ np.linalg.pinv(S, rcond=1e-13, hermitian=True)))
-        return found
+            improved.append(np.asarray(K + change @ np.linalg.pinv(S, rcond=1e-13, hermitian=True)))
+        return improved
 
     def _operator(self, probabilities: Sequence[float], gains: list[FloatArray]) -> FloatArray:
         """Return L as a matrix on upper triangles."""
@@ -356,8 +357,13 @@ def support(F: ArrayLike, Q: ArrayLike, H: ArrayLike, R: ArrayLike, depth: int) 
     roots = covariance_root(steady_covariance(F, Q, H, R))[None]
     root_Q, modes = square_root(Q), reading_modes([(H[:0], R[:0, :0]), (H, R)], len(F))
     for _ in range(depth):
-        each = np.zeros((len(roots), 1), dtype=np.uint8), np.ones((len(roots), 1), dtype=np.uint8)
-        roots = np.concatenate([move_roots(roots, mode, F, root_Q, modes) for mode in each])
+        one_slot_modes = (
+            np.zeros((len(roots), 1), dtype=np.uint8),
+            np.ones((len(roots), 1), dtype=np.uint8),
+        )
+        roots = np.concatenate(
+            [move_roots(roots, mode, F, root_Q, modes) for mode in one_slot_modes]
+        )
     return symmetric(roots @ np.swapaxes(roots, -1, -2))
 
 
@@ -387,51 +393,56 @@ def invariant_samples(
     modes = reading_modes([(H[:0], R[:0, :0]), (H, R)], n)
     # f_0 and f_1 are monotone: every start between these two ends between their ends.
     starts = np.stack([covariance_root(P), 1e3 * covariance_root(P + np.trace(P) * np.eye(n))])
-    drawn = np.empty((samples, n, n))
+    draws = np.empty((samples, n, n))
     for first in range(0, samples, MAX_SAMPLES_AT_ONCE):
-        some = min(MAX_SAMPLES_AT_ONCE, samples - first)
-        drawn[first : first + some], _ = couple_from_the_past(
+        count = min(MAX_SAMPLES_AT_ONCE, samples - first)
+        draws[first : first + count], _ = couple_from_the_past(
             lambda following, T: random.random((len(following), T)) < delivery,
             lambda roots, arrivals: move_roots(roots, arrivals, F, square_root(Q), modes),
             starts,
-            np.zeros((some, 0), dtype=bool),
+            np.zeros((count, 0), dtype=bool),
         )
-    return drawn
+    return draws
 
 
 def couple_from_the_past(
     draw: Callable[[np.ndarray, int], np.ndarray],
     propagate: Callable[[FloatArray, np.ndarray], FloatArray],
     starts: FloatArray,
-    nothing: np.ndarray,
+    empty: np.ndarray,
 ) -> tuple[FloatArray, np.ndarray]:
-    """Return draws (K, n, n) from the law that forward chains converge to, and their last modes.
+    """Return K exact draws (K, n, n) from the invariant law of a switched Riccati recursion, and
+    the last mode (K,) of each, by coupling from the past (Propp and Wilson 1996).
 
-    ``draw(following, T)`` returns the T modes before those in ``following`` (K, S) of K chains;
-    ``propagate(roots, modes)`` moves roots (K, n, n) through modes (K, T); ``nothing`` is an array
-    (K, 0) of modes. Raises TheoryError if chains from the two ``starts`` (2, n, n) do not meet
-    within MAX_PAST slots.
+    ``draw(following, T)`` returns the T modes before those in ``following`` (K, S);
+    ``propagate(roots, modes)`` applies modes (K, T) to roots (K, n, n); ``empty`` is an array
+    (K, 0) of modes, which fixes K and the type. Chains from both ``starts`` (2, n, n), between
+    which all others lie, run through ever longer pasts until they meet. Raises TheoryError if they
+    do not within MAX_PAST slots.
     """
-    out = np.empty((len(nothing), *starts.shape[1:]))
-    last = np.empty(len(nothing), dtype=nothing.dtype)
-    left = np.arange(len(nothing))
-    modes = draw(nothing, FIRST_PAST)
-    while len(left):
+    out = np.empty((len(empty), *starts.shape[1:]))
+    last = np.empty(len(empty), dtype=empty.dtype)
+    open_chains = np.arange(len(empty))
+    modes = draw(empty, FIRST_PAST)
+    while len(open_chains):
         ends = propagate(
-            np.repeat(starts, len(left), axis=0), np.concatenate([modes, modes])
-        ).reshape(2, len(left), *starts.shape[1:])
-        pair = ends @ np.swapaxes(ends, -1, -2)
-        if not np.isfinite(pair).all():
+            np.repeat(starts, len(open_chains), axis=0), np.concatenate([modes, modes])
+        ).reshape(2, len(open_chains), *starts.shape[1:])
+        covariances = ends @ np.swapaxes(ends, -1, -2)
+        if not np.isfinite(covariances).all():
             break
-        apart = np.abs(pair[0] - pair[1]).max(axis=(-1, -2))
+        distance = np.abs(covariances[0] - covariances[1]).max(axis=(-1, -2))
         # Chains that met are finished; the others need a longer past.
-        met = apart <= COALESCENCE_TOLERANCE * np.abs(pair[0]).max(axis=(-1, -2))
-        out[left[met]], last[left[met]] = symmetric(pair[0, met]), modes[met, -1]
-        left, modes = left[~met], modes[~met]
+        met = distance <= COALESCENCE_TOLERANCE * np.abs(covariances[0]).max(axis=(-1, -2))
+        out[open_chains[met]], last[open_chains[met]] = (
+            symmetric(covariances[0, met]),
+            modes[met, -1],
+        )
+        open_chains, modes = open_chains[~met], modes[~met]
         if 2 * modes.shape[1] > MAX_PAST:
             break
-        # The past grows at its far end: modes that were used stay the last ones.
+        # The past is extended at its far end: the modes drawn so far stay the last ones.
         modes = np.concatenate([draw(modes, modes.shape[1]), modes], axis=1)
-    if len(left):
+    if len(open_chains):
         raise TheoryError("the equation does not forget its start: no invariant law was reached")
     return out, last

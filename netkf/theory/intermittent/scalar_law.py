@@ -56,48 +56,49 @@ class ScalarLaw:
     def cdf(self, x: ArrayLike) -> FloatArray:
         """Return P(X <= x), exact to about 1e-15, elementwise."""
         point = np.array(x, dtype=np.float64)
-        total, share = np.zeros_like(point), np.ones_like(point)
+        total, weight = np.zeros_like(point), np.ones_like(point)
         top = self.hole[0]
-        while (share > NEGLIGIBLE).any():
-            share = np.where(point < self.least * (1.0 - 1e-15), 0.0, share)
+        while (weight > NEGLIGIBLE).any():
+            weight = np.where(point < self.least * (1.0 - 1e-15), 0.0, weight)
             # Above the hole every value after an arrival is smaller, and the last slot an outage.
             above = point >= top
-            total = total + np.where(above, share * self.delivery, 0.0)
-            share = share * np.where(above, 1.0 - self.delivery, self.delivery)
+            total = total + np.where(above, weight * self.delivery, 0.0)
+            weight = weight * np.where(above, 1.0 - self.delivery, self.delivery)
             with np.errstate(divide="ignore", invalid="ignore"):
                 reduced = (point - self.Q) / self.F**2
                 # f_1^-1: R y / (R - H^2 y) with y = (x - Q) / F^2
-                before = reduced * self.R / (self.R - self.H**2 * reduced)
-            point = np.where(above, reduced, before)
+                preimage = reduced * self.R / (self.R - self.H**2 * reduced)
+            point = np.where(above, reduced, preimage)
         return total
 
     def cdf_after(self, x: ArrayLike, slots: int, start: float) -> FloatArray:
         """Return P(P_t <= x) after ``slots`` slots from P_0 = ``start``, exact, elementwise.
 
-        P_t is f_0 of the value before with probability 1 - g and f_1 of it with probability g, so
-        that the distribution function obeys a recursion with two branches. One of them is empty
-        from P* on; below P*, where only a smaller start leads, both may count.
+        P_t is f_0(P_{t-1}) with probability 1 - g and f_1(P_{t-1}) with probability g, so that the
+        distribution function obeys ``P(P_t <= x) = (1 - g) P(P_{t-1} <= f_0^-1(x)) + g P(P_{t-1} <=
+        f_1^-1(x))``. At or above P* one of the two terms is 0 or 1; below P*, which only a smaller
+        start reaches, both count.
         """
         x = np.asarray(x, dtype=np.float64)
         point, owner = x.reshape(-1), np.arange(x.size)
-        share, total = np.ones(x.size), np.zeros(x.size)
+        weight, total = np.ones(x.size), np.zeros(x.size)
         # All values after s slots lie between those without losses and those without readings.
         lowest, highest = [np.array(start)], [np.array(start)]
         for _ in range(slots):
             lowest.append(self.with_reading(lowest[-1]))
             highest.append(self.without(highest[-1]))
-        for left in range(slots, -1, -1):
-            above = point >= highest[left] * (1.0 - 1e-15)
-            np.add.at(total, owner[above], share[above])
-            open_ = ~above & (point >= lowest[left] * (1.0 - 1e-15)) & (share > NEGLIGIBLE)
-            point, owner, share = point[open_], owner[open_], share[open_]
+        for slots_left in range(slots, -1, -1):
+            above = point >= highest[slots_left] * (1.0 - 1e-15)
+            np.add.at(total, owner[above], weight[above])
+            open_ = ~above & (point >= lowest[slots_left] * (1.0 - 1e-15)) & (weight > NEGLIGIBLE)
+            point, owner, weight = point[open_], owner[open_], weight[open_]
             reduced = (point - self.Q) / self.F**2
             scratch = self.R - self.H**2 * reduced
             with np.errstate(divide="ignore", invalid="ignore"):
-                before = np.where(scratch > 0.0, reduced * self.R / scratch, np.inf)
-            point = np.concatenate([reduced, before])
+                preimage = np.where(scratch > 0.0, reduced * self.R / scratch, np.inf)
+            point = np.concatenate([reduced, preimage])
             owner = np.concatenate([owner, owner])
-            share = np.concatenate([share * (1.0 - self.delivery), share * self.delivery])
+            weight = np.concatenate([weight * (1.0 - self.delivery), weight * self.delivery])
         return total.reshape(x.shape)
 
     def quantile(self, u: ArrayLike) -> FloatArray:
@@ -164,10 +165,10 @@ def scalar_law(
     if not 0.0 < delivery < 1.0:
         raise TheoryError(f"delivery must lie in (0, 1), got {delivery!r}")
     F_, Q_, H_, R_ = (float(matrix[0, 0]) for matrix in system)
-    least = float(steady_covariance(*system)[0, 0])
+    smallest = float(steady_covariance(*system)[0, 0])
     if F_ == 0.0 or H_ == 0.0:
         raise TheoryError("the exact law needs F and H that are not zero")
-    law = ScalarLaw(F_, Q_, H_, R_, float(delivery), least)
+    law = ScalarLaw(F_, Q_, H_, R_, float(delivery), smallest)
     if not law.hole[0] < law.hole[1]:
         raise TheoryError("the images of f_0 and f_1 meet: no recursion with one branch")
     return law

@@ -37,9 +37,9 @@ def as_whole(name: str, value: object, least: int, most: float = np.inf) -> int:
 def as_square(name: str, value: ArrayLike, n: int | None = None) -> FloatArray:
     """Return a finite (n, n) array, a number as 1 x 1, any n if None; raises TheoryError."""
     array = as_numbers(name, value)
-    wanted = "square" if n is None else f"{n} x {n}"
+    shape_text = "square" if n is None else f"{n} x {n}"
     if array.ndim != 2 or array.shape[0] != array.shape[1] or n not in (None, len(array)):
-        raise TheoryError(f"{name} must be a {wanted} matrix, its shape is {array.shape}")
+        raise TheoryError(f"{name} must be a {shape_text} matrix, its shape is {array.shape}")
     if not np.isfinite(array).all():
         raise TheoryError(f"{name} must be finite")
     return np.asarray(array)

@@ -1,10 +1,11 @@
-"""Linear maps on symmetric matrices that keep them positive semidefinite: radius and fixed point.
+"""Spectral radius and fixed points of positive maps: linear maps on symmetric matrices that keep
+them positive semidefinite.
 
-A map T takes and gives a stack (S, M, M) of symmetric matrices, such as second moments in each of S
-modes. Its spectral radius is an eigenvalue with a semidefinite stack X (Krein and Rutman), the
-rightmost one, which Arnoldi's method computes and a positive definite X proves (Collatz and
-Wielandt). If X is singular and proves nothing, small systems are solved by dense eigenvalues. The
-radius is below 1 if and only if ``X = T(X) + Q`` has a semidefinite solution for a positive
+A map T maps stacks (S, M, M) of symmetric matrices, such as second moments in each of S modes, to
+such stacks. Its spectral radius is its rightmost eigenvalue, with a semidefinite eigenvector X
+(Krein and Rutman). Arnoldi's method computes it, and if X is positive definite, X proves it as an
+upper bound (Collatz and Wielandt). If X is singular, small maps are solved by dense eigenvalues.
+The radius is below 1 if and only if ``X = T(X) + Q`` has a semidefinite solution for a positive
 definite Q.
 """
 
@@ -24,9 +25,9 @@ PositiveMap = Callable[[FloatArray], FloatArray]
 Shape = tuple[int, ...]
 
 MAX_DENSE, MAX_DENSE_FALLBACK = 55, 820
-"""Numbers in the triangles of a stack up to which T is a dense matrix: always, or if an iteration
-fails."""
-PROOF_TOLERANCE = 1e-6  # relative, between the radius and the bound that X proves
+"""Largest number of entries in the triangles of a stack for which T is written as a dense matrix:
+always, or after an iteration has failed."""
+PROOF_TOLERANCE = 1e-6  # relative difference of the radius and the upper bound that X proves
 # Vectors are as large as the stack: few of them fit.
 KRYLOV_VECTORS, RESTARTS = 24, 200
 # Iterative refinement stops at this residual; it gains some digits a round.
@@ -51,24 +52,24 @@ def fixed_point(T: PositiveMap, Q: FloatArray, radius: float) -> FloatArray:
     """Return the solution (S, M, M) of ``X = T(X) + Q`` by GMRES with refinement, for a positive
     map of spectral ``radius`` below 1.
 
-    Its residual is below RESIDUAL times 1 - radius, relative to the standard deviations of row and
+    Its residual is below RESIDUAL (1 - radius), relative to the standard deviations of row and
     column. Raises TheoryError if that is not reached.
     """
     # The error of the solution is up to 1 / (1 - radius) times the residual.
     tolerance = RESIDUAL * max(1.0 - radius, 1e-3)
-    few, X = _count_numbers(Q.shape) <= MAX_DENSE, np.array(Q)
+    is_small, X = _count_numbers(Q.shape) <= MAX_DENSE, np.array(Q)
     for _ in range(MAX_ROUNDS):
-        rest = Q + T(X) - X
-        if _is_small(rest, X, tolerance):
+        residual = Q + T(X) - X
+        if _is_small(residual, X, tolerance):
             return symmetric(X)
-        X = X + (_solve_by_elimination(T, rest) if few else _by_gmres(T, rest))
-    if not few and _count_numbers(Q.shape) <= MAX_DENSE_FALLBACK:
+        X = X + (_solve_by_elimination(T, residual) if is_small else _by_gmres(T, residual))
+    if not is_small and _count_numbers(Q.shape) <= MAX_DENSE_FALLBACK:
         return _solve_by_elimination(T, Q)
-    raise TheoryError(f"the mean squares were solved to {np.abs(rest).max():.1e} only")
+    raise TheoryError(f"the mean squares were solved to {np.abs(residual).max():.1e} only")
 
 
 def _count_numbers(shape: Shape) -> int:
-    """Return how many numbers the upper triangles of a stack have."""
+    """Return the number of entries in the upper triangles of a stack."""
     return shape[0] * shape[-1] * (shape[-1] + 1) // 2
 
 
@@ -77,18 +78,22 @@ def _confirm(T: PositiveMap, X: FloatArray, value: float) -> float:
     start, agrees; raises TheoryError if not.
     """
     start = X + np.diag(np.linspace(0.5, 1.5, X.shape[-1])) * np.trace(X.sum(axis=0))
-    again, _ = _extreme_eigenvalue(T, start, "LM")
-    if not abs(again - value) <= 1e-8 * value:
-        raise TheoryError(f"the radius is not certain: searches found {value:.8g} and {again:.8g}")
+    second_value, _ = _extreme_eigenvalue(T, start, "LM")
+    if not abs(second_value - value) <= 1e-8 * value:
+        raise TheoryError(
+            f"the radius is not certain: searches found {value:.8g} and {second_value:.8g}"
+        )
     return value
 
 
 def _extreme_eigenvalue(
     T: PositiveMap, start: FloatArray, which: Literal["LR", "LM"]
 ) -> tuple[float, FloatArray]:
-    """Return the modulus of an extreme eigenvalue of T and its X (S, M, M), of positive trace.
+    """Return the modulus of an extreme eigenvalue of T, and its eigenvector X (S, M, M) of positive
+    trace.
 
-    The search begins at ``start``: a positive definite one has a component along X.
+    Arnoldi's method starts at ``start``, which has a component along X if it is positive definite.
+    (0, zeros) if it fails for a map small enough for dense eigenvalues.
     """
     shape = start.shape
     try:
@@ -103,7 +108,7 @@ def _extreme_eigenvalue(
         )
     except scipy.sparse.linalg.ArpackError as error:
         if _count_numbers(shape) <= MAX_DENSE_FALLBACK:
-            return 0.0, np.zeros(shape)  # proves nothing
+            return 0.0, np.zeros(shape)  # singular: the caller turns to dense eigenvalues
         raise TheoryError(f"the mean-square radius was not found: {error}") from None
     X = symmetric(vectors[:, 0].real.reshape(shape))
     return float(abs(values[0])), X * np.sign(np.trace(X.sum(axis=0)))
@@ -115,48 +120,48 @@ def _least_factor(T: PositiveMap, X: FloatArray) -> float:
         roots = np.linalg.cholesky(X)
     except np.linalg.LinAlgError:
         return np.inf
-    return max(_largest_ratio(moved, L) for moved, L in zip(T(X), roots, strict=True))
+    return max(_largest_ratio(image, L) for image, L in zip(T(X), roots, strict=True))
 
 
-def _largest_ratio(moved: FloatArray, L: FloatArray) -> float:
+def _largest_ratio(image: FloatArray, L: FloatArray) -> float:
     """Return the largest eigenvalue of ``L^-1 moved L^-T``, for lower triangular L (M, M)."""
-    half = scipy.linalg.solve_triangular(L, moved, lower=True)
+    half = scipy.linalg.solve_triangular(L, image, lower=True)
     scaled = scipy.linalg.solve_triangular(L, half.T, lower=True)
     return float(np.linalg.eigvalsh(symmetric(scaled))[-1])
 
 
-def _is_small(rest: FloatArray, X: FloatArray, tolerance: float) -> bool:
+def _is_small(residual: FloatArray, X: FloatArray, tolerance: float) -> bool:
     """Return True if a residual is below ``tolerance`` for every entry of X."""
     variances = np.abs(np.diagonal(X, axis1=1, axis2=2)).sum(axis=0)
     deviations = np.sqrt(variances)
     # Small variances must be accurate too, beside large ones of other states.
     allowed = np.outer(deviations, deviations) + 1e-6 * variances.max(initial=0.0)
-    return bool((np.abs(rest) <= tolerance * allowed).all())
+    return bool((np.abs(residual) <= tolerance * allowed).all())
 
 
 def _triangle_indices(shape: Shape) -> tuple[IntArray, IntArray, IntArray]:
     """Return the indices of the upper triangles of a stack: of matrices, rows and columns."""
     rows, columns = np.triu_indices(shape[-1])
-    which = np.repeat(np.arange(shape[0]), len(rows))
-    return which, np.tile(rows, shape[0]), np.tile(columns, shape[0])
+    matrices = np.repeat(np.arange(shape[0]), len(rows))
+    return matrices, np.tile(rows, shape[0]), np.tile(columns, shape[0])
 
 
 def _dense_matrix(T: PositiveMap, shape: Shape) -> FloatArray:
     """Return T as a matrix on upper triangles."""
-    at, columns = _triangle_indices(shape), []
-    for s, i, j in zip(*at, strict=True):
+    triangle, columns = _triangle_indices(shape), []
+    for s, i, j in zip(*triangle, strict=True):
         unit = np.zeros(shape)
         unit[s, i, j] = unit[s, j, i] = 1.0
-        columns.append(T(unit)[at])
+        columns.append(T(unit)[triangle])
     return np.stack(columns, axis=1)
 
 
 def _solve_by_elimination(T: PositiveMap, right: FloatArray) -> FloatArray:
     """Return the solution (S, M, M) of ``X - T(X) = right`` by elimination."""
-    s, i, j = at = _triangle_indices(right.shape)
+    s, i, j = triangle = _triangle_indices(right.shape)
     X = np.zeros_like(right)
     X[s, i, j] = X[s, j, i] = np.linalg.solve(
-        np.eye(len(s)) - _dense_matrix(T, right.shape), symmetric(right)[at]
+        np.eye(len(s)) - _dense_matrix(T, right.shape), symmetric(right)[triangle]
     )
     return X
 
@@ -175,7 +180,7 @@ def _by_gmres(T: PositiveMap, right: FloatArray) -> FloatArray:
 
 
 def _linear_operator(apply: PositiveMap, shape: Shape) -> scipy.sparse.linalg.LinearOperator:
-    """Return a map on vectors; what is not symmetric in a vector does not count."""
+    """Return a map on vectors (S M M,) that acts on their symmetric parts."""
     size = int(np.prod(shape))
     return scipy.sparse.linalg.LinearOperator(
         (size, size),

@@ -1,14 +1,18 @@
 """Propagation of the state, of errors and of covariances over a gap between events.
 
 Without increments all errors obey the same ``e+ = F e + D x + w``, with the F of the filters and D
-from its difference to the plant's; :class:`Predictor` computes such a :class:`Prediction` from a
-stochastic differential equation. With increments each error has a transition of its own, computed
-by :class:`ErrorFlow`. With ``[X; Y](s) = E(s) [I; P]`` and ``E(s) = exp(M s)``, M the Hamiltonian,
-``Phi(g, s) = X(g)^-T X(s)^T`` and ``Phi(g, s) L(s) = X(g)^-T Y(s)^T H' R^-1`` are entire functions
-of s, which eight Gauss-Legendre nodes integrate to machine precision over steps of |M| g <= 1/2.
-Covariances are passed as roots ``P = S S'``, since ``(I + P G)^-1`` loses all digits where the
-eigenvalues of P differ much: with ``G_g = Gamma' Gamma`` from the same nodes and ``[I; Gamma S] =
-Z U``, it is ``I - (S Z_1)(Z_2' Gamma)``.
+the difference of the plant's F to it; :class:`Predictor` computes this :class:`Prediction` from a
+stochastic differential equation.
+
+With increments each error has a transition of its own, computed by :class:`ErrorFlow`. Let M be the
+Hamiltonian of the Riccati equation, ``E(s) = exp(M s)`` and ``[X; Y](s) = E(s) [I; P]``. Over a gap
+g the error's transition from s is ``Phi(g, s) = X(g)^-T X(s)^T``, and that of the filter's gain L
+``Phi(g, s) L(s) = X(g)^-T Y(s)^T H' R^-1``. Both are entire functions of s, which eight
+Gauss-Legendre nodes integrate to machine precision over steps of |M| g <= 1/2.
+
+Covariances are passed as roots ``P = S S'``, since ``(I + P G)^-1`` loses all digits if the
+eigenvalues of P differ by orders of magnitude. With ``G_g = Gamma' Gamma`` from the same nodes and
+the QR factorisation ``[I; Gamma S] = Z U`` it is ``I - (S Z_1)(Z_2' Gamma)``.
 """
 
 from __future__ import annotations
@@ -23,11 +27,11 @@ from netkf.linalg.arrays import FloatArray, as_kernel_array
 from netkf.theory.numerics.roots import discretise, flow_estimates, triangular
 from netkf.theory.numerics.stack import GaussianStack
 
-# Exact to rounding for e^{A s} within one unit; moved from [-1, 1] to [0, 1].
+# Eight nodes integrate e^{A s} to rounding within one unit; mapped from [-1, 1] to [0, 1].
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(8)
 NODES, WEIGHTS = 0.5 * (NODES + 1.0), 0.5 * WEIGHTS
-MAX_NORM, TERMS = 0.5, 22  # of |M| s in the series of exp(M s), whose rest is below 0.5^22 / 22!
-MAX_CACHED = 256  # predictions that are cached by their gap; periodic clocks have few gaps
+MAX_NORM, TERMS = 0.5, 22  # largest |M| s, and terms, of exp(M s); the remainder is 0.5^22 / 22!
+MAX_CACHED = 256  # predictions cached by their gap; periodic clocks have few different gaps
 
 
 class Prediction(NamedTuple):
@@ -50,7 +54,7 @@ class Prediction(NamedTuple):
 
 
 class ShortExponential:
-    """``exp(M s)`` by its Taylor series, for |M| s up to MAX_NORM; ``unit`` is the largest s."""
+    """``exp(M s)`` by its Taylor series for 0 <= s <= ``unit``, at which |M| s = MAX_NORM."""
 
     def __init__(self, M: FloatArray) -> None:
         self.unit = MAX_NORM / max(float(np.abs(M).sum(axis=0).max(initial=0.0)), 1e-300)
@@ -65,22 +69,24 @@ class ShortExponential:
         return np.asarray(np.tensordot(powers, self.terms, 1))
 
 
-def triangular_root(parts: FloatArray) -> FloatArray:
+def triangular_root(factor: FloatArray) -> FloatArray:
     """Return lower triangular S (..., n, n) with ``S S' = parts parts'``, parts (..., n, k)."""
-    n, k = parts.shape[-2:]
+    n, k = factor.shape[-2:]
     if k == 0:
-        return np.zeros((*parts.shape[:-1], n))
+        return np.zeros((*factor.shape[:-1], n))
     if k < n:
-        widths = [(0, 0)] * (parts.ndim - 1) + [(0, n - k)]
-        parts = np.pad(parts, widths)
-    if parts.ndim == 2:
-        return triangular(parts)
+        widths = [(0, 0)] * (factor.ndim - 1) + [(0, n - k)]
+        factor = np.pad(factor, widths)
+    if factor.ndim == 2:
+        return triangular(factor)
     # parts' = Z U, so parts parts' = U' U: U' is the root, with arbitrary signs of its columns.
-    return np.swapaxes(np.linalg.qr(np.swapaxes(parts, -1, -2), mode="r"), -1, -2)
+    return np.swapaxes(np.linalg.qr(np.swapaxes(factor, -1, -2), mode="r"), -1, -2)
 
 
 class Predictor:
-    """Predictions without increments: plant dx = A x dt + B dw, filters that assume A_f, B_f."""
+    """Predictions without increments, for the plant dx = A x dt + B dw and filters that assume A_f
+    and B_f instead.
+    """
 
     def __init__(self, A: FloatArray, B: FloatArray, A_f: FloatArray, B_f: FloatArray) -> None:
         self._n = n = len(A)
@@ -88,19 +94,19 @@ class Predictor:
         # State and error together, driven by the same noise: de = (A_f e + (A - A_f) x) dt + B dw.
         self._truth = None
         if not (np.array_equal(A, A_f) and np.array_equal(B, B_f)):
-            both = np.block([[A, np.zeros((n, n))], [A - A_f, A_f]])
-            self._truth = LinearSDE(both, np.concatenate([B, B], axis=0))
+            joint_drift = np.block([[A, np.zeros((n, n))], [A - A_f, A_f]])
+            self._truth = LinearSDE(joint_drift, np.concatenate([B, B], axis=0))
         self._known: dict[float, Prediction] = {}
 
     def __call__(self, gap: float) -> Prediction:
         """Return the prediction over ``gap`` seconds."""
-        found = self._known.get(gap)
-        if found is None:
-            found = self._discretise(gap)
+        prediction = self._known.get(gap)
+        if prediction is None:
+            prediction = self._discretise(gap)
             if len(self._known) >= MAX_CACHED:
                 self._known.clear()
-            self._known[gap] = found
-        return found
+            self._known[gap] = prediction
+        return prediction
 
     def _discretise(self, gap: float) -> Prediction:
         """Return the prediction over ``gap`` seconds."""
@@ -120,10 +126,10 @@ class LinearSDE:
 
     def discretise(self, gap: float) -> tuple[FloatArray, FloatArray]:
         """Return ``exp(A gap)`` (d, d) and a root (d, d) of the covariance that the noise adds."""
-        found: tuple[FloatArray, FloatArray] = discretise(
+        result: tuple[FloatArray, FloatArray] = discretise(
             self._exp.terms, self._exp.unit, self._B, gap, (NODES, WEIGHTS)
         )
-        return found
+        return result
 
 
 class FlowTransition(NamedTuple):
@@ -132,14 +138,14 @@ class FlowTransition(NamedTuple):
     transition : (K, n, n) of each error
     follow     : (K, n, n) factor of the state
     response   : (K, n, k) factor of the plant's k inputs
-    own        : (K, n, q) factor of q noises of the filter's readings, q at most n
+    reading_noise : (K, n, q) factor of q noises of the filter's readings, q at most n
     root       : (K, n, n) root of P at the end
     """
 
     transition: FloatArray
     follow: FloatArray
     response: FloatArray
-    own: FloatArray
+    reading_noise: FloatArray
     root: FloatArray
 
 
@@ -196,29 +202,33 @@ class ErrorFlow:
 
     def transition(self, roots: FloatArray, gap: float) -> FlowTransition:
         """Return the transition of K filters with ``roots`` (K, n, n) of P over ``gap`` seconds."""
-        times, w = NODES * gap, WEIGHTS * gap
+        times, weights = NODES * gap, WEIGHTS * gap
         T11, T12, T21, T22 = self._exponential_blocks(np.append(times, gap))
         F = np.linalg.inv(T11[-1])
-        at = np.sqrt(w)[:, None, None]
+        root_weights = np.sqrt(weights)[:, None, None]
         # X(g)^T = (I + P G_g) T11(g), so X(g)^-T = T11^-1 J = F J with J = (I + P G_g)^-1.
-        J, C, SZ = self._update_gramian(roots, at * (self._whitened @ np.linalg.inv(T11[:-1])))
+        J, C, SZ = self._update_gramian(
+            roots, root_weights * (self._whitened @ np.linalg.inv(T11[:-1]))
+        )
         FJ, FC = F @ J, F @ C
         phi = FJ[:, None] @ T11[:-1] + FC[:, None] @ T12[:-1]  # Phi(g, s) = X(g)^-T X(s)^T
         response = phi @ self._plant[1]
         follow = np.zeros_like(FJ)
         if self._state is not None:
             states = self._state(times)
-            weighted = w[:, None, None] * phi @ self._difference @ states
+            weighted = weights[:, None, None] * phi @ self._difference @ states
             follow = weighted.sum(axis=1)
             response = response + self._response_through_state(FJ, FC, gap)
         # Phi(g, s) L(s) at each node, L the gain of the filter at that time.
         gains = (FJ[:, None] @ T21[:-1] + FC[:, None] @ T22[:-1]) @ self._noise
-        own = _side_by_side(at * gains)
-        if own.shape[2] > self._n:
-            own = triangular_root(own)
+        reading_noise = _side_by_side(root_weights * gains)
+        if reading_noise.shape[2] > self._n:
+            reading_noise = triangular_root(reading_noise)
         # P at the end: the start through the closed loop, and the noise on the way.
-        root = self._final_root(F, F @ SZ, T11[:-1], T21[:-1], at)
-        return FlowTransition(FJ, follow, _side_by_side(at * response), own, root)
+        root = self._final_root(F, F @ SZ, T11[:-1], T21[:-1], root_weights)
+        return FlowTransition(
+            FJ, follow, _side_by_side(root_weights * response), reading_noise, root
+        )
 
     def move(
         self, stack: GaussianStack, names: Sequence[Hashable], gap: float, columns: tuple[int, int]
@@ -240,13 +250,13 @@ class ErrorFlow:
         )
 
     def _update_gramian(
-        self, roots: FloatArray, pieces: FloatArray
+        self, roots: FloatArray, gamma_rows: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return ``J = (I + P G)^-1``, ``J P`` and its root S Z_1, (K, n, n) each.
+        """Return ``J = (I + P G)^-1``, ``J P`` and the root S Z_1 of J P, (K, n, n) each.
 
-        ``pieces`` (8, p, n) are the rows of Gamma, ``G = Gamma' Gamma``.
+        ``roots`` (K, n, n) are S with P = S S'; ``gamma_rows`` (8, p, n) are the rows of Gamma.
         """
-        n, Gamma = self._n, pieces.reshape(-1, self._n)
+        n, Gamma = self._n, gamma_rows.reshape(-1, self._n)
         eye = np.broadcast_to(np.eye(n), roots.shape)
         if not len(Gamma):
             return eye, roots @ np.swapaxes(roots, 1, 2), roots
@@ -258,26 +268,39 @@ class ErrorFlow:
         return J, SZ @ np.swapaxes(SZ, 1, 2), SZ
 
     def _final_root(
-        self, F: FloatArray, moved: FloatArray, T11: FloatArray, T21: FloatArray, at: FloatArray
+        self,
+        F: FloatArray,
+        start_factor: FloatArray,
+        T11: FloatArray,
+        T21: FloatArray,
+        root_weights: FloatArray,
     ) -> FloatArray:
-        """Return the root of P at the end: F S Z_1 beside a root of the solution from P = 0."""
-        fresh = [_side_by_side((at * (F @ T11 @ self._B))[None])[0]]
-        fresh.append(_side_by_side((at * (F @ T21 @ self._weight @ self._root_R))[None])[0])
-        zero = triangular_root(np.concatenate(fresh, axis=1))
-        both = np.concatenate([moved, np.broadcast_to(zero, moved.shape)], axis=2)
-        return triangular_root(both)
+        """Return the root of P at the end of the gap: P(g) = (F S Z_1)(F S Z_1)' plus the solution
+        from P(0) = 0.
+        """
+        noise_factors = [_side_by_side((root_weights * (F @ T11 @ self._B))[None])[0]]
+        noise_factors.append(
+            _side_by_side((root_weights * (F @ T21 @ self._weight @ self._root_R))[None])[0]
+        )
+        noise_root = triangular_root(np.concatenate(noise_factors, axis=1))
+        factor = np.concatenate(
+            [start_factor, np.broadcast_to(noise_root, start_factor.shape)], axis=2
+        )
+        return triangular_root(factor)
 
     def _response_through_state(self, FJ: FloatArray, FC: FloatArray, gap: float) -> FloatArray:
-        """Return the response (K, 8, n, m) of errors to noise at each node through the state."""
+        """Return the response (K, 8, n, m) of errors, by way of the state, to the plant's noise at
+        each node.
+        """
         assert self._state is not None
-        parts = []
+        responses = []
         for s in NODES * gap:  # noise at s moves the state from s on, and that the errors
-            indices, w = s + NODES * (gap - s), WEIGHTS * (gap - s)
-            T11, T12, _, _ = self._exponential_blocks(indices)
+            later_times, weights = s + NODES * (gap - s), WEIGHTS * (gap - s)
+            T11, T12, _, _ = self._exponential_blocks(later_times)
             phi = FJ[:, None] @ T11 + FC[:, None] @ T12
-            states = self._state(indices - s) @ self._plant[1]
-            parts.append((w[:, None, None] * phi @ self._difference @ states).sum(axis=1))
-        return np.stack(parts, axis=1)
+            states = self._state(later_times - s) @ self._plant[1]
+            responses.append((weights[:, None, None] * phi @ self._difference @ states).sum(axis=1))
+        return np.stack(responses, axis=1)
 
 
 def propagate_state(
@@ -289,18 +312,20 @@ def propagate_state(
     """
     A, B = plant
     E = ShortExponential(A)(np.append((1.0 - NODES) * gap, gap))
-    at = np.sqrt(WEIGHTS * gap)[:, None, None]
-    return E[-1], _side_by_side((at * (E[:-1] @ B))[None])[0]
+    root_weights = np.sqrt(WEIGHTS * gap)[:, None, None]
+    return E[-1], _side_by_side((root_weights * (E[:-1] @ B))[None])[0]
 
 
-def _side_by_side(parts: FloatArray) -> FloatArray:
+def _side_by_side(matrices: FloatArray) -> FloatArray:
     """Reshape (K, s, n, m) to (K, n, s m): s matrices side by side."""
-    K, s, n, m = parts.shape
-    return np.ascontiguousarray(parts.transpose(0, 2, 1, 3)).reshape(K, n, s * m)
+    K, s, n, m = matrices.shape
+    return np.ascontiguousarray(matrices.transpose(0, 2, 1, 3)).reshape(K, n, s * m)
 
 
 def _balancing_scale(A: FloatArray, Q: FloatArray, G: FloatArray) -> float:
-    """Return the unit of covariances that makes the norm of the Hamiltonian about minimal."""
+    """Return the scale of covariances for which the off-diagonal blocks Q and G of the Hamiltonian
+    have about equal norms, so that steps are longest.
+    """
     q, g = float(np.abs(Q).max(initial=0.0)), float(np.abs(G).max(initial=0.0))
     if g == 0.0:
         return q or 1.0

@@ -1,9 +1,10 @@
 """Kernels for square roots of covariances, ``P = S S'``, and for the linear forms of errors.
 
-Errors are rows of ``forms`` (vectors, n, width): linear forms of independent standard normal
-inputs, of which the first ``used`` columns count. ``matrices`` (vectors, n, n) holds the root of P
-that belongs to each error. An update of one is an orthogonal triangularisation, so that no
-subtraction loses digits.
+An error is a linear form of independent standard normal inputs: ``forms`` (vectors, n, width) holds
+the coefficients of all errors, of which the first ``used`` columns are in use. ``matrices``
+(vectors, n, n) holds the root of P that belongs to each error. Roots are updated by orthogonal
+triangularisation (Kailath, Sayed and Hassibi 2000, Linear Estimation, chapter 12), in which no
+subtraction cancels digits.
 """
 
 from __future__ import annotations
@@ -19,25 +20,27 @@ from netkf.linalg.small import copy_matrix, solve_inplace
 
 
 @kernel
-def triangularise(parts: FloatArray, n: int, columns: int) -> None:
-    """Overwrite the first n columns of ``parts`` (n, at least n) by the lower triangular S (n, n)
-    with ``S S' = parts parts'``; the product is over the first ``columns`` columns.
+def triangularise(factor: FloatArray, n: int, columns: int) -> None:
+    """Overwrite the first n columns of ``factor`` (n, at least n) by the lower triangular S (n, n)
+    with ``S S' = factor factor'``, the product being over the first ``columns`` columns.
 
-    Columns from n on hold no result afterwards.
+    Columns from n on are overwritten with intermediate values.
     """
-    # Reflections from the right do not change parts parts'.
+    # Householder reflections from the right leave factor factor' unchanged.
     for i in range(n):
-        reflect(parts, i, n, columns)
+        reflect(factor, i, n, columns)
         # Exact zeros right of the diagonal, and in columns that are not part of the product.
         for c in range(min(i + 1, columns), max(n, columns)):
-            parts[i, c] = 0.0
+            factor[i, c] = 0.0
 
 
 @kernel(allocates=True)
-def triangular(parts: FloatArray) -> FloatArray:
-    """Return lower triangular S (n, n) with ``S S' = parts parts'``, parts (n, at least n)."""
-    n, scratch = parts.shape[0], parts.copy()
-    triangularise(scratch, n, parts.shape[1])
+def triangular(factor: FloatArray) -> FloatArray:
+    """Return the lower triangular S (n, n) with ``S S' = factor factor'`` for ``factor``
+    (n, at least n).
+    """
+    n, scratch = factor.shape[0], factor.copy()
+    triangularise(scratch, n, factor.shape[1])
     root = np.empty((n, n))
     _keep_root(root, scratch)
     return root
@@ -45,7 +48,7 @@ def triangular(parts: FloatArray) -> FloatArray:
 
 @kernel
 def cholesky_into(L: FloatArray, matrix: FloatArray, n: int) -> None:
-    """Write the lower triangular root of a positive definite matrix over the first n rows and
+    """Write the Cholesky factor of a positive definite matrix (n, n) into the first n rows and
     columns of L.
     """
     for i in range(n):
@@ -60,7 +63,7 @@ def cholesky_into(L: FloatArray, matrix: FloatArray, n: int) -> None:
 
 @kernel
 def divide_by_transpose(rows: FloatArray, L: FloatArray, count: int, n: int) -> None:
-    """Write ``rows L^-T`` over ``rows`` (count, n), for lower triangular L (n, n)."""
+    """Replace ``rows`` (count, n) by ``rows L^-T`` for a lower triangular L (n, n)."""
     for r in range(count):
         for j in range(n):
             total = rows[r, j]
@@ -71,7 +74,9 @@ def divide_by_transpose(rows: FloatArray, L: FloatArray, count: int, n: int) -> 
 
 @kernel
 def multiply_form(form: FloatArray, matrix: FloatArray, used: int, scratch: FloatArray) -> None:
-    """Write ``matrix form`` over a form (n, width); ``scratch`` is as large."""
+    """Replace the first ``used`` columns of a form (n, width) by ``matrix form``; ``scratch`` has
+    the shape (n, used).
+    """
     n = matrix.shape[0]
     for i in range(n):
         for c in range(used):
@@ -112,16 +117,16 @@ def predict_estimates(
     is (n, r).
     """
     n, r = error.shape[0], root.shape[1]
-    scratch, parts = np.empty((n, used)), np.empty((n, n + r))
+    scratch, factor = np.empty((n, used)), np.empty((n, n + r))
     for index in indices:
         multiply_form(forms[index], error, used, scratch)
         add_columns(forms[index], first, noise, 1.0)
-        _multiply_into(parts, error, matrices[index])
+        _multiply_into(factor, error, matrices[index])
         for i in range(n):
             for k in range(r):
-                parts[i, n + k] = root[i, k]
-        triangularise(parts, n, n + r)
-        _keep_root(matrices[index], parts)
+                factor[i, n + k] = root[i, k]
+        triangularise(factor, n, n + r)
+        _keep_root(matrices[index], factor)
 
 
 @kernel
@@ -136,12 +141,12 @@ def _multiply_into(out: FloatArray, a: FloatArray, b: FloatArray) -> None:
 
 
 @kernel
-def _keep_root(root: FloatArray, parts: FloatArray) -> None:
-    """Write the lower triangle of the first n columns of ``parts`` into ``root`` (n, n)."""
+def _keep_root(root: FloatArray, factor: FloatArray) -> None:
+    """Write the lower triangle of the first n columns of ``factor`` into ``root`` (n, n)."""
     n = root.shape[0]
     for i in range(n):
         for j in range(n):
-            root[i, j] = parts[i, j] if j <= i else 0.0
+            root[i, j] = factor[i, j] if j <= i else 0.0
 
 
 @kernel(allocates=True)
@@ -160,7 +165,7 @@ def update_root(
         for j in range(n):
             array[p + i, p + j] = root[i, j]
     triangularise(array, p + n, p + n)
-    K, after, closed = np.empty((n, p)), np.zeros((n, n)), np.zeros((n, n))
+    K, new_root, closed = np.empty((n, p)), np.zeros((n, n)), np.zeros((n, n))
     for i in range(n):
         for j in range(p - 1, -1, -1):
             total = array[p + i, j]
@@ -168,13 +173,13 @@ def update_root(
                 total -= K[i, k] * array[k, j]
             K[i, j] = total / array[j, j]
         for j in range(i + 1):
-            after[i, j] = array[p + i, p + j]
+            new_root[i, j] = array[p + i, p + j]
     for i in range(n):
         closed[i, i] = 1.0
         for j in range(n):
             for k in range(p):
                 closed[i, j] -= K[i, k] * H[k, j]
-    return closed, K, after
+    return closed, K, new_root
 
 
 @kernel(allocates=True)
@@ -196,9 +201,9 @@ def update_estimate(
     n, p = H.shape[1], H.shape[0]
     closed, K, root = update_root(matrices[index], H, R)
     multiply_form(forms[index], closed, used, np.empty((n, used)))
-    moved = np.empty((n, p))
-    _multiply_into(moved, K, noise)
-    add_columns(forms[index], first, moved, -1.0)
+    gain_noise = np.empty((n, p))
+    _multiply_into(gain_noise, K, noise)
+    add_columns(forms[index], first, gain_noise, -1.0)
     _keep_root(matrices[index], root)
 
 
@@ -206,16 +211,16 @@ def update_estimate(
 def average_roots(weights: FloatArray, roots: FloatArray) -> FloatArray:
     """Return a root (n, n) of ``sum_j w_j P_j`` from roots (J, n, n)."""
     count, n = roots.shape[0], roots.shape[1]
-    parts = np.empty((n, count * n))
+    factor = np.empty((n, count * n))
     for k in range(count):
         # sum w P = [w^1/2 S, ...] [w^1/2 S, ...]', a triangular root of which has n columns
         scale = math.sqrt(max(weights[k], 0.0))
         for i in range(n):
             for j in range(n):
-                parts[i, k * n + j] = scale * roots[k, i, j]
-    triangularise(parts, n, count * n)
+                factor[i, k * n + j] = scale * roots[k, i, j]
+    triangularise(factor, n, count * n)
     out = np.empty((n, n))
-    _keep_root(out, parts)
+    _keep_root(out, factor)
     return out
 
 
@@ -269,18 +274,19 @@ def fade_totals(
     noise: FloatArray,
     first: int,
 ) -> None:
-    """Predict totals of information U, which are their ``matrices``, and the errors ``u - U x``.
+    """Predict the totals of push-sum with running sums: their information U, in ``matrices``, and
+    their errors u - U x, in ``forms``.
 
-    ``U+ = s F^-T U F^-1`` and the error becomes ``s F^-T`` times itself less ``U+ w``, with
-    ``inverse`` F^-1 (n, n), s = ``fading`` and the plant's noise w, ``noise`` (n, k) times the
-    inputs from column ``first`` on.
+    ``U+ = s F^-T U F^-1`` and ``(u - U x)+ = s F^-T (u - U x) - U+ w``, with ``inverse`` F^-1
+    (n, n), s = ``fading``, and the plant's noise w = ``noise`` (n, k) times the inputs from column
+    ``first`` on. Totals without information are left alone.
     """
     n = inverse.shape[0]
-    moved, half, lost = np.empty((n, n)), np.empty((n, n)), np.empty(noise.shape)
+    transform, half, noise_term = np.empty((n, n)), np.empty((n, n)), np.empty(noise.shape)
     scratch = np.empty((n, used))
     for i in range(n):
         for j in range(n):
-            moved[i, j] = fading * inverse[j, i]
+            transform[i, j] = fading * inverse[j, i]
     for index in indices:
         empty = True
         for i in range(n):
@@ -288,11 +294,11 @@ def fade_totals(
                 empty = empty and matrices[index, i, j] == 0.0
         if empty:
             continue
-        _multiply_into(half, moved, matrices[index])
+        _multiply_into(half, transform, matrices[index])
         _multiply_into(matrices[index], half, inverse)
-        multiply_form(forms[index], moved, used, scratch)
-        _multiply_into(lost, matrices[index], noise)
-        add_columns(forms[index], first, lost, -1.0)
+        multiply_form(forms[index], transform, used, scratch)
+        _multiply_into(noise_term, matrices[index], noise)
+        add_columns(forms[index], first, noise_term, -1.0)
 
 
 @kernel(allocates=True)
@@ -301,7 +307,7 @@ def intersect_with_factors(weights: FloatArray, roots: FloatArray) -> tuple[Floa
     ``P^-1 = sum_j w_j P_j^-1``; nan if one of the roots (J, n, n) is singular.
     """
     count, n = roots.shape[0], roots.shape[1]
-    parts, inverses = np.empty((n, count * n)), np.zeros((count, n, n))
+    factor, inverses = np.empty((n, count * n)), np.zeros((count, n, n))
     for k in range(count):
         for i in range(n):
             inverses[k, i, i] = 1.0
@@ -309,13 +315,13 @@ def intersect_with_factors(weights: FloatArray, roots: FloatArray) -> tuple[Floa
         scale = math.sqrt(max(weights[k], 0.0))
         for i in range(n):
             for j in range(n):
-                parts[i, k * n + j] = scale * inverses[k, j, i]
+                factor[i, k * n + j] = scale * inverses[k, j, i]
     # L L' = P^-1, so L^-T is a root of P.
-    triangularise(parts, n, count * n)
+    triangularise(factor, n, count * n)
     root, P, factors = np.zeros((n, n)), np.empty((n, n)), np.empty((count, n, n))
     for i in range(n):
         root[i, i] = 1.0
-    divide_by_transpose(root, parts, n, n)
+    divide_by_transpose(root, factor, n, n)
     _multiply_into(P, root, root.T)
     half = np.empty((n, n))
     for k in range(count):
@@ -330,7 +336,7 @@ def intersect_with_factors(weights: FloatArray, roots: FloatArray) -> tuple[Floa
 
 @kernel(allocates=True)
 def exponential(series: FloatArray, share: float) -> FloatArray:
-    """Return the sum (d, d) of a power series (T, d, d) at ``share``."""
+    """Return ``sum_k share^k series[k]`` (d, d) of a power series (T, d, d), by Horner's scheme."""
     d = series.shape[1]
     E = np.empty((d, d))
     for i in range(d):
@@ -362,25 +368,25 @@ def discretise(
     nodes, weights = quadrature
     d, m = B.shape
     columns = max(len(nodes) * m, 2 * d)
-    parts = np.zeros((d, columns))
+    factor = np.zeros((d, columns))
     for k in range(len(nodes)):
         # The noise covariance is the integral of exp(A s) B B' exp(A s)': its root has a block for
         # each node of the quadrature.
         E = exponential(series, (1.0 - nodes[k]) * short / unit)
-        _add_product(parts, k * m, E, B, math.sqrt(weights[k] * short))
-    F, root, moved = exponential(series, short / unit), np.empty((d, d)), np.empty((d, d))
-    triangularise(parts, d, columns)
-    _keep_root(root, parts)
+        _add_product(factor, k * m, E, B, math.sqrt(weights[k] * short))
+    F, root, square = exponential(series, short / unit), np.empty((d, d)), np.empty((d, d))
+    triangularise(factor, d, columns)
+    _keep_root(root, factor)
     for _ in range(doublings):
         # Q(2 s) = F Q(s) F' + Q(s)
-        _multiply_into(parts, F, root)
+        _multiply_into(factor, F, root)
         for i in range(d):
             for j in range(d):
-                parts[i, d + j] = root[i, j]
-        triangularise(parts, d, 2 * d)
-        _keep_root(root, parts)
-        _multiply_into(moved, F, F)
-        copy_matrix(F, moved)
+                factor[i, d + j] = root[i, j]
+        triangularise(factor, d, 2 * d)
+        _keep_root(root, factor)
+        _multiply_into(square, F, F)
+        copy_matrix(F, square)
     return F, root
 
 
@@ -388,10 +394,11 @@ def discretise(
 def flow_blocks(
     series: FloatArray, unit: float, scale: float, gap: float, nodes: FloatArray
 ) -> FloatArray:
-    """Return the transposed blocks (K + 1, 4, n, n) of exp(M s), without the scale, at the nodes
-    (K,) of a gap and at its end.
+    """Return the transposes (K + 1, 4, n, n) of the four blocks of exp(M s), row by row, at the
+    ``nodes`` (K,) of a gap and at its end.
 
-    ``series`` (T, 2 n, 2 n) are the terms of the power series in s / unit.
+    ``series`` (T, 2 n, 2 n) are the terms of the power series of exp(M s) in s / unit for
+    covariances in units of ``scale``, which is removed from the result.
     """
     n, count = series.shape[1] // 2, len(nodes)
     out = np.empty((count + 1, 4, n, n))
@@ -408,14 +415,14 @@ def flow_blocks(
 
 @kernel(allocates=True)
 def flow_gramian(
-    blocks: FloatArray, whitened: FloatArray, at: FloatArray
+    blocks: FloatArray, whitened: FloatArray, root_weights: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Return F (n, n) and Gamma (K p, n) of a gap, see :mod:`netkf.theory.numerics.prediction`.
 
     ``blocks`` (K + 1, 4, n, n) are those of ``flow_blocks``, ``whitened`` (p, n) is R^-1/2 H, and
-    ``at`` (K,) has the square roots of the weights of the nodes in the gap.
+    ``root_weights`` (K,) are the square roots of the quadrature weights in seconds.
     """
-    count = len(at)
+    count = len(root_weights)
     p, n = whitened.shape
     F = np.zeros((n, n))
     Gamma = np.empty((count * p, n))
@@ -434,29 +441,29 @@ def flow_gramian(
                 total = 0.0
                 for m in range(n):
                     total += whitened[i, m] * inverse[m, j]
-                Gamma[k * p + i, j] = at[k] * total
+                Gamma[k * p + i, j] = root_weights[k] * total
     return F, Gamma
 
 
 @kernel(allocates=True)
 def flow_start(
-    F: FloatArray, blocks: FloatArray, B: FloatArray, gain: FloatArray, at: FloatArray
+    F: FloatArray, blocks: FloatArray, B: FloatArray, gain: FloatArray, root_weights: FloatArray
 ) -> FloatArray:
-    """Return the root (n, n) at the end of a gap of the covariance that is 0 at its start.
+    """Return the root (n, n) of P at the end of a gap from P = 0 at its start.
 
-    ``gain`` is ``H' R^-1/2`` (n, p).
+    ``gain`` is ``H' R^-1/2`` (n, p); ``F``, ``blocks`` and ``root_weights`` as in flow_gramian().
     """
-    count, n, m, p = len(at), B.shape[0], B.shape[1], gain.shape[1]
-    parts, moved = np.zeros((n, max(n, count * (m + p)))), np.empty((n, n))
+    count, n, m, p = len(root_weights), B.shape[0], B.shape[1], gain.shape[1]
+    factor, response = np.zeros((n, max(n, count * (m + p)))), np.empty((n, n))
     for k in range(count):
         first = k * (m + p)
-        _multiply_into(moved, F, blocks[k, 0])
-        _add_product(parts, first, moved, B, at[k])
-        _multiply_into(moved, F, blocks[k, 2])
-        _add_product(parts, first + m, moved, gain, at[k])
-    triangularise(parts, n, count * (m + p))
+        _multiply_into(response, F, blocks[k, 0])
+        _add_product(factor, first, response, B, root_weights[k])
+        _multiply_into(response, F, blocks[k, 2])
+        _add_product(factor, first + m, response, gain, root_weights[k])
+    triangularise(factor, n, count * (m + p))
     root = np.empty((n, n))
-    _keep_root(root, parts)
+    _keep_root(root, factor)
     return root
 
 
@@ -475,21 +482,23 @@ def _add_product(out: FloatArray, first: int, a: FloatArray, b: FloatArray, scal
 def flow_over_gap(
     F: FloatArray, Gamma: FloatArray, start: FloatArray, root: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return ``F J`` and ``F J P`` (n, n) with ``J = (I + P G)^-1``, ``G = Gamma' Gamma``, and the
-    root of P at the end of the gap, whose ``start`` is that from P = 0.
+    """Return ``F J``, ``F J P`` (n, n) and the root of P at the end of a gap.
+
+    ``J = (I + P G)^-1`` with P = root root' at the start of the gap and ``G = Gamma' Gamma``;
+    ``start`` (n, n) is the root at the end of the solution from P = 0, see flow_start().
     """
     n, rows = F.shape[0], Gamma.shape[0]
-    GS, moved = np.empty((rows, n)), root.copy()
+    GS, SL = np.empty((rows, n)), root.copy()
     _multiply_into(GS, Gamma, root)
-    parts = np.zeros((n, n + rows))
+    triangle = np.zeros((n, n + rows))
     for i in range(n):
-        parts[i, i] = 1.0
+        triangle[i, i] = 1.0
         for k in range(rows):
-            parts[i, n + k] = GS[k, i]
+            triangle[i, n + k] = GS[k, i]
     # L L' = I + S' G S, so that J = I - S (L L')^-1 S' G and S L^-T is a root of J P.
-    triangularise(parts, n, n + rows)
-    divide_by_transpose(moved, parts, n, n)
-    divide_by_transpose(GS, parts, rows, n)
+    triangularise(triangle, n, n + rows)
+    divide_by_transpose(SL, triangle, n, n)
+    divide_by_transpose(GS, triangle, rows, n)
     J, half, FJ = np.zeros((n, n)), np.zeros((n, n)), np.empty((n, n))
     for i in range(n):
         J[i, i] = 1.0
@@ -499,18 +508,18 @@ def flow_over_gap(
     for i in range(n):
         for j in range(n):
             for k in range(n):
-                J[i, j] -= moved[i, k] * half[k, j]
+                J[i, j] -= SL[i, k] * half[k, j]
     _multiply_into(FJ, F, J)
-    both, FSZ, FC = np.empty((n, 2 * n)), np.empty((n, n)), np.empty((n, n))
-    _multiply_into(FSZ, F, moved)
-    _multiply_into(FC, FSZ, moved.T)
+    factor, FSZ, FC = np.empty((n, 2 * n)), np.empty((n, n)), np.empty((n, n))
+    _multiply_into(FSZ, F, SL)
+    _multiply_into(FC, FSZ, SL.T)
     for i in range(n):
         for j in range(n):
-            both[i, j], both[i, n + j] = FSZ[i, j], start[i, j]
-    triangularise(both, n, 2 * n)
-    after = np.empty((n, n))
-    _keep_root(after, both)
-    return FJ, FC, after
+            factor[i, j], factor[i, n + j] = FSZ[i, j], start[i, j]
+    triangularise(factor, n, 2 * n)
+    end_root = np.empty((n, n))
+    _keep_root(end_root, factor)
+    return FJ, FC, end_root
 
 
 @kernel(allocates=True)
@@ -525,7 +534,8 @@ def flow_estimates(
     gap: float,
     quadrature: tuple[FloatArray, FloatArray],
 ) -> None:
-    """Move errors with the same continuous readings, and their roots, over a gap of at most a unit.
+    """Propagate errors of filters with the same continuous readings, and their roots of P, over a
+    gap of at most one unit.
 
     flow        : R^-1/2 H (p, n), the filters' gain factors H' R^-1/2 and H' R^-1 times a root of
                   the true noise (n, p), the filters' B and the plant's B
@@ -536,31 +546,31 @@ def flow_estimates(
     """
     whitened, gain, noise, B, plant = flow
     nodes, weights = quadrature
-    at = np.sqrt(weights * gap)
+    root_weights = np.sqrt(weights * gap)
     blocks = flow_blocks(exponential[0], exponential[1], exponential[2], gap, nodes)
-    F, Gamma = flow_gramian(blocks, whitened, at)
-    start = flow_start(F, blocks, B, gain, at)
+    F, Gamma = flow_gramian(blocks, whitened, root_weights)
+    start = flow_start(F, blocks, B, gain, root_weights)
     count, n, p = len(nodes), F.shape[0], whitened.shape[0]
     scratch, phi = np.empty((n, used)), np.empty((n, n))
-    own = np.zeros((n, max(n, count * p)))
+    reading_noise = np.zeros((n, max(n, count * p)))
     for e in range(len(indices)):
         form = forms[indices[e]]
         FJ, FC, root = flow_over_gap(F, Gamma, start, matrices[indices[e]])
         multiply_form(form, FJ, used, scratch)
         for i in range(n):
-            for j in range(own.shape[1]):
-                own[i, j] = 0.0
+            for j in range(reading_noise.shape[1]):
+                reading_noise[i, j] = 0.0
         for k in range(count):
             # Phi(g, s) = X(g)^-T X(s)^T, and Phi(g, s) L(s) with the gain L of the filter at s.
             _multiply_into(phi, FJ, blocks[k, 0])
             _add_product(phi, 0, FC, blocks[k, 1], 1.0)
-            _add_product(form, columns[0] + k * plant.shape[1], phi, plant, at[k])
+            _add_product(form, columns[0] + k * plant.shape[1], phi, plant, root_weights[k])
             _multiply_into(phi, FJ, blocks[k, 2])
             _add_product(phi, 0, FC, blocks[k, 3], 1.0)
-            _add_product(own, k * p, phi, noise, at[k])
+            _add_product(reading_noise, k * p, phi, noise, root_weights[k])
         if p > 0:
-            triangularise(own, n, max(n, count * p))
+            triangularise(reading_noise, n, max(n, count * p))
             for i in range(n):
                 for j in range(i + 1):
-                    form[i, columns[1] + e * n + j] += own[i, j]
+                    form[i, columns[1] + e * n + j] += reading_noise[i, j]
         _keep_root(matrices[indices[e]], root)

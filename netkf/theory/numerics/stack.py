@@ -1,10 +1,10 @@
 """Jointly Gaussian vectors, each stored as a linear form of independent standard normal inputs.
 
-With ``T`` (rows, inputs) the matrix of the stacked forms, the joint covariance is ``T T'``: it
-stays positive semidefinite, and a small error keeps its digits where it is the difference of large
-ones. T has a column for each input that was drawn; once there are many, an orthogonal matrix
-reduces them to as many as there are rows. Columns of forms that somebody keeps are frozen: they
-are never rotated again.
+With ``T`` (rows, inputs) the matrix of the stacked forms, the joint covariance is ``T T'``. It is
+positive semidefinite, and the difference of two nearly equal vectors keeps its digits. T has a
+column for each input; once there are many, an orthogonal matrix from the right reduces them to as
+many as there are rows, which leaves T T' unchanged. Columns of forms that a caller has stored
+(:meth:`GaussianStack.freeze`) are frozen: they are not rotated again.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ SPARE_INPUTS = 192  # columns kept beyond the number of rows between two reducti
 class GaussianStack:
     """Named Gaussian vectors of n entries; a name is any hashable value.
 
-    table    : (vectors, n, width), the forms; kernels work on it
-    matrices : (vectors, n, n), a matrix that belongs to each vector, such as a root of P
-    used     : number of columns that count
+    table    : (vectors, n, width) the forms, which kernels modify
+    matrices : (vectors, n, n) a matrix that belongs to each vector, such as a root of P
+    used     : number of columns in use
     """
 
     def __init__(self, n: int) -> None:
@@ -64,19 +64,21 @@ class GaussianStack:
         return columns
 
     def freeze(self, names: Sequence[Hashable]) -> FloatArray:
-        """Return the forms (K, n, inputs) of K vectors, which stay valid: later forms have these
-        inputs in the same columns, and the vectors do not depend on any others.
+        """Return the forms (K, n, inputs) of K vectors and freeze their inputs.
+
+        The vectors depend on these inputs only, which keep their columns in all later forms. So the
+        joint covariance with later vectors can be computed from the stored forms.
         """
         first = set(names)
         others = [name for name in self._index if name not in first]
         self._reduce([*names, *others], 0)
-        # Below a triangle of zeros, the first rows end within as many columns.
+        # After the triangularisation the first rows are zero beyond as many columns as rows.
         self._frozen = min(self.used, self._frozen + len(names) * self._n)
         return self.table[self.indices(names), :, : self._frozen]
 
     def _reduce(self, names: Iterable[Hashable], count: int) -> None:
-        """Rotate the inputs that are not frozen so that few are left, the first ones for the first
-        names, and make space for ``count`` more.
+        """Reduce the inputs that are not frozen to at most the number of rows, by a QR
+        factorisation of the forms in the order of ``names``; make space for ``count`` more.
         """
         rows = self.indices(names)
         stacked = self.table[rows, :, self._frozen : self.used].reshape(len(rows) * self._n, -1)
@@ -136,15 +138,15 @@ class GaussianStack:
         """Remove vectors; their storage is reused."""
         for name in names:
             index = self._index.pop(name)
-            # All columns: what is stored here next finds no rest in inputs that are newer.
+            # The next vector stored here must not inherit any columns.
             self.table[index, :, : self.used] = 0.0
             self._free.append(index)
 
-    def rename(self, name: Hashable, other: Hashable) -> None:
-        """Store the vector ``name`` under the name ``other``, which it overwrites."""
-        if other in self._index:
-            self.drop([other])
-        self._index[other] = self._index.pop(name)
+    def rename(self, name: Hashable, new: Hashable) -> None:
+        """Store the vector ``name`` under the name ``new``, which it overwrites."""
+        if new in self._index:
+            self.drop([new])
+        self._index[new] = self._index.pop(name)
 
     def covariance(self, names: Sequence[Hashable]) -> FloatArray:
         """Return the joint covariance (K n, K n) of K vectors."""
@@ -154,10 +156,10 @@ class GaussianStack:
     def _grow(self) -> int:
         """Double the storage and return a free index."""
         count = len(self.table)
-        more = max(4, 2 * count) - count
+        added = max(4, 2 * count) - count
         self.table, self.matrices = (
-            np.concatenate([part, np.zeros((more, *part.shape[1:]))])
+            np.concatenate([part, np.zeros((added, *part.shape[1:]))])
             for part in (self.table, self.matrices)
         )
-        self._free = list(range(count + more - 1, count, -1))
+        self._free = list(range(count + added - 1, count, -1))
         return count

@@ -62,8 +62,10 @@ def average_covariances(
 
     The estimate is the convex combination, so that each error is multiplied by its weight.
     """
-    used = np.array(weights, dtype=float)
-    return average_roots(used, np.stack(roots)), used[:, None, None] * np.eye(len(roots[0]))
+    weight_array = np.array(weights, dtype=float)
+    return average_roots(weight_array, np.stack(roots)), weight_array[:, None, None] * np.eye(
+        len(roots[0])
+    )
 
 
 def intersect_covariances(
@@ -74,13 +76,13 @@ def intersect_covariances(
 
     ``P^-1 = sum_j w_j P_j^-1``; error j is multiplied by ``w_j P P_j^-1``.
     """
-    found: tuple[FloatArray, FloatArray] = intersect_with_factors(
+    result: tuple[FloatArray, FloatArray] = intersect_with_factors(
         np.array(weights, dtype=float), np.stack(roots)
     )
-    return found
+    return result
 
 
 def add_information_to_root(root: FloatArray, U: FloatArray) -> FloatArray:
     """Return a root (n, n) of ``(P^-1 + U)^-1`` for a positive semidefinite U (n, n)."""
-    found: FloatArray = add_information(root, U)
-    return found
+    result: FloatArray = add_information(root, U)
+    return result

@@ -21,12 +21,12 @@ def one_bit_update(P: ArrayLike, H: ArrayLike, R: ArrayLike) -> FloatArray:
     Raises TheoryError if shapes or definiteness are wrong.
     """
     size = np.asarray(P, dtype=np.float64)
-    _, found, H_, R_ = check_system(np.eye(len(np.atleast_2d(size))), P, H, R)
+    _, result, H_, R_ = check_system(np.eye(len(np.atleast_2d(size))), P, H, R)
     # Whitened rows have independent noises of variance 1: they are used one after the other.
     for h in np.linalg.solve(np.linalg.cholesky(R_), H_):
-        Ph = found @ h
-        found = found - 2.0 / math.pi / (h @ Ph + 1.0) * np.outer(Ph, Ph)
-    return symmetric(found)
+        Ph = result @ h
+        result = result - 2.0 / math.pi / (h @ Ph + 1.0) * np.outer(Ph, Ph)
+    return symmetric(result)
 
 
 def bit_covariances(scenario: Scenario, run: Run) -> FloatArray:
@@ -35,7 +35,7 @@ def bit_covariances(scenario: Scenario, run: Run) -> FloatArray:
     F, Q = scenario.slot_belief
     sensors = [scenario.observation(node, believed=True) for node in nodes]
     used = _used_bits(scenario, run)
-    P, found, slot = [np.asarray(scenario.start(node)[1]) for node in nodes], [], 0
+    P, covariances, slot = [np.asarray(scenario.start(node)[1]) for node in nodes], [], 0
     for until in np.round(run.times / plant.period).astype(int).tolist():
         while slot < until:
             slot += 1
@@ -43,19 +43,19 @@ def bit_covariances(scenario: Scenario, run: Run) -> FloatArray:
             for receiver, sender in used.get(slot, ()):
                 k = index[receiver]
                 P[k] = one_bit_update(P[k], *sensors[index[sender]])
-        found.append(np.stack(P))
-    return np.stack(found)
+        covariances.append(np.stack(P))
+    return np.stack(covariances)
 
 
 def _used_bits(scenario: Scenario, run: Run) -> dict[int, list[tuple[int, int]]]:
     """Return by slot who used whose bits; a sender uses its own."""
-    found: dict[int, set[tuple[int, int]]] = {}
+    bits: dict[int, set[tuple[int, int]]] = {}
     rows = run.log[run.log["kind"] == CODES["deliver"]]
     slots = scenario.slot_plant.slots_of(rows["t"])
     for slot, node, peer in zip(slots, rows["node"].tolist(), rows["peer"].tolist(), strict=True):
-        found.setdefault(int(slot), set()).add((node, peer))
+        bits.setdefault(int(slot), set()).add((node, peer))
     rows = run.log[run.log["kind"] == CODES["send"]]
     slots = scenario.slot_plant.slots_of(rows["t"])
     for slot, node in zip(slots, rows["node"].tolist(), strict=True):
-        found.setdefault(int(slot), set()).add((node, node))
-    return {slot: sorted(pairs) for slot, pairs in found.items()}
+        bits.setdefault(int(slot), set()).add((node, node))
+    return {slot: sorted(pairs) for slot, pairs in bits.items()}

@@ -59,8 +59,8 @@ def _observability_row(scenario: Scenario) -> AssumptionRow:
     F, _ = scenario.slot_belief
     informations = [model.information for model in scenario.slot_models]
     hidden = unobservable_mode(F, np.sum(informations, axis=0))
-    alone = sum(unobservable_mode(F, G) is None for G in informations)
-    evidence = f"every mode is seen; {alone} of {len(informations)} nodes see all alone"
+    observing = sum(unobservable_mode(F, G) is None for G in informations)
+    evidence = f"every mode is seen; {observing} of {len(informations)} nodes see all alone"
     if hidden is not None:
         evidence = (
             f"the mode with eigenvalue {hidden:.6g} is not seen; a mode that decays does no harm"
@@ -207,16 +207,16 @@ def _exact_row(
     ``heavy``: mention heavy tails of averages over runs.
     """
     try:
-        found = measure()
+        radius = measure()
     except TheoryError as error:
         return *name, None, f"not decided: {error}"
-    evidence = f"exact radius {found:.6g} at the asymptotic gains; necessary and sufficient"
-    if heavy and found >= 1.0:
+    evidence = f"exact radius {radius:.6g} at the asymptotic gains; necessary and sufficient"
+    if heavy and radius >= 1.0:
         evidence += "; single paths may still stay bounded in probability"
-    elif heavy and found > HEAVY_TAIL_RADIUS:
+    elif heavy and radius > HEAVY_TAIL_RADIUS:
         evidence += f"; above {HEAVY_TAIL_RADIUS} averages over runs have heavy tails "
         evidence += "and no honest interval"
-    return *name, found < 1.0, evidence
+    return *name, radius < 1.0, evidence
 
 
 def _certified_row(scenario: Scenario, moment: Moment, source: str) -> AssumptionRow:
@@ -224,8 +224,10 @@ def _certified_row(scenario: Scenario, moment: Moment, source: str) -> Assumptio
     gamma = push_sum_filter(scenario).gamma
     name = f"gamma is certified for the {moment.replace('-', ' ')}"
     try:
-        least = minimum_gamma(scenario, moment)
+        certified_gamma = minimum_gamma(scenario, moment)
     except TheoryError as error:
         return name, source, False, str(error)
-    evidence = f"gamma {gamma}, certified from {least:,} on; sufficient, by far not necessary"
-    return name, source, gamma >= least, evidence
+    evidence = (
+        f"gamma {gamma}, certified from {certified_gamma:,} on; sufficient, by far not necessary"
+    )
+    return name, source, gamma >= certified_gamma, evidence

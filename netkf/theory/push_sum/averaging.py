@@ -1,13 +1,14 @@
 """Moments of P step 5: gamma averaging steps z_i <- z_i + 1/delta sum_j b_ij (z_j - z_i).
 
 One step is ``M = I - 1/delta sum of b_ij e_i (e_i - e_j)' + b_ji e_j (e_j - e_i)'`` over links,
-which are independent. So with ``d = Y_ii - Y_ij - Y_ji + Y_jj`` of each link
+with b_ij = 1 if i hears j, independent between links. With ``d = Y_ii - Y_ij - Y_ji + Y_jj`` of
+each link,
 
     E[M Y M'] = E[M] Y E[M]' + 1/delta^2 sum over links of +-cov(b, b) d,
 
-which touches only the link's own four blocks: a step costs two sparse products. If each step has a
-draw of its own, the moments of M^gamma are gamma such steps; if one draw is held over the slot,
-M^gamma is a polynomial in the same b, and its outcomes are enumerated.
+where each term changes only the four blocks of its link: a step costs two sparse products. If each
+step has its own draw, the moments of M^gamma are gamma such steps; if one draw is held over the
+slot, M^gamma is a polynomial in the same b, and all outcomes are enumerated.
 """
 
 from __future__ import annotations
@@ -73,16 +74,16 @@ class Averaging:
         N, (i, j) = self.nodes, self.links.T
         step = self.mean_step.toarray()
         expected = np.kron(step, step)
-        # Each link adds cov(b, b) to the Kronecker square: d is read at four entries (difference)
-        # and written to the same four (spread).
-        four = (i * N + i, i * N + j, j * N + i, j * N + j)
+        # Each link adds cov(b, b) d: ``difference`` computes d from the four entries of a link, and
+        # ``spread`` adds it, times covariances, to the same four.
+        entry_indices = (i * N + i, i * N + j, j * N + i, j * N + j)
         spread = np.zeros((N * N, len(i)))
         difference = np.zeros((len(i), N * N))
-        each = np.arange(len(i))
-        entries = zip(four, self._covariances, (1.0, -1.0, -1.0, 1.0), strict=True)
+        link_indices = np.arange(len(i))
+        entries = zip(entry_indices, self._covariances, (1.0, -1.0, -1.0, 1.0), strict=True)
         for index, covariance, sign in entries:
-            spread[index, each] = sign * covariance
-            difference[each, index] = sign
+            spread[index, link_indices] = sign * covariance
+            difference[link_indices, index] = sign
         return np.linalg.matrix_power(expected + spread @ difference, self.gamma)
 
     def second_moment(self, Y: FloatArray) -> FloatArray:
@@ -90,11 +91,13 @@ class Averaging:
         N, n = self.nodes, len(Y) // self.nodes
         if self.enumerated or N <= MAX_KRONECKER:
             pairs = Y.reshape(N, n, N, n).transpose(0, 2, 1, 3).reshape(N * N, n * n)
-            four = (self.kron @ pairs).reshape(N, N, n, n).transpose(0, 2, 1, 3)
-            return np.asarray(four.reshape(N * n, N * n))
+            result = (self.kron @ pairs).reshape(N, N, n, n).transpose(0, 2, 1, 3)
+            return np.asarray(result.reshape(N * n, N * n))
         i, j = self.links.T
-        own, cross, _, other = (c[:, None, None] for c in self._covariances)
-        each = np.arange(N)
+        first_variance, covariance, _, second_variance = (
+            c[:, None, None] for c in self._covariances
+        )
+        node_indices = np.arange(N)
         for _ in range(self.gamma):
             Z = Y.reshape(N, n, N, n)
             d = Z[i, :, i] - Z[i, :, j] - Z[j, :, i] + Z[j, :, j]
@@ -102,11 +105,11 @@ class Averaging:
             Y = self._multiply(self._multiply(Y).T).T.copy()
             Z = Y.reshape(N, n, N, n)
             at_node = np.zeros((N, n, n))
-            np.add.at(at_node, i, own * d)
-            np.add.at(at_node, j, other * d)
-            Z[each, :, each] += at_node
-            Z[i, :, j] -= cross * d
-            Z[j, :, i] -= cross * d
+            np.add.at(at_node, i, first_variance * d)
+            np.add.at(at_node, j, second_variance * d)
+            Z[node_indices, :, node_indices] += at_node
+            Z[i, :, j] -= covariance * d
+            Z[j, :, i] -= covariance * d
         return Y
 
     def _multiply(self, Y: FloatArray) -> FloatArray:
@@ -129,9 +132,9 @@ class Averaging:
         """Covariance matrix of (b_ij, b_ji) over delta^2, row by row, (E,) each."""
         first, second = self.hears.T
         # cov(b_ij, b_ji) = P(both) - p q; variances p (1 - p) and q (1 - q)
-        cross = (self.both - first * second) / self.delta**2
-        own, other = (p * (1.0 - p) / self.delta**2 for p in (first, second))
-        return own, cross, cross, other
+        covariance = (self.both - first * second) / self.delta**2
+        first_variance, second_variance = (p * (1.0 - p) / self.delta**2 for p in (first, second))
+        return first_variance, covariance, covariance, second_variance
 
     @cached_property
     def _moments(self) -> tuple[FloatArray, FloatArray]:
@@ -147,16 +150,16 @@ class Averaging:
                 "the outcomes of links held over gamma > 1 steps are enumerated, and there are too "
                 f"many: 2^{math.log2(count):.0f} on {N} nodes; take a smaller graph or fresh links"
             )
-        # Outcomes of two halves of the links are tabulated, and combined block by block.
+        # The outcomes of each half of the links are tabulated, then combined block by block.
         half = len(outcomes) // 2
-        one, other = (_tabulate(part, N * N) for part in (outcomes[:half], outcomes[half:]))
+        first, second = (_tabulate(part, N * N) for part in (outcomes[:half], outcomes[half:]))
         mean, square = np.zeros(N * N), np.zeros((N * N, N * N))
-        rows = max(1, MAX_OUTCOMES_AT_ONCE // len(other[0]))
-        for start in range(0, len(one[0]), rows):
-            probability, term = (table[start : start + rows, None] for table in one)
-            M = np.eye(N).reshape(-1) - term - other[1]
+        rows = max(1, MAX_OUTCOMES_AT_ONCE // len(second[0]))
+        for start in range(0, len(first[0]), rows):
+            probability, term = (table[start : start + rows, None] for table in first)
+            M = np.eye(N).reshape(-1) - term - second[1]
             power = np.linalg.matrix_power(M.reshape(-1, N, N), self.gamma).reshape(-1, N * N)
-            weighted = (probability * other[0]).reshape(-1, 1) * power
+            weighted = (probability * second[0]).reshape(-1, 1) * power
             mean += weighted.sum(axis=0)
             square += weighted.T @ power
         # Entry ((i, j), (k, l)) of the sum is M_ij M_kl, that of the Kronecker square M_ik M_jl.
@@ -169,7 +172,7 @@ class Averaging:
 
         M is the identity less one term of each link.
         """
-        N, found = self.nodes, []
+        N, outcomes = self.nodes, []
         for (i, j), (first, second), both in zip(self.links, self.hears, self.both, strict=True):
             probabilities = np.array(
                 [both, first - both, second - both, 1.0 - first - second + both]
@@ -177,8 +180,10 @@ class Averaging:
             terms = np.zeros((4, N, N))
             terms[[[0], [1]], i, [i, j]] = terms[[[0], [2]], j, [j, i]] = [1.0, -1.0]
             possible = probabilities > 1e-15
-            found.append((probabilities[possible], terms[possible].reshape(-1, N * N) / self.delta))
-        return found
+            outcomes.append(
+                (probabilities[possible], terms[possible].reshape(-1, N * N) / self.delta)
+            )
+        return outcomes
 
 
 def _tabulate(

@@ -60,39 +60,44 @@ def leader_agreement(scenario: Scenario, slots: int, leader: int | None = None) 
     probabilities of the channel, afresh in each slot. Exact, over all sets of nodes that may know.
     Raises TheoryError for more than 12 nodes and for links that are not drawn independently.
     """
-    law, slots = averaging_law(scenario), as_whole("slots", slots, 0)
-    if law.nodes > MAX_NODES:
-        raise TheoryError(f"sets of nodes are enumerated, and {law.nodes} nodes have too many")
+    averaging, slots = averaging_law(scenario), as_whole("slots", slots, 0)
+    if averaging.nodes > MAX_NODES:
+        raise TheoryError(
+            f"sets of nodes are enumerated, and {averaging.nodes} nodes have too many"
+        )
     chosen = max(scenario.nodes) if leader is None else leader
     if chosen not in scenario.nodes:
         raise TheoryError(f"the leader {leader!r} is not a node")
-    # missed[i, j]: the probability that i does not hear j in a slot
-    missed = np.ones((law.nodes, law.nodes))
-    for (i, j), (first, second) in zip(law.links.tolist(), law.hears.tolist(), strict=True):
+    # missed[i, j] is the probability that i does not hear j in a slot. Sets of informed nodes are
+    # bit masks, so that their law is an array of 2^N probabilities.
+    missed = np.ones((averaging.nodes, averaging.nodes))
+    for (i, j), (first, second) in zip(
+        averaging.links.tolist(), averaging.hears.tolist(), strict=True
+    ):
         missed[i, j], missed[j, i] = 1.0 - first, 1.0 - second
-    known = np.zeros(2**law.nodes)
-    known[1 << scenario.topology.index[chosen]] = 1.0
-    found = [known[-1]]
+    law_of_informed = np.zeros(2**averaging.nodes)
+    law_of_informed[1 << scenario.topology.index[chosen]] = 1.0
+    agreement = [law_of_informed[-1]]
     for _ in range(slots):
-        known = _spread(known, missed)
-        found.append(known[-1])
-    return np.array(found)
+        law_of_informed = _spread(law_of_informed, missed)
+        agreement.append(law_of_informed[-1])
+    return np.array(agreement)
 
 
-def _spread(known: FloatArray, missed: FloatArray) -> FloatArray:
-    """Return the law (2^N,) of the set of informed nodes one slot later, from ``known`` (2^N,)."""
-    N, after = len(missed), np.zeros_like(known)
-    for informed in np.flatnonzero(known).tolist():
-        inside = [k for k in range(N) if informed >> k & 1]
-        outside = [k for k in range(N) if not informed >> k & 1]
-        # No link serves two nodes outside, so that they are informed independently of each other.
-        stays = {k: float(np.prod(missed[k, inside])) for k in outside}
-        frontier = [k for k in outside if stays[k] < 1.0]
-        for told in itertools.product((False, True), repeat=len(frontier)):
-            p = known[informed]
-            following = informed
-            for k, heard in zip(frontier, told, strict=True):
+def _spread(law: FloatArray, missed: FloatArray) -> FloatArray:
+    """Return the law (2^N,) of the set of informed nodes one slot later, from ``law`` (2^N,)."""
+    N, next_law = len(missed), np.zeros_like(law)
+    for informed in np.flatnonzero(law).tolist():
+        members = [k for k in range(N) if informed >> k & 1]
+        others = [k for k in range(N) if not informed >> k & 1]
+        # A link from an informed node serves only one uninformed node: these are independent.
+        stays = {k: float(np.prod(missed[k, members])) for k in others}
+        frontier = [k for k in others if stays[k] < 1.0]
+        for outcome in itertools.product((False, True), repeat=len(frontier)):
+            p = law[informed]
+            next_set = informed
+            for k, heard in zip(frontier, outcome, strict=True):
                 p *= 1.0 - stays[k] if heard else stays[k]
-                following |= heard << k
-            after[following] += p
-    return after
+                next_set |= heard << k
+            next_law[next_set] += p
+    return next_law

@@ -81,10 +81,11 @@ def _bound_constants(scenario: Scenario) -> GammaConstants:
 
 def _require_conditions(scenario: Scenario, law: Averaging, P: FloatArray) -> None:
     """Raise TheoryError if a condition of P Theorems 5 and 6 fails."""
-    least = consensus_gain_bound(scenario).radius
-    if not law.delta > least:
+    laplacian_radius = consensus_gain_bound(scenario).radius
+    if not law.delta > laplacian_radius:
         raise TheoryError(
-            f"P Theorems 5 and 6 need delta above rho(L) = {least:.6g}, it is {law.delta:g}"
+            f"P Theorems 5 and 6 need delta above rho(L) = {laplacian_radius:.6g}, "
+            f"it is {law.delta:g}"
         )
     if law.held:
         raise TheoryError('P Theorems 5 and 6 need links = "fresh", a draw for each step')
@@ -162,8 +163,9 @@ def _check_moment(moment: str) -> Moment:
 
 
 def _least_certified(certified: Callable[[int], bool], constants: GammaConstants) -> int:
-    """Return the first certified gamma by bisection, since the bounds decrease with gamma."""
-    # Doubling finds a certified gamma, bisection the first one.
+    """Return the smallest certified gamma by doubling and bisection, since the bounds decrease with
+    gamma; raises TheoryError if there is none up to MAX_STEPS.
+    """
     high = 1
     while not certified(high):
         high *= 2
@@ -181,21 +183,31 @@ def _least_certified(certified: Callable[[int], bool], constants: GammaConstants
 
 def theorem_5(constants: GammaConstants, bound: float, gamma: int) -> float:
     """Return rho(A_R(gamma)) of P (36) with c_B = ``bound``; below 1 it certifies gamma."""
-    # Rows: deviation of the mean, and disagreement, which gamma steps reduce by theta^gamma.
-    far = constants.mean**gamma * bound
-    return _spectral_radius([[constants.contraction**0.5, far], [bound, far]])
+    # Rows: the mean of all nodes, and the disagreement, which gamma steps reduce by theta^gamma.
+    contracted = constants.mean**gamma * bound
+    return _spectral_radius([[constants.contraction**0.5, contracted], [bound, contracted]])
 
 
 def theorem_6(constants: GammaConstants, bound: float, gamma: int) -> float:
     """Return rho(A_S(gamma)) of P (45) with c_B = ``bound``; below 1 it certifies gamma."""
-    near, square = constants.contraction**0.5, bound * bound
-    one, both = constants.mean**gamma, constants.mean_square**gamma
+    root_lambda, bound_square = constants.contraction**0.5, bound * bound
+    mean_factor, square_factor = constants.mean**gamma, constants.mean_square**gamma
     return _spectral_radius(
         [
-            [near * near, bound * near, bound * near, square],
-            [bound * one * near, bound * one * near, square * one, square * one],
-            [bound * one * near, square * one, bound * one * near, square * one],
-            [square * both] * 4,
+            [root_lambda * root_lambda, bound * root_lambda, bound * root_lambda, bound_square],
+            [
+                bound * mean_factor * root_lambda,
+                bound * mean_factor * root_lambda,
+                bound_square * mean_factor,
+                bound_square * mean_factor,
+            ],
+            [
+                bound * mean_factor * root_lambda,
+                bound_square * mean_factor,
+                bound * mean_factor * root_lambda,
+                bound_square * mean_factor,
+            ],
+            [bound_square * square_factor] * 4,
         ]
     )
 
@@ -206,7 +218,7 @@ def _spectral_radius(matrix: list[list[float]]) -> float:
 
 
 def searches_gamma(scenario: Scenario) -> bool:
-    """Return True if a search for the exact smallest gamma takes seconds."""
+    """Return True if the network is small enough to search for the exact smallest gamma."""
     return len(scenario.nodes) * scenario.plant.n <= MAX_SEARCHED
 
 

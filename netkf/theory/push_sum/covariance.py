@@ -28,19 +28,19 @@ def covariance_of_steps(steps: EstimationSteps) -> FloatArray:
     return _covariance(steps, radius(steps))
 
 
-def _covariance(steps: EstimationSteps, found: float) -> FloatArray:
-    """Return the steady covariance (N, n, n) of steps with mean-square radius ``found``."""
-    if not found < 1.0:
+def _covariance(steps: EstimationSteps, value: float) -> FloatArray:
+    """Return the steady covariance (N, n, n) of steps 4 and 5 with mean-square radius ``value``."""
+    if not value < 1.0:
         raise TheoryError(
-            f"no steady error covariance: the mean-square radius is {found:.6g}, not below 1; "
+            f"no steady error covariance: the mean-square radius is {value:.6g}, not below 1; "
             "raise gamma or the delivery probability"
         )
     N, n, _ = steps.closed.shape
     scale = steps.scale
-    every = np.tile(scale, N)
+    scales = np.tile(scale, N)
     # E[(M (x) I) cov(h) (M (x) I)'], the constant term of the equation
-    noise = symmetric(steps.averaging.second_moment(steps.noise / np.outer(every, every)))
-    X = fixed_point(second_moment_map(steps.averaging, steps.scaled), noise[None], found)[0]
-    each = np.arange(N)
-    blocks = X.reshape(N, n, N, n)[each, :, each]
+    noise = symmetric(steps.averaging.second_moment(steps.noise / np.outer(scales, scales)))
+    X = fixed_point(second_moment_map(steps.averaging, steps.scaled), noise[None], value)[0]
+    nodes = np.arange(N)
+    blocks = X.reshape(N, n, N, n)[nodes, :, nodes]
     return symmetric(blocks * np.outer(scale, scale))

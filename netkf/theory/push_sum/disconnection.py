@@ -1,10 +1,10 @@
 """The probability that link failures disconnect a network: p_d of P Assumption 3.
 
-Links are processed in an order in which few nodes are open, that is, have processed links and links
-still to come. Only the partition of the open nodes by the links so far matters, so that the
-probability of each partition is carried from link to link; a part that closes apart from the rest
-disconnects the network. Exact, and fast as long as few nodes are open at a time, for any number of
-links.
+A transfer-matrix method over the nodes in an elimination order. A node is open while it has both
+eliminated neighbours and neighbours still to come. All that matters about the links so far is how
+they partition the open nodes into connected parts, so that the algorithm carries the probability of
+each partition from link to link. If a part loses its last open node while others remain, the
+network is disconnected. Exact, and fast as long as few nodes are open at a time.
 """
 
 from __future__ import annotations
@@ -29,10 +29,10 @@ if TYPE_CHECKING:
     import networkx
 
 MAX_PARTITIONS = 120_000  # partitions of open nodes at once: bounds time and memory
-MAX_ROOTS = 12  # first nodes that are tried
-MAX_OPEN = 40  # open nodes at a time; beyond, there are far too many partitions
+MAX_ROOTS = 12  # first nodes of an elimination order that are tried
+MAX_OPEN = 40  # open nodes at a time; with more there are far too many partitions
 MAX_SAMPLES, MIN_SAMPLES, NODE_SAMPLES = 200_000, 2_000, 2e7  # the last: samples times nodes
-MAX_DRAWS = 2_000_000  # of links in one array
+MAX_DRAWS = 2_000_000  # draws of links in one array
 CONFIDENCE = 0.99
 
 Edge = tuple[Any, Any]
@@ -51,9 +51,9 @@ class Probability(float):
 
     def __new__(cls, value: float, low: float, high: float, exact: bool) -> Probability:
         """Return the value with its interval."""
-        made = super().__new__(cls, value)
-        made.low, made.high, made.exact = low, high, exact
-        return made
+        probability = super().__new__(cls, value)
+        probability.low, probability.high, probability.exact = low, high, exact
+        return probability
 
     def __repr__(self) -> str:
         if self.exact:
@@ -96,7 +96,10 @@ def _scenario_probability(scenario: Scenario, seed: int, samples: int | None) ->
 def _probability(
     nodes: int, probabilities: dict[tuple[int, int], float], seed: int, samples: int | None
 ) -> Probability:
-    """Return the exact probability if it has few enough partitions, else an estimate."""
+    """Return the exact probability if few enough partitions occur, else an estimate.
+
+    ``probabilities`` are those that a link (pair of node indices) is up.
+    """
     neighbours: list[dict[int, float]] = [{} for _ in range(nodes)]
     for (i, j), p in probabilities.items():
         if p > 0.0:
@@ -122,13 +125,13 @@ def _link_probabilities(
         graph = graph.topology
     names, links = _nodes_and_links(graph)
     index = {name: k for k, name in enumerate(names)}
-    found = {}
+    probabilities = {}
     for link in links:
         i, j = sorted(index[end] for end in link)
-        # Loops connect nothing.
+        # Self-loops connect nothing.
         if i != j:
-            found[i, j] = _link_probability(link, delivery)
-    return len(names), found
+            probabilities[i, j] = _link_probability(link, delivery)
+    return len(names), probabilities
 
 
 def _nodes_and_links(graph: Any) -> tuple[list[Any], list[Edge]]:
@@ -180,15 +183,15 @@ def _channel_probabilities(scenario: Scenario) -> dict[Edge, float]:
     """
     channel, probabilities = scenario.network.channel, {}
     for i, j in scenario.topology.links:
-        one, other = (
+        forward, backward = (
             channel.loss.mean_delivery(direction, scenario.table_probability(direction))
             for direction in ((i, j), (j, i))
         )
-        if math.isnan(one + other):
+        if math.isnan(forward + backward):
             raise TheoryError("the channel is a record, not a law: give delivery")
-        if one != other or (not channel.symmetric and 0.0 < one < 1.0):
+        if forward != backward or (not channel.symmetric and 0.0 < forward < 1.0):
             raise TheoryError("the two directions of a link fail apart: give delivery")
-        probabilities[i, j] = one
+        probabilities[i, j] = forward
     return probabilities
 
 
@@ -203,21 +206,20 @@ def _is_connected(neighbours: list[dict[int, float]]) -> bool:
 
 
 def _elimination_order(neighbours: list[dict[int, float]]) -> list[int] | None:
-    """Return all nodes in an order in which few are open at a time.
-
-    The best of greedy orders from several first nodes; None if too many are open in each.
+    """Return all nodes in an order in which few are open at a time: the greedy order with the least
+    effort from several first nodes; None if too many nodes are open in each.
     """
     nodes = range(len(neighbours))
-    fewest = sorted(nodes, key=lambda node: len(neighbours[node]))[:MAX_ROOTS]
-    found = [_greedy_order(neighbours, root) for root in fewest]
-    return min((one for one in found if one is not None), default=(0.0, None))[1]
+    roots = sorted(nodes, key=lambda node: len(neighbours[node]))[:MAX_ROOTS]
+    orders = [_greedy_order(neighbours, root) for root in roots]
+    return min((order for order in orders if order is not None), default=(0.0, None))[1]
 
 
 def _greedy_order(neighbours: list[dict[int, float]], root: int) -> tuple[float, list[int]] | None:
-    """Return an estimate of the number of partitions and a greedy order of the nodes.
+    """Return an estimate of the effort (number of partitions) and a greedy order of the nodes.
 
-    The next node is the one that closes most open nodes and then opens fewest new ones. None as
-    soon as more than MAX_OPEN nodes are open.
+    The next node is the one that closes the most open nodes and then adds the fewest candidates.
+    None as soon as more than MAX_OPEN nodes are open.
     """
     waiting = [set(links) for links in neighbours]
     effort, order, opened, eliminated = 0.0, [], set[int](), set[int]()
@@ -225,16 +227,16 @@ def _greedy_order(neighbours: list[dict[int, float]], root: int) -> tuple[float,
     while candidates:
         ranked = []
         for node in candidates:
-            near = neighbours[node].keys()
-            closed = sum(len(waiting[other]) == 1 for other in near & opened)
-            stays = int(not near <= eliminated)
-            ranked.append((stays - closed, len(near - eliminated - candidates), node))
+            adjacent = neighbours[node].keys()
+            closed = sum(len(waiting[neighbour]) == 1 for neighbour in adjacent & opened)
+            stays = int(not adjacent <= eliminated)
+            ranked.append((stays - closed, len(adjacent - eliminated - candidates), node))
         node = min(ranked)[-1]
         order.append(node)
         eliminated.add(node)
         opened.add(node)
-        for other in neighbours[node]:
-            waiting[other].discard(node)
+        for neighbour in neighbours[node]:
+            waiting[neighbour].discard(node)
         opened = {k for k in opened if waiting[k]}
         if len(opened) > MAX_OPEN:
             return None
@@ -246,7 +248,8 @@ def _greedy_order(neighbours: list[dict[int, float]], root: int) -> tuple[float,
 def _exact_probability(neighbours: list[dict[int, float]], order: list[int]) -> float | None:
     """Return the probability that the network is disconnected, None for too many partitions.
 
-    A partition is the tuple of the labels of the open nodes, numbered in order of appearance.
+    A partition is represented by the labels of the open nodes' parts, numbered in order of
+    appearance.
     """
     index = {node: k for k, node in enumerate(order)}
     last = [max((index[k] for k in links), default=0) for links in neighbours]
@@ -257,12 +260,14 @@ def _exact_probability(neighbours: list[dict[int, float]], order: list[int]) -> 
         open_.append(node)
         # A new node starts as a part of its own.
         states = {(*labels, len(labels)): p for labels, p in states.items()}
-        for other in [x for x in open_ if x in neighbours[node]]:
-            states = _apply_link(states, open_.index(other), neighbours[node][other])
+        for neighbour in [x for x in open_ if x in neighbours[node]]:
+            states = _apply_link(states, open_.index(neighbour), neighbours[node][neighbour])
             if len(states) > MAX_PARTITIONS:
                 return None
         # A node stays open as long as some neighbour is still to come.
-        keep = [x for x, other in enumerate(open_) if max(last[other], index[other]) > k]
+        keep = [
+            x for x, neighbour in enumerate(open_) if max(last[neighbour], index[neighbour]) > k
+        ]
         if k + 1 < len(order):
             states, lost = _close_nodes(states, keep)
             cuts.append(lost)
@@ -275,36 +280,35 @@ def _apply_link(
     states: dict[tuple[int, ...], float], index: int, up: float
 ) -> dict[tuple[int, ...], float]:
     """Return the partitions after the link between open node ``index`` and the last open node."""
-    found: defaultdict[tuple[int, ...], float] = defaultdict(float)
+    partitions: defaultdict[tuple[int, ...], float] = defaultdict(float)
     for labels, p in states.items():
-        one, other = labels[index], labels[-1]
-        # The link joins nodes that are connected already: its state does not matter.
-        if one == other:
-            found[labels] += p
+        first, second = labels[index], labels[-1]
+        # Both ends are connected already: the state of the link does not matter.
+        if first == second:
+            partitions[labels] += p
             continue
         if up < 1.0:
-            found[labels] += p * (1.0 - up)
-        found[_renumber([one if x == other else x for x in labels])] += p * up
-    return dict(found)
+            partitions[labels] += p * (1.0 - up)
+        partitions[_renumber([first if x == second else x for x in labels])] += p * up
+    return dict(partitions)
 
 
 def _close_nodes(
     states: dict[tuple[int, ...], float], keep: list[int]
 ) -> tuple[dict[tuple[int, ...], float], float]:
-    """Return the partitions of the nodes that stay open, and the probability of a cut.
-
-    It is that of the partitions with a part none of whose nodes stays open.
+    """Return the partitions of the nodes that stay open (indices ``keep``), and the probability of
+    a cut: that of the partitions with a part of which no node stays open.
     """
-    found: defaultdict[tuple[int, ...], float] = defaultdict(float)
+    partitions: defaultdict[tuple[int, ...], float] = defaultdict(float)
     lost = []
     for labels, p in states.items():
-        rest = [labels[k] for k in keep]
+        open_labels = [labels[k] for k in keep]
         # Some part has no open node left: later links cannot reach it.
-        if len(set(rest)) < len(set(labels)):
+        if len(set(open_labels)) < len(set(labels)):
             lost.append(p)
         else:
-            found[_renumber(rest)] += p
-    return dict(found), math.fsum(lost)
+            partitions[_renumber(open_labels)] += p
+    return dict(partitions), math.fsum(lost)
 
 
 def _renumber(labels: list[int]) -> tuple[int, ...]:
@@ -318,19 +322,19 @@ def _estimate(
 ) -> Probability:
     """Return the fraction of disconnected draws, with its Clopper-Pearson interval."""
     ends, up = np.array(list(probabilities)), np.array(list(probabilities.values()))
-    random, cut, done = Streams(seed).generator("links"), 0, 0
-    while done < samples:
-        count = min(samples - done, max(1, MAX_DRAWS // len(ends)))
+    random, cut, drawn = Streams(seed).generator("links"), 0, 0
+    while drawn < samples:
+        count = min(samples - drawn, max(1, MAX_DRAWS // len(ends)))
         # All draws are one graph with a copy of the nodes for each.
-        which, link = np.nonzero(random.random((count, len(ends))) < up)
-        rows, columns = (which * nodes + ends[link, end] for end in (0, 1))
+        draw, link = np.nonzero(random.random((count, len(ends))) < up)
+        rows, columns = (draw * nodes + ends[link, end] for end in (0, 1))
         matrix = scipy.sparse.coo_array(
             (np.ones(len(rows), dtype=np.int8), (rows, columns)), shape=(count * nodes,) * 2
         )
         _, label = scipy.sparse.csgraph.connected_components(matrix, directed=False)
-        parts = label.reshape(count, nodes)
-        cut += int((parts != parts[:, :1]).any(axis=1).sum())
-        done += count
+        components = label.reshape(count, nodes)
+        cut += int((components != components[:, :1]).any(axis=1).sum())
+        drawn += count
     # The bounds of Clopper and Pearson are quantiles of beta distributions.
     tail = 0.5 * (1.0 - CONFIDENCE)
     low = scipy.special.betaincinv(cut, samples - cut + 1, tail) if cut else 0.0

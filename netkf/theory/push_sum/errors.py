@@ -1,12 +1,14 @@
 """Exact errors of the push-sum filter along the messages of a run.
 
-In slots P Fig. 1 with the corrected update of the mass; under clocks broadcast rounds with running
-sums. Under clocks an estimate is a ratio of masses: a node of weight w among N holds the
-information ``(w / N) (P^-1, P^-1 xhat)``. Every total (U, u) that was sent has an error ``u - U x``
-and refers to the present: over a gap ``U -> s F^-T U F^-1``, and the error becomes ``s F^-T`` times
-itself less ``U w``, where s < 1 is the factor by which old information fades. A node that gains
-(U, u), and then has the weight w, moves to ``xhat + (N / w) P (u - U xhat)``, and its error to
-``e - (N / w) P (U e + u - U x)``. The errors thus obey equations without x.
+In slots the rule is P Fig. 1 with the corrected update of the mass; under clocks it is that of
+broadcast rounds with running sums.
+
+Under clocks a node of weight w among N nodes holds the mass ``(w / N) (P^-1, P^-1 xhat)``. A total
+(U, u) that was sent is information U and information vector u, with the error ``u - U x``. Totals
+are predicted to the present: over a gap with transition F and noise v, ``U+ = s F^-T U F^-1`` and
+``(u - U x)+ = s F^-T (u - U x) - U+ v``, where s <= 1 is the factor by which old information fades.
+A node that gains (U, u), and then has the weight w, moves to ``xhat + (N / w) P (u - U xhat)``; its
+error becomes ``e - (N / w) P (U e + u - U x)``. So the errors obey equations without x.
 """
 
 from __future__ import annotations
@@ -32,11 +34,11 @@ from netkf.trace.schema import CODES
 
 
 def require_known_errors(scenario: Scenario, run: Run) -> None:
-    """Raise TheoryError if the errors in slots are not known here.
+    """Raise TheoryError if the errors in slots cannot be replayed.
 
-    They are not for frozen or asymptotic gains, for filters whose F differs from the plant's, for
-    sensors whose H varies, and at the horizon: the trace lacks the exchanges of a slot that begins
-    there.
+    That is so for frozen or asymptotic gains, for filters whose F differs from the plant's, for
+    sensors whose H varies, and for samples at the horizon, since the trace lacks the exchanges of a
+    slot that begins there.
     """
     algorithm: Any = scenario.filter.algorithm
     plant = scenario.slot_plant
@@ -62,10 +64,12 @@ class AveragingRule(ErrorRule):
         self._N, n = len(scenario.nodes), errors.n
         self._nu = np.array([scenario.topology.degrees[node] + 1 for node in scenario.nodes])
         models = scenario.slot_models
-        self._own = np.array([m.H.T @ np.linalg.solve(m.R, m.H) for m in models])
-        own = self._own.reshape(self._N, n * n)
+        self._information = np.array([m.H.T @ np.linalg.solve(m.R, m.H) for m in models])
+        information = self._information.reshape(self._N, n * n)
         # Masses z = (w, n~, C~) of each node, P (3): only the leader starts with a weight.
-        self._z = np.concatenate([np.zeros((self._N, 1)), np.ones((self._N, 1)), own], axis=1)
+        self._z = np.concatenate(
+            [np.zeros((self._N, 1)), np.ones((self._N, 1)), information], axis=1
+        )
         self._z[scenario.topology.index[algorithm.leader], 0] = 1.0
         # Running sums: totals offered by each node, and those last heard by i of j.
         self._running = algorithm.running_sums
@@ -82,7 +86,8 @@ class AveragingRule(ErrorRule):
                 news = np.where(received[..., None] > 0.0, self._offered - self._heard, 0.0)
                 self._heard, self._z = self._heard + news, shares + news.sum(axis=1)
                 return
-            # A node keeps the share of each link over which nothing came: links fail both ways.
+            # P (3)-(5) corrected: z_i+ = z_i/nu_i + sum_j [b_ij z_j/nu_j + (1 - b_ij) z_i/nu_i].
+            # A node keeps the shares of its failed links, which fail in both directions.
             retained = (self._nu - received.sum(axis=1))[:, None]
             self._z = retained * shares + received @ shares
             return
@@ -107,7 +112,7 @@ class AveragingRule(ErrorRule):
         heard = self._z[:, 0] > 0.0  # before any weight arrives a node knows its own sensor only
         weight = np.where(heard, self._z[:, 0], 1.0)
         learned = self._z[:, 2:].reshape(self._N, n, n) / weight[:, None, None]
-        G = np.where(heard[:, None, None], learned, self._own)
+        G = np.where(heard[:, None, None], learned, self._information)
         number = np.where(heard, self._z[:, 1] / weight, 1.0)
         columns = errors.reading_noises(observations)
         for estimator in range(self._N):
@@ -122,10 +127,11 @@ class AveragingRule(ErrorRule):
 
 
 class RunningTotalsRule(ErrorRule):
-    """Rule under clocks.
+    """Rule under clocks: push-sum with running sums.
 
-    It tracks the weight of each node, the total that each has sent to every receiver so far, and
-    the last totals that each has received.
+    It tracks the weight of each node, the total that it has offered to each receiver so far, and
+    the last total that it has received over each link. What a receiver gains is the difference of
+    two totals, so that a lost message only delays the gain.
     """
 
     def __init__(
@@ -173,7 +179,9 @@ class RunningTotalsRule(ErrorRule):
         )
 
     def sense(self, time: float, observations: EstimatorObservations) -> None:
-        """Update by samples, each N / w times, then add the shares of nodes that broadcast now."""
+        """Update by samples, each counted N / w times, and then add the shares of the nodes that
+        broadcast now to their totals.
+        """
         columns, number = self.errors.reading_noises(observations), self.errors.estimators
         for estimator, observation in observations.items():
             counted = observation._replace(R=observation.R * (self._weights[estimator] / number))
@@ -182,7 +190,7 @@ class RunningTotalsRule(ErrorRule):
             self._add_share(estimator)
 
     def _add_share(self, estimator: int) -> None:
-        """Add the node's share of its mass to the total that it sends to each receiver.
+        """Add the share 1 / (receivers + 1) of the node's mass to the total for each receiver.
 
         The mass is ``(w / N) (P^-1, P^-1 xhat)``, and its error ``-(w / N) P^-1 e``.
         """
@@ -192,11 +200,11 @@ class RunningTotalsRule(ErrorRule):
         weight, share = self._weights[estimator], 1.0 / (count + 1)
         inverse = np.linalg.inv(self.errors.roots[estimator])
         U = (share * weight / self.errors.estimators) * (inverse.T @ inverse)
-        before = self._totals[name]
-        sent, form = before + share * weight, stack.form(name) - U @ stack.form(estimator)
-        self._put_total(name, sent, self._copy_information(name) + U, form)
-        # One share stays with the node, the others are on their way to its receivers.
-        self._weights[estimator] = weight - count * (sent - before)
+        old_total = self._totals[name]
+        new_total, form = old_total + share * weight, stack.form(name) - U @ stack.form(estimator)
+        self._put_total(name, new_total, self._copy_information(name) + U, form)
+        # One share stays with the node; the others are under way to its receivers.
+        self._weights[estimator] = weight - count * (new_total - old_total)
 
     def send(self, messages: Sequence[SentMessage]) -> None:
         """Store the sender's present total for each message."""
@@ -206,10 +214,10 @@ class RunningTotalsRule(ErrorRule):
             self._totals[message] = self._totals[name]
 
     def arrive(self, time: float, messages: Sequence[SentMessage]) -> None:
-        """Add to each receiver the growth of its senders' totals since the last that it got."""
+        """Give each receiver the growth of its senders' totals since the last ones it received."""
         for estimator in sorted({message.receiver for message in messages}):
-            mine = [m for m in messages if m.receiver == estimator]
-            self._receive_totals(estimator, sorted(mine, key=lambda m: (m.sender, m.number)))
+            received = [m for m in messages if m.receiver == estimator]
+            self._receive_totals(estimator, sorted(received, key=lambda m: (m.sender, m.number)))
         for message in messages:
             del self._totals[message]
         self.errors.stack.drop(messages)
@@ -220,7 +228,7 @@ class RunningTotalsRule(ErrorRule):
         weight, U, form = 0.0, np.zeros((n, n)), np.zeros((n, 1))
         for message in messages:
             link, heard = (message.sender, estimator), ("heard", message.sender, estimator)
-            # An older total than the last one holds nothing new.
+            # A message that was overtaken holds nothing new.
             if message.number <= self._number.get(link, -1):
                 continue
             self._number[link] = message.number
@@ -232,10 +240,10 @@ class RunningTotalsRule(ErrorRule):
             self._totals[heard] = self._totals[message]
         if not weight > 0.0:
             return
-        after = self._weights[estimator] + weight
-        share = errors.estimators / after
+        new_weight = self._weights[estimator] + weight
+        share = errors.estimators / new_weight
         # Information adds up: (w+ / N) P+^-1 = (w / N) P^-1 + U.
-        scaled = np.sqrt(after / self._weights[estimator]) * errors.roots[estimator]
+        scaled = np.sqrt(new_weight / self._weights[estimator]) * errors.roots[estimator]
         root = add_information_to_root(scaled, share * U)
         # e+ = e - (N / w+) P+ (U e + u - U x)
         gain = share * root @ root.T
@@ -243,16 +251,16 @@ class RunningTotalsRule(ErrorRule):
             estimator, (np.eye(n) - gain @ U) @ errors.stack.form(estimator) - gain @ form
         )
         errors.roots[estimator] = root
-        self._weights[estimator] = after
+        self._weights[estimator] = new_weight
 
 
 def _read_rounds(scenario: Scenario, run: Run) -> dict[float, list[int]]:
     """Return the indices of the nodes that broadcast at each time (seconds)."""
-    found: dict[float, list[int]] = {}
+    rounds: dict[float, list[int]] = {}
     rows = run.log[run.log["kind"] == CODES["transmit"]]
     for time, node in zip(rows["t"].tolist(), rows["node"].tolist(), strict=True):
-        found.setdefault(time, []).append(scenario.topology.index[node])
-    return found
+        rounds.setdefault(time, []).append(scenario.topology.index[node])
+    return rounds
 
 
 def error_rule(

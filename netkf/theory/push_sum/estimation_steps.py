@@ -22,7 +22,7 @@ class EstimationSteps:
     averaging : the law of M
     closed    : (N, n, n) A_i = (I - K_i H_i) F
     process   : (N, n, n) I - K_i H_i, by which the plant's noise enters h, P (27)
-    own       : (N, n, n) K_i R_i K_i', the covariance of the sensors' noise in h
+    sensor_noise : (N, n, n) K_i R_i K_i', the covariance of the sensors' noise in h
     Q         : (n, n) of the plant
     limits    : the limits of steps 2 and 3, from which the gains are computed
     """
@@ -30,7 +30,7 @@ class EstimationSteps:
     averaging: Averaging
     closed: FloatArray
     process: FloatArray
-    own: FloatArray
+    sensor_noise: FloatArray
     Q: FloatArray
     limits: PushSumLimits
 
@@ -53,8 +53,8 @@ class EstimationSteps:
         covariance = np.einsum(
             "iab,bc,jdc->iajd", self.process, self.Q, self.process, optimize=True
         )
-        each = np.arange(N)
-        covariance[each, :, each] += self.own
+        nodes = np.arange(N)
+        covariance[nodes, :, nodes] += self.sensor_noise
         return symmetric(covariance.reshape(N * n, N * n))
 
 
@@ -73,9 +73,9 @@ def estimation_steps(scenario: Scenario, averaging: Averaging | None = None) -> 
     pairs = list(zip(limits.gains, truth, strict=True))
     # e+ = (I - K H)(F e + w) - K v at each node, before averaging, P (27)
     process = np.stack([np.eye(len(F)) - K @ H for K, (H, _) in pairs])
-    own = np.stack([K @ R @ K.T for K, (_, R) in pairs])
+    sensor_noise = np.stack([K @ R @ K.T for K, (_, R) in pairs])
     law = averaging_law(scenario) if averaging is None else averaging
-    return EstimationSteps(law, process @ F, process, own, plant.Q, limits)
+    return EstimationSteps(law, process @ F, process, sensor_noise, plant.Q, limits)
 
 
 def averaging_law(scenario: Scenario, delivery: float | None = None) -> Averaging:
@@ -120,6 +120,6 @@ def _probabilities(scenario: Scenario, delivery: float | None) -> FloatArray:
     # The first end hears the second by the direction (j, i).
     directions = [[(j, i), (i, j)] for i, j in links]
     hears = [
-        [loss.mean_delivery(w, scenario.table_probability(w)) for w in both] for both in directions
+        [loss.mean_delivery(w, scenario.table_probability(w)) for w in pair] for pair in directions
     ]
     return np.array(hears, dtype=np.float64).reshape(-1, 2)

@@ -1,4 +1,4 @@
-"""The push-sum filter with ever more averaging steps: P Lemma 4 and Theorem 4."""
+"""Limits of the push-sum filter for gamma to infinity: P Lemma 4 and Theorem 4."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from netkf.theory.push_sum.limits import consensus_gain_bound
 
 
 class LargeGamma(NamedTuple):
-    """Limits for gamma to infinity, of the filter that averages without end in every slot.
+    """Limits for gamma to infinity: nodes average until they agree in every slot.
 
     noise      : (N n, N n) covariance of the transformed noise, P Lemma 4: zero but for the first
                  block, that of the direction in which all nodes agree
@@ -62,11 +62,11 @@ def push_sum_noise(scenario: Scenario, gammas: Sequence[int]) -> FloatArray:
     first = np.column_stack([np.ones(N), np.eye(N)[:, : N - 1]])
     T = np.linalg.qr(first)[0]
     transform = np.kron(T * np.sign(T[0, 0]), np.eye(n))
-    found = []
+    covariances = []
     for gamma in gammas:
         moment = _with_gamma(steps, gamma).averaging.second_moment(steps.noise)
-        found.append(symmetric(transform.T @ moment @ transform))
-    return np.array(found)
+        covariances.append(symmetric(transform.T @ moment @ transform))
+    return np.array(covariances)
 
 
 def push_sum_covariances(scenario: Scenario, gammas: Sequence[int]) -> FloatArray:
@@ -78,13 +78,13 @@ def push_sum_covariances(scenario: Scenario, gammas: Sequence[int]) -> FloatArra
     """
     steps = estimation_steps(scenario)
     N, n, _ = steps.closed.shape
-    found = np.full((len(gammas), N, n, n), np.nan)
+    covariances = np.full((len(gammas), N, n, n), np.nan)
     for k, gamma in enumerate(gammas):
         try:
-            found[k] = covariance_of_steps(_with_gamma(steps, gamma))
+            covariances[k] = covariance_of_steps(_with_gamma(steps, gamma))
         except TheoryError:
             continue
-    return found
+    return covariances
 
 
 def _with_gamma(steps: EstimationSteps, gamma: int) -> EstimationSteps:
@@ -94,7 +94,7 @@ def _with_gamma(steps: EstimationSteps, gamma: int) -> EstimationSteps:
 
 
 def _require_averaging(scenario: Scenario, steps: EstimationSteps) -> None:
-    """Raise TheoryError unless gamma steps come to the mean of all nodes as gamma grows."""
+    """Raise TheoryError unless gamma steps converge to the mean of all nodes as gamma grows."""
     law = steps.averaging
     if law.held and not law.deterministic:
         raise TheoryError('P Theorem 4 needs links = "fresh": a draw that is held cuts the network')

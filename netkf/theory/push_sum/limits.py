@@ -48,32 +48,34 @@ def push_sum_limits(scenario: Scenario) -> PushSumLimits:
         raise TheoryError(
             "the sensors' H differs from slot to slot: their information has no limit"
         )
-    parts = len(scenario.topology.components)
-    if parts > 1:
-        raise TheoryError(f"the graph must be connected, it has {parts} parts")
+    component_count = len(scenario.topology.components)
+    if component_count > 1:
+        raise TheoryError(f"the graph must be connected, it has {component_count} parts")
     models, degrees = scenario.slot_models, scenario.topology.degrees
     # Node i has degree + 1 shares, so that the stationary weight is proportional to that, P (18).
     share = np.array([degrees[node] + 1.0 for node in scenario.nodes])
     share /= share.sum()
     # H_i' R_i^-1, whose products with H_i sum to G, P (10)
-    each = [np.linalg.solve(m.R, m.H).T for m in models]
-    G = symmetric(np.sum([e @ m.H for e, m in zip(each, models, strict=True)], axis=0))
+    weighted_H = [np.linalg.solve(m.R, m.H).T for m in models]
+    G = symmetric(np.sum([e @ m.H for e, m in zip(weighted_H, models, strict=True)], axis=0))
     pooled, N = scenario.pooled_slot_model, len(models)
     P = filtered_covariance(pooled.F, pooled.Q, pooled.H, pooled.R)
     # P (13)
-    gains = tuple(N * P @ e for e in each)
+    gains = tuple(N * P @ e for e in weighted_H)
     return PushSumLimits(share[:, None, None] * G, share * N, share, G, N, P, gains)
 
 
 def push_sum_filter(scenario: Scenario) -> Any:
     """Return the scenario's filter; raises TheoryError unless it is the push-sum filter."""
     algorithm: Any = scenario.filter.algorithm
-    name, known = type(algorithm).__name__, built_in_filters()["push-sum"]
-    if not isinstance(algorithm, known):
+    name, built_in = type(algorithm).__name__, built_in_filters()["push-sum"]
+    if not isinstance(algorithm, built_in):
         raise TheoryError(f"this is about the push-sum filter, and the scenario's is {name}")
-    own = overridden(algorithm, known)
-    if own:
-        raise TheoryError(f"this is about the push-sum filter, and {name} defines {own[0]} itself")
+    overridden_names = overridden(algorithm, built_in)
+    if overridden_names:
+        raise TheoryError(
+            f"this is about the push-sum filter, and {name} defines {overridden_names[0]} itself"
+        )
     return algorithm
 
 

@@ -22,9 +22,9 @@ from netkf.theory.numerics.positive_maps import PositiveMap, spectral_radius
 from netkf.theory.push_sum.averaging import Averaging
 from netkf.theory.push_sum.estimation_steps import EstimationSteps, averaging_law, estimation_steps
 
-MAX_ROWS = 500  # of X; with twice as many rows a step takes four times the work and memory
-DENSE_ROWS = 300  # of the mean dynamics up to which all eigenvalues are computed
-# Of Arnoldi's method for the mean: its vectors are small, unlike those of second moments.
+MAX_ROWS = 500  # of X; twice as many rows take four times the work and memory
+DENSE_ROWS = 300  # of the mean dynamics; up to these all eigenvalues are computed
+# Arnoldi's method for the mean, whose vectors are small, unlike those of second moments.
 MEAN_KRYLOV_VECTORS, MEAN_RESTARTS = 40, 60
 
 
@@ -51,14 +51,14 @@ def push_sum_stability(
 ) -> FloatArray:
     """Return ``push_sum_radius`` (len(gammas), len(deliveries)), the stability map."""
     steps = estimation_steps(scenario, averaging_law(scenario, 1.0))
-    found = np.empty((len(gammas), len(deliveries)))
+    radii = np.empty((len(gammas), len(deliveries)))
     for column, delivery in enumerate(deliveries):
         law = averaging_law(scenario, delivery)
         for row, gamma in enumerate(gammas):
             if int(gamma) != gamma or gamma < 1:
                 raise TheoryError(f"gamma must be a positive integer, got {gamma!r}")
-            found[row, column] = radius(replace(steps, averaging=replace(law, gamma=int(gamma))))
-    return found
+            radii[row, column] = radius(replace(steps, averaging=replace(law, gamma=int(gamma))))
+    return radii
 
 
 def radius(steps: EstimationSteps) -> float:
@@ -80,8 +80,8 @@ def _mean_radius(law: Averaging, closed: FloatArray) -> float:
     if N * n > DENSE_ROWS and not law.enumerated:
         return _mean_radius_by_arnoldi(law, closed)
     # (E[M^gamma] (x) I) diag(A_j)
-    whole = np.einsum("ij,jab->iajb", law.mean, closed).reshape(N * n, N * n)
-    return float(np.abs(np.linalg.eigvals(whole)).max())
+    mean_map = np.einsum("ij,jab->iajb", law.mean, closed).reshape(N * n, N * n)
+    return float(np.abs(np.linalg.eigvals(mean_map)).max())
 
 
 def _mean_radius_by_arnoldi(law: Averaging, closed: FloatArray) -> float:
@@ -90,10 +90,10 @@ def _mean_radius_by_arnoldi(law: Averaging, closed: FloatArray) -> float:
 
     def step(e: FloatArray) -> FloatArray:
         """Return the mean errors (N n,) one slot later."""
-        moved = (closed @ e.reshape(N, n, 1))[:, :, 0]
+        errors = (closed @ e.reshape(N, n, 1))[:, :, 0]
         for _ in range(law.gamma):
-            moved = law.mean_step @ moved
-        return np.asarray(moved.ravel())
+            errors = law.mean_step @ errors
+        return np.asarray(errors.ravel())
 
     operator = scipy.sparse.linalg.LinearOperator((N * n, N * n), matvec=step, dtype=np.float64)
     try:

@@ -23,8 +23,8 @@ from netkf.theory.push_sum.disconnection import disconnection_probability
 from netkf.theory.push_sum.limits import consensus_gain_bound, push_sum_limits
 from netkf.theory.push_sum.mean_square import push_sum_radius
 
-MAX_STEPS = 20  # gamma up to which the exact one is searched for
-MAX_LEADER_SLOTS, AGREEMENT = 200, 0.99  # slots of an election, and its probability to be over
+MAX_STEPS = 20  # largest gamma in the search for the exact smallest one
+MAX_LEADER_SLOTS, AGREEMENT = 200, 0.99  # slots of an election; probability that it is over
 
 
 def slot_promises(scenario: Scenario) -> dict[str, Any]:
@@ -57,21 +57,21 @@ def slot_promises(scenario: Scenario) -> dict[str, Any]:
 
     def cut() -> list[float]:
         """Return the interval of the disconnection probability."""
-        found = disconnection_probability(scenario)
-        return [found.low, found.high]
+        probability = disconnection_probability(scenario)
+        return [probability.low, probability.high]
 
     def corollary() -> dict[str, float]:
         """Return the numbers of Corollary 2 by name."""
-        found = corollary_2(scenario)
-        return found._asdict()
+        result = corollary_2(scenario)
+        return result._asdict()
 
     def leader() -> int:
-        """Return the slots until all nodes follow the leader nearly surely."""
-        known = leader_agreement(scenario, MAX_LEADER_SLOTS)
-        late = known < AGREEMENT
-        if late.all():
+        """Return the slots until all nodes know the leader with probability AGREEMENT."""
+        probabilities = leader_agreement(scenario, MAX_LEADER_SLOTS)
+        undecided = probabilities < AGREEMENT
+        if undecided.all():
             raise TheoryError(f"not within {MAX_LEADER_SLOTS} slots")
-        return int(late.sum())
+        return int(undecided.sum())
 
     functions: dict[str, Callable[[], Any]] = {
         "limit_trace": limit,
@@ -97,18 +97,18 @@ def _value_or_reason(function: Callable[[], Any]) -> dict[str, Any]:
         return {"value": None, "reason": str(error)}
 
 
-def slot_lines(found: dict[str, Any], number: Callable[[Any], str]) -> list[str]:
+def slot_lines(results: dict[str, Any], number: Callable[[Any], str]) -> list[str]:
     """Return the results as lines for a terminal; ``number`` formats a value."""
 
     def text(name: str, make: Callable[[Any], str] = number) -> str:
         """Return a value as text, or the reason why there is none."""
-        value = found[name]
+        value = results[name]
         return value["reason"] or make(value["value"])
 
     def errors(traces: list[float]) -> str:
         """Return mean and range of traces as text."""
         # The central trace is None where the central filter has no steady covariance.
-        mean, central = float(np.mean(traces)), found["central_trace"]["value"]
+        mean, central = float(np.mean(traces)), results["central_trace"]["value"]
         ratio = f", {mean / central:.4g} times the central one" if central else ""
         return f"mean {number(mean)}, from {number(min(traces))} to {number(max(traces))}{ratio}"
 
@@ -117,10 +117,10 @@ def slot_lines(found: dict[str, Any], number: Callable[[Any], str]) -> list[str]
         low, high = ends
         return number(low) if low == high else f"{number(low)} .. {number(high)} (simulated)"
 
-    def corollary(found: dict[str, float]) -> str:
+    def corollary(results: dict[str, float]) -> str:
         """Return the verdict on gamma as text."""
-        verdict = "too few" if found["gamma"] < found["needed"] else "enough"
-        return f"{found['gamma']}, where rho(A_R) is {number(found['radius'])}: {verdict}"
+        verdict = "too few" if results["gamma"] < results["needed"] else "enough"
+        return f"{results['gamma']}, where rho(A_R) is {number(results['radius'])}: {verdict}"
 
     return [
         f"trace of P_inf, what every node takes its covariance to be: {text('limit_trace')}",

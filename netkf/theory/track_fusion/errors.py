@@ -44,12 +44,12 @@ class PairRule(EstimateExchangeRule):
         """Fuse in the order of the senders, in which the messages are."""
         algorithm: Any = self.scenario.filter.algorithm
         root, factors = roots[0], [np.eye(len(roots[0]))]
-        for other in roots[1:]:
-            w = fusion_weight(root, other, algorithm.inverse, algorithm.minimise == TRACE)
+        for heard_root in roots[1:]:
+            w = fusion_weight(root, heard_root, algorithm.inverse, algorithm.minimise == TRACE)
             fuse = fuse_inversely if algorithm.inverse else intersect_covariances
-            root, (own, heard) = fuse([w, 1.0 - w], [root, other])
+            root, (own_factor, heard_factor) = fuse([w, 1.0 - w], [root, heard_root])
             # Earlier factors are multiplied by that of the estimate that they have made.
-            factors = [*(own @ factor for factor in factors), heard]
+            factors = [*(own_factor @ factor for factor in factors), heard_factor]
         return root, factors
 
 
@@ -105,15 +105,15 @@ class TrackRule(ErrorRule):
         changes: dict[Hashable, tuple[FloatArray, Sequence[Term]]] = {}
         for estimator, senders in heard.items():
             order = [estimator, *sorted(set(senders))]
-            own = errors.roots[_track_name(estimator)]
+            own_root = errors.roots[_track_name(estimator)]
             terms: list[Term] = [(_track_name(estimator), np.eye(n))]
-            root = own
+            root = own_root
             if len(order) > 1:
-                gain, root = best_combination(self._joint, order, own)
-                parts = np.split(gain, len(order) - 1, axis=1)
+                gain, root = best_combination(self._joint, order, own_root)
+                gains = np.split(gain, len(order) - 1, axis=1)
                 # e = e_i - sum_j G_j (e_i - e_j)
-                terms = [(_track_name(estimator), np.eye(n) - sum(parts))]
-                terms += [(_track_name(j), G) for j, G in zip(order[1:], parts, strict=True)]
+                terms = [(_track_name(estimator), np.eye(n) - sum(gains))]
+                terms += [(_track_name(j), G) for j, G in zip(order[1:], gains, strict=True)]
             changes[estimator] = root, terms
         errors.combine(changes)
 
