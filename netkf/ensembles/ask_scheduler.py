@@ -21,12 +21,12 @@ def scheduler_answers(address: str, seconds: float) -> bool:
     command = [sys.executable, "-P", "-m", "netkf.ensembles.ask_scheduler", address]
     nowhere = subprocess.DEVNULL
     try:
-        asked = subprocess.run(
+        process = subprocess.run(
             command, check=False, timeout=seconds, stdin=nowhere, stdout=nowhere, stderr=nowhere
         )
     except (subprocess.TimeoutExpired, ValueError):  # ValueError: a null character
         return False
-    return asked.returncode == 0
+    return process.returncode == 0
 
 
 async def _kind(address: str) -> str:

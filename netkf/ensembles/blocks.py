@@ -1,4 +1,4 @@
-"""Blocks of replicas: what a worker does."""
+"""Blocks of replicas, the units of work of a worker."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ BlockTask = Callable[[Scenario, int, range], Any]
 
 
 class PackedScenario(NamedTuple):
-    """A scenario as it travels to a worker.
+    """A scenario in the form that is sent to a worker.
 
-    digest, payload : its pickle, and the digest of that
-    modules : where its modules are
-    versions : versions that the worker must have, none if it is of this installation anyway
+    digest, payload : its pickle, and the SHA-256 of that
+    modules : names and folders of the modules of its plugged-in classes
+    versions : versions of packages that the worker must have; empty for workers of this computer
     """
 
     digest: str
@@ -39,8 +39,8 @@ class PackedScenario(NamedTuple):
 
 
 class Job(NamedTuple):
-    """A block of work: ``task`` for ``size`` replicas from ``start`` on, none from ``stop`` on,
-    counted from replica ``first``. ``start`` is a multiple of ``size``, a power of two.
+    """A block of work: ``task`` for the replicas first + start, ... up to ``size`` of them, before
+    first + stop. ``start`` is a multiple of ``size``, a power of two.
     """
 
     scenario: Scenario | PackedScenario
@@ -59,7 +59,7 @@ class Job(NamedTuple):
 
 
 def work(job: Job) -> Any:
-    """Do a block; raises EngineError that names a plugged-in class that fails."""
+    """Return the result of a block; raises EngineError that names a plugged-in class that fails."""
     scenario = job.scenario
     if isinstance(scenario, PackedScenario):
         scenario = unpack_scenario(scenario)
@@ -73,7 +73,7 @@ def work(job: Job) -> Any:
 
 
 def each_replica(task: Task, merge: Merge, scenario: Scenario, seed: int, replicas: range) -> Any:
-    """Do a task replica by replica, merging by the tree over them."""
+    """Return the results of ``task`` for each replica, merged by the tree over replicas."""
     tree = MergeTree(merge)
     for k, replica in enumerate(replicas):
         tree.add(k, task(scenario, seed, replica))
@@ -98,15 +98,15 @@ def pack_scenario(scenario: Scenario) -> PackedScenario:
 
 def _plugged_in_modules(scenario: Scenario) -> set[tuple[str, str]]:
     """Return the module of each plugged-in class, with the folder that it can be imported from."""
-    found = set()
+    modules = set()
     for part in plugged_in(scenario):
         name = type(part).__module__
         file = getattr(sys.modules.get(name), "__file__", None)
         if file is not None and name != "__main__":
             path = Path(file).resolve()
             up = name.count(".") + (path.name == "__init__.py")
-            found.add((name, str(path.parents[up])))
-    return found
+            modules.add((name, str(path.parents[up])))
+    return modules
 
 
 MAX_KEPT = 4  # scenarios that a worker keeps unpickled: a sweep goes from one to the next
@@ -114,7 +114,7 @@ _scenarios: dict[str, Scenario] = {}
 
 
 def unpack_scenario(travelling: PackedScenario) -> Scenario:
-    """Return the scenario that travelled, with its caches kept from one block to the next."""
+    """Return the unpickled scenario; a worker keeps the last MAX_KEPT with their caches."""
     scenario = _scenarios.get(travelling.digest)
     if scenario is None:
         while len(_scenarios) >= MAX_KEPT:
@@ -123,12 +123,16 @@ def unpack_scenario(travelling: PackedScenario) -> Scenario:
     return scenario
 
 
-def _check_versions(wanted: tuple[tuple[str, str], ...]) -> None:
-    """Raise EngineError if results of this worker could have other bits, or none at all."""
-    found = versions()
-    other = [(name, found.get(name, "none"), own) for name, own in wanted if found.get(name) != own]
-    if other:
-        listed = ", ".join(f"{name} {there} instead of {here}" for name, there, here in other)
+def _check_versions(required_versions: tuple[tuple[str, str], ...]) -> None:
+    """Raise EngineError if this worker lacks the required versions: results could differ."""
+    installed = versions()
+    differences = [
+        (name, installed.get(name, "none"), required)
+        for name, required in required_versions
+        if installed.get(name) != required
+    ]
+    if differences:
+        listed = ", ".join(f"{name} {there} instead of {here}" for name, there, here in differences)
         message = f"a worker of the scheduler has other versions than this computer: {listed}"
         raise EngineError(f"{message}; install the same there, or use --workers")
 

@@ -1,7 +1,7 @@
-"""Finished blocks on disk, ``blocks/000003.npz`` of a run directory: a kill loses little.
+"""Finished blocks on disk, ``blocks/000003.npz`` of a run directory, from which runs are resumed.
 
-A block is used only if it proves itself: its last line is the digest of all bytes before it, and
-inside it says to which run, which number and which installation it belongs.
+A block is used only if its last line is the digest of all bytes before it, and the identity inside
+(run, number, installation) is that of the run.
 """
 
 from __future__ import annotations
@@ -36,11 +36,11 @@ MAX_BLOCK = 1 << 32  # a number of runs beyond that is damage
 
 @dataclass(frozen=True)
 class RunIdentity:
-    """What blocks must have in common to be merged.
+    """The values that blocks must share to be merged.
 
     scenario : digest of the resolved scenario with its files
     seed, runs : seed and number of runs
-    trace, engine : as asked for
+    trace, engine : options of the command
     installation : digest of the versions of all packages and of netkf's own files, and of the
                    processor's features
     block : number of runs in a block
@@ -65,14 +65,14 @@ class RunIdentity:
 
 
 class BlockCheckpoints:
-    """Statistics of the blocks that are done, a file each, there whole or not at all."""
+    """Statistics of the finished blocks, one file each, written atomically."""
 
     def __init__(self, directory: Path, scenario: Scenario) -> None:
         self._folder, self._scenario = directory / BLOCKS, scenario
         self._numbers: set[int] = set()
 
     def begun_with(self) -> int | None:
-        """Return the number of runs in a block, as the first block says that can be read."""
+        """Return the number of runs in a block, from the first readable block; None without one."""
         for file in self._block_paths():
             with contextlib.suppress(DamagedError), _open_block(file) as arrays:
                 size = _read_texts(arrays)["identity"]["block"]
@@ -81,8 +81,8 @@ class BlockCheckpoints:
         return None
 
     def find(self, identity: RunIdentity) -> tuple[list[int], list[str]]:
-        """Return the numbers of the blocks of a run, in order, and a line on those that are not of
-        this run or cannot be read; those are removed.
+        """Return the numbers of the blocks of a run, in order, and a line about unreadable blocks
+        and those of other runs, which are removed.
         """
         bad: list[tuple[str, str]] = []
         for file in self._block_paths():
@@ -101,20 +101,20 @@ class BlockCheckpoints:
         """Return the statistics of the blocks of a scenario and a seed that can be read, in order,
         whatever installation made them; nothing is removed.
         """
-        found = []
-        wanted = {"scenario": scenario_digest, "seed": seed}
+        statistics = []
+        identity = {"scenario": scenario_digest, "seed": seed}
         for file in self._block_paths():
             with contextlib.suppress(DamagedError):
-                self._check(file, wanted)
+                self._check(file, identity)
                 with _open_block(file) as arrays:
-                    found.append(_restore_statistics(arrays))
-        return found
+                    statistics.append(_restore_statistics(arrays))
+        return statistics
 
     def save(self, number: int, statistics: RunStatistics, identity: RunIdentity) -> None:
         """Write a block with the traces that its runs left; raises WriteError."""
         with writing(self._folder):
             self._folder.mkdir(exist_ok=True)
-        # In memory first: where a disk is full, some versions of numpy leave their file open.
+        # In memory first: on a full disk some versions of numpy leave their file open.
         block = io.BytesIO()
         arrays = _as_arrays(statistics, identity.of(number))
         np.savez(block, **arrays)
@@ -144,37 +144,37 @@ class BlockCheckpoints:
 
     def _block_paths(self) -> list[Path]:
         """Return the files of all blocks, in order."""
-        found = self._folder.glob("*.npz") if self._folder.is_dir() else ()
-        return sorted(file for file in found if file.stem.isdecimal())
+        files = self._folder.glob("*.npz") if self._folder.is_dir() else ()
+        return sorted(file for file in files if file.stem.isdecimal())
 
     def _block_path(self, number: int) -> Path:
         """Return the path of a block."""
         return self._folder / f"{number:06d}.npz"
 
     def _check(self, file: Path, identity: dict[str, Any]) -> None:
-        """Raise DamagedError unless a file is whole, has this identity and fits the scenario."""
+        """Raise DamagedError unless a file is intact, has this identity and fits the scenario."""
         with _open_block(file, verified=False) as arrays:
-            found = _read_texts(arrays).get("identity")
+            stored = _read_texts(arrays).get("identity")
             for key, value in identity.items():
-                if not isinstance(found, dict) or found.get(key) != value:
+                if not isinstance(stored, dict) or stored.get(key) != value:
                     raise DamagedError(f"is of another {key}")
             if not self._has_form(_restore_statistics(arrays)):
                 raise DamagedError("does not fit the scenario")
 
-    def _has_form(self, found: RunStatistics) -> bool:
+    def _has_form(self, statistics: RunStatistics) -> bool:
         """Return True if all arrays have the shapes of statistics of the scenario."""
         count, n = len(self._scenario.nodes), self._scenario.plant.n
         columns = {"samples": count * (n * (n + 1) + 1), "averages": 3 * (count + 1)}
         rows = {"samples": len(self._scenario.times)}
-        moments = [(getattr(found, name), name) for name in PARTS]
-        moments += [(sums, "conserved") for sums, _ in found.conserved.values()]
+        moments = [(getattr(statistics, name), name) for name in PARTS]
+        moments += [(sums, "conserved") for sums, _ in statistics.conserved.values()]
         columns |= {"messages": len(MESSAGES), "conserved": 2}
-        totals = found.totals.shape == (2,) and found.totals.dtype == np.int64
+        totals = statistics.totals.shape == (2,) and statistics.totals.dtype == np.int64
         return totals and all(
-            one.mean.shape == one.M2.shape == (rows.get(name, 1), columns[name])
-            and one.size.shape == (rows.get(name, 1),)
-            and all(values.dtype == np.float64 for values in one)
-            for one, name in moments
+            quantity.mean.shape == quantity.M2.shape == (rows.get(name, 1), columns[name])
+            and quantity.size.shape == (rows.get(name, 1),)
+            and all(values.dtype == np.float64 for values in quantity)
+            for quantity, name in moments
         )
 
     def _restore_trace(self, arrays: Any, k: int) -> Trace:
@@ -183,14 +183,14 @@ class BlockCheckpoints:
         T, N, n = len(trace.times), len(self._scenario.nodes), self._scenario.plant.n
         shapes = [(), (len(trace.log),), (T,), (T, n), (T, N, n), (T, N, n, n), (T, N, n)]
         types = [np.dtype(np.int64), EVENT, *[np.dtype(np.float64)] * 5]
-        if [(one.dtype, one.shape) for one in trace] != list(zip(types, shapes, strict=True)):
+        if [(field.dtype, field.shape) for field in trace] != list(zip(types, shapes, strict=True)):
             raise DamagedError("does not fit the scenario")
         return Trace(int(trace.replica), *trace[1:])
 
     @contextlib.contextmanager
     def _expect_block(self, number: int) -> Iterator[None]:
-        """Raise EngineError for a block that was there a moment ago and cannot be used now; it is
-        removed.
+        """Turn a DamagedError about a block that was readable before into an EngineError, and
+        remove the block.
         """
         try:
             yield
@@ -203,8 +203,8 @@ class BlockCheckpoints:
 
 def is_block_size(value: object) -> bool:
     """Return True for a power of two, as numbers of runs in a block are."""
-    known = isinstance(value, int) and not isinstance(value, bool)
-    return known and 0 < value <= MAX_BLOCK and value & (value - 1) == 0  # type: ignore[operator]
+    is_integer = isinstance(value, int) and not isinstance(value, bool)
+    return is_integer and 0 < value <= MAX_BLOCK and value & (value - 1) == 0  # type: ignore[operator]
 
 
 def _block_number(file: Path, identity: RunIdentity) -> int:
@@ -216,7 +216,7 @@ def _block_number(file: Path, identity: RunIdentity) -> int:
 
 
 def _describe(bad: list[tuple[str, str]]) -> list[str]:
-    """Return no line, or one on all blocks that are done again."""
+    """Return a line about ``bad`` blocks (name, reason), which are simulated again; or none."""
     if not bad:
         return []
     listed = ", ".join(f"{name} {reason}" for name, reason in bad[:3])
@@ -236,19 +236,19 @@ def _verify(file: Path) -> None:
 
 def _digest(file: BinaryIO, length: int) -> bytes:
     """Return the SHA-256 of the first ``length`` bytes, in hexadecimal; leaves the file at them."""
-    digest, left = hashlib.sha256(), length
+    digest, remaining = hashlib.sha256(), length
     file.seek(0)
-    while left > 0 and (chunk := file.read(min(CHUNK, left))):
+    while remaining > 0 and (chunk := file.read(min(CHUNK, remaining))):
         digest.update(chunk)
-        left -= len(chunk)
+        remaining -= len(chunk)
     file.seek(length)
     return digest.hexdigest().encode()
 
 
 @contextlib.contextmanager
 def _open_block(file: Path, verified: bool = True) -> Iterator[Any]:
-    """Yield the arrays of a file; raises DamagedError for whatever is wrong with them. The digest
-    is compared unless it was ``verified`` before.
+    """Yield the arrays of a block's file, with its digest checked unless ``verified`` before;
+    raises DamagedError for anything wrong with it.
     """
     try:
         if not verified:
@@ -265,9 +265,11 @@ def _as_arrays(statistics: RunStatistics, identity: dict[str, Any]) -> dict[str,
     """Return the statistics of a block as arrays by name, for one npz file."""
     arrays: dict[str, Any] = {"totals": statistics.totals}
     moments = {name: getattr(statistics, name) for name in PARTS}
-    moments |= {f"conserved_{name}": found for name, (found, _) in statistics.conserved.items()}
-    for name, found in moments.items():
-        arrays |= {f"{name}_{field}": getattr(found, field) for field in Moments._fields}
+    moments |= {
+        f"conserved_{name}": quantity for name, (quantity, _) in statistics.conserved.items()
+    }
+    for name, quantity in moments.items():
+        arrays |= {f"{name}_{field}": getattr(quantity, field) for field in Moments._fields}
     for k, trace in enumerate(statistics.traces):
         arrays |= {f"trace_{k}_{field}": getattr(trace, field) for field in Trace._fields}
     texts = {
@@ -281,9 +283,9 @@ def _as_arrays(statistics: RunStatistics, identity: dict[str, Any]) -> dict[str,
 
 
 def _read_texts(arrays: Any) -> dict[str, Any]:
-    """Return the values of a block that are texts and numbers, not arrays."""
-    found: dict[str, Any] = json.loads(str(arrays["words"]))
-    return found
+    """Return the values of a block that are text or single numbers, stored as JSON."""
+    texts: dict[str, Any] = json.loads(str(arrays["words"]))
+    return texts
 
 
 def _restore_statistics(arrays: Any) -> RunStatistics:

@@ -36,12 +36,15 @@ from netkf.scenario.scenario import Scenario
 TRACES = ("full", "first", "none")
 MAX_TRACED_BLOCK = 8
 NOTE_SECONDS = 1.0
-"""Seconds between two manifests that say how many runs are done."""
+"""Least number of seconds between two updates of the number of finished runs in the manifest."""
 
 
 @dataclass(frozen=True, eq=False)
 class FinishedEnsemble:
-    """What ``runs_to_directory`` leaves: the directory, its summary, and what a picture needs."""
+    """The result of ``runs_to_directory``: the directory, its summary, and the data for pictures.
+
+    ``simulated`` is the number of runs that were not resumed from blocks, in ``seconds``.
+    """
 
     directory: Path
     status: str
@@ -54,9 +57,12 @@ class FinishedEnsemble:
 
 @dataclass(frozen=True)
 class EnsembleOptions:
-    """How the runs of a directory are simulated: by which ``engine`` and ``pool``, whether those of
-    all runs, of the first or of none leave a ``trace`` (of TRACES), and whether to ``resume`` what
-    was stopped.
+    """How the runs of a directory are simulated.
+
+    engine : name of the engine
+    trace  : which runs store events and states, one of TRACES
+    resume : continue the runs of a directory that were stopped
+    pool   : where runs are simulated
     """
 
     engine: str = "auto"
@@ -89,7 +95,7 @@ def runs_to_directory(
     ScenarioError and EngineError before anything is written, WriteError, InterruptedRunError (a
     KeyboardInterrupt) when interrupted, and EngineError where a plugged-in class fails.
     """
-    began = time.perf_counter()
+    started = time.perf_counter()
     runs = integer(low=1)("runs", runs)
     choice(*TRACES)("trace", options.trace)
     engine_used = choose_engine(options.engine, scenario, announce=False)
@@ -103,12 +109,12 @@ def runs_to_directory(
             keeper.begin(note)
             engine_used.announce(scenario)
             task = partial(block_statistics, engine=engine_used, traces=keeper.traces)
-            whole = keeper.simulate(task, pool, progress)
-            written = _write(keeper, whole)
-            finished = FinishedEnsemble(*written, keeper.simulated, time.perf_counter() - began)
+            statistics = keeper.simulate(task, pool, progress)
+            written = _write(keeper, statistics)
+            finished = FinishedEnsemble(*written, keeper.simulated, time.perf_counter() - started)
             if finish is not None:
                 finish(finished)
-            keeper.end(finished.status, whole)
+            keeper.end(finished.status, statistics)
         except BaseException as error:
             reason = keeper.stop(error)
             if reason is error:
@@ -137,36 +143,36 @@ def _make_keeper(
         size = min(size, MAX_TRACED_BLOCK)
     digest = scenario_digest(scenario)
     plan = RunIdentity(digest, scenario.seed, runs, options.trace, engine, installation(), size)
-    begun = ensemble_to_resume(out, scenario, plan) if options.resume else None
-    if begun is None:
+    unfinished = ensemble_to_resume(out, scenario, plan) if options.resume else None
+    if unfinished is None:
         return _Keeper(scenario, new_directory(out, scenario.name), plan)
-    if begun.finished:
-        BlockCheckpoints(begun.directory, scenario).remove()
+    if unfinished.finished:
+        BlockCheckpoints(unfinished.directory, scenario).remove()
         return None
     # Blocks on disk are only of use to a plan with blocks of the same size.
-    return _Keeper(scenario, begun.directory, replace(plan, block=begun.block))
+    return _Keeper(scenario, unfinished.directory, replace(plan, block=unfinished.block))
 
 
 def _write(
-    keeper: _Keeper, whole: RunStatistics
+    keeper: _Keeper, statistics: RunStatistics
 ) -> tuple[Path, str, dict[str, Any], Ensemble, PromisedTraces]:
     """Write all files but the manifest."""
     directory, scenario, plan = keeper.directory, keeper.scenario, keeper.plan
-    ensemble = ensemble_of(scenario, whole, plan.seed, plan.engine)
+    ensemble = ensemble_of(scenario, statistics, plan.seed, plan.engine)
     write_table(directory / "ensemble.parquet", ensemble_table(ensemble))
     if plan.trace != "none":
         with TraceTables(directory, scenario) as tables:
             for run in keeper.blocks.traces():
                 tables.add(*run)
     promised = promise_traces(scenario, scenario.times)
-    summary = summarise_ensemble(scenario, whole, promised)
+    summary = summarise_ensemble(scenario, statistics, promised)
     write_json(directory / "summary.json", summary)
     status = "diverged" if ensemble.diverged else "complete"
     return directory, status, summary, ensemble, promised
 
 
 class _Keeper:
-    """Keeps blocks as they come, and the manifest up to date."""
+    """Stores blocks as they complete, and keeps the manifest up to date."""
 
     def __init__(self, scenario: Scenario, directory: Path, plan: RunIdentity) -> None:
         self.scenario, self.directory, self.plan = scenario, directory, plan
@@ -199,28 +205,28 @@ class _Keeper:
         self, task: Callable[..., RunStatistics], pool: Pool, progress: Progress | None
     ) -> RunStatistics:
         """Return the statistics of all runs; those of kept blocks are read."""
-        known = {number: partial(self.blocks.load, number) for number in self._known}
-        blocks = NumberedBlocks(self.plan.block, known, self.save_block)
-        whole: RunStatistics = replicate_blocks(
+        finished_blocks = {number: partial(self.blocks.load, number) for number in self._known}
+        blocks = NumberedBlocks(self.plan.block, finished_blocks, self.save_block)
+        statistics: RunStatistics = replicate_blocks(
             task, merge, self.scenario, self.plan.runs, pool=pool, progress=progress, blocks=blocks
         )
-        return whole
+        return statistics
 
     def _runs_in_block(self, number: int) -> int:
         """Return the number of runs in a block."""
         return min(self.plan.block, self.plan.runs - number * self.plan.block)
 
-    def save_block(self, number: int, found: RunStatistics) -> RunStatistics:
+    def save_block(self, number: int, statistics: RunStatistics) -> RunStatistics:
         """Save a block; its traces stay on disk."""
-        self.blocks.save(number, found, self.plan)
+        self.blocks.save(number, statistics, self.plan)
         self._done += self._runs_in_block(number)
         self.simulated += self._runs_in_block(number)
         if time.monotonic() - self._noted >= NOTE_SECONDS:
             self.note()
-        return found._replace(traces=())
+        return statistics._replace(traces=())
 
     def note(self, status: str = "interrupted", error: BaseException | None = None) -> None:
-        """Write to the manifest how the runs stand, until they have ended."""
+        """Write status and progress to the manifest, unless the final one is written."""
         if not self._ended:
             self._manifest.write(
                 status, self._identity_entries(block=self.plan.block), self._done, error
@@ -228,7 +234,7 @@ class _Keeper:
             self._noted = time.monotonic()
 
     def stop(self, error: BaseException) -> BaseException:
-        """Write to the manifest why the runs end early, and return the exception to raise."""
+        """Write the reason of an early end to the manifest; return the exception to raise."""
         self.note("failed" if isinstance(error, Exception) else "interrupted", error)
         if isinstance(error, KeyboardInterrupt):
             return InterruptedRunError(
@@ -236,13 +242,15 @@ class _Keeper:
             )
         return explain_failure(self.scenario, error, self.directory)
 
-    def end(self, status: str, whole: RunStatistics) -> None:
+    def end(self, status: str, statistics: RunStatistics) -> None:
         """Write the manifest of all runs, with the digests of the other files."""
-        entries = self._identity_entries(diverged=int(whole.totals[1]), events=int(whole.totals[0]))
-        entries["fingerprint"] = whole.fingerprint
+        entries = self._identity_entries(
+            diverged=int(statistics.totals[1]), events=int(statistics.totals[0])
+        )
+        entries["fingerprint"] = statistics.fingerprint
         self._manifest.write(status, entries, self.plan.runs, names=own_names(self.scenario))
         self._ended = True
 
     def _identity_entries(self, **others: Any) -> dict[str, Any]:
-        """Return the entries of the manifest that say what belongs together."""
+        """Return the entries of the manifest that identify the run."""
         return {"scenario": self.plan.scenario, "trace": self.plan.trace, **others}

@@ -1,8 +1,8 @@
 """The binary tree over replicas, by which results of many runs are merged.
 
-Node (level, k) holds replicas k 2^level up to (k + 1) 2^level. Every result is merged along this
-tree, so that its bits do not depend on the size of blocks, on who did which, or on the order in
-which they came back.
+Node (level, k) holds the replicas from k 2^level to (k + 1) 2^level - 1. Every result is merged
+along this tree, so that its bits do not depend on the size of blocks, on the workers, or on the
+order of completion.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ Merge = Callable[[Any, Any], Any]
 
 
 class MergeTree:
-    """Takes the results of blocks in any order and merges neighbours as soon as both are there, so
-    that about as many wait as the logarithm of all.
+    """Merges the results of blocks, added in any order, with their neighbours as soon as both are
+    there. Added in order, only about log2(blocks) results wait at a time.
     """
 
     def __init__(self, merge: Merge) -> None:
@@ -23,24 +23,24 @@ class MergeTree:
         self._waiting: dict[tuple[int, int], Any] = {}
 
     def add(self, k: int, value: Any, level: int = 0) -> None:
-        """Take the result of node (level, k); the last one may be of fewer replicas. Nodes do not
-        overlap, and level 0 may stand for blocks of any one size.
+        """Add the result of node (level, k). Nodes must not overlap; the last may have fewer
+        replicas. Level 0 may stand for blocks of any one size.
         """
         while (level, k ^ 1) in self._waiting:
-            other = self._waiting.pop((level, k ^ 1))
-            value = self._merge(other, value) if k & 1 else self._merge(value, other)
+            neighbour = self._waiting.pop((level, k ^ 1))
+            value = self._merge(neighbour, value) if k & 1 else self._merge(value, neighbour)
             level, k = level + 1, k >> 1
         self._waiting[level, k] = value
 
     def result(self) -> Any:
-        """Return the result of all; those at the end that have no neighbour join from right to
-        left.
+        """Return the merged result of all nodes; nodes at the end without a neighbour are merged
+        from right to left.
         """
         values = [value for _, value in sorted(self._waiting.items(), key=_first)]
-        whole = values.pop()
+        total = values.pop()
         while values:
-            whole = self._merge(values.pop(), whole)
-        return whole
+            total = self._merge(values.pop(), total)
+        return total
 
 
 def _first(item: tuple[tuple[int, int], Any]) -> int:

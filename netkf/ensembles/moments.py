@@ -1,7 +1,7 @@
-"""Means and second central moments of many values, merged pairwise.
+"""Means and second central moments of many observations, merged pairwise.
 
-Leaves are single observations and merging goes by the binary tree over their numbers, so that a
-million of them lose no digits.
+Single observations are the leaves of a binary tree over their numbers, along which moments are
+merged, so that the rounding error of a million observations stays small.
 """
 
 from __future__ import annotations
@@ -53,18 +53,18 @@ def merge_moments(a: Moments, b: Moments) -> Moments:
 
 def _stack_pair(a: FloatArray, b: FloatArray) -> FloatArray:
     """Return ``np.stack([a, b])``, several times faster than numpy for small arrays."""
-    both = np.empty((2, *a.shape))
-    both[0] = a
-    both[1] = b
-    return both
+    stacked = np.empty((2, *a.shape))
+    stacked[0] = a
+    stacked[1] = b
+    return stacked
 
 
 @kernel(inlined=True)
 def merge_pair(
     size: FloatArray, mean: FloatArray, M2: FloatArray, a: int, b: int, s: int, t: int
 ) -> None:
-    """Merge the moments of row ``s`` of ``b`` into those of ``a``, size (R, S), mean (R, S, C);
-    their M2 (R, S', C) is row ``t`` (Chan, Golub and LeVeque 1983, (2.1)).
+    """Merge the moments of observation ``b`` into those of ``a``, for row ``s`` of size (R, S) and
+    mean (R, S, C) and row ``t`` of M2 (R, S', C) (Chan, Golub and LeVeque 1983, (2.1)).
     """
     total = size[a, s] + size[b, s]
     share = size[b, s] / max(total, 1.0)
@@ -92,7 +92,7 @@ def merge_leaves(
     """Write mean and M2 (S, C) of R observations (R, S, C), merged in the binary tree over R; size
     (R, S) and values are overwritten, ``work`` (R, 1, C) is scratch.
     """
-    # Row by row, so that the values of a row are still close by when they are merged again.
+    # Row by row, so that the values of a row are still in the cache when they are merged again.
     for s in range(values.shape[1]):
         merge_row(size, values, work, s)
         for c in range(values.shape[2]):
@@ -106,7 +106,7 @@ def merge_row(size: FloatArray, values: FloatArray, work: FloatArray, s: int) ->
     into ``work[0, 0]``; arrays as in ``merge_leaves``.
     """
     runs = len(values)
-    # An observation alone has M2 = 0.
+    # A single observation has M2 = 0.
     for r in range(runs):
         for c in range(values.shape[2]):
             work[r, 0, c] = 0.0

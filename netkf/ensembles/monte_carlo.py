@@ -130,7 +130,7 @@ def monte_carlo(
         raise ScenarioError("", "monte_carlo takes a netkf.Scenario", scenario, LOAD)
     chosen = choose_engine(engine, scenario)
     seed, count = scenario.seed if seed is None else seed, integer(low=1)("runs", runs)
-    whole = replicate_blocks(
+    statistics = replicate_blocks(
         partial(block_statistics, engine=chosen),
         merge,
         scenario,
@@ -140,19 +140,19 @@ def monte_carlo(
         progress=progress,
         together=chosen.together(scenario),
     )
-    return ensemble_of(scenario, whole, seed, chosen.name)
+    return ensemble_of(scenario, statistics, seed, chosen.name)
 
 
-def ensemble_of(scenario: Scenario, found: RunStatistics, seed: int, engine: str) -> Ensemble:
+def ensemble_of(scenario: Scenario, statistics: RunStatistics, seed: int, engine: str) -> Ensemble:
     """Return the ensemble that the statistics of all runs describe."""
-    samples, shape = found.samples, (len(scenario.times), len(scenario.nodes), -1)
+    samples, shape = statistics.samples, (len(scenario.times), len(scenario.nodes), -1)
     means = np.where(samples.size[:, None] > 0.0, samples.mean, np.nan)
     n = scenario.plant.n
     mean_P, mean_error, mean_nees = _unpack_samples(means.reshape(shape), n)
     se_P, se_error, se_nees = _unpack_samples(samples.standard_error().reshape(shape), n)
     for errors in (mean_error, mean_nees, se_error, se_nees):
-        errors[scenario.times >= found.rounding_from] = np.nan
-    totals = found.messages.mean[0] * found.messages.size
+        errors[scenario.times >= statistics.rounding_from] = np.nan
+    totals = statistics.messages.mean[0] * statistics.messages.size
     return Ensemble(
         scenario.times,
         scenario.nodes,
@@ -163,20 +163,20 @@ def ensemble_of(scenario: Scenario, found: RunStatistics, seed: int, engine: str
         se_error,
         mean_nees,
         se_nees,
-        found.averages.mean.reshape(-1, 3),
-        found.averages.standard_error().reshape(-1, 3),
+        statistics.averages.mean.reshape(-1, 3),
+        statistics.averages.standard_error().reshape(-1, 3),
         {
             name: round(total)
             for name, total in zip(MESSAGES, totals.tolist(), strict=True)
             if np.isfinite(total)
         },
-        int(found.totals[1]),
-        int(found.totals[0]),
+        int(statistics.totals[1]),
+        int(statistics.totals[0]),
         seed,
         engine,
-        found.fingerprint,
+        statistics.fingerprint,
         scenario.plant.truth_known,
-        found.rounding_from,
+        statistics.rounding_from,
         scenario,
     )
 

@@ -1,4 +1,4 @@
-"""Where blocks are done: this process, processes of our own, any executor, a Dask scheduler."""
+"""Pools that run blocks: this process, own worker processes, any executor, a Dask scheduler."""
 
 from __future__ import annotations
 
@@ -21,29 +21,32 @@ from netkf.runs.provenance import versions
 from netkf.scenario.scenario import Scenario
 
 AHEAD = 1024
-"""Most blocks that are handed out and not yet back."""
+"""Largest number of blocks that are submitted and not yet completed."""
 
 QUICK_SECONDS, MAX_BLOCK_HERE = 0.2, 1024
-"""Blocks done in this process grow to at most so many runs, while they take fewer seconds."""
+"""Blocks in this process double in size while they take fewer seconds, up to so many runs."""
 
 WARM, SAVING = 0.2, 2.0
-"""Worker processes are started where they save so many seconds, as the first blocks, which are done
-here, show after so many seconds. Starting them costs about as much.
+"""Seconds of work in this process after which the total time is estimated; and the estimated saving
+in seconds above which worker processes are started, about the cost of starting them.
 """
 
-MAX_BLOCK = 64  # runs in a block: a killed command repeats at most so many
+MAX_BLOCK = 64  # runs in a block: a killed command repeats at most so many for each worker
 MAX_BLOCKS = 4096  # blocks in all: each is a file and a message to a worker
-ROUNDS = 16  # blocks a worker: the last ones then end at nearly the same time
+ROUNDS = 16  # blocks for each worker, so that all workers end at nearly the same time
 
 PATIENCE = 8
 """Seconds to wait for a scheduler."""
 LOOK_SECONDS, CLOSE_SECONDS = 1.0, 2.0
-MAX_ADDRESS = 1024  # a longer one is no address
+"""Interval at which a scheduler's connection is checked, and longest wait when it is closed."""
+MAX_ADDRESS = 1024  # characters; a longer address is refused
 
 
 class Pool(ABC):
-    """Does blocks. ``width`` is how many at a time, as far as one can know; ``ahead`` is how many
-    may be handed out before the first is back.
+    """Runs blocks of replicas.
+
+    width : number of blocks that run at a time, as far as known
+    ahead : number of blocks that may be submitted before the first is complete
     """
 
     width: int = 1
@@ -51,11 +54,11 @@ class Pool(ABC):
 
     @abstractmethod
     def submit(self, job: Job) -> Future[Any]:
-        """Hand out a block."""
+        """Submit a block; return the future of its result."""
 
     def next_size(self, left: int, runs: int) -> int:
-        """Return the number of runs of the next block, a power of two, with ``left`` of ``runs``
-        left.
+        """Return the number of runs of the next block, a power of two, when ``left`` of ``runs``
+        are not yet submitted.
         """
         return block_size(runs, self.width)
 
@@ -68,7 +71,7 @@ class Pool(ABC):
 
 
 class LocalPool(Pool):
-    """The present process, one block at a time, with the scenario and the caches that it has."""
+    """A pool that runs one block at a time in this process, with its scenario and caches."""
 
     ahead = 1
 
@@ -76,32 +79,36 @@ class LocalPool(Pool):
         self._size = 1
 
     def submit(self, job: Job) -> Future[Any]:
-        """Do the block before returning."""
+        """Run the block at once; return its completed future."""
         future: Future[Any] = Future()
-        began, compiled = time.perf_counter(), seconds_spent()
+        started, compile_seconds = time.perf_counter(), seconds_spent()
         try:
             future.set_result(work(job))
         except Exception as error:
             future.set_exception(error)
-        self._note_duration(job, time.perf_counter() - began - (seconds_spent() - compiled))
+        self._note_duration(
+            job, time.perf_counter() - started - (seconds_spent() - compile_seconds)
+        )
         return future
 
     def next_size(self, left: int, runs: int) -> int:
-        """Return twice as many runs as before while blocks are quick."""
+        """Return the present size of blocks, which doubles while blocks are quick."""
         return self._size
 
     def _note_duration(self, job: Job, seconds: float) -> None:
-        """Remember how long a block took, without the time of compilation."""
-        # Blocks may be larger than was asked for: of several that take as long as one.
+        """Double the size of blocks if one of full size took less than QUICK_SECONDS, not counting
+        compilation.
+        """
+        # The caller may have made the block larger than asked, as a full set of SIMD lanes.
         if seconds < QUICK_SECONDS and len(job.replicas) >= self._size:
             self._size = min(2 * job.size, MAX_BLOCK_HERE)
 
 
 class AdaptivePool(LocalPool):
-    """The present process, until the rest of the work is worth processes of our own, which do it.
+    """A pool that runs blocks in this process until worker processes would save time for the rest.
 
-    In an ``open_ended`` pool, which serves one job after another, as much work is expected to come
-    as there was already.
+    An ``open_ended`` pool, which serves one job after another, expects as much work to come as it
+    has done already.
     """
 
     def __init__(self, workers: int, open_ended: bool = False) -> None:
@@ -112,7 +119,7 @@ class AdaptivePool(LocalPool):
         self._begun, self._seconds, self._runs, self._spent = False, 0.0, 0, 0.0
 
     def submit(self, job: Job) -> Future[Any]:
-        """Do the block here, or hand it to the processes once they are worth it."""
+        """Run the block here, or submit it to worker processes once they are worth it."""
         if job.scenario is not self._scenario:
             self._scenario, self._size = job.scenario, 1
             self._begun, self._seconds, self._runs = False, 0.0, 0
@@ -130,7 +137,7 @@ class AdaptivePool(LocalPool):
         return block_size(left, self.width)
 
     def _note_duration(self, job: Job, seconds: float) -> None:
-        """Keep the seconds that a block took, the first one apart."""
+        """Add the seconds of a block to the estimate; a quick first one only filled caches."""
         super()._note_duration(job, seconds)
         self._spent += seconds
         if self._begun or seconds > 1.0:  # the first block fills caches
@@ -160,13 +167,13 @@ class AdaptivePool(LocalPool):
 
 
 class RemotePool(Pool):
-    """A pool outside this process: scenarios are packed, each once."""
+    """A pool outside this process, to which each scenario is sent pickled, packed once."""
 
     def __init__(self) -> None:
         self._packed: tuple[object, PackedScenario] | None = None
 
     def submit(self, job: Job) -> Future[Any]:
-        """Hand out a block with the packed scenario."""
+        """Submit a block with the packed scenario; return its future."""
         if isinstance(job.scenario, Scenario):
             if self._packed is None or self._packed[0] is not job.scenario:
                 self._packed = job.scenario, self._pack(job.scenario)
@@ -174,16 +181,16 @@ class RemotePool(Pool):
         return self._send(job)
 
     def _pack(self, scenario: Scenario) -> PackedScenario:
-        """Return the scenario as it travels to the workers."""
+        """Return the scenario in the form that is sent to workers."""
         return pack_scenario(scenario)
 
     @abstractmethod
     def _send(self, job: Job) -> Future[Any]:
-        """Hand out a block that can travel."""
+        """Submit a block whose scenario is packed; return its future."""
 
 
 class ExecutorPool(RemotePool):
-    """An executor of the user's, which stays open."""
+    """A user's concurrent.futures executor, which is not shut down."""
 
     def __init__(self, executor: Executor) -> None:
         super().__init__()
@@ -196,7 +203,7 @@ class ExecutorPool(RemotePool):
 
 
 class DaskPool(RemotePool):
-    """The workers of a Dask scheduler, which does the blocks of lost workers again.
+    """The workers of a Dask scheduler, which repeats the blocks of lost workers.
 
     Raises ScenarioError for an address where no scheduler answers.
     """
@@ -209,7 +216,7 @@ class DaskPool(RemotePool):
         except ImportError:
             message = "a Dask scheduler needs the extra cluster; pip install 'netkf[cluster]'"
             raise EngineError(message) from None
-        # An address inside of this process cannot be asked from another one.
+        # scheduler_answers() asks from another process, which cannot reach an inproc:// address.
         if not (address.startswith("inproc://") or scheduler_answers(address, PATIENCE)):
             raise _unreachable(address, "no Dask scheduler answers there")
         connect: Any = distributed.Client
@@ -223,7 +230,7 @@ class DaskPool(RemotePool):
 
     def _pack(self, scenario: Scenario) -> PackedScenario:
         """Return the scenario with the versions that workers must have."""
-        # Workers may join at any time, so each looks at its own versions.
+        # Workers may join at any time, so that each checks its own versions.
         return pack_scenario(scenario)._replace(versions=tuple(versions().items()))
 
     def _send(self, job: Job) -> Future[Any]:
@@ -269,7 +276,7 @@ def _unreachable(address: str, reason: str) -> ScenarioError:
 
 
 class ProcessPool(RemotePool):
-    """Worker processes of our own, each with one BLAS thread and without the user's script."""
+    """Own worker processes, each with one BLAS thread and without the user's script as __main__."""
 
     def __init__(self, workers: int) -> None:
         super().__init__()
@@ -296,7 +303,11 @@ def cores() -> int:
 
 
 def block_size(runs: int, width: int) -> int:
-    """Return a power of two that leaves every worker several blocks, so that all end together."""
+    """Return the number of runs in a block, a power of two, for ``runs`` runs on ``width`` workers.
+
+    Every worker gets about ROUNDS blocks, so that all end at nearly the same time, within the
+    limits MAX_BLOCK and MAX_BLOCKS.
+    """
     size = 1
     while size < MAX_BLOCK and 2 * size * width * ROUNDS <= runs:
         size *= 2
@@ -307,9 +318,14 @@ def block_size(runs: int, width: int) -> int:
 
 @dataclass(frozen=True)
 class PoolOptions:
-    """Where replicas are simulated: on so many ``workers`` (processes; 1 is this one), by an
-    ``executor`` of concurrent.futures or by the Dask ``scheduler`` at an address, of which one may
-    be given; by default here, and on as many processes as there are cores once they are worth it.
+    """Where replicas are simulated; at most one of the three may be given.
+
+    workers   : number of processes; 1 is this process
+    executor  : an executor of concurrent.futures
+    scheduler : address of a Dask scheduler
+
+    By default runs are simulated in this process, and on as many processes as there are cores once
+    that saves time.
     """
 
     workers: int | None = None
@@ -327,11 +343,11 @@ def make_pool(blocks: int, options: PoolOptions = ANYWHERE, open_ended: bool = F
     Raises ScenarioError if the options ask for two pools, or for one of the wrong kind.
     """
     workers, executor, scheduler = options.workers, options.executor, options.scheduler
-    asked = {"workers": workers, "executor": executor, "scheduler": scheduler}
-    given = [name for name, value in asked.items() if value is not None]
-    if len(given) > 1:
-        rule = f"cannot go together with {given[1]}"
-        raise ScenarioError(given[0], rule, asked[given[0]], "give one of them")
+    values = {"workers": workers, "executor": executor, "scheduler": scheduler}
+    names = [name for name, value in values.items() if value is not None]
+    if len(names) > 1:
+        rule = f"cannot go together with {names[1]}"
+        raise ScenarioError(names[0], rule, values[names[0]], "give one of them")
     if executor is not None:
         if not hasattr(executor, "submit"):
             remedy = "give a ThreadPoolExecutor, a ProcessPoolExecutor, or one like them"

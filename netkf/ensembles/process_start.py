@@ -24,14 +24,14 @@ PRELOADED = ["netkf.ensembles.statistics"]
 
 
 def context() -> Any:
-    """Return a context whose processes begin without this one's threads and memory; quickly where
-    they can.
+    """Return a multiprocessing context whose processes do not inherit this one's threads and
+    memory: forkserver, which starts quickly, where it exists, else spawn.
     """
     if "forkserver" not in multiprocessing.get_all_start_methods():
         return multiprocessing.get_context("spawn")
-    made = multiprocessing.get_context("forkserver")
-    made.set_forkserver_preload(PRELOADED)
-    return made
+    forkserver = multiprocessing.get_context("forkserver")
+    forkserver.set_forkserver_preload(PRELOADED)
+    return forkserver
 
 
 def start_server() -> None:
@@ -72,22 +72,22 @@ def signals_blocked() -> Iterator[None]:
     if not hasattr(signal, "pthread_sigmask"):
         yield
         return
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT, signal.SIGTERM))
+    old_mask = signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT, signal.SIGTERM))
     try:
         yield
     finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        signal.pthread_sigmask(signal.SIG_SETMASK, old_mask)
 
 
 @contextmanager
 def one_blas_thread() -> Iterator[None]:
     """Set the variables that numerical libraries read when a process loads them."""
-    before = {name: os.environ.get(name) for name in ONE_THREAD}
+    old_values = {name: os.environ.get(name) for name in ONE_THREAD}
     os.environ.update(dict.fromkeys(ONE_THREAD, "1"))
     try:
         yield
     finally:
-        for name, value in before.items():
+        for name, value in old_values.items():
             if value is None:
                 os.environ.pop(name, None)
             else:

@@ -1,7 +1,9 @@
-"""What the statistics of an ensemble need of each run of a batch, computed for all runs at once.
+"""The values of each run of a batch that ensemble statistics are made of, for all runs at once.
 
-Runs are taken L at a time, as lanes (``netkf.linalg.lanes``): their samples of some times are
-turned into lanes, columns are computed, turned back and merged, all in the nearest cache.
+Runs are processed L at a time in SIMD lanes (``netkf.linalg.lanes``), and a few sample times at a
+time, so that all data stay in the nearest cache: the samples of L runs are transposed into lanes,
+columns (products of errors, NEES) are computed, transposed back to rows of runs, and merged into
+moments by the binary tree over runs.
 """
 
 from __future__ import annotations
@@ -34,20 +36,21 @@ from netkf.trace.batch import RunBatch
 from netkf.trace.nees import errors, fill_nees
 from netkf.trace.run import BLUR, ROUNDING
 
-TOGETHER = 512
-"""Numbers of a run that are looked at together: some lines of the cache."""
+NUMBERS_AT_ONCE = 512
+"""Number of values of a run that are processed together: some lines of the cache."""
 MAX_SCRATCH_ENTRIES = 1 << 15
-"""Entries of all P of a sample up to which scratch is kept: some 10 MB."""
+"""Largest number of entries of all P of a sample for which scratch is kept (some 10 MB)."""
 
 
 class Reduced(NamedTuple):
-    """Values of R runs, each independent of the others in its batch.
+    """Values of R runs with F filters of n states; u = n (n + 1) / 2.
 
-    ``samples``: of each piece of the runs the moments of the upper triangles of P and of e e' with
-    the error e, then NEES, (T, F (2 u + 1)) for F filters, of the runs that have the sample.
-    ``averages`` (R, F, 3): mean square error, mean trace of P and mean NEES over the samples after
-    time 0, nan where there is none. ``rounding_from`` (R,): the first sample time at which rounding
-    blurs the errors, inf where none.
+    samples       : for each piece of the runs the moments (T, F (2 u + 1)) over the runs that have
+                    the sample: of the upper triangles of P and of e e', e the error, and of NEES
+    averages      : (R, F, 3) mean square error, mean trace of P and mean NEES over the samples
+                    after time 0, nan without samples
+    rounding_from : (R,) the first sample time in seconds at which rounding blurs the errors, else
+                    inf
     """
 
     samples: list[Moments]
@@ -56,12 +59,12 @@ class Reduced(NamedTuple):
 
 
 class Batch(Struct):
-    """The arrays of a RunBatch for kernels, see there.
+    """The arrays of a RunBatch for kernels; see there for those not listed here.
 
-    kept : (R,), number of samples of each run that count
-    known, given : runs (R,) whose NEES is given, and that NEES (R, T, F)
-    start : sample with which averages begin
-    x_rows, P_rows, error_rows : the same arrays with a row a run
+    sample_counts : (R,) number of samples of each run that count
+    has_nees      : (R,) bool, runs whose NEES is taken from ``known_nees`` (R, T, F)
+    start         : index of the first sample in averages
+    x_rows, P_rows, error_rows : the arrays x, P and error with one row for each run
     """
 
     times: FloatArray
@@ -71,9 +74,9 @@ class Batch(Struct):
     lengths: np.ndarray
     diverged: np.ndarray
     exact: int
-    kept: np.ndarray
-    known: np.ndarray
-    given: FloatArray
+    sample_counts: np.ndarray
+    has_nees: np.ndarray
+    known_nees: FloatArray
     start: int
     x_rows: FloatArray
     P_rows: FloatArray
@@ -81,12 +84,12 @@ class Batch(Struct):
 
 
 class Sums(Struct):
-    """Sums over K chunks of R runs.
+    """Moments of K pieces of R runs, and values of the runs.
 
-    size : (K, T), number of runs
-    mean, M2 : (K, T, F (2 u + 1))
-    averages, rounding_from : of the runs, as in Reduced
-    regular : (R,), whether all P of a run are regular
+    size : (K, T) number of runs that have the sample
+    mean, M2 : (K, T, F (2 u + 1)) mean and sum of squared deviations
+    averages, rounding_from : as in Reduced
+    regular : (R,) bool, all P of the run can be inverted
     """
 
     size: FloatArray
@@ -98,16 +101,20 @@ class Sums(Struct):
 
 
 class ReductionScratch(Struct):
-    """Scratch for S times and C = F (2 u + 1) columns of L runs, with some memory behind.
+    """Scratch for S sample times and C = F (2 u + 1) columns of L runs, with some spare memory.
 
-    ``lines`` (L, S F n n) as they are in a batch; in lanes ``error`` (S F n, L), ``P``
-    (S F n n, L), ``x`` (S n, L), ``columns`` (S C, L) and ``totals`` (F, 3, L), the sums for the
-    averages; of one sample the error ``z`` (n, L), ``factor`` of P (n, n, L), NEES and whether P is
-    ``broken`` (L,), whether the sample counts as ``clear`` or as ``traced`` (L,); ``rows``
-    (L, S, C) by run and their M2 ``work`` (L, S, C), ``size`` (L, S). Of nodes of the tree over
-    runs, those that wait for a neighbour, ``node_size`` (D, S), ``mean`` and ``M2`` (D, S, C). Of a
-    sample alone ``one`` (n, n), ``solved`` (n, 1) and NEES ``alone`` (1,). ``lane_numbers``: 0 .. L
-    - 1.
+    lines  : (L, S F n n) samples of L runs in the order of the batch
+    error, P, x, columns : (S F n, L), (S F n n, L), (S n, L), (S C, L) the same in lanes
+    totals : (F, 3, L) sums for the averages
+    z, factor, nees, not_definite : (n, L), (n, n, L), (L,), (L,) of one sample: error, factor of P,
+             NEES, and 1 where P is not positive definite
+    clear, traced : (L,) 1 where the sample counts in averages of errors, and of P
+    rows, work, size : (L, S, C), (L, S, C), (L, S) columns of each run, their M2 and number
+    node_size, mean, M2 : (D, S), (D, S, C), (D, S, C) of the nodes of the tree over runs that wait
+             for a neighbour
+    single_factor, single_solved, single_nees : (n, n), (n, 1), (1,) for one sample of one run
+    lane_numbers : 0 .. L - 1
+    times  : S
     """
 
     lines: FloatArray
@@ -119,7 +126,7 @@ class ReductionScratch(Struct):
     z: FloatArray
     factor: FloatArray
     nees: FloatArray
-    broken: FloatArray
+    not_definite: FloatArray
     clear: FloatArray
     traced: FloatArray
     rows: FloatArray
@@ -128,9 +135,9 @@ class ReductionScratch(Struct):
     node_size: FloatArray
     mean: FloatArray
     M2: FloatArray
-    one: FloatArray
-    solved: FloatArray
-    alone: FloatArray
+    single_factor: FloatArray
+    single_solved: FloatArray
+    single_nees: FloatArray
     lane_numbers: np.ndarray
     times: int
 
@@ -138,8 +145,8 @@ class ReductionScratch(Struct):
 def reduction_scratch(filters: int, n: int, largest: int) -> ReductionScratch:
     """Return scratch for ``filters`` filters of n states, in chunks of at most ``largest`` runs."""
     columns = filters * (n * (n + 1) + 1)
-    times = max(1, TOGETHER // columns)
-    # L entries are moved at a time, which goes beyond the last column.
+    times = max(1, NUMBERS_AT_ONCE // columns)
+    # Transpositions move L entries at a time, possibly beyond the last column.
     wide = times + -(-LANES // columns)
     depth = largest.bit_length() + 1
     nodes, rows = (depth, wide, columns), (LANES, wide, columns)
@@ -158,7 +165,7 @@ def reduction_scratch(filters: int, n: int, largest: int) -> ReductionScratch:
         z=aligned((n, LANES)),
         factor=aligned((n, n, LANES)),
         nees=aligned((LANES,)),
-        broken=aligned((LANES,)),
+        not_definite=aligned((LANES,)),
         clear=aligned((LANES,)),
         traced=aligned((LANES,)),
         rows=np.zeros(rows),
@@ -167,9 +174,9 @@ def reduction_scratch(filters: int, n: int, largest: int) -> ReductionScratch:
         node_size=np.empty((depth, times)),
         mean=np.empty(nodes),
         M2=np.empty(nodes),
-        one=np.empty((n, n)),
-        solved=np.empty((n, 1)),
-        alone=np.empty(1),
+        single_factor=np.empty((n, n)),
+        single_solved=np.empty((n, 1)),
+        single_nees=np.empty(1),
         lane_numbers=np.arange(LANES),
         times=times,
     )
@@ -196,12 +203,12 @@ _scratch_cache = _ScratchCache()
 
 
 def reduce_batch(batch: RunBatch, pieces: Sequence[slice]) -> Reduced:
-    """Return values of all runs of a batch, samples by ``pieces``, which are neighbours and hold
-    all runs; the last sample of a run that diverged is left out.
+    """Return the values of all runs of a batch, with moments of samples for each of ``pieces``:
+    adjacent slices that cover all runs. The last sample of a run that diverged is left out.
     """
     runs, count, filters, n = batch.error.shape
     bounds = np.array([0, *(piece.stop for piece in pieces)])
-    columns, most = filters * (n * (n + 1) + 1), int(np.diff(bounds).max())
+    columns, largest = filters * (n * (n + 1) + 1), int(np.diff(bounds).max())
     sums = Sums(
         size=np.empty((len(pieces), count)),
         mean=np.empty((len(pieces), count, columns)),
@@ -210,15 +217,19 @@ def reduce_batch(batch: RunBatch, pieces: Sequence[slice]) -> Reduced:
         rounding_from=np.full(runs, np.inf),
         regular=np.ones(runs, dtype=np.bool_),
     )
-    given = _batch_arrays(batch)
-    scratch = _scratch_cache.of(filters, n, most)
-    reduce_runs(MANY, given, bounds, sums, scratch)
+    arrays = _batch_arrays(batch)
+    scratch = _scratch_cache.of(filters, n, largest)
+    reduce_runs(MANY, arrays, bounds, sums, scratch)
     if not sums.regular.all():
-        # Some P is exactly singular: those that are singular up to rounding are left out as well.
-        given.given, given.known = _nees_of_irregular(given, sums.regular), ~sums.regular
+        # Some P is exactly singular. In such runs a P that is singular up to rounding is no better:
+        # their NEES is computed again by errors(), which leaves both out.
+        arrays.known_nees, arrays.has_nees = (
+            _nees_of_irregular(arrays, sums.regular),
+            ~sums.regular,
+        )
         sums.averages[:], sums.rounding_from[:] = 0.0, np.inf
-        reduce_runs(MANY, given, bounds, sums, scratch)
-    samples = [Moments(*found) for found in zip(sums.size, sums.mean, sums.M2, strict=True)]
+        reduce_runs(MANY, arrays, bounds, sums, scratch)
+    samples = [Moments(*moments) for moments in zip(sums.size, sums.mean, sums.M2, strict=True)]
     return Reduced(samples, sums.averages, sums.rounding_from)
 
 
@@ -234,9 +245,9 @@ def _batch_arrays(batch: RunBatch) -> Batch:
         lengths=batch.lengths,
         diverged=batch.diverged,
         exact=int(batch.exact_errors),
-        kept=batch.lengths - batch.diverged,
-        known=np.zeros(runs, dtype=np.bool_),
-        given=np.empty((0, 0, 0)),
+        sample_counts=batch.lengths - batch.diverged,
+        has_nees=np.zeros(runs, dtype=np.bool_),
+        known_nees=np.empty((0, 0, 0)),
         start=int(np.searchsorted(batch.times, 0.0, side="right")),
         x_rows=x.reshape(runs, -1),
         P_rows=P.reshape(runs, -1),
@@ -245,35 +256,35 @@ def _batch_arrays(batch: RunBatch) -> Batch:
 
 
 def _nees_of_irregular(batch: Batch, regular: np.ndarray) -> FloatArray:
-    """Return NEES (R, T, F) of the kept samples of the runs that are not ``regular`` (R,)."""
+    """Return NEES (R, T, F) of the runs that are not ``regular`` (R,); other runs are not set."""
     nees = np.empty(batch.error.shape[:3])
     for r in np.flatnonzero(~regular):
-        kept = batch.kept[r]
-        nees[r, :kept] = errors(batch.error[r, :kept], batch.P[r, :kept])[1]
+        count = batch.sample_counts[r]
+        nees[r, :count] = errors(batch.error[r, :count], batch.P[r, :count])[1]
     return nees
 
 
-# Compact with all that is inlined here: loops over lanes gain nothing from being unrolled.
+# Compact, with all functions inlined here: unrolling loops over lanes gains nothing.
 @kernel(compact=True)
 def reduce_runs(
     lanes: Lanes, b: Batch, bounds: np.ndarray, sums: Sums, scratch: ReductionScratch
 ) -> None:
-    """Find the sums of R runs, of which piece k holds ``bounds[k]`` to ``bounds[k + 1]``."""
+    """Fill ``sums`` for R runs; piece k has the runs ``bounds[k]`` to ``bounds[k + 1] - 1``."""
     for k in range(len(bounds) - 1):
-        # Some times in all runs of a piece: what is found is merged before the next.
+        # A few sample times of all runs of a piece at a time.
         for t in range(0, len(b.times), scratch.times):
             count, depth = min(scratch.times, len(b.times) - t), 0
             for first in range(bounds[k], bounds[k + 1], len(lanes)):
                 active = min(len(lanes), bounds[k + 1] - first)
-                whole = reduce_group(lanes, b, sums, scratch, first, active, t, count)
-                add_node(lanes, scratch, active, count, depth, whole)
+                complete = reduce_group(lanes, b, sums, scratch, first, active, t, count)
+                add_node(lanes, scratch, active, count, depth, complete)
                 depth += 1
-                # A binary counter: as many nodes are complete as the number ends in ones.
+                # A binary counter: each trailing one of the group's number completes a node.
                 number = (first - bounds[k]) // len(lanes)
                 while number & 1 == 1:
                     depth = join_nodes(scratch, depth, count)
                     number >>= 1
-            # Those at the end that have no neighbour join from right to left.
+            # Nodes left without a neighbour at the end are merged from right to left.
             while depth > 1:
                 depth = join_nodes(scratch, depth, count)
             mean, M2, mean_of, M2_of = scratch.mean, scratch.M2, sums.mean, sums.M2
@@ -281,13 +292,13 @@ def reduce_runs(
                 sums.size[k, t + s] = scratch.node_size[0, s]
                 for c in range(mean.shape[2]):
                     mean_of[k, t + s, c], M2_of[k, t + s, c] = mean[0, s, c], M2[0, s, c]
-    for r in range(len(b.kept)):
+    for r in range(len(b.sample_counts)):
         divide_averages(b, sums, r)
 
 
 @kernel(compact=True)
 def join_nodes(scratch: ReductionScratch, depth: int, count: int) -> int:
-    """Merge the last two of the nodes that wait; return how many there are then."""
+    """Merge the last two of ``depth`` waiting nodes, for ``count`` times; return depth - 1."""
     for s in range(count):
         merge_pair(scratch.node_size, scratch.mean, scratch.M2, depth - 2, depth - 1, s, s)
     return depth - 1
@@ -295,12 +306,12 @@ def join_nodes(scratch: ReductionScratch, depth: int, count: int) -> int:
 
 @kernel(compact=True)
 def add_node(
-    lanes: Lanes, scratch: ReductionScratch, active: int, count: int, node: int, whole: bool
+    lanes: Lanes, scratch: ReductionScratch, active: int, count: int, node: int, complete: bool
 ) -> None:
-    """Merge the ``active`` rows of a group of runs in the tree over them, as a new node. They are
-    ``whole`` if none lacks a sample.
+    """Merge the ``active`` rows of a group of runs into the tree's waiting ``node``; ``complete``
+    if no run lacks one of the ``count`` samples.
     """
-    if whole and active == len(lanes):
+    if complete and active == len(lanes):
         merge_whole(lanes, scratch, count, node)
         return
     for s in range(count):
@@ -315,14 +326,14 @@ def add_node(
 
 @kernel
 def merge_whole(lanes: Lanes, scratch: ReductionScratch, count: int, node: int) -> None:
-    """Merge L rows as ``merge_row`` does, where all sizes are equal, L columns at a time."""
+    """Merge L rows that all have the sample, as ``merge_row`` does but L columns at a time."""
     rows, work, mean_of, M2_of = scratch.rows, scratch.work, scratch.mean, scratch.M2
     for s in range(count):
         scratch.node_size[node, s] = 1.0 * len(lanes)
     for c in range(0, count * rows.shape[2], len(lanes)):
         stride = 1
         while stride < len(lanes):
-            # Both have ``stride`` observations: shares of 1 / 2 in the mean.
+            # Both sides have ``stride`` observations: each has the weight 1 / 2 in the mean.
             for a in range(0, len(lanes), 2 * stride):
                 mean = load(lanes, rows, a, 0, c)
                 delta = load(lanes, rows, a + stride, 0, c) - mean
@@ -347,8 +358,8 @@ def gather_samples(
     lines: FloatArray,
     out: FloatArray,
 ) -> None:
-    """Turn ``count`` numbers of each run from ``first`` on, those from ``start`` on of ``samples``
-    (R, ...), into the lanes of ``out`` (>= count, L). Idle lanes repeat the last run.
+    """Transpose columns ``start`` to ``start + count`` of ``samples`` (R, ...) for the ``active``
+    runs from ``first`` on into lanes, ``out`` (>= count, L). Idle lanes repeat the last run.
     """
     for q in range(len(lanes)):
         r = first + min(q, active - 1)
@@ -369,21 +380,41 @@ def reduce_group(
     t: int,
     count: int,
 ) -> bool:
-    """Write the ``rows`` of ``count`` samples from ``t`` on of the ``active`` runs from ``first``
-    on, and add them to the averages; return True if no run lacks one of them.
+    """Fill ``scratch.rows`` for ``count`` samples from ``t`` on of the ``active`` runs from
+    ``first`` on, and add them to the averages; return True if no run lacks one of them.
     """
     filters, n = b.error.shape[2:]
-    each, whole, kept, totals, averages = filters * n, True, b.kept, scratch.totals, sums.averages
-    gather_samples(
-        lanes, b.error_rows, first, active, t * each, count * each, scratch.lines, scratch.error
+    entries, complete, sample_counts, totals, averages = (
+        filters * n,
+        True,
+        b.sample_counts,
+        scratch.totals,
+        sums.averages,
     )
     gather_samples(
-        lanes, b.P_rows, first, active, t * each * n, count * each * n, scratch.lines, scratch.P
+        lanes,
+        b.error_rows,
+        first,
+        active,
+        t * entries,
+        count * entries,
+        scratch.lines,
+        scratch.error,
+    )
+    gather_samples(
+        lanes,
+        b.P_rows,
+        first,
+        active,
+        t * entries * n,
+        count * entries * n,
+        scratch.lines,
+        scratch.P,
     )
     if not b.exact:
         gather_samples(lanes, b.x_rows, first, active, t * n, count * n, scratch.lines, scratch.x)
     for q in range(active):
-        whole = whole and t + count <= kept[first + q]
+        complete = complete and t + count <= sample_counts[first + q]
         for f in range(filters):
             for a in range(3):
                 totals[f, a, q] = averages[first + q, f, a]
@@ -398,19 +429,19 @@ def reduce_group(
         for f in range(filters):
             for a in range(3):
                 averages[first + q, f, a] = totals[f, a, q]
-    if not whole or active < len(lanes):
+    if not complete or active < len(lanes):
         mark_missing(b, scratch, first, active, t, count)
-    return whole
+    return complete
 
 
 @kernel(compact=True)
 def mark_missing(
     b: Batch, scratch: ReductionScratch, first: int, active: int, t: int, count: int
 ) -> None:
-    """Give samples that a run has size 1, and those that it lacks size 0 and zeros."""
+    """Set ``size`` to 1 for samples that a run has, else to 0, with zeros in ``rows``."""
     for q in range(active):
         for s in range(count):
-            exists = t + s < b.kept[first + q]
+            exists = t + s < b.sample_counts[first + q]
             scratch.size[q, s] = 1.0 if exists else 0.0
             for c in range(0 if exists else scratch.rows.shape[2]):
                 scratch.rows[q, s, c] = 0.0
@@ -428,10 +459,10 @@ def reduce_sample(
     s: int,
     f: int,
 ) -> None:
-    """Fill the columns of sample ``t``, the ``s``-th of a group, of filter ``f``, and add it to the
-    averages.
+    """Fill the columns of sample ``t``, number ``s`` of a group, for filter ``f``, and add it to
+    the averages.
     """
-    # Taken from the struct once, and not in each step of the loops.
+    # Loaded from the struct once instead of in each step of the loops.
     errors_of, P, columns, factor, z = (
         scratch.error,
         scratch.P,
@@ -441,12 +472,12 @@ def reduce_sample(
     )
     n = len(z)
     filters = len(scratch.totals)
-    # Columns of a sample of a filter: the upper triangles of P and of e e', and then NEES.
+    # Columns of one sample of a filter: upper triangle of P, upper triangle of e e', NEES.
     half = n * (n + 1) // 2
-    place = s * filters + f
-    index = place * n
-    index_P = place * n * n
-    column = place * (2 * half + 1)
+    filter_index = s * filters + f
+    index = filter_index * n
+    index_P = filter_index * n * n
+    column = filter_index * (2 * half + 1)
     last = column + 2 * half
     square = spread(lanes, 0.0)
     trace = spread(lanes, 0.0)
@@ -462,10 +493,10 @@ def reduce_sample(
             store(lanes, columns, half + column, e * load(lanes, errors_of, index + j))
             column += 1
     if any_lane(nees_of_lanes(lanes, scratch)):
-        # A singular P needs pivoting, sample by sample.
+        # A P that is not positive definite needs pivoting, one run at a time.
         for q in range(active):
-            if scratch.broken[q] > 0.0 and t < b.kept[first + q]:
-                nees_alone(b, sums, scratch, first + q, t, f, q)
+            if scratch.not_definite[q] > 0.0 and t < b.sample_counts[first + q]:
+                fill_single_nees(b, sums, scratch, first + q, t, f, q)
     nees = load(lanes, scratch.nees, 0)
     store(lanes, columns, last, nees)
     clear, traced = load(lanes, scratch.clear, 0) > 0.0, load(lanes, scratch.traced, 0) > 0.0
@@ -483,14 +514,16 @@ def add_total(lanes: Lanes, totals: FloatArray, f: int, a: int, number: Any) -> 
 
 
 @kernel(compact=True)
-def nees_alone(
+def fill_single_nees(
     b: Batch, sums: Sums, scratch: ReductionScratch, r: int, t: int, f: int, q: int
 ) -> None:
-    """Write NEES of one sample into lane ``q``, and note where its P is singular."""
+    """Write NEES of sample ``t`` of run ``r`` and filter ``f`` into lane ``q``, by Gaussian
+    elimination with pivoting; mark the run as not regular if P is singular.
+    """
     error, P = b.error[r, t, f : f + 1], b.P[r, t, f : f + 1]
-    if not fill_nees(error, P, scratch.alone, scratch.one, scratch.solved):
+    if not fill_nees(error, P, scratch.single_nees, scratch.single_factor, scratch.single_solved):
         sums.regular[r] = False
-    scratch.nees[q] = b.given[r, t, f] if b.known[r] else scratch.alone[0]
+    scratch.nees[q] = b.known_nees[r, t, f] if b.has_nees[r] else scratch.single_nees[0]
 
 
 @kernel(compact=True)
@@ -500,16 +533,22 @@ def mark_averaged(
     """Mark the runs in whose averages sample ``t`` counts, by the rule of
     ``runs.summary.averaged_samples``: ``clear`` for those of errors, ``traced`` for that of P.
     """
-    # Arrays are taken from the structs once, and not in each step of the loop.
-    times, kept, diverged, rounding_from = b.times, b.kept, b.diverged, sums.rounding_from
+    # Loaded from the structs once instead of in each step of the loop.
+    times, sample_counts, diverged, rounding_from = (
+        b.times,
+        b.sample_counts,
+        b.diverged,
+        sums.rounding_from,
+    )
     clear_runs, traced_runs = scratch.clear, scratch.traced
     for q in range(active):
         r = first + q
         blurred_from = rounding_from[r]  # seconds; errors are mostly rounding from then on
-        begin = b.start if b.start < kept[r] else 0  # without samples after time 0, all count
-        exists = begin <= t < kept[r]
+        # Without samples after time 0 all samples count.
+        begin = b.start if b.start < sample_counts[r] else 0
+        exists = begin <= t < sample_counts[r]
         clear = exists and times[t] < blurred_from
-        # Rounding spares covariances, but those of a run that diverges outgrow all bounds.
+        # Covariances do not suffer from rounding, but those of a diverging run grow without bound.
         traced = clear or (exists and not (diverged[r] and times[begin] < blurred_from))
         clear_runs[q] = 1.0 if clear else 0.0
         traced_runs[q] = 1.0 if traced else 0.0
@@ -518,12 +557,12 @@ def mark_averaged(
 @kernel(compact=True)
 def divide_averages(b: Batch, sums: Sums, r: int) -> None:
     """Divide the sums of run ``r`` by the numbers of samples in them."""
-    kept = b.kept[r]
-    first = b.start if b.start < kept else 0
+    count = b.sample_counts[r]
+    first = b.start if b.start < count else 0
     clear = first
-    while clear < kept and b.times[clear] < sums.rounding_from[r]:
+    while clear < count and b.times[clear] < sums.rounding_from[r]:
         clear += 1
-    last = clear if b.diverged[r] and clear > first else kept
+    last = clear if b.diverged[r] and clear > first else count
     for f in range(sums.averages.shape[1]):
         sums.averages[r, f, 0] /= clear - first
         sums.averages[r, f, 1] /= last - first
@@ -533,30 +572,30 @@ def divide_averages(b: Batch, sums: Sums, r: int) -> None:
 @kernel(inlined=True)
 def nees_of_lanes(lanes: Lanes, scratch: ReductionScratch) -> Any:
     """Write NEES ``e' P^-1 e`` of L samples, one in each lane, and return the lanes whose P is not
-    positive definite or not finite, which ``broken`` (L,) has as numbers.
+    positive definite or not finite; ``not_definite`` (L,) counts their bad pivots.
 
     On entry ``factor`` is P and ``z`` the error e; both are overwritten.
     """
     # P = G D G' with G unit lower triangular, and e' P^-1 e = z' D^-1 z with G z = e.
-    rest = scratch.factor
+    schur = scratch.factor
     error = scratch.z
     n = len(error)
     total = spread(lanes, 0.0)
-    broken = spread(lanes, 0.0)
+    not_definite = spread(lanes, 0.0)
     for k in range(n):
-        pivot, z = load(lanes, rest, k, k), load(lanes, error, k)
-        broken += select(pivot > 0.0, 0.0, 1.0)
+        pivot, z = load(lanes, schur, k, k), load(lanes, error, k)
+        not_definite += select(pivot > 0.0, 0.0, 1.0)
         inverse = 1.0 / pivot
         total += z * z * inverse
         for i in range(k + 1, n):
-            factor = load(lanes, rest, i, k) * inverse
+            factor = load(lanes, schur, i, k) * inverse
             for j in range(k + 1, i + 1):
-                entry = load(lanes, rest, i, j) - factor * load(lanes, rest, j, k)
-                store(lanes, rest, i, j, entry)
+                entry = load(lanes, schur, i, j) - factor * load(lanes, schur, j, k)
+                store(lanes, schur, i, j, entry)
             store(lanes, error, i, load(lanes, error, i) - factor * z)
     store(lanes, scratch.nees, 0, total)
-    store(lanes, scratch.broken, 0, broken)
-    return broken > 0.0
+    store(lanes, scratch.not_definite, 0, not_definite)
+    return not_definite > 0.0
 
 
 @kernel(inlined=True)
@@ -570,16 +609,18 @@ def mark_blurred(
     t: int,
     s: int,
 ) -> None:
-    """Note the time of sample ``t``, the ``s``-th of a group, in the runs where it is blurred."""
-    # Squares tell without a root where it is surely not. A nan is no number here: what is blurred
-    # is not decided by it either.
+    """Set ``rounding_from`` to the time of sample ``t``, number ``s`` of a group, in the runs in
+    which this is the first sample that rounding blurs.
+    """
+    # A fast sufficient test of all lanes by squares, without a root; is_blurred() decides about the
+    # runs that it does not clear. Comparisons with nan are false, as in is_blurred().
     filters, n = b.error.shape[2:]
     errors_of, P = scratch.error, scratch.P
-    largest, least = spread(lanes, 0.0), spread(lanes, np.inf)
+    largest, min_variance = spread(lanes, 0.0), spread(lanes, np.inf)
     for f in range(s * filters, (s + 1) * filters):
         for i in range(n):
             variance = load(lanes, P, f * n * n + i * n + i)
-            least = select(variance < least, variance, least)
+            min_variance = select(variance < min_variance, variance, min_variance)
             if b.exact:
                 size = magnitude(load(lanes, errors_of, f * n + i))
                 largest = select(size > largest, size, largest)
@@ -587,33 +628,33 @@ def mark_blurred(
         size = magnitude(load(lanes, scratch.x, index))
         largest = select(size > largest, size, largest)
     bound = ROUNDING * BLUR * largest
-    clear = (least < np.inf) & (bound * bound < 0.5 * least)
+    clear = (min_variance < np.inf) & (bound * bound < 0.5 * min_variance)
     if any_lane(select(clear, 0.0, 1.0) > 0.0):
         for r in range(first, first + active):
-            known = t >= b.lengths[r] or b.times[t] >= sums.rounding_from[r]
-            if not known and is_blurred(b, r, t):
+            decided = t >= b.lengths[r] or b.times[t] >= sums.rounding_from[r]
+            if not decided and is_blurred(b, r, t):
                 sums.rounding_from[r] = b.times[t]
 
 
 @kernel(compact=True)
 def is_blurred(b: Batch, r: int, t: int) -> bool:
-    """Return True if rounding blurs, by the rule of ``trace.run.rounding_from``, sample ``t`` of
-    run ``r``: x (n,), P (F, n, n), error (F, n).
+    """Return True if rounding blurs sample ``t`` of run ``r``, by the rule of
+    ``trace.run.rounding_from``.
     """
     filters, n = b.error.shape[2:]
-    largest, least, square = 0.0, np.inf, 0.0
-    given, broken = False, False
+    largest, min_variance, square = 0.0, np.inf, 0.0
+    has_covariance, is_undefined = False, False
     for f in range(filters):
         for i in range(n):
             value = abs(b.error[r, t, f, i]) if b.exact else abs(b.x[r, t, i])
-            broken = broken or np.isnan(value) or np.isnan(b.P[r, t, f, i, i])
-            largest, least = max(largest, value), min(least, b.P[r, t, f, i, i])
-            if not given:
+            is_undefined = is_undefined or np.isnan(value) or np.isnan(b.P[r, t, f, i, i])
+            largest, min_variance = max(largest, value), min(min_variance, b.P[r, t, f, i, i])
+            if not has_covariance:
                 square += b.error[r, t, f, i] * b.error[r, t, f, i]
                 for j in range(n):
-                    given = given or not np.isnan(b.P[r, t, f, i, j])
-    if not given:
+                    has_covariance = has_covariance or not np.isnan(b.P[r, t, f, i, j])
+    if not has_covariance:
         # The filter gives no covariance: the errors themselves show their size.
-        broken, least = np.isnan(square) or np.isnan(largest), square / (filters * n)
-    deviation = np.sqrt(max(least, 0.0)) / BLUR
-    return not broken and deviation > 0.0 and ROUNDING * largest > deviation
+        is_undefined, min_variance = np.isnan(square) or np.isnan(largest), square / (filters * n)
+    deviation = np.sqrt(max(min_variance, 0.0)) / BLUR
+    return not is_undefined and deviation > 0.0 and ROUNDING * largest > deviation

@@ -1,4 +1,4 @@
-"""``replicate``: something done with many replicas of a scenario, wherever there are workers."""
+"""``replicate``: apply a task to many replicas of a scenario on a pool of workers."""
 
 from __future__ import annotations
 
@@ -17,13 +17,16 @@ from netkf.linalg.lanes import LANES
 from netkf.scenario.scenario import Scenario
 
 Progress = Callable[[int, int], None]
-"""Called with the runs done and wanted."""
+"""Called with the number of runs done and the number of all runs."""
 
 
 class NumberedBlocks(NamedTuple):
-    """Blocks of ``size`` replicas, a power of two, numbered from 0. Those that are ``known`` are
-    not done again but called for; ``received(number, result)`` sees each of the others when it
-    comes and returns what to merge.
+    """Blocks of a fixed size, numbered from 0.
+
+    size     : replicas in a block, a power of two; 0 if the pool chooses
+    known    : functions that return the results of blocks that need not be simulated, by number
+    received : function of (number, result) that is called with each other block as it completes,
+               and returns the result to merge
     """
 
     size: int
@@ -37,9 +40,9 @@ def replicate(
     """Return ``task(scenario, seed, replica)`` for the replicas ``first`` .. ``first + runs - 1``,
     in their order; ``options`` are those of ``replicate_blocks``.
     """
-    whole = partial(each_replica, partial(_as_list, task), operator.add)
-    found: list[Any] = replicate_blocks(whole, operator.add, scenario, runs, seed, **options)
-    return found
+    block_task = partial(each_replica, partial(_as_list, task), operator.add)
+    results: list[Any] = replicate_blocks(block_task, operator.add, scenario, runs, seed, **options)
+    return results
 
 
 def replicate_blocks(
@@ -59,20 +62,22 @@ def replicate_blocks(
     runs - 1``, merged by ``merge(a, b)``, which joins the results of neighbours (a before b) into
     one of the same kind.
 
-    Results are merged in the binary tree over replicas, inside blocks by the task itself: the whole
-    is equal to the last bit for every number of workers, size of block and order of completion.
+    Results are merged in the binary tree over replicas, inside blocks by the task itself: the
+    result has the same bits for every number of workers, size of blocks and order of completion.
     ``task`` and ``merge`` are functions of a module, or partials of such, that workers can import;
-    what they return must pickle.
+    their results must pickle.
 
-    The work is done by a ``pool`` of make_pool, or by one that the options describe; it is closed
-    at the end. ``seed`` defaults to the scenario's.
+    seed     : defaults to the scenario's
+    pool     : a pool of make_pool, or options for one; it is closed at the end
+    progress : called after each block
+    together : smallest number of replicas in a block run in this process, a power of two; by
+               default as many as SIMD lanes for a scenario in slots, whose runs are simulated in
+               lanes, else 1
+    blocks   : numbered blocks of fixed size, some of which may be known; by default the pool
+               chooses the sizes
 
-    ``together`` replicas, a power of two, are one block at least where blocks are done here; by
-    default several of a scenario in slots, where runs are side by side. The pool chooses how many
-    replicas are a block, unless ``blocks`` are numbered.
-
-    Raises ScenarioError for arguments that are wrong, EngineError where workers die again and again
-    or a plugged-in class fails, and what ``task`` raises.
+    Raises ScenarioError for wrong arguments, EngineError if workers die again and again or a
+    plugged-in class fails, and whatever ``task`` raises.
     """
     if not isinstance(scenario, Scenario):
         raise ScenarioError("", "must be a netkf.Scenario", scenario, "netkf.load(path) gives one")
@@ -84,16 +89,15 @@ def replicate_blocks(
     ended = False
     try:
         job = Job(scenario, task, seed, first, 0, runs, blocks.size)
-        whole = _gather(pool, job, together, merge, blocks, progress or _report_nothing)
+        result = _gather(pool, job, together, merge, blocks, progress or _report_nothing)
         ended = True
     finally:
         pool.close(at_once=not ended)
-    return whole
+    return result
 
 
 def _as_list(task: Task, scenario: Scenario, seed: int, replica: int) -> list[Any]:
-    """Return the result of a block unchanged."""
-    """Return the result of one replica, for addition to join."""
+    """Return the result of one replica as a list, which ``operator.add`` merges with others."""
     return [task(scenario, seed, replica)]
 
 
@@ -117,7 +121,9 @@ def _gather(
     blocks: NumberedBlocks,
     progress: Progress,
 ) -> Any:
-    """Hand out the blocks that are not known, and merge all as they come."""
+    """Return the merged result of all blocks: known ones are loaded, others run on the pool, and
+    all are merged as they complete.
+    """
     tree, done, known = MergeTree(merge), 0, blocks.known
 
     def take(block: Job, result: Any) -> None:
@@ -137,19 +143,21 @@ def _gather(
 def _make_blocks(
     pool: Pool, job: Job, together: int | None, known: Mapping[int, Callable[[], Any]]
 ) -> Iterator[Job]:
-    """Yield the blocks that are not known yet, in order; the pool chooses sizes as it is asked."""
+    """Yield the blocks that are not known, in order, of the job's block size or, if that is 0, of
+    sizes that the pool chooses as blocks are submitted.
+    """
     if job.size:
         for number in range(-(-job.stop // job.size)):
             if number not in known:
                 yield job._replace(start=number * job.size)
         return
-    # Runs in slots are side by side in lanes: fewer of them take as long.
+    # Runs in slots are simulated in SIMD lanes: fewer runs than lanes take as long.
     slotted = isinstance(job.scenario, Scenario) and job.scenario.slotted
-    start, least = 0, together or (LANES if slotted else 1)
+    start, min_size = 0, together or (LANES if slotted else 1)
     while start < job.stop:
         size = pool.next_size(job.stop - start, job.stop)
         if pool.ahead == 1:
-            size = max(size, least)
+            size = max(size, min_size)
         if start:
             size = min(size, start & -start)  # a block is a node of the tree
         yield job._replace(start=start, size=size)

@@ -1,4 +1,4 @@
-"""Whether the runs in a directory can be gone on with: what must be the same, and is proved."""
+"""Conditions for resuming the runs in a directory: same scenario, options and installation."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ ANOTHER = "start in a new directory"
 
 
 class BegunEnsemble(NamedTuple):
-    """A directory to go on in, the number of runs in its blocks, and whether all is done."""
+    """A directory to resume in, the number of runs in its blocks, and whether it is complete."""
 
     directory: Path
     block: int
@@ -53,7 +53,7 @@ class BegunEnsemble(NamedTuple):
 def ensemble_to_resume(
     out: Path | None, scenario: Scenario, plan: RunIdentity
 ) -> BegunEnsemble | None:
-    """Return what is in the directory ``out``, None if it is new or empty.
+    """Return the ensemble in the directory ``out``, None if that is new or empty.
 
     Raises ScenarioError if it holds something else than a run with this plan on this installation,
     or one that was changed since it was written.
@@ -67,9 +67,9 @@ def ensemble_to_resume(
             return None
         _check_scenario(out, scenario)
         return BegunEnsemble(out, size, False)
-    found = read_manifest(out)
-    if found["runs"]["wanted"] != plan.runs:
-        rule, value = "the run was begun with another number of runs", found["runs"]["wanted"]
+    manifest = read_manifest(out)
+    if manifest["runs"]["wanted"] != plan.runs:
+        rule, value = "the run was begun with another number of runs", manifest["runs"]["wanted"]
         raise ScenarioError("--resume", rule, value, "give the same --runs")
     same = {
         "scenario": (plan.scenario, "give the same scenario, seed and settings"),
@@ -78,30 +78,32 @@ def ensemble_to_resume(
         "versions": (versions(), "go on with the versions that it was begun with"),
         "machine": (machine(), "go on where it was begun, or start in a new directory"),
     }
-    for key, (wanted, remedy) in same.items():
-        if found.get(key) != wanted:
+    for key, (planned, remedy) in same.items():
+        if manifest.get(key) != planned:
             rule = f"{out} holds a run of another {key.removesuffix('s')}"
             raise ScenarioError(
-                "--resume", rule, _describe_difference(found.get(key), wanted), remedy
+                "--resume", rule, _describe_difference(manifest.get(key), planned), remedy
             )
     blocks_prove = "remove it: the blocks prove themselves"
-    _require(out / "manifest.json", lambda: check_seal(found), blocks_prove)
+    _require(out / "manifest.json", lambda: check_seal(manifest), blocks_prove)
     _check_scenario(out, scenario)
-    finished = found["status"] in ENDED
+    finished = manifest["status"] in ENDED
     if finished:
-        _require(out, lambda: check_files(out, found), ANOTHER)
+        _require(out, lambda: check_files(out, manifest), ANOTHER)
     return BegunEnsemble(
-        out, found["block"] if is_block_size(found.get("block")) else size, finished
+        out, manifest["block"] if is_block_size(manifest.get("block")) else size, finished
     )
 
 
-def _describe_difference(found: Any, wanted: Any) -> Any:
-    """Return the entries of a table that are not as wanted, and other values as they are."""
-    if isinstance(found, dict) and isinstance(wanted, dict):
+def _describe_difference(stored: Any, planned: Any) -> Any:
+    """Return the entries of a stored table that differ from the planned one; other values whole."""
+    if isinstance(stored, dict) and isinstance(planned, dict):
         return {
-            key: found.get(key) for key in {**found, **wanted} if found.get(key) != wanted.get(key)
+            key: stored.get(key)
+            for key in {**stored, **planned}
+            if stored.get(key) != planned.get(key)
         }
-    return found
+    return stored
 
 
 def clear_unfinished_runs(
@@ -110,7 +112,7 @@ def clear_unfinished_runs(
     replica: int = 0,
     note: Callable[[str], None] | None = None,
 ) -> bool:
-    """Make room for a single run that was stopped to be done again; False where it is finished.
+    """Remove the files of a single run that was stopped; return False if it is finished.
 
     ``note`` is called with a line if a finished run was changed since: it is done again too. Raises
     ScenarioError where the directory holds a run of another scenario or replica.
@@ -119,18 +121,18 @@ def clear_unfinished_runs(
         if _has_own_files(directory, scenario):
             remove_unfinished(directory, scenario, own_names(scenario))
         return True
-    found = read_manifest(directory)
-    if found["replica"] != replica:
+    manifest = read_manifest(directory)
+    if manifest["replica"] != replica:
         rule, remedy = f"{directory} holds another replica", "give the same --replica"
-        raise ScenarioError("--resume", rule, found["replica"], remedy)
-    if found["runs"]["wanted"] != 1:
+        raise ScenarioError("--resume", rule, manifest["replica"], remedy)
+    if manifest["runs"]["wanted"] != 1:
         remedy = "give the same --runs"
         raise ScenarioError("--resume", "the run was begun with several runs", 1, remedy)
     _check_scenario(directory, scenario)
-    if found["status"] in ENDED:
+    if manifest["status"] in ENDED:
         try:
-            check_seal(found)
-            check_files(directory, found)
+            check_seal(manifest)
+            check_files(directory, manifest)
         except DamagedError as error:
             if note is not None:
                 note(f"the run in {directory} is done again: its record {error}")

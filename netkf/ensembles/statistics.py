@@ -24,7 +24,7 @@ MESSAGES = ("sent", "delivered", "lost", "in_flight", "transmissions")
 
 
 class Trace(NamedTuple):
-    """Everything of one run: events as EVENT rows, samples as in ``netkf.Run``."""
+    """All data of one run: events as EVENT rows, samples as in ``netkf.Run``."""
 
     replica: int
     log: np.ndarray
@@ -36,15 +36,19 @@ class Trace(NamedTuple):
 
 
 class RunStatistics(NamedTuple):
-    """Statistics of some runs of a scenario.
+    """Statistics of some runs of a scenario with N nodes; u = n (n + 1) / 2.
 
-    ``samples`` (T, N (2 u + 1)): of each node the upper triangles of P and of e e' with the error
-    e, then NEES. ``averages`` (1, (N + 1) 3): of every run the mean square error, mean trace of P
-    and mean NEES over the samples after time 0, of the nodes and of all. ``messages`` (1, 5) as
-    MESSAGES, transmissions nan in slots. ``totals`` are events and diverged runs. ``conserved``: of
-    each sum its mean at the start and at the end (1, 2), then the largest relative drift.
-    ``rounding_from`` is the first sample of any run at which rounding blurs the errors, inf where
-    none. ``fingerprint`` is that of replica 0. ``traces`` are those asked for, in order.
+    samples       : (T, N (2 u + 1)) moments at each time, for each node of the upper triangles of
+                    P and of e e', e the error, and of NEES
+    averages      : (1, (N + 1) 3) moments over runs of the mean square error, mean trace of P and
+                    mean NEES over the samples after time 0, for each node and all nodes
+    messages      : (1, 5) moments of the counts MESSAGES; transmissions are nan in slots
+    totals        : (2,) number of events and of diverged runs
+    conserved     : for each conserved sum its moments at start and end (1, 2), and the largest
+                    relative drift
+    rounding_from : time of the first sample of any run at which rounding blurs the errors, else inf
+    fingerprint   : of replica 0
+    traces        : traces that were kept, in the order of replicas
     """
 
     samples: Moments
@@ -83,32 +87,32 @@ def merge(a: RunStatistics, b: RunStatistics) -> RunStatistics:
 def block_statistics(
     scenario: Scenario, seed: int, replicas: range, engine: Engine, traces: int = 0
 ) -> RunStatistics:
-    """Simulate a block of replicas and merge their statistics; the first ``traces`` replicas of the
-    ensemble keep everything too. The fingerprint is that of replica 0.
+    """Return the merged statistics of a block of replicas, which it simulates; the traces of the
+    first ``traces`` replicas of the ensemble are kept.
     """
-    tree, done = MergeTree(merge), 0
-    for batch, kept in _batches(scenario, seed, replicas, engine, traces):
-        pieces = list(aligned_pieces(done, done + len(batch)))
-        values = run_values(batch, scenario, done)
+    tree, count = MergeTree(merge), 0
+    for batch, batch_traces in _batches(scenario, seed, replicas, engine, traces):
+        pieces = list(aligned_pieces(count, count + len(batch)))
+        values = run_values(batch, scenario, count)
         for number, (level, k) in enumerate(pieces):
             piece = merge_runs(values, number)
-            tree.add(k, piece._replace(fingerprint=batch.fingerprint, traces=kept), level)
-        done += len(batch)
-    whole: RunStatistics = tree.result()
-    return whole
+            tree.add(k, piece._replace(fingerprint=batch.fingerprint, traces=batch_traces), level)
+        count += len(batch)
+    result: RunStatistics = tree.result()
+    return result
 
 
 def _batches(
     scenario: Scenario, seed: int, replicas: range, engine: Engine, traces: int
 ) -> Iterator[tuple[RunBatch, tuple[Trace, ...]]]:
-    """Yield batches, and the traces of those that are a single traced run; the batch of replica 0
-    has a fingerprint.
+    """Yield batches of runs with their traces. A run with a trace is a batch of its own; the batch
+    of replica 0 has a fingerprint.
     """
     for replica in range(replicas.start, min(traces, replicas.stop)):
         yield _traced_run(scenario, seed, replica, engine)
-    rest = range(max(replicas.start, traces), replicas.stop)
-    if rest:
-        for batch in engine.run_many(scenario, seed, rest, fingerprint=rest.start == 0):
+    untraced = range(max(replicas.start, traces), replicas.stop)
+    if untraced:
+        for batch in engine.run_many(scenario, seed, untraced, fingerprint=untraced.start == 0):
             yield batch, ()
 
 
@@ -126,11 +130,15 @@ def _traced_run(
 
 
 class RunValues(NamedTuple):
-    """Values of R runs to be averaged, and the K ``pieces`` of them that are merged by themselves.
+    """Values of the R runs of a batch, and the K pieces in which they are merged.
 
-    ``samples`` of each piece, the moments (T, F (2 u + 1)) of F filters, each of which stands for
-    ``copies`` nodes (N for a pooled filter, else 1); ``averages`` (R, N + 1, 3); ``messages``
-    (R, 5); ``events``, ``diverged`` and ``rounding_from`` (R,); ``sums`` (R, 2).
+    pieces   : K slices of the runs, each a node of the tree over all runs
+    samples  : moments (T, F (2 u + 1)) of F filters for each piece
+    copies   : number of nodes for which a filter stands: N for a pooled filter, else 1
+    averages : (R, N + 1, 3)
+    messages : (R, 5)
+    events, diverged, rounding_from : (R,)
+    sums     : (R, 2) each conserved sum at start and end
     """
 
     pieces: Sequence[slice]
@@ -145,11 +153,11 @@ class RunValues(NamedTuple):
 
 
 def run_values(batch: RunBatch, scenario: Scenario, first: int = 0) -> RunValues:
-    """Return values of the runs of a batch, for every node where the filter is pooled.
+    """Return the values of the runs of a batch, with averages for every node.
 
-    ``first`` is the number of the first run in the tree over all runs, whose pieces these are.
+    ``first`` is the index of the batch's first run in the tree over all runs.
     """
-    # The runs of a batch that the tree merges by themselves, counted from the first of the batch.
+    # The largest nodes of the tree that consist of runs of this batch.
     indices = [(k << level, level) for level, k in aligned_pieces(first, first + len(batch))]
     pieces = [slice(at - first, at - first + (1 << level)) for at, level in indices]
     reduced, nodes = reduce_batch(batch, pieces), len(scenario.nodes)
@@ -170,8 +178,8 @@ def run_values(batch: RunBatch, scenario: Scenario, first: int = 0) -> RunValues
 
 
 def _mean_of_nodes(averages: FloatArray) -> FloatArray:
-    """Return means (R, 1, 3) over the nodes of (R, N, 3), node after node in every run."""
-    # accumulate() adds in this order, and sum() does not.
+    """Return the means (R, 1, 3) over the nodes of (R, N, 3), added in the order of nodes."""
+    # accumulate() adds in order; sum() may add in another one, and would give other bits.
     total = np.add.accumulate(averages, axis=1)[:, -1:]
     return np.asarray(total / averages.shape[1])
 
@@ -197,9 +205,9 @@ def merge_runs(values: RunValues, piece: int) -> RunStatistics:
         # All nodes have the estimate of one pooled filter.
         mean, M2 = (np.tile(moment, values.copies) for moment in (samples.mean, samples.M2))
         samples = Moments(samples.size, mean, M2)
-    # Averages and messages in one call, since columns are independent.
-    both = np.concatenate([averages.reshape(count, -1), messages], axis=1)
-    size, mean, M2 = moments_of(both[:, None], sizes)
+    # Averages and messages in one call: their columns are independent.
+    columns = np.concatenate([averages.reshape(count, -1), messages], axis=1)
+    size, mean, M2 = moments_of(columns[:, None], sizes)
     of_averages = slice(0, -len(MESSAGES))
     of_messages = slice(-len(MESSAGES), None)
     return RunStatistics(

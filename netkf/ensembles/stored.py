@@ -31,10 +31,10 @@ FORM["messages"] = {f"{name}?": NUMBER for name in MESSAGES}
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
 class StoredEnsemble(WithPromises, Ensemble):
-    """An ensemble that is read back from ``directory``, with its ``manifest`` and ``summary``.
+    """An ensemble read back from ``directory``, with its ``manifest`` and ``summary``.
 
-    ``status`` is complete, diverged, interrupted or failed; of one that did not finish it has the
-    runs that were kept, and no summary.
+    ``status`` is complete, diverged, interrupted or failed. An unfinished ensemble has the runs of
+    its readable blocks, and an empty summary.
     """
 
     directory: Path
@@ -65,15 +65,15 @@ def read_ensemble(directory: Path, scenario: Scenario, manifest: dict[str, Any])
 
     Raises DamagedError for files that are not as netkf writes them.
     """
-    kept: dict[str, Any] = {
+    stored: dict[str, Any] = {
         "directory": directory,
         "manifest": manifest,
         "status": str(manifest["status"]),
     }
     if not (directory / "ensemble.parquet").exists():
-        whole = _of_blocks(directory, scenario, manifest)
-        values: dict[str, Any] = {f.name: getattr(whole, f.name) for f in fields(Ensemble)}
-        return StoredEnsemble(**values, **kept, summary={})
+        ensemble = _of_blocks(directory, scenario, manifest)
+        values: dict[str, Any] = {f.name: getattr(ensemble, f.name) for f in fields(Ensemble)}
+        return StoredEnsemble(**values, **stored, summary={})
     check_files(directory, manifest, ["ensemble.parquet", "summary.json"])
     summary = read_form(directory, "summary.json", FORM)
     samples = _read_samples(directory / "ensemble.parquet", scenario)
@@ -97,21 +97,23 @@ def read_ensemble(directory: Path, scenario: Scenario, manifest: dict[str, Any])
         truth_known=scenario.plant.truth_known,
         rounding_from=np.inf if blurred is None else float(blurred),
         scenario=scenario,
-        **kept,
+        **stored,
         summary=summary,
     )
 
 
 def _of_blocks(directory: Path, scenario: Scenario, manifest: dict[str, Any]) -> Ensemble:
-    """Return the ensemble of the runs that an interrupted ensemble has kept."""
+    """Return the ensemble of the runs in the blocks of an interrupted one; raises DamagedError if
+    there are none.
+    """
     blocks = BlockCheckpoints(directory, scenario)
-    found = blocks.readable(scenario_digest(scenario), int(manifest["seed"]))
-    if not found:
+    blocks_statistics = blocks.readable(scenario_digest(scenario), int(manifest["seed"]))
+    if not blocks_statistics:
         raise DamagedError("no run of it was finished")
-    whole = found[0]
-    for block in found[1:]:
-        whole = merge(whole, block)
-    return ensemble_of(scenario, whole, int(manifest["seed"]), str(manifest.get("engine", "")))
+    statistics = blocks_statistics[0]
+    for block in blocks_statistics[1:]:
+        statistics = merge(statistics, block)
+    return ensemble_of(scenario, statistics, int(manifest["seed"]), str(manifest.get("engine", "")))
 
 
 def _read_averages(rows: list[dict[str, Any]]) -> tuple[FloatArray, FloatArray]:

@@ -1,4 +1,4 @@
-"""What an ensemble comes to: the summary of one run, averaged over runs, with standard errors."""
+"""The summary of an ensemble: that of one run, averaged over runs, with standard errors."""
 
 from __future__ import annotations
 
@@ -14,22 +14,24 @@ from netkf.scenario.usage import record_usage
 
 
 def summarise_ensemble(
-    scenario: Scenario, found: RunStatistics, promised: PromisedTraces
+    scenario: Scenario, statistics: RunStatistics, promised: PromisedTraces
 ) -> dict[str, Any]:
-    """Return the keys of one run's summary. ``rms_error`` is the root of the mean square error of
-    all runs; a key that ends in ``_se`` is a standard error.
+    """Return the summary of an ensemble, with the keys of one run's summary.
+
+    ``rms_error`` is the root of the mean square error of all runs; a key that ends in ``_se`` is a
+    standard error.
     """
-    mean = found.averages.mean.reshape(-1, 3)
-    error = found.averages.standard_error().reshape(-1, 3)
+    mean = statistics.averages.mean.reshape(-1, 3)
+    error = statistics.averages.standard_error().reshape(-1, 3)
     bound = _mean_bounds(scenario, promised)
-    blurred = found.rounding_from if np.isfinite(found.rounding_from) else None
+    blurred = statistics.rounding_from if np.isfinite(statistics.rounding_from) else None
     rows = [_make_row(*values) for values in zip(mean, error, bound, strict=True)]
-    messages = found.messages.mean[0].tolist()
-    messages_se = found.messages.standard_error()[0].tolist()
+    messages = statistics.messages.mean[0].tolist()
+    messages_se = statistics.messages.standard_error()[0].tolist()
     nodes = [{"node": node, **row} for node, row in zip(scenario.nodes, rows[:-1], strict=True)]
     summary: dict[str, Any] = {
-        "runs": found.runs,
-        "diverged": int(found.totals[1]),
+        "runs": statistics.runs,
+        "diverged": int(statistics.totals[1]),
         "nodes": nodes,
         "overall": rows[-1],
         "limit": promised.limit,
@@ -41,39 +43,42 @@ def summarise_ensemble(
         "messages_se": dict(zip(MESSAGES, messages_se, strict=True)),
     }
     if scenario.plant.truth_known:
-        summary["nees"] = _chi_square(scenario, found)
-    if found.conserved:
+        summary["nees"] = _chi_square(scenario, statistics)
+    if statistics.conserved:
         summary["conserved"] = {
             name: {"exact": sums.mean[0, 0], "total": sums.mean[0, 1], "drift": drift}
-            for name, (sums, drift) in found.conserved.items()
+            for name, (sums, drift) in statistics.conserved.items()
         }
-    records = {} if found.totals[1] else record_usage(scenario, None)
+    records = {} if statistics.totals[1] else record_usage(scenario, None)
     if records:
         summary["records"] = records
     return summary
 
 
-def _chi_square(scenario: Scenario, found: RunStatistics) -> dict[str, float]:
-    """Return bounds on the mean NEES of one sample over the runs that hold with ``confidence``
-    where P is exact, since the sum is chi-square; over n they bound the ANEES. ``inside``: the
-    share of all samples after time 0 that every run has and that rounding does not blur.
+def _chi_square(scenario: Scenario, statistics: RunStatistics) -> dict[str, float]:
+    """Return chi-square bounds on the mean NEES over the runs, and the share of means inside them.
+
+    If P is exact, the sum of NEES over the runs is chi-square with n runs degrees of freedom, so
+    that the mean lies within the bounds with probability ``confidence``; divided by n they bound
+    the ANEES (Bar-Shalom, Li and Kirubarajan 2001, section 5.4). The key ``inside`` is over the
+    samples after time 0 that every run has and that rounding does not blur.
     """
-    n, runs = scenario.plant.n, found.runs
+    n, runs = scenario.plant.n, statistics.runs
     low, high = nees_bounds(n, runs)
-    clear = (scenario.times > 0.0) & (scenario.times < found.rounding_from)
-    kept = clear & (found.samples.size == runs)
-    nees = found.samples.mean.reshape(len(kept), len(scenario.nodes), -1)[:, :, -1]
-    means = nees[kept]
-    inside = float(((means >= low) & (means <= high)).mean()) if means.size else np.nan
-    return {"n": n, "confidence": CONFIDENCE, "low": low, "high": high, "inside": inside}
+    clear = (scenario.times > 0.0) & (scenario.times < statistics.rounding_from)
+    usable = clear & (statistics.samples.size == runs)
+    nees = statistics.samples.mean.reshape(len(usable), len(scenario.nodes), -1)[:, :, -1]
+    means = nees[usable]
+    share_inside = float(((means >= low) & (means <= high)).mean()) if means.size else np.nan
+    return {"n": n, "confidence": CONFIDENCE, "low": low, "high": high, "inside": share_inside}
 
 
 def _mean_bounds(scenario: Scenario, promised: PromisedTraces) -> list[float | None]:
     """Return averages of the bound over the samples after time 0, of the nodes and of all."""
     if promised.bound is None:
         return [None] * (len(scenario.nodes) + 1)
-    after: FloatArray = promised.bound[scenario.times > 0.0]
-    nodes = (after if len(after) else promised.bound).mean(axis=0)
+    after_start: FloatArray = promised.bound[scenario.times > 0.0]
+    nodes = (after_start if len(after_start) else promised.bound).mean(axis=0)
     return [*nodes.tolist(), float(nodes.mean())]
 
 

@@ -1,8 +1,8 @@
-"""Worker processes of our own, each with a pipe of its own in either direction.
+"""Worker processes, each connected by one pipe in either direction.
 
-There are no queues, locks or threads between the processes. A worker that is killed at any moment,
-even in the middle of a result, closes its pipe, and this process sees the end of it: nothing here
-waits for something that a dead process has locked.
+There are no shared queues, locks or threads. If a worker is killed, even while it sends a result,
+its pipe is closed and this process reads end-of-file; so it never waits for a lock that a dead
+process holds, as concurrent.futures.ProcessPoolExecutor may.
 """
 
 from __future__ import annotations
@@ -32,13 +32,13 @@ from netkf.ensembles.process_start import (
 )
 
 MAX_ATTEMPTS = 4
-"""Workers that may die of one job before the job is given up."""
+"""Number of workers that may die during one job before it is given up."""
 GRACE = 2.0
-"""Seconds that idle workers have to end by themselves."""
+"""Seconds that idle workers get to end by themselves before they are killed."""
 
 
 class _Task(NamedTuple):
-    """A job that was handed in, its future, and how many workers have died of it."""
+    """A submitted job, its future, and the number of workers that died during it."""
 
     job: Job
     future: Future[Any]
@@ -46,7 +46,7 @@ class _Task(NamedTuple):
 
 
 class _Worker:
-    """A worker process with its two pipes and the task that it has, if any."""
+    """A worker process with its two pipes, and the task it works on (None if idle)."""
 
     def __init__(self, hide_main: bool) -> None:
         receiver, self._jobs = multiprocessing.Pipe(duplex=False)
@@ -68,7 +68,10 @@ class _Worker:
             sender.close()
 
     def send(self, task: _Task) -> None:
-        """Hand over a task to an idle worker; raises OSError if the worker is dead."""
+        """Send a task to an idle worker; raises OSError if the worker is dead.
+
+        The scenario is left out if it is the one of the worker's last task.
+        """
         self.task, job = task, task.job
         if isinstance(job.scenario, PackedScenario):
             digest = job.scenario.digest
@@ -78,22 +81,22 @@ class _Worker:
         self._jobs.send_bytes(pickle.dumps(job, pickle.HIGHEST_PROTOCOL))
 
     def receive(self) -> Any:
-        """Return the result of the task; raises OSError or EOFError if the worker died of it, and
-        otherwise what the task raised.
+        """Return the result of the task; raises OSError or EOFError if the worker died, else what
+        the task raised, with the worker's traceback as its cause.
         """
-        result, raised, where = pickle.loads(self.results.recv_bytes())
+        result, raised, traceback_text = pickle.loads(self.results.recv_bytes())
         if raised is None:
             return pickle.loads(result)
-        raise pickle.loads(raised) from _RemoteError(where)
+        raise pickle.loads(raised) from _RemoteError(traceback_text)
 
     def end(self) -> None:
-        """Let an idle worker end."""
+        """Close the pipes, upon which an idle worker ends."""
         for pipe in (self._jobs, self.results):
             with suppress(OSError):
                 pipe.close()
 
     def join(self, seconds: float) -> None:
-        """Wait for the end of the process, and kill it after ``seconds``."""
+        """Wait up to ``seconds`` for the process to end, then kill it."""
         if self._process.pid is None:
             return
         self._process.join(seconds)
@@ -104,7 +107,7 @@ class _Worker:
 
 
 class _RemoteError(Exception):
-    """The traceback in a worker, as the cause of what this process raises."""
+    """Carries the traceback of a worker as the cause of an exception raised here."""
 
     def __str__(self) -> str:
         return f"\n{self.args[0]}"
@@ -119,7 +122,7 @@ class WorkerProcesses:
         self._waiting: deque[_Task] = deque()
 
     def submit(self, job: Job) -> Future[Any]:
-        """Hand in a job; it is begun at once if a worker is idle."""
+        """Submit a job, which starts at once if a worker is idle; return its future."""
         future: Future[Any] = Future()
         self._waiting.append(_Task(job, future))
         self._hand_out()
@@ -137,7 +140,7 @@ class WorkerProcesses:
                 self._receive_result(busy[ready])  # type: ignore[index]
 
     def close(self, at_once: bool) -> None:
-        """End all workers, idle ones by themselves; ``at_once`` kills them, whatever they do."""
+        """End all workers; idle ones get GRACE seconds to end unless ``at_once``, others none."""
         workers, self._workers = self._workers, []
         for worker in workers:
             worker.end()
@@ -145,9 +148,11 @@ class WorkerProcesses:
             worker.join(0.0 if at_once or worker.task is not None else GRACE)
 
     def _hand_out(self) -> None:
-        """Give waiting tasks to idle workers, and start workers while there are too few."""
+        """Send waiting tasks to idle workers, and start workers up to the width."""
         while self._waiting:
-            worker = next((one for one in self._workers if one.task is None), None)
+            worker = next(
+                (candidate for candidate in self._workers if candidate.task is None), None
+            )
             if worker is None and len(self._workers) >= self._width:
                 return
             task = self._waiting.popleft()
@@ -162,7 +167,7 @@ class WorkerProcesses:
                 self._discard_worker(worker)
 
     def _receive_result(self, worker: _Worker) -> None:
-        """Take the result of a worker, or take note that it died."""
+        """Set the future of a worker's task to its result or error; replace a dead worker."""
         assert worker.task is not None
         future = worker.task.future
         try:
@@ -183,7 +188,7 @@ class WorkerProcesses:
             future.set_result(result)
 
     def _discard_worker(self, worker: _Worker) -> None:
-        """Put the task of a dead worker back to the others, unless too many died of it."""
+        """Remove a dead worker and queue its task again, or fail it after MAX_ATTEMPTS deaths."""
         self._workers.remove(worker)
         worker.end()
         worker.join(0.0)
@@ -196,13 +201,13 @@ class WorkerProcesses:
 
 
 def _may_hide_main(job: Job) -> bool:
-    """Return True if workers can do without the user's script."""
+    """Return True if no class of the scenario is defined in the user's script (__main__)."""
     return isinstance(job.scenario, PackedScenario) and b"__main__" not in job.scenario.payload
 
 
 def _serve(jobs: Connection, results: Connection) -> None:
-    """Do one job after the other, in a worker process, until the pipe with the jobs is closed."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # this end is the parent's decision
+    """Run jobs in a worker process until the pipe with the jobs is closed."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides when workers end
     threading.Thread(target=_end_with_parent, daemon=True).start()
     with suppress(EOFError, OSError):
         while True:
@@ -210,7 +215,7 @@ def _serve(jobs: Connection, results: Connection) -> None:
 
 
 def _run_job(message: bytes) -> bytes:
-    """Do a pickled job; return the pickle of (pickled result, pickled exception, traceback)."""
+    """Run a pickled job; return the pickle of (pickled result, pickled exception, traceback)."""
     try:
         answer: tuple[bytes | None, bytes | None, str]
         answer = pickle.dumps(work(pickle.loads(message)), pickle.HIGHEST_PROTOCOL), None, ""
@@ -220,14 +225,14 @@ def _run_job(message: bytes) -> bytes:
 
 
 def _pickled_error(error: Exception) -> bytes:
-    """Return the pickle of an exception, or of an EngineError in place of one that has none."""
+    """Return the pickle of an exception, or of an EngineError if it cannot be pickled."""
     try:
-        found = pickle.dumps(error, pickle.HIGHEST_PROTOCOL)
-        pickle.loads(found)
+        payload = pickle.dumps(error, pickle.HIGHEST_PROTOCOL)
+        pickle.loads(payload)
     except Exception:
         message = f"a worker failed with {type(error).__name__}: {error}"
         return pickle.dumps(EngineError(message), pickle.HIGHEST_PROTOCOL)
-    return found
+    return payload
 
 
 def _end_with_parent() -> None:
