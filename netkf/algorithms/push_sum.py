@@ -131,7 +131,7 @@ class PushSumArrays(NamedTuple):
     rule, tolerance, delta, gamma, asymptotic : settings; ``rule`` is an index in RULES
     limit : (n, n), root of P_inf, with asymptotic gains
     running : whether masses are exchanged by running sums
-    offered, heard : then the totals that each node has offered (B, H, m, L), and those last heard on
+    offered, heard : then the totals that nodes have offered (B, H, m, L), and those last heard on
                      each direction (B, W, m, L)
     share, before : scratch, shares (H, m, L) that nodes send, and a mass (m, L) before a step
     new_information, new_number : scratch, P (6) of this slot (n, n, L) and (1, L)

@@ -7,7 +7,7 @@ import pytest
 
 from netkf.engines.compiled import poisson
 from netkf.engines.compiled.poisson import PoissonSchedules, is_poisson, schedule
-from netkf.engines.compiled.schedule import Schedule, whole_schedules
+from netkf.engines.compiled.schedule import Schedule, all_windows
 from netkf.rng.streams import ReplicaStreams, Streams
 
 CHANNELS = {
@@ -29,8 +29,8 @@ def all_of(windows):
 
 def ticks_of(window):
     """Times, entities and the outcomes forth and back of each tick."""
-    assert window.at.max(initial=0) + 2 <= max(len(window.delay), 2)
-    return window.t, window.entity, window.delay[window.at[:, None] + [0, 1]]
+    assert window.first_outcome.max(initial=0) + 2 <= max(len(window.delay), 2)
+    return window.t, window.entity, window.delay[window.first_outcome[:, None] + [0, 1]]
 
 
 @pytest.fixture
@@ -73,8 +73,8 @@ def test_several_runs_are_what_each_is_alone(busy):
     few = PoissonSchedules(case, ReplicaStreams(3, 5, 3))
     few._rate *= 1e-3  # many more ticks than expected: the arrays grow
     for schedules in (few, PoissonSchedules(case, ReplicaStreams(3, 5, 3))):
-        ticks = schedules.whole()
-        for run, plain in enumerate(whole_schedules(case, ReplicaStreams(3, 5, 3))):
+        ticks = schedules.all()
+        for run, plain in enumerate(all_windows(case, ReplicaStreams(3, 5, 3))):
             found = ticks_of(poisson.window_of(ticks, run))
             for one, other in zip(found, ticks_of(plain), strict=True):
                 np.testing.assert_array_equal(one, other)
@@ -85,8 +85,8 @@ def test_ticks_that_crowd_are_put_in_order():
     random = np.random.default_rng(1)
     t = np.concatenate([random.random(200) ** 8, np.full(20, 0.5)])
     link = random.permutation(len(t))
-    found = poisson.Found(t, link, 2 * link, np.empty(0))
-    ordered = poisson._room(len(t), 0)
+    found = poisson.TickBuffer(t, link, 2 * link, np.empty(0))
+    ordered = poisson._empty_buffer(len(t), 0)
     poisson.put_in_time_order(0.0, 1.0, len(t), found, ordered, poisson._sorting(len(t)))
     order = np.lexsort((link, t))
     for one, other in zip(ordered[:3], found[:3], strict=True):

@@ -140,14 +140,14 @@ def simulate_agenda(
     visits = struct_at(visits_memory, Visits)
     if len(progress) == 0:
         if state.tick_at == 0:
-            find_heard(state, 0, state.ticks_stop, 0)
+            fill_arrival_bits(state, 0, state.ticks_stop, 0)
         wanted = run_agenda(state, visits, NEVER)
         process_visits(state, visits)
         return wanted
     batch = struct_at(batch_memory, BatchArrays)
     runs = len(batch.lengths)
-    for run in range(0 if batch.heard else runs):
-        find_heard(state, batch.first[run], batch.first[run + 1], batch.first_delay[run])
+    for run in range(0 if batch.has_bits else runs):
+        fill_arrival_bits(state, batch.first[run], batch.first[run + 1], batch.first_delay[run])
     for first in range(0, runs, len(progress)):
         simulate_group(
             state, visits, batch, progress[: min(len(progress), runs - first)], first, pause
@@ -189,7 +189,7 @@ def simulate_group(
 def suspend(state: Simulation, batch: BatchArrays, progress: np.ndarray, k: int) -> None:
     """Store the position of a run, entry ``k`` of ``progress``."""
     mine = progress[k]
-    mine.tick_at, mine.ticks_stop, mine.delays = state.tick_at, state.ticks_stop, state.delays
+    mine.tick_at, mine.ticks_stop, mine.delays = state.tick_at, state.ticks_stop, state.first_delay
     mine.piece, mine.grid_at, mine.wake_at = state.piece, state.grid_at, state.wake_at
     mine.probe_at, mine.samples = state.probe_at, state.samples
     for kind in range(len(state.counts)):
@@ -200,7 +200,7 @@ def suspend(state: Simulation, batch: BatchArrays, progress: np.ndarray, k: int)
 def resume(state: Simulation, batch: BatchArrays, progress: np.ndarray, k: int) -> None:
     """Restore the position of a run."""
     mine = progress[k]
-    state.tick_at, state.ticks_stop, state.delays = mine.tick_at, mine.ticks_stop, mine.delays
+    state.tick_at, state.ticks_stop, state.first_delay = mine.tick_at, mine.ticks_stop, mine.delays
     state.piece, state.grid_at, state.wake_at = mine.piece, mine.grid_at, mine.wake_at
     state.probe_at, state.samples = mine.probe_at, mine.samples
     state.run = state.first_run + k
@@ -280,7 +280,7 @@ def queue_ticks(state: Simulation, visits: Visits, first: int, until: float) -> 
 def queue_tick(state: Simulation, visits: Visits, first: int, now: float) -> None:
     """Queue the visits of the next tick, with all that is sent and absorbed at its time."""
     ticks, nodes, k = state.ticks, state.nodes, state.tick_at
-    entity, heard = state.entities[ticks.entity[k]], ticks.heard[k]
+    entity, heard = state.entities[ticks.entity[k]], ticks.arrival_bits[k]
     state.tick_at += 1
     if state.traced:
         record_tick(state, entity.sender, entity.other, entity.first, entity.after, heard, now)
@@ -293,7 +293,7 @@ def queue_tick(state: Simulation, visits: Visits, first: int, now: float) -> Non
     # The sender of a message that is lost needs no prediction, unless it reads increments.
     if nodes[entity.sender].sensors > nodes[entity.sender].sensor:
         queue_visit(state, visits, now, first + entity.sender)
-    if state.at == LINKS and nodes[entity.other].sensors > nodes[entity.other].sensor:
+    if state.clock_kind == LINKS and nodes[entity.other].sensors > nodes[entity.other].sensor:
         queue_visit(state, visits, now, first + entity.other)
 
 
@@ -308,7 +308,7 @@ def count_tick(state: Simulation, sent: int, heard: int) -> None:
         arrived, heard = arrived + 1, heard & (heard - 1)
     counts = state.counts
     counts[TICK] += 1
-    counts[TRANSMIT] += state.at >= NODES
+    counts[TRANSMIT] += state.clock_kind >= NODES
     counts[SEND] += sent
     counts[LOST] += sent - arrived
     counts[DELIVER] += arrived
@@ -325,11 +325,11 @@ def record_tick(
     nodes, receivers = state.nodes, 0
     record_event(state, now, TICK, nodes[i].id, nodes[j].id if j >= 0 else -1, -1)
     # A node's clock makes one transmission, which each receiver hears or loses.
-    if state.at >= NODES:
+    if state.clock_kind >= NODES:
         record_event(state, now, TRANSMIT, nodes[i].id, -1, nodes[i].sent)
         nodes[i].sent += 1
     for m in range(begin, after):
-        direction = state.directions[state.hearing[m]]
+        direction = state.directions[state.outgoing[m]]
         one, other = nodes[direction.sender].id, nodes[direction.receiver].id
         number = direction.messages
         direction.messages = number + 1
@@ -350,10 +350,10 @@ def queue_pairs(state: Simulation, visits: Visits, k: int, first: int, now: floa
     """Queue the visits of tick ``k``, of which something is heard: both ends of a link together,
     otherwise the sender with each receiver.
     """
-    heard, directions, hearing = state.ticks.heard[k], state.directions, state.hearing
+    heard, directions, hearing = state.ticks.arrival_bits[k], state.directions, state.outgoing
     entity = state.entities[state.ticks.entity[k]]
     sender, begin = first + entity.sender, entity.first
-    if state.at == LINKS:
+    if state.clock_kind == LINKS:
         # Both ends are predicted, whoever hears.
         other = first + entity.other
         level = max(visits.level[sender], visits.level[other]) + 1
@@ -361,7 +361,7 @@ def queue_pairs(state: Simulation, visits: Visits, k: int, first: int, now: floa
         v = append_visit(state, visits, level, now, sender, other)
         for m in range(entity.after - begin):
             if (heard >> m) & 1:
-                set_heard_link(
+                set_receiving_link(
                     visits,
                     v,
                     directions[hearing[begin + m]].receiver + first == sender,
@@ -380,11 +380,11 @@ def queue_pairs(state: Simulation, visits: Visits, k: int, first: int, now: floa
             receiver = first + directions[hearing[begin + m]].receiver
             visits.level[receiver] = level
             v = append_visit(state, visits, level, now, sender, receiver)
-            set_heard_link(visits, v, False, hearing[begin + m])
+            set_receiving_link(visits, v, False, hearing[begin + m])
 
 
 @kernel
-def set_heard_link(visits: Visits, v: int, first: bool, direction: int) -> None:
+def set_receiving_link(visits: Visits, v: int, first: bool, direction: int) -> None:
     """Let the ``first`` node of visit ``v``, or the second, hear the other over a directed link."""
     if first:
         visits.records[v].to_first = direction
@@ -393,16 +393,16 @@ def set_heard_link(visits: Visits, v: int, first: bool, direction: int) -> None:
 
 
 @kernel
-def find_heard(state: Simulation, first: int, after: int, delays: int) -> None:
+def fill_arrival_bits(state: Simulation, first: int, after: int, delays: int) -> None:
     """Write as bits which messages of the ticks ``first`` .. ``after`` - 1 arrive; their outcomes
     begin at ``delays``.
     """
     ticks, entities = state.ticks, state.entities
     for k in range(first, after):
         entity = entities[ticks.entity[k]]
-        begin, bits = delays + ticks.at[k], 0
+        begin, bits = delays + ticks.first_outcome[k], 0
         for m in range(entity.after - entity.first):
             # ``>=`` is false for LOST, which is negative, and for nan.
             if ticks.delay[begin + m] >= 0.0:
                 bits |= 1 << m
-        ticks.heard[k] = bits
+        ticks.arrival_bits[k] = bits

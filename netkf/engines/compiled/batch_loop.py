@@ -1,6 +1,6 @@
-"""Whole batches of runs through the event loop, one after the other in one compiled call.
+"""Batches of runs in the event loop, one run after the other in one compiled call.
 
-One Simulation has the draws of all runs and space for all of their samples.
+One Simulation holds the draws of all runs and space for all of their samples.
 """
 
 from __future__ import annotations
@@ -20,13 +20,15 @@ DIVERGED = CODES["diverged"]
 
 
 class BatchArrays(Struct):
-    """Where R runs begin, and how they end.
+    """Initial data and results of R runs.
 
-    Filters at time 0: ``nodes`` (N,), xhat (N, n), root (N, n, n). The ticks of run r are those
-    from ``first[r]`` up to ``first[r + 1]``, and what they send has the outcomes from
-    ``first_delay[r]`` on. ``lengths`` (R,): number of samples; ``counts`` (R, len(KINDS)) of
-    events; ``diverged`` (R,) is 1 where the last sample is not finite. Each filter stands for
-    ``carriers`` nodes. ``heard``: it is known already which messages arrive.
+    nodes, xhat, root : filters at time 0, (N,), (N, n) and (N, n, n)
+    first, first_delay : (R + 1,), run r has the ticks ``first[r]`` to ``first[r + 1]`` - 1, whose
+                         outcomes begin at ``first_delay[r]``
+    lengths, counts : number of samples (R,), and of events by kind (R, len(KINDS))
+    diverged : (R,), 1 if the last sample is not finite
+    carriers : number of nodes that share one filter, if filters are pooled
+    has_bits : whether the arrival bits of ticks are already filled in
     """
 
     nodes: np.ndarray
@@ -38,22 +40,22 @@ class BatchArrays(Struct):
     counts: IntArray
     diverged: IntArray
     carriers: int
-    heard: int
+    has_bits: int
 
 
 ALONE = -1
-"""Instead of the number of a run: the Simulation is no run of a batch."""
+"""In place of the number of a run: the Simulation is not a run of a batch."""
 
 
 def simulate_batch(state: Simulation, batch: BatchArrays) -> None:
     """Simulate all runs of a batch up to the horizon, or until an estimate is no longer finite."""
-    run, begun = 0, False
+    run, resumed = 0, False
     while run < len(batch.lengths):
-        run = int(simulate_runs(state, batch.memory, run, begun))
-        # The run goes on where it stopped for a larger pool: only messages have no known number.
+        run = int(simulate_runs(state, batch.memory, run, resumed))
+        # A run stops only if the pool of messages is too small; then it goes on with a larger one.
         if run < len(batch.lengths):
             add_messages(state, state.most_messages)
-            begun = True
+            resumed = True
 
 
 def run_alone(state: Simulation) -> int:
@@ -66,46 +68,46 @@ def run_alone(state: Simulation) -> int:
 @cache
 def no_batch() -> BatchArrays:
     """Return a batch without runs."""
-    none = np.zeros(0, dtype=np.int64)
+    no_runs = np.zeros(0, dtype=np.int64)
     return BatchArrays(
         nodes=np.zeros(0, dtype=NODE),
         xhat=np.zeros((0, 0)),
         root=np.zeros((0, 0, 0)),
-        first=none,
-        first_delay=none,
-        lengths=none,
+        first=no_runs,
+        first_delay=no_runs,
+        lengths=no_runs,
         counts=np.zeros((0, len(KINDS)), dtype=np.int64),
-        diverged=none,
+        diverged=no_runs,
         carriers=1,
-        heard=0,
+        has_bits=0,
     )
 
 
 @kernel
-def simulate_runs(state: Simulation, batch_memory: IntArray, run: int, begun: bool) -> int:
-    """Simulate the runs of a batch from ``run`` on, which has ``begun`` before or not; returns the
-    run that needs a larger pool of messages first, or the number of runs. For ALONE:
-    ``event_loop``.
+def simulate_runs(state: Simulation, batch_memory: IntArray, run: int, resumed: bool) -> int:
+    """Simulate the runs of a batch from ``run`` on, which goes on where it stopped if ``resumed``.
+    Return the run that needs a larger pool of messages, or the number of runs at the end. For ALONE
+    call ``event_loop`` and return its request.
     """
-    # numba identifies an array much faster than a struct.
+    # The batch comes as an array, since numba dispatches on arrays much faster than on structs.
     if run == ALONE:
         return event_loop(state, None, None, None)
-    return simulate_from(state, struct_at(batch_memory, BatchArrays), run, begun)
+    return simulate_from(state, struct_at(batch_memory, BatchArrays), run, resumed)
 
 
 @kernel
-def simulate_from(state: Simulation, batch: BatchArrays, run: int, begun: bool) -> int:
-    """``simulate_runs`` for kernels."""
+def simulate_from(state: Simulation, batch: BatchArrays, run: int, resumed: bool) -> int:
+    """Simulate the runs of a batch, see ``simulate_runs``."""
     while run < len(batch.lengths):
-        if not begun:
+        if not resumed:
             state.first_run = run
             reset_filters(state, batch, 0)
             reset_messages(state)
             begin(state, batch, run)
-        begun, wanted = False, -1
-        while wanted != DONE:
-            wanted = event_loop(state, None, None, None)
-            if wanted == WANT_MESSAGES:
+        resumed, request = False, -1
+        while request != DONE:
+            request = event_loop(state, None, None, None)
+            if request == WANT_MESSAGES:
                 return run
         finish(state, batch, run)
         run += 1
@@ -114,12 +116,11 @@ def simulate_from(state: Simulation, batch: BatchArrays, run: int, begun: bool) 
 
 @kernel
 def begin(state: Simulation, batch: BatchArrays, run: int) -> None:
-    """Set the Simulation to time 0 of a run."""
+    """Set the positions of a Simulation in its draws to the beginning of a run."""
     state.run, place = run, run - state.first_run
-    # Positions in the arrays of draws: the run begins at the first frame, piece, tick and sample.
     state.frame_at = state.piece = state.grid_at = state.wake_at = state.instant_at = 0
     state.tick_at, state.ticks_stop = batch.first[run], batch.first[run + 1]
-    state.delays = batch.first_delay[run]
+    state.first_delay = batch.first_delay[run]
     state.probe_at = state.row = state.samples = 0
     for kind in range(len(state.counts)):
         state.counts[kind] = 0
@@ -143,49 +144,49 @@ def reset_filters(state: Simulation, batch: BatchArrays, first: int) -> None:
 
 @kernel
 def reset_messages(state: Simulation) -> None:
-    """Empty the network: no message is under way, all of the pool is free."""
+    """Remove all messages: nothing is under way, and the whole pool is free."""
     for w in range(len(state.directions)):
         state.directions[w].messages = 0
     # Chain the whole pool into the list of free messages.
     for m in range(len(state.pool)):
         state.pool[m].next = m + 1
     # The heap needs no reset: only its first ``flying`` entries count.
-    state.free = state.flying = state.order = state.receivers = state.absorbing = 0
+    state.first_free = state.in_flight = state.order = state.receivers = state.absorbing = 0
     state.free_count, state.inbox_time = len(state.pool), 0.0
 
 
 @kernel
 def finish(state: Simulation, batch: BatchArrays, run: int) -> None:
-    """Record how a run ended: at its first sample that is not finite, if there is one, without what
-    happened later.
+    """Store the results of a run: its length and counts, up to the first sample that is not finite
+    if there is one.
     """
     buffer = state.buffer
     for kind in range(batch.counts.shape[1]):
         batch.counts[run, kind] = state.counts[kind]
     for k in range(state.samples):
         batch.lengths[run] = k + 1
-        broken = count_broken_filters(state, run, k)
-        if broken > 0:
+        diverged = count_diverged_filters(state, run, k)
+        if diverged > 0:
             # The counts are those at the broken sample, not those at the end.
             for kind in range(batch.counts.shape[1]):
                 batch.counts[run, kind] = buffer.counts[run, k, kind]
-            # One filter may stand for several nodes (pooled), each of which has diverged.
-            batch.counts[run, DIVERGED] += broken * batch.carriers
+            # A pooled filter stands for several nodes, each of which has diverged.
+            batch.counts[run, DIVERGED] += diverged * batch.carriers
             batch.diverged[run] = 1
             return
 
 
 @kernel
-def count_broken_filters(state: Simulation, run: int, k: int) -> int:
+def count_diverged_filters(state: Simulation, run: int, k: int) -> int:
     """Return the number of filters that are not finite in sample ``k`` of a run."""
-    xhat, P, n, broken = state.buffer.xhat, state.buffer.P, len(state.size), 0
+    xhat, P, n, diverged = state.buffer.xhat, state.buffer.P, len(state.size), 0
     for h in range(len(state.nodes)):
-        # Finiteness is enough, because P = S S' cannot be indefinite; 0 times a number that is not
+        # P = S S' cannot be indefinite, so only finiteness is tested: 0 times a number that is not
         # finite is nan.
         total = 0.0
         for i in range(n):
             total += 0.0 * xhat[run, k, h, i]
             for j in range(n):
                 total += 0.0 * P[run, k, h, i, j]
-        broken += total != 0.0
-    return broken
+        diverged += total != 0.0
+    return diverged

@@ -1,8 +1,8 @@
-"""Runs of one scenario in continuous time whose ticks, paths and noise are drawn together.
+"""Batches of runs in continuous time, whose ticks, paths and noise are drawn together.
 
-Beside its events, a short run costs the calls of Python that draw and prepare it. Here they are
-made once for all runs of a batch, which share one workspace. Every number is what it is for a run
-alone.
+For a short run the calls of Python that draw and prepare it cost as much as its events. Here they
+are made once for all runs of a batch, which share one workspace. Every number is the same as in a
+run that is simulated alone.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from netkf.engines.compiled.agenda import is_immediate, simulate_together, toget
 from netkf.engines.compiled.batch_loop import BatchArrays, simulate_batch
 from netkf.engines.compiled.draws import Noise, Paths, blocks_to_the_end, steps_to_the_end
 from netkf.engines.compiled.flow import Draws, FlowRun, Source, Workspace, empty_samples
-from netkf.engines.compiled.kept import once_per_scenario
+from netkf.engines.compiled.per_scenario import once_per_scenario
 from netkf.engines.compiled.poisson import all_ticks, window_of
 from netkf.engines.compiled.sample_tables import SampleTables
 from netkf.engines.compiled.schedule import Window
@@ -39,9 +39,9 @@ from netkf.trace.schema import KINDS
 
 MAX_BATCH_RUNS = 512
 QUICK_VISITS = 1 << 17
-"""Visits of nodes that take some ten milliseconds: to prepare a batch takes one or two."""
+"""Visits of nodes that take some ten milliseconds; preparing a batch takes one or two."""
 MAX_BATCH_BYTES = 1 << 25
-"""Bytes that are drawn for a batch, and that its samples take."""
+"""Limit of the bytes that are drawn for a batch, samples included."""
 
 
 def flow_batches(scenario: Scenario, seed: int, replicas: range) -> Iterator[RunBatch]:
@@ -53,27 +53,28 @@ def flow_batches(scenario: Scenario, seed: int, replicas: range) -> Iterator[Run
         yield _simulate(scenario, workspace, seed, range(first, min(first + size, replicas.stop)))
 
 
-_kept = threading.local()
+_thread = threading.local()
 
 
 def _workspace(scenario: Scenario) -> Workspace:
-    """Return the workspace of this thread, kept from one block of a scenario's runs to the next."""
+    """Return the workspace of this thread, reused for all blocks of runs of a scenario."""
     # Identity, not equality: the tables belong to this very scenario object.
-    known, workspace = getattr(_kept, "last", (None, None))
-    if workspace is None or known is not scenario:
+    cached_scenario, workspace = getattr(_thread, "last", (None, None))
+    if workspace is None or cached_scenario is not scenario:
         workspace = Workspace(scenario)
-        _kept.last = scenario, workspace
+        _thread.last = scenario, workspace
     return workspace
 
 
 def _simulate(scenario: Scenario, workspace: Workspace, seed: int, replicas: range) -> RunBatch:
+    """Simulate a batch of runs."""
     with np.errstate(over="ignore", invalid="ignore"):  # growth to infinity is reported
         if not drawn_together(scenario):
             sources = (Source(scenario, Streams(seed, replica)) for replica in replicas)
             return _run_by_run(scenario, workspace, sources, replicas)
         draws = BatchDraws(scenario, seed, replicas)
-        # Both have state outside the Simulation, which simulate_batch() does not carry. Origins are
-        # moved by Python, run by run.
+        # simulate_batch() handles neither state outside the Simulation (SPECIAL) nor moves of the
+        # origin, which Python does run by run.
         special = scenario.hosted.combination in SPECIAL
         if len(draws.paths.frame_times) or special:
             return _run_by_run(scenario, workspace, draws.runs(), replicas)
@@ -83,19 +84,21 @@ def _simulate(scenario: Scenario, workspace: Workspace, seed: int, replicas: ran
 def _run_by_run(
     scenario: Scenario, workspace: Workspace, draws: Iterable[Draws], replicas: range
 ) -> RunBatch:
-    """Simulate runs that call Python on their way: to move the origin, or for samples."""
+    """Simulate runs one by one, for scenarios that need Python during a run."""
     sink = batch_sink(scenario, replicas)
-    for mine in draws:
+    for run_draws in draws:
         recorder = Recorder([sink], counts_only=True)
-        run = FlowRun(scenario, workspace, mine, recorder, silent)
+        run = FlowRun(scenario, workspace, run_draws, recorder, silent)
         sink.finish(recorder, run.to_the_end())
     return sink.batch()
 
 
 def _all_at_once(scenario: Scenario, workspace: Workspace, draws: BatchDraws) -> RunBatch:
-    """Simulate all runs in one call, or nearly so."""
+    """Simulate all runs in one call of a kernel; more calls only if its pool of messages is too
+    small.
+    """
     start, runs = workspace.filters, len(draws.replicas)
-    # Runs that diverge go on to the end: all samples of all runs are written.
+    # np.empty: runs that diverge go on to the end, so that all samples are written.
     buffer = empty_samples((runs, len(scenario.times), *start.xhat.shape), make=np.empty)
     arrays = _batch_arrays(scenario, start, draws)
     if is_immediate(scenario):
@@ -121,7 +124,7 @@ def _all_at_once(scenario: Scenario, workspace: Workspace, draws: BatchDraws) ->
 
 
 def _batch_arrays(scenario: Scenario, start: Filters, draws: BatchDraws) -> BatchArrays:
-    """Return where the runs begin, from filters at time 0, and space for how they end."""
+    """Return the arrays of a batch: filters at time 0, ticks of its runs, and space for results."""
     runs = len(draws.replicas)
     return BatchArrays(
         nodes=start.nodes,
@@ -133,21 +136,21 @@ def _batch_arrays(scenario: Scenario, start: Filters, draws: BatchDraws) -> Batc
         counts=np.zeros((runs, len(KINDS)), dtype=np.int64),
         diverged=np.zeros(runs, dtype=np.int64),
         carriers=len(scenario.nodes) // len(start.nodes),
-        heard=int(draws.ticks.bits),
+        has_bits=int(draws.ticks.bits),
     )
 
 
 def drawn_together(scenario: Scenario) -> bool:
-    """Tell if all that is random comes from link clocks, channels and increments."""
+    """Return True if the runs of a batch can be drawn together: no sensor takes samples."""
     return uses_grid(scenario) and not scenario.sampled_sensors
 
 
 @once_per_scenario
 def batch_size(scenario: Scenario) -> int:
-    """Number of runs that are drawn and kept together, at least 1."""
+    """Return the number of runs that are drawn together, at least 1."""
     if not drawn_together(scenario):
         return 1
-    # An estimate of what one run draws and shows, in floats.
+    # An estimate of the floats that one run draws and stores as samples.
     n, period = scenario.plant.n, scenario.truth.sensing_period
     filters = 1 if scenario.hosted.pooled else len(scenario.nodes)
     # One piece for each step, and one more for each sample that cuts a step.
@@ -158,27 +161,29 @@ def batch_size(scenario: Scenario) -> int:
     # per step the two moments of each sensor's noise.
     drawn = steps * (8 * n + 2 * sensors * rows) + 8.0 * _expected_ticks(scenario)
     samples = len(scenario.times) * filters * n * (n + 2)
-    # At least one run, however large it is. Statistics take L runs side by side: as long for some
-    # as for all.
+    # At least one run, however large it is. A multiple of L, since statistics process L runs side
+    # by side and fewer take as long.
     size = max(1, int(min(MAX_BATCH_RUNS, MAX_BATCH_BYTES / (8.0 * (drawn + samples)))))
     return min(MAX_BATCH_RUNS, -(-size // LANES) * LANES) if size > LANES // 2 else size
 
 
 @once_per_scenario
 def quick_runs(scenario: Scenario) -> int:
-    """Return a number of runs, a power of two, that take some ten milliseconds together: what it
-    costs to prepare a batch is shared by so many at least.
+    """Return the number of runs, a power of two, that take some ten milliseconds together, so that
+    preparing a batch costs little of its time.
     """
     if not (drawn_together(scenario) and is_immediate(scenario)):
         return 1
     steps, nodes = steps_to_the_end(scenario), len(scenario.nodes)
     visits = steps * len(scenario.increment_sensors) + nodes * len(scenario.times)
-    most = int(QUICK_VISITS / (visits + _expected_ticks(scenario)))
-    return 1 << max(0, min(most, batch_size(scenario)).bit_length() - 1)
+    max_runs = int(QUICK_VISITS / (visits + _expected_ticks(scenario)))
+    return 1 << max(0, min(max_runs, batch_size(scenario)).bit_length() - 1)
 
 
 def _expected_ticks(scenario: Scenario) -> float:
-    """Ticks of all clocks of one run; many where a clock does not tell its rate."""
+    """Return the expected number of ticks of a run; a large number if a clock has no
+    finite rate.
+    """
     clock = scenario.network.activation
     if not (scenario.hosted.talks and isinstance(clock, LinkClock)):
         return 0.0
@@ -188,33 +193,34 @@ def _expected_ticks(scenario: Scenario) -> float:
 
 
 class BatchDraws:
-    """Everything random of some runs, drawn up to the horizon."""
+    """All random numbers of a batch of runs, drawn up to the horizon."""
 
     def __init__(self, scenario: Scenario, seed: int, replicas: range) -> None:
         streams = ReplicaStreams(seed, replicas.start, len(replicas))
         self._scenario, self.replicas, blocks = scenario, replicas, blocks_to_the_end(scenario)
         self.paths = Paths(scenario, streams, blocks)
-        # Runs that are simulated one by one, where origins move, look at outcomes themselves.
+        # Runs that are simulated one by one, since origins move, need outcomes and not bits.
         at_once = is_immediate(scenario) and not len(self.paths.frame_times)
         self.ticks = all_ticks(scenario, streams, at_once)
         steps = steps_to_the_end(scenario)
         self._block = self.paths.following(steps)
         noise = Noise(scenario, streams, steps)
-        # One stretch of noise reaches the horizon: it is drawn once.
+        # One block of noise reaches the horizon.
         noise.following()
         self.sensing = noise.sensing
         # An empty table: increment sensors have no samples.
         self.instants = SampleTables(scenario, Streams(seed, replicas.start), {}).instants
-        # Of runs that are simulated one by one, where origins move.
         self.states: States = PathStates(scenario, np.empty(0))
 
     def window(self) -> Window:
-        """The ticks of all runs, one after the other."""
+        """Return the ticks of all runs, one run after the other."""
         ticks = self.ticks
-        return Window(math.inf, *ticks[:4], heard=ticks.at if ticks.bits else None)
+        return Window(
+            math.inf, *ticks[:4], arrival_bits=ticks.first_outcome if ticks.bits else None
+        )
 
     def path(self, together: int = 1) -> PathBlock:
-        """All steps of all runs, of which so many are simulated together."""
+        """Return all steps of all runs, ``together`` of which are simulated at a time."""
         return self.paths.block(self._block, together)
 
     def runs(self) -> Iterator[RunDraws]:
@@ -222,14 +228,14 @@ class BatchDraws:
         return (RunDraws(self, self._scenario, run) for run in range(len(self.replicas)))
 
     def path_of(self, run: int) -> PathBlock:
-        """The steps of one run."""
+        """Return the steps of one run."""
         block, one = self._block, slice(run, run + 1)
         names = ("x_start", "x_end", "moments", "cubic")
-        mine: dict[str, Any] = {name: getattr(block, name)[one] for name in names}
-        return self.paths.block(block._replace(**mine))
+        own: dict[str, Any] = {name: getattr(block, name)[one] for name in names}
+        return self.paths.block(block._replace(**own))
 
     def sampled_states(self, times: FloatArray) -> FloatArray:
-        """(R, T, n) states at the sample times, where no origin moves."""
+        """Return the states (R, T, n) at the sample ``times``, if no origin moves."""
         block = self._block
         # Times of samples are ends of pieces or, at time 0, the start of the first.
         pieces = np.searchsorted(block.end, times)
@@ -251,9 +257,9 @@ class RunDraws:
         self.sensing = Sensing(**fields)
 
     def window(self) -> Window:
-        """All ticks."""
+        """Return all ticks of the run."""
         return window_of(self._batch.ticks, self._run)
 
     def path(self, together: int = 1) -> PathBlock:
-        """All steps."""
+        """Return all steps of the run."""
         return self._batch.path_of(self._run)

@@ -98,7 +98,7 @@ class CombinationState(Struct):
 
 def combination_state_of(scenario: Scenario, state: Simulation) -> CombinationState | None:
     """Return the extra arrays that the filter's combination needs, None if it needs none."""
-    if state.kind not in (BEST, INVERSE, GAINS, PREDICTIONS, BELIEFS):
+    if state.combination_kind not in (BEST, INVERSE, GAINS, PREDICTIONS, BELIEFS):
         return None
     algorithm: Any = scenario.hosted
     (N, n), root = state.xhat.shape, np.ascontiguousarray(state.root)
@@ -106,7 +106,7 @@ def combination_state_of(scenario: Scenario, state: Simulation) -> CombinationSt
     prior_root = state.root.copy()
     gains = _make_gains(scenario, state)
     return CombinationState(
-        kind=state.kind,
+        kind=state.combination_kind,
         trace=getattr(algorithm, "minimise", "") == "trace",
         share=getattr(algorithm, "share_readings", False),
         epsilon=getattr(algorithm, "epsilon", 0.0),
@@ -130,7 +130,10 @@ def _make_gains(scenario: Scenario, state: Simulation) -> dict[str, Any]:
     """Return the constant gains of all nodes, empty for filters of other combinations."""
     N, n = state.xhat.shape
     algorithm: Any = scenario.hosted
-    given = [algorithm.gain_of(k) if state.kind == GAINS else np.zeros((n, 0)) for k in range(N)]
+    given = [
+        algorithm.gain_of(k) if state.combination_kind == GAINS else np.zeros((n, 0))
+        for k in range(N)
+    ]
     p = max(1, *(one.shape[1] for one in given))
     found: dict[str, Any] = {
         "A": np.array(scenario.models[0].A),
@@ -146,13 +149,13 @@ def _make_gains(scenario: Scenario, state: Simulation) -> dict[str, Any]:
     for k, (node, model) in enumerate(zip(scenario.nodes, scenario.models, strict=True)):
         rows = len(model.H)
         found["L"][k, :, : given[k].shape[1]] = given[k]
-        if state.kind == GAINS and rows:
+        if state.combination_kind == GAINS and rows:
             loop = closed_loop(model, given[k])
             found["H"][k, :rows], found["closed"][k] = model.H, loop.A
             found["rate"][k] = gain_rate(given[k], model.H)
             found["model"][k] = len(tables)
             tables.append(loop.flow)
-        elif state.kind == GAINS and node in scenario.sampled_sensors:
+        elif state.combination_kind == GAINS and node in scenario.sampled_sensors:
             # A node that takes samples has one sensor.
             (placed_sensor,) = scenario.sampled_sensors[node]
             H, R = (

@@ -8,7 +8,7 @@ import math
 
 import numpy as np
 
-from netkf.engines.compiled.kept import once_per_scenario
+from netkf.engines.compiled.per_scenario import once_per_scenario
 from netkf.engines.compiled.state import PathBlock, Sensing
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel

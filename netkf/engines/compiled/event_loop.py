@@ -159,7 +159,7 @@ def next_event(state: Simulation) -> tuple[int, float]:
     if tick < now:
         event, now = ON_TICK, tick
     # The heap is ordered by arrival, so its top is the next delivery.
-    deliver = state.pool[state.heap[0]].arrival if state.flying > 0 else NEVER
+    deliver = state.pool[state.heap[0]].arrival if state.in_flight > 0 else NEVER
     if deliver < now:
         event, now = ON_DELIVER, deliver
     # Mail is absorbed at the instant it arrived, after all arrivals of that instant.
@@ -206,7 +206,7 @@ def count_participants(state: Simulation, event: int) -> int:
     # A message goes into an inbox: its receiver is predicted when it absorbs.
     elif event == ON_DELIVER:
         count = 0
-    elif event == ON_TICK and state.at == LINKS:
+    elif event == ON_TICK and state.clock_kind == LINKS:
         count = 2  # both ends of a link decide what they send before either hears the other
     return count
 
@@ -345,20 +345,20 @@ def on_tick(
     entity = state.entities[ticks.entity[k]]
     i, j = entity.sender, entity.other
     # A transmission after a sample has no tick of its own.
-    if state.at != AFTER_READINGS:
+    if state.clock_kind != AFTER_READINGS:
         record_event(state, now, TICK, nodes[i].id, nodes[j].id if j >= 0 else -1, -1)
     state.tick_at += 1
     # A node whose masses nobody hears does not transmit.
     if totals is not None and not offer_round(state, totals, i, now):
         return
     # A node's clock makes one transmission, which each receiver hears or loses.
-    if state.at >= NODES:
+    if state.clock_kind >= NODES:
         record_event(state, now, TRANSMIT, nodes[i].id, -1, nodes[i].sent)
         nodes[i].sent += 1
     # Outcomes of a tick lie one after the other in the order of its directed links.
-    first = state.delays + ticks.at[k] - entity.first
+    first = state.first_delay + ticks.first_outcome[k] - entity.first
     for m in range(entity.first, entity.after):
-        send(state, totals, combination, state.hearing[m], ticks.delay[first + m], now)
+        send(state, totals, combination, state.outgoing[m], ticks.delay[first + m], now)
 
 
 @kernel
@@ -396,7 +396,7 @@ def send(
         send_prediction(state, combination, m, h)
     elif combination is not None and combination.kind == BELIEFS:
         send_evidence(state, combination.evidence, m, h)
-    elif state.kind == READINGS:
+    elif state.combination_kind == READINGS:
         message.tag = state.nodes[h].reading
     else:
         # A copy: the sender goes on while the message is on its way.
@@ -407,8 +407,8 @@ def send(
     # ``order`` breaks ties between messages of one link that arrive at one time.
     message.arrival, message.order = now + delay, state.order
     state.order += 1
-    push(pool, state.heap, state.flying, m)
-    state.flying += 1
+    push(pool, state.heap, state.in_flight, m)
+    state.in_flight += 1
 
 
 @kernel
@@ -416,7 +416,7 @@ def is_lost(state: Simulation) -> bool:
     """Return True if all messages of the next tick are lost."""
     ticks = state.ticks
     entity = state.entities[ticks.entity[state.tick_at]]
-    first = state.delays + ticks.at[state.tick_at]
+    first = state.first_delay + ticks.first_outcome[state.tick_at]
     heard = False
     for m in range(entity.after - entity.first):
         heard = heard or ticks.delay[first + m] >= 0.0
@@ -426,7 +426,7 @@ def is_lost(state: Simulation) -> bool:
 @kernel
 def ends_instant(state: Simulation, now: float) -> bool:
     """Return True if messages of this instant are absorbed before any other tick or delivery."""
-    flying = state.flying > 0 and state.pool[state.heap[0]].arrival <= now
+    flying = state.in_flight > 0 and state.pool[state.heap[0]].arrival <= now
     return not flying and next_tick(state) > now
 
 
@@ -448,8 +448,8 @@ def absorb_messages(
 @kernel
 def on_deliver(state: Simulation, now: float) -> None:
     """Deliver the message that arrives next."""
-    m = pop(state.pool, state.heap, state.flying)
-    state.flying -= 1
+    m = pop(state.pool, state.heap, state.in_flight)
+    state.in_flight -= 1
     arrive(state, m, now)
 
 
@@ -555,7 +555,7 @@ def predict_payloads(state: Simulation, h: int, now: float) -> float:
     while m != -1:
         age = now - pool[m].sent
         # SWAP takes over the last message of the inbox only, so the others need no prediction.
-        if age > 0.0 and (state.kind != SWAP or pool[m].next == -1):
+        if age > 0.0 and (state.combination_kind != SWAP or pool[m].next == -1):
             propagate_root(
                 state.table, model, state.pool_root, state.pool_x, m, age, state.flow_scratch
             )
@@ -568,12 +568,12 @@ def predict_payloads(state: Simulation, h: int, now: float) -> float:
 def combine(state: Simulation, h: int, now: float) -> None:
     """Combine node ``h`` with the estimates in its inbox, predicted to now."""
     heard = predict_payloads(state, h, now)
-    if state.kind == CONVEX:
+    if state.combination_kind == CONVEX:
         # Lost weight goes to the node itself, so that weights sum to 1.
         combine_convex(state, h, max(0.0, 1.0 - heard))
-    elif state.kind == INTERSECTION:
+    elif state.combination_kind == INTERSECTION:
         intersect(state, h, max(0.0, 1.0 - heard), 1.0)
-    elif state.kind == SHARES:
+    elif state.combination_kind == SHARES:
         own, total = state.nodes[h].own, state.nodes[h].own + heard
         # "keep-own", or weights that are all 0: the own weight is what the others leave.
         if state.keep_own == 1 or total == 0.0:
@@ -581,7 +581,7 @@ def combine(state: Simulation, h: int, now: float) -> None:
         # With weight 1 the node keeps its estimate to the last bit.
         if own / total != 1.0:
             intersect(state, h, own / total, total)
-    elif state.kind == SWAP:
+    elif state.combination_kind == SWAP:
         # Gossip: the node takes over the estimate of its peer.
         last = state.nodes[h].last
         copy_state(state.size, state.xhat, state.root, h, state.pool_x, state.pool_root, last)

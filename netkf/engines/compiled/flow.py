@@ -1,7 +1,7 @@
-"""One run in continuous time: what the compiled event loop works on and is given when it stops.
+"""One run in continuous time: Python draws the random numbers, the compiled event loop simulates.
 
-Python draws - ticks, outcomes, the path, the noise - from the streams that the SimPy engine uses,
-and the loop does everything that happens an event at a time.
+Python draws ticks, outcomes, the path and the noise in blocks, from the streams that the SimPy
+engine uses. The loop handles events one by one, and stops when it needs the next block or space.
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ AT_START = (
     *(
         "run",
         "first_run",
-        "delays",
+        "first_delay",
         "frame_at",
         "piece",
         "grid_at",
@@ -88,9 +88,9 @@ AT_START = (
         "probe_at",
         "row",
     ),
-    *("free", "flying", "order", "receivers", "absorbing", "samples"),
+    *("first_free", "in_flight", "order", "receivers", "absorbing", "samples"),
 )
-"""Numbers of a Simulation that are 0 when a run begins."""
+"""Integer fields of a Simulation that are 0 when a run begins."""
 
 
 class Windows(Protocol):
@@ -101,7 +101,7 @@ class Windows(Protocol):
 
 
 class Draws(Protocol):
-    """Random numbers of one run, given out as the run goes on."""
+    """Random numbers of one run, in blocks as the run needs them."""
 
     sensing: Sensing
     instants: Instants
@@ -111,14 +111,13 @@ class Draws(Protocol):
         """Return the next window of ticks."""
 
     def path(self, together: int = 1) -> PathBlock:
-        """Return the next steps of the path for ``together`` runs.
-
-        Their noise is in ``sensing``, and the samples taken meanwhile in ``instants``.
+        """Return the next steps of the path for ``together`` runs; fill in the noise of these steps
+        in ``sensing``, and the samples taken during them in ``instants``.
         """
 
 
 class Source:
-    """Draws as they are wanted."""
+    """The random numbers of a run that is simulated alone, drawn on demand."""
 
     states: States
 
@@ -133,15 +132,15 @@ class Source:
         blocks = blocks_at_once(scenario) if self._grid else 0
         self._noise = Noise(scenario, streams, blocks * BLOCK)
         self.sensing = self._noise.sensing
-        self._read, self._n = -math.inf, scenario.plant.n
+        self._read_until, self._n = -math.inf, scenario.plant.n
         if self._grid:
             # Cut the path where a state is sampled: it is drawn there from its own stream.
             self._paths = Paths(scenario, streams, blocks, sampled)
             self.states = PathStates(scenario, self._paths.frame_times)
         else:
-            self.states = known = KnownStates(scenario, streams)
-            # The whole truth is known here, so that all samples are read at once.
-            samples.read(known.truth.states(sampled)[0], sampled, -math.inf, math.inf)
+            self.states = states = KnownStates(scenario, streams)
+            # The truth is complete, so that all samples are read at once.
+            samples.read(states.truth.states(sampled)[0], sampled, -math.inf, math.inf)
 
     def window(self) -> Window:
         """Return the next window: some ticks of each entity."""
@@ -154,15 +153,15 @@ class Source:
         # Noise and path advance together, a block of steps at a time.
         self._noise.following()
         path = self._paths.block(self._paths.following(), together)
-        # Samples in (read, end]: a time at the border of two blocks is read once.
-        first, last = np.searchsorted(self._sampled, [self._read, path.end], side="right")
+        # Samples in (read_until, end]: a time at the border of two blocks is read once.
+        first, last = np.searchsorted(self._sampled, [self._read_until, path.end], side="right")
         if first < last:
             times = self._sampled[first:last]
             pieces = np.searchsorted(path.stop, times)
             assert isinstance(self.states, PathStates)
             x = self.states.local(times, path, pieces)
-            self._samples.read(x, times, self._read, path.end)
-        self._read = path.end
+            self._samples.read(x, times, self._read_until, path.end)
+        self._read_until = path.end
         return path
 
 
@@ -175,12 +174,12 @@ def _make_windows(scenario: Scenario, streams: Streams, instants: Instants) -> W
 
 
 class Workspace:
-    """The tables of a scenario, and where the state of a run is; serves one run after another."""
+    """The tables of a scenario and the arrays of a run, reused for one run after another."""
 
     def __init__(self, scenario: Scenario) -> None:
         self._scenario, self._senders = scenario, senders_of(scenario)
         self._start, (entities, directions) = filters_at_start(scenario), entity_records(scenario)
-        # Directed links count their messages, which are those of this workspace.
+        # A copy, since directed links count the messages of a run.
         self._records = entities, directions.copy()
         self._waiting = np.zeros(len(self._start.nodes), dtype=np.int64)
         size, n = self._start.xhat.shape
@@ -194,8 +193,8 @@ class Workspace:
         scratch = max(1, min(MAX_BUFFERED_SAMPLES, SAMPLES_ROOM // (size * n * n)))
         self._buffer = empty_samples((1, scratch, size, n), terms)
         self._visits: Visits | None = None
-        # Code for each n makes runs of filters that combine estimates 1.5 times faster. Filters of
-        # sums and of readings gain nothing: one event loop is compiled for every n.
+        # Code compiled for each n makes filters that combine estimates 1.5 times faster. It does
+        # not help filters of sums and of readings: these share one event loop for all n.
         self._unrolled = scenario.hosted.combination not in SPECIAL
 
     @property
@@ -204,7 +203,7 @@ class Workspace:
         return self._start
 
     def visits(self, together: int = 1) -> Visits:
-        """Return empty arrays for the visits of ``together`` runs."""
+        """Return an empty queue of visits for ``together`` runs."""
         capacity = together * len(self._start.nodes)
         if self._visits is None or len(self._visits.level) < capacity:
             series, weights = series_of_lanes(self._scenario), self._records[1]["weight"]
@@ -214,15 +213,15 @@ class Workspace:
     def begin(
         self, draws: Draws, traced: bool, buffer: SampleBuffer | None = None, together: int = 1
     ) -> Simulation:
-        """Return the state at time 0 of one run, or of several that are simulated ``together`` and
-        write their samples into ``buffer``.
+        """Return the state at time 0 of one run, or of ``together`` runs that write their samples
+        into ``buffer``; ``traced``: rows of events are written.
         """
         start, instants, window = self._start, draws.instants, draws.window()
         entities, directions = self._records
         # Records are shared by all runs of the workspace: numbers of messages start again.
         directions["messages"] = 0
         pool = self._pool[0]
-        # All messages are free, in the order of the pool.
+        # All messages are free: a linked list in the order of the pool.
         pool["next"] = np.arange(1, len(pool) + 1)
         path = draws.path(together)
         scratch, flow, update = scratch_arrays(start.table, start.gains, instants, self._unrolled)
@@ -238,7 +237,7 @@ class Workspace:
             table=start.table,
             gains=start.gains,
             entities=entities,
-            hearing=self._senders.hearing,
+            outgoing=self._senders.outgoing,
             directions=directions,
             pool=pool,
             pool_x=self._pool[1],
@@ -267,17 +266,17 @@ class Workspace:
     def _scalar_fields(self, instants: Instants) -> dict[str, Any]:
         """Return the scalar fields of a Simulation by name."""
         algorithm: Any = self._scenario.hosted
-        most = int(np.diff(self._senders.first).max(initial=0))
+        max_messages = int(np.diff(self._senders.first).max(initial=0))
         return {
-            "kind": COMBINATIONS.index(algorithm.combination),
-            "at": CLOCKS.index(self._senders.at),
+            "combination_kind": COMBINATIONS.index(algorithm.combination),
+            "clock_kind": CLOCKS.index(self._senders.at),
             "keep_own": getattr(algorithm, "on_loss", "") == "keep-own",
-            "most_messages": most,
+            "most_messages": max_messages,
             "free_count": len(self._pool[0]),
             # Each message of a tick leaves a "send", its outcome and perhaps an "absorb", and the
             # tick or transmission two rows more; an instant of samples leaves one row per sensing
             # node.
-            "most_rows": 2 + 3 * most + int(np.diff(instants.first).max(initial=0)),
+            "most_rows": 2 + 3 * max_messages + int(np.diff(instants.first).max(initial=0)),
             "horizon": self._scenario.horizon,
             "age_limit": getattr(algorithm, "max_age", math.inf),
             "inbox_time": 0.0,
@@ -286,15 +285,17 @@ class Workspace:
 
 def ticks_of(window: Window) -> TickArrays:
     """Return the ticks of a window as arrays for kernels."""
-    heard = np.zeros(len(window.t), dtype=np.int64) if window.heard is None else window.heard
-    return TickArrays(**window._replace(heard=heard)._asdict())
+    bits = window.arrival_bits
+    if bits is None:
+        bits = np.zeros(len(window.t), dtype=np.int64)
+    return TickArrays(**window._replace(arrival_bits=bits)._asdict())
 
 
 def empty_samples(
     shape: tuple[int, int, int, int], terms: int = 0, make: Callable[..., Any] = np.zeros
 ) -> SampleBuffer:
-    """Return empty arrays for samples of ``shape`` (R, B, N, n), with ``terms`` of sums; ``make``
-    makes those of estimates and covariances.
+    """Return arrays for samples of ``shape`` (R, B, N, n), with ``terms`` terms of conserved sums;
+    ``make`` (np.zeros or np.empty) creates those of estimates and covariances.
     """
     runs, count, _, n = shape
     return SampleBuffer(
@@ -308,7 +309,7 @@ def empty_samples(
 
 
 class FlowRun:
-    """One run."""
+    """One run in continuous time, recorded by ``recorder``."""
 
     def __init__(
         self,
@@ -330,19 +331,19 @@ class FlowRun:
         """Simulate up to the horizon; returns complete or diverged."""
         try:
             # Any value but DONE.
-            wanted = WANT_ROWS
-            while wanted != DONE:
-                wanted = self._advance()
-                # Samples first: the run ends at one that is not finite, and with the rows before
-                # it.
-                if not self._hand_samples_on():
+            request = WANT_ROWS
+            while request != DONE:
+                request = self._advance()
+                # Samples first: the run ends at the first one that is not finite, with the rows
+                # before it.
+                if not self._record_samples():
                     return "diverged"
-                self._fulfil(wanted)
+                self._fulfil(request)
         finally:
-            # Ctrl-C between the two calls would lose rows that the loop has made.
+            # Ctrl-C between the two calls would lose rows of the loop.
             with defer_signals():
                 try:
-                    self._pass_rows_on(self._state.row, self._state.counts)
+                    self._record_rows(self._state.row, self._state.counts)
                 finally:
                     self._recorder.flush()
         return "complete"
@@ -355,33 +356,32 @@ class FlowRun:
             return run_alone(self._state)
         return int(event_loop(self._state, self._totals, self._history, self._combination))
 
-    def _fulfil(self, wanted: int) -> None:
+    def _fulfil(self, request: int) -> None:
         """Fulfil a request of the event loop: ticks, steps of the path, or space."""
         state = self._state
-        if wanted == WANT_TICKS:
+        if request == WANT_TICKS:
             window = self._draws.window()
             state.ticks, state.tick_at = ticks_of(window), 0
             state.ticks_stop = len(window.t)
-        elif wanted == WANT_STEPS:
+        elif request == WANT_STEPS:
             state.path = self._draws.path()
             # Positions count from the first piece and grid point of the new block.
             state.piece = state.grid_at = 0
-        elif wanted == WANT_MESSAGES:
-            self._more_messages()
-        elif wanted == WANT_ROWS:
-            self._pass_rows_on(state.row, state.counts)
-            self._make_rows()
-        elif wanted == WANT_PAST and self._history is not None:
+        elif request == WANT_MESSAGES:
+            self._enlarge_pool()
+        elif request == WANT_ROWS:
+            self._record_rows(state.row, state.counts)
+            self._enlarge_rows()
+        elif request == WANT_PAST and self._history is not None:
             add_past(self._history, len(state.nodes))
-        elif wanted == WANT_REBASE:
+        elif request == WANT_REBASE:
             self._rebase()
 
     def _rebase(self) -> None:
         """Make the present state the new origin of all states, estimates and messages."""
         state, k = self._state, self._state.frame_at
-        # Estimates are lowered by the state, which is the new origin.
         offset = -self._draws.states.offset(k, state.path, state.piece)
-        # The past of each node gets one entry: the frame that begins.
+        # The history of each node gets one entry: the beginning of the frame.
         if self._history is not None and self._history.free[1] < len(state.nodes):
             add_past(self._history, len(state.nodes))
         move_origin(
@@ -389,7 +389,7 @@ class FlowRun:
         )
         state.frame_at = k + 1
 
-    def _more_messages(self) -> None:
+    def _enlarge_pool(self) -> None:
         """Enlarge the pool of messages and every array that has an entry for each of them."""
         add_messages(self._state, self._state.most_messages)
         # Totals are offered by message: their array grows with the pool.
@@ -400,14 +400,16 @@ class FlowRun:
         if self._combination is not None:
             more_evidence(self._combination.evidence, len(self._state.pool))
 
-    def _make_rows(self) -> None:
-        """Make sure that the buffer of event rows is long enough for one more event."""
-        least = max(recording.BLOCK, 2 * self._state.most_rows)
-        if len(self._state.rows) < least:
-            self._state.rows = np.empty(least, dtype=EVENT)
+    def _enlarge_rows(self) -> None:
+        """Make the buffer of event rows long enough for one more event."""
+        length = max(recording.BLOCK, 2 * self._state.most_rows)
+        if len(self._state.rows) < length:
+            self._state.rows = np.empty(length, dtype=EVENT)
 
-    def _pass_rows_on(self, used: int, counts: np.ndarray) -> None:
-        """Pass the first ``used`` rows of events, or their ``counts`` by kind, to the recorder."""
+    def _record_rows(self, used: int, counts: np.ndarray) -> None:
+        """Record the first ``used`` rows of events, or, in a run without rows,
+        ``counts`` by kind.
+        """
         state, recorder = self._state, self._recorder
         if not state.traced:
             recorder.add_counts(counts)
@@ -417,47 +419,47 @@ class FlowRun:
         rows = state.rows
         state.row = 0
         recorder.extend(rows[:used])
-        state.rows = np.empty(len(rows), dtype=EVENT)  # the others are the recorder's now
+        # A new buffer, since the recorder keeps the old one.
+        state.rows = np.empty(len(rows), dtype=EVENT)
 
-    def _hand_samples_on(self) -> bool:
-        """Record the samples that are there; False where one of them is no longer finite."""
+    def _record_samples(self) -> bool:
+        """Record the samples in the buffer; return False if one of them is not finite."""
         state, buffer = self._state, self._state.buffer
         count, state.samples = state.samples, 0
         if not count:
             return True
         times = state.probes[state.probe_at - count : state.probe_at].copy()
         local, x = self._draws.states.states_at(times, state.path, buffer.piece[0, :count])
-        # Index of the sample at which the run stands: the last, or the first that is broken.
-        lost = [count - 1]
+        # Index of the last sample that counts: the last one, or the first that is not finite.
+        last = [count - 1]
 
         def pass_rows_on(k: int) -> None:
-            """Pass on the rows before sample ``k``, the first one that is not finite."""
-            lost[0] = k
-            # Rows up to that sample, and no row after it.
-            self._pass_rows_on(int(buffer.rows[0, k]), buffer.counts[0, k])
+            """Record the rows before sample ``k``, the first one that is not finite."""
+            last[0] = k
+            self._record_rows(int(buffer.rows[0, k]), buffer.counts[0, k])
 
         # Copies: the loop writes the next samples into the same space.
         xhat, P = buffer.xhat[0, :count].copy(), buffer.P[0, :count].copy()
-        # In local coordinates: the difference of absolute states would lose digits.
+        # Relative to the moving origin: a difference of large absolute states would lose digits.
         error = local[:, None] - xhat
         if local is not x:
             xhat += (x - local)[:, None]
         samples = StateSamples(times, x, xhat, P, error)
-        parts = self._scenario, self._recorder, self._progress
-        fine = record_samples(*parts, samples, pass_rows_on)
+        run = self._scenario, self._recorder, self._progress
+        finite = record_samples(*run, samples, pass_rows_on)
         if self._totals is not None:
-            self._recorder.sums = _sums(buffer.terms[lost[0]], self._totals.receivers)
-        return fine
+            self._recorder.sums = _sums(buffer.terms[last[0]], self._totals.receivers)
+        return finite
 
 
 def _sums(terms: FloatArray, receivers: np.ndarray) -> dict[str, tuple[float, float]]:
-    """Return the total weight of running sums at the start and now: what nodes hold and have sent,
-    less what was received.
+    """Return the total weight of running sums at the start and now: the weights that nodes hold,
+    plus the totals sent, minus the totals heard.
     """
     count = len(receivers)
-    # A total is sent to each receiver of the node.
+    # A total counts once for each receiver of its node.
     sent = np.repeat(terms[count : 2 * count], receivers)
-    # fsum: rounding of the check itself would look like a loss of weight.
+    # fsum: rounding of this sum would look like a loss of weight.
     now = math.fsum([*terms[:count].tolist(), *sent.tolist(), *(-terms[2 * count :]).tolist()])
     return {"weight": (float(count), now)}
 
@@ -472,7 +474,7 @@ def _make_totals(scenario: Scenario, state: Simulation) -> Totals | None:
 
 
 def _make_history(scenario: Scenario, state: Simulation) -> History | None:
-    """Return the past of all nodes, or None for filters that never go back."""
+    """Return the history of all nodes, or None for filters that use no late readings."""
     if scenario.hosted.combination != "readings":
         return None
     algorithm: Any = scenario.hosted

@@ -1,9 +1,10 @@
-"""The series that filters side by side need, one table for those that read and one for the others.
+"""Power series in the gap for filters in lanes: one table for nodes with increment sensors, one for
+those without.
 
-A prediction needs some dozen values that depend on the gap alone, and a reading as many gains.
-Both are power series; here they are expanded around the same gaps, so that one sum serves both.
-Values that are the same for all models and gaps - most of them 0, if axes of a plant are
-independent - are summed once.
+A prediction needs some dozen values that depend on the gap alone (Q_g, exp(A g), F and G_g, see
+kernels.root_flow), and a reading as many gains (kernels.gains). Both are power series; here they
+are expanded around the same gaps, so that one evaluation serves both. Equal columns - most of them
+0, if the axes of a plant are independent - are evaluated once.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ import math
 import numpy as np
 
 from netkf.algorithms.kernels.root_flow import CELL_BYTES
-from netkf.engines.compiled.kept import once_per_scenario
+from netkf.engines.compiled.per_scenario import once_per_scenario
 from netkf.engines.compiled.state import Filters, filters_at_start
 from netkf.linalg.arrays import FloatArray, IntArray
 from netkf.linalg.lanes import LANES, aligned
@@ -22,27 +23,31 @@ from netkf.linalg.structs import Struct
 from netkf.scenario.scenario import Scenario
 
 ROUNDING = 2.0**-52
-"""Of the largest term of an entry, what may be left out."""
+"""Share of the largest term of an entry below which terms are left out."""
 
 PARTS = 4
-"""Parts that a cell of FlowTable is divided into, since shorter cells need fewer terms; fewer parts
-where the table of a model would be larger than CELL_BYTES.
+"""Parts into which a cell of FlowTable is divided, since shorter cells need fewer terms; fewer
+parts if the table of a model would be larger than CELL_BYTES.
 """
 
 NEAR = 2
-"""Cells so near to 0, where entries vanish, that their series need more terms."""
+"""Number of first cells whose series need more terms, since entries vanish at 0."""
 
 
 class LaneSeries(Struct):
-    """Power series in cells of ``unit`` (M,) seconds: ``series`` (M, cells, terms, W) of columns,
-    around 0 in cell 0 and around the middles of the others, of which those from NEAR on need
-    ``far_terms`` only. Entry e of the values is column ``place[e]`` (E,). Model m of FlowTable is
-    ``row[m]`` here.
+    """Power series of E values for M models.
+
+    series : (M, cells, terms, W) coefficients of W columns, around 0 in cell 0 and around the
+             middles of the other cells
+    unit : (M,), length of a cell, seconds
+    column : (E,), value e is this column; equal values share one
+    row : model m of a FlowTable is model ``row[m]`` here
+    far_terms : number of terms that cells from NEAR on need
     """
 
     series: FloatArray
     unit: FloatArray
-    place: IntArray
+    column: IntArray
     row: IntArray
     far_terms: int
 
@@ -55,7 +60,7 @@ def series_of_lanes(scenario: Scenario) -> tuple[LaneSeries, LaneSeries]:
     return unobserved_series(filters), sensing_series(filters, period)
 
 
-def most_moments(filters: Filters) -> int:
+def max_moments(filters: Filters) -> int:
     """Return the largest number of moments that a node reads."""
     return int(filters.gains.moments.max())
 
@@ -63,9 +68,9 @@ def most_moments(filters: Filters) -> int:
 def unobserved_series(filters: Filters) -> LaneSeries:
     """Return the series of Q_g and exp(A g), for nodes without sensors."""
     n, table = filters.xhat.shape[1], filters.table
-    mine = table.sizes[:, 1] == 0
+    selected = table.sizes[:, 1] == 0
     width = n * (n + 1) // 2 + n * n
-    return _united(table.series[mine][..., :width], table.unit[mine], mine)
+    return _united(table.series[selected][..., :width], table.unit[selected], selected)
 
 
 def sensing_series(filters: Filters, period: float) -> LaneSeries:
@@ -73,25 +78,25 @@ def sensing_series(filters: Filters, period: float) -> LaneSeries:
     ``period`` seconds.
     """
     n, table = filters.xhat.shape[1], filters.table
-    width, mine = n * (n + 1) + 2 * n * n, table.sizes[:, 1] > 0
+    width, selected = n * (n + 1) + 2 * n * n, table.sizes[:, 1] > 0
     # Readings of more than a step of the sensing grid are never used at once.
     cells = min(table.series.shape[1], math.ceil(period / table.unit.min()) + 1)
-    unit = table.unit[mine]
-    flow = table.series[mine][:, :cells, :, :width]
-    gains = padded_gains(filters)[mine[:-1]]  # the last model has no sensors
+    unit = table.unit[selected]
+    flow = table.series[selected][:, :cells, :, :width]
+    gains = padded_gains(filters)[selected[:-1]]  # the last model has no sensors
     terms = max(flow.shape[2], gains.shape[1])
-    whole = np.zeros((*flow.shape[:2], terms, width + gains.shape[2]))
-    whole[:, :, : flow.shape[2], : flow.shape[3]] = flow
-    for k in range(len(whole)):
+    combined = np.zeros((*flow.shape[:2], terms, width + gains.shape[2]))
+    combined[:, :, : flow.shape[2], : flow.shape[3]] = flow
+    for k in range(len(combined)):
         for cell in range(cells):
             # Cell 0 is expanded at 0 and the others at their middles.
             middle = (cell + 0.5) * unit[k] if cell else 0.0
-            whole[k, cell, : gains.shape[1], width:] = shifted(gains[k], middle)
-    return _united(whole, unit, mine)
+            combined[k, cell, : gains.shape[1], width:] = expand_around(gains[k], middle)
+    return _united(combined, unit, selected)
 
 
-def shifted(series: FloatArray, middle: float) -> FloatArray:
-    """The power series (terms, ...) around 0 as one around ``middle``."""
+def expand_around(series: FloatArray, middle: float) -> FloatArray:
+    """Return the power series (terms, ...) around 0 expanded around ``middle``."""
     terms = len(series)
     powers = np.longdouble(middle) ** np.arange(terms)
     # Coefficient k of the shifted series: sum over j >= k of binomial(j, k) middle^(j - k) c_j.
@@ -99,93 +104,97 @@ def shifted(series: FloatArray, middle: float) -> FloatArray:
     for k in range(terms):
         for j in range(k, terms):
             shift[k, j] = math.comb(j, k) * powers[j - k]
-    moved = shift @ series.reshape(terms, -1).astype(np.longdouble)
-    return moved.astype(np.float64).reshape(series.shape)
+    result = shift @ series.reshape(terms, -1).astype(np.longdouble)
+    return result.astype(np.float64).reshape(series.shape)
 
 
 def padded_gains(filters: Filters) -> FloatArray:
-    """Return the series of the gains of all models (M, terms, 3 n q), padded with 0 to the most
-    rows of any.
+    """Return the series (M, terms, 3 n q) of the gains U, W and C of all models, padded with zeros
+    to the largest number q of moments.
     """
-    n, most, gains = filters.xhat.shape[1], most_moments(filters), filters.gains
-    known = gains.series.shape[1]
-    made = np.zeros((len(gains.series), known, 3 * n * most))
+    n, max_rows, gains = filters.xhat.shape[1], max_moments(filters), filters.gains
+    terms = gains.series.shape[1]
+    padded = np.zeros((len(gains.series), terms, 3 * n * max_rows))
     for k, q in enumerate(gains.moments.tolist()):
         if not q:
             continue
         # First moments of all rows come before the second ones.
-        columns = np.concatenate([np.arange(q // 2), most // 2 + np.arange(q // 2)])
+        columns = np.concatenate([np.arange(q // 2), max_rows // 2 + np.arange(q // 2)])
         parts = np.split(gains.series[k, :, : 3 * n * q], 3, axis=1)
-        whole = [np.zeros((known, n, most)), np.zeros((known, n, most)), np.zeros((known, most, n))]
-        for target, part in zip(whole[:2], parts[:2], strict=True):
-            target[:, :, columns] = part.reshape(known, n, q)
-        whole[2][:, columns] = parts[2].reshape(known, q, n)
-        made[k] = np.concatenate([part.reshape(known, -1) for part in whole], axis=1)
-    return made
+        padded_parts = [
+            np.zeros((terms, n, max_rows)),
+            np.zeros((terms, n, max_rows)),
+            np.zeros((terms, max_rows, n)),
+        ]
+        for target, part in zip(padded_parts[:2], parts[:2], strict=True):
+            target[:, :, columns] = part.reshape(terms, n, q)
+        padded_parts[2][:, columns] = parts[2].reshape(terms, q, n)
+        padded[k] = np.concatenate([part.reshape(terms, -1) for part in padded_parts], axis=1)
+    return padded
 
 
-def _united(series: FloatArray, unit: FloatArray, mine: np.ndarray) -> LaneSeries:
-    """The table of series (M, cells, terms, E), of the models that are ``mine``, with each column
-    once and no more terms than cells of ``unit`` (M,) seconds need.
+def _united(series: FloatArray, unit: FloatArray, selected: np.ndarray) -> LaneSeries:
+    """Return the table of series (M, cells, terms, E), with equal columns stored once and as many
+    terms as cells of ``unit`` (M,) seconds need; ``selected`` flags their models in a FlowTable.
     """
-    found: dict[bytes, int] = {}
+    indices: dict[bytes, int] = {}
     # 0.0 and not -0.0: they are the same number.
     columns = np.ascontiguousarray(np.moveaxis(series, -1, 0)) + 0.0
-    place = np.array([found.setdefault(column.tobytes(), len(found)) for column in columns])
-    first = np.unique(place, return_index=True)[1]
-    series, unit = divided(np.moveaxis(columns[first], 0, -1), unit)
+    column = np.array([indices.setdefault(values.tobytes(), len(indices)) for values in columns])
+    first = np.unique(column, return_index=True)[1]
+    series, unit = divide_cells(np.moveaxis(columns[first], 0, -1), unit)
     needed = terms_needed(series, unit)
     terms = number_of_terms(needed, series.shape[2])
     series = series[:, :, :terms]
-    # Whole lanes, see series.fill_row.
+    # A multiple of the lanes, see series.fill_row.
     width = -(-len(first) // LANES) * LANES
-    made: FloatArray = aligned((*series.shape[:2], terms, width))
-    made[:, :, : series.shape[2], : len(first)] = series
+    padded: FloatArray = aligned((*series.shape[:2], terms, width))
+    padded[:, :, : series.shape[2], : len(first)] = series
     return LaneSeries(
-        series=made,
+        series=padded,
         unit=unit,
-        place=place.astype(np.int64),
-        row=np.cumsum(mine) - 1,
+        column=column.astype(np.int64),
+        row=np.cumsum(selected) - 1,
         far_terms=number_of_terms(needed[NEAR:], terms),
     )
 
 
-def divided(series: FloatArray, unit: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the series (M, cells, terms, E) in shorter cells, and the seconds of these."""
+def divide_cells(series: FloatArray, unit: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the series (M, cells, terms, E) of shorter cells, and the length (M,) of these."""
     models, cells, terms, entries = series.shape
     parts = PARTS
     while parts > 1 and cells * parts * MANY_TERMS[-1] * entries * series.itemsize > CELL_BYTES:
         parts //= 2
     if parts == 1:
         return series, unit
-    made = np.empty((models, cells, parts, terms, entries))
+    divided = np.empty((models, cells, parts, terms, entries))
     for k in range(models):
         for part in range(parts):
             share = (part + 0.5) / parts
             # Series of cell 0 are around its start, and those of the others around their middles.
-            made[k, 0, part] = shifted(series[k, 0], share * unit[k] if part else 0.0)
-            rest = shifted(np.moveaxis(series[k, 1:], 1, 0), (share - 0.5) * unit[k])
-            made[k, 1:, part] = np.moveaxis(rest, 0, 1)
-    return made.reshape(models, cells * parts, terms, entries), unit / parts
+            divided[k, 0, part] = expand_around(series[k, 0], share * unit[k] if part else 0.0)
+            other_cells = expand_around(np.moveaxis(series[k, 1:], 1, 0), (share - 0.5) * unit[k])
+            divided[k, 1:, part] = np.moveaxis(other_cells, 0, 1)
+    return divided.reshape(models, cells * parts, terms, entries), unit / parts
 
 
 def terms_needed(series: FloatArray, unit: FloatArray) -> IntArray:
-    """Return for each cell the number of terms after which no entry of any model has more than
-    rounding left at the ends of the cell.
+    """Return the number of terms that each cell needs (cells,): what follows is below rounding at
+    the ends of the cell, for all entries of all models.
     """
     # From its middle a cell reaches half a unit, but the first one reaches a whole unit.
     spans = np.repeat(0.5 * unit[:, None], series.shape[1], axis=1)
     spans[:, :1] *= 2.0
     sizes = np.abs(series) * (spans[..., None] ** np.arange(series.shape[2]))[..., None]
-    left = np.cumsum(sizes[:, :, ::-1], axis=2)[:, :, ::-1]
+    remainder = np.cumsum(sizes[:, :, ::-1], axis=2)[:, :, ::-1]
     largest = sizes.max(axis=2, keepdims=True)
-    most = ROUNDING * largest + NOTHING * largest.max(axis=3, initial=0.0, keepdims=True)
-    return np.asarray((left > most).any(axis=(0, 3)).sum(axis=1))
+    tolerance = ROUNDING * largest + NOTHING * largest.max(axis=3, initial=0.0, keepdims=True)
+    return np.asarray((remainder > tolerance).any(axis=(0, 3)).sum(axis=1))
 
 
-def number_of_terms(needed: IntArray, most: int) -> int:
-    """Return how many terms to add up in cells that need so many, at most ``most``: a number that
-    ``series.fill_row`` adds up fast if there is one.
+def number_of_terms(needed: IntArray, max_terms: int) -> int:
+    """Return the number of terms to evaluate in cells that need ``needed``, at most ``max_terms``:
+    the next number for which ``series.fill_row`` is unrolled, if there is one.
     """
-    least = int(needed.max(initial=0))
-    return next((terms for terms in MANY_TERMS if terms >= least), most)
+    min_terms = int(needed.max(initial=0))
+    return next((terms for terms in MANY_TERMS if terms >= min_terms), max_terms)

@@ -1,4 +1,8 @@
-"""Readings that come late, used as if they had come in time (algorithms/intermittent, in loops)."""
+"""Late readings in the event loop, used as if they had come in time (see algorithms/intermittent).
+
+Each node remembers its recent events: readings and moves of the origin, each with the state after
+it. A late reading is inserted at its time, and all later events are repeated.
+"""
 
 from __future__ import annotations
 
@@ -20,13 +24,13 @@ PAST = np.dtype(
 class History(Struct):
     """The past of N nodes, for late readings: a pool of P events.
 
-    past : (P,), each with the instant of the reading used or the number of the frame begun (else
-           -1)
+    past : (P,) PAST records: index of the instant of a reading or number of a frame that begins
+           (else -1), index of the event ``before`` it, and time
     x, root : state right after each event (P, n), (P, n, n)
     newest : (N,), index of the newest event of each node
     free : (2,), first free entry and number of free ones
-    offsets : (F, n), of frames
-    lag : seconds for which events are kept
+    offsets : (F, n), shift of the estimates at the beginning of each frame
+    lag : seconds for which events are remembered
     """
 
     past: np.ndarray
@@ -46,7 +50,6 @@ def empty_history(state: Simulation, lag: float, capacity: int) -> History:
     past = np.zeros(capacity, dtype=PAST)
     past["instant"] = past["frame"] = -1
     past["before"] = np.arange(1, capacity + 1)
-    # Nothing was before time 0.
     past["before"][:count] = -1
     x, root = np.zeros((capacity, n)), np.zeros((capacity, n, n))
     x[:count], root[:count] = state.xhat, state.root
@@ -57,43 +60,43 @@ def empty_history(state: Simulation, lag: float, capacity: int) -> History:
     )
 
 
-def add_past(history: History, least: int) -> None:
-    """Double the capacity of a history, or add ``least``."""
+def add_past(history: History, at_least: int) -> None:
+    """Enlarge a history: double it, or add ``at_least`` entries if these are more."""
     old = len(history.past)
-    more = max(old, least)
+    added = max(old, at_least)
     # Chain the new entries, and the former free list behind them.
-    past = np.zeros(more, dtype=PAST)
-    past["before"] = np.arange(old + 1, old + more + 1)
+    past = np.zeros(added, dtype=PAST)
+    past["before"] = np.arange(old + 1, old + added + 1)
     past["before"][-1], history.free[0] = history.free[0], old
-    history.free[1] += more
+    history.free[1] += added
     history.past = np.concatenate([history.past, past])
-    history.x = np.concatenate([history.x, np.zeros((more, *history.x.shape[1:]))])
-    history.root = np.concatenate([history.root, np.zeros((more, *history.root.shape[1:]))])
+    history.x = np.concatenate([history.x, np.zeros((added, *history.x.shape[1:]))])
+    history.root = np.concatenate([history.root, np.zeros((added, *history.root.shape[1:]))])
 
 
 @kernel
 def use_instant(
     state: Simulation, instant: int, root: FloatArray, x: FloatArray, k: int, scale: float
 ) -> None:
-    """Update entry ``k`` with all samples of an instant together, in the order of sensors; R counts
-    ``scale``^2 times.
+    """Update entry ``k`` of ``root`` and ``x`` with all samples of an instant in one update,
+    stacked in the order of sensors, with noise ``scale``^2 R.
     """
-    given, scratch, n, row = state.instants, state.scratch, x.shape[1], 0
+    instants, scratch, n, row = state.instants, state.scratch, x.shape[1], 0
     # All sensors of the instant in one reading: R is block diagonal, and so is its root.
-    for s in range(given.first[instant], given.first[instant + 1]):
-        sensor, matrix = given.sensor[s], given.matrix[s]
-        p = given.rows[sensor]
+    for s in range(instants.first[instant], instants.first[instant + 1]):
+        sensor, matrix = instants.sensor[s], instants.matrix[s]
+        p = instants.rows[sensor]
         for i in range(p):
-            scratch.y[row + i] = given.y[s, i]
+            scratch.y[row + i] = instants.y[s, i]
             for j in range(n):
-                scratch.H[row + i, j] = given.H[matrix, i, j]
+                scratch.H[row + i, j] = instants.H[matrix, i, j]
             # Zeros left of the diagonal block: an earlier instant may have left entries there.
             for j in range(row):
                 scratch.root_R[row + i, j] = 0.0
             for j in range(i + 1):
-                scratch.root_R[row + i, row + j] = scale * given.root[sensor, i, j]
+                scratch.root_R[row + i, row + j] = scale * instants.root[sensor, i, j]
         row += p
-    # One update with all rows, as the SimPy engine makes it.
+    # One update with all rows, as in the SimPy engine.
     if row > 0:
         sample_root(root, x, k, scratch.y[:row], scratch.H, scratch.root_R, state.update_scratch)
 
@@ -108,7 +111,7 @@ def copy_state(
     from_root: FloatArray,
     m: int,
 ) -> None:
-    """Copy entry ``m`` to entry ``k``."""
+    """Copy entry ``m`` of (from_x, from_root) to entry ``k`` of (x, root)."""
     for i in range(len(size)):
         x[k, i] = from_x[m, i]
         # Only the lower triangle of a root is ever read.
@@ -118,7 +121,9 @@ def copy_state(
 
 @kernel
 def allocate_past(history: History, time: float, instant: int, frame: int) -> int:
-    """Take an entry for an event at ``time`` from the free ones; return its index."""
+    """Allocate an entry for an event at ``time``: a reading (``instant``) or a frame; return its
+    index.
+    """
     k = history.free[0]
     entry = history.past[k]
     history.free[0] = entry.before
@@ -131,9 +136,11 @@ def allocate_past(history: History, time: float, instant: int, frame: int) -> in
 def remember(
     state: Simulation, history: History, h: int, time: float, instant: int, frame: int
 ) -> None:
-    """Keep the state of node ``h`` after it used a reading, or a frame began."""
+    """Store the state of node ``h`` after an event at ``time``: a reading (``instant``), or the
+    beginning of a ``frame``; -1 for the other one.
+    """
     k = allocate_past(history, time, instant, frame)
-    # Each node has a list of its past, the newest first.
+    # The events of a node are a linked list, the newest first.
     history.past[k].before = history.newest[h]
     history.newest[h] = k
     copy_state(state.size, history.x, history.root, k, state.xhat, state.root, h)
@@ -141,8 +148,8 @@ def remember(
 
 @kernel
 def forget(history: History, h: int, since: float) -> None:
-    """Free the events of node ``h`` that no late reading can reach: all before the last one before
-    ``since``.
+    """Free the events of node ``h`` that no late reading can reach: those from ``since`` on stay,
+    and one before it.
     """
     past = history.past
     k = history.newest[h]
@@ -151,43 +158,44 @@ def forget(history: History, h: int, since: float) -> None:
         k = past[k].before
     if k == -1:
         return
-    gone = past[k].before
+    freed = past[k].before
     past[k].before = -1
-    # Give back all that is older.
-    while gone != -1:
-        following = past[gone].before
-        past[gone].before = history.free[0]
-        history.free[0] = gone
+    while freed != -1:
+        following = past[freed].before
+        past[freed].before = history.free[0]
+        history.free[0] = freed
         history.free[1] += 1
-        gone = following
+        freed = following
 
 
 @kernel
 def use_reading(state: Simulation, history: History, h: int, instant: int) -> None:
-    """Use a reading of now."""
+    """Update node ``h`` with a reading of the present instant, and remember it."""
     use_instant(state, instant, state.root, state.xhat, h, 1.0)
     lag, time = history.lag, state.instants.t[instant]
-    # Without delays nothing is kept.
+    # Without delays nothing need be remembered.
     if lag <= 0.0:
         return
     # Once in each interval of length lag, so that forgetting costs little.
-    if time // lag > history.past[history.newest[h]].time // lag:  # now and then
+    if time // lag > history.past[history.newest[h]].time // lag:
         forget(history, h, time - lag)
     remember(state, history, h, time, instant, -1)
 
 
 @kernel
 def use_late_reading(state: Simulation, history: History, h: int, instant: int, now: float) -> None:
-    """Go back to before the time of a reading, use it, and do again what came after it."""
+    """Update node ``h`` with a reading that arrives late, at ``now``: go back to the event before
+    its time, use it, and repeat all later events.
+    """
     past, x, root, model = history.past, history.x, history.root, state.nodes[h].model
     time = state.instants.t[instant]
-    # Go back: entries after the reading's time are reversed into the list ``again``. Times that
+    # Go back: move the later events into the list ``later_events``, the oldest first. Times that
     # differ by rounding count as equal.
-    again, k = -1, history.newest[h]
+    later_events, k = -1, history.newest[h]
     while past[k].time > time + TIME_TOLERANCE * now and past[k].before != -1:
         before = past[k].before
-        past[k].before = again
-        again, k = k, before
+        past[k].before = later_events
+        later_events, k = k, before
     # The late reading becomes an entry of its own at its place in time.
     before, k = k, allocate_past(history, time, instant, -1)
     past[k].before = before
@@ -200,13 +208,13 @@ def use_late_reading(state: Simulation, history: History, h: int, instant: int, 
             propagate_root(state.table, model, root, x, k, gap, state.flow_scratch)
         if past[k].instant >= 0:
             use_instant(state, past[k].instant, root, x, k, 1.0)
-        # A frame that began since then: estimates count from its origin afterwards.
+        # A frame begins: move the origin of the estimate.
         if past[k].frame >= 0:
             for i in range(x.shape[1]):
                 x[k, i] += history.offsets[past[k].frame, i]
-        if again == -1:
+        if later_events == -1:
             break
-        before, k, again = k, again, past[again].before
+        before, k, later_events = k, later_events, past[later_events].before
         past[k].before = before
     history.newest[h] = k
     copy_state(state.size, state.xhat, state.root, h, x, root, k)

@@ -11,18 +11,18 @@ from netkf.linalg.compiling import kernel
 @kernel
 def arrives_first(pool: np.ndarray, a: int, b: int) -> bool:
     """Return True if message ``a`` arrives before ``b``: by time, directed link, order sent."""
-    # Never by insertion: the order must be that of the SimPy engine.
-    one, other = pool[a], pool[b]
-    if one.arrival != other.arrival:
-        return bool(one.arrival < other.arrival)
-    if one.direction != other.direction:
-        return bool(one.direction < other.direction)
-    return bool(one.order < other.order)
+    # Ties must not depend on the order of insertion: the order is that of the SimPy engine.
+    first, second = pool[a], pool[b]
+    if first.arrival != second.arrival:
+        return bool(first.arrival < second.arrival)
+    if first.direction != second.direction:
+        return bool(first.direction < second.direction)
+    return bool(first.order < second.order)
 
 
 @kernel
 def push(pool: np.ndarray, heap: np.ndarray, size: int, message: int) -> None:
-    """Put a message on the heap of ``size``."""
+    """Insert a message into the heap, which holds ``size`` messages ordered by arrival."""
     # A binary heap of indices in the pool: sift up. heapq would need Python objects.
     k = size
     while k > 0 and arrives_first(pool, message, heap[(k - 1) // 2]):
@@ -33,7 +33,9 @@ def push(pool: np.ndarray, heap: np.ndarray, size: int, message: int) -> None:
 
 @kernel
 def pop(pool: np.ndarray, heap: np.ndarray, size: int) -> int:
-    """Take the next message off the heap of ``size``."""
+    """Remove and return the message that arrives next from the heap, which holds
+    ``size`` messages.
+    """
     # Sift the last entry down from the top.
     top, moved, k = heap[0], heap[size - 1], 0
     while 2 * k + 1 < size - 1:
@@ -50,51 +52,51 @@ def pop(pool: np.ndarray, heap: np.ndarray, size: int) -> int:
 
 @kernel
 def take(state: Simulation) -> int:
-    """Take a free message from the pool."""
+    """Remove a free message from the pool and return its index."""
     # The free messages are a linked list: a stack, so that recently used memory comes first.
-    message = state.free
-    state.free = state.pool[message].next
+    message = state.first_free
+    state.first_free = state.pool[message].next
     state.free_count -= 1
     return message
 
 
 @kernel
 def release(state: Simulation, message: int) -> None:
-    """Give a message back to the pool."""
-    state.pool[message].next = state.free
-    state.free = message
+    """Return a message to the free ones of the pool."""
+    state.pool[message].next = state.first_free
+    state.first_free = message
     state.free_count += 1
 
 
 @kernel
 def put(state: Simulation, h: int, message: int) -> None:
-    """Put a message into the inbox of node ``h``, in the order of senders; of several of one sender
-    the newest counts, or all readings in the order of arrival.
+    """Insert a message into the inbox of node ``h``, which is sorted by sender. Of several messages
+    of one sender the newest replaces the others; readings (READINGS) all stay, in the order of
+    arrival.
     """
     nodes, directions, pool = state.nodes, state.directions, state.pool
-    newest_only = state.kind != READINGS
+    newest_only = state.combination_kind != READINGS
     node, peer = nodes[h], directions[pool[message].direction].sender
     before, here = -1, node.inbox
-    # Inboxes are linked lists, with the last one known: a message from a later sender goes to the
-    # end.
-    # Mostly they come in order.
+    # Inboxes are linked lists with a pointer to the last message. Mostly messages come in the order
+    # of senders and go to the end at once.
     if here != -1 and directions[pool[node.last].direction].sender < peer:
         before, here = node.last, -1
     while here != -1:
-        other = directions[pool[here].direction].sender
-        # Before the first message of a later sender, and in place of one of this sender if the
-        # newest counts.
-        if other > peer or (other == peer and newest_only):
+        sender = directions[pool[here].direction].sender
+        # Stop at the first message of a later sender, or at one of this sender if the newest
+        # counts.
+        if sender > peer or (sender == peer and newest_only):
             break
         before, here = here, pool[here].next
     if here != -1 and directions[pool[here].direction].sender == peer:
-        # An older message than the one that is there brings nothing.
+        # A message older than the present one is dropped.
         if pool[message].sent < pool[here].sent:
             release(state, message)
             return
         # The newer message takes the place of the older one.
-        gone, here = here, pool[here].next
-        release(state, gone)
+        replaced, here = here, pool[here].next
+        release(state, replaced)
     pool[message].next = here
     if before == -1:
         node.inbox = message

@@ -35,9 +35,9 @@ def move_origin(
         for h in range(len(state.nodes)):
             remember(state, history, h, now, -1, k)
     # Totals were moved above, and readings stay in the coordinates of their own time.
-    if totals is not None or state.kind == READINGS:
+    if totals is not None or state.combination_kind == READINGS:
         return
-    for m in state.heap[: state.flying]:
+    for m in state.heap[: state.in_flight]:
         # An estimate under way is of the time it was sent: the offset is moved back to then.
         state.pool_x[m] += scenario.move_back(offset, now - state.pool["sent"][m])
 
@@ -49,7 +49,7 @@ def _move_totals(
     for times, values in ((totals.sent_at, totals.sent), (totals.heard_at, totals.heard)):
         for k, time in enumerate(times.tolist()):
             _shift_total(values[k], scenario.move_back(offset, now - time))
-    for m in state.heap[: state.flying]:
+    for m in state.heap[: state.in_flight]:
         _shift_total(totals.offered[m], scenario.move_back(offset, now - state.pool["sent"][m]))
 
 

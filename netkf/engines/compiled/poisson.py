@@ -1,8 +1,8 @@
-"""Schedules of Poisson clocks whose messages have one chance each and one delay: drawn and merged
-in compiled code.
+"""Schedules of Poisson clocks, drawn and sorted in compiled code, if each directed link has a
+constant delivery probability and all messages have one delay.
 
-The clocks of a network are together as even in time as one clock of their sum of rates. So ticks
-are put in order by counting: as many bins of a window as it has ticks, of about one each.
+The ticks of all clocks together are a Poisson process, evenly spread over a window. So they are
+sorted by counting: a window is divided into as many bins as it has ticks, of about one tick each.
 """
 
 from __future__ import annotations
@@ -12,14 +12,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from netkf.engines.compiled.kept import once_per_scenario
+from netkf.engines.compiled.per_scenario import once_per_scenario
 from netkf.engines.compiled.schedule import (
     LOST,
     Schedule,
     Window,
-    delivery_chances,
+    all_windows,
+    delivery_probabilities_of,
     has_table_law,
-    whole_schedules,
 )
 from netkf.engines.compiled.senders import Senders, senders_of
 from netkf.linalg.arrays import FloatArray
@@ -30,134 +30,134 @@ from netkf.rng.streams import ReplicaStreams, Streams
 from netkf.scenario.scenario import Scenario
 
 TICKS, TICKS_A_LINK, MAX_WINDOW_TICKS = 1 << 15, 4, 1 << 20
-"""In a window: what they take fits the processor's cache, unless there are so many links that what
-one costs is to be spread over some ticks.
+"""Ticks in a window: TICKS, whose arrays fit the processor's cache, or TICKS_A_LINK per entity if
+these are more, since each entity has a fixed cost in a window.
 """
 
 
-class Drawing(NamedTuple):
-    """The clocks of R runs, E entities in all, and the law of their messages.
+class PoissonClocks(NamedTuple):
+    """The Poisson clocks of R runs, E entities in all, and the loss model of their messages.
 
-    coming  : (E,) time of the next tick, seconds
-    rate    : (E,) ticks per second
-    ticks   : (E, 4) states of the random streams of ticks
-    losses  : (S, 4) states of the streams that decide about losses, ``streams`` of them in each
-              run; S = 0: no message is lost
-    first, hearing : entity e of a run sends on the directions ``hearing[first[e]:first[e + 1]]``
-    source  : (W,) stream of each direction
-    chance  : (W,) probability that a message arrives
-    bits    : whether only the bits of messages that arrive are drawn, without outcomes
+    next_tick : (E,), time of the next tick, seconds
+    rate : (E,), ticks per second
+    tick_streams : (E, 4), states of the random streams of ticks
+    loss_streams : (S, 4), states of the random streams of losses; S = 0: no message is lost
+    streams_per_run : number of loss streams of each run
+    first, outgoing : entity e of a run sends on the directions ``outgoing[first[e]:first[e + 1]]``
+    source : (W,), loss stream of each direction, within a run
+    delivery_probability : (W,), of the messages of each direction
+    bits : whether outcomes are stored as arrival bits, see TickBuffer
     """
 
-    coming: FloatArray
+    next_tick: FloatArray
     rate: FloatArray
-    ticks: np.ndarray
-    losses: np.ndarray
-    streams: int
+    tick_streams: np.ndarray
+    loss_streams: np.ndarray
+    streams_per_run: int
     first: np.ndarray
-    hearing: np.ndarray
+    outgoing: np.ndarray
     source: np.ndarray
-    chance: FloatArray
+    delivery_probability: FloatArray
     bits: bool
 
 
-class Found(NamedTuple):
-    """Ticks as they are found: ``t, entity`` (K,), and where in ``delay`` their outcomes begin, or
-    a bit for each of them.
+class TickBuffer(NamedTuple):
+    """Space for K ticks: times ``t`` and ``entity`` (K,). Their outcomes begin at
+    ``first_outcome[k]`` of ``delay``; with ``bits`` this number itself has a bit for each message
+    that arrives, and ``delay`` is empty.
     """
 
     t: FloatArray
     entity: np.ndarray
-    at: np.ndarray
+    first_outcome: np.ndarray
     delay: FloatArray
 
 
 @kernel
 def draw_ticks(
-    drawing: Drawing,
+    clocks: PoissonClocks,
     run: int,
     end: float,
     delay: float,
     exponential: Ziggurat,
-    found: Found,
-    used: np.ndarray,
+    buffer: TickBuffer,
+    counts: np.ndarray,
 ) -> bool:
-    """Write the ticks before ``end`` of a run behind those that are there; ``used`` (2,) counts
-    them and their outcomes. False where the room ended first.
+    """Append the ticks of a run before ``end`` (seconds) to ``buffer``; ``counts`` (2,) are the
+    numbers of ticks and outcomes in it. Return False if the buffer is full before.
     """
-    # Entity by entity, each from its own stream; the order of time is made afterwards.
-    for e in range(len(drawing.first) - 1):
-        if not draw_ticks_of(drawing, run, e, end, delay, exponential, found, used):
+    # Entity by entity, each from its own stream; put_in_time_order() sorts them afterwards.
+    for e in range(len(clocks.first) - 1):
+        if not draw_ticks_of(clocks, run, e, end, delay, exponential, buffer, counts):
             return False
     return True
 
 
 @kernel
 def draw_ticks_of(
-    drawing: Drawing,
+    clocks: PoissonClocks,
     run: int,
     e: int,
     end: float,
     delay: float,
     exponential: Ziggurat,
-    found: Found,
-    used: np.ndarray,
+    buffer: TickBuffer,
+    counts: np.ndarray,
 ) -> bool:
-    """``draw_ticks`` of one entity."""
-    states, first, after = drawing.ticks, drawing.first[e], drawing.first[e + 1]
-    k = run * (len(drawing.first) - 1) + e
-    now, rate, high, low = drawing.coming[k], drawing.rate[k], states[k, 0], states[k, 1]
-    m, room, ended = used[0], len(found.delay) - (after - first), True
+    """Append the ticks of entity ``e`` of a run, see ``draw_ticks``."""
+    states, first, after = clocks.tick_streams, clocks.first[e], clocks.first[e + 1]
+    k = run * (len(clocks.first) - 1) + e
+    now, rate, high, low = clocks.next_tick[k], clocks.rate[k], states[k, 0], states[k, 1]
+    m, max_outcomes, complete = counts[0], len(buffer.delay) - (after - first), True
     while now < end:
-        # The room is checked before a tick is written, so that a stop leaves the streams where they
-        # are for this tick.
-        if m == len(found.t) or used[1] > room:
-            ended = False
+        # Check the space before a tick is drawn: after an enlargement drawing goes on with this
+        # tick.
+        if m == len(buffer.t) or counts[1] > max_outcomes:
+            complete = False
             break
-        found.t[m], found.entity[m] = now, e
-        found.at[m] = draw_outcomes(drawing, run, first, after, delay, found, used)
+        buffer.t[m], buffer.entity[m] = now, e
+        buffer.first_outcome[m] = draw_outcomes(clocks, run, first, after, delay, buffer, counts)
         m += 1
         # The next tick is drawn now: it may lie in the next window.
         gap, high, low = exponential_of(states, k, high, low, exponential)
         now += gap / rate
-    drawing.coming[k], states[k, 0], states[k, 1], used[0] = now, high, low, m
-    return ended
+    clocks.next_tick[k], states[k, 0], states[k, 1], counts[0] = now, high, low, m
+    return complete
 
 
 @kernel(inlined=True)
 def draw_outcomes(
-    drawing: Drawing,
+    clocks: PoissonClocks,
     run: int,
     first: int,
     after: int,
     delay: float,
-    found: Found,
-    used: np.ndarray,
+    buffer: TickBuffer,
+    counts: np.ndarray,
 ) -> int:
-    """Draw which messages of a tick arrive, on the directions ``hearing[first:after]``;
-    return where their outcomes begin, or a bit for each.
+    """Draw which messages of a tick arrive, on the directions ``outgoing[first:after]``; return the
+    ``first_outcome`` of the tick, see TickBuffer.
     """
-    at, uniform, drawn = 0 if drawing.bits else used[1], 0.0, -1
-    # One uniform number for each source of outcomes: directions that share a source follow one
-    # another.
+    outcome, uniform, last_source = 0 if clocks.bits else counts[1], 0.0, -1
+    # One uniform number for each loss stream: directions that share a stream are neighbours.
     for m in range(first, after):
-        w = drawing.hearing[m]
-        if drawing.streams > 0 and drawing.source[w] != drawn:
-            drawn = drawing.source[w]
-            # The number is below 1, so that a link with probability 1 never loses.
-            uniform = next_unit(drawing.losses, run * drawing.streams + drawn)
-        arrives = uniform < drawing.chance[w]
-        if drawing.bits:
-            at |= np.int64(arrives) << (m - first)
+        w = clocks.outgoing[m]
+        if clocks.streams_per_run > 0 and clocks.source[w] != last_source:
+            last_source = clocks.source[w]
+            # The uniform number is below 1, so that a link with probability 1 loses nothing.
+            uniform = next_unit(clocks.loss_streams, run * clocks.streams_per_run + last_source)
+        arrives = uniform < clocks.delivery_probability[w]
+        if clocks.bits:
+            outcome |= np.int64(arrives) << (m - first)
         else:
-            found.delay[used[1]] = delay if arrives else LOST
-            used[1] += 1
-    return at
+            buffer.delay[counts[1]] = delay if arrives else LOST
+            counts[1] += 1
+    return outcome
 
 
 class Sorting(NamedTuple):
-    """Scratch to put K ticks in order: where the next tick of a bin goes, ``place`` (K + 1,),
-    and which tick goes where, ``source`` (K,). Short integers stay in the cache.
+    """Scratch to sort K ticks: position of the next tick of each bin, ``place`` (K + 1,), and the
+    index of the tick at each position, ``source`` (K,). Int32 halves their size in the cache.
     """
 
     place: np.ndarray
@@ -165,55 +165,61 @@ class Sorting(NamedTuple):
 
 
 def _sorting(ticks: int) -> Sorting:
+    """Return scratch to sort so many ticks."""
     return Sorting(np.empty(ticks + 1, dtype=np.int32), np.empty(ticks, dtype=np.int32))
 
 
 @kernel
 def put_in_time_order(
-    begin: float, end: float, count: int, found: Found, ordered: Found, sorting: Sorting
+    begin: float, end: float, count: int, buffer: TickBuffer, ordered: TickBuffer, sorting: Sorting
 ) -> None:
-    """Write the first ``count`` ticks, which lie in [begin, end), by (time, entity)."""
+    """Write the first ``count`` ticks of ``buffer``, which lie in [begin, end) seconds, into
+    ``ordered``, sorted by (time, entity).
+    """
     # Ticks are evenly spread, hence about one in each of ``count`` equal bins.
     place, source, scale = sorting.place, sorting.source, count / (end - begin)
     # Counting sort by bin: count, sum up, and place.
     for m in range(count + 1):
         place[m] = 0
     for m in range(count):
-        place[bin_of(found.t[m], begin, scale, count) + 1] += 1
+        place[bin_of(buffer.t[m], begin, scale, count) + 1] += 1
     for m in range(count):
         place[m + 1] += place[m]
     for m in range(count):
         # place[k] is where the next tick of bin k goes.
-        k = bin_of(found.t[m], begin, scale, count)
+        k = bin_of(buffer.t[m], begin, scale, count)
         source[place[k]] = m
         place[k] += 1
-    # Insertion sort mends the order inside bins, in linear time on average, as few share one.
+    # Insertion sort orders ticks inside bins, in linear time on average, since few share one.
     # It is by (time, entity): ties keep the order of entities.
-    t, entity, at = ordered.t, ordered.entity, ordered.at
-    for to in range(count):
-        m, k = source[to], to
-        now, which = found.t[m], found.entity[m]
-        while k > 0 and (t[k - 1] > now or (t[k - 1] == now and entity[k - 1] > which)):
-            t[k], entity[k], at[k] = t[k - 1], entity[k - 1], at[k - 1]
+    t, entity, outcome = ordered.t, ordered.entity, ordered.first_outcome
+    for position in range(count):
+        m, k = source[position], position
+        now, who = buffer.t[m], buffer.entity[m]
+        while k > 0 and (t[k - 1] > now or (t[k - 1] == now and entity[k - 1] > who)):
+            t[k], entity[k], outcome[k] = t[k - 1], entity[k - 1], outcome[k - 1]
             k -= 1
-        t[k], entity[k], at[k] = now, which, found.at[m]
+        t[k], entity[k], outcome[k] = now, who, buffer.first_outcome[m]
 
 
 @kernel(inlined=True)
 def bin_of(time: float, begin: float, scale: float, count: int) -> int:
-    """Return which of ``count`` bins a time lies in, ``scale`` of them in a second."""
+    """Return the index of the bin that a time lies in, of ``count`` bins, ``scale`` per second."""
     return min(int((time - begin) * scale), count - 1)
 
 
 class AllTicks(NamedTuple):
-    """The ticks of R runs one after the other, those of run r from ``first[r]`` up to ``first[r +
-    1]``, as in a Window; ``at`` counts from the first outcome of the run, which is ``delay`` at
-    ``first_delay[r]``; with ``bits`` it says which messages arrive.
+    """The ticks of R runs, one run after the other, as in a TickBuffer.
+
+    t, entity, first_outcome : (K,); ticks ``first[r]`` to ``first[r + 1]`` - 1 are those of run r,
+                               whose ``first_outcome`` counts from ``first_delay[r]``
+    delay : outcomes of all runs
+    bits : whether ``first_outcome`` holds arrival bits instead
     """
 
     t: FloatArray
     entity: np.ndarray
-    at: np.ndarray
+    first_outcome: np.ndarray
     delay: FloatArray
     first: np.ndarray
     first_delay: np.ndarray
@@ -222,56 +228,66 @@ class AllTicks(NamedTuple):
 
 @kernel
 def draw_all_ticks(
-    drawing: Drawing,
+    clocks: PoissonClocks,
     horizon: float,
     delay: float,
     exponential: Ziggurat,
-    found: Found,
-    used: np.ndarray,
+    buffer: TickBuffer,
+    counts: np.ndarray,
     sorting: Sorting,
     ticks: AllTicks,
 ) -> bool:
-    """Draw the ticks of all runs up to the horizon, in the order of (time, entity); ``found``,
-    ``used`` (2,) and ``sorting`` are scratch. False where some array is too small.
+    """Draw the ticks of all runs up to the horizon into ``ticks``, sorted by (time, entity) in each
+    run; ``buffer``, ``counts`` (2,) and ``sorting`` are scratch. Return False if an array is too
+    small.
     """
     for run in range(len(ticks.first) - 1):
-        used[0] = used[1] = 0
-        if not draw_ticks(drawing, run, horizon, delay, exponential, found, used):
+        counts[0] = counts[1] = 0
+        if not draw_ticks(clocks, run, horizon, delay, exponential, buffer, counts):
             return False
         first, begin = ticks.first[run], ticks.first_delay[run]
-        last, end = first + used[0], begin + used[1]
+        last, end = first + counts[0], begin + counts[1]
         # The arrays are too small for this run: the caller starts again with more space.
         if last > len(ticks.t) or end > len(ticks.delay):
             return False
-        ordered = Found(
-            ticks.t[first:last], ticks.entity[first:last], ticks.at[first:last], found.delay
+        ordered = TickBuffer(
+            ticks.t[first:last],
+            ticks.entity[first:last],
+            ticks.first_outcome[first:last],
+            buffer.delay,
         )
-        put_in_time_order(0.0, horizon, used[0], found, ordered, sorting)
-        # ``at`` counts within the run, so that outcomes are copied without a change.
-        for k in range(used[1]):
-            ticks.delay[begin + k] = found.delay[k]
+        put_in_time_order(0.0, horizon, counts[0], buffer, ordered, sorting)
+        # ``first_outcome`` counts within the run, so that outcomes are copied as they are.
+        for k in range(counts[1]):
+            ticks.delay[begin + k] = buffer.delay[k]
         ticks.first[run + 1], ticks.first_delay[run + 1] = last, end
     return True
 
 
 def is_poisson(scenario: Scenario) -> bool:
-    """Return True if kernels can draw the schedules of a scenario."""
+    """Return True if kernels can draw the schedules of a scenario: Poisson clocks,
+    constant laws.
+    """
     network = scenario.network
     talks = scenario.hosted.talks and bool(scenario.topology.links)
     return talks and type(network.activation) is Poisson and has_table_law(network.channel)
 
 
 @once_per_scenario
-def _rates_and_chances(scenario: Scenario) -> tuple[FloatArray, FloatArray]:
-    """Ticks per second of each entity (E,), and the delivery probability of each direction (W,)."""
+def _rates_and_probabilities(scenario: Scenario) -> tuple[FloatArray, FloatArray]:
+    """Return ticks per second of each entity (E,), and delivery probabilities of
+    directions (W,).
+    """
     clock, senders = scenario.network.activation, senders_of(scenario)
     assert isinstance(clock, LinkClock)
     rates = np.array([clock.mean_rate(entity) for entity in senders.entities])
-    return rates, delivery_chances(scenario, senders.directions)
+    return rates, delivery_probabilities_of(scenario, senders.directions)
 
 
 class PoissonSchedules:
-    """The ticks of some runs of such a scenario, a window at a time."""
+    """The ticks of some runs of a scenario with Poisson clocks: window by window, or
+    all at once.
+    """
 
     def __init__(
         self,
@@ -283,39 +299,39 @@ class PoissonSchedules:
         runs = streams.runs
         senders = senders_of(scenario) if senders is None else senders
         ticks, count = StreamBatch(streams, "clock", senders.entities), len(senders.entities) * runs
-        # No states where nothing is random: draw_ticks() then draws no number.
+        # Without random losses no streams: draw_ticks() then draws no uniform numbers.
         losses: np.ndarray = np.empty((0, 4), dtype=np.uint64)
         if not scenario.network.channel.loss.deterministic:
             losses = StreamBatch(streams, "loss", senders.sources).states
-        rates, chances = _rates_and_chances(scenario)
-        self._drawing = Drawing(
-            coming=ticks.exponentials(np.arange(count), np.ones(count, dtype=np.int64)),
+        rates, probabilities = _rates_and_probabilities(scenario)
+        self._clocks = PoissonClocks(
+            next_tick=ticks.exponentials(np.arange(count), np.ones(count, dtype=np.int64)),
             rate=np.tile(rates, runs),
-            ticks=ticks.states,
-            losses=losses,
-            streams=len(losses) // runs,
+            tick_streams=ticks.states,
+            loss_streams=losses,
+            streams_per_run=len(losses) // runs,
             first=senders.first,
-            hearing=senders.hearing,
+            outgoing=senders.outgoing,
             source=senders.source,
-            chance=chances,
+            delivery_probability=probabilities,
             bits=bits,
         )
         # The first tick of each entity, unit exponentials over its rate.
-        self._drawing.coming[:] /= self._drawing.rate
+        self._clocks.next_tick[:] /= self._clocks.rate
         self._runs, self._rate = runs, float(rates.sum())
         # Mean number of messages for each tick.
         self._sends = float(rates @ np.diff(senders.first)) / self._rate
-        self._most = int(np.diff(senders.first).max())
+        self._max_sends = int(np.diff(senders.first).max())
         self._delay = float(scenario.network.channel.delay.fixed or 0.0)
         self._horizon, self._length = scenario.horizon, math.inf
         if self._rate > 0.0:
             entities = len(senders.entities)
             # A window of some thousand ticks, more of them where there are many links.
             self._length = max(TICKS, min(TICKS_A_LINK * entities, MAX_WINDOW_TICKS)) / self._rate
-        self._end, self._found = 0.0, _room(0, 0)
+        self._end, self._buffer = 0.0, _empty_buffer(0, 0)
 
     def following(self) -> Window:
-        """The next window of one run; its end is infinite where nothing comes after it."""
+        """Return the next window of one run; the last one ends at infinity."""
         begin, end = self._end, self._end + self._length
         # The last window has no end, so that the loop asks for no other.
         if not begin < end < self._horizon:
@@ -323,96 +339,103 @@ class PoissonSchedules:
         self._end = end
         return self._window(0, begin, end)
 
-    def whole(self) -> AllTicks:
-        """All ticks of all runs."""
-        states = self._drawing.coming, self._drawing.ticks, self._drawing.losses
-        # Streams as they are now: a try without enough space begins with them again.
-        begun = [state.copy() for state in states]
-        # A Poisson count exceeds its mean by eight standard deviations with a negligible chance,
-        # and even then the loop only tries again.
+    def all(self) -> AllTicks:
+        """Return all ticks of all runs."""
+        states = self._clocks.next_tick, self._clocks.tick_streams, self._clocks.loss_streams
+        # Copies of the streams: an attempt that runs out of space starts again from them.
+        copies = [state.copy() for state in states]
+        # Space for the mean plus eight standard deviations of a Poisson count; in the rare case of
+        # more ticks the loop tries again with more space.
         expected, spread = self._rate * self._horizon, 8.0
         while True:
-            most = int(expected + spread * math.sqrt(expected)) + 8
-            total = int(self._runs * expected + spread * math.sqrt(self._runs * expected)) + most
-            found, ticks = self._space(most), self._space_for_all(total)
-            scratch = found, np.zeros(2, dtype=np.int64), _sorting(most)
-            given = self._drawing, self._horizon, self._delay, ziggurat()
-            if draw_all_ticks(*given, *scratch, ticks):
+            max_ticks = int(expected + spread * math.sqrt(expected)) + 8
+            total = (
+                int(self._runs * expected + spread * math.sqrt(self._runs * expected)) + max_ticks
+            )
+            buffer, ticks = self._space(max_ticks), self._space_for_all(total)
+            scratch = buffer, np.zeros(2, dtype=np.int64), _sorting(max_ticks)
+            arguments = self._clocks, self._horizon, self._delay, ziggurat()
+            if draw_all_ticks(*arguments, *scratch, ticks):
                 return ticks
             spread *= 2.0
-            for state, before in zip(states, begun, strict=True):
-                state[:] = before
+            for state, copy in zip(states, copies, strict=True):
+                state[:] = copy
 
-    def _space(self, ticks: int) -> Found:
-        sends = 0.0 if self._drawing.bits else self._sends
-        return _room(ticks, int(sends * ticks) + self._most)
+    def _space(self, ticks: int) -> TickBuffer:
+        """Return space for so many ticks and the messages that they send."""
+        sends = 0.0 if self._clocks.bits else self._sends
+        return _empty_buffer(ticks, int(sends * ticks) + self._max_sends)
 
     def _space_for_all(self, ticks: int) -> AllTicks:
-        t, entity, at, delay = self._space(ticks)
+        """Return space for so many ticks of all runs together."""
+        t, entity, first_outcome, delay = self._space(ticks)
         first, first_delay = (np.zeros(self._runs + 1, dtype=np.int64) for _ in range(2))
-        return AllTicks(t, entity, at, delay, first, first_delay, self._drawing.bits)
+        return AllTicks(t, entity, first_outcome, delay, first, first_delay, self._clocks.bits)
 
     def _window(self, run: int, begin: float, end: float) -> Window:
-        last, used = min(end, self._horizon), np.zeros(2, dtype=np.int64)
+        """Draw and return the ticks of a run in [begin, end) seconds."""
+        last, counts = min(end, self._horizon), np.zeros(2, dtype=np.int64)
         expected = self._rate * (last - begin)
         ticks = int(expected + 8.0 * math.sqrt(expected)) + 8
-        # The same bound for one window.
-        sends = int(self._sends * ticks) + self._most
+        sends = int(self._sends * ticks) + self._max_sends
         while True:
-            self._make_room(ticks, sends, used)
-            if draw_ticks(self._drawing, run, last, self._delay, ziggurat(), self._found, used):
+            self._enlarge_buffer(ticks, sends)
+            if draw_ticks(self._clocks, run, last, self._delay, ziggurat(), self._buffer, counts):
                 break
-            # What was found so far stays: drawing goes on where it stopped.
+            # The ticks so far stay in the buffer: the kernel continues where it stopped.
             ticks, sends = 2 * ticks, 2 * sends
-        count = int(used[0])
-        ordered = _room(count, 0)._replace(delay=self._found.delay[: used[1]].copy())
-        put_in_time_order(begin, last, count, self._found, ordered, _sorting(count))
+        count = int(counts[0])
+        ordered = _empty_buffer(count, 0)._replace(delay=self._buffer.delay[: counts[1]].copy())
+        put_in_time_order(begin, last, count, self._buffer, ordered, _sorting(count))
         return Window(end, *ordered)
 
-    def _make_room(self, ticks: int, sends: int, used: np.ndarray) -> None:
-        # The room only grows.
-        if len(self._found.t) >= ticks and len(self._found.delay) >= sends:
+    def _enlarge_buffer(self, ticks: int, sends: int) -> None:
+        """Make the buffer large enough for ``ticks`` and their ``sends``; it never shrinks."""
+        if len(self._buffer.t) >= ticks and len(self._buffer.delay) >= sends:
             return
-        larger = _room(ticks, sends)
-        for target, source in zip(larger, self._found, strict=True):
-            kept = min(len(source), len(target))
-            target[:kept] = source[:kept]
-        self._found = larger
+        larger = _empty_buffer(ticks, sends)
+        for target, source in zip(larger, self._buffer, strict=True):
+            size = min(len(source), len(target))
+            target[:size] = source[:size]
+        self._buffer = larger
 
 
-def _room(ticks: int, sends: int) -> Found:
-    entity, at = (np.empty(ticks, dtype=np.int64) for _ in range(2))
-    return Found(np.empty(ticks), entity, at, np.empty(sends))
+def _empty_buffer(ticks: int, sends: int) -> TickBuffer:
+    """Return space for so many ticks and outcomes."""
+    entity, first_outcome = (np.empty(ticks, dtype=np.int64) for _ in range(2))
+    return TickBuffer(np.empty(ticks), entity, first_outcome, np.empty(sends))
 
 
 def all_ticks(scenario: Scenario, streams: ReplicaStreams, bits: bool = False) -> AllTicks:
-    """All ticks of several runs; where clocks are Poisson and no message takes time, with ``bits``
-    for outcomes if they are wanted.
+    """Return all ticks of several runs. ``bits``: with arrival bits instead of outcomes, which is
+    possible if clocks are Poisson and no message takes time.
     """
     if is_poisson(scenario):
-        return PoissonSchedules(scenario, streams, bits=bits).whole()
-    # Any other clock or channel: windows made in Python, joined run after run.
-    windows = whole_schedules(scenario, streams)
+        return PoissonSchedules(scenario, streams, bits=bits).all()
+    # Any other clock or channel: windows drawn in Python, joined run after run.
+    windows = all_windows(scenario, streams)
     first, first_delay = (
         np.cumsum([0, *(len(getattr(window, name)) for window in windows)])
         for name in ("t", "delay")
     )
-    t, entity, at, delay = (
+    t, entity, first_outcome, delay = (
         np.concatenate([getattr(window, name) for window in windows])
-        for name in ("t", "entity", "at", "delay")
+        for name in ("t", "entity", "first_outcome", "delay")
     )
-    return AllTicks(t, entity, at, delay, first, first_delay)
+    return AllTicks(t, entity, first_outcome, delay, first, first_delay)
 
 
 def window_of(ticks: AllTicks, run: int) -> Window:
-    """All ticks of one run."""
-    mine, sent = (slice(*first[run : run + 2]) for first in (ticks.first, ticks.first_delay))
-    return Window(math.inf, ticks.t[mine], ticks.entity[mine], ticks.at[mine], ticks.delay[sent])
+    """Return all ticks of one run as a window without an end."""
+    own, outcomes = (slice(*first[run : run + 2]) for first in (ticks.first, ticks.first_delay))
+    return Window(
+        math.inf, ticks.t[own], ticks.entity[own], ticks.first_outcome[own], ticks.delay[outcomes]
+    )
 
 
 def schedule(
     scenario: Scenario, streams: Streams, senders: Senders | None = None
 ) -> PoissonSchedules | Schedule:
-    """The windows of one run, one after the other."""
-    made = PoissonSchedules if is_poisson(scenario) else Schedule
-    return made(scenario, streams, senders)
+    """Return the source of the windows of one run, drawn in compiled code if possible."""
+    cls = PoissonSchedules if is_poisson(scenario) else Schedule
+    return cls(scenario, streams, senders)

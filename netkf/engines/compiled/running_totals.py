@@ -1,6 +1,7 @@
-"""Push-sum by running sums in the event loop (algorithms/running_sums, in loops).
+"""Push-sum by running sums in the event loop: the kernels of algorithms/running_sums.
 
-Totals move with the plant. Here each keeps the time it refers to, and is moved once it is needed.
+A total (w, U, u) refers to an instant and is predicted with the plant. Here each total has a time
+of its own, and is predicted only when it is used.
 """
 
 from __future__ import annotations
@@ -20,19 +21,22 @@ from netkf.linalg.lanes import ONE
 from netkf.linalg.small import multiply_square
 from netkf.linalg.structs import Struct
 
-TERMS = 18  # of the exponential, for a norm of at most 1/2
+TERMS = 18  # of the exponential series, for a norm of at most 1/2
 
 
 class Totals(Struct):
-    """Running sums of N nodes on W directed links; m = 1 + n n + n numbers each.
+    """Running sums of N nodes on W directed links; a total has m = 1 + n n + n numbers: weight w,
+    information U and u.
 
-    weight : (N,)
-    sent, sent_at : totals (N, m) to each receiver, and the times (N,) that they refer to
-    rounds, receivers : (N,), numbers of broadcasts and of nodes that can hear
-    heard, number, heard_at : last total (W, m) heard, its number (W,) (-1: none) and its time
+    weight : (N,), weights w that nodes hold
+    sent, sent_at : totals (N, m) that each node has offered to each of its receivers, and the times
+                    (N,) that they refer to
+    rounds, receivers : (N,), number of broadcasts so far, and of nodes that can hear
+    heard, number, heard_at : last total (W, m) that was heard, its number (W,) (-1: none) and the
+                              time that it refers to
     offered : totals (C, m) of messages under way
-    A, forgetting : of the plant (n, n), and the rate at which old information fades
-    gained, scratch : (m,) and (4, n, n)
+    A, forgetting : matrix of the plant (n, n), and the rate in 1/s at which old information fades
+    gain, scratch : scratch, growth (m,) of the totals in an inbox, and (4, n, n)
     """
 
     weight: FloatArray
@@ -46,14 +50,14 @@ class Totals(Struct):
     offered: FloatArray
     A: FloatArray
     forgetting: float
-    gained: FloatArray
+    gain: FloatArray
     scratch: FloatArray
 
 
 def empty_totals(
     state: Simulation, receivers: np.ndarray, A: FloatArray, forgetting: float
 ) -> Totals:
-    """Weight 1 at every node, and nothing sent yet."""
+    """Return the running sums at time 0: weight 1 at every node, and nothing sent yet."""
     count, n = state.xhat.shape
     m, directions = 1 + n * n + n, len(state.directions)
     return Totals(
@@ -68,51 +72,51 @@ def empty_totals(
         offered=np.zeros((len(state.pool), m)),
         A=np.array(A, dtype=np.float64),
         forgetting=forgetting,
-        gained=np.zeros(m),
+        gain=np.zeros(m),
         scratch=np.zeros((4, n, n)),
     )
 
 
 @kernel
 def fill_inverse(totals: Totals, gap: float) -> None:
-    """Write ``e^{-A gap}`` into ``scratch[0]``: the power series of a part of the gap, squared."""
-    A, out, term, moved = totals.A, totals.scratch[0], totals.scratch[1], totals.scratch[2]
+    """Write ``e^{-A gap}`` into ``scratch[0]``, by scaling and squaring."""
+    A, out, term, product = totals.A, totals.scratch[0], totals.scratch[1], totals.scratch[2]
     n, norm = len(A), 0.0
     for i in range(n):
-        # The largest row sum of |A| gap bounds the norm of the series.
+        # The largest row sum of |A| gap bounds the norm of A gap.
         row = 0.0
         for j in range(n):
             row += abs(A[i, j]) * gap
             out[i, j] = term[i, j] = 1.0 if i == j else 0.0
         norm = max(norm, row)
-    # exp(-A g) = exp(-A g / 2^k)^(2^k): scaling and squaring.
+    # exp(-A g) = exp(-A g / 2^k)^(2^k), with a norm of at most 1/2 for the power series.
     halvings, step = 0, -gap
     while norm > 0.5:
         norm, step, halvings = 0.5 * norm, 0.5 * step, halvings + 1
-    # A norm of 0 leaves the identity.
+    # For a norm of 0 the result is the identity.
     for k in range(1, TERMS if norm > 0.0 else 1):
-        multiply_square(moved, term, A)
+        multiply_square(product, term, A)
         for i in range(n):
             for j in range(n):
-                term[i, j] = moved[i, j] * step / k
+                term[i, j] = product[i, j] * step / k
                 out[i, j] += term[i, j]
     for _ in range(halvings):
-        multiply_square(moved, out, out)
+        multiply_square(product, out, out)
         for i in range(n):
             for j in range(n):
-                out[i, j] = moved[i, j]
+                out[i, j] = product[i, j]
 
 
 @kernel
-def move_total(totals: Totals, values: FloatArray, k: int, gap: float) -> None:
-    """Predict row ``k`` of totals by ``gap`` seconds: ``U <- s Phi^-T U Phi^-1``, ``u <- s Phi^-T
-    u``.
+def predict_total(totals: Totals, values: FloatArray, k: int, gap: float) -> None:
+    """Predict total ``values[k]`` by ``gap`` seconds: ``U <- s Phi^-T U Phi^-1`` and ``u <- s
+    Phi^-T u``, with Phi = e^{A gap} and the fading s.
     """
     if not gap > 0.0:
         return
     # Phi^-1 = exp(-A gap); information moves by Phi^-T from the left and by Phi^-1 from the right.
     fill_inverse(totals, gap)
-    inverse, half, moved = totals.scratch[0], totals.scratch[1], totals.scratch[2]
+    inverse, half, predicted_u = totals.scratch[0], totals.scratch[1], totals.scratch[2]
     # Forgetting multiplies information by s = exp(-2 f gap).
     n, fading = len(inverse), math.exp(-2.0 * totals.forgetting * gap)
     for i in range(n):
@@ -125,9 +129,9 @@ def move_total(totals: Totals, values: FloatArray, k: int, gap: float) -> None:
         total = 0.0
         for r in range(n):
             total += inverse[r, i] * values[k, 1 + n * n + r]
-        moved[0, i] = fading * total
+        predicted_u[0, i] = fading * total
     for i in range(n):
-        values[k, 1 + n * n + i] = moved[0, i]
+        values[k, 1 + n * n + i] = predicted_u[0, i]
         for j in range(n):
             total = 0.0
             for r in range(n):
@@ -137,23 +141,22 @@ def move_total(totals: Totals, values: FloatArray, k: int, gap: float) -> None:
 
 @kernel
 def offer_round(state: Simulation, totals: Totals, h: int, now: float) -> bool:
-    """Offer node ``h``'s share of its mass to its receivers, which shrinks all its masses by one
-    factor; return False if nobody hears it.
+    """Offer a share of node ``h``'s mass to each of its receivers: add it to the total ``sent[h]``,
+    and subtract it from the node's weight. Return False if the node has no receivers.
     """
     receivers, n, weight = totals.receivers[h], state.xhat.shape[1], totals.weight[h]
     if receivers == 0:
         return False
-    # The node's own total is brought to now before it grows.
-    move_total(totals, totals.sent, h, now - totals.sent_at[h])
+    # Predict the total to now before it grows.
+    predict_total(totals, totals.sent, h, now - totals.sent_at[h])
     totals.sent_at[h] = now
     totals.rounds[h] += 1
     inverse, U, sent = totals.scratch[0], totals.scratch[1], totals.sent
-    # The node gives up exactly what its total grows by, for each receiver, or nothing.
     before, share = sent[h, 0], weight / (receivers + 1)
-    # Exact in floating point: the total in fact grows by ``grown``, which may differ from
-    # ``share``.
+    # ``grown`` is the amount by which the total really grows in floating point. The node gives up
+    # exactly that for each receiver, so that the weight is conserved.
     grown = (before + share) - before
-    # The share has become rounding beside the total: sending it would lose mass.
+    # The share is at the level of rounding of the total: offer nothing in this round.
     if abs(grown - share) > MIN_ACCURACY * share:
         return True
     # P^-1 = S^-T S^-1.
@@ -172,16 +175,13 @@ def offer_round(state: Simulation, totals: Totals, h: int, now: float) -> bool:
             total += U[i, j] * state.xhat[h, j]
         sent[h, 1 + n * n + i] += total / (receivers + 1)
     sent[h, 0] = before + share
-    # Conserved: the node gives up as often as a receiver will gain.
     totals.weight[h] -= receivers * grown
     return True
 
 
 @kernel
 def fill_inverse_root(out: FloatArray, root: FloatArray, h: int) -> None:
-    """Write the inverse of row ``h`` of ``root``, lower triangular and regular, into ``out`` (n,
-    n).
-    """
+    """Write the inverse of ``root[h]``, lower triangular and regular, into ``out`` (n, n)."""
     n = root.shape[1]
     for i in range(n):
         for j in range(i + 1):
@@ -193,65 +193,63 @@ def fill_inverse_root(out: FloatArray, root: FloatArray, h: int) -> None:
 
 @kernel
 def hear(state: Simulation, totals: Totals, h: int, now: float) -> None:
-    """Add to the mass of node ``h`` the growth of each total since it was last heard; an older
-    total adds nothing.
+    """Add the growth of each total in the inbox, since its sender was last heard, to the mass of
+    node ``h``. A total older than the last one heard adds nothing.
     """
-    gained, pool, heard, offered = totals.gained, state.pool, totals.heard, totals.offered
-    # Two passes over the inbox: gains first, because nothing is remembered if the mass did not
-    # grow.
-    for j in range(len(gained)):
-        gained[j] = 0.0
+    gain, pool, heard, offered = totals.gain, state.pool, totals.heard, totals.offered
+    # Two passes over the inbox: first the sum of all growth, because the totals are not stored as
+    # heard unless the weight grows.
+    for j in range(len(gain)):
+        gain[j] = 0.0
     m = state.nodes[h].inbox
     while m != -1:
         message = pool[m]
         w = message.direction
         # A total of a later round contains all earlier ones: only growth since then counts.
         if message.tag > totals.number[w]:
-            # Both totals are brought to now before they are compared.
-            move_total(totals, offered, m, now - message.sent)
-            move_total(totals, heard, w, now - totals.heard_at[w])
+            # Predict both totals to now before they are compared.
+            predict_total(totals, offered, m, now - message.sent)
+            predict_total(totals, heard, w, now - totals.heard_at[w])
             totals.heard_at[w] = now
-            for j in range(len(gained)):
-                gained[j] += offered[m, j] - heard[w, j]
+            for j in range(len(gain)):
+                gain[j] += offered[m, j] - heard[w, j]
         m = message.next
-    # Rounding, or old totals only.
-    if not gained[0] > 0.0:
+    # No growth but rounding, or old totals only.
+    if not gain[0] > 0.0:
         return
-    # Now remember what was heard, so that it is not gained again.
+    # Store the totals, so that their growth is not counted again.
     m = state.nodes[h].inbox
     while m != -1:
         message = pool[m]
         if message.tag > totals.number[message.direction]:
             totals.number[message.direction] = message.tag
-            for j in range(len(gained)):
+            for j in range(len(gain)):
                 heard[message.direction, j] = offered[m, j]
         m = message.next
-    # The weight of the node grows by what it gained, and P^-1 becomes the weighted mean.
-    weight = totals.weight[h] + gained[0]
-    size = math.sqrt(weight / totals.weight[h])
+    # The weight grows by the gain, and P^-1 becomes the weighted mean.
+    weight = totals.weight[h] + gain[0]
+    factor = math.sqrt(weight / totals.weight[h])
     totals.weight[h] = weight
-    gain_mass(state, totals, h, size, len(state.nodes) / weight)
+    gain_mass(state, totals, h, factor, len(state.nodes) / weight)
 
 
 @kernel
-def gain_mass(state: Simulation, totals: Totals, h: int, size: float, share: float) -> None:
-    """Add gained mass to node ``h``: ``P^-1 <- (w P^-1 + N U) / w+`` and the estimate likewise.
-
-    The root is multiplied by ``size``, the gain by ``share``; gained information cannot be
-    negative.
+def gain_mass(state: Simulation, totals: Totals, h: int, factor: float, share: float) -> None:
+    """Add the mass ``totals.gain`` to node ``h``: ``P^-1 <- (w P^-1 + N U) / w+`` with the new
+    weight w+, and the estimate likewise. ``factor`` is (w+ / w)^1/2, ``share`` is N / w+.
     """
-    root, gained, n = state.root, totals.gained, state.xhat.shape[1]
+    root, gain, n = state.root, totals.gain, state.xhat.shape[1]
     inner, half, vectors = totals.scratch[0], totals.scratch[1], totals.scratch[2]
     # S sqrt(w+ / w): the root of P with P^-1 scaled by w / w+.
     for i in range(n):
         for j in range(i + 1):
-            root[h, i, j] *= size
-    # inner = I + share S' U S, with U symmetrised.
+            root[h, i, j] *= factor
+    # inner = I + share S' U S, with U symmetrised; then P = S inner^-1 S'.
     for i in range(n):
         for j in range(n):
             total = 0.0
             for r in range(j, n):
-                total += (gained[1 + i * n + r] + gained[1 + r * n + i]) * root[h, r, j]
+                total += (gain[1 + i * n + r] + gain[1 + r * n + i]) * root[h, r, j]
             half[i, j] = total
     for i in range(n):
         for j in range(n):
@@ -259,16 +257,16 @@ def gain_mass(state: Simulation, totals: Totals, h: int, size: float, share: flo
             for r in range(i, n):
                 total += root[h, r, i] * half[r, j]
             inner[i, j] = 0.5 * share * total + (1.0 if i == j else 0.0)
-    # By eigenvalues, because U is a difference of sums and may be indefinite by rounding.
+    # Invert it by eigenvalues: U is a difference of sums, and may be indefinite by rounding.
     diagonalise(inner, vectors)
     update_root_by_gain(state, h, inner, vectors)
-    move_by_gain(state, h, gained, share, totals.scratch[3, 0])
+    move_by_gain(state, h, gain, share, totals.scratch[3, 0])
 
 
 @kernel
 def update_root_by_gain(state: Simulation, h: int, values: FloatArray, vectors: FloatArray) -> None:
-    """Write the triangular root of ``S V D^-1 V' S'``, where D (``values``, diagonal) is at least 1
-    and V are ``vectors``.
+    """Replace root S of node ``h`` by the lower triangular root of ``S V D^-1 V' S'``, with the
+    eigenvalues D on the diagonal of ``values``, raised to at least 1, and eigenvectors V.
     """
     root, F, n = state.root, state.flow_scratch.values, state.xhat.shape[1]
     wide, noise = state.flow_scratch.wide, state.flow_scratch.T
@@ -289,32 +287,35 @@ def update_root_by_gain(state: Simulation, h: int, values: FloatArray, vectors: 
 
 @kernel
 def move_by_gain(
-    state: Simulation, h: int, gained: FloatArray, share: float, news: FloatArray
+    state: Simulation, h: int, gain: FloatArray, share: float, innovation: FloatArray
 ) -> None:
-    """Correct the estimate by what was gained, ``xhat += P share (u - U xhat)``; ``news`` (n,) is
-    scratch.
+    """Correct the estimate of node ``h`` by the mass gained, ``xhat += P share (u - U xhat)``;
+    ``innovation`` (n,) is scratch.
     """
     root, xhat, n = state.root, state.xhat, state.xhat.shape[1]
-    # N / w (u - U xhat): the innovation in terms of information.
+    # innovation = N / w+ (u - U xhat).
     for i in range(n):
-        total = gained[1 + n * n + i]
+        total = gain[1 + n * n + i]
         for j in range(n):
-            total -= gained[1 + i * n + j] * xhat[h, j]
-        news[i] = share * total
-    for j in range(n):  # S' news: entry j is not read again
+            total -= gain[1 + i * n + j] * xhat[h, j]
+        innovation[i] = share * total
+    # S' innovation in place: entry j is not read again.
+    for j in range(n):
         total = 0.0
         for i in range(j, n):
-            total += root[h, i, j] * news[i]
-        news[j] = total
-    # S (S' news) = P news.
+            total += root[h, i, j] * innovation[i]
+        innovation[j] = total
+    # S (S' innovation) = P innovation.
     for i in range(n):
         for j in range(i + 1):
-            xhat[h, i] += root[h, i, j] * news[j]
+            xhat[h, i] += root[h, i, j] * innovation[j]
 
 
 @kernel
 def add_reading(state: Simulation, totals: Totals, h: int, instant: int) -> None:
-    """Add a reading, ``U += H' R^-1 H`` and ``u += H' R^-1 y``, N / w times that in P^-1."""
-    # R scaled by w / N: the information counts N / w times in P^-1.
+    """Add the samples of an ``instant`` to the mass of node ``h``: ``U += H' R^-1 H`` and ``u += H'
+    R^-1 y``, which counts N / w times in P^-1.
+    """
+    # Equivalent to noise R w / N.
     scale = math.sqrt(totals.weight[h] / len(state.nodes))
     use_instant(state, instant, state.root, state.xhat, h, scale)

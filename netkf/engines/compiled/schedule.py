@@ -1,9 +1,9 @@
-"""Schedules made beforehand: ticks of all clocks and outcomes of their messages, window by window.
+"""Schedules computed before a run: ticks of all clocks and outcomes of their messages, by windows.
 
 Nothing here depends on an estimate. Every clock draws its ticks, and every directed link its
-outcomes, in blocks from its own streams, as one message after the other would; a window takes what
-lies in a stretch of time and merges the clocks. What they have in common is done for all of them at
-once, since there may be hundreds of thousands with a few ticks each.
+outcomes, in blocks from streams of its own; the numbers are those that the SimPy engine draws
+message by message. A window merges the ticks of all clocks in an interval of time. Operations are
+vectorised over entities, since there may be hundreds of thousands with a few ticks each.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ from netkf.rng.draws import StreamBatch
 from netkf.rng.streams import ReplicaStreams, Streams
 from netkf.scenario.scenario import Scenario
 
-# Ticks drawn at once for an entity, doubling: slow clocks draw few in vain.
+# Ticks drawn at once for an entity, doubling each time: slow clocks draw few that are not used.
 FIRST_BLOCK, MAX_BLOCK_SLOTS = 8, 1024
-TICKS_A_LINK = 256  # in a window, so that what a clock costs is spread over them
+TICKS_A_LINK = 256  # ticks of an entity in a window, which share its fixed cost
 MAX_WINDOW_TICKS, MIN_WINDOW_TICKS = 1 << 20, 1 << 12
 LOST = -1.0  # no delay is negative
 
@@ -43,48 +43,50 @@ class Window(NamedTuple):
     """All ticks before ``end``, in the order of (time, entity).
 
     end : seconds
-    t, entity : (K,), time and index of the entity among the senders'
-    at, delay : the outcomes of tick k begin at ``delay[at[k]]``, in the order of its directed
-                links: seconds or LOST
-    heard : (K,), where no message takes time instead of ``delay``: a bit for each message that
-            arrives
+    t, entity : (K,), time (seconds) of each tick and index of its entity in Senders
+    first_outcome, delay : the outcomes of tick k begin at ``delay[first_outcome[k]]``, in the order
+                           of its directed links: delay in seconds, or LOST
+    arrival_bits : (K,), in place of ``delay`` if no message takes time: a bit for each message of
+                   the tick that arrives
     """
 
     end: float
     t: FloatArray
     entity: np.ndarray
-    at: np.ndarray
+    first_outcome: np.ndarray
     delay: FloatArray
-    heard: np.ndarray | None = None
+    arrival_bits: np.ndarray | None = None
 
 
 class Ticks(NamedTuple):
-    """Some ticks, those of each entity together and in order of time: ``t, entity`` (K,), and the
-    outcomes ``delay`` of all that they send, tick after tick.
+    """K ticks: times ``t`` and ``entity`` (K,), and the outcomes ``delay`` of all their messages,
+    tick after tick.
     """
 
     t: FloatArray
     entity: np.ndarray
     delay: FloatArray
 
-    def chosen(self, which: np.ndarray, sizes: np.ndarray) -> Ticks:
-        """Return the ticks of some indices, where a tick of entity e has ``sizes[e]`` outcomes."""
-        # Outcomes lie tick after tick: the indices of those that are chosen, in their new order.
+    def select(self, indices: np.ndarray, sizes: np.ndarray) -> Ticks:
+        """Return the ticks with these ``indices``; a tick of entity e has ``sizes[e]`` outcomes."""
+        # Indices of the outcomes of these ticks, tick after tick in their new order.
         sent = sizes[self.entity]
-        first, count = (np.cumsum(sent) - sent)[which], sent[which]
+        first, count = (np.cumsum(sent) - sent)[indices], sent[indices]
         begin = np.cumsum(count) - count
-        indices = np.repeat(first - begin, count) + np.arange(int(count.sum()))
-        return Ticks(self.t[which], self.entity[which], self.delay[indices])
+        outcomes = np.repeat(first - begin, count) + np.arange(int(count.sum()))
+        return Ticks(self.t[indices], self.entity[indices], self.delay[outcomes])
 
     def window(self, end: float, sizes: np.ndarray) -> Window:
-        """Return ticks that are in order of time as a window up to ``end``."""
+        """Return these ticks, which must be in the order of time, as a window up to ``end``."""
         sent = sizes[self.entity]
         return Window(end, self.t, self.entity, np.cumsum(sent) - sent, self.delay)
 
 
 class TickSource:
-    """The ticks of E entities in all runs, run by run and block by block: ``last`` (E,) are the
-    last ones known, infinite after the horizon, and ``drawn`` (E,) how many were drawn.
+    """Draws the ticks of E entities, those of all runs one run after the other, block by block.
+
+    ``last`` (E,) are the times of the last ticks so far, infinite once the horizon is passed, and
+    ``drawn`` (E,) the numbers of ticks so far.
     """
 
     def __init__(
@@ -117,28 +119,26 @@ class TickSource:
             )
 
     def more(self, indices: np.ndarray, counts: np.ndarray) -> tuple[FloatArray, np.ndarray]:
-        """Return the next ``counts`` ticks of some entities before the horizon, entity by entity,
-        and how many each has.
-
-        The horizon is half open; later ticks, which may be many, are dropped.
+        """Draw the next ``counts`` ticks of the entities ``indices``; return the times of those
+        before the horizon, entity by entity, and how many each entity has.
         """
         if self._all_poisson:
-            times, asked = self._exponential(indices, counts), counts
+            times, sizes = self._exponential(indices, counts), counts
         else:
-            drawn = [self._ticks(k, count) for k, count in zip(indices, counts, strict=True)]
-            asked = np.array([len(t) for t in drawn])
+            blocks = [self._ticks(k, count) for k, count in zip(indices, counts, strict=True)]
+            sizes = np.array([len(t) for t in blocks])
             # Rows of different lengths are padded with infinity.
-            times = np.full((len(indices), max(asked.max(), 1)), np.inf)
-            for row, t in zip(times, drawn, strict=True):
+            times = np.full((len(indices), max(sizes.max(), 1)), np.inf)
+            for row, t in zip(times, blocks, strict=True):
                 row[: len(t)] = t
         # The horizon is half open.
-        kept = times < self._horizon
-        got = kept.sum(axis=1)
-        self.drawn[indices] += asked
-        # Fewer than asked for lie before the horizon: this entity has ended.
-        ended = (asked == 0) | (got < asked)
-        self.last[indices] = np.where(ended, np.inf, times[np.arange(len(indices)), asked - 1])
-        return times[kept], got
+        before_horizon = times < self._horizon
+        numbers = before_horizon.sum(axis=1)
+        self.drawn[indices] += sizes
+        # An entity has ended if some of its ticks lie beyond the horizon.
+        ended = (sizes == 0) | (numbers < sizes)
+        self.last[indices] = np.where(ended, np.inf, times[np.arange(len(indices)), sizes - 1])
+        return times[before_horizon], numbers
 
     def _exponential(self, indices: np.ndarray, counts: np.ndarray) -> FloatArray:
         """Return the times (E, count) of the next ticks of Poisson clocks, infinite beyond the
@@ -174,7 +174,7 @@ def delay_is_zero(channel: Channel) -> bool:
     return delay.fixed == 0.0 and not delay.is_random and not delay_depends_on_message(delay)
 
 
-def delivery_chances(scenario: Scenario, directions: tuple[Link, ...]) -> FloatArray:
+def delivery_probabilities_of(scenario: Scenario, directions: tuple[Link, ...]) -> FloatArray:
     """Return the delivery probability (W,) of the messages of each directed link."""
     loss = scenario.network.channel.loss
     return np.array(
@@ -186,7 +186,7 @@ def delivery_chances(scenario: Scenario, directions: tuple[Link, ...]) -> FloatA
 
 
 class Outcomes:
-    """Outcomes of all messages, run by run, activation after activation of each entity."""
+    """Draws the outcomes of all messages of some runs: delays in seconds, or LOST."""
 
     def __init__(
         self, scenario: Scenario, streams: Streams | ReplicaStreams, senders: Senders
@@ -194,9 +194,9 @@ class Outcomes:
         self._channel = channel = scenario.network.channel
         runs = streams.runs
         self._senders, self._directions = senders, len(senders.directions)
-        self._first, self._hearing = senders.first, senders.hearing
+        self._first, self._outgoing = senders.first, senders.outgoing
         self._count, self._sources = len(senders.entities), len(senders.sources)
-        self._measured = np.array(
+        self._table_probabilities = np.array(
             [scenario.table_probability(direction) for direction in senders.directions]
         )
         self._identical, self._has_table_law = (
@@ -205,49 +205,52 @@ class Outcomes:
         )
         # Probabilities that depend on the link only are tabulated.
         if self._identical:
-            self._probabilities = delivery_chances(scenario, senders.directions)
-        # Channels with memory or random delays keep a sampler for each stream.
+            self._probabilities = delivery_probabilities_of(scenario, senders.directions)
+        # Channels with memory or random delays need a sampler for each stream.
         if not self._has_table_law:
             self._samplers = [
-                ChannelSampler(channel, partial(_stream, made, source))
-                for made in (
+                ChannelSampler(channel, partial(_stream, run_streams, source))
+                for run_streams in (
                     one.with_seeds(stream_purposes(channel), senders.sources)
                     for one in streams.per_replica
                 )
                 for source in senders.sources
             ]
         elif not channel.loss.deterministic:
-            # A batch of streams draws for all links at once.
+            # Otherwise a batch of streams draws uniform numbers for all links at once.
             self._uniforms = StreamBatch(streams, "loss", senders.sources)
         self.sizes = np.tile(np.diff(senders.first), runs)
 
     def of(self, indices: np.ndarray, counts: np.ndarray, first: np.ndarray) -> FloatArray:
-        """Return the outcomes of the next ``counts`` activations of each entity, whose first one
-        has number ``first``, tick after tick.
+        """Return the outcomes of the next ``counts`` ticks of the entities ``indices`` (over all
+        runs), entity by entity and tick after tick; ``first`` are the numbers of their first ticks.
         """
         runs, entity = np.divmod(indices, max(self._count, 1))
         sizes = self.sizes[indices]
         out = np.empty(int((counts * sizes).sum()))
         begin = np.cumsum(counts * sizes) - counts * sizes
-        drawn: tuple[np.ndarray, ...] = ()
-        # The k-th directed link of all entities that have one, so that each pass is vectorised.
+        draws: tuple[np.ndarray, ...] = ()
+        # Vectorised over entities: the k-th directed link of all entities that have so many.
         for k in range(int(sizes.max(initial=0))):
-            some = sizes > k
-            directions = self._hearing[self._first[entity[some]] + k]
-            count = counts[some]
+            has_link = sizes > k
+            directions = self._outgoing[self._first[entity[has_link]] + k]
+            count = counts[has_link]
             # With a symmetric channel the second direction of a link takes the draws of the first.
-            if not drawn or not self._senders.shared:
-                sources = runs[some] * self._sources + self._senders.source[directions]
-                drawn = self._draw(sources, count)
-            # Place of each outcome: tick after tick, and inside a tick in the order of its links.
+            if not draws or not self._senders.shared:
+                sources = runs[has_link] * self._sources + self._senders.source[directions]
+                draws = self._draw(sources, count)
+            # Position of each outcome: tick after tick, and inside a tick in the order of its
+            # links.
             step = np.arange(int(count.sum())) - np.repeat(np.cumsum(count) - count, count)
-            to = np.repeat(begin[some] + k, count) + step * np.repeat(sizes[some], count)
-            out[to] = self._delays(directions, count, first[some], *drawn)
+            positions = np.repeat(begin[has_link] + k, count) + step * np.repeat(
+                sizes[has_link], count
+            )
+            out[positions] = self._delays(directions, count, first[has_link], *draws)
         return out
 
     def _draw(self, sources: np.ndarray, counts: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Return for K messages uniform draws, whether the channel is in its bad state, and delays
-        as drawn.
+        """Draw for the next ``counts`` messages of each stream of ``sources``, K in all: return
+        uniform numbers, bad states of the channel (bool) and delays, (K,) each.
         """
         total = int(counts.sum())
         if not self._has_table_law:
@@ -258,9 +261,9 @@ class Outcomes:
             return tuple(np.concatenate([np.empty(0), *column]) for column in columns)
         # A broadcast view: one delay for all.
         delay = np.broadcast_to(np.float64(self._channel.delay.fixed or 0.0), (total,))
-        certain = self._channel.loss.deterministic
-        # 0 is below every positive probability: nothing is lost where nothing is random.
-        uniform = np.zeros(total) if certain else self._uniforms.units(sources, counts)
+        lossless = self._channel.loss.deterministic
+        # A uniform number of 0 is below every positive probability: nothing is lost.
+        uniform = np.zeros(total) if lossless else self._uniforms.units(sources, counts)
         return uniform, np.zeros(total, dtype=bool), delay
 
     def _delays(
@@ -272,34 +275,37 @@ class Outcomes:
         bad: np.ndarray,
         delay: np.ndarray,
     ) -> FloatArray:
-        """Return the delays (K,) of messages in seconds, LOST for lost ones."""
+        """Return the outcomes (K,) of messages from their draws: delays in seconds, or LOST."""
         if self._identical:
             probability = np.repeat(self._probabilities[directions], counts)
         else:
             probability = self._delivery_probability(directions, counts, first, bad)
         lost = uniform >= probability
         if delay_depends_on_message(self._channel.delay):
-            delay = self._by_message(directions, counts, first, lost, delay)
+            delay = self._message_delays(directions, counts, first, lost, delay)
         return np.where(lost, LOST, delay)
 
     def _delivery_probability(
         self, directions: np.ndarray, counts: np.ndarray, first: np.ndarray, bad: np.ndarray
     ) -> FloatArray:
-        """Return the delivery probability of each message, by direction; ``bad`` (K,) is the state
-        of the channel for each.
+        """Return the delivery probabilities (K,) of messages, ``counts`` on each of ``directions``
+        with numbers from ``first`` on; ``bad`` (K,) is the state of the channel.
         """
         loss, out, done = self._channel.loss, np.empty(len(bad)), 0
         # Probabilities that may depend on the state of the link and on the number of the message.
         for w, count, number in zip(directions, counts.tolist(), first.tolist(), strict=True):
             part = slice(done, done + count)
-            direction, measured = self._senders.directions[w], float(self._measured[w])
+            direction, table_probability = (
+                self._senders.directions[w],
+                float(self._table_probabilities[w]),
+            )
             out[part] = delivery_probabilities(
-                loss, direction, number, bad[part].astype(bool), measured
+                loss, direction, number, bad[part].astype(bool), table_probability
             )
             done += count
         return out
 
-    def _by_message(
+    def _message_delays(
         self,
         directions: np.ndarray,
         counts: np.ndarray,
@@ -307,8 +313,8 @@ class Outcomes:
         lost: np.ndarray,
         delay: np.ndarray,
     ) -> FloatArray:
-        """Return the delays of all messages that are not ``lost``, by a law that depends on the
-        message.
+        """Return the delays (K,) in seconds if their law depends on the message, except those of
+        ``lost`` messages, which keep ``delay``.
         """
         model, out, k = self._channel.delay, np.array(delay), 0
         for w, count, number in zip(directions, counts.tolist(), first.tolist(), strict=True):
@@ -322,8 +328,8 @@ class Outcomes:
 
 
 class EntityDraws:
-    """Ticks and outcomes of all entities, drawn as they are asked for; nothing where the filter
-    does not talk. Entities of several runs follow one another, run by run.
+    """Draws ticks and outcomes of E entities on demand. Entities are those of all runs, run by run;
+    none if the filter sends no messages.
     """
 
     def __init__(
@@ -333,51 +339,49 @@ class EntityDraws:
         self._clocks = TickSource(scenario, streams, senders)
         self._outcomes = Outcomes(scenario, streams, senders)
         self.sizes = self._outcomes.sizes
-        # Longer blocks cost less for each tick, but must not make too many at once.
-        self._longest = min(
+        # Longer blocks cost less for each tick; the limit is the memory for all entities together.
+        self._max_block = min(
             MAX_BLOCK_SLOTS, max(FIRST_BLOCK, 4 * MAX_WINDOW_TICKS // max(self.count, 1))
         )
         self._block = np.full(self.count, FIRST_BLOCK)
 
     @property
     def last(self) -> FloatArray:
-        """(E,) the last tick known of each entity; infinite where all are."""
+        """(E,) time of the last tick drawn of each entity; infinite after the horizon."""
         return self._clocks.last
 
     @property
     def rate(self) -> float:
-        """Ticks a second of all together, as far as they are known."""
-        # Measured: ticks so far over the time of the last.
+        """Ticks per second of all entities, estimated from the ticks so far."""
         return float((self._clocks.drawn / self.last).sum())
 
     def more(self, indices: np.ndarray) -> Ticks:
-        """Return the next block of ticks of each of these entities, given in increasing order."""
+        """Draw and return the next block of ticks of these entities, whose indices increase."""
         first = self._clocks.drawn[indices]
         t, counts = self._clocks.more(indices, self._block[indices])
         # Blocks double: an entity with few ticks draws few.
-        self._block[indices] = np.minimum(2 * self._block[indices], self._longest)
+        self._block[indices] = np.minimum(2 * self._block[indices], self._max_block)
         return Ticks(t, np.repeat(indices, counts), self._outcomes.of(indices, counts, first))
 
 
 def _concatenate(parts: list[Ticks]) -> Ticks:
-    """Return several lists of ticks one after the other."""
+    """Return the concatenation of several Ticks."""
     return Ticks(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
 
 class Schedule:
-    """The windows of one run, one after the other."""
+    """The windows of one run, for clocks and channels of any kind."""
 
     def __init__(
         self, scenario: Scenario, streams: Streams, senders: Senders | None = None
     ) -> None:
         senders = senders_of(scenario) if senders is None else senders
         self._draws = draws = EntityDraws(scenario, streams, senders)
-        # About so many ticks in a window.
-        wanted = min(max(TICKS_A_LINK * draws.count, MIN_WINDOW_TICKS), MAX_WINDOW_TICKS)
+        window_ticks = min(max(TICKS_A_LINK * draws.count, MIN_WINDOW_TICKS), MAX_WINDOW_TICKS)
         self._horizon, self._end = scenario.horizon, 0.0
-        self._known = draws.more(np.arange(draws.count)) if draws.count else NO_TICKS
+        self._waiting = draws.more(np.arange(draws.count)) if draws.count else NO_TICKS
         # The rate of the first blocks decides the length of all windows.
-        self._length = wanted / draws.rate if draws.rate > 0.0 else math.inf
+        self._length = window_ticks / draws.rate if draws.rate > 0.0 else math.inf
 
     def following(self) -> Window:
         """Return the next window; the last one ends at infinity."""
@@ -386,25 +390,25 @@ class Schedule:
         if not self._end < end < self._horizon:
             end = math.inf
         self._end = end
-        parts = [self._known]
-        # An entity's ticks are complete up to ``end`` once its last known tick is beyond it.
+        parts = [self._waiting]
+        # Draw until the last tick of each entity is beyond ``end``.
         while len(late := np.flatnonzero(draws.last < end)):
             parts.append(draws.more(late))
-        known = _concatenate(parts)
-        now = known.t < end
-        # Ticks beyond the end wait for the next window.
-        self._known = known.chosen(np.flatnonzero(~now), draws.sizes)
-        order = np.flatnonzero(now)
-        # Sorting by time alone is faster; ties are rare, and only then entities matter.
-        order = order[np.argsort(known.t[order])]
-        if (np.diff(known.t[order]) == 0.0).any():
-            order = order[np.lexsort((known.entity[order], known.t[order]))]
-        return known.chosen(order, draws.sizes).window(end, draws.sizes)
+        ticks = _concatenate(parts)
+        in_window = ticks.t < end
+        # Ticks beyond the end belong to later windows.
+        self._waiting = ticks.select(np.flatnonzero(~in_window), draws.sizes)
+        order = np.flatnonzero(in_window)
+        # Sort by time alone, which is faster; only if there are ties, by (time, entity).
+        order = order[np.argsort(ticks.t[order])]
+        if (np.diff(ticks.t[order]) == 0.0).any():
+            order = order[np.lexsort((ticks.entity[order], ticks.t[order]))]
+        return ticks.select(order, draws.sizes).window(end, draws.sizes)
 
 
 class ReadingsSchedule:
-    """The windows of one run in which nodes transmit after their samples, at the times ``t`` (K,)
-    and indices ``index`` (K,), in order.
+    """The windows of one run in which nodes transmit after their samples: at times ``t`` (K,), in
+    order, node ``index`` (K,).
     """
 
     def __init__(
@@ -422,48 +426,49 @@ class ReadingsSchedule:
     def following(self) -> Window:
         """Return the next window; the last one ends at infinity."""
         begin, sizes = self._begin, self._outcomes.sizes
-        # As many instants as have about MAX_WINDOW_TICKS messages; a node without receivers counts
-        # as one.
+        # As many instants as send about MAX_WINDOW_TICKS messages; a node without receivers counts
+        # as one message.
         sent = np.cumsum(np.maximum(sizes[self._index[begin:]], 1))
         stop = begin + int(np.searchsorted(sent, MAX_WINDOW_TICKS))
         while 0 < stop < len(self._t) and self._t[stop] == self._t[stop - 1]:
-            stop += 1  # an instant is in one window
+            # All transmissions of an instant are in one window.
+            stop += 1
         self._begin = stop
         t, index = self._t[begin:stop], self._index[begin:stop]
-        # Outcomes are drawn entity by entity, and put back into the order of time.
+        # Draw outcomes entity by entity, then restore the order of time.
         indices, counts = np.unique(index, return_counts=True)
         delay = self._outcomes.of(indices, counts, self._sent[indices])
         self._sent[indices] += counts
         by_entity = np.argsort(index, kind="stable")
         ticks = Ticks(t[by_entity], index[by_entity], delay)
-        back = np.empty(len(index), dtype=np.int64)
-        back[by_entity] = np.arange(len(index))
+        inverse = np.empty(len(index), dtype=np.int64)
+        inverse[by_entity] = np.arange(len(index))
         end = float(self._t[stop]) if stop < len(self._t) else math.inf
-        return ticks.chosen(back, sizes).window(end, sizes)
+        return ticks.select(inverse, sizes).window(end, sizes)
 
 
-def whole_schedules(scenario: Scenario, streams: ReplicaStreams) -> list[Window]:
-    """Return all ticks of each of several runs, one window a run."""
+def all_windows(scenario: Scenario, streams: ReplicaStreams) -> list[Window]:
+    """Return all ticks of several runs, one window for each run."""
     senders, runs = senders_of(scenario), streams.runs
     draws = EntityDraws(scenario, streams, senders)
     if not draws.count:
         return [NO_TICKS.window(math.inf, draws.sizes)] * runs
     parts = [NO_TICKS]
-    # All ticks up to the horizon: an entity whose last tick is infinite has ended.
+    # Draw until the horizon: the last tick of each entity is then infinite.
     while len(late := np.flatnonzero(draws.last < math.inf)):
         parts.append(draws.more(late))
-    known, count = _concatenate(parts), draws.count // runs
-    run, entity = np.divmod(known.entity, count)
+    ticks, count = _concatenate(parts), draws.count // runs
+    run, entity = np.divmod(ticks.entity, count)
     # By run, then by (time, entity), as within one run.
-    order = np.lexsort((entity, known.t, run))
-    known = known.chosen(order, draws.sizes)
+    order = np.lexsort((entity, ticks.t, run))
+    ticks = ticks.select(order, draws.sizes)
     cuts = np.concatenate([[0], np.cumsum(np.bincount(run, minlength=runs))])
     windows = []
     for k in range(runs):
-        mine = known.chosen(np.arange(cuts[k], cuts[k + 1]), draws.sizes)
+        run_ticks = ticks.select(np.arange(cuts[k], cuts[k + 1]), draws.sizes)
         # Entities are numbered within the run again.
-        mine = mine._replace(entity=mine.entity - k * count)
-        windows.append(mine.window(math.inf, draws.sizes))
+        run_ticks = run_ticks._replace(entity=run_ticks.entity - k * count)
+        windows.append(run_ticks.window(math.inf, draws.sizes))
     return windows
 
 

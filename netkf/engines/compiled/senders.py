@@ -1,4 +1,4 @@
-"""Who transmits when something ticks, and over which directed links."""
+"""Which entities have clocks, and on which directed links each of them sends."""
 
 from __future__ import annotations
 
@@ -7,28 +7,29 @@ from typing import NamedTuple
 import numpy as np
 
 from netkf.core.clock import Entity
-from netkf.engines.compiled.kept import once_per_scenario
+from netkf.engines.compiled.per_scenario import once_per_scenario
 from netkf.network.clocks import LinkClock
 from netkf.network.graphs import Link
 from netkf.scenario.scenario import Scenario
 
 
 class Senders(NamedTuple):
-    """Which clock makes which node send on which directed links.
+    """The clocks of a network and the directed links on which each tick sends.
 
     at : kind of clock: "links", "directions", "nodes" or "readings"
     entities : the E entities with a clock; nodes for "readings"
     directions : the W directed links, in the order in which simultaneous messages arrive
-    first, hearing : entity e sends on the directions ``hearing[first[e]:first[e + 1]]``
-    sources, source : streams of outcomes, and the index (W,) of the stream of each direction;
-                      directions that share a stream share a draw at each tick
+    first, outgoing : entity e sends on the directions ``outgoing[first[e]:first[e + 1]]``
+    sources, source : keys of the random streams of losses and delays, and the index (W,) of the
+                      stream of each direction; directions that share a stream share a draw at each
+                      tick
     """
 
     at: str
     entities: tuple[Entity, ...]
     directions: tuple[Link, ...]
     first: np.ndarray
-    hearing: np.ndarray
+    outgoing: np.ndarray
     sources: tuple[Link, ...]
     source: np.ndarray
 
@@ -40,41 +41,41 @@ class Senders(NamedTuple):
 
 @once_per_scenario
 def senders_of(scenario: Scenario) -> Senders:
-    """Return who transmits over which directed links; nobody if the filter does not talk."""
+    """Return the senders of a scenario; none if the filter sends no messages."""
     topology, clock = scenario.topology, scenario.network.activation
-    # Slots have no link clock: nobody is woken by one.
+    # In slots there is no link clock.
     if not scenario.hosted.talks or not isinstance(clock, LinkClock):
-        none = np.zeros(0, dtype=np.int64)
-        return Senders("links", (), (), np.zeros(1, dtype=np.int64), none, (), none)
+        no_links = np.zeros(0, dtype=np.int64)
+        return Senders("links", (), (), np.zeros(1, dtype=np.int64), no_links, (), no_links)
     if clock.at == "links":
         return _link_senders(topology.links, topology.directed, scenario.network.channel.symmetric)
     directions = topology.directions
-    each = np.arange(len(directions))
+    indices = np.arange(len(directions))
     # Each direction has a clock, and sends on itself only.
     if clock.at == "directions":
         first = np.arange(len(directions) + 1)
-        return Senders(clock.at, directions, directions, first, each, directions, each)
+        return Senders(clock.at, directions, directions, first, indices, directions, indices)
     # Nodes have clocks: each sends on all directed links that leave it.
     senders = np.array([topology.index[i] for i, _ in directions], dtype=np.int64)
     counts = np.bincount(senders, minlength=len(topology.nodes))
     first = np.concatenate([[0], np.cumsum(counts)])
     entities = tuple((node,) for node in topology.nodes)
     # Stable, so that the links of a node keep the order in which messages arrive.
-    hearing = np.argsort(senders, kind="stable")
-    return Senders(clock.at, entities, directions, first, hearing, directions, each)
+    outgoing = np.argsort(senders, kind="stable")
+    return Senders(clock.at, entities, directions, first, outgoing, directions, indices)
 
 
 def _link_senders(links: tuple[Link, ...], directed: bool, symmetric: bool) -> Senders:
     """Return the senders if links have clocks: an entity is a link of one or two directions."""
     if directed:
-        each = np.arange(len(links))
-        return Senders("links", links, links, np.arange(len(links) + 1), each, links, each)
+        indices = np.arange(len(links))
+        return Senders("links", links, links, np.arange(len(links) + 1), indices, links, indices)
     # Both directions of a link are neighbours, forth and back, so that 2 k and 2 k + 1 belong to
     # link k.
     directions = tuple(direction for i, j in links for direction in ((i, j), (j, i)))
-    each = np.arange(len(directions))
+    indices = np.arange(len(directions))
     first = np.arange(0, len(directions) + 1, 2)
     # Both directions share the stream of their link.
     if symmetric:
-        return Senders("links", links, directions, first, each, links, each // 2)
-    return Senders("links", links, directions, first, each, directions, each)
+        return Senders("links", links, directions, first, indices, links, indices // 2)
+    return Senders("links", links, directions, first, indices, directions, indices)

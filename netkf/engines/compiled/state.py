@@ -1,4 +1,4 @@
-"""Everything that the event loop works on: a run as plain arrays in a few named groups.
+"""The state of the event loop: a run as plain arrays in a few named groups.
 
 Numbers that belong to one node, message or directed link are fields of a record, so that they have
 names in compiled code too. No type depends on the size of a scenario: one compiled loop fits all.
@@ -19,7 +19,7 @@ from netkf.algorithms.kernels.root_flow import (
 )
 from netkf.algorithms.kernels.root_update import UpdateScratch, update_scratch
 from netkf.algorithms.models import FlowModel, first_root
-from netkf.engines.compiled.kept import once_per_scenario
+from netkf.engines.compiled.per_scenario import once_per_scenario
 from netkf.engines.compiled.senders import senders_of
 from netkf.linalg.arrays import FloatArray, IntArray
 from netkf.linalg.structs import Size, Struct
@@ -39,21 +39,21 @@ NODE = _record_type("model id sensor sensors inbox last sent reading", "own")
 
 model : index of its model
 id : id in the trace, -1 if pooled
-sensor, sensors : its increment sensors, from ``sensor`` up to ``sensors``
+sensor, sensors : its increment sensors are those with indices ``sensor`` to ``sensors`` - 1
 inbox, last : first and last message of its inbox, -1: none
-sent : number of transmissions
-reading : instant of its newest sample
-own : its own weight
+sent : number of transmissions so far
+reading : index of the instant of its newest sample
+own : the weight that it gives to itself when all messages arrive
 """
 
-WAY = _record_type("sender receiver messages", "weight")
-"""A directed link: nodes by index, how many messages went, the weight of each."""
+DIRECTED_LINK = _record_type("sender receiver messages", "weight")
+"""A directed link: indices of sender and receiver, number of messages so far, their weight."""
 
 ENTITY = _record_type("sender other first after")
-"""Whatever has a clock.
+"""An entity with a clock: a link, a directed link or a node.
 
 sender, other : the node that sends, and the other end of a link, else -1
-first, after : it sends on the directed links ``Simulation.hearing[first:after]``
+first, after : it sends on the directed links ``Simulation.outgoing[first:after]``
 """
 
 MESSAGE = _record_type("direction number next order tag", "sent arrival")
@@ -72,10 +72,10 @@ COMBINATIONS = (
     *("convex", "intersection", "swap", "shares", "readings", "sums", "none"),
     *("best intersection", "inverse intersection", "constant gain", "predictions", "beliefs"),
 )
-"""``Filter.combination`` in the order of the numbers by which the event loop knows it."""
+"""The values of ``Filter.combination`` in the order of the constants CONVEX to BELIEFS."""
 
 SPECIAL = ("readings", "sums", *COMBINATIONS[BEST:])
-"""Combinations that have state outside a Simulation."""
+"""Combinations whose state is not in a Simulation alone (Totals, History, CombinationState)."""
 
 LINKS, DIRECTIONS, NODES, AFTER_READINGS = range(4)
 CLOCKS = ("links", "directions", "nodes", "readings")
@@ -92,13 +92,13 @@ class Gains(Struct):
 
 
 class Scratch(Struct):
-    """Scratch arrays; p: most increment rows of a node, q: most rows of a sample.
+    """Scratch arrays; p is the largest number of increment rows of a node, q that of a sample.
 
-    moments : (2 p,)
-    early, cut : (2, p), noise of a part of a step, and normals for it
-    state_moments, total : (2, n), moments of x and their sum
-    values : of the longest series
-    y, H, root_R : (q,), (q, n), (q, q), a sample
+    moments : (2 p,), of a reading
+    early, cut : (2, p), noise of the first part of a divided step, and the normals that divide it
+    state_moments, total : (2, n), moments of x over an interval, and their sum over pieces
+    values : values of the longest series at a gap
+    y, H, root_R : (q,), (q, n), (q, q), all samples of an instant
     """
 
     moments: FloatArray
@@ -117,11 +117,13 @@ class Sensing(Struct):
 
     rows, kind : (S,), number of rows; sensors of one kind have the same H and R
     H, root : (S, p, n) and the root of R (S, p, p)
-    noise : (R S steps, 2, p), run by run and sensor by sensor: what is left of the noise of each of
-        so many ``steps``, since a reading of a part of a step takes its share of the noise away
-    cuts : streams (R S, 4) of normals for parts of a step
+    noise, steps : (R S steps, 2, p), run by run and sensor by sensor, the moments of the noise of
+                   each of ``steps`` steps as far as it is not read yet: a reading of a part of a
+                   step takes its share of the noise away
+    cuts : (R S, 4), streams of normals that divide the noise of a step
     height, width, inside : numpy's ziggurat table for these
-    index, node : (K,), index and id of the nodes that wake at a grid point, in order
+    index, node : (K,), index and id of the nodes with increment sensors, which read at each point
+                  of the grid, in order
     """
 
     rows: IntArray
@@ -162,14 +164,20 @@ class Instants(Struct):
 
 
 class PathBlock(Struct):
-    """Some steps of the sensing grid of R runs, the last of which ends at ``end``.
+    """Some steps of the sensing grid of R runs, cut into K pieces where a state is sampled.
 
-    K pieces (a step is cut where a state is sampled or shown): start, stop (K,), x at both
-    (R, K, n), moments (R, K, 2, n), cubic (R, K, 4, n), whose step (K,) it is and where that ends
-    (K,); ``grid`` holds the times at which sensors wake; ``table`` is the
-    course_table of the plant's laws. The ``course`` (G, C, D, W) of x in some pieces: those that
-    are ``known`` (G, C), each at the remainder of its number, of the G runs that are simulated
-    together. Where nothing senses increments there is one piece without an end.
+    end : end of the last step, seconds
+    start, stop : (K,), times at which pieces begin and end
+    x_start, x_stop, moments, cubic : (R, K, n), (R, K, n), (R, K, 2, n) and (R, K, 4, n), the state
+                                      at both ends, its moments, and a cubic of the path
+    step, last : (K,), number of the step that a piece belongs to, and the time at which that ends
+    grid : times at which increment sensors are read
+    table : ``course_table`` of the plant's laws
+    course, known : (G, C, D, W) and (G, C), a cache for the G runs that are simulated together: the
+                    polynomials of x in C pieces, and the numbers of these; piece k is in entry k
+                    modulo C
+
+    If nothing senses increments there is one piece, which ends at infinity.
     """
 
     end: float
@@ -188,27 +196,27 @@ class PathBlock(Struct):
 
 
 class TickArrays(Struct):
-    """The ticks of a ``schedule.Window``, or those of several runs one after the other; where no
-    message takes time, which of them arrive: a bit for each outcome (``heard``, (K,)).
+    """The ticks of a ``schedule.Window``, or those of several runs one after the other. If no
+    message takes time, ``arrival_bits`` (K,) has a bit for each message of a tick that arrives.
     """
 
     end: float
     t: FloatArray
     entity: IntArray
-    at: IntArray
+    first_outcome: IntArray
     delay: FloatArray
-    heard: IntArray
+    arrival_bits: IntArray
 
 
 class SampleBuffer(Struct):
     """Space for B samples of all N nodes in R runs.
 
-    They are handed on many at a time, since a call of the loop costs more than a sample.
+    Python takes many at a time, since a call of the loop costs more than a sample.
 
     xhat, P : (R, B, N, n) and (R, B, N, n, n)
     rows, counts : rows (R, B) of events, or events by kind (R, B, len(KINDS)), before each sample
     piece : piece (R, B) of the path that each sample is in
-    terms : (B, T), terms of conserved sums, of one run
+    terms : (B, T), terms of conserved sums, for one run
     """
 
     xhat: FloatArray
@@ -224,31 +232,35 @@ class Simulation(Struct):
 
     Filters
 
-    size, nodes : n as a type, and NODE records (N,)
+    size, nodes : n as a type (linalg.structs), and NODE records (N,)
     xhat, root : (G N, n) and (G N, n, n)
     now : time (G N,) in seconds that each estimate refers to
     table, gains : tables of all models, the last without sensors, for messages under way
-    kind, at, keep_own : the filter's combination (COMBINATIONS), its clocks (CLOCKS), its
-                         ``on_loss``
+    combination_kind : the filter's combination, an index in COMBINATIONS
+    clock_kind : kind of its clocks, an index in CLOCKS
+    keep_own : 1 if its ``on_loss`` is "keep-own"
 
     Links and messages
 
-    entities, hearing, directions : ENTITY records (E,), their directed links, WAY records (W,)
-    pool, pool_x, pool_root : MESSAGE records (C,) and what they carry, (C, n) and (C, n, n)
-    free, free_count, most_messages : first free message, number of free ones and of those that one
-                                      event may need
-    heap, flying, order : heap (C,) of arrivals, messages on it, and messages ever put there
-    waiting, receivers, absorbing, inbox_time : nodes (N,) with messages, their number, how many of
-                                               them are done, and the instant
-    age_limit : messages older than so many seconds are late
+    entities, directions : ENTITY records (E,) and DIRECTED_LINK records (W,)
+    outgoing : indices of directed links, those of each entity together
+    pool, pool_x, pool_root : MESSAGE records (C,), and the estimates (C, n) and roots (C, n, n)
+                              that they carry
+    first_free, free_count : first free message of the pool, and number of free ones
+    most_messages : largest number of messages that one event may send
+    heap, in_flight, order : heap (C,) of messages under way, number of these, and of all that were
+                             ever put there
+    waiting, receivers : nodes (N,) with messages in their inbox, and number of these
+    absorbing, inbox_time : how many of them have absorbed, and the instant (seconds)
+    age_limit : messages older than this, in seconds, are late
 
     Events to come; ``..._at`` is the index of the next one
 
     instants, instant_at : samples of nodes
-    sensing, grid_at, wake_at : increment sensors, point of the sensing grid, node that wakes there
+    sensing, grid_at, wake_at : increment sensors, point of the sensing grid, node that reads there
     path, piece : path of the plant, and its present piece
-    ticks, tick_at, ticks_stop, delays : ticks, where those of this run end, and where their
-                                         outcomes begin
+    ticks, tick_at, ticks_stop, first_delay : ticks, where those of this run end, and where their
+                                              outcomes begin
     frames, frame_at : times (F,) at which frames begin
     probes, probe_at : times (T,) of samples
     run, first_run : number of the present run, and of the first one
@@ -256,10 +268,10 @@ class Simulation(Struct):
 
     Results
 
-    buffer, samples : space for samples, and samples that are not handed on yet
-    traced, rows, row, most_rows : whether rows of events are written, the rows, the next one, and
-                                   how many one event may need
-    counts : events by kind (len(KINDS),)
+    buffer, samples : space for samples, and number of samples in it
+    traced, rows, row : whether rows of events are written, the rows, and the next one
+    most_rows : largest number of rows that one event may need
+    counts : number of events of each kind (len(KINDS),)
 
     Scratch
 
@@ -274,7 +286,7 @@ class Simulation(Struct):
     table: FlowTable
     gains: Gains
     entities: np.ndarray
-    hearing: IntArray
+    outgoing: IntArray
     directions: np.ndarray
     pool: np.ndarray
     pool_x: FloatArray
@@ -293,14 +305,14 @@ class Simulation(Struct):
     scratch: Scratch
     flow_scratch: FlowScratch
     update_scratch: UpdateScratch
-    kind: int
-    at: int
+    combination_kind: int
+    clock_kind: int
     keep_own: int
     traced: int
     run: int
     first_run: int
     ticks_stop: int
-    delays: int
+    first_delay: int
     frame_at: int
     piece: int
     grid_at: int
@@ -311,9 +323,9 @@ class Simulation(Struct):
     row: int
     most_rows: int
     most_messages: int
-    free: int
+    first_free: int
     free_count: int
-    flying: int
+    in_flight: int
     order: int
     receivers: int
     absorbing: int
@@ -335,7 +347,7 @@ class Filters(NamedTuple):
 
 @once_per_scenario
 def filters_at_start(scenario: Scenario) -> Filters:
-    """Return the filters at time 0; if they are pooled, one stands for all."""
+    """Return the filters at time 0, or the one that reads all sensors if they are pooled."""
     # A pooled filter is one node with the id -1 and the sensors of all.
     ids, pooled = scenario.nodes, scenario.hosted.pooled
     models = (scenario.pooled_model,) if pooled else scenario.models
@@ -365,8 +377,8 @@ def _stack_model_tables(models: list[FlowModel]) -> tuple[FlowTable, Gains]:
     """Return the stacked flow tables and gains of some models with equal n."""
     n = len(models[0].A)
     # A model without sensors has no gains; its entry keeps the numbering.
-    nothing = GainTable(n, 0, np.zeros((0, 1)))
-    gains = [model.gains if len(model.H) else nothing for model in models]
+    no_gains = GainTable(n, 0, np.zeros((0, 1)))
+    gains = [model.gains if len(model.H) else no_gains for model in models]
     terms, width = np.max([gain.series.shape for gain in gains], axis=0)
     # The padding is never read: the last reach of a table is infinite.
     series, reach = np.zeros((len(gains), terms, width - 1)), np.zeros((len(gains), terms, 1))
@@ -382,7 +394,7 @@ def _stack_model_tables(models: list[FlowModel]) -> tuple[FlowTable, Gains]:
 
 @once_per_scenario
 def entity_records(scenario: Scenario) -> tuple[np.ndarray, np.ndarray]:
-    """Return the ENTITY and WAY records of a run that has not begun."""
+    """Return the ENTITY and DIRECTED_LINK records of a run that has not begun."""
     senders, index = senders_of(scenario), scenario.topology.index
     entities = np.zeros(len(senders.entities), dtype=ENTITY)
     # (i, j) of a link or direction, (i, -1) of a node.
@@ -393,7 +405,7 @@ def entity_records(scenario: Scenario) -> tuple[np.ndarray, np.ndarray]:
     if senders.at != "links":
         entities["other"][:] = [index[e[1]] if len(e) > 1 else -1 for e in senders.entities]
     entities["first"], entities["after"] = senders.first[:-1], senders.first[1:]
-    directions = np.zeros(len(senders.directions), dtype=WAY)
+    directions = np.zeros(len(senders.directions), dtype=DIRECTED_LINK)
     directions["sender"] = [index[i] for i, _ in senders.directions]
     directions["receiver"] = [index[j] for _, j in senders.directions]
     directions["weight"] = [scenario.weight(j, i) for i, j in senders.directions]
@@ -404,16 +416,16 @@ def scratch_arrays(
     table: FlowTable, gains: Gains, instants: Instants, unrolled: bool
 ) -> tuple[Scratch, FlowScratch, UpdateScratch]:
     """Return scratch arrays for all computations; ``unrolled`` ones have types that know n."""
-    n, most, width = table.levels.shape[3], int(gains.moments.max()), gains.series.shape[2]
+    n, max_moments, width = table.levels.shape[3], int(gains.moments.max()), gains.series.shape[2]
     # Rows of the reading of each sample, then the largest sum over one instant.
     rows = np.concatenate([instants.rows, [0]])[instants.sensor]
     totals = np.concatenate([[0], np.cumsum(rows)])[instants.first]
     q = max(1, int(np.diff(totals).max(initial=0)))
     scratch = Scratch(
-        moments=np.zeros(most),
-        # moments come in pairs: two for each row.
-        early=np.zeros((2, most // 2)),
-        cut=np.zeros((2, most // 2)),
+        moments=np.zeros(max_moments),
+        # Two moments for each row.
+        early=np.zeros((2, max_moments // 2)),
+        cut=np.zeros((2, max_moments // 2)),
         state_moments=np.zeros((2, n)),
         total=np.zeros((2, n)),
         # fill_state_moments() needs two rows of a course.
@@ -432,15 +444,15 @@ def empty_pool(capacity: int, n: int) -> tuple[np.ndarray, FloatArray, FloatArra
     return pool, np.zeros((capacity, n)), np.zeros((capacity, n, n)), np.zeros(capacity, np.int64)
 
 
-def add_messages(state: Simulation, least: int) -> None:
-    """Double the pool of messages at least, by ``least`` or more."""
+def add_messages(state: Simulation, at_least: int) -> None:
+    """Enlarge the pool of messages: double it, or add ``at_least`` messages if these are more."""
     # Doubling keeps the cost of copies proportional to the messages.
     old, n = len(state.pool), state.xhat.shape[1]
-    more = max(old, least)
-    fresh = empty_pool(more, n)
-    fresh[0]["next"] = np.arange(old + 1, old + more + 1)
+    added = max(old, at_least)
+    new_pool = empty_pool(added, n)
+    new_pool[0]["next"] = np.arange(old + 1, old + added + 1)
     # The new messages come first in the list of free ones.
-    fresh[0]["next"][-1], state.free = state.free, old
-    state.free_count += more
-    for name, part in zip(("pool", "pool_x", "pool_root", "heap"), fresh, strict=True):
-        setattr(state, name, np.concatenate([getattr(state, name), part]))
+    new_pool[0]["next"][-1], state.first_free = state.first_free, old
+    state.free_count += added
+    for name, new_part in zip(("pool", "pool_x", "pool_root", "heap"), new_pool, strict=True):
+        setattr(state, name, np.concatenate([getattr(state, name), new_part]))

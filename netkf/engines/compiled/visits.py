@@ -43,7 +43,7 @@ from netkf.engines.compiled.lane_readings import (
 from netkf.engines.compiled.lane_series import (
     NEAR,
     LaneSeries,
-    most_moments,
+    max_moments,
 )
 from netkf.engines.compiled.state import Filters, Simulation
 from netkf.linalg.arrays import FloatArray, IntArray
@@ -158,7 +158,7 @@ def empty_visits(
     # Networks have few distinct weights: lanes look them up in a table, roots included.
     distinct, weight_row = np.unique(weights, return_inverse=True)
     own, table = np.maximum(0.0, 1.0 - distinct), filters.table
-    (unobserved, sensing), q = series, most_moments(filters)
+    (unobserved, sensing), q = series, max_moments(filters)
     shapes = {
         "gains": (3 * n * q, LANES),
         **dict.fromkeys(("x", "other_x", "moved"), (n, LANES)),
@@ -324,9 +324,9 @@ def queue_interval(
     visit ``v``.
     """
     # A node is on its way to one visit of a level only, so the ring has space for all.
-    interval = visits.intervals[ring_index(visits, visits.added)]
+    interval = visits.intervals[ring_index(visits, visits.after_intervals)]
     interval.place, interval.visit, interval.now, interval.least = place, v, now, least
-    visits.added += 1
+    visits.after_intervals += 1
     prefetch_path_and_noise(state, visits, v, place)
 
 
@@ -347,11 +347,11 @@ def prefetch_path_and_noise(state: Simulation, visits: Visits, v: int, place: in
 @kernel
 def process_intervals(state: Simulation, visits: Visits) -> None:
     """Predict all sensing nodes of a level up to their visits, and use their increments."""
-    while visits.begun < visits.added:
+    while visits.first_interval < visits.after_intervals:
         # What follows an interval is added while it is used.
-        count = min(LANES, visits.added - visits.begun)
+        count = min(LANES, visits.after_intervals - visits.first_interval)
         for q in range(count):
-            interval = visits.intervals[ring_index(visits, visits.begun + q)]
+            interval = visits.intervals[ring_index(visits, visits.first_interval + q)]
             visits.places[SENSING, q] = interval.place
         gather_states(state, visits.places[SENSING], count, visits.x, visits.S)
         fill_rates(state, visits, count)
@@ -367,7 +367,7 @@ def fill_rates(state: Simulation, visits: Visits, count: int) -> None:
     """
     size, readings = state.size, visits.readings
     for q in range(count):
-        interval = visits.intervals[ring_index(visits, visits.begun + q)]
+        interval = visits.intervals[ring_index(visits, visits.first_interval + q)]
         visit = visits.records[interval.visit]
         h = node_at(state, visit.run, interval.place)
         load_model(readings, q, state.nodes[h].model, state.table.whitened_H)
@@ -381,9 +381,12 @@ def begin_interval(state: Simulation, visits: Visits, q: int) -> None:
     """Take the next interval from the ring, whose node is in lane q: assign it the lane, or predict
     its node at once if P is too wide for one step.
     """
-    interval, readings = visits.intervals[ring_index(visits, visits.begun)], visits.readings
+    interval, readings = (
+        visits.intervals[ring_index(visits, visits.first_interval)],
+        visits.readings,
+    )
     place, now, v = interval.place, interval.now, interval.visit
-    visits.begun += 1
+    visits.first_interval += 1
     visit = visits.records[v]
     h = node_at(state, visit.run, place)
     m, time = state.nodes[h].model, visit.time
@@ -557,16 +560,16 @@ def combine_pairs(state: Simulation, visits: Visits, k: int, count: int) -> None
         heard_0 = assign_receiver(visits, 0, q, visit.to_first, visit.first) or heard_0
         heard_1 = assign_receiver(visits, 1, q, visit.to_second, visit.second) or heard_1
     for q in range(count, LANES):
-        visits.hearing[0, q] = visits.hearing[1, q] = NO_NODE
+        visits.receiver_places[0, q] = visits.receiver_places[1, q] = NO_NODE
     # Both are as they were before either hears the other.
     gather_states(state, places[0], count, visits.x, visits.S)
     gather_states(state, places[1], count, visits.other_x, visits.other_S)
     if heard_0:
         combine_lanes(state, visits, 0, visits.x, visits.S, visits.other_x, visits.other_S)
-        scatter_states(state, visits.hearing[0], visits.moved, visits.V)
+        scatter_states(state, visits.receiver_places[0], visits.moved, visits.V)
     if heard_1:
         combine_lanes(state, visits, 1, visits.other_x, visits.other_S, visits.x, visits.S)
-        scatter_states(state, visits.hearing[1], visits.moved, visits.V)
+        scatter_states(state, visits.receiver_places[1], visits.moved, visits.V)
 
 
 @kernel
@@ -575,13 +578,13 @@ def assign_receiver(visits: Visits, side: int, lane: int, direction: int, place:
     returns False if it hears nothing (NOT_HEARD).
     """
     if direction == NOT_HEARD:
-        visits.hearing[side, lane] = NO_NODE
+        visits.receiver_places[side, lane] = NO_NODE
         return False
-    visits.hearing[side, lane] = place
+    visits.receiver_places[side, lane] = place
     weight_row = visits.weight_row[direction]
     # Mostly all links have one weight, which the lane has from the visit before.
-    if visits.known[side, lane] != weight_row:
-        visits.known[side, lane] = weight_row
+    if visits.loaded_weights[side, lane] != weight_row:
+        visits.loaded_weights[side, lane] = weight_row
         for k in range(4):
             visits.in_lanes[4 * side + k, lane] = visits.weight_table[weight_row, k]
     return True
