@@ -1,8 +1,7 @@
-"""Events of runs whose messages take no time, before any filter moves: see ``visits``.
+"""The event loop for messages that take no time: it queues visits of filters, see ``visits``.
 
-The order of events, their rows and what stops the loop are those of ``event_loop``. Ticks are those
-of Poisson clocks, no two of which are at one time: all that is sent at a time is absorbed before
-anything else happens.
+The order of events, their rows and the requests are those of ``event_loop``. Clocks are Poisson, so
+that no two ticks are at one time: all messages of a tick are absorbed before the next event.
 """
 
 from __future__ import annotations
@@ -56,18 +55,18 @@ from netkf.network.clocks import Poisson
 from netkf.scenario.scenario import Scenario
 
 PAUSE, FULL = -1, -2
-"""Why the agenda stopped, beside WANT_...: the time it goes to, or no space for visits."""
+"""Why ``agenda`` stopped, besides WANT_...: it reached its time, or the queue of visits is full."""
 
 MAX_LINKS_OF_CLOCK = 62
-"""Directed links that one clock sends on, each of which is a bit."""
+"""Directed links that one clock may send on: each of them has an arrival bit."""
 
 MAX_FILTERS = 200
-"""Filters that are simulated together, unless one run has more."""
+"""Filters that are simulated together at most, unless one run has more."""
 
 _POSITIONS = (
     "tick_at",
     "ticks_stop",
-    "delays",
+    "first_delay",
     "piece",
     "grid_at",
     "wake_at",
@@ -75,12 +74,12 @@ _POSITIONS = (
     "samples",
 )
 PROGRESS = np.dtype([(name, np.int64) for name in _POSITIONS])
-"""Where one of several runs stands, see Simulation."""
+"""The position of a run that is interrupted, see Simulation."""
 
 
 def is_immediate(scenario: Scenario) -> bool:
-    """Return True if lanes can simulate a scenario: convex combinations of messages without delay,
-    Poisson clocks, and no samples.
+    """Return True if filters of a scenario can be simulated in lanes: convex combinations, messages
+    without delay, Poisson clocks, and no sensors that take samples.
     """
     hosted, network = scenario.hosted, scenario.network
     return (
@@ -95,18 +94,20 @@ def is_immediate(scenario: Scenario) -> bool:
 
 
 def together(nodes: int, runs: int) -> int:
-    """Return how many of several runs are simulated together."""
+    """Return how many of ``runs`` runs with ``nodes`` filters are simulated together."""
     return max(1, min(runs, MAX_FILTERS // nodes))
 
 
 def pause_of(state: Simulation, ticks: int, count: int) -> float:
-    """Return the seconds of simulated time after which ``count`` runs, of so many ``ticks`` each,
-    process their visits.
+    """Return the simulated time in seconds after which ``count`` runs with ``ticks`` ticks each
+    process their visits: as long as the queue of visits has space for.
     """
     nodes = len(state.nodes)
-    each = ticks + len(state.path.grid) * len(state.sensing.index) + nodes * len(state.probes)
-    # Some visits less than there is space for.
-    return state.horizon * 0.7 * MAX_VISITS / max(1.0, count * each)
+    visits_per_run = (
+        ticks + len(state.path.grid) * len(state.sensing.index) + nodes * len(state.probes)
+    )
+    # 30 % of the queue is a reserve, since visits are not evenly spread.
+    return state.horizon * 0.7 * MAX_VISITS / max(1.0, count * visits_per_run)
 
 
 def simulate_together(state: Simulation, visits: Visits, batch: BatchArrays, group: int) -> None:
@@ -117,12 +118,15 @@ def simulate_together(state: Simulation, visits: Visits, batch: BatchArrays, gro
 
 
 def advance_alone(state: Simulation, visits: Visits) -> int:
-    """Simulate one run until it needs something from Python; returns what (WANT_... or DONE)."""
+    """Simulate one run until it needs something from Python; return the request
+    (WANT_... or DONE).
+    """
     return int(simulate_agenda(state, visits.memory, no_batch().memory, _no_progress(), math.inf))
 
 
 @cache
 def _no_progress() -> np.ndarray:
+    """Return no positions, for a run that is simulated alone."""
     return np.zeros(0, dtype=PROGRESS)
 
 
@@ -134,16 +138,17 @@ def simulate_agenda(
     progress: np.ndarray,
     pause: float,
 ) -> int:
-    """Simulate a batch, as many runs together as there is ``progress`` for, which make their visits
-    every ``pause`` seconds; without any, one run until it needs something from Python.
+    """Simulate a batch, ``len(progress)`` runs together, which process their visits every ``pause``
+    seconds of simulated time. If ``progress`` is empty simulate one run until it needs something
+    from Python, and return the request.
     """
     visits = struct_at(visits_memory, Visits)
     if len(progress) == 0:
         if state.tick_at == 0:
             fill_arrival_bits(state, 0, state.ticks_stop, 0)
-        wanted = run_agenda(state, visits, NEVER)
+        request = run_agenda(state, visits, NEVER)
         process_visits(state, visits)
-        return wanted
+        return request
     batch = struct_at(batch_memory, BatchArrays)
     runs = len(batch.lengths)
     for run in range(0 if batch.has_bits else runs):
@@ -164,7 +169,7 @@ def simulate_group(
     first: int,
     pause: float,
 ) -> None:
-    """Simulate the runs from ``first`` on, one for each entry of ``progress``."""
+    """Simulate together the runs from ``first`` on, one for each entry of ``progress``."""
     state.first_run = first
     for k in range(len(progress)):
         reset_filters(state, batch, k * len(state.nodes))
@@ -187,22 +192,30 @@ def simulate_group(
 
 @kernel
 def suspend(state: Simulation, batch: BatchArrays, progress: np.ndarray, k: int) -> None:
-    """Store the position of a run, entry ``k`` of ``progress``."""
-    mine = progress[k]
-    mine.tick_at, mine.ticks_stop, mine.delays = state.tick_at, state.ticks_stop, state.first_delay
-    mine.piece, mine.grid_at, mine.wake_at = state.piece, state.grid_at, state.wake_at
-    mine.probe_at, mine.samples = state.probe_at, state.samples
+    """Store the position and counts of the present run in entry ``k`` of ``progress``."""
+    position = progress[k]
+    position.tick_at, position.ticks_stop, position.first_delay = (
+        state.tick_at,
+        state.ticks_stop,
+        state.first_delay,
+    )
+    position.piece, position.grid_at, position.wake_at = state.piece, state.grid_at, state.wake_at
+    position.probe_at, position.samples = state.probe_at, state.samples
     for kind in range(len(state.counts)):
         batch.counts[state.run, kind] = state.counts[kind]
 
 
 @kernel
 def resume(state: Simulation, batch: BatchArrays, progress: np.ndarray, k: int) -> None:
-    """Restore the position of a run."""
-    mine = progress[k]
-    state.tick_at, state.ticks_stop, state.first_delay = mine.tick_at, mine.ticks_stop, mine.delays
-    state.piece, state.grid_at, state.wake_at = mine.piece, mine.grid_at, mine.wake_at
-    state.probe_at, state.samples = mine.probe_at, mine.samples
+    """Restore the position and counts of the run in entry ``k`` of ``progress``."""
+    position = progress[k]
+    state.tick_at, state.ticks_stop, state.first_delay = (
+        position.tick_at,
+        position.ticks_stop,
+        position.first_delay,
+    )
+    state.piece, state.grid_at, state.wake_at = position.piece, position.grid_at, position.wake_at
+    state.probe_at, state.samples = position.probe_at, position.samples
     state.run = state.first_run + k
     for kind in range(len(state.counts)):
         state.counts[kind] = batch.counts[state.run, kind]
@@ -210,36 +223,39 @@ def resume(state: Simulation, batch: BatchArrays, progress: np.ndarray, k: int) 
 
 @kernel
 def run_agenda(state: Simulation, visits: Visits, until: float) -> int:
-    """Queue the visits of a run up to a time, and process them whenever the queue is full; returns
-    why it stopped (WANT_..., DONE or PAUSE).
+    """Go through the events of a run before ``until`` (seconds): queue visits, and process them
+    whenever the queue is full. Return why it stopped (WANT_..., DONE or PAUSE).
     """
-    wanted = FULL
-    # A batch has space for all of its samples: it stops behind the last one only.
-    while wanted == FULL or (wanted == WANT_SAMPLES and until < NEVER):
-        wanted = agenda(state, visits, until)
-        if wanted == FULL:
+    request = FULL
+    # A batch has space for all of its samples: WANT_SAMPLES comes after the last one and is
+    # ignored.
+    while request == FULL or (request == WANT_SAMPLES and until < NEVER):
+        request = agenda(state, visits, until)
+        if request == FULL:
             process_visits(state, visits)
-    return wanted
+    return request
 
 
 @kernel
 def agenda(state: Simulation, visits: Visits, until: float) -> int:
-    """Go through the events of a run before ``until`` and queue visits; returns why it stopped."""
+    """Go through the events of a run before ``until`` and queue visits; return why it stopped
+    (WANT_..., DONE, PAUSE or FULL).
+    """
     nodes = len(state.nodes)
-    first, most = (state.run - state.first_run) * nodes, nodes + 2 + state.most_messages
+    first, max_visits = (state.run - state.first_run) * nodes, nodes + 2 + state.most_messages
     while True:
         event, now = next_event(state)
-        wanted = find_shortage(state, None, event, now)
-        if wanted != GO_ON:
-            return wanted
+        request = find_shortage(state, None, event, now)
+        if request != GO_ON:
+            return request
         if now >= until:
             return PAUSE
-        if visits.count + most > len(visits.records):
+        if visits.count + max_visits > len(visits.records):
             return FULL
         while state.path.stop[state.piece] < now:
             state.piece += 1
         if event == ON_TICK:
-            queue_ticks(state, visits, first, min(until, next_but_ticks(state)))
+            queue_ticks(state, visits, first, min(until, end_of_ticks(state)))
         elif event == ON_SENSE:
             queue_visit(state, visits, now, first + state.sensing.index[state.wake_at])
             on_sense(state, now)
@@ -254,9 +270,9 @@ def agenda(state: Simulation, visits: Visits, until: float) -> int:
 
 
 @kernel
-def next_but_ticks(state: Simulation) -> float:
-    """Return the time of the next event that is not a tick, or the end of the piece of the path or
-    of the window of ticks, whichever comes first.
+def end_of_ticks(state: Simulation) -> float:
+    """Return the time up to which only ticks happen: that of the next other event, or the end of
+    the present piece of the path or of the window of ticks, whichever comes first.
     """
     path, ticks = state.path, state.ticks
     event = min(next_of(state.frames, state.frame_at), next_of(path.grid, state.grid_at))
@@ -266,28 +282,28 @@ def next_but_ticks(state: Simulation) -> float:
 
 @kernel
 def queue_ticks(state: Simulation, visits: Visits, first: int, until: float) -> None:
-    """Queue the visits of at least one tick, and of all ticks before ``until`` for which there is
-    space.
+    """Queue the visits of the next tick, and of all later ticks before ``until`` while the queue
+    has space.
     """
     ticks, space = state.ticks, len(visits.records) - 2 - state.most_messages
     queue_tick(state, visits, first, ticks.t[state.tick_at])
-    # Rows of a trace may need more space: they are looked at one tick at a time.
+    # A run with rows goes tick by tick, since each tick checks the space for its rows.
     while not state.traced and next_tick(state) < until and visits.count < space:
         queue_tick(state, visits, first, ticks.t[state.tick_at])
 
 
 @kernel
 def queue_tick(state: Simulation, visits: Visits, first: int, now: float) -> None:
-    """Queue the visits of the next tick, with all that is sent and absorbed at its time."""
+    """Queue the visits of the next tick; record or count its messages and their absorption."""
     ticks, nodes, k = state.ticks, state.nodes, state.tick_at
-    entity, heard = state.entities[ticks.entity[k]], ticks.arrival_bits[k]
+    entity, bits = state.entities[ticks.entity[k]], ticks.arrival_bits[k]
     state.tick_at += 1
     if state.traced:
-        record_tick(state, entity.sender, entity.other, entity.first, entity.after, heard, now)
+        record_tick(state, entity.sender, entity.other, entity.first, entity.after, bits, now)
     else:
-        count_tick(state, entity.after - entity.first, heard)
-    # The bits of messages that arrive: both nodes of a pair have to meet.
-    if heard != 0:
+        count_tick(state, entity.after - entity.first, bits)
+    # Some message arrives: its sender and receiver are predicted and combine.
+    if bits != 0:
         queue_pairs(state, visits, k, first, now)
         return
     # The sender of a message that is lost needs no prediction, unless it reads increments.
@@ -298,14 +314,14 @@ def queue_tick(state: Simulation, visits: Visits, first: int, now: float) -> Non
 
 
 @kernel
-def count_tick(state: Simulation, sent: int, heard: int) -> None:
-    """Count the events that ``record_tick`` records: ``sent`` messages, of which those in the bits
-    of ``heard`` arrive.
+def count_tick(state: Simulation, sent: int, bits: int) -> None:
+    """Count the events that ``record_tick`` records: ``sent`` messages, of which as many arrive as
+    ``bits`` has ones.
     """
-    # Clears the lowest bit in each turn.
+    # bits & (bits - 1) clears the lowest one.
     arrived = 0
-    while heard != 0:
-        arrived, heard = arrived + 1, heard & (heard - 1)
+    while bits != 0:
+        arrived, bits = arrived + 1, bits & (bits - 1)
     counts = state.counts
     counts[TICK] += 1
     counts[TRANSMIT] += state.clock_kind >= NODES
@@ -317,10 +333,11 @@ def count_tick(state: Simulation, sent: int, heard: int) -> None:
 
 @kernel
 def record_tick(
-    state: Simulation, i: int, j: int, begin: int, after: int, heard: int, now: float
+    state: Simulation, i: int, j: int, begin: int, after: int, bits: int, now: float
 ) -> None:
-    """Record a tick of node i (and j), its messages on the directed links ``hearing[begin:after]``,
-    which arrive where ``heard`` has a bit, and their absorption.
+    """Record a tick of node i (and j), its messages on the directed links
+    ``outgoing[begin:after]``, of which message m arrives if bit m of ``bits`` is 1, and their
+    absorption.
     """
     nodes, receivers = state.nodes, 0
     record_event(state, now, TICK, nodes[i].id, nodes[j].id if j >= 0 else -1, -1)
@@ -330,16 +347,16 @@ def record_tick(
         nodes[i].sent += 1
     for m in range(begin, after):
         direction = state.directions[state.outgoing[m]]
-        one, other = nodes[direction.sender].id, nodes[direction.receiver].id
+        sender_id, receiver_id = nodes[direction.sender].id, nodes[direction.receiver].id
         number = direction.messages
         direction.messages = number + 1
-        record_event(state, now, SEND, one, other, number)
-        if (heard >> (m - begin)) & 1:
-            record_event_with_age(state, now, DELIVER, other, one, number, 0.0)
+        record_event(state, now, SEND, sender_id, receiver_id, number)
+        if (bits >> (m - begin)) & 1:
+            record_event_with_age(state, now, DELIVER, receiver_id, sender_id, number, 0.0)
             state.waiting[receivers] = direction.receiver
             receivers += 1
         else:
-            record_event(state, now, LOST, one, other, number)
+            record_event(state, now, LOST, sender_id, receiver_id, number)
     sort_indices(state.waiting, receivers)
     for m in range(receivers):
         record_event_with_age(state, now, ABSORB, nodes[state.waiting[m]].id, -1, -1, 0.0)
@@ -347,45 +364,47 @@ def record_tick(
 
 @kernel
 def queue_pairs(state: Simulation, visits: Visits, k: int, first: int, now: float) -> None:
-    """Queue the visits of tick ``k``, of which something is heard: both ends of a link together,
-    otherwise the sender with each receiver.
+    """Queue the visits of tick ``k``, some messages of which arrive: one visit of both ends of a
+    link, or one of the sender with each receiver of a broadcast.
     """
-    heard, directions, hearing = state.ticks.arrival_bits[k], state.directions, state.outgoing
+    bits, directions, outgoing = state.ticks.arrival_bits[k], state.directions, state.outgoing
     entity = state.entities[state.ticks.entity[k]]
     sender, begin = first + entity.sender, entity.first
     if state.clock_kind == LINKS:
-        # Both ends are predicted, whoever hears.
+        # Both ends are predicted, whichever of them receives.
         other = first + entity.other
         level = max(visits.level[sender], visits.level[other]) + 1
         visits.level[sender] = visits.level[other] = level
         v = append_visit(state, visits, level, now, sender, other)
         for m in range(entity.after - begin):
-            if (heard >> m) & 1:
+            if (bits >> m) & 1:
                 set_receiving_link(
                     visits,
                     v,
-                    directions[hearing[begin + m]].receiver + first == sender,
-                    hearing[begin + m],
+                    directions[outgoing[begin + m]].receiver + first == sender,
+                    outgoing[begin + m],
                 )
         return
-    # A broadcast is heard by several: its level lies behind the visits of all who hear it.
+    # All visits of a broadcast are in one level, above those of the sender and all receivers.
     level = visits.level[sender]
     for m in range(entity.after - begin):
-        if (heard >> m) & 1:
-            level = max(level, visits.level[first + directions[hearing[begin + m]].receiver])
+        if (bits >> m) & 1:
+            level = max(level, visits.level[first + directions[outgoing[begin + m]].receiver])
     level += 1
     visits.level[sender] = level
     for m in range(entity.after - begin):
-        if (heard >> m) & 1:
-            receiver = first + directions[hearing[begin + m]].receiver
+        if (bits >> m) & 1:
+            receiver = first + directions[outgoing[begin + m]].receiver
             visits.level[receiver] = level
             v = append_visit(state, visits, level, now, sender, receiver)
-            set_receiving_link(visits, v, False, hearing[begin + m])
+            set_receiving_link(visits, v, False, outgoing[begin + m])
 
 
 @kernel
 def set_receiving_link(visits: Visits, v: int, first: bool, direction: int) -> None:
-    """Let the ``first`` node of visit ``v``, or the second, hear the other over a directed link."""
+    """Set the directed link over which the first node of visit ``v``, or the second
+    one, receives.
+    """
     if first:
         visits.records[v].to_first = direction
     else:
@@ -394,8 +413,8 @@ def set_receiving_link(visits: Visits, v: int, first: bool, direction: int) -> N
 
 @kernel
 def fill_arrival_bits(state: Simulation, first: int, after: int, delays: int) -> None:
-    """Write as bits which messages of the ticks ``first`` .. ``after`` - 1 arrive; their outcomes
-    begin at ``delays``.
+    """Write the arrival bits of the ticks ``first`` to ``after`` - 1: bit m is 1 if message m of a
+    tick arrives. The outcomes of their run begin at ``delays``.
     """
     ticks, entities = state.ticks, state.entities
     for k in range(first, after):

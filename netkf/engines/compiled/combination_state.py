@@ -1,8 +1,8 @@
-"""State of the combinations that need more than estimates and messages.
+"""Extra state of some combinations in the event loop, besides estimates and messages.
 
-Estimates fused one by one with the best weight (BEST, INVERSE), constant gains (GAINS), consensus
-on predictions (PREDICTIONS) and belief propagation (BELIEFS); other combinations have none, and
-nothing is compiled for them.
+These are fusion with the optimal weight (BEST, INVERSE), constant gains (GAINS), consensus on
+predictions (PREDICTIONS) and belief propagation (BELIEFS). For other combinations it is None, and
+none of this is compiled.
 """
 
 from __future__ import annotations
@@ -53,8 +53,8 @@ class CombinationState(Struct):
     Consensus on predictions:
 
     share, epsilon : whether readings are sent too; strength of the consensus term
-    prior, prior_root : predictions of this instant, (N, n) and (N, n, n)
-    prior_lanes : (1, N, n, n, 1) the same memory as ``prior_root``
+    prior, prior_root : predictions before any reading of this instant, (N, n) and (N, n, n)
+    prior_lanes : (1, N, n, n, 1), a view of ``prior_root``
     moved   : (N, n, 1) the consensus term
 
     Constant gains:
@@ -63,7 +63,7 @@ class CombinationState(Struct):
     closed, table, model, rate : closed loops A - L H (N, n, n), tabulated, the row (N,) of each
               node, and the rate in 1/s at which its error changes
     sampled, noise : (N, n, n) I - L H and a root of L R L' of sampled sensors
-    lanes   : (1, N, n, n, 1) the roots of the Simulation
+    lanes   : (1, N, n, n, 1), a view of the roots of the Simulation
 
     Scratch: ``pair`` (2 n + 2, n), ``x`` (1, n), ``root`` (1, n, n), ``maps`` (6, n, n), ``work``
     (2, n, n, 1), ``flow_scratch``. Belief propagation has its own ``evidence``.
@@ -127,15 +127,15 @@ def combination_state_of(scenario: Scenario, state: Simulation) -> CombinationSt
 
 
 def _make_gains(scenario: Scenario, state: Simulation) -> dict[str, Any]:
-    """Return the constant gains of all nodes, empty for filters of other combinations."""
+    """Return the fields of constant gains, empty for filters of other combinations."""
     N, n = state.xhat.shape
     algorithm: Any = scenario.hosted
-    given = [
+    node_gains = [
         algorithm.gain_of(k) if state.combination_kind == GAINS else np.zeros((n, 0))
         for k in range(N)
     ]
-    p = max(1, *(one.shape[1] for one in given))
-    found: dict[str, Any] = {
+    p = max(1, *(one.shape[1] for one in node_gains))
+    fields: dict[str, Any] = {
         "A": np.array(scenario.models[0].A),
         "L": np.zeros((N, n, p)),
         "H": np.zeros((N, p, n)),
@@ -148,12 +148,12 @@ def _make_gains(scenario: Scenario, state: Simulation) -> dict[str, Any]:
     tables: list[FlowTable] = []
     for k, (node, model) in enumerate(zip(scenario.nodes, scenario.models, strict=True)):
         rows = len(model.H)
-        found["L"][k, :, : given[k].shape[1]] = given[k]
+        fields["L"][k, :, : node_gains[k].shape[1]] = node_gains[k]
         if state.combination_kind == GAINS and rows:
-            loop = closed_loop(model, given[k])
-            found["H"][k, :rows], found["closed"][k] = model.H, loop.A
-            found["rate"][k] = gain_rate(given[k], model.H)
-            found["model"][k] = len(tables)
+            loop = closed_loop(model, node_gains[k])
+            fields["H"][k, :rows], fields["closed"][k] = model.H, loop.A
+            fields["rate"][k] = gain_rate(node_gains[k], model.H)
+            fields["model"][k] = len(tables)
             tables.append(loop.flow)
         elif state.combination_kind == GAINS and node in scenario.sampled_sensors:
             # A node that takes samples has one sensor.
@@ -162,14 +162,16 @@ def _make_gains(scenario: Scenario, state: Simulation) -> dict[str, Any]:
                 scenario.sensors[placed_sensor.entry].H,
                 scenario.noise(placed_sensor.entry, believed=True),
             )
-            found["sampled"][k], found["noise"][k] = sample_maps(given[k], H, R)
-    found["table"] = stack_tables(tables) if tables else state.table
-    return found
+            fields["sampled"][k], fields["noise"][k] = sample_maps(node_gains[k], H, R)
+    fields["table"] = stack_tables(tables) if tables else state.table
+    return fields
 
 
 @kernel
 def keep_prediction(state: Simulation, combination: CombinationState, h: int) -> None:
-    """Keep the prediction of node ``h``, before anything of this instant is used."""
+    """Store the prediction of node ``h`` as its prior, before any reading of this
+    instant is used.
+    """
     copy_state(state.size, combination.prior, combination.prior_root, h, state.xhat, state.root, h)
     # A reading of an earlier instant is not sent any more.
     state.nodes[h].reading = -1
@@ -179,8 +181,8 @@ def keep_prediction(state: Simulation, combination: CombinationState, h: int) ->
 def predict_with_gain(
     state: Simulation, combination: CombinationState, h: int, now: float, time: float
 ) -> None:
-    """Bring node ``h`` with increments to ``time`` by its constant gain, in intervals that the
-    gain can follow.
+    """Predict node ``h`` from ``now`` to ``time`` and use its increments by its constant gain, in
+    intervals short against the rate of the gain.
     """
     piece, m, longest = state.piece, combination.model[h], usable(combination.rate[h])
     least = MIN_GAP_SHARE * (time - now)
@@ -190,7 +192,7 @@ def predict_with_gain(
             end = interval_end(now, time, max(longest, least))
             least *= LONGER
         gap = end - now
-        # The mean moves as if nothing were read, and P by the closed loop, which counts that.
+        # The mean moves open loop, and P by the closed loop A - L H, which includes the readings.
         for i in range(combination.x.shape[1]):
             combination.x[0, i] = state.xhat[h, i]
             for j in range(combination.x.shape[1]):
@@ -218,11 +220,16 @@ def sample_with_gain(
     state: Simulation, combination: CombinationState, h: int, instant: int
 ) -> None:
     """Use the sample of node ``h`` by its constant gain."""
-    given = state.instants
-    s = given.first[instant]
-    p = given.rows[given.sensor[s]]
+    instants = state.instants
+    s = instants.first[instant]
+    p = instants.rows[instants.sensor[s]]
     correct_by_innovation(
-        state.xhat, h, given.H[given.matrix[s]], combination.L[h], given.y[s, :p], combination.x[0]
+        state.xhat,
+        h,
+        instants.H[instants.matrix[s]],
+        combination.L[h],
+        instants.y[s, :p],
+        combination.x[0],
     )
     # (I - L H) P (I - L H)' + L R L' has the form of a prediction.
     predict_root(
@@ -240,8 +247,8 @@ def sample_with_gain(
 
 @kernel
 def fuse_inbox(state: Simulation, combination: CombinationState, h: int) -> None:
-    """Fuse the estimate of node ``h`` with each that it heard, one after the other, with the best
-    weight.
+    """Fuse the estimate of node ``h`` with each one in its inbox, one after the other, with the
+    optimal weight.
     """
     m = state.nodes[h].inbox
     while m != -1:
@@ -254,7 +261,9 @@ def fuse_inbox(state: Simulation, combination: CombinationState, h: int) -> None
 
 @kernel
 def send_prediction(state: Simulation, combination: CombinationState, m: int, h: int) -> None:
-    """Put the prediction of node ``h`` into a message, and its reading of this instant."""
+    """Write the prior of node ``h`` into message ``m``, and the instant of its reading if readings
+    are shared.
+    """
     copy_state(
         state.size, state.pool_x, state.pool_root, m, combination.prior, combination.prior_root, h
     )
@@ -263,11 +272,11 @@ def send_prediction(state: Simulation, combination: CombinationState, m: int, h:
 
 @kernel
 def use_readings_heard(state: Simulation, h: int, now: float) -> None:
-    """Use the readings that node ``h`` hears without delay."""
+    """Update node ``h`` with the readings in its inbox that arrive without delay."""
     m = state.nodes[h].inbox
     while m != -1:
         message = state.pool[m]
-        # A late one belongs to another instant.
+        # A late reading belongs to another instant.
         if message.tag >= 0 and now - message.sent <= 0.0:
             use_instant(state, message.tag, state.root, state.xhat, h, 1.0)
         m = message.next
@@ -275,7 +284,9 @@ def use_readings_heard(state: Simulation, h: int, now: float) -> None:
 
 @kernel
 def add_consensus(state: Simulation, combination: CombinationState, h: int) -> None:
-    """Add the consensus term on predictions to the estimate of node ``h``."""
+    """Add the consensus term on predictions, ``gamma P sum_j (xbar_j - xbar)``, to the estimate of
+    node ``h``.
+    """
     n = state.xhat.shape[1]
     for i in range(n):
         total, m = 0.0, state.nodes[h].inbox

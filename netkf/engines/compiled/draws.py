@@ -1,5 +1,5 @@
-"""The paths and the noise of all sensors, drawn in blocks of steps of the sensing grid, for one run
-or for several together.
+"""The path of the plant and the noise of increment sensors, drawn in blocks of steps of the sensing
+grid, for one run or for several together.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ from netkf.rng.streams import ReplicaStreams, Streams
 from netkf.scenario.model import PlacedSensor
 from netkf.scenario.scenario import Scenario
 
-MAX_STEP_BLOCKS = 16  # of steps that are drawn at once
-MAX_NORMALS = 1 << 20  # of all sensors
+MAX_STEP_BLOCKS = 16  # blocks of steps that are drawn at once
+MAX_NORMALS = 1 << 20  # normals of all sensors that are drawn at once
 COURSES = 16
 """Pieces of a run whose courses are kept at a time, a power of two: nodes are at much the same
 time, and all of them would not fit the processor's cache.
@@ -41,9 +41,9 @@ def steps_to_the_end(scenario: Scenario) -> int:
     """Return the number of steps that reach the horizon."""
     period = scenario.truth.sensing_period
     assert period is not None
-    # A first guess from below, which the loop completes.
+    # A first guess from below; the loop counts the rest.
     steps = max(1, int(scenario.horizon / period) - 1)
-    # The test is the grid time itself, as the engine compares it.
+    # Compare grid times bit for bit, as the engine does.
     while grid_time(period, steps) < scenario.horizon:
         steps += 1
     return steps
@@ -51,8 +51,8 @@ def steps_to_the_end(scenario: Scenario) -> int:
 
 def increments(scenario: Scenario) -> list[tuple[int, PlacedSensor]]:
     """Return all increment sensors, each with its node, in the order of nodes."""
-    found = scenario.increment_sensors.items()
-    return [(node, sensor) for node, placed in found for sensor in placed]
+    by_node = scenario.increment_sensors.items()
+    return [(node, sensor) for node, placed in by_node for sensor in placed]
 
 
 def blocks_at_once(scenario: Scenario) -> int:
@@ -66,8 +66,8 @@ def blocks_at_once(scenario: Scenario) -> int:
 
 
 class Paths:
-    """The paths of some runs, as so many ``blocks`` of BLOCK steps at once; they are cut where a
-    state is ``sampled``.
+    """The paths of some runs, drawn ``blocks`` blocks of BLOCK steps at a time. Steps are cut into
+    pieces at times at which a state is ``sampled``.
     """
 
     def __init__(
@@ -78,8 +78,8 @@ class Paths:
         sampled: FloatArray = NO_TIMES,
     ) -> None:
         self._blocks = blocks
-        # One stream each for the path, for the states shown and for those sampled, so that none
-        # depends on how many numbers the others take.
+        # Separate streams for the path, for the states at probes and for those at samples, so that
+        # none depends on how many numbers the others take.
         plant, probe, samples = (
             StreamNormals(streams.seed_words(purpose, [()]))
             for purpose in ("plant", "probe", "samples")
@@ -165,8 +165,8 @@ def _sensor_fields(scenario: Scenario) -> tuple[dict[str, np.ndarray], list[tupl
         [len(roots[placed_sensor.entry]) for _, placed_sensor in placed], dtype=np.int64
     )
     # Sensors with fewer rows are padded to the most.
-    n, count, most = scenario.plant.n, len(placed), int(rows.max(initial=0))
-    H, root = np.zeros((count, most, n)), np.zeros((count, most, most))
+    n, count, max_rows = scenario.plant.n, len(placed), int(rows.max(initial=0))
+    H, root = np.zeros((count, max_rows, n)), np.zeros((count, max_rows, max_rows))
     for k, (_, placed_sensor) in enumerate(placed):
         p = rows[k]
         H[k, :p], root[k, :p, :p] = (

@@ -1,4 +1,6 @@
-"""The compiled engine: schedules made beforehand, and compiled loops that carry the states."""
+"""The compiled engine: schedules drawn before a run, and compiled loops that simulate
+the filters.
+"""
 
 from __future__ import annotations
 
@@ -36,7 +38,7 @@ from netkf.scenario.scenario import Scenario
 from netkf.trace.batch import RunBatch
 from netkf.trace.recorder import Recorder
 
-KNOWN = (
+BUILT_IN_PARTS = (
     *(Diffusion, RecordedDiffusion, UnknownDiffusion),
     *(LinearPlant, RecordedPlant, UnknownPlant),
     *(LinearSensor, RegressorSensor, RecordedSensor),
@@ -45,8 +47,8 @@ KNOWN = (
 
 @dataclass(frozen=True)
 class CompiledEngine(Engine):
-    """Runs all built-in plants, sensors and filters; clocks and channels may be anybody's, since
-    schedules are made in Python.
+    """Runs all built-in plants, sensors and filters; clocks and channels may be a user's own, since
+    schedules are drawn in Python.
     """
 
     name = "compiled"
@@ -57,10 +59,10 @@ class CompiledEngine(Engine):
         parts: list[tuple[str, Component]] = [("plant", scenario.plant)]
         parts += [("sensor", sensor) for sensor in scenario.sensors]
         parts += [("filter", scenario.filter.algorithm)]
-        known = {*KNOWN, *built_in_filters().values()}
+        compiled = {*BUILT_IN_PARTS, *built_in_filters().values()}
         for family, part in parts:
             # ``type`` and not ``isinstance``: kernels do not know what a derived class changes.
-            if type(part) not in known:
+            if type(part) not in compiled:
                 return (
                     f'engine "compiled" cannot run the {family} {name_of(family, part)!r}; {remedy}'
                 )
@@ -72,7 +74,7 @@ class CompiledEngine(Engine):
         return None
 
     def announce(self, scenario: Scenario) -> None:
-        """Say on stderr that code is compiled, unless it is kept from an earlier run."""
+        """Say on stderr that code is compiled, unless it is cached from an earlier run."""
         # Slots and continuous time are compiled separately.
         if scenario.slotted:
             compiling.announce(scenario.hosted.slot_kernel)
@@ -90,8 +92,8 @@ class CompiledEngine(Engine):
             return FlowRun(scenario, workspace, draws, recorder, progress).to_the_end()
 
     def together(self, scenario: Scenario) -> int:
-        """Return the number of runs that together take about as long as one, since they run side by
-        side.
+        """Return the number of runs that are worth simulating together: they take little longer
+        than one.
         """
         if not scenario.slotted:
             return quick_runs(scenario)
@@ -103,7 +105,7 @@ class CompiledEngine(Engine):
         """Yield the runs of consecutive replicas in order."""
         alone = partial(super().run_many, scenario, seed)
         if not scenario.slotted:
-            # Batches make no rows of events.
+            # Batches write no rows of events, which a fingerprint needs.
             first = replicas[: int(fingerprint)]
             yield from alone(first, fingerprint)
             yield from flow_batches(scenario, seed, replicas[len(first) :])
@@ -111,6 +113,6 @@ class CompiledEngine(Engine):
         elif not slot_setup(scenario).is_drawn:
             yield from alone(replicas, fingerprint)
         else:
-            # A run that diverges has to be repeated alone: batches carry it to the end.
+            # A run that diverges is repeated alone, since a batch goes on to the end.
             for batch in slot_batches(scenario, seed, replicas, fingerprint):
                 yield with_ends(batch, alone)

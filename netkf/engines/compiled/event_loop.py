@@ -1,9 +1,9 @@
-"""The event loop: what happens in one run, event after event, compiled.
+"""The compiled event loop of one run in continuous time.
 
 ``event_loop`` finds the next event, predicts the nodes that take part in it, and calls its handler;
-the order is (time, rank, entity) as ``engines.base`` says. It stops and says why where Python has
-something to do: draw more, pass rows on, show samples, move the origin. All state is in one struct,
-so that it goes on where it stopped.
+events are ordered by (time, rank, entity) as in ``engines.base``. It returns a request when Python
+has something to do: draw more random numbers, record rows or samples, enlarge a buffer, move the
+origin. All state is in one struct, so that the next call goes on where it stopped.
 """
 
 from __future__ import annotations
@@ -70,11 +70,12 @@ SENSE, TICK, SEND, DELIVER, LOST, LATE, ABSORB, TRANSMIT = (
 )
 (GO_ON, WANT_TICKS, WANT_STEPS, WANT_MESSAGES, WANT_ROWS, WANT_SAMPLES, WANT_REBASE,
  WANT_PAST, DONE) = range(9)  # fmt: skip
-"""Why the loop stopped: it needs the next window of ticks, the next steps of the path, a larger
-pool of messages, space for rows, for samples; the origin moves; a longer history.
+"""Requests of the loop to Python: the next window of ticks, the next steps of the path, a larger
+pool of messages, space for rows, for samples; a move of the origin; a longer history; DONE: the run
+has reached the horizon. GO_ON: no request.
 """
 ON_REBASE, ON_SENSE, ON_SAMPLE, ON_TICK, ON_DELIVER, ON_ABSORB, ON_PROBE = range(7)
-"""Events, in the order in which those of one instant happen."""
+"""Kinds of events, in the order in which those of one instant happen."""
 NEVER = math.inf
 
 
@@ -85,14 +86,16 @@ def event_loop(
     history: History | None,
     combination: CombinationState | None,
 ) -> int:
-    """Simulate until the loop needs something from Python, and return what (WANT_... or DONE)."""
+    """Simulate until the loop needs something from Python; return the request (WANT_...
+    or DONE).
+    """
     while True:
-        # Nothing changes before the loop knows that the event has all that it needs: it may stop
-        # here and find the same event again.
+        # Check first that the event has everything it needs: if not, nothing has changed, and the
+        # next call finds the same event again.
         event, now = next_event(state)
-        wanted = find_shortage(state, history, event, now)
-        if wanted != GO_ON:
-            return wanted
+        request = find_shortage(state, history, event, now)
+        if request != GO_ON:
+            return request
         # The piece of the path that the event lies in; events come in the order of time.
         while state.path.stop[state.piece] < now:
             state.piece += 1
@@ -101,9 +104,9 @@ def event_loop(
         predict_participants(state, combination, event, lost, now)
         if event == ON_TICK:
             on_tick(state, totals, combination, now)
-            # The next events, unless there are others at this instant.
-            alone = totals is None and history is None and ends_instant(state, now)
-            if alone:
+            # Absorptions come next, unless there are other events at this instant.
+            ends = totals is None and history is None and ends_instant(state, now)
+            if ends:
                 absorb_messages(state, totals, history, combination, now)
         elif event == ON_ABSORB:
             on_absorb(state, totals, history, combination, now)
@@ -114,34 +117,36 @@ def event_loop(
         elif event == ON_DELIVER:
             on_deliver(state, now)
         elif event == ON_REBASE:
-            # Python moves the origin and steps over the frame.
+            # Python moves the origin and goes to the next frame.
             return WANT_REBASE
-        # No space for another sample: this one has been kept, and the loop goes on behind it.
+        # The sample is stored, but there is no space for another one.
         elif not on_probe(state, totals):
             return WANT_SAMPLES
 
 
 @kernel
 def find_shortage(state: Simulation, history: History | None, event: int, now: float) -> int:
-    """Return what Python has to provide before an event can happen (WANT_..., DONE), or GO_ON."""
-    # Worst cases of one event, so that no handler has to stop half-way.
-    wanted = GO_ON
+    """Return the request for what an event at ``now`` needs and lacks (WANT_..., DONE),
+    or GO_ON.
+    """
+    # Space for the worst case of one event, so that no handler has to stop half-way.
+    request = GO_ON
     if state.traced and state.row + state.most_rows > len(state.rows):
-        wanted = WANT_ROWS
+        request = WANT_ROWS
     elif state.free_count < state.most_messages:
-        wanted = WANT_MESSAGES
-    # At or after the end of the window a tick may come first that is not drawn yet.
+        request = WANT_MESSAGES
+    # From the end of the window on, a tick that is not drawn yet may come first.
     elif now >= state.ticks.end and state.ticks.end < NEVER:
-        wanted = WANT_TICKS
+        request = WANT_TICKS
     # Events after the last step need more of the path, unless it reaches the horizon.
     elif now > state.path.end and state.path.end < state.horizon:
-        wanted = WANT_STEPS
+        request = WANT_STEPS
     elif now == NEVER:
-        wanted = DONE
-    # The pool of the past is as finite as that of messages.
-    elif history is not None and history.free[1] < readings_at_once(state, event):
-        wanted = WANT_PAST
-    return wanted
+        request = DONE
+    # Each reading that is used needs an entry of the history.
+    elif history is not None and history.free[1] < max_readings(state, event):
+        request = WANT_PAST
+    return request
 
 
 @kernel
@@ -162,7 +167,7 @@ def next_event(state: Simulation) -> tuple[int, float]:
     deliver = state.pool[state.heap[0]].arrival if state.in_flight > 0 else NEVER
     if deliver < now:
         event, now = ON_DELIVER, deliver
-    # Mail is absorbed at the instant it arrived, after all arrivals of that instant.
+    # Messages are absorbed at the instant of their arrival, after all arrivals of that instant.
     absorb = state.inbox_time if state.receivers > 0 else NEVER
     if absorb < now:
         event, now = ON_ABSORB, absorb
@@ -188,7 +193,9 @@ def next_of(times: FloatArray, k: int) -> float:
 def predict_participants(
     state: Simulation, combination: CombinationState | None, event: int, lost: bool, now: float
 ) -> None:
-    """Predict the nodes that take part in an event; ``lost``: all messages of the tick are lost."""
+    """Predict the nodes that take part in an event to ``now``; ``lost``: all messages of the tick
+    are lost.
+    """
     for k in range(count_participants(state, event)):
         h = participant(state, event, k)
         # The sender of a message that is lost needs no prediction, unless it reads increments.
@@ -203,18 +210,18 @@ def count_participants(state: Simulation, event: int) -> int:
     # Samples and moves of the origin concern the states of all nodes at one time.
     if event in (ON_REBASE, ON_PROBE):
         count = len(state.nodes)
-    # A message goes into an inbox: its receiver is predicted when it absorbs.
+    # A delivery changes an inbox only: the receiver is predicted when it absorbs.
     elif event == ON_DELIVER:
         count = 0
     elif event == ON_TICK and state.clock_kind == LINKS:
-        count = 2  # both ends of a link decide what they send before either hears the other
+        # Both ends of a link.
+        count = 2
     return count
 
 
 @kernel
 def participant(state: Simulation, event: int, k: int) -> int:
     """Return the index of the k-th participant of an event."""
-    # Ends of a link are predicted one after the other; only then the tick happens.
     if event == ON_TICK:
         entity = state.entities[state.ticks.entity[state.tick_at]]
         return int(entity.sender if k == 0 else entity.other)
@@ -232,8 +239,8 @@ def participant(state: Simulation, event: int, k: int) -> int:
 
 
 @kernel
-def readings_at_once(state: Simulation, event: int) -> int:
-    """Largest number of readings that an event uses."""
+def max_readings(state: Simulation, event: int) -> int:
+    """Return the largest number of readings that an event uses."""
     if event == ON_SAMPLE:
         return 1
     count = 0
@@ -249,7 +256,7 @@ def readings_at_once(state: Simulation, event: int) -> int:
 def record_event(
     state: Simulation, t: float, kind: int, node: int, peer: int, message: int
 ) -> None:
-    """Record an event without an age."""
+    """Record an event without an age, see ``record_event_with_age``."""
     record_event_with_age(state, t, kind, node, peer, message, np.nan)
 
 
@@ -257,9 +264,8 @@ def record_event(
 def record_event_with_age(
     state: Simulation, t: float, kind: int, node: int, peer: int, message: int, age: float
 ) -> None:
-    """Write one row of the trace, or count the event in a batch."""
+    """Write one event as a row, or only count it if rows are not ``traced``."""
     if not state.traced:
-        # A batch keeps counts only: no row is written.
         state.counts[kind] += 1
         return
     row = state.rows[state.row]
@@ -271,13 +277,15 @@ def record_event_with_age(
 
 @kernel
 def predict(state: Simulation, combination: CombinationState | None, h: int, time: float) -> None:
-    """Predict node ``h`` to ``time``, unless it is there already."""
+    """Predict node ``h`` to ``time`` (seconds), using its increments, unless it is
+    there already.
+    """
     node, now = state.nodes[h], state.now[h]
-    # ``not <`` also stops at a time that is not a number.
+    # ``not <`` also returns for a time that is nan.
     if not now < time:
         return
     state.now[h] = time
-    # With increment sensors the gap is cut into intervals.
+    # With increment sensors the gap is divided into measurement intervals.
     if combination is not None and combination.kind == GAINS and node.sensors > node.sensor:
         predict_with_gain(state, combination, h, now, time)
     elif node.sensors > node.sensor:
@@ -312,14 +320,15 @@ def on_sample(
     combination: CombinationState | None,
     now: float,
 ) -> None:
-    """Update a node with all its samples of an instant."""
-    given, instant = state.instants, state.instant_at
-    h, sensed = given.index[instant], -1
-    for s in range(given.first[instant], given.first[instant + 1]):
-        if given.node[s] != sensed:  # of a pooled filter several nodes, in order
-            sensed = given.node[s]
-            record_event(state, now, SENSE, sensed, -1, -1)
-    # Running sums weigh the reading, and late readings keep it in the past.
+    """Update a node with all its samples of the next instant."""
+    instants, instant = state.instants, state.instant_at
+    h, last_node = instants.index[instant], -1
+    for s in range(instants.first[instant], instants.first[instant + 1]):
+        # A pooled filter reads several nodes at an instant: one row for each.
+        if instants.node[s] != last_node:
+            last_node = instants.node[s]
+            record_event(state, now, SENSE, last_node, -1, -1)
+    # Running sums weight the reading, and filters of readings remember it.
     if totals is not None:
         add_reading(state, totals, h, instant)
     elif history is not None:
@@ -330,7 +339,7 @@ def on_sample(
         add_samples(state, combination.evidence, h, instant)
     else:
         use_instant(state, instant, state.root, state.xhat, h, 1.0)
-    # The newest sample: what a filter of readings sends after this event.
+    # The newest sample, which a filter of readings sends after this event.
     state.nodes[h].reading = instant
     state.instant_at += 1
 
@@ -339,16 +348,17 @@ def on_sample(
 def on_tick(
     state: Simulation, totals: Totals | None, combination: CombinationState | None, now: float
 ) -> None:
-    """Handle a tick of a clock, or a transmission after a sample: send to each receiver."""
+    """Handle a tick of a clock, or a transmission after a sample: send on all its
+    directed links.
+    """
     ticks, nodes, k = state.ticks, state.nodes, state.tick_at
-    # The record lists directed links, so that one tick may send on several.
     entity = state.entities[ticks.entity[k]]
     i, j = entity.sender, entity.other
     # A transmission after a sample has no tick of its own.
     if state.clock_kind != AFTER_READINGS:
         record_event(state, now, TICK, nodes[i].id, nodes[j].id if j >= 0 else -1, -1)
     state.tick_at += 1
-    # A node whose masses nobody hears does not transmit.
+    # A node without receivers does not transmit.
     if totals is not None and not offer_round(state, totals, i, now):
         return
     # A node's clock makes one transmission, which each receiver hears or loses.
@@ -370,16 +380,16 @@ def send(
     delay: float,
     now: float,
 ) -> None:
-    """Send one message on a directed link; ``delay`` is LOST or nan where it is lost."""
+    """Send one message on directed link ``w``; ``delay`` (seconds) is LOST or nan if it is lost."""
     direction, pool = state.directions[w], state.pool
     number, h = direction.messages, direction.sender
-    # The number is taken even if the message is lost: recorded losses name messages by it.
+    # A lost message has a number too: recorded losses refer to it.
     direction.messages += 1
-    one, other = state.nodes[h].id, state.nodes[direction.receiver].id
-    record_event(state, now, SEND, one, other, number)
+    sender_id, receiver_id = state.nodes[h].id, state.nodes[direction.receiver].id
+    record_event(state, now, SEND, sender_id, receiver_id, number)
     # ``not >=`` catches both LOST, which is negative, and nan.
     if not delay >= 0.0:
-        record_event(state, now, LOST, one, other, number)
+        record_event(state, now, LOST, sender_id, receiver_id, number)
         return
     # The horizon is half open: a message that arrives after it leaves no event.
     if delay > 0.0 and not now + delay < state.horizon:
@@ -399,12 +409,12 @@ def send(
     elif state.combination_kind == READINGS:
         message.tag = state.nodes[h].reading
     else:
-        # A copy: the sender goes on while the message is on its way.
+        # A copy: the sender's estimate changes while the message is under way.
         copy_state(state.size, state.pool_x, state.pool_root, m, state.xhat, state.root, h)
     if delay == 0.0:
         arrive(state, m, now)
         return
-    # ``order`` breaks ties between messages of one link that arrive at one time.
+    # ``order`` breaks ties between messages of one link that arrive at the same time.
     message.arrival, message.order = now + delay, state.order
     state.order += 1
     push(pool, state.heap, state.in_flight, m)
@@ -425,9 +435,9 @@ def is_lost(state: Simulation) -> bool:
 
 @kernel
 def ends_instant(state: Simulation, now: float) -> bool:
-    """Return True if messages of this instant are absorbed before any other tick or delivery."""
-    flying = state.in_flight > 0 and state.pool[state.heap[0]].arrival <= now
-    return not flying and next_tick(state) > now
+    """Return True if no tick or delivery at ``now`` is left, so that absorptions come next."""
+    arriving = state.in_flight > 0 and state.pool[state.heap[0]].arrival <= now
+    return not arriving and next_tick(state) > now
 
 
 @kernel
@@ -455,18 +465,18 @@ def on_deliver(state: Simulation, now: float) -> None:
 
 @kernel
 def arrive(state: Simulation, m: int, now: float) -> None:
-    """Put a message into the inbox of its receiver, unless it is too old."""
+    """Put message ``m`` into the inbox of its receiver, or drop it if it is too old."""
     message = state.pool[m]
     direction = state.directions[message.direction]
-    one, other = state.nodes[direction.sender].id, state.nodes[direction.receiver].id
+    sender_id, receiver_id = state.nodes[direction.sender].id, state.nodes[direction.receiver].id
     age = now - message.sent
     # ``not <=`` also rejects an age that is nan.
     if not age <= state.age_limit:
-        record_event_with_age(state, now, LATE, other, one, message.number, age)
+        record_event_with_age(state, now, LATE, receiver_id, sender_id, message.number, age)
         release(state, m)
         return
-    record_event_with_age(state, now, DELIVER, other, one, message.number, age)
-    # The first message of the instant puts its receiver on the list of those that absorb.
+    record_event_with_age(state, now, DELIVER, receiver_id, sender_id, message.number, age)
+    # The first message of the instant adds its receiver to the list of nodes that absorb.
     if state.nodes[direction.receiver].inbox == -1:
         state.waiting[state.receivers] = direction.receiver
         state.receivers += 1
@@ -482,7 +492,7 @@ def on_absorb(
     combination: CombinationState | None,
     now: float,
 ) -> None:
-    """Let a node absorb all messages of this instant, in the order of senders."""
+    """Let the next node absorb all messages of this instant, in the order of senders."""
     pool, h = state.pool, state.waiting[state.absorbing]
     node, oldest = state.nodes[h], 0.0
     # The age of the oldest message goes into the trace.
@@ -497,7 +507,7 @@ def on_absorb(
         combine_with_state(state, combination, h, now)
     else:
         combine(state, h, now)
-    # Messages go back to the pool only now, because handlers read them through the inbox.
+    # Messages return to the pool only now, since handlers read them through the inbox.
     m = node.inbox
     while m != -1:
         following = pool[m].next
@@ -506,18 +516,18 @@ def on_absorb(
     node.inbox = -1
     record_event_with_age(state, now, ABSORB, node.id, -1, -1, oldest)
     state.absorbing += 1
-    # All mail of this instant is absorbed.
+    # All messages of this instant are absorbed.
     if state.absorbing == state.receivers:
         state.absorbing = state.receivers = 0
 
 
 @kernel
 def use_messages(state: Simulation, history: History, h: int, now: float) -> None:
-    """Use the readings of other nodes in the inbox of node ``h``."""
+    """Update node ``h`` with the readings in its inbox."""
     m = state.nodes[h].inbox
     while m != -1:
         message = state.pool[m]
-        # Messages without delay are of now, and need no going back.
+        # A reading that took no time is of the present instant.
         if now - message.sent <= 0.0:
             use_reading(state, history, h, message.tag)
         else:
@@ -529,14 +539,14 @@ def use_messages(state: Simulation, history: History, h: int, now: float) -> Non
 def combine_with_state(
     state: Simulation, combination: CombinationState, h: int, now: float
 ) -> None:
-    """Combine node ``h`` with its inbox, by a combination that has a state of its own."""
+    """Combine node ``h`` with its inbox, for combinations that have a CombinationState."""
     if combination.kind == PREDICTIONS:
         use_readings_heard(state, h, now)
-    heard = predict_payloads(state, h, now)
+    received_weight = predict_payloads(state, h, now)
     if combination.kind == PREDICTIONS:
         add_consensus(state, combination, h)
     elif combination.kind == GAINS:
-        combine_convex(state, h, max(0.0, 1.0 - heard))
+        combine_convex(state, h, max(0.0, 1.0 - received_weight))
     elif combination.kind == BELIEFS:
         absorb_evidence(state, combination.evidence, h, now)
     else:
@@ -545,54 +555,54 @@ def combine_with_state(
 
 @kernel
 def predict_payloads(state: Simulation, h: int, now: float) -> float:
-    """Predict the estimates in the inbox of node ``h`` to now, without readings, where they were
-    delayed; returns the sum of their weights.
+    """Predict the estimates in the inbox of node ``h`` that were delayed to ``now``, without
+    readings; return the sum of the weights of all messages.
     """
     # The last model of the table has no sensors: prediction alone, as readings since then are
     # unknown here.
     pool, directions, model = state.pool, state.directions, len(state.table.unit) - 1
-    m, heard = state.nodes[h].inbox, 0.0
+    m, received_weight = state.nodes[h].inbox, 0.0
     while m != -1:
         age = now - pool[m].sent
-        # SWAP takes over the last message of the inbox only, so the others need no prediction.
+        # SWAP uses the last message of the inbox only.
         if age > 0.0 and (state.combination_kind != SWAP or pool[m].next == -1):
             propagate_root(
                 state.table, model, state.pool_root, state.pool_x, m, age, state.flow_scratch
             )
-        heard += directions[pool[m].direction].weight
+        received_weight += directions[pool[m].direction].weight
         m = pool[m].next
-    return heard
+    return received_weight
 
 
 @kernel
 def combine(state: Simulation, h: int, now: float) -> None:
     """Combine node ``h`` with the estimates in its inbox, predicted to now."""
-    heard = predict_payloads(state, h, now)
+    received_weight = predict_payloads(state, h, now)
     if state.combination_kind == CONVEX:
-        # Lost weight goes to the node itself, so that weights sum to 1.
-        combine_convex(state, h, max(0.0, 1.0 - heard))
+        # The weights of messages that do not arrive go to the own one, so that weights sum to 1.
+        combine_convex(state, h, max(0.0, 1.0 - received_weight))
     elif state.combination_kind == INTERSECTION:
-        intersect(state, h, max(0.0, 1.0 - heard), 1.0)
+        intersect(state, h, max(0.0, 1.0 - received_weight), 1.0)
     elif state.combination_kind == SHARES:
-        own, total = state.nodes[h].own, state.nodes[h].own + heard
-        # "keep-own", or weights that are all 0: the own weight is what the others leave.
+        own, total = state.nodes[h].own, state.nodes[h].own + received_weight
+        # "keep-own", or weights that are all 0: the own weight is 1 minus the others.
         if state.keep_own == 1 or total == 0.0:
-            own, total = max(0.0, 1.0 - heard), 1.0
+            own, total = max(0.0, 1.0 - received_weight), 1.0
         # With weight 1 the node keeps its estimate to the last bit.
         if own / total != 1.0:
             intersect(state, h, own / total, total)
     elif state.combination_kind == SWAP:
-        # Gossip: the node takes over the estimate of its peer.
+        # Gossip: the estimate of the peer replaces the own one.
         last = state.nodes[h].last
         copy_state(state.size, state.xhat, state.root, h, state.pool_x, state.pool_root, last)
 
 
 @kernel
 def combine_convex(state: Simulation, h: int, own: float) -> None:
-    """Combine by H (7) and (9): x = w x + sum w_j x_j and P = w P + sum w_j P_j, one message after
-    the other.
+    """Combine node ``h`` with its inbox by H (7) and (9): x = w x + sum w_j x_j and P = w P + sum
+    w_j P_j, with the own weight w = ``own``.
     """
-    # w_i P_i first, then + w_j P_j for each message.
+    # w P first, then + w_j P_j for each message.
     xhat, root, pool, directions = state.xhat, state.root, state.pool, state.directions
     scale_root(state.size, root, xhat, h, own)
     m = state.nodes[h].inbox
@@ -604,10 +614,12 @@ def combine_convex(state: Simulation, h: int, own: float) -> None:
 
 @kernel
 def intersect(state: Simulation, h: int, own: float, total: float) -> None:
-    """Intersect covariances by D (8) and (9), with weights divided by their ``total``."""
+    """Combine node ``h`` with its inbox by covariance intersection, D (8) and (9), with the own
+    weight ``own`` and the weights of messages divided by ``total``.
+    """
     xhat, root, pool, directions = state.xhat, state.root, state.pool, state.directions
     scratch = state.update_scratch
-    # Means count from the node's own estimate: differences of near states lose no digits.
+    # Means are relative to the own estimate: differences of near states lose no digits.
     begin_intersection(scratch)
     add_to_intersection(own, root, xhat, h, xhat, h, scratch)
     m = state.nodes[h].inbox
@@ -620,9 +632,9 @@ def intersect(state: Simulation, h: int, own: float, total: float) -> None:
 
 @kernel
 def on_probe(state: Simulation, totals: Totals | None) -> bool:
-    """Store a sample of all nodes. Returns False if there is no space for another."""
+    """Store a sample of all nodes; return False if there is no space for another one."""
     store_sample(state, state.run, 0, state.samples)
-    # The weight of the whole network: held by nodes, sent, and less what was heard.
+    # Terms of the weight of the network: held by nodes, sent, and (to subtract) heard.
     if totals is not None:
         buffer, count, k = state.buffer, len(state.nodes), state.samples
         for h in range(count):
@@ -653,8 +665,8 @@ def store_sample(state: Simulation, run: int, first: int, k: int) -> None:
 
 @kernel
 def count_sample(state: Simulation) -> bool:
-    """Count a stored sample. Returns False if there is no space for another."""
-    # Counts and rows at the sample: a run that diverges here ends with them.
+    """Store counts and position of a sample; return False if there is no space for another one."""
+    # A run that diverges at this sample ends with these counts and rows.
     buffer, run, k = state.buffer, state.run, state.samples
     for kind in range(len(state.counts)):
         buffer.counts[run, k, kind] = state.counts[kind]

@@ -1,5 +1,6 @@
-"""Belief propagation in the event loop (algorithms/belief_propagation, in loops): evidence that
-nodes keep of their own readings and of what each neighbour sent last.
+"""Belief propagation in the event loop: the kernels of algorithms/belief_propagation.
+
+Each node holds the evidence of its own readings and that which each neighbour sent last.
 """
 
 from __future__ import annotations
@@ -27,15 +28,21 @@ from netkf.linalg.structs import Struct
 
 
 class EvidenceArrays(Struct):
-    """Evidence (n, n + 1, 1) that counts from the beliefs of nodes: priors and own readings
-    (N, ...), what was received last on each of W directed links, and when that was sent
-    (``sent_at``, (W,); never: -inf), and what messages carry (C, ...). The links that node h hears
-    are ``direction[k]`` from ``first[h]`` up to ``first[h + 1]``, in the order of senders.
+    """Evidence (n, n + 1, 1), see kernels.beliefs, of N nodes, W directed links and C messages. It
+    is relative to the estimate of the node that holds it.
 
-    The estimates of the Simulation as ``lanes`` (1, N, n, 1) and its roots (1, N, n, n, 1); the
-    plant's ``A`` (n, n). Scratch: ``centre`` (N, n, 1), ``before`` and ``after`` (n, 1), whitened
-    readings y (1, 1, 1, p, 1) and H (1, 1, 1, p, n, 1), ``total`` and ``work`` (n, n + 1, 1),
-    ``maps`` (6, n, n).
+    prior, own : (N, ...), priors, and evidence of own readings
+    received, sent_at : (W, ...), evidence that was received last on each link, and the time (W,) at
+                        which it was sent; -inf: none yet
+    carried : (C, ...), evidence in messages
+    first, direction : the incoming links of node h are ``direction[first[h]:first[h + 1]]``, in the
+                       order of senders
+    lanes, roots : views of the estimates (1, N, n, 1) and roots (1, N, n, n, 1) of the Simulation
+    A : (n, n), of the plant
+
+    Scratch: ``centre`` (N, n, 1), ``before`` and ``after`` (n, 1), whitened readings y
+    (1, 1, 1, p, 1) and H (1, 1, 1, p, n, 1), ``total`` and ``work`` (n, n + 1, 1), ``maps``
+    (6, n, n).
     """
 
     prior: FloatArray
@@ -59,21 +66,21 @@ class EvidenceArrays(Struct):
 
 
 def empty_evidence(state: Simulation, A: FloatArray, roots: FloatArray) -> EvidenceArrays:
-    """Return that of nodes that have read and heard nothing; ``roots`` (1, N, n, n, 1)."""
+    """Return the evidence at time 0, priors only; ``roots`` (1, N, n, n, 1)."""
     N, n = state.xhat.shape
-    directions, p, part = state.directions, len(state.scratch.y), (n, n + 1, 1)
-    heard = np.lexsort((directions["sender"], directions["receiver"]))
-    prior = np.zeros((N, *part))
+    directions, p, shape = state.directions, len(state.scratch.y), (n, n + 1, 1)
+    incoming = np.lexsort((directions["sender"], directions["receiver"]))
+    prior = np.zeros((N, *shape))
     for h in range(N):
         write_prior_single(roots, h, prior[h])
     return EvidenceArrays(
         prior=prior,
-        own=np.zeros((N, *part)),
-        received=np.zeros((len(directions), *part)),
+        own=np.zeros((N, *shape)),
+        received=np.zeros((len(directions), *shape)),
         sent_at=np.full(len(directions), -math.inf),
-        carried=np.zeros((len(state.pool), *part)),
-        first=np.searchsorted(directions["receiver"][heard], np.arange(N + 1)).astype(np.int64),
-        direction=heard.astype(np.int64),
+        carried=np.zeros((len(state.pool), *shape)),
+        first=np.searchsorted(directions["receiver"][incoming], np.arange(N + 1)).astype(np.int64),
+        direction=incoming.astype(np.int64),
         lanes=state.xhat.reshape(1, N, n, 1),
         roots=roots,
         A=np.array(A),
@@ -82,22 +89,22 @@ def empty_evidence(state: Simulation, A: FloatArray, roots: FloatArray) -> Evide
         after=np.zeros((n, 1)),
         y=np.zeros((1, 1, 1, p, 1)),
         H=np.zeros((1, 1, 1, p, n, 1)),
-        total=np.zeros(part),
-        work=np.zeros(part),
+        total=np.zeros(shape),
+        work=np.zeros(shape),
         maps=np.zeros((6, n, n)),
     )
 
 
-def more_evidence(evidence: EvidenceArrays, capacity: int) -> None:
-    """Enlarge the arrays of evidence under way to ``capacity`` messages."""
-    grown = np.zeros((capacity, *evidence.carried.shape[1:]))
-    grown[: len(evidence.carried)] = evidence.carried
-    evidence.carried = grown
+def enlarge_evidence(evidence: EvidenceArrays, capacity: int) -> None:
+    """Enlarge the array of evidence in messages to ``capacity`` messages."""
+    carried = np.zeros((capacity, *evidence.carried.shape[1:]))
+    carried[: len(evidence.carried)] = evidence.carried
+    evidence.carried = carried
 
 
 @kernel
 def predict_node_evidence(evidence: EvidenceArrays, h: int, gap: float) -> None:
-    """Let all evidence of node ``h`` speak about the state ``gap`` seconds later."""
+    """Predict all evidence of node ``h`` by ``gap`` seconds."""
     fill_inverse_transition(evidence.A, gap, evidence.maps)
     back, total, work = evidence.maps[0], evidence.total, evidence.work
     predict_part(ONE, evidence.prior[h], back, total, work)
@@ -108,7 +115,9 @@ def predict_node_evidence(evidence: EvidenceArrays, h: int, gap: float) -> None:
 
 @kernel
 def update_belief(state: Simulation, evidence: EvidenceArrays, h: int) -> None:
-    """Make the belief of node ``h`` from its prior and all evidence, which counts from it then."""
+    """Compute the belief of node ``h``, the sum of its prior and all evidence, and move the centre
+    of these to the new estimate.
+    """
     total, work, centre = evidence.total, evidence.work, evidence.centre
     for i in range(state.xhat.shape[1]):
         centre[h, i, 0] = state.xhat[h, i]
@@ -127,23 +136,23 @@ def update_belief(state: Simulation, evidence: EvidenceArrays, h: int) -> None:
 
 @kernel
 def add_samples(state: Simulation, evidence: EvidenceArrays, h: int, instant: int) -> None:
-    """Add the samples of an instant to the own evidence of node ``h``."""
-    given, n = state.instants, state.xhat.shape[1]
+    """Add the samples of an instant to the own evidence of node ``h``, and update its belief."""
+    instants, n = state.instants, state.xhat.shape[1]
     for i in range(n):
         evidence.centre[h, i, 0] = state.xhat[h, i]
-    for s in range(given.first[instant], given.first[instant + 1]):
-        sensor, matrix = given.sensor[s], given.matrix[s]
-        rows = given.rows[sensor]
+    for s in range(instants.first[instant], instants.first[instant + 1]):
+        sensor, matrix = instants.sensor[s], instants.matrix[s]
+        rows = instants.rows[sensor]
         # L^-1 y and L^-1 H with L L' = R.
         for i in range(rows):
-            scale, y = 1.0 / given.root[sensor, i, i], given.y[s, i]
+            scale, y = 1.0 / instants.root[sensor, i, i], instants.y[s, i]
             for m in range(i):
-                y -= given.root[sensor, i, m] * evidence.y[0, 0, 0, m, 0]
+                y -= instants.root[sensor, i, m] * evidence.y[0, 0, 0, m, 0]
             evidence.y[0, 0, 0, i, 0] = scale * y
             for j in range(n):
-                entry = given.H[matrix, i, j]
+                entry = instants.H[matrix, i, j]
                 for m in range(i):
-                    entry -= given.root[sensor, i, m] * evidence.H[0, 0, 0, m, j, 0]
+                    entry -= instants.root[sensor, i, m] * evidence.H[0, 0, 0, m, j, 0]
                 evidence.H[0, 0, 0, i, j, 0] = scale * entry
         add_reading_pair(
             ONE, evidence.own[h], 1.0, evidence.y, evidence.H, (0, 0, 0), rows,
@@ -154,7 +163,9 @@ def add_samples(state: Simulation, evidence: EvidenceArrays, h: int, instant: in
 
 @kernel
 def send_evidence(state: Simulation, evidence: EvidenceArrays, m: int, h: int) -> None:
-    """Write the evidence of node ``h`` into message ``m``, without that of its receiver."""
+    """Write the sum of the evidence of node ``h``, without that of the receiver, into message
+    ``m``.
+    """
     receiver = state.directions[state.pool[m].direction].receiver
     copy_state(state.size, state.pool_x, state.pool_root, m, state.xhat, state.root, h)
     copy_part(ONE, evidence.own[h], evidence.carried[m])
@@ -166,8 +177,9 @@ def send_evidence(state: Simulation, evidence: EvidenceArrays, m: int, h: int) -
 
 @kernel
 def absorb_evidence(state: Simulation, evidence: EvidenceArrays, h: int, now: float) -> None:
-    """Replace the earlier evidence of each sender to node ``h``, unless that was sent later; the
-    centres of what they carry are predicted to now.
+    """Replace the evidence of each sender in the inbox of node ``h``, unless the present one was
+    sent later; then update the belief. The estimates in the messages, the centres of their
+    evidence, are predicted to ``now`` already.
     """
     m, maps = state.nodes[h].inbox, evidence.maps
     while m != -1:

@@ -29,7 +29,7 @@ from netkf.engines.compiled.event_loop import (
     WANT_TICKS,
     event_loop,
 )
-from netkf.engines.compiled.evidence import more_evidence
+from netkf.engines.compiled.evidence import enlarge_evidence
 from netkf.engines.compiled.lane_series import series_of_lanes
 from netkf.engines.compiled.late_readings import History, add_past, empty_history
 from netkf.engines.compiled.origins import move_origin
@@ -57,7 +57,7 @@ from netkf.engines.compiled.state import (
     filters_at_start,
     scratch_arrays,
 )
-from netkf.engines.compiled.truth import KnownStates, PathStates, States
+from netkf.engines.compiled.truth import CompleteStates, PathStates, States
 from netkf.engines.compiled.visits import Visits, empty_visits
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.lanes import with_spare
@@ -138,7 +138,7 @@ class Source:
             self._paths = Paths(scenario, streams, blocks, sampled)
             self.states = PathStates(scenario, self._paths.frame_times)
         else:
-            self.states = states = KnownStates(scenario, streams)
+            self.states = states = CompleteStates(scenario, streams)
             # The truth is complete, so that all samples are read at once.
             samples.read(states.truth.states(sampled)[0], sampled, -math.inf, math.inf)
 
@@ -398,7 +398,7 @@ class FlowRun:
             grown[: len(self._totals.offered)] = self._totals.offered
             self._totals.offered = grown
         if self._combination is not None:
-            more_evidence(self._combination.evidence, len(self._state.pool))
+            enlarge_evidence(self._combination.evidence, len(self._state.pool))
 
     def _enlarge_rows(self) -> None:
         """Make the buffer of event rows long enough for one more event."""

@@ -1,4 +1,4 @@
-"""Everything in the coordinates of a new origin, see plants/truth."""
+"""Moves of the origin that states and estimates are relative to, see plants/truth."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ def move_origin(
     k: int,
     offset: FloatArray,
 ) -> None:
-    """Shift all estimates by ``offset`` (n,) at the time of frame ``k``, and messages under way by
-    the offset taken back to when they were sent.
+    """Add ``offset`` (n,) to all estimates at the time of frame ``k``, and to the estimates in
+    messages under way the offset predicted back to the time of sending.
     """
     now = float(state.frames[k])
     # Covariances stay: only means refer to an origin.
@@ -28,24 +28,26 @@ def move_origin(
     if combination is not None:
         combination.prior[:] += offset
     if totals is not None:
-        _move_totals(scenario, state, totals, now, offset)
-    # A late reading that goes back over this time must move the origin again on its way forward.
+        _shift_totals(scenario, state, totals, now, offset)
+    # A late reading that goes back beyond this time must repeat the move.
     if history is not None and history.lag > 0.0:
         history.offsets[k] = offset
         for h in range(len(state.nodes)):
             remember(state, history, h, now, -1, k)
-    # Totals were moved above, and readings stay in the coordinates of their own time.
+    # Totals are shifted above, and readings keep the coordinates of their own time.
     if totals is not None or state.combination_kind == READINGS:
         return
     for m in state.heap[: state.in_flight]:
-        # An estimate under way is of the time it was sent: the offset is moved back to then.
+        # An estimate under way refers to the time of sending: predict the offset back to it.
         state.pool_x[m] += scenario.move_back(offset, now - state.pool["sent"][m])
 
 
-def _move_totals(
+def _shift_totals(
     scenario: Scenario, state: Simulation, totals: Totals, now: float, offset: FloatArray
 ) -> None:
-    """Move every ``u`` by ``U offset``, in coordinates of the time that it refers to."""
+    """Add ``U offset`` to the ``u`` of all totals, with the offset at the time that
+    each refers to.
+    """
     for times, values in ((totals.sent_at, totals.sent), (totals.heard_at, totals.heard)):
         for k, time in enumerate(times.tolist()):
             _shift_total(values[k], scenario.move_back(offset, now - time))

@@ -1,4 +1,4 @@
-"""All samples of a run as tables: at which instants, by which sensors, and what they read."""
+"""Tables of all samples of a run: instants, sensors and values."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from netkf.scenario.scenario import Scenario
 
 
 class SampledSensor(NamedTuple):
-    """One sensor: the ``times`` (K,) of its samples, what reads them, the indices (K,) of
-    its samples among all, and its own order among sensors.
+    """One sensor: the ``times`` (K,) of its ``samples``, their ``indices`` (K,) among all samples
+    of the run, and the ``order`` of the sensor.
     """
 
     times: FloatArray
@@ -26,17 +26,17 @@ class SampledSensor(NamedTuple):
 
 
 class SampleTables:
-    """The samples of one run. What is read is filled in once the state is known: a state does not
-    depend on estimates, nor do readings.
+    """The samples of one run. Their values are filled in by ``read`` once the states are drawn,
+    which do not depend on estimates.
     """
 
     def __init__(
         self, scenario: Scenario, streams: Streams, times: dict[tuple[int, int], FloatArray]
     ) -> None:
         placed = [
-            (n, placed_sensor)
-            for n, some in scenario.sampled_sensors.items()
-            for placed_sensor in some
+            (node, placed_sensor)
+            for node, sensors in scenario.sampled_sensors.items()
+            for placed_sensor in sensors
         ]
         counts = [len(times[node, placed_sensor.ordinal]) for node, placed_sensor in placed]
         # All samples of all sensors in one list, sensor by sensor.
@@ -47,40 +47,42 @@ class SampleTables:
         # Sorted by (time, sensor), the order in which one update stacks them.
         order = np.lexsort((sensor, t))
         # The inverse permutation: where the samples of each sensor have gone.
-        back = np.empty(len(t), dtype=np.int64)
-        back[order] = np.arange(len(t))
+        position = np.empty(len(t), dtype=np.int64)
+        position[order] = np.arange(len(t))
         cuts = np.cumsum(counts)[:-1]
-        parts = np.split(back, cuts) if placed else []
+        parts = np.split(position, cuts) if placed else []
         self._sensors = [
             SampledSensor(
                 times[node, placed_sensor.ordinal],
                 scenario.sample_path(streams, node, placed_sensor),
-                some,
+                indices,
                 k,
             )
-            for k, ((node, placed_sensor), some) in enumerate(zip(placed, parts, strict=True))
+            for k, ((node, placed_sensor), indices) in enumerate(zip(placed, parts, strict=True))
         ]
         self.instants = _make_instants(scenario, placed, t[order], sensor[order])
         self._matrices: list[FloatArray] = []
 
     def read(self, states: FloatArray, times: FloatArray, after: float, until: float) -> None:
-        """Fill in the samples taken in (``after``, ``until``], from the states (T, n) at ``times``
-        (T,).
+        """Fill in the values of the samples taken in (``after``, ``until``], from the states (T, n)
+        at ``times`` (T,), which contain their times.
         """
-        given = self.instants
+        instants = self.instants
         for sensor in self._sensors:
             # (after, until]: a time at the border of two blocks is read once.
             first, last = np.searchsorted(sensor.times, [after, until], side="right")
             if first == last:
                 continue
-            here = sensor.times[first:last]
+            sample_times = sensor.times[first:last]
             # The state at each sample; ``times`` contains all of them.
-            x = states[np.searchsorted(times, here)]
+            x = states[np.searchsorted(times, sample_times)]
             y, H = sensor.samples.several(range(first, last), x)
             indices, p = sensor.indices[first:last], y.shape[1]
-            given.y[indices, :p] = y
-            if given.matrix[indices[0]] >= len(given.rows):  # a sensor with an H for each sample
-                given.H[given.matrix[indices], :p] = H
+            instants.y[indices, :p] = y
+            if instants.matrix[indices[0]] >= len(
+                instants.rows
+            ):  # a sensor with an H for each sample
+                instants.H[instants.matrix[indices], :p] = H
 
 
 def _make_instants(
@@ -95,27 +97,27 @@ def _make_instants(
     filters = np.array([0 if pooled else index[k] for k in node.tolist()], dtype=np.int64)
     parts = [(scenario.sensors[p.entry], scenario.noise(p.entry, believed=True)) for _, p in placed]
     rows = np.array([len(R) for _, R in parts], dtype=np.int64)
-    most = int(rows.max(initial=1))
-    root, H = np.zeros((len(parts), most, most)), np.zeros((len(parts), most, n))
+    max_rows = int(rows.max(initial=1))
+    root, H = np.zeros((len(parts), max_rows, max_rows)), np.zeros((len(parts), max_rows, n))
     # The Cholesky factor of the R that filters believe, once for each sensor.
     for k, (part, R) in enumerate(parts):
         root[k, : len(R), : len(R)], H[k, : len(R)] = np.linalg.cholesky(R), part.H
     # Sensors whose H varies get a matrix for each sample, behind the fixed ones.
-    own = np.array([part.varying for part, _ in parts], dtype=bool)
-    matrix, varying = sensor.copy(), own[sensor] if parts else np.zeros(0, dtype=bool)
+    has_varying_H = np.array([part.varying for part, _ in parts], dtype=bool)
+    matrix, varying = sensor.copy(), has_varying_H[sensor] if parts else np.zeros(0, dtype=bool)
     matrix[varying] = len(parts) + np.arange(int(varying.sum()))
-    H = np.concatenate([H, np.zeros((int(varying.sum()), most, n))])
-    whose = filters[sensor] if parts else sensor
+    H = np.concatenate([H, np.zeros((int(varying.sum()), max_rows, n))])
+    filter_index = filters[sensor] if parts else sensor
     # Samples of one node at one time are one instant, and one update.
     begins = np.ones(len(t), dtype=bool)
-    begins[1:] = (np.diff(t) != 0.0) | (np.diff(whose) != 0)
+    begins[1:] = (np.diff(t) != 0.0) | (np.diff(filter_index) != 0)
     first = np.flatnonzero(begins)
     return Instants(
         t=t[first],
-        index=whose[first],
+        index=filter_index[first],
         first=np.append(first, len(t)),
         node=node[sensor] if parts else sensor,
-        y=np.zeros((len(t), most)),
+        y=np.zeros((len(t), max_rows)),
         sensor=sensor,
         matrix=matrix,
         rows=rows,

@@ -1,4 +1,4 @@
-"""Samples that were taken in compiled code, on their way to the recorder."""
+"""Recording of samples that compiled code has taken."""
 
 from __future__ import annotations
 
@@ -23,30 +23,32 @@ def record_samples(
     samples: StateSamples,
     pass_rows_on: Callable[[int], None],
 ) -> bool:
-    """Record samples up to the first that is not sound; return True if all are sound.
+    """Record samples up to the first one that is not sound (engines.soundness); return True if all
+    are sound.
 
-    Where filters are pooled, ``samples`` have one estimator for all nodes. ``pass_rows_on`` is
-    called with the index of the first sample that is not sound: what happened after it is dropped.
+    ``pass_rows_on`` is called with the index of the first sample that is not sound, to record the
+    events before it; later ones are dropped. If filters are pooled, ``samples`` have one estimator
+    for all nodes.
     """
     times, x, xhat, P, error = samples
     # The loop may stop for other reasons than samples.
     if not len(times):
         return True
-    intact = sound_mask(xhat, P).all(axis=1)
+    sound = sound_mask(xhat, P).all(axis=1)
     # The trace shows a row for each node, though all of them share a pooled filter.
     if scenario.filter.algorithm.pooled:
         nodes = len(scenario.nodes)
         xhat, P, error = (np.repeat(values, nodes, axis=1) for values in (xhat, P, error))
     # argmin finds the first False.
-    last = len(times) - 1 if intact.all() else int(np.argmin(intact))
+    last = len(times) - 1 if sound.all() else int(np.argmin(sound))
     after, time = last + 1, float(times[last])
     recorder.samples(times[:after], x[:after], xhat[:after], P[:after], error[:after])
     progress(time)
-    if intact.all():
+    if sound.all():
         return True
     # Events up to the sample come first, and then which nodes have diverged.
     pass_rows_on(last)
-    lost = ~sound_mask(xhat[last], P[last])
-    for node in (scenario.nodes[k] for k in np.flatnonzero(lost)):
+    diverged = ~sound_mask(xhat[last], P[last])
+    for node in (scenario.nodes[k] for k in np.flatnonzero(diverged)):
         recorder.append((time, DIVERGED, node, -1, -1, -1, NAN))
     return False

@@ -1,8 +1,8 @@
-"""Messages in slots made one by one, for channels and activations that kernels cannot draw.
+"""Messages in slots, made one by one in Python, for channels and activations that kernels cannot
+draw: a user's own losses and delays, messages that take time, and recorded exchanges.
 
-Losses and delays of a user's own, messages that take time, and recorded exchanges. What happens in
-a slot depends on clocks and channels alone; where nodes may be silent, blocks are one slot long,
-and the filters' kernel says who is.
+Messages do not depend on estimates, unless nodes may be silent: then a block is one slot long, and
+the filters' kernel decides who sends.
 """
 
 from __future__ import annotations
@@ -36,13 +36,17 @@ from netkf.trace.recorder import NAN
 from netkf.trace.schema import CODES, EVENT
 
 LATE = CODES["late"]
-DRAWN_TOGETHER = 64  # draws of a channel at once: a call of numpy costs as much as some ten numbers
+DRAWN_TOGETHER = (
+    64  # draws of a channel at once, since a call of numpy costs as much as ten of them
+)
 Draw = tuple[float, bool, float]
 Row = tuple[float, int, int, int, int, int, float]
 
 
-class Direction:
-    """One direction of a link: its index, its messages so far and what is drawn for them."""
+class DirectedLink:
+    """A directed link: its ends and index, its number of messages so far, and the draws
+    for them.
+    """
 
     def __init__(self, scenario: Scenario, streams: Streams, ends: Link, index: int) -> None:
         self.ends, self.index, self.messages = ends, index, 0
@@ -52,16 +56,17 @@ class Direction:
         )
 
     def draws(self) -> Iterator[Draw]:
-        """Yield (uniform number, bad state, delay) of its activations, one after the other."""
+        """Yield (uniform number, bad state, delay) for its activations, one after the other."""
         while True:
-            # Draws come in blocks, and are handed out one by one: the numbers do not depend on the
-            # block.
+            # Drawn in blocks for speed; the numbers do not depend on the length of a block.
             columns = self._sampler.draws(DRAWN_TOGETHER)
             yield from zip(*(column.tolist() for column in columns), strict=True)
 
 
 class Step(NamedTuple):
-    """One step of an exchange: its ``slot``, number there, ``phase``, step of the phase, times."""
+    """One step of an exchange: its ``slot``, the number of the ``step`` in the slot, the ``phase``
+    and the step ``repeat`` of that phase, and its times in seconds.
+    """
 
     slot: int
     step: int
@@ -71,8 +76,8 @@ class Step(NamedTuple):
     end: float
 
 
-class Closed(NamedTuple):
-    """A step after which nodes may stop: its slot, when it ends, and its number of absorb rows."""
+class StepEnd(NamedTuple):
+    """The end of a step after which nodes may stop: its slot, time, and number of absorb rows."""
 
     slot: int
     end: float
@@ -86,65 +91,66 @@ class SlotEvents:
         self._scenario, self._setup, self._algorithm = scenario, setup, scenario.hosted
         self._random = streams.generator("matching")
         self._directions = [
-            Direction(scenario, streams, ends, k) for k, ends in enumerate(setup.directions)
+            DirectedLink(scenario, streams, ends, k) for k, ends in enumerate(setup.directions)
         ]
         self._indices = {direction.ends: direction.index for direction in self._directions}
-        each, own = setup.directions_per_link, setup.streams_per_link
+        each, count = setup.directions_per_link, setup.streams_per_link
         # Directions of a link are neighbours; a directed graph has one of them.
         pairs = [direction.ends for direction in self._directions[::each]]
         self._by_link = {
             link: self._directions[k * each : (k + 1) * each] for k, link in enumerate(pairs)
         }
-        # With a symmetric channel only the first direction of a link draws.
+        # With a symmetric channel only the first direction of a link has a stream.
         self._draws = {
-            link: [direction.draws() for direction in both[:own]]
+            link: [direction.draws() for direction in both[:count]]
             for link, both in self._by_link.items()
         }
         self._last: dict[Link, list[Draw]] = {}
-        self._in_flight: list[tuple[float, int, int, Direction, int, float, int, int]] = []
+        self._in_flight: list[tuple[float, int, int, DirectedLink, int, float, int, int]] = []
         self._slot, self._order, self._exchanges, self._open = 0, 0, 0, -1
-        self._noted = True
+        self._recording = True
         self._inbox: dict[int, dict[int, tuple[int, float]]] = {}
-        self._rows: list[Row | Closed | None] = []
+        self._rows: list[Row | StepEnd | None] = []
         self._sent: np.ndarray | None = None
         self._unread = np.zeros((0, 0), dtype=bool)
-        # Pairs of the exchanges of a slot that are drawn before its messages, in their order.
-        self._drawn: list[tuple[list[Link], set[Link] | None]] = []
+        # Pairs of exchanges that were drawn by asked(), before the messages of the slot.
+        self._chosen_pairs: list[tuple[list[Link], set[Link] | None]] = []
 
     def asked(self) -> np.ndarray:
-        """Return which nodes are asked for a message in the steps of the next slot, (E, N) of 0 and
-        1.
+        """Return (E, N): 1 if a node is asked for a message in a step of the next slot. Draws the
+        pairs of the slot.
         """
         setup, index = self._setup, self._scenario.topology.index
         asked = np.zeros((len(setup.fresh), len(setup.nodes)), dtype=np.uint8)
         for step in self._iterate_steps(self._slot):
-            self._drawn.append(self._choose_pairs(step))
-            links = self._drawn[-1][0] if self._algorithm.pairwise else self._by_link
+            self._chosen_pairs.append(self._choose_pairs(step))
+            links = self._chosen_pairs[-1][0] if self._algorithm.pairwise else self._by_link
             asked[step.step, [index[node] for link in links for node in link]] = 1
         return asked
 
-    def following(self, rows: int, sent: np.ndarray | None) -> tuple[int, np.ndarray]:
-        """Make the next slots, up to about ``rows`` events; return their number and ``up`` (1, S,
-        E, W).
+    def following(self, max_events: int, sent: np.ndarray | None) -> tuple[int, np.ndarray]:
+        """Make the messages and events of the next slots, up to about ``max_events`` events; return
+        the number of slots S and ``up`` (1, S, E, W).
 
-        It is one slot if ``sent`` (E, N) says which of the nodes ``asked`` send.
+        If nodes may be silent it is one slot, and ``sent`` (E, N) says which of the nodes that are
+        ``asked`` send.
         """
-        setup, made = self._setup, []
+        setup, arrivals = self._setup, []
         self._rows, self._sent = [], sent
         while self._slot < setup.slots:
-            made.append(self._one_slot())
+            arrivals.append(self._one_slot())
             self._slot += 1
-            if sent is not None or len(self._rows) >= rows:
+            if sent is not None or len(self._rows) >= max_events:
                 break
-        # Messages that are still under way after the last slot may be delivered or late.
+        # After the last slot deliver the messages that are still under way.
         if self._slot == setup.slots:
-            self._noted = True
+            self._recording = True
             self._deliver(math.inf)
-        return len(made), np.stack(made)[None]
+        return len(arrivals), np.stack(arrivals)[None]
 
     def _one_slot(self) -> np.ndarray:
-        """Make all events of the present slot; return which messages were used, ``up`` (steps,
-        directions).
+        """Make all events of the present slot; return ``up`` (E, W), the messages that are used in
+        each step.
         """
         setup, algorithm, slot = self._setup, self._algorithm, self._slot
         up = np.zeros((len(setup.fresh), len(self._directions)), dtype=np.uint8)
@@ -152,16 +158,16 @@ class SlotEvents:
             self._unread = setup.unread(slot, 1)[0]
         start = self._scenario.slot_plant.slot_time(slot)
         sampled = bool(np.isin(slot, setup.samples))
-        # First what arrived since the slot before, at the latest at this very time.
+        # First deliver messages that arrive until the slot begins.
         self._deliver(start)
         # Filters that predict are sampled at the beginning of the slot, the others at its end.
         if sampled and algorithm.predicts:
             self._rows.append(None)
         # At the horizon only the sample matters: no events.
-        self._noted = slot < setup.last
-        if self._noted or not algorithm.predicts:
+        self._recording = slot < setup.last
+        if self._recording or not algorithm.predicts:
             self._make_stage_events(slot, up)
-        self._noted = True
+        self._recording = True
         if sampled and not algorithm.predicts:
             self._rows.append(None)
         return up
@@ -171,22 +177,23 @@ class SlotEvents:
         steps, now = self._iterate_steps(slot), self._scenario.slot_plant.slot_time(slot)
         for step in self._setup.stages.step.tolist():
             if step < 0:
-                # Slot 0 of a filter that does not predict has no reading: it shows its start.
+                # Slot 0 of a filter that does not predict has no reading: its sample is the initial
+                # state.
                 if slot > 0 or self._algorithm.predicts:
                     for node in self._scenario.sensing:
                         self._append_row((now, SENSE, node, -1, -1, -1, NAN))
                 continue
-            for made in islice(steps, 1):
-                now = made.end
+            for exchange_step in islice(steps, 1):
+                now = exchange_step.end
                 # The number of the exchange tells messages in time from late ones.
                 self._exchanges += 1
                 self._open = self._exchanges
-                self._send_all(made)
-                self._deliver(made.end)
-                self._end_step(made, up[step])
+                self._send_all(exchange_step)
+                self._deliver(exchange_step.end)
+                self._end_step(exchange_step, up[step])
 
     def _iterate_steps(self, slot: int) -> Iterator[Step]:
-        """Yield the steps of the exchanges of a slot, none where it has no exchange."""
+        """Yield the steps of the exchanges of a slot, if any."""
         setup, algorithm, repeats = self._setup, self._algorithm, [0, 0]
         # At the horizon filters that predict are only sampled.
         acts = slot < setup.last or not algorithm.predicts
@@ -195,9 +202,9 @@ class SlotEvents:
         start = now = self._scenario.slot_plant.slot_time(slot)
         for step, phase, end in zip(*(c.tolist() for c in setup.stages[:3]), strict=True):
             if step >= 0:
-                made = Step(slot, step, phase, repeats[phase], now, start + end)
-                now, repeats[phase] = made.end, repeats[phase] + 1
-                yield made
+                exchange_step = Step(slot, step, phase, repeats[phase], now, start + end)
+                now, repeats[phase] = exchange_step.end, repeats[phase] + 1
+                yield exchange_step
 
     def rows(self, stopped: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the events as EVENT rows, and the number of rows before each sample."""
@@ -206,8 +213,9 @@ class SlotEvents:
         for row in self._rows:
             if row is None:
                 before.append(len(rows))
-            # The kernel knows only afterwards who has stopped: stop rows are inserted by node then.
-            elif isinstance(row, Closed):
+            # The kernel has decided which nodes stop only after these rows were made: insert the
+            # stop rows here, by node.
+            elif isinstance(row, StepEnd):
                 stops: list[Row] = [
                     (
                         row.end,
@@ -229,13 +237,13 @@ class SlotEvents:
 
     def _append_row(self, row: Row) -> None:
         """Append a row, unless events of this slot are not recorded."""
-        if self._noted:
+        if self._recording:
             self._rows.append(row)
 
     def _send_all(self, step: Step) -> None:
         """Send all messages of a step, with a draw of the channel for each."""
         broadcast, now, phase = not self._algorithm.pairwise, step.begin, step.phase
-        pairs, up = self._drawn.pop(0) if self._drawn else self._choose_pairs(step)
+        pairs, up = self._chosen_pairs.pop(0) if self._chosen_pairs else self._choose_pairs(step)
         if broadcast:
             self._append_row((now, ROUND, -1, -1, -1, phase, NAN))
         for i, j in pairs:
@@ -243,21 +251,23 @@ class SlotEvents:
                 self._append_row((now, TICK, i, j, -1, phase, NAN))
             both = self._by_link[i, j]
             if self._setup.fresh[step.step] or (i, j) not in self._last:
-                # Drawn even if a node sends nothing, so that the network does not depend on the
+                # Draw even if a node sends nothing, so that the network does not depend on the
                 # filter.
                 drawn = [next(draws) for draws in self._draws[i, j]]
                 # Both directions take the one draw of a symmetric channel.
                 self._last[i, j] = drawn if len(drawn) == len(both) else drawn * 2
-            # A link that is down loses its messages whatever was drawn.
-            here = up is None or (i, j) in up
+            # A recorded link that is down loses its messages, whatever was drawn.
+            is_up = up is None or (i, j) in up
             for direction, draw in zip(both, self._last[i, j], strict=True):
                 if self._setup.talks[step.step, direction.index] and not self._is_silent(
                     direction, step
                 ):
-                    self._send(step, direction, draw if here else None)
+                    self._send(step, direction, draw if is_up else None)
 
     def _choose_pairs(self, step: Step) -> tuple[list[Link], set[Link] | None]:
-        """Return the links that are used, and the set of those that are up (None: all)."""
+        """Return the links that are used in a step, and the set of those that are up
+        (None: all).
+        """
         activation, topology = self._scenario.network.activation, self._scenario.topology
         links = list(topology.links)
         if isinstance(activation, Matching):
@@ -271,15 +281,15 @@ class SlotEvents:
         up = set(listed)
         return links, up if topology.directed else up | {(j, i) for i, j in listed}
 
-    def _is_silent(self, direction: Direction, step: Step) -> bool:
+    def _is_silent(self, direction: DirectedLink, step: Step) -> bool:
         """Return True if the sender sends nothing in this step."""
         node = self._scenario.topology.index[direction.ends[0]]
         if self._sent is not None and not self._sent[step.step, node]:
             return True
         return bool(self._setup.may_miss and self._unread[step.step, node])
 
-    def _send(self, step: Step, direction: Direction, draw: Draw | None) -> None:
-        """Send one message: it is lost, arrives at once, or is put among those in flight."""
+    def _send(self, step: Step, direction: DirectedLink, draw: Draw | None) -> None:
+        """Send one message: it is lost, arrives at once, or is under way."""
         (sender, receiver), number, now = direction.ends, direction.messages, step.begin
         direction.messages = number + 1
         self._append_row((now, SEND, sender, receiver, number, step.phase, NAN))
@@ -295,7 +305,7 @@ class SlotEvents:
             self._append_row((now, LOST, sender, receiver, number, step.phase, NAN))
         elif delay == 0.0:
             self._append_row((now, DELIVER, receiver, sender, number, step.phase, 0.0))
-            # The inbox keeps one message of each sender, the last to arrive.
+            # The inbox holds one message of each sender, the last to arrive.
             self._inbox.setdefault(receiver, {})[sender] = (number, 0.0)
         # A message that would arrive after the end leaves no event.
         elif now + delay < self._scenario.ends:
@@ -314,7 +324,9 @@ class SlotEvents:
             heapq.heappush(self._in_flight, entry)
 
     def _deliver(self, until: float) -> None:
-        """Deliver what arrives by then; in time if the exchange it was sent in is still open."""
+        """Deliver the messages that arrive up to ``until`` (seconds): in time if the step in which
+        they were sent is still open, else late.
+        """
         while self._in_flight and self._in_flight[0][0] <= until:
             now, _, _, direction, number, sent, phase, exchange = heapq.heappop(self._in_flight)
             (sender, receiver), in_time = direction.ends, exchange == self._open
@@ -326,7 +338,9 @@ class SlotEvents:
                 self._inbox.setdefault(receiver, {})[sender] = (number, now - sent)
 
     def _end_step(self, step: Step, up: np.ndarray) -> None:
-        """End a step: messages in the inboxes count as used, in ``up``."""
+        """End a step: mark the messages in the inboxes as used in ``up`` (W,), and record
+        absorptions.
+        """
         count = len(self._rows)
         # By receiver and sender, the order of the kernels and of SimPy.
         for node in sorted(self._inbox):
@@ -339,8 +353,8 @@ class SlotEvents:
             if not self._algorithm.pairwise:
                 oldest = max(age for _, age in arrived.values())
                 self._append_row((step.end, ABSORB, node, -1, -1, step.phase, oldest))
-        if step.step == self._setup.stages.stopping and self._noted:
-            self._rows.append(Closed(step.slot, step.end, len(self._rows) - count))
+        if step.step == self._setup.stages.stopping and self._recording:
+            self._rows.append(StepEnd(step.slot, step.end, len(self._rows) - count))
         self._inbox.clear()
         # From now on messages of this exchange are late.
         self._open = -1

@@ -1,4 +1,4 @@
-"""The state of one run at its samples, and relative to a moving origin."""
+"""The true state of one run at its samples, absolute and relative to a moving origin."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from netkf.scenario.scenario import Scenario
 
 
 class States(Protocol):
-    """The states that a run asks for."""
+    """True states of a run; local ones are relative to the origin of the present frame."""
 
     frame_times: FloatArray
 
@@ -30,8 +30,8 @@ class States(Protocol):
         """Return local and absolute states (T, n) at times within these pieces of the path."""
 
 
-class KnownStates:
-    """States of a truth that was drawn up to the horizon, or recorded."""
+class CompleteStates:
+    """States of a truth that is drawn up to the horizon, or recorded, before the run."""
 
     def __init__(self, scenario: Scenario, streams: Streams) -> None:
         self.truth = scenario.continuous_truth(streams)
@@ -39,7 +39,7 @@ class KnownStates:
 
     def offset(self, k: int, path: PathBlock, piece: int) -> FloatArray:
         """Return the local state (n,) just before ``frame_times[k]``."""
-        # The truth keeps its own frames.
+        # The truth has frames of its own.
         return np.asarray(self.truth.rebase(k))
 
     def states_at(
@@ -57,10 +57,10 @@ class PathStates:
         self.frame_times = frame_times
         # Without frames the origin never moves, and no transition is needed.
         self._moves = Transitions(scenario.truth.A, scenario.truth.B) if len(frame_times) else None
-        self._frame, self._begun, self._origin = 0, 0.0, np.zeros(scenario.plant.n)
+        self._frame, self._frame_start, self._origin = 0, 0.0, np.zeros(scenario.plant.n)
 
     def local(self, times: FloatArray, path: PathBlock, pieces: np.ndarray) -> FloatArray:
-        """Return the states (T, n) in the present frame, 0 where one begins."""
+        """Return the local states (T, n) at ``times``, 0 at times at which a frame begins."""
         # A time is the end of its piece, or the start of the first one.
         ends = (times == path.stop[pieces])[:, None]
         x = np.where(ends, path.x_stop[0, pieces], path.x_start[0, pieces])
@@ -76,7 +76,7 @@ class PathStates:
             # The new origin: the old one moved to now, plus the local state.
             self._origin = self._origin_at(np.array([time]))[0] + x
         # From now on times count from this frame.
-        self._frame, self._begun = k + 1, time
+        self._frame, self._frame_start = k + 1, time
         return np.asarray(x)
 
     def states_at(
@@ -91,11 +91,11 @@ class PathStates:
             return local, local + self._origin_at(times)
 
     def _origin_at(self, times: FloatArray) -> FloatArray:
-        """Return the absolute origin (T, n) of the present frame at some times: its transition from
-        where the frame began.
+        """Return the absolute origin (T, n) of the present frame at some times: the origin at the
+        beginning of the frame, moved by the plant without noise.
         """
         # An origin of 0 stays 0, and its transition may overflow.
         if self._moves is None or not self._origin.any():
             return np.broadcast_to(self._origin, (len(times), len(self._origin)))
-        moves = self._moves.transitions(times - self._begun)
+        moves = self._moves.transitions(times - self._frame_start)
         return apply(moves, self._origin)

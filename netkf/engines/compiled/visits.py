@@ -1,14 +1,14 @@
-"""Predictions and combinations of filters in SIMD lanes, where messages take no time.
+"""Predictions and combinations of filters in SIMD lanes, for messages that take no time.
 
-What happens, and when, does not depend on estimates then. So ``agenda`` goes through the events of
-several runs first and queues visits: at a time a node is predicted, or two nodes are predicted and
-combine what they have. The level of a visit is one more than those of earlier visits of the same
-nodes, so that visits of one level have no node in common: their nodes, of whatever run, are
-predicted and combined eight at a time in the lanes of vector registers (linalg/lanes.py). Lanes do
-not mix: a visit gives the same bits whichever visits share its registers.
+Then the events and their times do not depend on estimates. So ``agenda`` goes through the events of
+several runs first and queues visits: a visit predicts one node to a time, or predicts two nodes and
+combines their estimates. The level of a visit is one more than those of earlier visits of the same
+nodes. So visits of one level have no node in common: the nodes, of any run, are predicted and
+combined eight at a time in the lanes of vector registers (linalg/lanes.py). Lanes do not mix: a
+visit gives the same bits whichever visits share its registers.
 
-A prediction that takes several steps (a long gap, a wide covariance) does not fit into a lane; it
-is made by the scalar kernels of the event loop.
+A prediction that takes several steps (a long gap, a wide covariance) does not fit into a lane; the
+scalar kernels of the event loop do it.
 """
 
 from __future__ import annotations
@@ -54,34 +54,38 @@ from netkf.linalg.series import fill_row
 from netkf.linalg.structs import Struct
 
 MAX_VISITS = 1 << 14
-"""Visits that wait: their records fit the processor's cache."""
+"""Length of the queue of visits, so that it fits the processor's cache."""
 
 NO_NODE, ALL_NODES, NOT_HEARD, HAS_SENSORS, UNKNOWN = -1, -2, -1, -1, -1
 UNOBSERVED, SENSING = 0, 1
 
 _NUMBERS = ("next", "first", "second", "to_first", "to_second", "run", "piece")
 VISIT = np.dtype([*((name, np.int32) for name in _NUMBERS), ("time", np.float64)], align=True)
-"""A visit: the nodes at the places ``first`` and ``second`` of the state arrays are predicted to
-``time``, which lies in ``piece`` of the path of their ``run``.
+"""A visit: the nodes at the places ``first`` and ``second`` (indices in the state arrays) are
+predicted to ``time``, which lies in ``piece`` of the path of their ``run``.
 
-They hear each other over the directed links ``to_first`` and ``to_second``, or not (NOT_HEARD).
-``second`` NO_NODE: only one node is predicted; ALL_NODES: the nodes of the run, from ``first`` on,
-are stored as sample number ``piece``. ``next`` is another visit of the same level, or -1.
+Then each receives the other's estimate over the directed link ``to_first`` or ``to_second``, unless
+that is NOT_HEARD. ``second`` is NO_NODE if only one node is predicted, and ALL_NODES for a sample:
+the nodes of the run, from ``first`` on, are stored as sample number ``piece``. ``next`` is the next
+visit of the same level, or -1.
 """
 
 
 INTERVAL = np.dtype(
     [*((name, np.int64) for name in ("place", "visit")), ("now", float), ("least", float)]
 )
-"""The node at ``place`` has been predicted up to ``now`` on its way to ``visit``; ``least`` is the
-shortest interval that may follow, see ``next_interval``.
+"""The next measurement interval of the node at ``place``, which has been predicted up to ``now``
+(seconds) on its way to the time of ``visit``; ``least`` is the lower bound of its length, see
+``next_interval``.
 """
 
 
 LANE = np.dtype(
     [*((name, np.int64) for name in ("visit", "model")), ("now", float), ("end", float)]
 )
-"""The prediction in a lane: from ``now`` to ``end``, on the way to ``visit``."""
+"""The prediction in a lane, by ``model`` from ``now`` to ``end`` (seconds), on the way to
+``visit``.
+"""
 
 
 class Visits(Struct):
@@ -90,26 +94,30 @@ class Visits(Struct):
 
     The queue:
 
-    records   (C,) of VISIT, of which ``count`` are used
-    level     (F,) that of each place's last visit
-    first     (C + 2,) first visit of each level, or -1; ``top`` is the highest level
-    pairs     (C,) visits of a level that combine
-    intervals (2^k >= F,) of INTERVAL, a ring from ``begun`` up to ``added``
-    model     (F,) model of each place, HAS_SENSORS where the node reads increments
-    longest   (M,) longest gap in seconds that one step of a model spans
-    weight_row, weight_table  (W,) and (K, 4): row ``weight_row[w]`` holds own weight and message
-              weight of directed link w, and their square roots
+    records : (C,) of VISIT, of which ``count`` are used
+    level : (F,), level of the last visit of each place
+    first : (C + 2,), first visit of each level, or -1; ``top`` is the highest level
+    pairs : (C,), visits of a level that combine two nodes
+    intervals : (2^k >= F,) of INTERVAL, a ring buffer of the entries ``first_interval`` to
+                ``after_intervals`` - 1
+    model : (F,), model of each place, HAS_SENSORS if the node reads increments
+    longest : (M,), longest gap in seconds that one step of a model spans
+    weight_row, weight_table : (W,) and (K, 4); row ``weight_row[w]`` holds the own weight and the
+                               message weight of directed link w, and their square roots
 
-    The lanes, of nodes without sensors (index UNOBSERVED, of which some are ``waiting``) and with
-    them (SENSING):
+    The lanes, of nodes without increment sensors (index UNOBSERVED, ``waiting`` of them are in use)
+    and with them (SENSING):
 
-    lanes, places  (2, L) the predictions, and the places of their nodes
-    unobserved_rows, sensing_rows  (L, W') what the series give for each lane's gap
-    readings  what sensing nodes read
-    hearing   (2, L) places of the first and second nodes that hear the other
-    in_lanes  (8, L) weights of both directions; ``known`` (2, L) are their rows in the table
-    columns, values, gains  (W', L), (E, L), (3 n q, L) the same numbers by entry, for all lanes
-    x, other_x, moved  (n, L) means; S, other_S, V, T  (n, n, L) roots and scratch
+    lanes, places : (2, L), the predictions, and the places of their nodes
+    unobserved, sensing : power series in the gap
+    unobserved_rows, sensing_rows : (L, W'), their values at each lane's gap
+    columns, values, gains : (W', L), (E, L) and (3 n q, L), the same transposed, by value
+    readings : arrays for the readings of sensing nodes
+    receiver_places : (2, L), places of the first and second nodes that receive, else NO_NODE
+    in_lanes, loaded_weights : (8, L), weights of both directions, and (2, L), the rows of the table
+                               that they come from
+    x, other_x, moved : (n, L), means
+    S, other_S, V, T : (n, n, L), roots and scratch
     """
 
     records: np.ndarray
@@ -123,8 +131,8 @@ class Visits(Struct):
     weight_table: FloatArray
     lanes: np.ndarray
     places: IntArray
-    hearing: IntArray
-    known: IntArray
+    receiver_places: IntArray
+    loaded_weights: IntArray
     in_lanes: FloatArray
     unobserved: LaneSeries
     sensing: LaneSeries
@@ -144,17 +152,17 @@ class Visits(Struct):
     waiting: int
     count: int
     top: int
-    begun: int
-    added: int
+    first_interval: int
+    after_intervals: int
 
 
 def empty_visits(
     filters: Filters, weights: FloatArray, places: int, series: tuple[LaneSeries, LaneSeries]
 ) -> Visits:
-    """Return an empty queue for filters at so many ``places``; ``weights`` (W,) of directed links,
-    ``series`` of nodes without sensors and with them.
+    """Return an empty queue for filters at ``places`` places; ``weights`` (W,) are those of
+    directed links, ``series`` those of nodes without increment sensors and with them.
     """
-    n, most = filters.xhat.shape[1], max(MAX_VISITS, 4 * places)
+    n, capacity = filters.xhat.shape[1], max(MAX_VISITS, 4 * places)
     # Networks have few distinct weights: lanes look them up in a table, roots included.
     distinct, weight_row = np.unique(weights, return_inverse=True)
     own, table = np.maximum(0.0, 1.0 - distinct), filters.table
@@ -172,10 +180,10 @@ def empty_visits(
     nodes = filters.nodes
     model = np.where(nodes["sensors"] > nodes["sensor"], HAS_SENSORS, nodes["model"])
     return Visits(
-        records=np.zeros(most, dtype=VISIT),
+        records=np.zeros(capacity, dtype=VISIT),
         level=np.zeros(places, dtype=np.int64),
-        first=np.full(most + 2, -1, dtype=np.int64),
-        pairs=np.zeros(most, dtype=np.int64),
+        first=np.full(capacity + 2, -1, dtype=np.int64),
+        pairs=np.zeros(capacity, dtype=np.int64),
         model=np.tile(model, places // len(nodes)),
         longest=table.unit * 2.0 ** table.sizes[:, 4],
         weight_row=weight_row.astype(np.int64).reshape(-1),
@@ -183,8 +191,8 @@ def empty_visits(
         readings=empty_readings(filters),
         lanes=np.zeros((2, LANES), dtype=LANE),
         places=np.zeros((2, LANES), dtype=np.int64),
-        hearing=np.zeros((2, LANES), dtype=np.int64),
-        known=np.full((2, LANES), UNKNOWN, dtype=np.int64),
+        receiver_places=np.zeros((2, LANES), dtype=np.int64),
+        loaded_weights=np.full((2, LANES), UNKNOWN, dtype=np.int64),
         unobserved=unobserved,
         sensing=sensing,
         **{name: with_spare(shape) for name, shape in shapes.items()},
@@ -192,8 +200,8 @@ def empty_visits(
         waiting=0,
         count=0,
         top=0,
-        begun=0,
-        added=0,
+        first_interval=0,
+        after_intervals=0,
     )
 
 
@@ -204,14 +212,14 @@ def empty_visits(
 def append_visit(
     state: Simulation, visits: Visits, level: int, time: float, first: int, second: int
 ) -> int:
-    """Add a visit of the nodes at places ``first``, ``second`` to a level; returns its number."""
+    """Add a visit of the nodes at places ``first`` and ``second`` to a level; return its index."""
     v = visits.count
     visits.count = v + 1
     visit = visits.records[v]
     visit.first, visit.second, visit.time = first, second, time
     visit.to_first = visit.to_second = NOT_HEARD
     visit.run, visit.piece = state.run, state.piece
-    # The list of a level is in no order: its visits do not depend on each other.
+    # Visits of a level are independent of each other: their order in the list does not matter.
     visit.next = visits.first[level]
     visits.first[level] = v
     visits.top = max(visits.top, level)
@@ -220,8 +228,7 @@ def append_visit(
 
 @kernel
 def queue_visit(state: Simulation, visits: Visits, time: float, place: int) -> None:
-    """Queue the prediction of the node at a place."""
-    # Behind the last visit of this node, and of no other: nodes of one level are independent.
+    """Queue the prediction of the node at ``place`` to ``time``, one level above its last visit."""
     level = visits.level[place] + 1
     visits.level[place] = level
     append_visit(state, visits, level, time, place, NO_NODE)
@@ -229,8 +236,9 @@ def queue_visit(state: Simulation, visits: Visits, time: float, place: int) -> N
 
 @kernel
 def queue_sample(state: Simulation, visits: Visits, first: int) -> None:
-    """Queue a sample of all nodes of a run, from place ``first`` on, behind all their visits."""
-    # A sample needs all nodes of the run: it is a barrier behind their last visits.
+    """Queue a sample of all nodes of a run, from place ``first`` on, one level above all their
+    visits.
+    """
     level = 0
     for h in range(len(state.nodes)):
         level = max(level, visits.level[first + h])
@@ -257,7 +265,7 @@ def process_visits(state: Simulation, visits: Visits) -> None:
 
 @kernel
 def process_level(state: Simulation, visits: Visits, first: int) -> None:
-    """Process the visits of a level, the list of which begins with ``first``."""
+    """Process the visits of a level, a linked list that begins with ``first``."""
     v, pairs = first, 0
     while v != -1:
         visit = visits.records[v]
@@ -272,7 +280,7 @@ def process_level(state: Simulation, visits: Visits, first: int) -> None:
                 visits.pairs[pairs] = v
                 pairs += 1
         v = visit.next
-    # Both ends of a link are predicted before either hears the other.
+    # Both ends of a link are predicted before either combines.
     predict_unobserved(state, visits)
     process_intervals(state, visits)
     for k in range(0, pairs, LANES):
@@ -281,8 +289,8 @@ def process_level(state: Simulation, visits: Visits, first: int) -> None:
 
 @kernel
 def queue_prediction(state: Simulation, visits: Visits, v: int, place: int) -> None:
-    """Queue the node at a place for its prediction in a lane, or predict it at once if the gap is
-    too long for one step.
+    """Queue the node at ``place`` for its prediction to visit ``v`` in a lane, or predict it at
+    once if the gap is too long for one step.
     """
     visit, now = visits.records[v], state.now[place]
     # A node may have several visits at one time: it is predicted with the first of them.
@@ -293,26 +301,28 @@ def queue_prediction(state: Simulation, visits: Visits, v: int, place: int) -> N
     if m == HAS_SENSORS:
         queue_interval(state, visits, place, v, now, 0.0)
         return
-    # Without sensors one step is exact for any P, if the gap lies inside the table of series.
+    # Without sensors one step is exact for any P if the gap lies inside the cells of the table.
     if not gap < visits.longest[m]:
         propagate_root(state.table, m, state.root, state.xhat, place, gap, state.flow_scratch)
         return
-    q = visits.waiting
-    visits.waiting = q + 1
-    assign_lane(visits, UNOBSERVED, q, place, v, m, now, visit.time)
-    if q + 1 == LANES:
+    lane = visits.waiting
+    visits.waiting = lane + 1
+    assign_lane(visits, UNOBSERVED, lane, place, v, m, now, visit.time)
+    if lane + 1 == LANES:
         predict_unobserved(state, visits)
 
 
 @kernel
 def node_at(state: Simulation, run: int, place: int) -> int:
-    """Return the number in its run of the node at a place."""
+    """Return the index within its run of the node at ``place``."""
     return place - (run - state.first_run) * len(state.nodes)
 
 
 @kernel(inlined=True)
 def ring_index(visits: Visits, number: int) -> int:
-    """Return the index of an interval in its ring, whose length is a power of two."""
+    """Return the index in the ring buffer, whose length is a power of two, of interval
+    ``number``.
+    """
     return number & (len(visits.intervals) - 1)
 
 
@@ -323,7 +333,7 @@ def queue_interval(
     """Queue a sensing node, predicted up to ``now`` so far, for the next interval on its way to
     visit ``v``.
     """
-    # A node is on its way to one visit of a level only, so the ring has space for all.
+    # A node has one visit in a level at most, so the ring buffer has space for all.
     interval = visits.intervals[ring_index(visits, visits.after_intervals)]
     interval.place, interval.visit, interval.now, interval.least = place, v, now, least
     visits.after_intervals += 1
@@ -348,7 +358,7 @@ def prefetch_path_and_noise(state: Simulation, visits: Visits, v: int, place: in
 def process_intervals(state: Simulation, visits: Visits) -> None:
     """Predict all sensing nodes of a level up to their visits, and use their increments."""
     while visits.first_interval < visits.after_intervals:
-        # What follows an interval is added while it is used.
+        # The next interval of a node is added while this one is processed.
         count = min(LANES, visits.after_intervals - visits.first_interval)
         for q in range(count):
             interval = visits.intervals[ring_index(visits, visits.first_interval + q)]
@@ -362,8 +372,8 @@ def process_intervals(state: Simulation, visits: Visits) -> None:
 
 @kernel
 def fill_rates(state: Simulation, visits: Visits, count: int) -> None:
-    """Write trace(P G) (the rate of information, 1/s) and trace(P) for the nodes in ``count``
-    lanes.
+    """Write the rate of information trace(P G) in 1/s and trace(P) of the nodes in the first
+    ``count`` lanes into ``visits.readings``.
     """
     size, readings = state.size, visits.readings
     for q in range(count):
@@ -371,15 +381,15 @@ def fill_rates(state: Simulation, visits: Visits, count: int) -> None:
         visit = visits.records[interval.visit]
         h = node_at(state, visit.run, interval.place)
         load_model(readings, q, state.nodes[h].model, state.table.whitened_H)
-    # Both are found for all lanes at once, before each lane decides how far it goes.
+    # Both for all lanes at once, before the length of each lane's interval is chosen.
     store(MANY, readings.rate, 0, information_rate(MANY, size, readings.seen, visits.S))
     store(MANY, readings.trace, 0, trace_of_root(MANY, size, visits.S))
 
 
 @kernel
 def begin_interval(state: Simulation, visits: Visits, q: int) -> None:
-    """Take the next interval from the ring, whose node is in lane q: assign it the lane, or predict
-    its node at once if P is too wide for one step.
+    """Take the next interval from the ring buffer, whose node is in lane q: assign it the lane, or
+    predict its node at once if P is too wide for one step.
     """
     interval, readings = (
         visits.intervals[ring_index(visits, visits.first_interval)],
@@ -396,7 +406,7 @@ def begin_interval(state: Simulation, visits: Visits, q: int) -> None:
     else:
         visits.places[SENSING, q] = NO_NODE
         advance_over_interval(state, visit.run, h, place, visit.piece, now, end)
-    # The rest of the gap waits for its turn, with the covariance that this interval leaves.
+    # The rest of the gap is queued: its next interval depends on the covariance after this one.
     if end < time:
         queue_interval(state, visits, place, v, end, least)
 
@@ -405,8 +415,8 @@ def begin_interval(state: Simulation, visits: Visits, q: int) -> None:
 def assign_lane(
     visits: Visits, kind: int, q: int, place: int, v: int, m: int, now: float, end: float
 ) -> None:
-    """Assign lane q of its kind to a node with model ``m``, for its prediction from ``now`` to
-    ``end``.
+    """Assign lane q of ``kind`` to the node at ``place`` with model ``m``, for its prediction from
+    ``now`` to ``end`` on the way to visit ``v``.
     """
     lane = visits.lanes[kind, q]
     lane.visit, lane.model, lane.now, lane.end = v, m, now, end
@@ -437,7 +447,9 @@ def read_increments_in_lanes(state: Simulation, visits: Visits, count: int) -> N
 def gather_states(
     state: Simulation, places: IntArray, count: int, x: FloatArray, S: FloatArray
 ) -> None:
-    """Copy the states at ``count`` places into lanes; the other lanes get NO_NODE."""
+    """Copy the states at the first ``count`` ``places`` into lanes; the other places become
+    NO_NODE.
+    """
     n = len(state.size)
     for q in range(count, LANES):
         places[q] = NO_NODE
@@ -449,7 +461,7 @@ def gather_states(
 
 @kernel
 def scatter_states(state: Simulation, places: IntArray, x: FloatArray, S: FloatArray) -> None:
-    """Copy states in lanes back to their places, but not to NO_NODE."""
+    """Copy the states in lanes back to their ``places``, except lanes with NO_NODE."""
     n = len(state.size)
     for first in range(0, n, LANES):
         scatter(MANY, x, first, state.xhat, places, n - first)
@@ -464,12 +476,12 @@ def predict_unobserved(state: Simulation, visits: Visits) -> None:
     if count == 0:
         return
     visits.waiting = 0
-    # What lanes do alone goes from lane to lane in short loops: a processor overlaps their turns.
+    # Work of single lanes is in short loops over lanes, whose turns a processor overlaps.
     for q in range(count):
         evaluate_series(visits, UNOBSERVED, q, visits.unobserved, visits.unobserved_rows)
     gather_states(state, places, count, visits.x, visits.S)
     transpose_rows(visits.unobserved_rows, visits.columns)
-    copy_columns(visits.columns, visits.unobserved.place, 0, width_of(n, False), visits.values)
+    copy_columns(visits.columns, visits.unobserved.column, 0, width_of(n, False), visits.values)
     predict_lanes(state, visits, False)
     scatter_states(state, places, visits.x, visits.S)
 
@@ -484,10 +496,10 @@ def predict_sensing(state: Simulation, visits: Visits, count: int) -> None:
     read_increments_in_lanes(state, visits, count)
     transpose_rows(visits.sensing_rows, visits.columns)
     width = width_of(len(state.size), True)
-    copy_columns(visits.columns, visits.sensing.place, 0, width, visits.values)
-    copy_columns(visits.columns, visits.sensing.place, width, len(visits.gains), visits.gains)
+    copy_columns(visits.columns, visits.sensing.column, 0, width, visits.values)
+    copy_columns(visits.columns, visits.sensing.column, width, len(visits.gains), visits.gains)
     predict_lanes(state, visits, True)
-    # The covariance counts the readings already; the estimate uses them at the end of the gap.
+    # P includes the readings of the gap already (F and G_g); now they correct the estimate.
     moments = visits.readings.moments
     use_moments(MANY, state.size, visits.S, visits.x, visits.gains, moments)
     scatter_states(state, places, visits.x, visits.S)
@@ -497,7 +509,7 @@ def predict_sensing(state: Simulation, visits: Visits, count: int) -> None:
 def evaluate_series(
     visits: Visits, kind: int, q: int, series: LaneSeries, rows: FloatArray
 ) -> None:
-    """Evaluate the series of the model in a lane at its gap, into row ``q``."""
+    """Evaluate the ``series`` of the model in lane ``q`` at the lane's gap into ``rows[q]``."""
     lane = visits.lanes[kind, q]
     row = series.row[lane.model]
     cell, since = cell_of(series.unit[row], lane.end - lane.now)
@@ -514,17 +526,17 @@ def transpose_rows(rows: FloatArray, out: FloatArray) -> None:
 
 @kernel
 def copy_columns(
-    columns: FloatArray, place: IntArray, first: int, count: int, out: FloatArray
+    columns: FloatArray, index: IntArray, first: int, count: int, out: FloatArray
 ) -> None:
-    """Copy ``count`` values to ``out``; value e is the column ``place[first + e]``."""
+    """Copy ``count`` values to ``out``: entry e is column ``index[first + e]`` of ``columns``."""
     for e in range(count):
-        store(MANY, out, e, load(MANY, columns, place[first + e]))
+        store(MANY, out, e, load(MANY, columns, index[first + e]))
 
 
 @kernel(fused=True)
 def predict_lanes(state: Simulation, visits: Visits, reads: bool) -> None:
-    """Predict the states ``x`` and ``S`` by what is in ``values``: x = exp(A g) x, P = Q_g + F P (I
-    + G P)^-1 F'; G = 0 unless it ``reads``.
+    """Predict the states ``visits.x`` and ``visits.S`` by the matrices in ``visits.values``: x =
+    exp(A g) x and P = Q_g + F P (I + G_g P)^-1 F', with G_g = 0 and F = exp(A g) unless ``reads``.
     """
     size, n, values = state.size, len(state.size), visits.values
     S, V, T = (
@@ -532,11 +544,11 @@ def predict_lanes(state: Simulation, visits: Visits, reads: bool) -> None:
         local_lanes_matrix(size, MANY, visits.V),
         local_lanes_matrix(size, MANY, visits.T),
     )
-    # Local arrays of a known size stay in registers.
+    # Local arrays of a size known at compile time stay in registers.
     for i in range(n):
         for j in range(i + 1):
             store(MANY, S, i, j, load(MANY, visits.S, i, j))
-    # The root of P (I + G P)^-1.
+    # S <- root of P (I + G_g P)^-1.
     if reads:
         condition_root(MANY, size, S, values, V)
     # x <- exp(A g) x, then the root of F P F' + Q_g with Q_g = T T'.
@@ -551,38 +563,44 @@ def predict_lanes(state: Simulation, visits: Visits, reads: bool) -> None:
 
 @kernel
 def combine_pairs(state: Simulation, visits: Visits, k: int, count: int) -> None:
-    """Let the nodes of ``count`` visits hear each other, from index ``k`` of ``pairs`` on."""
+    """Combine the two nodes of each of the visits ``pairs[k:k + count]``, one visit in
+    each lane.
+    """
     records, places = visits.records, visits.places
-    heard_0, heard_1 = False, False
+    first_receives, second_receives = False, False
     for q in range(count):
         visit = records[visits.pairs[k + q]]
         places[0, q], places[1, q] = visit.first, visit.second
-        heard_0 = assign_receiver(visits, 0, q, visit.to_first, visit.first) or heard_0
-        heard_1 = assign_receiver(visits, 1, q, visit.to_second, visit.second) or heard_1
+        first_receives = (
+            assign_receiver(visits, 0, q, visit.to_first, visit.first) or first_receives
+        )
+        second_receives = (
+            assign_receiver(visits, 1, q, visit.to_second, visit.second) or second_receives
+        )
     for q in range(count, LANES):
         visits.receiver_places[0, q] = visits.receiver_places[1, q] = NO_NODE
-    # Both are as they were before either hears the other.
+    # Both states from before the combination.
     gather_states(state, places[0], count, visits.x, visits.S)
     gather_states(state, places[1], count, visits.other_x, visits.other_S)
-    if heard_0:
+    if first_receives:
         combine_lanes(state, visits, 0, visits.x, visits.S, visits.other_x, visits.other_S)
         scatter_states(state, visits.receiver_places[0], visits.moved, visits.V)
-    if heard_1:
+    if second_receives:
         combine_lanes(state, visits, 1, visits.other_x, visits.other_S, visits.x, visits.S)
         scatter_states(state, visits.receiver_places[1], visits.moved, visits.V)
 
 
 @kernel
 def assign_receiver(visits: Visits, side: int, lane: int, direction: int, place: int) -> bool:
-    """Let the node at a place hear a directed link in a lane, with the weights of that link;
-    returns False if it hears nothing (NOT_HEARD).
+    """Assign a lane the receiver at ``place`` (``side`` 0: first node of the visit, 1: second) and
+    the weights of its incoming link ``direction``. Return False if it receives nothing (NOT_HEARD).
     """
     if direction == NOT_HEARD:
         visits.receiver_places[side, lane] = NO_NODE
         return False
     visits.receiver_places[side, lane] = place
     weight_row = visits.weight_row[direction]
-    # Mostly all links have one weight, which the lane has from the visit before.
+    # Mostly all links have one weight, which the lane has already from the visit before.
     if visits.loaded_weights[side, lane] != weight_row:
         visits.loaded_weights[side, lane] = weight_row
         for k in range(4):
@@ -600,14 +618,16 @@ def combine_lanes(
     other_x: FloatArray,
     other_S: FloatArray,
 ) -> None:
-    """Write H (7) and (9), x = w x + w_j x_j and P = w P + w_j P_j, into ``moved`` and ``V``."""
+    """Write the convex combination H (7) and (9), w x + w_j x_j and the root of w P + w_j P_j, into
+    ``moved`` and ``V``, with the weights of ``side``.
+    """
     size, n, values = state.size, len(state.size), visits.in_lanes
     total, wide = local_lanes_matrix(size, MANY, visits.V), local_lanes_matrix(size, MANY, visits.T)
     own, weight = load(MANY, values, 4 * side), load(MANY, values, 4 * side + 1)
     own_root, root = load(MANY, values, 4 * side + 2), load(MANY, values, 4 * side + 3)
     for i in range(n):
-        mean = own * load(MANY, x, i) + weight * load(MANY, other_x, i)
-        store(MANY, visits.moved, i, mean)
+        combined = own * load(MANY, x, i) + weight * load(MANY, other_x, i)
+        store(MANY, visits.moved, i, combined)
         for j in range(i + 1):
             store(MANY, total, i, j, own_root * load(MANY, S, i, j))
             store(MANY, wide, i, j, root * load(MANY, other_S, i, j))
