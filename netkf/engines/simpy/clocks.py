@@ -42,16 +42,16 @@ def clock_processes(
     activation = scenario.network.activation
     if not scenario.hosted.talks or not isinstance(activation, LinkClock):
         return []
-    air = (scenario, recorder, transmitter, nodes)
+    shared = (scenario, recorder, transmitter, nodes)
     if activation.at == "readings":
-        _transmit_after_samples(timeline, *air)
+        _transmit_after_samples(timeline, *shared)
         return []
-    make = {
+    make_activations = {
         "links": _link_activations,
         "directions": _direction_activations,
         "nodes": _node_activations,
     }
-    activations = make[activation.at](*air)
+    activations = make_activations[activation.at](*shared)
     return [
         _tick_process(scenario, streams, timeline, recorder, entity, k, activate)
         # The index of an entity orders simultaneous ticks.
@@ -77,7 +77,7 @@ def _tick_process(
     origin = clock.origin(entity, partial(stream, streams, entity, "phase"))
     now, index, count = 0.0, 0, FIRST_BLOCK
     while True:
-        # Ticks are drawn in blocks; a block never depends on how far the simulation has come.
+        # Ticks are drawn in blocks; their times do not depend on the length of a block.
         times = next_ticks(clock, entity, ClockPosition(origin, index, now), random, count).tolist()
         for now in times:
             # Half open: a tick at the horizon does not happen.
@@ -85,12 +85,13 @@ def _tick_process(
                 return
             yield timeline.at(now, Rank.TICK, tick_order)
             activate(now)
-        # A clock that gives no more ticks has stopped for good.
+        # An empty block: the clock has no more ticks.
         if not times:
             return
         recorder.flush_if_full()
         index += len(times)
-        # Few numbers at first: a slow clock uses few, and a fast one soon draws long blocks.
+        # Blocks double in length: a slow clock wastes few numbers, a fast one soon draws many at
+        # once.
         count = min(2 * count, MAX_BLOCK)
 
 
@@ -114,7 +115,7 @@ def _link_activations(
         def activate(now: float) -> None:
             """Send a message in each direction."""
             recorder.append((now, TICK, i, j, -1, -1, NAN))
-            # Both ends decide what they send before either hears the other.
+            # Both payloads are computed before either end receives.
             exchange.exchange((nodes[i].emit(now, (j,)), nodes[j].emit(now, (i,))))
 
         return activate
@@ -138,7 +139,7 @@ def _direction_activations(
         def activate(now: float) -> None:
             """Send one message."""
             recorder.append((now, TICK, i, j, -1, -1, NAN))
-            # Drawn before the payload is made: even if nothing is sent, the channel takes its step.
+            # Drawn in any case: even if nothing is sent, the channel takes its step.
             outcome = direction.sampler.draw()
             transmitter.send(direction, nodes[i].emit(now, (j,)), outcome)
 
@@ -153,9 +154,9 @@ def broadcasts(
     transmitter: Transmitter,
     nodes: dict[int, ClockedNode],
 ) -> dict[int, Activation]:
-    """Return for each node an activation that transmits once to all that can hear it.
+    """Return for each node an activation that broadcasts one payload to all its receivers.
 
-    Each hearer has an outcome of its own.
+    Each receiver has an outcome of its own.
     """
     directions: dict[int, list[Any]] = {node: [] for node in scenario.nodes}
     for k, (i, j) in enumerate(scenario.topology.directions):
@@ -165,14 +166,14 @@ def broadcasts(
 
     def activation(node: int) -> Activation:
         """Return the broadcast of a node: one payload to all its neighbours."""
-        hearers, sent = tuple(direction.link[1] for direction in directions[node]), 0
+        receivers, sent = tuple(direction.link[1] for direction in directions[node]), 0
 
         def transmit(now: float) -> None:
             """Send one payload to each neighbour, each with an outcome of its own."""
             nonlocal sent
             # Drawn even if the filter sends nothing, so that the network does not depend on it.
             outcomes = [direction.sampler.draw() for direction in directions[node]]
-            payload = nodes[node].emit(now, hearers)
+            payload = nodes[node].emit(now, receivers)
             if payload is None:
                 return
             # A broadcast is one transmission, numbered by sender; its messages are numbered by
@@ -221,12 +222,11 @@ def _transmit_after_samples(
     transmit = broadcasts(scenario, recorder, transmitter, nodes)
     # Only nodes with sampled sensors have samples to transmit after.
     for node in scenario.sampled_sensors:
-        carrier = nodes[node]
+        clocked_node = nodes[node]
 
-        def after(now: float, node: int = node, entity: int = carrier.entity) -> None:
+        def transmit_now(now: float, node: int = node, entity: int = clocked_node.entity) -> None:
             """Broadcast as soon as all samples of this instant have been used."""
-            # At the rank of ticks: every sample of this instant has been used by then, at all
-            # nodes.
+            # At the rank of ticks: by then all nodes have used their samples of this instant.
             timeline.call_at(now, Rank.TICK, entity, lambda _: transmit[node](now))
 
-        carrier.after_sample = after
+        clocked_node.after_sample = transmit_now

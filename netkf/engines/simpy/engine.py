@@ -40,9 +40,9 @@ class DivergedError(Exception):
 
 @dataclass
 class SimpyEngine(Engine):
-    """Runs every scenario: sensors, clocks and samplers are processes, messages that take time and
-    the mail of a node are events. ``arrange`` may reorder the processes before they start; nothing
-    that happens depends on it. What ran is counted in the recorder's ``stats``.
+    """Runs every scenario: sensors, clocks and samplers are processes; messages that take time and
+    absorptions are events. ``arrange`` may reorder the processes before they start, which changes
+    no result. The recorder's ``stats`` count processes and events.
     """
 
     arrange: Callable[[list[Process]], list[Process]] = list
@@ -69,7 +69,7 @@ class SimpyEngine(Engine):
             except DivergedError:
                 return "diverged"
             finally:
-                # Also after an error: the trace keeps what has happened.
+                # Also after an error, so that the trace has all events so far.
                 recorder.stats = {"processes": timeline.processes, "events": timeline.events}
                 recorder.flush()
         return "complete"
@@ -92,16 +92,16 @@ class _Simulation:
         scenario, streams, timeline = self._scenario, self._streams, self.timeline
         truth = scenario.continuous_truth(streams)
 
-        def make(node: int, entity: int, sensing: tuple[int, ...]) -> ClockedNode:
+        def make_node(node: int, entity: int, sensing: tuple[int, ...]) -> ClockedNode:
             """Return one node in continuous time with its increment sensors."""
-            # A pooled filter carries the increment sensors of all nodes.
-            carriers = [(k, p) for k in sensing for p in scenario.increment_sensors.get(k, ())]
-            sensors = increment_sensors(scenario, streams, carriers)
+            # A pooled filter has the increment sensors of all nodes.
+            placed = [(k, p) for k in sensing for p in scenario.increment_sensors.get(k, ())]
+            sensors = increment_sensors(scenario, streams, placed)
             common = (timeline, self._recorder, truth, sensors)
             return ClockedNode(*common, *_identify(scenario, node, entity))
 
-        nodes = _nodes(scenario, make)
-        # Before anything happens: the sums that exchanges must conserve from now on.
+        nodes = _nodes(scenario, make_node)
+        # The conserved sums at the start, before any exchange.
         sums = _Sums(distinct(nodes))
         shared = (scenario, streams, timeline, self._recorder)
         return [
@@ -115,7 +115,7 @@ class _Simulation:
         """Record the states at the probe times."""
         for time in self._scenario.times.tolist():
             yield self.timeline.at(time, Rank.PROBE, 0)
-            # Other events leave a node at its own time; a sample needs all of them at one.
+            # Events predict only the nodes that take part; a sample needs all nodes at one time.
             for node in distinct(nodes):
                 node.predict_to(time)
             self._record(time, truth.absolute(time), truth.local(time), nodes, sums)
@@ -129,7 +129,7 @@ class _Simulation:
             yield self.timeline.at(time, Rank.REBASE, 0)
             for node in distinct(nodes):
                 node.predict_to(time)
-            # Estimates are lowered by the local state, which is the new origin.
+            # The new origin is the local state: subtract it from all estimates.
             offset = -truth.rebase(k)
             for node in distinct(nodes):
                 node.shift(offset)
@@ -189,7 +189,7 @@ class _Simulation:
                 sample()
             elif last:
                 recorder.pause()  # the horizon is half open: this slot makes its sample only
-            # A filtered state is there only after all stages of the slot.
+            # A filtered state is sampled after all stages of the slot.
             if not predicts:
                 yield self.timeline.at(*schedule.end(slot), 0)
                 recorder.resume()
@@ -200,26 +200,31 @@ class _Simulation:
             slot += 1
 
     def _record(self, time: float, x: Any, local: Any, nodes: dict[int, Any], sums: _Sums) -> None:
-        """Record one sample; ``local`` is the state in the coordinates of the estimates."""
+        """Record one sample of the state ``x``; ``local`` is x relative to the origin of the
+        estimates.
+
+        Raises DivergedError if an estimate is not sound.
+        """
         scenario, recorder = self._scenario, self._recorder
         # By identity: a pooled filter is asked once, and its estimate serves all nodes.
         estimate_by_state = {id(n): n.algorithm.estimate(n.state) for n in distinct(nodes)}
         estimates = [estimate_by_state[id(nodes[node])] for node in scenario.nodes]
-        near, P, without = stack_estimates(estimates)
-        # The trace shows absolute states; adding the origin loses digits, so the error is separate.
-        far = near if x is local else near + (x - local)
-        recorder.sample(time, x, far, P, local - near)
+        local_estimates, P, has_no_P = stack_estimates(estimates)
+        # The trace has absolute states. Adding the origin loses digits, so the error is computed
+        # from local ones.
+        xhat = local_estimates if x is local else local_estimates + (x - local)
+        recorder.sample(time, x, xhat, P, local - local_estimates)
         # Sums are taken at samples only: summing over all nodes at every event would be quadratic.
         if sums.start:
             recorder.sums = sums.pairs()
         recorder.flush_if_full()
         self._progress(time)
-        # A broken estimate ends the run, but only at a sample: between samples nobody looks.
-        lost = broken(scenario, near, P, without)
-        # Recorded after the sample, which shows the broken estimate.
-        for node in lost:
+        # An estimate that is not sound ends the run; it is noticed at samples only.
+        diverged = broken(scenario, local_estimates, P, has_no_P)
+        # Recorded after the sample, which has the diverged estimate.
+        for node in diverged:
             recorder.append((time, DIVERGED, node, -1, -1, -1, NAN))
-        if lost:
+        if diverged:
             raise DivergedError
 
 
@@ -234,7 +239,7 @@ def _nodes(scenario: Scenario, make: Callable[[int, int, tuple[int, ...]], Any])
 def _identify(scenario: Scenario, node: int, entity: int) -> tuple[Any, ...]:
     """Return the arguments of Node: filter, id, index, model, start and NodeInfo."""
     model, first = scenario.believed_models[entity], scenario.nodes[entity]
-    # -1: the pooled filter is no node of the graph.
+    # -1: the pooled filter, which is not a node of the graph.
     if node < 0:
         model = scenario.believed_pooled_model
     return (
@@ -257,7 +262,7 @@ class _Sums:
     def _compute(self) -> dict[str, float]:
         """Return the conserved sums over all nodes by name."""
         parts = [_conserved_terms(node.algorithm, node.state) for node in self._nodes]
-        # fsum: rounding of the check itself would look like a loss.
+        # fsum: rounding of this sum would look like a loss.
         return {name: math.fsum(t for part in parts for t in part[name]) for name in parts[0]}
 
     def pairs(self) -> dict[str, tuple[float, float]]:
@@ -267,6 +272,6 @@ class _Sums:
 
 
 def _conserved_terms(algorithm: Filter, state: Any) -> dict[str, list[float]]:
-    """Return the terms of a node to the conserved sums, as lists by name."""
-    found = algorithm.conserved(state)
-    return {name: np.atleast_1d(np.asarray(value)).tolist() for name, value in found.items()}
+    """Return the terms that a node contributes to the conserved sums, as lists by name."""
+    quantities = algorithm.conserved(state)
+    return {name: np.atleast_1d(np.asarray(value)).tolist() for name, value in quantities.items()}

@@ -19,11 +19,12 @@ SENSE, ABSORB = CODES["sense"], CODES["absorb"]
 
 
 class Envelope(NamedTuple):
-    """A message under way: message ``number`` of its sender on a directed link.
+    """A message under way.
 
-    ``weight`` is the weight that the receiver gives it, ``sent`` its time in seconds, ``exchange``
-    the exchange of the run that it belongs to in slots (-1 under clocks), and ``age`` the seconds
-    that it took, once it has arrived.
+    sender, number : node that sent it, and its number on the directed link
+    weight : weight that the receiver gives to it
+    sent, age : time of sending, and the seconds that it took once it has arrived
+    exchange : in slots the number, within the run, of its exchange; -1 under clocks
     """
 
     sender: int
@@ -58,14 +59,16 @@ class Node:
         self.inbox: dict[int, list[Envelope]] = {}
 
     def put(self, envelope: Envelope) -> None:
-        """Put a message into the inbox, in place of an older one of that sender if newest_only."""
-        known = self.inbox.setdefault(envelope.sender, [])
-        if self.algorithm.newest_only and known:
+        """Put a message into the inbox; with ``newest_only`` the newest of each sender replaces
+        others.
+        """
+        envelopes = self.inbox.setdefault(envelope.sender, [])
+        if self.algorithm.newest_only and envelopes:
             # Delays may differ: a message that arrives later may have been sent earlier.
-            if envelope.sent >= known[0].sent:
-                known[0] = envelope
+            if envelope.sent >= envelopes[0].sent:
+                envelopes[0] = envelope
         else:
-            known.append(envelope)
+            envelopes.append(envelope)
 
     def take_messages(self) -> tuple[list[Envelope], list[Message]]:
         """Empty the inbox and return its envelopes and messages, ordered by sender."""
@@ -112,15 +115,15 @@ class ClockedNode(Node):
             self.state = self.algorithm.predict(self.state, time - self._now)
             self._now = time
             return
-        # Without a lower bound, an exploding covariance would ask for ever shorter intervals.
-        least = MIN_GAP_SHARE * (time - self._now)
+        # A lower bound: a diverging covariance would make intervals ever shorter.
+        min_interval = MIN_GAP_SHARE * (time - self._now)
         while self._now < time:
             end = time
             interval = self.algorithm.max_measurement_interval(self.state)
             if interval < time - self._now:
                 # P changes too much over the whole gap: use the increments of a part of it.
-                end = interval_end(self._now, time, max(interval, least))
-                least *= LONGER
+                end = interval_end(self._now, time, max(interval, min_interval))
+                min_interval *= LONGER
             # Predict first: the increments of a gap are an observation at its end.
             gap = end - self._now
             self.state = self.algorithm.predict(self.state, gap)
@@ -137,11 +140,11 @@ class ClockedNode(Node):
         x_moments = truth.moments(start, end)
         parts = [sensor.moments(truth, x_moments, start, end) for sensor in self._increments]
         # Stack the sensors: first moments of all rows, then the second ones.
-        whole = parts[0] if len(parts) == 1 else np.concatenate(parts, axis=1)
-        return np.asarray(whole.reshape(-1))
+        stacked = parts[0] if len(parts) == 1 else np.concatenate(parts, axis=1)
+        return np.asarray(stacked.reshape(-1))
 
     def sample(self, node: int, y: FloatArray, H: Any, R: FloatArray) -> None:
-        """Take a sample of one sensor of ``node``; one update uses all of this instant."""
+        """Store a sample of one sensor of ``node``; one update uses all samples of this instant."""
         # The first sample of an instant schedules the update, which then uses all of them.
         if not self._samples:
             self._timeline.call_at(self._timeline.now, Rank.UPDATE, self.entity, self._use_samples)
@@ -166,7 +169,7 @@ class ClockedNode(Node):
 
     def emit(self, time: float, receivers: tuple[int, ...]) -> Any:
         """Return the payload that the node sends at ``time``, before it absorbs anything."""
-        # What is sent is the state of now, and not that of the last event.
+        # The payload is of the present state, not of that at the last event.
         self.predict_to(time)
         exchange = Exchange(time=time, receivers=receivers)
         self.state, payload = self.algorithm.emit(self.state, exchange)
@@ -196,13 +199,13 @@ class ClockedNode(Node):
 def linearise(
     algorithm: Filter, state: Any, y: FloatArray, H: Any
 ) -> tuple[FloatArray, FloatArray]:
-    """Return a reading y (p,) and its H (p, n); one of a nonlinear sensor, which comes with a
-    function in place of H, is linearised at the estimate of the node that takes it.
+    """Return a reading y (p,) and its H (p, n). A nonlinear sensor has a function in place of H,
+    which linearises its reading at the node's estimate.
     """
     if isinstance(H, np.ndarray):
         return y, H
-    found: tuple[FloatArray, FloatArray] = H(y, algorithm.estimate(state)[0])
-    return found
+    reading: tuple[FloatArray, FloatArray] = H(y, algorithm.estimate(state)[0])
+    return reading
 
 
 def distinct(nodes: dict[int, Any]) -> list[Any]:

@@ -32,7 +32,7 @@ def sensor_processes(
     truth: Any,
     nodes: dict[int, ClockedNode],
 ) -> list[Process]:
-    """Return all processes that read the truth."""
+    """Return one process for each node with increment sensors and for each sampled sensor."""
     index = scenario.topology.index
     processes = [
         # One process for all increment sensors of a node: they are read at the same times.
@@ -61,14 +61,14 @@ def _increment_process(
     node: int,
     entity: int,
 ) -> Process:
-    """Make the node use its increments at each point of the sensing grid."""
-    # Nothing is sensed at time 0: increments need a time that has passed.
+    """Make ``node`` use its increments at each point of the sensing grid."""
+    # From grid point 1 on, since increments need an interval.
     k = 1
-    # Half open: at the horizon nothing is sensed.
+    # Half open: the horizon is excluded.
     while (time := truth.grid(k)) < scenario.horizon:
         yield timeline.at(time, Rank.SENSE, entity)
         recorder.append((time, SENSE, node, -1, -1, -1, NAN))
-        # predict_to() uses the increments up to now; nothing else is to be done here.
+        # predict_to() uses the increments up to now.
         carrier.predict_to(time)
         k += 1
 
@@ -84,10 +84,10 @@ class SamplingProcess:
     R: FloatArray
 
     def run(self, timeline: Timeline, truth: Any, receiver: ClockedNode) -> Process:
-        """Read the truth at the sample times, and hand each sample to the node."""
+        """Read the truth at the sample times, and pass each sample to the node."""
         for k, time in enumerate(self.times.tolist()):
             yield timeline.at(time, Rank.SENSE, self.entity)
-            # In local coordinates, as the estimates are.
+            # Relative to the moving origin, like the estimates.
             y, H = self.samples.reading(k, truth.local(time))
             receiver.sample(self.node, y, H, self.R)
 
@@ -95,15 +95,15 @@ class SamplingProcess:
 def increment_sensors(
     scenario: Scenario, streams: Streams, placed: list[tuple[int, PlacedSensor]]
 ) -> list[SensorPath]:
-    """Return the readings of some increment sensors in one run."""
+    """Return the readings of the increment sensors ``placed`` (node, sensor) in one run."""
     paths = []
     for node, placed_sensor in placed:
         sensor = scenario.sensors[placed_sensor.entry]
         assert isinstance(sensor, LinearSensor)
-        # Noise on the grid and noise of cuts have streams of their own, so that the grid does not
-        # depend on the network.
-        noise, cutting = (
+        # Noise on the grid and the division of steps have separate streams, so that the noise on
+        # the grid does not depend on the network.
+        noise, division = (
             streams.generator(p, node, placed_sensor.ordinal) for p in ("noise", "cut")
         )
-        paths.append(sensor.path(noise, cutting))
+        paths.append(sensor.path(noise, division))
     return paths

@@ -1,8 +1,8 @@
-"""Scenarios in slots: clocks that all tick together.
+"""Scenarios in slots: all nodes follow one schedule of predictions, readings and exchanges.
 
-The filter's schedule says what happens in a slot and when: predictions, readings, exchanges in
-steps. Each node is a process that follows it, each node with sensors another one that reads, and
-one clock lets all nodes (or the pairs of a matching) transmit at once.
+Each node is a process that follows the schedule of the filter; each node with sensors has another
+process that reads them; and one process, the slot clock, lets all nodes (or the pairs of a
+matching) transmit at once.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ SENSE, TICK, ROUND, SWAP, ABSORB, STOP = (
     CODES[kind] for kind in ("sense", "tick", "round", "swap", "absorb", "stop")
 )
 FIRST_RANK = Rank.PROBE + 1
-"""What happens in a slot comes after arrivals of that instant, in the order of the schedule."""
+"""The stages of a slot come after arrivals of the same instant; their ranks follow the schedule."""
 
 Process = Generator[simpy.Event, Any, None]
 
@@ -86,7 +86,8 @@ class SlotSchedule:
     def stages(self, slot: int) -> list[Stage]:
         """Return the stages of a slot in their order."""
         if slot not in self._cache:
-            self._cache.pop(slot - 2, None)  # no process is so far behind
+            # All processes are in this slot or the one before.
+            self._cache.pop(slot - 2, None)
             self._cache[slot] = list(self._stages_of(slot))
         return self._cache[slot]
 
@@ -99,15 +100,15 @@ class SlotSchedule:
         """Yield the stages of a slot in order: sends, absorptions, updates and predictions."""
         algorithm, start = self._algorithm, self.start(slot)
         now, rank, phase = start, FIRST_RANK + 1, 0
-        # A filtered estimate starts from what is known before any reading.
-        waits = slot == 0 and not algorithm.predicts
+        # In slot 0 a filter that does not predict uses no reading: its sample is the initial state.
+        is_initial = slot == 0 and not algorithm.predicts
         talks = algorithm.talks and slot >= algorithm.first_slot
         # Exchanges begin at the filter's first slot, and their numbers at 0 there.
         number = (slot - algorithm.first_slot) * sum(self._exchanges)
         for kind in algorithm.schedule or ():
             if kind == "exchange":
-                # Steps share the phase equally, and end at computed times: no sum of lengths
-                # drifts.
+                # Steps share the phase equally. Their ends are computed from the start of the slot,
+                # so that rounding does not add up.
                 steps = self._exchanges[phase]
                 for step in range(steps if talks else 0):
                     yield Stage("send", now, rank, phase, step, number)
@@ -117,11 +118,11 @@ class SlotSchedule:
                     yield Stage("absorb", now, rank + 1, phase, step, number)
                     rank, number = rank + 2, number + 1
                 phase += 1
-            elif not waits and kind == "sense":
+            elif not is_initial and kind == "sense":
                 yield Stage("read", now, rank)
                 yield Stage("update", now, rank + 1)
                 rank += 2
-            elif not waits:
+            elif not is_initial:
                 yield Stage("predict", now, rank)
                 rank += 1
 
@@ -135,10 +136,10 @@ class SlotNode(Node):
         schedule: SlotSchedule,
         period: float,
         streams: Streams,
-        *rest: Any,
+        *arguments: Any,
     ) -> None:
-        super().__init__(*rest)
-        # Made for those who decide at random only.
+        super().__init__(*arguments)
+        # Only randomised filters draw from this stream.
         randomised = self.algorithm.randomised
         self._uniforms = streams.generator("trigger", self.node) if randomised else None
         self._recorder, self._schedule, self._period = recorder, schedule, period
@@ -150,17 +151,17 @@ class SlotNode(Node):
     def run_process(self, timeline: Timeline) -> Process:
         """Run the process of the node: follow the schedule, slot after slot."""
         slot = 0
-        # Readers and the clock follow the same stages; ranks put the processes in order.
+        # Readers and the slot clock follow the same stages; ranks order the processes.
         while self._schedule.runs(slot):
             for stage in self._schedule.stages(slot):
-                # Reading and sending belong to other processes.
+                # Other processes do the reading and sending.
                 if stage.kind not in ("read", "send"):
                     yield timeline.at(stage.time, stage.rank, self.entity)
                     self._perform(stage, slot)
             slot += 1
 
     def _perform(self, stage: Stage, slot: int) -> None:
-        """Carry out one stage of a slot."""
+        """Do one stage of a slot: predict, update or absorb."""
         if stage.kind == "predict":
             self.state = self.algorithm.predict(self.state, self._period)
         elif stage.kind == "update":
@@ -169,7 +170,7 @@ class SlotNode(Node):
             self._close(stage, slot)
 
     def read(self, y: FloatArray, H: Any) -> None:
-        """Take the reading of one sensor."""
+        """Store the reading of one sensor."""
         self._samples.append((y, H))
 
     def _update(self, time: float) -> None:
@@ -202,7 +203,7 @@ class SlotNode(Node):
 
     def in_time(self, envelope: Envelope) -> bool:
         """Return True if the inbox is still open for the exchange of the message."""
-        # A message carries the exchange it was sent in: a later one does not take it.
+        # A message carries the number of its exchange: in a later one it is late.
         return envelope.exchange == self._open
 
     def receive(self, envelope: Envelope) -> None:
@@ -217,7 +218,7 @@ class SlotNode(Node):
         self._open = -1
         exchange = Exchange(now, phase, stage.step, slot)
         self.state = self.algorithm.absorb(self.state, messages, exchange)
-        # A swap shows each message; other filters absorb all of them as one.
+        # A swap records each message; other filters absorb all of them in one event.
         if self.algorithm.pairwise:
             for envelope in envelopes:
                 peer, number, age = envelope.sender, envelope.number, envelope.age
@@ -232,8 +233,8 @@ class SlotNode(Node):
 
 
 def _finite_rows(y: FloatArray, H: FloatArray) -> np.ndarray:
-    """Return which rows (p,) of a reading have a value."""
-    # A reading without values has no row that counts.
+    """Return flags (p,) of the rows of a reading that have a value."""
+    # A recorded sensor without a row has an empty y.
     return np.isfinite(y) if len(y) == len(H) else np.zeros(len(H), dtype=bool)
 
 
@@ -279,7 +280,7 @@ class SlotClock:
         self._distinct = distinct(nodes)
         self._matching_random = streams.generator("matching")
         links = scenario.topology.links if scenario.hosted.talks else ()
-        # Nodes without links send to nobody, and are not asked.
+        # Nodes without links are never asked for a message.
         self._talking = sorted({node for link in links for node in link})
         self._links = {
             link: LinkExchange(scenario, transmitter, nodes, link, k)
@@ -299,7 +300,7 @@ class SlotClock:
     def _exchange(self, stage: Stage, slot: int) -> None:
         """Let all nodes of this exchange send, over the links or pairs that are active."""
         now, phase, broadcast = stage.time, stage.phase, not self._algorithm.pairwise
-        # All inboxes open before anyone sends: a message without delay arrives at once.
+        # All inboxes open before any node sends: a message without delay arrives at once.
         for node in self._distinct:
             node.open(stage.number)
         pairs, up = self._pairs(stage, slot, broadcast)
@@ -309,17 +310,17 @@ class SlotClock:
         else:
             senders = sorted({node for pair in pairs for node in pair})
         exchange = Exchange(now, phase, stage.step, slot)
-        # Everyone emits before anyone hears, so that the order of nodes does not matter.
+        # All payloads are computed before any message arrives: the order of nodes does not matter.
         payloads = {node: self._nodes[node].emit(exchange) for node in senders}
-        # Links that are held keep their outcome for all steps of an exchange.
+        # Held links keep their outcome for all steps of an exchange.
         fresh = self._algorithm.redraws_links(phase, stage.step)
         for i, j in pairs:
             if not broadcast:
                 self._recorder.append((now, TICK, i, j, -1, phase, NAN))
-            # A link that is listed as down loses its messages, but draws all the same.
-            here = up is None or (i, j) in up
+            # A recorded link that is down loses its messages, but its channel draws all the same.
+            is_up = up is None or (i, j) in up
             both = payloads[i], payloads[j]
-            self._links[i, j].exchange(both, phase, stage.number, here, fresh)
+            self._links[i, j].exchange(both, phase, stage.number, is_up, fresh)
 
     def _pairs(self, stage: Stage, slot: int, broadcast: bool) -> tuple[list[Any], set[Any] | None]:
         """Return the links that are used, and the subset of them that is up (None for all)."""

@@ -1,4 +1,4 @@
-"""Simulated time: a SimPy environment in which every event has its place in the order."""
+"""Simulated time: a SimPy environment with an explicit order of simultaneous events."""
 
 from __future__ import annotations
 
@@ -22,23 +22,24 @@ class Timeline(simpy.Environment):
         self.processes = 0
 
     def start(self, process: Generator[simpy.Event, Any, Any]) -> None:
-        """Let a process begin; in what order processes are started makes no difference."""
+        """Start a process; the order in which processes start does not matter."""
         self.processes += 1
         self.process(process)
 
     def at(self, time: float, rank: Rank | int, entity: int) -> simpy.Event:
         """Return an event that happens at ``time``, before those of higher (rank, entity).
 
-        ``Environment.timeout`` would add a delay to the present time, and ``now + (time - now)`` is
-        not ``time`` in the last bit: recorded times would not come back, lattices would not meet.
-        This is what simpy.Timeout does, with the time itself and an explicit priority.
+        ``Environment.timeout`` would add a delay to the present time, and ``now + (time - now)``
+        may differ from ``time`` in the last bit: recorded times would not be reproduced, and events
+        of two grids would not coincide. This does the same as simpy.Timeout, with an absolute time
+        and an explicit priority.
         """
         event = simpy.Event(self)
-        # An event that has its value is triggered: SimPy calls its callbacks when it comes up.
+        # An event with a value counts as triggered: SimPy calls its callbacks when its time comes.
         event._ok, event._value = True, None
         queue: list[Any] = self._queue  # simpy annotates its priorities as two constants
-        # Rank before entity in one integer: 48 bits hold any entity. The event number only breaks
-        # ties.
+        # The priority is (rank, entity) as one integer; 48 bits hold any entity. The event number
+        # is unique, so that events themselves are never compared.
         heappush(queue, (time, rank << 48 | entity, next(self._eid), event))
         return event
 
@@ -53,6 +54,7 @@ class Timeline(simpy.Environment):
 
     @property
     def events(self) -> int:
-        """How many events SimPy has processed so far."""
-        # Its counter of events cannot be read without moving it; each one that is left waits.
+        """Number of events that SimPy has processed so far."""
+        # All events created, less those still in the queue. next() would advance SimPy's counter,
+        # so read it from its repr.
         return int(repr(self._eid)[len("count(") : -1]) - len(self._queue)

@@ -49,14 +49,14 @@ class DirectedLink:
         sampler: ChannelSampler,
     ) -> None:
         self.link, self.entity, self.sampler, self.receiver = link, entity, sampler, receiver
-        # Looked up once: table and weight do not change in a run.
+        # Probability in the table and weight do not change in a run.
         self.table_probability = scenario.table_probability(link)
         self.weight = scenario.weight(link[1], link[0])
         self.messages = 0
 
 
 class Transmitter:
-    """Carries all messages of a run; each message that takes time is an event."""
+    """Sends and delivers all messages of a run; a message that takes time is an event."""
 
     def __init__(
         self, scenario: Scenario, streams: Streams, timeline: Timeline, recorder: Recorder
@@ -66,7 +66,7 @@ class Transmitter:
         self._channel = scenario.network.channel
         self._horizon, self._until = scenario.horizon, scenario.ends
         # Payloads under way, by link and number, because a move of the origin shifts them.
-        self._flying: dict[tuple[Link, int], Envelope] = {}
+        self._under_way: dict[tuple[Link, int], Envelope] = {}
 
     def sampler(self, link: Link) -> ChannelSampler:
         """Return the sampler of a link (symmetric channel) or of one direction of it."""
@@ -108,23 +108,23 @@ class Transmitter:
             self._arrive(direction, phase, envelope, None)
         # A message that would arrive after the end is neither delivered nor lost.
         elif now + delay < self._until:
-            # Kept here and in the callback; the one here may be shifted meanwhile.
-            self._flying[direction.link, number] = envelope
+            # Delivery takes the envelope from this dictionary, since it may be shifted meanwhile.
+            self._under_way[direction.link, number] = envelope
             callback = partial(self._arrive, direction, phase, envelope)
             self._timeline.call_at(now + delay, Rank.DELIVER, direction.entity, callback)
 
     def _arrive(
         self, direction: DirectedLink, phase: int, envelope: Envelope, arrival: simpy.Event | None
     ) -> None:
-        """Deliver a message to its receiver, or record that it came too late."""
+        """Deliver a message to its receiver, or record that it arrives too late."""
         now, (sender, receiver) = self._timeline.now, direction.link
         # A message without delay arrives inside the tick, and keeps its age of 0.
         if arrival is not None:
             # The stored envelope may have been shifted since it was sent.
-            envelope = self._flying.pop((direction.link, envelope.number))
+            envelope = self._under_way.pop((direction.link, envelope.number))
             envelope = envelope._replace(age=now - envelope.sent)
         arrives_in_time = direction.receiver.in_time(envelope)
-        # After the horizon only the last slot is finished, for its sample: it leaves no events.
+        # After the horizon the last slot is finished for its sample, without recording events.
         if now < self._horizon or envelope.sent == now:
             kind, number = DELIVER if arrives_in_time else LATE, envelope.number
             self._recorder.append((now, kind, receiver, sender, number, phase, envelope.age))
@@ -134,11 +134,11 @@ class Transmitter:
     def shift(self, algorithm: Filter, offset: FloatArray) -> None:
         """Shift all messages under way: the origin of coordinates has moved by ``-offset``."""
         now = self._timeline.now
-        for key, envelope in self._flying.items():
-            # A payload is of the time it was sent: the offset is moved back to then.
+        for key, envelope in self._under_way.items():
+            # A payload refers to the time of sending: predict the offset back to it.
             earlier = self._scenario.move_back(offset, now - envelope.sent)
             payload = algorithm.shift_payload(envelope.payload, earlier)
-            self._flying[key] = envelope._replace(payload=payload)
+            self._under_way[key] = envelope._replace(payload=payload)
 
 
 class LinkExchange:
@@ -158,7 +158,7 @@ class LinkExchange:
     ) -> None:
         i, j = link
         self._transmitter, self._shared = transmitter, scenario.network.channel.symmetric
-        # Outcomes of the last draw, for links that are held.
+        # Outcomes of the last draw, for held links.
         self._outcomes: list[ChannelDraw] = []
         forth = transmitter.sampler((i, j))
         # Entities 2 k and 2 k + 1: the order in which simultaneous messages arrive.
@@ -186,10 +186,13 @@ class LinkExchange:
         if fresh or not self._outcomes:
             first, *others = self._directions
             # The first direction draws; with a symmetric channel its draw serves both.
-            drawn = first.sampler.draw()
+            outcome_forth = first.sampler.draw()
             self._outcomes = [
-                drawn,
-                *(drawn if self._shared else direction.sampler.draw() for direction in others),
+                outcome_forth,
+                *(
+                    outcome_forth if self._shared else direction.sampler.draw()
+                    for direction in others
+                ),
             ]
         # Not strict: in a directed graph only the first end sends.
         for direction, payload, outcome in zip(
