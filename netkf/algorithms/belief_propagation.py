@@ -467,6 +467,8 @@ def predict_evidence(evidence: FloatArray, back: FloatArray) -> FloatArray:
 
 def recentre_evidence(evidence: FloatArray, before: FloatArray, after: FloatArray) -> FloatArray:
     """Return evidence with its centre moved from ``before`` (n,) to ``after``."""
-    moved, old, new = (np.array(values)[..., None] for values in (evidence, before, after))
-    recentre_part_single(moved, old, new)
-    return np.ascontiguousarray(moved[..., 0])
+    result, old_centre, new_centre = (
+        np.array(values)[..., None] for values in (evidence, before, after)
+    )
+    recentre_part_single(result, old_centre, new_centre)
+    return np.ascontiguousarray(result[..., 0])

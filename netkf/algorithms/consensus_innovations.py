@@ -146,7 +146,7 @@ class GainSequence:
     def __init__(self, design: Design) -> None:
         n, N = design.n, design.nodes
         self._n = n
-        self._heard = design.heard
+        self._neighbours = design.heard
         self._F = np.frombuffer(design.F).reshape(n, n)
         self._information = np.frombuffer(design.information).reshape(N, n, n)
         self._pseudo = pseudo_states(self._F, self._information.sum(axis=0))
@@ -180,24 +180,26 @@ class GainSequence:
         slots = np.minimum(slots, len(self._gains))
         slot_gains = self._gains[slots[0] - 1 : slots[-1]]
         node_gains = [one for gains in slot_gains for one in gains]
-        K, N, n = len(slot_gains), len(self._heard), self._n
-        B, *rest = (
+        K, N, n = len(slot_gains), len(self._neighbours), self._n
+        B, *other_gains = (
             np.concatenate([getattr(one, name).reshape(-1, n, n) for one in node_gains])
             for name in SlotGains._fields
         )
-        table = SlotGains(B.reshape(K, -1, n, n), *(part.reshape(K, N, n, n) for part in rest))
+        table = SlotGains(
+            B.reshape(K, -1, n, n), *(part.reshape(K, N, n, n) for part in other_gains)
+        )
         return slots - slots[0], table
 
     @staticmethod
     def _has_converged(before: tuple[NodeGains, ...], now: tuple[NodeGains, ...]) -> bool:
         """Return True if no covariance has changed by more than rounding."""
         roots = (np.stack([one.root for one in gains]) for gains in (before, now))
-        old, new = (S @ np.swapaxes(S, 1, 2) for S in roots)
-        return bool(np.abs(new - old).max() <= CONVERGED * np.abs(new).max())
+        former, present = (S @ np.swapaxes(S, 1, 2) for S in roots)
+        return bool(np.abs(present - former).max() <= CONVERGED * np.abs(present).max())
 
     def _advance_slot(self) -> tuple[NodeGains, ...]:
         """Advance the errors by one slot, and return its gains."""
-        nodes = range(len(self._heard))
+        nodes = range(len(self._neighbours))
         self._errors = np.hstack([self._predict(), self._driven])
         predicted = [self._covariance_root(i) for i in nodes]
         gains = self._correct_pseudo_states()
@@ -212,7 +214,7 @@ class GainSequence:
     def _predict(self) -> FloatArray:
         """Return the errors after F, (2 N n, inputs): those of all xhat, and then of all yhat."""
         # e_x <- F e_x and e_y <- coupling e_x + A e_y, with the plant's noise added by the caller.
-        x, y = self._errors.reshape(2, len(self._heard), self._n, -1)
+        x, y = self._errors.reshape(2, len(self._neighbours), self._n, -1)
         predicted = np.stack([self._F @ x, self._pseudo.coupling @ x + self._pseudo.A @ y])
         return predicted.reshape(self._errors.shape)
 
@@ -222,7 +224,7 @@ class GainSequence:
 
     def _pseudo_error(self, i: int) -> FloatArray:
         """Return the error (n, inputs) of a node's yhat."""
-        return self._state_error(len(self._heard) + i)
+        return self._state_error(len(self._neighbours) + i)
 
     def _covariance_root(self, i: int) -> FloatArray:
         """Return the lower triangular root (n, n) of P of node ``i``."""
@@ -230,11 +232,11 @@ class GainSequence:
 
     def _correct_pseudo_states(self) -> list[tuple[FloatArray, FloatArray]]:
         """Correct all yhat at once; return B (d, n, n) and M (n, n) of each node."""
-        n, N, first = self._n, len(self._heard), self._errors.shape[1]
+        n, N, first = self._n, len(self._neighbours), self._errors.shape[1]
         inputs = sum(noise.shape[1] for noise in self._noises)
         self._errors = np.hstack([self._errors, np.zeros((len(self._errors), inputs))])
         gains, corrected = [], []
-        for i, heard in enumerate(self._heard):
+        for i, neighbours in enumerate(self._neighbours):
             e = self._pseudo_error(i)
             observed = self._information[i] @ self._pseudo.inverse
             innovation = observed @ e
@@ -243,13 +245,13 @@ class GainSequence:
             innovation[:, first:stop] = self._noises[i]
             first = stop
             # yhat_i is corrected by the differences to its neighbours' and by the innovation.
-            theta = np.concatenate([*(e - self._pseudo_error(j) for j in heard), innovation])
-            sizes = [variances(e) + variances(self._pseudo_error(j)) for j in heard]
+            theta = np.concatenate([*(e - self._pseudo_error(j) for j in neighbours), innovation])
+            sizes = [variances(e) + variances(self._pseudo_error(j)) for j in neighbours]
             sizes.append(np.square(observed) @ variances(e) + np.diag(self._information[i]))
             gain = optimal_gain(e, theta, np.concatenate(sizes))
             # All yhat are corrected at once, from those before the exchange.
             corrected.append(e - gain @ theta)
-            split = np.stack(np.split(gain, len(heard) + 1, axis=1))
+            split = np.stack(np.split(gain, len(neighbours) + 1, axis=1))
             gains.append((split[:-1], split[-1]))
         self._errors[N * n :] = np.concatenate(corrected)
         return gains
@@ -524,8 +526,8 @@ class ConsensusInnovations(Filter):
         gains, order = state.gains, state.design.heard[state.node_index]
         senders = [order.index(message.payload.node_index) for message in messages]
         received_gains = gains._replace(B=gains.B[senders])
-        heard = [message.payload.yhat for message in messages]
-        xhat, yhat = correct_estimates(state, received_gains, heard)
+        received = [message.payload.yhat for message in messages]
+        xhat, yhat = correct_estimates(state, received_gains, received)
         return state._replace(xhat=xhat, yhat=yhat, root=gains.root)
 
     def shift(self, state: PseudoState, offset: FloatArray) -> PseudoState:
@@ -543,13 +545,13 @@ class ConsensusInnovations(Filter):
 
 
 def correct_estimates(
-    state: PseudoState, gains: NodeGains, heard: Sequence[FloatArray]
+    state: PseudoState, gains: NodeGains, received: Sequence[FloatArray]
 ) -> tuple[FloatArray, FloatArray]:
-    """Return xhat and yhat (n,) of a node after an exchange in which it ``heard`` the estimates of
-    pseudo-states to which the gains B belong.
+    """Return xhat and yhat (n,) of a node after an exchange in which it ``received`` the estimates
+    of pseudo-states to which the gains B belong.
     """
-    n, y = len(state.xhat), np.stack([state.yhat, *heard])[None, :, :, None]
-    links, up = star_of([1.0] * len(heard))
+    n, y = len(state.xhat), np.stack([state.yhat, *received])[None, :, :, None]
+    links, up = star_of([1.0] * len(received))
     readings = block_of_reading(*(state.reading or (np.zeros(0), np.zeros((0, n)))))
     gain_arrays = SlotGains(*(np.array(getattr(gains, name)) for name in SlotGains._fields))
     table = SlotGains(gain_arrays.B[None], *(part[None, None] for part in gain_arrays[1:]))

@@ -62,24 +62,24 @@ def swap_pairs(
                 store(lanes, scratch.root, h, i, j, load(lanes, nodes.root, b, h, i, j))
     for h in range(len(nodes.rows)):
         for m in range(links.first[h], links.first[h + 1]):
-            heard = load_flags(lanes, plan.up, b, s, 0, links.direction[m])
+            arrived = load_flags(lanes, plan.up, b, s, 0, links.direction[m])
             # Skip idle links: in a single run a matching uses few.
-            if any_lane(heard):
-                copy_pair(nodes, scratch, b, h, links.sender[m], heard)
+            if any_lane(arrived):
+                copy_pair(nodes, scratch, b, h, links.sender[m], arrived)
 
 
 @kernel(inlined=True)
 def copy_pair(
-    nodes: SlotNodes, scratch: SlotScratch, b: int, h: int, sender: int, heard: Any
+    nodes: SlotNodes, scratch: SlotScratch, b: int, h: int, sender: int, arrived: Any
 ) -> None:
-    """Copy the pair that ``sender`` sent to filter ``h``, in the lanes that ``heard`` it."""
+    """Copy the pair that ``sender`` sent to filter ``h``, in the lanes that ``arrived`` it."""
     lanes = scratch.lanes
     for i in range(len(scratch.size)):
         own, sent = load(lanes, nodes.xhat, b, h, i), load(lanes, scratch.xhat, sender, i)
-        store(lanes, nodes.xhat, b, h, i, select(heard, sent, own))
+        store(lanes, nodes.xhat, b, h, i, select(arrived, sent, own))
         for j in range(i + 1):
             own, sent = load(lanes, nodes.root, b, h, i, j), load(lanes, scratch.root, sender, i, j)
-            store(lanes, nodes.root, b, h, i, j, select(heard, sent, own))
+            store(lanes, nodes.root, b, h, i, j, select(arrived, sent, own))
 
 
 @built_in("gossip")

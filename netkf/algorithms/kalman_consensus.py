@@ -200,11 +200,13 @@ class Kcf(Filter):
 
 
 def consensus_term(
-    prior: FloatArray, root: FloatArray, heard: Sequence[FloatArray], epsilon: float
+    prior: FloatArray, root: FloatArray, predictions: Sequence[FloatArray], epsilon: float
 ) -> FloatArray:
-    """Return ``gamma P sum_j (xbar_j - xbar)`` (n,) for the predictions that were heard."""
-    n, x = len(prior), np.stack([prior, *heard])[None, :, :, None]
-    links, up = star_of([1.0] * len(heard))
+    """Return ``gamma P sum_j (xbar_j - xbar)`` (n,) for the ``predictions`` (n,) that a node
+    received.
+    """
+    n, x = len(prior), np.stack([prior, *predictions])[None, :, :, None]
+    links, up = star_of([1.0] * len(predictions))
     term, S = np.empty((1, n, 1)), np.ascontiguousarray(root).reshape(1, 1, n, n, 1)
     consensus_term_single(x, links, up, S, epsilon, term, np.empty((n, 1)))
     return term.reshape(n)

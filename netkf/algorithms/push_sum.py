@@ -45,7 +45,7 @@ from netkf.algorithms.kernels.slots import (
     store_sample_of_slot,
     whiten_reading,
 )
-from netkf.algorithms.kernels.stopping import NEVER, PAPER, RULES, has_stopped
+from netkf.algorithms.kernels.stopping import NEVER, PAPER, RULES, MassStep, has_stopped
 from netkf.algorithms.models import SlotModel, first_root
 from netkf.algorithms.registry import built_in
 from netkf.algorithms.running_sums import Offer, RunningSums
@@ -155,28 +155,10 @@ class PushSumArrays(NamedTuple):
     new_information: FloatArray
     new_number: FloatArray
     silent: np.ndarray
-    stop: StopScratch
+    stop: MassStep
     running: bool
     offered: FloatArray
     heard: FloatArray
-
-
-class StopScratch(NamedTuple):
-    """The arguments of ``has_stopped``, for one lane.
-
-    mass, before : (1, m) and (m,), the mass now and before the step
-    information, former : G^(i) (1, n, n) of P (6), now and before
-    number, former_number : N^(i) (1,), now and before
-    work : (n, n), scratch
-    """
-
-    mass: FloatArray
-    before: FloatArray
-    information: FloatArray
-    number: FloatArray
-    former: FloatArray
-    former_number: FloatArray
-    work: FloatArray
 
 
 @kernel
@@ -250,7 +232,9 @@ def exchange_mass(
     b: int,
     s: int,
 ) -> None:
-    """Exchange mass once, P steps 2.1 to 2.3."""
+    """Exchange mass once in slot ``s`` of block ``b``, P steps 2.1 to 2.3: all nodes send shares of
+    their mass, mix what arrives, and update their estimates of the network.
+    """
     H, slot = len(arrays.degree), plan.first + s
     # All shares are computed before any mass changes.
     for h in range(H):
@@ -263,10 +247,12 @@ def exchange_mass(
         if arrays.running:
             receive_totals(arrays, plan, links, scratch, b, s, h)
             # Running sums have no stop rule: the number of shares does not matter.
-            learn(arrays, samples, scratch, b, h, spread(scratch.lanes, 0.0), slot)
+            update_network_estimate(
+                arrays, samples, scratch, b, h, spread(scratch.lanes, 0.0), slot
+            )
         else:
             received = mix_mass(arrays, plan, links, scratch, b, s, h)
-            learn(arrays, samples, scratch, b, h, received, slot)
+            update_network_estimate(arrays, samples, scratch, b, h, received, slot)
 
 
 @kernel
@@ -359,7 +345,7 @@ def mix_mass(
 
 
 @kernel(inlined=True)
-def learn(
+def update_network_estimate(
     arrays: PushSumArrays,
     samples: SlotSamples,
     scratch: SlotScratch,
@@ -401,16 +387,13 @@ def stops(arrays: PushSumArrays, b: int, h: int, q: int, all_up: bool) -> bool:
     """
     stop, n = arrays.stop, arrays.new_information.shape[0]
     for i in range(arrays.mass.shape[2]):
-        stop.mass[0, i], stop.before[i] = arrays.mass[b, h, i, q], arrays.before[i, q]
+        stop.mass[i], stop.before[i] = arrays.mass[b, h, i, q], arrays.before[i, q]
     for i in range(n):
         for j in range(n):
-            stop.information[0, i, j] = arrays.new_information[i, j, q]
-            stop.former[0, i, j] = arrays.information[b, h, i, j, q]
+            stop.information[i, j] = arrays.new_information[i, j, q]
+            stop.former[i, j] = arrays.information[b, h, i, j, q]
     stop.number[0], stop.former_number[0] = arrays.new_number[0, q], arrays.number[b, h, q]
-    return has_stopped(
-        arrays.rule, arrays.tolerance, stop.mass, 0, stop.before, all_up, stop.information,
-        stop.number, stop.former, stop.former_number, stop.work,
-    )  # fmt: skip
+    return has_stopped(arrays.rule, arrays.tolerance, stop, all_up)
 
 
 @kernel(inlined=True)
@@ -564,7 +547,7 @@ class PushSum(Filter):
         mass = np.stack([state.mass for state in states])
         m, running = mass.shape[1], self._keeps_totals
         W = sum(info.degree for info in infos) if running else 0
-        shapes = (1, m), (m,), (1, n, n), (1,), (1, n, n), (1,), (n, n)
+        shapes = (m,), (m,), (n, n), (n, n), (1,), (1,), (n, n)
         return (
             PushSumArrays(
                 mass=in_lanes(mass, blocks),
@@ -588,7 +571,7 @@ class PushSum(Filter):
                 new_information=aligned((n, n, LANES)),
                 new_number=aligned((1, LANES)),
                 silent=np.zeros(LANES, dtype=np.uint8),
-                stop=StopScratch(*(np.zeros(shape) for shape in shapes)),
+                stop=MassStep(*(np.zeros(shape) for shape in shapes)),
                 running=running,
                 offered=aligned((blocks, H if running else 0, m, LANES)),
                 heard=aligned((blocks, W, m, LANES)),
@@ -676,19 +659,16 @@ class PushSum(Filter):
         if state.stopped:
             return state
         estimate, former = network(state.mass, state.model), state.network
-        stopped = has_stopped(
-            RULES.index(self.stop),
-            self.tolerance,
-            state.mass[None],
-            0,
+        step = MassStep(
             before,
-            all_up,
-            estimate.information[None],
-            np.array([estimate.number]),
-            former.information[None],
+            state.mass,
+            former.information,
+            estimate.information,
             np.array([former.number]),
+            np.array([estimate.number]),
             np.empty(estimate.information.shape),
         )
+        stopped = has_stopped(RULES.index(self.stop), self.tolerance, step, all_up)
         return state._replace(network=estimate, stopped=stopped)
 
     def update(self, state: Any, reading: Reading) -> Any:

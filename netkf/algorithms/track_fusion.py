@@ -172,8 +172,8 @@ class PairFusion(Filter):
         """Fuse with each estimate heard, predicted to now."""
         pair = state.xhat, state.root
         for message in messages:
-            heard = message.payload
-            other = state.model.extrapolate(heard.xhat, heard.root, message.age)
+            payload = message.payload
+            other = state.model.extrapolate(payload.xhat, payload.root, message.age)
             pair = fuse_tracks(pair, other, self.inverse, self.minimise == TRACE)
         return state._replace(xhat=pair[0], root=pair[1])
 

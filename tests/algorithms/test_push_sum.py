@@ -197,14 +197,12 @@ def test_the_stop_rule_of_the_paper_breaks_and_the_safe_one_does_not(delivery, w
 
 
 def within(D, bound):
-    mass = np.concatenate([[1.0, 1.0], D.reshape(-1)])[None]
-    return stopping.moved_within(mass, 0, np.zeros(mass.shape[1]), bound, np.empty(D.shape))
+    mass = np.concatenate([[1.0, 1.0], D.reshape(-1)])
+    return stopping.moved_within(np.zeros(len(mass)), mass, bound, np.empty(D.shape))
 
 
 def settled(information, number, former, former_number, tolerance):
-    return stopping.has_converged(
-        information[None], number, former[None], 0, former_number, tolerance
-    )
+    return stopping.has_converged(former, information, former_number, number, tolerance)
 
 
 @pytest.mark.parametrize("n", [1, 2, 4, 7])

@@ -130,7 +130,7 @@ def test_tables_of_lanes_hold_transitions_and_gains(ring, case):
     A, n = np.array(case.plant.A), case.plant.n
     lower = n * (n + 1) // 2
     model = next(model for model in case.models if len(model.H))
-    places = {"unobserved": waiting.unobserved.place, "sensing": waiting.sensing.place}
+    places = {"unobserved": waiting.unobserved.column, "sensing": waiting.sensing.place}
     # Two axes that are alike have few columns of their own.
     assert (len(set(places["sensing"])) < 30) == (len(set(places["unobserved"])) < 10)
     for kind, longest in (("unobserved", 0.9), ("sensing", 0.19)):
@@ -141,7 +141,7 @@ def test_tables_of_lanes_hold_transitions_and_gains(ring, case):
             np.random.default_rng(1).random(30), 0.5 ** np.arange(1, 12)
         ):
             summed(table.series, table.unit[0], table.far_terms, gap, out)
-            values = out[0][table.place]
+            values = out[0][table.column]
             if kind == "unobserved":
                 Q = noise_over(A, np.array(case.plant.B), gap)[np.tril_indices(n)]
                 np.testing.assert_allclose(values[:lower], Q, rtol=1e-12)

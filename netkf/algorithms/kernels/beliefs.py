@@ -5,6 +5,8 @@ lower triangular, and z is relative to a centre c (n,), ``Z (x - c) = z + v`` wi
 block of runs filter ``h`` holds the evidence of its own readings, ``own[h]`` (H, n, n + 1, L), and
 for each direction m of ``SlotLinks`` the evidence that its sender sent last, ``received[m]``
 (W, n, n + 1, L), both relative to its own centre. A ``part`` is one such array (n, n + 1, L).
+
+``lanes`` is ONE for a single run or MANY for L runs side by side (``netkf.linalg.lanes``).
 """
 
 from __future__ import annotations

@@ -48,18 +48,18 @@ def fill_exponential_integrals(
     """Write ``J_1 = int_0^s e^{M u} du``, and e^{M s} and ``J_2 = int_0^s (s - u) e^{M u} du`` into
     the first and the last of ``work`` (4, n, n), by power series; M is multiplied by ``sign``.
     """
-    n, E, term, moved, J_2 = len(M), work[0], work[1], work[2], work[3]
+    n, E, term, product, J_2 = len(M), work[0], work[1], work[2], work[3]
     for i in range(n):
         for j in range(n):
-            one = 1.0 if i == j else 0.0
-            E[i, j] = term[i, j] = one
-            J_1[i, j], J_2[i, j] = step * one, 0.5 * step * step * one
+            identity = 1.0 if i == j else 0.0
+            E[i, j] = term[i, j] = identity
+            J_1[i, j], J_2[i, j] = step * identity, 0.5 * step * step * identity
     # (M s)^k / k!, integrated once and twice.
     for k in range(1, TERMS):
-        multiply_square(moved, term, M)
+        multiply_square(product, term, M)
         for i in range(n):
             for j in range(n):
-                term[i, j] = sign * moved[i, j] * step / k
+                term[i, j] = sign * product[i, j] * step / k
                 E[i, j] += term[i, j]
                 J_1[i, j] += term[i, j] * step / (k + 1)
                 J_2[i, j] += term[i, j] * step * step / ((k + 1) * (k + 2))
@@ -70,19 +70,19 @@ def double_gap(step: float, J_1: FloatArray, work: FloatArray) -> None:
     """Double the step of the integrals that ``fill_exponential_integrals`` wrote for ``step``:
     J_2 <- J_2 + s J_1 + E J_2, J_1 <- J_1 + E J_1 and E <- E E.
     """
-    n, E, moved, J_2 = len(J_1), work[0], work[2], work[3]
-    multiply_square(moved, E, J_2)
+    n, E, product, J_2 = len(J_1), work[0], work[2], work[3]
+    multiply_square(product, E, J_2)
     for i in range(n):
         for j in range(n):
-            J_2[i, j] += step * J_1[i, j] + moved[i, j]
-    multiply_square(moved, E, J_1)
+            J_2[i, j] += step * J_1[i, j] + product[i, j]
+    multiply_square(product, E, J_1)
     for i in range(n):
         for j in range(n):
-            J_1[i, j] += moved[i, j]
-    multiply_square(moved, E, E)
+            J_1[i, j] += product[i, j]
+    multiply_square(product, E, E)
     for i in range(n):
         for j in range(n):
-            E[i, j] = moved[i, j]
+            E[i, j] = product[i, j]
 
 
 @kernel

@@ -6,6 +6,8 @@ and z is relative to a centre c (n,), the estimate of the node that holds the pa
 differences of near states lose no digits. Omega may be singular, as that of a single reading is.
 
 Stacks ``parts`` (2, K, H, n, n + 1, L) hold K pairs of each of H nodes, before and after a step.
+
+``lanes`` is ONE for a single run or MANY for L runs side by side (``netkf.linalg.lanes``).
 """
 
 from __future__ import annotations

@@ -1,6 +1,8 @@
 """Kernels of covariance intersection, D (8) and (9), for filters in slots, on lanes.
 
 Information is carried as a root too, ``P^-1 = Z' Z``; the formulas are those of ``root_update``.
+
+``lanes`` is ONE for a single run or MANY for L runs side by side (``netkf.linalg.lanes``).
 """
 
 from __future__ import annotations
@@ -30,8 +32,8 @@ def invert_lanes(lanes: Lanes, out: FloatArray, root: FloatArray, b: int, h: int
             entry = load(lanes, root, b, h, i, j)
             row += entry * entry
         diagonal, floor = load(lanes, root, b, h, i, i), SINGULAR * root_of(row)
-        size = magnitude(diagonal)
-        inverse = 1.0 / with_sign(select(size > floor, size, floor), diagonal)
+        length = magnitude(diagonal)
+        inverse = 1.0 / with_sign(select(length > floor, length, floor), diagonal)
         # Forward substitution, row i of S^-1.
         for j in range(i):
             value = spread(lanes, 0.0)

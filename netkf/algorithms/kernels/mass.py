@@ -5,6 +5,8 @@ The order of every sum is fixed, since the rounding of masses decides in which s
 
 Node ``h`` of block ``b`` has index ``[b, h]`` of stacks with lanes (``netkf.linalg.lanes``): masses
 (B, H, m, L), roots (B, H, n, n, L).
+
+``lanes`` is ONE for a single run or MANY for L runs side by side (``netkf.linalg.lanes``).
 """
 
 from __future__ import annotations

@@ -3,6 +3,8 @@ combinations.
 
 Filter ``h`` of a block has index ``[b, h]`` of stacks with lanes (``netkf.linalg.lanes``):
 estimates (B, H, n, L), lower triangular roots (B, H, n, n, L).
+
+``lanes`` is ONE for a single run or MANY for L runs side by side (``netkf.linalg.lanes``).
 """
 
 from __future__ import annotations

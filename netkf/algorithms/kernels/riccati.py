@@ -64,8 +64,8 @@ def lyapunov_series(A: FloatArray, Q: FloatArray, terms: int) -> FloatArray:
     series[1] = Q
     for k in range(2, terms):
         # k W_k = A W_(k-1) + W_(k-1) A' from k = 2 on: Q is constant and enters W_1 only.
-        moved = A @ series[k - 1]
-        series[k] = (moved + moved.T) / k
+        A_W = A @ series[k - 1]
+        series[k] = (A_W + A_W.T) / k
     return series
 
 
@@ -182,8 +182,8 @@ def substep(
     if len(table.unobserved):
         values = polynomial(table.unobserved, gap)
         transition, noise = values[: n * n].reshape(n, n), values[n * n :].reshape(n, n)
-        moved = matmul(transition, P)
-        return symmetrize(add_matmul(noise, moved, transition.T)), matvec(transition, x)
+        transition_P = matmul(transition, P)
+        return symmetrize(add_matmul(noise, transition_P, transition.T)), matvec(transition, x)
     values = polynomial(table.series, gap)
     E, transition = values[: 4 * n * n].reshape(2 * n, 2 * n), values[4 * n * n :].reshape(n, n)
     # [X; Y] = E [I; P], and the new P is Y X^-1

@@ -27,6 +27,9 @@ read or written) and x (K, n), with scratch arrays from :func:`flow_scratch`:
     information_rate(lanes, size, whitened_H, S)                  trace(P G) in 1/s
     gain_root(size, moments, series, ...)                         readings of a gap, see gains.py
 
+    lanes : ONE for a single run or MANY for L runs side by side, see linalg.lanes; arrays of lanes
+            have a last axis L. size : has the length n, which a compiler may know (linalg.structs)
+
 and for Python, one node at a time, ``flow_root(table, root, x, gap)`` and
 ``gain_update_root(gains, root, x, moments, gap)``.
 """
@@ -786,9 +789,10 @@ def cholesky_in_lanes(lanes: Lanes, size: Size, T: FloatArray, packed: FloatArra
             for r in range(j):
                 total -= load(lanes, T, i, r) * load(lanes, T, j, r)
             store(lanes, T, i, j, total)
+        # T_jj = pivot^1/2 and T_ij = total_i / T_jj.
         pivot = load(lanes, T, j, j)
-        counts = pivot > PIVOT * load(lanes, packed, j * (j + 1) // 2 + j)
-        inverse = select(counts, 1.0 / root_of(select(counts, pivot, 1.0)), 0.0)
+        is_positive = pivot > PIVOT * load(lanes, packed, j * (j + 1) // 2 + j)
+        inverse = select(is_positive, 1.0 / root_of(select(is_positive, pivot, 1.0)), 0.0)
         for i in range(j, n):
             store(lanes, T, i, j, load(lanes, T, i, j) * inverse)
 

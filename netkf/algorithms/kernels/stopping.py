@@ -6,6 +6,7 @@ Both engines call these kernels, so that rounding is the same and a node stops i
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
@@ -14,57 +15,60 @@ RULES = ("never", "safe", "paper")
 NEVER, SAFE, PAPER = range(3)
 
 
-@kernel
-def has_stopped(
-    rule: int,
-    tolerance: float,
-    mass: FloatArray,
-    k: int,
-    before: FloatArray,
-    all_up: bool,
-    information: FloatArray,
-    number: FloatArray,
-    former: FloatArray,
-    former_number: FloatArray,
-    work: FloatArray,
-) -> bool:
-    """Return True if a node stops by ``rule`` (its index in RULES) with this ``tolerance``.
+class MassStep(NamedTuple):
+    """How the mass and the network estimate of one node changed in a step.
 
-    In this step its mass (2 + n n,) changed from ``before`` to ``mass[k]``, and its estimates of
-    the network, P (6), from ``former[k]`` (n, n) and ``former_number[k]`` to ``information[0]`` and
-    ``number[0]``. ``all_up``: all links of the node were up. ``work`` (n, n) is scratch.
+    before, mass : (2 + n n,), its mass before the step and after it
+    former, information : (n, n), G^(i) of P (6), before and after
+    former_number, number : (1,), N^(i), before and after
+    work : (n, n), scratch
+    """
+
+    before: FloatArray
+    mass: FloatArray
+    former: FloatArray
+    information: FloatArray
+    former_number: FloatArray
+    number: FloatArray
+    work: FloatArray
+
+
+@kernel
+def has_stopped(rule: int, tolerance: float, step: MassStep, all_up: bool) -> bool:
+    """Return True if a node stops by ``rule`` (its index in RULES) with this ``tolerance``;
+    ``all_up``: all links of the node were up in this step.
     """
     if rule == PAPER:
         # P step 2.3 waits until information has reached the node, since a mass of zero does not
         # change either.
         has_mass = False
-        for i in range(2, mass.shape[1]):
-            has_mass = has_mass or mass[k, i] != 0.0
-        return has_mass and moved_within(mass, k, before, tolerance, work)
+        for i in range(2, len(step.mass)):
+            has_mass = has_mass or step.mass[i] != 0.0
+        return has_mass and moved_within(step.before, step.mass, tolerance, step.work)
     # SAFE trusts a step only if all links were up: in an outage estimates do not change either.
-    if rule == SAFE and all_up and mass[k, 0] > 0.0:
-        return has_converged(information, number[0], former, k, former_number[k], tolerance)
+    if rule == SAFE and all_up and step.mass[0] > 0.0:
+        return has_converged(
+            step.former, step.information, step.former_number[0], step.number[0], tolerance
+        )
     return False
 
 
 @kernel
-def moved_within(
-    mass: FloatArray, k: int, before: FloatArray, bound: float, work: FloatArray
-) -> bool:
-    """Return True if the change D of the information, from ``before`` to ``mass[k]``, has a
-    spectral norm below ``bound``: both ``bound I - D`` and ``bound I + D`` are positive definite.
+def moved_within(before: FloatArray, mass: FloatArray, bound: float, work: FloatArray) -> bool:
+    """Return True if the change D of the information, from ``before`` to ``mass``, has a spectral
+    norm below ``bound``: both ``bound I - D`` and ``bound I + D`` are positive definite.
     """
     n = len(work)
     # |D_ii| < bound is necessary and cheap to test first. ``not <`` rejects nan.
     for i in range(n):
         index = 2 + i * n + i
-        if not abs(mass[k, index] - before[index]) < bound:
+        if not abs(mass[index] - before[index]) < bound:
             return False
     for sign in (-1.0, 1.0):
         for i in range(n):
             for j in range(n):
                 index = 2 + i * n + j
-                work[i, j] = sign * (mass[k, index] - before[index])
+                work[i, j] = sign * (mass[index] - before[index])
             work[i, i] += bound
         if not has_positive_pivots(work):
             return False
@@ -91,25 +95,21 @@ def has_positive_pivots(work: FloatArray) -> bool:
 
 @kernel
 def has_converged(
-    information: FloatArray,
-    number: float,
     former: FloatArray,
-    k: int,
+    information: FloatArray,
     former_number: float,
+    number: float,
     tolerance: float,
 ) -> bool:
-    """Return True if N^(i) and G^(i) changed by less than ``tolerance``, relative to their present
-    values: from ``former_number`` to ``number``, and from ``former[k]`` to ``information[0]`` (n,
-    n) in the Frobenius norm.
+    """Return True if N^(i) and G^(i) (n, n; Frobenius norm) changed by less than ``tolerance``,
+    relative to their present values ``number`` and ``information``.
     """
     if not abs(number - former_number) < tolerance * number:
         return False
-    n = information.shape[1]
-    change = size = 0.0
-    for i in range(n):
-        for j in range(n):
-            step = information[0, i, j] - former[k, i, j]
-            change += step * step
-            # The Frobenius norm of the new G, by which the step is scaled.
-            size += information[0, i, j] * information[0, i, j]
-    return math.sqrt(change) <= tolerance * math.sqrt(size)
+    change = square = 0.0
+    for i in range(len(information)):
+        for j in range(len(information)):
+            difference = information[i, j] - former[i, j]
+            change += difference * difference
+            square += information[i, j] * information[i, j]
+    return math.sqrt(change) <= tolerance * math.sqrt(square)

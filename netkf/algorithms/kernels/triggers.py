@@ -2,6 +2,8 @@
 
 Filter ``h`` of a block has index ``[b, h]`` of stacks with lanes (``netkf.linalg.lanes``):
 estimates (B, H, n, L), lower triangular roots (B, H, n, n, L).
+
+``lanes`` is ONE for a single run or MANY for L runs side by side (``netkf.linalg.lanes``).
 """
 
 from __future__ import annotations
@@ -43,20 +45,20 @@ def weigh_news(
     b, s, h = index
     # H that is fixed has one block and one slot.
     d, t = min(b, readings.H.shape[0] - 1), min(s, readings.H.shape[1] - 1)
-    news = size = spread(lanes, 0.0)
+    news = magnitudes = spread(lanes, 0.0)
     for k in range(rows):
         innovation = load(lanes, readings.y, b, s, h, k)
-        size += magnitude(innovation)
+        magnitudes += magnitude(innovation)
         for i in range(x.shape[2]):
             weight = load(lanes, readings.H, d, t, h, k, i)
-            size += magnitude(weight)
+            magnitudes += magnitude(weight)
             innovation -= weight * load(lanes, x, b, h, i)
         store(lanes, z, k, innovation)
     for k in range(rows):
         for j in range(rows):
             news += Y[h, k, j] * load(lanes, z, k) * load(lanes, z, j)
     # A slot in which a recorded sensor has no row holds zeros: no reading.
-    return select(size > 0.0, select(news > 0.0, news, 0.0), NO_READING)
+    return select(magnitudes > 0.0, select(news > 0.0, news, 0.0), NO_READING)
 
 
 @kernel

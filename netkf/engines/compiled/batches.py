@@ -159,11 +159,11 @@ def batch_size(scenario: Scenario) -> int:
     rows = max((len(sensor.R) for sensor in scenario.sensors), default=0)
     # Per piece: two states, two moments and the four coefficients of the cubic, of n entries each;
     # per step the two moments of each sensor's noise.
-    drawn = steps * (8 * n + 2 * sensors * rows) + 8.0 * _expected_ticks(scenario)
-    samples = len(scenario.times) * filters * n * (n + 2)
+    floats = steps * (8 * n + 2 * sensors * rows) + 8.0 * _expected_ticks(scenario)
+    sample_floats = len(scenario.times) * filters * n * (n + 2)
     # At least one run, however large it is. A multiple of L, since statistics process L runs side
     # by side and fewer take as long.
-    size = max(1, int(min(MAX_BATCH_RUNS, MAX_BATCH_BYTES / (8.0 * (drawn + samples)))))
+    size = max(1, int(min(MAX_BATCH_RUNS, MAX_BATCH_BYTES / (8.0 * (floats + sample_floats)))))
     return min(MAX_BATCH_RUNS, -(-size // LANES) * LANES) if size > LANES // 2 else size
 
 

@@ -55,7 +55,7 @@ class CombinationState(Struct):
     share, epsilon : whether readings are sent too; strength of the consensus term
     prior, prior_root : predictions before any reading of this instant, (N, n) and (N, n, n)
     prior_lanes : (1, N, n, n, 1), a view of ``prior_root``
-    moved   : (N, n, 1) the consensus term
+    consensus_term : (N, n, 1)
 
     Constant gains:
 
@@ -76,7 +76,7 @@ class CombinationState(Struct):
     prior: FloatArray
     prior_root: FloatArray
     prior_lanes: FloatArray
-    moved: FloatArray
+    consensus_term: FloatArray
     A: FloatArray
     L: FloatArray
     H: FloatArray
@@ -113,7 +113,7 @@ def combination_state_of(scenario: Scenario, state: Simulation) -> CombinationSt
         prior=state.xhat.copy(),
         prior_root=prior_root,
         prior_lanes=prior_root.reshape(1, N, n, n, 1),
-        moved=np.zeros((N, n, 1)),
+        consensus_term=np.zeros((N, n, 1)),
         lanes=root.reshape(1, N, n, n, 1),
         pair=np.zeros((2 * n + 2, n)),
         x=np.zeros((1, n)),
@@ -293,15 +293,15 @@ def add_consensus(state: Simulation, combination: CombinationState, h: int) -> N
         while m != -1:
             total += state.pool_x[m, i] - combination.prior[h, i]
             m = state.pool[m].next
-        combination.moved[h, i, 0] = total
+        combination.consensus_term[h, i, 0] = total
     scale_by_covariance(
         ONE,
         combination.prior_lanes,
         0,
         h,
         combination.epsilon,
-        combination.moved,
+        combination.consensus_term,
         combination.work[0, 0],
     )
     for i in range(n):
-        state.xhat[h, i] += combination.moved[h, i, 0]
+        state.xhat[h, i] += combination.consensus_term[h, i, 0]

@@ -159,8 +159,8 @@ def _sensor_fields(scenario: Scenario) -> tuple[dict[str, np.ndarray], list[tupl
     """
     placed = increments(scenario)
     # Many nodes may have the same sensor: its R is factored once.
-    used = {placed_sensor.entry for _, placed_sensor in placed}
-    roots = {entry: cholesky(scenario.sensors[entry].R) for entry in used}
+    entries = {placed_sensor.entry for _, placed_sensor in placed}
+    roots = {entry: cholesky(scenario.sensors[entry].R) for entry in entries}
     rows = np.array(
         [len(roots[placed_sensor.entry]) for _, placed_sensor in placed], dtype=np.int64
     )

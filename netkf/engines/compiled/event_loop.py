@@ -306,7 +306,7 @@ def on_sense(state: Simulation, now: float) -> None:
     sensing = state.sensing
     record_event(state, now, SENSE, sensing.node[state.wake_at], -1, -1)
     state.wake_at += 1
-    # One point of the grid wakes all nodes that sense increments, one event for each.
+    # At each point of the grid all nodes with increment sensors read, one event for each.
     if state.wake_at == len(sensing.index):
         state.wake_at = 0
         state.grid_at += 1
@@ -427,10 +427,10 @@ def is_lost(state: Simulation) -> bool:
     ticks = state.ticks
     entity = state.entities[ticks.entity[state.tick_at]]
     first = state.first_delay + ticks.first_outcome[state.tick_at]
-    heard = False
+    any_arrives = False
     for m in range(entity.after - entity.first):
-        heard = heard or ticks.delay[first + m] >= 0.0
-    return not heard
+        any_arrives = any_arrives or ticks.delay[first + m] >= 0.0
+    return not any_arrives
 
 
 @kernel

@@ -406,8 +406,8 @@ class FlowRun:
         if len(self._state.rows) < length:
             self._state.rows = np.empty(length, dtype=EVENT)
 
-    def _record_rows(self, used: int, counts: np.ndarray) -> None:
-        """Record the first ``used`` rows of events, or, in a run without rows,
+    def _record_rows(self, count: int, counts: np.ndarray) -> None:
+        """Record the first ``count`` rows of events, or, in a run without rows,
         ``counts`` by kind.
         """
         state, recorder = self._state, self._recorder
@@ -418,7 +418,7 @@ class FlowRun:
             return
         rows = state.rows
         state.row = 0
-        recorder.extend(rows[:used])
+        recorder.extend(rows[:count])
         # A new buffer, since the recorder keeps the old one.
         state.rows = np.empty(len(rows), dtype=EVENT)
 

@@ -62,12 +62,12 @@ def empty_history(state: Simulation, lag: float, capacity: int) -> History:
 
 def add_past(history: History, at_least: int) -> None:
     """Enlarge a history: double it, or add ``at_least`` entries if these are more."""
-    old = len(history.past)
-    added = max(old, at_least)
+    capacity = len(history.past)
+    added = max(capacity, at_least)
     # Chain the new entries, and the former free list behind them.
     past = np.zeros(added, dtype=PAST)
-    past["before"] = np.arange(old + 1, old + added + 1)
-    past["before"][-1], history.free[0] = history.free[0], old
+    past["before"] = np.arange(capacity + 1, capacity + added + 1)
+    past["before"][-1], history.free[0] = history.free[0], capacity
     history.free[1] += added
     history.past = np.concatenate([history.past, past])
     history.x = np.concatenate([history.x, np.zeros((added, *history.x.shape[1:]))])

@@ -37,16 +37,16 @@ def pop(pool: np.ndarray, heap: np.ndarray, size: int) -> int:
     ``size`` messages.
     """
     # Sift the last entry down from the top.
-    top, moved, k = heap[0], heap[size - 1], 0
+    top, last, k = heap[0], heap[size - 1], 0
     while 2 * k + 1 < size - 1:
         child = 2 * k + 1
         if child + 1 < size - 1 and arrives_first(pool, heap[child + 1], heap[child]):
             child += 1
-        if not arrives_first(pool, heap[child], moved):
+        if not arrives_first(pool, heap[child], last):
             break
         heap[k] = heap[child]
         k = child
-    heap[k] = moved
+    heap[k] = last
     return int(top)
 
 
@@ -77,33 +77,33 @@ def put(state: Simulation, h: int, message: int) -> None:
     nodes, directions, pool = state.nodes, state.directions, state.pool
     newest_only = state.combination_kind != READINGS
     node, peer = nodes[h], directions[pool[message].direction].sender
-    before, here = -1, node.inbox
+    previous, position = -1, node.inbox
     # Inboxes are linked lists with a pointer to the last message. Mostly messages come in the order
     # of senders and go to the end at once.
-    if here != -1 and directions[pool[node.last].direction].sender < peer:
-        before, here = node.last, -1
-    while here != -1:
-        sender = directions[pool[here].direction].sender
+    if position != -1 and directions[pool[node.last].direction].sender < peer:
+        previous, position = node.last, -1
+    while position != -1:
+        sender = directions[pool[position].direction].sender
         # Stop at the first message of a later sender, or at one of this sender if the newest
         # counts.
         if sender > peer or (sender == peer and newest_only):
             break
-        before, here = here, pool[here].next
-    if here != -1 and directions[pool[here].direction].sender == peer:
+        previous, position = position, pool[position].next
+    if position != -1 and directions[pool[position].direction].sender == peer:
         # A message older than the present one is dropped.
-        if pool[message].sent < pool[here].sent:
+        if pool[message].sent < pool[position].sent:
             release(state, message)
             return
         # The newer message takes the place of the older one.
-        replaced, here = here, pool[here].next
+        replaced, position = position, pool[position].next
         release(state, replaced)
-    pool[message].next = here
-    if before == -1:
+    pool[message].next = position
+    if previous == -1:
         node.inbox = message
     else:
-        pool[before].next = message
+        pool[previous].next = message
     # The end of the list moved.
-    if here == -1:
+    if position == -1:
         node.last = message
 
 
@@ -113,9 +113,9 @@ def sort_indices(indices: np.ndarray, count: int) -> None:
     gap = count // 2
     while gap > 0:
         for k in range(gap, count):
-            moved, to = indices[k], k
-            while to >= gap and indices[to - gap] > moved:
-                indices[to] = indices[to - gap]
-                to -= gap
-            indices[to] = moved
+            value, position = indices[k], k
+            while position >= gap and indices[position - gap] > value:
+                indices[position] = indices[position - gap]
+                position -= gap
+            indices[position] = value
         gap //= 2

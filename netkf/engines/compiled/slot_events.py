@@ -43,7 +43,7 @@ Draw = tuple[float, bool, float]
 Row = tuple[float, int, int, int, int, int, float]
 
 
-class DirectedLink:
+class DirectionDraws:
     """A directed link: its ends and index, its number of messages so far, and the draws
     for them.
     """
@@ -91,7 +91,7 @@ class SlotEvents:
         self._scenario, self._setup, self._algorithm = scenario, setup, scenario.hosted
         self._random = streams.generator("matching")
         self._directions = [
-            DirectedLink(scenario, streams, ends, k) for k, ends in enumerate(setup.directions)
+            DirectionDraws(scenario, streams, ends, k) for k, ends in enumerate(setup.directions)
         ]
         self._indices = {direction.ends: direction.index for direction in self._directions}
         each, count = setup.directions_per_link, setup.streams_per_link
@@ -106,7 +106,7 @@ class SlotEvents:
             for link, both in self._by_link.items()
         }
         self._last: dict[Link, list[Draw]] = {}
-        self._in_flight: list[tuple[float, int, int, DirectedLink, int, float, int, int]] = []
+        self._in_flight: list[tuple[float, int, int, DirectionDraws, int, float, int, int]] = []
         self._slot, self._order, self._exchanges, self._open = 0, 0, 0, -1
         self._recording = True
         self._inbox: dict[int, dict[int, tuple[int, float]]] = {}
@@ -281,14 +281,14 @@ class SlotEvents:
         up = set(listed)
         return links, up if topology.directed else up | {(j, i) for i, j in listed}
 
-    def _is_silent(self, direction: DirectedLink, step: Step) -> bool:
+    def _is_silent(self, direction: DirectionDraws, step: Step) -> bool:
         """Return True if the sender sends nothing in this step."""
         node = self._scenario.topology.index[direction.ends[0]]
         if self._sent is not None and not self._sent[step.step, node]:
             return True
         return bool(self._setup.may_miss and self._unread[step.step, node])
 
-    def _send(self, step: Step, direction: DirectedLink, draw: Draw | None) -> None:
+    def _send(self, step: Step, direction: DirectionDraws, draw: Draw | None) -> None:
         """Send one message: it is lost, arrives at once, or is under way."""
         (sender, receiver), number, now = direction.ends, direction.messages, step.begin
         direction.messages = number + 1

@@ -346,14 +346,15 @@ class SlotTimes(NamedTuple):
     """When S slots begin and what happens in them.
 
     first, start : number of the first slot, and the times (S,) at which slots begin
-    noted, sensed, exchanged : (S,), whether events are recorded, sensors are read, nodes exchange
+    recorded, sensed, exchanged : (S,), whether events are recorded, sensors are read and nodes
+                                  exchange
     sample : (S,), index of the slot's sample among those of the block or run, -1: none
     predicts : whether filters predict, so that they are sampled at the beginning of a slot
     """
 
     first: int
     start: FloatArray
-    noted: np.ndarray
+    recorded: np.ndarray
     sensed: np.ndarray
     exchanged: np.ndarray
     sample: np.ndarray
@@ -407,7 +408,7 @@ class SlotMessages(NamedTuple):
     sent: np.ndarray
 
 
-class Stage(NamedTuple):
+class SlotStage(NamedTuple):
     """One stage of one slot, in which events happen.
 
     slot, s : number of the slot, and its index among the S slots
@@ -424,7 +425,14 @@ class Stage(NamedTuple):
 
 @kernel
 def write_row(
-    rows: Rows, stage: Stage, kind: int, node: int, peer: int, message: int, age: float, row: int
+    rows: Rows,
+    stage: SlotStage,
+    kind: int,
+    node: int,
+    peer: int,
+    message: int,
+    age: float,
+    row: int,
 ) -> int:
     """Write one event into ``row`` of ``rows``; return the index of the next row."""
     rows.t[row], rows.kind[row], rows.node[row], rows.peer[row] = stage.t, kind, node, peer
@@ -453,7 +461,7 @@ def make_rows(
         if times.predicts:
             mark_sample(times, s, rows, row)
         # At the horizon nothing is recorded but the sample.
-        if times.noted[s]:
+        if times.recorded[s]:
             row = _slot_rows(stages, times, c, h, d, pairwise, rows, s, row)
         if not times.predicts:
             mark_sample(times, s, rows, row)
@@ -483,7 +491,7 @@ def _slot_rows(
     """Write the events of slot ``s`` from ``row`` on; return the index of the next row."""
     now = times.start[s]
     for k in range(len(stages.step)):
-        stage = Stage(times.first + s, s, stages.step[k], stages.phase[k], now)
+        stage = SlotStage(times.first + s, s, stages.step[k], stages.phase[k], now)
         if stage.step < 0:
             if times.sensed[s]:
                 for node in h.sensing:
@@ -492,14 +500,20 @@ def _slot_rows(
             row = _write_sends(c, h, d, rows, stage, pairwise, row)
             # Absorptions happen at the end of the step, when its inboxes close.
             now = times.start[s] + stages.end[k]
-            closing = Stage(stage.slot, s, stage.step, stage.phase, now)
+            closing = SlotStage(stage.slot, s, stage.step, stage.phase, now)
             row = _write_step_end(h, d, rows, closing, pairwise, stages.stopping, row)
     return row
 
 
 @kernel
 def _write_sends(
-    c: Channels, h: TracedNodes, d: SlotMessages, rows: Rows, stage: Stage, pairwise: bool, row: int
+    c: Channels,
+    h: TracedNodes,
+    d: SlotMessages,
+    rows: Rows,
+    stage: SlotStage,
+    pairwise: bool,
+    row: int,
 ) -> int:
     """Write the messages sent in a step: after the tick of each pair, or after one "round" for
     broadcasts; return the index of the next row.
@@ -518,7 +532,7 @@ def _write_sends(
 
 @kernel
 def _link_rows(
-    c: Channels, h: TracedNodes, d: SlotMessages, rows: Rows, stage: Stage, link: int, row: int
+    c: Channels, h: TracedNodes, d: SlotMessages, rows: Rows, stage: SlotStage, link: int, row: int
 ) -> int:
     """Write the messages sent on a link, each followed by its arrival or loss; return the index of
     the next row.
@@ -539,7 +553,7 @@ def _link_rows(
 
 
 @kernel
-def is_silent(d: SlotMessages, b: int, stage: Stage, node: int, q: int) -> bool:
+def is_silent(d: SlotMessages, b: int, stage: SlotStage, node: int, q: int) -> bool:
     """Return True if ``node`` (an index) sends nothing in a step, in lane ``q`` of block ``b``."""
     return len(d.sent) > 0 and d.sent[b, stage.s, stage.step, node, q] == 0
 
@@ -549,7 +563,7 @@ def _write_step_end(
     h: TracedNodes,
     d: SlotMessages,
     rows: Rows,
-    stage: Stage,
+    stage: SlotStage,
     pairwise: bool,
     stopping: int,
     row: int,
@@ -558,15 +572,15 @@ def _write_step_end(
     next row.
     """
     for i in range(len(h.nodes)):
-        heard = False
+        has_received = False
         for k in range(h.first[i], h.first[i + 1]):
             if d.up[0, stage.s, stage.step, h.direction[k], 0] == 1:
-                heard = True
+                has_received = True
                 if pairwise:
                     # The message of this step is the last one that was numbered.
                     peer, number = h.nodes[h.sender[k]], h.sent[h.direction[k]] - 1
                     row = write_row(rows, stage, SWAP, h.nodes[i], peer, number, 0.0, row)
-        if heard and not pairwise:
+        if has_received and not pairwise:
             row = write_row(rows, stage, ABSORB, h.nodes[i], -1, -1, 0.0, row)
         # A node that stops in this slot does so after it absorbed.
         if stage.step == stopping and h.stopped[0, i, 0] == stage.slot:
@@ -593,12 +607,12 @@ def count_events(
         for kind in range(len(scratch)):
             store(lanes, scratch, kind, 0.0)
         for s in range(len(times.start)):
-            for k in range(len(stages.step) if times.noted[s] else 0):
+            for k in range(len(stages.step) if times.recorded[s] else 0):
                 e = stages.step[k]
                 if e < 0 and times.sensed[s]:
                     add_count(lanes, scratch, SENSE, 1.0 * len(h.sensing))
                 elif e >= 0 and times.exchanged[s]:
-                    stage = Stage(times.first + s, s, e, stages.phase[k], 0.0)
+                    stage = SlotStage(times.first + s, s, e, stages.phase[k], 0.0)
                     count_step(lanes, c, h, d, stage, pairwise, stages.stopping, scratch, counts, b)
         first = b * len(lanes)
         for q in range(min(len(lanes), len(counts) - first)):
@@ -618,7 +632,7 @@ def count_step(
     c: Channels,
     h: TracedNodes,
     d: SlotMessages,
-    stage: Stage,
+    stage: SlotStage,
     pairwise: bool,
     stopping: int,
     scratch: FloatArray,
@@ -643,12 +657,12 @@ def count_step(
     # LOST was counted as if all were lost: each delivery takes one off.
     absorbed = delivered = spread(lanes, 0.0)
     for i in range(len(h.nodes)):
-        heard = spread(lanes, 0.0)
+        received = spread(lanes, 0.0)
         for k in range(h.first[i], h.first[i + 1]):
             up = load_flags(lanes, d.up, b, stage.s, stage.step, h.direction[k])
-            heard += select(up, 1.0, 0.0)
-        delivered += heard
-        absorbed += select(heard > 0.0, 1.0, 0.0)
+            received += select(up, 1.0, 0.0)
+        delivered += received
+        absorbed += select(received > 0.0, 1.0, 0.0)
     add_count(lanes, scratch, DELIVER, delivered)
     add_count(lanes, scratch, LOST, -delivered)
     add_count(lanes, scratch, SWAP if pairwise else ABSORB, delivered if pairwise else absorbed)
@@ -661,7 +675,7 @@ def count_matched_pairs(
     lanes: Lanes,
     c: Channels,
     d: SlotMessages,
-    stage: Stage,
+    stage: SlotStage,
     scratch: FloatArray,
     counts: np.ndarray,
     b: int,
@@ -684,7 +698,7 @@ def count_matched_pairs(
 
 @kernel
 def count_silent(
-    lanes: Lanes, c: Channels, d: SlotMessages, stage: Stage, scratch: FloatArray, b: int
+    lanes: Lanes, c: Channels, d: SlotMessages, stage: SlotStage, scratch: FloatArray, b: int
 ) -> None:
     """Subtract the messages of silent nodes from SEND and LOST."""
     silent = spread(lanes, 0.0)
@@ -704,7 +718,7 @@ def count_silent(
 
 
 @kernel
-def count_stops(lanes: Lanes, h: TracedNodes, stage: Stage, counts: np.ndarray, b: int) -> None:
+def count_stops(lanes: Lanes, h: TracedNodes, stage: SlotStage, counts: np.ndarray, b: int) -> None:
     """Count the nodes that stop in a slot."""
     first = b * len(lanes)
     for r in range(first, min(first + len(lanes), len(counts))):

@@ -293,9 +293,9 @@ class SlotRuns:
         """Return flags, samples and, if ``timed``, start times of the next ``count`` slots."""
         setup, algorithm, plant = self.setup, self.setup.algorithm, self._scenario.slot_plant
         slots = np.arange(self._slot, self._slot + count)
-        noted = slots < setup.last
+        recorded = slots < setup.last
         # At the horizon a filter that predicts is only sampled: its prediction is the result.
-        active = noted | (not algorithm.predicts)
+        active = recorded | (not algorithm.predicts)
         # Filters that do not predict use no reading in slot 0: its sample is their initial state.
         sensed = active & ((slots > 0) | algorithm.predicts)
         exchanged = active & (slots >= algorithm.first_slot) & algorithm.talks
@@ -308,7 +308,7 @@ class SlotRuns:
         # Only event rows need the times: a batch without them saves the loop.
         if timed:
             start = np.array([plant.slot_time(slot) for slot in slots.tolist()])
-        return SlotTimes(self._slot, start, noted, sensed, exchanged, sample, algorithm.predicts)
+        return SlotTimes(self._slot, start, recorded, sensed, exchanged, sample, algorithm.predicts)
 
     def _draw_messages(self, times: SlotTimes) -> SlotMessages:
         """Draw and return the matchings and messages of a block of slots for all runs."""

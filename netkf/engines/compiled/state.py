@@ -447,12 +447,12 @@ def empty_pool(capacity: int, n: int) -> tuple[np.ndarray, FloatArray, FloatArra
 def add_messages(state: Simulation, at_least: int) -> None:
     """Enlarge the pool of messages: double it, or add ``at_least`` messages if these are more."""
     # Doubling keeps the cost of copies proportional to the messages.
-    old, n = len(state.pool), state.xhat.shape[1]
-    added = max(old, at_least)
+    capacity, n = len(state.pool), state.xhat.shape[1]
+    added = max(capacity, at_least)
     new_pool = empty_pool(added, n)
-    new_pool[0]["next"] = np.arange(old + 1, old + added + 1)
+    new_pool[0]["next"] = np.arange(capacity + 1, capacity + added + 1)
     # The new messages come first in the list of free ones.
-    new_pool[0]["next"][-1], state.first_free = state.first_free, old
+    new_pool[0]["next"][-1], state.first_free = state.first_free, capacity
     state.free_count += added
     for name, new_part in zip(("pool", "pool_x", "pool_root", "heap"), new_pool, strict=True):
         setattr(state, name, np.concatenate([getattr(state, name), new_part]))
