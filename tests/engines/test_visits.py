@@ -130,7 +130,7 @@ def test_tables_of_lanes_hold_transitions_and_gains(ring, case):
     A, n = np.array(case.plant.A), case.plant.n
     lower = n * (n + 1) // 2
     model = next(model for model in case.models if len(model.H))
-    places = {"unobserved": waiting.unobserved.column, "sensing": waiting.sensing.place}
+    places = {"unobserved": waiting.unobserved.column, "sensing": waiting.sensing.column}
     # Two axes that are alike have few columns of their own.
     assert (len(set(places["sensing"])) < 30) == (len(set(places["unobserved"])) < 10)
     for kind, longest in (("unobserved", 0.9), ("sensing", 0.19)):
