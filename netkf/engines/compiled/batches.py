@@ -38,8 +38,8 @@ from netkf.trace.recorder import Recorder
 from netkf.trace.schema import KINDS
 
 MAX_BATCH_RUNS = 512
-QUICK_VISITS = 1 << 17
-"""Visits of nodes that take some ten milliseconds; preparing a batch takes one or two."""
+QUICK_VISITS = 1 << 18
+"""Visits of nodes that take some thirty milliseconds; preparing a batch takes one or two."""
 MAX_BATCH_BYTES = 1 << 25
 """Limit of the bytes that are drawn for a batch, samples included."""
 
@@ -169,7 +169,7 @@ def batch_size(scenario: Scenario) -> int:
 
 @once_per_scenario
 def quick_runs(scenario: Scenario) -> int:
-    """Return the number of runs, a power of two, that take some ten milliseconds together, so that
+    """Return the number of runs, a power of two, that take some thirty milliseconds together, so that
     preparing a batch costs little of its time.
     """
     if not (drawn_together(scenario) and is_immediate(scenario)):
