@@ -169,8 +169,8 @@ def batch_size(scenario: Scenario) -> int:
 
 @once_per_scenario
 def quick_runs(scenario: Scenario) -> int:
-    """Return the number of runs, a power of two, that take some thirty milliseconds together, so that
-    preparing a batch costs little of its time.
+    """Return the number of runs, a power of two, that take some thirty milliseconds together, so
+    that preparing a batch costs little of its time.
     """
     if not (drawn_together(scenario) and is_immediate(scenario)):
         return 1
