@@ -140,8 +140,8 @@ class RunDirectory:
     @property
     def rounding_from(self) -> float:
         """Time from which rounding blurs the errors, inf if it does not."""
-        found = self.summary.get("rounding_from")
-        return math.inf if found is None else float(found)
+        stored = self.summary.get("rounding_from")
+        return math.inf if stored is None else float(stored)
 
     def by_run(self, quantity: str, node: int, end: float) -> pd.Series[float] | None:
         """Return averages over time, run by run; None if the states were not kept.
@@ -187,7 +187,7 @@ def _read(directory: Path, name: str, form: dict[str, Any]) -> dict[str, Any]:
 
 @contextmanager
 def damage_named(directory: Path) -> Iterator[None]:
-    """Raise ScenarioError that names the directory in place of a DamagedError."""
+    """Turn a DamagedError into a ScenarioError that names the directory."""
     try:
         yield
     except DamagedError as error:
@@ -197,9 +197,10 @@ def damage_named(directory: Path) -> Iterator[None]:
 
 @dataclass(frozen=True)
 class Comparison(NotebookTable):
-    """Rows side by side; all marks together are right with probability ``confidence``.
+    """Quantities of several directories side by side.
 
-    ``notes`` are those of the summaries, on what their averages leave out.
+    All marks of certain differences are right with probability ``confidence``. ``notes`` are those
+    of the summaries, on what their averages leave out.
     """
 
     directories: tuple[str, ...]
@@ -253,29 +254,25 @@ def compare(directories: Sequence[str | Path], confidence: float = 0.95) -> Comp
     ``confidence`` (Bonferroni). A single run says nothing about certainty. Raises ScenarioError for
     a directory that is not that of a finished run.
     """
-    found = _read_all(directories)
+    runs = _read_all(directories)
     confidence = number(above=0.0, below=1.0)("--confidence", confidence)
-    first = found[0]
-    wanted = [(q, -1) for q in (*AVERAGES, *MESSAGES)]
-    if all(other.nodes == first.nodes for other in found):
-        wanted += [("rms_error", node) for node in first.nodes]
-    level = (1.0 - confidence) / (len(wanted) * max(1, len(found) - 1))
+    first = runs[0]
+    quantities = [(q, -1) for q in (*AVERAGES, *MESSAGES)]
+    if all(run.nodes == first.nodes for run in runs):
+        quantities += [("rms_error", node) for node in first.nodes]
+    level = (1.0 - confidence) / (len(quantities) * max(1, len(runs) - 1))
     rows = [
-        ComparedRow(
-            q, node, tuple(_compare_quantity(first, other, q, node, level) for other in found)
-        )
-        for q, node in wanted
+        ComparedRow(q, node, tuple(_compare_quantity(first, run, q, node, level) for run in runs))
+        for q, node in quantities
     ]
-    rows += [
-        ComparedRow(q, -1, tuple(Entry(*other.value(q, -1)) for other in found)) for q in TRACES
-    ]
+    rows += [ComparedRow(q, -1, tuple(Entry(*run.value(q, -1)) for run in runs)) for q in TRACES]
     return Comparison(
-        tuple(str(other.directory) for other in found),
-        tuple(str(other.manifest.get("name", "")) for other in found),
-        tuple(other.runs for other in found),
+        tuple(str(run.directory) for run in runs),
+        tuple(str(run.manifest.get("name", "")) for run in runs),
+        tuple(run.runs for run in runs),
         confidence,
         tuple(rows),
-        tuple(tuple(other.summary.get("notes", ())) for other in found),
+        tuple(tuple(run.summary.get("notes", ())) for run in runs),
     )
 
 
@@ -307,10 +304,10 @@ def _pair_runs(
 ) -> Entry | None:
     """Return the entry with a paired difference, None if the runs do not have the same truth."""
     end = min(first.rounding_from, other.rounding_from)
-    one, two = (finished.by_run(quantity, node, end) for finished in (first, other))
-    if one is None or two is None or not _same_truth(first, other):
+    base_values, values = (finished.by_run(quantity, node, end) for finished in (first, other))
+    if base_values is None or values is None or not _same_truth(first, other):
         return None
-    gaps = np.asarray((two - one).dropna(), dtype=np.float64)
+    gaps = np.asarray((values - base_values).dropna(), dtype=np.float64)
     if len(gaps) < 2:
         return None
     mean, error = mean_over_runs(gaps)
@@ -323,13 +320,21 @@ def _pair_runs(
 
 def _same_truth(first: RunDirectory, other: RunDirectory) -> bool:
     """Return True if the samples have equal states wherever both have runs and times."""
-    one, two = first.samples, other.samples
-    if one is None or two is None or first.manifest.get("seed") != other.manifest.get("seed"):
+    base_samples, samples = first.samples, other.samples
+    if (
+        base_samples is None
+        or samples is None
+        or first.manifest.get("seed") != other.manifest.get("seed")
+    ):
         return False
-    columns = ["run", "t", *(c for c in one.columns if c.startswith("x") and c[1:].isdecimal())]
-    if not set(columns) <= set(two.columns):
+    columns = [
+        "run",
+        "t",
+        *(c for c in base_samples.columns if c.startswith("x") and c[1:].isdecimal()),
+    ]
+    if not set(columns) <= set(samples.columns):
         return False
-    states = [s[columns].drop_duplicates().set_index(["run", "t"]) for s in (one, two)]
+    states = [s[columns].drop_duplicates().set_index(["run", "t"]) for s in (base_samples, samples)]
     shared = states[0].index.intersection(states[1].index)
     return bool(len(shared)) and bool(states[0].loc[shared].equals(states[1].loc[shared]))
 
@@ -337,7 +342,11 @@ def _same_truth(first: RunDirectory, other: RunDirectory) -> bool:
 def _welch_difference(
     base: tuple[float | None, float | None], entry: Entry, runs: tuple[int, int], level: float
 ) -> Entry:
-    """Return the entry with the difference of independent runs, by Welch's interval."""
+    """Return the entry with the difference of independent runs, by Welch's t interval.
+
+    ``base`` and ``entry`` have means and standard errors over ``runs`` runs each; the degrees of
+    freedom are those of Welch and Satterthwaite.
+    """
     errors = [base[1], entry.se]
     if base[0] is None or entry.value is None:
         return entry
@@ -346,9 +355,9 @@ def _welch_difference(
         return entry._replace(difference=difference, method="one run")
     squares = [float(e or 0.0) * float(e or 0.0) for e in errors]
     total = sum(squares)
-    parts = sum(s * s / (n - 1) for s, n in zip(squares, runs, strict=True))
-    freedom = total * total / parts if parts > 0.0 else float(min(runs) - 1)
-    low, high = _student_interval(difference, math.sqrt(total), freedom, level)
+    denominator = sum(s * s / (n - 1) for s, n in zip(squares, runs, strict=True))
+    degrees = total * total / denominator if denominator > 0.0 else float(min(runs) - 1)
+    low, high = _student_interval(difference, math.sqrt(total), degrees, level)
     return entry._replace(
         difference=difference, low=low, high=high, real=_excludes_zero(low, high), method="Welch"
     )

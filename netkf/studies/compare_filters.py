@@ -173,13 +173,17 @@ def compare_filters(
     first = next(iter(values))
     level = (1.0 - confidence) / (len(QUANTITIES) * max(1, len(values) - 1))
     rows = []
-    for label, made, reason in candidates:
-        if made is None:
+    for label, scenario_of_filter, reason in candidates:
+        if scenario_of_filter is None:
             rows.append(ComparedFilter(label, {}, "-", math.nan, math.nan, reason))
             continue
         base = values[first] if label != first else None
         row = _make_row(label, values[label], base, traffic[label], scenario.plant.n, level)
-        rows.append(dataclasses.replace(row, predicts=made.slotted and made.hosted.predicts))
+        rows.append(
+            dataclasses.replace(
+                row, predicts=scenario_of_filter.slotted and scenario_of_filter.hosted.predicts
+            )
+        )
     return FilterComparison(scenario.name, count, root, confidence, tuple(rows))
 
 
@@ -187,8 +191,8 @@ def _simulate(scenario: Scenario, runs: int, seed: int, engine: str, pool: Pool)
     """Return the values of all runs of a filter."""
     with explain_failures(scenario):
         task = partial(block_values, engine=choose_engine(engine, scenario))
-        found: FilterValues = replicate_blocks(task, join_values, scenario, runs, seed, pool=pool)
-    return found
+        values: FilterValues = replicate_blocks(task, join_values, scenario, runs, seed, pool=pool)
+    return values
 
 
 def _make_row(
@@ -220,16 +224,16 @@ def _candidates(scenario: Scenario, filters: Any, engine: str) -> tuple[FilterEn
     if len(filters) > MAX_FILTERS:
         rule = f"must be at most {MAX_FILTERS} filters"
         raise ScenarioError("filters", rule, len(filters), "compare fewer at a time")
-    found = [_make_candidate(scenario, choice, engine) for choice in filters]
-    labels = _distinct_labels(filters, [candidate.label for candidate in found])
-    found = [one._replace(label=label) for one, label in zip(found, labels, strict=True)]
+    entries = [_make_candidate(scenario, choice, engine) for choice in filters]
+    labels = _distinct_labels(filters, [candidate.label for candidate in entries])
+    entries = [entry._replace(label=label) for entry, label in zip(entries, labels, strict=True)]
     for label in labels:
         if labels.count(label) > 1:
             raise ScenarioError("filters", "must differ from each other", label, "remove one")
-    if all(candidate.scenario is None for candidate in found):
-        problem = f"none of them can run there; {found[0].label}: {found[0].reason}"
+    if all(candidate.scenario is None for candidate in entries):
+        problem = f"none of them can run there; {entries[0].label}: {entries[0].reason}"
         raise ScenarioError("filters", problem, None, "choose others, or change the scenario")
-    return tuple(found)
+    return tuple(entries)
 
 
 def _make_candidate(scenario: Scenario, choice: Choice, engine: str) -> FilterEntry:
@@ -240,24 +244,26 @@ def _make_candidate(scenario: Scenario, choice: Choice, engine: str) -> FilterEn
         label = _make_label(name_of("filter", choice), {})
     else:
         table = _filter_table(scenario, choice)
-        given = {} if isinstance(choice, str) else {k: v for k, v in choice.items() if k != "kind"}
+        settings = (
+            {} if isinstance(choice, str) else {k: v for k, v in choice.items() if k != "kind"}
+        )
         label, make = (
-            _make_label(str(table["kind"]), given),
+            _make_label(str(table["kind"]), settings),
             partial(scenario.replace, {"filter": table}),
         )
     try:
-        made = make()
-        choose_engine(engine, made)
+        candidate = make()
+        choose_engine(engine, candidate)
     except (ScenarioError, EngineError) as error:
         return FilterEntry(label, None, f"cannot run here: {error}")
-    return FilterEntry(label, made)
+    return FilterEntry(label, candidate)
 
 
 def _distinct_labels(filters: Sequence[Choice], labels: list[str]) -> list[str]:
     """Return the labels of filters, of objects with the settings in which those of one label differ
     from each other.
     """
-    made = list(labels)
+    distinct = list(labels)
     for label in {one for one in labels if labels.count(one) > 1}:
         indices = [k for k, one in enumerate(labels) if one == label]
         objects = [filters[k] for k in indices]
@@ -270,8 +276,10 @@ def _distinct_labels(filters: Sequence[Choice], labels: list[str]) -> list[str]:
         for k, own in zip(indices, settings, strict=True):
             # What is left out of a table is at its default.
             values = {name: own.get(name, str(getattr(filters[k], name))) for name in differing}
-            made[k] = _make_label(label, {name: shorten(value) for name, value in values.items()})
-    return made
+            distinct[k] = _make_label(
+                label, {name: shorten(value) for name, value in values.items()}
+            )
+    return distinct
 
 
 def _filter_settings(algorithm: Any) -> dict[str, str]:
@@ -291,18 +299,18 @@ def _filter_table(scenario: Scenario, choice: Any) -> dict[str, Any]:
     if not isinstance(choice, (str, Mapping)):
         remedy = "give kinds, tables {kind = ...} or filters"
         raise ScenarioError("filters", "must hold filters", choice, remedy)
-    own = as_table(scenario)["filter"]
+    own_table = as_table(scenario)["filter"]
     table = {"kind": choice} if isinstance(choice, str) else dict(choice)
     kind = table.get("kind")
-    known = sorted(kinds_of("filter"))
-    if not isinstance(kind, str) or (":" not in kind and kind not in known):
-        hint = nearest(kind, known) if isinstance(kind, str) else ""
+    kinds = sorted(kinds_of("filter"))
+    if not isinstance(kind, str) or (":" not in kind and kind not in kinds):
+        hint = nearest(kind, kinds) if isinstance(kind, str) else ""
         raise ScenarioError(
-            "filters", "is no filter", kind, f"{hint}filters are {', '.join(known)}"
+            "filters", "is no filter", kind, f"{hint}filters are {', '.join(kinds)}"
         )
-    carried = {key: value for key, value in own.items() if key in CARRIED}
-    if isinstance(choice, str) and kind == own["kind"]:
-        return dict(own)
+    carried = {key: value for key, value in own_table.items() if key in CARRIED}
+    if isinstance(choice, str) and kind == own_table["kind"]:
+        return dict(own_table)
     return {**carried, **table}
 
 

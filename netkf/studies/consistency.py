@@ -41,12 +41,12 @@ if TYPE_CHECKING:
 LOAD = "load it first: netkf.consistency(netkf.load(path))"
 MIN_RUNS = 10
 MAX_ERRORS = 256
-"""Errors of all nodes together (N n) up to which their exact covariance is computed: some seconds a
-run, in work that grows with the third power of the number of nodes.
+"""Largest number of errors N n of all nodes for which the exact covariance is computed. It takes
+some seconds for each run, and the work grows with the third power of the number of nodes.
 """
 UNDECIDED = "undecided: rounding blurs the errors of too many samples"
 BIAS_TOLERANCE = 0.02
-"""Relative distance of the expected value from n that is worth a remark in the verdict."""
+"""Relative distance of the expected value from n above which the verdict has a remark."""
 
 
 class RunConsistency(NamedTuple):
@@ -74,16 +74,16 @@ def run_consistency(
     """Simulate one replica and return its NEES and NIS."""
     run = simulate(scenario, seed, replica, engine)
     _, nees = errors(run.error, run.P)
-    after = np.flatnonzero(run.times > 0.0)
+    after_start = np.flatnonzero(run.times > 0.0)
     sigma = _exact_covariance(scenario, run)
-    lost = blurred_samples(run, run.P)
-    lost |= False if sigma is None else blurred_samples(run, sigma)
-    nis, expected_nis = _mean_nis(scenario, run, sigma, lost)
-    times = run.times[lost.any(axis=1) & (run.times > 0.0)]
+    blurred = blurred_samples(run, run.P)
+    blurred |= False if sigma is None else blurred_samples(run, sigma)
+    nis, expected_nis = _mean_nis(scenario, run, sigma, blurred)
+    times = run.times[blurred.any(axis=1) & (run.times > 0.0)]
     return RunConsistency(
-        np.where(lost, np.nan, nees)[after],
-        _mean(nees[after], lost[after]),
-        _mean(_expected_nees(run.P, sigma)[after], lost[after]),
+        np.where(blurred, np.nan, nees)[after_start],
+        _mean(nees[after_start], blurred[after_start]),
+        _mean(_expected_nees(run.P, sigma)[after_start], blurred[after_start]),
         nis,
         expected_nis,
         times[:1] if len(times) else np.full(1, np.inf),
@@ -91,11 +91,13 @@ def run_consistency(
     )
 
 
-def _mean(values: FloatArray, lost: np.ndarray) -> FloatArray:
-    """Return the means (N,) over the samples (T, N) that are not lost; nan without any."""
-    count = (~lost).sum(axis=0)
+def _mean(values: FloatArray, blurred: np.ndarray) -> FloatArray:
+    """Return the means (N,) over the samples (T, N) that are not blurred; nan without any."""
+    count = (~blurred).sum(axis=0)
     with np.errstate(invalid="ignore"):
-        return np.asarray(np.where(lost, 0.0, values).sum(axis=0) / np.where(count, count, np.nan))
+        return np.asarray(
+            np.where(blurred, 0.0, values).sum(axis=0) / np.where(count, count, np.nan)
+        )
 
 
 def _count_errors(scenario: Scenario) -> int:
@@ -126,33 +128,33 @@ def _expected_nees(P: FloatArray, sigma: FloatArray | None) -> FloatArray:
 
 
 def _mean_nis(
-    scenario: Scenario, run: Run, sigma: FloatArray | None, lost: np.ndarray
+    scenario: Scenario, run: Run, sigma: FloatArray | None, blurred: np.ndarray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the mean NIS (N,) of each node's own readings and its expected value; nan under
-    clocks, where predictions are no samples.
+    """Return the mean NIS (N,) of each node's own readings and its expected value; nan in
+    continuous time, where predictions at readings are not sampled.
     """
     unknown = np.full(len(run.nodes), np.nan)
     if not scenario.slotted:
         return unknown, unknown.copy()
-    innovations = _Innovations(scenario, run, sigma, lost)
+    innovations = _Innovations(scenario, run, sigma, blurred)
     pairs = [np.array(list(innovations.of_node(i))) for i in range(len(run.nodes))]
     means = np.array([p.mean(axis=0) if len(p) else (np.nan, np.nan) for p in pairs])
     return means[:, 0], means[:, 1]
 
 
 class _Innovations:
-    """Innovations of a run in slots whose prediction is a sample or follows from the one before.
+    """Innovations of a run in slots, from predictions that are samples (or one step after one).
 
-    An innovation is the reading that the sensor would give of the error, so that large states cost
-    it no digits.
+    The innovation is computed as H e + v from the error e of the prediction, by letting the sensor
+    read e instead of the state, so that a large state costs no digits.
     """
 
     def __init__(
-        self, scenario: Scenario, run: Run, sigma: FloatArray | None, lost: np.ndarray
+        self, scenario: Scenario, run: Run, sigma: FloatArray | None, blurred: np.ndarray
     ) -> None:
-        self._scenario, self._run, self._sigma, self._lost = scenario, run, sigma, lost
+        self._scenario, self._run, self._sigma, self._blurred = scenario, run, sigma, blurred
         self._streams = Streams(run.seed, run.replica)
-        # Samples of a filter that predicts are predictions; others have to be moved one slot on.
+        # Samples of a predicting filter are predictions; others are predicted by one slot.
         self._steps = 0 if scenario.hosted.predicts else 1
         slots = np.round(run.times / scenario.slot_plant.period).astype(int).tolist()
         self._samples = [
@@ -175,11 +177,11 @@ class _Innovations:
             for believed in (True, False)
         )
         for k, slot, noise in zip(self._samples, self._slots, self._noise, strict=True):
-            before = k - self._steps
-            if self._lost[k, i] or self._lost[before, i]:
+            source = k - self._steps
+            if self._blurred[k, i] or self._blurred[source, i]:
                 continue
             H = np.concatenate([sensor.matrix(slot) for sensor in sensors])
-            e, P, Sigma = self._prediction(before, i, noise if self._steps else None)
+            e, P, Sigma = self._prediction(source, i, noise if self._steps else None)
             v = np.concatenate([sensor.reading(slot, e) for sensor in sensors])
             S = H @ P @ H.T + believed_R
             expected = np.nan
@@ -203,14 +205,16 @@ class _Innovations:
         same = np.array_equal(F, plant.F)
         if Sigma is not None:
             Sigma = plant.F @ Sigma @ plant.F.T + plant.Q if same else None
-        ahead = plant.F @ e + noise
+        predicted = plant.F @ e + noise
         if not same:
-            ahead = ahead + (plant.F - F) @ run.xhat[k, i]
-        return ahead, F @ P @ F.T + Q, Sigma
+            predicted = predicted + (plant.F - F) @ run.xhat[k, i]
+        return predicted, F @ P @ F.T + Q, Sigma
 
 
 def _plant_noise(scenario: Scenario, streams: Streams, slots: list[int]) -> list[FloatArray]:
-    """Return the noise (n,) of the steps that end in ``slots``: the path of a plant with F = 0."""
+    """Return the plant's noise (n,) of the steps that end in ``slots``: with F = 0 in place of the
+    plant's F the state is the noise of the last step, with the same draws.
+    """
     plant = scenario.slot_plant
     memoryless = dataclasses.replace(plant, F=np.zeros_like(plant.F))
     path = memoryless.truth(streams.generator("plant"))
@@ -223,7 +227,7 @@ class NodeConsistency:
 
     nees, width  : mean NEES over runs and samples, and the half width of its interval
     expected     : expected value of NEES, nan if unknown
-    inside       : share of samples whose mean over the runs lies in the chi-square bounds
+    inside       : share of samples whose mean NEES over the runs lies in the chi-square bounds
     nis, expected_nis : mean NIS and its expected value, nan if unknown
     verdict      : a sentence, which begins with BROKEN if the errors are not as expected
     """
@@ -240,11 +244,11 @@ class NodeConsistency:
 
 @dataclass(frozen=True)
 class Consistency(NotebookTable):
-    """Rows by node; false if the errors of one are not what they should be.
+    """Rows by node; false if the errors of a node contradict their expected size.
 
-    ``low`` and ``high`` are the chi-square bounds on the mean NEES of one sample over the runs if P
-    is exact, each side missing with (1 - confidence) / 2; over n they bound the ANEES. ``notes``
-    say what was left out and why, one sentence each.
+    ``low`` and ``high`` are the two-sided chi-square bounds at ``confidence`` on the mean NEES of a
+    sample over the runs if P is exact; divided by n they bound the ANEES. ``notes`` are sentences
+    on what was left out, and why.
     """
 
     scenario: str
@@ -300,22 +304,22 @@ def consistency(
     confidence = number(above=0.0, below=1.0)("confidence", confidence)
     task = partial(run_consistency, engine=choose_engine(engine, scenario))
     pool = PoolOptions(workers, executor, scheduler)
-    found = replicate(task, _without_horizon(scenario), count, seed, pool=pool)
-    return judge_consistency(scenario, found, confidence)
+    results = replicate(task, _without_horizon(scenario), count, seed, pool=pool)
+    return judge_consistency(scenario, results, confidence)
 
 
 def _without_horizon(scenario: Scenario) -> Scenario:
-    """Return the scenario without samples at the horizon where they have no exact covariance: a
-    filtered estimate has seen the exchanges of the slot that begins there, which no trace holds.
+    """Return the scenario without a sample at the horizon for filtered estimates in slots, which
+    has no exact covariance: the trace lacks the exchanges of the slot that begins there.
     """
     hosted = scenario.hosted
     if not scenario.slotted or not hosted.talks or hosted.predicts:
         return scenario
     over = [scenario.slot_plant.over(slot, scenario.horizon) for slot in scenario.slots]
-    kept = scenario.times[~np.array(over)]
-    if all(over) or not (kept > 0.0).any():
+    times = scenario.times[~np.array(over)]
+    if all(over) or not (times > 0.0).any():
         return scenario
-    return dataclasses.replace(scenario, probe=kept) if any(over) else scenario
+    return dataclasses.replace(scenario, probe=times) if any(over) else scenario
 
 
 def judge_consistency(
@@ -327,15 +331,15 @@ def judge_consistency(
         2.0 * float(scipy.special.gammaincinv(0.5 * count * n, q)) / count
         for q in (0.5 * level, 1.0 - 0.5 * level)
     )
-    inside = _share_inside(runs, low, high)
+    shares_inside = _share_inside(runs, low, high)
     # Bonferroni over the nodes, two-sided.
     quantile = float(scipy.special.stdtrit(count - 1, 1.0 - 0.5 * level / len(scenario.nodes)))
     rows = [
-        _judge_node(scenario, runs, i, float(inside[i]), quantile)
+        _judge_node(scenario, runs, i, float(shares_inside[i]), quantile)
         for i in range(len(scenario.nodes))
     ]
-    given, blurred_from = _covariance_given(runs), _blurred_from(runs)
-    notes = () if given else (NO_COVARIANCE,)
+    has_covariance, blurred_from = _covariance_given(runs), _blurred_from(runs)
+    notes = () if has_covariance else (NO_COVARIANCE,)
     if _count_errors(scenario) > MAX_ERRORS:
         reason = (
             f"what NEES should be is left out: the exact covariance of {_count_errors(scenario):,} "
@@ -362,9 +366,9 @@ def _share_inside(runs: Sequence[RunConsistency], low: float, high: float) -> Fl
     """Return for each node (N,) the share of samples whose mean NEES lies in the bounds."""
     shortest = min(len(run.samples) for run in runs)  # runs that diverged ended early
     means = np.mean([run.samples[:shortest] for run in runs], axis=0)
-    clear = np.isfinite(means).sum(axis=0)
-    inside = ((means >= low) & (means <= high)).sum(axis=0)
-    return np.asarray(inside / np.where(clear, clear, np.nan))
+    usable = np.isfinite(means).sum(axis=0)
+    count_inside = ((means >= low) & (means <= high)).sum(axis=0)
+    return np.asarray(count_inside / np.where(usable, usable, np.nan))
 
 
 def _judge_node(
@@ -373,15 +377,15 @@ def _judge_node(
     """Return the verdict on node ``i`` by the interval of its mean NEES over the runs."""
     nees = np.array([run.nees[i] for run in runs])
     expected = np.array([run.expected[i] for run in runs])
-    known = bool(np.isfinite(expected).all())
-    gaps = nees - (expected if known else scenario.plant.n)
+    is_known = bool(np.isfinite(expected).all())
+    gaps = nees - (expected if is_known else scenario.plant.n)
     width = quantile * float(gaps.std(ddof=1)) / math.sqrt(len(runs))
     if not _covariance_given(runs):
         verdict = NO_COVARIANCE
     elif np.isfinite(_blurred_from(runs)) and np.isnan(nees).any():
         verdict = UNDECIDED
     else:
-        mean = float(expected.mean()) if known else None
+        mean = float(expected.mean()) if is_known else None
         verdict = _verdict(scenario, float(gaps.mean()), width, mean)
     return NodeConsistency(
         scenario.nodes[i],

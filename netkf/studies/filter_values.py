@@ -17,9 +17,9 @@ from netkf.trace.batch import RunBatch
 from netkf.trace.schema import CODES
 
 BYTES = 8
-"""Of a number in a message."""
+"""Bytes of a number in a message."""
 ROUNDING = 1e-9
-"""Relative difference below which two filters are the same."""
+"""Relative difference up to which two filters count as equal."""
 
 
 class FilterValues(NamedTuple):
@@ -46,22 +46,24 @@ def block_values(scenario: Scenario, seed: int, replicas: range, engine: Engine)
 def _batch_values(scenario: Scenario, batch: RunBatch) -> FilterValues:
     """Return the values of a batch of runs."""
     values = run_values(batch, scenario)
-    whole = values.averages[:, -1]
-    worst = [
+    all_nodes_mean = values.averages[:, -1]
+    largest = [
         _largest_error(batch, r, float(end)) for r, end in enumerate(values.rounding_from.tolist())
     ]
-    return FilterValues(whole[:, 0], np.array(worst), whole[:, 2], values.diverged > 0)
+    return FilterValues(
+        all_nodes_mean[:, 0], np.array(largest), all_nodes_mean[:, 2], values.diverged > 0
+    )
 
 
 def _largest_error(batch: RunBatch, r: int, blurred_from: float) -> float:
     """Return the largest |e| of a run after time 0, where rounding does not blur it."""
     length = int(batch.lengths[r])
     times = batch.times[:length]
-    # The last sample of a run that diverges is the broken one.
-    used = (times > 0.0) & ~(times >= blurred_from)
+    # The last sample of a run that diverges is not finite.
+    usable = (times > 0.0) & ~(times >= blurred_from)
     if batch.diverged[r]:
-        used[-1:] = False
-    sizes = np.linalg.norm(batch.error[r, :length][used], axis=-1)
+        usable[-1:] = False
+    sizes = np.linalg.norm(batch.error[r, :length][usable], axis=-1)
     return float(sizes.max()) if sizes.size else math.nan
 
 
@@ -71,7 +73,7 @@ def join_values(*parts: FilterValues) -> FilterValues:
 
 
 class Traffic(NamedTuple):
-    """What all nodes send in a run: ``transmissions``, a broadcast once, and their ``bytes``."""
+    """The traffic of all nodes in a run; a broadcast is one of the ``transmissions``."""
 
     transmissions: int
     bytes: float
@@ -99,8 +101,10 @@ def count_traffic(scenario: Scenario, seed: int, engine: Engine) -> Traffic:
 
 
 class Quantity(NamedTuple):
-    """A mean over runs with its standard error, and its difference from that of the first filter
-    with an interval; ``real`` if that leaves 0 out. nan and False where there is none.
+    """A mean over runs with its standard error, and its difference from that of the first filter.
+
+    ``low`` and ``high`` are the interval of the difference, ``real`` is True if it excludes 0; nan
+    and False without a difference.
     """
 
     value: float
@@ -117,28 +121,32 @@ def estimate_quantities(
     """Return ``rms_error``, ``worst_instant`` and ``nees_ratio`` (NEES / n) of a filter, with the
     paired differences from the ``first`` one; each interval misses with probability ``level``.
     """
-    found = {}
+    quantities = {}
     base = _influences(first, n) if first is not None else {}
     for name, (value, influence) in _influences(values, n).items():
         runs = len(influence)
         quantity = Quantity(value, _standard_error(influence))
         if name in base and not (values.diverged.any() or first is None or first.diverged.any()):
-            other, paired = base[name][0], influence - base[name][1]
+            base_value, paired = base[name][0], influence - base[name][1]
             width = _width(paired, level)
-            gap = value - other
+            gap = value - base_value
             # Filters that are one algorithm differ by rounding.
             real = runs > 1 and abs(gap) > max(width, ROUNDING * abs(value))
             quantity = quantity._replace(
                 difference=gap, low=gap - width, high=gap + width, real=bool(real)
             )
-        found[name] = quantity
-    return found
+        quantities[name] = quantity
+    return quantities
 
 
 def _influences(values: FilterValues, n: int) -> dict[str, tuple[float, FloatArray]]:
-    """Return each quantity with one number a run (R,) of which its deviation is the mean."""
+    """Return each quantity with its influence values (R,), one for each run.
+
+    The standard error of the quantity is that of the mean of its influence values, and paired
+    differences of two filters follow from differences of these (delta method).
+    """
     rms = math.sqrt(float(values.square.mean()))
-    # The root of a mean moves by half of what its argument does, over the root.
+    # d sqrt(m) = dm / (2 sqrt(m))
     square = values.square / (2.0 * rms) if rms > 0.0 else values.square
     nees = values.nees / n
     return {

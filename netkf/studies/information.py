@@ -1,13 +1,13 @@
 """How information travelled through a run: a backward search over its messages.
 
-The log of a run says when each node took readings, when each message was sent and when its receiver
-used it. From a node at an instant the search goes back along the messages and finds, of every other
-node, the last moment whose knowledge can have reached it. All of it works on arrays, in one pass
-over the messages from the newest to the oldest.
+The log of a run has the times at which nodes took readings, and messages were sent and used. From a
+node at an instant the search follows messages backwards and finds, for every other node, the latest
+time up to which its information can have reached the first one. It is one pass over arrays of
+messages, from the newest to the oldest.
 
-What a message carries depends on the filter. A filter that combines estimates passes on all that
-its sender knows; one that sends readings passes on the reading of that instant; one that swaps
-states replaces what its receiver knew.
+What a message carries depends on the filter: all information of its sender for filters that combine
+estimates; the reading of that instant for filters that send readings; and for filters that swap
+states all information of the sender, which replaces that of the receiver.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ from netkf.trace.schema import CODES
 IntArray = np.ndarray
 NEVER = -1
 OUTCOMES = ("used", "lost", "late", "refused", "under way", "unused")
-"""What became of a message until the end of a log. Late ones came after the inbox of their slot had
-closed, refused ones were too old for the filter, unused ones gave way to another message of that
+"""Fate of a message at the end of a log. Late messages arrived after the exchange of their slot,
+refused ones were too old for the filter, unused ones were replaced by another message of the same
 instant.
 """
 USED, LOST, LATE, REFUSED, UNDER_WAY, UNUSED = range(len(OUTCOMES))
@@ -85,21 +85,23 @@ def match_messages(log: IntArray, swaps: bool, slotted: bool) -> Messages:
     first[1:] = (sender[1:] != sender[:-1]) | (receiver[1:] != receiver[:-1])
     links = _Links(sender[first], receiver[first], np.flatnonzero(first))
     outcome = np.full(len(rows), UNDER_WAY)
-    arrived, used = np.full(len(rows), np.nan), np.full(len(rows), NEVER)
+    arrived, used_row = np.full(len(rows), np.nan), np.full(len(rows), NEVER)
     lost = np.flatnonzero(kind == CODES["lost"])
     outcome[links.indices(log["node"][lost], log["peer"][lost], log["message"][lost])] = LOST
     late = np.flatnonzero(kind == CODES["late"])
-    at = links.indices(log["peer"][late], log["node"][late], log["message"][late])
-    outcome[at], arrived[at] = (LATE if slotted else REFUSED), log["t"][late]
-    came = np.flatnonzero(kind == CODES["deliver"])
-    at = links.indices(log["peer"][came], log["node"][came], log["message"][came])
-    arrived[at], used[at] = log["t"][came], _next_use(log, came)
-    outcome[at] = np.where(used[at] == NEVER, UNDER_WAY, USED)
+    indices = links.indices(log["peer"][late], log["node"][late], log["message"][late])
+    outcome[indices], arrived[indices] = (LATE if slotted else REFUSED), log["t"][late]
+    deliveries = np.flatnonzero(kind == CODES["deliver"])
+    indices = links.indices(
+        log["peer"][deliveries], log["node"][deliveries], log["message"][deliveries]
+    )
+    arrived[indices], used_row[indices] = log["t"][deliveries], _next_use(log, deliveries)
+    outcome[indices] = np.where(used_row[indices] == NEVER, UNDER_WAY, USED)
     if swaps:
         chosen = np.flatnonzero(outcome == USED)
-        outcome[chosen[~_last_of_instant(used[chosen], sender[chosen], rows[chosen])]] = UNUSED
+        outcome[chosen[~_last_of_instant(used_row[chosen], sender[chosen], rows[chosen])]] = UNUSED
     sent, phase = log["t"][rows], log["phase"][rows]
-    return Messages(sender, receiver, number, sent, arrived, phase, outcome, rows, used)
+    return Messages(sender, receiver, number, sent, arrived, phase, outcome, rows, used_row)
 
 
 class _Links(NamedTuple):
@@ -112,30 +114,32 @@ class _Links(NamedTuple):
     start: IntArray
 
     def indices(self, sender: IntArray, receiver: IntArray, number: IntArray) -> IntArray:
-        """Return the indices of messages among those of all links."""
+        """Return the indices of messages, by link and number on it, among those of all links."""
         if not len(self.start):
             return np.empty(0, dtype=np.int64)
         ids = np.unique(np.concatenate([self.sender, self.receiver]))
         keys = np.searchsorted(ids, self.sender) * len(ids) + np.searchsorted(ids, self.receiver)
-        wanted = np.searchsorted(ids, sender) * len(ids) + np.searchsorted(ids, receiver)
-        return np.asarray(self.start[np.searchsorted(keys, wanted)] + number)
+        message_keys = np.searchsorted(ids, sender) * len(ids) + np.searchsorted(ids, receiver)
+        return np.asarray(self.start[np.searchsorted(keys, message_keys)] + number)
 
 
 def _next_use(log: IntArray, rows: IntArray) -> IntArray:
-    """Return the row at which the node of each of the ``rows`` next uses what has arrived."""
+    """Return the row at which the node of each of ``rows`` next uses arrived messages; NEVER if it
+    does not.
+    """
     uses = np.flatnonzero((log["kind"] == CODES["absorb"]) | (log["kind"] == CODES["swap"]))
     ids, length = np.unique(log["node"]), len(log) + 1
     keys = np.searchsorted(ids, log["node"][uses]) * length + uses
     order = np.argsort(keys)
     node = np.searchsorted(ids, log["node"][rows])
     position = np.searchsorted(keys[order], node * length + rows)
-    found = np.append(uses[order], NEVER)[position]
-    return np.where((found >= 0) & (log["node"][found] == log["node"][rows]), found, NEVER)
+    next_row = np.append(uses[order], NEVER)[position]
+    return np.where((next_row >= 0) & (log["node"][next_row] == log["node"][rows]), next_row, NEVER)
 
 
 def _last_of_instant(used: IntArray, sender: IntArray, sent_row: IntArray) -> IntArray:
-    """Return a mask (K,) of the messages used by receivers that take only one message an instant:
-    that of the sender with the largest id, and of these the last sent.
+    """Return a mask (K,) of the messages that count if a receiver uses one message at an instant:
+    that of the sender with the largest id, and of several from it the last sent.
     """
     order = np.lexsort((sent_row, sender, used))
     last = np.ones(len(used), dtype=bool)
@@ -146,8 +150,9 @@ def _last_of_instant(used: IntArray, sender: IntArray, sent_row: IntArray) -> In
 
 
 def at_once(messages: Messages, log: IntArray) -> Messages:
-    """Return the messages as if those that were not used had been used at the instant of sending:
-    a lower bound for a search, since the time at which they would have arrived is unknown.
+    """Return the messages with unused ones taken to be used when they were sent.
+
+    The time at which they would have arrived is unknown; so ages found with these are lower bounds.
     """
     last = np.searchsorted(log["t"], messages.sent, side="right") - 1
     used = np.where(messages.outcome == USED, messages.used_row, last)
@@ -155,32 +160,34 @@ def at_once(messages: Messages, log: IntArray) -> Messages:
 
 
 def rows_until(scenario: DerivedScenario, log: IntArray, at: float) -> IntArray:
-    """Return the rows of an EVENT log that the state shown at ``at`` seconds contains."""
+    """Return the rows of an EVENT log that influence the sample at ``at`` seconds."""
     return np.asarray(log[: _count_events(scenario, log["t"], at)])
 
 
 def _count_events(scenario: DerivedScenario, times: FloatArray, at: float) -> int:
-    """Return the number of events that the sample at ``at`` seconds contains."""
+    """Return the number of events that influence the sample at ``at`` seconds."""
     if not scenario.slotted:
         return int(np.searchsorted(times, at, side="right"))
     plant = scenario.slot_plant
     slot = round(at / plant.period)
-    # A prediction is shown before anything of its slot happens, a filtered state after all of it.
+    # A sample of a predicting filter is before the events of its slot, a filtered one after them.
     end = plant.slot_time(slot if scenario.hosted.predicts else slot + 1)
     return int(np.searchsorted(times, end, side="left"))
 
 
 @dataclass(frozen=True, eq=False)
 class Flow:
-    """The flow of information in a log: segments, and the messages that join them.
+    """The flow of information in a log: a graph of G segments joined by M messages.
 
     A segment is an interval of rows over which the information of one node accumulates: the whole
     run for filters that combine, from one swap to the next for filters that swap, and one instant
-    for the readings that a message carries. ``node`` and ``start`` (G,) are the node of each
-    segment and its first row. Of each message, ``origin`` (M,) is the segment that its sender is
-    in, ``target`` (M,) the one of its receiver, and ``cost`` (M,) is 1 if it was not used in the
-    run and 0 if it was. ``last`` is the segment of each node at the end of the log, by node. If
-    ``pooled``, one filter has the readings of all nodes.
+    for the readings that a message carries.
+
+    node, start    : (G,) node and first row of each segment
+    origin, target : (M,) segments of the sender and of the receiver of each message
+    cost           : (M,) 0 for messages that were used in the run, 1 for others
+    last           : segment of each node at the end of the log, by node
+    pooled         : one filter has the readings of all nodes
     """
 
     messages: Messages
@@ -199,15 +206,15 @@ def find_flow(
 ) -> Flow:
     """Return the flow of information in a log with these messages.
 
-    ``used`` (M,) bool marks the messages that were used in the original run, which the log may be a
-    replay of; by default those used in this log. The others cost 1 each.
+    ``used`` (M,) bool marks the messages that cost nothing: those that were used in the original
+    run, of which the log may be a replay; by default those used in this log.
     """
     used = messages.outcome == USED if used is None else used
     nodes = np.array(scenario.nodes)
     combination = scenario.hosted.combination
     if combination == "swap":
         return _swap_flow(nodes, len(log), messages, np.asarray(used))
-    # One segment a node, the whole run: its number is the index of the node.
+    # One segment for each node, the whole run; its index is that of the node.
     node = nodes
     start = np.zeros(len(nodes), dtype=np.int64)
     origin = np.searchsorted(nodes, messages.sender)
@@ -242,7 +249,7 @@ def _carry_readings(combination: str, messages: Messages) -> IntArray:
 
 
 def _swap_flow(nodes: IntArray, rows: int, messages: Messages, used: IntArray) -> Flow:
-    """Return the segments that begin with each swap."""
+    """Return the flow of a filter that swaps: each swap begins a new segment of its receiver."""
     swapped = np.flatnonzero(used)
     node = np.concatenate([nodes, messages.receiver[swapped]])
     start = np.concatenate([np.zeros(len(nodes), np.int64), messages.used_row[swapped]])
@@ -257,7 +264,7 @@ def _swap_flow(nodes: IntArray, rows: int, messages: Messages, used: IntArray) -
         return np.asarray(np.searchsorted(keys, wanted, side="right") - 1)
 
     origin = segment(messages.sender, messages.sent_row)
-    # A swap that happened begins a segment at its own row, one that did not falls into another.
+    # A swap that took place begins a segment at its row; others fall into an existing segment.
     target = segment(messages.receiver, np.maximum(messages.used_row, 0))
     last = segment(nodes, np.full(len(nodes), rows))
     ends = dict(zip(nodes.tolist(), last.tolist(), strict=True))
@@ -266,11 +273,11 @@ def _swap_flow(nodes: IntArray, rows: int, messages: Messages, used: IntArray) -
 
 @dataclass(frozen=True, eq=False)
 class Reach:
-    """The result of a backward search from one node at the end of a log.
+    """The result of a backward search from one node at the end of a log, for budgets b = 0 .. B.
 
-    ``deadline`` (B + 1, G): what is known in a segment before this row reaches the node if at most
-    b of the messages that cost something had come; NEVER if nothing does. ``via`` (B + 1, G) is the
-    first message on the way, NEVER at the node itself.
+    deadline : (B + 1, G) row before which the information of a segment reaches the node if b
+               messages of cost 1 are used; NEVER if it does not
+    via      : (B + 1, G) first message on the path from the segment; NEVER at the node itself
     """
 
     flow: Flow
@@ -278,18 +285,18 @@ class Reach:
     via: IntArray
 
     def messages_from(self, segment: int, budget: int) -> list[int]:
-        """Return the messages on the way from a segment to the node, in the order of sending."""
-        found: list[int] = []
+        """Return the messages on the path from a segment to the node, in the order of sending."""
+        path: list[int] = []
         while self.via[budget, segment] != NEVER:
             message = int(self.via[budget, segment])
-            found.append(message)
+            path.append(message)
             budget -= int(self.flow.cost[message])
             segment = int(self.flow.target[message])
-        return found
+        return path
 
     def needed(self, message: int) -> int | None:
-        """Return how many messages that cost something must come, this one included, for what it
-        carries to reach the node; None if more than the budget of the search.
+        """Return the number of messages of cost 1 that must be used, this one included, for its
+        information to reach the node; None if it exceeds the budget of the search.
         """
         used, cost = self.flow.messages.used_row[message], int(self.flow.cost[message])
         for budget in range(len(self.deadline) - cost):
@@ -299,21 +306,21 @@ class Reach:
 
 
 def search_back(flow: Flow, node: int, budget: int = 0) -> Reach:
-    """Search back from ``node`` at the end of the log, along the messages that were used and at
-    most ``budget`` others.
+    """Return the backward search from ``node`` at the end of the log, along messages of cost 0 and
+    at most ``budget`` others.
     """
     segments = len(flow.node)
     deadline = [[NEVER] * segments for _ in range(budget + 1)]
     via = [[NEVER] * segments for _ in range(budget + 1)]
     for layer in deadline:
-        for known in flow.last.values() if flow.pooled else (flow.last[node],):
-            layer[known] = flow.rows
+        for segment in flow.last.values() if flow.pooled else (flow.last[node],):
+            layer[segment] = flow.rows
     usable = np.flatnonzero((flow.messages.used_row != NEVER) & (flow.cost <= budget))
     order = usable[np.argsort(-flow.messages.used_row[usable], kind="stable")]
     columns = (flow.messages.used_row, flow.messages.sent_row, flow.origin, flow.target, flow.cost)
     rows = zip(order.tolist(), *(column[order].tolist() for column in columns), strict=True)
-    # From the last use to the first: a message that moves a deadline beyond a row was sent after
-    # that row, and used later still, so it has been looked at.
+    # In decreasing order of use, one pass suffices: a message that sets a segment's deadline is
+    # used after it was sent, hence processed before any message that is used by that deadline.
     for message, used, sent, origin, target, cost in rows:
         for b in range(cost, budget + 1):
             if used < deadline[b - cost][target] and sent > deadline[b][origin]:
@@ -353,7 +360,7 @@ class KeptReadings:
         if node not in self._rows:
             return np.nan
         if node in self._scenario.increment_sensors:
-            # Continuous readings are used up to the very moment at which the node is asked.
+            # Continuous readings are used up to the event at the end of the rows.
             return float(self._times[end]) if end < len(self._times) else self._at
         rows = self._rows[node]
         k = int(np.searchsorted(rows, end)) - 1
@@ -369,8 +376,11 @@ class KeptReadings:
 
 
 class Newest(NamedTuple):
-    """The newest information of a node that reached another: the ``reading`` time and the last
-    moment ``known``, seconds, nan without one, and the segment it came from (NEVER without one).
+    """The newest information of a node that reached another.
+
+    reading : time in seconds of its newest reading, nan without one
+    known   : last time in seconds up to which its information is included, nan if to the end
+    segment : index of the segment from which it came
     """
 
     reading: float
@@ -381,17 +391,19 @@ class Newest(NamedTuple):
 def newest_information(
     reach: Reach, log: IntArray, readings: KeptReadings, budget: int
 ) -> dict[int, Newest]:
-    """Return by node the newest information that reached the node of a search within a budget."""
-    flow, found = reach.flow, dict[int, Newest]()
+    """Return the newest information, by node, that reached the node of a search with a budget."""
+    flow, newest = reach.flow, dict[int, Newest]()
     deadline = reach.deadline[budget]
     for segment in np.flatnonzero(deadline != NEVER).tolist():
         node, end = int(flow.node[segment]), int(deadline[segment])
         reading = readings.newest(node, int(flow.start[segment]), end)
         known = float(log["t"][end]) if end < len(log) else np.nan
-        best = found.get(node)
-        if best is None or _age_key(reading, known) > _age_key(best.reading, best.known):
-            found[node] = Newest(reading, known, segment)
-    return found
+        previous = newest.get(node)
+        if previous is None or _age_key(reading, known) > _age_key(
+            previous.reading, previous.known
+        ):
+            newest[node] = Newest(reading, known, segment)
+    return newest
 
 
 def _age_key(reading: float, known: float) -> tuple[float, float]:
@@ -403,9 +415,9 @@ def _age_key(reading: float, known: float) -> tuple[float, float]:
 
 
 def route(reach: Reach, segment: int, budget: int) -> tuple[int, ...]:
-    """Return the nodes through which information of ``segment`` reaches the node of the search, at
-    the cost of at most ``budget`` messages that were not used.
+    """Return the nodes through which information of ``segment`` reaches the node of the search,
+    using at most ``budget`` messages of cost 1.
     """
-    passed: Iterable[int] = reach.messages_from(segment, budget)
-    hops = [int(reach.flow.messages.receiver[m]) for m in passed]
+    path: Iterable[int] = reach.messages_from(segment, budget)
+    hops = [int(reach.flow.messages.receiver[m]) for m in path]
     return (int(reach.flow.node[segment]), *hops)

@@ -1,7 +1,7 @@
 """The smallest set of messages whose arrival would have kept a covariance below a limit.
 
-Every set that is named was replayed. Sets are tried by size, and those of one size in the order of
-what their members do alone and in pairs, the most promising first.
+Sets are tried by size, and within a size in the order of the expected decrease of the trace, which
+is estimated from replays of single messages and pairs. Every reported set was replayed.
 """
 
 from __future__ import annotations
@@ -18,19 +18,19 @@ from netkf.studies.information import MessageKey
 from netkf.studies.replay import Replayer
 
 NEGLIGIBLE = 1e-2
-"""Messages before some time are left out if the arrival of all of them would have changed the trace
-by less than this part of what is missing.
+"""The oldest messages are left out if all of them together change the trace by less than this share
+of its distance from the limit.
 """
 MAX_SETS = 300_000
-"""Sets of one size that are put in order at once."""
+"""Largest number of sets of one size that are sorted at once."""
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """A message that did not come, but from which information could have reached the node.
+    """A message that was not used, but from which information could have reached the node.
 
-    ``needed`` counts the messages that have to come for that, this one included; ``sent`` is its
-    time in seconds.
+    ``sent`` is its time in seconds, ``needed`` the number of missing messages, this one included,
+    that must be delivered for that.
     """
 
     key: MessageKey
@@ -40,13 +40,15 @@ class Candidate:
 
 @dataclass(frozen=True)
 class SmallestSet:
-    """The answer: ``messages`` whose arrival brings the trace of P down to ``trace``, at most
-    ``limit``; None if no such set was found. ``best`` is the set, of all that were tried, that
-    brought it down most, to ``best_trace``.
+    """The result of the search.
 
-    All sets of up to ``complete`` messages were tried, out of ``considered`` of the ``candidates``:
-    those sent from ``since`` on (seconds). ``replays`` were made; if they did not suffice for all
-    sets of up to ``most`` messages, ``complete`` is less than that.
+    messages   : set whose delivery brings the trace of P down to ``trace`` <= ``limit``, or None
+    most       : largest size of the sets in the search
+    complete   : size up to which all sets were tried
+    candidates : number of messages that could matter
+    considered : number of them in the search: those sent from ``since`` (seconds) on
+    replays    : number of replays; with too few of them ``complete`` is below ``most``
+    best, best_trace : the tried set with the smallest trace
     """
 
     messages: tuple[MessageKey, ...] | None
@@ -83,17 +85,17 @@ def smallest_set(
     if base <= limit:
         return SmallestSet((), base, limit, most, most, len(candidates), 0, math.nan, 0)
     recent = search.recent(sorted(candidates, key=lambda c: (c.sent, c.key)))
-    complete, found = 0, None
+    complete, messages = 0, None
     for size in range(1, most + 1):
         # Half of the replays for single messages, a quarter for pairs, and so on.
         share = replays if size == most else replays - (replays >> size)
-        found, all_tried = search.of_size(recent, size, first + share)
-        if found is not None:
+        messages, all_tried = search.of_size(recent, size, first + share)
+        if messages is not None:
             break
         complete = size if all_tried and complete == size - 1 else complete
     return SmallestSet(
-        messages=found,
-        trace=math.nan if found is None else search.trace(found),
+        messages=messages,
+        trace=math.nan if messages is None else search.trace(messages),
         limit=limit,
         most=most,
         complete=complete,
@@ -107,26 +109,25 @@ def smallest_set(
 
 
 class _Search:
-    """The traces of P that replays have shown, and what sets of messages gain by them."""
+    """Traces of P by replays, and the gains (decreases of the trace) of sets of messages."""
 
     def __init__(self, replayer: Replayer, limit: float) -> None:
         self._replayer, self._limit = replayer, limit
         self._gains: dict[tuple[MessageKey, ...], float] = {}
 
     def trace(self, keys: Sequence[MessageKey]) -> float:
-        """Return the trace of P had these messages come."""
+        """Return the trace of P with these messages delivered."""
         return self._replayer.outcome(keys).trace
 
     @property
     def best(self) -> tuple[MessageKey, ...]:
-        """The set that gained most, without messages if none gained anything."""
-        found = max(self._gains, key=self._gains.__getitem__, default=())
-        return found if self._gains.get(found, 0.0) > 0.0 else ()
+        """The set with the largest gain; empty if no set decreased the trace."""
+        largest = max(self._gains, key=self._gains.__getitem__, default=())
+        return largest if self._gains.get(largest, 0.0) > 0.0 else ()
 
     def recent(self, candidates: Sequence[Candidate]) -> list[Candidate]:
-        """Return the candidates from the first on that matters, in the order of sending.
-
-        All before it together would not have changed the trace by more than NEGLIGIBLE.
+        """Return the candidates without the oldest ones that change next to nothing together, in
+        the order of sending; their number is found by bisection.
         """
         base = self.trace(())
         tolerance = NEGLIGIBLE * (base - self._limit)
@@ -148,8 +149,8 @@ class _Search:
     def of_size(
         self, candidates: Sequence[Candidate], size: int, most_replays: int
     ) -> tuple[tuple[MessageKey, ...] | None, bool]:
-        """Return a set of that size that is good enough, of single messages the best one, None if
-        none was found; and True if all sets of that size were tried.
+        """Return a set of this size that reaches the limit (of single messages the best one), or
+        None; and True if all sets of this size were tried.
         """
         best: tuple[float, tuple[MessageKey, ...]] | None = None
         sets, all_listed = self._in_order(candidates, size)
@@ -167,48 +168,52 @@ class _Search:
     def _in_order(
         self, candidates: Sequence[Candidate], size: int
     ) -> tuple[Iterator[tuple[MessageKey, ...]], bool]:
-        """Return sets of a size, those first that should lower the trace most, or of the latest
-        messages; and False where there are too many to list.
+        """Return the sets of a size in decreasing order of expected gain, then of latest messages;
+        and False if there are too many, so that the least promising messages are left out.
         """
-        alone = {c.key: self._gains.get((c.key,), 0.0) for c in candidates}
-        ranked = sorted(candidates, key=lambda c: (-alone[c.key], -c.sent))
-        kept = len(ranked)
-        while math.comb(kept, size) > MAX_SETS:
-            kept = max(size, int(0.9 * kept))
-        numbers = itertools.chain.from_iterable(itertools.combinations(range(kept), size))
-        chosen = np.fromiter(numbers, np.intp, math.comb(kept, size) * size).reshape(-1, size)
-        needed = np.array([c.needed for c in ranked[:kept]], dtype=np.intp)
+        single_gains = {c.key: self._gains.get((c.key,), 0.0) for c in candidates}
+        ranked = sorted(candidates, key=lambda c: (-single_gains[c.key], -c.sent))
+        count = len(ranked)
+        while math.comb(count, size) > MAX_SETS:
+            count = max(size, int(0.9 * count))
+        numbers = itertools.chain.from_iterable(itertools.combinations(range(count), size))
+        chosen = np.fromiter(numbers, np.intp, math.comb(count, size) * size).reshape(-1, size)
+        needed = np.array([c.needed for c in ranked[:count]], dtype=np.intp)
         chosen = chosen[_are_joined(needed[chosen])]
-        keys = sorted(c.key for c in ranked[:kept])
+        keys = sorted(c.key for c in ranked[:count])
         place = {key: k for k, key in enumerate(keys)}
-        places = np.array([place[c.key] for c in ranked[:kept]], dtype=np.intp)
+        places = np.array([place[c.key] for c in ranked[:count]], dtype=np.intp)
         members = np.sort(places[chosen], axis=1)
-        order = np.argsort(-self._expected(members, place, alone), kind="stable")
+        order = np.argsort(-self._expected(members, place, single_gains), kind="stable")
         sets = (tuple(keys[k] for k in members[row].tolist()) for row in order.tolist())
-        return sets, kept == len(ranked)
+        return sets, count == len(ranked)
 
     def _expected(
         self,
         members: np.ndarray,
         place: Mapping[MessageKey, int],
-        alone: Mapping[MessageKey, float],
+        single_gains: Mapping[MessageKey, float],
     ) -> FloatArray:
-        """Return the sum (S,) of what the messages of each set gain alone, and of what pairs gain
-        beyond that; ``members`` (S, size) are numbers of messages, as in ``place``.
+        """Return the expected gain (S,) of each set: the sum of the gains of its single messages,
+        and of the interactions of its pairs as far as they are known.
+
+        ``members`` (S, size) are indices of messages, as in ``place``.
         """
         size = members.shape[1]
-        single = np.array([alone[key] for key in place])
+        single = np.array([single_gains[key] for key in place])
         gain = np.zeros(len(members))
         for column in members.T:
             gain += single[column]
         if size > 2:
-            beyond = np.zeros((len(place), len(place)))
-            for pair, together in self._gains.items():
+            pair_gains = np.zeros((len(place), len(place)))
+            for pair, gain_of_pair in self._gains.items():
                 if len(pair) == 2 and set(pair) <= place.keys():
                     a, b = pair
-                    beyond[place[a], place[b]] = together - alone[a] - alone[b]
+                    pair_gains[place[a], place[b]] = (
+                        gain_of_pair - single_gains[a] - single_gains[b]
+                    )
             for i, j in itertools.combinations(range(size), 2):
-                gain += beyond[members[:, i], members[:, j]]
+                gain += pair_gains[members[:, i], members[:, j]]
         return gain
 
 

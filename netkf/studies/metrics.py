@@ -23,9 +23,11 @@ from netkf.trace.run import Run
 from netkf.trace.schema import KINDS
 
 MAX_ERRORS = 24
-"""Errors of all nodes together whose exact covariance is about as cheap as a few runs, in slots."""
+"""Largest number of errors of all nodes whose exact covariance costs about as much as a few runs,
+in slots.
+"""
 MAX_COUPLED = 40
-"""The same in continuous time, where compiled code integrates them."""
+"""The same in continuous time, where compiled code integrates the covariance."""
 
 
 class RunMetrics(NamedTuple):
@@ -70,7 +72,8 @@ def join_metrics(*parts: RunMetrics) -> RunMetrics:
 def expected_metrics(scenario: Scenario, seed: int, replica: int, engine: Engine) -> RunMetrics:
     """Return the metrics of one replica with the expected squared error given its events.
 
-    The expectation removes the chance of the noise, so that far fewer runs are enough.
+    The conditional expectation removes the variance that the noises cause (Rao-Blackwell), so that
+    far fewer runs are enough.
     """
     run = simulate(scenario, seed, replica, engine)
     if run.status != "complete":
@@ -140,8 +143,8 @@ def square_root_of(estimate: MeanEstimate) -> MeanEstimate:
 
 def time_average(scenario: Scenario, values: FloatArray) -> FloatArray:
     """Return the means (N,) of values (T, N) over the samples after time 0, as in summaries."""
-    after = scenario.times > 0.0
-    return np.asarray(values[after if after.any() else slice(None)].mean(axis=0))
+    after_start = scenario.times > 0.0
+    return np.asarray(values[after_start if after_start.any() else slice(None)].mean(axis=0))
 
 
 def bound_traces(scenario: Scenario) -> FloatArray:
@@ -187,17 +190,19 @@ def _require_fixed_H(scenario: Scenario) -> None:
 
 
 def _slot_traces(scenario: Scenario, model: SlotModel, start: FloatArray) -> FloatArray:
-    """Return the traces (T,) of P of a Kalman filter with a model at the samples."""
+    """Return the traces (T,) of P at the samples of a Kalman filter with ``model``, from P(0) =
+    ``start``.
+    """
     predicts = scenario.filter.algorithm.predicts  # type: ignore[union-attr]
     F, Q, H, R = model.F, model.Q, model.H, model.R
-    P, found = start, np.empty(max(scenario.slots) + 1)
-    found[0] = np.trace(start)
-    for slot in range(1, len(found)):
+    P, traces = start, np.empty(max(scenario.slots) + 1)
+    traces[0] = np.trace(start)
+    for slot in range(1, len(traces)):
         if predicts:
             P = riccati_step(P, F, Q, H, R) if len(H) else F @ P @ F.T + Q
         else:
             P = F @ P @ F.T + Q
             S = H @ P @ H.T + R
             P = P - P @ H.T @ np.linalg.solve(S, H @ P) if len(H) else P
-        found[slot] = np.trace(P)
-    return np.asarray(found[np.array(scenario.slots)])
+        traces[slot] = np.trace(P)
+    return np.asarray(traces[np.array(scenario.slots)])

@@ -70,7 +70,7 @@ def open(directory: str | Path, *, trust: bool = False) -> Stored:
     Raises ScenarioError for whatever is not as netkf writes it.
     """
     folder = as_path("directory", directory, "name what netkf run or netkf sweep left")
-    where = shorten(directory)
+    name = shorten(directory)
     try:
         if not (folder / "manifest.json").exists() and (folder / "verdict.json").exists():
             return read_verdict(folder, trust)
@@ -86,7 +86,7 @@ def open(directory: str | Path, *, trust: bool = False) -> Stored:
         return read_run(folder, scenario, manifest)
     except DamagedError as error:
         remedy = "name a directory that netkf run, sweep, check or compare-filters left"
-        raise ScenarioError(where, f"cannot be opened: {error}", None, remedy) from None
+        raise ScenarioError(name, f"cannot be opened: {error}", None, remedy) from None
 
 
 def _read_manifest(folder: Path) -> dict[str, Any]:

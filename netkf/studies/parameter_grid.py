@@ -41,14 +41,14 @@ def _even_values(key: str, start: str, stop: str, count: str) -> list[Any]:
     """Return the values of START:STOP:COUNT, whole numbers if all are whole."""
     try:
         low, high, number = float(start), float(stop), int(count)
-        whole = [int(start), int(stop)]
+        integers = [int(start), int(stop)]
     except ValueError:
-        whole = []
+        integers = []
     if not _are_finite(start, stop) or not 2 <= int(count) <= MAX_POINTS:
         rule = f"range of {key} must be START:STOP:COUNT with two numbers and a count of at least 2"
         raise ScenarioError("--vary", rule, f"{start}:{stop}:{count}", "correct it")
     values = np.linspace(low, high, number)
-    if whole and np.array_equal(values, np.round(values)):
+    if integers and np.array_equal(values, np.round(values)):
         return [int(value) for value in values]
     return [float(f"{value:.12g}") for value in values]
 

@@ -1,10 +1,10 @@
-"""What a node would have known had chosen messages come: replays of a run up to one instant.
+"""Replays of a run up to one instant in which chosen messages are delivered.
 
-The scenario, the seed and all draws are those of the run. Only the outcome of chosen messages is
-another: they are delivered, after the delay that they drew, and those that came too late take no
-time. The truth and the readings do not depend on the network, so they are the same (with continuous
-readings, a message that newly arrives between two grid times may split the reading of that interval
-at another moment; its parts are then drawn anew, given the same whole).
+The scenario, the seed and all draws are those of the run. Only chosen messages differ: they are
+delivered after their drawn delay, or without delay if they were late. True states and readings do
+not depend on the network, so that they are the same. (With continuous readings, a message that is
+newly delivered between two grid times may split the reading of that interval at another moment; its
+parts are then drawn anew, given the same whole.)
 """
 
 from __future__ import annotations
@@ -38,8 +38,8 @@ Chosen = frozenset[MessageKey]
 
 
 class Deliveries:
-    """The messages that come in the next replay whatever the channel says: ``chosen``, or all where
-    that is None; those in ``hurried`` take no time.
+    """The messages that are delivered in the next replay in any case: ``chosen``, all if None.
+    Those in ``hurried`` take no time.
     """
 
     def __init__(self) -> None:
@@ -49,11 +49,10 @@ class Deliveries:
 
 @dataclass(frozen=True, eq=False)
 class DeliveringLoss(Loss):
-    """The losses of ``given``, but for the messages of ``deliveries``."""
+    """The losses of ``given``, except that the messages of ``deliveries`` are delivered."""
 
     given: Loss = field(instance(Loss))
-    # It changes from replay to replay, so that one scenario serves all of them: what follows from a
-    # scenario is computed once.
+    # A mutable object, set before each replay: one scenario with its cached tables serves all.
     deliveries: Deliveries = field(instance(Deliveries))
 
     @property
@@ -73,7 +72,7 @@ class DeliveringLoss(Loss):
     def delivery_probability(
         self, link: Link, message: int, bad: bool, table_probability: float
     ) -> float:
-        """Return 1 for chosen messages, else what the given losses say."""
+        """Return 1 for chosen messages, else the probability of the given losses."""
         chosen = self.deliveries.chosen
         if chosen is None or (*link, message) in chosen:
             return 1.0
@@ -95,7 +94,7 @@ class DeliveringLoss(Loss):
 
 @dataclass(frozen=True, eq=False)
 class HurryingDelay(Delay):
-    """The delays of ``given``, but for the hurried messages of ``deliveries``."""
+    """The delays of ``given``, except that hurried messages of ``deliveries`` take no time."""
 
     given: Delay = field(instance(Delay))
     deliveries: Deliveries = field(instance(Deliveries))
@@ -120,9 +119,9 @@ class HurryingDelay(Delay):
         return self.given.is_random
 
     def message_delay(self, link: Link, message: int, drawn: float) -> float:
-        """Return 0 for hurried messages, else what the given delays say.
+        """Return 0 for hurried messages, else the given delay in seconds.
 
-        A message whose record says nothing but that it was lost takes no time if it comes.
+        A message that is recorded as lost has no delay (nan): it takes no time if it is delivered.
         """
         chosen, key = self.deliveries.chosen, (*link, message)
         if key in self.deliveries.hurried:
@@ -137,8 +136,11 @@ class HurryingDelay(Delay):
 
 
 class Outcome(NamedTuple):
-    """The state of a node at an instant: its estimate ``xhat`` (n,), covariance ``P`` (n, n), nan
-    where the filter gives none, and ``error`` (n,) = x - xhat, nan without a known truth.
+    """The state of a node at an instant.
+
+    xhat  : (n,) estimate
+    P     : (n, n) covariance, nan if the filter gives none
+    error : (n,) x - xhat, nan without ground truth
     """
 
     xhat: FloatArray
@@ -157,58 +159,56 @@ class Outcome(NamedTuple):
 
 
 class Replayer:
-    """Replays a run up to the state of ``node`` at ``at`` seconds, which stops there.
-
-    ``count`` is the number of replays so far.
+    """Replays a run up to ``at`` seconds, for the state of ``node`` at that time; ``count`` is the
+    number of replays so far.
     """
 
     def __init__(self, scenario: Scenario, seed: int, replica: int, node: int, at: float) -> None:
         self.scenario, self._seed, self._replica = scenario, seed, replica
         self._node, self.at, self.count = scenario.nodes.index(node), at, 0
         self._deliveries = Deliveries()
-        self._short, self._whole = (
-            _delivering(_shorten(scenario, at, whole), self._deliveries) for whole in (False, True)
+        self._short, self._full = (
+            _delivering(_shorten(scenario, at, to_horizon), self._deliveries)
+            for to_horizon in (False, True)
         )
-        self._known: dict[tuple[Chosen | None, bool], Outcome] = {}
+        self._outcomes: dict[tuple[Chosen | None, bool], Outcome] = {}
 
     @cached_property
     def log(self) -> IntArray:
-        """The EVENT rows of the run as it was, up to the state that is asked about."""
-        return self._replay(frozenset(), whole=False)
+        """The EVENT rows of the unchanged run, up to the state at ``at``."""
+        return self._replay(frozenset(), to_horizon=False)
 
     @cached_property
     def hurried(self) -> Chosen:
-        """The messages of the run that had not been used by then though they were not lost: late
-        ones, refused ones, and those under way.
-        """
+        """The messages that were not lost but not used by then: late, refused or under way."""
         scenario = self.scenario
         swaps = scenario.hosted.combination == "swap"
         messages = match_messages(self.log, swaps, scenario.slotted)
-        found = np.flatnonzero(np.isin(messages.outcome, (LATE, REFUSED, UNDER_WAY)))
-        return frozenset(messages.key(m) for m in found.tolist())
+        unused = np.flatnonzero(np.isin(messages.outcome, (LATE, REFUSED, UNDER_WAY)))
+        return frozenset(messages.key(m) for m in unused.tolist())
 
     @cached_property
     def full_log(self) -> IntArray:
-        """The EVENT rows of the run if every message had come."""
-        return self._replay(None, whole=False)
+        """The EVENT rows of the run with all messages delivered."""
+        return self._replay(None, to_horizon=False)
 
     def outcome(self, chosen: Iterable[MessageKey] | None = (), error: bool = False) -> Outcome:
-        """Return the state had the ``chosen`` messages come; None stands for all messages.
+        """Return the state with the ``chosen`` messages delivered, all for None; cached.
 
         ``error`` asks for the error too, which may take the whole run; it is nan otherwise.
         """
-        wanted = None if chosen is None else frozenset(chosen)
-        whole = error and bool(self.scenario.sampled_sensors)
-        if (wanted, whole) not in self._known:
-            if wanted is None and not whole:
+        keys = None if chosen is None else frozenset(chosen)
+        to_horizon = error and bool(self.scenario.sampled_sensors)
+        if (keys, to_horizon) not in self._outcomes:
+            if keys is None and not to_horizon:
                 _ = self.full_log
-            elif wanted == frozenset() and not whole:
+            elif keys == frozenset() and not to_horizon:
                 _ = self.log
             else:
-                self._replay(wanted, whole)
-        return self._known[wanted, whole]
+                self._replay(keys, to_horizon)
+        return self._outcomes[keys, to_horizon]
 
-    def _replay(self, chosen: Chosen | None, whole: bool) -> IntArray:
+    def _replay(self, chosen: Chosen | None, to_horizon: bool) -> IntArray:
         """Simulate the run again with the ``chosen`` messages delivered, or all for None; return
         the rows of events.
         """
@@ -217,40 +217,40 @@ class Replayer:
         if chosen is None or chosen:
             hurried = self.hurried if chosen is None else chosen & self.hurried
         self._deliveries.chosen, self._deliveries.hurried = chosen, hurried
-        scenario = self._whole if whole else self._short
+        scenario = self._full if to_horizon else self._short
         run = simulate(scenario, self._seed, self._replica)
         k = self._node
         outcome = Outcome(run.xhat[-1, k], run.P[-1, k], run.error[-1, k])
         if run.times[-1] != self.at:  # it diverged before
             outcome = Outcome(*(np.full_like(part, np.nan) for part in outcome))
-        self._known[chosen, whole] = outcome
+        self._outcomes[chosen, to_horizon] = outcome
         return rows_until(self.scenario, run.log, self.at)
 
 
 def _delivering(scenario: Scenario, deliveries: Deliveries) -> Scenario:
-    """Return the scenario in which the messages of ``deliveries`` come."""
+    """Return the scenario in which the messages of ``deliveries`` are delivered."""
     network = scenario.network
-    given = network.channel
-    loss, delay = DeliveringLoss(given.loss, deliveries), given.delay
-    # Without delays nothing is ever late, and the engines are faster.
+    channel_of_run = network.channel
+    loss, delay = DeliveringLoss(channel_of_run.loss, deliveries), channel_of_run.delay
+    # Without delays no message is late, and the engines have a faster path.
     if not isinstance(delay, NoDelay):
         delay = HurryingDelay(delay, deliveries)
-    channel = Channel(loss=loss, delay=delay, symmetric=given.symmetric)
+    channel = Channel(loss=loss, delay=delay, symmetric=channel_of_run.symmetric)
     return _with(scenario, network=dataclasses.replace(network, channel=channel))
 
 
-def _shorten(scenario: Scenario, at: float, whole: bool) -> Scenario:
-    """Return the scenario with the state at ``at`` seconds as its last sample; unless ``whole`` it
-    ends there.
+def _shorten(scenario: Scenario, at: float, to_horizon: bool) -> Scenario:
+    """Return the scenario with ``at`` seconds as its last sample, which also ends there unless it
+    runs ``to_horizon``.
 
     Earlier samples stay: with continuous readings they decide where the readings of an interval are
-    split. The true state between two samples of sensors depends on the later one too, so errors may
-    need the ``whole`` run.
+    split. The true state between two samples of sensors depends on the later one too, so that
+    errors may need the run to its horizon.
     """
     times = scenario.times
     probe = np.append(times[times < at], at)
-    beyond = scenario.slot_plant.period if scenario.slotted else max(1e-9, 1e-12 * at)
-    end = scenario.horizon if whole else min(scenario.horizon, at + beyond)
+    margin = scenario.slot_plant.period if scenario.slotted else max(1e-9, 1e-12 * at)
+    end = scenario.horizon if to_horizon else min(scenario.horizon, at + margin)
     return _with(scenario, probe=probe, horizon=end)
 
 

@@ -1,4 +1,4 @@
-"""The search of ``netkf.size``: a bisection whose values are decided by theory or simulation."""
+"""The search of ``netkf.size``: a bisection whose probes are decided by theory or simulation."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ if TYPE_CHECKING:
     import pandas as pd
 
 REACHED, MISSED, UNDECIDED, NOT_SHOWN = "reached", "missed", "undecided", "not shown"
-"""What was found of a value; ``not shown``: a bound is above the limit, which proves nothing."""
+"""States of a value; ``not shown``: an upper bound is above the limit, which proves nothing."""
 FIRST_BATCH, FIRST_EXPECTED = 32, 8
-"""Runs before the first look at a value, and those of expected squared errors."""
+"""Runs before the first decision about a value: of simulated errors, and of expected ones."""
 END_RATIO = 1.25
 """Ratio of values below which the search ends once one of them is undecided."""
 MAX_PROBES = {"theory": 40, "simulation": 16, "both": 16}
@@ -36,18 +36,24 @@ DIGITS = {"theory": 4, "simulation": 2, "both": 2}
 """Significant digits of the values that are tried."""
 EXACT, BOUND, SIMULATION = "exact", "bound", "simulation"
 """How a value was decided."""
-
-
 MAX_EXTRAPOLATION, MARGIN = 100.0, 1.5
-"""Factor beyond the range up to which a next range is advised, and the safety on its exponent."""
+"""Largest factor beyond the range for which a next range is advised, and safety factor on the
+logarithm of the extrapolated one.
+"""
 MAX_RUNS, FUTILE = 1e7, 10.0
-"""Runs beyond which no number is advised; multiple of the runs at which a value is given up."""
+"""Largest number of runs that is advised; a value that needs FUTILE times the given runs is given
+up early.
+"""
 
 
 class Probe(NamedTuple):
-    """A value that was tried: the quantity there with the ends of its interval, the number of runs,
-    whether the target was reached or missed, is undecided or not shown, and how that was decided:
-    by the exact quantity, by a bound or by simulation. A bound is the upper end of its interval.
+    """A value of the key that was tried.
+
+    value    : of the key
+    quantity, low, high : the quantity with its interval; an upper bound is the upper end
+    runs     : number of simulated runs
+    target   : reached, missed, undecided or not shown
+    by       : exact, bound or simulation
     """
 
     value: float
@@ -63,11 +69,14 @@ class Probe(NamedTuple):
 class Sizing(NotebookTable):
     """The result of a search; true if a value reaches the target.
 
-    ``value`` is the smallest value that reaches it (``grows`` False: the quantity falls as the key
-    grows) or the largest one, ``misses`` the nearest value that was not shown to reach it; None if
-    there is none. ``by`` is theory, simulation, or both: a bound where it reaches the target, and
-    simulation elsewhere. ``quantity`` says what was computed, ``sure`` how sure the result is and
-    what was assumed, ``advice`` what to try next (empty if nothing).
+    value    : the smallest value that reaches the target, or the largest if ``grows``; None if none
+               does
+    misses   : the nearest value that was not shown to reach it, or None
+    grows    : True if the quantity grows with the key
+    by       : theory, simulation, or both (a bound where it reaches the target, else simulation)
+    quantity : description of the computed quantity
+    sure     : certainty of the result, and assumptions
+    advice   : what to try next, or empty
     """
 
     key: str
@@ -116,8 +125,10 @@ class SizingProblem:
 
 @dataclass(frozen=True)
 class SimulationPlan:
-    """How a value is decided by simulation: at most ``runs`` runs of ``task`` on a pool, ``first``
-    of them before the first look, each interval missing with probability ``level``.
+    """How values are decided by simulation.
+
+    At most ``runs`` runs of ``task`` on a ``pool``, ``first`` of them before the first decision;
+    each interval misses the truth with probability ``level``.
     """
 
     task: BlockTask
@@ -141,8 +152,8 @@ def decide_by_theory(problem: SizingProblem, value: float) -> Probe:
 
 def decide_by_both(problem: SizingProblem, plan: SimulationPlan, value: float) -> Probe:
     """Return the probe of a value from a bound if that reaches the target, else by simulation."""
-    found = decide_by_theory(problem, value)
-    return decide_by_simulation(problem, plan, value) if found.target == NOT_SHOWN else found
+    bound = decide_by_theory(problem, value)
+    return decide_by_simulation(problem, plan, value) if bound.target == NOT_SHOWN else bound
 
 
 def decide_by_simulation(problem: SizingProblem, plan: SimulationPlan, value: float) -> Probe:
@@ -151,16 +162,18 @@ def decide_by_simulation(problem: SizingProblem, plan: SimulationPlan, value: fl
     """
     scenario, target = problem.at(value), problem.target
     central = central_trace(scenario) if target.quantity == "within_central" else None
-    done, found = 0, []
+    simulated, metrics = 0, []
     if plan.progress is not None:
         plan.progress(f"{problem.key} = {value:g}: simulating")
     while True:
-        batch = min(max(plan.first, done), plan.runs - done)
-        found.append(
-            replicate_blocks(plan.task, join_metrics, scenario, batch, first=done, pool=plan.pool)
+        batch = min(max(plan.first, simulated), plan.runs - simulated)
+        metrics.append(
+            replicate_blocks(
+                plan.task, join_metrics, scenario, batch, first=simulated, pool=plan.pool
+            )
         )
-        done += batch
-        interval = quantity_by_simulation(join_metrics(*found), target, plan.level, central)
+        simulated += batch
+        interval = quantity_by_simulation(join_metrics(*metrics), target, plan.level, central)
         state = UNDECIDED
         if interval.high <= target.limit:
             state = REACHED
@@ -169,21 +182,23 @@ def decide_by_simulation(problem: SizingProblem, plan: SimulationPlan, value: fl
         if plan.progress is not None:
             plan.progress(
                 f"{problem.key} = {value:g}: {target.quantity} {interval.value:.4g}, between "
-                f"{interval.low:.4g} and {interval.high:.4g} after {done:,} of at most "
+                f"{interval.low:.4g} and {interval.high:.4g} after {simulated:,} of at most "
                 f"{plan.runs:,} runs, {state}"
             )
-        probe = Probe(value, *interval, done, state)
-        if state != UNDECIDED or done >= plan.runs or _is_futile(probe, target, plan.runs):
+        probe = Probe(value, *interval, simulated, state)
+        if state != UNDECIDED or simulated >= plan.runs or _is_futile(probe, target, plan.runs):
             return probe
 
 
 def _is_futile(probe: Probe, target: Target, runs: int) -> bool:
-    """Return True if a quarter of the runs says that ten times as many would not decide."""
+    """Return True if after a quarter of ``runs`` the forecast is more than FUTILE times these."""
     return probe.runs >= runs // 4 and _runs_to_decide(probe, target) > FUTILE * runs
 
 
 def _runs_to_decide(probe: Probe, target: Target) -> float:
-    """Return how many runs would decide an undecided value, if its estimate is right."""
+    """Return the forecast number of runs that decide a value, if its estimate is right; nan if
+    unknown.
+    """
     width, distance = 0.5 * (probe.high - probe.low), abs(probe.quantity - target.limit)
     if not math.isfinite(width):
         return math.nan
@@ -234,8 +249,8 @@ class Search:
         return last.quantity > first.quantity
 
     def _bisect(self, value: float, misses: float) -> tuple[float, float]:
-        """Return the values next to the limit, one that reaches the target and one that does not,
-        from two such values.
+        """Return two neighbouring values, of which the first reaches the target and the second
+        does not, from two such values further apart.
         """
         while len(self.probes) < MAX_PROBES[self._problem.by]:
             middle = self._value_between(*sorted((value, misses)))
@@ -243,7 +258,7 @@ class Search:
                 break
             reached = self._probe(middle).target == REACHED
             value, misses = (middle, misses) if reached else (value, middle)
-            # Noise hides the limit near a value that stayed undecided.
+            # Close to an undecided value simulation noise hides the limit.
             if self._is_undecided(misses) and max(value, misses) <= END_RATIO * min(value, misses):
                 break
         return value, misses
@@ -294,17 +309,17 @@ def advise(
 
 
 def _advise_beyond(problem: SizingProblem, end: Probe, inner: Probe, grows: bool) -> str:
-    """Return where the target may be met beyond the ``end`` of the range, an empty string if its
-    two last probes do not tell.
+    """Return advice on a range beyond ``end``, extrapolated from the last two probes; an empty
+    string if they do not tell.
     """
-    # The quantity follows a power of the key.
+    # The quantity is taken to be a power of the key.
     numbers = (end.value, inner.value, end.quantity, inner.quantity)
     if not all(math.isfinite(x) and x > 0.0 for x in numbers) or end.value == inner.value:
         return ""
     power = math.log(end.quantity / inner.quantity) / math.log(end.value / inner.value)
     needed = math.log(problem.target.limit / end.quantity) / power if power else math.inf
-    beyond = (needed < 0.0) if grows else (needed > 0.0)
-    if beyond and abs(needed) <= math.log(MAX_EXTRAPOLATION):
+    is_outside = (needed < 0.0) if grows else (needed > 0.0)
+    if is_outside and abs(needed) <= math.log(MAX_EXTRAPOLATION):
         return _advise_range(problem, end.value, end.value * math.exp(MARGIN * needed))
     return (
         f"{problem.target.quantity} hardly changes beyond {problem.key} = {end.value:g}, where it "
@@ -312,27 +327,27 @@ def _advise_beyond(problem: SizingProblem, end: Probe, inner: Probe, grows: bool
     )
 
 
-def _advise_range(problem: SizingProblem, end: float, other: float) -> str:
-    """Return the advice to search between a value and one beyond it, if the key can have it."""
+def _advise_range(problem: SizingProblem, end: float, next_end: float) -> str:
+    """Return the advice to search between ``end`` and ``next_end``, or why that is impossible."""
     if end == 0.0:
         return ""
-    other = round(other) if problem.integer else float(f"{other:.2g}")
+    next_end = round(next_end) if problem.integer else float(f"{next_end:.2g}")
     try:
-        problem.at(other)
+        problem.at(next_end)
     except ScenarioError as error:
-        return f"{problem.key} cannot be {other:g}: {error.rule}"
-    low, high = sorted((end, other))
+        return f"{problem.key} cannot be {next_end:g}: {error.rule}"
+    low, high = sorted((end, next_end))
     return f"next range: --vary {problem.key}={low:g}:{high:g}" if low < high else ""
 
 
 def _advise_runs(probe: Probe, target: Target) -> str:
-    """Return how many runs would decide an undecided value, if its estimate is right."""
-    wanted = _runs_to_decide(probe, target) if probe.target == UNDECIDED else math.nan
-    if math.isnan(wanted):
+    """Return advice on the number of runs for an undecided value, or an empty string."""
+    runs = _runs_to_decide(probe, target) if probe.target == UNDECIDED else math.nan
+    if math.isnan(runs):
         return ""
-    if wanted > MAX_RUNS:
+    if runs > MAX_RUNS:
         return f"at {probe.value:g} it is too close to the limit for runs to tell"
-    return f"at {probe.value:g} about --runs {float(f'{max(wanted, probe.runs):.2g}'):g} would tell"
+    return f"at {probe.value:g} about --runs {float(f'{max(runs, probe.runs):.2g}'):g} would tell"
 
 
 def _describe_certainty(
@@ -351,12 +366,12 @@ def _describe_certainty(
             )
     # Bounds are compared with bounds, since they lie above what simulation finds.
     pure = len({probe.by for probe in probes}) == 1 and probes[0].by == BOUND
-    for one, other in pairwise(sorted(probes)):
-        ends = [(p.quantity, p.quantity) if pure else (p.low, p.high) for p in (one, other)]
+    for first, second in pairwise(sorted(probes)):
+        ends = [(p.quantity, p.quantity) if pure else (p.low, p.high) for p in (first, second)]
         turned = ends[0][0] > ends[1][1] if grows else ends[0][1] < ends[1][0]
         if turned:
             return (
-                f"{certainty}; NOT monotone between {one.value:g} and {other.value:g}: "
+                f"{certainty}; NOT monotone between {first.value:g} and {second.value:g}: "
                 "other values may reach it too, narrow the range"
             )
     tried = "at the ends and in the middle" if none_reached else f"at {len(probes)} values"

@@ -81,23 +81,23 @@ def size(
         raise ScenarioError("", "size takes a netkf.Scenario", scenario, LOAD)
     if by is not None:
         choice("theory", "simulation")("--by", by)
-    wanted, confidence = (
+    parsed, confidence = (
         parse_target(target),
         number(above=0.0, below=1.0)("--confidence", confidence),
     )
     integer(low=FIRST_BATCH)("--runs", runs)
-    if wanted.of_errors and not scenario.plant.truth_known:
+    if parsed.of_errors and not scenario.plant.truth_known:
         rule = "is about errors, and there is no ground truth"
         raise ScenarioError("--target", rule, target, "ask for mean_trace or worst_trace")
     base = scenario if seed is None else scenario.replace({"seed": seed})
-    whole = _check_range(base, key, low, high)
-    used = choose_engine(engine, base.replace({key: low}))
-    chosen = by or _choose_method(base, key, (low, high), wanted)
-    problem = SizingProblem(base, key, whole, wanted, chosen)
+    is_integer = _check_range(base, key, low, high)
+    engine_used = choose_engine(engine, base.replace({key: low}))
+    chosen = by or _choose_method(base, key, (low, high), parsed)
+    problem = SizingProblem(base, key, is_integer, parsed, chosen)
     if chosen == "theory":
-        quantity = quantity_by_theory(problem.at(low), wanted)[1]
+        quantity = quantity_by_theory(problem.at(low), parsed)[1]
         return Search(problem, partial(decide_by_theory, problem)).run(low, high, 1.0, quantity)
-    task, simulated, first = _choose_task(problem, low, used)
+    task, simulated, first = _choose_task(problem, low, engine_used)
     quantity = _describe_quantity(problem, low, simulated)
     # Bonferroni over all values and all interim looks at each of them.
     level = (1.0 - confidence) / (MAX_PROBES["simulation"] * _count_looks(runs, first))
@@ -119,25 +119,27 @@ def _describe_quantity(problem: SizingProblem, low: float, simulated: str) -> st
 
 
 def _choose_task(problem: SizingProblem, low: float, engine: Engine) -> tuple[BlockTask, str, int]:
-    """Return the task that simulates, what the quantity is, and the runs of a first look."""
+    """Return the task to simulate, a description of its quantity, and the runs before the first
+    decision.
+    """
     quantity = f"{QUANTITIES[problem.target.quantity]}, over the runs"
     if problem.target.of_errors and expected_errors_known(problem.at(low)):
-        one = partial(expected_metrics, engine=engine)
+        task = partial(expected_metrics, engine=engine)
         exact = ", each with its exact expected squared error given its events"
-        return partial(each_replica, one, join_metrics), quantity + exact, FIRST_EXPECTED
+        return partial(each_replica, task, join_metrics), quantity + exact, FIRST_EXPECTED
     return partial(block_metrics, engine=engine), quantity, FIRST_BATCH
 
 
 def _count_looks(runs: int, first: int) -> int:
-    """Return how often a value is looked at while its runs are doubled from ``first`` on."""
+    """Return the number of decisions about a value while its runs are doubled from ``first`` on."""
     return 1 + math.ceil(math.log2(max(1.0, runs / first)))
 
 
 def _check_range(scenario: Scenario, key: str, low: float, high: float) -> bool:
     """Return True if the key is an integer; raises ScenarioError for a wrong range or key."""
-    whole = is_integer_key(scenario, key)
+    is_integer = is_integer_key(scenario, key)
     for end in (low, high):
-        if whole and not isinstance(end, int):
+        if is_integer and not isinstance(end, int):
             rule = f"{key} is an integer, so LOW:HIGH must be integers"
             raise ScenarioError("--vary", rule, f"{low}:{high}", "leave out the decimals")
     if not low < high:
@@ -145,15 +147,15 @@ def _check_range(scenario: Scenario, key: str, low: float, high: float) -> bool:
         raise ScenarioError("--vary", rule, f"{low}:{high}", "swap or correct the ends")
     for end in (low, high):
         scenario.replace({key: end})
-    return whole
+    return is_integer
 
 
 def _choose_method(scenario: Scenario, key: str, ends: tuple[float, float], target: Target) -> str:
     """Return theory if it is exact at both ends, both if it is a bound, else simulation."""
     scenarios = [scenario.replace({key: end}) for end in ends]
     try:
-        for one in scenarios:
-            quantity_by_theory(one, target)
+        for at_end in scenarios:
+            quantity_by_theory(at_end, target)
     except TheoryError:
         return "simulation"
-    return "theory" if all(theory_is_exact(one, target) for one in scenarios) else "both"
+    return "theory" if all(theory_is_exact(at_end, target) for at_end in scenarios) else "both"

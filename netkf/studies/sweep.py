@@ -192,7 +192,7 @@ def sweep_to_directory(
     """
     import pandas as pd
 
-    began = time.perf_counter()
+    started = time.perf_counter()
     check_sources(plan.base)
     directory = new_directory(out, f"{plan.base.name}-sweep")
     write_scenario(directory, plan.base)
@@ -209,7 +209,7 @@ def sweep_to_directory(
         status = "failed"
         raise
     finally:
-        seconds = time.perf_counter() - began
+        seconds = time.perf_counter() - started
         completed = CompletedSweep(directory, pd.DataFrame(rows), tuple(plan.vary), seconds)
         if status == "complete" and take is not None:
             take(completed)

@@ -22,7 +22,7 @@ MAX_ROWS = 40  # rows that fit onto a screen
 MAX_LENGTH = 30  # characters of a cell
 
 
-def sweep_text(found: pd.DataFrame, keys: Sequence[str]) -> str:
+def sweep_text(lines: pd.DataFrame, keys: Sequence[str]) -> str:
     """Return the table of a sweep, one row per point; of long tables the ends."""
     header = [*keys, *(name.replace("_", " ") for name in COLUMNS), "messages", "status"]
     rows = [
@@ -32,7 +32,7 @@ def sweep_text(found: pd.DataFrame, keys: Sequence[str]) -> str:
             f"{row['sent']:,.6g}",
             row["status"],
         ]
-        for row in found.to_dict("records")
+        for row in lines.to_dict("records")
     ]
     return table(header, shorten_rows(rows, MAX_ROWS))
 
@@ -157,15 +157,15 @@ def filters_text(found: FilterComparison) -> str:
     return "\n".join(lines)
 
 
-def _quantity_cells(found: Quantity) -> tuple[str, str]:
+def _quantity_cells(cells: Quantity) -> tuple[str, str]:
     """Return the value with its standard error, and the difference with half its interval."""
     difference = "-"
-    if math.isfinite(found.difference):
-        width = 0.5 * (found.high - found.low)
-        difference = f"{found.difference:+.4g}"
+    if math.isfinite(cells.difference):
+        width = 0.5 * (cells.high - cells.low)
+        difference = f"{cells.difference:+.4g}"
         difference += f" +- {width:.2g}" if math.isfinite(width) else ""
-        difference += "*" if found.real else ""
-    return _with_error(found.value, found.se), difference
+        difference += "*" if cells.real else ""
+    return _with_error(cells.value, cells.se), difference
 
 
 def comparison_text(found: Comparison) -> str:

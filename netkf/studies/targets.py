@@ -54,18 +54,18 @@ class QuantityInterval(NamedTuple):
 
 def parse_target(text: Any) -> Target:
     """Return the target of a text like ``worst_rms<=0.5``; raises ScenarioError at --target."""
-    found = re.fullmatch(r"\s*(\w+)\s*<=\s*(\S+)\s*", text) if isinstance(text, str) else None
+    match = re.fullmatch(r"\s*(\w+)\s*<=\s*(\S+)\s*", text) if isinstance(text, str) else None
     listed = ", ".join(QUANTITIES)
-    if found is None or found[1] not in QUANTITIES:
+    if match is None or match[1] not in QUANTITIES:
         message = f"must be QUANTITY<=LIMIT with a quantity of {listed}"
         raise ScenarioError("--target", message, text, "write worst_rms<=0.5")
     try:
-        limit = float(found[2])
+        limit = float(match[2])
     except ValueError:
         limit = math.nan
     if not (math.isfinite(limit) and limit > 0.0):
-        raise ScenarioError("--target", "limit must be a number above 0", found[2], "correct it")
-    return Target(found[1], limit)
+        raise ScenarioError("--target", "limit must be a number above 0", match[2], "correct it")
+    return Target(match[1], limit)
 
 
 def quantity_by_theory(scenario: Scenario, target: Target) -> tuple[float, str]:
@@ -114,18 +114,18 @@ def _explain_errors(scenario: Scenario) -> str:
 
 
 def quantity_by_simulation(
-    found: RunMetrics, target: Target, level: float, central: float | None
+    metrics: RunMetrics, target: Target, level: float, central: float | None
 ) -> QuantityInterval:
-    """Return the quantity with an interval that misses with probability ``level``.
+    """Return the quantity with an interval that misses the truth with probability ``level``.
 
-    The interval is Student's, for all nodes at once if the target is about the worst. ``central``
-    is the trace of the centralised filter to divide by, or None.
+    The interval is Student's, simultaneous for all nodes (Bonferroni) if the target is about the
+    worst node. ``central`` is the trace of the centralised filter to divide by, or None.
     """
-    values = found.mean_square if target.of_errors else found.trace
-    if (np.isnan(values) & ~(found.diverged > 0)).any():
-        # Rounding has left no errors to judge by.
+    values = metrics.mean_square if target.of_errors else metrics.trace
+    if (np.isnan(values) & ~(metrics.diverged > 0)).any():
+        # Rounding hides the errors of some run: nothing can be decided.
         return QuantityInterval(math.nan, -math.inf, math.inf)
-    values = np.where(found.diverged > 0, np.inf, values)
+    values = np.where(metrics.diverged > 0, np.inf, values)
     columns = values if target.of_worst else values.mean(axis=1, keepdims=True)
     runs, count = columns.shape
     with np.errstate(over="ignore", invalid="ignore"):
@@ -136,5 +136,5 @@ def quantity_by_simulation(
     if central is not None:
         ends /= central
     ends = np.sqrt(np.maximum(ends, 0.0)) if target.of_errors else ends
-    # inf - inf of runs that diverged: their errors are infinite.
+    # nan is inf - inf of diverged runs, whose errors count as infinite.
     return QuantityInterval(*map(float, np.where(np.isnan(ends), np.inf, ends)))

@@ -46,7 +46,7 @@ if TYPE_CHECKING:
 
 MAX_MISSING = 3
 MIN_REPLAYS, MAX_REPLAYS, MAX_EVENTS = 100, 1000, 5_000_000
-"""By default as many replays look for a set as have so many events together, within the limits."""
+"""Limits of the default number of replays, and the number of events that all of them may have."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -97,34 +97,34 @@ def why(
 
     Raises ScenarioError for a node, time or run that is not there, and for a run without events.
     """
-    run, known = _check_run(run, scenario, replica, trust)
-    at = _check_instant(run, known, node, at)
+    run, run_scenario = _check_run(run, scenario, replica, trust)
+    at = _check_instant(run, run_scenario, node, at)
     most = integer(low=1, high=MAX_MISSING)("most", most)
     limit = None if below is None else number(above=0.0)("below", below)
-    replayer = Replayer(known, run.seed, run.replica, node, at)
-    _same_events(rows_until(known, run.log, at), replayer.log)
-    before = replayer.outcome(error=True)
-    if not np.isfinite(before.xhat).all() or np.isinf(before.P).any():
+    replayer = Replayer(run_scenario, run.seed, run.replica, node, at)
+    _same_events(rows_until(run_scenario, run.log, at), replayer.log)
+    outcome = replayer.outcome(error=True)
+    if not np.isfinite(outcome.xhat).all() or np.isinf(outcome.P).any():
         raise ScenarioError(
             "at", "lies after the run had diverged", at, "ask about an earlier time"
         )
     evidence = _Evidence(replayer, node, most)
     sources = evidence.sources()
-    found = None
-    if math.isfinite(before.trace):
+    smallest = None
+    if math.isfinite(outcome.trace):
         target = (1.0 + GOOD_ENOUGH) * replayer.outcome(None).trace if limit is None else limit
         wanted = _default_replays(len(replayer.log)) if replays is None else replays
         count = integer(low=1)("replays", wanted)
-        found = smallest_set(replayer, evidence.candidates(), target, most, count)
+        smallest = smallest_set(replayer, evidence.candidates(), target, most, count)
     return Why(
-        scenario=known.name,
+        scenario=run_scenario.name,
         node=node,
         at=at,
         seed=run.seed,
         replica=run.replica,
         sources=sources,
-        what_ifs=_what_ifs(replayer, sources, found),
-        smallest=found,
+        what_ifs=_what_ifs(replayer, sources, smallest),
+        smallest=smallest,
         missing=evidence.missing,
         notes=_replay_notes(evidence),
     )
@@ -134,31 +134,33 @@ def _check_run(
     run: Run | str | Path, scenario: Scenario | None, replica: int | None, trust: bool
 ) -> tuple[Run, Scenario]:
     """Return a run with all its events, and its scenario; raises ScenarioError."""
-    where = "run" if isinstance(run, Run) else shorten(run)
+    name = "run" if isinstance(run, Run) else shorten(run)
     if not isinstance(run, Run):
         run = _read_run(run, replica, trust)
     if replica is not None and replica != run.replica:
         rule = f"is another one than that of the run, {run.replica}"
         raise ScenarioError("replica", rule, replica, "leave it out")
-    known = run.scenario if scenario is None else scenario
-    if known is None:
+    run_scenario = run.scenario if scenario is None else scenario
+    if run_scenario is None:
         raise ScenarioError("scenario", "is not known", None, "give the scenario of the run")
-    if run.nodes != known.nodes:
-        raise ScenarioError("scenario", "has other nodes than the run", known, "give that of it")
+    if run.nodes != run_scenario.nodes:
+        raise ScenarioError(
+            "scenario", "has other nodes than the run", run_scenario, "give that of it"
+        )
     if not len(run.log):
         rule = "has no events, and they tell which messages came"
-        raise ScenarioError(where, rule, None, "run it again with --trace full")
-    return run, known
+        raise ScenarioError(name, rule, None, "run it again with --trace full")
+    return run, run_scenario
 
 
 def _read_run(directory: str | Path, replica: int | None, trust: bool) -> Run:
     """Return a run that is read back from its directory; raises ScenarioError."""
-    found = open_directory(directory, trust=trust)
-    if isinstance(found, Run):
-        return found
-    if isinstance(found, StoredEnsemble):
-        return found.replica(replica or 0)
-    rule = f"holds no run with events, but {found!r}"
+    stored = open_directory(directory, trust=trust)
+    if isinstance(stored, Run):
+        return stored
+    if isinstance(stored, StoredEnsemble):
+        return stored.replica(replica or 0)
+    rule = f"holds no run with events, but {stored!r}"
     raise ScenarioError(shorten(directory), rule, None, "name what netkf run left")
 
 
@@ -183,11 +185,11 @@ def _check_instant(run: Run, scenario: Scenario, node: int, at: float) -> float:
     return plant.slot_time(int(plant.slots_of(np.array([time]))[0]))
 
 
-def _same_events(kept: IntArray, again: IntArray) -> None:
+def _same_events(logged: IntArray, replayed: IntArray) -> None:
     """Raise ScenarioError if a replay does not have the events of the run."""
-    same = len(kept) == len(again) and all(
-        np.array_equal(kept[name], again[name], equal_nan=kept[name].dtype.kind == "f")
-        for name in kept.dtype.names or ()
+    same = len(logged) == len(replayed) and all(
+        np.array_equal(logged[name], replayed[name], equal_nan=logged[name].dtype.kind == "f")
+        for name in logged.dtype.names or ()
     )
     if not same:
         rule = "has other events than its replay, so another scenario or version made it"
@@ -195,7 +197,12 @@ def _same_events(kept: IntArray, again: IntArray) -> None:
 
 
 class _Evidence:
-    """What the events of a run say about one node at one instant."""
+    """The evidence in the events of a run about one node at one instant.
+
+    ``missing`` are the messages that were not used; ``same_sends`` is True if the replay with all
+    messages sends the same messages as the run, so that it tells when each missing message would
+    have been used. Otherwise they are taken to be used when they were sent (at_once).
+    """
 
     def __init__(self, replayer: Replayer, node: int, most: int) -> None:
         self._replayer, self._node, self._most = replayer, node, most
@@ -205,35 +212,35 @@ class _Evidence:
         swaps, slotted = self.scenario.hosted.combination == "swap", self.scenario.slotted
         self.messages = match_messages(replayer.log, swaps, slotted)
         full = match_messages(replayer.full_log, swaps, slotted)
-        # Filters may send something else, or nothing, after what they have heard.
+        # What some filters send depends on the messages that they have received.
         self.same_sends = len(full) == len(self.messages) and np.array_equal(
             full.sent, self.messages.sent
         )
-        came = self.messages.outcome == USED
-        # The replay of all messages shows when each of those that did not come would have.
+        was_used = self.messages.outcome == USED
+        # The replay with all messages shows when each missing one would have been used.
         self._log = replayer.full_log if self.same_sends else replayer.log
-        timed = full if self.same_sends else at_once(self.messages, self._log)
-        self._flow: Flow = find_flow(self.scenario, self._log, timed, came)
+        usable = full if self.same_sends else at_once(self.messages, self._log)
+        self._flow: Flow = find_flow(self.scenario, self._log, usable, was_used)
         self._reach: Reach = search_back(self._flow, node, most)
-        every = find_flow(self.scenario, replayer.full_log, full)
-        self._every = replayer.full_log, search_back(every, node)
+        full_flow = find_flow(self.scenario, replayer.full_log, full)
+        self._every = replayer.full_log, search_back(full_flow, node)
         self.missing: dict[MessageKey, Missing] = {
             self.messages.key(m): _describe_missing(self.messages, m)
-            for m in np.flatnonzero(~came).tolist()
+            for m in np.flatnonzero(~was_used).tolist()
         }
 
     def candidates(self) -> list[Candidate]:
-        """Return the messages that did not come and could have mattered."""
-        found = []
+        """Return the unused messages from which information could have reached the node."""
+        candidates = []
         for m in np.flatnonzero(self._flow.cost).tolist():
             needed = self._reach.needed(m)
             if needed is not None:
                 sent = float(self.messages.sent[m])
-                found.append(Candidate(self.messages.key(m), sent, needed))
-        return found
+                candidates.append(Candidate(self.messages.key(m), sent, needed))
+        return candidates
 
     def sources(self) -> tuple[InformationSource, ...]:
-        """Return what had reached the node from every other node, and from its own sensor."""
+        """Return the information that had reached the node from every other node and its sensor."""
         scenario, at = self.scenario, self._replayer.at
         readings = KeptReadings(scenario, self._log, at)
         by_budget = [
@@ -241,32 +248,34 @@ class _Evidence:
             for budget in range(self._most + 1)
         ]
         log, reach = self._every
-        every = newest_information(reach, log, KeptReadings(scenario, log, at), 0)
-        wanted = [n for n in scenario.nodes if n != self._node or n in scenario.placed]
+        without_losses = newest_information(reach, log, KeptReadings(scenario, log, at), 0)
+        nodes = [n for n in scenario.nodes if n != self._node or n in scenario.placed]
         return tuple(
-            self._make_source(n, [b.get(n) for b in by_budget], every.get(n)) for n in wanted
+            self._make_source(n, [b.get(n) for b in by_budget], without_losses.get(n))
+            for n in nodes
         )
 
     def _make_source(
-        self, node: int, found: Sequence[Newest | None], every: Newest | None
+        self, node: int, newest_by_budget: Sequence[Newest | None], without_losses: Newest | None
     ) -> InformationSource:
-        """Return which readings of a node the estimate has, and which messages would have brought
-        newer ones.
+        """Return the newest reading of ``node`` that the estimate has, and the missing messages
+        that would have brought a newer one.
+
+        ``newest_by_budget`` is the newest information with 0, 1, ... missing messages delivered,
+        ``without_losses`` that with all of them.
         """
-        reading, *more = [math.nan if n is None else n.reading for n in found]
+        reading, *with_more = [math.nan if n is None else n.reading for n in newest_by_budget]
         last, unheard = self._last_direct(node)
-        way: tuple[int, ...] = ()
-        if found[0] is not None:
-            way = route(self._reach, found[0].segment, 0)
-        newer = next((b for b, r in enumerate(more, 1) if _is_newer(r, reading)), None)
+        path_nodes: tuple[int, ...] = ()
+        if newest_by_budget[0] is not None:
+            path_nodes = route(self._reach, newest_by_budget[0].segment, 0)
+        budget = next((b for b, r in enumerate(with_more, 1) if _is_newer(r, reading)), None)
         missing: tuple[Missing, ...] = ()
-        if newer is not None:
-            segment = found[newer]
-            assert segment is not None
-            passed = self._reach.messages_from(segment.segment, newer)
-            missing = tuple(
-                _describe_missing(self.messages, m) for m in passed if self._flow.cost[m]
-            )
+        if budget is not None:
+            newest = newest_by_budget[budget]
+            assert newest is not None
+            path = self._reach.messages_from(newest.segment, budget)
+            missing = tuple(_describe_missing(self.messages, m) for m in path if self._flow.cost[m])
         return InformationSource(
             node=node,
             sensor=node in self.scenario.placed,
@@ -274,24 +283,24 @@ class _Evidence:
             heard=math.nan if last is None else float(self.messages.sent[last]),
             arrived=math.nan if last is None else float(self.messages.arrived[last]),
             unheard=unheard,
-            known=self._replayer.at if node == self._node else _known_time(found[0]),
+            known=self._replayer.at if node == self._node else _known_time(newest_by_budget[0]),
             reading=reading,
-            route=way,
-            with_more=tuple(more),
-            without_losses=math.nan if every is None else every.reading,
+            route=path_nodes,
+            with_more=tuple(with_more),
+            without_losses=math.nan if without_losses is None else without_losses.reading,
             missing=missing,
         )
 
     def _last_direct(self, sender: int) -> tuple[int | None, int]:
-        """Return the last message from a node that was used, and how many were sent since."""
+        """Return the last used message from ``sender``, and the number of unused ones since."""
         messages = self.messages
-        mine = (messages.sender == sender) & (messages.receiver == self._node)
-        came = np.flatnonzero(mine & (messages.outcome == USED))
-        others = np.flatnonzero(mine & (messages.outcome != USED))
-        if not len(came):
-            return None, len(others)
-        last = int(came[np.argmax(messages.used_row[came])])
-        return last, int((messages.sent[others] > messages.sent[last]).sum())
+        direct = (messages.sender == sender) & (messages.receiver == self._node)
+        used = np.flatnonzero(direct & (messages.outcome == USED))
+        unused = np.flatnonzero(direct & (messages.outcome != USED))
+        if not len(used):
+            return None, len(unused)
+        last = int(used[np.argmax(messages.used_row[used])])
+        return last, int((messages.sent[unused] > messages.sent[last]).sum())
 
 
 def _known_time(newest: Newest | None) -> float:

@@ -19,11 +19,11 @@ if TYPE_CHECKING:
 MAX_ROWS, MAX_LISTED = 20, 4
 
 
-def source_table(found: Explanation) -> pd.DataFrame:
+def source_table(explanation: Explanation) -> pd.DataFrame:
     """Return a row for each source of an explanation: ages in seconds, nan if unknown."""
     import pandas as pd
 
-    more = len(found.sources[0].with_more) if found.sources else 0
+    budget = len(explanation.sources[0].with_more) if explanation.sources else 0
     rows = [
         {
             "node": s.node,
@@ -32,53 +32,56 @@ def source_table(found: Explanation) -> pd.DataFrame:
             "heard": s.heard,
             "arrived": s.arrived,
             "unheard": s.unheard,
-            "known_age": _age_at_sample(found, s.known),
+            "known_age": _age_at_sample(explanation, s.known),
             "reading": s.reading,
-            "reading_age": _age_at_sample(found, s.reading),
+            "reading_age": _age_at_sample(explanation, s.reading),
             "route": " -> ".join(map(str, s.route)),
-            **{f"age_with_{k}_more": found.at - s.with_more[k - 1] for k in range(1, more + 1)},
-            "age_without_losses": found.at - s.without_losses,
+            **{
+                f"age_with_{k}_more": explanation.at - s.with_more[k - 1]
+                for k in range(1, budget + 1)
+            },
+            "age_without_losses": explanation.at - s.without_losses,
             "missing": "; ".join(map(str, s.missing)),
         }
-        for s in found.sources
+        for s in explanation.sources
     ]
     return pd.DataFrame(rows)
 
 
-def why_document(found: Explanation) -> dict[str, Any]:
+def why_document(explanation: Explanation) -> dict[str, Any]:
     """Return plain JSON values; what is unknown is None."""
-    smallest = found.smallest
+    smallest = explanation.smallest
     document: dict[str, Any] = {
-        "scenario": found.scenario,
-        "node": found.node,
-        "at": found.at,
-        "seed": found.seed,
-        "replica": found.replica,
-        "trace": found.trace,
-        "error": found.error,
-        "sentences": sentences(found),
+        "scenario": explanation.scenario,
+        "node": explanation.node,
+        "at": explanation.at,
+        "seed": explanation.seed,
+        "replica": explanation.replica,
+        "trace": explanation.trace,
+        "error": explanation.error,
+        "sentences": sentences(explanation),
         "sources": [
-            {**vars(s), "missing": [_message_entry(found, m.key) for m in s.missing]}
-            for s in found.sources
+            {**vars(s), "missing": [_message_entry(explanation, m.key) for m in s.missing]}
+            for s in explanation.sources
         ],
         "what_ifs": [
             {
                 "label": w.label,
-                "messages": _message_entries(found, w.messages),
+                "messages": _message_entries(explanation, w.messages),
                 "trace": w.trace,
                 "error": w.error,
             }
-            for w in found.what_ifs
+            for w in explanation.what_ifs
         ],
         "smallest": None,
-        "notes": found.notes,
+        "notes": explanation.notes,
     }
     if smallest is not None:
-        messages = _message_entries(found, smallest.messages)
+        messages = _message_entries(explanation, smallest.messages)
         document["smallest"] = {
             **vars(smallest),
             "messages": messages,
-            "best": _message_entries(found, smallest.best),
+            "best": _message_entries(explanation, smallest.best),
             "proven": smallest.proven,
         }
     plain: dict[str, Any] = finite(document)
@@ -86,15 +89,15 @@ def why_document(found: Explanation) -> dict[str, Any]:
 
 
 def _message_entries(
-    found: Explanation, keys: Sequence[MessageKey] | None
+    explanation: Explanation, keys: Sequence[MessageKey] | None
 ) -> list[dict[str, Any]] | None:
     """Return messages as entries of the document."""
-    return None if keys is None else [_message_entry(found, key) for key in keys]
+    return None if keys is None else [_message_entry(explanation, key) for key in keys]
 
 
-def _message_entry(found: Explanation, key: MessageKey) -> dict[str, Any]:
+def _message_entry(explanation: Explanation, key: MessageKey) -> dict[str, Any]:
     """Return a message as an entry of the document."""
-    missing = found.missing[key]
+    missing = explanation.missing[key]
     return {
         "sender": key.sender,
         "receiver": key.receiver,
@@ -105,81 +108,96 @@ def _message_entry(found: Explanation, key: MessageKey) -> dict[str, Any]:
     }
 
 
-def why_text(found: Explanation) -> str:
+def why_text(explanation: Explanation) -> str:
     """Return the answer for a terminal: sentences, the table of sources, the table of replays."""
-    lines = [*sentences(found), "", _source_table(found), "", _replay_table(found)]
-    lines += [f"note: {note}" for note in found.notes]
+    lines = [
+        *sentences(explanation),
+        "",
+        _source_table(explanation),
+        "",
+        _replay_table(explanation),
+    ]
+    lines += [f"note: {note}" for note in explanation.notes]
     return "\n".join(lines)
 
 
-def sentences(found: Explanation) -> list[str]:
+def sentences(explanation: Explanation) -> list[str]:
     """Return the answer in sentences, one line each."""
     return [
-        *_state_sentences(found),
-        *_heard_sentences(found),
-        *_reading_sentences(found),
-        *_smallest_sentences(found),
+        *_state_sentences(explanation),
+        *_heard_sentences(explanation),
+        *_reading_sentences(explanation),
+        *_smallest_sentences(explanation),
     ]
 
 
-def _state_sentences(found: Explanation) -> Iterator[str]:
-    """Yield the sentence on the estimate."""
-    where = f"{shorten(found.scenario, 60)}, seed {found.seed}, replica {found.replica}"
-    sentence = f"Node {found.node} at {found.at:g} s ({where})"
-    if math.isfinite(found.trace):
-        rms = math.sqrt(max(found.trace, 0.0))
-        sentence += f": trace P is {found.trace:.4g}, which claims an RMS error of {rms:.3g}"
+def _state_sentences(explanation: Explanation) -> Iterator[str]:
+    """Yield the sentence about the estimate: trace of P and error."""
+    run = f"seed {explanation.seed}, replica {explanation.replica}"
+    scenario = shorten(explanation.scenario, 60)
+    sentence = f"Node {explanation.node} at {explanation.at:g} s ({scenario}, {run})"
+    if math.isfinite(explanation.trace):
+        rms = math.sqrt(max(explanation.trace, 0.0))
+        sentence += f": trace P is {explanation.trace:.4g}, which claims an RMS error of {rms:.3g}"
     else:
         sentence += ": the filter gives no covariance"
-    error = f"; its error is {found.error:.3g}" if math.isfinite(found.error) else ""
+    error = f"; its error is {explanation.error:.3g}" if math.isfinite(explanation.error) else ""
     yield f"{sentence}{error}."
 
 
-def _heard_sentences(found: Explanation) -> Iterator[str]:
-    """Yield whom the node heard directly."""
-    neighbours = [s for s in found.sources if s.neighbour]
+def _heard_sentences(explanation: Explanation) -> Iterator[str]:
+    """Yield sentences about the neighbours that the node heard, and about lost messages."""
+    neighbours = [s for s in explanation.sources if s.neighbour]
     if not neighbours:
-        yield f"No other node sends to node {found.node}."
+        yield f"No other node sends to node {explanation.node}."
         return
     heard = sorted((s for s in neighbours if not math.isnan(s.heard)), key=lambda s: -s.heard)
     silent = [s.node for s in neighbours if math.isnan(s.heard)]
-    parts = [f"node {s.node} {_format_time_before(found, s.heard)}" for s in heard[:MAX_LISTED]]
+    parts = [
+        f"node {s.node} {_format_time_before(explanation, s.heard)}" for s in heard[:MAX_LISTED]
+    ]
     if parts:
-        rest = f" and {len(heard) - MAX_LISTED} others before" if len(heard) > MAX_LISTED else ""
-        yield f"It last heard {_join_with_and(parts)}{rest} (times of sending)."
+        others = f" and {len(heard) - MAX_LISTED} others before" if len(heard) > MAX_LISTED else ""
+        yield f"It last heard {_join_with_and(parts)}{others} (times of sending)."
     if silent:
         yield f"It had never heard node {_list_messages(silent)}."
     unheard = sum(s.unheard for s in neighbours)
     if unheard:
-        which = [f"{s.unheard} of node {s.node}" for s in neighbours if s.unheard]
+        counts = [f"{s.unheard} of node {s.node}" for s in neighbours if s.unheard]
         noun = "message" if unheard == 1 else "messages"
         verb = "was" if unheard == 1 else "were"
         yield (
             f"{unheard} {noun} sent to it since then {verb} lost, late or not used: "
-            f"{_list_messages(which, 'other nodes')}."
+            f"{_list_messages(counts, 'other nodes')}."
         )
 
 
-def _reading_sentences(found: Explanation) -> Iterator[str]:
-    """Yield the newest readings, and what kept newer ones away."""
-    sensors = [s for s in found.sources if s.sensor and s.node != found.node]
-    known = sorted((s for s in sensors if not math.isnan(s.reading)), key=lambda s: s.reading)
+def _reading_sentences(explanation: Explanation) -> Iterator[str]:
+    """Yield sentences about the newest readings that reached the node, and about the messages that
+    would have brought newer ones.
+    """
+    sensors = [s for s in explanation.sources if s.sensor and s.node != explanation.node]
+    with_reading = sorted(
+        (s for s in sensors if not math.isnan(s.reading)), key=lambda s: s.reading
+    )
     never = [s.node for s in sensors if math.isnan(s.reading)]
-    if known:
-        oldest = known[:MAX_LISTED]
+    if with_reading:
+        oldest = with_reading[:MAX_LISTED]
         parts = [
-            f"{found.at - s.reading:.4g} s old from node {s.node} ({_format_route(s)})"
+            f"{explanation.at - s.reading:.4g} s old from node {s.node} ({_format_route(s)})"
             for s in oldest
         ]
-        which = "The oldest of its" if len(known) > MAX_LISTED else "Its"
-        yield f"{which} newest readings are {_join_with_and(parts)}."
+        prefix = "The oldest of its" if len(with_reading) > MAX_LISTED else "Its"
+        yield f"{prefix} newest readings are {_join_with_and(parts)}."
     if never:
         yield f"No reading of node {_list_messages(never)} can have reached it."
-    kept_away = [s for s in known + [s for s in sensors if math.isnan(s.reading)] if s.missing]
+    kept_away = [
+        s for s in with_reading + [s for s in sensors if math.isnan(s.reading)] if s.missing
+    ]
     for source in kept_away[:MAX_LISTED]:
         newest = source.with_more[len(source.missing) - 1]
         messages = _join_with_and([str(m) for m in source.missing])
-        age = f"{found.at - newest:.4g} s old"
+        age = f"{explanation.at - newest:.4g} s old"
         yield f"A newer reading of node {source.node}, {age}, would have come with {messages}."
     if len(kept_away) > MAX_LISTED:
         others = len(kept_away) - MAX_LISTED
@@ -188,30 +206,38 @@ def _reading_sentences(found: Explanation) -> Iterator[str]:
         yield "No newer reading was kept away by up to three messages that did not come."
 
 
-def _smallest_sentences(found: Explanation) -> Iterator[str]:
+def _smallest_sentences(explanation: Explanation) -> Iterator[str]:
     """Yield the sentences on the smallest set of messages that would have sufficed."""
-    smallest, whole = found.smallest, found.what_ifs[-1]
+    smallest, no_losses = explanation.smallest, explanation.what_ifs[-1]
     if smallest is None:
         return
-    change = relative_change(whole.trace, found.trace)
-    error = "" if math.isnan(whole.error) else f" and the error {whole.error:.4g}"
-    yield f"Had no message been missing, trace P would be {whole.trace:.4g} ({change}){error}."
+    change = relative_change(no_losses.trace, explanation.trace)
+    error = "" if math.isnan(no_losses.error) else f" and the error {no_losses.error:.4g}"
+    yield f"Had no message been missing, trace P would be {no_losses.trace:.4g} ({change}){error}."
     if smallest.messages == ():
-        limit = _format_limit(found, smallest)
+        limit = _format_limit(explanation, smallest)
         yield f"No message had to come: trace P as it was is at most {limit}."
         return
     tried = _describe_search(smallest)
     if smallest.messages is not None:
-        named = _join_with_and([str(found.missing[key]) for key in smallest.messages])
-        one = len(smallest.messages) == 1
-        what = "One message would" if one else f"{len(smallest.messages)} messages together would"
-        fewer = "" if one else ("; fewer would not" if smallest.proven else "; perhaps fewer would")
+        named = _join_with_and([str(explanation.missing[key]) for key in smallest.messages])
+        is_single = len(smallest.messages) == 1
+        subject = (
+            "One message would"
+            if is_single
+            else f"{len(smallest.messages)} messages together would"
+        )
+        fewer = (
+            ""
+            if is_single
+            else ("; fewer would not" if smallest.proven else "; perhaps fewer would")
+        )
         yield (
-            f"{what} have brought trace P to {smallest.trace:.4g} (wanted: at most "
-            f"{_format_limit(found, smallest)}): {named}{fewer} ({tried})."
+            f"{subject} have brought trace P to {smallest.trace:.4g} (wanted: at most "
+            f"{_format_limit(explanation, smallest)}): {named}{fewer} ({tried})."
         )
         return
-    limit = _format_limit(found, smallest)
+    limit = _format_limit(explanation, smallest)
     if smallest.proven:
         yield f"No {smallest.most} messages or fewer would have brought it to {limit} ({tried})."
     else:
@@ -220,21 +246,21 @@ def _smallest_sentences(found: Explanation) -> Iterator[str]:
             f"tried ({tried}; --replays tries more)."
         )
     if smallest.best:
-        named = _join_with_and([str(found.missing[key]) for key in smallest.best])
-        change = relative_change(smallest.best_trace, found.trace)
+        named = _join_with_and([str(explanation.missing[key]) for key in smallest.best])
+        change = relative_change(smallest.best_trace, explanation.trace)
         yield f"The best that was tried brings it to {smallest.best_trace:.4g} ({change}): {named}."
 
 
-def _format_limit(found: Explanation, smallest: SmallestSet) -> str:
-    """Return the trace that was wanted, and where it comes from unless it was asked for."""
-    usual = (1.0 + GOOD_ENOUGH) * found.what_ifs[-1].trace
+def _format_limit(explanation: Explanation, smallest: SmallestSet) -> str:
+    """Return the limit on the trace as text, with its origin if it is the default one."""
+    usual = (1.0 + GOOD_ENOUGH) * explanation.what_ifs[-1].trace
     where = f", {1.0 + GOOD_ENOUGH:g} times that with no message missing"
-    own = math.isclose(smallest.limit, usual, rel_tol=1e-9)
-    return f"{smallest.limit:.4g}{where if own else ''}"
+    is_default = math.isclose(smallest.limit, usual, rel_tol=1e-9)
+    return f"{smallest.limit:.4g}{where if is_default else ''}"
 
 
 def _describe_search(smallest: SmallestSet) -> str:
-    """Return which messages the search looked at."""
+    """Return the number of messages that the search considered, as text."""
     sentence = f"{smallest.candidates} messages could have mattered"
     if smallest.considered < smallest.candidates:
         if not smallest.considered:
@@ -244,45 +270,50 @@ def _describe_search(smallest: SmallestSet) -> str:
     return f"{sentence}; {smallest.replays} replays"
 
 
-def _source_table(found: Explanation) -> str:
+def _source_table(explanation: Explanation) -> str:
     """Return the table of sources: sensors and neighbours first."""
-    chosen = [s for s in found.sources if s.sensor or s.neighbour or s.node == found.node]
-    others = len(found.sources) - len(chosen)
-    more = len(chosen[0].with_more) if chosen else 0
+    chosen = [
+        s for s in explanation.sources if s.sensor or s.neighbour or s.node == explanation.node
+    ]
+    others = len(explanation.sources) - len(chosen)
+    budget = len(chosen[0].with_more) if chosen else 0
     header = ["from", "last heard", "missed since", "newest reading", "age"]
-    header += [f"+{k}" for k in range(1, more + 1)] + ["none lost", "way"]
+    header += [f"+{k}" for k in range(1, budget + 1)] + ["none lost", "way"]
     rows = [
         [
             f"{s.node}{'' if s.sensor else ' (no sensor)'}",
             _format_time(s.heard),
             str(s.unheard) if s.neighbour else "-",
             _format_time(s.reading),
-            *(format_number(found.at - t) for t in (s.reading, *s.with_more, s.without_losses)),
+            *(
+                format_number(explanation.at - t)
+                for t in (s.reading, *s.with_more, s.without_losses)
+            ),
             _format_route(s),
         ]
         for s in chosen
     ]
     text = table(header, shorten_rows(rows, MAX_ROWS), left=1)
-    rest = f"\n{others} other nodes have no sensor and no link to it." if others else ""
+    other_text = f"\n{others} other nodes have no sensor and no link to it." if others else ""
     explained = (
-        f"times in seconds; +1 .. +{more}: age of the newest reading with so many more messages"
+        f"times in seconds; +1 .. +{budget}: age of the newest reading with so many more messages"
     )
-    return f"{text}\n{explained}{rest}"
+    return f"{text}\n{explained}{other_text}"
 
 
-def _replay_table(found: Explanation) -> str:
+def _replay_table(explanation: Explanation) -> str:
     """Return the table of replays."""
-    truth = any(math.isfinite(w.error) for w in found.what_ifs)
+    truth = any(math.isfinite(w.error) for w in explanation.what_ifs)
     header = ["replayed with", "messages", "trace P", "change", *(["error"] if truth else [])]
     rows = [
         [
             w.label,
             _count_messages(w),
             format_number(w.trace),
-            "" if k == 0 else relative_change(w.trace, found.trace),
+            "" if k == 0 else relative_change(w.trace, explanation.trace),
             *([format_number(w.error)] if truth else []),
         ]
-        for k, w in enumerate(found.what_ifs)
+        for k, w in enumerate(explanation.what_ifs)
     ]
     return table(header, shorten_rows(rows, MAX_ROWS), left=1)
 
@@ -293,7 +324,7 @@ def _count_messages(what_if: WhatIf) -> str:
 
 
 def relative_change(trace: float, base: float) -> str:
-    """Return by how many percent a trace differs from another."""
+    """Return the relative difference of a trace from ``base`` in percent, as text."""
     if not (math.isfinite(trace) and base > 0.0):
         return "-"
     percent = round(100.0 * (trace / base - 1.0), 1) + 0.0  # no -0.0
@@ -305,15 +336,17 @@ def _format_time(seconds: float) -> str:
     return "-" if math.isnan(seconds) else f"{seconds:.6g}"
 
 
-def _age_at_sample(found: Explanation, seconds: float) -> float:
+def _age_at_sample(explanation: Explanation, seconds: float) -> float:
     """Return the age in seconds of something at the time of the sample."""
-    return seconds if math.isnan(seconds) else max(0.0, found.at - seconds)
+    return seconds if math.isnan(seconds) else max(0.0, explanation.at - seconds)
 
 
-def _format_time_before(found: Explanation, seconds: float) -> str:
+def _format_time_before(explanation: Explanation, seconds: float) -> str:
     """Return a time as text, with its distance from the sample."""
-    # A filtered sample is labelled with the beginning of the slot whose exchanges it has.
-    since = "in this slot" if seconds > found.at else f"{found.at - seconds:.4g} s before"
+    # A filtered sample has the time of the beginning of its slot, before the slot's exchanges.
+    since = (
+        "in this slot" if seconds > explanation.at else f"{explanation.at - seconds:.4g} s before"
+    )
     return f"at {seconds:.6g} s ({since})"
 
 
@@ -330,7 +363,7 @@ def _format_route(source: InformationSource) -> str:
 
 
 def _list_messages(items: Sequence[object], others: str = "others") -> str:
-    """Return the first items in words, and how many ``others`` there are."""
+    """Return the first items joined by commas and "and", with the number of ``others``."""
     parts = [str(item) for item in items[:MAX_LISTED]]
     more = len(items) - len(parts)
     return _join_with_and([*parts, f"{more} {others}"] if more else parts)
