@@ -181,11 +181,11 @@ def _error_difference(run: Run, twin: Run) -> float:
     comparable = np.broadcast_to(
         (rounding <= 0.1 * TWIN_TOLERANCE * size) & (size > 0.0), gap.shape
     )
-    share = gap / np.where(size > 0.0, size, 1.0)
+    relative_gap = gap / np.where(size > 0.0, size, 1.0)
     if not comparable.any():
         return math.nan
     # An error that is nan in one run only differs infinitely.
-    return float(np.nan_to_num(share[comparable], nan=np.inf).max())
+    return float(np.nan_to_num(relative_gap[comparable], nan=np.inf).max())
 
 
 def _same_as_base(results: list[ReplicaResult], level: float) -> Finding:
@@ -354,9 +354,9 @@ def _look_again(
     """
     look, level = (earlier.looks if earlier is not None else 0) + 1, 1.0 - confidence
     # A single look may spend the whole level, unless others are planned.
-    share = level_of_look(level, look) if may_continue or earlier is not None else level
-    spent = (earlier.spent if earlier is not None else 0.0) + share
-    verdict = judge_replicas(scenario, results, seed, 1.0 - share)
+    level_now = level_of_look(level, look) if may_continue or earlier is not None else level
+    spent = (earlier.spent if earlier is not None else 0.0) + level_now
+    verdict = judge_replicas(scenario, results, seed, 1.0 - level_now)
     rows = keep_decisions(earlier.rows, verdict.rows) if earlier is not None else verdict.rows
     confident = 1.0 - max(spent, level) if may_continue else 1.0 - spent
     return dataclasses.replace(

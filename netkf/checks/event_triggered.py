@@ -25,11 +25,11 @@ def check_nees_bound(samples: RunSamples, level: float) -> Finding:
     finite = np.flatnonzero(np.isfinite(nees).all(axis=0))
     if not len(finite):
         return find_nothing(NEES_TOLERANCE)
-    ratios, share = nees[:, finite] / n, level / len(finite)
+    ratios, single_level = nees[:, finite] / n, level / len(finite)
     means, spreads = ratios.mean(axis=0), ratios.std(axis=0, ddof=1) / math.sqrt(samples.count)
     k = int(np.argmax(means + 2.0 * spreads))
     intervals = [
-        student_interval(float(mean), float(spread), samples.count, share)
+        student_interval(float(mean), float(spread), samples.count, single_level)
         for mean, spread in zip(means, spreads, strict=True)
     ]
     highest = max(interval.high for interval in intervals)

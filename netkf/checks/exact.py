@@ -444,8 +444,8 @@ def check_expected_nees(samples: RunSamples, level: float) -> Finding:
     intervals, sizes = [], weights.sum(axis=2, keepdims=True)
     units = np.divide(n, sizes, out=np.zeros(sizes.shape), where=sizes > 0.0)
     for k in tested.tolist():
-        total, share = float((units[:, k, 0] * nees[:, k]).sum()), 0.5 * level / len(tested)
-        ratio = quadratic_interval(total, (units * weights)[:, k].ravel(), share)
+        total, single_level = float((units[:, k, 0] * nees[:, k]).sum()), 0.5 * level / len(tested)
+        ratio = quadratic_interval(total, (units * weights)[:, k].ravel(), single_level)
         intervals.append((deviation_interval(1.0, ratio), f"at {samples.point_labels[k]}"))
     message = (
         f"mean NEES {nees[:, tested].mean():.4g}, exact errors say "

@@ -280,8 +280,8 @@ def _sensors_together(samples: GossipSamples, level: float) -> Finding:
     """
     traces = np.trace(samples.runs.P, axis1=-2, axis2=-1)
     expected = np.trace(samples.reference.P, axis1=-2, axis2=-1)
-    N, share = traces.shape[2], level / (2 * traces.shape[1])
-    widths = band_width(len(traces), share / N), band_width(expected.shape[1], share)
+    N, band_level = traces.shape[2], level / (2 * traces.shape[1])
+    widths = band_width(len(traces), band_level / N), band_width(expected.shape[1], band_level)
     intervals = []
     for k, slot in enumerate(check_slots(samples.scenario)):
         points = round_digits(np.concatenate([traces[:, k].ravel(), expected[k]]))

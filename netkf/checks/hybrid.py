@@ -100,11 +100,11 @@ def _mean_below_bound(samples: HybridSamples, level: float) -> Finding:
     """
     P, bound = samples.runs.P, samples.bound
     _, times, nodes = P.shape[:3]
-    share = level / (times * nodes)
+    single_level = level / (times * nodes)
     intervals = []
     for k in range(times):
         for i in range(nodes):
-            excess = _relative_excess(P[:, k, i], bound[k, i], share)
+            excess = _relative_excess(P[:, k, i], bound[k, i], single_level)
             if excess is not None:
                 intervals.append((excess, f"at {samples.point_labels[k * nodes + i]}"))
     if not intervals:

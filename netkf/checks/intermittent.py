@@ -308,8 +308,10 @@ def _in_support(samples: IntermittentSamples, level: float) -> Finding:
         log_decay = (
             np.log(FAR_START**2 / np.median(spread[:, finite] / size)) if finite.any() else 0.0
         )
-    share = math.log(FAR_START**2 / SUPPORT_TOLERANCE) / log_decay if log_decay > 0.0 else math.inf
-    return finding._replace(early=True, horizon=1.2 * share * end)
+    decay_factor = (
+        math.log(FAR_START**2 / SUPPORT_TOLERANCE) / log_decay if log_decay > 0.0 else math.inf
+    )
+    return finding._replace(early=True, horizon=1.2 * decay_factor * end)
 
 
 def _check_arrival_counts(samples: IntermittentSamples, level: float) -> Finding:
@@ -320,8 +322,8 @@ def _check_arrival_counts(samples: IntermittentSamples, level: float) -> Finding
     sent, arrived = samples.runs.sent.sum(axis=0), samples.runs.arrived.sum(axis=0)
     intervals = []
     for k, pair in enumerate(pairs):
-        share = probability_interval(int(arrived[k]), int(sent[k]), level / len(pairs))
-        deviation = deviation_interval(_delivery_probability(samples.scenario, pair), share)
+        probability = probability_interval(int(arrived[k]), int(sent[k]), level / len(pairs))
+        deviation = deviation_interval(_delivery_probability(samples.scenario, pair), probability)
         intervals.append((deviation, f"from node {pair[0]} to {pair[1]}"))
     message = f"largest difference in {int(sent.sum()):,} messages"
     return find_largest(intervals, PROBABILITY_TOLERANCE, message)
@@ -460,14 +462,14 @@ def _outage_counts(samples: IntermittentSamples, level: float) -> Finding:
     start still matters. Counts of a cell are binomial; Pearson's p-value is added to the message.
     """
     laws, intervals, tests = _scalar_laws(samples.scenario), [], []
-    share = level / (len(laws) * (CELLS + 1))
+    single_level = level / (len(laws) * (CELLS + 1))
     for k, law in laws.items():
         edges = _outage_edges(law)
         cells = np.searchsorted(edges, samples.runs.P[:, -1, k, 0, 0])
         counts = np.bincount(cells, minlength=CELLS + 1)
         below = np.concatenate([[0.0], _law_at_end(samples, k, law)(edges), [1.0]])
         for cell, probability in enumerate(np.diff(below).tolist()):
-            interval = probability_interval(int(counts[cell]), int(counts.sum()), share)
+            interval = probability_interval(int(counts[cell]), int(counts.sum()), single_level)
             label = f"{cell} slots without a reading, node {samples.nodes[k]}"
             intervals.append((deviation_interval(probability, interval), label))
         p, cell_count = pearson_test(counts, np.diff(below))

@@ -107,18 +107,18 @@ def compare_laws(pairs: Sequence[Pair], level: float, start: float = 0.0) -> Fin
     equal shares of the level. ``start`` is the largest trace at time 0, whose rounding errors
     remain in P.
     """
-    share, early = level / sum(pair.one.shape[-1] for pair in pairs), False
+    single_level, early = level / sum(pair.one.shape[-1] for pair in pairs), False
     intervals = []
     for pair in pairs:
         for k in range(pair.one.shape[-1]):
             one, other = pair.one[:, k, k], pair.other[:, k, k]
             blur = _rounding_of(pair.one, start)
             if pair.expected is None:
-                distance = law_distance(one, other, share, blur)
+                distance = law_distance(one, other, single_level, blur)
             else:
                 limit_law = pair.expected[:, k, k]
-                low = law_distance(one, limit_law, share / 2.0, blur).low
-                distance = law_distance(one, other, share / 2.0, blur)
+                low = law_distance(one, limit_law, single_level / 2.0, blur).low
+                distance = law_distance(one, other, single_level / 2.0, blur)
                 distance = distance._replace(low=low, high=max(distance.high, low))
                 early |= law_distance(limit_law, other, 0.5).value > LAW_TOLERANCE
             intervals.append((distance, f"at {pair.label}, entry {k}"))
@@ -158,11 +158,13 @@ def compare_growth(
     should have: only faster growth than theirs breaks the promise. Where it is None, growth leaves
     the row undecided.
     """
-    share, early = 0.5 * level / sum(pair.one.shape[-1] for pair in pairs), False
+    single_level, early = 0.5 * level / sum(pair.one.shape[-1] for pair in pairs), False
     intervals = []
     for pair, laws in zip(pairs, expected, strict=True):
-        growths = growth(pair.one, pair.other, share)
-        expected_growths = growth(*laws, share) if laws is not None else [None] * len(growths)
+        growths = growth(pair.one, pair.other, single_level)
+        expected_growths = (
+            growth(*laws, single_level) if laws is not None else [None] * len(growths)
+        )
         for k, (run, law) in enumerate(zip(growths, expected_growths, strict=True)):
             low = max(0.0, run.low - law.high) if law is not None else 0.0
             early |= (law.value if law is not None else run.low) > LAW_TOLERANCE

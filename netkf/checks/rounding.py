@@ -48,8 +48,8 @@ def compare_identities(
         return find_identity(0.0, base, message)
     limit = allowed_deviation(scale, largest, base)
     with np.errstate(divide="ignore", invalid="ignore"):
-        share = np.where(deviations > 0.0, deviations / limit, 0.0)
-    worst_index = int(np.argmax(share))
+        relative = np.where(deviations > 0.0, deviations / limit, 0.0)
+    worst_index = int(np.argmax(relative))
     # Relative to the size of the result or, if that is 0, of the terms.
     unit = float(scale[worst_index] or largest[worst_index] or 1.0)
     return find_identity(

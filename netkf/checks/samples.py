@@ -169,8 +169,8 @@ def relative_difference(P: FloatArray, expected: FloatArray) -> FloatArray:
     size = np.abs(expected).max(axis=(-1, -2), keepdims=True)
     with np.errstate(invalid="ignore", divide="ignore"):
         gap = np.abs(P - expected)
-        share = np.where(gap == 0.0, 0.0, gap / size)
-        return np.asarray(np.nan_to_num(share, nan=np.inf))
+        relative = np.where(gap == 0.0, 0.0, gap / size)
+        return np.asarray(np.nan_to_num(relative, nan=np.inf))
 
 
 def check_growth(samples: RunSamples, level: float) -> Finding:

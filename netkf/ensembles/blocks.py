@@ -113,13 +113,13 @@ MAX_KEPT = 4  # scenarios that a worker keeps unpickled: a sweep goes from one t
 _scenarios: dict[str, Scenario] = {}
 
 
-def unpack_scenario(travelling: PackedScenario) -> Scenario:
+def unpack_scenario(packed: PackedScenario) -> Scenario:
     """Return the unpickled scenario; a worker keeps the last MAX_KEPT with their caches."""
-    scenario = _scenarios.get(travelling.digest)
+    scenario = _scenarios.get(packed.digest)
     if scenario is None:
         while len(_scenarios) >= MAX_KEPT:
             _scenarios.pop(next(iter(_scenarios)), None)
-        scenario = _scenarios.setdefault(travelling.digest, _unpickle(travelling))
+        scenario = _scenarios.setdefault(packed.digest, _unpickle(packed))
     return scenario
 
 
@@ -137,16 +137,16 @@ def _check_versions(required_versions: tuple[tuple[str, str], ...]) -> None:
         raise EngineError(f"{message}; install the same there, or use --workers")
 
 
-def _unpickle(travelling: PackedScenario) -> Scenario:
+def _unpickle(packed: PackedScenario) -> Scenario:
     """Return the scenario in a worker, after its modules have been made importable there."""
-    if travelling.versions:
-        _check_versions(travelling.versions)
-    for name, folder in travelling.modules:
+    if packed.versions:
+        _check_versions(packed.versions)
+    for name, folder in packed.modules:
         forget_other(name, Path(folder))
         if folder not in sys.path:
             sys.path.insert(0, folder)
     try:
-        scenario: Scenario = pickle.loads(travelling.payload)
+        scenario: Scenario = pickle.loads(packed.payload)
     except (AttributeError, ImportError) as error:
         message = (
             f"a class of the scenario cannot be imported by a worker ({describe_error(error)})"

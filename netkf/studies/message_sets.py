@@ -88,8 +88,8 @@ def smallest_set(
     complete, messages = 0, None
     for size in range(1, most + 1):
         # Half of the replays for single messages, a quarter for pairs, and so on.
-        share = replays if size == most else replays - (replays >> size)
-        messages, all_tried = search.of_size(recent, size, first + share)
+        replay_budget = replays if size == most else replays - (replays >> size)
+        messages, all_tried = search.of_size(recent, size, first + replay_budget)
         if messages is not None:
             break
         complete = size if all_tried and complete == size - 1 else complete

@@ -223,7 +223,7 @@ class _Evidence:
         self._flow: Flow = find_flow(self.scenario, self._log, usable, was_used)
         self._reach: Reach = search_back(self._flow, node, most)
         full_flow = find_flow(self.scenario, replayer.full_log, full)
-        self._every = replayer.full_log, search_back(full_flow, node)
+        self._full_search = replayer.full_log, search_back(full_flow, node)
         self.missing: dict[MessageKey, Missing] = {
             self.messages.key(m): _describe_missing(self.messages, m)
             for m in np.flatnonzero(~was_used).tolist()
@@ -247,7 +247,7 @@ class _Evidence:
             newest_information(self._reach, self._log, readings, budget)
             for budget in range(self._most + 1)
         ]
-        log, reach = self._every
+        log, reach = self._full_search
         without_losses = newest_information(reach, log, KeptReadings(scenario, log, at), 0)
         nodes = [n for n in scenario.nodes if n != self._node or n in scenario.placed]
         return tuple(

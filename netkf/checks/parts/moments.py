@@ -83,46 +83,49 @@ def moments(z: FloatArray, states: FloatArray | None = None) -> NoiseMoments:
     added; 0 where none is known.
     """
     present = np.isfinite(z)
-    there = present.astype(float)
+    # Missing entries are 0, so that they add nothing to sums of products, and have the weight 0.
+    weight = present.astype(float)
     z = np.where(present, z, 0.0)
     rank = np.where(present, 2.0 * scipy.special.ndtr(np.abs(z)) - 1.0, 0.0)
     square = z**2
     lagged_terms = [
         [
-            there[k:] * there[:-k],
+            weight[k:] * weight[:-k],
             z[k:] * z[:-k],
-            square[k:] * there[:-k],
-            there[k:] * square[:-k],
+            square[k:] * weight[:-k],
+            weight[k:] * square[:-k],
         ]
         for k in range(2, FURTHER + 2)
     ]
-    pieces = zip(np.array_split(there, PARTS), np.array_split(z, PARTS), strict=True)
+    parts = zip(np.array_split(weight, PARTS), np.array_split(z, PARTS), strict=True)
     known_states = np.zeros((len(z), 0, z.shape[1])) if states is None else np.nan_to_num(states)
-    number, state_products = (
-        (there[:, None] * (known_states != 0.0)).sum(axis=0),
+    state_counts, state_products = (
+        (weight[:, None] * (known_states != 0.0)).sum(axis=0),
         (z[:, None] * known_states).sum(axis=0),
     )
     return NoiseMoments(
-        there.T @ there,
-        z.sum(axis=0),
-        z.T @ z,
-        z[1:].T @ z[:-1],
-        there[1:].T @ there[:-1],
-        count_cells(scipy.special.ndtr(z), present),
-        (z**4).sum(axis=0),
-        np.array([square.T @ there, square[1:].T @ there[:-1], there[1:].T @ square[:-1]]),
-        np.array([[sums.sum(axis=0) for sums in lag] for lag in lagged_terms]),
-        np.array(
+        together=weight.T @ weight,
+        first=z.sum(axis=0),
+        second=z.T @ z,
+        lagged=z[1:].T @ z[:-1],
+        pairs=weight[1:].T @ weight[:-1],
+        cells=count_cells(scipy.special.ndtr(z), present),
+        fourth=(z**4).sum(axis=0),
+        squares=np.array(
+            [square.T @ weight, square[1:].T @ weight[:-1], weight[1:].T @ square[:-1]]
+        ),
+        further=np.array([[sums.sum(axis=0) for sums in lag] for lag in lagged_terms]),
+        sizes=np.array(
             [
-                (there[1:] * there[:-1]).sum(axis=0),
-                (rank[1:] * there[:-1]).sum(axis=0),
-                (there[1:] * rank[:-1]).sum(axis=0),
-                (rank[1:] ** 2 * there[:-1]).sum(axis=0),
+                (weight[1:] * weight[:-1]).sum(axis=0),
+                (rank[1:] * weight[:-1]).sum(axis=0),
+                (weight[1:] * rank[:-1]).sum(axis=0),
+                (rank[1:] ** 2 * weight[:-1]).sum(axis=0),
                 (rank[1:] * rank[:-1]).sum(axis=0),
             ]
         ),
-        np.array([[number.sum(), (part**2).sum()] for number, part in pieces]),
-        np.array([number, state_products, state_products**2, number > 0.0]),
+        variance=np.array([[weights.sum(), (values**2).sum()] for weights, values in parts]),
+        states=np.array([state_counts, state_products, state_products**2, state_counts > 0.0]),
     )
 
 
@@ -178,11 +181,11 @@ def compare_variances(
             fourth = totals[1] * count / totals[2] * (square / count * totals[2] / totals[0]) ** 2
             label = f"all {noun} in part {k + 1} of {PARTS} of a run"
             intervals.append((interval(square, fourth, count, level / (3.0 * PARTS)), label))
-    share = level / (3.0 * len(squares))
+    single_level = level / (3.0 * len(squares))
     for k, label in enumerate(labels):
         if counts[k] >= MIN_COUNT:
             entry_sums = float(squares[k]), float(sums.fourth[k]), float(counts[k])
-            intervals.append((interval(*entry_sums, share), label))
+            intervals.append((interval(*entry_sums, single_level), label))
     message = f"variances over the stated ones, {counts.sum():,.0f} values,"
     return with_best(intervals, VARIANCE_TOLERANCE, message)
 
@@ -197,13 +200,15 @@ def compare_means(sums: NoiseMoments, labels: list[str], level: float) -> Findin
     if counts.max() < MIN_COUNT:
         return nothing_to_see(MEAN_TOLERANCE)
     states = _with_states(sums, labels, level / 2.0)
-    share, intervals = level / ((2.0 if states else 1.0) * len(labels)), []
+    single_level, intervals = level / ((2.0 if states else 1.0) * len(labels)), []
     for entry_sum, count, label in zip(sums.first.tolist(), counts.tolist(), labels, strict=True):
         if count < MIN_COUNT:
             continue
         value, deviation = entry_sum / count, 1.0 / math.sqrt(count)
-        reach = deviation * -float(scipy.special.ndtri(share / 2.0))
-        mean = Interval(value, value - reach, value + reach, detectable_shift(deviation, share))
+        reach = deviation * -float(scipy.special.ndtri(single_level / 2.0))
+        mean = Interval(
+            value, value - reach, value + reach, detectable_shift(deviation, single_level)
+        )
         intervals.append((deviation_interval(0.0, mean), label))
     message = "largest mean in standard deviations"
     message += ", or correlation with a state," if states else ""
@@ -240,10 +245,10 @@ def compare_correlations(sums: NoiseMoments, labels: list[str], level: float) ->
     entries = [entry for entry in entries if entry[1] >= MIN_COUNT]
     if not entries:
         return nothing_to_see(CORRELATION_TOLERANCE)
-    share, intervals = level / len(entries), []
+    single_level, intervals = level / len(entries), []
     for value, count, label in entries:
         intervals.append(
-            (deviation_interval(0.0, correlation_interval(value, count, share)), label)
+            (deviation_interval(0.0, correlation_interval(value, count, single_level)), label)
         )
     return find_largest(intervals, CORRELATION_TOLERANCE, "largest correlation")
 
@@ -262,11 +267,11 @@ def compare_cells(cells: FloatArray, labels: list[str], level: float, noun: str)
         (_cell_interval(count, counts.sum(), level / (2.0 * CELLS)), f"all, {_cell_label(k)}")
         for k, count in enumerate(cells.sum(axis=1).tolist())
     ]
-    share = level / (2.0 * CELLS * len(labels))
+    single_level = level / (2.0 * CELLS * len(labels))
     for column, label in enumerate(labels if len(labels) > 1 else ()):
         if counts[column] >= 10 * CELLS:
             for k, count in enumerate(cells[:, column].tolist()):
-                distance = _cell_interval(count, counts[column], share)
+                distance = _cell_interval(count, counts[column], single_level)
                 intervals.append((distance, f"{label}, {_cell_label(k)}"))
     message = f"{counts.sum():,.0f} {noun}, largest difference of a share from 1/{CELLS}"
     return with_best(intervals, SHARE_TOLERANCE, message, CELLS)

@@ -166,7 +166,7 @@ class StackedErrors:
             return
         stack, (H, R, root) = self.stack, map(as_kernel_array, observation)
         index, first = stack.index(name), columns.start
-        update_estimate(stack.table, stack.matrices, index, stack.used, H, R, root, first)
+        update_estimate(stack.arrays, index, H, R, root, first)
 
     def multiply(self, name: Hashable, matrix: FloatArray, root: FloatArray) -> None:
         """Multiply an error by a matrix (n, n) and set the root of its P."""
@@ -191,10 +191,8 @@ class StackedErrors:
         x = stack.form(STATE) if self.follows else None
         # e+ = F e + D x + w for all estimates, and x+ = F x + w for the state
         predict_estimates(
-            stack.table,
-            stack.matrices,
+            stack.arrays,
             indices,
-            stack.used,
             as_kernel_array(step.error),
             as_kernel_array(noise),
             as_kernel_array(step.root),

@@ -19,7 +19,7 @@ from netkf.plants.regressors import RegressorSensor
 from netkf.plants.sensors import LinearSensor
 from netkf.rng.streams import Streams
 from netkf.scenario.scenario import Scenario
-from netkf.theory.numerics.matrices import as_whole
+from netkf.theory.numerics.matrices import as_integer
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -57,8 +57,8 @@ def information_level(
     """
     import pandas as pd
 
-    runs, seed = as_whole("runs", runs, 2), as_whole("seed", seed, 0)
-    window = None if window is None else as_whole("window", window, 1)
+    runs, seed = as_integer("runs", runs, 2), as_integer("seed", seed, 0)
+    window = None if window is None else as_integer("window", window, 1)
     sources = _make_sources(scenario)
     past = _draw_pasts(scenario, sources, runs, Streams(seed).generator("past"))
     network = (-1, sources, past)

@@ -11,7 +11,7 @@ from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray, square_root
 from netkf.rng.streams import Streams
 from netkf.scenario.scenario import Scenario
-from netkf.theory.numerics.matrices import as_whole
+from netkf.theory.numerics.matrices import as_integer
 
 QUANTILE = 2.576  # of the standard normal law, for 99 % intervals
 
@@ -43,7 +43,7 @@ def tracking_level(
     """
     if not p >= 1.0 or not beta > 2.0:
         raise TheoryError(f"D (29) needs p >= 1 and beta > 2, got {p!r} and {beta!r}")
-    samples, seed = as_whole("samples", samples, 100), as_whole("seed", seed, 0)
+    samples, seed = as_integer("samples", samples, 100), as_integer("seed", seed, 0)
     xi = _draw_noises(scenario, samples, Streams(seed).generator("noises"))
     powers = (xi * np.log(math.e + xi) ** beta) ** p
     mean, error = float(powers.mean()), QUANTILE * float(powers.std(ddof=1)) / math.sqrt(samples)

@@ -13,7 +13,7 @@ from netkf.rng.streams import Streams
 from netkf.scenario.scenario import Scenario
 from netkf.theory.gossip.matchings import effective_matching, primitive
 from netkf.theory.intermittent.riccati import couple_from_the_past
-from netkf.theory.numerics.matrices import as_whole
+from netkf.theory.numerics.matrices import as_integer
 
 MAX_SAMPLES_AT_ONCE = 2000  # bounds the memory of the arrays
 FAR_START_DEVIATIONS = 1e3  # standard deviations of the upper start, in units of those of the plant
@@ -44,7 +44,7 @@ def switched_samples(scenario: Scenario, samples: int, seed: int) -> SwitchedSam
     matching = effective_matching(scenario)
     if not primitive(matching)[0]:
         raise TheoryError("G C.1 fails: Abar is not irreducible, so that nodes have different laws")
-    samples, seed = as_whole("samples", samples, 1), as_whole("seed", seed, 0)
+    samples, seed = as_integer("samples", samples, 1), as_integer("seed", seed, 0)
     F, Q = scenario.slot_belief
     n, N = len(F), len(scenario.nodes)
     modes = reading_modes([(model.H, model.R) for model in scenario.slot_models], n)

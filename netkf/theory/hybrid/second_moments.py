@@ -85,15 +85,15 @@ class _SecondMomentEquation:
         to_j = loss.mean_delivery((i, j), scenario.table_probability((i, j)))
         to_i = loss.mean_delivery((j, i), scenario.table_probability((j, i)))
         # Symmetric losses are lost together, others independently.
-        kron = min(to_i, to_j) if channel.symmetric else to_i * to_j
+        both_arrive = min(to_i, to_j) if channel.symmetric else to_i * to_j
         at_i, at_j = scenario.weight(i, j), scenario.weight(j, i)
         for x, y, probability, weight in ((a, b, to_i, at_i), (b, a, to_j, at_j)):
             self._mixing[x, y] += rate * probability * weight
             self._mixing[x, x] -= rate * probability * weight
         self._outcomes += [
-            (a, b, rate * (to_i - kron), at_i, 0.0),
-            (a, b, rate * (to_j - kron), 0.0, at_j),
-            (a, b, rate * kron, at_i, at_j),
+            (a, b, rate * (to_i - both_arrive), at_i, 0.0),
+            (a, b, rate * (to_j - both_arrive), 0.0, at_j),
+            (a, b, rate * both_arrive, at_i, at_j),
         ]
 
     def __call__(self, flat: FloatArray) -> FloatArray:

@@ -20,7 +20,7 @@ from netkf.theory.intermittent.riccati import (
     riccati_step,
     steady_covariance,
 )
-from netkf.theory.numerics.matrices import as_covariance, as_whole
+from netkf.theory.numerics.matrices import as_covariance, as_integer
 
 BATCHES = 50  # parts of a path (batch means), whose averages are nearly independent
 MAX_ENTRIES = 2_000_000  # entries of the covariances in memory at once
@@ -60,7 +60,7 @@ def path_average(
     exist.
     """
     system, g = check_system(F, Q, H, R), check_delivery(delivery)
-    slots, seed = as_whole("slots", slots, BATCHES), as_whole("seed", seed, 0)
+    slots, seed = as_integer("slots", slots, BATCHES), as_integer("seed", seed, 0)
     n = len(system.F)
     P = steady_covariance(*system) if start is None else as_covariance("start", start, n)
     arrived = Streams(seed).generator("arrivals").random(slots) < g
@@ -122,7 +122,7 @@ def mean_covariance_bounds(
     system, g = check_system(F, Q, H, R), check_delivery(delivery)
     first = as_covariance("start", start, len(system.F))
     lower, upper = [first], [first]
-    for _ in range(as_whole("slots", slots, 0)):
+    for _ in range(as_integer("slots", slots, 0)):
         S, X = lower[-1], upper[-1]
         lower.append(symmetric((1.0 - g) * system.F @ S @ system.F.T + system.Q))
         arrived, lost = riccati_step(X, *system), lyapunov_step(X, system.F, system.Q)

@@ -16,7 +16,13 @@ from netkf.algorithms.kernels.chains import move_roots, reading_modes
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import ArrayLike, FloatArray, square_root, symmetric
 from netkf.rng.streams import Streams
-from netkf.theory.numerics.matrices import RESIDUAL, as_covariance, as_numbers, as_square, as_whole
+from netkf.theory.numerics.matrices import (
+    RESIDUAL,
+    as_covariance,
+    as_integer,
+    as_numbers,
+    as_square,
+)
 
 MAX_DEPTH = 22  # of the tree of compositions: 4 million covariances
 MAX_POLICIES = 40  # policy iterations at one value of s
@@ -352,7 +358,7 @@ def support(F: ArrayLike, Q: ArrayLike, H: ArrayLike, R: ArrayLike, depth: int) 
     f_1(P*) = P*, so that each depth contains the ones before. Raises TheoryError for a depth
     outside 0 .. 22 and if P* does not exist.
     """
-    depth = as_whole("depth", depth, 0, MAX_DEPTH)
+    depth = as_integer("depth", depth, 0, MAX_DEPTH)
     F, Q, H, R = check_system(F, Q, H, R)
     roots = covariance_root(steady_covariance(F, Q, H, R))[None]
     root_Q, modes = square_root(Q), reading_modes([(H[:0], R[:0, :0]), (H, R)], len(F))
@@ -387,7 +393,7 @@ def invariant_samples(
     """
     F, Q, H, R = check_system(F, Q, H, R)
     delivery = check_delivery(delivery)
-    samples, seed = as_whole("samples", samples, 1), as_whole("seed", seed, 0)
+    samples, seed = as_integer("samples", samples, 1), as_integer("seed", seed, 0)
     n, P = len(F), steady_covariance(F, Q, H, R)
     random = Streams(seed).generator("arrivals")
     modes = reading_modes([(H[:0], R[:0, :0]), (H, R)], n)

@@ -24,12 +24,16 @@ def as_numbers(name: str, value: ArrayLike) -> FloatArray:
     return array.reshape(1, 1) if array.ndim == 0 else array
 
 
-def as_whole(name: str, value: object, least: int, most: float = np.inf) -> int:
-    """Return ``value`` as an int in least .. most; raises TheoryError otherwise."""
+def as_integer(name: str, value: object, min_value: int, max_value: float = np.inf) -> int:
+    """Return ``value``, an int in ``min_value`` .. ``max_value``, otherwise raises TheoryError."""
     if isinstance(value, bool) or not isinstance(value, (int, np.integer)):
         raise TheoryError(f"{name} must be an integer, got {value!r}")
-    if not least <= value <= most:
-        bound = f"at least {least}" if most == np.inf else f"an integer from {least} to {most:g}"
+    if not min_value <= value <= max_value:
+        bound = (
+            f"at least {min_value}"
+            if max_value == np.inf
+            else f"an integer from {min_value} to {max_value:g}"
+        )
         raise TheoryError(f"{name} must be {bound}, got {value!r}")
     return int(value)
 

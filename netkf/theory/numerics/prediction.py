@@ -238,10 +238,8 @@ class ErrorFlow:
         ``columns``: the first of the plant's 8 m inputs, and the first of n inputs of each error.
         """
         flow_estimates(
-            stack.table,
-            stack.matrices,
+            stack.arrays,
             stack.indices(names),
-            stack.used,
             columns,
             self._tables,
             (self._exp.terms, self._exp.unit, self._scale),

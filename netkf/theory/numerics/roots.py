@@ -10,6 +10,7 @@ subtraction cancels digits.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -17,6 +18,19 @@ from netkf.algorithms.kernels.square_root import reflect
 from netkf.linalg.arrays import FloatArray, IntArray
 from netkf.linalg.compiling import kernel
 from netkf.linalg.small import copy_matrix, solve_inplace
+
+
+class ErrorTable(NamedTuple):
+    """The arrays of a GaussianStack of errors, which kernels modify.
+
+    forms    : (vectors, n, width) linear forms of the errors
+    matrices : (vectors, n, n) a matrix of each error, such as the root of its P
+    used     : number of columns of forms in use
+    """
+
+    forms: FloatArray
+    matrices: FloatArray
+    used: int
 
 
 @kernel
@@ -102,26 +116,25 @@ def add_columns(form: FloatArray, first: int, matrix: FloatArray, sign: float) -
 
 @kernel(allocates=True)
 def predict_estimates(
-    forms: FloatArray,
-    matrices: FloatArray,
+    errors: ErrorTable,
     indices: IntArray,
-    used: int,
-    error: FloatArray,
+    F: FloatArray,
     noise: FloatArray,
     root: FloatArray,
     first: int,
 ) -> None:
-    """Predict errors and roots: ``e+ = F e + noise w``, ``P+ = F P F' + root root'``.
+    """Predict the errors at ``indices`` and the roots of their P.
 
-    ``error`` is F (n, n), ``noise`` (n, k) belongs to the inputs from column ``first`` on, ``root``
-    is (n, r).
+    ``e+ = F e + noise w`` and ``P+ = F P F' + root root'``. F is (n, n), ``noise`` (n, k) multiplies the inputs from column ``first`` on, ``root`` is
+    (n, r).
     """
-    n, r = error.shape[0], root.shape[1]
+    forms, matrices, used = errors
+    n, r = F.shape[0], root.shape[1]
     scratch, factor = np.empty((n, used)), np.empty((n, n + r))
     for index in indices:
-        multiply_form(forms[index], error, used, scratch)
+        multiply_form(forms[index], F, used, scratch)
         add_columns(forms[index], first, noise, 1.0)
-        _multiply_into(factor, error, matrices[index])
+        _multiply_into(factor, F, matrices[index])
         for i in range(n):
             for k in range(r):
                 factor[i, n + k] = root[i, k]
@@ -184,10 +197,8 @@ def update_root(
 
 @kernel(allocates=True)
 def update_estimate(
-    forms: FloatArray,
-    matrices: FloatArray,
+    errors: ErrorTable,
     index: int,
-    used: int,
     H: FloatArray,
     R: FloatArray,
     noise: FloatArray,
@@ -198,6 +209,7 @@ def update_estimate(
     ``noise`` (p, p) is a root of the true covariance, and belongs to the inputs from column
     ``first`` on.
     """
+    forms, matrices, used = errors
     n, p = H.shape[1], H.shape[0]
     closed, K, root = update_root(matrices[index], H, R)
     multiply_form(forms[index], closed, used, np.empty((n, used)))
@@ -265,22 +277,21 @@ def add_information(root: FloatArray, U: FloatArray) -> FloatArray:
 
 @kernel(allocates=True)
 def fade_totals(
-    forms: FloatArray,
-    matrices: FloatArray,
+    totals: ErrorTable,
     indices: IntArray,
-    used: int,
     inverse: FloatArray,
     fading: float,
     noise: FloatArray,
     first: int,
 ) -> None:
-    """Predict the totals of push-sum with running sums: their information U, in ``matrices``, and
-    their errors u - U x, in ``forms``.
+    """Predict the totals of push-sum with running sums at ``indices``.
 
+    The matrices of ``totals`` are their information U, the forms are their errors u - U x.
     ``U+ = s F^-T U F^-1`` and ``(u - U x)+ = s F^-T (u - U x) - U+ w``, with ``inverse`` F^-1
     (n, n), s = ``fading``, and the plant's noise w = ``noise`` (n, k) times the inputs from column
     ``first`` on. Totals without information are left alone.
     """
+    forms, matrices, used = totals
     n = inverse.shape[0]
     transform, half, noise_term = np.empty((n, n)), np.empty((n, n)), np.empty(noise.shape)
     scratch = np.empty((n, used))
@@ -524,10 +535,8 @@ def flow_over_gap(
 
 @kernel(allocates=True)
 def flow_estimates(
-    forms: FloatArray,
-    matrices: FloatArray,
+    errors: ErrorTable,
     indices: IntArray,
-    used: int,
     columns: tuple[int, int],
     flow: tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray],
     exponential: tuple[FloatArray, float, float],
@@ -544,6 +553,7 @@ def flow_estimates(
     columns     : the first of the K m inputs of the plant, and the first of the n inputs of each
                   error's own noise, which are there if p > 0
     """
+    forms, matrices, used = errors
     whitened, gain, noise, B, plant = flow
     nodes, weights = quadrature
     root_weights = np.sqrt(weights * gap)

@@ -14,7 +14,7 @@ from collections.abc import Hashable, Iterable, Mapping, Sequence
 import numpy as np
 
 from netkf.linalg.arrays import FloatArray, IntArray
-from netkf.theory.numerics.roots import mixed_form
+from netkf.theory.numerics.roots import ErrorTable, mixed_form
 
 SPARE_INPUTS = 192  # columns kept beyond the number of rows between two reductions
 
@@ -43,6 +43,11 @@ class GaussianStack:
     def names(self) -> tuple[Hashable, ...]:
         """Names of the vectors, in the order in which they were added."""
         return tuple(self._index)
+
+    @property
+    def arrays(self) -> ErrorTable:
+        """The present arrays for kernels; valid until vectors or inputs are added."""
+        return ErrorTable(self.table, self.matrices, self.used)
 
     def index(self, name: Hashable) -> int:
         """Return the index of a vector in the tables."""

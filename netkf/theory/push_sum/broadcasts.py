@@ -11,7 +11,7 @@ from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import ArrayLike, FloatArray
 from netkf.network.graphs import Topology
 from netkf.scenario.scenario import Scenario
-from netkf.theory.numerics.matrices import as_whole
+from netkf.theory.numerics.matrices import as_integer
 from netkf.theory.push_sum.estimation_steps import averaging_law
 
 MAX_NODES = 12  # of a network whose informed sets are enumerated
@@ -60,7 +60,7 @@ def leader_agreement(scenario: Scenario, slots: int, leader: int | None = None) 
     probabilities of the channel, afresh in each slot. Exact, over all sets of nodes that may know.
     Raises TheoryError for more than 12 nodes and for links that are not drawn independently.
     """
-    averaging, slots = averaging_law(scenario), as_whole("slots", slots, 0)
+    averaging, slots = averaging_law(scenario), as_integer("slots", slots, 0)
     if averaging.nodes > MAX_NODES:
         raise TheoryError(
             f"sets of nodes are enumerated, and {averaging.nodes} nodes have too many"

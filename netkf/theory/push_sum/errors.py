@@ -174,8 +174,12 @@ class RunningTotalsRule(ErrorRule):
         inverse = np.asarray(scipy.linalg.expm(-gap * self._A), order="C")
         fading, stack = math.exp(-2.0 * self._rate * gap), self.errors.stack
         fade_totals(
-            *(stack.table, stack.matrices, stack.indices(self._totals), stack.used),
-            *(inverse, fading, as_kernel_array(noise), columns.start),
+            stack.arrays,
+            stack.indices(self._totals),
+            inverse,
+            fading,
+            as_kernel_array(noise),
+            columns.start,
         )
 
     def sense(self, time: float, observations: EstimatorObservations) -> None:

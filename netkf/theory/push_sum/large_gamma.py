@@ -12,7 +12,7 @@ import scipy.linalg
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray, symmetric
 from netkf.scenario.scenario import Scenario
-from netkf.theory.numerics.matrices import as_whole
+from netkf.theory.numerics.matrices import as_integer
 from netkf.theory.push_sum.covariance import covariance_of_steps
 from netkf.theory.push_sum.estimation_steps import EstimationSteps, estimation_steps
 from netkf.theory.push_sum.limits import consensus_gain_bound
@@ -89,7 +89,7 @@ def push_sum_covariances(scenario: Scenario, gammas: Sequence[int]) -> FloatArra
 
 def _with_gamma(steps: EstimationSteps, gamma: int) -> EstimationSteps:
     """Return the estimation steps with another gamma, a whole number of at least 1."""
-    law = replace(steps.averaging, gamma=as_whole("gamma", gamma, 1))
+    law = replace(steps.averaging, gamma=as_integer("gamma", gamma, 1))
     return replace(steps, averaging=law)
 
 
