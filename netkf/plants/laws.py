@@ -23,10 +23,6 @@ from netkf.linalg.small import matmul
 
 MAX_LAWS = 256  # laws of states inside a step that are kept
 MAX_GRIDS = 256  # parts of the sensing grid that are kept
-LEGENDRE = np.array(
-    [[1.0, -1.0, 1.0, -1.0], [0.0, 2.0, -6.0, 12.0], [0.0, 0.0, 6.0, -30.0], [0.0, 0.0, 0.0, 20.0]]
-)
-"""P_0 to P_3 of 2 u - 1 (columns) by powers of u."""
 DEPENDENT = 1e-9  # share of a row that is not rounding
 _NODES, _WEIGHTS = gauss_legendre(20)
 
@@ -179,23 +175,23 @@ def course_width(n: int) -> int:
 
 
 def course_table(to_end: FloatArray, n: int, longest: float) -> FloatArray:
-    """Return the table (D, 5 n, W) of what ``paths.fill_course`` multiplies with the state at the
-    start of a piece of at most so many seconds, by powers of its length, and with the four Legendre
-    coefficients of its cubic, (4, n) in row-major order. Columns are those of the course.
+    """Return the table (D, 2 n, W) of what ``paths.fill_course`` multiplies with the state at the
+    start of a piece of at most ``longest`` seconds, by powers of its length (the first n rows),
+    and with the coefficients of its cubic. Columns are those of the course.
     """
     # Terms beyond are below rounding, see linalg/series.
     needed = int(np.searchsorted(to_end[:-1, -1], longest)) + 1
     terms = max(needed, 4)  # those of a cubic
-    table = np.zeros((terms, 5 * n, course_width(n)))
+    table = np.zeros((terms, 2 * n, course_width(n)))
     # Integrals of u^d and of u u^d over the share u of a piece.
     plain, tilted = 1.0 / np.arange(1, terms + 1), 1.0 / np.arange(2, terms + 2)
     response = np.zeros((terms, n, n))
     response[:needed] = to_end[:needed, :-1].reshape(needed, n, n)
     table[:, :n, :n] = np.swapaxes(response, 1, 2) * plain[:, None, None]
     table[:, :n, n : 2 * n] = np.swapaxes(response, 1, 2) * tilted[:, None, None]
-    for i in range(n):
-        table[:4, n + i :: n, i] = LEGENDRE * plain[:4, None]
-        table[:4, n + i :: n, n + i] = LEGENDRE * tilted[:4, None]
+    # The cubic has no term of degree 0.
+    for d in range(1, 4):
+        table[d, n:, :n], table[d, n:, n : 2 * n] = plain[d] * np.eye(n), tilted[d] * np.eye(n)
     return table
 
 

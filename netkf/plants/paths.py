@@ -30,8 +30,9 @@ BLOCK = 64  # steps drawn at once, or a multiple of it
 
 
 class PathStep(NamedTuple):
-    """One stretch of the path: times, states at its ends, (2, n) moments and the cubic's (4, n)
-    Legendre coefficients of what noise added.
+    """One stretch of the path: times, states at its ends, (2, n) moments, and the cubic of what
+    noise added: (3, n) coefficients of u, u^2 and u^3 of the share u of the stretch, times its
+    seconds.
     """
 
     start: float
@@ -44,7 +45,7 @@ class PathStep(NamedTuple):
 
 class Block(NamedTuple):
     """Some steps S as K pieces, since a step is cut where a state is probed: ``start, end`` (K,), x
-    at both (K, n), ``moments`` (K, 2, n), ``cubic`` (K, 4, n) and whose ``step`` (K,) each is;
+    at both (K, n), ``moments`` (K, 2, n), ``cubic`` (K, 3, n) and whose ``step`` (K,) each is;
     ``ends`` (S,) of the steps. What is random comes for B paths at once, (B, K, ...).
     """
 
@@ -104,7 +105,7 @@ class DiffusionPaths:
         laws, (count, n) = self.laws, self._x.shape
         total = blocks * BLOCK if most is None else min(most, blocks * BLOCK)
         x_start, x_end = (np.empty((count, total, n)) for _ in range(2))
-        moments, cubic = np.empty((count, total, 2, n)), np.empty((count, total, 4, n))
+        moments, cubic = np.empty((count, total, 2, n)), np.empty((count, total, 3, n))
         # One kernel call draws all steps of all runs: end, moments and cubic.
         fill_steps(
             self._normals.draw((total, 3 * n)),
@@ -320,13 +321,15 @@ def fill_cubic(
     plain: float,
     tilted: float,
 ) -> None:
-    """Write the Legendre coefficients of the cubic on [0, 1] that starts at 0, ends at ``end`` and
-    has these moments over ``length`` seconds: P_0 and P_1 follow from the moments, P_2 and P_3 from
-    the ends.
+    """Write the coefficients of u, u^2 and u^3, times ``length`` seconds, of the cubic that is 0 at
+    u = 0, ``end`` at u = 1 and has these moments over the seconds.
     """
-    mean, slope = plain / length, 3.0 * tilted / length
-    cubic[run, row, 0, i], cubic[run, row, 1, i] = mean, slope
-    cubic[run, row, 2, i], cubic[run, row, 3, i] = 0.5 * end - mean, 0.5 * end - slope
+    # c = 6 M_0 - 10 S_1 + 3 e, 30 S_1 - 6 M_0 - 12 e, 10 e - 20 S_1 of e = length end, the moment
+    # M_0 with P_0 and S_1 = 3 M_1: its integrals with P_0 and P_1 are M_0 and M_1.
+    last, slope = length * end, 3.0 * tilted
+    cubic[run, row, 0, i] = 6.0 * plain - 10.0 * slope + 3.0 * last
+    cubic[run, row, 1, i] = 30.0 * slope - 6.0 * plain - 12.0 * last
+    cubic[run, row, 2, i] = 10.0 * last - 20.0 * slope
 
 
 @kernel
@@ -342,7 +345,7 @@ def fill_steps(
     out: tuple[FloatArray, FloatArray, FloatArray, FloatArray],
 ) -> None:
     """Write S steps of B paths from standard normals (B, S, 3 n): states at their starts and ends
-    (B, S, n), moments (B, S, 2, n) and cubics (B, S, 4, n). ``x`` (B, n) is the state before the
+    (B, S, n), moments (B, S, 2, n) and cubics (B, S, 3, n). ``x`` (B, n) is the state before the
     steps and then after them; ``drawn`` steps were before. A frame begins every ``frame_steps``
     steps, 0: never. ``factor`` (3 n, 3 n) and ``response`` (3, n, n) are those of GridLaws;
     ``noise`` (3 n,) is scratch.
@@ -536,11 +539,9 @@ def fill_course(
                 total += x_start[k, i] * load(MANY, table, d, i, j)
             total *= power
             # What noise adds is a cubic.
-            if d < 4:
-                for c in range(4):
-                    for i in range(n):
-                        row = load(MANY, table, d, (1 + c) * n + i, j)
-                        total += row * (length * cubic[k, c, i])
+            if 0 < d < 4:
+                for i in range(n):
+                    total += cubic[k, d - 1, i] * load(MANY, table, d, n + i, j)
             store(MANY, out, d, j, total)
         power *= length
 

@@ -157,9 +157,9 @@ def batch_size(scenario: Scenario) -> int:
     steps = BLOCK + len(scenario.times) + (scenario.horizon / period if period else 0.0)
     sensors = sum(len(placed) for placed in scenario.placed.values())
     rows = max((len(sensor.R) for sensor in scenario.sensors), default=0)
-    # Per piece: two states, two moments and the four coefficients of the cubic, of n entries each;
+    # Per piece: two states, two moments and the three coefficients of the cubic, of n entries each;
     # per step the two moments of each sensor's noise.
-    floats = steps * (8 * n + 2 * sensors * rows) + 8.0 * _expected_ticks(scenario)
+    floats = steps * (7 * n + 2 * sensors * rows) + 8.0 * _expected_ticks(scenario)
     sample_floats = len(scenario.times) * filters * n * (n + 2)
     # At least one run, however large it is. A multiple of L, since statistics process L runs side
     # by side and fewer take as long.

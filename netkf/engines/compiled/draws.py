@@ -141,7 +141,7 @@ def no_path(n: int) -> PathBlock:
         start=np.zeros(1),
         stop=np.array([math.inf]),
         moments=np.zeros((1, 1, 2, n)),
-        cubic=np.zeros((1, 1, 4, n)),
+        cubic=np.zeros((1, 1, 3, n)),
         step=np.zeros(1, dtype=np.int64),
         last=np.array([math.inf]),
         grid=np.empty(0),

@@ -168,7 +168,7 @@ class PathBlock(Struct):
 
     end : end of the last step, seconds
     start, stop : (K,), times at which pieces begin and end
-    x_start, x_stop, moments, cubic : (R, K, n), (R, K, n), (R, K, 2, n) and (R, K, 4, n), the state
+    x_start, x_stop, moments, cubic : (R, K, n), (R, K, n), (R, K, 2, n) and (R, K, 3, n), the state
                                       at both ends, its moments, and a cubic of the path
     step, last : (K,), number of the step that a piece belongs to, and the time at which that ends
     grid : times at which increment sensors are read
