@@ -28,7 +28,7 @@ def local_slots(
     nodes: SlotNodes,
     readings: ReadingBlock,
     plan: SlotPlan,
-    links: SlotLinks,  # noqa: ARG001 - nobody talks
+    links: SlotLinks,  # noqa: ARG001 - nodes send nothing
     samples: SlotSamples,
     scratch: SlotScratch,
 ) -> None:

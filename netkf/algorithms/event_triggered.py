@@ -203,7 +203,7 @@ def decide_estimate(
     last.
     """
     lanes, copies = scratch.lanes, (arrays.x, arrays.root)
-    # Copies in order: those heard on each link, what each node sends now, what it sent last.
+    # Copies in order: last received on each link, sent now by each node, sent last by each node.
     own = len(links.sender) + h
     last = own + len(nodes.rows)
     near = is_near(
@@ -220,8 +220,8 @@ def decide_estimate(
     sent = load_flags(lanes, plan.sent, b, s, 0, h)
     copy_estimate(lanes, copies, last, nodes.xhat, nodes.root, h, b, sent)
     # The payload of this exchange: estimates change one after the other while nodes combine.
-    everyone = spread(lanes, 1.0) > 0.0
-    copy_estimate(lanes, copies, own, nodes.xhat, nodes.root, h, b, everyone)
+    all_lanes = spread(lanes, 1.0) > 0.0
+    copy_estimate(lanes, copies, own, nodes.xhat, nodes.root, h, b, all_lanes)
 
 
 @kernel

@@ -57,8 +57,8 @@ class Model(Protocol):
 class NetworkInfo(NamedTuple):
     """The whole network of N nodes, for filters whose gains are computed before a run.
 
-    information (N, n, n): H' R^-1 H of each node's sensors, as the filters believe it; heard: the
-    indices, from 0 in the order of ids, of the nodes that each can hear.
+    information : (N, n, n), H' R^-1 H of each node's sensors, with the R that filters believe
+    heard : for each node the indices, from 0 in the order of ids, of the nodes that it can hear
     """
 
     information: FloatArray
@@ -68,11 +68,15 @@ class NetworkInfo(NamedTuple):
 class NodeInfo(NamedTuple):
     """Facts that a node may know about itself and the network at time 0.
 
-    node: its id; degree: nodes that it can hear when no link fails; receivers: nodes that can hear
-    it; nodes: how many there are in all; own_weight: what is left to it when the messages of all
-    neighbours arrive; information (n, n): the sum of H' R^-1 H over all sensors, as the filters
-    believe it; max_delay: the longest time a message may take, seconds (inf where unbounded);
-    place: its index in the order of ids, from 0; network: of all nodes, if it ``needs_network``.
+    node : its id
+    degree : number of nodes that it can hear when no link fails
+    receivers : number of nodes that can hear it
+    nodes : number of all nodes
+    own_weight : weight that it gives to itself when the messages of all neighbours arrive
+    information : (n, n), sum of H' R^-1 H over all sensors, with the R that filters believe
+    max_delay : longest time that a message may take, seconds (inf if unbounded)
+    place : its index in the order of ids, from 0
+    network : the whole network, if the filter ``needs_network``
     """
 
     node: int
@@ -189,7 +193,7 @@ class Filter(Component):
     schedule  phases of a slot in their order, of "predict", "sense" and "exchange"; None: not in
               slots. A filtered one predicts to a slot first, a prediction filter last
     clocks    what may make its nodes transmit in continuous time, of CLOCKS; (): nothing
-    predicts  a sample in slots shows the prediction with which a slot begins, else what is known
+    predicts  a sample in slots is the prediction with which the slot begins, else the estimate
               after the slot's exchanges
     first_slot  the first slot in which nodes exchange
     pairwise  in slots nodes exchange in pairs (a matching), else all with all neighbours
@@ -202,15 +206,15 @@ class Filter(Component):
               class only; None: it runs in the SimPy engine
     newest_only    of several messages of one sender at one instant the newest counts
     fixed_sensors  it adds up information, so the H of a sensor must not vary
-    needs_network  ``NodeInfo.network`` is told to its nodes
+    needs_network  its nodes are given ``NodeInfo.network``
     randomised     in slots ``emit`` is given a number ``Exchange.uniform``, from the stream
                    "trigger" of the node, which nothing else draws from
-    paper        the paper whose theory and checks speak about it: rooms of that name
-    combination  how it combines what it hears, for the engines and the theory that know it:
-                 "convex", "intersection", "swap", "shares", "readings", "sums", "none"; "" where
-                 only its methods say it
+    paper        name of its packages in netkf.theory and netkf.checks, "" if there are none
+    combination  how it combines messages, for the compiled engine and the theory: "convex",
+                 "intersection", "swap", "shares", "readings", "sums", "none", ...; "" if only its
+                 methods define it
     P_by_design  how P compares with the covariance of its error in slots and under clocks:
-                 "larger", "smaller", or "" where they are equal or nothing is known
+                 "larger", "smaller", or "" if they are equal or nothing is proved
     """
 
     schedule: ClassVar[tuple[str, ...] | None] = ("predict", "sense", "exchange")
@@ -298,7 +302,9 @@ class Filter(Component):
         return state._replace(xhat=state.xhat + offset)
 
     def shift_payload(self, payload: Any, offset: FloatArray) -> Any:
-        """Return a payload under way shifted alike; ``offset`` refers to the time of sending."""
+        """Return a payload under way with ``offset`` added; ``offset`` refers to the time of
+        sending.
+        """
         return payload._replace(xhat=payload.xhat + offset)
 
     def accepts(self, payload: Any, age: float) -> bool:
@@ -354,8 +360,8 @@ class Filter(Component):
         return True
 
     def decides_in_slots(self) -> bool:
-        """Return True if a node may be silent because of what it knows: ``slot_kernel`` then writes
-        who sends (kernels.slots.SlotPlan); for compiled filters.
+        """Return True if a node may decide to send nothing: ``slot_kernel`` then writes which nodes
+        send (``sent`` of kernels.slots.SlotPlan); for compiled filters.
         """
         return False
 

@@ -133,7 +133,7 @@ def has_read(readings: ReadingBlock, rows: int, b: int, s: int, h: int) -> bool:
     """Return True if filter ``h`` has a reading in slot ``s``, the same in all runs: y and H are
     zero if a recorded sensor has no row.
     """
-    # H that is fixed has one block and one slot.
+    # A fixed H has one block and one slot.
     c, t = min(b, readings.H.shape[0] - 1), min(s, readings.H.shape[1] - 1)
     for k in range(rows):
         if readings.y[b, s, h, k, 0] != 0.0:
@@ -206,7 +206,7 @@ def send_bits(
     """Write the ``signs`` (p, L) of the innovations of filter ``h`` in slot ``s`` of block ``b`` of
     runs, and correct the filter by them; ``row`` and ``gains`` (n, L) are scratch.
     """
-    # H that is fixed has one block and one slot.
+    # A fixed H has one block and one slot.
     c, t = min(b, readings.H.shape[0] - 1), min(s, readings.H.shape[1] - 1)
     for k in range(rows):
         # Each row refers to the estimate that has used the bits of those before it.
@@ -243,7 +243,7 @@ def use_bit(
     """
     s, sender, k = index
     n = x.shape[2]
-    # H that is fixed has one block and one slot.
+    # A fixed H has one block and one slot.
     c, t = min(b, readings.H.shape[0] - 1), min(s, readings.H.shape[1] - 1)
     # ``row`` becomes h S with P = S S', and ``square`` p = h P h'.
     square = spread(lanes, 0.0)
@@ -292,8 +292,9 @@ class OneBit(Filter):
     innovations, one bit for each row of its reading, and all who hear it correct by them,
     ``xhat + sqrt(2 / pi) P h' / sqrt(h P h' + r) b`` and ``P - (2 / pi) P h' h P / (h P h' + r)``.
 
-    It is the paper's filter where everyone hears everyone. Who misses bits goes on with another
-    estimate, to which later bits do not refer. Readings enter as bits only, one's own too.
+    It is the paper's filter if all nodes receive all bits. A node that misses some continues with
+    another estimate, to which later bits do not refer. Readings enter as bits only, also the
+    node's own.
     """
 
     paper: ClassVar[str] = "one_bit"

@@ -73,7 +73,7 @@ MASS, AVERAGE = 0, 1
 MAX_STEPS = 100_000
 MAX_DOUBLINGS = 60
 MAX_SPREAD = 1e14
-"""The largest ``|G| |P|`` at which double precision still tells a steady covariance."""
+"""The largest ``|G| |P|`` at which double precision can still detect a steady covariance."""
 
 
 class NetworkInformation(NamedTuple):
@@ -215,7 +215,8 @@ def write_conserved_sums(
         for k in range(2):
             value = load(scratch.lanes, arrays.mass, b, h, k)
             if arrays.running:
-                # Offered to each of the neighbours, less what was heard of theirs.
+                # Mass under way to node h: offered by each neighbour, minus the part that was
+                # heard.
                 for m in range(links.first[h], links.first[h + 1]):
                     offered = load(scratch.lanes, arrays.offered, b, links.sender[m], k)
                     value += offered - load(scratch.lanes, arrays.heard, b, m, k)

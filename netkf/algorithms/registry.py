@@ -1,8 +1,8 @@
 """The built-in filters: each registers in its own file, and everything else finds it here.
 
 A filter's file says what the rest of the package must know of it: its name in scenario files, the
-paper whose theory and checks speak about it (packages ``netkf.theory.<paper>`` and
-``netkf.checks.<paper>``), and how it combines what it hears (``Filter.combination``).
+paper whose theory and checks apply to it (packages ``netkf.theory.<paper>`` and
+``netkf.checks.<paper>``), and how it combines messages (``Filter.combination``).
 """
 
 from __future__ import annotations
@@ -26,7 +26,9 @@ WEIGHING = ("share", "max_measurement_interval", "steps", "exchange_steps", "red
 """Methods besides STEPS that theorems rely on; other weights of links are known to the theory."""
 
 LINK_WEIGHTS = ("weight", "pair_weights")
-"""What a class may define anew and stay what it is: theory asks the class for its weights."""
+"""Methods that a derived class may override without losing the theory, which asks it for its
+weights.
+"""
 
 TRAITS = ("schedule", "clocks", "predicts", "first_slot", "pairwise", "talks", "pooled",
           "newest_only")  # fmt: skip

@@ -14,7 +14,7 @@ is the central filter.
 
 Totals refer to an instant: as time passes they are predicted with the plant, without its noise,
 ``U -> s Phi^-T U Phi^-1`` and ``u -> s Phi^-T u`` with Phi = e^{A gap}. All totals are predicted
-alike, so differences stay what they are. s = e^{-2 r gap} lets old information fade where it
+in the same way, so their differences are too. s = e^{-2 r gap} lets old information fade where it
 would grow without bound, with r the fastest rate at which the plant forgets its state (0 if it
 never does).
 """

@@ -708,8 +708,8 @@ class WrappedState(NamedTuple):
 class TriggeredMessages(Filter):
     """A filter whose nodes send nothing after readings that bring little news.
 
-    The filter takes a message that is not sent for one that is lost. Nodes use their own readings
-    in any case, and those without a reading send.
+    The filter takes a message that is not sent for one that is lost. Nodes always use their own
+    readings, and those without a reading send.
     """
 
     Y: float | FloatArray
@@ -818,9 +818,9 @@ class StochasticTrigger(Delegate):
     Y      positive definite, of as many rows as each reading; a number is that times the identity
 
     With "intermittent" errors stay Gaussian with covariance P, and a node sends with probability
-    ``1 - det(I + Pi Y)^-1/2``, ``Pi = H Pbar H' + R``, where everyone hears everyone and no message
-    is lost: who misses one takes it for silence. Own readings count when they are sent. With other
-    filters a node uses its reading in any case, and is silent until the next one.
+    ``1 - det(I + Pi Y)^-1/2``, ``Pi = H Pbar H' + R``, if all nodes receive all messages: a node
+    that misses one takes it for silence. Own readings count when they are sent. With other filters
+    a node always uses its reading, and is silent until the next one.
     """
 
     clocks: ClassVar[tuple[str, ...]] = ()

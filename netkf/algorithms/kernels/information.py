@@ -65,7 +65,7 @@ def add_reading_pair(
     """
     b, s, h = index
     n, factor = len(total), share**0.5
-    # H that is fixed has one block and one slot.
+    # A fixed H has one block and one slot.
     d, t = min(b, H.shape[0] - 1), min(s, H.shape[1] - 1)
     for k in range(rows):
         # Merge a row [H, y - H c], as the last row of a lower triangular root.

@@ -165,7 +165,7 @@ def add_gain(
     (n, L) are scratch.
     """
     n = x.shape[2]
-    # H that is fixed has one block and one slot.
+    # A fixed H has one block and one slot.
     d, t = min(b, H.shape[0] - 1), min(s, H.shape[1] - 1)
     # H' (y - H x); the noise is white with variance 1, so no R^-1 appears.
     for i in range(n):

@@ -59,7 +59,7 @@ def fill_pseudo_innovation(
     ``state`` (n, L) scratch for ``G^+ yhat``.
     """
     n = len(inverse)
-    # H that is fixed has one block and one slot.
+    # A fixed H has one block and one slot.
     c, t = min(b, readings.H.shape[0] - 1), min(s, readings.H.shape[1] - 1)
     # state = G^+ yhat.
     for i in range(n):

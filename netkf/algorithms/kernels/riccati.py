@@ -198,7 +198,7 @@ def substep(
 def propagate_riccati(
     table: RiccatiTable, P: FloatArray, x: FloatArray, gap: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Return P (n, n) moved by the flow over ``gap`` seconds and x (n,) by ``exp(A gap)``."""
+    """Return P (n, n) after the Riccati flow over ``gap`` seconds, and ``exp(A gap) x`` (n,)."""
     P, x = P.copy(), x.copy()  # C-contiguous, so that one version of this code is compiled
     # One step for each binary digit 1 of the number of whole units, with its tabulated triple.
     units, level = int(gap / table.unit), 0

@@ -323,7 +323,7 @@ def update_by_reading(
     lanes, size, n = scratch.lanes, scratch.size, len(scratch.size)
     row = local_lanes_vector(size, lanes, scratch.row)
     gains = local_lanes_vector(size, lanes, scratch.gains)
-    # H that is fixed has one block and one slot.
+    # A fixed H has one block and one slot.
     c, t = min(b, readings.H.shape[0] - 1), min(s, readings.H.shape[1] - 1)
     for k in range(nodes.rows[sender]):
         # Scalar update with unit noise: h S and the innovation y - h x with all earlier rows used.
@@ -465,7 +465,7 @@ def write_root_column(
     """Write column ``i`` of the triangular root of ``[moved, noise]`` into ``root[b, h]``: apply
     the Householder reflection that zeroes row ``i`` right of its diagonal to the rows below.
     """
-    # The columns of root_Q right of i are still zero here.
+    # The squared length of row i; the columns of ``noise`` right of i are still zero here.
     n, pivot, square = len(size), load(lanes, moved, i, i), spread(lanes, 0.0)
     for j in range(i + 1, n):
         entry = load(lanes, moved, i, j)

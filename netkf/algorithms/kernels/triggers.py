@@ -43,7 +43,7 @@ def weigh_news(
     x (B, H, n, L) are the estimates, Y (H, p, p) is for whitened rows, ``z`` (p, L) is scratch.
     """
     b, s, h = index
-    # H that is fixed has one block and one slot.
+    # A fixed H has one block and one slot.
     d, t = min(b, readings.H.shape[0] - 1), min(s, readings.H.shape[1] - 1)
     news = magnitudes = spread(lanes, 0.0)
     for k in range(rows):

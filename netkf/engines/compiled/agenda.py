@@ -175,14 +175,15 @@ def simulate_group(
         reset_filters(state, batch, k * len(state.nodes))
         begin(state, batch, first + k)
         suspend(state, batch, progress, k)
-    until, going = pause, True
-    while going:
-        going = False
+    # Each run in turn up to the same time; then the visits of all runs together.
+    until, running = pause, True
+    while running:
+        running = False
         for k in range(len(progress)):
             resume(state, batch, progress, k)
-            going = run_agenda(state, visits, until) != DONE or going
+            running = run_agenda(state, visits, until) != DONE or running
             suspend(state, batch, progress, k)
-        # Visits of all runs are processed together: more of them are on one level.
+        # Together, so that more visits are in one level and fill the lanes.
         process_visits(state, visits)
         until += pause
     for k in range(len(progress)):

@@ -95,7 +95,7 @@ class Paths:
         self._senses, self._horizon = bool(scenario.increment_sensors), scenario.horizon
         steps, laws = self._paths.frame_steps, self._paths.laws
         self.frame_times = np.empty(0)
-        # Frames begin every so many steps of the grid; their times are grid times, bit for bit.
+        # A frame begins every ``steps`` steps of the grid, at grid times, bit for bit.
         if steps is not None:
             count = int(scenario.horizon / (steps * laws.period)) + 2
             times = np.array([grid_time(laws.period, steps * k) for k in range(1, count)])
@@ -233,7 +233,7 @@ def fill_noise(
         # Streams are numbered run by run, so the sensor is the remainder.
         p = rows[k % len(rows)]
         high, low = states[k, 0], states[k, 1]
-        # Rows beyond p draw nothing: a stream gives what it gives without padding.
+        # Rows beyond p are padding and draw nothing, so that streams do not depend on it.
         for c in range(out.shape[1]):
             for half in range(2):
                 for i in range(p):

@@ -1,6 +1,6 @@
 """Belief propagation in the event loop: the kernels of algorithms/belief_propagation.
 
-Each node holds the evidence of its own readings and that which each neighbour sent last.
+Each node holds the evidence of its own readings and the evidence that each neighbour sent last.
 """
 
 from __future__ import annotations

@@ -365,7 +365,7 @@ class FlowRun:
             state.ticks_stop = len(window.t)
         elif request == WANT_STEPS:
             state.path = self._draws.path()
-            # Positions count from the first piece and grid point of the new block.
+            # Positions are relative to the new block.
             state.piece = state.grid_at = 0
         elif request == WANT_MESSAGES:
             self._enlarge_pool()

@@ -165,7 +165,7 @@ class Sorting(NamedTuple):
 
 
 def _sorting(ticks: int) -> Sorting:
-    """Return scratch to sort so many ticks."""
+    """Return scratch to sort ``ticks`` ticks."""
     return Sorting(np.empty(ticks + 1, dtype=np.int32), np.empty(ticks, dtype=np.int32))
 
 
@@ -362,12 +362,12 @@ class PoissonSchedules:
                 state[:] = copy
 
     def _space(self, ticks: int) -> TickBuffer:
-        """Return space for so many ticks and the messages that they send."""
+        """Return space for ``ticks`` ticks and their messages."""
         sends = 0.0 if self._clocks.bits else self._sends
         return _empty_buffer(ticks, int(sends * ticks) + self._max_sends)
 
     def _space_for_all(self, ticks: int) -> AllTicks:
-        """Return space for so many ticks of all runs together."""
+        """Return space for ``ticks`` ticks of all runs together, and their messages."""
         t, entity, first_outcome, delay = self._space(ticks)
         first, first_delay = (np.zeros(self._runs + 1, dtype=np.int64) for _ in range(2))
         return AllTicks(t, entity, first_outcome, delay, first, first_delay, self._clocks.bits)
@@ -401,7 +401,7 @@ class PoissonSchedules:
 
 
 def _empty_buffer(ticks: int, sends: int) -> TickBuffer:
-    """Return space for so many ticks and outcomes."""
+    """Return space for ``ticks`` ticks and ``sends`` outcomes."""
     entity, first_outcome = (np.empty(ticks, dtype=np.int64) for _ in range(2))
     return TickBuffer(np.empty(ticks), entity, first_outcome, np.empty(sends))
 

@@ -230,7 +230,7 @@ class Outcomes:
         out = np.empty(int((counts * sizes).sum()))
         begin = np.cumsum(counts * sizes) - counts * sizes
         draws: tuple[np.ndarray, ...] = ()
-        # Vectorised over entities: the k-th directed link of all entities that have so many.
+        # Vectorised over entities: the k-th directed link of all entities with more than k.
         for k in range(int(sizes.max(initial=0))):
             has_link = sizes > k
             directions = self._outgoing[self._first[entity[has_link]] + k]

@@ -185,7 +185,7 @@ class SlotEvents:
                 continue
             for exchange_step in islice(steps, 1):
                 now = exchange_step.end
-                # The number of the exchange tells messages in time from late ones.
+                # A message is in time if its exchange is still open.
                 self._exchanges += 1
                 self._open = self._exchanges
                 self._send_all(exchange_step)

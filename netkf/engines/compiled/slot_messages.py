@@ -57,7 +57,7 @@ class Matchings(NamedTuple):
 
 
 class Channels(NamedTuple):
-    """Loss model of all links, its random streams, and what they drew last.
+    """Loss model of all links, its random streams, and the last numbers drawn from them.
 
     K = links x ``streams_per_link``: a symmetric channel has one stream for both directions.
 
@@ -87,68 +87,73 @@ class Channels(NamedTuple):
 
 
 @kernel
-def draw_matching(m: Matchings, ends: np.ndarray, r: int, active: np.ndarray) -> int:
+def draw_matching(matchings: Matchings, ends: np.ndarray, r: int, active: np.ndarray) -> int:
     """Write the links of one matching of run ``r`` into ``active`` in their order; return how many.
 
     The numbers are those that ``Matching.draw`` takes from the same stream.
     """
-    count = len(ends)
+    count, states = len(ends), matchings.states
+    first, members = matchings.first, matchings.members
     if count == 0:
         return 0
     # The order of the draws is that of Matching.draw: it decides which numbers a protocol takes.
-    if m.protocol == ONE_EDGE:
-        lazy = next_unit(m.states, r) < m.probability
-        active[0] = next_integer(m.states, r, count)
+    if matchings.protocol == ONE_EDGE:
+        lazy = next_unit(states, r) < matchings.probability
+        active[0] = next_integer(states, r, count)
         return 0 if lazy else 1
-    if m.protocol == NODE_WAKEUP:
-        node = next_integer(m.states, r, len(m.busy))
-        uniform = next_unit(m.states, r)
-        peers = m.first[node + 1] - m.first[node]
+    if matchings.protocol == NODE_WAKEUP:
+        node = next_integer(states, r, len(matchings.busy))
+        uniform = next_unit(states, r)
+        peers = first[node + 1] - first[node]
         # An isolated node takes both numbers too: what follows in the stream does not depend on it.
         if peers == 0:
             return 0
-        active[0] = m.members[m.first[node] + int(uniform * peers)]
+        active[0] = members[first[node] + int(uniform * peers)]
         return 1
-    if m.protocol == UNIFORM_MAXIMAL:
-        matching = next_integer(m.states, r, len(m.first) - 1)
-        for k in range(m.first[matching], m.first[matching + 1]):
-            active[k - m.first[matching]] = m.members[k]
-        return int(m.first[matching + 1] - m.first[matching])
-    return _free_links(m, ends, r, active)
+    if matchings.protocol == UNIFORM_MAXIMAL:
+        matching = next_integer(states, r, len(first) - 1)
+        for k in range(first[matching], first[matching + 1]):
+            active[k - first[matching]] = members[k]
+        return int(first[matching + 1] - first[matching])
+    return _free_links(matchings, ends, r, active)
 
 
 @kernel
-def _free_links(m: Matchings, ends: np.ndarray, r: int, active: np.ndarray) -> int:
+def _free_links(matchings: Matchings, ends: np.ndarray, r: int, active: np.ndarray) -> int:
     """Write the links of a matching of run ``r`` to the front of ``active``; return their number.
 
     MAXIMAL visits the links in random order and takes each one whose ends are both free.
     INDEPENDENT wakes each link with a probability and takes those that share no node with another
     link that is awake.
     """
-    count, pairs = len(ends), 0
-    for h in range(len(m.busy)):
-        m.busy[h] = 0
-    if m.protocol == MAXIMAL:
+    count, pairs, states = len(ends), 0, matchings.states
+    order, busy = matchings.order, matchings.busy
+    for h in range(len(busy)):
+        busy[h] = 0
+    if matchings.protocol == MAXIMAL:
         # A random order of links, taken greedily: a maximal matching.
-        shuffle(m.states, r, m.order, count)
+        shuffle(states, r, order, count)
         for k in range(count):
-            i, j = ends[m.order[k], 0], ends[m.order[k], 1]
+            i, j = ends[order[k], 0], ends[order[k], 1]
             # Without a branch: its outcome is random, so the processor would mispredict it. If the
             # link is not free, the entry behind the last pair is written again with its own value.
-            free = (m.busy[i] | m.busy[j]) ^ 1
+            free = (busy[i] | busy[j]) ^ 1
             index = min(pairs, len(active) - 1)
-            active[index] += free * (m.order[k] - active[index])
-            m.busy[i], m.busy[j] = m.busy[i] | free, m.busy[j] | free
+            active[index] += free * (order[k] - active[index])
+            busy[i], busy[j] = (
+                busy[i] | free,
+                busy[j] | free,
+            )
             pairs += free
         return pairs
     # INDEPENDENT: ``order`` is 1 for links that are awake, ``busy`` counts those at each node.
     for k in range(count):
-        m.order[k] = 1 if next_unit(m.states, r) < m.probability else 0
-        m.busy[ends[k, 0]] += m.order[k]
-        m.busy[ends[k, 1]] += m.order[k]
+        order[k] = 1 if next_unit(states, r) < matchings.probability else 0
+        busy[ends[k, 0]] += order[k]
+        busy[ends[k, 1]] += order[k]
     # A link that meets no other is the only one at both of its ends.
     for k in range(count):
-        if m.order[k] == 1 and m.busy[ends[k, 0]] == 1 and m.busy[ends[k, 1]] == 1:
+        if order[k] == 1 and busy[ends[k, 0]] == 1 and busy[ends[k, 1]] == 1:
             active[pairs] = k
             pairs += 1
     return pairs
@@ -156,60 +161,72 @@ def _free_links(m: Matchings, ends: np.ndarray, r: int, active: np.ndarray) -> i
 
 @kernel
 def draw_link(
-    lanes: Lanes, c: Channels, b: int, link: int, fresh: bool, up: np.ndarray, s: int, e: int
+    lanes: Lanes, channels: Channels, b: int, link: int, fresh: bool, up: np.ndarray, s: int, e: int
 ) -> None:
     """Draw which messages of one activation of a link arrive, in step ``e`` of slot ``s``, in all
     runs of block ``b``; write them into ``up``. Links that are not ``fresh`` keep their last draws.
     """
-    for d in range(c.directions_per_link):
+    uniforms = channels.loss_uniform
+    for d in range(channels.directions_per_link):
         # With one stream per link (symmetric) both directions use it.
-        k = link * c.streams_per_link + min(d, c.streams_per_link - 1)
+        k = link * channels.streams_per_link + min(d, channels.streams_per_link - 1)
         # A held link keeps its uniform number; -1 marks a link that has none yet.
         if (
-            d < c.streams_per_link
-            and len(c.loss_streams) > 0
-            and (fresh or c.loss_uniform[b, k, 0] < 0.0)
+            d < channels.streams_per_link
+            and len(channels.loss_streams) > 0
+            and (fresh or uniforms[b, k, 0] < 0.0)
         ):
-            next_units(lanes, c.loss_streams, b, k, c.loss_uniform)
+            next_units(lanes, channels.loss_streams, b, k, uniforms)
             # The channel state (Gilbert-Elliott) takes one step for each activation.
-            if len(c.state_streams) > 0:
-                next_units(lanes, c.state_streams, b, k, c.state_uniform)
+            if len(channels.state_streams) > 0:
+                next_units(lanes, channels.state_streams, b, k, channels.state_uniform)
                 for q in range(len(lanes)):
-                    c.bad[b, k, q] = next_state(
-                        c.bad[b, k, q], c.state_uniform[b, k, q], c.to_bad, c.to_good
+                    channels.bad[b, k, q] = next_state(
+                        channels.bad[b, k, q],
+                        channels.state_uniform[b, k, q],
+                        channels.to_bad,
+                        channels.to_good,
                     )
-        w = link * c.directions_per_link + d
-        if c.talks[e, w] == 1:
-            uniform = load(lanes, c.loss_uniform, b, k)
-            if len(c.state_streams) == 0:
-                store_flags(lanes, up, b, s, e, w, uniform < c.delivery[0, w])
+        w = link * channels.directions_per_link + d
+        if channels.talks[e, w] == 1:
+            uniform = load(lanes, uniforms, b, k)
+            if len(channels.state_streams) == 0:
+                store_flags(lanes, up, b, s, e, w, uniform < channels.delivery[0, w])
                 continue
             for q in range(len(lanes)):
-                probability = c.delivery[1, w] if c.bad[b, k, q] == 1 else c.delivery[0, w]
-                up[b, s, e, w, q] = c.loss_uniform[b, k, q] < probability
+                probability = (
+                    channels.delivery[1, w]
+                    if channels.bad[b, k, q] == 1
+                    else channels.delivery[0, w]
+                )
+                up[b, s, e, w, q] = uniforms[b, k, q] < probability
 
 
 @kernel
 def draw_link_of_lane(
-    c: Channels, b: int, link: int, fresh: bool, up: np.ndarray, s: int, e: int, q: int
+    channels: Channels, b: int, link: int, fresh: bool, up: np.ndarray, s: int, e: int, q: int
 ) -> None:
     """Draw one link for the run of lane ``q`` alone, as ``draw_link`` does for all lanes."""
-    for d in range(c.directions_per_link):
-        k = link * c.streams_per_link + min(d, c.streams_per_link - 1)
+    for d in range(channels.directions_per_link):
+        k = link * channels.streams_per_link + min(d, channels.streams_per_link - 1)
         if (
-            d < c.streams_per_link
-            and len(c.loss_streams) > 0
-            and (fresh or c.loss_uniform[b, k, q] < 0.0)
+            d < channels.streams_per_link
+            and len(channels.loss_streams) > 0
+            and (fresh or channels.loss_uniform[b, k, q] < 0.0)
         ):
-            c.loss_uniform[b, k, q] = next_unit_of_lane(c.loss_streams, b, k, q)
-            if len(c.state_streams) > 0:
-                u = next_unit_of_lane(c.state_streams, b, k, q)
-                c.bad[b, k, q] = next_state(c.bad[b, k, q], u, c.to_bad, c.to_good)
-        w = link * c.directions_per_link + d
-        if c.talks[e, w] == 1:
+            channels.loss_uniform[b, k, q] = next_unit_of_lane(channels.loss_streams, b, k, q)
+            if len(channels.state_streams) > 0:
+                u = next_unit_of_lane(channels.state_streams, b, k, q)
+                channels.bad[b, k, q] = next_state(
+                    channels.bad[b, k, q], u, channels.to_bad, channels.to_good
+                )
+        w = link * channels.directions_per_link + d
+        if channels.talks[e, w] == 1:
             # A channel without states keeps bad = -1.
-            probability = c.delivery[1, w] if c.bad[b, k, q] == 1 else c.delivery[0, w]
-            up[b, s, e, w, q] = c.loss_uniform[b, k, q] < probability
+            probability = (
+                channels.delivery[1, w] if channels.bad[b, k, q] == 1 else channels.delivery[0, w]
+            )
+            up[b, s, e, w, q] = channels.loss_uniform[b, k, q] < probability
 
 
 @kernel
@@ -226,7 +243,7 @@ def next_state(bad: int, u: float, to_bad: float, to_good: float) -> int:
 
 @kernel
 def draw_broadcasts(
-    lanes: Lanes, c: Channels, exchanged: np.ndarray, fresh: np.ndarray, up: np.ndarray
+    lanes: Lanes, channels: Channels, exchanged: np.ndarray, fresh: np.ndarray, up: np.ndarray
 ) -> None:
     """Draw the messages of broadcasts, which use every link in every step, into ``up`` (B, S, E, W,
     L), which holds zeros before. Slots that are not ``exchanged`` (S,) stay 0; links draw anew in
@@ -235,15 +252,15 @@ def draw_broadcasts(
     for b in range(up.shape[0]):
         for s in range(up.shape[1]):
             for e in range(up.shape[2] if exchanged[s] else 0):
-                for link in range(len(c.ends)):
-                    draw_link(lanes, c, b, link, fresh[e], up, s, e)
+                for link in range(len(channels.ends)):
+                    draw_link(lanes, channels, b, link, fresh[e], up, s, e)
 
 
 @kernel
 def draw_matched(
     lanes: Lanes,
-    c: Channels,
-    m: Matchings,
+    channels: Channels,
+    matchings: Matchings,
     exchanged: np.ndarray,
     fresh: np.ndarray,
     up: np.ndarray,
@@ -257,14 +274,14 @@ def draw_matched(
     for b in range(up.shape[0]):
         for s in range(up.shape[1]):
             for e in range(up.shape[2] if exchanged[s] else 0):
-                draw_pairs(lanes, c, m, fresh[e], up, active, pair_count, b, s, e)
+                draw_pairs(lanes, channels, matchings, fresh[e], up, active, pair_count, b, s, e)
 
 
 @kernel
 def draw_pairs(
     lanes: Lanes,
-    c: Channels,
-    m: Matchings,
+    channels: Channels,
+    matchings: Matchings,
     fresh: bool,
     up: np.ndarray,
     active: np.ndarray,
@@ -277,29 +294,31 @@ def draw_pairs(
     first = b * len(lanes)
     for q in range(min(len(lanes), len(pair_count) - first)):
         r = first + q
-        pairs = draw_matching(m, c.ends, r, active[r, s, e])
+        pairs = draw_matching(matchings, channels.ends, r, active[r, s, e])
         pair_count[r, s, e] = pairs
         for k in range(pairs):
-            draw_link_of_lane(c, b, active[r, s, e, k], fresh, up, s, e, q)
+            draw_link_of_lane(channels, b, active[r, s, e, k], fresh, up, s, e, q)
 
 
 @kernel
-def mark_all_senders(lanes: Lanes, c: Channels, exchanged: np.ndarray, sent: np.ndarray) -> None:
+def mark_all_senders(
+    lanes: Lanes, channels: Channels, exchanged: np.ndarray, sent: np.ndarray
+) -> None:
     """Write 1 into ``sent`` (B, S, E, N, L) for all nodes with links, in the slots that are
     ``exchanged`` (S,): broadcasts ask each of them for a message.
     """
     for b in range(sent.shape[0]):
         for s in range(sent.shape[1]):
             for e in range(sent.shape[2] if exchanged[s] else 0):
-                for link in range(len(c.ends)):
+                for link in range(len(channels.ends)):
                     for end in range(2):
                         for q in range(len(lanes)):
-                            sent[b, s, e, c.ends[link, end], q] = 1
+                            sent[b, s, e, channels.ends[link, end], q] = 1
 
 
 @kernel
 def mark_paired_senders(
-    lanes: Lanes, c: Channels, active: np.ndarray, pair_count: np.ndarray, sent: np.ndarray
+    lanes: Lanes, channels: Channels, active: np.ndarray, pair_count: np.ndarray, sent: np.ndarray
 ) -> None:
     """Write 1 into ``sent`` (B, S, E, N, L) for both ends of all paired links: matchings ask each
     of them for a message. ``active``, ``pair_count``: see SlotMessages.
@@ -309,7 +328,7 @@ def mark_paired_senders(
             for e in range(pair_count.shape[2]):
                 for a in range(pair_count[r, s, e]):
                     for end in range(2):
-                        node = c.ends[active[r, s, e, a], end]
+                        node = channels.ends[active[r, s, e, a], end]
                         sent[r // len(lanes), s, e, node, r % len(lanes)] = 1
 
 
@@ -444,9 +463,9 @@ def write_row(
 def make_rows(
     stages: Stages,
     times: SlotTimes,
-    c: Channels,
-    h: TracedNodes,
-    d: SlotMessages,
+    channels: Channels,
+    traced: TracedNodes,
+    messages: SlotMessages,
     pairwise: bool,
     first: int,
     stop: int,
@@ -462,7 +481,7 @@ def make_rows(
             mark_sample(times, s, rows, row)
         # At the horizon nothing is recorded but the sample.
         if times.recorded[s]:
-            row = _slot_rows(stages, times, c, h, d, pairwise, rows, s, row)
+            row = _slot_rows(stages, times, channels, traced, messages, pairwise, rows, s, row)
         if not times.predicts:
             mark_sample(times, s, rows, row)
     return row
@@ -480,9 +499,9 @@ def mark_sample(times: SlotTimes, s: int, rows: Rows, row: int) -> None:
 def _slot_rows(
     stages: Stages,
     times: SlotTimes,
-    c: Channels,
-    h: TracedNodes,
-    d: SlotMessages,
+    channels: Channels,
+    traced: TracedNodes,
+    messages: SlotMessages,
     pairwise: bool,
     rows: Rows,
     s: int,
@@ -494,22 +513,22 @@ def _slot_rows(
         stage = SlotStage(times.first + s, s, stages.step[k], stages.phase[k], now)
         if stage.step < 0:
             if times.sensed[s]:
-                for node in h.sensing:
+                for node in traced.sensing:
                     row = write_row(rows, stage, SENSE, node, -1, -1, NAN, row)
         elif times.exchanged[s]:
-            row = _write_sends(c, h, d, rows, stage, pairwise, row)
+            row = _write_sends(channels, traced, messages, rows, stage, pairwise, row)
             # Absorptions happen at the end of the step, when its inboxes close.
             now = times.start[s] + stages.end[k]
             closing = SlotStage(stage.slot, s, stage.step, stage.phase, now)
-            row = _write_step_end(h, d, rows, closing, pairwise, stages.stopping, row)
+            row = _write_step_end(traced, messages, rows, closing, pairwise, stages.stopping, row)
     return row
 
 
 @kernel
 def _write_sends(
-    c: Channels,
-    h: TracedNodes,
-    d: SlotMessages,
+    channels: Channels,
+    traced: TracedNodes,
+    messages: SlotMessages,
     rows: Rows,
     stage: SlotStage,
     pairwise: bool,
@@ -520,32 +539,42 @@ def _write_sends(
     """
     if not pairwise:
         row = write_row(rows, stage, ROUND, -1, -1, -1, NAN, row)
-    links = d.pair_count[0, stage.s, stage.step] if pairwise else len(c.ends)
+    links = messages.pair_count[0, stage.s, stage.step] if pairwise else len(channels.ends)
     for a in range(links):
-        link = d.active[0, stage.s, stage.step, a] if pairwise else a
+        link = messages.active[0, stage.s, stage.step, a] if pairwise else a
         if pairwise:
-            i, j = h.nodes[c.ends[link, 0]], h.nodes[c.ends[link, 1]]
+            i, j = traced.nodes[channels.ends[link, 0]], traced.nodes[channels.ends[link, 1]]
             row = write_row(rows, stage, TICK, i, j, -1, NAN, row)
-        row = _link_rows(c, h, d, rows, stage, link, row)
+        row = _link_rows(channels, traced, messages, rows, stage, link, row)
     return row
 
 
 @kernel
 def _link_rows(
-    c: Channels, h: TracedNodes, d: SlotMessages, rows: Rows, stage: SlotStage, link: int, row: int
+    channels: Channels,
+    traced: TracedNodes,
+    messages: SlotMessages,
+    rows: Rows,
+    stage: SlotStage,
+    link: int,
+    row: int,
 ) -> int:
     """Write the messages sent on a link, each followed by its arrival or loss; return the index of
     the next row.
     """
-    for end in range(c.directions_per_link):
-        w, i = link * c.directions_per_link + end, c.ends[link, end]
-        if c.talks[stage.step, w] == 0 or is_silent(d, 0, stage, i, 0):
+    for end in range(channels.directions_per_link):
+        w, i = link * channels.directions_per_link + end, channels.ends[link, end]
+        if channels.talks[stage.step, w] == 0 or is_silent(messages, 0, stage, i, 0):
             continue
         # Messages of a direction are numbered from 0, lost ones included.
-        number, sender, receiver = h.sent[w], h.nodes[i], h.nodes[c.ends[link, 1 - end]]
-        h.sent[w] = number + 1
+        number, sender, receiver = (
+            traced.sent[w],
+            traced.nodes[i],
+            traced.nodes[channels.ends[link, 1 - end]],
+        )
+        traced.sent[w] = number + 1
         row = write_row(rows, stage, SEND, sender, receiver, number, NAN, row)
-        if d.up[0, stage.s, stage.step, w, 0] == 1:
+        if messages.up[0, stage.s, stage.step, w, 0] == 1:
             row = write_row(rows, stage, DELIVER, receiver, sender, number, 0.0, row)
         else:
             row = write_row(rows, stage, LOST, sender, receiver, number, NAN, row)
@@ -553,15 +582,15 @@ def _link_rows(
 
 
 @kernel
-def is_silent(d: SlotMessages, b: int, stage: SlotStage, node: int, q: int) -> bool:
+def is_silent(messages: SlotMessages, b: int, stage: SlotStage, node: int, q: int) -> bool:
     """Return True if ``node`` (an index) sends nothing in a step, in lane ``q`` of block ``b``."""
-    return len(d.sent) > 0 and d.sent[b, stage.s, stage.step, node, q] == 0
+    return len(messages.sent) > 0 and messages.sent[b, stage.s, stage.step, node, q] == 0
 
 
 @kernel
 def _write_step_end(
-    h: TracedNodes,
-    d: SlotMessages,
+    traced: TracedNodes,
+    messages: SlotMessages,
     rows: Rows,
     stage: SlotStage,
     pairwise: bool,
@@ -571,20 +600,23 @@ def _write_step_end(
     """Write which nodes absorb or swap when a step ends, and which stop; return the index of the
     next row.
     """
-    for i in range(len(h.nodes)):
+    for i in range(len(traced.nodes)):
         has_received = False
-        for k in range(h.first[i], h.first[i + 1]):
-            if d.up[0, stage.s, stage.step, h.direction[k], 0] == 1:
+        for k in range(traced.first[i], traced.first[i + 1]):
+            if messages.up[0, stage.s, stage.step, traced.direction[k], 0] == 1:
                 has_received = True
                 if pairwise:
                     # The message of this step is the last one that was numbered.
-                    peer, number = h.nodes[h.sender[k]], h.sent[h.direction[k]] - 1
-                    row = write_row(rows, stage, SWAP, h.nodes[i], peer, number, 0.0, row)
+                    peer, number = (
+                        traced.nodes[traced.sender[k]],
+                        traced.sent[traced.direction[k]] - 1,
+                    )
+                    row = write_row(rows, stage, SWAP, traced.nodes[i], peer, number, 0.0, row)
         if has_received and not pairwise:
-            row = write_row(rows, stage, ABSORB, h.nodes[i], -1, -1, 0.0, row)
+            row = write_row(rows, stage, ABSORB, traced.nodes[i], -1, -1, 0.0, row)
         # A node that stops in this slot does so after it absorbed.
-        if stage.step == stopping and h.stopped[0, i, 0] == stage.slot:
-            row = write_row(rows, stage, STOP, h.nodes[i], -1, -1, NAN, row)
+        if stage.step == stopping and traced.stopped[0, i, 0] == stage.slot:
+            row = write_row(rows, stage, STOP, traced.nodes[i], -1, -1, NAN, row)
     return row
 
 
@@ -593,9 +625,9 @@ def count_events(
     lanes: Lanes,
     stages: Stages,
     times: SlotTimes,
-    c: Channels,
-    h: TracedNodes,
-    d: SlotMessages,
+    channels: Channels,
+    traced: TracedNodes,
+    messages: SlotMessages,
     pairwise: bool,
     scratch: FloatArray,
     counts: np.ndarray,
@@ -603,17 +635,28 @@ def count_events(
     """Add to ``counts`` (R, KINDS) the number of events of each kind that ``make_rows`` would
     write; ``scratch`` (KINDS, L).
     """
-    for b in range(d.up.shape[0]):
+    for b in range(messages.up.shape[0]):
         for kind in range(len(scratch)):
             store(lanes, scratch, kind, 0.0)
         for s in range(len(times.start)):
             for k in range(len(stages.step) if times.recorded[s] else 0):
                 e = stages.step[k]
                 if e < 0 and times.sensed[s]:
-                    add_count(lanes, scratch, SENSE, 1.0 * len(h.sensing))
+                    add_count(lanes, scratch, SENSE, 1.0 * len(traced.sensing))
                 elif e >= 0 and times.exchanged[s]:
                     stage = SlotStage(times.first + s, s, e, stages.phase[k], 0.0)
-                    count_step(lanes, c, h, d, stage, pairwise, stages.stopping, scratch, counts, b)
+                    count_step(
+                        lanes,
+                        channels,
+                        traced,
+                        messages,
+                        stage,
+                        pairwise,
+                        stages.stopping,
+                        scratch,
+                        counts,
+                        b,
+                    )
         first = b * len(lanes)
         for q in range(min(len(lanes), len(counts) - first)):
             for kind in range(len(scratch)):
@@ -629,9 +672,9 @@ def add_count(lanes: Lanes, scratch: FloatArray, kind: int, number: Any) -> None
 @kernel
 def count_step(
     lanes: Lanes,
-    c: Channels,
-    h: TracedNodes,
-    d: SlotMessages,
+    channels: Channels,
+    traced: TracedNodes,
+    messages: SlotMessages,
     stage: SlotStage,
     pairwise: bool,
     stopping: int,
@@ -644,22 +687,22 @@ def count_step(
     """
     stops = stage.step == stopping
     if pairwise:
-        count_matched_pairs(lanes, c, d, stage, scratch, counts, b)
+        count_matched_pairs(lanes, channels, messages, stage, scratch, counts, b)
     else:
         add_count(lanes, scratch, ROUND, 1.0)
         sent = 0
-        for w in range(d.up.shape[3]):
-            sent += c.talks[stage.step, w]
+        for w in range(messages.up.shape[3]):
+            sent += channels.talks[stage.step, w]
         add_count(lanes, scratch, SEND, 1.0 * sent)
         add_count(lanes, scratch, LOST, 1.0 * sent)
-        if len(d.sent) > 0:
-            count_silent(lanes, c, d, stage, scratch, b)
+        if len(messages.sent) > 0:
+            count_silent(lanes, channels, messages, stage, scratch, b)
     # LOST was counted as if all were lost: each delivery takes one off.
     absorbed = delivered = spread(lanes, 0.0)
-    for i in range(len(h.nodes)):
+    for i in range(len(traced.nodes)):
         received = spread(lanes, 0.0)
-        for k in range(h.first[i], h.first[i + 1]):
-            up = load_flags(lanes, d.up, b, stage.s, stage.step, h.direction[k])
+        for k in range(traced.first[i], traced.first[i + 1]):
+            up = load_flags(lanes, messages.up, b, stage.s, stage.step, traced.direction[k])
             received += select(up, 1.0, 0.0)
         delivered += received
         absorbed += select(received > 0.0, 1.0, 0.0)
@@ -667,14 +710,14 @@ def count_step(
     add_count(lanes, scratch, LOST, -delivered)
     add_count(lanes, scratch, SWAP if pairwise else ABSORB, delivered if pairwise else absorbed)
     if stops:
-        count_stops(lanes, h, stage, counts, b)
+        count_stops(lanes, traced, stage, counts, b)
 
 
 @kernel
 def count_matched_pairs(
     lanes: Lanes,
-    c: Channels,
-    d: SlotMessages,
+    channels: Channels,
+    messages: SlotMessages,
     stage: SlotStage,
     scratch: FloatArray,
     counts: np.ndarray,
@@ -685,12 +728,14 @@ def count_matched_pairs(
     """
     first = b * len(lanes)
     for r in range(first, min(first + len(lanes), len(counts))):
-        pairs, sent = d.pair_count[r, stage.s, stage.step], 0
+        pairs, sent = messages.pair_count[r, stage.s, stage.step], 0
         for a in range(pairs):
-            link = d.active[r, stage.s, stage.step, a]
-            for direction in range(c.directions_per_link):
-                if not is_silent(d, b, stage, c.ends[link, direction], r - first):
-                    sent += c.talks[stage.step, link * c.directions_per_link + direction]
+            link = messages.active[r, stage.s, stage.step, a]
+            for direction in range(channels.directions_per_link):
+                if not is_silent(messages, b, stage, channels.ends[link, direction], r - first):
+                    sent += channels.talks[
+                        stage.step, link * channels.directions_per_link + direction
+                    ]
         scratch[TICK, r - first] += pairs
         scratch[SEND, r - first] += sent
         scratch[LOST, r - first] += sent
@@ -698,19 +743,24 @@ def count_matched_pairs(
 
 @kernel
 def count_silent(
-    lanes: Lanes, c: Channels, d: SlotMessages, stage: SlotStage, scratch: FloatArray, b: int
+    lanes: Lanes,
+    channels: Channels,
+    messages: SlotMessages,
+    stage: SlotStage,
+    scratch: FloatArray,
+    b: int,
 ) -> None:
     """Subtract the messages of silent nodes from SEND and LOST."""
     silent = spread(lanes, 0.0)
-    for w in range(len(c.ends) * c.directions_per_link):
-        if c.talks[stage.step, w] == 1:
+    for w in range(len(channels.ends) * channels.directions_per_link):
+        if channels.talks[stage.step, w] == 1:
             sends = load_flags(
                 lanes,
-                d.sent,
+                messages.sent,
                 b,
                 stage.s,
                 stage.step,
-                c.ends[w // c.directions_per_link, w % c.directions_per_link],
+                channels.ends[w // channels.directions_per_link, w % channels.directions_per_link],
             )
             silent += select(sends, 0.0, 1.0)
     add_count(lanes, scratch, SEND, -silent)
@@ -718,9 +768,11 @@ def count_silent(
 
 
 @kernel
-def count_stops(lanes: Lanes, h: TracedNodes, stage: SlotStage, counts: np.ndarray, b: int) -> None:
+def count_stops(
+    lanes: Lanes, traced: TracedNodes, stage: SlotStage, counts: np.ndarray, b: int
+) -> None:
     """Count the nodes that stop in a slot."""
     first = b * len(lanes)
     for r in range(first, min(first + len(lanes), len(counts))):
-        for i in range(len(h.nodes)):
-            counts[r, STOP] += h.stopped[b, i, r - first] == stage.slot
+        for i in range(len(traced.nodes)):
+            counts[r, STOP] += traced.stopped[b, i, r - first] == stage.slot

@@ -75,7 +75,7 @@ class PathStates:
         with np.errstate(over="ignore", invalid="ignore"):
             # The new origin: the old one moved to now, plus the local state.
             self._origin = self._origin_at(np.array([time]))[0] + x
-        # From now on times count from this frame.
+        # The present frame begins here.
         self._frame, self._frame_start = k + 1, time
         return np.asarray(x)
 

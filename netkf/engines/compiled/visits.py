@@ -330,8 +330,8 @@ def ring_index(visits: Visits, number: int) -> int:
 def queue_interval(
     state: Simulation, visits: Visits, place: int, v: int, now: float, least: float
 ) -> None:
-    """Queue a sensing node, predicted up to ``now`` so far, for the next interval on its way to
-    visit ``v``.
+    """Queue the next measurement interval of the sensing node at ``place``, which has been
+    predicted up to ``now`` on its way to visit ``v``; ``least``: see INTERVAL.
     """
     # A node has one visit in a level at most, so the ring buffer has space for all.
     interval = visits.intervals[ring_index(visits, visits.after_intervals)]
