@@ -70,8 +70,8 @@ def built_in_filters() -> dict[str, type[Filter]]:
 
 def built_in_class(algorithm: object) -> type[Filter] | None:
     """Return the built-in class of a filter, or the one that a user's class is derived from."""
-    known = set(built_in_filters().values())
-    return next((cls for cls in type(algorithm).__mro__ if cls in known), None)
+    classes = set(built_in_filters().values())
+    return next((cls for cls in type(algorithm).__mro__ if cls in classes), None)
 
 
 def base_filter(algorithm: Filter) -> Filter:
@@ -79,10 +79,10 @@ def base_filter(algorithm: Filter) -> Filter:
 
     Raises TypeError if it derives from none.
     """
-    known = built_in_class(algorithm)
-    if known is None:
+    cls = built_in_class(algorithm)
+    if cls is None:
         raise TypeError(f"{type(algorithm).__name__} derives from no built-in filter")
-    base: Filter = as_class(algorithm, known)
+    base: Filter = as_class(algorithm, cls)
     return base
 
 
@@ -92,30 +92,30 @@ def own_attributes(algorithm: object) -> list[str]:
     Methods, class variables, weights and private helpers alike; fields and dunder names are left
     out.
     """
-    known = built_in_class(algorithm)
-    if known is None:
+    base = built_in_class(algorithm)
+    if base is None:
         return []
-    order = type(algorithm).__mro__
+    classes = type(algorithm).__mro__
     names = {
         name
-        for one in order[: order.index(known)]
-        for name in vars(one)
-        if hasattr(known, name) and not name.startswith("__")
+        for cls in classes[: classes.index(base)]
+        for name in vars(cls)
+        if hasattr(base, name) and not name.startswith("__")
     }
-    fields = {field.name for field in dataclasses.fields(known)}
+    fields = {field.name for field in dataclasses.fields(base)}
     return sorted(names - fields - {"_abc_impl", "_is_protocol"})
 
 
-def overridden(algorithm: object, known: type | None = None) -> list[str]:
+def overridden(algorithm: object, base: type | None = None) -> list[str]:
     """Return the methods and class variables that a user's class defines anew, other than weights
     of links.
 
-    Theorems about the built-in class (``known``) do not hold for it.
+    Theorems about the built-in class (``base``) do not hold for it.
     """
-    known = known or built_in_class(algorithm)
+    base = base or built_in_class(algorithm)
     cls = type(algorithm)
     return [
         name
         for name in (*STEPS, *WEIGHING, *TRAITS)
-        if hasattr(known, name) and getattr(cls, name, None) is not getattr(known, name)
+        if hasattr(base, name) and getattr(cls, name, None) is not getattr(base, name)
     ]

@@ -512,7 +512,7 @@ class BarShalomCampo(Filter):
         """Combine the own track with those heard."""
         if not messages:
             return state
-        state = with_senders(state, messages)
+        state = add_senders(state, messages)
         tracks = [0, *(state.senders.index(message.sender) for message in messages)]
         differences = np.concatenate([message.payload.xhat - state.xhat for message in messages])
         gain, root = best_combination(state.joint, tracks, state.root)
@@ -574,13 +574,15 @@ def updated_joint(joint: FloatArray, sensors: Sequence[FloatArray]) -> FloatArra
     return updated
 
 
-def with_senders(state: TrackState, messages: Sequence[Message]) -> TrackState:
-    """Return the state that knows all senders of messages, and the covariances of their tracks."""
-    new = [message for message in messages if message.sender not in state.senders]
-    if not new:
+def add_senders(state: TrackState, messages: Sequence[Message]) -> TrackState:
+    """Return the state extended by the new senders of messages: their ids, sensors, and the joint
+    covariance of all tracks.
+    """
+    new_messages = [message for message in messages if message.sender not in state.senders]
+    if not new_messages:
         return state
-    senders = (*state.senders, *(message.sender for message in new))
-    sensors = (*state.sensors, *(message.payload.H for message in new))
+    senders = (*state.senders, *(message.sender for message in new_messages))
+    sensors = (*state.sensors, *(message.payload.H for message in new_messages))
     # The joint covariance does not depend on data: recompute it from slot 0 with the new tracks.
     joint = np.tile(state.start, (len(senders), len(senders), 1, 1))
     for _ in range(state.slot):

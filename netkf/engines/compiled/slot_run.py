@@ -149,11 +149,11 @@ class SlotRuns:
     def _begin_readings(self) -> None:
         """Create the random streams and regressor paths from which readings are drawn."""
         setup, streams = self.setup, self._streams
-        entities = [(s.node, s.placed_sensor.ordinal) for s in setup.drawn]
+        entities = [(s.node, s.placed_sensor.ordinal) for s in setup.kernel_sensors]
         # One stream for each drawn sensor of each run.
         self._noise = StreamBatch(streams, "noise", entities).states
         self._regressors: list[tuple[Path, np.ndarray]] = []
-        for s, (A, drive, start) in zip(setup.driven, setup.regressors, strict=True):
+        for s, (A, drive, start) in zip(setup.regressor_sensors, setup.regressors, strict=True):
             x = in_lanes(start, self._blocks)
             # No frame: regressors do not grow as an unstable plant does.
             path = Path(A, drive, 0, x, np.zeros(x.shape))
@@ -161,7 +161,7 @@ class SlotRuns:
             self._regressors.append((path, states))
         scenario, first = self._scenario, self._first
         self._recorded: list[tuple[AssignedSensor, Any]] = [
-            (s, scenario.slot_path(first, s.node, s.placed_sensor)) for s in setup.recorded
+            (s, scenario.slot_path(first, s.node, s.placed_sensor)) for s in setup.recorded_sensors
         ]
 
     def _begin_messages(self) -> None:

@@ -132,48 +132,57 @@ class SlotSetup:
         self.estimators = 1 if pooled else len(scenario.nodes)
         rows = np.zeros(self.estimators, dtype=np.int64)
         self.sensing = np.array(scenario.sensing, dtype=np.int64)
-        self.placed: list[AssignedSensor] = []
+        self.assigned: list[AssignedSensor] = []
         for node in scenario.sensing:
             estimator = 0 if pooled else scenario.topology.index[node]
             for placed_sensor in scenario.placed[node]:
                 R = scenario.noise(placed_sensor.entry, believed=True)
                 root = cholesky(R)
                 # A filter stacks the readings of its sensors, one below the other.
-                self.placed.append(
+                self.assigned.append(
                     AssignedSensor(node, placed_sensor, estimator, int(rows[estimator]), root)
                 )
                 rows[estimator] += len(root)
         self.rows, self.p = rows, int(rows.max(initial=1))
-        kinds = [type(scenario.sensors[s.placed_sensor.entry]) for s in self.placed]
-        self.recorded = [s for s, k in zip(self.placed, kinds, strict=True) if k is RecordedSensor]
-        # Recorded sensors are read in Python, the others by kernels.
-        self.drawn = [s for s, k in zip(self.placed, kinds, strict=True) if k is not RecordedSensor]
-        self.driven = [s for s, k in zip(self.placed, kinds, strict=True) if k is RegressorSensor]
-        self.varies = bool(self.recorded or self.driven)
+        kinds = [type(scenario.sensors[s.placed_sensor.entry]) for s in self.assigned]
+        self.recorded_sensors = [
+            s for s, k in zip(self.assigned, kinds, strict=True) if k is RecordedSensor
+        ]
+        # Python reads recorded sensors, kernels read the others; some of these have regressors as
+        # H.
+        self.kernel_sensors = [
+            s for s, k in zip(self.assigned, kinds, strict=True) if k is not RecordedSensor
+        ]
+        self.regressor_sensors = [
+            s for s, k in zip(self.assigned, kinds, strict=True) if k is RegressorSensor
+        ]
+        self.varies = bool(self.recorded_sensors or self.regressor_sensors)
         self.H: FloatArray = aligned((1, 1, self.estimators, self.p, self.n, LANES))
-        self._set_drawn(scenario)
+        self._set_kernel_sensors(scenario)
 
-    def _set_drawn(self, scenario: Scenario) -> None:
+    def _set_kernel_sensors(self, scenario: Scenario) -> None:
         """Set the whitened H = L_b^-1 H and noise factors L_b^-1 L of all sensors that kernels
         read, and the processes of random regressors.
         """
-        count, p, n = len(self.drawn), self.p, self.n
+        count, p, n = len(self.kernel_sensors), self.p, self.n
         H, noise = np.zeros((count, p, n)), np.zeros((count, p, p))
-        driven = np.full(count, -1, dtype=np.int64)
-        for m, s in enumerate(self.drawn):
+        regressor_index = np.full(count, -1, dtype=np.int64)
+        for m, s in enumerate(self.kernel_sensors):
             sensor = scenario.sensors[s.placed_sensor.entry]
             rows = len(s.root)
             true_root = cholesky(sensor.R)
-            # Noise L_b^-1 L of a whitened reading, with the believed R = L_b L_b' and the true R =
-            # L L'.
+            # The noise of a whitened reading is L_b^-1 L times white noise, with the believed R =
+            # L_b L_b' and the true R = L L'.
             noise[m, :rows, :rows] = solve_lower(s.root, true_root)
             if isinstance(sensor, RegressorSensor):
                 # A regressor's one row is random: H holds the whitening factor alone.
-                driven[m], H[m, 0, 0] = self.driven.index(s), 1.0 / s.root[0, 0]
+                regressor_index[m], H[m, 0, 0] = self.regressor_sensors.index(s), 1.0 / s.root[0, 0]
                 continue
             H[m, :rows] = solve_lower(s.root, sensor.H)
             self.H[0, 0, s.estimator, s.row : s.row + rows] = H[m, :rows, :, None]
-        regressors: list[Any] = [scenario.sensors[s.placed_sensor.entry] for s in self.driven]
+        regressors: list[Any] = [
+            scenario.sensors[s.placed_sensor.entry] for s in self.regressor_sensors
+        ]
         # Regressors of different sizes are padded with zeros, which stay zero.
         k = max((len(sensor.A) for sensor in regressors), default=1)
         q = max((sensor.B.shape[1] for sensor in regressors), default=1)
@@ -188,12 +197,12 @@ class SlotSetup:
             # Columns of noise are not padded: a padded one would draw numbers from the stream.
             self.regressors.append((A, np.ascontiguousarray(drive[:, : root.shape[1]]), start))
         self.sensors = SlotSensors(
-            np.array([s.estimator for s in self.drawn], dtype=np.int64),
-            np.array([s.row for s in self.drawn], dtype=np.int64),
-            np.array([len(s.root) for s in self.drawn], dtype=np.int64),
+            np.array([s.estimator for s in self.kernel_sensors], dtype=np.int64),
+            np.array([s.row for s in self.kernel_sensors], dtype=np.int64),
+            np.array([len(s.root) for s in self.kernel_sensors], dtype=np.int64),
             H,
             noise,
-            driven,
+            regressor_index,
             C,
         )
 
@@ -275,11 +284,11 @@ class SlotSetup:
         are recorded: only these may lack one.
         """
         slots: dict[int, set[int]] = {}
-        for s in self.recorded:
+        for s in self.recorded_sensors:
             sensor: Any = scenario.sensors[s.placed_sensor.entry]
             recorded_slots = sensor.table(s.node, scenario.slot_plant.period)
             slots.setdefault(scenario.topology.index[s.node], set()).update(recorded_slots)
-        for s in self.drawn:
+        for s in self.kernel_sensors:
             slots.pop(scenario.topology.index[s.node], None)
         return slots
 
