@@ -429,6 +429,7 @@ def stack_tables(tables: Sequence[FlowTable]) -> FlowTable:
     """Return one table of all models of ``tables``, in their order."""
 
     def padded(parts: list[FloatArray], fill: float) -> FloatArray:
+        """Return arrays of several models stacked, padded to the largest shape with ``fill``."""
         # The padding is never read: ``sizes`` and the infinite last reach end every loop before it.
         shape = np.max([part.shape for part in parts], axis=0)
         out: FloatArray = aligned((sum(len(part) for part in parts), *shape[1:]), parts[0].dtype)
@@ -548,7 +549,9 @@ def propagate_level(
     k: int,
     scratch: FlowScratch,
 ) -> None:
-    """Apply ``propagate_root`` over ``unit 2^level`` seconds."""
+    """Apply ``propagate_root`` over ``unit 2^level`` seconds, with the tabulated exp(A g), F, Gamma
+    and T: ``P <- F P (I + Gamma' Gamma P)^-1 F' + T T'`` and ``x <- exp(A g) x``.
+    """
     n, levels, T, observed = len(scratch.size), table.levels, scratch.T, scratch.observed
     if table.sizes[m, 1] > 0:
         # Gamma_r S for each row r of Gamma, both triangular, as an observation of unit noise.

@@ -55,7 +55,9 @@ from netkf.network.clocks import Poisson
 from netkf.scenario.scenario import Scenario
 
 PAUSE, FULL = -1, -2
-"""Why ``agenda`` stopped, besides WANT_...: it reached its time, or the queue of visits is full."""
+"""Why ``queue_events`` stopped, besides WANT_...: it reached its time, or the queue of visits is
+full.
+"""
 
 MAX_LINKS_OF_CLOCK = 62
 """Directed links that one clock may send on: each of them has an arrival bit."""
@@ -231,14 +233,14 @@ def run_agenda(state: Simulation, visits: Visits, until: float) -> int:
     # A batch has space for all of its samples: WANT_SAMPLES comes after the last one and is
     # ignored.
     while request == FULL or (request == WANT_SAMPLES and until < NEVER):
-        request = agenda(state, visits, until)
+        request = queue_events(state, visits, until)
         if request == FULL:
             process_visits(state, visits)
     return request
 
 
 @kernel
-def agenda(state: Simulation, visits: Visits, until: float) -> int:
+def queue_events(state: Simulation, visits: Visits, until: float) -> int:
     """Go through the events of a run before ``until`` and queue visits; return why it stopped
     (WANT_..., DONE, PAUSE or FULL).
     """

@@ -219,7 +219,9 @@ def predict_with_gain(
 def sample_with_gain(
     state: Simulation, combination: CombinationState, h: int, instant: int
 ) -> None:
-    """Use the sample of node ``h`` by its constant gain."""
+    """Update node ``h`` with its sample of an instant by its constant gain: ``xhat += L (y - H
+    xhat)`` and ``P <- (I - L H) P (I - L H)' + L R L'``.
+    """
     instants = state.instants
     s = instants.first[instant]
     p = instants.rows[instants.sensor[s]]
@@ -231,7 +233,7 @@ def sample_with_gain(
         instants.y[s, :p],
         combination.x[0],
     )
-    # (I - L H) P (I - L H)' + L R L' has the form of a prediction.
+    # The update of P has the form of a prediction.
     predict_root(
         ONE,
         state.size,
