@@ -162,7 +162,7 @@ class ConstantGain(Filter):
     def slot_arrays(
         self, states: Sequence[Any], infos: Sequence[NodeInfo], runs: int
     ) -> tuple[ConstantGainArrays]:
-        """Return the gains for whitened readings and what follows from them."""
+        """Return the constant matrices of all filters, for whitened readings."""
         n = len(states[0].xhat)
         max_rows = max(1, *(state.gain.shape[1] for state in states))
         closed, noise = np.zeros((len(states), n, n)), np.zeros((len(states), n, n))

@@ -72,7 +72,7 @@ def swap_pairs(
 def copy_pair(
     nodes: SlotNodes, scratch: SlotScratch, b: int, h: int, sender: int, arrived: Any
 ) -> None:
-    """Copy the pair that ``sender`` sent to filter ``h``, in the lanes that ``arrived`` it."""
+    """Copy the pair that ``sender`` sent to filter ``h``, in the lanes in which it ``arrived``."""
     lanes = scratch.lanes
     for i in range(len(scratch.size)):
         own, sent = load(lanes, nodes.xhat, b, h, i), load(lanes, scratch.xhat, sender, i)

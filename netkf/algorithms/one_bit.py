@@ -52,8 +52,8 @@ HALF_PI = math.pi / 2.0
 
 
 class Bits(NamedTuple):
-    """A payload: ``signs`` (p,) of the innovations of a reading's rows, and what all nodes know of
-    the sensor, the rows ``H`` (p, n) over the deviation of their noise.
+    """A payload: ``signs`` (p,) of the innovations of a reading's rows, and the whitened rows
+    ``H`` (p, n) of the sensor, which all nodes know.
     """
 
     signs: FloatArray
@@ -305,7 +305,7 @@ class OneBit(Filter):
     slot_kernel = staticmethod(one_bit_slots)
 
     def decides_in_slots(self) -> bool:
-        """Return True: nodes are silent but in their turn."""
+        """Return True: a node is silent except in its turn."""
         return True
 
     def slot_arrays(

@@ -77,8 +77,8 @@ MAX_SPREAD = 1e14
 
 
 class NetworkInformation(NamedTuple):
-    """A node's estimate of the network: the mean ``information`` (n, n), G^(i) of P (6), and the
-    ``number`` of nodes, N^(i); with asymptotic gains the ``root`` of P_inf.
+    """A node's estimate of the network: the ``information`` (n, n) of all sensors, G^(i) of P (6),
+    and the ``number`` of nodes, N^(i); with asymptotic gains the ``root`` of P_inf.
     """
 
     information: FloatArray
@@ -407,8 +407,8 @@ def correct(
     s: int,
     h: int,
 ) -> None:
-    """Correct filter ``h`` of a block after its prediction, step 4, P (7) and (8); with asymptotic
-    gains step 3 too.
+    """Correct filter ``h`` of block ``b`` by its reading of slot ``s``, step 4, P (7) and (8); with
+    asymptotic gains also predict it, step 3.
     """
     n, lanes = nodes.xhat.shape[2], scratch.lanes
     if arrays.asymptotic:

@@ -59,9 +59,9 @@ def learn_network(
     information: FloatArray,
     number: FloatArray,
 ) -> None:
-    """Write the network's mean information G = C~ / w and number of nodes N = n~ / w as node ``h``
-    estimates them, P (6), into ``information`` (n, n, L) and ``number`` (1, L). While its weight w
-    is exactly 0, these are its own information ``alone[h]`` and 1.
+    """Write the information of all sensors G = C~ / w and the number of nodes N = n~ / w as node
+    ``h`` estimates them, P (6), into ``information`` (n, n, L) and ``number`` (1, L). While its
+    weight w is exactly 0, these are its own information ``alone[h]`` and 1.
     """
     n, weight = information.shape[0], load(lanes, mass, b, h, 0)
     is_empty = weight == 0.0

@@ -72,7 +72,7 @@ def scale_by_covariance(
     work: FloatArray,
 ) -> None:
     """Multiply ``differences[h]`` (n, L) by the consensus gain of the Kalman consensus filter (KCF,
-    Olfati-Saber 2007), ``epsilon / (1 + |P|) P`` with the Frobenius norm; ``work`` (n, L) is
+    Olfati-Saber 2009), ``epsilon / (1 + |P|) P`` with the Frobenius norm; ``work`` (n, L) is
     scratch.
     """
     n, square = root.shape[2], spread(lanes, 0.0)

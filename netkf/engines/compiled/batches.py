@@ -141,7 +141,9 @@ def _batch_arrays(scenario: Scenario, start: Filters, draws: BatchDraws) -> Batc
 
 
 def drawn_together(scenario: Scenario) -> bool:
-    """Return True if the runs of a batch can be drawn together: no sensor takes samples."""
+    """Return True if the runs of a batch can be drawn together: paths are drawn on the sensing
+    grid, and no sensor takes samples.
+    """
     return uses_grid(scenario) and not scenario.sampled_sensors
 
 

@@ -352,7 +352,7 @@ class Stages(NamedTuple):
     step : (K,), number of the exchange step in the slot, -1 where sensors are read
     phase : (K,), number of the exchange that the step belongs to, -1 where sensors are read
     end : (K,), seconds after the slot begins
-    stopping : step in which nodes may stop exchanging for good, -1: none
+    stopping : step in which nodes may permanently freeze their network estimate, -1: none
     """
 
     step: np.ndarray
