@@ -475,7 +475,7 @@ class ConsensusInnovations(Filter):
         return (arrays[0]._replace(table_row=rows, gains=gains),)
 
     def check_scenario(self, scenario: Any) -> None:
-        """Raise ScenarioError where estimates do not begin alike."""
+        """Raise ScenarioError unless all estimates have the same start."""
         require_common_start(scenario, "from which gains are computed", "hcmci")
 
     def payload_numbers(self, n: int, rows: int, phase: int) -> int:

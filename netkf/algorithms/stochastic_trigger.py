@@ -338,7 +338,7 @@ class ScheduledState(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class ScheduledReadings(Filter):
-    """Every node broadcasts its reading y or is silent, and all who hear nothing use that, too.
+    """Every node broadcasts its reading y or is silent, and its receivers use the silence, too.
 
     Silence is as informative as a reading ``H xbar`` with noise ``R + Y^-1``. Own readings count
     when they are sent, and the first is sent.
@@ -521,8 +521,8 @@ def decide_senders(
     order: TriggerPlan,
     s: int,
 ) -> None:
-    """Decide who sends in slot ``s``: in steps before the reading by the last reading, then by this
-    one.
+    """Decide which nodes send in slot ``s``: in steps before the reading by the reading of the slot
+    before, then by this one.
     """
     for b in range(plan.sent.shape[0]):
         for e in range(order.first):

@@ -466,7 +466,7 @@ class BarShalomCampo(Filter):
         return tracks.xhat
 
     def check_scenario(self, scenario: Any) -> None:
-        """Raise ScenarioError where tracks do not begin alike or H varies."""
+        """Raise ScenarioError unless all tracks have the same start and each H is fixed."""
         why = "where cross-covariances begin"
         require_common_start(scenario, why, INTERSECTION)
         for k, sensor in enumerate(scenario.sensors):

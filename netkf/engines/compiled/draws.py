@@ -101,11 +101,11 @@ class Paths:
             times = np.array([grid_time(laws.period, steps * k) for k in range(1, count)])
             self.frame_times = times[times < scenario.horizon]
 
-    def following(self, most: int | None = None) -> Block:
-        """Return the next steps of all runs together, at most ``most``; the last ones reach the
-        horizon or beyond.
+    def following(self, max_steps: int | None = None) -> Block:
+        """Return the next steps of all runs together, at most ``max_steps``; the last ones reach
+        the horizon or beyond.
         """
-        return self._paths.following(self._blocks, most)
+        return self._paths.following(self._blocks, max_steps)
 
     def block(self, block: Block, together: int = 1) -> PathBlock:
         """Return a block of steps as arrays for the event loop, which simulates ``together`` runs
