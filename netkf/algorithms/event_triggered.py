@@ -247,6 +247,7 @@ def combine_copies(
     for m in range(links.first[h], links.first[h + 1]):
         arrived = load_flags(lanes, plan.up, b, s, 0, links.direction[m])
         copies = (arrays.x, arrays.root)
+        # The estimates that arrive replace the copies of their links.
         if any_lane(arrived):
             sender = W + links.sender[m]
             copy_estimate(lanes, copies, m, arrays.x, arrays.root, sender, b, arrived)
@@ -280,16 +281,9 @@ def combine_copies(
             whiten(lanes, scratch.whitened, weight, arrays.inverse, arrays.mean, m, own)
             merge_lanes(lanes, scratch.total, scratch.whitened)
     finish_lanes(
-        lanes,
-        nodes.root,
-        nodes.xhat,
-        b,
-        h,
-        scratch.xhat,
-        scratch.total,
-        scratch.whitened,
+        lanes, nodes.root, nodes.xhat, b, h, scratch.xhat, scratch.total, scratch.whitened,
         has_no_copy,
-    )
+    )  # fmt: skip
 
 
 @kernel
