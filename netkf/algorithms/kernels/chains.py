@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from netkf.algorithms.kernels.square_root import lower_triangular, reflect
+from netkf.algorithms.kernels.square_root import lower_triangular, step_root
 from netkf.linalg.arrays import FloatArray, as_kernel_array
 from netkf.linalg.compiling import kernel
 
@@ -64,13 +64,13 @@ def move_roots(
     # More threads than chains or cores would only wait.
     workers = min(os.cpu_count() or 1, len(roots))
     if sequences.size < FEW or workers < 2:
-        run_sequences(lower_roots, sequences, F, low_Q, modes)
+        run_sequences(lower_roots, sequences, F, low_Q, *modes)
         return lower_roots
     # Threads own contiguous blocks of chains, as views of one array, so nothing is copied back.
     cuts = np.linspace(0, len(roots), workers + 1).astype(int)
     with ThreadPoolExecutor(workers) as pool:
         jobs = [
-            pool.submit(run_sequences, lower_roots[a:b], sequences[a:b], F, low_Q, modes)
+            pool.submit(run_sequences, lower_roots[a:b], sequences[a:b], F, low_Q, *modes)
             for a, b in itertools.pairwise(cuts)
         ]
         for job in jobs:
@@ -97,7 +97,7 @@ def trace_paths(
     work = np.empty((modes.H.shape[1] + n, 2 * n + modes.H.shape[1]))
     for low, sequence in zip(lows, sequences, strict=True):
         path = np.empty((len(sequence), *low.shape))
-        run_path(low[None], sequence, F, low_Q, modes, work, path)
+        run_path(low[None], sequence, F, low_Q, *modes, work, path)
         yield path
 
 
@@ -107,7 +107,9 @@ def run_path(
     sequence: np.ndarray,
     F: FloatArray,
     root_Q: FloatArray,
-    modes: ReadingModes,
+    H: FloatArray,
+    root_R: FloatArray,
+    rows: np.ndarray,
     work: FloatArray,
     path: FloatArray,
 ) -> None:
@@ -115,7 +117,7 @@ def run_path(
     ``path`` (T, n, n).
     """
     for step in range(len(sequence)):
-        step_root(roots, 0, sequence[step], F, root_Q, modes, work)
+        step_root(roots, 0, sequence[step], F, root_Q, H, root_R, rows, work)
         for i in range(len(F)):
             for j in range(len(F)):
                 path[step, i, j] = roots[0, i, j]
@@ -127,49 +129,16 @@ def run_sequences(
     sequences: np.ndarray,
     F: FloatArray,
     root_Q: FloatArray,
-    modes: ReadingModes,
+    H: FloatArray,
+    root_R: FloatArray,
+    rows: np.ndarray,
 ) -> None:
     """Move the roots (K, n, n) of K chains in place along their mode ``sequences`` (K, T); roots
     and root_Q are lower triangular.
     """
     # The pre-array [[H S, root_R, 0], [F S, 0, root_Q]] of the largest reading, reused by all
     # steps.
-    work = np.empty((modes.H.shape[1] + len(F), 2 * len(F) + modes.H.shape[1]))
+    work = np.empty((H.shape[1] + len(F), 2 * len(F) + H.shape[1]))
     for chain in range(sequences.shape[0]):
         for step in range(sequences.shape[1]):
-            step_root(roots, chain, sequences[chain, step], F, root_Q, modes, work)
-
-
-@kernel
-def step_root(
-    roots: FloatArray,
-    chain: int,
-    m: int,
-    F: FloatArray,
-    root_Q: FloatArray,
-    modes: ReadingModes,
-    work: FloatArray,
-) -> None:
-    """Replace root ``chain`` of ``roots`` (K, n, n) by that of f_m(P), R (17): update with reading
-    ``m`` and predict. ``work`` (>= p + n, >= 2 n + p) is scratch.
-    """
-    n, p, H, root_R = len(F), modes.rows[m], modes.H, modes.root_R
-    # The pre-array [[H S, root_R, 0], [F S, 0, root_Q]].
-    for i in range(p + n):
-        for j in range(n):
-            total = 0.0
-            for k in range(j, n):
-                total += (H[m, i, k] if i < p else F[i - p, k]) * roots[chain, k, j]
-            work[i, j] = total
-        for j in range(p):
-            work[i, n + j] = root_R[m, i, j] if i < p else 0.0
-        for j in range(n):
-            work[i, n + p + j] = root_Q[i - p, j] if i >= p else 0.0
-    # Reflections of the columns make it lower triangular, row by row. Row i is zero right of column
-    # n + p + (i - p), because root_Q is lower triangular.
-    for i in range(p + n):
-        reflect(work, i, p + n, n + p + max(0, i - p + 1))
-    # The post-array is [[C, 0], [K C, S+]]: its lower right block is the root of f_m(P).
-    for i in range(n):
-        for j in range(i + 1):
-            roots[chain, i, j] = work[p + i, p + j]
+            step_root(roots, chain, sequences[chain, step], F, root_Q, H, root_R, rows, work)

@@ -91,3 +91,40 @@ def reflect_row(
             store(lanes, wide, r, j, load(lanes, wide, r, j) - share * load(lanes, wide, i, j))
         for j in range(i + 1):
             store(lanes, T, r, j, load(lanes, T, r, j) - share * load(lanes, T, i, j))
+
+
+@kernel
+def step_root(
+    roots: FloatArray,
+    chain: int,
+    m: int,
+    F: FloatArray,
+    root_Q: FloatArray,
+    H: FloatArray,
+    root_R: FloatArray,
+    rows: np.ndarray,
+    work: FloatArray,
+) -> None:
+    """Replace root ``chain`` of ``roots`` (K, n, n) by that of f_m(P), R (17): update with reading
+    ``m`` and predict. ``work`` (>= p + n, >= 2 n + p) is scratch.
+    """
+    n, p = len(F), rows[m]
+    # The pre-array [[H S, root_R, 0], [F S, 0, root_Q]].
+    for i in range(p + n):
+        for j in range(n):
+            total = 0.0
+            for k in range(j, n):
+                total += (H[m, i, k] if i < p else F[i - p, k]) * roots[chain, k, j]
+            work[i, j] = total
+        for j in range(p):
+            work[i, n + j] = root_R[m, i, j] if i < p else 0.0
+        for j in range(n):
+            work[i, n + p + j] = root_Q[i - p, j] if i >= p else 0.0
+    # Reflections of the columns make it lower triangular, row by row. Row i is zero right of column
+    # n + p + (i - p), because root_Q is lower triangular.
+    for i in range(p + n):
+        reflect(work, i, p + n, n + p + max(0, i - p + 1))
+    # The post-array is [[C, 0], [K C, S+]]: its lower right block is the root of f_m(P).
+    for i in range(n):
+        for j in range(i + 1):
+            roots[chain, i, j] = work[p + i, p + j]
