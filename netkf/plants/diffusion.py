@@ -44,19 +44,19 @@ class Diffusion(Plant):
 
     @cached_property
     def laws(self) -> GridLaws:
-        """The laws on the sensing grid that all paths of this plant share."""
+        """The laws of the steps of the sensing grid, shared by all paths of this plant."""
         assert self.sensing_period is not None
         return GridLaws(self.A, self.B, self.sensing_period)
 
     @property
     def longest_period(self) -> float:
-        """Seconds; the longest sensing period for which the path is exact."""
+        """The longest sensing period (seconds) for which the path is exact to rounding."""
         norm = float(np.abs(self.A).sum(axis=0).max())
         return MAX_STEP / norm if norm > 0.0 else math.inf
 
     @cached_property
     def moves(self) -> Transitions:
-        """Exact discretisation over any gap."""
+        """The exact discretisation over any gap."""
         return Transitions(self.A, self.B)
 
     def path(
@@ -69,14 +69,16 @@ class Diffusion(Plant):
         horizon: float = 0.0,
         frames: bool = False,
     ) -> DiffusionPath:
-        """Return a path of its own that can be asked for its state on the sensing grid and at the
-        times ``sampled`` and ``probe_times`` (increasing). ``sampling`` is used only for times
-        sampled off the grid, ``probing`` only for those probed off both. With ``frames``, states
-        are local, see ``truth``, in frames that begin before the ``horizon``.
+        """Return the path of one run, with states on the sensing grid and at the times ``sampled``
+        and ``probe_times`` (increasing, seconds).
+
+        ``random`` draws x(0) and the steps, ``sampling`` only the states at times ``sampled`` off
+        the grid, ``probing`` only those at probe times off both. With ``frames`` states are local
+        to frames that begin before the ``horizon``, see ``truth``.
         """
-        own, probes = GeneratorNormals([random]), GeneratorNormals([probing])
+        steps, probes = GeneratorNormals([random]), GeneratorNormals([probing])
         samples = GeneratorNormals([] if sampling is None else [sampling])
-        paths = self.paths(own, probes, probe_times, samples, sampled, frames)
+        paths = self.paths(steps, probes, probe_times, samples, sampled, frames)
         return DiffusionPath(paths, horizon)
 
     def paths(
@@ -88,8 +90,8 @@ class Diffusion(Plant):
         sampled: FloatArray = NO_TIMES,
         frames: bool = False,
     ) -> DiffusionPaths:
-        """Return the paths of several runs together, which are sampled and probed at the
-        same times.
+        """Return the paths of several runs, one for each stream of ``normals``; all are sampled and
+        probed at the same times. Parameters are as in ``path``.
         """
         start = self.starts(normals)
         cuts = [] if sampling is None or not len(sampled) else [Cuts(sampled, sampling)]
@@ -102,7 +104,7 @@ class Diffusion(Plant):
 
     @property
     def frame_steps(self) -> int | None:
-        """Steps of the sensing grid between two frames; None for a plant that is not unstable."""
+        """Steps of the sensing grid from one frame to the next; None for a stable plant."""
         period = frame_period(self.A)
         assert self.sensing_period is not None
         return None if period is None else max(1, int(period / self.sensing_period))
@@ -116,8 +118,8 @@ class Diffusion(Plant):
         horizon: float,
         frames: bool = False,
     ) -> SampledTruth:
-        """Return a path that needs no sensing grid: it can be asked for its state at ``samples``,
-        ``probes`` and frame times, up to the ``horizon``.
+        """Return a path without a sensing grid: it has states only at ``samples``, ``probes`` and
+        frame times (seconds), up to the ``horizon``.
         """
         marks = multiples(frame_period(self.A), horizon)
         start = self.start(random)
@@ -128,19 +130,21 @@ class Diffusion(Plant):
 def default_sensing_period(
     plant: Diffusion, informations: list[FloatArray], longest: float
 ) -> float:
-    """Return the sensing period for which the errors' covariance is within 1e-3 of the exact one.
+    """Return the sensing period (seconds) for which error covariances are within 1e-3 of the exact.
 
-    ``informations`` are the matrices H' R^-1 H of the nodes that sense, ``longest`` what their
-    filters can use at once (algorithms/kernels/gains). The period is a fraction
-    of the fastest time constant of the plant and of a node's own filter (a large
-    covariance asks for nothing shorter, see FlowFilter.stretch), rounded down to 1, 2 or 5 times a
-    power of ten. It depends on nothing else, so that filters and networks meet the same truth.
+    ``informations`` are the matrices H' R^-1 H (n, n) of the nodes that sense, ``longest`` is the
+    longest interval (seconds) that one update of their filters can use (algorithms/kernels/gains).
+    The period is a fraction of the fastest time constant of the plant and of the stationary
+    Kalman-Bucy filter of each node, rounded down to 1, 2 or 5 times a power of ten. It depends on
+    nothing else, so that all filters and networks see the same truth.
     """
     fastest = float(np.abs(np.linalg.eigvals(plant.A)).max())
     for G in informations:
+        # The eigenvalues of the Hamiltonian matrix of the Riccati equation are those of the
+        # node's filter, with both signs.
         M = np.block([[-plant.A.T, G], [plant.Q, plant.A]])
         fastest = max(fastest, float(np.abs(np.linalg.eigvals(M)).max()))
-    wanted = min(0.5 / fastest if fastest > 0.0 else 1.0, longest, plant.longest_period)
-    power = 10.0 ** math.floor(math.log10(wanted))
-    digit = next(d for d in (5.0, 2.0, 1.0) if d * power <= wanted * (1.0 + 1e-9))
+    bound = min(0.5 / fastest if fastest > 0.0 else 1.0, longest, plant.longest_period)
+    power = 10.0 ** math.floor(math.log10(bound))
+    digit = next(d for d in (5.0, 2.0, 1.0) if d * power <= bound * (1.0 + 1e-9))
     return float(f"{digit * power:.12g}")

@@ -1,4 +1,8 @@
-"""The laws of the steps of a diffusion, which all its paths on one sensing grid share."""
+"""The laws of the steps of a diffusion, shared by all its paths on one sensing grid.
+
+A step is described by 3 n numbers: the state at its end and the two moments ``int x dt`` and
+``int x P_1 dt`` over it, with the Legendre polynomial P_1 of the step.
+"""
 
 from __future__ import annotations
 
@@ -21,21 +25,28 @@ from netkf.linalg.portable import (
 from netkf.linalg.series import polynomial, with_reach
 from netkf.linalg.small import matmul
 
-MAX_LAWS = 256  # laws of states inside a step that are kept
-MAX_GRIDS = 256  # parts of the sensing grid that are kept
-DEPENDENT = 1e-9  # share of a row that is not rounding
+MAX_LAWS = 256  # cached laws of states inside a step
+MAX_GRIDS = 256  # cached parts of the sensing grid
+DEPENDENT = 1e-9  # a remainder below this share of the row's norm is rounding
 _NODES, _WEIGHTS = gauss_legendre(20)
 
 
 def grid_time(period: float, k: int) -> float:
-    """Return a time of the grid, rounded so that lattices of other periods meet it."""
+    """Return the time k * period in seconds, rounded so that grids whose periods are multiples of
+    each other have equal times.
+    """
     return float(round(k * period, 12))
 
 
 class GridLaws:
-    """The laws of all paths of ``dx = A x dt + B dw`` on the sensing grid of one ``period``.
+    """The laws of all paths of ``dx = A x dt + B dw`` on the sensing grid of one ``period`` (s).
 
-    Laws of states inside a step are computed on demand and kept.
+    to_end, to_moments  power series of the response to the state at the start of a step
+    response            (3, n, n) that response over one period
+    noise_factor        (3 n, 3 n) lower triangular root of the covariance of end and moments
+    course_table        the table that ``paths.fill_course`` uses
+
+    Laws of states inside a step are computed on demand and cached.
     """
 
     def __init__(self, A: FloatArray, B: FloatArray, period: float) -> None:
@@ -49,13 +60,13 @@ class GridLaws:
         self._grids: dict[tuple[int, int], FloatArray] = {}
 
     def grid(self, first: int, count: int) -> FloatArray:
-        """Return points (count,) of the sensing grid from number ``first`` on."""
-        known = self._grids.get((first, count))
-        if known is None:
-            known = np.array([grid_time(self.period, first + k) for k in range(count)])
+        """Return the points ``first`` .. ``first + count - 1`` of the sensing grid in seconds."""
+        times = self._grids.get((first, count))
+        if times is None:
+            times = np.array([grid_time(self.period, first + k) for k in range(count)])
             if len(self._grids) < MAX_GRIDS:
-                self._grids[first, count] = known
-        return known
+                self._grids[first, count] = times
+        return times
 
     def responses(self, gap: float) -> FloatArray:
         """Return the matrices (3, n, n) that map a state to the state ``gap`` seconds later and to
@@ -65,8 +76,8 @@ class GridLaws:
         return np.concatenate(values).reshape(3, self.n, self.n)
 
     def _impulse_responses(self, gap: float) -> FloatArray:
-        """Return the responses (3 n, 20 m) of the end and the moments to noise at the quadrature
-        nodes.
+        """Return the responses (3 n, 20 m) of the end and the moments of a step of ``gap`` seconds
+        to noise at the quadrature nodes; times their transpose they are a covariance.
         """
         out = np.empty((3 * self.n, len(_NODES) * self.B.shape[1]))
         self._fill_impulses(out, 0, gap, _NODES * gap, _WEIGHTS * gap)
@@ -75,19 +86,20 @@ class GridLaws:
     def _fill_impulses(
         self, out: FloatArray, row: int, end: float, instants: FloatArray, weights: FloatArray
     ) -> None:
-        """Write the responses to impulses of noise at ``instants`` into ``out`` from ``row`` on, as
-        ``fill_impulses``.
+        """Write the responses to noise at ``instants`` into 3 n rows of ``out`` from ``row`` on;
+        see ``fill_impulses``.
         """
         tables = self.to_end, self.to_moments, self.B
         fill_impulses(out, row, *tables, end, instants, weights)
 
-    def conditional_law(self, length: float, left: float) -> tuple[FloatArray, FloatArray]:
-        """Return the conditional law of state and moments at ``left`` seconds of a step.
+    def conditional_law(self, length: float, before: float) -> tuple[FloatArray, FloatArray]:
+        """Return the law of state and moments ``before`` seconds after the start of a piece, given
+        the end and moments of the whole piece of ``length`` seconds.
 
-        It is given by those of the whole step of ``length`` seconds; the result is the gain and a
-        square root of the covariance, both (3 n, 3 n).
+        The result is the gain of the conditional mean and a square root of the conditional
+        covariance, both (3 n, 3 n).
         """
-        key = round(length, 12), round(left, 12)
+        key = round(length, 12), round(before, 12)
         law = self._conditional_laws.get(key)
         if law is None:
             if len(self._conditional_laws) >= MAX_LAWS:
@@ -95,20 +107,20 @@ class GridLaws:
             law = self._conditional_laws[key] = self._conditional(*key)
         return law
 
-    def _conditional(self, length: float, left: float) -> tuple[FloatArray, FloatArray]:
-        """Return gain and root (3 n, 3 n) of the law at a cut, ``left`` seconds after the start of
-        a piece of ``length`` seconds, given the end and moments of the piece.
-        """
-        size = 3 * self.n
-        instants = np.concatenate([_NODES * left, left + _NODES * (length - left)])
-        weights = np.concatenate([_WEIGHTS * left, _WEIGHTS * (length - left)])
+    def _conditional(self, length: float, before: float) -> tuple[FloatArray, FloatArray]:
+        """Compute ``conditional_law``."""
+        size, after = 3 * self.n, length - before
+        instants = np.concatenate([_NODES * before, before + _NODES * after])
+        weights = np.concatenate([_WEIGHTS * before, _WEIGHTS * after])
         factor = np.empty((2 * size, len(instants) * self.B.shape[1]))
         self._fill_impulses(factor, 0, length, instants, weights)
-        self._fill_impulses(factor, size, left, instants, weights)
+        self._fill_impulses(factor, size, before, instants, weights)
+        # Joint covariance C of the whole piece (first) and of the part before the cut (second).
+        # The second given the first: K = C_21 C_11^+, covariance C_22 - K C_12.
         C = matmul(factor, np.ascontiguousarray(factor.T))
-        known, asked, cross = C[:size, :size], C[size:, size:], C[size:, :size]
-        gain = product(cross, pseudo_inverse(known, 1e-13))
-        return gain, symmetric_root(symmetric(asked - product(gain, cross.T)))
+        C_11, C_22, C_21 = C[:size, :size], C[size:, size:], C[size:, :size]
+        gain = product(C_21, pseudo_inverse(C_11, 1e-13))
+        return gain, symmetric_root(symmetric(C_22 - product(gain, C_21.T)))
 
 
 @kernel(allocates=True, compact=True)
@@ -122,24 +134,27 @@ def fill_impulses(
     instants: FloatArray,
     weights: FloatArray,
 ) -> None:
-    """Write what noise of unit density at each of K ``instants``, times the root of its weight,
-    adds to x(end) and to the moments over [0, end] into 3 n rows of ``out`` (., K m) from ``row``
-    on. Noise after ``end`` adds nothing. ``B`` is (n, m), the series are those of GridLaws.
+    """Write the response of x(end) and of the moments over [0, end] to an impulse of the noise at
+    each of K ``instants``, times sqrt(weight), into 3 n rows of ``out`` (., K m) from ``row`` on.
+
+    By Gauss quadrature ``out out'`` is the covariance of end and moments. Noise after ``end`` has
+    no effect. ``B`` is (n, m); the series ``to_end`` and ``to_moments`` are those of GridLaws.
     """
     n, m = B.shape
     for k in range(len(instants)):
-        # In an interval that begins with the noise it is a state, B dw.
-        rest = max(end - instants[k], 0.0)
-        moved, means = polynomial(to_end, rest), polynomial(to_moments, rest)
-        # P_1 of the whole interval, which may be a point, is (1 - share) + share P_1 of the rest.
-        share = rest / end if rest > 0.0 else 0.0
-        scale = math.sqrt(weights[k]) if rest > 0.0 else 0.0
+        # An impulse is a state B dw at its instant: its response over the remaining time is that
+        # to a state at the start of an interval of ``remaining`` seconds.
+        remaining = max(end - instants[k], 0.0)
+        Phi, responses = polynomial(to_end, remaining), polynomial(to_moments, remaining)
+        # P_1 of [0, end] is (1 - share) + share P_1 of the remaining interval.
+        share = remaining / end if remaining > 0.0 else 0.0
+        scale = math.sqrt(weights[k]) if remaining > 0.0 else 0.0
         for i in range(n):
             for j in range(m):
                 last = plain = tilted = 0.0
                 for c in range(n):
-                    mean, slope = means[i * n + c], means[(n + i) * n + c]
-                    last += moved[i * n + c] * B[c, j]
+                    mean, slope = responses[i * n + c], responses[(n + i) * n + c]
+                    last += Phi[i * n + c] * B[c, j]
                     plain += mean * B[c, j]
                     tilted += ((1.0 - share) * mean + share * slope) * B[c, j]
                 out[row + i, k * m + j] = last * scale
@@ -148,13 +163,15 @@ def fill_impulses(
 
 
 def _response_series(A: FloatArray, longest: float) -> tuple[FloatArray, FloatArray]:
-    """Return power series in the gap of ``exp(A g)`` (terms, n n + 1) and of its two moments
-    (terms, 2 n n + 1), with their reach, see linalg/series.
+    """Return power series in the gap g <= ``longest`` (seconds) of ``exp(A g)`` (terms, n n + 1)
+    and of its two moments over the gap (terms, 2 n n + 1). The last column is the reach of each
+    term, see linalg/series.
     """
-    n, size = len(A), float(np.abs(A).sum(axis=0).max()) * longest
-    terms, last = 1, 1.0
-    while last > 1e-18 or terms < 8:
-        last *= size / terms
+    n, norm_times_gap = len(A), float(np.abs(A).sum(axis=0).max()) * longest
+    # The term |A g|^k / k! bounds the rest of the series from some k on.
+    terms, term = 1, 1.0
+    while term > 1e-18 or terms < 8:
+        term *= norm_times_gap / terms
         terms += 1
     exponential = [np.eye(n)]
     for k in range(1, terms):
@@ -168,22 +185,25 @@ def _response_series(A: FloatArray, longest: float) -> tuple[FloatArray, FloatAr
 
 
 def course_width(n: int) -> int:
-    """Return the number of columns of ``course_table``: whole lanes for two integrals of
-    n states.
+    """Return the number of columns W of ``course_table``: 2 n (two integrals of n states), rounded
+    up to whole lanes.
     """
     return -(-2 * n // LANES) * LANES
 
 
 def course_table(to_end: FloatArray, n: int, longest: float) -> FloatArray:
-    """Return the table (D, 2 n, W) of what ``paths.fill_course`` multiplies with the state at the
-    start of a piece of at most ``longest`` seconds, by powers of its length (the first n rows),
-    and with the coefficients of its cubic. Columns are those of the course.
+    """Return the table (D, 2 n, W) from which ``paths.fill_course`` computes the coefficients
+    (D, W) of the course of x over a piece of at most ``longest`` seconds.
+
+    Rows 0 .. n - 1 are the factors of the state at the start, to be scaled by powers of the length
+    of the piece; the other n those of the coefficients of the cubic. ``to_end`` is the series of
+    GridLaws.
     """
-    # Terms beyond are below rounding, see linalg/series.
+    # Later terms are below rounding, see linalg/series.
     needed = int(np.searchsorted(to_end[:-1, -1], longest)) + 1
-    terms = max(needed, 4)  # those of a cubic
+    terms = max(needed, 4)  # a cubic has 4
     table = np.zeros((terms, 2 * n, course_width(n)))
-    # Integrals of u^d and of u u^d over the share u of a piece.
+    # int_0^u v^d dv = u^(d+1) / (d + 1) and int_0^u v v^d dv = u^(d+2) / (d + 2).
     plain, tilted = 1.0 / np.arange(1, terms + 1), 1.0 / np.arange(2, terms + 2)
     response = np.zeros((terms, n, n))
     response[:needed] = to_end[:needed, :-1].reshape(needed, n, n)
@@ -196,21 +216,22 @@ def course_table(to_end: FloatArray, n: int, longest: float) -> FloatArray:
 
 
 def _nonnegative_factor(noise: FloatArray) -> FloatArray:
-    """Return the lower triangular S with ``S S' = noise noise'`` and no entry below zero on its
-    diagonal, whose column is zero where a row of ``noise`` depends on those before it.
+    """Return the lower triangular S (r, r) with ``S S' = noise noise'`` for ``noise`` (r, c).
+
+    The diagonal is not negative; column k is zero if row k of ``noise`` depends on the rows before.
     """
-    # Gram and Schmidt, twice, which is enough (Kahan and Parlett). Householder's reflections would
-    # give a dependent row a direction of its own, made of rounding, and later rows a share in it.
+    # Gram-Schmidt, each row twice, which suffices (Kahan and Parlett). Householder reflections
+    # would give a dependent row a direction made of rounding errors, and later rows a share in it.
     size = len(noise)
     S, directions = np.zeros((size, size)), np.zeros_like(noise)
     for k, row in enumerate(noise):
-        rest = row.copy()
+        remainder = row.copy()
         for _ in range(2):
-            along = apply(directions[:k], rest)
-            S[k, :k] += along
-            rest -= apply(directions[:k].T, along)
-        length = float(norm(rest))
+            components = apply(directions[:k], remainder)
+            S[k, :k] += components
+            remainder -= apply(directions[:k].T, components)
+        length = float(norm(remainder))
         if length > DEPENDENT * float(norm(row)):
             S[k, k] = length
-            directions[k] = rest / length
+            directions[k] = remainder / length
     return S

@@ -1,7 +1,7 @@
 """The linear plant in slots, x[k+1] = F x[k] + w[k], and its readings.
 
-The path and the noise of every sensor are drawn slot by slot from streams of their own, whatever
-the network does.
+The path and the noise of each sensor are drawn slot by slot from separate streams, so that they do
+not depend on the network.
 """
 
 from __future__ import annotations
@@ -40,19 +40,25 @@ class LinearPlant(Plant):
         return len(self.F)
 
     def slot_time(self, k: int) -> float:
-        """Return the start of slot k in seconds, rounded so that other lattices meet it."""
+        """Return the start of slot k in seconds, rounded so that grids whose periods are multiples
+        of each other have equal times.
+        """
         return float(round(k * self.period, 12))
 
     def slots_of(self, times: FloatArray) -> np.ndarray:
-        """Return the slot of each time; rounding errors just before a slot are tolerated."""
+        """Return the slot that contains each time (seconds); a time that is below the start of a
+        slot by rounding belongs to that slot.
+        """
         return np.asarray(np.floor(times / self.period + 1e-9).astype(int))
 
     def over(self, slot: int, horizon: float) -> bool:
-        """Return True if a slot begins at or after the horizon, up to rounding."""
+        """Return True if ``slot`` begins at or after the horizon (seconds), up to rounding."""
         return self.slot_time(slot) >= horizon - 1e-9 * self.period
 
     def truth(self, random: np.random.Generator, frames: bool = False) -> Truth:
-        """Return the truth of one run; ``frames``: in frames, where the plant is unstable."""
+        """Return the truth of one run; with ``frames`` the states of an unstable plant are local to
+        frames, see ``truth``.
+        """
         start = self.start_mean + apply(self.start_root, random.standard_normal(self.n))
         slots = frame_slots(self.F) if frames else None
         return LinearPath(self._steps, self.noise_root, start, random, slots)
@@ -69,14 +75,14 @@ class LinearPlant(Plant):
 
 
 class Truth(Protocol):
-    """The state of one run in slots, asked for in their order.
+    """The state of one run in slots; slots must be asked for in increasing order.
 
-    On frames see ``truth``: after ``rebase`` of a slot its local state is zero.
+    ``truth`` explains frames: after ``rebase`` of a slot its local state is zero.
     """
 
     @property
     def frame_slots(self) -> int | None:
-        """Slots between two frames, the first of which begins at slot 0; None without frames."""
+        """Slots from one frame to the next, the first begins at slot 0; None without frames."""
 
     def local(self, slot: int) -> FloatArray:
         """Return x (n,) in the present frame."""
@@ -107,8 +113,10 @@ class Readings(Protocol):
 
 
 class LinearPath:
-    """The path of one run, slot by slot, from ``start`` (n,) on; what each step adds is ``root``
-    (n, q) times standard normals. With ``frame_slots``, a frame begins every so many slots.
+    """The path ``x[k+1] = F x[k] + root z[k]`` of one run from x[0] = ``start`` (n,) on.
+
+    ``steps`` is the recursion with F, ``root`` is (n, q) and z[k] are standard normals of
+    ``random``. With ``frame_slots``, a frame begins every ``frame_slots`` slots.
     """
 
     def __init__(
@@ -121,10 +129,12 @@ class LinearPath:
     ) -> None:
         self._steps, self._root, self._random = steps, root, random
         self.frame_slots = frame_slots
-        # States of some slots before any rebase, and the one that the next slot starts from.
+        # States (S, n) of the slots from ``_first`` on, each before a rebase, and the state after a
+        # rebase from which the recursion goes on.
         self._first, self._x, self._last = 0, start[None], start
-        self._rebased = 0
-        self._origins = {0: np.zeros(len(start))}  # absolute, by the slot at which a frame begins
+        self._rebased = 0  # slot of the last rebase
+        # Absolute position of the origin of each frame, by the slot at which the frame begins.
+        self._origins = {0: np.zeros(len(start))}
 
     def local(self, slot: int) -> FloatArray:
         """Return x (n,) in the present frame, at a slot not before the last one asked for."""
@@ -132,7 +142,7 @@ class LinearPath:
         return np.zeros(len(x)) if slot == self._rebased > 0 else x
 
     def _state_at(self, slot: int) -> FloatArray:
-        """Return the state (n,) at a slot; slots must not decrease."""
+        """Return the local state (n,) before a rebase; slots must not decrease."""
         while slot >= self._first + len(self._x):
             normals = self._random.standard_normal((BLOCK, self._root.shape[1]))
             noise = product(normals, self._root.T)
@@ -141,13 +151,20 @@ class LinearPath:
         return np.asarray(self._x[slot - self._first])
 
     def _next_states(self, noise: FloatArray) -> FloatArray:
-        """Return states (BLOCK + 1, n) before any rebase, of which the first is known."""
+        """Return the states (BLOCK + 1, n), each before a rebase, from the last one drawn on.
+
+        ``noise`` (BLOCK, n) is what each step adds.
+        """
         frame, first = self.frame_slots, self._first
         if frame is None:
             return np.asarray(self._steps.states(self._x[-1:], noise[None, None])[0])
-        begun = max(slot for slot in self._origins if slot <= first)
-        self._origins = {slot: x for slot, x in self._origins.items() if slot >= begun - frame}
+        frame_start = max(slot for slot in self._origins if slot <= first)
+        # Earlier origins are not asked for again.
+        self._origins = {
+            slot: x for slot, x in self._origins.items() if slot >= frame_start - frame
+        }
         parts, start = [self._x[-1:]], 0
+        # The recursion is interrupted at each rebase.
         for end in [*range(frame - first % frame, len(noise), frame), len(noise)]:
             x = self._steps.states(self._last[None], noise[None, None, start:end])[0]
             parts.append(x[1:])
@@ -158,14 +175,14 @@ class LinearPath:
         return np.concatenate(parts)
 
     def _move_origin(self, slot: int) -> FloatArray:
-        """Return the absolute position (n,) in a slot of the origin of the frame that holds its
-        state before any rebase.
+        """Return the absolute position (n,) at ``slot`` of the origin of the frame before a rebase
+        in that slot: it moves as x[k+1] = F x[k] from the start of the frame.
         """
         assert self.frame_slots is not None
-        begun = max(slot - 1, 0) // self.frame_slots * self.frame_slots
-        x = self._origins[begun]
+        frame_start = max(slot - 1, 0) // self.frame_slots * self.frame_slots
+        x = self._origins[frame_start]
         with np.errstate(over="ignore", invalid="ignore"):
-            for _ in range(slot - begun if x.any() else 0):
+            for _ in range(slot - frame_start if x.any() else 0):
                 x = apply(self._steps.F, x)
         return np.asarray(x)
 
@@ -175,7 +192,7 @@ class LinearPath:
         return self._state_at(slot)
 
     def absolute(self, slot: int) -> FloatArray:
-        """Return x (n,), at a slot not before the last one asked for."""
+        """Return x (n,) in the plant's coordinates, at a slot not before the last one asked for."""
         x = self._state_at(slot)
         return x if self.frame_slots is None else self._move_origin(slot) + x
 
@@ -195,30 +212,31 @@ class SlotReadings:
         return self._H
 
     def reading(self, slot: int, x: FloatArray) -> FloatArray:
-        """Return the reading (p,) of a slot not before the last one asked for; each has its own
-        noise.
+        """Return ``H x + v`` (p,) of a slot not before the last one asked for, where the state is x
+        (n,).
         """
         return apply(self.matrix(slot), x) + self.noise(slot)
 
     def noise(self, slot: int) -> FloatArray:
-        """Return the noise (p,) of the reading of a slot not before the last one asked for."""
+        """Return the noise v (p,) of a slot not before the last one asked for."""
         while self._slot < slot:
             self._v = apply(self._root, self._noise.draw())
             self._slot += 1
         return self._v
 
     def matrices(self, slots: Sequence[int]) -> FloatArray:
-        """Return ``matrix`` (S, p, n) of slots that ascend."""
+        """Return ``matrix`` (S, p, n) of increasing slots."""
         return np.broadcast_to(self._H, (len(slots), *self._H.shape))
 
     def several(self, slots: Sequence[int], x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return ``reading`` (S, p) and ``matrix`` (S, p, n) of slots that ascend, with states
+        """Return ``reading`` (S, p) and ``matrix`` (S, p, n) of increasing slots whose states are x
         (S, n).
         """
         H = self.matrices(slots)
-        ahead = np.array(slots) - self._slot - 1
-        # Slot by slot, so that no reading is rounded as the slots happen to be taken together.
-        normals = self._noise.draws(int(ahead[-1]) + 1)[ahead]
+        offsets = np.array(slots) - self._slot - 1
+        # ``apply`` multiplies each vector by itself: readings have the same bits however many slots
+        # are asked for together.
+        normals = self._noise.draws(int(offsets[-1]) + 1)[offsets]
         noise = apply(self._root, normals)
         self._slot, self._v = slots[-1], noise[-1]
         return apply(H, x) + noise, H
@@ -240,9 +258,9 @@ class Blocks:
 
     def draws(self, count: int) -> FloatArray:
         """Return the next vectors (count, size)."""
-        short = self._used + count - len(self._drawn)
-        if short > 0:
-            more = self._random.standard_normal((max(short, BLOCK), self._size))
-            self._drawn, self._used = np.concatenate([self._drawn[self._used :], more]), 0
+        shortfall = self._used + count - len(self._drawn)
+        if shortfall > 0:
+            block = self._random.standard_normal((max(shortfall, BLOCK), self._size))
+            self._drawn, self._used = np.concatenate([self._drawn[self._used :], block]), 0
         self._used += count
         return np.asarray(self._drawn[self._used - count : self._used])

@@ -36,13 +36,13 @@ GRAPH = "graph"
 
 
 class Linearised:
-    """What a filter makes of a reading of a sensor at one of its nodes."""
+    """Linearises readings of a sensor at one of its nodes, as the extended Kalman filter does."""
 
     def __init__(self, sensor: NonlinearSensor, node: int) -> None:
         self._sensor, self._node = sensor, node
 
     def __call__(self, y: FloatArray, xhat: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return y (p,) and H (p, n) of the reading as linearised at an estimate (n,)."""
+        """Return ``y - h(xhat) + J xhat`` (p,) and the Jacobian J (p, n) at xhat (n,)."""
         J = np.asarray(self._sensor.jacobian(xhat, self._node), dtype=np.float64)
         expected = np.asarray(self._sensor.h(xhat, self._node), dtype=np.float64)
         return self._sensor.difference(y, expected) + J @ xhat, J
@@ -63,21 +63,21 @@ class NonlinearSensor(Sensor):
 
     @abstractmethod
     def h(self, x: FloatArray, node: int) -> FloatArray:
-        """Return the reading (p,) without noise of a node when the state is x (n,)."""
+        """Return the noiseless reading (p,) of a node when the state is x (n,)."""
 
     @abstractmethod
     def jacobian(self, x: FloatArray, node: int) -> FloatArray:
-        """Return the derivatives (p, n) of ``h`` at x (n,)."""
+        """Return the Jacobian (p, n) of ``h`` at x (n,)."""
 
     def difference(self, y: FloatArray, expected: FloatArray) -> FloatArray:
-        """Return how far a reading (p,) is from an expected one."""
+        """Return the innovation (p,): a reading y (p,) minus the ``expected`` one (p,)."""
         return y - expected
 
     def check_state(self, n: int) -> None:
         """Raise ScenarioError if the sensor cannot read a state of n components."""
 
     def located(self, positions: dict[int, tuple[float, float]] | None) -> NonlinearSensor:
-        """Return the sensor with its nodes at the ``positions`` of the graph, if it needs any."""
+        """Return the sensor with the nodes at the ``positions`` of the graph, if it uses them."""
         return self
 
     @property
@@ -86,7 +86,7 @@ class NonlinearSensor(Sensor):
         return True
 
     def matrix_of(self, n: int) -> FloatArray:
-        """Return zeros (p, n): there is no H before an estimate."""
+        """Return zeros (p, n): H is unknown before there is an estimate."""
         return np.zeros((len(self.R), n))
 
     def slot_path(
@@ -114,8 +114,9 @@ class NonlinearSensor(Sensor):
 
 
 class NonlinearReadings(SlotReadings):
-    """The readings of a nonlinear sensor at one node, one a slot; ``matrix`` is how a filter
-    linearises them.
+    """The readings of a nonlinear sensor at one node, one a slot.
+
+    ``matrix`` returns the function that linearises a reading instead of a matrix.
     """
 
     def __init__(self, sensor: NonlinearSensor, node: int, random: np.random.Generator) -> None:
@@ -129,8 +130,8 @@ class NonlinearReadings(SlotReadings):
     def reading(self, slot: int, x: FloatArray) -> FloatArray:
         """Return the reading (p,) of a slot not before the last one asked for."""
         noise = self.noise(slot)
-        found: FloatArray = np.asarray(self._sensor.h(x, self._node), dtype=np.float64) + noise
-        return found
+        y: FloatArray = np.asarray(self._sensor.h(x, self._node), dtype=np.float64) + noise
+        return y
 
 
 class NonlinearSamples:
@@ -189,9 +190,9 @@ class PositionedSensor(NonlinearSensor):
         if max(self.states) >= n or len(set(self.states)) < len(self.states):
             rule = f"must be different components of a state of {n}, counted from 0"
             raise ScenarioError("states", rule, list(self.states), "name those of the position")
-        most = (2, 3) if self.rows == 1 and not self.turns else (2,)
-        if len(self.states) not in most:
-            rule = f"must be {' or '.join(map(str, most))} for this sensor"
+        dimensions = (2, 3) if self.rows == 1 and not self.turns else (2,)
+        if len(self.states) not in dimensions:
+            rule = f"must be {' or '.join(map(str, dimensions))} for this sensor"
             raise ScenarioError("states", rule, list(self.states), "name those of the position")
         shape = np.shape(self.positions)
         if not isinstance(self.positions, str) and shape != (len(self.nodes), len(self.states)):
@@ -202,29 +203,29 @@ class PositionedSensor(NonlinearSensor):
             raise ScenarioError("R", rule, "{} x {}".format(*self.R.shape), "add or remove")
 
     def offset(self, x: FloatArray, node: int) -> FloatArray:
-        """Return the target's position relative to a node."""
+        """Return the position (d,) of the target relative to a node, d = len(states)."""
         positions = np.asarray(self.positions, dtype=np.float64)
         return np.asarray(x[list(self.states)] - positions[self.nodes.index(node)])
 
     def placed_columns(self, derivatives: FloatArray, n: int) -> FloatArray:
-        """Return derivatives (p, d) by the position as those (p, n) by the state."""
-        found = np.zeros((len(derivatives), n))
-        found[:, list(self.states)] = derivatives
-        return found
+        """Return the Jacobian (p, n) by the state from ``derivatives`` (p, d) by the position."""
+        jacobian = np.zeros((len(derivatives), n))
+        jacobian[:, list(self.states)] = derivatives
+        return jacobian
 
     def difference(self, y: FloatArray, expected: FloatArray) -> FloatArray:
-        """Return the difference of readings, angles as the shorter way round, in [-pi, pi)."""
-        found = y - expected
+        """Return ``y - expected`` (p,), with angles wrapped to [-pi, pi)."""
+        innovation = y - expected
         if self.turns:
-            found[-1] = (found[-1] + math.pi) % (2.0 * math.pi) - math.pi
-        return found
+            innovation[-1] = (innovation[-1] + math.pi) % (2.0 * math.pi) - math.pi
+        return innovation
 
 
 @dataclass(frozen=True, eq=False)
 class RangeSensor(PositionedSensor):
     """``y = |p - q| + v``: the distance of a target at p from the node at q, in 2 or 3 dimensions.
 
-    At distance 0, where there is no derivative, a reading is taken to say nothing.
+    At distance 0, where h has no derivative, the Jacobian is 0: the reading has no effect.
     """
 
     rows: ClassVar[int] = 1
@@ -234,14 +235,14 @@ class RangeSensor(PositionedSensor):
         return np.array([math.hypot(*self.offset(x, node))])
 
     def jacobian(self, x: FloatArray, node: int) -> FloatArray:
-        """Return the unit vector from the node to the target as a row."""
+        """Return the Jacobian (1, n): the unit vector from the node to the target."""
         return self.placed_columns(toward(self.offset(x, node))[None], len(x))
 
 
 @dataclass(frozen=True, eq=False)
 class BearingSensor(PositionedSensor):
     """``y = atan2(p_2 - q_2, p_1 - q_1) + v`` in radians: the direction from the node at q to a
-    target at p. Innovations are the shorter way round.
+    target at p. Innovations are wrapped to [-pi, pi).
     """
 
     rows: ClassVar[int] = 1
@@ -253,7 +254,7 @@ class BearingSensor(PositionedSensor):
         return np.array([math.atan2(second, first)])
 
     def jacobian(self, x: FloatArray, node: int) -> FloatArray:
-        """Return ``[-d_2, d_1] / |d|^2`` for the offset d as a row."""
+        """Return the Jacobian (1, n): ``[-d_2, d_1] / |d|^2`` for the offset d."""
         return self.placed_columns(across(self.offset(x, node))[None], len(x))
 
 
@@ -270,7 +271,7 @@ class RangeBearingSensor(PositionedSensor):
         return np.array([math.hypot(first, second), math.atan2(second, first)])
 
     def jacobian(self, x: FloatArray, node: int) -> FloatArray:
-        """Return the rows of both."""
+        """Return the Jacobian (2, n): the row of the distance, then that of the angle."""
         d = self.offset(x, node)
         return self.placed_columns(np.stack([toward(d), across(d)]), len(x))
 

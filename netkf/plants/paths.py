@@ -1,13 +1,15 @@
 """The path of a diffusion in one run, drawn block by block of steps of the sensing grid.
 
 The path is drawn exactly on the sensing grid ``t_k = k h``: each step gives ``x(t_{k+1})`` and the
-two moments of x over the step (core/legendre), all from one stream and whatever the network does.
-Between grid points, filters that are woken by the network need part of a step. There the path is
-the response to the state at the grid point plus the cubic that agrees with the step's end and with
-its two moments; what that leaves out of a reading is of third order in h and less than 1e-4 h^3 of
-the noise intensity. Where a state is *sampled* or *probed* off the grid, the step is cut there
-beforehand: state and moments are drawn from their exact law given the step, from streams of their
-own, the sampled ones first. On frames see ``truth``.
+two moments of x over the step, ``int x dt`` and ``int x P_1 dt`` with the Legendre polynomial P_1
+of the step (linalg/legendre). All come from one stream and do not depend on the network.
+
+A filter that the network wakes between grid points needs the moments over part of a step. There the
+path is approximated by the response to the state at the grid point plus the cubic that agrees with
+the end and the two moments of the step; the error in a reading is of third order in h, less than
+1e-4 h^3 of the noise intensity. Where a state is *sampled* or *probed* off the grid, the step is
+cut beforehand: state and moments are drawn from their exact law given the step, from separate
+streams, sample times first. ``truth`` explains frames.
 """
 
 from __future__ import annotations
@@ -30,9 +32,12 @@ BLOCK = 64  # steps drawn at once, or a multiple of it
 
 
 class PathStep(NamedTuple):
-    """One stretch of the path: times, states at its ends, (2, n) moments, and the cubic of what
-    noise added: (3, n) coefficients of u, u^2 and u^3 of the share u of the stretch, times its
-    seconds.
+    """One piece of the path: a sensing step, or a part of one that was cut.
+
+    ``start, end`` are in seconds, ``x_start, x_end`` (n,) the states there and ``moments`` (2, n)
+    the integrals of x and of x P_1 over the piece (P_1: Legendre polynomial). ``cubic`` (3, n)
+    stands for the contribution of the noise to x: coefficients of u, u^2 and u^3, times the length
+    in seconds, where u is the share of the piece that has passed.
     """
 
     start: float
@@ -44,9 +49,11 @@ class PathStep(NamedTuple):
 
 
 class Block(NamedTuple):
-    """Some steps S as K pieces, since a step is cut where a state is probed: ``start, end`` (K,), x
-    at both (K, n), ``moments`` (K, 2, n), ``cubic`` (K, 3, n) and whose ``step`` (K,) each is;
-    ``ends`` (S,) of the steps. What is random comes for B paths at once, (B, K, ...).
+    """S consecutive sensing steps of B paths, cut into K >= S pieces at the sample and probe times.
+
+    Of the pieces: ``start, end`` (K,) in seconds, states ``x_start, x_end`` (B, K, n), ``moments``
+    (B, K, 2, n) and ``cubic`` (B, K, 3, n) as in PathStep, and the index ``step`` (K,) of the step
+    that each belongs to. ``ends`` (S,) are the end times of the steps.
     """
 
     start: FloatArray
@@ -59,7 +66,7 @@ class Block(NamedTuple):
     ends: FloatArray
 
     def of(self, k: int) -> Block:
-        """Return the block of path ``k``, without the first axis."""
+        """Return the block of path ``k``: arrays (K, ...) without the axis of paths."""
         return self._replace(
             x_start=self.x_start[k],
             x_end=self.x_end[k],
@@ -76,14 +83,15 @@ class Cuts(NamedTuple):
 
 
 class DiffusionPaths:
-    """The paths of B runs, which are cut at the same times: ``start`` (B, n), the normals of each,
-    and where states are sampled or probed (``cuts``, one after the other).
+    """The paths of B runs from x(0) = ``start`` (B, n), drawn with the ``normals`` of each run.
 
-    With ``frame_steps``, states are local: they start again from zero every so many steps, so that
-    a piece may end at a state that the next one does not start from.
+    All are cut at the same times: those of the first of ``cuts``, then those of the second given
+    the first. ``start`` is overwritten: it holds the state at the end of the last step drawn.
 
-    Each path is to the last bit what it is alone, and however many steps are drawn at once;
-    ``start`` is overwritten.
+    With ``frame_steps`` states are local: they restart from zero after every ``frame_steps`` steps,
+    so that a piece may end at a state from which the next one does not start.
+
+    A path has the same bits alone or among others, and however many steps one call draws.
     """
 
     def __init__(
@@ -99,13 +107,13 @@ class DiffusionPaths:
         self._x, self._drawn = start, 0
 
     def following(self, blocks: int = 1, most: int | None = None) -> Block:
-        """Return the next steps of the sensing grid, ``blocks`` times BLOCK, but ``most``
-        at most.
+        """Draw and return the next steps of the sensing grid: ``blocks`` times BLOCK of them, at
+        most ``most``.
         """
-        laws, (count, n) = self.laws, self._x.shape
+        laws, (paths, n) = self.laws, self._x.shape
         total = blocks * BLOCK if most is None else min(most, blocks * BLOCK)
-        x_start, x_end = (np.empty((count, total, n)) for _ in range(2))
-        moments, cubic = np.empty((count, total, 2, n)), np.empty((count, total, 3, n))
+        x_start, x_end = (np.empty((paths, total, n)) for _ in range(2))
+        moments, cubic = np.empty((paths, total, 2, n)), np.empty((paths, total, 3, n))
         # One kernel call draws all steps of all runs: end, moments and cubic.
         fill_steps(
             self._normals.draw((total, 3 * n)),
@@ -134,50 +142,52 @@ class DiffusionPaths:
         # One kind of cuts after the other: probed states are drawn given those that were sampled.
         for cuts in self._cuts:
             first, last = np.searchsorted(cuts.times, times[[0, -1]], side="right")
-            due = cuts.times[first:last]
+            block_times = cuts.times[first:last]
             # A time at the end of a piece needs no cut.
-            inside = due[~np.isin(due, block.end)]
+            inside = block_times[~np.isin(block_times, block.end)]
             if len(inside):
                 block = self._cut(block, inside, cuts.normals)
         return block
 
     def _cut(self, block: Block, times: FloatArray, source: Normals) -> Block:
-        """Return the block with pieces that also end at the ``times``, inside its
-        own pieces.
+        """Return the block cut further at the ``times`` (C,), none of which is an end of a piece;
+        states and moments there are drawn from ``source``.
         """
-        # The piece that each time is in.
+        # Index of the piece that contains each time.
         owners = np.searchsorted(block.end, times)
         normals = source.draw((len(times), 3 * self.laws.n))
         # A piece with m cuts becomes m + 1 rows, copies of it at first.
         counts = 1 + np.bincount(owners, minlength=len(block.end))
-        # A piece cut twice is cut at the first time, and what is left of it at the second.
+        # A piece with several cuts is cut at the first time, then its remainder at the second, ...:
+        # ``turn`` numbers the cuts of a piece from 0.
         turn = np.arange(len(times)) - np.searchsorted(owners, owners)
-        which = np.repeat(np.arange(len(block.end)), counts)
+        parents = np.repeat(np.arange(len(block.end)), counts)
         pieces = Block(
-            start=block.start[which],
-            end=block.end[which],
-            x_start=np.take(block.x_start, which, axis=1),
-            x_end=np.take(block.x_end, which, axis=1),
-            moments=np.take(block.moments, which, axis=1),
-            cubic=np.take(block.cubic, which, axis=1),
-            step=block.step[which],
+            start=block.start[parents],
+            end=block.end[parents],
+            x_start=np.take(block.x_start, parents, axis=1),
+            x_end=np.take(block.x_end, parents, axis=1),
+            moments=np.take(block.moments, parents, axis=1),
+            cubic=np.take(block.cubic, parents, axis=1),
+            step=block.step[parents],
             ends=block.ends,
         )
-        # Row in which a time's piece is at its turn, and the end of the copies of its piece.
+        # Row of the piece to cut at each time, and the row after the last copy of that piece.
         firsts = np.cumsum(counts) - counts
         rows, stops = firsts[owners] + turn, (firsts + counts)[owners]
         # The k-th cuts of all pieces at once.
         for k in range(int(turn.max()) + 1):
-            chosen = turn == k
-            # The conditional law depends on the length and on the cut alone: equal ones are drawn
-            # together. Rounding unites lengths that differ by rounding.
-            lengths = np.round(pieces.end[rows[chosen]] - pieces.start[rows[chosen]], 12)
-            lefts = np.round(times[chosen] - pieces.start[rows[chosen]], 12)
-            laws = np.unique(np.stack([lengths, lefts]), axis=1, return_inverse=True)[1].ravel()
+            cuts = np.flatnonzero(turn == k)
+            # The conditional law depends only on the length and on the position of the cut: cuts
+            # with the same law are drawn together. Values that differ by rounding count as equal.
+            starts = pieces.start[rows[cuts]]
+            lengths = np.round(pieces.end[rows[cuts]] - starts, 12)
+            positions = np.round(times[cuts] - starts, 12)
+            laws = np.unique(np.stack([lengths, positions]), axis=1, return_inverse=True)[1].ravel()
             for law in range(int(laws.max()) + 1):
-                same = np.flatnonzero(chosen)[laws == law]
+                group = cuts[laws == law]
                 self._split(
-                    pieces, rows[same], stops[same], times[same], np.take(normals, same, axis=1)
+                    pieces, rows[group], stops[group], times[group], np.take(normals, group, axis=1)
                 )
         return pieces
 
@@ -189,19 +199,21 @@ class DiffusionPaths:
         times: FloatArray,
         normals: FloatArray,
     ) -> None:
-        """Draw the paths at ``times`` given the pieces in ``rows``, all of one length and cut at
-        the same position, and divide each with the rows after it up to its ``stops``.
+        """Cut the pieces in ``rows`` (C,) at ``times`` (C,), given their ends and moments.
+
+        All have the same length and are cut at the same position. The row becomes the part before
+        the cut, the rows after it up to ``stops`` (C,) the part after it. ``normals`` (B, C, 3 n).
         """
         laws = self.laws
         length = float(pieces.end[rows[0]] - pieces.start[rows[0]])
-        left = float(times[0] - pieces.start[rows[0]])
+        before = float(times[0] - pieces.start[rows[0]])
         split_pieces(
             rows,
             stops,
             normals,
-            *laws.conditional_law(length, left),
-            np.stack([laws.responses(gap) for gap in (length, left, length - left)]),
-            np.array([length, left]),
+            *laws.conditional_law(length, before),
+            np.stack([laws.responses(gap) for gap in (length, before, length - before)]),
+            np.array([length, before]),
             np.empty((4, 3 * laws.n)),
             (pieces.x_start, pieces.x_end, pieces.moments, pieces.cubic),
         )
@@ -216,62 +228,71 @@ def split_pieces(
     stops: IntArray,
     normals: FloatArray,
     gain: FloatArray,
-    spread: FloatArray,
+    factor: FloatArray,
     responses: FloatArray,
     lengths: FloatArray,
     work: FloatArray,
     pieces: tuple[FloatArray, FloatArray, FloatArray, FloatArray],
 ) -> None:
-    """Cut the pieces in ``rows`` (K,) of B paths, all of one length and at the same position, from
-    standard normals (B, K, 3 n): a row becomes the part before the cut, and those after it up to
-    its ``stops`` (K,) the rest. ``pieces`` are states at their starts and ends, moments and cubics
-    as in ``fill_steps``. ``gain`` and ``spread`` (3 n, 3 n) are GridLaws.conditional_law,
-    ``responses`` (3, 3, n, n) those over the whole, the part before and the rest, ``lengths`` (2,)
-    the seconds of the first two; ``work`` (4, 3 n) is scratch.
+    """Cut the pieces in ``rows`` (K,) of B paths, given their ends and moments.
+
+    All have the same length and are cut at the same position. A row becomes the part before the
+    cut, and the rows after it up to its ``stops`` (K,) the part after it.
+
+    normals   (B, K, 3 n) standard normal numbers
+    gain      (3 n, 3 n) and ``factor`` (3 n, 3 n): GridLaws.conditional_law
+    responses (3, 3, n, n) GridLaws.responses over the whole piece and the parts before and after
+    lengths   (2,) seconds of the whole piece and of the part before the cut
+    work      (4, 3 n) scratch
+    pieces    states at the starts and ends, moments and cubics, as in ``fill_steps``
+
+    Vectors of 3 n numbers hold a state x and the two moments, one after the other.
     """
     x_start, x_end, moments, _ = pieces
-    n, length, left = x_start.shape[2], lengths[0], lengths[1]
-    known, free, noise, values = work[0], work[1], work[2], work[3]
-    share = left / length
+    n, length, before = x_start.shape[2], lengths[0], lengths[1]
+    whole, noise, cut_noise, cut = work[0], work[1], work[2], work[3]
+    share = before / length
     for run in range(len(normals)):
         for k in range(len(rows)):
             row = rows[k]
+            # whole = (end, moments) of the piece
             for i in range(n):
-                known[i] = x_end[run, row, i]
-                known[n + i], known[2 * n + i] = moments[run, row, 0, i], moments[run, row, 1, i]
-            # Law of (state, moments) at the cut given (end, moments) of the piece, all without the
-            # response to its start.
-            add_response(free, known, -1.0, responses, 0, x_start, run, row)
+                whole[i] = x_end[run, row, i]
+                whole[n + i], whole[2 * n + i] = moments[run, row, 0, i], moments[run, row, 1, i]
+            # noise = whole - response to the start: the contribution of the noise
+            add_response(noise, whole, -1.0, responses, 0, x_start, run, row)
+            # cut_noise = gain noise + factor z: that contribution to (state, moments) at the cut,
+            # drawn from its conditional law
             for e in range(3 * n):
                 mean = deviation = 0.0
                 for c in range(3 * n):
-                    mean += free[c] * gain[e, c]
-                    deviation += normals[run, k, c] * spread[e, c]
-                noise[e] = mean + deviation
-            # Add the response to the start again.
-            add_response(values, noise, 1.0, responses, 1, x_start, run, row)
-            set_part(pieces, run, row, left, values, noise)
-            # Moments of the rest: the whole's P_1 is (share - 1) + share P_1 on the left part and
-            # share + (1 - share) P_1 on the right one.
+                    mean += noise[c] * gain[e, c]
+                    deviation += normals[run, k, c] * factor[e, c]
+                cut_noise[e] = mean + deviation
+            # cut = cut_noise + response to the start: state at the cut and moments before it
+            add_response(cut, cut_noise, 1.0, responses, 1, x_start, run, row)
+            set_part(pieces, run, row, before, cut, cut_noise)
+            # Moments after the cut, written to ``whole``. P_1 of the whole piece is
+            # (share - 1) + share P_1 on the part before and share + (1 - share) P_1 on the part
+            # after, which is solved for the moments after.
             for i in range(n):
-                x_end[run, row, i] = values[i]
-                first, slope = values[n + i], values[2 * n + i]
-                plain = known[n + i] - first
-                tilted = known[2 * n + i] - (share - 1.0) * first - share * slope
-                known[n + i], known[2 * n + i] = plain, (tilted - share * plain) / (1.0 - share)
-            # The rest starts from the state at the cut: what noise adds there is what the response
-            # to that state leaves.
-            add_response(free, known, -1.0, responses, 2, x_end, run, row)
+                x_end[run, row, i] = cut[i]
+                plain_before, tilted_before = cut[n + i], cut[2 * n + i]
+                plain = whole[n + i] - plain_before
+                tilted = whole[2 * n + i] - (share - 1.0) * plain_before - share * tilted_before
+                whole[n + i], whole[2 * n + i] = plain, (tilted - share * plain) / (1.0 - share)
+            # noise = whole - response to the state at the cut, where the part after starts
+            add_response(noise, whole, -1.0, responses, 2, x_end, run, row)
             for after in range(row + 1, stops[k]):
                 for i in range(n):
-                    x_start[run, after, i] = values[i]
-                set_part(pieces, run, after, length - left, known, free)
+                    x_start[run, after, i] = cut[i]
+                set_part(pieces, run, after, length - before, whole, noise)
 
 
 @kernel(compact=True)
 def add_response(
     out: FloatArray,
-    given: FloatArray,
+    values: FloatArray,
     sign: float,
     responses: FloatArray,
     which: int,
@@ -279,8 +300,8 @@ def add_response(
     run: int,
     row: int,
 ) -> None:
-    """Write ``given`` (3 n,) plus ``sign`` times the response of state and moments to the state
-    x[run, row].
+    """Write ``out`` = ``values`` + ``sign`` R x[run, row], both (3 n,), where R (3 n, n) is
+    ``responses[which]``: the response of end state and moments to the state at the start.
     """
     n = x.shape[2]
     for m in range(3):
@@ -288,7 +309,7 @@ def add_response(
             total = 0.0
             for j in range(n):
                 total += x[run, row, j] * responses[which, m, i, j]
-            out[m * n + i] = given[m * n + i] + sign * total
+            out[m * n + i] = values[m * n + i] + sign * total
 
 
 @kernel(compact=True)
@@ -300,8 +321,10 @@ def set_part(
     values: FloatArray,
     noise: FloatArray,
 ) -> None:
-    """Write the moments in ``values`` (3 n,) and the cubic of what ``noise`` (3 n,) adds to the end
-    and to the moments of a piece of ``length`` seconds.
+    """Set moments and cubic of the piece ``row`` of ``length`` seconds in path ``run``.
+
+    ``values`` (3 n,) are its end state and moments, ``noise`` (3 n,) the contribution of the noise
+    to them, which the cubic interpolates.
     """
     _, _, moments, cubic = pieces
     n = moments.shape[3]
@@ -321,11 +344,13 @@ def fill_cubic(
     plain: float,
     tilted: float,
 ) -> None:
-    """Write the coefficients of u, u^2 and u^3, times ``length`` seconds, of the cubic that is 0 at
-    u = 0, ``end`` at u = 1 and has these moments over the seconds.
+    """Set ``cubic[run, row, :, i]``: the coefficients, times ``length``, of u, u^2 and u^3 of the
+    cubic on 0 <= u <= 1 that is 0 at u = 0 and ``end`` at u = 1.
+
+    Over ``length`` seconds its integral is ``plain`` and that of its product with P_1 ``tilted``.
     """
-    # c = 6 M_0 - 10 S_1 + 3 e, 30 S_1 - 6 M_0 - 12 e, 10 e - 20 S_1 of e = length end, the moment
-    # M_0 with P_0 and S_1 = 3 M_1: its integrals with P_0 and P_1 are M_0 and M_1.
+    # With e = length end, M_0 = plain and S_1 = 3 tilted the four conditions give
+    # 6 M_0 - 10 S_1 + 3 e, 30 S_1 - 6 M_0 - 12 e and 10 e - 20 S_1.
     last, slope = length * end, 3.0 * tilted
     cubic[run, row, 0, i] = 6.0 * plain - 10.0 * slope + 3.0 * last
     cubic[run, row, 1, i] = 30.0 * slope - 6.0 * plain - 12.0 * last
@@ -344,17 +369,23 @@ def fill_steps(
     noise: FloatArray,
     out: tuple[FloatArray, FloatArray, FloatArray, FloatArray],
 ) -> None:
-    """Write S steps of B paths from standard normals (B, S, 3 n): states at their starts and ends
-    (B, S, n), moments (B, S, 2, n) and cubics (B, S, 3, n). ``x`` (B, n) is the state before the
-    steps and then after them; ``drawn`` steps were before. A frame begins every ``frame_steps``
-    steps, 0: never. ``factor`` (3 n, 3 n) and ``response`` (3, n, n) are those of GridLaws;
-    ``noise`` (3 n,) is scratch.
+    """Write S sensing steps of B paths into ``out``: states at their starts and ends (B, S, n),
+    moments (B, S, 2, n) and cubics (B, S, 3, n).
+
+    normals     (B, S, 3 n) standard normal numbers
+    factor      (3 n, 3 n) GridLaws.noise_factor: covariance root of end and moments of one step
+    response    (3, n, n) GridLaws.response: their response to the state at the start
+    frame_steps steps from one frame to the next; 0: no frames
+    drawn       number of steps of these paths before this call
+    x           (B, n) state before the steps, replaced by the one after them
+    noise       (3 n,) scratch
     """
     x_start, x_end, moments, cubic = out
     runs, steps, n = x_start.shape
     for run in range(runs):
         for k in range(steps):
-            # What noise adds to the end of the step and to its two moments.
+            # noise = factor z: the contribution of the noise to the end and to the two moments.
+            # factor is lower triangular.
             for i in range(3 * n):
                 noise[i] = 0.0
                 for j in range(i + 1):
@@ -365,27 +396,33 @@ def fill_steps(
                 x_start[run, k, i] = x[run, i]
                 x_end[run, k, i] = end
                 moments[run, k, 0, i], moments[run, k, 1, i] = plain, tilted
-                # Response to the start of the step, exact for all three.
+                # Plus the response to the start: end += e^{A h} x, and likewise the moments.
                 for j in range(n):
                     x_end[run, k, i] += response[0, i, j] * x[run, j]
                     moments[run, k, 0, i] += response[1, i, j] * x[run, j]
                     moments[run, k, 1, i] += response[2, i, j] * x[run, j]
-            # A frame ends with this step: the next one starts from 0 in its own coordinates.
+            # The next step starts from 0 in the coordinates of its own frame.
             rebased = frame_steps > 0 and (drawn + k + 1) % frame_steps == 0
             for i in range(n):
                 x[run, i] = 0.0 if rebased else x_end[run, k, i]
 
 
 class DiffusionPath:
-    """The path of one run, asked for step by step."""
+    """The path of one run: states and moments at times that do not decrease.
+
+    Blocks of steps are drawn when a time beyond the last one is asked for. With frames, those that
+    begin before the ``horizon`` (seconds) have ``frame_times``.
+    """
 
     def __init__(self, paths: DiffusionPaths, horizon: float = 0.0) -> None:
         self.laws, self.period, self._paths = paths.laws, paths.laws.period, paths
         self.frame_times = self._frame_times(horizon)
         self._moves = Transitions(self.laws.A, self.laws.B) if len(self.frame_times) else None
-        self._frame, self._origin = 0, np.zeros(self.laws.n)  # of the present frame, at its start
+        # Number of the present frame, and absolute position of its origin at its start.
+        self._frame, self._origin = 0, np.zeros(self.laws.n)
         self._block: Block | None = None
-        self._first = self._piece = 0  # of the present step, and the one last asked for
+        # Indices of the first piece of the present step, and of the piece last asked for.
+        self._first = self._piece = 0
         self._step, self._step_end = PathStep(0.0, 0.0, *[np.empty(0)] * 4), 0.0
 
     def grid(self, k: int) -> float:
@@ -393,19 +430,18 @@ class DiffusionPath:
         return grid_time(self.period, k)
 
     def _at(self, time: float) -> PathStep:
-        """Return the piece that ``time`` is in; it may lie before the last one asked for, in its
-        step.
+        """Return the piece that contains ``time`` (start < time <= end), in the sensing step last
+        asked for or a later one.
         """
-        # Blocks are drawn when they are asked for: the path is never longer than it has to be.
         while self._block is None or time > self._block.ends[-1]:
             self._block, self._first, self._piece = self._paths.following().of(0), 0, -1
-        # From the first piece of the present step, since a node may lag behind the last call.
+        # Search from the first piece of the present step: nodes ask in any order within a step.
         block, k = self._block, self._first
         while block.end[k] < time:
             k += 1
         if k != self._piece:
             self._piece = k
-            self._step = PathStep(*(part[k] for part in block[:6]))
+            self._step = PathStep(*(array[k] for array in block[:6]))
             self._step_end = float(block.ends[block.step[k]])
             self._first = int(np.searchsorted(block.step, block.step[k]))
         return self._step
@@ -415,8 +451,8 @@ class DiffusionPath:
         return self._step_end
 
     def moments(self, start: float, end: float) -> FloatArray:
-        """Return moments (2, n) of x over ``[start, end]``, which lies inside one sensing step and
-        not in one before the last one asked for.
+        """Return moments (2, n) of x over ``[start, end]``, inside one sensing step: the one last
+        asked for or a later one.
         """
         step = self._at(end)
         if start >= step.start:
@@ -424,27 +460,26 @@ class DiffusionPath:
         return self._over_pieces(start, end)
 
     def _over_pieces(self, start: float, end: float) -> FloatArray:
-        """Return ``moments`` over several pieces of a step, which samples of other nodes
-        may cut.
+        """Return ``moments`` over several pieces of one step, as sample times of other nodes may
+        cut it inside the interval.
         """
         block, k, gap = self._block, self._piece, end - start
         assert block is not None
         total = np.zeros((2, self.laws.n))
         while True:
-            step = PathStep(*(part[k] for part in block[:6]))
-            first, last = max(start, step.start), min(end, step.end)
-            part = state_moments(self.laws, step, first, last)
-            # P_1 of the whole interval on this part of it.
+            piece = PathStep(*(array[k] for array in block[:6]))
+            first, last = max(start, piece.start), min(end, piece.end)
+            moments = state_moments(self.laws, piece, first, last)
+            # On [first, last] P_1 of the whole interval is middle + share P_1 of [first, last].
             middle = ((first - start) - (end - last)) / gap
-            # Moment by moment: P_0 adds up, P_1 is shifted by the middle and scaled by the share.
-            total[0] += part[0]
-            total[1] += middle * part[0] + (last - first) / gap * part[1]
-            if step.start <= start:
+            total[0] += moments[0]
+            total[1] += middle * moments[0] + (last - first) / gap * moments[1]
+            if piece.start <= start:
                 return total
             k -= 1
 
     def _frame_times(self, horizon: float) -> FloatArray:
-        """Return the times in seconds below the horizon at which a new moving frame begins."""
+        """Return the times (F,) in seconds, below the horizon, at which a new frame begins."""
         steps = self._paths.frame_steps
         if steps is None:
             return np.empty(0)
@@ -453,12 +488,12 @@ class DiffusionPath:
         return np.asarray(times[times < horizon])
 
     def local(self, time: float) -> FloatArray:
-        """Return x (n,) in the present frame, on the sensing grid or at a time sampled or probed,
-        not before the last one asked for; 0 at a frame time.
+        """Return x (n,) in the present frame at a grid, sample or probe time, not before the last
+        one asked for; 0 at a frame time.
         """
         step = self._at(time)
         assert time in (step.start, step.end), f"{time} is neither on the grid nor probed"
-        # The step that ends at the frame time still has coordinates of the frame before.
+        # The step that ends at the frame time is in coordinates of the previous frame.
         if self._begins_frame(time):
             return np.zeros(self.laws.n)
         return step.x_end if time == step.end else step.x_start
@@ -476,21 +511,21 @@ class DiffusionPath:
         step = self._at(time)
         start = 0.0 if k == 0 else float(self.frame_times[k - 1])
         with np.errstate(over="ignore", invalid="ignore"):
-            # The new origin: the old one moved to this time, plus the local state.
+            # New origin = e^{A g} (previous origin) + local state.
             self._origin = self._move_origin(time - start) + step.x_end
         self._frame = k + 1
         return step.x_end
 
     def _move_origin(self, gap: float) -> FloatArray:
         """Return the origin (n,) of the present frame ``gap`` seconds after its start."""
-        # An origin at 0 stays there.
+        # An origin at 0 stays there; the product would be nan where the transition overflows.
         if self._moves is None or not self._origin.any():
             return self._origin
         return apply(self._moves.transitions(np.array([gap]))[0], self._origin)
 
     def absolute(self, time: float) -> FloatArray:
-        """Return x (n,), as ``local``; ``rebase`` must have been called for all frame
-        times so far.
+        """Return x (n,) in the plant's coordinates at the times that ``local`` takes; ``rebase``
+        must have been called for all frame times so far.
         """
         x = self.local(time)
         if not self._frame:
@@ -502,9 +537,10 @@ class DiffusionPath:
 
 
 def state_moments(laws: GridLaws, step: PathStep, start: float, end: float) -> FloatArray:
-    """Return moments (2, n) of x over ``[start, end]`` inside a step."""
+    """Return moments (2, n) of x over ``[start, end]`` seconds inside a piece of the path."""
     n = len(step.x_start)
-    # The moments of a whole piece were drawn from their exact law: no cubic is needed.
+    # The moments of a whole piece were drawn from their exact law; those of a part are approximated
+    # by the cubic.
     if start == step.start and end == step.end:
         return step.moments
     since, gap, length = start - step.start, end - start, step.end - step.start
@@ -525,20 +561,22 @@ def fill_course(
     cubic: FloatArray,
     k: int,
 ) -> None:
-    """Write piece ``k`` of ``length`` seconds as a polynomial in the share u of the piece:
-    coefficients (D, W >= 2 n) such that ``u sum_d u^d out[d, :n]`` is the integral of x up to
-    there, and ``u^2 sum_d u^d out[d, n : 2 n]`` that of x times the share; ``table`` is
-    GridLaws.course_table.
+    """Write the running integrals of x over piece ``k`` of ``length`` seconds as polynomials in
+    u = (t - start) / length, 0 <= u <= 1.
+
+    The coefficients ``out`` (D, W >= 2 n) are such that the integral of x from the start to u is
+    ``u sum_d u^d out[d, :n]``, and that of x u is ``u^2 sum_d u^d out[d, n : 2 n]``. ``table`` is
+    GridLaws.course_table, ``x_start`` (K, n), ``cubic`` (K, 3, n).
     """
-    n, power = len(size), length
+    n, power = len(size), length  # power = length^(d + 1)
     for d in range(len(out)):
         for j in range(0, out.shape[1], LANES):
-            # The response to the state at the start: exp(A s) x by powers of s = u length.
+            # Response to the state at the start: the term A^d / d! (u length)^d of e^{A s} x.
             total = spread(MANY, 0.0)
             for i in range(n):
                 total += x_start[k, i] * load(MANY, table, d, i, j)
             total *= power
-            # What noise adds is a cubic.
+            # Contribution of the noise: a cubic without a term of degree 0.
             if 0 < d < 4:
                 for i in range(n):
                     total += cubic[k, d - 1, i] * load(MANY, table, d, n + i, j)
@@ -556,9 +594,11 @@ def fill_state_moments(
     length: float,
     scratch: FloatArray,
 ) -> None:
-    """Write the moments (2, n) of x over ``gap`` seconds from ``since`` on in a piece of ``length``
-    seconds into ``out``; ``course`` is what ``fill_course`` wrote for it, ``scratch`` has two rows
-    of it.
+    """Write the moments ``out`` (2, n) of x over ``gap`` seconds, which begin ``since`` seconds
+    after the start of a piece of ``length`` seconds.
+
+    ``course`` (D, W) are the coefficients that ``fill_course`` wrote for the piece, ``scratch``
+    (2 W,).
     """
     first, share = since / length, gap / length
     fill_integrals(scratch, course, first, first + share)
@@ -567,11 +607,12 @@ def fill_state_moments(
 
 @kernel(inlined=True, fused=True)
 def fill_integrals(out: FloatArray, course: FloatArray, first: float, last: float) -> None:
-    """Write both integrals of a ``course`` (D, W) up to the share ``first`` of the piece into
-    ``out[:W]``, and up to ``last`` behind them.
+    """Evaluate the polynomials ``u sum_d u^d course[d]`` (W,) of a ``course`` (D, W) at u =
+    ``first`` into ``out[:W]`` and at u = ``last`` into ``out[W : 2 W]``.
     """
     width, top = course.shape[1], len(course) - 1
-    # Horner's rule, of both at a time: each waits for the product before.
+    # Horner's rule at both points in one loop: each product waits for the one before it, so two
+    # independent chains take the time of one.
     for j in range(0, width, LANES):
         early = late = load(MANY, course, top, j)
         for d in range(top - 1, -1, -1):
@@ -592,11 +633,13 @@ def fill_moments_between(
     first: Any,
     share: Any,
 ) -> None:
-    """Write the moments (2, n, L) of x over a ``share`` of a piece that begins at its share
-    ``first``, from what ``fill_integrals`` wrote, (2 W, L) with W = ``width``.
+    """Write the moments ``out`` (2, n, L) of x over u in [first, first + share] of a piece.
+
+    ``integrals`` (2 W, L), W = ``width``, are those that ``fill_integrals`` wrote for both ends.
     """
     n, last = len(size), first + share
-    # P_1 of the gap is (u - middle) times 2 over its share of the piece.
+    # P_1 of the interval is (u - middle) scale. Row 0: int x. Row 1: int x P_1. The second integral
+    # of the course still lacks a factor u: int x u = u (that value).
     middle, scale = first + 0.5 * share, 2.0 / share
     for i in range(n):
         plain = load(lanes, integrals, width + i) - load(lanes, integrals, i)

@@ -26,7 +26,7 @@ class Plant(Component):
     former_names: ClassVar[Mapping[str, str]] = {"is_random": "drawn", "truth_known": "shown"}
 
     is_random: ClassVar[bool] = True
-    """True if runs draw the state from the model; otherwise only the filters use the model."""
+    """True if runs draw the state from the model; else the model is only the filters' belief."""
     truth_known: ClassVar[bool] = True
     """True if the state is known, so that errors can be computed."""
 
@@ -54,7 +54,7 @@ class Plant(Component):
         return noise_root(self.start_cov)
 
     def starts(self, normals: Normals) -> FloatArray:
-        """Return x(0) (B, n) of each run, drawn."""
-        # Row by row, so that no state is rounded as its neighbours happen to be.
-        drawn = product(normals.draw((1, self.n)), self.start_root.T)
-        return np.asarray(self.start_mean + drawn[:, 0])
+        """Draw x(0) = mean + root z of B runs, (B, n), one for each stream of ``normals``."""
+        # A product for each run: its state has the same bits whatever the other runs are.
+        deviations = product(normals.draw((1, self.n)), self.start_root.T)
+        return np.asarray(self.start_mean + deviations[:, 0])

@@ -1,7 +1,7 @@
 """Plants and sensors whose truth or readings come from tables, in both kinds of time.
 
-``demand`` refuses, before a run starts, a table that lacks a state that the run needs. Readings
-may be missing: a node without a row for a slot has no reading then.
+``demand`` raises, before a run starts, if the table lacks a state that the run needs. Readings may
+be missing: a node whose table has no row for a slot has no reading in that slot.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ from netkf.plants.sensors import Sensor
 from netkf.plants.truth import TOLERANCE, RecordedTruth, demand_rows
 
 Table = dict[int, FloatArray]
-"""What is recorded, by slot."""
-NOTHING = np.empty(0)
+"""Recorded values by slot."""
+NO_TIMES = np.empty(0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +74,7 @@ class RecordedPlant(LinearPlant):
         return by_slot(self.path, rows, self.period, "")
 
     def demand(self, slots: Iterable[int]) -> None:
-        """Raise ScenarioError where the table lacks one of the slots."""
+        """Raise ScenarioError if the table has no state for one of the slots."""
         _demand_rows(self.path, self.table, slots, self.period, "state")
 
     def truth(self, random: np.random.Generator, frames: bool = False) -> RecordedPath:
@@ -94,7 +94,7 @@ class UnknownDiffusion(Diffusion):
     @property
     def recorded_truth(self) -> RecordedTruth:
         """The truth of a run: nan at all times."""
-        return RecordedTruth(NOTHING, np.empty((0, self.n)), self.n)
+        return RecordedTruth(NO_TIMES, np.empty((0, self.n)), self.n)
 
     def demand(self, times: FloatArray, what: str) -> None:
         """Accept any times: no state is known."""
@@ -132,21 +132,22 @@ class RecordedDiffusion(Diffusion):
         return RecordedTruth(*self.table, self.n)
 
     def demand(self, times: FloatArray, what: str) -> None:
-        """Raise ScenarioError where the table lacks a state at one of the times; ``what`` says what
-        needs it.
+        """Raise ScenarioError if the table has no state at one of the times (seconds).
+
+        ``what`` names the use of the states in the message.
         """
         demand_rows(self.path, self.table[0], times, what)
 
 
 def _states(source: SourceFile, n: int) -> tuple[FloatArray, FloatArray]:
-    """Return times (K,) and states (K, n) of a table ``t,x0,x1,...``, row by row."""
+    """Return times (K,) in seconds and states (K, n) of a table ``t,x0,x1,...``, in its order."""
     names = [f"x{k}" for k in range(n)]
     columns = read_columns(source, ("t", *names))
     return columns["t"], np.stack([columns[name] for name in names], axis=1)
 
 
 class RecordedPath:
-    """States by slot, or ``otherwise``."""
+    """The truth of a run from a table: states (n,) by slot, ``otherwise`` (n,) if missing."""
 
     frame_slots: int | None = None
 
@@ -185,8 +186,8 @@ class RecordedSensor(Sensor):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        given: tuple[int, ...] | None = self.nodes
-        if given is None:
+        nodes: tuple[int, ...] | None = self.nodes
+        if nodes is None:
             object.__setattr__(self, "nodes", self.listed)
         if not self.nodes:
             raise ScenarioError("path", f"{self.path.name} has no rows", None, "add some")
@@ -220,8 +221,8 @@ class RecordedSensor(Sensor):
     @cached_property
     def _lines(self) -> tuple[list[str], list[tuple[int, list[str]]]]:
         """Header and numbered lines of the file."""
-        wanted = tuple(f"y{k}" for k in range(self._outputs))
-        return read_rows(self.path, ("t", "node", *wanted, *self._regressors))
+        outputs = tuple(f"y{k}" for k in range(self._outputs))
+        return read_rows(self.path, ("t", "node", *outputs, *self._regressors))
 
     @cached_property
     def listed(self) -> tuple[int, ...]:
@@ -230,12 +231,12 @@ class RecordedSensor(Sensor):
 
     @cached_property
     def row_times(self) -> list[tuple[int, float]]:
-        """Node and time of every row."""
+        """Node and time (seconds) of every row."""
         header, lines = self._lines
         indices = [header.index("t"), header.index("node")]
-        read = [finite_numbers(self.path, line, header, row, indices) for line, row in lines]
-        nodes = whole(self.path, "node", np.array([node for _, node in read]))
-        return list(zip(nodes, (t for t, _ in read), strict=True))
+        numbers = [finite_numbers(self.path, line, header, row, indices) for line, row in lines]
+        nodes = whole(self.path, "node", np.array([node for _, node in numbers]))
+        return list(zip(nodes, (t for t, _ in numbers), strict=True))
 
     @property
     def _ids(self) -> list[int]:
@@ -249,28 +250,31 @@ class RecordedSensor(Sensor):
         p = self._outputs
         names = ("t", *(f"y{k}" for k in range(p)), *self._regressors)
         indices = [header.index(name) for name in names]
-        beyond = [k for k, name in enumerate(header) if _column_number(name) >= p]
+        surplus = [k for k, name in enumerate(header) if _column_number(name) >= p]
         rows: dict[int, list[tuple[float, FloatArray]]] = {node: [] for node in self.nodes}
         for node, (line, entries) in zip(self._ids, lines, strict=True):
             if node in rows:
                 t, *y = finite_numbers(self.path, line, header, entries, indices)
-                self._demand_empty(line, header, entries, beyond)
+                self._demand_empty(line, header, entries, surplus)
                 rows[node].append((t, np.array(y)))
         return rows
 
     def _demand_empty(
-        self, line: int, header: list[str], entries: list[str], beyond: list[int]
+        self, line: int, header: list[str], entries: list[str], surplus: list[int]
     ) -> None:
-        """Raise ScenarioError for a value in a column y_k without a row in H."""
-        for index in beyond:
+        """Raise ScenarioError for a value in one of the ``surplus`` columns y_k, k >= p, which have
+        no row in H.
+        """
+        for index in surplus:
             if entries[index].strip().lower() not in ("", "nan", "0", "0.0"):
                 rule = f"{self.path.name} line {line}: {header[index]} has no row in H"
                 raise ScenarioError("path", rule, entries[index], "leave it empty or correct H")
 
     def table(self, node: int, period: float) -> Table:
-        """Return the readings (p,) of a node, with their regressors where there are any, by slot of
-        ``period`` seconds; raises ScenarioError for times that are no slots and for slots that are
-        there twice.
+        """Return the readings (p,) of a node, or readings and regressors (1 + n,), by slot of
+        ``period`` seconds.
+
+        Raises ScenarioError for a time that is not the start of a slot and for two rows of a slot.
         """
         return by_slot(self.path, self._rows[node], period, f" of node {node}")
 
@@ -295,13 +299,15 @@ class RecordedSensor(Sensor):
         return np.array([t for t, _ in self._rows[node]])
 
     def rows(self, node: int) -> tuple[FloatArray, FloatArray]:
-        """Return times (K,), increasing, and readings (K, p) of a node, each with its regressor
-        where there are any; raises ScenarioError for times below 0 or that are there twice.
+        """Return the increasing times (K,) in seconds and the readings (K, p) of a node; with
+        regressors, (K, 1 + n).
+
+        Raises ScenarioError for a time below 0 and for two rows at one time.
         """
-        given = sorted(self._rows[node], key=lambda row: row[0])
-        times = np.array([t for t, _ in given])
-        values = np.array([y for _, y in given]).reshape(
-            len(given), self._outputs + len(self._regressors)
+        rows = sorted(self._rows[node], key=lambda row: row[0])
+        times = np.array([t for t, _ in rows])
+        values = np.array([y for _, y in rows]).reshape(
+            len(rows), self._outputs + len(self._regressors)
         )
         if len(times) and times[0] < 0.0:
             rule = f"{self.path.name}: t must be at least 0"
@@ -332,7 +338,9 @@ class RecordedReadings:
         self._H, self._table = H, table
 
     def matrix(self, slot: int) -> FloatArray:
-        """Return H (p, n) as the filters believe it or as it is recorded; zeros without a row."""
+        """Return H (p, n): the recorded phi' if there are regressors, else the given H; zeros for a
+        slot without a row.
+        """
         row = self._table.get(slot)
         if row is None:
             return np.zeros_like(self._H)
@@ -345,9 +353,8 @@ class RecordedReadings:
         return np.full(len(self._H), math.nan) if row is None else row[: len(self._H)]
 
     def several(self, slots: Sequence[int], x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return readings (S, p) and matrices (S, p, n) of some slots.
-
-        Both are zero for a slot without a row, which carries no information.
+        """Return readings (S, p) and matrices (S, p, n) of the slots; zeros, which carry no
+        information, for a slot without a row.
         """
         y, H = np.zeros((len(slots), len(self._H))), np.zeros((len(slots), *self._H.shape))
         for k, slot in enumerate(slots):
@@ -357,7 +364,7 @@ class RecordedReadings:
 
 
 def _column_number(name: str, letter: str = "y") -> int:
-    """Return k of a column name such as ``y3``, -1 for other names."""
+    """Return the number of a column, 3 for ``y3`` with ``letter`` "y"; -1 for other names."""
     number = name.removeprefix(letter)
     return int(number) if name.startswith(letter) and number.isdecimal() else -1
 
@@ -365,7 +372,11 @@ def _column_number(name: str, letter: str = "y") -> int:
 def by_slot(
     source: SourceFile, rows: Iterable[tuple[float, FloatArray]], period: float, whose: str
 ) -> Table:
-    """Return rows (t, values) by the slot that begins at t."""
+    """Return the values of ``rows`` (t, values) by the slot of ``period`` seconds that begins at t.
+
+    Raises ScenarioError for a time that is not the start of a slot and for two rows of a slot;
+    ``whose`` names the owner of the rows in the message.
+    """
     table: Table = {}
     for t, values in rows:
         slot = round(t / period)
@@ -382,7 +393,7 @@ def by_slot(
 def _demand_rows(
     source: SourceFile, table: Table, slots: Iterable[int], period: float, what: str
 ) -> None:
-    """Raise ScenarioError if a slot has no row in the table."""
+    """Raise ScenarioError if one of the ``slots`` has no row; ``what`` names its content."""
     missing = next((slot for slot in slots if slot not in table), None)
     if missing is not None:
         rule = f"{source.name} has no {what} for slot {missing}, t = {missing * period:g}"

@@ -1,7 +1,7 @@
 """Sensors whose observation row is itself random: y = phi' x + v with a regressor phi of its own.
 
-The regressor is truth: it is drawn from a stream of its own, whatever the network does, and travels
-with the reading as known data.
+The regressor is part of the truth: it is drawn from a separate stream, so that it does not depend
+on the network. Filters are given it with the reading.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class RegressorSensor(Sensor):
 
     @cached_property
     def drive(self) -> FloatArray:
-        """The factor (m, q) that standard normals drive the regressor's state with."""
+        """The factor (m, q) of the noise of the regressor's state, B times a root of xi_cov."""
         return product(self.B, noise_root(self.xi_cov))
 
     def slot_path(

@@ -1,4 +1,4 @@
-"""Samples of sensors over a diffusion, and recorded sampling times."""
+"""Samples of sensors of a plant in continuous time, and recorded sampling times."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from netkf.plants.linear import SlotReadings
 
 
 class Samples(Protocol):
-    """The samples of one sensor on one node in one run, k = 0, 1, ... in order of time."""
+    """The samples of one sensor on one node in one run, numbered k = 0, 1, ... in order of time."""
 
     def reading(self, k: int, x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return ``y`` (p,) and ``H`` (p, n) of sample k, not before the last one asked for, at
-        which the state is x (n,).
+        """Return ``y`` (p,) and ``H`` (p, n) of sample k, at which the state is x (n,); k must not
+        decrease from call to call.
         """
 
     def several(self, ks: Sequence[int], x: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -30,8 +30,8 @@ class Samples(Protocol):
 
 
 class DrawnSamples:
-    """``y = H x + v``, cov(v) = R: v is the Cholesky factor of R times p standard normals of
-    ``random`` a sample, in order.
+    """Samples ``y = H x + v``, cov(v) = R; v is the Cholesky factor of R times the next p standard
+    normals of ``random``.
     """
 
     def __init__(self, H: FloatArray, R: FloatArray, random: np.random.Generator) -> None:
@@ -42,12 +42,12 @@ class DrawnSamples:
         return self._readings.reading(k, x), self._readings.matrix(k)
 
     def several(self, ks: Sequence[int], x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return ``y`` (S, p) and ``H`` (S, p, n) of some samples."""
+        """Return ``y`` (S, p) and ``H`` (S, p, n) of increasing samples with states x (S, n)."""
         return self._readings.several(ks, x)
 
 
 class RecordedSamples:
-    """Samples from ``rows`` (K, p) of a table, or (K, 1 + n) with the row of H of each."""
+    """Samples from the ``rows`` of a table: y (K, p), or y and its row of H, (K, 1 + n)."""
 
     def __init__(self, H: FloatArray, rows: FloatArray) -> None:
         self._H, self._rows = H, rows
@@ -59,7 +59,7 @@ class RecordedSamples:
         return self._rows[k, :p], phi[None] if phi.size else self._H
 
     def several(self, ks: Sequence[int], x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return ``y`` (S, p) and ``H`` (S, p, n) of some samples."""
+        """Return ``y`` (S, p) and ``H`` (S, p, n) of the samples, whatever x."""
         p, rows = len(self._H), self._rows[list(ks)]
         if rows.shape[1] > p:
             return rows[:, :p], rows[:, None, p:]
@@ -96,7 +96,7 @@ class RecordedSampling(Clock):
         return tuple(self._times)
 
     def recorded_times(self, node: int) -> FloatArray:
-        """Return the instants (K,) at which a node samples, increasing."""
+        """Return the increasing times (K,) in seconds at which a node samples."""
         return self._times.get(node, np.empty(0))
 
     def ticks(
@@ -108,7 +108,7 @@ class RecordedSampling(Clock):
         random: np.random.Generator,
         count: int,
     ) -> FloatArray:
-        """Return the recorded times of the node ``entity[0]``."""
+        """Return up to ``count`` recorded times of the node ``entity[0]`` from ``index`` on."""
         return self._times.get(entity[0], np.empty(0))[index : index + count]
 
 

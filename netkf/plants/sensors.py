@@ -1,9 +1,10 @@
 """Sensors: the contract, the fixed linear one, and its readings in continuous time.
 
 The noise of a sensor is drawn on the sensing grid from the sensor's own stream, as its two moments
-over each step. When the network wakes a node inside a step, the step is cut: the two moments of
-the first part are drawn given those of the whole (exactly, from a second stream), and the rest
-keeps what is left. The noise on the grid therefore never depends on the network.
+over each step, ``int dv`` and ``int P_1 dv`` with the Legendre polynomial P_1 of the step. When the
+network wakes a node inside a step, the step is cut: the moments of the first part are drawn from
+their exact law given those of the whole, from a second stream, and the moments of the remaining
+part follow. The noise on the grid therefore does not depend on the network.
 """
 
 from __future__ import annotations
@@ -40,10 +41,10 @@ ROOT_3 = math.sqrt(3.0)
 
 @dataclass(frozen=True, eq=False)
 class Sensor(Component):
-    """The contract: each of ``nodes`` has such a sensor, with noise of its own."""
+    """The contract of sensors: each of ``nodes`` has one, with independent noise."""
 
     is_random: ClassVar[bool] = True
-    """Whether runs draw the readings from H and R; else those are what the filters believe."""
+    """True if runs draw the readings from H and R; else H and R are only the filters' belief."""
 
     nodes: tuple[int, ...] = field(several(integer(), "node ids"))
 
@@ -64,8 +65,9 @@ class Sensor(Component):
     def slot_path(
         self, node: int, period: float, generator: Callable[[str], np.random.Generator]
     ) -> Readings:
-        """Return the readings of one of the nodes in one run, in slots of ``period`` seconds;
-        ``generator`` makes the streams of that sensor by purpose.
+        """Return the readings of the sensor on ``node`` in one run, in slots of ``period`` seconds.
+
+        ``generator`` returns the random stream of that sensor for a purpose.
         """
 
     def sample_times(
@@ -75,16 +77,17 @@ class Sensor(Component):
         generator: Callable[[str], np.random.Generator],
         horizon: float,
     ) -> FloatArray:
-        """Return the times (K,) in continuous time at which one of the nodes samples, below the
-        ``horizon``; sensors in slots and of increments have none.
+        """Return the times (K,) in seconds, below the ``horizon``, at which the sensor on ``node``
+        samples; ``ordinal`` is its number among the sensors of that node.
+
+        There are none by default: only sensors in continuous time with a clock sample.
         """
-        # None by default: only sensors with a clock sample.
         return np.empty(0)
 
     def samples(
         self, node: int, generator: Callable[[str], np.random.Generator], horizon: float
     ) -> Samples:
-        """Return the samples of one of the nodes at these times in one run."""
+        """Return the samples of the sensor on ``node`` at its ``sample_times`` in one run."""
         raise NotImplementedError
 
 
@@ -94,7 +97,9 @@ def sampling_ticks(
     generator: Callable[[str], np.random.Generator],
     horizon: float,
 ) -> FloatArray:
-    """Return the times (K,) at which a sensor (node, number on it) samples, from the streams
+    """Return the times (K,) in seconds, below the ``horizon``, at which a sensor samples.
+
+    ``entity`` is the node and the number of the sensor among those of that node. Streams:
     "sampling" and "sampling phase".
     """
     phase = partial(generator, "sampling phase")
@@ -103,8 +108,9 @@ def sampling_ticks(
 
 @dataclass(frozen=True, eq=False)
 class LinearSensor(Sensor):
-    """In continuous time ``dy = H x dt + dv``, cov(dv) = R dt, H (3), or with a clock as
-    ``sampling`` ``y = H x + v``, cov(v) = R, whenever it ticks; in slots the latter in every slot.
+    """A sensor that is linear in the state. In slots it reads ``y = H x + v``, cov(v) = R, in every
+    slot. In continuous time it reads increments ``dy = H x dt + dv``, cov(dv) = R dt, paper H (3).
+    With a clock as ``sampling`` it reads ``y = H x + v`` in continuous time at every tick.
 
     ``H`` (p, n), ``R`` (p, p).
     """
@@ -132,7 +138,10 @@ class LinearSensor(Sensor):
         return DrawnSamples(self.H, self.R, generator("noise"))
 
     def path(self, random: np.random.Generator, cutting: np.random.Generator) -> SensorPath:
-        """Return the readings of one of the nodes in one run in continuous time."""
+        """Return the increments that the sensor on one node reads in one run.
+
+        ``random`` draws the noise on the sensing grid, ``cutting`` that of parts of steps.
+        """
         return SensorPath(self.H, self.R, random, cutting)
 
     def slot_path(
@@ -143,7 +152,7 @@ class LinearSensor(Sensor):
 
 
 class SensorPath:
-    """Readings of one sensor on one node, asked for in order of time."""
+    """Increments dy of one sensor on one node; intervals must be asked for in order of time."""
 
     def __init__(
         self,
@@ -153,38 +162,40 @@ class SensorPath:
         cutting: np.random.Generator,
     ) -> None:
         self.H = H
-        # Cholesky factor of R: the noise is drawn with unit intensity and multiplied by it.
+        # The noise is drawn with unit intensity and multiplied by the Cholesky factor of R.
         self._root = cholesky(R)
         self._random, self._cutting = random, cutting
         self._drawn = np.empty((0, 2, len(R)))
         self._used = 0
         self._end = 0.0
-        # The noise of the present step that has not been read yet.
-        self._rest = np.zeros((2, len(R)))
+        # Noise moments of the part of the present step that has not been read yet.
+        self._unread = np.zeros((2, len(R)))
 
     def moments(
         self, truth: DiffusionPath, x_moments: FloatArray, start: float, end: float
     ) -> FloatArray:
-        """Return moments (2, p) of dy over ``[start, end]`` inside the truth's present step, where
-        x has the moments ``x_moments``; ``start`` is where the last call ended.
+        """Return moments (2, p) of dy over ``[start, end]``, inside the truth's present step.
+
+        ``x_moments`` (2, n) are those of x over the same interval; ``start`` is the end of the
+        interval of the previous call.
         """
-        last = truth.step_end()
-        # A new step: what was left of the one before has been read to its end.
-        if last != self._end:
-            self._rest, self._end = self._draw(truth.period), last
-        if end < last:
-            # Normals for cuts come from a second stream, so that the noise on the grid is the same
-            # whoever wakes whom.
-            normals = self._cutting.standard_normal(self._rest.shape)
-            length = last - start
-            noise, self._rest = cut(self._rest, normals, (end - start) / length, length)
+        step_end = truth.step_end()
+        # A new step: the previous one has been read to its end.
+        if step_end != self._end:
+            self._unread, self._end = self._draw(truth.period), step_end
+        if end < step_end:
+            # Normals for cuts come from a second stream, so that the noise on the grid does not
+            # depend on when nodes wake.
+            normals = self._cutting.standard_normal(self._unread.shape)
+            length = step_end - start
+            noise, self._unread = cut(self._unread, normals, (end - start) / length, length)
         else:
-            noise = self._rest
+            noise = self._unread
         return reading(x_moments, self.H, noise, self._root)
 
     def _draw(self, period: float) -> FloatArray:
         """Return the noise moments (2, p) of the next step of ``period`` seconds."""
-        # Blocks of normals: one call for many steps.
+        # One call of the generator draws the normals of many steps.
         if self._used == len(self._drawn):
             self._drawn = self._random.standard_normal((BLOCK, *self._drawn.shape[1:]))
             self._used = 0
@@ -194,8 +205,8 @@ class SensorPath:
 
 
 def step_noise(normals: FloatArray, period: float) -> FloatArray:
-    """Return moments (..., 2, p) of unit white noise over ``period`` seconds: independent, with
-    variances g and g / 3.
+    """Return moments (..., 2, p) of unit white noise over ``period`` seconds from standard
+    ``normals`` (..., 2, p): independent, with variances g and g / 3 for g = ``period``.
     """
     return np.asarray(normals * np.sqrt(np.array([[period], [period / 3.0]])))
 
@@ -203,7 +214,9 @@ def step_noise(normals: FloatArray, period: float) -> FloatArray:
 def reading(
     x_moments: FloatArray, H: FloatArray, noise: FloatArray, root: FloatArray
 ) -> FloatArray:
-    """Return moments (2, p) of dy from those of x (2, n) and of unit white noise (2, p)."""
+    """Return moments (2, p) of dy = H x dt + root dw from those of x (2, n) and of unit white noise
+    w (2, p).
+    """
     out = np.empty(2 * len(H))
     fill_reading(ONE, H[0], out, 0, len(H), x_moments, H[None], noise, root[None], 0)
     return out.reshape(2, len(H))
@@ -222,12 +235,14 @@ def fill_reading(
     root: FloatArray,
     s: int,
 ) -> None:
-    """Write the moments of dy of sensor ``s``, ``rows`` of each, from those of x, ``x_moments``
-    (2, n, L), and of unit white noise (2, p, L): the first ones from ``out[row]`` on and the second
-    ones half of ``out`` (q, L) later. H is (S, p, n, L), root (S, p, p, L) and lower triangular.
+    """Write the moments of dy of sensor ``s``, which has ``rows`` rows, into ``out`` (2 q, L).
+
+    Its first moments begin at ``out[row]``, its second moments at ``out[q + row]``. ``x_moments``
+    (2, n, L) are those of x, ``noise`` (2, p, L) those of unit white noise; H is (S, p, n, L), root
+    (S, p, p, L) and lower triangular.
     """
     half = len(out) // 2
-    # Both moments are linear: dy = H x dt + dv, moment by moment.
+    # moment_m(dy) = H moment_m(x) + root moment_m(noise)
     for m in range(2):
         for i in range(rows):
             total = spread(lanes, 0.0)
@@ -239,27 +254,30 @@ def fill_reading(
 
 
 def cut(
-    rest: FloatArray, normals: FloatArray, u: float, length: float
+    whole: FloatArray, normals: FloatArray, u: float, length: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Return moments (2, p) of the first share ``u`` of an interval of ``length`` seconds and of
-    what is left, given those of the whole, from standard ``normals`` (2, p).
+    """Return noise moments (2, p) of the first part of an interval, a share ``u`` of its ``length``
+    in seconds, and of the remaining part, given those of the ``whole`` (2, p).
+
+    ``normals`` (2, p) are standard normal; see ``divide``.
     """
-    # Copies, so that callers keep their arrays.
-    first, left = np.empty(rest.shape), rest.copy()
-    divide(ONE, first, left, normals, u, length)
-    return first, left
+    first, remaining = np.empty(whole.shape), whole.copy()
+    divide(ONE, first, remaining, normals, u, length)
+    return first, remaining
 
 
 @kernel(inlined=True)
 def divide(
     lanes: Lanes, first: FloatArray, rest: FloatArray, normals: FloatArray, u: Any, length: Any
 ) -> None:
-    """Divide the moments ``rest`` (2, p, L) of an interval of ``length`` seconds into those of its
-    first part, a share ``u`` of the length, which are written to ``first`` (2, p, L), and those of
-    the remaining part, which stay in ``rest``. ``normals`` (2, p, L) are standard normal.
+    """Divide the noise moments ``rest`` (2, p, L) of an interval of ``length`` seconds in two.
 
-    Exact conditional law of four independent moments (variances g, g/3 on each part) given their
-    two sums; written so that nothing cancels when a part is short.
+    Those of its first part, a share ``u`` of the length, are written to ``first`` (2, p, L), those
+    of the remaining part replace ``rest``. ``normals`` (2, p, L) are standard normal.
+
+    The four moments of the parts are independent, with variances g and g / 3 for a part of g
+    seconds; they are drawn from their exact law given the two moments of the whole. The formulas
+    avoid cancellation when a part is short.
     """
     w = 1.0 - u
     # At least 1 / 4 for every u in [0, 1], so that the divisions below are safe.
@@ -268,15 +286,14 @@ def divide(
     size_first, size_slope = size * root, size / root
     size_other = size_slope / ROOT_3
     for k in range(rest.shape[1]):
-        # Given the sums the first moment has the mean u whole - 3 u w tilted; the rest gets the
-        # same noise with the other sign.
+        # The first moments of the parts have the means u whole - 3 u w tilted and
+        # w whole + 3 u w tilted; their noise has opposite signs, since they add up to ``whole``.
         whole, tilted = load(lanes, rest, 0, k), load(lanes, rest, 1, k)
-        # The noise of the first moment also tilts both parts: one normal for both.
+        # That noise also enters the second moments, as ``slope``; ``other`` is independent of it.
         normal = load(lanes, normals, 0, k)
         early, slope = size_first * normal, size_slope * normal
         other = size_other * load(lanes, normals, 1, k)
         store(lanes, first, 0, k, u * whole - 3.0 * u * w * tilted + early)
         store(lanes, first, 1, k, u * u * (tilted + slope) + w * other)
-        # Subtracted from the rest: both parts add up to the whole.
         store(lanes, rest, 0, k, w * whole + 3.0 * u * w * tilted - early)
         store(lanes, rest, 1, k, w * w * (tilted + slope) - u * other)

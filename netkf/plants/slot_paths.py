@@ -1,7 +1,7 @@
-"""The state and the readings of a plant in slots as kernels, slot after slot from given normals.
+"""Kernels that draw the states and the readings of a plant in slots for many runs at once.
 
-Runs are side by side in B blocks of L lanes (``netkf.linalg.lanes``); each draws from streams of
-its own, so that it is the same alone and in a batch.
+Runs are side by side in B blocks of L lanes (``netkf.linalg.lanes``). Each draws from separate
+streams, so that a run has the same bits alone and in a batch.
 """
 
 from __future__ import annotations
@@ -17,9 +17,11 @@ from netkf.rng.numbers import NormalZiggurat, next_normal
 
 
 class Path(NamedTuple):
-    """``x[k+1] = F x[k] + root z[k]`` in R runs: F (n, n), root (n, q), the state x (B, n, L) of
-    the next slot and the absolute position of its ``origin`` (B, n, L), which moves to the state
-    every ``frame`` slots (0: never).
+    """``x[k+1] = F x[k] + root z[k]`` in R runs, z standard normal: F (n, n), root (n, q).
+
+    frame   slots from one frame to the next; 0: no frames
+    x       (B, n, L) state of the next slot, local to the present frame
+    origin  (B, n, L) absolute position of the origin of that frame in that slot
     """
 
     F: FloatArray
@@ -34,19 +36,21 @@ def draw_normals(
     lanes: Lanes,
     states: np.ndarray,
     first: int,
-    every: int,
+    stride: int,
     runs: int,
     ziggurat: NormalZiggurat,
     normals: FloatArray,
     count: int,
 ) -> None:
-    """Fill ``normals`` (>= count, L) with the next numbers of the streams ``first``,
-    ``first + every``, ... of so many ``runs``; idle lanes keep what they have.
+    """Fill ``normals`` (>= count, L) with the next ``count`` standard normals of L streams.
+
+    Lane q takes them from row ``first + q * stride`` of ``states`` if q < ``runs``, the number of
+    runs left; idle lanes keep their values.
     """
-    # Lane by lane: one number does not wait for another there.
+    # Lanes in the inner loop: numbers of different streams do not wait for each other.
     for j in range(count):
         for q in range(min(runs, len(lanes))):
-            normals[j, q] = next_normal(states, first + q * every, ziggurat)
+            normals[j, q] = next_normal(states, first + q * stride, ziggurat)
 
 
 @kernel
@@ -59,8 +63,10 @@ def draw_starts(
     scratch: FloatArray,
     x: FloatArray,
 ) -> None:
-    """Fill x (B, n, L) with ``mean + root z`` for the first normals z (q,) of each of the streams
-    ``states`` (R, >= 4); ``scratch`` (q, L) is scratch.
+    """Write the states x(0) = mean + root z (B, n, L) of R runs, where z (q,) are the next standard
+    normals of the stream of each run, ``states`` (R, >= 4).
+
+    ``mean`` (n,), ``root`` (n, q); ``scratch`` (q, L).
     """
     for b in range(len(x)):
         first, count = b * len(lanes), root.shape[1]
@@ -84,18 +90,20 @@ def move_path(
     absolute: FloatArray,
     moved: FloatArray,
 ) -> None:
-    """Write the states of block ``b`` in ``slot`` into ``local[b, s]`` and ``absolute[b, s]``
-    (n, L), in the coordinates of the frame that ends there and in those of the plant, and move on
-    with ``normals`` (q, L); ``moved`` (n, L) is scratch.
+    """Write the state of block ``b`` in ``slot`` and move ``path`` to the next slot.
+
+    ``local[b, s]`` (n, L) gets the state in the frame before a rebase in this slot; with frames
+    ``absolute[b, s]`` (n, L) gets the state in the plant's coordinates. ``normals`` (q, L) drive
+    the step; ``moved`` (n, L) is scratch.
     """
     n = len(path.F)
-    # The state of this slot is written before the origin moves: it ends the frame.
+    # Before a rebase: the errors of this slot are still in coordinates of the old frame.
     for i in range(n):
         x = load(lanes, path.x, b, i)
         store(lanes, local, b, s, i, x)
         if path.frame > 0:
             store(lanes, absolute, b, s, i, x + load(lanes, path.origin, b, i))
-    # Slot 0 begins the first frame: its origin is already where it should be.
+    # Rebase: origin <- origin + x, x <- 0. Slot 0 begins the first frame, whose origin is 0.
     if path.frame > 0 and slot > 0 and slot % path.frame == 0:
         for i in range(n):
             origin = load(lanes, path.origin, b, i) + load(lanes, path.x, b, i)
@@ -111,7 +119,7 @@ def move_path(
         store(lanes, moved, i, total)
     for i in range(n):
         store(lanes, path.x, b, i, load(lanes, moved, i))
-    # The origin moves with the plant, without noise.
+    # origin <- F origin: it moves with the plant, without noise.
     if path.frame > 0:
         for i in range(n):
             total = spread(lanes, 0.0)
@@ -133,8 +141,10 @@ def draw_paths(
     local: FloatArray,
     absolute: FloatArray,
 ) -> None:
-    """Fill ``local`` and, with frames, ``absolute`` (B, S, n, L) from ``slot`` on with the next
-    numbers of the streams ``states`` (R, >= 4); ``scratch`` (2, max(n, q), L) is scratch.
+    """Write the states of S slots from ``slot`` on into ``local`` and, with frames, ``absolute``
+    (B, S, n, L), see ``move_path``.
+
+    Each run draws from its own stream, ``states`` (R, >= 4); ``scratch`` (2, max(n, q), L).
     """
     for b in range(local.shape[0]):
         first = b * len(lanes)
@@ -153,11 +163,15 @@ def draw_paths(
 
 
 class SlotSensors(NamedTuple):
-    """M drawn sensors: which filter reads each (``estimator``) and its first ``row`` and number of
-    ``rows`` in that filter's reading (M, each), H (M, p, n) and factor of the noise (M, p, p).
+    """M sensors whose readings are drawn from the model; p is the largest number of rows.
 
-    Where H is random, ``driven`` (M,) is the index of the sensor's regressor ``C s`` with C
-    (D, n, k), else -1.
+    estimator (M,) index of the filter that uses the readings of the sensor
+    row, rows (M,) first row and number of rows of the sensor in the stacked reading of that filter
+    H         (M, p, n) whitened observation matrix; for a random H the whitening factor of its one
+              row in H[m, 0, 0]
+    noise     (M, p, p) factor of the noise
+    driven    (M,) index d of the sensor's regressor if H is random, else -1
+    C         (D, n, k) the random row of regressor d is C[d] s with its state s (k,)
     """
 
     estimator: np.ndarray
@@ -181,17 +195,19 @@ def draw_readings(
     y: FloatArray,
     H: FloatArray,
 ) -> None:
-    """Fill the readings y (B, S, estimators, p, L), and H (B, S, estimators, p, n, L) where it is
-    random, from the states x (B, S, n, L) and ``regressors`` (D, B, S, k, L), with the next numbers
-    of the streams ``states`` (R M, >= 4); ``scratch`` (p, L) is scratch.
+    """Write the readings y (B, S, estimators, p, L) of all sensors in S slots, and H
+    (B, S, estimators, p, n, L) where it is random.
+
+    x (B, S, n, L) are the states, ``regressors`` (D, B, S, k, L) those of the regressors. Run r
+    draws the noise of sensor m from row r M + m of ``states`` (R M, >= 4); ``scratch`` (p, L).
     """
     count = len(sensors.estimator)
     for b in range(x.shape[0] if count > 0 else 0):
         runs, first = len(states) // count - b * len(lanes), b * len(lanes) * count
         for s in range(x.shape[1]):
             for m in range(count):
-                # All normals of a sensor's reading before its rows, in the order that a single run
-                # takes them.
+                # All normals of a reading before its rows, in the order in which a single run
+                # draws them.
                 draw_normals(
                     lanes, states, first + m, count, runs, ziggurat, scratch, sensors.rows[m]
                 )
@@ -213,17 +229,20 @@ def read_row(
     y: FloatArray,
     H: FloatArray,
 ) -> None:
-    """Write row ``i`` of the reading of sensor ``m``, and of its H if that is random."""
+    """Write row ``i`` of the reading of sensor ``m`` in slot ``s`` of block ``b``, and that row of
+    H if it is random; see ``draw_readings``.
+    """
     estimator, row, d = sensors.estimator[m], sensors.row[m] + i, sensors.driven[m]
+    # total = (noise factor) z, row i
     total = spread(lanes, 0.0)
     for j in range(sensors.rows[m]):
         total += sensors.noise[m, i, j] * load(lanes, normals, j)
-    # Whitened reading: y = H x + noise with the weights of this row.
+    # y = H x + total
     for j in range(x.shape[2]):
         weight = spread(lanes, sensors.H[m, i, j])
-        if d >= 0:  # sensors.H holds the whitening factor of the one row then
+        if d >= 0:
+            # H[j] = (C s)[j] times the whitening factor
             weight = spread(lanes, 0.0)
-            # The random row is C s, whitened.
             for k in range(sensors.C.shape[2]):
                 weight += sensors.C[d, j, k] * load(lanes, regressors, d, b, s, k)
             weight *= sensors.H[m, i, 0]

@@ -10,56 +10,59 @@ from netkf.linalg.arrays import FloatArray
 from netkf.linalg.portable import apply, gauss_legendre, norm, product
 
 UNIT_SIZE = 0.5  # largest norm of A times a gap for which one power series is used
-DEPENDENT = 1e-9  # share of a row's norm below which what is left of it counts as rounding
-KNOWN = 32
-"""Sets of gaps whose laws are kept."""
+DEPENDENT = 1e-9  # a remainder below this share of the row's norm counts as rounding
+MAX_LAWS = 32
+"""Cached sets of gaps."""
 _NODES, _WEIGHTS = gauss_legendre(10)  # exact to rounding for gaps of that size
 
 
 class Transitions:
-    """``x(t + g) = Phi x(t) + L z`` for ``A`` (n, n), ``B`` (n, m): z is standard normal and
-    ``L L' = int_0^g e^{A s} B B' e^{A' s} ds``.
+    """The discretisation ``x(t + g) = Phi x(t) + L z`` of ``A`` (n, n), ``B`` (n, m), z standard
+    normal: ``Phi = e^{A g}`` and ``L L' = int_0^g e^{A s} B B' e^{A' s} ds``.
 
-    L is lower triangular with a diagonal that is not negative, and column k is zero where
-    component k depends on those before it. Short gaps use a power series and Gauss quadrature,
-    which keep the relative accuracy of entries of very different size (a chain of integrators over
-    1e-9 s); longer ones are doubled from there. Every law is the same to the last bit whichever
-    others are worked out with it.
+    L is lower triangular with a diagonal that is not negative; column k is zero if component k of
+    the noise depends on those before it. Short gaps use a power series and Gauss quadrature, which
+    keep the relative accuracy of entries of very different size (a chain of integrators over
+    1e-9 s); longer gaps are reached by doubling. A law has the same bits whichever others are
+    computed with it.
     """
 
     def __init__(self, A: FloatArray, B: FloatArray) -> None:
         self.n = len(A)
         self._norm = float(np.abs(A).sum(axis=0).max())
         powers = [np.eye(self.n)]
-        last, k = 1.0, 1
-        while last > 1e-19:
-            last *= UNIT_SIZE / k
+        # The terms A^k / k! that matter for gaps with |A| g <= UNIT_SIZE.
+        term, k = 1.0, 1
+        while term > 1e-19:
+            term *= UNIT_SIZE / k
             powers.append(product(powers[-1], A) / k)
             k += 1
         self._series = np.stack(powers)
         self._response = product(self._series, B)
         # Runs that are sampled at the same times ask for the same gaps again.
-        self._known: dict[bytes, tuple[FloatArray, FloatArray]] = {}
+        self._laws: dict[bytes, tuple[FloatArray, FloatArray]] = {}
 
     def laws(self, gaps: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return ``Phi`` and ``L``, both (K, n, n), of K gaps in seconds, none below 0."""
         distinct, index = np.unique(gaps, return_inverse=True)
         key = distinct.tobytes()
-        if key not in self._known:
-            if len(self._known) >= KNOWN:
-                self._known.clear()
-            self._known[key] = self._distinct_laws(distinct)
-        Phi, L = self._known[key]
+        if key not in self._laws:
+            if len(self._laws) >= MAX_LAWS:
+                self._laws.clear()
+            self._laws[key] = self._distinct_laws(distinct)
+        Phi, L = self._laws[key]
         return Phi[index], L[index]
 
     def _distinct_laws(self, distinct: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return transitions and noise factors (K, n, n) of K distinct gaps, by doubling from at
-        most one unit.
+        """Return ``Phi`` and ``L``, both (K, n, n), of K ``distinct`` gaps in seconds.
+
+        Each gap is halved until the power series applies, then doubled:
+        Phi(2 g) = Phi(g)^2 and L(2 g) L(2 g)' = [L, Phi L] [L, Phi L]'.
         """
         doublings = self._doublings(distinct)
         units = np.ldexp(distinct, -doublings)
         Phi, L = self._unit_transition(units), noise_factors(self._unit_noise(units))[0]
-        with np.errstate(over="ignore", invalid="ignore"):  # unstable over a very long gap
+        with np.errstate(over="ignore", invalid="ignore"):  # unstable A over a very long gap
             for level in range(int(doublings.max(initial=0))):
                 k = np.flatnonzero(doublings > level)
                 L[k] = noise_factors(np.concatenate([L[k], product(Phi[k], L[k])], axis=2))[0]
@@ -67,7 +70,7 @@ class Transitions:
         return Phi, L
 
     def transitions(self, gaps: FloatArray) -> FloatArray:
-        """Return ``Phi = e^{A g}`` (K, n, n) alone."""
+        """Return only ``Phi = e^{A g}`` (K, n, n) of K gaps in seconds."""
         distinct, index = np.unique(gaps, return_inverse=True)
         doublings = self._doublings(distinct)
         Phi = self._unit_transition(np.ldexp(distinct, -doublings))
@@ -78,9 +81,11 @@ class Transitions:
         return np.asarray(Phi[index])
 
     def bridges(self, before: FloatArray, after: FloatArray) -> FloatArray:
-        """Return rows D (K, n, 2 n) with ``z = D [z1; z2]``: how the noise of a whole gap is made
-        of that of its two parts of ``before`` and ``after`` seconds (K,). Rows are orthonormal or
-        zero.
+        """Return D (K, n, 2 n) with ``z = D [z1; z2]`` for gaps that consist of two parts of
+        ``before`` and ``after`` seconds (K,).
+
+        z are the standard normals of a whole gap, z1 and z2 those of its parts:
+        L z = Phi2 L1 z1 + L2 z2. The rows of D are orthonormal or zero.
         """
         pairs, index = np.unique(np.stack([before, after]), axis=1, return_inverse=True)
         L1, (Phi2, L2) = self.laws(pairs[0])[1], self.laws(pairs[1])
@@ -88,18 +93,20 @@ class Transitions:
         return np.asarray(directions[index.reshape(-1)])
 
     def _doublings(self, gaps: FloatArray) -> np.ndarray:
-        """Return how often (K,) each gap is halved before the power series is used."""
+        """Return the number of halvings (K,) after which the power series applies to each gap."""
         sizes = np.maximum(gaps * (self._norm / UNIT_SIZE), 1.0)
         return np.ceil(np.log2(sizes)).astype(np.int64)
 
     def _unit_transition(self, gaps: FloatArray) -> FloatArray:
-        """Return exp(A gap) (K, n, n) of gaps within one unit, by its power series."""
+        """Return exp(A g) (K, n, n) by its power series, for gaps g (K,) within one unit."""
         n, terms = self.n, len(self._series)
         powers = _powers(gaps, terms)
         return product(powers, self._series.reshape(terms, n * n)).reshape(-1, n, n)
 
     def _unit_noise(self, gaps: FloatArray) -> FloatArray:
-        """Return a factor (K, n, 10 m) of the noise, ``e^{A s} B sqrt(weight)`` at the nodes s."""
+        """Return a factor (K, n, 10 m) of the noise covariance of gaps (K,) within one unit:
+        columns ``e^{A s} B sqrt(weight)`` at the 10 quadrature nodes s.
+        """
         terms, n, m = self._response.shape
         powers = _powers(gaps[:, None] * _NODES, terms)
         response = product(powers, self._response.reshape(terms, n * m))
@@ -109,35 +116,34 @@ class Transitions:
 
 
 def noise_factors(noise: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return lower triangular ``S`` (K, n, n) and rows ``D`` (K, n, c) with ``S D = noise``
-    (K, n, c).
+    """Return ``S`` (K, n, n), lower triangular, and ``D`` (K, n, c) with ``S D = noise`` (K, n, c).
 
-    The rows of D are orthonormal, or zero (as is the column of S) where a row of ``noise``
-    depends on those before it. Modified Gram-Schmidt, twice (Kahan and Parlett): unlike
-    reflections it gives a dependent row no direction that is made of rounding.
+    The rows of D are orthonormal; where a row of ``noise`` depends on those before it, its row of D
+    and its column of S are zero. Gram-Schmidt, each row twice (Kahan and Parlett): Householder
+    reflections would give a dependent row a direction made of rounding errors.
     """
     count, n, columns = noise.shape
     S, D = np.zeros((count, n, n)), np.zeros((count, n, columns))
     for k in range(n):
         row = noise[:, k]
         scale = np.abs(row).max(axis=1, initial=0.0)
-        scale[scale == 0.0] = 1.0  # rows of any size, without underflow of their squares
-        rest = row / scale[:, None]
-        length = whole = norm(rest)
+        scale[scale == 0.0] = 1.0  # scaled rows: the squares of small numbers do not underflow
+        remainder = row / scale[:, None]
+        row_norm = norm(remainder)
         for _ in range(2):
-            along = apply(D[:, :k], rest)
-            S[:, k, :k] += along * scale[:, None]
-            rest = rest - apply(np.swapaxes(D[:, :k], 1, 2), along)
-        length = norm(rest)
-        free = length > DEPENDENT * whole
-        S[free, k, k] = (length * scale)[free]
-        D[free, k] = rest[free] / length[free, None]
+            components = apply(D[:, :k], remainder)
+            S[:, k, :k] += components * scale[:, None]
+            remainder = remainder - apply(np.swapaxes(D[:, :k], 1, 2), components)
+        length = norm(remainder)
+        independent = length > DEPENDENT * row_norm
+        S[independent, k, k] = (length * scale)[independent]
+        D[independent, k] = remainder[independent] / length[independent, None]
     return S, D
 
 
 def _powers(gaps: FloatArray, terms: int) -> FloatArray:
-    """Return (K, c, terms): the powers 0 .. terms - 1 of gaps (K, c) or (K,), where c is 1."""
-    # Products, since the last bit of a power depends on the CPU.
+    """Return the powers g^0 .. g^(terms - 1), (K, c, terms), of g (K, c), or (K,) for c = 1."""
+    # By multiplication: the last bit of numpy's power depends on the CPU.
     gaps = gaps if gaps.ndim > 1 else gaps[:, None]
     factors = np.ones((*gaps.shape, terms))
     factors[:, :, 1:] = gaps[:, :, None]
@@ -145,12 +151,13 @@ def _powers(gaps: FloatArray, terms: int) -> FloatArray:
 
 
 GROWTH = 10.0 * math.log(2.0)
-"""Logarithm of how much an unstable state may grow between two frames."""
+"""Logarithm of the factor by which an unstable state may grow within a frame, 2^10."""
 
 
 def frame_period(A: FloatArray) -> float | None:
-    """Return the longest time (seconds) between two frames of ``dx = A x dt``: growth e^{a g} of at
-    most 2^10 for the spectral abscissa a of ``A`` (n, n); None for a plant that is not unstable.
+    """Return the seconds g from one frame to the next for ``dx = A x dt``, A (n, n).
+
+    The growth e^{a g} is 2^10 for the spectral abscissa a of A; None if a <= 0.
     """
     abscissa = float(np.linalg.eigvals(A).real.max())
     return _round_seconds(GROWTH / abscissa) if abscissa > 0.0 else None
@@ -158,13 +165,14 @@ def frame_period(A: FloatArray) -> float | None:
 
 def _round_seconds(seconds: float) -> float:
     """Return a time rounded to 9 significant digits."""
-    # Frames are to begin at the same times whatever the last bits of an eigenvalue.
+    # Frames must not depend on the last bits of an eigenvalue, which differ between machines.
     return float(f"{seconds:.9g}")
 
 
 def frame_slots(F: FloatArray) -> int | None:
-    """Return the slots between two frames of ``x[k+1] = F x[k]``: growth of at most 2^10 for the
-    spectral radius of ``F`` (n, n); None for a plant that is not unstable.
+    """Return the slots from one frame to the next for ``x[k+1] = F x[k]``, F (n, n).
+
+    The growth r^k of the spectral radius r of F is at most 2^10, or k = 1; None if r <= 1.
     """
     radius = float(np.abs(np.linalg.eigvals(F)).max())
     return max(1, int(_round_seconds(GROWTH / math.log(radius)))) if radius > 1.0 else None

@@ -1,9 +1,10 @@
-"""The true state of one run in continuous time, and the frames in which it is given.
+"""The true state of one run in continuous time, and its frames.
 
 Errors ``x - xhat`` of affine filters do not change when the truth, the readings and all estimates
-are shifted along a solution of ``dc = A c dt``. On an unstable plant the state therefore starts
-again from zero at every *frame time*: ``local`` states are counted from the origin of the present
-frame, which moves with the plant, and keep the digits that ``absolute`` ones lose to growth.
+are shifted along a solution of ``dc = A c dt``. On an unstable plant the state is therefore reset
+to zero at every *frame time* (a rebase), which starts a new frame. ``local`` states are relative to
+the origin of the present frame, which moves with the plant; they keep the digits that ``absolute``
+states lose as they grow.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from netkf.linalg.portable import apply
 from netkf.plants.transitions import Transitions
 
 TOLERANCE = 1e-9  # seconds by which a recorded time may be off
-BLOCK = 1024  # laws worked out at once
+BLOCK = 1024  # gaps whose laws are computed at once
 
 
 class ContinuousTruth(Protocol):
@@ -46,7 +47,7 @@ class ContinuousTruth(Protocol):
 
 
 def multiples(period: float | None, horizon: float) -> FloatArray:
-    """Return the multiples of ``period`` in (0, horizon)."""
+    """Return the multiples (K,) of ``period`` in (0, horizon), seconds; empty without a period."""
     if period is None or period >= horizon:
         return np.empty(0)
     times = period * np.arange(1, int(horizon / period) + 2)
@@ -54,18 +55,20 @@ def multiples(period: float | None, horizon: float) -> FloatArray:
 
 
 def origins(Phi: FloatArray, offsets: FloatArray) -> FloatArray:
-    """Return the absolute state (F + 1, n) at the origin of each frame when the frame begins, 0 for
-    the first.
+    """Return the absolute position (F + 1, n) of each frame's origin at the start of the frame.
 
-    ``Phi`` (F, n, n) are the transitions over the frames that end by a rebase, ``offsets`` (F, n)
-    the local states that become the new origins.
+    The first is 0, then ``c[k+1] = Phi[k] c[k] + offsets[k]``: ``Phi`` (F, n, n) are the
+    transitions over the frames that end by a rebase, ``offsets`` (F, n) the local states before it.
     """
-    found = np.zeros((len(offsets) + 1, offsets.shape[1]))
+    positions = np.zeros((len(offsets) + 1, offsets.shape[1]))
     with np.errstate(over="ignore", invalid="ignore"):
         for k, offset in enumerate(offsets):
             # An origin at 0 stays there; the product would be nan if Phi has overflowed.
-            found[k + 1] = apply(Phi[k], found[k]) + offset if found[k].any() else offset
-    return found
+            if positions[k].any():
+                positions[k + 1] = apply(Phi[k], positions[k]) + offset
+            else:
+                positions[k + 1] = offset
+    return positions
 
 
 def absolute_states(
@@ -74,7 +77,7 @@ def absolute_states(
     """Return absolute states (K, n) at times ``t`` (K,) from local states ``x`` (K, n).
 
     A frame begins at 0 and at each of ``frame_times`` (F,), in seconds; ``offsets`` (F, n) are the
-    local states by which its origin was moved. At a frame time ``x`` is local to the new frame.
+    local states just before these rebases. At a frame time ``x`` is local to the new frame.
     """
     starts = np.concatenate([[0.0], frame_times])
     at_start = origins(moves.transitions(np.diff(starts)), offsets)
@@ -95,11 +98,12 @@ class TruthTimes(NamedTuple):
 
 
 class SampledTruth:
-    """A path drawn exactly at ``samples`` and ``marks`` from ``random``, and at ``probes`` from
-    ``probing`` by the exact conditional law, so that neither probes nor the network move it.
+    """A path from x(0) = ``start`` (n,) on, drawn exactly at the times ``at`` and nowhere else.
 
-    ``start`` (n,) is x(0). ``marks`` are the frame times of the plant; they are used as such only
-    with ``frames``, and the path is the same without. All times in seconds, at least 0.
+    ``random`` draws the states at samples and marks; ``probing`` draws those at probes from their
+    exact law given the others, so that the path does not depend on the probes. The marks are the
+    frame times if ``frames``; without frames the path is the same. All times are in seconds and at
+    least 0.
     """
 
     def __init__(
@@ -131,7 +135,7 @@ class SampledTruth:
             )
 
     def _index_of(self, time: float) -> int:
-        """Return the index of a time among those of the truth."""
+        """Return the index of a time among those of the path."""
         k = int(np.searchsorted(self._times, time))
         assert k < len(self._times), f"{time} is no sample, probe or frame time"
         assert self._times[k] == time, f"{time} is no sample, probe or frame time"
@@ -162,23 +166,26 @@ def _draw_states(
     times: FloatArray,
     rebased: np.ndarray,
 ) -> tuple[FloatArray, FloatArray]:
-    """Return states (K, n) at ``times`` (K,) just before any rebase, which makes them 0, and the
-    normals (K - 1, n) of the gaps.
+    """Return states (K, n) at ``times`` (K,), each before a rebase, and the standard normals
+    (K - 1, n) of the gaps.
+
+    ``x <- Phi x + L z`` from ``start`` (n,) on; at times marked in ``rebased`` (K,) it restarts
+    from 0.
     """
     gaps = np.diff(times)
     states = np.empty((len(times), moves.n))
     states[0] = x = start
-    drawn = [np.empty((0, moves.n))]
+    blocks = [np.empty((0, moves.n))]
     for first in range(0, len(gaps), BLOCK):
         Phi, L = moves.laws(gaps[first : first + BLOCK])
         normals = random.standard_normal((len(Phi), moves.n))
-        drawn.append(normals)
+        blocks.append(normals)
         noise = apply(L, normals)
         for k in range(len(Phi)):
             x = states[first + k + 1] = apply(Phi[k], x) + noise[k]
             if rebased[first + k + 1]:
                 x = np.zeros(moves.n)
-    return states, np.concatenate(drawn)
+    return states, np.concatenate(blocks)
 
 
 def _bridge_gap(
@@ -189,41 +196,47 @@ def _bridge_gap(
     probing: np.random.Generator,
     probes: FloatArray,
 ) -> FloatArray:
-    """Return states (P, n) at ``probes`` (P,), in the frame of the time before, given those at
-    ``times``; beyond the last of them the path goes on freely.
+    """Return states (P, n) at increasing ``probes`` (P,) given the ``states`` (K, n) at ``times``.
+
+    ``normals`` (K - 1, n) are those of the gaps between the times. A state is in the frame of the
+    last time before it. After the last of ``times`` the path is drawn without a condition.
+
+    A probe divides a gap, or what follows the previous probe in it, in two parts with normals z1
+    and z2. Given the normals z = D [z1; z2] of the whole, [z1; z2] = D' z + (I - D' D) w with
+    standard normal w (see Transitions.bridges).
     """
     n = moves.n
-    found, rest = np.empty((len(probes), n)), np.empty(0)
-    gap = np.searchsorted(times, probes) - 1  # the number of the gap that each probe lies in
+    x_probes, z_gap = np.empty((len(probes), n)), np.empty(0)
+    gap = np.searchsorted(times, probes) - 1  # index of the gap that contains each probe
+    # Each part begins at the last time before the probe, or at the probe before it in the same gap.
     starts = times[gap]
-    again = np.flatnonzero(np.diff(gap) == 0) + 1
-    starts[again] = probes[again - 1]
+    shared = np.flatnonzero(np.diff(gap) == 0) + 1
+    starts[shared] = probes[shared - 1]
     ends = np.append(times, math.inf)[gap + 1]
     for first in range(0, len(probes), BLOCK):
-        some = slice(first, first + BLOCK)
-        before, after = probes[some] - starts[some], ends[some] - probes[some]
+        block = slice(first, first + BLOCK)
+        before, after = probes[block] - starts[block], ends[block] - probes[block]
         Phi, L = moves.laws(before)
-        free = np.isinf(after)
-        D = moves.bridges(before, np.where(free, 0.0, after))
-        drawn = probing.standard_normal((len(before), 2 * n))
+        unconditional = np.isinf(after)
+        D = moves.bridges(before, np.where(unconditional, 0.0, after))
+        w = probing.standard_normal((len(before), 2 * n))
         for k in range(len(before)):
-            number = first + k
-            if number and gap[number] == gap[number - 1]:
-                x = found[number - 1]
+            index = first + k
+            if index and gap[index] == gap[index - 1]:
+                x = x_probes[index - 1]
             else:
-                x = states[gap[number]]
-                rest = rest if free[k] else normals[gap[number]]
-            z = drawn[k]
-            if not free[k]:
-                # What is left free by the noise of the whole gap, which is known.
-                z = apply(D[k].T, rest) + (z - apply(D[k].T, apply(D[k], z)))
-                rest = z[n:]
-            found[number] = apply(Phi[k], x) + apply(L[k], z[:n])
-    return found
+                x = states[gap[index]]
+                z_gap = z_gap if unconditional[k] else normals[gap[index]]
+            z_parts = w[k]
+            if not unconditional[k]:
+                z_parts = apply(D[k].T, z_gap) + (z_parts - apply(D[k].T, apply(D[k], z_parts)))
+                z_gap = z_parts[n:]
+            x_probes[index] = apply(Phi[k], x) + apply(L[k], z_parts[:n])
+    return x_probes
 
 
 class RecordedTruth:
-    """States (K, n) at recorded times (K,), which are asked for to 1e-9 s; nan elsewhere."""
+    """States (K, n) at recorded times (K,) in seconds, matched to 1e-9 s; nan at other times."""
 
     frame_times = np.empty(0)
 
@@ -232,7 +245,7 @@ class RecordedTruth:
         self._missing = np.full(n, math.nan)
 
     def local(self, time: float) -> FloatArray:
-        """Return x (n,), or nan."""
+        """Return x (n,); nan at a time without a row."""
         k = nearest_row(self._times, time)
         return self._missing if k is None else np.asarray(self._states[k])
 
@@ -243,20 +256,22 @@ class RecordedTruth:
         raise IndexError(k)
 
     def states(self, times: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return states (K, n) at times in any order, twice."""
+        """Return local and absolute states (K, n), which are equal, at times in any order."""
         x = np.array([self.local(time) for time in times.tolist()]).reshape(-1, len(self._missing))
         return x, x
 
 
 def nearest_row(times: FloatArray, time: float) -> int | None:
-    """Return the row whose time (increasing) is ``time`` to 1e-9 s."""
+    """Return the index in increasing ``times`` of the one within 1e-9 s of ``time``, else None."""
     k = int(np.searchsorted(times, time - TOLERANCE))
     return k if k < len(times) and times[k] <= time + TOLERANCE else None
 
 
-def demand_rows(source: SourceFile, times: FloatArray, wanted: FloatArray, what: str) -> None:
-    """Raise ScenarioError for the first of the ``wanted`` times that has no row."""
-    for time in wanted.tolist():
+def demand_rows(source: SourceFile, times: FloatArray, needed: FloatArray, what: str) -> None:
+    """Raise ScenarioError for the first of the ``needed`` times that is not among the ``times`` of
+    the table; ``what`` names the use of the state in the message.
+    """
+    for time in needed.tolist():
         if nearest_row(times, time) is None:
             rule = f"{source.name} has no state for {what}, t = {time:.9g}"
             raise ScenarioError("path", rule, None, "add the row, or ask for no state then")

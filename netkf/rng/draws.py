@@ -1,10 +1,15 @@
-"""Numbers of many streams at once: those that numpy's ``Generator(PCG64DXSM)`` draws, compiled.
+"""Random numbers of many streams at once, in compiled code: words, uniforms and exponentials.
 
-A network of 1e5 links has as many streams, and a generator of numpy for each costs more than what
-is drawn from it. So the state of all of them is one array here. The words follow PCG64DXSM (M. E.
-O'Neill's permuted congruential generator with the output of numpy's issue 13635), which numpy's
-policy keeps as it is; exponentials come from the ziggurat of Marsaglia and Tsang (2000) with
-numpy's tables (``ziggurat_constants.h``, BSD-3-Clause), kept in ``ziggurat.npz``.
+The numbers are, bit for bit, those of numpy's ``Generator(PCG64DXSM)``. A network of 1e5 links has
+as many streams, and to make a numpy generator for each takes longer than to draw from it; here the
+states of all streams are one array. Words follow PCG64DXSM (M. E. O'Neill's permuted congruential
+generator with the output function of numpy's issue 13635), which numpy's policy on streams keeps
+unchanged. Exponentials come from the ziggurat of Marsaglia and Tsang (2000) with numpy's tables
+(``ziggurat_constants.h``, BSD-3-Clause), stored in ``ziggurat.npz``.
+
+A state is a row (high, low, high of the increment, low of the increment) of 64-bit words: a 128-bit
+number ``state = 2^64 high + low``, and the odd increment that tells streams apart. All arithmetic
+is modulo 2^64.
 """
 
 from __future__ import annotations
@@ -29,12 +34,17 @@ CHEAP = _U(0xDA942042E4DD58B5)  # the multiplier of PCG64DXSM, see numpy/random/
 FULL_HIGH, FULL_LOW = _U(0x2360ED051FC65DA4), _U(0x4385DF649FCCF645)
 ZERO, ONE, HALF, LAYER = _U(0), _U(1), _U(0xFFFFFFFF), _U(0xFF)
 S3, S8, S11, S32, S48, S63 = _U(3), _U(8), _U(11), _U(32), _U(48), _U(63)
-TO_UNIT = 2.0**-53  # the spacing of numpy's uniform numbers
+TO_UNIT = 2.0**-53  # spacing of numpy's uniform numbers
 EXPONENTIAL_TAIL = 7.69711747013104972  # where numpy's exponential ziggurat begins its tail
 
 
 class Ziggurat(NamedTuple):
-    """256 layers under exp(-x): heights, widths / 2^53, and the integers that are surely inside."""
+    """The 256 layers of the ziggurat under exp(-x), (256,) each.
+
+    height  exp(-x) at the edge of the layer
+    width   x at the edge, divided by 2^53
+    inside  integers below this are inside the curve without a test
+    """
 
     height: FloatArray
     width: FloatArray
@@ -44,13 +54,16 @@ class Ziggurat(NamedTuple):
 @cache
 def ziggurat() -> Ziggurat:
     """Return the tables of numpy's ziggurat for exponential numbers."""
-    with np.load(Path(__file__).with_name("ziggurat.npz")) as kept:
-        return Ziggurat(kept["fe"], kept["we"], kept["ke"])
+    with np.load(Path(__file__).with_name("ziggurat.npz")) as tables:
+        return Ziggurat(tables["fe"], tables["we"], tables["ke"])
 
 
 @kernel
 def high_word_by_halves(a: Any, b: Any) -> Any:
-    """Return ``high_word(a, b)`` from products of halves, which compilers can vectorise."""
+    """Return the upper 64 bits of the product a b, from 32-bit halves.
+
+    It equals ``linalg.words.high_word``, but compilers can vectorise it.
+    """
     a1, a0, b1, b0 = a >> S32, a & HALF, b >> S32, b & HALF
     low, cross = a0 * b0, a1 * b0
     middle = (low >> S32) + (cross & HALF) + a0 * b1
@@ -59,28 +72,29 @@ def high_word_by_halves(a: Any, b: Any) -> Any:
 
 @kernel
 def scramble(high: Any, low: Any) -> Any:
-    """Return the output word of a state (high, low): the DXSM permutation."""
-    made = high ^ (high >> S32)
-    made *= CHEAP
-    made ^= made >> S48
-    return made * (low | ONE)
+    """Return the output word of a state (high, low): the DXSM permutation of PCG."""
+    word = high ^ (high >> S32)
+    word *= CHEAP
+    word ^= word >> S48
+    return word * (low | ONE)
 
 
 @kernel
-def following(high: Any, low: Any, upper: Any, more_high: Any, more_low: Any) -> tuple[Any, Any]:
-    """Return the state of a stream after (high, low), given its increment; ``upper`` is
-    ``high_word(low, CHEAP)``.
+def following(
+    high: Any, low: Any, upper: Any, increment_high: Any, increment_low: Any
+) -> tuple[Any, Any]:
+    """Return the state after (high, low): ``state <- state * CHEAP + increment`` modulo 2^128.
+
+    ``more_high, more_low`` are the increment; ``upper`` is the upper word of ``low * CHEAP``.
     """
-    step = low * CHEAP + more_low
-    carry = ONE if step < more_low else ZERO
-    return high * CHEAP + upper + more_high + carry, step
+    step = low * CHEAP + increment_low
+    carry = ONE if step < increment_low else ZERO
+    return high * CHEAP + upper + increment_high + carry, step
 
 
 @kernel
 def next_word(states: np.ndarray, k: int) -> Any:
-    """Return the next word of stream ``k`` of states (K, 4): state and increment, high
-    words first.
-    """
+    """Return the next 64-bit word of stream ``k`` of states (K, >= 4), and step its state."""
     high, low = states[k, 0], states[k, 1]
     upper = high_word(low, CHEAP)
     states[k, 0], states[k, 1] = following(high, low, upper, states[k, 2], states[k, 3])
@@ -95,10 +109,10 @@ def next_unit(states: np.ndarray, k: int) -> float:
 
 @kernel
 def next_units(lanes: Lanes, states: np.ndarray, b: int, k: int, units: FloatArray) -> None:
-    """Write the next uniform number of stream ``k`` of each run of block ``b`` into ``units[b, k]``
-    (L,), from states (B, K, 4, L).
+    """Write the next uniform number of stream ``k`` for the L runs of block ``b`` into
+    ``units[b, k]`` (L,), from states (B, K, 4, L).
     """
-    # One instruction for several lanes: all do the same to words of their own.
+    # No branch depends on a word, so that the compiler computes several lanes with one instruction.
     for q in range(len(lanes)):
         high, low = states[b, k, 0, q], states[b, k, 1, q]
         units[b, k, q] = float(scramble(high, low) >> S11) * TO_UNIT
@@ -110,7 +124,7 @@ def next_units(lanes: Lanes, states: np.ndarray, b: int, k: int, units: FloatArr
 
 @kernel
 def next_unit_of_lane(states: np.ndarray, b: int, k: int, q: int) -> float:
-    """Return the next uniform number of stream ``k`` of the run of lane ``q`` of block ``b``."""
+    """Return the next uniform number of stream ``k`` for the run in lane ``q`` of block ``b``."""
     high, low = states[b, k, 0, q], states[b, k, 1, q]
     states[b, k, 0, q], states[b, k, 1, q] = following(
         high, low, high_word(low, CHEAP), states[b, k, 2, q], states[b, k, 3, q]
@@ -119,18 +133,22 @@ def next_unit_of_lane(states: np.ndarray, b: int, k: int, q: int) -> float:
 
 
 @kernel(inlined=True)
-def next_stream_state(high: Any, low: Any, more_high: Any, more_low: Any) -> tuple[Any, Any]:
-    """Return the state of a stream after (high, low); its increment is ``more``."""
-    return following(high, low, high_word(low, CHEAP), more_high, more_low)
+def next_stream_state(
+    high: Any, low: Any, increment_high: Any, increment_low: Any
+) -> tuple[Any, Any]:
+    """Return the state of a stream after (high, low), given its increment; see ``following``."""
+    return following(high, low, high_word(low, CHEAP), increment_high, increment_low)
 
 
 @kernel(inlined=True)
 def exponential_of(
     states: np.ndarray, k: int, high: Any, low: Any, ziggurat: Ziggurat
 ) -> tuple[float, Any, Any]:
-    """Return ``next_exponential`` of stream ``k``, whose state is in registers; return the state
-    after it too. Numbers of one stream wait for each other's state, and memory makes them wait
-    longer.
+    """Return ``next_exponential`` of stream ``k`` and the state after it, for a loop that keeps the
+    state (high, low) in registers.
+
+    Each number of a stream waits for the state after the one before; a state in memory would take
+    longer. ``states[k]`` is only read and written for the rare numbers outside the fast path.
     """
     word = scramble(high, low) >> S3
     layer = int(word & LAYER)
@@ -138,6 +156,7 @@ def exponential_of(
     if word < ziggurat.inside[layer]:
         high, low = next_stream_state(high, low, states[k, 2], states[k, 3])
         return float(word) * ziggurat.width[layer], high, low
+    # The slow path draws the same word again, from the state before it.
     states[k, 0], states[k, 1] = high, low
     x = next_exponential(states, k, ziggurat)
     return x, states[k, 0], states[k, 1]
@@ -145,16 +164,19 @@ def exponential_of(
 
 @kernel
 def next_exponential(states: np.ndarray, k: int, ziggurat: Ziggurat) -> float:
-    """Return the next number of stream ``k`` from the exponential law of mean 1."""
+    """Return the next number of stream ``k`` from the exponential law of mean 1 (ziggurat)."""
     while True:
+        # 8 bits choose a layer, 53 bits a point across it.
         word = next_word(states, k) >> S3
         layer = int(word & LAYER)
         word >>= S8
         x: float = float(word) * ziggurat.width[layer]
         if word < ziggurat.inside[layer]:
             return x
+        # The tail of an exponential law is the same law, shifted.
         if layer == 0:
             return EXPONENTIAL_TAIL - math.log1p(-next_unit(states, k))
+        # At the edge of a layer: accept x if a uniform height in the layer is below exp(-x).
         above, height = ziggurat.height[layer - 1], ziggurat.height[layer]
         if (above - height) * next_unit(states, k) + height < math.exp(-x):
             return x
@@ -162,25 +184,32 @@ def next_exponential(states: np.ndarray, k: int, ziggurat: Ziggurat) -> float:
 
 @kernel
 def seed_states(words: np.ndarray, states: np.ndarray) -> None:
-    """Write the states (K, 4) that follow from four words of seed (K, 4) each."""
+    """Write the states (K, 4) of K streams that are seeded with four words (K, 4) each.
+
+    As numpy: words 0 and 1 are the initial state s, words 2 and 3 the stream number i. The
+    increment is 2 i + 1, and the first state (s + increment) * FULL + increment modulo 2^128.
+    """
     for k in range(len(words)):
+        # increment = 2 i + 1
         high = (words[k, 2] << ONE) | (words[k, 3] >> S63)
         low = (words[k, 3] << ONE) | ONE
         states[k, 2], states[k, 3] = high, low
+        # (upper, start) = s + increment
         start = low + words[k, 1]
         carry = ONE if start < low else ZERO
         upper = high + words[k, 0] + carry
-        made = start * FULL_LOW
-        product = high_word(start, FULL_LOW) + upper * FULL_LOW + start * FULL_HIGH
-        states[k, 1] = made + low
+        # (product_high, product_low) = (upper, start) * FULL
+        product_low = start * FULL_LOW
+        product_high = high_word(start, FULL_LOW) + upper * FULL_LOW + start * FULL_HIGH
+        states[k, 1] = product_low + low
         carry = ONE if states[k, 1] < low else ZERO
-        states[k, 0] = product + high + carry
+        states[k, 0] = product_high + high + carry
 
 
 @kernel
 def fill_units(states: np.ndarray, which: np.ndarray, counts: np.ndarray, out: FloatArray) -> None:
-    """Write the next ``counts`` uniform numbers of each of the streams ``which``, one stream after
-    the other.
+    """Write the next ``counts[m]`` uniform numbers of stream ``which[m]`` into ``out``, for each m
+    in turn; both (M,), ``out`` (sum of counts,).
     """
     index = 0
     for m in range(len(which)):
@@ -193,7 +222,9 @@ def fill_units(states: np.ndarray, which: np.ndarray, counts: np.ndarray, out: F
 def fill_exponentials(
     states: np.ndarray, which: np.ndarray, counts: np.ndarray, ziggurat: Ziggurat, out: FloatArray
 ) -> None:
-    """Write the next ``counts`` exponential numbers of mean 1 of each of the streams ``which``."""
+    """Write the next ``counts[m]`` exponential numbers of mean 1 of stream ``which[m]`` into
+    ``out``, as ``fill_units``.
+    """
     index = 0
     for m in range(len(which)):
         for _ in range(counts[m]):
@@ -202,8 +233,9 @@ def fill_exponentials(
 
 
 class StreamBatch:
-    """The streams of one purpose of many entities, in order, run by run: their ``states`` (K, 4),
-    which drawing changes; needs numba.
+    """The streams of one purpose for many entities: ``states`` (K, 4), which drawing changes.
+
+    With ReplicaStreams of R runs, K is R times the number of entities, run by run.
     """
 
     def __init__(
@@ -214,26 +246,27 @@ class StreamBatch:
         seed_states(words, self.states)
 
     def in_lanes(self, runs: int) -> np.ndarray:
-        """Return the states (B, K, 4, L) of the K streams of each of so many runs, by blocks of
-        lanes.
+        """Return the states (B, K, 4, L) of the K streams of each of ``runs`` runs, side by side in
+        B blocks of L lanes; idle lanes are 0.
         """
         count = len(self.states) // runs
         by_lane = np.zeros((blocks_of(runs) * LANES, count, 4), dtype=np.uint64)
         by_lane[:runs] = self.states.reshape(runs, count, 4)
-        made: np.ndarray = aligned((blocks_of(runs), count, 4, LANES), np.uint64)
-        made[:] = np.moveaxis(by_lane.reshape(-1, LANES, count, 4), 1, -1)
-        return made
+        lanes: np.ndarray = aligned((blocks_of(runs), count, 4, LANES), np.uint64)
+        lanes[:] = np.moveaxis(by_lane.reshape(-1, LANES, count, 4), 1, -1)
+        return lanes
 
     def units(self, which: np.ndarray, counts: np.ndarray) -> FloatArray:
-        """Return ``Generator.random(count)`` of each of the entities in these places, one after the
-        other.
+        """Return the next ``counts[m]`` uniforms of stream ``which[m]``, concatenated over m.
+
+        They equal ``Generator.random(counts[m])`` of that stream.
         """
         out = np.empty(int(counts.sum()))
         fill_units(self.states, which, counts, out)
         return out
 
     def exponentials(self, which: np.ndarray, counts: np.ndarray) -> FloatArray:
-        """Return ``Generator.standard_exponential(count)`` of each entity, as ``units``."""
+        """Return ``Generator.standard_exponential(counts[m])`` of each stream, as ``units``."""
         out = np.empty(int(counts.sum()))
         fill_exponentials(self.states, which, counts, ziggurat(), out)
         return out

@@ -1,4 +1,4 @@
-"""Standard normal numbers of several streams at once, as arrays with the streams first."""
+"""Standard normal numbers of several streams at once."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from netkf.rng.numbers import NormalZiggurat, normal_of, normal_ziggurat
 
 
 class Normals(Protocol):
-    """K streams of standard normal numbers."""
+    """The contract of K independent streams of standard normal numbers."""
 
     def draw(self, shape: tuple[int, ...]) -> FloatArray:
         """Return the next numbers (K, *shape) of each stream."""
 
 
 class GeneratorNormals:
-    """The streams of numpy's generators."""
+    """The streams of K numpy generators."""
 
     def __init__(self, randoms: Sequence[np.random.Generator]) -> None:
         self._randoms = randoms
@@ -32,7 +32,10 @@ class GeneratorNormals:
 
 
 class StreamNormals:
-    """The same streams from their seeds ``words`` (K, 4), drawn in compiled code."""
+    """Streams with the seed ``words`` (K, 4), drawn in compiled code.
+
+    They give the same numbers as numpy generators with these seeds.
+    """
 
     def __init__(self, words: np.ndarray) -> None:
         self.states = np.empty(words.shape, dtype=np.uint64)
@@ -47,7 +50,9 @@ class StreamNormals:
 
 @kernel
 def fill_normals_of_all(states: np.ndarray, ziggurat: NormalZiggurat, out: FloatArray) -> None:
-    """Write the next numbers of each stream of ``states`` (K, >= 4) into its row of ``out``."""
+    """Write the next M numbers of stream ``states[k]`` into ``out[k]``; states (K, >= 4), out
+    (K, M).
+    """
     for k in range(out.shape[0]):
         high, low = states[k, 0], states[k, 1]
         for m in range(out.shape[1]):

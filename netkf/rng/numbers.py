@@ -1,9 +1,9 @@
 """Normal numbers and bounded integers of numpy's ``Generator(PCG64DXSM)``, drawn in kernels.
 
-``rng.draws`` holds the words and the uniform and exponential numbers. Normals come from the
+``rng.draws`` has the words, uniforms and exponentials, and explains states. Normals come from the
 ziggurat of Marsaglia and Tsang (2000) with numpy's 256 layers (``ziggurat_normal.npz``), integers
-from Lemire's method (ACM TOMACS 29, 2019) and orders from masked halves of words. tests/rng
-compares all of them with numpy.
+from Lemire's method (ACM TOMACS 29, 2019) and permutations from masked 32-bit halves of words.
+tests/rng compares all of them with numpy.
 """
 
 from __future__ import annotations
@@ -34,11 +34,18 @@ MANTISSA, S1, S9 = _U(0x000FFFFFFFFFFFFF), _U(1), _U(9)
 TAIL_START = 3.6541528853610087963519472518
 INVERSE_TAIL_START = 0.27366123732975827203338247596
 HAS_HALF, KEPT_HALF = 4, 5
-"""Columns of a row of states, after the four of rng.draws: whether half a word is kept, and it."""
+"""Columns 4 and 5 of a state, after the four of rng.draws: 1 if half of a word is left over from
+the last 32-bit draw, and that half.
+"""
 
 
 class NormalZiggurat(NamedTuple):
-    """256 layers under exp(-x^2 / 2): heights, widths / 2^52, integers that are surely inside."""
+    """The 256 layers of the ziggurat under exp(-x^2 / 2), (256,) each.
+
+    height  exp(-x^2 / 2) at the edge of the layer
+    width   x at the edge, divided by 2^52
+    inside  integers below this are inside the curve without a test
+    """
 
     height: FloatArray
     width: FloatArray
@@ -48,16 +55,16 @@ class NormalZiggurat(NamedTuple):
 @cache
 def normal_ziggurat() -> NormalZiggurat:
     """Return the layers that numpy uses."""
-    with np.load(Path(__file__).with_name("ziggurat_normal.npz")) as kept:
-        return NormalZiggurat(kept["fi"], kept["wi"], kept["ki"])
+    with np.load(Path(__file__).with_name("ziggurat_normal.npz")) as tables:
+        return NormalZiggurat(tables["fi"], tables["wi"], tables["ki"])
 
 
 @kernel(inlined=True)
 def normal_of(
     states: np.ndarray, k: int, high: Any, low: Any, ziggurat: NormalZiggurat
 ) -> tuple[float, Any, Any]:
-    """Return ``next_normal`` of stream ``k``, whose state is in registers; return the state after
-    it too, see ``exponential_of``.
+    """Return ``next_normal`` of stream ``k`` and the state after it, for a loop that keeps the
+    state (high, low) in registers; see ``draws.exponential_of``.
     """
     word = scramble(high, low)
     layer = int(word & LAYER)
@@ -66,6 +73,7 @@ def normal_of(
         x: float = float(size) * ziggurat.width[layer]
         high, low = next_stream_state(high, low, states[k, 2], states[k, 3])
         return -x if (word >> S8) & ONE == ONE else x, high, low
+    # The slow path draws the same word again, from the state before it.
     states[k, 0], states[k, 1] = high, low
     x = next_normal(states, k, ziggurat)
     return x, states[k, 0], states[k, 1]
@@ -73,8 +81,9 @@ def normal_of(
 
 @kernel
 def next_normal(states: np.ndarray, k: int, ziggurat: NormalZiggurat) -> float:
-    """Return the next standard normal number of stream ``k`` of states (K, >= 4)."""
+    """Return the next standard normal number of stream ``k`` of states (K, >= 4) (ziggurat)."""
     while True:
+        # 8 bits choose a layer, one the sign, 52 a point across the layer.
         word = next_word(states, k)
         layer = int(word & LAYER)
         word >>= S8
@@ -85,8 +94,9 @@ def next_normal(states: np.ndarray, k: int, ziggurat: NormalZiggurat) -> float:
             x = -x
         if size < ziggurat.inside[layer]:
             return x
-        if layer == 0:
+        if layer == 0:  # the sign bit of the tail is another one than that of the layers
             return _tail(states, k, ((size >> S8) & ONE) == ONE)
+        # At the edge of a layer: accept x if a uniform height in the layer is below exp(-x^2 / 2).
         above, height = ziggurat.height[layer - 1], ziggurat.height[layer]
         if (above - height) * next_unit(states, k) + height < math.exp(-0.5 * x * x):
             return x
@@ -94,7 +104,7 @@ def next_normal(states: np.ndarray, k: int, ziggurat: NormalZiggurat) -> float:
 
 @kernel
 def _tail(states: np.ndarray, k: int, negative: bool) -> float:
-    """Return a number beyond the lowest layer (Marsaglia 1964)."""
+    """Return a normal number with |x| > TAIL_START, by rejection (Marsaglia 1964)."""
     while True:
         x = -INVERSE_TAIL_START * math.log1p(-next_unit(states, k))
         y = -math.log1p(-next_unit(states, k))
@@ -104,8 +114,8 @@ def _tail(states: np.ndarray, k: int, negative: bool) -> float:
 
 @kernel
 def next_half(states: np.ndarray, k: int) -> Any:
-    """Return the next 32 bits of stream ``k`` of states (K, 6): the lower half of a word, then the
-    upper half.
+    """Return the next 32 bits of stream ``k`` of states (K, 6): the lower half of a new word, then
+    at the next call its upper half.
     """
     if states[k, HAS_HALF] == ONE:
         states[k, HAS_HALF] = _U(0)
@@ -117,33 +127,41 @@ def next_half(states: np.ndarray, k: int) -> Any:
 
 @kernel
 def next_integer(states: np.ndarray, k: int, count: int) -> Any:
-    """Return the next integer of stream ``k`` of states (K, 6), uniform from 0 to ``count`` - 1 <
-    2^32.
+    """Return the next integer of stream ``k`` of states (K, 6), uniform on 0 .. ``count`` - 1.
+
+    ``count`` is at most 2^32 - 1. Lemire's method: of count times 32 random bits the upper half is
+    the result; products whose lower half is below 2^32 mod count are rejected, so that all results
+    are equally likely.
     """
     if count <= 1:
         return np.int64(0)
-    excluded = _U(count)
-    product = next_half(states, k) * excluded
-    if (product & HALF) < excluded:
-        least = ((HALF - excluded) + ONE) % excluded
-        while (product & HALF) < least:
-            product = next_half(states, k) * excluded
+    bound = _U(count)
+    product = next_half(states, k) * bound
+    # The threshold is below ``bound``: the division is rarely needed.
+    if (product & HALF) < bound:
+        threshold = ((HALF - bound) + ONE) % bound
+        while (product & HALF) < threshold:
+            product = next_half(states, k) * bound
     return np.int64(product >> S32)
 
 
 @kernel
 def shuffle(states: np.ndarray, k: int, order: np.ndarray, count: int) -> None:
-    """Write a random order of 0 .. count - 1 into ``order``: ``Generator.permutation(count)``."""
+    """Write a random permutation of 0 .. count - 1 into ``order`` (>= count,) by Fisher-Yates.
+
+    It equals ``Generator.permutation(count)``; ``states`` is (K, 6).
+    """
     for i in range(count):
         order[i] = i
     mask = ONE
     while mask < _U(count):
         mask = (mask << ONE) | ONE
     for i in range(count - 1, 0, -1):
-        while (mask >> ONE) >= _U(i):  # the smallest 2^b - 1 that is at least i
+        while (mask >> ONE) >= _U(i):  # mask: the smallest 2^b - 1 that is at least i
             mask >>= ONE
-        drawn = next_half(states, k) & mask
-        while drawn > _U(i):
-            drawn = next_half(states, k) & mask
-        j = np.int64(drawn)
+        # j uniform on 0 .. i: draw b bits until they are at most i.
+        bits = next_half(states, k) & mask
+        while bits > _U(i):
+            bits = next_half(states, k) & mask
+        j = np.int64(bits)
         order[i], order[j] = order[j], order[i]

@@ -1,7 +1,7 @@
 """The seeds of many streams at once: numpy's ``SeedSequence`` as one kernel.
 
-The algorithm is M. E. O'Neill's ``seed_seq_fe``, which numpy's policy on streams keeps as it is; a
-``SeedSequence`` object for each stream costs 30 microseconds.
+The algorithm is M. E. O'Neill's ``seed_seq_fe``, which numpy's policy on streams keeps unchanged. A
+``SeedSequence`` object for each stream would cost 30 microseconds.
 """
 
 from __future__ import annotations
@@ -23,8 +23,9 @@ S32 = _L(32)
 
 @kernel
 def _scramble(value: Any, constant: Any, factor: Any) -> Any:
-    """Return ``hashmix`` of numpy's SeedSequence for one word of 32 bits, without its change of the
-    constant.
+    """Return ``hashmix`` of numpy's SeedSequence for one 32-bit word.
+
+    The caller replaces ``constant`` by ``constant * factor`` after each call, as numpy's does.
     """
     mixed = _U(_U(value ^ constant) * _U(constant * factor))
     return _U(mixed ^ (mixed >> S16))
@@ -32,7 +33,7 @@ def _scramble(value: Any, constant: Any, factor: Any) -> Any:
 
 @kernel
 def _mix(x: Any, y: Any) -> Any:
-    """Return ``mix`` of numpy's SeedSequence for two words of 32 bits."""
+    """Return ``mix`` of numpy's SeedSequence for two 32-bit words."""
     mixed = _U(_U(MIX_LEFT * x) - _U(MIX_RIGHT * y))
     return _U(mixed ^ (mixed >> S16))
 
@@ -45,24 +46,28 @@ def seed_words(entropy: np.ndarray, keys: np.ndarray, pool: np.ndarray, words: n
     ``entropy`` (at least 4,) holds the words of the seed, lowest first, padded with zeros; ``pool``
     (4,) is scratch; all but ``words`` are uint32.
     """
-    given = len(entropy)
+    entropy_words = len(entropy)
     for row in range(len(keys)):
         constant = START_A
+        # Fill the pool with the first words of the seed.
         for i in range(POOL):
             pool[i] = _scramble(entropy[i], constant, FACTOR_A)
             constant = _U(constant * FACTOR_A)
+        # Mix every word of the pool into every other.
         for source in range(POOL):
             for target in range(POOL):
                 if source != target:
-                    made = _scramble(pool[source], constant, FACTOR_A)
+                    hashed = _scramble(pool[source], constant, FACTOR_A)
                     constant = _U(constant * FACTOR_A)
-                    pool[target] = _mix(pool[target], made)
-        for i in range(POOL, given + keys.shape[1]):
-            value = entropy[i] if i < given else keys[row, i - given]
+                    pool[target] = _mix(pool[target], hashed)
+        # Mix the remaining words of the seed, then those of the key, into all words of the pool.
+        for i in range(POOL, entropy_words + keys.shape[1]):
+            value = entropy[i] if i < entropy_words else keys[row, i - entropy_words]
             for target in range(POOL):
-                made = _scramble(value, constant, FACTOR_A)
+                hashed = _scramble(value, constant, FACTOR_A)
                 constant = _U(constant * FACTOR_A)
-                pool[target] = _mix(pool[target], made)
+                pool[target] = _mix(pool[target], hashed)
+        # Hash the pool again, in turn, to 8 words of 32 bits: generate_state.
         constant = START_B
         for i in range(4):
             low = _scramble(pool[(2 * i) % POOL], constant, FACTOR_B)
