@@ -194,7 +194,7 @@ class GilbertElliott(Loss):
         return True
 
     def next_state(self, bad: bool | None, random: np.random.Generator) -> bool:
-        """Make one step of the chain; the first state is drawn from the stationary law."""
+        """Return the state after a step; the first is drawn from the stationary law."""
         to_bad, to_good = self.transitions
         u = random.random()
         if bad is None:
@@ -384,7 +384,7 @@ class ChannelSampler:
         self._delay_random = streams.get("delay")
 
     def draw(self) -> ChannelDraw:
-        """Return the draw of the next activation; its delay is 0 if there is none to draw."""
+        """Return the draw of the next activation; a delay that is not random is fixed or 0."""
         uniform, bad, delay = 0.0, False, self._fixed_delay
         if self._loss_random is not None:
             uniform = float(self._loss_random.random())

@@ -79,8 +79,8 @@ class OnReadings(LinkClock):
 
 
 def _accumulate(now: float, gaps: FloatArray) -> FloatArray:
-    """Return the ticks (K,) at ``now`` plus the sums of the first 1, 2, ... ``gaps`` (K,)."""
-    # One addition a tick, so that the size of a block never shows in a time.
+    """Return the ticks (K,) ``now + gaps[0] + ... + gaps[k]`` from ``gaps`` (K,), in seconds."""
+    # Added one after the other from ``now``: times do not depend on how many are drawn at once.
     return np.asarray(np.add.accumulate(np.concatenate([[now], gaps]))[1:])
 
 
@@ -121,27 +121,27 @@ class Poisson(LinkClock):
     def __post_init__(self) -> None:
         super().__post_init__()
         length, rule = (2, _node_rate) if self.at == "nodes" else (3, _link_rate)
-        for k, given in enumerate(self.rates):
-            if len(given) != length:
+        for k, entry in enumerate(self.rates):
+            if len(entry) != length:
                 printed = [
-                    int(value) if value.is_integer() else value for value in map(float, given)
+                    int(value) if value.is_integer() else value for value in map(float, entry)
                 ]
                 remedy = f'{rule.remedy}, because at = "{self.at}"'
                 raise ScenarioError(f"rates[{k}]", rule.requirement, printed, remedy)
 
     @cached_property
-    def _own(self) -> dict[Entity, float]:
-        """Rates of the entities that have one of their own, per second."""
-        return {self._entity_of(given): given[-1] for given in self.rates}
+    def _entity_rates(self) -> dict[Entity, float]:
+        """The rates per second of the entities that ``rates`` lists."""
+        return {self._entity_of(entry): entry[-1] for entry in self.rates}
 
-    def _entity_of(self, given: tuple[float, ...]) -> Entity:
+    def _entity_of(self, entry: tuple[float, ...]) -> Entity:
         """Return the entity that an entry of ``rates`` names."""
-        ids = tuple(int(number) for number in given[:-1])
+        ids = tuple(int(number) for number in entry[:-1])
         return tuple(sorted(ids)) if self.at == "links" else ids
 
     def mean_rate(self, entity: Entity) -> float:
         """Return the rate of the process, in ticks per second."""
-        rate = self._own.get(entity, self.rate)
+        rate = self._entity_rates.get(entity, self.rate)
         return math.nan if rate is None else rate
 
     @property
@@ -158,26 +158,29 @@ class Poisson(LinkClock):
         random: np.random.Generator,
         count: int,
     ) -> FloatArray:
-        """Return ticks with exponential gaps; twice the rate gives the same gaps, halved."""
+        """Return the next ``count`` ticks after ``now``, with exponential gaps.
+
+        The gaps are proportional to 1 / rate: clocks of different rates use the same numbers.
+        """
         return _accumulate(now, random.standard_exponential(count) / self.mean_rate(entity))
 
     def check(self, topology: Topology) -> None:
         """Raise ScenarioError unless every entity has a rate and every rate has one entity."""
-        entities, named = self.entities(topology), set()
-        known, what = set(entities), self.at.removesuffix("s")
-        for k, given in enumerate(self.rates):
-            entity = self._entity_of(given)
-            if entity not in known or entity in named:
+        entities, listed = set(self.entities(topology)), set()
+        what = self.at.removesuffix("s")
+        for k, entry in enumerate(self.rates):
+            entity = self._entity_of(entry)
+            if entity not in entities or entity in listed:
                 again = f"names a {what} again"
-                rule = again if entity in named else f"must name a {what} of the graph"
-                raise ScenarioError(f"rates[{k}]", rule, list(given[:-1]), "remove or correct it")
-            named.add(entity)
-        bare = sorted(known - self._own.keys())
-        if self.rate is None and bare:
-            one = bare[0][0] if len(bare[0]) == 1 else bare[0]
+                rule = again if entity in listed else f"must name a {what} of the graph"
+                raise ScenarioError(f"rates[{k}]", rule, list(entry[:-1]), "remove or correct it")
+            listed.add(entity)
+        unlisted = sorted(entities - listed)
+        if self.rate is None and unlisted:
+            first = unlisted[0][0] if len(unlisted[0]) == 1 else unlisted[0]
             raise ScenarioError(
                 "rate",
-                f"is missing, and {what} {one} has no rate of its own",
+                f"is missing, and {what} {first} has no rate of its own",
                 None,
                 f"add rate = ... as the default of all {self.at}",
             )
@@ -223,15 +226,15 @@ class Renewal(LinkClock):
             if value is not None and name not in needed + one_of:
                 rule = f"means nothing for {self.distribution} gaps"
                 raise ScenarioError(name, rule, value, "remove it")
-        given = [name for name in one_of if getattr(self, name) is not None]
-        if one_of and len(given) != 1:
+        names = [name for name in one_of if getattr(self, name) is not None]
+        if one_of and len(names) != 1:
             rule = f"exactly one of {', '.join(one_of)} must be given"
-            raise ScenarioError("mean", rule, given, "keep or add one")
+            raise ScenarioError("mean", rule, names, "keep or add one")
         if self.low is not None and self.high is not None and self.high < self.low:
             raise ScenarioError("high", "must be at least low", self.high, "swap the two")
         if self._mean < MIN_GAP:
             rule = f"gaps must be at least {MIN_GAP:g} s on average"
-            raise ScenarioError("high" if not one_of else given[0], rule, self._mean, "lengthen")
+            raise ScenarioError("high" if not one_of else names[0], rule, self._mean, "lengthen")
 
     @property
     def _mean(self) -> float:
@@ -240,8 +243,8 @@ class Renewal(LinkClock):
             return 0.5 * (self.low + self.high)
         if self.scale is not None and self.shape is not None:
             weibull = self.distribution == "weibull"
-            unit = math.gamma(1.0 + 1.0 / self.shape) if weibull else self.shape
-            return self.scale * unit
+            mean_of_unit_scale = math.gamma(1.0 + 1.0 / self.shape) if weibull else self.shape
+            return self.scale * mean_of_unit_scale
         return self.mean if self.mean is not None else 1.0 / (self.rate or math.nan)
 
     def mean_rate(self, entity: Entity) -> float:
@@ -262,7 +265,7 @@ class Renewal(LinkClock):
         random: np.random.Generator,
         count: int,
     ) -> FloatArray:
-        """Return cumulative sums of gaps of the distribution."""
+        """Return the next ``count`` ticks after ``now``, with gaps drawn from the distribution."""
         shape = self.shape or 1.0
         if self.distribution == "gamma":
             gaps = random.standard_gamma(shape, count)
@@ -324,7 +327,8 @@ class Periodic(LinkClock):
         random: np.random.Generator,
         count: int,
     ) -> FloatArray:
-        """Return the points of the lattice, each delayed by its jitter."""
+        """Return ticks ``index`` to ``index + count - 1``: lattice points, each plus its jitter."""
+        # With phase 0 the lattice point at time 0 is no tick.
         times = _lattice(origin, self.period, index + (origin == 0.0), count)
         return times + self.jitter * random.random(count) if self.jitter > 0.0 else times
 
@@ -388,7 +392,7 @@ class RecordedClock(LinkClock):
         random: np.random.Generator,
         count: int,
     ) -> FloatArray:
-        """Return the recorded times."""
+        """Return up to ``count`` recorded times of the entity from ``index`` on."""
         return self._instants.get(entity, np.empty(0))[index : index + count]
 
     def check(self, topology: Topology) -> None:

@@ -36,7 +36,7 @@ Link = tuple[int, int]
 MAX_TRIES = 1000  # random graphs that are tried until one is connected
 # Limits of what fits into memory with all states and messages.
 MAX_NODES, MAX_LINKS = 200_000, 1_000_000
-MAX_DRAWN = 400_000  # nodes and links of all graphs that are drawn until one is connected
+MAX_DRAWN = 400_000  # nodes and links of all graphs drawn in search of a connected one
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,11 +98,13 @@ class Topology:
         return self._ends(1)
 
     def _ends(self, end: int) -> dict[int, tuple[int, ...]]:
-        """Return for each node the other end of each direction with it at position ``end``."""
-        found: dict[int, list[int]] = {node: [] for node in self.nodes}
+        """Return for each node its peers: the other ends of the directions that have the node at
+        position ``end``, 0 for the sender and 1 for the receiver.
+        """
+        peers: dict[int, list[int]] = {node: [] for node in self.nodes}
         for direction in self.directions:
-            found[direction[end]].append(direction[1 - end])
-        return {node: tuple(sorted(others)) for node, others in found.items()}
+            peers[direction[end]].append(direction[1 - end])
+        return {node: tuple(sorted(ids)) for node, ids in peers.items()}
 
     def receivers(self, node: int) -> tuple[int, ...]:
         """Return the ids of the nodes that may hear ``node``, in increasing order."""
@@ -121,10 +123,11 @@ class Topology:
         ends = np.array([(self.index[i], self.index[j]) for i, j in self.links]).reshape(-1, 2)
         ones, size = np.ones(len(ends)), len(self.nodes)
         _, labels = connected_components(coo_array((ones, tuple(ends.T)), shape=(size, size)))
+        # Node indices sorted by label, cut where the label changes.
         order = np.argsort(labels, kind="stable")
-        parts = np.split(order, np.flatnonzero(np.diff(labels[order])) + 1)
-        found = [{self.nodes[k] for k in part.tolist()} for part in parts]
-        return sorted(found, key=len, reverse=True)
+        groups = np.split(order, np.flatnonzero(np.diff(labels[order])) + 1)
+        components = [{self.nodes[k] for k in group.tolist()} for group in groups]
+        return sorted(components, key=len, reverse=True)
 
 
 def demand_links(source: SourceFile, pairs: Iterable[Link], topology: Topology) -> None:
@@ -255,7 +258,9 @@ class RandomGraph(Graph):
     def _draw(
         self, seed: int, make: Callable[[np.random.RandomState], networkx.Graph[Any]]
     ) -> networkx.Graph[Any]:
-        """Return the first graph of successive seeds that is connected, if that is asked for."""
+        """Return the graph that ``make`` draws with the seed; if ``connected``, the first connected
+        one of successive seeds. Raises ScenarioError if none of the tries is.
+        """
         import networkx
 
         first, tries, drawn = seed if self.seed is None else self.seed, 0, 0
@@ -300,9 +305,10 @@ class Regular(RandomGraph):
             if 2 * degree < N:
                 sparse: networkx.Graph[Any] = networkx.random_regular_graph(degree, N, state)
                 return sparse
-            # networkx pairs stubs at random, which rarely succeeds for dense graphs.
-            rest = networkx.random_regular_graph(N - 1 - degree, N, state)
-            dense: networkx.Graph[Any] = networkx.complement(rest)
+            # networkx pairs stubs at random, which rarely succeeds for dense graphs. The complement
+            # of a random regular graph is one too.
+            complement = networkx.random_regular_graph(N - 1 - degree, N, state)
+            dense: networkx.Graph[Any] = networkx.complement(complement)
             return dense
 
         return _from_networkx(self._draw(seed, make))
@@ -440,7 +446,7 @@ class CsvGraph(Graph):
         )
 
     def _table(self) -> _Table:
-        """Delivery probability of each listed direction, and whether the file gives them."""
+        """Return the table of the file; raises ScenarioError for wrong or repeated rows."""
         columns = read_columns(self.path, ("sender", "receiver"), ("delivery_probability",))
         senders = whole(self.path, "sender", columns["sender"])
         receivers = whole(self.path, "receiver", columns["receiver"])
@@ -467,10 +473,11 @@ class CsvGraph(Graph):
                 self.minimum,
                 "add the column or leave minimum out",
             )
-        given = table.probability
-        if self.directed or any((j, i) in given for i, j in given):
+        probability = table.probability
+        if self.directed or any((j, i) in probability for i, j in probability):
             return table
-        return table._replace(probability=given | {(j, i): p for (i, j), p in given.items()})
+        reverse = {(j, i): p for (i, j), p in probability.items()}
+        return table._replace(probability=probability | reverse)
 
     def _links(self, delivery: dict[Link, float]) -> set[Link]:
         """Return the directions whose probability reaches the minimum (both, if undirected)."""
@@ -523,8 +530,8 @@ def _isolated_note(nodes: set[int], minimum: float) -> tuple[str, ...]:
     if not nodes:
         return ()
     listed = ", ".join(map(str, sorted(nodes)))
-    one = len(nodes) == 1
-    return (f"node{'' if one else 's'} {listed} left out: no link reaches the minimum {minimum:g}",)
+    plural = "" if len(nodes) == 1 else "s"
+    return (f"node{plural} {listed} left out: no link reaches the minimum {minimum:g}",)
 
 
 def _one_way_note(pairs: list[Link]) -> tuple[str, ...]:
@@ -534,7 +541,7 @@ def _one_way_note(pairs: list[Link]) -> tuple[str, ...]:
     return (f"links listed in one direction only left out: {_list_directions(pairs)}",)
 
 
-def _list_directions(pairs: list[Link], most: int = 3) -> str:
-    """Return the first few directions as text."""
-    text = ", ".join(f"{i} to {j}" for i, j in pairs[:most])
-    return text if len(pairs) <= most else f"{text} and {len(pairs) - most} more"
+def _list_directions(pairs: list[Link], max_listed: int = 3) -> str:
+    """Return the first ``max_listed`` directions and the number of the others as text."""
+    text = ", ".join(f"{i} to {j}" for i, j in pairs[:max_listed])
+    return text if len(pairs) <= max_listed else f"{text} and {len(pairs) - max_listed} more"

@@ -1,7 +1,7 @@
 """Activation in slots: random matchings with their exact mean, broadcasts and records.
 
-The mean matching ``Abar`` has the probability that i and j are paired in a slot as entry (i, j) and
-that of staying alone on the diagonal, G section II. It is exact: a formula or a recursion.
+Entry (i, j) of the mean matching ``Abar`` is the probability that i and j are paired in a slot;
+entry (i, i) that i is not paired, paper G section II. It is exact: a formula or a recursion.
 """
 
 from __future__ import annotations
@@ -112,7 +112,7 @@ class Matching(SlotActivation):
         return [link for link in up if busy[link[0]] == busy[link[1]] == 1]
 
     def mean(self, topology: Topology) -> FloatArray:
-        """Return the exact mean matching (N, N).
+        """Return the exact mean matching ``Abar`` (N, N), in the order of the nodes.
 
         Raises ScenarioError if the graph has too many links to compute it.
         """
@@ -143,10 +143,9 @@ class Matching(SlotActivation):
                 "use one-edge, node-wakeup or independent",
             )
         if self.protocol == "uniform-maximal":
-            every = maximal_matchings(links)
-            return {link: sum(link in m for m in every) / len(every) for link in links}
-        shares = _greedy_shares(links)
-        return dict(zip(links, shares, strict=True))
+            matchings = maximal_matchings(links)
+            return {link: sum(link in m for m in matchings) / len(matchings) for link in links}
+        return dict(zip(links, _greedy_probabilities(links), strict=True))
 
 
 def _shares_node(link: Link, pairs: list[Link]) -> bool:
@@ -157,11 +156,11 @@ def _shares_node(link: Link, pairs: list[Link]) -> bool:
 def _node_wakeup(topology: Topology, random: np.random.Generator) -> list[Link]:
     """Return the link of a uniform node with a uniform neighbour."""
     node = topology.nodes[int(random.integers(len(topology.nodes)))]
-    share = random.random()
+    uniform = random.random()
     peers = sorted({j if i == node else i for i, j in topology.links if node in (i, j)})
     if not peers:
         return []
-    peer = peers[int(share * len(peers))]
+    peer = peers[int(uniform * len(peers))]
     return [(min(node, peer), max(node, peer))]
 
 
@@ -174,12 +173,12 @@ def _random_greedy(topology: Topology, random: np.random.Generator) -> list[Link
 
 def _uniform_maximal(topology: Topology, random: np.random.Generator) -> list[Link]:
     """Return one of all maximal matchings, each with equal probability."""
-    every = maximal_matchings(topology.links)
-    return list(every[int(random.integers(len(every)))])
+    matchings = maximal_matchings(topology.links)
+    return list(matchings[int(random.integers(len(matchings)))])
 
 
 def _choose_greedily(links: list[Link]) -> list[Link]:
-    """Return the links whose ends are both free when their turn comes."""
+    """Return the links that are chosen if each is taken in turn when both of its ends are free."""
     matched: set[int] = set()
     chosen = []
     for i, j in links:
@@ -193,12 +192,14 @@ def _choose_greedily(links: list[Link]) -> list[Link]:
 @lru_cache(maxsize=8)
 def maximal_matchings(links: tuple[Link, ...]) -> tuple[tuple[Link, ...], ...]:
     """Return all matchings to which no link can be added, each sorted, in sorted order."""
-    found: set[tuple[Link, ...]] = set()
+    matchings: set[tuple[Link, ...]] = set()
 
     def extend(chosen: tuple[Link, ...], free: tuple[Link, ...]) -> None:
-        """Add all maximal matchings of the ``chosen`` links and some ``free`` ones."""
+        """Add all maximal matchings that consist of the ``chosen`` links and some of the ``free``
+        ones, which meet none of the chosen.
+        """
         if not free:
-            found.add(tuple(sorted(chosen)))
+            matchings.add(tuple(sorted(chosen)))
             return
         first = free[0]
         # A maximal matching holds the first free link or one that meets it.
@@ -207,14 +208,15 @@ def maximal_matchings(links: tuple[Link, ...]) -> tuple[tuple[Link, ...], ...]:
                 extend((*chosen, link), tuple(o for o in free if not set(o) & set(link)))
 
     extend((), links)
-    return tuple(sorted(found))
+    return tuple(sorted(matchings))
 
 
-def _greedy_shares(links: tuple[Link, ...]) -> tuple[float, ...]:
-    """Return the probability of each link in the greedy matching in random order.
+def _greedy_probabilities(links: tuple[Link, ...]) -> tuple[float, ...]:
+    """Return the probability that each link is in the greedy matching in random order.
 
-    The first link of a random order is uniform; what is left after it is a random order of the
-    links that do not meet it. Recursion over the sets of links that are left, as bit masks.
+    The first link a of a random order is uniform, and the links that do not meet it follow in a
+    random order again: ``p(free) = mean over a in free of (1 at a) + p(free without those that meet
+    a)``. This is a recursion over sets of links, as bit masks.
     """
     count = len(links)
     meets = [
@@ -222,18 +224,17 @@ def _greedy_shares(links: tuple[Link, ...]) -> tuple[float, ...]:
     ]
 
     @cache
-    def shares(free: int) -> tuple[float, ...]:
-        """Return the probability of each link to be chosen among the ``free`` ones, a bit mask."""
-        left = [a for a in range(count) if free >> a & 1]
+    def probabilities(free: int) -> tuple[float, ...]:
+        """Return the probability that each link is chosen among the ``free`` ones, a bit mask."""
+        candidates = [a for a in range(count) if free >> a & 1]
         total = [0.0] * count
-        for a in left:
-            rest = shares(free & ~meets[a])
+        for a in candidates:
             total[a] += 1.0
-            for b, value in enumerate(rest):
+            for b, value in enumerate(probabilities(free & ~meets[a])):
                 total[b] += value
-        return tuple(value / max(len(left), 1) for value in total)
+        return tuple(value / max(len(candidates), 1) for value in total)
 
-    return shares((1 << count) - 1)
+    return probabilities((1 << count) - 1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -293,7 +294,7 @@ class RecordedSlots(SlotActivation):
         return tuple(self._pairs)
 
     def pairs(self, slot: int, phase: int, step: int = 0) -> list[Link]:
-        """Return the sorted pairs of one step of an exchange; those of broadcasts as listed."""
+        """Return the sorted pairs of one exchange step; for broadcasts the listed directions."""
         return self._pairs.get((slot, phase, step), [])
 
     def check(self, topology: Topology) -> None:

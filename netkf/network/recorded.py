@@ -23,7 +23,9 @@ _after = choice(*AFTER)
 
 
 class MessageUse(NamedTuple):
-    """Use of a table by a run: its ``rows``, ``unused`` rows, and messages ``beyond`` it."""
+    """Numbers of ``rows`` of a table, of ``unused`` rows, and of messages ``beyond`` the table: a
+    run sent them, but the table does not list them.
+    """
 
     rows: int
     unused: int
@@ -63,7 +65,7 @@ class MessageTable:
         return value
 
     def use(self, sent: Mapping[Link, int]) -> MessageUse:
-        """Return how ``sent`` messages of each directed link, numbered from 0, use the table."""
+        """Return the use of the table by a run with ``sent`` messages on each directed link."""
         rows = sum(map(len, self.values.values()))
         used = sum(
             number < count for link, count in sent.items() for number in self.values.get(link, ())

@@ -31,9 +31,9 @@ def _largest_sparse(degrees: FloatArray, ends: np.ndarray) -> float:
     import scipy.sparse.linalg
 
     size = len(degrees)
-    one = np.full(len(ends), -1.0)
-    half = scipy.sparse.coo_array((one, (ends[:, 0], ends[:, 1])), shape=(size, size))
-    L = (half + half.T + scipy.sparse.diags_array(degrees)).tocsr()
+    entries = np.full(len(ends), -1.0)
+    upper = scipy.sparse.coo_array((entries, (ends[:, 0], ends[:, 1])), shape=(size, size))
+    L = (upper + upper.T + scipy.sparse.diags_array(degrees)).tocsr()
     # A fixed start: ARPACK's own would differ from call to call, and so would the last digits.
     start = np.random.default_rng(0).standard_normal(size)
     return float(scipy.sparse.linalg.eigsh(L, k=1, v0=start, return_eigenvectors=False)[0])

@@ -63,7 +63,7 @@ class RunBatch:
 
 
 class BatchSink(Sink):
-    """Gathers the samples of recorded runs as a batch; ``finish`` ends each run.
+    """Collects the samples of recorded runs into a batch; ``finish`` ends each run.
 
     ``times`` (T,) are the sample times of a run that completes, ``shape`` = (F, n) is the number of
     filters and of states.
@@ -84,12 +84,12 @@ class BatchSink(Sink):
         self._fingerprint = ""
 
     def events(self, rows: np.ndarray) -> None:
-        """Ignore events, which the recorder counts."""
+        """Ignore the events: the recorder counts them."""
 
     def states(
         self, t: FloatArray, x: FloatArray, xhat: FloatArray, P: FloatArray, error: FloatArray
     ) -> None:
-        """Put behind the samples of the present run."""
+        """Append to the samples of the present run."""
         run = len(self._status)
         first, last = self._lengths[run], self._lengths[run] + len(t)
         self._x[run, first:last] = x
@@ -100,7 +100,7 @@ class BatchSink(Sink):
         self._lengths[run] = last
 
     def finish(self, recorder: Recorder, status: str) -> None:
-        """End the present run; what follows belongs to the next replica."""
+        """End the present run; later samples belong to the next replica."""
         if not self._status:
             self._fingerprint = recorder.fingerprint
         self._counts[len(self._status)] = recorder.counts

@@ -27,8 +27,10 @@ def errors(e: FloatArray, P: FloatArray) -> tuple[FloatArray, FloatArray]:
 def fill_nees(
     e: FloatArray, P: FloatArray, out: FloatArray, factor: FloatArray, solved: FloatArray
 ) -> bool:
-    """Write NEES (K,) of errors (K, n) and covariances (K, n, n), nan where P is exactly singular;
-    False where there is such a P. ``factor`` (n, n) and ``solved`` (n, 1) are scratch.
+    """Write NEES ``e' P^-1 e`` (K,) of errors (K, n) and covariances (K, n, n), nan where P is
+    exactly singular; return False if a finite P is.
+
+    ``factor`` (n, n) and ``solved`` (n, 1) are scratch.
     """
     regular, n = True, e.shape[1]
     for k in range(len(e)):
@@ -52,7 +54,7 @@ def _is_regular(P: FloatArray) -> np.ndarray:
     """Return a mask (K,) of the matrices (K, n, n) that are finite and of full rank up to
     rounding.
     """
-    found = np.asarray(np.isfinite(P).all(axis=(1, 2)))
-    ranks = np.linalg.matrix_rank(P[found], hermitian=True)
-    found[found] = np.asarray(ranks) == P.shape[-1]
-    return found
+    regular = np.asarray(np.isfinite(P).all(axis=(1, 2)))
+    ranks = np.linalg.matrix_rank(P[regular], hermitian=True)
+    regular[regular] = np.asarray(ranks) == P.shape[-1]
+    return regular

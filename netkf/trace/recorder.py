@@ -1,9 +1,9 @@
 """The recording of events and samples of a run, with little work in the event loop.
 
-Events are appended to a list as tuples and leave it in blocks, or come in blocks; states come as
-one block a sample time or several. Both go to sinks, which keep them in memory or write them to
-files. From the first long block on, a thread of its own does that and the fingerprint, one thing
-after the other, while the engine goes on.
+Engines append events to a list as tuples, which is passed on in blocks, or hand over blocks of
+events; samples arrive one or several at a time. Both go to sinks, which keep them in memory or
+write them to files. From the first long block on, a thread calls the sinks and updates the
+fingerprint, in order, while the engine continues.
 """
 
 from __future__ import annotations
@@ -76,8 +76,8 @@ def _ignore(row: tuple[float, int, int, int, int, int, float]) -> None:
 
 
 class Recorder:
-    """Takes events and samples from an engine, counts them, fingerprints the events. Where
-    ``counted`` events are only counted, and the sinks see samples alone.
+    """Takes events and samples from an engine, counts and fingerprints the events, and passes both
+    to sinks. With ``counts_only`` events are only counted: sinks get nothing but samples.
     """
 
     def __init__(self, sinks: Sequence[Sink], counts_only: bool = False) -> None:
@@ -86,7 +86,7 @@ class Recorder:
         self._hash = hashlib.sha256()
         self._counts = np.zeros(len(KINDS), dtype=np.int64)
         self._thread: ThreadPoolExecutor | None = None
-        self._handed: list[Future[None]] = []
+        self._pending: list[Future[None]] = []
         self.append: Callable[[tuple[float, int, int, int, int, int, float]], None]
         self.append = self._rows.append
         """``append((t, kind code, node, peer, message, phase, age))`` records one event."""
@@ -120,12 +120,12 @@ class Recorder:
         self.append = self._rows.append
 
     def flush_if_full(self) -> None:
-        """Pass the gathered events on if there are enough of them for a block."""
+        """Pass the appended events on if there are enough of them for a block."""
         if len(self._rows) >= BLOCK:
             self.flush()
 
     def flush(self) -> None:
-        """Pass the gathered events on and wait until every sink has taken all of them."""
+        """Pass the appended events on and wait until every sink has taken all of them."""
         with defer_signals():
             try:
                 self._flush_gathered()
@@ -136,7 +136,7 @@ class Recorder:
                     thread.shutdown()
 
     def _flush_gathered(self) -> None:
-        """Pass the gathered rows to all sinks, or only count them."""
+        """Pass the appended events to all sinks, or only count them."""
         if not self._rows:
             return
         if self.counts_only:
@@ -169,25 +169,25 @@ class Recorder:
         self._flush_gathered()
         self._counts += counts
 
-    def _run_or_submit(self, something: Callable[..., None], *arguments: Any) -> None:
-        """Call ``something``, in the recorder's thread after earlier calls if it has one."""
+    def _run_or_submit(self, function: Callable[..., None], *arguments: Any) -> None:
+        """Call ``function`` now, or in the recorder's thread after earlier calls if it has one."""
         if self._thread is None:
-            something(*arguments)
+            function(*arguments)
         else:
-            self._handed.append(self._thread.submit(something, *arguments))
+            self._pending.append(self._thread.submit(function, *arguments))
 
     def _wait(self) -> None:
         """Wait for the recorder's thread; raises the exception of the first call that failed."""
-        while self._handed:
-            self._handed[0].result()
-            del self._handed[0]
+        while self._pending:
+            self._pending[0].result()
+            del self._pending[0]
 
     def _count(self, kinds: np.ndarray) -> None:
-        """Add the kinds of some events to the counts."""
+        """Count events by their kind codes ``kinds`` (K,)."""
         self._counts += np.bincount(kinds, minlength=len(KINDS))
 
     def _pass_on(self, rows: np.ndarray) -> None:
-        """Count and fingerprint some rows, and pass them to all sinks."""
+        """Count and fingerprint a block of EVENT rows, and pass it to all sinks."""
         self._count(rows["kind"])
         self._hash.update(rows.data)
         for sink in self._sinks:
@@ -229,5 +229,7 @@ class Recorder:
 
     @property
     def fingerprint(self) -> str:
-        """SHA-256 of the flushed events, whatever the blocks; empty if ``counts_only``."""
+        """SHA-256 of the flushed events, which does not depend on the blocks; empty if
+        ``counts_only``.
+        """
         return "" if self.counts_only else self._hash.hexdigest()

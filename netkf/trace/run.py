@@ -20,8 +20,8 @@ if TYPE_CHECKING:
 
 ROUNDING = 4.0 * np.finfo(float).eps
 BLUR, CERTAIN = 100.0, 1e-14
-"""Standard deviations below so many rounding errors are not judged; variances below this share of
-the largest one are rounding themselves.
+"""Errors with a standard deviation below BLUR times their rounding error are not judged; variances
+below the share CERTAIN of the largest one are rounding errors.
 """
 
 
@@ -33,11 +33,11 @@ class Run(NotebookTable):
     covariance, error (T, N, n); ``log`` holds the events as a structured array
     (trace.schema.EVENT). ``error`` is x - xhat; with ``exact_errors`` it has digits even where x
     and xhat are so large that their difference has lost them, else digits are lost from
-    ``rounding_from`` on. ``status`` is complete, interrupted or diverged. ``sums`` holds what
-    exchanges should conserve, summed over all nodes: at the start and at the last sample. Unless
+    ``rounding_from`` on. ``status`` is complete, interrupted or diverged. ``sums`` holds the sums
+    over all nodes that exchanges should conserve: at the start and at the last sample. Unless
     ``truth_known``, x is nan and tables have no columns of errors. ``stats`` holds the counts that
     the engine keeps of its own work. ``scenario`` is the ``netkf.Scenario`` that was simulated,
-    None if nobody said.
+    None if it is unknown.
     """
 
     times: FloatArray
@@ -93,12 +93,12 @@ class Run(NotebookTable):
 
     @cached_property
     def nees(self) -> FloatArray:
-        """The NEES (T, N) of the samples, nan where P is singular or nobody knows the error."""
+        """The NEES (T, N) of the samples, nan where P is singular or the truth is unknown."""
         return errors(self.error, self.P)[1]
 
     @cached_property
     def rounding(self) -> FloatArray:
-        """The size (T,) of the rounding error in ``error``."""
+        """The magnitude (T,) of the rounding error of ``error``."""
         return rounding(carried_size(self.x, self.error, self.exact_errors))
 
     @cached_property
@@ -159,18 +159,20 @@ def event_columns(rows: np.ndarray, replica: int, first: int) -> dict[str, Any]:
 
 
 def rounding_from(times: FloatArray, x: FloatArray, P: FloatArray, e: FloatArray) -> float:
-    """Return the first of the times (T,) at which states x (T, n) are so large that rounding blurs
-    errors x - xhat of the size that P (T, N, n, n) says, or, where P is nan, of the root mean
-    square of the errors e (T, N, n) themselves; inf where there is none.
+    """Return the first of the times (T,) at which the rounding error of x - xhat exceeds 1 / BLUR
+    of the standard deviation of the errors; inf if none does.
+
+    The rounding error is that of states x (T, n), the standard deviation the smallest one of
+    P (T, N, n, n) or, where P is nan, the root mean square of the errors e (T, N, n).
     """
     if not len(times):
         return np.inf
     with np.errstate(over="ignore", invalid="ignore"):
-        least = np.diagonal(P, axis1=2, axis2=3).min(axis=(1, 2))
-        least = np.where(np.isnan(P).all(axis=(1, 2, 3)), (e * e).mean(axis=(1, 2)), least)
-    deviation = np.sqrt(np.maximum(least, 0.0)) / BLUR
-    lost = (rounding(x) > deviation) & (deviation > 0.0)
-    return float(times[np.argmax(lost)]) if lost.any() else np.inf
+        variance = np.diagonal(P, axis1=2, axis2=3).min(axis=(1, 2))
+        variance = np.where(np.isnan(P).all(axis=(1, 2, 3)), (e * e).mean(axis=(1, 2)), variance)
+    limit = np.sqrt(np.maximum(variance, 0.0)) / BLUR
+    blurred = (rounding(x) > limit) & (limit > 0.0)
+    return float(times[np.argmax(blurred)]) if blurred.any() else np.inf
 
 
 def carried_size(x: FloatArray, e: FloatArray, exact: bool) -> FloatArray:
@@ -183,23 +185,24 @@ def carried_size(x: FloatArray, e: FloatArray, exact: bool) -> FloatArray:
 
 
 def rounding(x: FloatArray) -> FloatArray:
-    """Return the size (T,) of the error that rounding adds to x - xhat where both are about x
-    (T, n).
-    """
+    """Return the magnitude (T,) of the rounding error of x - xhat if both are about x (T, n)."""
     return np.asarray(ROUNDING * np.abs(x).max(axis=1))
 
 
 def blurred_samples(run: Run, matrices: FloatArray) -> np.ndarray:
-    """Return samples (T, N) whose errors rounding blurs in some direction, where their covariances
-    are these (T, N, n, n): directions that are certain do not count, nor do matrices of nan.
+    """Return a mask (T, N) of the samples whose rounding error exceeds 1 / BLUR of the standard
+    deviation of the error in some direction.
+
+    ``matrices`` (T, N, n, n) are the covariances of the errors. Directions without uncertainty (see
+    CERTAIN) and matrices of nan do not count.
     """
     if not run.rounding.any():
         return np.zeros(matrices.shape[:2], dtype=bool)
-    whole = np.asarray(np.isfinite(matrices).all(axis=(2, 3)))
-    values = np.linalg.eigvalsh(np.where(whole[..., None, None], matrices, 0.0))
-    uncertain = values > CERTAIN * values[..., -1:]
-    least = np.where(uncertain, values, np.inf).min(axis=-1)
-    return np.asarray((BLUR * run.rounding[:, None]) ** 2 > least)
+    finite = np.asarray(np.isfinite(matrices).all(axis=(2, 3)))
+    variances = np.linalg.eigvalsh(np.where(finite[..., None, None], matrices, 0.0))
+    uncertain = variances > CERTAIN * variances[..., -1:]
+    smallest = np.where(uncertain, variances, np.inf).min(axis=-1)
+    return np.asarray((BLUR * run.rounding[:, None]) ** 2 > smallest)
 
 
 class StateSamples(NamedTuple):
@@ -245,9 +248,9 @@ def first_difference(a: Run | pd.DataFrame, b: Run | pd.DataFrame) -> str | None
 
     Takes runs or event tables; nan equals nan.
     """
-    for given in (a, b):
-        if not isinstance(given, Run) and not hasattr(given, "iloc"):
-            message = f"first_difference takes runs or their event tables, got {quote(given)}"
+    for argument in (a, b):
+        if not isinstance(argument, Run) and not hasattr(argument, "iloc"):
+            message = f"first_difference takes runs or their event tables, got {quote(argument)}"
             raise TypeError(message)
     one, other = (t.events if isinstance(t, Run) else t for t in (a, b))
     names = [name for name in EVENT_COLUMNS if name not in ("run", "seq")]
@@ -265,8 +268,8 @@ def first_difference(a: Run | pd.DataFrame, b: Run | pd.DataFrame) -> str | None
         row = shorter
     else:
         return None
-    shown = [
+    descriptions = [
         " ".join(f"{name}={t[name].iloc[row]}" for name in names) if row < len(t) else "no event"
         for t in (one, other)
     ]
-    return f"event {row}: {shown[0]} | {shown[1]}"
+    return f"event {row}: {descriptions[0]} | {descriptions[1]}"

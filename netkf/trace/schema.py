@@ -28,8 +28,8 @@ send     node sent message number ``message`` to peer
 lost     that message (node to peer) was lost by the channel
 deliver  node received message number ``message`` from peer, ``age`` seconds after it was sent
 late     the same, but the inbox that it was meant for had closed; it counts as lost
-absorb   node used all that had arrived at t in one reset; ``age`` is that of the oldest message
-swap     node put what it got from peer in place of its own
+absorb   node used all messages of t in one reset; ``age`` is that of the oldest message
+swap     node replaced its estimate and covariance by those of peer
 round    a step of exchange number ``phase`` of the slot begins, in which every node sends
 stop     node has stopped learning from the others in exchange number ``phase``
 diverged the estimate of node was no longer finite, or its covariance no longer finite and positive
@@ -50,7 +50,7 @@ EVENT = np.dtype(
         ("age", "<f8"),
     ]
 )
-"""One event; -1 or nan where a column means nothing."""
+"""One event; -1 or nan in columns that do not apply to its kind."""
 
 EVENT_COLUMNS = ("run", "seq", "t", "kind", "node", "peer", "message", "phase", "age")
 
