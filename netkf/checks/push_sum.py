@@ -250,24 +250,27 @@ def _many_steps(samples: PushSumSamples, level: float) -> Finding:
     their limits, until they agree to STEADY_TOLERANCE or gamma exceeds MAX_STEPS.
     """
     scenario = with_promised_filter(samples.scenario)
-    limits, gamma, size = large_gamma_limits(scenario), 1, np.inf
-    noisy = float(np.abs(limits.noise).max())
-    first: float | None = None
-    while size > STEADY_TOLERANCE and gamma < MAX_STEPS:
+    limits, gamma, distance = large_gamma_limits(scenario), 1, np.inf
+    noise_scale = float(np.abs(limits.noise).max())
+    first_distance: float | None = None
+    while distance > STEADY_TOLERANCE and gamma < MAX_STEPS:
         covariances = push_sum_covariances(scenario, [gamma])[0]
         noise = push_sum_noise(scenario, [gamma])[0]
-        errors = _relative_distance(covariances, limits.covariance)
-        size = max(errors, float(np.abs(noise - limits.noise).max()) / noisy)
-        size, first = (np.inf if np.isnan(size) else size), (errors if first is None else first)
+        error_distance = _relative_distance(covariances, limits.covariance)
+        distance = max(error_distance, float(np.abs(noise - limits.noise).max()) / noise_scale)
+        distance, first_distance = (
+            (np.inf if np.isnan(distance) else distance),
+            (error_distance if first_distance is None else first_distance),
+        )
         gamma *= 2
     if scenario.filters_know_the_truth:
         central = push_sum_limits(scenario).P
-        size = max(size, _relative_distance(limits.covariance[None], central))
+        distance = max(distance, _relative_distance(limits.covariance[None], central))
     message = (
-        f"computed, not simulated: with gamma {gamma // 2} errors and noise are within {size:.1e} "
-        f"of their limits, the errors of the central filter; with gamma 1 within {first:.3g}"
+        f"computed, not simulated: with gamma {gamma // 2} errors and noise are within {distance:.1e} "
+        f"of their limits, the errors of the central filter; with gamma 1 within {first_distance:.3g}"
     )
-    margin = STEADY_TOLERANCE - size
+    margin = STEADY_TOLERANCE - distance
     return Finding((margin, margin, margin), 0.0, message, early=gamma >= MAX_STEPS)
 
 

@@ -219,5 +219,5 @@ def ensemble_table(ensemble: Ensemble) -> dict[str, np.ndarray]:
         ensemble.se_nees.reshape(rows),
     ]
     names = ensemble_columns(n)
-    kept = len(names) if ensemble.truth_known else 3 + 2 * len(i)
-    return dict(zip(names[:kept], columns[:kept], strict=True))
+    column_count = len(names) if ensemble.truth_known else 3 + 2 * len(i)
+    return dict(zip(names[:column_count], columns[:column_count], strict=True))

@@ -98,13 +98,15 @@ def one_blas_thread() -> Iterator[None]:
 def main_hidden(hide: bool) -> Iterator[None]:
     """Keep new processes from running the user's script once more."""
     main = sys.modules["__main__"]
-    kept = {name: main.__dict__[name] for name in ("__file__", "__spec__") if name in main.__dict__}
+    attributes = {
+        name: main.__dict__[name] for name in ("__file__", "__spec__") if name in main.__dict__
+    }
     if not hide:
-        kept = {}
-    for name in kept:
+        attributes = {}
+    for name in attributes:
         setattr(main, name, None)
     try:
         yield
     finally:
-        for name, value in kept.items():
+        for name, value in attributes.items():
             setattr(main, name, value)

@@ -101,12 +101,12 @@ def _as_list(task: Task, scenario: Scenario, seed: int, replica: int) -> list[An
     return [task(scenario, seed, replica)]
 
 
-def _as_it_came(number: int, result: Any) -> Any:  # noqa: ARG001
+def _keep_result(number: int, result: Any) -> Any:  # noqa: ARG001
     """Return the result of a block unchanged."""
     return result
 
 
-CHOSEN_BY_POOL = NumberedBlocks(0, {}, _as_it_came)
+CHOSEN_BY_POOL = NumberedBlocks(0, {}, _keep_result)
 
 
 def _report_nothing(done: int, wanted: int) -> None:
@@ -124,14 +124,14 @@ def _gather(
     """Return the merged result of all blocks: known ones are loaded, others run on the pool, and
     all are merged as they complete.
     """
-    tree, done, known = MergeTree(merge), 0, blocks.known
+    tree, runs_done, known = MergeTree(merge), 0, blocks.known
 
     def take(block: Job, result: Any) -> None:
         """Add the result of a block to the tree and report progress."""
-        nonlocal done
+        nonlocal runs_done
         tree.add(block.start // block.size, result, block.size.bit_length() - 1)
-        done += len(block.replicas)
-        progress(done, job.stop)
+        runs_done += len(block.replicas)
+        progress(runs_done, job.stop)
 
     for number in sorted(known):
         take(job._replace(start=number * job.size), known[number]())

@@ -179,11 +179,11 @@ def _has_own_files(directory: Path, scenario: Scenario) -> bool:
 
 def _check_scenario(directory: Path, scenario: Scenario) -> None:
     """Raise ScenarioError if scenario.toml of a directory is not that of its run."""
-    kept, text = directory / "scenario.toml", to_toml(resolve_defaults(scenario))
-    if not kept.exists():
+    path, text = directory / "scenario.toml", to_toml(resolve_defaults(scenario))
+    if not path.exists():
         return
     with contextlib.suppress(OSError, ValueError):
-        if kept.is_file() and kept.read_text(encoding="utf-8") == text:
+        if path.is_file() and path.read_text(encoding="utf-8") == text:
             return
     rule = f"{directory} holds a run of another scenario, or its scenario.toml was changed"
     remedy = "give the same scenario, seed and settings, or move scenario.toml away"
@@ -201,9 +201,9 @@ def _require(path: Path, check: Callable[[], None], remedy: str) -> None:
 def read_manifest(directory: Path) -> dict[str, Any]:
     """Return ``manifest.json`` of a directory; raises ScenarioError where it is not one."""
     try:
-        found = read_document(directory / "manifest.json")
-        require(found, MANIFEST)
+        manifest = read_document(directory / "manifest.json")
+        require(manifest, MANIFEST)
     except DamagedError as error:
         rule = f"must be a directory that netkf run left: manifest.json {error}"
         raise ScenarioError("--resume", rule, str(directory), "give another --out") from None
-    return found
+    return manifest

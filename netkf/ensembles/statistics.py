@@ -159,13 +159,13 @@ def run_values(batch: RunBatch, scenario: Scenario, first: int = 0) -> RunValues
     """
     # The largest nodes of the tree that consist of runs of this batch.
     indices = [(k << level, level) for level, k in aligned_pieces(first, first + len(batch))]
-    pieces = [slice(at - first, at - first + (1 << level)) for at, level in indices]
-    reduced, nodes = reduce_batch(batch, pieces), len(scenario.nodes)
+    slices = [slice(at - first, at - first + (1 << level)) for at, level in indices]
+    reduced, nodes = reduce_batch(batch, slices), len(scenario.nodes)
     copies, averages = nodes // batch.error.shape[2], reduced.averages
     if copies > 1:
         averages = np.repeat(averages, nodes, axis=1)
     return RunValues(
-        pieces,
+        slices,
         reduced.samples,
         copies,
         np.concatenate([averages, _mean_of_nodes(averages)], axis=1),

@@ -64,18 +64,18 @@ class SharedCache:
         try:
             folder = Path(self._cache.cache_path)
             folder.mkdir(parents=True, exist_ok=True)
-            opened = os.open(folder / name, os.O_RDWR | os.O_CREAT, 0o600)
+            descriptor = os.open(folder / name, os.O_RDWR | os.O_CREAT, 0o600)
         except OSError:
             # A full or read-only disk, for instance: compiling twice is better than failing.
             yield
             return
         try:
-            _wait_for(opened)
+            _wait_for(descriptor)
             yield
         finally:
             # Closing alone is not enough: a process forked meanwhile has the file open too.
-            _unlock(opened)
-            os.close(opened)
+            _unlock(descriptor)
+            os.close(descriptor)
 
 
 if sys.platform == "win32":

@@ -264,18 +264,18 @@ def _distinct_labels(filters: Sequence[Choice], labels: list[str]) -> list[str]:
     from each other.
     """
     distinct = list(labels)
-    for label in {one for one in labels if labels.count(one) > 1}:
-        indices = [k for k, one in enumerate(labels) if one == label]
+    for label in {item for item in labels if labels.count(item) > 1}:
+        indices = [k for k, item in enumerate(labels) if item == label]
         objects = [filters[k] for k in indices]
         # A kind or a table beside an object of that kind: nothing tells what differs.
-        if not all(isinstance(one, Filter) for one in objects):
+        if not all(isinstance(item, Filter) for item in objects):
             continue
-        settings = [_filter_settings(one) for one in objects]
-        names = dict.fromkeys(name for one in settings for name in one)
-        differing = [name for name in names if len({one.get(name) for one in settings}) > 1]
-        for k, own in zip(indices, settings, strict=True):
+        settings = [_filter_settings(item) for item in objects]
+        names = dict.fromkeys(name for item in settings for name in item)
+        differing = [name for name in names if len({item.get(name) for item in settings}) > 1]
+        for k, table in zip(indices, settings, strict=True):
             # What is left out of a table is at its default.
-            values = {name: own.get(name, str(getattr(filters[k], name))) for name in differing}
+            values = {name: table.get(name, str(getattr(filters[k], name))) for name in differing}
             distinct[k] = _make_label(
                 label, {name: shorten(value) for name, value in values.items()}
             )

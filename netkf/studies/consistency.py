@@ -372,7 +372,7 @@ def _share_inside(runs: Sequence[RunConsistency], low: float, high: float) -> Fl
 
 
 def _judge_node(
-    scenario: Scenario, runs: Sequence[RunConsistency], i: int, inside: float, quantile: float
+    scenario: Scenario, runs: Sequence[RunConsistency], i: int, share_inside: float, quantile: float
 ) -> NodeConsistency:
     """Return the verdict on node ``i`` by the interval of its mean NEES over the runs."""
     nees = np.array([run.nees[i] for run in runs])
@@ -392,7 +392,7 @@ def _judge_node(
         float(nees.mean()),
         width,
         float(expected.mean()),
-        inside,
+        share_inside,
         float(np.mean([run.nis[i] for run in runs])),
         float(np.mean([run.expected_nis[i] for run in runs])),
         verdict,

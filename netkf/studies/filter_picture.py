@@ -39,12 +39,12 @@ def filter_picture(scenario: Scenario, completed: CompletedComparison) -> None:
 
 def _claim(rows: list[ComparedFilter]) -> str:
     """Return a sentence on the filter with the smallest RMS error."""
-    known = [row for row in rows if math.isfinite(row.quantities["rms_error"].value)]
-    if not known:
+    finite_rows = [row for row in rows if math.isfinite(row.quantities["rms_error"].value)]
+    if not finite_rows:
         return "No filter has a finite error"
-    best = min(known, key=lambda row: row.quantities["rms_error"].value)
-    error = best.quantities["rms_error"].value
-    return f"{shorten(best.filter, MAX_LABEL)} has the smallest RMS error, {error:.3g}"
+    best_row = min(finite_rows, key=lambda row: row.quantities["rms_error"].value)
+    error = best_row.quantities["rms_error"].value
+    return f"{shorten(best_row.filter, MAX_LABEL)} has the smallest RMS error, {error:.3g}"
 
 
 def _draw_quantity(axes: Any, rows: list[ComparedFilter], name: str, label: str) -> None:

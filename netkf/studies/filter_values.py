@@ -127,8 +127,8 @@ def estimate_quantities(
         runs = len(influence)
         quantity = Quantity(value, _standard_error(influence))
         if name in base and not (values.diverged.any() or first is None or first.diverged.any()):
-            base_value, paired = base[name][0], influence - base[name][1]
-            width = _width(paired, level)
+            base_value, influence_difference = base[name][0], influence - base[name][1]
+            width = _width(influence_difference, level)
             gap = value - base_value
             # Filters that are one algorithm differ by rounding.
             real = runs > 1 and abs(gap) > max(width, ROUNDING * abs(value))

@@ -258,10 +258,10 @@ def _swap_flow(nodes: IntArray, rows: int, messages: Messages, used: IntArray) -
     indices, length = np.searchsorted(nodes, node), rows + 1
     keys = indices * length + start
 
-    def segment(who: IntArray, row: IntArray) -> IntArray:
+    def segment(segment_nodes: IntArray, row: IntArray) -> IntArray:
         """Return the segment of each node at an event row."""
-        wanted = np.searchsorted(nodes, who) * length + row
-        return np.asarray(np.searchsorted(keys, wanted, side="right") - 1)
+        sought_keys = np.searchsorted(nodes, segment_nodes) * length + row
+        return np.asarray(np.searchsorted(keys, sought_keys, side="right") - 1)
 
     origin = segment(messages.sender, messages.sent_row)
     # A swap that took place begins a segment at its row; others fall into an existing segment.
@@ -397,12 +397,12 @@ def newest_information(
     for segment in np.flatnonzero(deadline != NEVER).tolist():
         node, end = int(flow.node[segment]), int(deadline[segment])
         reading = readings.newest(node, int(flow.start[segment]), end)
-        known = float(log["t"][end]) if end < len(log) else np.nan
+        known_until = float(log["t"][end]) if end < len(log) else np.nan
         previous = newest.get(node)
-        if previous is None or _age_key(reading, known) > _age_key(
+        if previous is None or _age_key(reading, known_until) > _age_key(
             previous.reading, previous.known
         ):
-            newest[node] = Newest(reading, known, segment)
+            newest[node] = Newest(reading, known_until, segment)
     return newest
 
 

@@ -152,18 +152,18 @@ class _Search:
         """Return a set of this size that reaches the limit (of single messages the best one), or
         None; and True if all sets of this size were tried.
         """
-        best: tuple[float, tuple[MessageKey, ...]] | None = None
+        best_set: tuple[float, tuple[MessageKey, ...]] | None = None
         sets, all_listed = self._in_order(candidates, size)
         for keys in sets:
             if self._replayer.count >= most_replays:
-                return (None if best is None else best[1]), False
+                return (None if best_set is None else best_set[1]), False
             trace = self.trace(keys)
             self._gains[keys] = self.trace(()) - trace
-            if trace <= self._limit and (best is None or trace < best[0]):
-                best = trace, keys
+            if trace <= self._limit and (best_set is None or trace < best_set[0]):
+                best_set = trace, keys
                 if size > 1:
                     break
-        return (None if best is None else best[1]), all_listed
+        return (None if best_set is None else best_set[1]), all_listed
 
     def _in_order(
         self, candidates: Sequence[Candidate], size: int

@@ -65,19 +65,21 @@ def check_grid(grid: Any) -> dict[str, list[Any]]:
     """Return the values of each key, at least one; raises ScenarioError at --vary."""
     if not isinstance(grid, Mapping) or not grid:
         raise ScenarioError("--vary", "needs a key with its values", grid or None, "KEY=V1,V2,...")
-    found = {}
+    values_by_key = {}
     for key, values in grid.items():
         listed = isinstance(values, (list, tuple, range, np.ndarray)) and len(values)
         if not listed:
             raise ScenarioError("--vary", f"{key} needs a list of values", values, "give some")
         plain = values.tolist() if isinstance(values, np.ndarray) else list(values)
         # Parts stand for their tables, which manifests and tables of results can hold.
-        found[str(key)] = [part_as_table(v) if isinstance(v, Component) else v for v in plain]
-    size = math.prod(map(len, found.values()))
+        values_by_key[str(key)] = [
+            part_as_table(v) if isinstance(v, Component) else v for v in plain
+        ]
+    size = math.prod(map(len, values_by_key.values()))
     if size > MAX_POINTS:
         rule = f"is a grid of {size:,} points, at most {MAX_POINTS:,} are possible"
         raise ScenarioError("--vary", rule, None, "vary less at once")
-    return found
+    return values_by_key
 
 
 class GridPoint(NamedTuple):

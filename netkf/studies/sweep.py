@@ -229,14 +229,14 @@ def _write_rows(completed: CompletedSweep) -> None:
         write_text(directory / "sweep.csv", table.to_csv(index=False))
 
 
-def _write_manifest(directory: Path, plan: SweepPlan, done: int, status: str) -> None:
-    """Write manifest.json of a sweep with ``done`` points."""
+def _write_manifest(directory: Path, plan: SweepPlan, points_done: int, status: str) -> None:
+    """Write manifest.json of a sweep with ``points_done`` points."""
     manifest = {
         "name": plan.base.name,
         "versions": versions(),
         "seed": plan.base.seed,
         "vary": check_grid(plan.vary),
-        "runs": {"wanted": plan.runs * len(plan.points), "done": plan.runs * done},
+        "runs": {"wanted": plan.runs * len(plan.points), "done": plan.runs * points_done},
         "status": status,
     }
     write_sealed(directory / "manifest.json", manifest)

@@ -48,9 +48,9 @@ def _with_error(value: float | None, error: float | None) -> str:
     return format_number(value) + standard_error(error)
 
 
-def sizing_text(found: Sizing) -> str:
+def sizing_text(sizing: Sizing) -> str:
     """Return the values that were tried, the answer, and how sure it is."""
-    header = [found.key, found.target.quantity, "at least", "at most", "runs", "target", "by"]
+    header = [sizing.key, sizing.target.quantity, "at least", "at most", "runs", "target", "by"]
     rows = [
         [
             f"{p.value:g}",
@@ -61,43 +61,47 @@ def sizing_text(found: Sizing) -> str:
             p.target,
             p.by,
         ]
-        for p in sorted(found.probes)
+        for p in sorted(sizing.probes)
     ]
-    if found.by == "theory":
-        header = [header[0], f"{found.target.quantity} ({found.probes[0].by})", header[-2]]
-        rows = [[f"{p.value:g}", f"{p.quantity:.7g}", p.target] for p in sorted(found.probes)]
+    if sizing.by == "theory":
+        header = [header[0], f"{sizing.target.quantity} ({sizing.probes[0].by})", header[-2]]
+        rows = [[f"{p.value:g}", f"{p.quantity:.7g}", p.target] for p in sorted(sizing.probes)]
     lines = [table(header, rows), ""]
-    lines += [answer(found), f"{found.target.quantity}: {found.quantity}", f"sure: {found.sure}"]
-    lines += [found.advice] if found.advice else []
+    lines += [
+        answer(sizing),
+        f"{sizing.target.quantity}: {sizing.quantity}",
+        f"sure: {sizing.sure}",
+    ]
+    lines += [sizing.advice] if sizing.advice else []
     return "\n".join(lines)
 
 
-def answer(found: Sizing) -> str:
+def answer(sizing: Sizing) -> str:
     """Return the answer of a search as one sentence."""
-    values = [probe.value for probe in found.probes]
+    values = [probe.value for probe in sizing.probes]
     span = f"{min(values):g} .. {max(values):g}"
-    if found.value is None:
-        undecided = any(probe.target in ("undecided", "not shown") for probe in found.probes)
+    if sizing.value is None:
+        undecided = any(probe.target in ("undecided", "not shown") for probe in sizing.probes)
         verb = "was shown to reach" if undecided else "reaches"
-        return f"no value of {found.key} in {span} {verb} {found.target}"
-    which = "largest" if found.grows else "smallest"
-    if found.misses is None:
-        return f"{found.key} = {found.value:g}: all of {span} reaches {found.target}"
-    miss = next(probe for probe in found.probes if probe.value == found.misses)
+        return f"no value of {sizing.key} in {span} {verb} {sizing.target}"
+    extreme = "largest" if sizing.grows else "smallest"
+    if sizing.misses is None:
+        return f"{sizing.key} = {sizing.value:g}: all of {span} reaches {sizing.target}"
+    miss = next(probe for probe in sizing.probes if probe.value == sizing.misses)
     if miss.target == "not shown":
         return (
-            f"{found.key} = {found.value:g} is the {which} for which the bound shows "
-            f"{found.target}; at {found.misses:g} the bound is above the limit, the quantity may "
+            f"{sizing.key} = {sizing.value:g} is the {extreme} for which the bound shows "
+            f"{sizing.target}; at {sizing.misses:g} the bound is above the limit, the quantity may "
             "not be"
         )
     verb = "misses it" if miss.target == "missed" else "was not shown to"
     return (
-        f"{found.key} = {found.value:g} is the {which} that reaches {found.target}; "
-        f"{found.misses:g} {verb}"
+        f"{sizing.key} = {sizing.value:g} is the {extreme} that reaches {sizing.target}; "
+        f"{sizing.misses:g} {verb}"
     )
 
 
-def consistency_text(found: Consistency) -> str:
+def consistency_text(consistency: Consistency) -> str:
     """Return one row per node, and a legend of the columns."""
     header = ["node", "NEES", "should be", "inside", "NIS", "should be", "verdict"]
     rows = [
@@ -110,28 +114,29 @@ def consistency_text(found: Consistency) -> str:
             format_number(row.expected_nis),
             row.verdict,
         ]
-        for row in found.rows
+        for row in consistency.rows
     ]
-    ends = f"{found.low:.4g} .. {found.high:.4g}"
-    scaled = f"{found.low / found.n:.4g} .. {found.high / found.n:.4g}"
+    level = f"{consistency.confidence:g}"
+    ends = f"{consistency.low:.4g} .. {consistency.high:.4g}"
+    scaled = f"{consistency.low / consistency.n:.4g} .. {consistency.high / consistency.n:.4g}"
     return "\n".join(
         [
             table(header, shorten_rows(rows, MAX_ROWS)),
             "",
-            f"{found.runs:,} runs, n = {found.n}; +-: half width of the interval on the difference "
-            f"from what NEES should be, all nodes together at confidence {found.confidence:g}",
+            f"{consistency.runs:,} runs, n = {consistency.n}; +-: half width of the interval on "
+            f"the difference from what NEES should be, all nodes together at confidence {level}",
             f"inside: samples whose mean over the runs lies in {ends} (ANEES {scaled}), the "
-            f"chi-square bounds at {found.confidence:g} where P is exact",
-            *(f"note: {note}" for note in found.notes),
+            f"chi-square bounds at {level} where P is exact",
+            *(f"note: {note}" for note in consistency.notes),
         ]
     )
 
 
-def filters_text(found: FilterComparison) -> str:
+def filters_text(comparison: FilterComparison) -> str:
     """Return one row per filter, reasons of those that cannot run, and a legend of the columns."""
     header = ["filter", "RMS error", "difference", "worst instant", "difference", "NEES / n"]
     header += ["difference", "consistency", "transmissions", "kB"]
-    ran = [row for row in found.rows if row.ran]
+    ran = [row for row in comparison.rows if row.ran]
     rows = [
         [
             shorten(row.filter),
@@ -143,16 +148,18 @@ def filters_text(found: FilterComparison) -> str:
         for row in ran
     ]
     lines = [table(header, rows, left=1), ""]
-    noted = [row for row in found.rows if row.status != "complete"]
+    noted = [row for row in comparison.rows if row.status != "complete"]
     lines += [f"{shorten(row.filter)}: {row.status}" for row in noted]
-    runs = f"{found.runs:,} run{'s' if found.runs > 1 else ''} of each on the same draws"
+    runs = f"{comparison.runs:,} run{'s' if comparison.runs > 1 else ''} of each on the same draws"
     lines.append(f"{runs}; +-: one standard error; differences from {shorten(ran[0].filter)}, run")
-    lines.append(f"by run; * for certain, all marks together at confidence {found.confidence:g}")
+    lines.append(
+        f"by run; * for certain, all marks together at confidence {comparison.confidence:g}"
+    )
     lines.append("worst instant: largest error of any node at any sample; traffic of replica 0")
-    ahead = [shorten(row.filter) for row in ran if row.predicts]
-    if ahead and len(ahead) < len(ran):
+    predicting = [shorten(row.filter) for row in ran if row.predicts]
+    if predicting and len(predicting) < len(ran):
         lines.append(
-            f"note: samples of {', '.join(ahead)} are predictions, the others are filtered"
+            f"note: samples of {', '.join(predicting)} are predictions, the others are filtered"
         )
     return "\n".join(lines)
 
@@ -168,13 +175,13 @@ def _quantity_cells(cells: Quantity) -> tuple[str, str]:
     return _with_error(cells.value, cells.se), difference
 
 
-def comparison_text(found: Comparison) -> str:
+def comparison_text(comparison: Comparison) -> str:
     """Return directories side by side; a star marks significant differences from the first."""
-    numbered = [f"({k + 1})" for k in range(len(found.directories))]
+    numbered = [f"({k + 1})" for k in range(len(comparison.directories))]
     lines = [
         f"{mark} {shorten(directory)}: {shorten(name)}, {runs:,} run{'s' if runs > 1 else ''}"
         for mark, directory, name, runs in zip(
-            numbered, found.directories, found.names, found.runs, strict=True
+            numbered, comparison.directories, comparison.names, comparison.runs, strict=True
         )
     ]
     rows = [
@@ -182,7 +189,7 @@ def comparison_text(found: Comparison) -> str:
             row.quantity if row.node < 0 else f"{row.quantity} of node {row.node}",
             *map(_format_marked, row.entries),
         ]
-        for row in found.rows
+        for row in comparison.rows
     ]
     if len(rows) > MAX_ROWS:
         left_out = f"({len(rows) - MAX_ROWS} more; --json has all)"
@@ -190,17 +197,17 @@ def comparison_text(found: Comparison) -> str:
     lines += ["", table(["", *numbered], rows, left=1)]
     notes = [
         f"note: {mark} {shorten(note, 500)}"
-        for mark, texts in zip(numbered, found.notes, strict=True)
+        for mark, texts in zip(numbered, comparison.notes, strict=True)
         for note in texts
     ]
     lines += ["", *notes] if notes else []
-    methods = {e.method for row in found.rows for e in row.entries if e.method}
+    methods = {e.method for row in comparison.rows for e in row.entries if e.method}
     if methods - {"one run"}:
-        how = ", ".join(sorted(methods - {"one run"}))
+        method_names = ", ".join(sorted(methods - {"one run"}))
         lines += [
             "",
             f"* differs from (1) for certain; all marks together at confidence "
-            f"{found.confidence:g} ({how})",
+            f"{comparison.confidence:g} ({method_names})",
         ]
     if "one run" in methods:
         lines += [

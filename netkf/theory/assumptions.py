@@ -170,22 +170,26 @@ def _link_clock_rows(scenario: Scenario) -> list[AssumptionRow]:
     if transmits_at_samples(scenario):
         evidence = "nodes transmit when they have sampled, see the row about sensors that sample"
         return [("nodes transmit at independent Poisson processes", "H II-B b", None, evidence)]
-    entities, what = clock.entities(scenario.topology), clock.at
+    entities, entity_kind = clock.entities(scenario.topology), clock.at
     rates = np.array([clock.mean_rate(entity) for entity in entities])
     # A recorded clock has no rates beforehand: mean_rate is then nan.
-    known = rates[np.isfinite(rates)]
-    unknown = len(known) < len(rates)
-    positive = None if unknown else bool((known > 0.0).all())
+    known_rates = rates[np.isfinite(rates)]
+    unknown = len(known_rates) < len(rates)
+    positive = None if unknown else bool((known_rates > 0.0).all())
     name, record = name_of("activation", clock), isinstance(clock, RecordedClock)
-    spread = f"{known.min():g} .. {known.max():g} per second" if known.size else "no rate known"
+    spread = (
+        f"{known_rates.min():g} .. {known_rates.max():g} per second"
+        if known_rates.size
+        else "no rate known"
+    )
     if unknown:
         spread = f"a {name} clock does not tell its rates beforehand"
-    elif known.size and np.ptp(known) == 0.0:
-        spread = f"{known[0]:g} per second on every {what[:-1]}"
+    elif known_rates.size and np.ptp(known_rates) == 0.0:
+        spread = f"{known_rates[0]:g} per second on every {entity_kind[:-1]}"
     return [
-        (f"the rates of all {what} are positive", "H II-B b", positive, spread),
+        (f"the rates of all {entity_kind} are positive", "H II-B b", positive, spread),
         (
-            f"the {what[:-1]} clocks are independent Poisson processes",
+            f"the {entity_kind[:-1]} clocks are independent Poisson processes",
             "H II-B b, Theorem 2",
             None if record else clock.memoryless,
             "exponential gaps"
@@ -195,7 +199,7 @@ def _link_clock_rows(scenario: Scenario) -> list[AssumptionRow]:
             else f"the gaps of a {name} clock are not exponential: H(12) is not promised",
         ),
         (
-            f"all {what} have one rate",
+            f"all {entity_kind} have one rate",
             "H Theorem 3",
             None if unknown else not rates.size or bool(np.ptp(rates) == 0.0),
             f"{spread}; the limit does not need it when the rates grow together",

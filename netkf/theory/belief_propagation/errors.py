@@ -26,9 +26,11 @@ from netkf.trace.run import Run
 
 
 class BeliefRule(ErrorRule):
-    """Evidence of nodes, own and received, and the beliefs that follow from it.
+    """Rule of belief propagation: the information that nodes hold, and the beliefs it gives.
 
-    In the stack of errors each piece of evidence is a vector s, whose matrix is U.
+    A node holds the information of its own readings and the last received from each neighbour. An
+    item is U = H' R^-1 H and, in terms of errors, s = H' R^-1 v, summed over the readings that it
+    covers; in the stack of errors it is a vector s, whose matrix is U.
     """
 
     takes_messages = False
@@ -49,22 +51,22 @@ class BeliefRule(ErrorRule):
             errors.copy(estimator, _prior_name(estimator), estimator)
 
     def _put_evidence(self, name: Hashable, U: FloatArray, s: FloatArray) -> None:
-        """Set a piece of evidence."""
+        """Set the U (n, n) and the form of s (n, inputs) of an item of evidence."""
         self._evidence.add(name)
         self.errors.stack.put(name, s)
         self.errors.stack.matrices[self.errors.stack.index(name)] = U
 
     def _drop_evidence(self, names: Sequence[Hashable]) -> None:
-        """Forget some evidence."""
+        """Remove items of evidence."""
         self._evidence.difference_update(names)
         self.errors.stack.drop(names)
 
     def _sum_evidence(self, names: Sequence[Hashable]) -> tuple[FloatArray, FloatArray]:
-        """Return U (n, n) and the form of s (n, inputs) of several pieces of evidence together."""
+        """Return the sums of U (n, n) and of the forms of s (n, inputs) of the items present."""
         stack, n = self.errors.stack, self.errors.n
-        known = [name for name in names if name in self._evidence]
-        U = sum((stack.matrices[stack.index(name)] for name in known), np.zeros((n, n)))
-        return U, sum((stack.form(name) for name in known), np.zeros((n, stack.used)))
+        present_names = [name for name in names if name in self._evidence]
+        U = sum((stack.matrices[stack.index(name)] for name in present_names), np.zeros((n, n)))
+        return U, sum((stack.form(name) for name in present_names), np.zeros((n, stack.used)))
 
     def elapse(self, gap: float, columns: slice | None, noise: FloatArray | None) -> None:
         """Predict all evidence over ``gap`` seconds."""
@@ -109,7 +111,7 @@ class BeliefRule(ErrorRule):
             self._update_belief(estimator)
 
     def _update_belief(self, estimator: int) -> None:
-        """Set the error and the root of P of a node."""
+        """Set the error and the root of P of a node from its prior and its evidence."""
         errors, eye = self.errors, np.eye(self.errors.n)
         U, s = self._sum_evidence(
             [_own_name(estimator), *((estimator, j) for j in self._received[estimator])]
@@ -126,27 +128,29 @@ class BeliefRule(ErrorRule):
         errors.roots[estimator] = triangular_root(root)
 
     def _evidence_for(self, sender: int, receiver: int) -> tuple[FloatArray, FloatArray]:
-        """Return the evidence for one receiver: all but that of the receiver itself."""
+        """Return U and s of the message to ``receiver``: the evidence of the sender's readings and
+        that received from all its other neighbours.
+        """
         others = [(sender, j) for j in self._received[sender] if j != receiver]
         return self._sum_evidence([_own_name(sender), *others])
 
     def exchange(self, slot: int, phase: int, messages: Sequence[SentMessage]) -> None:
         """Pass the messages of all steps of a slot that arrived."""
         estimators = self.errors.estimators
-        nothing = np.zeros((estimators, estimators))
+        no_arrivals = np.zeros((estimators, estimators))
         for step in range(self._steps):
-            up = self._arrivals.get((slot, phase, step), nothing)
-            pairs = [(i, j) for i, j in np.argwhere(up).tolist()]
-            # All messages of a step before any is used: they are sent at once.
-            said = {(i, j): self._evidence_for(j, i) for i, j in pairs}
-            for (i, j), (U, s) in said.items():
+            arrived = self._arrivals.get((slot, phase, step), no_arrivals)
+            pairs = [(i, j) for i, j in np.argwhere(arrived).tolist()]
+            # Contents first: all messages of a step are sent at the same time.
+            contents = {(i, j): self._evidence_for(j, i) for i, j in pairs}
+            for (i, j), (U, s) in contents.items():
                 self._put_evidence((i, j), U, s)
                 self._received[i][j] = slot
         for estimator in range(estimators):
             self._update_belief(estimator)
 
     def send(self, messages: Sequence[SentMessage]) -> None:
-        """Keep the evidence of each message that takes time."""
+        """Store the contents of each message that arrives later."""
         for message in messages:
             if message.late:
                 self._put_evidence(message, *self._evidence_for(message.sender, message.receiver))
@@ -154,8 +158,8 @@ class BeliefRule(ErrorRule):
     def arrive(self, time: float, messages: Sequence[SentMessage]) -> None:
         """Replace the earlier evidence of each sender, unless that was sent later."""
         late = [message for message in messages if message.late]
-        # All at once: a message says what its sender knew before this instant's messages.
-        said = {
+        # Contents first: a message has the sender's evidence before this instant's messages.
+        contents = {
             message: self._sum_evidence([message])
             if message.late
             else self._evidence_for(message.sender, message.receiver)
@@ -165,7 +169,7 @@ class BeliefRule(ErrorRule):
             received = self._received[message.receiver]
             if received.get(message.sender, -np.inf) <= message.time:
                 received[message.sender] = message.time
-                self._put_evidence((message.receiver, message.sender), *said[message])
+                self._put_evidence((message.receiver, message.sender), *contents[message])
         self._drop_evidence(late)
         for estimator in {message.receiver for message in messages}:
             self._update_belief(estimator)

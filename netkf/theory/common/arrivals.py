@@ -27,11 +27,13 @@ def arrivals_by_step(scenario: Scenario, run: Run) -> ArrivalsByStep:
     step = np.round(since * steps[rows["phase"]] / length).astype(int)
     if not len(rows):
         return {}
-    keys, which = np.unique(np.stack([slot, rows["phase"], step]), axis=1, return_inverse=True)
+    keys, key_indices = np.unique(
+        np.stack([slot, rows["phase"], step]), axis=1, return_inverse=True
+    )
     index_of = np.vectorize(index.__getitem__, otypes=[int])
-    up = np.zeros((keys.shape[1], size, size))
-    up[which.reshape(-1), index_of(rows["node"]), index_of(rows["peer"])] = 1.0
-    return {(t, phase, k): up[n] for n, (t, phase, k) in enumerate(keys.T.tolist())}
+    arrived = np.zeros((keys.shape[1], size, size))
+    arrived[key_indices.reshape(-1), index_of(rows["node"]), index_of(rows["peer"])] = 1.0
+    return {(t, phase, k): arrived[n] for n, (t, phase, k) in enumerate(keys.T.tolist())}
 
 
 def require_traced_exchanges(scenario: Scenario, run: Run) -> None:

@@ -34,8 +34,8 @@ class SentMessage(NamedTuple):
 class ErrorRule:
     """Rule of filters that use their own readings only; rules of other filters derive from it.
 
-    ``times`` are instants (seconds) of events other than samples and arrivals. In slots,
-    ``takes_messages`` says that ``exchange`` looks at the messages that it is given.
+    ``times`` are the instants (seconds) of events other than samples and arrivals.
+    ``takes_messages`` is False if ``exchange`` ignores its messages, which then need not be built.
     """
 
     takes_messages: ClassVar[bool] = True
@@ -55,16 +55,17 @@ class ErrorRule:
         """Record messages that leave at this instant and will arrive."""
 
     def arrive(self, time: float, messages: Sequence[SentMessage]) -> None:
-        """Use all messages that arrive at this instant; instantaneous ones were sent just now."""
+        """Use all messages that arrive at this instant; those without delay also left at it."""
 
     def exchange(self, slot: int, phase: int, messages: Sequence[SentMessage]) -> None:
         """Use the messages that arrived in time in exchange number ``phase`` of a slot."""
         self.arrive(slot, messages)
 
     def elapse(self, gap: float, columns: slice | None, noise: FloatArray | None) -> None:
-        """Advance quantities other than estimates by ``gap`` seconds.
+        """Predict quantities other than estimates over ``gap`` seconds.
 
-        Without increments the plant's noise is ``noise`` (n, k) times the inputs in ``columns``.
+        ``noise`` (n, k) times the inputs in ``columns`` is the plant's noise over the gap. Both are
+        None if a sensor senses increments, or if the gap is 0.
         """
 
 
@@ -72,7 +73,7 @@ class EstimateExchangeRule(ErrorRule):
     """Filters that send their estimate, which the receiver predicts to the time of arrival."""
 
     def send(self, messages: Sequence[SentMessage]) -> None:
-        """Copy the sender's estimate for each message that takes time."""
+        """Copy the sender's estimate for each message that arrives later."""
         for message in messages:
             if message.late:
                 self.errors.copy(message.sender, message, None)
@@ -108,7 +109,9 @@ class EstimateExchangeRule(ErrorRule):
     def combine(
         self, node: int, weights: list[float], roots: list[FloatArray]
     ) -> tuple[FloatArray, Iterable[FloatArray]]:
-        """Return the new root (n, n) and the factor (n, n) of each error.
+        """Return the root (n, n) of the new P, and factors (n, n): the new error is the sum of the
+        errors, each multiplied by its factor.
 
-        ``roots``: the node's own first, then those of the messages, which have ``weights``.
+        ``roots`` (n, n) of P are those of the node's estimate and of the k messages, in this order,
+        which is also that of the factors; ``weights`` (k) are those of the messages.
         """

@@ -16,13 +16,13 @@ def require_scenario(functions: dict[str, Any]) -> dict[str, Any]:
 
     Returns the wrapped functions by name. They raise ScenarioError, which says how to load one.
     """
-    found = {}
+    wrapped = {}
     for name, function in functions.items():
         if inspect.isfunction(function):
             first = next(iter(inspect.signature(function).parameters.values()), None)
             if first is not None and first.annotation == "Scenario":
-                found[name] = _check_first_argument(name, function)
-    return found
+                wrapped[name] = _check_first_argument(name, function)
+    return wrapped
 
 
 def _check_first_argument(name: str, function: Callable[..., Any]) -> Callable[..., Any]:

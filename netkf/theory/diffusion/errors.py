@@ -19,10 +19,12 @@ class DiffusionRule(EstimateExchangeRule):
     def combine(
         self, node: int, weights: list[float], roots: list[FloatArray]
     ) -> tuple[FloatArray, FloatArray]:
-        """Share the weight of lost messages as the filter does, so that weights sum to 1."""
+        """Intersect covariances; weights of lost messages are shared as the filter does, so that
+        the weights sum to 1.
+        """
         algorithm: Any = self.scenario.filter.algorithm
-        own, heard = algorithm.share(self.scenario.own_weights[node], weights)
-        return intersect_covariances([own, *heard], roots)
+        own_weight, heard_weights = algorithm.share(self.scenario.own_weights[node], weights)
+        return intersect_covariances([own_weight, *heard_weights], roots)
 
 
 def error_rule(

@@ -148,9 +148,9 @@ def _sensor_rows(sources: list[_Source], past: list[FloatArray], window: int) ->
     rows: list[LevelRow | None] = [None] * len(sources)
     for group in _group_by_kind(sources):
         for k in group:
-            same = rows[group[0]] if not sources[k].drive.size else None
-            found = same or _make_row(sources[k].node, [sources[k]], [past[k]], window)
-            rows[k] = (sources[k].node, *found[1:])
+            shared_row = rows[group[0]] if not sources[k].drive.size else None
+            sensor_row = shared_row or _make_row(sources[k].node, [sources[k]], [past[k]], window)
+            rows[k] = (sources[k].node, *sensor_row[1:])
     return [row for row in rows if row is not None]
 
 

@@ -72,9 +72,9 @@ def _solve_coupled(packed: PackedRiccati, times: FloatArray) -> FloatArray:
             return solve_by_taylor_series(
                 packed, times, _covariance_scale(packed), MAX_EXPLICIT_EVALUATIONS, OVERFLOW
             )
-    pieces = _PiecewiseSolution(packed)
-    pieces.extend(float(times[-1]))
-    return np.stack([pieces(float(t)) for t in times])
+    solution = _PiecewiseSolution(packed)
+    solution.extend(float(times[-1]))
+    return np.stack([solution(float(t)) for t in times])
 
 
 def _covariance_scale(packed: PackedRiccati) -> float:
@@ -207,25 +207,27 @@ class _PiecewiseSolution:
     def _integrate(
         self, begin: float, end: float, slope: Slope, growth: float = math.inf
     ) -> tuple[Callable[[float], FloatArray], float]:
-        """Return a dense output over a piece and where it ends, which is before ``end`` if the
-        solution has grown by a factor ``growth``; raises TheoryError if its defect is too large.
+        """Return the solution from time ``begin`` on as a function of time, and its last time.
+
+        That is ``end`` (seconds), or earlier if the solution has grown by a factor ``growth``.
+        Raises TheoryError if the solver fails or the defect of the solution is too large.
         """
-        refused: TheoryError | None = None
+        first_error: TheoryError | None = None
         for step_count in PARTS:  # shorter steps reduce the error of the dense output between them
             max_step = (end - begin) / step_count if step_count > 1 else np.inf
-            solved = self._integrate_piece(begin, end, slope, max_step, growth)
-            if not solved.success:
-                raise TheoryError(f"H(12) could not be integrated to {end:g} s: {solved.message}")
-            assert solved.sol is not None
+            result = self._integrate_piece(begin, end, slope, max_step, growth)
+            if not result.success:
+                raise TheoryError(f"H(12) could not be integrated to {end:g} s: {result.message}")
+            assert result.sol is not None
             try:
-                _check_defect(slope, solved.sol)
+                _check_defect(slope, result.sol)
             except TheoryError as error:
-                refused = refused or error
+                first_error = first_error or error
                 continue
-            output: Callable[[float], FloatArray] = solved.sol
-            return output, float(solved.t[-1])
-        assert refused is not None
-        raise refused
+            output: Callable[[float], FloatArray] = result.sol
+            return output, float(result.t[-1])
+        assert first_error is not None
+        raise first_error
 
     def _integrate_piece(
         self, begin: float, end: float, slope: Slope, max_step: float, growth: float
@@ -300,7 +302,7 @@ def _growth_event(limit: float) -> Callable[[float, FloatArray], float]:
     """Return an event of the solver that ends it where an entry exceeds ``limit``."""
 
     def below(_: float, y: FloatArray) -> float:
-        """Return a number that is negative beyond the limit."""
+        """Return the margin to the limit, which is negative beyond it."""
         return limit - float(np.abs(y).max()) if math.isfinite(limit) else 1.0
 
     below.terminal = True  # type: ignore[attr-defined]
@@ -360,13 +362,13 @@ def _joseph_update(P: FloatArray, observation: Observation) -> FloatArray:
 
 def _limit_evaluations(slope: Slope) -> Slope:
     """Return ``slope``, which raises StiffError after MAX_EXPLICIT_EVALUATIONS calls."""
-    left = MAX_EXPLICIT_EVALUATIONS
+    evaluations_left = MAX_EXPLICIT_EVALUATIONS
 
     def limited(t: float, y: FloatArray) -> FloatArray:
         """Return the slope; raises StiffError after too many evaluations."""
-        nonlocal left
-        left -= 1
-        if left < 0:
+        nonlocal evaluations_left
+        evaluations_left -= 1
+        if evaluations_left < 0:
             raise StiffError
         return slope(t, y)
 

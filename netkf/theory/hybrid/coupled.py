@@ -102,8 +102,8 @@ def reason_without_bound(scenario: Scenario) -> str | None:
         )
     overridden_names = overridden(algorithm)  # built-in resets by intersection give no larger P
     if overridden_names:
-        own = f"{name} defines {overridden_names[0]} itself"
-        return f"not promised: H(12) is about the hybrid filter, and {own}"
+        definition = f"{name} defines {overridden_names[0]} itself"
+        return f"not promised: H(12) is about the hybrid filter, and {definition}"
     assert isinstance(network.activation, LinkClock)
     if not transmits_at_samples(scenario) and not network.activation.memoryless:
         return (

@@ -129,8 +129,8 @@ class PackedRiccati:
         if sent is None:
             arriving = self.pack(P)[group.nodes] - decrease
         else:
-            after = self.pack(sent)[group.nodes] - self.pack(group.sample_decrease(sent))
-            arriving = self.predict(after)
+            updated = self.pack(sent)[group.nodes] - self.pack(group.sample_decrease(sent))
+            arriving = self.predict(updated)
         change += group.heard @ arriving
 
     def series(self, Y: FloatArray, span: float, order: int) -> FloatArray:
@@ -209,38 +209,40 @@ class LinearisedRiccati(NamedTuple):
         """Return the arrivals (N, m) at each node for rows X (N, m)."""
         total = np.zeros_like(X)
         for rates, nodes, maps in self.heard:
-            each = X[nodes]
-            total += rates @ (each @ maps[0] if len(maps) == 1 else (each[:, None] @ maps)[:, 0])
+            sent = X[nodes]
+            total += rates @ (sent @ maps[0] if len(maps) == 1 else (sent[:, None] @ maps)[:, 0])
         return total
 
     def mean_map(self) -> FloatArray:
         """Return the map (m, m) of the mean over the nodes of rows that are equal everywhere."""
         total = self.blocks.mean(axis=0)
         for rates, _, maps in self.heard:
-            share = np.asarray(rates.sum(axis=0)).reshape(-1) / len(self.blocks)
-            total += share.sum() * maps[0] if len(maps) == 1 else np.tensordot(share, maps, 1)
+            # the rate at which each sender is heard, over the number of nodes
+            rate = np.asarray(rates.sum(axis=0)).reshape(-1) / len(self.blocks)
+            total += rate.sum() * maps[0] if len(maps) == 1 else np.tensordot(rate, maps, 1)
         return np.asarray(total)
 
     def matrix(self, arriving: bool = True) -> scipy.sparse.csc_array:
-        """Return the operator as a sparse matrix (N m, N m), without the arrivals if not wanted."""
+        """Return the linear map as a sparse matrix (N m, N m), with or without the arrivals."""
         size, m, _ = self.blocks.shape
         shape = (size * m, size * m)
-        turned = np.ascontiguousarray(np.swapaxes(self.blocks, 1, 2))
-        parts = (turned, np.arange(size), np.arange(size + 1))
-        whole = scipy.sparse.csr_array(scipy.sparse.bsr_array(parts, shape=shape))
+        transposed = np.ascontiguousarray(np.swapaxes(self.blocks, 1, 2))
+        bsr_arrays = (transposed, np.arange(size), np.arange(size + 1))
+        operator = scipy.sparse.csr_array(scipy.sparse.bsr_array(bsr_arrays, shape=shape))
         for rates, nodes, maps in self.heard if arriving else ():
             if rates is self.packed.equations.coupling:
-                whole = whole + self.packed.arriving_matrix
+                operator = operator + self.packed.arriving_matrix
                 continue
             # Each rate multiplies a map (m, m) of its own, at the block (receiver, sender).
             entries = scipy.sparse.coo_array(rates)
-            turned = np.swapaxes(maps, 1, 2)[entries.col] * entries.data[:, None, None]
+            transposed = np.swapaxes(maps, 1, 2)[entries.col] * entries.data[:, None, None]
             rows = entries.row[:, None, None] * m + np.arange(m)[None, :, None]
             columns = nodes[entries.col][:, None, None] * m + np.arange(m)[None, None, :]
             indices = np.broadcast_arrays(rows, columns)
-            flat = (turned.reshape(-1), tuple(index.reshape(-1) for index in indices))
-            whole = whole + scipy.sparse.csr_array(scipy.sparse.coo_array(flat, shape=shape))
-        return scipy.sparse.csc_array(whole)
+            coo_arrays = (transposed.reshape(-1), tuple(index.reshape(-1) for index in indices))
+            arrivals = scipy.sparse.coo_array(coo_arrays, shape=shape)
+            operator = operator + scipy.sparse.csr_array(arrivals)
+        return scipy.sparse.csc_array(operator)
 
 
 def _low_rank_factors(G: FloatArray) -> FloatArray:

@@ -168,13 +168,17 @@ def _find_stabilising(packed: PackedRiccati, first: FloatArray | None = None) ->
 def _no_steady_state(scenario: Scenario, equations: CoupledRiccati) -> str:
     """Return the message that says why there is no steady state and what would give one."""
     if not equations.talks:
-        missing = np.isnan(steady_by_node(scenario)[:, 0, 0])
-        alone = [str(node) for node, no in zip(scenario.nodes, missing, strict=True) if no]
-        listed = ", ".join(alone[:MAX_LISTED]) + (", ..." if len(alone) > MAX_LISTED else "")
+        unsteady = np.isnan(steady_by_node(scenario)[:, 0, 0])
+        unsteady_nodes = [
+            str(node) for node, no in zip(scenario.nodes, unsteady, strict=True) if no
+        ]
+        listed = ", ".join(unsteady_nodes[:MAX_LISTED]) + (
+            ", ..." if len(unsteady_nodes) > MAX_LISTED else ""
+        )
         talks = scenario.filter.algorithm.talks
-        why = "no message ever arrives" if talks else "the filter does not talk"
-        several = "s" if len(alone) > 1 else ""
-        return f"{why}, and the covariance of node{several} {listed} alone has no steady state"
+        reason = "no message ever arrives" if talks else "the filter does not talk"
+        plural = "s" if len(unsteady_nodes) > 1 else ""
+        return f"{reason}, and the covariance of node{plural} {listed} alone has no steady state"
     activation = scenario.network.activation
     if transmits_at_samples(scenario):
         return "H(12) has no steady state: nodes that sample more often would transmit more often"
@@ -182,8 +186,8 @@ def _no_steady_state(scenario: Scenario, equations: CoupledRiccati) -> str:
     if factor is None:
         return "H(12) has no steady state, and faster links do not give it one"
     rate = getattr(activation, "rate", None)
-    what = {"nodes": "node", "directions": "direction"}.get(getattr(activation, "at", ""), "link")
-    remedy = f"every {what} rate must be at least {factor:.5g} times what it is"
+    entity = {"nodes": "node", "directions": "direction"}.get(getattr(activation, "at", ""), "link")
+    remedy = f"every {entity} rate must be at least {factor:.5g} times what it is"
     if rate is not None and not getattr(activation, "rates", ()):
         remedy = f"the rate {rate:g} is below the threshold {factor * rate:.5g}"
     return f"H(12) has no steady state: {remedy}"

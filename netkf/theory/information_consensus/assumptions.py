@@ -33,14 +33,14 @@ def _judge_counts(scenario: Scenario) -> tuple[bool, str]:
     steps = scenario.hosted.exchange_steps(0)
     # A node that hears nothing counts its own reading in full, whatever the weights.
     _, silent = effective_weights(scenario, [])
-    whole = channel.delay.fixed == 0.0 and all(
+    lossless = channel.delay.fixed == 0.0 and all(
         channel.loss.mean_delivery(link, scenario.table_probability(link)) == 1.0
         for link in scenario.topology.directions
     )
-    if not whole:
-        most = float(silent.max())
-        which = "its own, in slots in which it hears nothing"
-        return most <= 1.0 + TOLERANCE, f"a node counts a reading up to {most:.4g} times: {which}"
+    if not lossless:
+        max_count = float(silent.max())
+        evidence = f"a node counts a reading up to {max_count:.4g} times: its own, in slots in "
+        return max_count <= 1.0 + TOLERANCE, f"{evidence}which it hears nothing"
     _, counts = effective_weights(scenario, [weights] * steps)
-    most = float(np.max(counts))
-    return most <= 1.0 + TOLERANCE, f"a node counts a reading up to {most:.4g} times"
+    max_count = float(np.max(counts))
+    return max_count <= 1.0 + TOLERANCE, f"a node counts a reading up to {max_count:.4g} times"

@@ -67,13 +67,13 @@ class KcfRule(ErrorRule):
             self.errors.update(estimator, observation, self._columns[estimator])
 
     def send(self, messages: Sequence[SentMessage]) -> None:
-        """Copy the sender's prediction for each message that takes time."""
+        """Copy the sender's prediction for each message that arrives later."""
         for message in messages:
             if message.late:
                 self.errors.copy(self._prediction_name(message.sender), message, None)
 
     def arrive(self, time: float, messages: Sequence[SentMessage]) -> None:
-        """Add the consensus terms, and use the readings that took no time."""
+        """Add the consensus terms, and use the readings of messages without delay."""
         inboxes: dict[int, dict[int, SentMessage]] = {}
         # Messages of one sender can overtake each other: the last one sent counts.
         for message in sorted(messages, key=lambda m: (m.sender, m.time, m.number)):
@@ -99,14 +99,14 @@ class KcfRule(ErrorRule):
 
     def _consensus_term(self, estimator: int, inbox: list[SentMessage]) -> FloatArray:
         """Return the form of ``gamma P sum_j (ebar_j - ebar)``."""
-        own, stack = self._prediction_name(estimator), self.errors.stack
-        root = self.errors.roots[own]
+        prediction, stack = self._prediction_name(estimator), self.errors.stack
+        root = self.errors.roots[prediction]
         # The gain uses the predicted P, as the consensus term does predictions.
         P = root @ root.T
-        total = np.zeros_like(stack.form(own))
+        total = np.zeros_like(stack.form(prediction))
         for message in inbox:
             source = message if message.late else self._prediction_name(message.sender)
-            total += stack.form(source) - stack.form(own)
+            total += stack.form(source) - stack.form(prediction)
         # gamma = epsilon / (1 + |P|) keeps the gain bounded where P is large.
         return np.asarray(self._epsilon / (1.0 + np.linalg.norm(P)) * P @ total)
 

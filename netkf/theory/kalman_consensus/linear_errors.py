@@ -52,8 +52,8 @@ def slot_jumps(scenario: Scenario) -> SlotJumps:
         (i, j): terms[index[j]] for i, j in scenario.topology.directions
     }
     directions = directions_of(scenario, weights, scenario.phase_length) if weights else None
-    whole = gains.reshape(-1, rows[-1])
-    plant, noise = scenario.slot_plant, whole @ true @ whole.T
+    stacked_gains = gains.reshape(-1, rows[-1])
+    plant, noise = scenario.slot_plant, stacked_gains @ true @ stacked_gains.T
     return SlotJumps(plant.F, plant.Q, np.stack(closed), noise, directions, on_predictions=True)
 
 

@@ -125,8 +125,8 @@ def predict_estimates(
 ) -> None:
     """Predict the errors at ``indices`` and the roots of their P.
 
-    ``e+ = F e + noise w`` and ``P+ = F P F' + root root'``. F is (n, n), ``noise`` (n, k) multiplies the inputs from column ``first`` on, ``root`` is
-    (n, r).
+    ``e+ = F e + noise w`` and ``P+ = F P F' + root root'``. F is (n, n), ``noise`` (n, k)
+    multiplies the inputs from column ``first`` on, ``root`` is (n, r).
     """
     forms, matrices, used = errors
     n, r = F.shape[0], root.shape[1]

@@ -173,9 +173,16 @@ class Averaging:
         M is the identity less one term of each link.
         """
         N, outcomes = self.nodes, []
-        for (i, j), (first, second), both in zip(self.links, self.hears, self.both, strict=True):
+        for (i, j), (first_hears, second_hears), both_hear in zip(
+            self.links, self.hears, self.both, strict=True
+        ):
             probabilities = np.array(
-                [both, first - both, second - both, 1.0 - first - second + both]
+                [
+                    both_hear,
+                    first_hears - both_hear,
+                    second_hears - both_hear,
+                    1.0 - first_hears - second_hears + both_hear,
+                ]
             )
             terms = np.zeros((4, N, N))
             terms[[[0], [1]], i, [i, j]] = terms[[[0], [2]], j, [j, i]] = [1.0, -1.0]

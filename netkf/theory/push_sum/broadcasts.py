@@ -71,10 +71,10 @@ def leader_agreement(scenario: Scenario, slots: int, leader: int | None = None) 
     # missed[i, j] is the probability that i does not hear j in a slot. Sets of informed nodes are
     # bit masks, so that their law is an array of 2^N probabilities.
     missed = np.ones((averaging.nodes, averaging.nodes))
-    for (i, j), (first, second) in zip(
+    for (i, j), (first_hears, second_hears) in zip(
         averaging.links.tolist(), averaging.hears.tolist(), strict=True
     ):
-        missed[i, j], missed[j, i] = 1.0 - first, 1.0 - second
+        missed[i, j], missed[j, i] = 1.0 - first_hears, 1.0 - second_hears
     law_of_informed = np.zeros(2**averaging.nodes)
     law_of_informed[1 << scenario.topology.index[chosen]] = 1.0
     agreement = [law_of_informed[-1]]

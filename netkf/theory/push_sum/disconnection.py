@@ -321,20 +321,23 @@ def _estimate(
     nodes: int, probabilities: dict[tuple[int, int], float], seed: int, samples: int
 ) -> Probability:
     """Return the fraction of disconnected draws, with its Clopper-Pearson interval."""
-    ends, up = np.array(list(probabilities)), np.array(list(probabilities.values()))
-    random, cut, drawn = Streams(seed).generator("links"), 0, 0
-    while drawn < samples:
-        count = min(samples - drawn, max(1, MAX_DRAWS // len(ends)))
+    edges, edge_probabilities = (
+        np.array(list(probabilities)),
+        np.array(list(probabilities.values())),
+    )
+    random, cut, draws_done = Streams(seed).generator("links"), 0, 0
+    while draws_done < samples:
+        count = min(samples - draws_done, max(1, MAX_DRAWS // len(edges)))
         # All draws are one graph with a copy of the nodes for each.
-        draw, link = np.nonzero(random.random((count, len(ends))) < up)
-        rows, columns = (draw * nodes + ends[link, end] for end in (0, 1))
+        draw, link = np.nonzero(random.random((count, len(edges))) < edge_probabilities)
+        rows, columns = (draw * nodes + edges[link, end] for end in (0, 1))
         matrix = scipy.sparse.coo_array(
             (np.ones(len(rows), dtype=np.int8), (rows, columns)), shape=(count * nodes,) * 2
         )
         _, label = scipy.sparse.csgraph.connected_components(matrix, directed=False)
         components = label.reshape(count, nodes)
         cut += int((components != components[:, :1]).any(axis=1).sum())
-        drawn += count
+        draws_done += count
     # The bounds of Clopper and Pearson are quantiles of beta distributions.
     tail = 0.5 * (1.0 - CONFIDENCE)
     low = scipy.special.betaincinv(cut, samples - cut + 1, tail) if cut else 0.0

@@ -26,10 +26,12 @@ from netkf.theory.numerics.updates import intersect_covariances
 from netkf.trace.run import Run
 
 
-def fusion_weight(own: FloatArray, other: FloatArray, inverse: bool, trace: bool) -> float:
+def fusion_weight(
+    own_root: FloatArray, other_root: FloatArray, inverse: bool, trace: bool
+) -> float:
     """Return the weight of the first of two covariances given by roots (n, n), see PairFusion."""
-    n = len(own)
-    first, second = (np.ascontiguousarray(triangular_root(S)) for S in (own, other))
+    n = len(own_root)
+    first, second = (np.ascontiguousarray(triangular_root(S)) for S in (own_root, other_root))
     U, W, b = np.empty((n, n)), np.empty((n, n)), np.empty(n)
     common_basis(first, second, U, W, b)
     return float(best_weight(W, b, inverse, trace))
@@ -41,14 +43,14 @@ class PairRule(EstimateExchangeRule):
     def combine(
         self, node: int, weights: list[float], roots: list[FloatArray]
     ) -> tuple[FloatArray, list[FloatArray]]:
-        """Fuse in the order of the senders, in which the messages are."""
+        """Fuse with the estimate of each message in turn, in the order of the senders."""
         algorithm: Any = self.scenario.filter.algorithm
         root, factors = roots[0], [np.eye(len(roots[0]))]
         for heard_root in roots[1:]:
             w = fusion_weight(root, heard_root, algorithm.inverse, algorithm.minimise == TRACE)
             fuse = fuse_inversely if algorithm.inverse else intersect_covariances
             root, (own_factor, heard_factor) = fuse([w, 1.0 - w], [root, heard_root])
-            # Earlier factors are multiplied by that of the estimate that they have made.
+            # The errors fused so far are in the estimate, whose error has the factor own_factor.
             factors = [*(own_factor @ factor for factor in factors), heard_factor]
         return root, factors
 

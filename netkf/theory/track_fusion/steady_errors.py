@@ -75,12 +75,12 @@ def _mean_reported_covariance(scenario: Scenario, joint: FloatArray, i: int) -> 
         )
     total: FloatArray = np.zeros_like(joint[i, i])
     # E[P] over who is heard: best combinations are no linear function of the outcomes.
-    for up in itertools.product((True, False), repeat=len(unsure)):
-        outcomes = list(zip(unsure, up, strict=True))
+    for heard in itertools.product((True, False), repeat=len(unsure)):
+        outcomes = list(zip(unsure, heard, strict=True))
         probability = math.prod(
-            probabilities[j] if one else 1.0 - probabilities[j] for j, one in outcomes
+            probabilities[j] if is_heard else 1.0 - probabilities[j] for j, is_heard in outcomes
         )
-        order = [i, *certain, *(j for j, one in outcomes if one)]
+        order = [i, *certain, *(j for j, is_heard in outcomes if is_heard)]
         total += probability * _fuse_tracks(joint, order)
     return total
 
@@ -103,8 +103,8 @@ def _hearing_probabilities(scenario: Scenario, node: int) -> dict[int, float]:
 
 def _fuse_tracks(joint: FloatArray, order: list[int]) -> FloatArray:
     """Return the covariance (n, n) of the best combination of tracks, the first one the own."""
-    own: FloatArray = joint[order[0], order[0]]
+    P: FloatArray = joint[order[0], order[0]]
     if len(order) == 1:
-        return own
-    root = best_combination(joint, order, square_root(own))[1]
+        return P
+    root = best_combination(joint, order, square_root(P))[1]
     return np.asarray(root @ root.T)
