@@ -258,17 +258,18 @@ def _many_steps(samples: PushSumSamples, level: float) -> Finding:
         noise = push_sum_noise(scenario, [gamma])[0]
         error_distance = _relative_distance(covariances, limits.covariance)
         distance = max(error_distance, float(np.abs(noise - limits.noise).max()) / noise_scale)
-        distance, first_distance = (
-            (np.inf if np.isnan(distance) else distance),
-            (error_distance if first_distance is None else first_distance),
-        )
+        if np.isnan(distance):
+            distance = np.inf
+        if first_distance is None:
+            first_distance = error_distance
         gamma *= 2
     if scenario.filters_know_the_truth:
         central = push_sum_limits(scenario).P
         distance = max(distance, _relative_distance(limits.covariance[None], central))
     message = (
-        f"computed, not simulated: with gamma {gamma // 2} errors and noise are within {distance:.1e} "
-        f"of their limits, the errors of the central filter; with gamma 1 within {first_distance:.3g}"
+        f"computed, not simulated: with gamma {gamma // 2} errors and noise are within "
+        f"{distance:.1e} of their limits, the errors of the central filter; with gamma 1 within "
+        f"{first_distance:.3g}"
     )
     margin = STEADY_TOLERANCE - distance
     return Finding((margin, margin, margin), 0.0, message, early=gamma >= MAX_STEPS)

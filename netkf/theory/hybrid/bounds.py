@@ -45,21 +45,21 @@ def covariance_bound(scenario: Scenario, times: Any) -> FloatArray:
     delay or samples, or where H(12) is stiff). Raises TheoryError, with the reason, if the theorem
     does not apply.
     """
-    moments = np.atleast_1d(np.asarray(times, dtype=np.float64))
-    if moments.ndim != 1 or not moments.size or not np.isfinite(moments).all():
+    instants = np.atleast_1d(np.asarray(times, dtype=np.float64))
+    if instants.ndim != 1 or not instants.size or not np.isfinite(instants).all():
         raise TheoryError("times must be a list of finite numbers that is not empty")
-    if (np.diff(moments) < 0.0).any() or moments[0] < 0.0:
+    if (np.diff(instants) < 0.0).any() or instants[0] < 0.0:
         raise TheoryError("times must be increasing and not negative")
     equations = coupled_riccati(scenario)
-    if equations.jumps and moments[-1] > scenario.horizon:
+    if equations.jumps and instants[-1] > scenario.horizon:
         raise TheoryError("samples at known times are known up to the horizon")
     if not equations.talks and not equations.samples and not equations.jumps:
-        P = _solve_uncoupled(equations, moments)
+        P = _solve_uncoupled(equations, instants)
     else:
         packed = PackedRiccati(equations)
-        P = packed.unpack(_solve_coupled(packed, moments))
+        P = packed.unpack(_solve_coupled(packed, instants))
     if not np.abs(P).max() < OVERFLOW:
-        raise TheoryError(f"H(12) grows beyond {OVERFLOW:g} before {moments[-1]:g} s")
+        raise TheoryError(f"H(12) grows beyond {OVERFLOW:g} before {instants[-1]:g} s")
     return P
 
 
@@ -100,7 +100,14 @@ def _solve_uncoupled(equations: CoupledRiccati, times: FloatArray) -> FloatArray
 
 
 class _PiecewiseSolution:
-    """The solution up to the time that ``extend`` has reached, a dense output for each piece."""
+    """The packed solution Y(t) (N, m) of H(12) up to the time that ``extend`` has reached.
+
+    _outputs            : the solution over each piece, as a function of time that returns N m
+    _piece_ends         : the time 0 and the ends of the pieces, seconds
+    _start_value        : (N, m) the solution where the next piece begins
+    _values_after_jumps : by time, the solution (N, m) just after it jumps
+    _without_arrivals   : the equations until the first message has taken the delay
+    """
 
     def __init__(self, packed: PackedRiccati) -> None:
         self._packed = packed
@@ -108,11 +115,11 @@ class _PiecewiseSolution:
         # Until the first message has taken the delay, nodes lose nothing and receive nothing.
         quiet = tuple(s._replace(heard=0.0 * s.heard) for s in equations.samples)
         silent = equations._replace(coupling=0.0 * equations.coupling, samples=quiet)
-        self._silent = PackedRiccati(silent)
+        self._without_arrivals = PackedRiccati(silent)
         self._jumps = _SampleJumps(packed)
-        self._first = packed.start
-        self._jumped: dict[float, FloatArray] = {}
-        self._ends: list[float] = [0.0]
+        self._start_value = packed.start
+        self._values_after_jumps: dict[float, FloatArray] = {}
+        self._piece_ends: list[float] = [0.0]
         self._outputs: list[Callable[[float], FloatArray]] = []
 
     def __call__(self, t: float) -> FloatArray:
@@ -120,10 +127,10 @@ class _PiecewiseSolution:
         start = self._packed.start
         if t <= 0.0:
             return start
-        if t in self._jumped:
-            return self._jumped[t]
+        if t in self._values_after_jumps:
+            return self._values_after_jumps[t]
         # t may exceed the last end by a rounding error.
-        piece = min(int(np.searchsorted(self._ends, t)), len(self._outputs)) - 1
+        piece = min(int(np.searchsorted(self._piece_ends, t)), len(self._outputs)) - 1
         return self._outputs[piece](t).reshape(start.shape)
 
     def extend(self, last: float) -> None:
@@ -136,8 +143,8 @@ class _PiecewiseSolution:
         solution jumps and where messages sent at jumps arrive.
         """
         delay = self._packed.equations.delay
-        while self._ends[-1] < last:
-            begin = self._ends[-1]
+        while self._piece_ends[-1] < last:
+            begin = self._piece_ends[-1]
             end = self._jumps.before(begin, self._piece_end(begin, last))
             slope = self._slope(begin)
             if delay == 0.0 or end - begin <= delay * (1.0 + 1e-12):
@@ -148,7 +155,9 @@ class _PiecewiseSolution:
             else:
                 self._iterate(begin, end, slope)
             if self._jumps.jumps_at(end):
-                self._first = self._jumped[end] = self._jumps.apply(end, self._first)
+                self._start_value = self._values_after_jumps[end] = self._jumps.apply(
+                    end, self._start_value
+                )
 
     def _piece_end(self, begin: float, last: float) -> float:
         """Return how far the piece from ``begin`` may reach, seconds: inside it the delayed terms
@@ -165,31 +174,31 @@ class _PiecewiseSolution:
     def _append(self, end: float, output: Callable[[float], FloatArray]) -> None:
         """Add a piece that ends at ``end``, given by its dense ``output``."""
         self._outputs.append(output)
-        self._ends.append(end)
-        self._first = output(end).reshape(self._packed.start.shape)
+        self._piece_ends.append(end)
+        self._start_value = output(end).reshape(self._packed.start.shape)
 
     def _iterate(self, begin: float, end: float, slope: Slope) -> None:
         """Append a piece longer than the delay by Picard iteration; raises TheoryError."""
-        start = self._first
+        start = self._start_value
         probes = np.linspace(begin, end, 9)[1:]
         self._append(end, lambda _: start.reshape(-1))  # first guess: constant
-        last = np.inf
+        last_change = np.inf
         for _ in range(MAX_ROUNDS):
             old_values = np.array([self(t).reshape(-1) for t in probes])
-            self._first = start
+            self._start_value = start
             self._outputs[-1], _ = self._integrate(begin, end, slope)
-            self._first = self._outputs[-1](end).reshape(start.shape)
+            self._start_value = self._outputs[-1](end).reshape(start.shape)
             values = np.array([self(t).reshape(-1) for t in probes])
             change = float(np.abs(values - old_values).max() / np.abs(values).max())
             # The solver's choice of steps differs between rounds, which leaves a small change.
-            if change <= TOLERANCE or (0.5 * last < change <= ROUND_TOLERANCE):
+            if change <= TOLERANCE or (0.5 * last_change < change <= ROUND_TOLERANCE):
                 return
-            last = change
+            last_change = change
         raise TheoryError(f"late arrivals did not converge between {begin:g} and {end:g} s")
 
     def _slope(self, begin: float) -> Slope:
         """Return the right-hand side of H(12), flat, for a piece that begins at ``begin``."""
-        packed, silent, delay = self._packed, self._silent, self._packed.equations.delay
+        packed, silent, delay = self._packed, self._without_arrivals, self._packed.equations.delay
 
         def slope(t: float, y: FloatArray) -> FloatArray:
             """Return dY/dt of the packed covariances."""
@@ -260,7 +269,7 @@ class _PiecewiseSolution:
         return scipy.integrate.solve_ivp(
             slope,
             (begin, end),
-            self._first.reshape(-1),
+            self._start_value.reshape(-1),
             dense_output=True,
             rtol=TOLERANCE,
             atol=self._absolute_tolerance(begin),
@@ -283,12 +292,12 @@ class _PiecewiseSolution:
                 "the smaller one"
             )
         tolerance = 1e-3 * TOLERANCE * sizes + rounding
-        return np.repeat(tolerance, self._first.shape[1])
+        return np.repeat(tolerance, self._start_value.shape[1])
 
     def _entry_sizes(self) -> FloatArray:
         """Return the size (N,) of the covariance of each node, also where it begins at 0."""
         return np.asarray(
-            np.maximum(np.abs(self._first).max(axis=1), _covariance_scale(self._packed))
+            np.maximum(np.abs(self._start_value).max(axis=1), _covariance_scale(self._packed))
         )
 
     def _jacobian(self, t: float, y: FloatArray) -> Any:
@@ -301,12 +310,12 @@ class _PiecewiseSolution:
 def _growth_event(limit: float) -> Callable[[float, FloatArray], float]:
     """Return an event of the solver that ends it where an entry exceeds ``limit``."""
 
-    def below(_: float, y: FloatArray) -> float:
+    def margin(_: float, y: FloatArray) -> float:
         """Return the margin to the limit, which is negative beyond it."""
         return limit - float(np.abs(y).max()) if math.isfinite(limit) else 1.0
 
-    below.terminal = True  # type: ignore[attr-defined]
-    return below
+    margin.terminal = True  # type: ignore[attr-defined]
+    return margin
 
 
 class _SampleJumps:
