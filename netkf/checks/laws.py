@@ -28,15 +28,15 @@ GROWTH = 4.0
 class Pair(NamedTuple):
     """Two samples of covariances (S, n, n) and (S', n, n) that should have the same law.
 
-    They may depend on each other. If the promise is about a limit, ``other`` is a sample of the
-    limit law, and ``expected`` (S'', n, n) one of the law that ``one`` should have at its own time.
-    Then only a difference between ``one`` and ``expected`` breaks the promise; the distance of
-    ``expected`` from ``other`` tells whether the limit is reached.
+    They may depend on each other. If the promise is about a limit, ``second`` is a sample of the
+    limit law, and ``expected`` (S'', n, n) one of the law of ``first`` at its own time. Then only a
+    difference between ``first`` and ``expected`` breaks the promise; the distance of ``expected``
+    from ``second`` tells whether the limit is reached.
     """
 
     label: str
-    one: FloatArray
-    other: FloatArray
+    first: FloatArray
+    second: FloatArray
     expected: FloatArray | None = None
 
 
@@ -107,32 +107,32 @@ def compare_laws(pairs: Sequence[Pair], level: float, start: float = 0.0) -> Fin
     equal shares of the level. ``start`` is the largest trace at time 0, whose rounding errors
     remain in P.
     """
-    single_level, early = level / sum(pair.one.shape[-1] for pair in pairs), False
+    single_level, early = level / sum(pair.first.shape[-1] for pair in pairs), False
     intervals = []
     for pair in pairs:
-        for k in range(pair.one.shape[-1]):
-            one, other = pair.one[:, k, k], pair.other[:, k, k]
-            blur = _rounding_of(pair.one, start)
+        for k in range(pair.first.shape[-1]):
+            first, second = pair.first[:, k, k], pair.second[:, k, k]
+            blur = _rounding_of(pair.first, start)
             if pair.expected is None:
-                distance = law_distance(one, other, single_level, blur)
+                distance = law_distance(first, second, single_level, blur)
             else:
                 limit_law = pair.expected[:, k, k]
-                low = law_distance(one, limit_law, single_level / 2.0, blur).low
-                distance = law_distance(one, other, single_level / 2.0, blur)
+                low = law_distance(first, limit_law, single_level / 2.0, blur).low
+                distance = law_distance(first, second, single_level / 2.0, blur)
                 distance = distance._replace(low=low, high=max(distance.high, low))
-                early |= law_distance(limit_law, other, 0.5).value > LAW_TOLERANCE
+                early |= law_distance(limit_law, second, 0.5).value > LAW_TOLERANCE
             intervals.append((distance, f"at {pair.label}, entry {k}"))
     finding = find_largest(intervals, LAW_TOLERANCE, "largest distance of distribution functions")
     differs = any(distance.low > 0.0 for distance, _ in intervals)
     return finding._replace(early=early and not differs)
 
 
-def diagonal_distances(one: FloatArray, other: FloatArray) -> FloatArray:
+def diagonal_distances(first: FloatArray, second: FloatArray) -> FloatArray:
     """Return the largest differences (n,) between the empirical distribution functions of the
     diagonals of two samples (S, n, n) and (S', n, n).
     """
     return np.array(
-        [law_distance(one[:, k, k], other[:, k, k], 0.5).value for k in range(one.shape[-1])]
+        [law_distance(first[:, k, k], second[:, k, k], 0.5).value for k in range(first.shape[-1])]
     )
 
 
@@ -158,17 +158,17 @@ def compare_growth(
     should have: only faster growth than theirs breaks the promise. Where it is None, growth leaves
     the row undecided.
     """
-    single_level, early = 0.5 * level / sum(pair.one.shape[-1] for pair in pairs), False
+    single_level, early = 0.5 * level / sum(pair.first.shape[-1] for pair in pairs), False
     intervals = []
     for pair, laws in zip(pairs, expected, strict=True):
-        growths = growth(pair.one, pair.other, single_level)
+        growths = growth(pair.first, pair.second, single_level)
         expected_growths = (
             growth(*laws, single_level) if laws is not None else [None] * len(growths)
         )
-        for k, (run, law) in enumerate(zip(growths, expected_growths, strict=True)):
-            low = max(0.0, run.low - law.high) if law is not None else 0.0
-            early |= (law.value if law is not None else run.low) > LAW_TOLERANCE
-            intervals.append((run._replace(low=low), f"at {pair.label}, entry {k}"))
+        for k, (measured, by_law) in enumerate(zip(growths, expected_growths, strict=True)):
+            low = max(0.0, measured.low - by_law.high) if by_law is not None else 0.0
+            early |= (by_law.value if by_law is not None else measured.low) > LAW_TOLERANCE
+            intervals.append((measured._replace(low=low), f"at {pair.label}, entry {k}"))
     message = f"largest excess of P(P > {GROWTH:g} J) at the end over P(P > J) at half of the time"
     finding = find_largest(intervals, LAW_TOLERANCE, message)
     differs = any(interval.low > 0.0 for interval, _ in intervals)

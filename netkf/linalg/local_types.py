@@ -28,9 +28,11 @@ from netkf.linalg.value_lowering import DATA, I64
 
 
 def _register(function: Callable[..., Any], dimensions: int, lanes: bool) -> None:
-    """Register one function of ``local`` with numba.
+    """Register the typing and the two implementations of a function of ``local`` with numba.
 
-    n appears ``dimensions`` times in the shape of the array, followed by L with ``lanes``.
+    The array has n in each of its first ``dimensions`` dimensions, followed by L with ``lanes``.
+    If n and L are given as lengths of tuples, they are part of the types: the array has a constant
+    shape and is on the stack. Otherwise the function returns ``scratch``, its last argument.
     """
 
     @type_callable(function)
@@ -52,9 +54,9 @@ def _register(function: Callable[..., Any], dimensions: int, lanes: bool) -> Non
 
     @lower_builtin(function, types.BaseTuple, *lane_types, types.Array)
     def _on_stack(context: Any, builder: Any, sig: Any, _args: Any) -> Any:
-        n, kind = len(sig.args[0]), sig.return_type
-        shape = [n] * dimensions + [len(part) for part in sig.args[1:-1]]
-        array = context.get_value_type(kind)
+        n, array_type = len(sig.args[0]), sig.return_type
+        shape = [n] * dimensions + [len(lane_tuple) for lane_tuple in sig.args[1:-1]]
+        array = context.get_value_type(array_type)
         memory = cgutils.alloca_once(builder, ir.ArrayType(ir.DoubleType(), math.prod(shape)))
         # Lines of the cache, for values of several lanes.
         memory.align = ALIGNMENT if lanes else WORD

@@ -277,24 +277,24 @@ def _variable_collector() -> Callable[..., Any]:
             return entries
         return values if isinstance(part, dict) else leaf
 
-    def collect(part: Any, found: list[Any]) -> None:
-        """Append the variables of a part to ``found``."""
+    def collect(part: Any, collected: list[Any]) -> None:
+        """Append the variables of a part to ``collected``."""
         role = roles.get(type(part))
         if role is None:
             role = roles[type(part)] = role_of(part)
         if role == variable:
-            found.append(part)
+            collected.append(part)
         elif role == instruction:
-            found += part.list_vars()
+            collected += part.list_vars()
         elif role != leaf:
-            for each in part if role == entries else part.values():
-                collect(each, found)
+            for member in part if role == entries else part.values():
+                collect(member, collected)
 
     def variables(_: Any, part: Any) -> list[Any]:
         """Return the variables of a part, as ``ir.Inst._rec_list_vars`` does."""
-        found: list[Any] = []
-        collect(part, found)
-        return found
+        collected: list[Any] = []
+        collect(part, collected)
+        return collected
 
     return variables
 

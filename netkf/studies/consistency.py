@@ -202,11 +202,11 @@ class _Innovations:
         if noise is None:
             return e, P, Sigma
         F, Q = self._scenario.slot_belief
-        same = np.array_equal(F, plant.F)
+        model_is_true = np.array_equal(F, plant.F)
         if Sigma is not None:
-            Sigma = plant.F @ Sigma @ plant.F.T + plant.Q if same else None
+            Sigma = plant.F @ Sigma @ plant.F.T + plant.Q if model_is_true else None
         predicted = plant.F @ e + noise
-        if not same:
+        if not model_is_true:
             predicted = predicted + (plant.F - F) @ run.xhat[k, i]
         return predicted, F @ P @ F.T + Q, Sigma
 

@@ -49,7 +49,10 @@ class Deliveries:
 
 @dataclass(frozen=True, eq=False)
 class DeliveringLoss(Loss):
-    """The losses of ``given``, except that the messages of ``deliveries`` are delivered."""
+    """The loss model ``given`` of the run, except that the messages of ``deliveries`` arrive.
+
+    All but the chosen messages have the same draws and fates as in the run.
+    """
 
     given: Loss = field(instance(Loss))
     # A mutable object, set before each replay: one scenario with its cached tables serves all.
@@ -57,22 +60,22 @@ class DeliveringLoss(Loss):
 
     @property
     def deterministic(self) -> bool:
-        """Return that of the given losses, so that the same numbers are drawn."""
+        """The value of the model ``given``, so that the same numbers are drawn."""
         return self.given.deterministic
 
     @property
     def stateful(self) -> bool:
-        """Return that of the given losses, so that the same numbers are drawn."""
+        """The value of the model ``given``, so that the same numbers are drawn."""
         return self.given.stateful
 
     def next_state(self, bad: bool | None, random: np.random.Generator) -> bool:
-        """Return that of the given losses."""
+        """Return the next state by the model ``given``."""
         return self.given.next_state(bad, random)
 
     def delivery_probability(
         self, link: Link, message: int, bad: bool, table_probability: float
     ) -> float:
-        """Return 1 for chosen messages, else the probability of the given losses."""
+        """Return 1 for chosen messages, else the probability of the model ``given``."""
         chosen = self.deliveries.chosen
         if chosen is None or (*link, message) in chosen:
             return 1.0
@@ -88,38 +91,40 @@ class DeliveringLoss(Loss):
         return False
 
     def check(self, topology: Topology) -> None:
-        """Raise ScenarioError if the given losses do not fit the graph."""
+        """Raise ScenarioError if the model ``given`` does not fit the graph."""
         self.given.check(topology)
 
 
 @dataclass(frozen=True, eq=False)
 class HurryingDelay(Delay):
-    """The delays of ``given``, except that hurried messages of ``deliveries`` take no time."""
+    """The delay model ``given`` of the run, except that hurried messages of ``deliveries`` take no
+    time.
+    """
 
     given: Delay = field(instance(Delay))
     deliveries: Deliveries = field(instance(Deliveries))
 
     def draw(self, random: np.random.Generator) -> float:
-        """Return the draw of the given delays."""
+        """Return a draw of the model ``given``."""
         return self.given.draw(random)
 
     @property
     def fixed(self) -> float | None:
-        """Return that of the given delays."""
+        """The value of the model ``given``."""
         return self.given.fixed
 
     @property
     def longest(self) -> float:
-        """Return that of the given delays."""
+        """The value of the model ``given``."""
         return self.given.longest
 
     @property
     def is_random(self) -> bool:
-        """Return that of the given delays, so that the same numbers are drawn."""
+        """The value of the model ``given``, so that the same numbers are drawn."""
         return self.given.is_random
 
     def message_delay(self, link: Link, message: int, drawn: float) -> float:
-        """Return 0 for hurried messages, else the given delay in seconds.
+        """Return the delay in seconds: 0 for hurried messages, else that of the model ``given``.
 
         A message that is recorded as lost has no delay (nan): it takes no time if it is delivered.
         """
@@ -131,7 +136,7 @@ class HurryingDelay(Delay):
         return 0.0 if comes and math.isnan(seconds) else seconds
 
     def check(self, topology: Topology) -> None:
-        """Raise ScenarioError if the given delays do not fit the graph."""
+        """Raise ScenarioError if the model ``given`` does not fit the graph."""
         self.given.check(topology)
 
 

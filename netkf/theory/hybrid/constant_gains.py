@@ -64,22 +64,22 @@ def _linear_equation(
     if equations.samples or equations.jumps or equations.delay:
         raise TheoryError("constant gains are for sensors in continuous time and no delay")
     A, N, n = equations.A, len(equations.start), len(equations.A)
-    observed = [scenario.observation(node, believed=True) for node in scenario.nodes]
+    observations = [scenario.observation(node, believed=True) for node in scenario.nodes]
     if gains is None:
         P = steady_covariance_bound(scenario)
-        gains = [p @ np.linalg.solve(R, H).T for p, (H, R) in zip(P, observed, strict=True)]
-    chosen = [np.asarray(L, dtype=np.float64) for L in gains]
-    if [L.shape for L in chosen] != [(n, len(H)) for H, _ in observed]:
+        gains = [p @ np.linalg.solve(R, H).T for p, (H, R) in zip(P, observations, strict=True)]
+    gain_matrices = [np.asarray(L, dtype=np.float64) for L in gains]
+    if [L.shape for L in gain_matrices] != [(n, len(H)) for H, _ in observations]:
         raise TheoryError("gains must have one (n, p_i) array for each node")
-    eye, blocks, right = np.eye(n), [], np.empty((N, n, n))
-    for i, (L, (H, R)) in enumerate(zip(chosen, observed, strict=True)):
+    eye, blocks, constant = np.eye(n), [], np.empty((N, n, n))
+    for i, (L, (H, R)) in enumerate(zip(gain_matrices, observations, strict=True)):
         closed = A - L @ H
         blocks.append(np.kron(closed, eye) + np.kron(eye, closed))
-        right[i] = L @ R @ L.T + equations.Q
+        constant[i] = L @ R @ L.T + equations.Q
     leaving = scipy.sparse.diags_array(np.asarray(equations.coupling.sum(axis=1)).reshape(-1))
     exchange = scipy.sparse.csr_array(equations.coupling - leaving)
     matrix = scipy.sparse.block_diag(blocks) + scipy.sparse.kron(exchange, np.eye(n * n))
-    return scipy.sparse.csr_array(matrix), right.reshape(-1), np.array(equations.start)
+    return scipy.sparse.csr_array(matrix), constant.reshape(-1), np.array(equations.start)
 
 
 def _steady(A: scipy.sparse.csr_array, right: FloatArray, n: int) -> FloatArray:
