@@ -72,7 +72,7 @@ def student_interval(value: float, deviation: float, count: int, level: float) -
     """
 
     def limits(value: float, factor: float) -> tuple[float, float]:
-        """Return both ends for another mean and ``factor`` times the samples."""
+        """Return the limits for another mean and ``factor`` times the samples."""
         quantile = -float(scipy.special.stdtrit(factor * count - 1.0, level / 2.0))
         reach = deviation / math.sqrt(factor) * quantile
         return value - reach, value + reach
@@ -93,7 +93,7 @@ def probability_interval(successes: int, trials: int, level: float) -> Interval:
     low = high = detectable = math.nan
 
     def limits(share: float, factor: float) -> tuple[float, float]:
-        """Return both ends for another share and ``factor`` times the trials (Clopper-Pearson)."""
+        """Return the Clopper-Pearson limits for another share and ``factor`` times the trials."""
         hits = min(max(share, 0.0), 1.0) * trials * factor
         missed = trials * factor - hits
         low = float(scipy.special.betaincinv(hits, missed + 1, level / 2)) if hits else 0.0
@@ -112,7 +112,7 @@ def affine(interval: Interval, scale: float, shift: float) -> Interval:
     """Return the interval of ``scale`` times a quantity plus ``shift``; the scale is positive."""
 
     def limits(value: float, factor: float) -> tuple[float, float]:
-        """Return both ends for another value and ``factor`` times the samples."""
+        """Return the limits for another value and ``factor`` times the samples."""
         low, high = interval.limits((value - shift) / scale, factor)
         return scale * low + shift, scale * high + shift
 
@@ -126,7 +126,7 @@ def with_drawn(interval: Interval, sample_factor: Callable[[float], float]) -> I
     """
 
     def limits(value: float, factor: float) -> tuple[float, float]:
-        """Return both ends for ``factor`` times the runs."""
+        """Return the limits of the interval for ``factor`` times the runs."""
         actual = sample_factor(factor)
         # The caller has divided the value by sqrt(factor); it shrinks by sqrt(actual) only.
         return interval.limits(value * math.sqrt(factor / actual), actual)
@@ -211,7 +211,7 @@ def _band_interval(gaps: FloatArray, a: int, b: int, level: float, grow: bool) -
     width = sum(widths)
 
     def limits(value: float, factor: float) -> tuple[float, float]:
-        """Return both ends for another distance and ``factor`` times the samples."""
+        """Return the limits for another distance and ``factor`` times the samples."""
         first, second = widths[0] / math.sqrt(factor), widths[1]
         reach = first + (second / math.sqrt(factor) if grow else second)
         return value - reach, value + reach
@@ -247,7 +247,7 @@ def band_around(value: float, width: float, detectable: float = math.nan) -> Int
     """Return the interval ``value`` +- ``width``, clipped to [0, 1], for a distance of laws."""
 
     def limits(value: float, factor: float) -> tuple[float, float]:
-        """Return both ends for another distance and ``factor`` times the samples."""
+        """Return the limits for another distance and ``factor`` times the samples."""
         reach = width / math.sqrt(factor)
         return value - reach, value + reach
 
@@ -267,7 +267,7 @@ def scale_interval(total: float, freedom: float, level: float) -> Interval:
         return upper, lower
 
     def limits(value: float, factor: float) -> tuple[float, float]:
-        """Return both ends for another variance and ``factor`` times the samples."""
+        """Return the limits for another variance and ``factor`` times the samples."""
         total_freedom = factor * freedom
         upper, lower = quantiles(total_freedom)
         return value * total_freedom / upper, value * total_freedom / lower

@@ -366,7 +366,7 @@ def _welch_difference(
 def _student_interval(
     mean: float, error: float, freedom: float, level: float
 ) -> tuple[float, float]:
-    """Return both ends of Student's interval."""
+    """Return the limits of Student's t interval, ``mean`` +- a quantile times ``error``."""
     width = float(scipy.special.stdtrit(freedom, 1.0 - level / 2.0)) * error
     return mean - width, mean + width
 

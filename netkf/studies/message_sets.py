@@ -126,14 +126,16 @@ class _Search:
         return largest if self._gains.get(largest, 0.0) > 0.0 else ()
 
     def recent(self, candidates: Sequence[Candidate]) -> list[Candidate]:
-        """Return the candidates without the oldest ones that change next to nothing together, in
-        the order of sending; their number is found by bisection.
+        """Return the candidates, in the order of sending, without the oldest ones.
+
+        Those left out, found by bisection, change the trace together by less than NEGLIGIBLE times
+        the decrease that the limit asks for.
         """
         base = self.trace(())
         tolerance = NEGLIGIBLE * (base - self._limit)
 
         def negligible(count: int) -> bool:
-            """Return True if the first ``count`` candidates change next to nothing."""
+            """Return True if the first ``count`` candidates change the trace negligibly."""
             keys = [candidate.key for candidate in candidates[:count]]
             return abs(self.trace(keys) - base) <= tolerance
 
@@ -149,8 +151,12 @@ class _Search:
     def of_size(
         self, candidates: Sequence[Candidate], size: int, most_replays: int
     ) -> tuple[tuple[MessageKey, ...] | None, bool]:
-        """Return a set of this size that reaches the limit (of single messages the best one), or
-        None; and True if all sets of this size were tried.
+        """Return a set of ``size`` messages with which the trace is at most the limit, and whether
+        all sets of this size were considered.
+
+        Of single messages it is the one with the smallest trace, of larger sets the first that is
+        tried; None if there is none. The search ends when the replayer's count of replays is
+        ``most_replays``.
         """
         best_set: tuple[float, tuple[MessageKey, ...]] | None = None
         sets, all_listed = self._in_order(candidates, size)

@@ -27,7 +27,7 @@ MAX_ERRORS = 24
 in slots.
 """
 MAX_COUPLED = 40
-"""The same in continuous time, where compiled code integrates the covariance."""
+"""The same number in continuous time, where compiled code integrates the covariance."""
 
 
 class RunMetrics(NamedTuple):

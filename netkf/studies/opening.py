@@ -58,11 +58,13 @@ Stored = StoredRun | StoredEnsemble | StoredSweep | StoredComparison | StoredVer
 
 
 def open(directory: str | Path, *, trust: bool = False) -> Stored:
-    """Return what ``netkf run``, ``netkf run --runs``, ``netkf sweep``, ``netkf.save``, ``netkf
-    compare-filters`` or ``netkf check`` left in a directory: what ``netkf.simulate``,
-    ``netkf.monte_carlo``, ``netkf.sweep``, ``netkf.compare_filters`` and ``netkf.check`` return,
-    with the scenario, the manifest and the summary. What was interrupted has what was kept. Where a
-    verdict lies beside a run, the run is returned.
+    """Return the results in a directory that ``netkf run``, ``netkf run --runs``, ``netkf sweep``,
+    ``netkf.save``, ``netkf compare-filters`` or ``netkf check`` wrote.
+
+    They are those that ``netkf.simulate``, ``netkf.monte_carlo``, ``netkf.sweep``,
+    ``netkf.compare_filters`` and ``netkf.check`` return, with the scenario, the manifest and the
+    summary; of an interrupted run those that were written. If a directory has a run and a verdict,
+    the run is returned.
 
     Files are read without trust: with ``trust`` classes of modules in the directory, or in the
     current folder, that its scenario names are imported, which executes them.

@@ -291,7 +291,7 @@ def advise(
     misses: float | None,
     grows: bool,
 ) -> str:
-    """Return what to try next if the range or the runs did not suffice, else an empty string."""
+    """Return advice on range and runs of the next search, empty if this one was conclusive."""
     by_value = sorted(probes)
     if value is not None and misses is None:
         end = by_value[-1] if grows else by_value[0]
@@ -310,7 +310,7 @@ def advise(
 
 def _advise_beyond(problem: SizingProblem, end: Probe, inner: Probe, grows: bool) -> str:
     """Return advice on a range beyond ``end``, extrapolated from the last two probes; an empty
-    string if they do not tell.
+    string if their quantities are not positive and finite.
     """
     # The quantity is taken to be a power of the key.
     numbers = (end.value, inner.value, end.quantity, inner.quantity)

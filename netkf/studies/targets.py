@@ -102,7 +102,7 @@ def _starts_with_the_truth(scenario: Scenario) -> bool:
 
 
 def _explain_errors(scenario: Scenario) -> str:
-    """Return how P bounds the errors; raises TheoryError if it does not."""
+    """Return the reason why P bounds the errors, as text; raises TheoryError if it does not."""
     if not scenario.filters_know_the_truth:
         raise TheoryError("the filters' model differs from the truth: P need not bound the errors")
     rows = assumptions(scenario)

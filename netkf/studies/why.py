@@ -314,7 +314,7 @@ def _is_newer(reading: float, than: float) -> bool:
 
 
 def _describe_missing(messages: Messages, m: int) -> Missing:
-    """Return what became of a message that did not arrive in time."""
+    """Return the outcome and the times of a message that did not arrive in time."""
     return Missing(
         messages.key(m),
         OUTCOMES[int(messages.outcome[m])],

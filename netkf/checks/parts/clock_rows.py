@@ -260,7 +260,7 @@ def _count_interval(
     )
 
     def limits(value: float, factor: float) -> tuple[float, float]:
-        """Return both ends for another value and ``factor`` times the runs."""
+        """Return the limits for another value and ``factor`` times the runs."""
         low, high = distance.limits(value, factor)
         return max(0.0, low - relative_slack), max(0.0, high - relative_slack)
 
@@ -275,7 +275,7 @@ def _poisson_interval(total: float, mean: float, level: float) -> Interval:
     """
 
     def limits(ratio: float, factor: float) -> tuple[float, float]:
-        """Return both ends for another ratio and ``factor`` times the runs."""
+        """Return the limits for another ratio and ``factor`` times the runs."""
         count, expected = ratio * mean * factor, mean * factor
         low = float(scipy.special.gammaincinv(count, level / 2.0)) if count else 0.0
         high = float(scipy.special.gammaincinv(count + 1.0, 1.0 - level / 2.0))

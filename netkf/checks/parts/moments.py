@@ -295,7 +295,7 @@ def correlation_interval(value: float, count: float, level: float) -> Interval:
     reach = -spread * float(scipy.special.ndtri(level / 2.0))
 
     def limits(value: float, factor: float) -> tuple[float, float]:
-        """Return both ends for another correlation and ``factor`` times the samples."""
+        """Return the limits for another correlation and ``factor`` times the samples."""
         centre = math.atanh(min(max(value, -1.0 + 1e-12), 1.0 - 1e-12))
         wide = reach / math.sqrt(factor)
         return math.tanh(centre - wide), math.tanh(centre + wide)

@@ -149,7 +149,7 @@ def _share_of_bounded_runs(
     mean = min(max(expected + float(excess.mean()) / max_sent, 0.0), 1.0)
 
     def limits(value: float, factor: float) -> tuple[float, float]:
-        """Return both ends for another share and ``factor`` times the runs."""
+        """Return the limits for another share and ``factor`` times the runs."""
         centre = min(max(expected + (value - expected) / scale, 0.0), 1.0)
         limit = math.log(2.0 / level) / (factor * runs)
         low, high = (_share_at(centre, end, limit) for end in (0.0, 1.0))

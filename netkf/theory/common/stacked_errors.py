@@ -74,10 +74,11 @@ class StackedErrors:
         self._add_offsets(scenario)
 
     def _add_offsets(self, scenario: Scenario) -> None:
-        """Let the errors begin at the distance of each filter's mean from the plant's.
+        """Add to each error the difference of the plant's and the filter's first means.
 
-        The distances are factors of one more input, which is the number 1 and not drawn. A vector
-        that holds only that input finds its share in any error, after any rotation of the inputs.
+        The differences multiply one more input, which is the constant 1. Reductions of the stack
+        rotate the inputs; the vector OFFSET, the constant times a unit vector, is rotated with
+        them, so that the mean of any error is the product of its form with the first row of OFFSET.
         """
         start, n = scenario.plant.start_mean, self.n
         offsets: dict[Hashable, FloatArray] = {
@@ -95,12 +96,12 @@ class StackedErrors:
             self.stack.add(name, column, offset[:, None])
 
     def keep(self) -> None:
-        """Keep the present errors of all estimators, for ``law``."""
+        """Store the present errors of all estimators for ``law``."""
         self._kept.append(self.stack.freeze(range(self.estimators)))
 
     def law(self) -> tuple[FloatArray, FloatArray]:
-        """Return the mean (K M n,) and the joint covariance of the errors of the estimators that
-        were kept K times.
+        """Return the mean (K M n,) and the covariance (K M n, K M n) of the errors of the M
+        estimators at the K times at which ``keep`` was called.
         """
         rows, width = self.estimators * self.n, self.stack.used
         forms = np.zeros((len(self._kept), rows, width))
@@ -114,7 +115,7 @@ class StackedErrors:
             return np.zeros(len(forms)), np.asarray(forms @ forms.T)
         constant_input = self.stack.form(OFFSET)[0]
         mean = np.asarray(forms @ constant_input)
-        # What is left is random: the part along the input that is a number is taken out first.
+        # The covariance is that of the other inputs: the part along the constant is subtracted.
         random_part = forms - np.outer(mean, constant_input)
         return mean, np.asarray(random_part @ random_part.T)
 

@@ -40,7 +40,7 @@ class ConstantGainRule(EstimateExchangeRule):
     def combine(
         self, node: int, weights: list[float], roots: list[FloatArray]
     ) -> tuple[FloatArray, FloatArray]:
-        """Give the node's own estimate the weight that the messages leave."""
+        """Average covariances; the node's own estimate has the weight 1 - sum of ``weights``."""
         return average_covariances([1.0 - sum(weights), *weights], roots)
 
 

@@ -18,7 +18,7 @@ class ResetRule(EstimateExchangeRule):
     def combine(
         self, node: int, weights: list[float], roots: list[FloatArray]
     ) -> tuple[FloatArray, FloatArray]:
-        """Give the node's own estimate the weight that the messages leave."""
+        """Average or intersect; the node's own estimate has the weight 1 - sum of ``weights``."""
         all_weights = [1.0 - sum(weights), *weights]
         if self.scenario.hosted.combination == "intersection":
             return intersect_covariances(all_weights, roots)

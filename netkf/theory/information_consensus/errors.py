@@ -35,14 +35,16 @@ def step_weights(scenario: Scenario) -> FloatArray:
 def effective_weights(
     scenario: Scenario, weights: Sequence[FloatArray]
 ) -> tuple[FloatArray, FloatArray]:
-    """Return how often the pairs of predictions and of readings count after the steps of a slot,
-    (N, N) each, from the ``weights`` (N, N) of the messages that arrived in each step.
+    """Return the weights (N, N) of the predictions and of the readings (N, N) in the estimates.
+
+    Entry (i, j) is the number of times that node i counts the information of node j.
+    ``weights`` (N, N) of each step are those of the messages that arrived in it, 0 for others.
     """
     algorithm: Any = scenario.hosted
     N = len(scenario.nodes)
     mixing = np.eye(N)
     for heard in weights:
-        # The weight of what did not come stays with the node.
+        # A node gives the weight of lost messages to its own pair.
         mixing = (heard + np.diag(np.maximum(1.0 - heard.sum(axis=1), 0.0))) @ mixing
     shares, counts = algorithm.recipe(N)
     times = counts[:-1] @ shares
@@ -61,11 +63,11 @@ class ConsensusRule(ErrorRule):
         self._observations: EstimatorObservations = {}
 
     def sense(self, time: float, observations: EstimatorObservations) -> None:
-        """Keep the readings of the slot, which are combined before they are used."""
+        """Store the readings of the slot for ``exchange``."""
         self._observations = observations
 
     def exchange(self, slot: int, phase: int, messages: Sequence[SentMessage]) -> None:
-        """Combine the pairs in the steps of the slot, and make the estimates of them."""
+        """Update all estimates by the predictions and readings with their weights of this slot."""
         nothing = np.zeros_like(self._weights)
         heard = [
             self._weights * self._arrivals.get((slot, phase, step), nothing)

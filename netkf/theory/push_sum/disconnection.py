@@ -206,8 +206,10 @@ def _is_connected(neighbours: list[dict[int, float]]) -> bool:
 
 
 def _elimination_order(neighbours: list[dict[int, float]]) -> list[int] | None:
-    """Return all nodes in an order in which few are open at a time: the greedy order with the least
-    effort from several first nodes; None if too many nodes are open in each.
+    """Return an order of the nodes for ``_exact_probability``, in which few are open at a time.
+
+    It is the greedy order of least effort from several first nodes; None if in each of them more
+    than MAX_OPEN nodes are open.
     """
     nodes = range(len(neighbours))
     roots = sorted(nodes, key=lambda node: len(neighbours[node]))[:MAX_ROOTS]

@@ -218,7 +218,7 @@ class RunningTotalsRule(ErrorRule):
             self._totals[message] = self._totals[name]
 
     def arrive(self, time: float, messages: Sequence[SentMessage]) -> None:
-        """Give each receiver the growth of its senders' totals since the last ones it received."""
+        """Add to each receiver's mass the difference between the totals received now and last."""
         for estimator in sorted({message.receiver for message in messages}):
             received = [m for m in messages if m.receiver == estimator]
             self._receive_totals(estimator, sorted(received, key=lambda m: (m.sender, m.number)))
@@ -232,7 +232,7 @@ class RunningTotalsRule(ErrorRule):
         weight, U, form = 0.0, np.zeros((n, n)), np.zeros((n, 1))
         for message in messages:
             link, heard = (message.sender, estimator), ("heard", message.sender, estimator)
-            # A message that was overtaken holds nothing new.
+            # A later message of the sender came first: its total includes that of this one.
             if message.number <= self._number.get(link, -1):
                 continue
             self._number[link] = message.number

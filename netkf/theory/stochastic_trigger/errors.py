@@ -44,7 +44,9 @@ def decisions(scenario: Scenario, run: Run) -> Decisions:
 
 
 class ScheduleRule(ErrorRule):
-    """Readings that were sent, and the silence of all other sensors."""
+    """Rule of the stochastic trigger: updates by readings that were sent and by the silence of all
+    other sensors.
+    """
 
     takes_messages = False
 
@@ -55,11 +57,11 @@ class ScheduleRule(ErrorRule):
         self._observations: EstimatorObservations = {}
 
     def sense(self, time: float, observations: EstimatorObservations) -> None:
-        """Keep the readings for the exchange of the slot."""
+        """Store the readings of the slot for ``exchange``."""
         self._observations = observations
 
     def exchange(self, slot: int, phase: int, messages: Sequence[SentMessage]) -> None:
-        """Update all nodes by all sensors."""
+        """Update the estimates of all nodes by every sensor, whether it sent or not."""
         columns = self.errors.reading_noises(self._observations)
         for estimator, observation in self._observations.items():
             # Silence counts as a reading that equals its prediction, with the noise R + Y^-1.
@@ -69,7 +71,7 @@ class ScheduleRule(ErrorRule):
 
 
 def silence(reading: Observation, Y: float | FloatArray) -> Observation:
-    """Return the reading that silence stands for, with the noise R + Y^-1."""
+    """Return the observation to which silence is equivalent: the same H, with noise R + Y^-1."""
     R = silence_noise(reading.R, Y)
     # The true noise, whose root the reading has, may differ from the believed R.
     root = np.asarray(np.linalg.cholesky(reading.root @ reading.root.T + R - reading.R))

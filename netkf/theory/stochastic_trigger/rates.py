@@ -30,10 +30,11 @@ def trigger_rate(P: ArrayLike, H: ArrayLike, R: ArrayLike, Y: ArrayLike) -> floa
 
 
 def expected_sends(scenario: Scenario, run: Run) -> tuple[int, float]:
-    """Return how often nodes sent in a run whose nodes all hear each other, and the sum of the
-    probabilities of that, each given all that happened before.
+    """Return the number of transmissions in a run and its expectation.
 
-    The first slot, in which every node with a sensor sends, is left out.
+    The expectation is the sum over slots and nodes of the probability of a transmission given all
+    earlier ones. All nodes must hear each other. The first slot, in which every node with a sensor
+    sends, is left out.
     """
     algorithm: Any = scenario.filter.algorithm
     sent = decisions(scenario, run)
