@@ -177,27 +177,29 @@ def _make_kernel(
 
 
 def _widen_arguments(function: Any) -> None:
-    """Make calls by other kernels share one compiled version: literal types become their general
-    types and all signed integers int64, where numba would compile the function for each.
+    """Replace the types of a kernel's arguments in calls by other kernels by more general ones.
+
+    Literal types become their general types and all signed integers int64, so that calls share one
+    compiled version; numba would compile one for each literal and each width.
     """
     from numba.core import types
 
     kinds, template_for = cast(Any, types), function.get_call_template
 
-    def widened(kind: Any) -> Any:
-        kind = kinds.unliteral(kind)
+    def widen(kind: Any) -> Any:
+        general = kinds.unliteral(kind)
         # Fields of records may be int8 or int32.
-        return kinds.int64 if isinstance(kind, kinds.Integer) and kind.signed else kind
+        return kinds.int64 if isinstance(general, kinds.Integer) and general.signed else general
 
-    def for_types(args: Any, kws: Any) -> Any:
-        named = {name: widened(kind) for name, kind in kws.items()}
-        return template_for(tuple(widened(kind) for kind in args), named)
+    def template_of_widened(args: Any, kws: Any) -> Any:
+        named = {name: widen(kind) for name, kind in kws.items()}
+        return template_for(tuple(widen(kind) for kind in args), named)
 
-    function.get_call_template = for_types
+    function.get_call_template = template_of_widened
 
 
 def _use_compile_settings(dispatcher: Any, config: Any) -> None:
-    """Make a dispatcher compile at LLVM's optimisation level 2 and with a larger unroll threshold.
+    """Set LLVM's optimisation level 2 and a larger unroll threshold for a dispatcher.
 
     Level 3 takes a quarter longer and gains nothing here. Both settings are global, so that they
     are set around the compilation of this function only. Its duration is added to _compile_times.
@@ -207,7 +209,7 @@ def _use_compile_settings(dispatcher: Any, config: Any) -> None:
 
     compile_for = dispatcher._compile_for_args
 
-    def moderately(*args: Any, **kwargs: Any) -> Any:
+    def compile_with_settings(*args: Any, **kwargs: Any) -> Any:
         level, started = config.OPT, time.perf_counter()
         config.OPT = type(level)(2)
         set_option("netkf", f"-unroll-threshold={UNROLLED}")
@@ -227,7 +229,7 @@ def _use_compile_settings(dispatcher: Any, config: Any) -> None:
             dispatcher._cache.release()
             _compile_times.append(time.perf_counter() - started)
 
-    dispatcher._compile_for_args = moderately
+    dispatcher._compile_for_args = compile_with_settings
 
 
 def seconds_spent() -> float:

@@ -142,13 +142,16 @@ class KernelLower(ValueLower):
         return indices
 
     def _wrapped(self, index: Any, array: Any, axis: int) -> Any:
-        """Return an index; as in Python a negative constant counts from the end of its axis."""
+        """Return ``index``, plus the length of its axis if it is negative, as Python does.
+
+        An index that is known to be nonnegative is returned without the test that numba emits.
+        """
         builder = self.builder
         if is_nonnegative(index):
             return index
         length = builder.extract_value(array, [SHAPE, axis])
-        below = builder.icmp_signed("<", index, ZERO)
-        return builder.select(below, builder.add(index, length), index)
+        is_negative = builder.icmp_signed("<", index, ZERO)
+        return builder.select(is_negative, builder.add(index, length), index)
 
     def _row(self, resty: Any, kind: Any, array: Any, index: Any) -> Any:
         """Return the view ``array[index]`` of an array with more axes, without an owner."""

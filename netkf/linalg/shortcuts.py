@@ -167,15 +167,16 @@ def _refresh_if_changed(refresh: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _without_liveness(run: Callable[..., Any]) -> Callable[..., Any]:
-    """Skip the analysis of live variables at the start of blocks, which numba repeats after each of
-    six passes; only generators and object mode need it.
+    """Return a replacement of ``PostProcessor.run`` that skips the analysis of live variables at
+    the start of blocks, which numba repeats after each of six passes; only generators and object
+    mode need it.
     """
     from numba.core import postproc, transforms
 
     VariableLifetime: Any = postproc.VariableLifetime
     canonicalize: Any = transforms.canonicalize_cfg
 
-    def run_lightly(self: Any, emit_dels: bool = False, **options: Any) -> None:
+    def run_without_liveness(self: Any, emit_dels: bool = False, **options: Any) -> None:
         function = self.func_ir
         if function.is_generator:
             run(self, emit_dels, **options)
@@ -186,7 +187,7 @@ def _without_liveness(run: Callable[..., Any]) -> Callable[..., Any]:
         if emit_dels:
             self._insert_var_dels(**options)
 
-    return run_lightly
+    return run_without_liveness
 
 
 def _cache_sizes(size_of: Callable[..., Any]) -> Callable[..., Any]:
@@ -203,17 +204,19 @@ def _cache_sizes(size_of: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _skip_sign_test(original: Callable[..., Any]) -> Callable[..., Any]:
-    """Do not test computed indices for being negative, see ``lean_lowering.is_nonnegative``."""
+    """Return a replacement of ``fix_integer_index`` without the test for a negative index where
+    none is needed, see ``lean_lowering.is_nonnegative``.
+    """
     from numba import types
 
     from netkf.linalg.lean_lowering import is_nonnegative
 
-    def place_of(context: Any, builder: Any, index_type: Any, index: Any, size: Any) -> Any:
+    def fix_index(context: Any, builder: Any, index_type: Any, index: Any, size: Any) -> Any:
         if is_nonnegative(index):
             return context.cast(builder, index, index_type, types.intp)
         return original(context, builder, index_type, index, size)
 
-    return place_of
+    return fix_index
 
 
 def _no_timer(*_: Any) -> AbstractContextManager[None]:
@@ -222,16 +225,18 @@ def _no_timer(*_: Any) -> AbstractContextManager[None]:
 
 
 def _only_with_listeners(notify: Callable[..., Any]) -> Callable[..., Any]:
-    """Skip numba's event notifications, two for each call of LLVM, if there is no listener."""
+    """Return a replacement of ``notify`` that does nothing if there is no listener: numba notifies
+    twice for each call of LLVM.
+    """
     from numba.core import event
 
     listeners: Any = event._registered
 
-    def told(*args: Any, **kwargs: Any) -> None:
+    def notify_listeners(*args: Any, **kwargs: Any) -> None:
         if any(listeners.values()):
             notify(*args, **kwargs)
 
-    return told
+    return notify_listeners
 
 
 class _NoContext:

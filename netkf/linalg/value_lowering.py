@@ -339,11 +339,7 @@ def remove_unread(function: Any) -> None:
         for instruction in all_instructions
         if type(instruction) is instructions.AllocaInstr
     }
-    unread |= {
-        instruction
-        for instruction in variables
-        if readers.get(instruction) == writers.get(instruction)
-    }
+    unread |= {variable for variable in variables if readers.get(variable) == writers.get(variable)}
     unread |= {
         id(instruction)
         for instruction in stores

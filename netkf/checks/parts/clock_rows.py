@@ -109,7 +109,7 @@ def _drawn_counts(
     first: int,
     count: int,
 ) -> np.ndarray:
-    """Return the ticks (count, E) of all clocks in the replicas from ``first`` on."""
+    """Return the numbers of ticks (count, E) of all clocks in the replicas from ``first`` on."""
     return np.array([draw(scenario, seed, first + k) for k in range(count)])
 
 

@@ -80,8 +80,8 @@ def sampling_clocks(scenario: Scenario) -> ClockGroup:
                 return ClockGroup((), (), ())
             entities.append((node, placed_sensor.ordinal))
             stated.append(stated_part(clock, "sampling"))
-            several = f"sensor {placed_sensor.ordinal} of " if len(placed_sensors) > 1 else ""
-            labels.append(f"the clock of {several}node {node}")
+            sensor_label = f"sensor {placed_sensor.ordinal} of " if len(placed_sensors) > 1 else ""
+            labels.append(f"the clock of {sensor_label}node {node}")
     return ClockGroup(tuple(entities), tuple(stated), tuple(labels))
 
 
