@@ -187,6 +187,7 @@ def _widen_arguments(function: Any) -> None:
     kinds, template_for = cast(Any, types), function.get_call_template
 
     def widen(kind: Any) -> Any:
+        """Return the more general type of an argument."""
         general = kinds.unliteral(kind)
         # Fields of records may be int8 or int32.
         return kinds.int64 if isinstance(general, kinds.Integer) and general.signed else general

@@ -99,9 +99,12 @@ def _register_type(function: Any) -> Callable[[Callable[..., Any]], Callable[...
     """
 
     def register(result: Callable[..., Any]) -> Callable[..., Any]:
+        """Register ``result`` and return it unchanged."""
+
         @infer_global(function)
         class Typing(AbstractTemplate):
             def generic(self, args: Any, _kws: Any) -> Any:
+                """Return the signature of a call, None if the types do not fit, as numba asks."""
                 result_type = result(*args)
                 return None if result_type is None else signature(result_type, *args)
 
@@ -427,6 +430,7 @@ def _arithmetic(operation: Any, name: str) -> None:
 
     @_register_type(operation)
     def result(*args: Any) -> Any:
+        """Return the type of the result: a value of as many lanes as the operands."""
         count = _pair_count(*args) if len(args) == 2 else 0
         return value_type(count) if count else None
 
@@ -447,6 +451,7 @@ def _comparison(operation: Any, sign: str) -> None:
 
     @_register_type(operation)
     def result(*args: Any) -> Any:
+        """Return the type of the result: flags of as many lanes as the operands."""
         count = _pair_count(*args) if len(args) == 2 else 0
         return flags_type(count) if count else None
 
@@ -502,11 +507,13 @@ def _instruction(function: Any, name: str, arguments: int) -> None:
 
     @_register_type(function)
     def result(*args: Any) -> Any:
+        """Return the type of the result: a value of as many lanes as the widest argument."""
         are_values = all(isinstance(kind, LaneValue) or _is_number(kind) for kind in args)
         return value_type(max(map(_count, args))) if are_values else None
 
     @lower_builtin(function, *[types.Any] * arguments)
     def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        """Emit a call of the intrinsic, with plain numbers copied to all lanes first."""
         count = _count(sig.return_type)
         values = [
             _broadcast(context, builder, v, k, count) for v, k in zip(args, sig.args, strict=True)

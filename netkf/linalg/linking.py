@@ -104,14 +104,15 @@ def _patches() -> list[tuple[Any, str, Callable[..., Any]]]:
 def _count_depth(stage: str, original: Callable[..., Any]) -> Callable[..., Any]:
     """Return ``original`` with a count of its nested calls in the attribute ``stage`` of _DEPTH."""
 
-    def counted(*args: Any, **kwargs: Any) -> Any:
+    def count_and_call(*args: Any, **kwargs: Any) -> Any:
+        """Call ``original`` with the count one higher, also if it raises."""
         setattr(_DEPTH, stage, getattr(_DEPTH, stage) + 1)
         try:
             return original(*args, **kwargs)
         finally:
             setattr(_DEPTH, stage, getattr(_DEPTH, stage) - 1)
 
-    return counted
+    return count_and_call
 
 
 def _only_outermost(
@@ -154,6 +155,7 @@ def _internalise(optimize: Callable[..., Any]) -> Callable[..., Any]:
     """
 
     def optimize_all(library: Any) -> Any:
+        """Mark the linked inner functions of a library, then optimise it."""
         for function in library._final_module.functions:
             if function.name in _INNER_NAMES and not function.is_declaration:
                 function.linkage = "internal"
@@ -187,6 +189,7 @@ def _link_once(finalize: Callable[..., Any]) -> Callable[..., Any]:
     """
 
     def finalize_flat(library: Any) -> Any:
+        """Finalize with all callees if the library is the outermost one, else with none."""
         direct_callees = library._linking_libraries
         library._linking_libraries = [] if _is_linked("finalize") else _all_called(library)
         try:
@@ -206,6 +209,7 @@ def _all_called(library: Any) -> list[_OwnCode]:
     visited: set[Any] = set()
 
     def visit(caller: Any) -> None:
+        """Append the callees of ``caller`` that were not visited, each after its own callees."""
         for callee in reversed(list(caller._linking_libraries)):
             if callee not in visited:
                 visited.add(callee)

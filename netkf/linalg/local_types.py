@@ -37,7 +37,12 @@ def _register(function: Callable[..., Any], dimensions: int, lanes: bool) -> Non
 
     @type_callable(function)
     def _typer(_: Any) -> Callable[..., Any]:
+        """Return the function that numba calls for the type of a call; its parameters are those of
+        ``function``, so that keyword arguments work.
+        """
+
         def typed(size: Any, *others: Any) -> Any:
+            """Return the type of the array: that of ``scratch`` unless ``size`` is a tuple."""
             if isinstance(size, types.BaseTuple):
                 return types.Array(types.float64, dimensions + lanes, "C")
             return others[-1]
@@ -54,6 +59,7 @@ def _register(function: Callable[..., Any], dimensions: int, lanes: bool) -> Non
 
     @lower_builtin(function, types.BaseTuple, *lane_types, types.Array)
     def _on_stack(context: Any, builder: Any, sig: Any, _args: Any) -> Any:
+        """Emit an array of constant shape in the stack frame of the calling function."""
         n, array_type = len(sig.args[0]), sig.return_type
         shape = [n] * dimensions + [len(lane_tuple) for lane_tuple in sig.args[1:-1]]
         array = context.get_value_type(array_type)
@@ -66,6 +72,7 @@ def _register(function: Callable[..., Any], dimensions: int, lanes: bool) -> Non
 
     @lower_builtin(function, types.Array, *lane_types, types.Array)
     def _in_memory(_context: Any, _builder: Any, _sig: Any, args: Any) -> Any:
+        """Return the argument ``scratch``."""
         return args[-1]
 
 

@@ -119,14 +119,16 @@ def shortcuts() -> list[Patch]:
 
 
 def _cache_call_types(find: Callable[..., Any]) -> Callable[..., Any]:
-    """Cache the signature of a call by function and argument types.
+    """Return ``find``, which finds the signature of a call, with a cache by function and argument
+    types.
 
     numba resolves it anew for each call, by trying all definitions of the function (dozens for an
     operator).
     """
     signatures: dict[Any, Any] = {}
 
-    def found(function: Any, context: Any, args: Any, kws: Any) -> Any:
+    def cached_signature(function: Any, context: Any, args: Any, kws: Any) -> Any:
+        """Return the signature of a call; calls with keyword arguments are not cached."""
         if kws:
             return find(function, context, args, kws)
         # Definitions are only ever added: their number is part of the key.
@@ -135,7 +137,7 @@ def _cache_call_types(find: Callable[..., Any]) -> Callable[..., Any]:
             signatures[call] = find(function, context, args, kws)
         return signatures[call]
 
-    return found
+    return cached_signature
 
 
 def _run_pass(manager: Any, _: int, step: Any, state: Any) -> None:
@@ -146,17 +148,19 @@ def _run_pass(manager: Any, _: int, step: Any, state: Any) -> None:
 
 
 def _refresh_if_changed(refresh: Callable[..., Any]) -> Callable[..., Any]:
-    """Refresh numba's tables of definitions only if definitions were added: each refresh imports
-    thirty modules.
+    """Return a replacement of ``refresh`` that refreshes numba's tables of definitions only if some
+    were added: each refresh imports thirty modules.
     """
     known_sizes: dict[int, int] = {}
 
     def size_of(context: Any) -> int:
+        """Return the number of definitions in the registries that a context reads."""
         registries = [*context._registries, *context.typing_context._registries]
         lists = ("functions", "getattrs", "setattrs", "casts", "constants", "attributes", "globals")
         return sum(len(getattr(registry, name, ())) for registry in registries for name in lists)
 
     def refresh_if_new(context: Any) -> None:
+        """Refresh a context if its registries have grown since the last refresh."""
         # numba makes a context for each function, and they share these registries.
         key = id(context._registries)
         if known_sizes.get(key) != size_of(context):
@@ -177,6 +181,7 @@ def _without_liveness(run: Callable[..., Any]) -> Callable[..., Any]:
     canonicalize: Any = transforms.canonicalize_cfg
 
     def run_without_liveness(self: Any, emit_dels: bool = False, **options: Any) -> None:
+        """Post-process ``self.func_ir`` without its live variables, a generator as numba does."""
         function = self.func_ir
         if function.is_generator:
             run(self, emit_dels, **options)
@@ -195,6 +200,7 @@ def _cache_sizes(size_of: Callable[..., Any]) -> Callable[..., Any]:
     sizes: dict[tuple[Any, str], int] = {}
 
     def size(context: Any, llvm_type: Any) -> int:
+        """Return the size of an LLVM type in bytes."""
         key = context, str(llvm_type)
         if key not in sizes:
             sizes[key] = size_of(context, llvm_type)
@@ -212,6 +218,7 @@ def _skip_sign_test(original: Callable[..., Any]) -> Callable[..., Any]:
     from netkf.linalg.lean_lowering import is_nonnegative
 
     def fix_index(context: Any, builder: Any, index_type: Any, index: Any, size: Any) -> Any:
+        """Emit the index as an integer of the machine's word, from the start of the axis."""
         if is_nonnegative(index):
             return context.cast(builder, index, index_type, types.intp)
         return original(context, builder, index_type, index, size)

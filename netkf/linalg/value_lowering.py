@@ -281,10 +281,12 @@ def call_without_errors(user_function: Callable[..., Any]) -> Callable[..., Any]
     functions that never raise are not followed by a test of their status.
     """
 
-    def function(fndesc: Any, libs: Any) -> Any:
+    def user_function_without_errors(fndesc: Any, libs: Any) -> Any:
+        """Return the emitter of calls of one compiled function, as ``user_function`` does."""
         checking_call = user_function(fndesc, libs)
 
         def call(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+            """Emit a call, with a test of its status unless the callee never raises."""
             is_plain = not isinstance(sig.return_type, types.Optional)
             if not (is_plain and fndesc.llvm_func_name in _NEVER_FAIL):
                 return checking_call(context, builder, sig, args)
@@ -301,7 +303,7 @@ def call_without_errors(user_function: Callable[..., Any]) -> Callable[..., Any]
         call.signature, call.libs = checking_call.signature, checking_call.libs  # type: ignore[attr-defined]
         return call
 
-    return function
+    return user_function_without_errors
 
 
 # Dead code.
