@@ -81,8 +81,9 @@ class BlockCheckpoints:
         return None
 
     def find(self, identity: RunIdentity) -> tuple[list[int], list[str]]:
-        """Return the numbers of the blocks of a run, in order, and a line about unreadable blocks
-        and those of other runs, which are removed.
+        """Return the numbers of the blocks of a run, in order, and lines about removed ones.
+
+        Files that are unreadable or belong to another run are removed.
         """
         bad: list[tuple[str, str]] = []
         for file in self._block_paths():

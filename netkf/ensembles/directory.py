@@ -156,7 +156,11 @@ def _make_keeper(
 def _write(
     keeper: _Keeper, statistics: RunStatistics
 ) -> tuple[Path, str, dict[str, Any], Ensemble, PromisedTraces]:
-    """Write all files but the manifest."""
+    """Write all files but the manifest.
+
+    Returns the directory, the status ("complete" or "diverged"), the summary, the ensemble and the
+    promised traces.
+    """
     directory, scenario, plan = keeper.directory, keeper.scenario, keeper.plan
     ensemble = ensemble_of(scenario, statistics, plan.seed, plan.engine)
     write_table(directory / "ensemble.parquet", ensemble_table(ensemble))

@@ -287,11 +287,11 @@ def reduce_runs(
             # Nodes left without a neighbour at the end are merged from right to left.
             while depth > 1:
                 depth = join_nodes(scratch, depth, count)
-            mean, M2, mean_of, M2_of = scratch.mean, scratch.M2, sums.mean, sums.M2
+            mean, M2, mean_out, M2_out = scratch.mean, scratch.M2, sums.mean, sums.M2
             for s in range(count):
                 sums.size[k, t + s] = scratch.node_size[0, s]
                 for c in range(mean.shape[2]):
-                    mean_of[k, t + s, c], M2_of[k, t + s, c] = mean[0, s, c], M2[0, s, c]
+                    mean_out[k, t + s, c], M2_out[k, t + s, c] = mean[0, s, c], M2[0, s, c]
     for r in range(len(b.sample_counts)):
         divide_averages(b, sums, r)
 
@@ -556,17 +556,22 @@ def mark_averaged(
 
 @kernel(compact=True)
 def divide_averages(b: Batch, sums: Sums, r: int) -> None:
-    """Divide the sums of run ``r`` by the numbers of samples in them."""
+    """Divide the sums of run ``r`` over its samples by the numbers of samples in them.
+
+    Sums begin at sample ``b.start``, or at 0 if the run diverged before it. Those of squared errors
+    and NEES end where rounding errors exceed the errors, the trace of P with them if the run
+    diverged.
+    """
     count = b.sample_counts[r]
     first = b.start if b.start < count else 0
-    clear = first
-    while clear < count and b.times[clear] < sums.rounding_from[r]:
-        clear += 1
-    last = clear if b.diverged[r] and clear > first else count
+    clear_end = first
+    while clear_end < count and b.times[clear_end] < sums.rounding_from[r]:
+        clear_end += 1
+    traced_end = clear_end if b.diverged[r] and clear_end > first else count
     for f in range(sums.averages.shape[1]):
-        sums.averages[r, f, 0] /= clear - first
-        sums.averages[r, f, 1] /= last - first
-        sums.averages[r, f, 2] /= clear - first
+        sums.averages[r, f, 0] /= clear_end - first
+        sums.averages[r, f, 1] /= traced_end - first
+        sums.averages[r, f, 2] /= clear_end - first
 
 
 @kernel(inlined=True)

@@ -143,7 +143,7 @@ def clear_unfinished_runs(
 
 
 def remove_unfinished(directory: Path, scenario: Scenario, names: Collection[str]) -> None:
-    """Remove files of these names, which were left by a command that was stopped.
+    """Remove the files ``names`` of a command that was stopped.
 
     Raises ScenarioError if they are of another scenario, or the only copies of what this one reads.
     """
