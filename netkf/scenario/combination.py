@@ -43,18 +43,18 @@ def check_nonlinear(scenario: DerivedScenario, key: str, sensor: NonlinearSensor
 
 def check_weights(scenario: DerivedScenario) -> None:
     """Raise ScenarioError if weights given for pairs do not fit the nodes and links."""
-    given, nodes = scenario.hosted.pair_weights, scenario.nodes
-    if given is None:
+    weights, nodes = scenario.hosted.pair_weights, scenario.nodes
+    if weights is None:
         return
-    demand_shape("filter.weights", given, (len(nodes),) * 2, f"there are {len(nodes)} nodes")
+    demand_shape("filter.weights", weights, (len(nodes),) * 2, f"there are {len(nodes)} nodes")
     links = set(scenario.topology.directions)
-    for sender, receiver in np.argwhere(given > 0.0).tolist():
+    for sender, receiver in np.argwhere(weights > 0.0).tolist():
         pair = (nodes[sender], nodes[receiver])
         if sender != receiver and pair not in links:
             raise ScenarioError(
                 f"filter.weights[{sender}][{receiver}]",
                 f"must be 0, because no link goes from node {pair[0]} to node {pair[1]}",
-                float(given[sender, receiver]),
+                float(weights[sender, receiver]),
                 "add the link; rows are senders, columns receivers",
             )
 
@@ -62,20 +62,20 @@ def check_weights(scenario: DerivedScenario) -> None:
 def check_invertible(scenario: DerivedScenario) -> None:
     """Raise ScenarioError if a covariance may become singular.
 
-    It stays regular if noise reaches every state, or if all covariances are regular at the start
-    and no step is singular.
+    It stays regular if noise reaches every state (for a diffusion: if (A, Q) is controllable), or
+    if all covariances are regular at the start and no step is singular.
     """
     n = scenario.plant.n
     starts = [scenario.start(node)[1] for node in scenario.nodes]
-    whole = all(np.linalg.matrix_rank(cov, hermitian=True) == n for cov in starts)
+    regular_starts = all(np.linalg.matrix_rank(cov, hermitian=True) == n for cov in starts)
     if scenario.slotted:
         F, Q = scenario.slot_belief
         driven = np.linalg.matrix_rank(Q, hermitian=True) == n
-        regular = driven or (whole and np.linalg.matrix_rank(F) == n)
+        regular = driven or (regular_starts and np.linalg.matrix_rank(F) == n)
     else:
         A, Q = scenario.belief
-        reached = [np.linalg.matrix_power(A, k) @ Q for k in range(n)]
-        regular = whole or np.linalg.matrix_rank(np.concatenate(reached, axis=1)) == n
+        blocks = [np.linalg.matrix_power(A, k) @ Q for k in range(n)]  # controllability matrix
+        regular = regular_starts or np.linalg.matrix_rank(np.concatenate(blocks, axis=1)) == n
     if not regular:
         name = kind_name(scenario.filter.algorithm)
         raise ScenarioError(

@@ -218,12 +218,12 @@ class ScenarioModel(Component):
     @cached_property
     def placed(self) -> dict[int, tuple[PlacedSensor, ...]]:
         """The sensors of each node that has any."""
-        found: dict[int, list[PlacedSensor]] = {}
+        placed: dict[int, list[PlacedSensor]] = {}
         for entry, sensor in enumerate(self.sensors):
             for node in sensor.nodes:
-                here = found.setdefault(node, [])
-                here.append(PlacedSensor(entry, len(here)))
-        return {node: tuple(found[node]) for node in sorted(found)}
+                sensors = placed.setdefault(node, [])
+                sensors.append(PlacedSensor(entry, len(sensors)))
+        return {node: tuple(placed[node]) for node in sorted(placed)}
 
     @property
     def sensing(self) -> tuple[int, ...]:

@@ -47,12 +47,12 @@ def unnamed_class(scenario: Any, in_script: bool = True) -> str | None:
 def module_files(scenario: Component) -> dict[str, Path | None]:
     """Return the modules of users' classes: the file if it is beside the scenario, else None."""
     folder = getattr(scenario, "_folder", None)
-    found: dict[str, Path | None] = {}
+    files: dict[str, Path | None] = {}
     for part in plugged_in(scenario):
         name = type(part).__module__
         beside = None if folder is None or "." in name else folder / f"{name}.py"
-        found[name] = beside if beside is not None and _is_file_of(beside, name) else None
-    return found
+        files[name] = beside if beside is not None and _is_file_of(beside, name) else None
+    return files
 
 
 def _is_file_of(path: Path, module_name: str) -> bool:

@@ -25,7 +25,7 @@ MAX_SAMPLES = 1e9  # samples of one sensor; more are a slip in a unit of time
 
 def sample_times(scenario: ScenarioModel, streams: Streams) -> dict[tuple[int, int], FloatArray]:
     """Return the times at which each sensor (node, ordinal) samples, below the horizon."""
-    found = {}
+    times_of_sensors = {}
     for node, placed_sensor in _iterate_placed(scenario):
         sensor, generator = (
             scenario.sensors[placed_sensor.entry],
@@ -35,8 +35,8 @@ def sample_times(scenario: ScenarioModel, streams: Streams) -> dict[tuple[int, i
             times = sensor.sample_times(node, placed_sensor.ordinal, generator, scenario.horizon)
         except ScenarioError as error:
             raise error.under(f"sensors[{placed_sensor.entry}]") from None
-        found[node, placed_sensor.ordinal] = times
-    return found
+        times_of_sensors[node, placed_sensor.ordinal] = times
+    return times_of_sensors
 
 
 def sample_path(

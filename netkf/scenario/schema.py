@@ -95,7 +95,7 @@ def scenario_schema() -> Schema:
 def keys_of(cls: type[Component]) -> list[KeyOf]:
     """Return the keys of a table that is read as an object of this class."""
     text = documentation(cls)
-    found = []
+    keys = []
     for field in dataclasses.fields(cls):
         if not field.init:
             continue
@@ -108,8 +108,8 @@ def keys_of(cls: type[Component]) -> list[KeyOf]:
         if rule is not None and not own:
             requirement = rule.requirement.removeprefix("must be ")
         description = describe(text, field.name)
-        found.append(KeyOf(field.name, schema, requirement, description, required, default))
-    return found
+        keys.append(KeyOf(field.name, schema, requirement, description, required, default))
+    return keys
 
 
 def _own_table(cls: type[Component], name: str) -> Schema | None:

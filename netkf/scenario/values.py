@@ -55,10 +55,10 @@ def _require_short(option: str, text: str) -> None:
 
 def _parse_value(text: str) -> Any:
     """Return the value of a TOML expression."""
-    found = parse_toml(f"value = {text}")
-    if list(found) != ["value"]:
+    table = parse_toml(f"value = {text}")
+    if list(table) != ["value"]:
         raise ValueError
-    return found["value"]
+    return table["value"]
 
 
 def _split_list(text: str) -> list[str]:
