@@ -134,9 +134,6 @@ def read_source(directory: Path, replica: int | None = None, trust: bool = False
     found = open_directory(directory, trust=trust)
     text = _read_text(directory / "scenario.toml")
     if isinstance(found, StoredSweep):
-        if len(found.table) and "worst_rms_se" not in found.table:
-            rule = "is not the directory of a sweep: sweep.parquet lacks worst_rms_se"
-            raise ScenarioError(shorten(directory), rule, None, "name what netkf sweep left")
         return Opened(str(directory), found.manifest, found.scenario, text, sweep=found)
     if isinstance(found, StoredComparison):
         return Opened(str(directory), found.manifest, found.base, text, filters=found)

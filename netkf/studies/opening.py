@@ -24,8 +24,9 @@ from netkf.trace.run import plot_by_name
 if TYPE_CHECKING:
     import pandas as pd
 
-RESULTS = ("worst_rms", "mean_rms", "mean_trace", "worst_trace", "bound", "central")
-"""Columns of numbers that every sweep has beside its keys."""
+MEANS = ("worst_rms", "mean_rms", "mean_trace", "worst_trace")
+RESULTS = (*MEANS, *(f"{name}_se" for name in MEANS), "bound", "central")
+"""Columns of numbers that every sweep has beside its keys: means with standard errors, bounds."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,8 +120,11 @@ def _read_table(path: Path, keys: tuple[str, ...]) -> pd.DataFrame:
         if names.count(name) != 1:
             raise DamagedError(f"{path.name} has no column {name}")
     numeric = [name for name in names if is_numeric_column(path, name)]
-    if not {*RESULTS, "runs"} <= set(numeric):
-        raise DamagedError(f"{path.name} has texts in columns of numbers")
+    # Values of keys may be texts; a column of a later version is one of numbers too.
+    texts = set(names) - {*numeric, *keys, "status"}
+    if texts:
+        listed = ", ".join(sorted(texts))
+        raise DamagedError(f"{path.name} has texts in columns of numbers: {listed}")
     columns: dict[str, Any] = dict(read_numbers(path, numeric, missing=True))
     columns |= {n: read_texts(path, n).astype(str) for n in names if n not in numeric}
     return pd.DataFrame({name: columns[name] for name in names})

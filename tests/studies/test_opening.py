@@ -275,6 +275,23 @@ def test_a_damaged_table_is_one_line_that_names_it(kept, tmp_path, name, how):
         netkf.open(copy).replica(0)
 
 
+@pytest.mark.parametrize(
+    ("damage", "complaint"),
+    [
+        (lambda t: t.assign(worst_rms_se="much"), "texts in columns of numbers: worst_rms_se"),
+        (lambda t: t.assign(bound="none"), "texts in columns of numbers: bound"),
+        (lambda t: t.drop(columns="mean_rms_se"), "no column mean_rms_se"),
+    ],
+)
+def test_a_damaged_table_of_a_sweep_is_one_line_that_names_its_column(
+    short, tmp_path, damage, complaint
+):
+    folder = tmp_path / "sweep"
+    sweep_to_directory(plan_sweep(short, {"filter.epsilon": [0.1, 0.3]}), folder, PoolOptions(1))
+    damage(pd.read_parquet(folder / "sweep.parquet")).to_parquet(folder / "sweep.parquet")
+    assert f"sweep.parquet has {complaint}" in refused(folder)
+
+
 def test_modules_of_a_directory_are_not_imported_without_trust(tmp_path):
     module = tmp_path / "mine.py"
     module.write_text("import netkf\n\nclass Mine(netkf.parts.Hybrid):\n    pass\n")
