@@ -116,20 +116,17 @@ def _register_type(function: Any) -> Callable[[Callable[..., Any]], Callable[...
 # Memory
 
 
-def _pointer(context: Any, builder: Any, sig: Any, args: Any, last: int) -> Any:
-    """Emit the address of the first lane of a value in memory.
+def _pointer(context: Any, builder: Any, kinds: Any, values: Any) -> Any:
+    """Emit the address of an entry: ``values`` are an array and indices, of numba types ``kinds``.
 
-    ``args`` are (lanes, array, indices ...); the indices end before argument ``last``.
+    Indices that are not given are 0, such as that of the lanes, the last axis.
     """
-    kind = sig.args[1]
     indices = [
-        context.cast(builder, value, number, types.intp)
-        for value, number in zip(args[2:last], sig.args[2:last], strict=True)
+        context.cast(builder, value, kind, types.intp)
+        for value, kind in zip(values[1:], kinds[1:], strict=True)
     ]
-    # The last axis is that of the lanes, from its start unless an index is given for it.
-    if len(indices) < kind.ndim:
-        indices.append(context.get_constant(types.intp, 0))
-    return entry_pointer(builder, kind, args[1], indices)
+    indices += [ir.Constant(I64, 0)] * (kinds[0].ndim - len(indices))
+    return entry_pointer(builder, kinds[0], values[0], indices)
 
 
 def _as_vector(builder: Any, pointer: Any, element: Any, count: int) -> Any:
@@ -146,7 +143,7 @@ def _load(lanes: Any, _array: Any, *_place: Any) -> Any:
 @lower_builtin(names.load, types.VarArg(types.Any))
 def lower_load(context: Any, builder: Any, sig: Any, args: Any) -> Any:
     """Emit one vector load of all lanes."""
-    pointer = _pointer(context, builder, sig, args, len(args))
+    pointer = _pointer(context, builder, sig.args[1:], args[1:])
     return builder.load(_as_vector(builder, pointer, DOUBLE, len(sig.args[0])), align=8)
 
 
@@ -159,7 +156,7 @@ def _store(_lanes: Any, _array: Any, *_place: Any) -> Any:
 def lower_store(context: Any, builder: Any, sig: Any, args: Any) -> Any:
     """Emit one vector store of all lanes."""
     count = len(sig.args[0])
-    pointer = _pointer(context, builder, sig, args, len(args) - 1)
+    pointer = _pointer(context, builder, sig.args[1:-1], args[1:-1])
     value = _broadcast(context, builder, args[-1], sig.args[-1], count)
     builder.store(value, _as_vector(builder, pointer, DOUBLE, count), align=8)
     return context.get_dummy_value()
@@ -308,13 +305,7 @@ def _prefetch(_array: Any, *_place: Any) -> Any:
 @lower_builtin(names.prefetch, types.VarArg(types.Any))
 def lower_prefetch(context: Any, builder: Any, sig: Any, args: Any) -> Any:
     """Emit a prefetch of the cache line at the given indices of an array."""
-    kind = sig.args[0]
-    indices = [
-        context.cast(builder, value, number, types.intp)
-        for value, number in zip(args[1:], sig.args[1:], strict=True)
-    ]
-    indices += [ir.Constant(I64, 0)] * (kind.ndim - len(indices))
-    pointer = builder.bitcast(entry_pointer(builder, kind, args[0], indices), cgutils.voidptr_t)
+    pointer = builder.bitcast(_pointer(context, builder, sig.args, args), cgutils.voidptr_t)
     kinds = ir.FunctionType(ir.VoidType(), [cgutils.voidptr_t, I32, I32, I32])
     prefetch = cgutils.get_or_insert_function(builder.module, kinds, "llvm.prefetch.p0")
     # LLVM's arguments: to be read (0), kept in all caches (3), data (1).
@@ -341,7 +332,7 @@ def _load_flags(lanes: Any, _array: Any, *_place: Any) -> Any:
 @lower_builtin(names.load_flags, types.VarArg(types.Any))
 def lower_load_flags(context: Any, builder: Any, sig: Any, args: Any) -> Any:
     """Emit one vector load of bytes, compared with 0."""
-    pointer = _pointer(context, builder, sig, args, len(args))
+    pointer = _pointer(context, builder, sig.args[1:], args[1:])
     flags = builder.load(_as_vector(builder, pointer, BYTE, len(sig.args[0])), align=1)
     return builder.icmp_unsigned("!=", flags, ir.Constant(flags.type, None))
 
@@ -355,7 +346,7 @@ def _store_flags(_lanes: Any, _array: Any, *_place: Any) -> Any:
 def lower_store_flags(context: Any, builder: Any, sig: Any, args: Any) -> Any:
     """Emit one vector store of all flags as bytes."""
     count = len(sig.args[0])
-    pointer = _pointer(context, builder, sig, args, len(args) - 1)
+    pointer = _pointer(context, builder, sig.args[1:-1], args[1:-1])
     kind = BYTE if count == 1 else ir.VectorType(BYTE, count)
     flags = builder.zext(args[-1], kind)
     builder.store(flags, _as_vector(builder, pointer, BYTE, count), align=1)

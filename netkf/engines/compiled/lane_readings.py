@@ -29,39 +29,40 @@ from netkf.plants.sensors import divide, fill_reading
 
 
 class LaneReadings(Struct):
-    """Readings of L nodes, one in each lane.
+    """Readings of L nodes, one in each lane: q moments of p rows, of n states.
 
-    The ``moments`` (q, L) of the readings. Where some node has several sensors lanes read
-    ``alone``.
-
-    What is known of the nodes: the ``model`` (L,) and its ``seen`` (q, n, L), see FlowTable, the
-    ``kind`` (L,) of sensor with H (1, p, n, L) and ``root`` of R (1, p, p, L). Of the roots in
-    lanes: ``rate``, trace(P G), and ``trace`` of P (1, L).
-
-    Of a reading: at which share of a piece it begins, ``first``, and its own ``share``; how long it
-    is, ``gap``, and how long what is ``left`` of the step, seconds (1, L); both integrals by lane,
-    ``rows`` (L, 2 W), and all lanes together, ``integrals`` (2 W, L); the moments ``x`` (2, n, L)
-    of x. Noise: the place ``stream`` (L,) of what is left of the step, ``rest``, ``early`` and
-    ``normals`` (2, p, L).
+    moments : (q, L), what is read
+    model, whitened_H : (L,) and (q, n, L), model of each node in FlowTable, and its R^-1/2 H
+    kind, H, root : (L,), (1, p, n, L) and (1, p, p, L), kind of sensor with H and the root of R
+    rate, trace : (1, L), trace(P G) in 1/s and trace(P)
+    first, share : (1, L), where the reading begins in its piece of the path and how much of the
+                   piece it takes, as shares of the piece
+    gap, remaining : (1, L), seconds of the reading, and from its start to the end of the step
+    rows, integrals : (L, 2 W) and (2 W, L), both integrals of the path by lane, and by entry
+    x : (2, n, L), moments of the path over the reading
+    noise_row, noise : (L,) and (2, p, L), row of Sensing.noise that the reading takes its share of,
+                       and that row
+    early, normals : (2, p, L), the share, and the standard normal numbers that divide the row
+    alone : 1 if some node has several sensors: then each lane is read by the scalar kernels
     """
 
     moments: FloatArray
     model: IntArray
-    seen: FloatArray
+    whitened_H: FloatArray
     kind: IntArray
     H: FloatArray
     root: FloatArray
     rate: FloatArray
     trace: FloatArray
     gap: FloatArray
-    left: FloatArray
+    remaining: FloatArray
     first: FloatArray
     share: FloatArray
     rows: FloatArray
     integrals: FloatArray
     x: FloatArray
-    stream: IntArray
-    rest: FloatArray
+    noise_row: IntArray
+    noise: FloatArray
     early: FloatArray
     normals: FloatArray
     alone: int
@@ -71,21 +72,21 @@ def empty_readings(filters: Filters) -> LaneReadings:
     """Return arrays for the readings of such filters."""
     n, q = filters.xhat.shape[1], int(filters.gains.moments.max())
     p, width = q // 2, 2 * course_width(n)
-    names = ("rate", "trace", "gap", "left", "first", "share")
+    names = ("rate", "trace", "gap", "remaining", "first", "share")
     shapes = {
         "moments": (q, LANES),
-        "seen": (*filters.table.whitened_H.shape[1:], LANES),
+        "whitened_H": (*filters.table.whitened_H.shape[1:], LANES),
         "H": (1, p, n, LANES),
         "root": (1, p, p, LANES),
         **dict.fromkeys(names, (1, LANES)),
         "rows": (LANES, width),
         "integrals": (width, LANES),
         "x": (2, n, LANES),
-        **dict.fromkeys(("rest", "early", "normals"), (2, p, LANES)),
+        **dict.fromkeys(("noise", "early", "normals"), (2, p, LANES)),
     }
     several = (filters.nodes["sensors"] - filters.nodes["sensor"]).max() > 1
     unknown: dict[str, Any] = {
-        name: np.full(LANES, -1, dtype=np.int64) for name in ("model", "kind", "stream")
+        name: np.full(LANES, -1, dtype=np.int64) for name in ("model", "kind", "noise_row")
     }
     return LaneReadings(
         **{name: with_spare(shape) for name, shape in shapes.items()},
@@ -95,14 +96,14 @@ def empty_readings(filters: Filters) -> LaneReadings:
 
 
 @kernel
-def load_model(readings: LaneReadings, q: int, m: int, seen: FloatArray) -> None:
+def load_model(readings: LaneReadings, q: int, m: int, whitened_H: FloatArray) -> None:
     """Copy R^-1/2 H of model ``m`` into lane q, unless the lane has it."""
     if readings.model[q] == m:
         return
     readings.model[q] = m
-    for r in range(seen.shape[1]):
-        for i in range(seen.shape[2]):
-            readings.seen[r, i, q] = seen[m, r, i]
+    for r in range(whitened_H.shape[1]):
+        for i in range(whitened_H.shape[2]):
+            readings.whitened_H[r, i, q] = whitened_H[m, r, i]
 
 
 @kernel
@@ -160,9 +161,9 @@ def begin_reading(
     """
     path, sensing, s = state.path, state.sensing, state.nodes[h].sensor
     load_sensor(readings, q, sensing, s)
-    readings.stream[q] = noise_index(sensing, run, s, path.step[piece])
+    readings.noise_row[q] = noise_index(sensing, run, s, path.step[piece])
     last, normals = path.last[piece], state.scratch.cut
-    readings.gap[0, q], readings.left[0, q] = end - now, last - now
+    readings.gap[0, q], readings.remaining[0, q] = end - now, last - now
     # The whole rest needs none: what a lane has is multiplied by 0.
     if end < last:
         draw_cut(sensing, run, s, normals)
@@ -197,16 +198,17 @@ def set_moments(readings: LaneReadings, q: int, moments: FloatArray) -> None:
 @kernel
 def end_readings(state: Simulation, readings: LaneReadings) -> None:
     """Write the moments of the readings of all lanes."""
-    r, size, p = readings, state.size, readings.rest.shape[1]
+    r, size, p = readings, state.size, readings.noise.shape[1]
     for j in range(0, r.rows.shape[1], LANES):
         turn(MANY, r.rows, j, r.integrals)
     first, share = load(MANY, r.first, 0), load(MANY, r.share, 0)
     fill_moments_between(MANY, size, r.x, r.integrals, r.rows.shape[1] // 2, first, share)
-    noise, places = state.sensing.noise, r.stream
+    step_noise = state.sensing.noise
     for j in range(0, 2 * p, LANES):
-        gather(MANY, noise, places, j, r.rest)
-    left = load(MANY, r.left, 0)
-    divide(MANY, r.early, r.rest, r.normals, load(MANY, r.gap, 0) / left, left)
+        gather(MANY, step_noise, r.noise_row, j, r.noise)
+    remaining = load(MANY, r.remaining, 0)
+    share_of_noise = load(MANY, r.gap, 0) / remaining
+    divide(MANY, r.early, r.noise, r.normals, share_of_noise, remaining)
     for j in range(0, 2 * p, LANES):
-        scatter(MANY, r.rest, j, noise, places, 2 * p - j)
+        scatter(MANY, r.noise, j, step_noise, r.noise_row, 2 * p - j)
     fill_reading(MANY, size, r.moments, 0, p, r.x, r.H, r.early, r.root, 0)

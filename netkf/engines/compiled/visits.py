@@ -269,8 +269,6 @@ def process_level(state: Simulation, visits: Visits, first: int) -> None:
     v, pairs = first, 0
     while v != -1:
         visit = visits.records[v]
-        # Records of a level are far apart: the next one comes while this one is processed.
-        prefetch(visits.records, max(visit.next, 0))
         if visit.second == ALL_NODES:
             store_sample(state, visit.run, visit.first, visit.piece)
         else:
@@ -382,7 +380,7 @@ def fill_rates(state: Simulation, visits: Visits, count: int) -> None:
         h = node_at(state, visit.run, interval.place)
         load_model(readings, q, state.nodes[h].model, state.table.whitened_H)
     # Both for all lanes at once, before the length of each lane's interval is chosen.
-    store(MANY, readings.rate, 0, information_rate(MANY, size, readings.seen, visits.S))
+    store(MANY, readings.rate, 0, information_rate(MANY, size, readings.whitened_H, visits.S))
     store(MANY, readings.trace, 0, trace_of_root(MANY, size, visits.S))
 
 
@@ -428,7 +426,7 @@ def read_increments_in_lanes(state: Simulation, visits: Visits, count: int) -> N
     """Write the moments of the increments that the nodes in lanes read."""
     places, readings = visits.places[SENSING], visits.readings
     for q in range(LANES):
-        readings.stream[q] = NO_NODE
+        readings.noise_row[q] = NO_NODE
     for q in range(count):
         if places[q] == NO_NODE:
             continue

@@ -148,7 +148,7 @@ class ClockJumps:
 
     @cached_property
     def _pairs(self) -> list[tuple[IntArray, IntArray, FloatArray]]:
-        """For each clock all pairs of its directions, and the rates (S, P) at which both messages
+        """All pairs of directions of each clock, and the rates (S, P) at which both messages
         arrive.
         """
         assert self.directions is not None
