@@ -11,7 +11,7 @@ from typing import Any
 
 from netkf.checks.check import Verdict
 from netkf.checks.evidence import BROKEN, NOT_PROMISED, VERDICTS, Evidence
-from netkf.runs.files import finite
+from netkf.runs.files import to_json_value
 
 INDENT = " " * 13
 WIDTH = 87  # with the indent 100 columns
@@ -120,5 +120,5 @@ def verdict_json(verdict: Verdict) -> dict[str, Any]:
         "holds": bool(verdict),
         "decided": verdict.is_decided,
     }
-    plain: dict[str, Any] = finite(document)
+    plain: dict[str, Any] = to_json_value(document)
     return plain

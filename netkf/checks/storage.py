@@ -29,14 +29,14 @@ from netkf.runs.documents import (
     write_sealed,
 )
 from netkf.runs.files import (
-    BLOCKS,
-    copied_names,
-    only_own,
+    BLOCKS_FOLDER,
+    copied_file_names,
+    holds_only,
     scenario_digest,
     write_atomically,
     write_scenario,
     write_text,
-    writing,
+    writing_file,
 )
 from netkf.runs.provenance import machine, versions
 from netkf.scenario.scenario import Scenario
@@ -67,7 +67,7 @@ def _save_verdict(directory: Path, scenario: Scenario, verdict: Verdict, text: s
         verdict.table.to_csv(part, index=False)
     write_text(directory / "verdict.txt", text + "\n")
     # A picture of an earlier verdict with fewer runs is out of date.
-    with writing(directory / PICTURE):
+    with writing_file(directory / PICTURE):
         (directory / PICTURE).unlink(missing_ok=True)
     document = verdict_json(verdict)
     document |= {
@@ -91,8 +91,10 @@ def clear_unfinished(directory: Path, scenario: Scenario) -> bool:
     if not directory.is_dir() or not any(directory.iterdir()):
         return True
     # Files of a run are not in the list: those of a finished run must not be removed.
-    names = ["scenario.toml", *FILES, *copied_names(scenario)]
-    if (directory / BLOCKS).exists() or not only_own(directory, [*names, f"{VERDICT}.part"]):
+    names = ["scenario.toml", *FILES, *copied_file_names(scenario)]
+    if (directory / BLOCKS_FOLDER).exists() or not holds_only(
+        directory, [*names, f"{VERDICT}.part"]
+    ):
         return False
     remove_unfinished(directory, scenario, [*names, f"{VERDICT}.part"])
     return True

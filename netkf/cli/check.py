@@ -61,11 +61,11 @@ def _declare(parser: argparse.ArgumentParser) -> None:
 
 def _run(options: argparse.Namespace) -> int:
     """Return the exit status: 1 if a promise is broken."""
-    from netkf.runs.directory_lock import only_writer
+    from netkf.runs.directory_lock import lock_directory
 
     # Promises are checked at times of their own, so that the file's may not fit the horizon.
     scenario = load_scenario(options, {"probe": [0.0]})
-    with only_writer(options.out):
+    with lock_directory(options.out):
         return _check(scenario, options)
 
 
@@ -133,11 +133,11 @@ def _read_earlier(scenario: Scenario, options: argparse.Namespace) -> Verdict | 
             raise ScenarioError("--resume", "needs a verdict to add runs to", None, remedy)
         return None
     from netkf.checks.storage import clear_unfinished, load_verdict
-    from netkf.runs.files import new_directory
+    from netkf.runs.files import create_output_directory
 
     if options.resume and not clear_unfinished(options.out, scenario):
         return load_verdict(options.out, scenario, scenario.seed)
-    new_directory(options.out, scenario.name)
+    create_output_directory(options.out, scenario.name)
     return None
 
 

@@ -49,9 +49,9 @@ def _declare(parser: argparse.ArgumentParser) -> None:
 
 def _run(options: argparse.Namespace) -> int:
     """Compare filters; return the exit status."""
-    from netkf.runs.directory_lock import only_writer
+    from netkf.runs.directory_lock import lock_directory
 
-    with only_writer(options.out, empty=True):
+    with lock_directory(options.out, must_be_empty=True):
         return _compare(options)
 
 

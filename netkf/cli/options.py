@@ -202,6 +202,6 @@ def print_title(scenario: Scenario) -> None:
 
 def print_json(document: Any) -> None:
     """Print a document as JSON; numbers that are not finite become null."""
-    from netkf.runs.files import finite
+    from netkf.runs.files import to_json_value
 
-    print(json.dumps(finite(document), indent=2))
+    print(json.dumps(to_json_value(document), indent=2))

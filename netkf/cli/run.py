@@ -68,9 +68,9 @@ def _run(options: argparse.Namespace) -> int:
     if options.resume and options.out is None:
         remedy = "add --out DIR with the directory of the run that was stopped"
         raise ScenarioError("--resume", "needs the directory to go on in", None, remedy)
-    from netkf.runs.directory_lock import only_writer
+    from netkf.runs.directory_lock import lock_directory
 
-    with only_writer(options.out):
+    with lock_directory(options.out):
         return _run_many(scenario, options) if many else _run_once(scenario, options)
 
 
@@ -179,7 +179,7 @@ def _describe_divergence(completed: CompletedRun) -> str:
     listed += ", ..." if len(nodes) > MAX_LISTED_NODES else ""
     which = f"node{'s' if len(nodes) > 1 else ''} {listed}"
     problem = f"estimate or covariance of {which} is no longer finite"
-    if samples.ended_finite:
+    if samples.is_finite_at_end:
         problem = f"covariance of {which} is no longer positive semidefinite"
     left_out = ""
     if samples.rounding_from is not None:

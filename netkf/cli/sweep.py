@@ -49,7 +49,7 @@ def _declare(parser: argparse.ArgumentParser) -> None:
 def _run(options: argparse.Namespace) -> int:
     """Simulate a grid of scenarios into a directory; return the exit status."""
     from netkf.ensembles.pools import PoolOptions
-    from netkf.runs.directory_lock import only_writer
+    from netkf.runs.directory_lock import lock_directory
     from netkf.studies.parameter_grid import parse_grid
     from netkf.studies.sweep import plan_sweep, sweep_to_directory
 
@@ -57,7 +57,7 @@ def _run(options: argparse.Namespace) -> int:
     draw = partial(pictures.draw_picture, pictures.SWEEP, scenario.name)
     completed: list[CompletedSweep] = []
     try:
-        with only_writer(options.out), ProgressLine() as line:
+        with lock_directory(options.out), ProgressLine() as line:
             sweep_to_directory(
                 plan_sweep(scenario, grid, options.runs, engine=options.engine),
                 options.out,

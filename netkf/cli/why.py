@@ -59,12 +59,12 @@ def _declare(parser: argparse.ArgumentParser) -> None:
 
 def _run(options: argparse.Namespace) -> int:
     """Explain a sample of a run; return the exit status."""
-    from netkf.runs.directory_lock import only_writer
+    from netkf.runs.directory_lock import lock_directory
 
     if (options.node is None) != (options.at is None):
         remedy = "give both, or neither for the worst sample"
         raise ScenarioError("why", "takes --node and --at together", None, remedy)
-    with only_writer(options.out, empty=True):
+    with lock_directory(options.out, must_be_empty=True):
         return _explain(options)
 
 

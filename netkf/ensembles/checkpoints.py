@@ -23,7 +23,7 @@ from netkf.core.errors import EngineError
 from netkf.ensembles.moments import Moments
 from netkf.ensembles.statistics import MESSAGES, RunStatistics, Trace
 from netkf.runs.documents import DamagedError, reading_file
-from netkf.runs.files import BLOCKS, write_atomically, writing
+from netkf.runs.files import BLOCKS_FOLDER, write_atomically, writing_file
 from netkf.scenario.scenario import Scenario
 from netkf.trace.schema import EVENT
 
@@ -68,7 +68,7 @@ class BlockCheckpoints:
     """Statistics of the finished blocks, one file each, written atomically."""
 
     def __init__(self, directory: Path, scenario: Scenario) -> None:
-        self._folder, self._scenario = directory / BLOCKS, scenario
+        self._folder, self._scenario = directory / BLOCKS_FOLDER, scenario
         self._numbers: set[int] = set()
 
     def begun_with(self) -> int | None:
@@ -113,7 +113,7 @@ class BlockCheckpoints:
 
     def save(self, number: int, statistics: RunStatistics, identity: RunIdentity) -> None:
         """Write a block with the traces that its runs left; raises WriteError."""
-        with writing(self._folder):
+        with writing_file(self._folder):
             self._folder.mkdir(exist_ok=True)
         # In memory first: on a full disk some versions of numpy leave their file open.
         block = io.BytesIO()

@@ -20,18 +20,19 @@ from netkf.ensembles.summary import summarise_ensemble
 from netkf.runs.failures import InterruptedRunError, explain_failure
 from netkf.runs.files import (
     check_sources,
-    new_directory,
-    own_names,
+    create_output_directory,
+    run_file_names,
     scenario_digest,
     write_json,
     write_scenario,
 )
 from netkf.runs.parquet_files import TraceTables, write_table
-from netkf.runs.provenance import installation
+from netkf.runs.provenance import installation_digest
 from netkf.runs.run import Manifest
 from netkf.runs.simulate import choose_engine
 from netkf.runs.summary import PromisedTraces, promise_traces
 from netkf.scenario.scenario import Scenario
+from netkf.trace.run import StateSamples
 
 TRACES = ("full", "first", "none")
 MAX_TRACED_BLOCK = 8
@@ -142,10 +143,12 @@ def _make_keeper(
     if options.trace == "full":
         size = min(size, MAX_TRACED_BLOCK)
     digest = scenario_digest(scenario)
-    plan = RunIdentity(digest, scenario.seed, runs, options.trace, engine, installation(), size)
+    plan = RunIdentity(
+        digest, scenario.seed, runs, options.trace, engine, installation_digest(), size
+    )
     unfinished = ensemble_to_resume(out, scenario, plan) if options.resume else None
     if unfinished is None:
-        return _Keeper(scenario, new_directory(out, scenario.name), plan)
+        return _Keeper(scenario, create_output_directory(out, scenario.name), plan)
     if unfinished.finished:
         BlockCheckpoints(unfinished.directory, scenario).remove()
         return None
@@ -166,8 +169,8 @@ def _write(
     write_table(directory / "ensemble.parquet", ensemble_table(ensemble))
     if plan.trace != "none":
         with TraceTables(directory, scenario) as tables:
-            for run in keeper.blocks.traces():
-                tables.add(*run)
+            for replica, log, *arrays in keeper.blocks.traces():
+                tables.add(replica, log, StateSamples(*arrays))
     promised = promise_traces(scenario, scenario.times)
     summary = summarise_ensemble(scenario, statistics, promised)
     write_json(directory / "summary.json", summary)
@@ -252,7 +255,7 @@ class _Keeper:
             diverged=int(statistics.totals[1]), events=int(statistics.totals[0])
         )
         entries["fingerprint"] = statistics.fingerprint
-        self._manifest.write(status, entries, self.plan.runs, names=own_names(self.scenario))
+        self._manifest.write(status, entries, self.plan.runs, names=run_file_names(self.scenario))
         self._ended = True
 
     def _identity_entries(self, **others: Any) -> dict[str, Any]:

@@ -531,7 +531,8 @@ def mark_averaged(
     b: Batch, sums: Sums, scratch: ReductionScratch, first: int, active: int, t: int
 ) -> None:
     """Mark the runs in whose averages sample ``t`` counts, by the rule of
-    ``runs.summary.averaged_samples``: ``clear`` for those of errors, ``traced`` for that of P.
+    ``runs.summary.select_averaged_samples``: ``clear`` for those of errors, ``traced`` for that of
+    P.
     """
     # Loaded from the structs once instead of in each step of the loop.
     times, sample_counts, diverged, rounding_from = (

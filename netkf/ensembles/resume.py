@@ -11,15 +11,15 @@ from netkf.core.errors import ScenarioError
 from netkf.ensembles.checkpoints import BlockCheckpoints, RunIdentity, is_block_size
 from netkf.runs.documents import (
     COUNT,
-    ENDED,
+    FINAL_STATUSES,
     TEXT,
     DamagedError,
     check_files,
     check_seal,
     read_document,
-    require,
+    require_form,
 )
-from netkf.runs.files import new_directory, only_own, own_names, remove_own
+from netkf.runs.files import create_output_directory, holds_only, remove_files, run_file_names
 from netkf.runs.provenance import machine, versions
 from netkf.scenario.plugins import module_files
 from netkf.scenario.scenario import Scenario
@@ -87,7 +87,7 @@ def ensemble_to_resume(
     blocks_prove = "remove it: the blocks prove themselves"
     _require(out / "manifest.json", lambda: check_seal(manifest), blocks_prove)
     _check_scenario(out, scenario)
-    finished = manifest["status"] in ENDED
+    finished = manifest["status"] in FINAL_STATUSES
     if finished:
         _require(out, lambda: check_files(out, manifest), ANOTHER)
     return BegunEnsemble(
@@ -119,7 +119,7 @@ def clear_unfinished_runs(
     """
     if not (directory / "manifest.json").exists():
         if _has_own_files(directory, scenario):
-            remove_unfinished(directory, scenario, own_names(scenario))
+            remove_unfinished(directory, scenario, run_file_names(scenario))
         return True
     manifest = read_manifest(directory)
     if manifest["replica"] != replica:
@@ -129,7 +129,7 @@ def clear_unfinished_runs(
         remedy = "give the same --runs"
         raise ScenarioError("--resume", "the run was begun with several runs", 1, remedy)
     _check_scenario(directory, scenario)
-    if manifest["status"] in ENDED:
+    if manifest["status"] in FINAL_STATUSES:
         try:
             check_seal(manifest)
             check_files(directory, manifest)
@@ -138,7 +138,7 @@ def clear_unfinished_runs(
                 note(f"the run in {directory} is done again: its record {error}")
         else:
             return False
-    remove_unfinished(directory, scenario, own_names(scenario))
+    remove_unfinished(directory, scenario, run_file_names(scenario))
     return True
 
 
@@ -149,7 +149,7 @@ def remove_unfinished(directory: Path, scenario: Scenario, names: Collection[str
     """
     _check_scenario(directory, scenario)
     _check_sources_elsewhere(directory, scenario)
-    remove_own(directory, names)
+    remove_files(directory, names)
 
 
 def _check_sources_elsewhere(directory: Path, scenario: Scenario) -> None:
@@ -172,8 +172,8 @@ def _has_own_files(directory: Path, scenario: Scenario) -> bool:
     """
     if not directory.is_dir() or not any(directory.iterdir()):
         return False
-    if not only_own(directory, own_names(scenario)):
-        new_directory(directory, scenario.name)  # says that it is not empty
+    if not holds_only(directory, run_file_names(scenario)):
+        create_output_directory(directory, scenario.name)  # says that it is not empty
     return True
 
 
@@ -202,7 +202,7 @@ def read_manifest(directory: Path) -> dict[str, Any]:
     """Return ``manifest.json`` of a directory; raises ScenarioError where it is not one."""
     try:
         manifest = read_document(directory / "manifest.json")
-        require(manifest, MANIFEST)
+        require_form(manifest, MANIFEST)
     except DamagedError as error:
         rule = f"must be a directory that netkf run left: manifest.json {error}"
         raise ScenarioError("--resume", rule, str(directory), "give another --out") from None

@@ -14,7 +14,7 @@ from netkf.ensembles.moments import Moments, merge_moments, moments_of
 from netkf.ensembles.reduction import reduce_batch
 from netkf.linalg.arrays import FloatArray
 from netkf.rng.streams import Streams
-from netkf.runs.simulate import collect
+from netkf.runs.simulate import collect_run
 from netkf.scenario.scenario import Scenario
 from netkf.trace.batch import RunBatch
 from netkf.trace.recorder import MemorySink, Recorder
@@ -124,7 +124,7 @@ def _traced_run(
     recorder = Recorder([sink, memory])
     status = engine.run(scenario, Streams(seed, replica), recorder, silent)
     sink.finish(recorder, status)
-    run = collect(scenario, memory, recorder, seed, replica, engine.name, status)
+    run = collect_run(scenario, memory, recorder, seed, replica, engine.name, status)
     trace = Trace(replica, run.log, run.times, run.x, run.xhat, run.P, run.error)
     return sink.batch(), (trace,)
 

@@ -18,14 +18,14 @@ from netkf.linalg.arrays import FloatArray
 from netkf.runs.documents import COUNT, NUMBER, DamagedError, check_files
 from netkf.runs.files import scenario_digest
 from netkf.runs.parquet_files import column_names, read_numbers
-from netkf.runs.stored import SUMMARY, StoredRun, WithPromises, read_form, read_run
+from netkf.runs.stored import SUMMARY_FORM, StoredRun, WithPromises, read_checked_document, read_run
 from netkf.scenario.scenario import Scenario
 from netkf.trace.schema import ensemble_columns
 
 if TYPE_CHECKING:
     import pandas as pd
 
-FORM: dict[str, Any] = {**SUMMARY, "runs": COUNT, "diverged": COUNT}
+FORM: dict[str, Any] = {**SUMMARY_FORM, "runs": COUNT, "diverged": COUNT}
 FORM["messages"] = {f"{name}?": NUMBER for name in MESSAGES}
 
 
@@ -61,7 +61,7 @@ class StoredEnsemble(WithPromises, Ensemble):
 
 
 def read_ensemble(directory: Path, scenario: Scenario, manifest: dict[str, Any]) -> StoredEnsemble:
-    """Return the ensemble in a directory whose ``manifest`` has passed runs.stored.MANIFEST.
+    """Return the ensemble in a directory whose ``manifest`` has passed runs.stored.MANIFEST_FORM.
 
     Raises DamagedError for files that are not as netkf writes them.
     """
@@ -75,7 +75,7 @@ def read_ensemble(directory: Path, scenario: Scenario, manifest: dict[str, Any])
         values: dict[str, Any] = {f.name: getattr(ensemble, f.name) for f in fields(Ensemble)}
         return StoredEnsemble(**values, **stored, summary={})
     check_files(directory, manifest, ["ensemble.parquet", "summary.json"])
-    summary = read_form(directory, "summary.json", FORM)
+    summary = read_checked_document(directory, "summary.json", FORM)
     samples = _read_samples(directory / "ensemble.parquet", scenario)
     rows = [*summary["nodes"], summary["overall"]]
     if [row["node"] for row in summary["nodes"]] != list(scenario.nodes):
@@ -138,7 +138,7 @@ def _read_samples(path: Path, scenario: Scenario) -> dict[str, Any]:
         names = names[: 3 + 2 * len(i)]
     if column_names(path) != names:
         raise DamagedError(f"{path.name} does not have the columns of this scenario")
-    table = read_numbers(path, names, missing=True)
+    table = read_numbers(path, names, allow_empty=True)
     T = len(scenario.times)
     times = np.repeat(scenario.times, N)
     if not (

@@ -26,7 +26,7 @@ from netkf.runs.innovations import (
     MIN_READINGS,
     Innovations,
     autocorrelations,
-    chi_square_means,
+    chi_square_interval,
 )
 from netkf.runs.summary import CONFIDENCE, nees_bounds
 
@@ -109,7 +109,7 @@ def draw_nis(axes: Any, found: Innovations) -> tuple[float, float]:
     )
     full = freedom > 0.0
     centres = 0.5 * (edges[1:] + edges[:-1])[full]
-    low, high = chi_square_means(freedom[full], CONFIDENCE)
+    low, high = chi_square_interval(freedom[full], CONFIDENCE)
     axes.fill_between(
         centres,
         low,
@@ -126,7 +126,7 @@ def draw_nis(axes: Any, found: Innovations) -> tuple[float, float]:
         axes.set_ylim(bottom=max(axes.get_ylim()[0], 1e-3))
     axes.set(ylabel="NIS / rows of a reading", xlabel=SECONDS)
     draw_legend(axes)
-    ends = chi_square_means(rows, CONFIDENCE)
+    ends = chi_square_interval(rows, CONFIDENCE)
     share = float(((nis / rows >= ends[0]) & (nis / rows <= ends[1])).mean())
     return share, float(nis.sum() / rows.sum())
 

@@ -11,14 +11,14 @@ import numpy as np
 from netkf.core.errors import ScenarioError
 from netkf.ensembles.monte_carlo import Ensemble
 from netkf.linalg.arrays import FloatArray
-from netkf.runs.innovations import Innovations, innovations
+from netkf.runs.innovations import Innovations, compute_innovations
 from netkf.runs.run import CompletedRun
 from netkf.runs.summary import (
     NO_COVARIANCE,
     PromisedTraces,
     SummarySink,
-    averaged_samples,
     promise_traces,
+    select_averaged_samples,
     summarise,
 )
 from netkf.scenario.scenario import Scenario
@@ -81,7 +81,7 @@ class Subject:
         Raises NetkfError where they cannot be computed.
         """
         assert self.run is not None
-        return innovations(self.run)
+        return compute_innovations(self.run)
 
     @cached_property
     def sensing(self) -> np.ndarray:
@@ -92,7 +92,7 @@ class Subject:
     def used(self) -> np.ndarray:
         """Indices of the samples that averages of errors are taken over."""
         diverged = self.status == "diverged" and self.runs == 1
-        return averaged_samples(self.times, self.rounding_from, diverged).errors
+        return select_averaged_samples(self.times, self.rounding_from, diverged).errors
 
     @property
     def log(self) -> np.ndarray:
@@ -225,7 +225,7 @@ def subject_of_samples(
     shape = len(sink.times), len(scenario.nodes)
     error, trace, nees, first = (
         np.array(values, dtype=np.float64).reshape(shape)
-        for values in (sink.sq_error, sink.trace, sink.nees, sink.first)
+        for values in (sink.sq_error, sink.trace, sink.nees, sink.first_component)
     )
     return Subject(
         scenario,

@@ -13,8 +13,8 @@ from netkf.report.packing import Packer
 from netkf.runs.innovations import (
     Innovations,
     autocorrelations,
-    chi_square_means,
-    innovations,
+    chi_square_interval,
+    compute_innovations,
 )
 from netkf.runs.tables import format_number
 
@@ -46,7 +46,7 @@ def read_innovations(source: Opened) -> Innovations | str | None:
     if source.status in ("interrupted", "failed"):
         return f"the run was {source.status}, so that its readings are not replayed"
     try:
-        return innovations(source.run, MAX_EVENTS)
+        return compute_innovations(source.run, MAX_EVENTS)
     except NetkfError as error:
         return str(error)
 
@@ -60,7 +60,7 @@ def node_means(found: Innovations) -> NodeMeans:
         for values in (found.rows, found.nis)
     )
     # Bonferroni: nodes share the noise of the plant, so their sums are dependent.
-    low, high = chi_square_means(rows, 1.0 - (1.0 - CONFIDENCE) / max(1, len(nodes)))
+    low, high = chi_square_interval(rows, 1.0 - (1.0 - CONFIDENCE) / max(1, len(nodes)))
     return NodeMeans(nodes, sums / rows, low, high)
 
 

@@ -30,7 +30,7 @@ from netkf.report.mending import (
 )
 from netkf.report.messages import MESSAGE, join_messages
 from netkf.report.packing import Packer
-from netkf.runs.documents import ENDED, DamagedError
+from netkf.runs.documents import FINAL_STATUSES, DamagedError
 from netkf.runs.files import write_text
 from netkf.runs.innovations import Innovations
 from netkf.runs.stored import StoredRun
@@ -181,7 +181,7 @@ def _compare(entries: list[_Entry], directories: Sequence[str | Path]) -> Compar
     """Return the comparison of two entries, or why there is none."""
     if len(entries) < 2:
         return None
-    ended = all(entry.source.status in ENDED and entry.source.summary for entry in entries)
+    ended = all(entry.source.status in FINAL_STATUSES and entry.source.summary for entry in entries)
     return compare(directories) if ended else "A run did not finish, so nothing is compared"
 
 

@@ -11,9 +11,9 @@ from scipy.special import stdtrit
 from netkf.linalg.arrays import FloatArray
 from netkf.report.directories import Opened
 from netkf.report.markup import bullets, paragraph, table_box
-from netkf.runs.files import finite
+from netkf.runs.files import to_json_value
 from netkf.runs.summary import CONFIDENCE, nees_bounds
-from netkf.runs.tables import COLUMNS, format_number, standard_error
+from netkf.runs.tables import COLUMNS, format_number, format_standard_error
 from netkf.studies.compare import Comparison, Entry
 from netkf.studies.compare_filters import QUANTITIES
 from netkf.studies.filter_values import Quantity
@@ -82,7 +82,9 @@ def summary_section(source: Opened) -> str:
 
 def _cells(row: dict[str, Any]) -> list[str]:
     """Return the cells of a row of the summary."""
-    return [format_number(row[key]) + standard_error(row.get(f"{key}_se")) for key in COLUMNS]
+    return [
+        format_number(row[key]) + format_standard_error(row.get(f"{key}_se")) for key in COLUMNS
+    ]
 
 
 def _bound_notes(source: Opened) -> list[str]:
@@ -141,7 +143,7 @@ def comparison_section(comparison: Comparison) -> str:
 
 def _format_value(entry: Entry) -> str:
     """Return a value with its standard error as text."""
-    return format_number(entry.value) + standard_error(entry.se)
+    return format_number(entry.value) + format_standard_error(entry.se)
 
 
 def _difference_cells(entry: Entry) -> list[str]:
@@ -186,7 +188,7 @@ def filters_table(found: StoredComparison) -> str:
 
 def _quantity_cells(found: Quantity) -> list[str]:
     """Return the cells of a quantity: value, difference, mark."""
-    value = format_number(found.value) + standard_error(found.se)
+    value = format_number(found.value) + format_standard_error(found.se)
     if not math.isfinite(found.difference):
         return [value, "-", "-"]
     interval = f"{format_number(found.low)} .. {format_number(found.high)}"
@@ -213,7 +215,9 @@ def _format_cell(value: Any, error: Any) -> str:
     if isinstance(value, (int, np.integer)):
         return f"{int(value):,}"
     if isinstance(value, (float, np.floating)):
-        return format_number(float(value)) + standard_error(None if error is None else float(error))
+        return format_number(float(value)) + format_standard_error(
+            None if error is None else float(error)
+        )
     return str(value)
 
 
@@ -245,7 +249,7 @@ def ensemble_curves(source: Opened) -> dict[str, Any] | None:
             "nees": _with_interval(found.mean_nees[:, k], found.se_nees[:, k]),
         }
         if found.bound is not None:
-            nodes[str(node)]["bound"] = finite(found.bound[:, k].tolist())
+            nodes[str(node)]["bound"] = to_json_value(found.bound[:, k].tolist())
     interval = list(nees_bounds(source.scenario.plant.n, max(1, source.runs)))
     return {"times": found.times.tolist(), "nodes": nodes, "nees_interval": interval}
 
@@ -268,7 +272,7 @@ def difference_curves(one: Opened, other: Opened) -> dict[str, Any] | None:
     level = (1.0 - CONFIDENCE) / (2.0 * gap.size)
     wide = float(stdtrit(freedom, 1.0 - level)) * error
     nodes = {
-        str(node): [finite(part[:, k].tolist()) for part in (gap, gap - wide, gap + wide)]
+        str(node): [to_json_value(part[:, k].tolist()) for part in (gap, gap - wide, gap + wide)]
         for k, node in enumerate(first.nodes)
     }
     return {"confidence": CONFIDENCE, "times": first.times.tolist(), "nodes": nodes}
@@ -291,7 +295,7 @@ def _with_interval(mean: Any, error: Any) -> list[list[float | None]]:
     """Return mean, lower and upper end as JSON values."""
     wide = INTERVAL * np.asarray(error, dtype=float)
     return [
-        finite(column.tolist())
+        to_json_value(column.tolist())
         for column in (np.asarray(mean, dtype=float), mean - wide, mean + wide)
     ]
 

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from netkf.runs.stored import StoredRun
-from netkf.runs.summary import SampleIndices, averaged_samples
+from netkf.runs.summary import SampleIndices, select_averaged_samples
 
 COME_DOWN, LATE_SHARE = 0.8, 0.25
 """Trace P has a start-up if its mean over the last quarter of the samples is below this share of
@@ -98,7 +98,7 @@ def samples_averaged(run: StoredRun, summary: Mapping[str, Any]) -> SampleIndice
     """Return the indices of the samples that the summary averages over."""
     found = summary.get("rounding_from")
     blurred = math.inf if found is None else float(found)
-    return averaged_samples(run.times, blurred, run.count("diverged") > 0)
+    return select_averaged_samples(run.times, blurred, run.count("diverged") > 0)
 
 
 class WorstSample(NamedTuple):

@@ -1,4 +1,4 @@
-"""One command at a time writes into a directory."""
+"""A lock on a directory, so that only one command at a time writes into it."""
 
 from __future__ import annotations
 
@@ -11,58 +11,64 @@ from hashlib import sha256
 from pathlib import Path
 
 from netkf.core.errors import ScenarioError
-from netkf.runs.files import make_directory, new_directory
+from netkf.runs.files import create_output_directory, make_directory
 
 
 @contextlib.contextmanager
-def only_writer(directory: Path | None, empty: bool = False) -> Iterator[None]:
-    """Make a directory and lock it for the body; the operating system unlocks it if this process
-    dies. It is removed again if it was made here and is empty at the end. Nothing for None.
+def lock_directory(directory: Path | None, must_be_empty: bool = False) -> Iterator[None]:
+    """Create a directory and hold its lock during the body; do nothing for None.
 
-    Raises ScenarioError if another command has locked it, if it cannot be made, or if it has to be
-    ``empty`` and is not. A note says so where a file system has no locks.
+    The operating system releases the lock if this process dies. A directory that was created here
+    and is still empty at the end is removed. Prints a note if the file system does not support
+    locks.
+
+    Raises ScenarioError if another command holds the lock, if the directory cannot be created, or
+    if it ``must_be_empty`` and is not.
     """
     if directory is None:
         yield
         return
     # os.path instead of Path.exists, which raises for names that no file can have.
-    made = not os.path.exists(directory)
+    is_new = not os.path.exists(directory)
     make_directory(directory)
     try:
-        with _locked(directory):
-            if empty:
-                new_directory(directory, "")
+        with _hold_lock(directory):
+            if must_be_empty:
+                create_output_directory(directory, "")
             yield
     finally:
-        if made:
-            with contextlib.suppress(OSError):  # it has files now
+        if is_new:
+            with contextlib.suppress(OSError):  # not empty any more
                 directory.rmdir()
 
 
 @contextlib.contextmanager
-def _locked(directory: Path) -> Iterator[None]:
-    """Hold the lock of a directory; go on with a note if its file system knows no locks."""
-    opened = None
+def _hold_lock(directory: Path) -> Iterator[None]:
+    """Hold the lock of a directory during the body.
+
+    If the file system does not support locks, print a note and run the body without a lock.
+    """
+    descriptor = None
     try:
-        opened = _open(directory)
+        descriptor = _open_lock_file(directory)
     except OSError as error:
         _print_note(directory, error)
     else:
-        _lock_or_refuse(opened, directory)
+        _lock_or_refuse(descriptor, directory)
     try:
         yield
     finally:
-        if opened is not None:
+        if descriptor is not None:
             with contextlib.suppress(OSError):
-                os.close(opened)
+                os.close(descriptor)
 
 
-def _lock_or_refuse(opened: int, directory: Path) -> None:
-    """Take the lock; raises ScenarioError if another process holds it."""
+def _lock_or_refuse(descriptor: int, directory: Path) -> None:
+    """Lock an open file; raises ScenarioError and closes it if another process holds the lock."""
     try:
-        _lock(opened)
+        _lock_file(descriptor)
     except (BlockingIOError, PermissionError):  # the latter on Windows
-        os.close(opened)
+        os.close(descriptor)
         rule = "is in use: another netkf command writes there"
         remedy = "wait for its end, or choose another"
         raise ScenarioError("--out", rule, str(directory), remedy) from None
@@ -71,7 +77,7 @@ def _lock_or_refuse(opened: int, directory: Path) -> None:
 
 
 def _print_note(directory: Path, error: OSError) -> None:
-    """Say on standard error that the directory is not locked."""
+    """Print to standard error that the directory could not be locked, and why."""
     note = f"note: {directory} cannot be locked ({error.strerror}): one command at a time on it"
     print(note, file=sys.stderr)
 
@@ -79,22 +85,24 @@ def _print_note(directory: Path, error: OSError) -> None:
 if sys.platform == "win32":
     import msvcrt
 
-    def _open(directory: Path) -> int:
-        """Open a file that stands for the directory, which Windows does not open."""
+    def _open_lock_file(directory: Path) -> int:
+        """Open and return a temporary file named after the directory: Windows cannot open a
+        directory itself.
+        """
         name = sha256(str(directory.resolve()).casefold().encode()).hexdigest()[:32]
         return os.open(Path(tempfile.gettempdir()) / f"netkf-{name}.lock", os.O_RDWR | os.O_CREAT)
 
-    def _lock(opened: int) -> None:
-        """Take the lock without waiting; raises OSError."""
-        msvcrt.locking(opened, msvcrt.LK_NBLCK, 1)
+    def _lock_file(descriptor: int) -> None:
+        """Take the lock without waiting; raises OSError if that fails."""
+        msvcrt.locking(descriptor, msvcrt.LK_NBLCK, 1)
 
 else:
     import fcntl
 
-    def _open(directory: Path) -> int:
-        """Open the directory itself, so that no file of a lock is left."""
+    def _open_lock_file(directory: Path) -> int:
+        """Open the directory itself and return its descriptor: no lock file is left behind."""
         return os.open(directory, os.O_RDONLY)
 
-    def _lock(opened: int) -> None:
-        """Take the lock without waiting; raises OSError."""
-        fcntl.flock(opened, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    def _lock_file(descriptor: int) -> None:
+        """Take the lock without waiting; raises OSError if that fails."""
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)

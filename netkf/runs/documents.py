@@ -1,7 +1,7 @@
-"""JSON documents of run directories: sealed with a digest, and read without trust.
+"""JSON documents of run directories: written with a digest, and validated when they are read.
 
-A seal finds damage and files that were edited or mixed up. It is no signature: who wants to deceive
-can compute it too.
+The digest, called the seal, reveals damaged files and files that were edited or mixed up. It is not
+a signature: anyone can compute it.
 """
 
 from __future__ import annotations
@@ -14,24 +14,25 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from netkf.runs.files import file_digest, finite, write_json
+from netkf.runs.files import file_digest, to_json_value, write_json
 
 SEAL = "sha256"
-"""Key of the digest of all other entries."""
-ENDED = ("complete", "diverged")
-"""Values of ``status`` in the manifest of a run that has come to its end."""
+"""Key of the SHA-256 of all other entries of a document."""
+FINAL_STATUSES = ("complete", "diverged")
+"""Values of ``status`` in the manifest of a run that was neither interrupted nor failed."""
 MAX_COUNT = 1 << 62
+"""Largest absolute value of an integer that is accepted: int64 with a spare bit."""
 MAX_BYTES = 1 << 28
-"""Largest document that is read: the summary of some 500,000 nodes."""
+"""Size of the largest document that is read: about the summary of 500,000 nodes."""
 
 
 class DamagedError(ValueError):
-    """A file is not what netkf wrote; the message says why, without the name of the file."""
+    """A file is not as netkf wrote it; the message says why, often without the name of the file."""
 
 
 def write_sealed(path: Path, document: dict[str, Any]) -> None:
     """Write a JSON document with its seal."""
-    write_json(path, {**document, SEAL: _digest(finite(document))})
+    write_json(path, {**document, SEAL: _digest(to_json_value(document))})
 
 
 def check_seal(document: Mapping[str, Any]) -> None:
@@ -44,31 +45,33 @@ def check_seal(document: Mapping[str, Any]) -> None:
 
 
 def _digest(document: Mapping[str, Any]) -> str:
-    """Return the SHA-256 of a document, whatever the order of its keys."""
+    """Return the SHA-256 of a document in hexadecimal; the order of its keys does not matter."""
     text = json.dumps(document, sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(text.encode()).hexdigest()
 
 
 @contextlib.contextmanager
 def reading_file(path: Path, name: str = "") -> Iterator[None]:
-    """Raise DamagedError in place of what the body raises while it reads a file, whatever is in it,
-    and for anything but a regular file. ``name`` begins the message.
+    """Turn every exception of a body that reads the file ``path`` into a DamagedError.
+
+    Raises DamagedError before the body runs if ``path`` is not a regular file. Messages begin with
+    ``name``.
     """
-    where = f"{name} " if name else ""
+    prefix = f"{name} " if name else ""
     try:
-        # Anything but a regular file, such as a pipe, may never end.
+        # Reading anything but a regular file, such as a pipe, may never end.
         if not path.is_file():
-            raise DamagedError(f"{where}is {'no regular file' if path.exists() else 'missing'}")
+            raise DamagedError(f"{prefix}is {'no regular file' if path.exists() else 'missing'}")
         yield
     except DamagedError:
         raise
     except Exception as error:
-        raise DamagedError(f"{where}cannot be read ({type(error).__name__})") from None
+        raise DamagedError(f"{prefix}cannot be read ({type(error).__name__})") from None
 
 
 @contextlib.contextmanager
-def damage_in(name: str) -> Iterator[None]:
-    """Put the name of a file into a DamagedError about it."""
+def add_file_name(name: str) -> Iterator[None]:
+    """Prefix the message of a DamagedError that the body raises with the ``name`` of the file."""
     try:
         yield
     except DamagedError as error:
@@ -76,7 +79,7 @@ def damage_in(name: str) -> Iterator[None]:
 
 
 def read_document(path: Path) -> dict[str, Any]:
-    """Return the JSON object in a file; raises DamagedError for everything else."""
+    """Return the JSON object in a file; raises DamagedError if the file holds anything else."""
     with reading_file(path):
         if path.stat().st_size > MAX_BYTES:
             raise DamagedError(f"is larger than {MAX_BYTES >> 20} MiB")
@@ -87,33 +90,33 @@ def read_document(path: Path) -> dict[str, Any]:
 
 
 def _refuse_constant(name: str) -> Any:
-    """Raise ValueError for NaN and infinities, which JSON does not have."""
+    """Raise ValueError: ``name`` is NaN or an infinity, which Python reads but JSON excludes."""
     raise ValueError(name)
 
 
 def file_digests(directory: Path, names: Iterable[str]) -> dict[str, str]:
-    """Return the SHA-256 of those of the named files that a directory has."""
-    found = ((name, directory / name) for name in sorted(set(names)))
-    return {name: file_digest(path) for name, path in found if path.is_file()}
+    """Return the SHA-256, by name, of each of the named files that exists in a directory."""
+    paths = {name: directory / name for name in sorted(set(names))}
+    return {name: file_digest(path) for name, path in paths.items() if path.is_file()}
 
 
 def check_files(directory: Path, manifest: Mapping[str, Any], names: Iterable[str] = ()) -> None:
-    """Raise DamagedError for a file that is not the one whose digest the manifest has.
+    """Raise DamagedError if a file is missing or does not have its digest in the manifest.
 
-    It looks at ``names`` if the manifest lists them, and by default at all that it lists.
+    Checks the ``names`` that the manifest lists; by default, all files that it lists.
     """
     digests = manifest.get("files", {})
-    require(digests, {}, "files")
+    require_form(digests, {}, "files")
     for name in names or digests:
-        known = digests.get(name)
-        if known is None:
+        digest = digests.get(name)
+        if digest is None:
             continue
         path = directory / name
         try:
-            same = path.is_file() and file_digest(path) == known
+            is_unchanged = path.is_file() and file_digest(path) == digest
         except (OSError, ValueError) as error:
             raise DamagedError(f"{name} cannot be read ({type(error).__name__})") from None
-        if not same:
+        if not is_unchanged:
             problem = "was changed since" if path.exists() else "is missing since"
             raise DamagedError(f"{name} {problem} the run ended")
 
@@ -124,43 +127,44 @@ TEXT = "a text"
 TEXTS = "a list of texts"
 
 
-def require(value: Any, form: Any, where: str = "") -> None:
-    """Raise DamagedError unless a JSON value, found at the key path ``where``, has a form: NUMBER,
-    COUNT, TEXT, TEXTS, a list with the form of its items, or a dictionary with the forms of its
-    keys, of which those that end in ``?`` may be missing; there may be other keys.
+def require_form(value: Any, form: Any, key_path: str = "") -> None:
+    """Raise DamagedError unless a JSON value has a form; messages name its ``key_path``.
+
+    A form is NUMBER, COUNT, TEXT or TEXTS, a list [form of every item], or a dictionary {key: form
+    of its value}. Keys that end in ``?`` are optional, and other keys are allowed.
     """
     if isinstance(form, dict):
-        _require_form(isinstance(value, dict), "a table", where)
-        for key, inner in form.items():
+        _raise_unless(isinstance(value, dict), "a table", key_path)
+        for key, inner_form in form.items():
             name = key.removesuffix("?")
-            path = f"{where}.{name}" if where else name
+            inner_path = f"{key_path}.{name}" if key_path else name
             if name in value:
-                require(value[name], inner, path)
+                require_form(value[name], inner_form, inner_path)
             elif name == key:
-                raise DamagedError(f"lacks {path}")
+                raise DamagedError(f"lacks {inner_path}")
     elif isinstance(form, list):
-        _require_form(isinstance(value, list), "a list", where)
+        _raise_unless(isinstance(value, list), "a list", key_path)
         for item in value:
-            require(item, form[0], where)
+            require_form(item, form[0], key_path)
     else:
-        _require_form(_FORMS[form](value), form, where)
+        _raise_unless(_FORMS[form](value), form, key_path)
 
 
-def _require_form(kept: bool, form: str, where: str) -> None:
-    """Raise DamagedError unless ``kept``."""
-    if not kept:
-        raise DamagedError(f"needs {form} at {where}" if where else f"is not {form}")
+def _raise_unless(has_form: bool, form: str, key_path: str) -> None:
+    """Raise DamagedError, with the form that is needed at ``key_path``, unless ``has_form``."""
+    if not has_form:
+        raise DamagedError(f"needs {form} at {key_path}" if key_path else f"is not {form}")
 
 
 def _is_number(value: Any) -> bool:
-    """Return True for finite numbers and null."""
+    """Return True for finite numbers, integers up to MAX_COUNT, and None (JSON null)."""
     if isinstance(value, int):
         return not isinstance(value, bool) and abs(value) <= MAX_COUNT
     return value is None or (isinstance(value, float) and math.isfinite(value))
 
 
 def _is_count(value: Any) -> bool:
-    """Return True for whole numbers from 0 up to MAX_COUNT."""
+    """Return True for integers from 0 to MAX_COUNT."""
     return isinstance(value, int) and not isinstance(value, bool) and 0 <= value <= MAX_COUNT
 
 
@@ -168,5 +172,5 @@ _FORMS: dict[str, Callable[[Any], bool]] = {
     NUMBER: _is_number,
     COUNT: _is_count,
     TEXT: lambda value: isinstance(value, str),
-    TEXTS: lambda value: isinstance(value, list) and all(isinstance(one, str) for one in value),
+    TEXTS: lambda value: isinstance(value, list) and all(isinstance(item, str) for item in value),
 }

@@ -1,4 +1,4 @@
-"""Exceptions of runs that do not end: which class of the user failed, and what was kept."""
+"""Exceptions for interrupted and failed runs, with the directory of their partial results."""
 
 from __future__ import annotations
 
@@ -12,7 +12,10 @@ from netkf.scenario.scenario import Scenario
 
 
 class InterruptedRunError(KeyboardInterrupt):
-    """A run was stopped; ``directory`` holds the results until then."""
+    """A run was interrupted; ``directory`` holds its partial results.
+
+    ``remedy`` ends the message, such as how to resume.
+    """
 
     def __init__(self, directory: Path, remedy: str = "") -> None:
         self.directory = directory
@@ -22,14 +25,16 @@ class InterruptedRunError(KeyboardInterrupt):
 def explain_failure(
     scenario: Scenario, error: BaseException, directory: Path | None = None
 ) -> BaseException:
-    """Return the exception to end with after ``error``: one that names the user's class in which it
-    was raised, or ``error`` itself if no such class is involved.
+    """Return the exception to raise in place of ``error``.
 
-    ``directory`` is that of a run whose manifest has the traceback.
+    It is an EngineError that names the user's class in which ``error`` was raised, an
+    InterruptedRunError for Ctrl-C during a run into ``directory``, or otherwise ``error`` itself.
+    ``directory`` is the run directory, whose manifest has the traceback, or None.
     """
     if isinstance(error, KeyboardInterrupt) and directory is not None:
         return InterruptedRunError(directory)
-    # Errors of netkf name their cause already, and a full disk is no fault of a user's class.
+    # Errors of netkf name their cause already, and an OSError such as a full disk is not the fault
+    # of a user's class.
     if not isinstance(error, Exception) or isinstance(error, (NetkfError, OSError)):
         return error
     message = blame(scenario, error)
@@ -39,7 +44,7 @@ def explain_failure(
 
 @contextmanager
 def explain_failures(scenario: Scenario) -> Iterator[None]:
-    """Replace exceptions of the body by those of :func:`explain_failure`."""
+    """Replace exceptions of the body as :func:`explain_failure` does."""
     try:
         yield
     except Exception as error:

@@ -1,4 +1,4 @@
-"""Files of run directories, written whole or not at all."""
+"""Files and folders of run directories; each file is written completely or not at all."""
 
 from __future__ import annotations
 
@@ -23,8 +23,11 @@ from netkf.scenario.writing import resolve_defaults, to_toml
 
 
 @contextlib.contextmanager
-def writing(path: Path) -> Iterator[None]:
-    """Raise a WriteError about ``path`` in place of the body's OSErrors, and for a NUL in it."""
+def writing_file(path: Path) -> Iterator[None]:
+    """Turn every OSError of the body into a WriteError about ``path``.
+
+    Raises WriteError before the body runs if ``path`` has a NUL character or no file name.
+    """
     if "\0" in str(path):
         raise WriteError(OSError(errno.EINVAL, ""), path)
     if not path.name:
@@ -37,14 +40,14 @@ def writing(path: Path) -> Iterator[None]:
         raise WriteError(error, path) from error
 
 
-def publish(part: Path, path: Path) -> None:
-    """Give a finished file its name, once its contents are on the disk; raises OSError.
+def publish(temporary: Path, path: Path) -> None:
+    """Flush a finished ``temporary`` file to disk and rename it to ``path``; raises OSError.
 
-    After a loss of power there is the whole file under that name, or none.
+    After a power failure ``path`` is the complete file, or is as it was before.
     """
-    with part.open("rb+") as file:
+    with temporary.open("rb+") as file:
         os.fsync(file.fileno())
-    os.replace(part, path)
+    os.replace(temporary, path)
     with contextlib.suppress(OSError):  # not every system can open a directory
         directory = os.open(path.parent, os.O_RDONLY)
         try:
@@ -57,93 +60,98 @@ def publish(part: Path, path: Path) -> None:
 def write_atomically(path: Path) -> Iterator[Path]:
     """Yield the path of a temporary file that replaces ``path`` at the end of the body.
 
-    A reader never sees half a file; if the body raises, the temporary file is removed. Raises
-    WriteError where the body or the system fails to write.
+    Readers never see an incomplete file; if the body raises, the temporary file is removed. Raises
+    WriteError if the body raises OSError or the file cannot be renamed.
     """
-    part = path.parent / f"{path.name}.part"
+    temporary = path.parent / f"{path.name}.part"
     try:
-        with writing(path):
-            yield part
-            publish(part, path)
+        with writing_file(path):
+            yield temporary
+            publish(temporary, path)
     except BaseException:
         with contextlib.suppress(OSError, ValueError):
-            part.unlink(missing_ok=True)
+            temporary.unlink(missing_ok=True)
         raise
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a text file, whole or not at all."""
-    with write_atomically(path) as part:
-        part.write_text(text, encoding="utf-8")
+    """Write a text file atomically, in UTF-8; raises WriteError."""
+    with write_atomically(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Write a JSON file; numbers that are not finite become null."""
+    """Write a JSON file atomically; numbers that are not finite become null. Raises WriteError."""
     write_text(path, json_text(value) + "\n")
 
 
 def json_text(value: Any, margin: str = "\n") -> str:
-    """Return ``json.dumps(finite(value), indent=2)`` for a value whose lines begin with ``margin``.
+    """Return the text of ``json.dumps(to_json_value(value), indent=2)``, computed faster.
 
-    The standard library indents in plain Python, a call for each number. Here each dictionary and
-    list without others in it, such as the row of a node, is one call of its compiled encoder.
+    ``margin`` is the line break and the indentation of the line that the value begins on. The
+    standard library indents in plain Python, with a call for each number; here each dictionary or
+    list of scalars, such as the row of a node, takes one call of its compiled encoder.
     """
     if not isinstance(value, (dict, list, tuple)) or not value:
-        return json.dumps(finite(value))
+        return json.dumps(to_json_value(value))
     inner = margin + "  "
-    parts = value.values() if isinstance(value, dict) else value
-    if not any(isinstance(part, (dict, list, tuple)) for part in parts):
-        text = json.JSONEncoder(separators=("," + inner, ": ")).encode(finite(value))
+    items = value.values() if isinstance(value, dict) else value
+    if not any(isinstance(item, (dict, list, tuple)) for item in items):
+        text = json.JSONEncoder(separators=("," + inner, ": ")).encode(to_json_value(value))
         return text[0] + inner + text[1:-1] + margin + text[-1]
     if isinstance(value, dict):
-        named = (f"{json.dumps(str(key))}: {json_text(item, inner)}" for key, item in value.items())
-        return "{" + inner + ("," + inner).join(named) + margin + "}"
+        entries = (
+            f"{json.dumps(str(key))}: {json_text(item, inner)}" for key, item in value.items()
+        )
+        return "{" + inner + ("," + inner).join(entries) + margin + "}"
     return "[" + inner + ("," + inner).join(json_text(item, inner) for item in value) + margin + "]"
 
 
-def finite(value: Any) -> Any:
-    """Return a plain JSON value: numpy numbers become Python ones, and None if not finite."""
+def to_json_value(value: Any) -> Any:
+    """Return a value with numpy numbers as Python numbers, tuples as lists, and None in place of
+    floats that are not finite, which JSON excludes.
+    """
     if isinstance(value, (float, np.floating)):
         return float(value) if math.isfinite(value) else None
     if isinstance(value, dict):
-        return {str(key): finite(item) for key, item in value.items()}
+        return {str(key): to_json_value(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
-        return [finite(item) for item in value]
+        return [to_json_value(item) for item in value]
     return value.item() if isinstance(value, np.generic) else value
 
 
-def new_directory(wanted: Path | None, name: str) -> Path:
-    """Create and return the directory of a run: ``wanted``, or the first free runs/NAME-k.
+def create_output_directory(requested: Path | None, name: str) -> Path:
+    """Create and return a directory for results: ``requested``, or the first free runs/NAME-k.
 
-    Raises ScenarioError if ``wanted`` cannot be created or is not empty.
+    Raises ScenarioError if ``requested`` cannot be created or is not empty.
     """
-    if wanted is None:
+    if requested is None:
         safe = "".join(c if c.isalnum() or c in "-_." else "-" for c in name)[:100].strip(".")
-        tries = (Path("runs") / f"{safe or 'run'}-{k}" for k in range(1, 1_000_000))
-        # Another command that starts now may choose the same name.
-        return next(path for path in tries if make_directory(path, anew=True))
-    make_directory(wanted)
-    if any(wanted.iterdir()):
+        paths = (Path("runs") / f"{safe or 'run'}-{k}" for k in range(1, 1_000_000))
+        # Creating it decides whether a name is free: another command may try it at the same time.
+        return next(path for path in paths if make_directory(path, must_be_new=True))
+    make_directory(requested)
+    if any(requested.iterdir()):
         raise ScenarioError(
             "--out",
             "must be a new or empty directory",
-            str(wanted),
+            str(requested),
             "choose another, or remove it first",
         )
-    return wanted
+    return requested
 
 
-def make_directory(path: Path, anew: bool = False) -> bool:
-    """Make a directory if there is none, and check that it can be read.
+def make_directory(path: Path, must_be_new: bool = False) -> bool:
+    """Create a directory unless it exists, check that it can be read, and return True.
 
-    Return True, or False if ``anew`` and the directory exists already. Raises ScenarioError if it
-    cannot be made or read.
+    Return False instead if it ``must_be_new`` and exists already. Raises ScenarioError if it cannot
+    be created or read.
     """
     try:
-        path.mkdir(parents=True, exist_ok=not anew)
+        path.mkdir(parents=True, exist_ok=not must_be_new)
         next(path.iterdir(), None)
     except FileExistsError as error:
-        if anew:
+        if must_be_new:
             return False
         reason = error.strerror
     except (OSError, ValueError) as error:
@@ -153,9 +161,9 @@ def make_directory(path: Path, anew: bool = False) -> bool:
     raise ScenarioError("--out", f"cannot be made ({reason})", str(path), "choose another")
 
 
-BLOCKS = "blocks"
-"""Folder of the blocks of an unfinished ensemble."""
-OWN_FILES = (
+BLOCKS_FOLDER = "blocks"
+"""Folder, in the directory of an unfinished ensemble, of its checkpoints by block of runs."""
+RUN_FILES = (
     "scenario.toml",
     "manifest.json",
     "events.parquet",
@@ -164,49 +172,53 @@ OWN_FILES = (
     "summary.json",
     "run.png",
 )
-"""Files of a run directory that netkf writes."""
+"""Names of the files that netkf writes to a run directory."""
 
 
-def own_names(scenario: Scenario) -> list[str]:
-    """Return the names of all files that a run of this scenario may leave in its directory."""
-    return [*OWN_FILES, *copied_names(scenario)]
+def run_file_names(scenario: Scenario) -> list[str]:
+    """Return the names of all files that a run of this scenario may write to its directory."""
+    return [*RUN_FILES, *copied_file_names(scenario)]
 
 
-def copied_names(scenario: Scenario) -> list[str]:
-    """Return the names of the modules and tables that :func:`write_scenario` copies."""
+def copied_file_names(scenario: Scenario) -> list[str]:
+    """Return the names of the Python modules and CSV files that :func:`write_scenario` copies."""
     modules = [file.name for file in module_files(scenario).values() if file is not None]
     return [*modules, *(source.name for source in source_files(scenario))]
 
 
-def only_own(directory: Path, names: Collection[str]) -> bool:
-    """Return True if a directory holds nothing but files of these names, their unfinished versions
-    and blocks of an ensemble.
+def holds_only(directory: Path, names: Collection[str]) -> bool:
+    """Return True if a directory holds nothing but files of these ``names`` (paths relative to it),
+    their temporary files (NAME.part) and checkpoints of an ensemble.
     """
-    known = {*names, *(f"{name}.part" for name in names)}
-    folders = {str(folder) for name in names for folder in Path(name).parents} | {BLOCKS}
-    found = (path.relative_to(directory).as_posix() for path in directory.rglob("*"))
-    return all(name in known or name in folders or name.startswith(f"{BLOCKS}/") for name in found)
+    allowed = {*names, *(f"{name}.part" for name in names), BLOCKS_FOLDER}
+    allowed |= {str(folder) for name in names for folder in Path(name).parents}
+    present = (path.relative_to(directory).as_posix() for path in directory.rglob("*"))
+    return all(name in allowed or name.startswith(f"{BLOCKS_FOLDER}/") for name in present)
 
 
 def file_digest(path: Path) -> str:
-    """Return the SHA-256 of a file."""
+    """Return the SHA-256 of a file in hexadecimal; raises OSError."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def remove_own(directory: Path, names: Iterable[str]) -> None:
-    """Remove files of these names and their unfinished versions from a directory, and no others."""
+def remove_files(directory: Path, names: Iterable[str]) -> None:
+    """Remove the files of these ``names`` (relative paths), their temporary files (NAME.part) and
+    the folders that this leaves empty from a directory.
+    """
     for name in names:
         for file in (directory / name, directory / f"{name}.part"):
             file.unlink(missing_ok=True)
         for folder in Path(name).parents[:-1]:
-            with contextlib.suppress(OSError):  # there may be more in it, or it may be gone
+            with contextlib.suppress(OSError):  # not empty, or removed already
                 (directory / folder).rmdir()
 
 
 def check_sources(scenario: Scenario) -> None:
-    """Raise ScenarioError for a file of the scenario with the name of a file of run directories,
-    and for a class that scenario.toml cannot name.
+    """Raise ScenarioError if a run directory could not hold a copy of the scenario.
+
+    That is if a class is defined where scenario.toml cannot import it from, or if a file that the
+    scenario names has the name of a file that netkf writes.
     """
     unnamed = unnamed_class(scenario, in_script=False)
     if unnamed is not None:
@@ -214,15 +226,17 @@ def check_sources(scenario: Scenario) -> None:
         remedy = "put it into a module (a .py file beside the scenario) and import it from there"
         raise ScenarioError("scenario.toml", rule, None, remedy)
     for source in source_files(scenario):
-        if source.name in OWN_FILES:
+        if source.name in RUN_FILES:
             rule = "is a name that run directories use themselves"
             raise ScenarioError("path", rule, source.name, "rename the file")
 
 
 def write_scenario(directory: Path, scenario: Scenario, seed: int | None = None) -> None:
-    """Write scenario.toml with all defaults filled in, and copy the files and modules it names.
+    """Write scenario.toml with all defaults filled in, and copy the files and modules that it
+    names.
 
-    ``seed`` replaces the root seed of the scenario. The copy reproduces the run.
+    ``seed`` replaces the root seed of the scenario, so that the copy reproduces the run. Raises
+    WriteError.
     """
     for source in source_files(scenario):
         _copy(source.full, directory / source.name)
@@ -235,17 +249,22 @@ def write_scenario(directory: Path, scenario: Scenario, seed: int | None = None)
 
 
 def _copy(source: Path, target: Path) -> None:
-    """Copy a file, unless the copy is there: a scenario may be that of the directory itself."""
+    """Copy the file ``source`` to ``target`` atomically, unless ``target`` has the same contents.
+
+    They are even the same file if the scenario was loaded from the run directory.
+    """
     if target.is_file() and target.read_bytes() == source.read_bytes():
         return
-    with writing(target):
+    with writing_file(target):
         target.parent.mkdir(parents=True, exist_ok=True)
-    with write_atomically(target) as part:
-        shutil.copyfile(source, part)
+    with write_atomically(target) as temporary:
+        shutil.copyfile(source, temporary)
 
 
 def scenario_digest(scenario: Scenario) -> str:
-    """Return the SHA-256 of a resolved scenario and of the files and modules that it names."""
+    """Return the SHA-256, in hexadecimal, of a scenario with all defaults filled in, together with
+    the files and modules that it names.
+    """
     digest = hashlib.sha256(to_toml(resolve_defaults(scenario)).encode())
     files = {source.name: source.full for source in source_files(scenario)}
     files |= {f"{name}.py": file for name, file in module_files(scenario).items() if file}
@@ -255,7 +274,9 @@ def scenario_digest(scenario: Scenario) -> str:
 
 
 def missing_modules(scenario: Scenario) -> list[str]:
-    """Return a sentence about each module that a run needs and its directory does not hold."""
+    """Return a sentence about each Python module that a run needs but that cannot be copied to its
+    directory.
+    """
     return [
         f"the run directory needs the Python module {name}, which was not copied into it: it is no "
         "single file beside the scenario"

@@ -1,9 +1,9 @@
-"""Innovations of increments: what the readings of an interval are beyond what was expected.
+"""Innovations of increments: readings of a continuous sensor over an interval minus predictions.
 
 Over ``[a, b]`` of length g a node with ``dy = H x ds + dv``, cov(dv) = R ds, reads y = int dy. From
-its estimate at a it expects ``H z``, where z is the integral of its prediction, so that the
-innovation ``y - H z`` has the covariance ``S = H Z H' + R g`` with Z that of the integral of the
-predicted error: dz = e ds and de = A e ds + dw, which begins at P(a).
+its estimate at a it predicts ``H z``, where z is the integral of the predicted state over the
+interval. The innovation ``y - H z`` has the covariance ``S = H Z H' + R g``, where Z is the
+covariance of the integral of the prediction error e: de = A e ds + dw with cov(e(a)) = P(a).
 """
 
 from __future__ import annotations
@@ -19,8 +19,11 @@ from netkf.theory.numerics.prediction import LinearSDE
 
 
 class WhitenedInnovation(NamedTuple):
-    """An interval of increments: its ``end`` (seconds), the ``node`` (-1 for a filter of all
-    sensors), and the innovation (p,) times the inverse root of its covariance.
+    """The whitened innovation of the increments of one interval.
+
+    end      : end of the interval, seconds
+    node     : node that read it; -1 for a pooled filter, which reads all sensors
+    whitened : (p,) innovation times the inverse Cholesky factor of its covariance
     """
 
     end: float
@@ -28,9 +31,12 @@ class WhitenedInnovation(NamedTuple):
     whitened: FloatArray
 
 
-class Noted(NamedTuple):
-    """The state of a filter with the node and the time (seconds) that it belongs to, and the
-    estimate and P of the ``start`` of the interval that has just passed.
+class TimedState(NamedTuple):
+    """The state of a filter, ``inner``, with what a whitened innovation needs besides.
+
+    node  : node of the state; -1 for a pooled filter, which reads all sensors
+    time  : present time of the state, seconds
+    start : estimate (n,) and P (n, n), or None, before the last prediction
     """
 
     inner: Any
@@ -39,87 +45,97 @@ class Noted(NamedTuple):
     start: tuple[FloatArray, FloatArray | None]
 
 
-class Expectations:
-    """Increments that are expected under one model, and their covariances."""
+class ExpectedIncrements:
+    """Predictions of increments under one ``model`` with A, Q, H and R, for intervals of any
+    length.
+    """
 
     def __init__(self, model: Any) -> None:
         n = len(model.A)
         self._n, self._H, self._R = n, model.H, model.R
-        # (x, z) with dx = A x ds + dw and dz = x ds.
+        # The joint equation of (x, z): dx = A x ds + dw and dz = x ds.
         A = np.block([[model.A, np.zeros((n, n))], [np.eye(n), np.zeros((n, n))]])
         B = np.concatenate([square_root(model.Q), np.zeros((n, n))])
         self._equation = LinearSDE(A, B)
 
-    def innovation(self, xhat: FloatArray, P: FloatArray, y: FloatArray, gap: float) -> FloatArray:
-        """Return the innovation (p,) of increments y (p,) times the inverse root of S."""
+    def whitened_innovation(
+        self, xhat: FloatArray, P: FloatArray, y: FloatArray, gap: float
+    ) -> FloatArray:
+        """Return the innovation (p,) of increments y (p,) over ``gap`` seconds, times the inverse
+        Cholesky factor of its covariance S; ``xhat`` (n,) and ``P`` (n, n) are those at the start.
+        """
         n, H = self._n, self._H
         F, root = self._equation.discretise(gap)
-        J = F[n:, :n]
+        J = F[n:, :n]  # integral of exp(A s) over the gap, so that E[z] = J xhat
         S = H @ (J @ P @ J.T + root[n:] @ root[n:].T) @ H.T + self._R * gap
         return np.asarray(np.linalg.solve(np.linalg.cholesky(S), y - H @ J @ xhat))
 
 
 def record_increments(algorithm: Filter, intervals: list[WhitenedInnovation]) -> Filter:
-    """Return a filter with the same estimates that appends the whitened innovation of each
-    measured increment to ``intervals``.
+    """Return a filter with the estimates of ``algorithm`` that appends the whitened innovation of
+    each measured increment to ``intervals``.
 
-    Its states are those of ``algorithm`` with their node and time.
+    Its states are TimedState, which wrap those of ``algorithm``.
     """
-    known: dict[int, tuple[Any, Expectations]] = {}
+    cache: dict[int, tuple[Any, ExpectedIncrements]] = {}
 
-    def expectations(model: Any) -> Expectations:
-        """Return the expectations of a model, computed once."""
-        # A reference to the model keeps its id from being used by another model.
-        if id(model) not in known:
-            known[id(model)] = model, Expectations(model)
-        return known[id(model)][1]
+    def expected_increments(model: Any) -> ExpectedIncrements:
+        """Return the predictions of a model, which are set up once."""
+        # The entry refers to the model, so that its id is not reused for another one.
+        if id(model) not in cache:
+            cache[id(model)] = model, ExpectedIncrements(model)
+        return cache[id(model)][1]
 
     base: Any = type(algorithm)
 
-    class Noting(base):  # type: ignore[misc]
-        """The filter on states that know their node and time."""
+    class RecordingFilter(base):  # type: ignore[misc]
+        """The filter on TimedState: methods unwrap the state, call the filter and wrap again."""
 
-        def init(self, model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo) -> Noted:
-            noted_node = -1 if base.pooled else node.node
-            return Noted(base.init(self, model, mean, cov, node), noted_node, 0.0, (mean, None))
+        def init(self, model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo) -> TimedState:
+            inner = base.init(self, model, mean, cov, node)
+            return TimedState(inner, -1 if base.pooled else node.node, 0.0, (mean, None))
 
-        def predict(self, state: Noted, gap: float) -> Noted:
+        def predict(self, state: TimedState, gap: float) -> TimedState:
             start = base.estimate(self, state.inner)
             inner = base.predict(self, state.inner, gap)
-            return Noted(inner, state.node, state.time + gap, start)
+            return TimedState(inner, state.node, state.time + gap, start)
 
-        def update(self, state: Noted, reading: Increments | Reading) -> Noted:
+        def update(self, state: TimedState, reading: Increments | Reading) -> TimedState:
             xhat, P = state.start
             if isinstance(reading, Increments) and P is not None and np.isfinite(P).all():
+                # The first half of the moments is the integral of dy.
                 y = reading.moments[: len(reading.moments) // 2]
-                found = expectations(state.inner.model).innovation(xhat, P, y, reading.gap)
-                intervals.append(WhitenedInnovation(state.time, state.node, found))
+                expected = expected_increments(state.inner.model)
+                whitened = expected.whitened_innovation(xhat, P, y, reading.gap)
+                intervals.append(WhitenedInnovation(state.time, state.node, whitened))
             return state._replace(inner=base.update(self, state.inner, reading))
 
-        def emit(self, state: Noted, exchange: Any) -> tuple[Noted, Any]:
+        def emit(self, state: TimedState, exchange: Any) -> tuple[TimedState, Any]:
             inner, payload = base.emit(self, state.inner, exchange)
             return state._replace(inner=inner), payload
 
-        def absorb(self, state: Noted, messages: Sequence[Any], exchange: Any) -> Noted:
+        def absorb(self, state: TimedState, messages: Sequence[Any], exchange: Any) -> TimedState:
             return state._replace(inner=base.absorb(self, state.inner, messages, exchange))
 
-        def estimate(self, state: Noted) -> tuple[FloatArray, FloatArray | None]:
-            found: tuple[FloatArray, FloatArray | None] = base.estimate(self, state.inner)
-            return found
+        def estimate(self, state: TimedState) -> tuple[FloatArray, FloatArray | None]:
+            estimate: tuple[FloatArray, FloatArray | None] = base.estimate(self, state.inner)
+            return estimate
 
-        def shift(self, state: Noted, offset: FloatArray) -> Noted:
+        def shift(self, state: TimedState, offset: FloatArray) -> TimedState:
             return state._replace(inner=base.shift(self, state.inner, offset))
 
-        def max_measurement_interval(self, state: Noted) -> float:
+        def max_measurement_interval(self, state: TimedState) -> float:
             return float(base.max_measurement_interval(self, state.inner))
 
-        def stopped(self, state: Noted) -> bool:
+        def stopped(self, state: TimedState) -> bool:
             return bool(base.stopped(self, state.inner))
 
-        def conserved(self, state: Noted) -> Any:
+        def conserved(self, state: TimedState) -> Any:
             return base.conserved(self, state.inner)
 
-    Noting.__name__, Noting.__module__ = base.__name__, base.__module__
-    made: Any = object.__new__(Noting)
-    made.__dict__.update(algorithm.__dict__)
-    return made  # type: ignore[no-any-return]
+    # Errors name the class by them, and the module says whether it is a user's class.
+    RecordingFilter.__name__, RecordingFilter.__module__ = base.__name__, base.__module__
+    # Copied instead of constructed: its parameters have been checked already.
+    recording: Any = object.__new__(RecordingFilter)
+    recording.__dict__.update(algorithm.__dict__)
+    return recording  # type: ignore[no-any-return]

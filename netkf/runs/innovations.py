@@ -1,7 +1,7 @@
-"""Innovations of a run: what each reading was against what the node expected, and tests of them.
+"""Innovations of a run: readings minus their predictions by the nodes, and their autocorrelations.
 
-Traces keep no readings. A replay in the SimPy engine, whose events and states are those of the run,
-hands every reading to the filter again, and this time it is noted.
+Traces do not contain readings. A replay in the SimPy engine, with the same events and states as the
+run, passes every reading to the filter again, and the filter records it.
 """
 
 from __future__ import annotations
@@ -22,19 +22,33 @@ from netkf.trace.run import Run, first_difference
 from netkf.trace.schema import CODES
 
 MAX_EVENTS = 400_000
-"""Events of a run up to which it is replayed: half a minute."""
+"""Largest number of events of a run that is replayed: that takes about half a minute."""
 MAX_LAG = 20
+"""Largest lag of autocorrelations, in readings."""
 MIN_READINGS = 30
-"""Readings of a node from which on its autocorrelations say something."""
+"""Smallest number of readings of a node for which autocorrelations are computed."""
+
+
+class RecordedSample(NamedTuple):
+    """A sample, with the estimate (n,) and P (n, n), or None, of its node just before it."""
+
+    reading: Reading
+    xhat: FloatArray
+    P: FloatArray | None
 
 
 class Innovations(NamedTuple):
-    """Innovations v = y - H xhat of M readings in their order, with S = H P H' + R.
+    """Innovations v (p,) of M readings in order of time, with covariances S.
 
-    times (M,); nodes (M,); ``rows`` (M,): the length p of v; nis (M,): v' S^-1 v; ``whitened``: a
-    list of M arrays (p,), the roots of S^-1 times v; ``increments``: how many of the readings are
-    increments of an interval between two events of a node, whose v is what they are beyond those
-    expected from the estimate at its beginning.
+    A sample y has v = y - H xhat and S = H P H' + R, with the estimate just before it; increments
+    over an interval have the v and S of runs.increments, with the estimate at its beginning.
+
+    times      : (M,) seconds; of increments, the end of the interval
+    nodes      : (M,) node that read it, -1 for a pooled filter, which reads all sensors
+    rows       : (M,) length p of v
+    nis        : (M,) v' S^-1 v, nan without a covariance
+    whitened   : M arrays (p,), L^-1 v with S = L L'
+    increments : number of readings that are increments
     """
 
     times: FloatArray
@@ -45,95 +59,114 @@ class Innovations(NamedTuple):
     increments: int = 0
 
 
-def innovations(run: Run, most: int = MAX_EVENTS) -> Innovations:
-    """Return the innovations of the samples and increments of a run, by a replay.
+def compute_innovations(run: Run, max_events: int = MAX_EVENTS) -> Innovations:
+    """Return the innovations of the samples and increments of a run, which is replayed for them.
 
-    Raises NetkfError with a sentence if there are none: the filter has its own form of readings or
-    gives no covariance, the run has more than ``most`` events, or a replay makes other events, as
-    another version may.
+    Raises NetkfError with the reason if there are none: the filter implements a deprecated
+    contract or gives no covariance, there are no readings, the run has more than ``max_events``
+    events, or the events of the replay differ, as they may if another version made the run.
     """
     scenario: Scenario = run.scenario
     if not isinstance(scenario.filter.algorithm, Filter):
         raise NetkfError("filters of the deprecated contracts do not say how they use readings")
-    if len(run.log) > most:
-        raise NetkfError(f"a run of more than {most:,} events is not replayed")
+    if len(run.log) > max_events:
+        raise NetkfError(f"a run of more than {max_events:,} events is not replayed")
     algorithm: Filter = scenario.filter.algorithm
-    noted: list[tuple[Reading, FloatArray, FloatArray | None]] = []
+    samples: list[RecordedSample] = []
     intervals: list[WhitenedInnovation] = []
     if not scenario.slotted and scenario.increment_sensors:
         algorithm = record_increments(algorithm, intervals)
-    filtering = dataclasses.replace(
-        scenario.filter, algorithm=_record_innovations(algorithm, noted)
-    )
-    again = simulate(with_filter(scenario, filtering), run.seed, run.replica, "simpy")
-    if len(run.log) and first_difference(run, again) is not None:
+    filtering = dataclasses.replace(scenario.filter, algorithm=_record_samples(algorithm, samples))
+    replay = simulate(with_filter(scenario, filtering), run.seed, run.replica, "simpy")
+    # Without a trace there are no events to compare.
+    if len(run.log) and first_difference(run, replay) is not None:
         raise NetkfError("a replay makes other events than the run: it is of another version")
-    return _collect(again, noted, intervals)
+    return _collect_innovations(replay, samples, intervals)
 
 
 def with_filter(scenario: Scenario, filtering: Any) -> Scenario:
-    """Return a scenario with another filter that keeps its topology and folder."""
-    found = dataclasses.replace(scenario, filter=filtering)
+    """Return a copy of a scenario with the [filter] ``filtering``, in the same folder and with the
+    same topology, which need not be drawn again.
+    """
+    copy = dataclasses.replace(scenario, filter=filtering)
     for name in ("_folder", "_trust", "topology"):
         if name in scenario.__dict__:
-            found.__dict__[name] = scenario.__dict__[name]
-    return found
+            copy.__dict__[name] = scenario.__dict__[name]
+    return copy
 
 
-def _record_innovations(algorithm: Filter, noted: list[Any]) -> Filter:
-    """Return the filter with an ``update`` that notes each sample and the estimate before it."""
+def _record_samples(algorithm: Filter, samples: list[RecordedSample]) -> Filter:
+    """Return a filter with the estimates of ``algorithm`` that appends each sample that it is
+    updated with to ``samples``.
+    """
     base: Any = type(algorithm)
 
     def update(self: Any, state: Any, reading: Any) -> Any:
-        """Note the sample with the estimate before it, then update."""
+        """Record the sample with the estimate before it, then update."""
         if isinstance(reading, Reading):
-            noted.append((reading, *self.estimate(state)))
+            samples.append(RecordedSample(reading, *self.estimate(state)))
         return base.update(self, state, reading)
 
     def shift(self: Any, state: Any, offset: FloatArray) -> Any:
-        """Shift as the filter does."""
+        """Shift the state as the filter does."""
         return base.shift(self, state, offset)
 
-    # A class that defines ``update`` must define ``shift`` too, or it would lose its moving frame.
-    own = {"update": update, "shift": shift, "__module__": base.__module__}
-    made: Any = object.__new__(type(base.__name__, (base,), own))
-    made.__dict__.update(algorithm.__dict__)
-    return made  # type: ignore[no-any-return]
+    # Shifted coordinates are given up for a class that defines ``update`` but not ``shift``.
+    methods = {"update": update, "shift": shift, "__module__": base.__module__}
+    # Copied instead of constructed: its parameters have been checked already.
+    recording: Any = object.__new__(type(base.__name__, (base,), methods))
+    recording.__dict__.update(algorithm.__dict__)
+    return recording  # type: ignore[no-any-return]
 
 
-def _collect(run: Run, noted: list[Any], intervals: list[WhitenedInnovation]) -> Innovations:
-    """Return the innovations of the recorded readings and intervals, in the order of time."""
-    nodes, kept = _match_nodes(run, [one for one in noted if len(one[0].y)])
-    whitened = [_whiten(*one) for one in kept] + [one.whitened for one in intervals]
+def _collect_innovations(
+    run: Run, samples: list[RecordedSample], intervals: list[WhitenedInnovation]
+) -> Innovations:
+    """Return the innovations of the recorded samples and intervals of a run, in order of time.
+
+    Raises NetkfError if there are none, or no covariance to judge them by.
+    """
+    nodes, samples = _match_nodes(run, [sample for sample in samples if len(sample.reading.y)])
+    whitened = [_whiten(sample) for sample in samples]
+    whitened += [interval.whitened for interval in intervals]
     nis = np.array([float(v @ v) for v in whitened])
     if not np.isfinite(nis).any():
         raise NetkfError(
             "there are no readings, or the filter gives no covariance to judge them by"
         )
-    times = np.array([*(reading.time for reading, *_ in kept), *(one.end for one in intervals)])
-    nodes = np.concatenate([nodes, np.array([one.node for one in intervals], dtype=np.int64)])
+    ends = [interval.end for interval in intervals]
+    times = np.array([sample.reading.time for sample in samples] + ends)
+    interval_nodes = np.array([interval.node for interval in intervals], dtype=np.int64)
+    nodes = np.concatenate([nodes, interval_nodes])
     order = np.argsort(times, kind="stable")
     rows = np.array([len(values) for values in whitened])
     ordered = [whitened[k] for k in order.tolist()]
     return Innovations(times[order], nodes[order], rows[order], nis[order], ordered, len(intervals))
 
 
-def _match_nodes(run: Run, noted: list[Any]) -> tuple[np.ndarray, list[Any]]:
-    """Return the node of each recorded reading, -1 where a pooled filter reads for all."""
+def _match_nodes(
+    run: Run, samples: list[RecordedSample]
+) -> tuple[np.ndarray, list[RecordedSample]]:
+    """Return the node of each sample, -1 if a pooled filter reads for all, and the samples without
+    those after the last event of the run.
+    """
     senses = run.log[run.log["kind"] == CODES["sense"]][["t", "node"]]
     # A node with several sensors uses them together, and may have an event for each.
     first = np.ones(len(senses), dtype=bool)
     first[1:] = senses[1:] != senses[:-1]
     senses = senses[first]
-    times = np.array([reading.time for reading, *_ in noted])
-    # In slots the last readings come after the last sample, when events are no longer recorded.
-    if len(senses) <= len(noted) and np.array_equal(senses["t"], times[: len(senses)]):
-        return senses["node"], noted[: len(senses)]
-    return np.full(len(noted), -1), noted
+    times = np.array([sample.reading.time for sample in samples])
+    # In slots the last readings come after the last state sample, when events are not recorded.
+    if len(senses) <= len(samples) and np.array_equal(senses["t"], times[: len(senses)]):
+        return senses["node"], samples[: len(senses)]
+    return np.full(len(samples), -1), samples
 
 
-def _whiten(reading: Reading, xhat: FloatArray, P: FloatArray | None) -> FloatArray:
-    """Return the innovation (p,) times the inverse root of its covariance, nan without one."""
+def _whiten(sample: RecordedSample) -> FloatArray:
+    """Return the innovation (p,) of a sample times the inverse Cholesky factor of its covariance;
+    nan if the filter gives no finite P.
+    """
+    reading, xhat, P = sample
     if P is None or not np.isfinite(P).all():
         return np.full(len(reading.y), np.nan)
     S = reading.H @ P @ reading.H.T + reading.R
@@ -141,38 +174,43 @@ def _whiten(reading: Reading, xhat: FloatArray, P: FloatArray | None) -> FloatAr
     return np.asarray(np.linalg.solve(np.linalg.cholesky(S), v))
 
 
-def chi_square_means(freedom: FloatArray, probability: float) -> tuple[FloatArray, FloatArray]:
-    """Return the ends of the intervals that hold chi-square over its degrees of ``freedom`` (M,)
-    with a probability, each end missed with half of the rest.
+def chi_square_interval(freedom: FloatArray, probability: float) -> tuple[FloatArray, FloatArray]:
+    """Return the lower and upper ends (M,) of intervals for chi-square variables divided by their
+    degrees of ``freedom`` (M,).
+
+    Each interval holds its variable with the given ``probability``; the tails are equally probable.
     """
     tail = 0.5 * (1.0 - probability)
-    ends = (2.0 * gammaincinv(0.5 * freedom, q) / freedom for q in (tail, 1.0 - tail))
-    low, high = (np.asarray(end) for end in ends)
-    return low, high
+    low, high = (2.0 * gammaincinv(0.5 * freedom, q) / freedom for q in (tail, 1.0 - tail))
+    return np.asarray(low), np.asarray(high)
 
 
-def innovation_series(found: Innovations) -> dict[int, FloatArray]:
-    """Return the first whitened component of the innovations of each node that has MIN_READINGS."""
-    first = np.array([values[0] for values in found.whitened])
+def innovation_series(recorded: Innovations) -> dict[int, FloatArray]:
+    """Return, by node with at least MIN_READINGS readings, the first components (M,) of their
+    whitened innovations.
+    """
+    first_components = np.array([values[0] for values in recorded.whitened])
     series = {}
-    for node in np.unique(found.nodes).tolist():
-        values = first[(found.nodes == node) & np.isfinite(first)]
+    for node in np.unique(recorded.nodes).tolist():
+        values = first_components[(recorded.nodes == node) & np.isfinite(first_components)]
         if len(values) >= MIN_READINGS:
             series[node] = values
     return series
 
 
 def autocorrelation(values: FloatArray, lags: int) -> FloatArray:
-    """Return the autocorrelation at lags 1 .. ``lags`` of a series (M,) of mean 0 by model."""
+    """Return the autocorrelation at lags 1 .. ``lags`` of a series (M,) with expectation 0."""
     total = float(values @ values)
     return np.array([values[k:] @ values[:-k] for k in range(1, lags + 1)]) / max(total, 1e-300)
 
 
-def autocorrelations(found: Innovations) -> tuple[dict[int, FloatArray], dict[int, int]]:
-    """Return the autocorrelations of the innovations of each node that has MIN_READINGS, at lags 1
-    .. MAX_LAG, and how many readings each has.
+def autocorrelations(recorded: Innovations) -> tuple[dict[int, FloatArray], dict[int, int]]:
+    """Return, by node with at least MIN_READINGS readings, the autocorrelation of its innovations
+    at lags 1 .. MAX_LAG, and the number of its readings.
+
+    The lags are the same for all nodes: fewer than MAX_LAG if a node has few readings.
     """
-    series = innovation_series(found)
+    series = innovation_series(recorded)
     counts = {node: len(values) for node, values in series.items()}
     lags = min([MAX_LAG, *(count - 2 for count in counts.values())])
     return {node: autocorrelation(values, lags) for node, values in series.items()}, counts

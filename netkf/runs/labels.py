@@ -1,4 +1,4 @@
-"""Names of limits and notes on covariances, the same in `netkf theory`, tables and pictures."""
+"""Names of limits and notes on covariances, shared by `netkf theory`, tables and pictures."""
 
 from __future__ import annotations
 
@@ -8,32 +8,36 @@ from netkf.theory.hybrid.coupled import has_balanced_rates
 
 
 def limit_label(scenario: Scenario) -> str:
-    """Return the name of the limit of the bound as the rates of the links grow."""
+    """Return the name of the limit that the bound on P approaches as the link rates grow."""
     balanced = has_balanced_rates(scenario)
     name = "limit S of H(13)" if balanced else "weighted limit (not S of H(13))"
     return name + delay_suffix(scenario)
 
 
 def delay_suffix(scenario: Scenario) -> str:
-    """Return the condition under which a limit holds if messages are delayed; empty otherwise."""
+    """Return text to append to the name of a limit that assumes no delays: empty unless messages
+    are delayed.
+    """
     delayed = scenario.filter.algorithm.talks and scenario.network.channel.delay.fixed != 0.0
     return ", if messages took no time" if delayed else ""
 
 
 def covariance_bias(scenario: Scenario) -> str:
-    """Return "larger" or "smaller" if the filter's design makes P so, compared with the covariance
-    of its error; empty if neither is known.
+    """Return "larger" or "smaller" if P is larger or smaller than the covariance of the error by
+    the design of the filter; empty if neither is known.
     """
     algorithm = scenario.filter.algorithm
     design = scenario.hosted.P_by_design[0 if scenario.slotted else 1]
-    # The statement is about the steps of the built-in class; one without links does not combine.
+    # P_by_design is about the steps of the built-in class, with links and linear readings.
     if overridden(algorithm) or not scenario.topology.links or not scenario.is_linear:
         return ""
     return "" if design == "larger" and not scenario.filters_know_the_truth else design
 
 
 def nees_note(scenario: Scenario) -> str:
-    """Return a note on NEES if P is not the covariance of the error by design; else empty."""
+    """Return a note for users on NEES if P differs from the covariance of the error by design; else
+    an empty text.
+    """
     n, design = scenario.plant.n, covariance_bias(scenario)
     if design == "smaller":
         return (
@@ -50,7 +54,9 @@ def nees_note(scenario: Scenario) -> str:
 
 
 def mismatch_note(scenario: Scenario) -> str:
-    """Return a note on P and its bound if the filters have a wrong model; else empty."""
+    """Return a note for users on P and its bound if the filters' model may differ from the truth;
+    else an empty text.
+    """
     if not scenario.is_linear:
         return (
             "readings are not linear: filters linearise them at their own estimates, and P need "

@@ -1,4 +1,4 @@
-"""Parquet tables of run directories, written whole or not at all."""
+"""Parquet tables of run directories; each file is written completely or not at all."""
 
 from __future__ import annotations
 
@@ -15,120 +15,142 @@ import pyarrow.parquet as pq
 
 from netkf.linalg.arrays import FloatArray
 from netkf.runs.documents import DamagedError, reading_file
-from netkf.runs.files import publish, writing
+from netkf.runs.files import publish, writing_file
 from netkf.scenario.scenario import Scenario
 from netkf.trace.recorder import Sink
 from netkf.trace.run import StateSamples, event_columns, state_table
 from netkf.trace.schema import EVENT
 
-ROWS = 1 << 17
+ROW_GROUP_ROWS = 1 << 17
+"""Rows that are collected before they are written as one row group."""
 MAX_READ_ROWS = 1 << 28
-"""Rows of a table up to which it is read as a whole."""
+"""Largest number of rows of a table that is read into memory."""
 EVENT_ENCODING = {
     "use_dictionary": ["run", "kind", "node", "peer", "phase", "age"],
     "column_encoding": dict.fromkeys(("seq", "message"), "DELTA_BINARY_PACKED"),
 }
 STATE_ENCODING = {"use_dictionary": ["run", "t", "node"]}
-"""Dictionaries only where values repeat: half the size in half the time."""
+"""Options of pyarrow. Dictionaries only for columns whose values repeat take half the size and half
+the time of dictionaries for all.
+"""
 
 
 def read_numbers(
-    path: Path, columns: Sequence[str], run: int | None = None, missing: bool = False
+    path: Path, columns: Sequence[str], run: int | None = None, allow_empty: bool = False
 ) -> pd.DataFrame:
-    """Return columns of numbers of a Parquet file, of one ``run`` if it is given; with ``missing``
-    an empty cell of a float is nan.
+    """Return numeric columns of a Parquet file, only the rows of one ``run`` unless that is None.
 
-    Raises DamagedError for any other file, for one with more than MAX_READ_ROWS rows, and for
-    empty cells that are not allowed.
+    With ``allow_empty`` empty cells of floats become nan.
+
+    Raises DamagedError if the file cannot be read, lacks one of the columns, has more than
+    MAX_READ_ROWS rows, or has empty cells that are not allowed.
     """
     with _open_for_reading(path) as source, pq.ParquetFile(source) as file:
         names, types = file.schema_arrow.names, file.schema_arrow.types
-        known = dict(zip(names, types, strict=True))
-        wrong = [name for name in columns if names.count(name) != 1 or not _is_numeric(known[name])]
-        if wrong:
-            raise DamagedError(f"{path.name} has no column {wrong[0]} of numbers")
-        table = _read(file, path.name, source, columns, run)
-        empty = [name for name in columns if table[name].null_count]
-        if not all(missing and pa.types.is_floating(known[name]) for name in empty):
-            raise DamagedError(f"{path.name} has missing values")
-        # Types that pandas has noted in the file are not netkf's: plain numbers only.
+        types_by_name = dict(zip(names, types, strict=True))
+        for name in columns:
+            if names.count(name) != 1 or not _is_numeric(types_by_name[name]):
+                raise DamagedError(f"{path.name} has no column {name} of numbers")
+        table = _read_columns(file, source, path.name, columns, run)
+        for name in columns:
+            is_allowed = allow_empty and pa.types.is_floating(types_by_name[name])
+            if table[name].null_count and not is_allowed:
+                raise DamagedError(f"{path.name} has missing values")
+        # Without pandas metadata, which may ask for other types than plain numbers.
         return pd.DataFrame(table.to_pandas(ignore_metadata=True))
 
 
 def read_texts(path: Path, column: str, run: int | None = None) -> pd.Series[str]:
-    """Return a column of texts of a Parquet file, of one ``run`` if it is given; raises
-    DamagedError for any other file.
+    """Return a text column of a Parquet file as a categorical series, only the rows of one ``run``
+    unless that is None.
+
+    Raises DamagedError if the file cannot be read, lacks the column or has empty cells in it.
     """
     with _open_for_reading(path) as source, pq.ParquetFile(source) as file:
         names = file.schema_arrow.names
         if names.count(column) != 1:
             raise DamagedError(f"{path.name} has no column {column}")
-        found = _read(file, path.name, source, [column], run)[column]
-        texts = found.cast(pa.string()).combine_chunks()
+        table = _read_columns(file, source, path.name, [column], run)
+        texts = table[column].cast(pa.string()).combine_chunks()
         if texts.null_count:
             raise DamagedError(f"{path.name} has missing values")
         return pd.Series(texts.dictionary_encode().to_pandas())
 
 
 def read_flags(path: Path, column: str) -> np.ndarray:
-    """Return a column of truth values of a Parquet file; raises DamagedError for any other file."""
+    """Return a column of booleans of a Parquet file as an array (rows,).
+
+    Raises DamagedError if the file cannot be read, lacks the column or has empty cells in it.
+    """
     with _open_for_reading(path) as source, pq.ParquetFile(source) as file:
-        known = dict(zip(file.schema_arrow.names, file.schema_arrow.types, strict=True))
-        if not pa.types.is_boolean(known.get(column, pa.null())):
+        types_by_name = dict(zip(file.schema_arrow.names, file.schema_arrow.types, strict=True))
+        if not pa.types.is_boolean(types_by_name.get(column, pa.null())):
             raise DamagedError(f"{path.name} has no column {column} of truth values")
-        found = _read(file, path.name, source, [column], None)[column]
-        if found.null_count:
+        flags = _read_columns(file, source, path.name, [column], None)[column]
+        if flags.null_count:
             raise DamagedError(f"{path.name} has missing values")
-        return np.asarray(found.to_numpy(), dtype=bool)
+        return np.asarray(flags.to_numpy(), dtype=bool)
 
 
 @contextlib.contextmanager
 def _open_for_reading(path: Path) -> Iterator[Any]:
-    """Open a file for pyarrow; raises DamagedError for what goes wrong inside."""
-    with reading_file(path, path.name), _open(path, "rb") as source:
+    """Yield an Arrow file to read; turn every exception of the body into a DamagedError."""
+    with reading_file(path, path.name), _open_arrow_file(path, "rb") as source:
         yield source
 
 
-def _open(path: Path, mode: str) -> Any:
-    """Return an open Arrow file."""
-    # As bytes: pyarrow writes texts as UTF-8, which need not be the encoding of file names.
+def _open_arrow_file(path: Path, mode: str) -> Any:
+    """Open and return an Arrow file, in mode "rb" or "wb"."""
+    # The path as bytes: pyarrow encodes a text as UTF-8, which may not be how the system does.
     return pa.OSFile(os.fsencode(path), mode)
 
 
-def _read(file: Any, name: str, source: Any, columns: Sequence[str], run: int | None) -> Any:
-    """Return an Arrow table with the columns, of those rows that are of ``run``."""
+def _read_columns(
+    file: Any, source: Any, name: str, columns: Sequence[str], run: int | None
+) -> Any:
+    """Return an Arrow table with the columns, only the rows of one ``run`` unless that is None.
+
+    ``file`` is the ParquetFile of ``source``. Raises DamagedError, which begins with the ``name``
+    of the file, if it has more than MAX_READ_ROWS rows.
+    """
     if file.metadata.num_rows > MAX_READ_ROWS:
         raise DamagedError(f"{name} has more than {MAX_READ_ROWS:,} rows")
     if run is None:
         return file.read(columns=list(columns))
-    # Row groups of other runs are not even read where their statistics say so.
+    # A filter skips row groups whose statistics exclude the run.
     return pq.read_table(source, columns=list(columns), filters=[("run", "==", run)])
 
 
 def column_names(path: Path) -> list[str]:
-    """Return the names of the columns of a Parquet file; raises DamagedError."""
+    """Return the names of the columns of a Parquet file; raises DamagedError if it is not one."""
     with _open_for_reading(path) as source:
         return list(pq.read_schema(source).names)
 
 
 def is_numeric_column(path: Path, name: str) -> bool:
-    """Return True if a column of a Parquet file holds numbers; raises DamagedError."""
+    """Return True if the column ``name`` of a Parquet file holds numbers; raises DamagedError if
+    the file cannot be read.
+    """
     with _open_for_reading(path) as source:
         return _is_numeric(pq.read_schema(source).field(name).type)
 
 
 def _is_numeric(kind: Any) -> bool:
-    """Return True for Arrow types of numbers."""
+    """Return True for Arrow types of integers and floats."""
     return bool(pa.types.is_integer(kind) or pa.types.is_floating(kind))
 
 
 class ParquetSink(Sink):
-    """Streams events and states to Parquet, one row group per block, so that memory is bounded."""
+    """Writes the events and states of one run to events.parquet and states.parquet as they come.
+
+    Rows are written block by block, so that memory is bounded. Without ``events`` there are no
+    files.
+    """
 
     thread_safe: ClassVar[bool] = True
 
     def __init__(self, directory: Path, scenario: Scenario, replica: int, events: bool) -> None:
-        self._nodes, self._replica, self._first = scenario.nodes, replica, 0
+        self._nodes, self._replica, self._event_count = scenario.nodes, replica, 0
         self._truth_known = scenario.plant.truth_known
         self._events = _Table(directory / "events.parquet", EVENT_ENCODING) if events else None
         self._states = _Table(directory / "states.parquet", STATE_ENCODING) if events else None
@@ -138,21 +160,23 @@ class ParquetSink(Sink):
     def events(self, rows: np.ndarray) -> None:
         """Write a block of EVENT rows as a row group."""
         if self._events is not None:
-            self._events.write(event_columns(rows, self._replica, self._first))
-            self._first += len(rows)
+            self._events.write(event_columns(rows, self._replica, self._event_count))
+            self._event_count += len(rows)
 
     def states(
         self, t: FloatArray, x: FloatArray, xhat: FloatArray, P: FloatArray, error: FloatArray
     ) -> None:
-        """Collect samples until they fill a row group."""
+        """Collect samples, of the shapes in StateSamples, and write them when they fill a row
+        group.
+        """
         if self._states is not None:
             self._samples.append((t, x, xhat, P, error))
             self._rows += len(t) * len(self._nodes)
-            if self._rows >= ROWS:
+            if self._rows >= ROW_GROUP_ROWS:
                 self._flush()
 
     def _flush(self) -> None:
-        """Write the samples that have been gathered."""
+        """Write the samples that have been collected as a row group."""
         if self._states is None or not self._samples:
             return
         columns = zip(*self._samples, strict=True)
@@ -169,60 +193,54 @@ class ParquetSink(Sink):
         )
 
     def close(self) -> None:
-        """Finish the files and rename them from NAME.part."""
-        with contextlib.ExitStack() as last_first:
+        """Finish both files and rename them from NAME.part; raises WriteError."""
+        # Callbacks run in reverse order and all of them run: if the disk is full when the last
+        # samples are written, the table of events is finished nevertheless.
+        with contextlib.ExitStack() as callbacks:
             if self._states is not None:
-                last_first.callback(self._states.close, None)
+                callbacks.callback(self._states.close, None)
             if self._events is not None:
-                last_first.callback(self._events.close, _no_events)
-            # A full disk that fails here leaves the table that can be finished.
-            last_first.callback(self._flush)
+                callbacks.callback(self._events.close, _empty_event_columns)
+            callbacks.callback(self._flush)
 
 
-def _no_events() -> dict[str, Any]:
-    """Return the columns of an empty table of events."""
+def _empty_event_columns() -> dict[str, Any]:
+    """Return the columns of a table of events without rows."""
     return event_columns(np.empty(0, dtype=EVENT), 0, 0)
 
 
 class TraceTables:
-    """Writes events.parquet and states.parquet of several runs, one run after the other; use it as
-    a context manager.
+    """Writes events.parquet and states.parquet of several runs, one run after the other.
+
+    Use it as a context manager: an exception in its body removes the unfinished files.
     """
 
     def __init__(self, directory: Path, scenario: Scenario) -> None:
         self._nodes, self._truth_known = scenario.nodes, scenario.plant.truth_known
         self._events = _Table(directory / "events.parquet", EVENT_ENCODING)
         self._states = _Table(directory / "states.parquet", STATE_ENCODING)
-        self._gathered: tuple[list[pd.DataFrame], list[pd.DataFrame]] = ([], [])
+        self._pending_events: list[pd.DataFrame] = []
+        self._pending_states: list[pd.DataFrame] = []
         self._rows = 0
 
-    def add(
-        self,
-        replica: int,
-        log: np.ndarray,
-        times: FloatArray,
-        x: FloatArray,
-        xhat: FloatArray,
-        P: FloatArray,
-        error: FloatArray,
-    ) -> None:
-        """Append one run: its EVENT rows, and its samples with the shapes of ``netkf.Run``."""
-        samples = StateSamples(times, x, xhat, P, error)
+    def add(self, replica: int, log: np.ndarray, samples: StateSamples) -> None:
+        """Append one run: the EVENT rows ``log`` and its samples."""
         states = state_table(replica, self._nodes, samples, self._truth_known)
-        for gathered, columns in zip(
-            self._gathered, (event_columns(log, replica, 0), states), strict=True
-        ):
-            gathered.append(pd.DataFrame(columns))
-        self._rows += max(len(log), len(times) * len(self._nodes))
-        if self._rows >= ROWS:
+        self._pending_events.append(pd.DataFrame(event_columns(log, replica, 0)))
+        self._pending_states.append(pd.DataFrame(states))
+        self._rows += max(len(log), len(samples.times) * len(self._nodes))
+        if self._rows >= ROW_GROUP_ROWS:
             self._flush()
 
     def _flush(self) -> None:
-        """Write the tables that have been gathered."""
-        for gathered, table in zip(self._gathered, (self._events, self._states), strict=True):
-            if gathered:
-                table.write(pd.concat(gathered, ignore_index=True))
-                gathered.clear()
+        """Write the tables that have been collected, a row group each."""
+        for pending, table in (
+            (self._pending_events, self._events),
+            (self._pending_states, self._states),
+        ):
+            if pending:
+                table.write(pd.concat(pending, ignore_index=True))
+                pending.clear()
         self._rows = 0
 
     def __enter__(self) -> TraceTables:
@@ -241,66 +259,70 @@ class TraceTables:
 
 
 def write_table(path: Path, columns: dict[str, Any]) -> None:
-    """Write columns as a Parquet file."""
+    """Write columns {name: values (rows,)} as a Parquet file; raises WriteError."""
     table = _Table(path)
     table.write(columns)
     table.close(None)
 
 
 class _Table:
-    """A Parquet file under construction; its schema is that of the first rows.
+    """A Parquet file that is being written; its first rows determine the schema.
 
-    The file has its name once it is whole and on the disk. If writing fails, nothing is left of it,
-    and WriteError is raised.
+    It is NAME.part until it is complete and on the disk. If writing fails, this temporary file is
+    removed and WriteError is raised.
     """
 
     def __init__(self, path: Path, encoding: dict[str, Any] | None = None) -> None:
-        self._path, self._part = path, path.with_name(path.name + ".part")
+        self._path, self._temporary = path, path.with_name(path.name + ".part")
         self._encoding = encoding or {}
         self._file: Any = None
         self._writer: Any = None
         self._closed = False
 
     def write(self, columns: dict[str, Any] | pd.DataFrame) -> None:
-        """Append rows; the first ones create the file."""
+        """Append rows as a row group; the first call creates the file."""
         table = pa.Table.from_pandas(pd.DataFrame(columns), preserve_index=False)
-        with self._or_nothing():
+        with self._discard_on_failure():
             if self._writer is None:
-                schema, how = table.schema, self._encoding
-                self._file = _open(self._part, "wb")
-                self._writer = pq.ParquetWriter(self._file, schema, compression="zstd", **how)
+                self._file = _open_arrow_file(self._temporary, "wb")
+                self._writer = pq.ParquetWriter(
+                    self._file, table.schema, compression="zstd", **self._encoding
+                )
             self._writer.write_table(table)
 
-    def close(self, empty: Callable[[], dict[str, Any]] | None) -> None:
-        """Finish the file; without rows, one with the columns of ``empty``, if there are such."""
+    def close(self, empty_columns: Callable[[], dict[str, Any]] | None) -> None:
+        """Finish the file and rename it from NAME.part.
+
+        If no rows were written, the file gets the ``empty_columns``; with None there is no file.
+        """
         if self._closed:
             return
-        if self._writer is None and empty is not None:
-            self.write(empty())
+        if self._writer is None and empty_columns is not None:
+            self.write(empty_columns())
         self._closed = True
         if self._writer is not None:
-            with self._or_nothing():
+            with self._discard_on_failure():
                 self._writer.close()
                 self._file.close()
-                publish(self._part, self._path)
+                publish(self._temporary, self._path)
 
     def discard(self) -> None:
-        """Remove the unfinished file."""
+        """Close and remove the unfinished file; does nothing after ``close``."""
         if self._closed:
             return
         self._closed = True
-        for one in (self._writer, self._file):
-            if one is not None:
+        for file in (self._writer, self._file):
+            if file is not None:
                 with contextlib.suppress(OSError, pa.ArrowException):
-                    one.close()
+                    file.close()
         with contextlib.suppress(OSError):
-            self._part.unlink(missing_ok=True)
+            self._temporary.unlink(missing_ok=True)
 
     @contextlib.contextmanager
-    def _or_nothing(self) -> Iterator[None]:
-        """Discard the unfinished file if anything fails meanwhile."""
+    def _discard_on_failure(self) -> Iterator[None]:
+        """Remove the unfinished file if the body raises; its OSErrors become WriteErrors."""
         try:
-            with writing(self._path):
+            with writing_file(self._path):
                 yield
         except BaseException:
             self._closed = False

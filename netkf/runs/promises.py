@@ -10,9 +10,9 @@ import numpy as np
 
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray
-from netkf.runs.files import finite
+from netkf.runs.files import to_json_value
 from netkf.runs.labels import delay_suffix, limit_label, mismatch_note
-from netkf.runs.tables import MAX_NODES, format_number, table
+from netkf.runs.tables import MAX_NODES, format_number, format_table
 from netkf.scenario.registry import name_of
 from netkf.scenario.scenario import Scenario
 from netkf.theory import (
@@ -31,10 +31,10 @@ from netkf.theory.common.mean_square import has_linear_errors, is_quickly_solved
 from netkf.theory.common.papers import paper_function
 from netkf.theory.hybrid.steady import steady_by_node
 
-CLOSE_TO_S = 0.1  # of the Frobenius norm of S
-MAX_RATED = 60  # nodes for which rates are looked for in seconds
-MAX_UNKNOWNS = 60_000  # of the steady bound, which takes some ten seconds
-MAX_COUPLED = 120_000  # unknowns times links of a node: dense networks take longer
+CLOSE_TO_S = 0.1  # distance from S, as a share of its Frobenius norm, to find link rates for
+MAX_RATE_NODES = 60  # largest network for which they are found within seconds
+MAX_UNKNOWNS = 60_000  # of the steady bound, which takes about ten seconds
+MAX_COUPLED = 120_000  # unknowns times neighbours of a node: dense networks take longer
 MARKS = {True: "holds", False: "FAILS", None: "unknown"}
 LIMITS: dict[str, Callable[[Scenario], FloatArray]] = {
     "limit_covariance": limit_covariance,
@@ -44,46 +44,59 @@ LIMITS: dict[str, Callable[[Scenario], FloatArray]] = {
 
 
 def compute_promises(scenario: Scenario) -> dict[str, Any]:
-    """Return assumptions, the bound at the horizon and in the steady state, and limits.
+    """Return what theory states about a scenario, as plain JSON (`netkf theory --json`).
 
-    The values are plain JSON; if a number does not exist, ``reason`` says why.
+    The assumptions; in continuous time the bound at the horizon and in the steady state, link rates
+    and limits; in slots the promises of the filter's paper or the centralised covariance; the exact
+    steady error covariance of linear filters with constant gains. Matrices are dictionaries with
+    ``value`` and ``trace``; if one does not exist these are None and ``reason`` says why.
     """
-    found: dict[str, Any] = {
+    promises: dict[str, Any] = {
         "scenario": scenario.name,
         "filter": name_of("filter", scenario.filter.algorithm),
         "nodes": list(scenario.nodes),
         "assumptions": [
-            {"assumption": a, "source": s, "holds": None if h is None else bool(h), "evidence": e}
-            for a, s, h, e in assumption_rows(scenario)
+            {
+                "assumption": assumption,
+                "source": source,
+                "holds": None if holds is None else bool(holds),
+                "evidence": evidence,
+            }
+            for assumption, source, holds, evidence in assumption_rows(scenario)
         ],
     }
-    own = paper_function(scenario, "promises", "slot_promises") if scenario.slotted else None
-    if own is not None:
-        found[scenario.hosted.paper] = own(scenario)
-    elif scenario.slotted:
-        found["slot_central_covariance"] = _value_or_reason(lambda: _slot_central(scenario))
-    if has_linear_errors(scenario) and scenario.hosted.talks:
-        found["steady_error"] = _steady_error(scenario)
     if scenario.slotted:
-        plain: dict[str, Any] = finite(found)
-        return plain
-    ends = np.array([scenario.horizon])
-    found["bound_at_horizon"] = _value_or_reason(lambda: covariance_bound(scenario, ends)[0])
-    found["steady_bound"] = _steady(scenario)
-    found["link_rate"] = _link_rate(scenario)
-    for name, function in LIMITS.items():
-        found[name] = _value_or_reason(lambda function=function: function(scenario))  # type: ignore[misc]
-    whole: dict[str, Any] = finite(found)
-    return whole
+        slot_promises = paper_function(scenario, "promises", "slot_promises")
+        if slot_promises is not None:
+            promises[scenario.hosted.paper] = slot_promises(scenario)
+        else:
+            promises["slot_central_covariance"] = _value_or_reason(
+                lambda: _slot_central_covariance(scenario)
+            )
+    if has_linear_errors(scenario) and scenario.hosted.talks:
+        promises["steady_error"] = _steady_error(scenario)
+    if not scenario.slotted:
+        ends = np.array([scenario.horizon])
+        promises["bound_at_horizon"] = _value_or_reason(lambda: covariance_bound(scenario, ends)[0])
+        promises["steady_bound"] = _steady_bound(scenario)
+        promises["link_rate"] = _sufficient_link_rate(scenario)
+        for name, function in LIMITS.items():
+            promises[name] = _value_or_reason(lambda function=function: function(scenario))  # type: ignore[misc]
+    document: dict[str, Any] = to_json_value(promises)
+    return document
 
 
-def _link_rate(scenario: Scenario) -> dict[str, Any]:
-    """Return the link rates from which on the steady bound is within a share of the size of S."""
+def _sufficient_link_rate(scenario: Scenario) -> dict[str, Any]:
+    """Return the link rate, 1/s, from which on the steady bound is close to its limit S.
+
+    ``value`` is the rate (None if links differ), ``factor`` the same as a multiple of the rates in
+    the scenario, and ``delta`` the distance from S, CLOSE_TO_S of its norm; None with a ``reason``.
+    """
     try:
-        if len(scenario.nodes) > MAX_RATED:
+        if len(scenario.nodes) > MAX_RATE_NODES:
             raise TheoryError(
-                f"not looked for beyond {MAX_RATED} nodes; netkf.theory.link_rate_for looks for "
-                "them however long it takes"
+                f"not looked for beyond {MAX_RATE_NODES} nodes; "
+                "netkf.theory.link_rate_for looks for them however long it takes"
             )
         delta = CLOSE_TO_S * float(np.linalg.norm(limit_covariance(scenario)))
         factor, rate = link_rate_for(scenario, delta)
@@ -93,10 +106,12 @@ def _link_rate(scenario: Scenario) -> dict[str, Any]:
 
 
 def _steady_error(scenario: Scenario) -> dict[str, Any]:
-    """Return the exact steady mean squares of the errors and their radius."""
+    """Return the exact steady error covariance of each node, as :func:`_value_or_reason` does, with
+    its mean-square ``radius``; None with a ``reason`` if there is none.
+    """
 
     def covariance() -> FloatArray:
-        """Return the steady error covariance; raises TheoryError if that takes long."""
+        """Return the steady error covariances (N, n, n); raises TheoryError if they take long."""
         if not is_quickly_solved(scenario):
             raise TheoryError(
                 "left out, because it takes more than seconds; "
@@ -104,40 +119,51 @@ def _steady_error(scenario: Scenario) -> dict[str, Any]:
             )
         return steady_error_covariance(scenario)
 
-    found = _value_or_reason(covariance)
-    return {**found, "radius": None if found["reason"] else mean_square_radius(scenario)}
+    result = _value_or_reason(covariance)
+    return {**result, "radius": None if result["reason"] else mean_square_radius(scenario)}
 
 
-def _slot_central(scenario: Scenario) -> FloatArray:
-    """Return P* (n, n), the prediction covariance of a filter with all readings in every slot."""
+def _slot_central_covariance(scenario: Scenario) -> FloatArray:
+    """Return P* (n, n), the steady prediction covariance of a Kalman filter with all readings in
+    every slot; raises TheoryError if H is not constant.
+    """
     for node in scenario.sensing:
-        scenario.observation(node)  # raises where H is not fixed
+        scenario.observation(node)  # raises TheoryError if H is not constant
     model = scenario.pooled_slot_model
     return steady_covariance(model.F, model.Q, model.H, model.R)
 
 
-def _steady(scenario: Scenario) -> dict[str, Any]:
-    """Return the steady bound; without messages some nodes may have one and others not."""
+def _steady_bound(scenario: Scenario) -> dict[str, Any]:
+    """Return the steady bounds (N, n, n) on P, as :func:`_value_or_reason` does.
+
+    Nodes that do not exchange messages may have one or not: then the value has nan for those
+    without, next to the reason.
+    """
     n = scenario.plant.n
     unknowns = len(scenario.nodes) * n * (n + 1) // 2
     degree = len(scenario.topology.directions) / len(scenario.nodes)
-    large = f"more than {MAX_UNKNOWNS:,}" if unknowns > MAX_UNKNOWNS else ""
-    if not large and unknowns * degree > MAX_COUPLED:
-        large = f"and its nodes have {degree:,.3g} neighbours each"
-    if large:
+    excess = ""
+    if unknowns > MAX_UNKNOWNS:
+        excess = f"more than {MAX_UNKNOWNS:,}"
+    elif unknowns * degree > MAX_COUPLED:
+        excess = f"and its nodes have {degree:,.3g} neighbours each"
+    if excess:
         reason = (
-            f"left out, because it has {unknowns:,} unknowns, {large}; "
+            f"left out, because it has {unknowns:,} unknowns, {excess}; "
             "netkf.theory.steady_covariance_bound computes it however long it takes"
         )
         return {"value": None, "trace": None, "reason": reason}
-    found = _value_or_reason(lambda: steady_covariance_bound(scenario))
-    if found["reason"] and not scenario.filter.algorithm.talks:
-        found = {**_value_or_reason(lambda: steady_by_node(scenario)), "reason": found["reason"]}
-    return found
+    result = _value_or_reason(lambda: steady_covariance_bound(scenario))
+    if result["reason"] and not scenario.filter.algorithm.talks:
+        by_node = _value_or_reason(lambda: steady_by_node(scenario))
+        return {**by_node, "reason": result["reason"]}
+    return result
 
 
 def _value_or_reason(function: Callable[[], FloatArray]) -> dict[str, Any]:
-    """Return a matrix with its trace, or the reason why there is none."""
+    """Return the ``value`` of a function, one matrix (n, n) or a stack of them, with its ``trace``;
+    if it raises TheoryError both are None and ``reason`` is the message.
+    """
     try:
         value = function()
     except TheoryError as error:
@@ -146,39 +172,41 @@ def _value_or_reason(function: Callable[[], FloatArray]) -> dict[str, Any]:
     return {"value": value.tolist(), "trace": trace.tolist(), "reason": None}
 
 
-def promises_text(scenario: Scenario, found: dict[str, Any]) -> str:
-    """Return the result of :func:`compute_promises` as text for a terminal."""
+def promises_text(scenario: Scenario, promises: dict[str, Any]) -> str:
+    """Return the ``promises`` of :func:`compute_promises` as text for a terminal."""
     title = f"{scenario.name}: {scenario.claim}" if scenario.claim else scenario.name
-    lines = [title, "", "assumptions", *_assumption_lines(found["assumptions"])]
+    lines = [title, "", "assumptions", *_assumption_lines(promises["assumptions"])]
     paper = scenario.hosted.paper
-    if paper and paper in found:
-        own_lines = paper_function(scenario, "promises", "slot_lines")(found[paper], format_number)
-        return "\n".join([*lines, "", *own_lines])
+    if paper and paper in promises:
+        slot_lines = paper_function(scenario, "promises", "slot_lines")
+        return "\n".join([*lines, "", *slot_lines(promises[paper], format_number)])
     if scenario.slotted:
-        central = found["slot_central_covariance"]
+        central = promises["slot_central_covariance"]
         trace = central["reason"] or format_number(central["trace"])
         lines += ["", f"trace of P*, the prediction covariance with all readings: {trace}"]
-        return "\n".join([*lines, *_error_lines(scenario, found)])
-    lines += [*_bound_lines(scenario, found), *_limit_lines(scenario, found)]
-    return "\n".join([*lines, *_error_lines(scenario, found)])
+        return "\n".join([*lines, *_steady_error_lines(scenario, promises)])
+    lines += [*_bound_lines(scenario, promises), *_limit_lines(scenario, promises)]
+    return "\n".join([*lines, *_steady_error_lines(scenario, promises)])
 
 
-def _error_lines(scenario: Scenario, found: dict[str, Any]) -> list[str]:
-    """Return the lines on exact steady mean squares, where the filter has constant gains."""
-    if "steady_error" not in found:
+def _steady_error_lines(scenario: Scenario, promises: dict[str, Any]) -> list[str]:
+    """Return the line on the exact steady error covariances; no line if they were not computed."""
+    if "steady_error" not in promises:
         return []
-    value, title = found["steady_error"], "trace of the steady error covariance, exact"
-    if value["reason"]:
-        return textwrap.wrap(f"{title}: {value['reason']}", 98, subsequent_indent="    ")
-    traces, nodes = np.array(value["trace"]), scenario.nodes
-    low, high = int(np.argmin(traces)), int(np.argmax(traces))
-    ends = [f"{format_number(float(traces[k]))} at node {nodes[k]}" for k in (low, high)]
-    mean, radius = (format_number(float(one)) for one in (traces.mean(), value["radius"]))
-    return [f"{title}: mean {mean}, from {ends[0]} to {ends[1]}; mean-square radius {radius}"]
+    error, title = promises["steady_error"], "trace of the steady error covariance, exact"
+    if error["reason"]:
+        return textwrap.wrap(f"{title}: {error['reason']}", 98, subsequent_indent="    ")
+    traces, nodes = np.array(error["trace"]), scenario.nodes
+    smallest, largest = (
+        f"{format_number(float(traces[k]))} at node {nodes[k]}"
+        for k in (int(np.argmin(traces)), int(np.argmax(traces)))
+    )
+    mean, radius = format_number(float(traces.mean())), format_number(float(error["radius"]))
+    return [f"{title}: mean {mean}, from {smallest} to {largest}; mean-square radius {radius}"]
 
 
 def _assumption_lines(rows: list[dict[str, Any]]) -> list[str]:
-    """Return the lines on assumptions."""
+    """Return the lines on assumptions, with their evidence wrapped and indented below each."""
     lines = []
     for row in rows:
         lines.append(f"  {MARKS[row['holds']]:7}  {row['assumption']}  [{row['source']}]")
@@ -187,12 +215,14 @@ def _assumption_lines(rows: list[dict[str, Any]]) -> list[str]:
     return lines
 
 
-def _bound_lines(scenario: Scenario, found: dict[str, Any]) -> list[str]:
-    """Return the lines on bounds, a table of traces by node."""
+def _bound_lines(scenario: Scenario, promises: dict[str, Any]) -> list[str]:
+    """Return the lines on the bounds on P: reasons why they do not exist, and a table of traces by
+    node.
+    """
     lines = ["", "trace of the bound on E[P_i]"]
     columns = {
-        f"at {scenario.horizon:g} s": found["bound_at_horizon"],
-        "steady state": found["steady_bound"],
+        f"at {scenario.horizon:g} s": promises["bound_at_horizon"],
+        "steady state": promises["steady_bound"],
     }
     for label, column in columns.items():
         if column["reason"]:
@@ -200,12 +230,12 @@ def _bound_lines(scenario: Scenario, found: dict[str, Any]) -> list[str]:
                 f"{label}: {column['reason']}", 98, initial_indent="  ", subsequent_indent="    "
             )
     if any(column["trace"] for column in columns.values()):
-        lines.append(textwrap.indent(_by_node(scenario, list(columns.values())), "  "))
+        lines.append(textwrap.indent(_bound_table(scenario, list(columns.values())), "  "))
     return lines
 
 
-def _limit_lines(scenario: Scenario, found: dict[str, Any]) -> list[str]:
-    """Return the lines on limits to compare with."""
+def _limit_lines(scenario: Scenario, promises: dict[str, Any]) -> list[str]:
+    """Return the lines on the traces of limits to compare P with, and on link rates."""
     error_limit = "limit of the true error covariance (derived)" + delay_suffix(scenario)
     labels = {
         "limit_covariance": f"{limit_label(scenario)}, as links tick ever faster",
@@ -214,34 +244,38 @@ def _limit_lines(scenario: Scenario, found: dict[str, Any]) -> list[str]:
     }
     lines = ["", "traces to compare"]
     for name, label in labels.items():
-        lines.append(f"  {label}: {found[name]['reason'] or format_number(found[name]['trace'])}")
-    if found["link_rate"]["reason"] is None:
-        lines.append(_rate_line(found["link_rate"]))
+        limit = promises[name]
+        lines.append(f"  {label}: {limit['reason'] or format_number(limit['trace'])}")
+    if promises["link_rate"]["reason"] is None:
+        lines.append(_link_rate_line(promises["link_rate"]))
     note = mismatch_note(scenario)
     return [*lines, f"note: {note}"] if note else lines
 
 
-def _rate_line(found: dict[str, Any]) -> str:
-    """Return the line on the rates of H Theorem 3."""
-    rates = f"{format_number(found['factor'])} times the rates given"
-    if found["value"] is not None:
-        rates = f"links from {format_number(found['value'])} per second on"
+def _link_rate_line(link_rate: dict[str, Any]) -> str:
+    """Return the line on the link rates of H Theorem 3."""
+    rates = f"{format_number(link_rate['factor'])} times the rates given"
+    if link_rate["value"] is not None:
+        rates = f"links from {format_number(link_rate['value'])} per second on"
     return f"  {rates} keep the steady bound within {CLOSE_TO_S:.0%} of S, H Theorem 3"
 
 
-def _by_node(scenario: Scenario, columns: list[dict[str, Any]]) -> str:
-    """Return a row per node; of large networks the nodes with the smallest, middle and largest
-    bounds.
+def _bound_table(scenario: Scenario, columns: list[dict[str, Any]]) -> str:
+    """Return a table of the traces of bounds with a row per node.
+
+    ``columns`` are the bounds at the horizon and in the steady state. Of more than MAX_NODES nodes
+    only those with the smallest, middle and largest bounds are listed.
     """
-    rows = [
-        [str(node), *(format_number(c["trace"][k] if c["trace"] else None) for c in columns)]
-        for k, node in enumerate(scenario.nodes)
-    ]
+    rows = []
+    for k, node in enumerate(scenario.nodes):
+        traces = [column["trace"][k] if column["trace"] else None for column in columns]
+        rows.append([str(node), *map(format_number, traces)])
     header = ["node", f"at {scenario.horizon:g} s", "steady state"]
     if len(rows) <= MAX_NODES:
-        return table(header, rows)
-    traces = [c["trace"] for c in columns if c["trace"]]
-    sizes = np.nan_to_num(np.array(traces[-1], dtype=np.float64), nan=np.inf)
+        return format_table(header, rows)
+    # Ranked by the steady bound, or by that at the horizon if there is no steady bound.
+    ranking = [column["trace"] for column in columns if column["trace"]][-1]
+    sizes = np.nan_to_num(np.array(ranking, dtype=np.float64), nan=np.inf)
     order, third = np.argsort(sizes, kind="stable"), MAX_NODES // 3
     middle = (len(order) - third) // 2
     listed = [*order[:third], *order[middle : middle + third], *order[-third:]]
@@ -249,4 +283,4 @@ def _by_node(scenario: Scenario, columns: list[dict[str, Any]]) -> str:
         f"the {third} nodes with the smallest, the middle and the largest bound of "
         f"{len(rows):,}; --json has all"
     )
-    return "\n".join([line, table(header, [rows[k] for k in listed])])
+    return "\n".join([line, format_table(header, [rows[k] for k in listed])])

@@ -1,4 +1,4 @@
-"""Software and hardware that results depend on, bit for bit, besides the scenario."""
+"""Software and hardware that the last bits of results depend on, besides the scenario."""
 
 from __future__ import annotations
 
@@ -17,64 +17,72 @@ from netkf.core.version import __version__
 from netkf.linalg.compiling import source_digest
 
 PACKAGES = ("numpy", "scipy", "numba", "llvmlite", "simpy", "networkx")
-"""Arithmetic and random draws (numpy, scipy), compiled code (numba, llvmlite), order of events
-(simpy) and random graphs (networkx). pandas and pyarrow are left out: they do not change numbers.
+"""Packages for arithmetic and random draws (numpy, scipy), compiled code (numba, llvmlite), the
+order of events (simpy) and random graphs (networkx); pandas and pyarrow do not change numbers.
 """
 VARIABLES = ("NUMBA_", "OPENBLAS_CORETYPE", "MKL_CBWR", "NPY_DISABLE_CPU_FEATURES")
-"""Prefixes of environment variables by which libraries choose their code."""
-HARMLESS = ("NUMBA_CACHE_DIR", "NUMBA_NUM_THREADS", "NUMBA_DEBUG_CACHE")
+"""Prefixes of the environment variables by which libraries choose the instructions they use."""
+UNRELATED_VARIABLES = ("NUMBA_CACHE_DIR", "NUMBA_NUM_THREADS", "NUMBA_DEBUG_CACHE")
+"""Variables with one of these prefixes that do not change results."""
 
 
 def versions() -> dict[str, str]:
-    """Return the versions of the packages that results depend on, bit for bit; ``source`` is the
-    digest of netkf's own files, which change between versions.
+    """Return the version of each package that the last bits of results depend on, by name.
+
+    ``source`` is the digest of netkf's own files, which may change without a new version.
     """
-    return dict(_versions())
+    return dict(_cached_versions())
 
 
 @cache
-def _versions() -> dict[str, str]:
-    """Return the versions of netkf, Python, packages and BLAS."""
-    found = {"netkf": __version__, "source": source_digest(), "python": platform.python_version()}
+def _cached_versions() -> dict[str, str]:
+    """Return the versions of netkf, Python, packages and BLAS; the same dictionary every time."""
+    result = {"netkf": __version__, "source": source_digest(), "python": platform.python_version()}
     for package in PACKAGES:
         try:
-            found[package] = metadata.version(package)
+            result[package] = metadata.version(package)
         except metadata.PackageNotFoundError:
             continue
-    blas = _build().get("Build Dependencies", {}).get("blas", {})
+    blas = _numpy_build().get("Build Dependencies", {}).get("blas", {})
     if "name" in blas:
-        found["blas"] = f"{blas['name']} {blas.get('version', '')}".strip()
-    return found
+        result["blas"] = f"{blas['name']} {blas.get('version', '')}".strip()
+    return result
 
 
 @cache
 def machine() -> dict[str, Any]:
-    """Return the architecture, the processor and its features (as a digest) for which numba
-    compiles, the vector instructions that numpy has found, and environment variables. Libraries
-    choose their code, and so their rounding, by them.
+    """Return properties of the computer by which libraries choose their code, and so its rounding.
+
+    ``architecture`` and ``system``; ``processor`` and ``features`` (a digest), for which numba
+    compiles; ``vector_instructions`` that numpy uses; ``environment`` variables, if any are set.
     """
-    found: dict[str, Any] = {"architecture": platform.machine(), "system": platform.system()}
+    result: dict[str, Any] = {"architecture": platform.machine(), "system": platform.system()}
     try:
         binding = importlib.import_module("llvmlite.binding")
-        found["processor"] = binding.get_host_cpu_name()
+        result["processor"] = binding.get_host_cpu_name()
         features = binding.get_host_cpu_features().flatten()
-        found["features"] = hashlib.sha256(features.encode()).hexdigest()[:16]
+        result["features"] = hashlib.sha256(features.encode()).hexdigest()[:16]
     except (ImportError, RuntimeError):
         pass
-    simd = _build().get("SIMD Extensions", {})
-    found["vector_instructions"] = [*simd.get("baseline", []), *simd.get("found", [])]
-    chosen = {k: v for k, v in sorted(os.environ.items()) if k.startswith(VARIABLES)}
-    chosen = {name: value for name, value in chosen.items() if name not in HARMLESS}
-    return {**found, "environment": chosen} if chosen else found
+    simd = _numpy_build().get("SIMD Extensions", {})
+    result["vector_instructions"] = [*simd.get("baseline", []), *simd.get("found", [])]
+    environment = {
+        name: value
+        for name, value in sorted(os.environ.items())
+        if name.startswith(VARIABLES) and name not in UNRELATED_VARIABLES
+    }
+    return {**result, "environment": environment} if environment else result
 
 
-def installation() -> str:
-    """Return the digest of all that results depend on, bit for bit, besides the scenario."""
+def installation_digest() -> str:
+    """Return the SHA-256, in hexadecimal, of the software and hardware that the last bits of
+    results depend on.
+    """
     text = json.dumps([versions(), machine()], sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()
 
 
-def _build() -> dict[str, Any]:
-    """Return the build configuration of numpy."""
+def _numpy_build() -> dict[str, Any]:
+    """Return the build configuration of numpy, nested dictionaries by topic."""
     configuration: Any = np.show_config(mode="dicts")
     return dict(configuration or {})

@@ -22,8 +22,8 @@ from netkf.runs.documents import file_digests, write_sealed
 from netkf.runs.failures import explain_failure
 from netkf.runs.files import (
     check_sources,
-    new_directory,
-    own_names,
+    create_output_directory,
+    run_file_names,
     write_json,
     write_scenario,
 )
@@ -45,13 +45,20 @@ from netkf.trace.recorder import Recorder, Sink
 from netkf.trace.run import Run
 
 ENDINGS = {"failed": "failed", "interrupted": "was interrupted"}
+"""How sentences say the status of a run with partial results."""
 
 
 @dataclass(frozen=True, eq=False)
 class CompletedRun:
-    """A run that was written to ``directory``, with its summary and the samples for a picture.
+    """A run that was written to ``directory``, with the data for a picture.
 
-    events: number of events; seconds: wall-clock time of the simulation without compiling.
+    status   : "complete" or "diverged"
+    summary  : contents of summary.json
+    samples  : errors and traces of P at the sample times
+    promised : what theory promises at these times
+    events   : number of events
+    seconds  : wall-clock time of the simulation, without compiling
+    engine   : name of the engine
     """
 
     directory: Path
@@ -73,25 +80,27 @@ def run_to_directory(
     finish: Callable[[CompletedRun], None] | None = None,
     replica: int = 0,
 ) -> CompletedRun:
-    """Run once, as ``replica`` of an ensemble, and write scenario.toml, manifest.json, the Parquet
-    tables and summary.json.
+    """Simulate a scenario once, as ``replica`` of an ensemble, and write a run directory.
 
-    ``trace`` is full, first (the same for a single run) or none (no tables). ``finish`` adds its
-    files to the directory before the manifest says that the run is complete. A run that is
-    interrupted or fails keeps its results until then: the files are finished, the manifest says
-    ``interrupted``, or ``failed`` with the error.
+    It holds scenario.toml, manifest.json, the Parquet tables and summary.json. ``out`` is the
+    directory (None: the first free runs/NAME-k). ``trace`` is "full", "first" (the same for a
+    single run) or "none" (no tables). ``finish`` may add files before the manifest says that the
+    run is complete. If the run is interrupted or fails, its results until then are written, and the
+    manifest says ``interrupted``, or ``failed`` with the error.
 
     Raises ScenarioError and EngineError before anything is written, InterruptedRunError (a
     KeyboardInterrupt) when interrupted, and EngineError if a user's class fails.
     """
     replica = integer(low=0)("replica", replica)
-    chosen = choose_engine(engine, scenario)
-    output = _create_output(scenario, out, scenario.seed, replica, chosen.name, trace != "none")
+    chosen_engine = choose_engine(engine, scenario)
+    output = _create_output(
+        scenario, out, scenario.seed, replica, chosen_engine.name, trace != "none"
+    )
     recorder = Recorder(output.sinks)
-    done = False
+    is_complete = False
     try:
-        status, seconds = _simulate(chosen, scenario, replica, recorder, progress)
-        done = status == "complete"
+        status, seconds = _simulate(chosen_engine, scenario, replica, recorder, progress)
+        is_complete = status == "complete"
         output.tables.close()
         promised = promise_traces(scenario, np.array(output.samples.times))
         summary = output.write_summary(promised, recorder.count, recorder.sums, status)
@@ -103,26 +112,30 @@ def run_to_directory(
             promised,
             recorder.total,
             seconds,
-            chosen.name,
+            chosen_engine.name,
         )
         if finish is not None:
             finish(completed)
     except BaseException as error:
-        _keep_partial_results(output, recorder, done, error)
+        _keep_partial_results(output, recorder, is_complete, error)
         explained = explain_failure(scenario, error, output.directory)
         if explained is error:
             raise
         raise explained from error
-    output.manifest.write(status, _event_totals(recorder), done, names=own_names(scenario))
+    totals = _event_totals(recorder)
+    output.manifest.write(status, totals, is_complete, names=run_file_names(scenario))
     return completed
 
 
 def save(run: Run, scenario: Scenario, directory: str | Path) -> Path:
-    """Write a run that is in memory as ``netkf run`` would have: scenario.toml, manifest.json, the
-    Parquet tables and summary.json; return the directory, which must be new or empty.
+    """Write a simulated run to a new or empty directory, as ``netkf run`` does, and return its
+    path.
 
-    The scenario.toml carries the run's seed; running it again gives the same files for replica 0.
-    Raises ScenarioError if the run belongs to another scenario.
+    The files are scenario.toml, manifest.json, the Parquet tables and summary.json. scenario.toml
+    has the seed of the run, so that simulating it again gives the same files for replica 0.
+
+    Raises ScenarioError if the run belongs to another scenario or the directory is not empty, and
+    WriteError.
     """
     if run.nodes != scenario.nodes or run.x.shape[1] != scenario.plant.n:
         rule = "must be a run of this scenario: its nodes or its state differ"
@@ -136,15 +149,17 @@ def save(run: Run, scenario: Scenario, directory: str | Path) -> Path:
     output.write_summary(promise_traces(scenario, run.times), run.count, run.sums, run.status)
     totals: dict[str, Any] = {"events": len(run.log), "fingerprint": run.fingerprint}
     totals |= {"simpy": run.stats} if run.stats else {}
-    done = run.status == "complete"
-    output.manifest.write(run.status, totals, done, names=own_names(scenario))
+    is_complete = run.status == "complete"
+    output.manifest.write(run.status, totals, is_complete, names=run_file_names(scenario))
     return output.directory
 
 
 @dataclass(frozen=True, eq=False)
 class _Output:
-    """The directory of a run with the sinks that fill it; ``links`` is empty or counts the messages
-    of each link, which only records of losses or delays need.
+    """A run directory with the sinks that a run writes to.
+
+    ``links`` has one sink that counts the messages of each link if losses or delays are recorded,
+    and is empty otherwise.
     """
 
     directory: Path
@@ -156,7 +171,7 @@ class _Output:
 
     @property
     def sinks(self) -> list[Sink]:
-        """All sinks, to record a run with."""
+        """All sinks, which receive the events and samples of the run."""
         return [self.samples, self.tables, *self.links]
 
     def write_summary(
@@ -166,7 +181,11 @@ class _Output:
         sums: dict[str, tuple[float, float]],
         status: str,
     ) -> dict[str, Any]:
-        """Write and return summary.json; ``count`` gives the number of events of a kind."""
+        """Write summary.json and return its contents.
+
+        ``count`` returns the number of events of a kind; ``sums`` has, by name, the exact value and
+        the last total of each conserved sum. Raises WriteError.
+        """
         messages = {
             "sent": count("send"),
             "delivered": count("deliver"),
@@ -175,7 +194,7 @@ class _Output:
         summary = summarise(self.scenario, self.samples, promised, messages)
         if sums:
             summary["conserved"] = conserved_sums(sums)
-        # A run that ended early says nothing about how much of a record it would have used.
+        # A run that ended early did not use all of a record that a complete run would have used.
         if status == "complete":
             usage = record_usage(self.scenario, self.links[0].sent if self.links else {})
             summary |= {"records": usage} if usage else {}
@@ -186,16 +205,17 @@ class _Output:
 def _create_output(
     scenario: Scenario, out: Path | None, seed: int, replica: int, engine: str, tables: bool
 ) -> _Output:
-    """Create the run directory with its scenario and a manifest; ``tables`` asks for Parquet files.
+    """Create the run directory with scenario.toml and a manifest, and return it with its sinks.
 
-    Raises ScenarioError if the directory is not empty or a file of the scenario is in the way.
+    ``tables`` says whether Parquet tables are written. Raises ScenarioError if the directory is not
+    empty or cannot hold a copy of the scenario, and WriteError.
     """
     check_sources(scenario)
-    directory = new_directory(out, scenario.name)
+    directory = create_output_directory(out, scenario.name)
     channel = scenario.network.channel
-    by_message = isinstance(channel.loss, RecordedLoss) or isinstance(channel.delay, RecordedDelay)
+    is_recorded = isinstance(channel.loss, RecordedLoss) or isinstance(channel.delay, RecordedDelay)
     manifest = Manifest(directory, scenario.name, seed, replica, engine)
-    # Written first, so that a run that is killed outright says that it did not finish.
+    # Written first, so that the directory of a process that is killed says "interrupted".
     manifest.write("interrupted", {})
     write_scenario(directory, scenario, seed)
     return _Output(
@@ -203,7 +223,7 @@ def _create_output(
         scenario,
         SummarySink(),
         ParquetSink(directory, scenario, replica, tables),
-        [SentPerLink()] if by_message else [],
+        [SentPerLink()] if is_recorded else [],
         manifest,
     )
 
@@ -211,17 +231,20 @@ def _create_output(
 def _simulate(
     engine: Engine, scenario: Scenario, replica: int, recorder: Recorder, progress: Progress
 ) -> tuple[str, float]:
-    """Return the status of a run and its wall-clock seconds, those spent compiling left out."""
-    began, compiled = time.perf_counter(), compiling.seconds_spent()
+    """Simulate and return the status of the run and its wall-clock seconds without compiling."""
+    start, compiled_before = time.perf_counter(), compiling.seconds_spent()
     status = engine.run(scenario, Streams(scenario.seed, replica), recorder, progress)
-    compiled = compiling.seconds_spent() - compiled
-    return status, time.perf_counter() - began - compiled
+    compile_seconds = compiling.seconds_spent() - compiled_before
+    return status, time.perf_counter() - start - compile_seconds
 
 
 def _keep_partial_results(
-    output: _Output, recorder: Recorder, done: bool, error: BaseException
+    output: _Output, recorder: Recorder, is_complete: bool, error: BaseException
 ) -> None:
-    """Finish the files of a run that stopped with ``error`` and write the error to its manifest."""
+    """Finish the files of a run that stopped with ``error`` and write the error to its manifest.
+
+    ``is_complete`` says whether the simulation itself was complete, so that only writing failed.
+    """
     status = "failed" if isinstance(error, Exception) else "interrupted"
     for finish in (recorder.flush, output.tables.close):
         with contextlib.suppress(Exception):  # a full disk fails again, and ``error`` says so
@@ -230,36 +253,38 @@ def _keep_partial_results(
         unknown = PromisedTraces(None, np.nan, np.nan, f"not computed: the run {ENDINGS[status]}")
         with contextlib.suppress(OSError):
             output.write_summary(unknown, recorder.count, recorder.sums, status)
-    output.manifest.write(status, _event_totals(recorder), done, error)
+    output.manifest.write(status, _event_totals(recorder), is_complete, error)
 
 
 def _event_totals(recorder: Recorder) -> dict[str, Any]:
-    """Return number and fingerprint of the events for the manifest."""
+    """Return the entries of the manifest about events: number, fingerprint, counts of SimPy."""
     totals: dict[str, Any] = {"events": recorder.total, "fingerprint": recorder.fingerprint}
     return totals | ({"simpy": recorder.stats} if recorder.stats else {})
 
 
 @dataclass(frozen=True, eq=False)
 class Manifest:
-    """The manifest.json of a directory of one run, or of ``wanted`` runs from ``replica`` on."""
+    """The manifest.json of a directory of ``runs`` runs, numbered from ``replica`` on."""
 
     directory: Path
     name: str
     seed: int
     replica: int
     engine: str
-    wanted: int = 1
+    runs: int = 1
 
     def write(
         self,
         status: str,
         totals: dict[str, Any],
-        done: int = 0,
+        completed_runs: int = 0,
         error: BaseException | None = None,
         names: Iterable[str] = (),
     ) -> None:
-        """Write manifest.json with the status, the totals, the number of runs that are done, the
-        digests of the files with these ``names``, and its own digest.
+        """Write manifest.json; raises WriteError.
+
+        It has the status, the ``totals``, the number of completed runs, the ``error`` of a failed
+        run, the digests of the existing files among ``names``, and its own digest.
         """
         manifest: dict[str, Any] = {
             "name": self.name,
@@ -267,7 +292,7 @@ class Manifest:
             "machine": machine(),
             "seed": self.seed,
             "replica": self.replica,
-            "runs": {"wanted": self.wanted, "done": int(done)},
+            "runs": {"wanted": self.runs, "done": int(completed_runs)},
             "engine": self.engine,
             "status": status,
             **totals,

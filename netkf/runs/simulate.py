@@ -17,16 +17,18 @@ from netkf.trace.recorder import MemorySink, Recorder, Sink
 from netkf.trace.run import Run
 from netkf.trace.schema import EVENT
 
-LOAD = "load it first: netkf.simulate(netkf.load(path))"
+LOAD_REMEDY = "load it first: netkf.simulate(netkf.load(path))"
 ENGINES = ("auto", "simpy", "compiled")
 
 
 def choose_engine(name: str | Engine, scenario: Scenario, announce: bool = True) -> Engine:
-    """Return the engine of a name: ``simpy`` (or ``processes``), ``compiled``, or ``auto``, that is
-    ``compiled`` if that engine can run the scenario and ``simpy`` otherwise. ``announce`` says so
-    where it will compile first.
+    """Return the engine for a scenario, by ``name`` or given as an Engine.
 
-    Raises EngineError for an unknown name and if the engine cannot run the scenario.
+    Names are ``simpy`` (or ``processes``), ``compiled``, and ``auto``: the compiled engine if it
+    can run the scenario, and SimPy otherwise. With ``announce`` an engine that has to compile first
+    prints so.
+
+    Raises EngineError if the name is unknown or the engine cannot run the scenario.
     """
     if isinstance(name, Engine):
         engine: Engine = name
@@ -54,25 +56,25 @@ def simulate(
     sinks: Sequence[Sink] = (),
     progress: Progress = silent,
 ) -> Run:
-    """Run a scenario once and return all events and samples.
+    """Simulate a scenario once and return the run with all events and samples.
 
-    ``seed`` defaults to the scenario's; runs of one seed differ by ``replica``. Additional
-    ``sinks`` receive the same rows and samples during the run.
+    ``seed`` is that of the scenario if None; runs with the same seed differ by ``replica``.
+    Additional ``sinks`` receive the same events and samples during the run.
 
     Raises EngineError if no engine can run the scenario, ScenarioError for bad arguments.
     """
     if not isinstance(scenario, Scenario):
-        raise ScenarioError("", "simulate takes a netkf.Scenario", scenario, LOAD)
+        raise ScenarioError("", "simulate takes a netkf.Scenario", scenario, LOAD_REMEDY)
     seed = scenario.seed if seed is None else integer(low=0)("seed", seed)
     replica = integer(low=0)("replica", replica)
-    chosen = choose_engine(engine, scenario)
+    chosen_engine = choose_engine(engine, scenario)
     memory = MemorySink()
     recorder = Recorder([memory, *sinks])
-    status = chosen.run(scenario, Streams(seed, replica), recorder, progress)
-    return collect(scenario, memory, recorder, seed, replica, chosen.name, status)
+    status = chosen_engine.run(scenario, Streams(seed, replica), recorder, progress)
+    return collect_run(scenario, memory, recorder, seed, replica, chosen_engine.name, status)
 
 
-def collect(
+def collect_run(
     scenario: Scenario,
     memory: MemorySink,
     recorder: Recorder,
@@ -81,10 +83,13 @@ def collect(
     engine: str,
     status: str,
 ) -> Run:
-    """Return the Run of a finished simulation whose recorder fed ``memory``."""
+    """Return the Run of a finished simulation whose ``recorder`` wrote to ``memory``.
+
+    ``engine`` is the name of the engine, ``status`` "complete" or "diverged".
+    """
     count, n = len(scenario.nodes), scenario.plant.n
     shapes = (), (n,), (count, n), (count, n, n), (count, n)
-    # Empty arrays in front give the right shapes to a run without samples.
+    # Concatenated with empty arrays, the arrays of a run without samples have the right shapes.
     empty = tuple(np.empty((0, *shape)) for shape in shapes)
     columns = zip(empty, *memory.samples, strict=True)
     times, x, xhat, P, error = (np.concatenate(column) for column in columns)

@@ -1,4 +1,4 @@
-"""A run that is read back from its directory."""
+"""Runs that are read back from their directories."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from netkf.runs.documents import (
     SEAL,
     TEXT,
     DamagedError,
+    add_file_name,
     check_files,
     check_seal,
-    damage_in,
     read_document,
-    require,
+    require_form,
 )
 from netkf.runs.parquet_files import column_names, read_numbers, read_texts
 from netkf.runs.summary import PromisedTraces, promise_traces
@@ -32,19 +32,27 @@ from netkf.trace.schema import CODES, EVENT, state_columns
 if TYPE_CHECKING:
     import pandas as pd
 
-AVERAGE: dict[str, Any] = {
-    f"{name}{end}": NUMBER
-    for name in ("rms_error", "mean_trace", "mean_nees", "bound?", "ratio?")
-    for end in ("", "_se?")
-    if not (end and name.endswith("?"))
-}
-SUMMARY: dict[str, Any] = {
-    "nodes": [{"node": COUNT, **AVERAGE}],
-    "overall": AVERAGE,
+AVERAGES_FORM: dict[str, Any] = dict.fromkeys(
+    (
+        "rms_error",
+        "rms_error_se?",
+        "mean_trace",
+        "mean_trace_se?",
+        "mean_nees",
+        "mean_nees_se?",
+        "bound?",
+        "ratio?",
+    ),
+    NUMBER,
+)
+"""Forms of JSON values, see documents.require_form."""
+SUMMARY_FORM: dict[str, Any] = {
+    "nodes": [{"node": COUNT, **AVERAGES_FORM}],
+    "overall": AVERAGES_FORM,
     "messages": {"sent": NUMBER, "delivered": NUMBER, "lost": NUMBER},
     "rounding_from?": NUMBER,
 }
-MANIFEST: dict[str, Any] = {
+MANIFEST_FORM: dict[str, Any] = {
     "name": TEXT,
     "status": TEXT,
     "seed": COUNT,
@@ -55,23 +63,23 @@ MANIFEST: dict[str, Any] = {
     "runs": {"wanted": COUNT, "done": COUNT},
     "simpy?": {},
 }
-TABLES = ("states.parquet", "events.parquet")
+TABLE_FILES = ("states.parquet", "events.parquet")
 
 
 class WithPromises:
-    """What theory promises about results that are read back: they know their scenario and times."""
+    """Mixin of results that are read back: what theory promises at their sample times (T,)."""
 
     scenario: Any
     times: FloatArray
 
     @cached_property
     def promised(self) -> PromisedTraces:
-        """Return what theory promises at the sample times: bound, limit, centralised filter."""
+        """What theory promises at the sample times: bound, limit, centralised filter."""
         return promise_traces(self.scenario, self.times)
 
     @property
     def bound(self) -> FloatArray | None:
-        """Return traces (T, N) of the bound H(12) at the samples, None if it does not apply."""
+        """Traces (T, N) of the bound H(12) at the sample times; None if it does not apply."""
         return self.promised.bound
 
 
@@ -79,9 +87,9 @@ class WithPromises:
 class StoredRun(WithPromises, Run):
     """A run that is read back from ``directory``, with its ``manifest`` and ``summary``.
 
-    ``error`` is the difference of the stored x and xhat, so that it has lost digits where both are
-    large; ``sq_error``, ``nees`` and ``states`` are those that were written and have lost none.
-    Without tables (``--trace none``) it has no samples and no events.
+    ``error`` is the difference of the stored x and xhat, which loses digits if both are large;
+    ``sq_error``, ``nees`` and ``states`` are as the run wrote them, and ``stored`` is the table of
+    state samples. A run without tables (``--trace none``) has no samples and no events.
     """
 
     directory: Path
@@ -91,32 +99,36 @@ class StoredRun(WithPromises, Run):
 
     @cached_property
     def states(self) -> pd.DataFrame:
-        """Return the table of state samples as it was written."""
+        """The table of state samples as the run wrote it."""
         return self.stored
 
     @cached_property
     def sq_error(self) -> FloatArray:
-        """Return the squared errors (T, N) as they were written, nan without known truth."""
+        """Squared errors (T, N) as the run wrote them; nan without ground truth."""
         return self._column("sq_error")
 
     @cached_property
     def nees(self) -> FloatArray:
-        """Return the NEES (T, N) as it was written, nan where it is unknown."""
+        """NEES (T, N) as the run wrote it; nan where it is unknown."""
         return self._column("nees")
 
     def _column(self, name: str) -> FloatArray:
-        """Return one column of the samples (T, N), nan if the file does not have it."""
+        """Return a column of the state samples as an array (T, N), nan if the table lacks it."""
         shape = len(self.times), len(self.nodes)
         if name not in self.stored:
             return np.full(shape, np.nan)
         return self.stored[name].to_numpy(dtype=np.float64).reshape(shape)
 
 
-def read_form(directory: Path, name: str, form: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a JSON document of a directory that has a form; raises DamagedError."""
-    with damage_in(name):
+def read_checked_document(directory: Path, name: str, form: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the JSON document in the file ``name`` of a directory.
+
+    Raises DamagedError if it does not have the ``form`` (see documents.require_form) or if it has a
+    seal that does not fit.
+    """
+    with add_file_name(name):
         document = read_document(directory / name)
-        require(document, dict(form))
+        require_form(document, dict(form))
         if SEAL in document:
             check_seal(document)
     return document
@@ -125,30 +137,34 @@ def read_form(directory: Path, name: str, form: Mapping[str, Any]) -> dict[str, 
 def read_run(
     directory: Path, scenario: Scenario, manifest: dict[str, Any], replica: int | None = None
 ) -> StoredRun:
-    """Return the run in a directory, or one ``replica`` of an ensemble that kept its trace.
+    """Return the run in a directory, or one ``replica`` of an ensemble that was traced.
 
-    ``manifest`` has passed MANIFEST. Raises DamagedError for files that are not as netkf writes
-    them.
+    ``manifest`` has the form MANIFEST_FORM. Raises DamagedError if a file is not as netkf writes
+    it.
     """
-    check_files(directory, manifest, [*TABLES, "summary.json"])
-    summary = read_form(directory, "summary.json", SUMMARY)
-    single = replica is None
-    number = int(manifest.get("replica", 0)) if replica is None else replica
-    states, arrays = _read_states(directory / "states.parquet", scenario, number)
-    log = _read_events(directory / "events.parquet", scenario, number)
-    conserved = summary.get("conserved", {}) if single else {}
+    check_files(directory, manifest, [*TABLE_FILES, "summary.json"])
+    summary = read_checked_document(directory, "summary.json", SUMMARY_FORM)
+    # In the directory of an ensemble the manifest and the summary are about all of its runs.
+    is_single_run = replica is None
+    if replica is None:
+        replica = int(manifest.get("replica", 0))
+    states, arrays = _read_states(directory / "states.parquet", scenario, replica)
+    log = _read_events(directory / "events.parquet", scenario, replica)
+    conserved = summary.get("conserved", {}) if is_single_run else {}
+    # The fingerprint of an ensemble is that of its first run.
+    has_fingerprint = is_single_run or replica == 0
     return StoredRun(
         **arrays,
         nodes=scenario.nodes,
         log=log,
         seed=int(manifest["seed"]),
-        replica=number,
+        replica=replica,
         engine=str(manifest.get("engine", "")),
-        status=str(manifest["status"]) if single else _read_status(log),
-        fingerprint=str(manifest.get("fingerprint", "")) if single or number == 0 else "",
+        status=str(manifest["status"]) if is_single_run else _status_of_log(log),
+        fingerprint=str(manifest.get("fingerprint", "")) if has_fingerprint else "",
         sums=_read_sums(conserved),
         truth_known=scenario.plant.truth_known,
-        stats=dict(manifest.get("simpy", {})) if single else {},
+        stats=dict(manifest.get("simpy", {})) if is_single_run else {},
         scenario=scenario,
         directory=directory,
         manifest=manifest,
@@ -157,43 +173,54 @@ def read_run(
     )
 
 
-def _read_status(log: np.ndarray) -> str:
-    """Return "diverged" or "complete"."""
+def _status_of_log(log: np.ndarray) -> str:
+    """Return "diverged" if the EVENT rows of a run say so, else "complete"."""
     return "diverged" if (log["kind"] == CODES["diverged"]).any() else "complete"
 
 
 def _read_sums(conserved: Any) -> dict[str, tuple[float, float]]:
-    """Return the conserved sums of a manifest; raises DamagedError."""
+    """Return (exact value, last total) of each conserved sum, by name.
+
+    ``conserved`` is the entry of summary.json. Raises DamagedError if it has another form.
+    """
     form = {"exact": NUMBER, "total": NUMBER}
-    require(conserved, {}, "conserved")
-    for name, found in conserved.items():
-        require(found, form, f"conserved.{name}")
-    return {name: (found["exact"], found["total"]) for name, found in conserved.items()}
+    require_form(conserved, {}, "conserved")
+    for name, entry in conserved.items():
+        require_form(entry, form, f"conserved.{name}")
+    return {name: (entry["exact"], entry["total"]) for name, entry in conserved.items()}
 
 
 def _read_states(
     path: Path, scenario: Scenario, replica: int
 ) -> tuple[pd.DataFrame, dict[str, Any]]:
-    """Return the table of samples of a replica, and the arrays of a Run that stand in it."""
+    """Return the table of state samples of a replica, and the arrays of a Run that it holds.
+
+    The arrays, by name, are times (T,), x (T, n), xhat and error (T, N, n) and P (T, N, n, n).
+    Without the file T is 0. Raises DamagedError if the file does not fit the scenario.
+    """
     import pandas as pd
 
     n, N = scenario.plant.n, len(scenario.nodes)
     names = state_columns(n)
     if not scenario.plant.truth_known:
-        names = names[:-2]
+        names = names[:-2]  # without sq_error and nees
     if path.exists():
         if column_names(path) != names:
             raise DamagedError(f"{path.name} does not have the columns of this scenario")
-        table = read_numbers(path, names, replica, missing=True)
+        table = read_numbers(path, names, replica, allow_empty=True)
     else:
         table = pd.DataFrame({name: np.empty(0) for name in names})
     T = len(table) // N
     times = table["t"].to_numpy(dtype=np.float64)[::N]
-    whole = len(table) == T * N and np.array_equal(table["node"], np.tile(scenario.nodes, T))
-    if not (
-        whole and np.array_equal(table["t"], np.repeat(times, N)) and (np.diff(times) > 0).all()
-    ):
+    has_all_rows = (
+        len(table) == T * N
+        and np.array_equal(table["node"], np.tile(scenario.nodes, T))
+        and np.array_equal(table["t"], np.repeat(times, N))
+        and (np.diff(times) > 0).all()
+    )
+    if not has_all_rows:
         raise DamagedError(f"{path.name} does not have a row for each time and node")
+    # After run, t and node: x, xhat and the upper triangle of P, row by row.
     values = table[names[3:]].to_numpy(dtype=np.float64).reshape(T, N, len(names) - 3)
     x, xhat = values[:, 0, :n], values[:, :, n : 2 * n]
     i, j = np.triu_indices(n)
@@ -203,24 +230,26 @@ def _read_states(
 
 
 def _read_events(path: Path, scenario: Scenario, replica: int) -> np.ndarray:
-    """Return the events of a replica as EVENT rows; none without the file."""
+    """Return the events of a replica as EVENT rows; no rows without the file.
+
+    Raises DamagedError if the file does not fit the scenario.
+    """
     if not path.exists():
         return np.empty(0, dtype=EVENT)
     columns = [name for name in EVENT.names or () if name != "kind"]
-    table = read_numbers(path, columns, replica, missing=True)
+    table = read_numbers(path, columns, replica, allow_empty=True)
     kinds = read_texts(path, "kind", replica)
     codes = kinds.cat.categories.map(CODES)
     if codes.hasnans:
         raise DamagedError(f"{path.name} has events of an unknown kind")
     rows = np.empty(len(table), dtype=EVENT)
     for name in columns:
-        whole = EVENT[name].kind == "i"
-        if whole and table[name].dtype.kind != "i":
+        if EVENT[name].kind == "i" and table[name].dtype.kind != "i":
             raise DamagedError(f"{path.name} has no column {name} of integers")
         rows[name] = table[name]
     rows["kind"] = np.asarray(codes, dtype=np.uint8)[kinds.cat.codes]
-    known = [-1, *scenario.nodes]
-    if not (np.isin(rows["node"], known).all() and np.isin(rows["peer"], known).all()):
+    nodes = [-1, *scenario.nodes]  # -1: the event has no node, or no peer
+    if not (np.isin(rows["node"], nodes).all() and np.isin(rows["peer"], nodes).all()):
         raise DamagedError(f"{path.name} has events of nodes that the scenario does not have")
     if not np.isfinite(rows["t"]).all() or (np.diff(rows["t"]) < 0.0).any():
         raise DamagedError(f"{path.name} has events out of order")

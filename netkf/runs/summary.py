@@ -1,4 +1,4 @@
-"""The summary of a run: errors and covariances per node beside the bounds of theory."""
+"""The summary of a run: errors and covariances of each node next to the bounds of theory."""
 
 from __future__ import annotations
 
@@ -23,20 +23,23 @@ from netkf.trace.schema import CODES
 
 CONFIDENCE = 0.95
 MAX_BOUND_BYTES, SERIES_TERMS = 1.5 * 2**30, 30
+"""Largest memory of a bound that is computed, and the terms of the series that computing it stores.
+"""
 MAX_STEADY_ENTRIES = 100_000
-"""Entries of the covariances of all nodes up to which a run looks for the steady state."""
+"""Largest number of entries of all covariances for which a run computes the steady state."""
 
 
 class SummarySink(Sink):
-    """Reduces samples to the numbers that tables and pictures need.
+    """Reduces samples and events to the numbers that tables and pictures need.
 
-    times            : T sample times in seconds
-    sq_error, trace, nees, first : for each of them (N,) squared error, trace of P, NEES and first
-                       component of the estimate
-    delivered        : messages delivered over each link, both directions together
-    rounding_from    : time of the first sample whose errors rounding blurs because the state is too
-                       large (unstable plants over long horizons); None without one
-    diverged         : nodes whose estimate or covariance was not usable at the last sample
+    times           : T sample times in seconds
+    sq_error, trace, nees, first_component : T arrays (N,) each: squared error, trace of P, NEES and
+                      first component of the estimate
+    delivered       : number of messages delivered over each link (i, j), i < j, both directions
+    rounding_from   : time of the first sample whose errors are mostly rounding, because the state
+                      is large (unstable plants over long horizons); None if there is none
+    diverged        : nodes whose estimate or covariance was unusable at the last sample
+    transmissions   : number of messages and transmissions of each node
     """
 
     thread_safe: ClassVar[bool] = True
@@ -46,45 +49,45 @@ class SummarySink(Sink):
         self.sq_error: list[FloatArray] = []
         self.trace: list[FloatArray] = []
         self.nees: list[FloatArray] = []
-        self.first: list[FloatArray] = []
+        self.first_component: list[FloatArray] = []
         self.delivered: dict[tuple[int, int], int] = {}
         self.rounding_from: float | None = None
         self.diverged: list[int] = []
         self.transmissions = Transmissions()
 
     def events(self, rows: np.ndarray) -> None:
-        """Count the messages of a block of EVENT rows."""
+        """Count the messages in a block of EVENT rows, and note nodes that diverged."""
         self.transmissions.add(rows)
         self.diverged += rows["node"][rows["kind"] == CODES["diverged"]].tolist()
-        arrived = rows[rows["kind"] == CODES["deliver"]]
-        ends = np.sort(np.column_stack([arrived["node"], arrived["peer"]]), axis=1)
-        pairs, counts = np.unique(ends, axis=0, return_counts=True)
-        for (i, j), count in zip(pairs.tolist(), counts.tolist(), strict=True):
+        deliveries = rows[rows["kind"] == CODES["deliver"]]
+        ends = np.sort(np.column_stack([deliveries["node"], deliveries["peer"]]), axis=1)
+        links, counts = np.unique(ends, axis=0, return_counts=True)
+        for (i, j), count in zip(links.tolist(), counts.tolist(), strict=True):
             self.delivered[i, j] = self.delivered.get((i, j), 0) + count
 
     def states(
         self, t: FloatArray, x: FloatArray, xhat: FloatArray, P: FloatArray, error: FloatArray
     ) -> None:
-        """Reduce a block of samples; P (T, N, n, n) is not kept."""
+        """Reduce a block of samples, with the shapes in trace.recorder.Sink; P is not stored."""
         if not len(t):
             return
         sq_error, nees = errors(error, P)
         self.times += t.tolist()
         self.sq_error += list(sq_error)
         self.nees += list(nees)
-        self.first += list(np.array(xhat[:, :, 0]))
+        self.first_component += list(np.array(xhat[:, :, 0]))
         self.trace += list(np.trace(P, axis1=2, axis2=3))
         if self.rounding_from is None:
             first = rounding_from(t, carried_size(x, error, self.exact_errors), P, error)
             self.rounding_from = first if first < np.inf else None
 
     @property
-    def covariance_given(self) -> bool:
+    def has_covariance(self) -> bool:
         """True if the filter gives a covariance, or no sample was taken."""
         return not self.trace or any(np.isfinite(trace).any() for trace in self.trace)
 
     @property
-    def ended_finite(self) -> bool:
+    def is_finite_at_end(self) -> bool:
         """True if errors and covariances were finite at the last sample."""
         return bool(np.isfinite([self.sq_error[-1], self.trace[-1]]).all())
 
@@ -99,23 +102,27 @@ class SampleIndices(NamedTuple):
     covariances: np.ndarray
 
 
-def averaged_samples(times: FloatArray, rounding_from: float, diverged: bool) -> SampleIndices:
-    """Return which of the samples at ``times`` (T,) are averaged.
+def select_averaged_samples(
+    times: FloatArray, rounding_from: float, diverged: bool
+) -> SampleIndices:
+    """Return the indices of the samples at ``times`` (T,) whose averages a summary has.
 
-    These are the samples after time 0 (all of them if there is none later), without the last sample
-    of a run that ``diverged``. Errors that rounding blurs are left out, and so are the covariances
-    at the same times if the run diverged, since they outgrow all bounds.
+    These are the samples after time 0 (all of them if none is later), without the last sample of a
+    run that ``diverged``. Errors from ``rounding_from`` on are left out because rounding dominates
+    them, and covariances at the same times if the run diverged, because they grow without bound.
     """
-    kept = times[: len(times) - 1] if diverged and len(times) > 1 else times
-    after = kept > 0.0 if (kept > 0.0).any() else np.ones(len(kept), dtype=bool)
-    clear = after & (kept < rounding_from)
-    covariances = clear if diverged and clear.any() else after
-    return SampleIndices(np.flatnonzero(clear), np.flatnonzero(covariances))
+    usable = times[: len(times) - 1] if diverged and len(times) > 1 else times
+    after_start = usable > 0.0 if (usable > 0.0).any() else np.ones(len(usable), dtype=bool)
+    exact = after_start & (usable < rounding_from)
+    covariances = exact if diverged and exact.any() else after_start
+    return SampleIndices(np.flatnonzero(exact), np.flatnonzero(covariances))
 
 
 def nees_bounds(n: int, runs: int = 1) -> tuple[float, float]:
-    """Return the interval that holds the mean NEES of one sample over ``runs`` runs with
-    probability CONFIDENCE if P is exact: the sum is chi-square with ``runs n`` degrees of freedom.
+    """Return the ends of the interval that holds the mean NEES of one sample over ``runs`` runs
+    with probability CONFIDENCE if P is exact.
+
+    The sum over the runs is chi-square with ``runs n`` degrees of freedom, n states.
     """
     ends = 0.5 * (1.0 - CONFIDENCE), 0.5 * (1.0 + CONFIDENCE)
     low, high = (2.0 * float(gammaincinv(0.5 * runs * n, end)) / runs for end in ends)
@@ -143,7 +150,10 @@ class PromisedTraces:
 
 
 def promise_traces(scenario: Scenario, times: FloatArray) -> PromisedTraces:
-    """Return the bounds and limits of a scenario at the sample ``times`` (T,) of a run."""
+    """Return the bounds at the sample ``times`` (T,) of a run, and the limits, of a scenario.
+
+    If theory does not apply or takes too much memory, the reason is given instead.
+    """
     bound, reason = None, ""
     try:
         if len(times):
@@ -163,7 +173,7 @@ def promise_traces(scenario: Scenario, times: FloatArray) -> PromisedTraces:
 
 
 def _require_small_bound(scenario: Scenario, samples: int) -> None:
-    """Raise TheoryError if H(12) at all samples would take more memory than a large run itself."""
+    """Raise TheoryError if H(12) at ``samples`` times takes more memory than MAX_BOUND_BYTES."""
     if reason_without_bound(scenario):
         return
     n = scenario.plant.n
@@ -177,7 +187,9 @@ def _require_small_bound(scenario: Scenario, samples: int) -> None:
 
 
 def _steady_note(scenario: Scenario) -> str:
-    """Return a note if the bound on P has no steady state, or none that is known."""
+    """Return a note for users if the bound on P has no steady state, or if this is not known; else
+    an empty text.
+    """
     if scenario.slotted or reason_without_bound(scenario):
         return ""
     if len(scenario.nodes) * scenario.plant.n**2 > MAX_STEADY_ENTRIES:
@@ -197,7 +209,7 @@ def _steady_note(scenario: Scenario) -> str:
 
 
 def _trace_or_nan(function: Any, scenario: Scenario) -> float:
-    """Return the trace of a promised matrix, nan if it is not promised."""
+    """Return the trace of the matrix ``function(scenario)``; nan if it raises TheoryError."""
     try:
         return float(np.trace(function(scenario)))
     except TheoryError:
@@ -209,15 +221,16 @@ def summarise(
 ) -> dict[str, Any]:
     """Return the summary of a run, as in summary.json.
 
-    It has, per node and overall, the RMS error and the mean trace of P over time, the mean bound
-    and their ratio, the mean NEES over the samples after time 0, and the messages sent and
-    transmissions of each node; then the totals of messages. Errors and NEES leave out the samples
-    that rounding blurs. Numbers are nan if there is no sample or no covariance.
+    ``nodes`` and ``overall`` have averages over time, see :func:`select_averaged_samples`: the RMS
+    error, the mean trace of P, the mean bound and the ratio of both, and the mean NEES; ``nodes``
+    also the numbers of messages and transmissions of each node. ``messages`` are the numbers of
+    messages ``sent``, ``delivered`` and ``lost`` in the network. Averages are nan if there is no
+    sample or no covariance.
     """
     nodes, overall = _average_rows(scenario, sink, promised)
     counts = sink.transmissions
     for row in nodes:
-        row |= {"sent": counts.sent[row["node"]], "transmissions": counts.of(row["node"])}
+        row |= {"sent": counts.sent[row["node"]], "transmissions": counts.count_for(row["node"])}
     return {
         "nodes": nodes,
         "overall": overall,
@@ -225,7 +238,7 @@ def summarise(
         "central": promised.central,
         "bound": promised.reason or "H(12), promised by H Theorem 2",
         "rounding_from": sink.rounding_from,
-        "notes": summary_notes(scenario, sink.rounding_from, sink.covariance_given),
+        "notes": summary_notes(scenario, sink.rounding_from, sink.has_covariance),
         "messages": {
             **messages,
             "transmissions": counts.total,
@@ -237,28 +250,32 @@ def summarise(
 def _average_rows(
     scenario: Scenario, sink: SummarySink, promised: PromisedTraces
 ) -> tuple[list[dict[str, Any]], dict[str, Any]]:
-    """Return a row of averages over time for each node, and one for all nodes together."""
-    blurred = np.inf if sink.rounding_from is None else sink.rounding_from
-    used = averaged_samples(np.array(sink.times), blurred, bool(sink.diverged))
-    square = _mean_or_nan(sink.sq_error, used.errors, scenario)
-    trace = _mean_or_nan(sink.trace, used.covariances, scenario)
-    nees = _mean_or_nan(sink.nees, used.errors, scenario)
-    columns = [square, trace, nees]
+    """Return a row of averages over time for each node, and one for all nodes together.
+
+    A row is a dictionary: the averages by their names in summary.json, of nodes also ``node``.
+    """
+    rounding_from = np.inf if sink.rounding_from is None else sink.rounding_from
+    indices = select_averaged_samples(np.array(sink.times), rounding_from, bool(sink.diverged))
+    mean_square = _mean_or_nan(sink.sq_error, indices.errors, scenario)
+    trace = _mean_or_nan(sink.trace, indices.covariances, scenario)
+    nees = _mean_or_nan(sink.nees, indices.errors, scenario)
+    columns = [mean_square, trace, nees]
     with np.errstate(all="ignore"):  # ratios to a bound of 0, and diverged runs
         if promised.bound is not None:
-            columns.append(promised.bound[used.covariances].mean(axis=0))
-        averages = _averages(*columns)
-        means = _averages(*(np.array([column.mean()]) for column in columns))
-    rows = zip(*averages.values(), strict=True)
+            columns.append(promised.bound[indices.covariances].mean(axis=0))
+        by_node = _averages(*columns)
+        overall = _averages(*(np.array([column.mean()]) for column in columns))
     nodes = [
-        {"node": node, **dict(zip(averages, row, strict=True))}
-        for node, row in zip(scenario.nodes, rows, strict=True)
+        {"node": node, **{name: values[k] for name, values in by_node.items()}}
+        for k, node in enumerate(scenario.nodes)
     ]
-    return nodes, {name: value for name, (value,) in means.items()}
+    return nodes, {name: value for name, (value,) in overall.items()}
 
 
 def _mean_or_nan(values: list[FloatArray], indices: np.ndarray, scenario: Scenario) -> FloatArray:
-    """Return the mean (N,) of the samples at ``indices`` of T arrays (N,), nan without any."""
+    """Return the mean (N,) of those of T arrays ``values`` (N,) at ``indices``; nan if there are
+    none.
+    """
     if not len(indices):
         return np.full(len(scenario.nodes), np.nan)
     with np.errstate(all="ignore"):
@@ -266,10 +283,10 @@ def _mean_or_nan(values: list[FloatArray], indices: np.ndarray, scenario: Scenar
 
 
 def summary_notes(
-    scenario: Scenario, rounding_from: float | None, covariance_given: bool
+    scenario: Scenario, rounding_from: float | None, has_covariance: bool
 ) -> list[str]:
-    """Return notes on the averages of a run or of an ensemble, one sentence each."""
-    notes = [] if covariance_given else [NO_COVARIANCE]
+    """Return notes for users on the averages of a run or of an ensemble, one sentence each."""
+    notes = [] if has_covariance else [NO_COVARIANCE]
     if rounding_from is not None and scenario.plant.truth_known:
         notes.append(
             f"from {rounding_from:g} s on the state is so large that rounding blurs the errors: "
@@ -279,8 +296,10 @@ def summary_notes(
 
 
 def conserved_sums(sums: dict[str, tuple[float, float]]) -> dict[str, Any]:
-    """Return the sums over all nodes that exchanges should conserve: the exact value, the total at
-    the last sample and its relative deviation.
+    """Return the entry of summary.json on sums over all nodes that exchanges should conserve.
+
+    ``sums`` has (exact value, total at the last sample) by name; the entry adds the relative
+    deviation of the total, ``drift``.
     """
     return {
         name: {"exact": exact, "total": total, "drift": (total - exact) / exact}
@@ -291,12 +310,15 @@ def conserved_sums(sums: dict[str, tuple[float, float]]) -> dict[str, Any]:
 def _averages(
     mean_square: FloatArray, trace: FloatArray, nees: FloatArray, bound: FloatArray | None = None
 ) -> dict[str, list[Any]]:
-    """Return the averages of summary.json, a list of N numbers each; None without a bound."""
-    none = [None] * len(trace)
+    """Return the averages of summary.json by name, a list of N numbers each, from arrays (N,).
+
+    Without a ``bound``, the lists of the bound and of the ratio to it hold None.
+    """
+    missing = [None] * len(trace)
     return {
         "rms_error": np.sqrt(mean_square).tolist(),
         "mean_trace": trace.tolist(),
-        "bound": none if bound is None else bound.tolist(),
-        "ratio": none if bound is None else (trace / bound).tolist(),
+        "bound": missing if bound is None else bound.tolist(),
+        "ratio": missing if bound is None else (trace / bound).tolist(),
         "mean_nees": nees.tolist(),
     }

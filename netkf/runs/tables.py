@@ -10,9 +10,9 @@ from netkf.core.printable import one_line
 from netkf.scenario.usage import usage_notes
 
 MAX_NODES = 30
-"""Rows of a table with one row per node; longer tables show the ends of the list."""
+"""Largest number of rows of a table of nodes; longer ones list the best and the worst nodes."""
 DRIFT_TOLERANCE = 1e-9
-"""Relative drift of a conserved sum that rounding cannot explain."""
+"""Relative drift of a conserved sum above which rounding cannot be the cause."""
 COLUMNS = {
     "rms_error": "RMS error",
     "mean_trace": "mean trace P",
@@ -20,52 +20,58 @@ COLUMNS = {
     "ratio": "ratio",
     "mean_nees": "NEES",
 }
+"""Headers of the columns of averages, by the key in summary.json."""
 
 
 def format_number(value: float | None) -> str:
-    """Format a number with four significant digits; a dash if it is None or not finite."""
+    """Return a number with four significant digits; a dash if it is None or not finite."""
     if value is None or not math.isfinite(value):
         return "-"
     return f"{value:.4g}"
 
 
-def standard_error(error: float | None) -> str:
-    """Format a standard error as `` +- 0.1``; empty if it is None or not finite."""
-    known = error is not None and math.isfinite(error)
-    return f" +- {error:.1g}" if known else ""
+def format_standard_error(error: float | None) -> str:
+    """Return a standard error as `` +- 0.1``; empty if it is None or not finite."""
+    if error is None or not math.isfinite(error):
+        return ""
+    return f" +- {error:.1g}"
 
 
-def table(header: list[str], rows: list[list[str]], left: int = 0) -> str:
-    """Return aligned columns, the first ``left`` to the left and the others to the right. Cells may
-    hold text from files: line breaks and control characters in them are escaped.
+def format_table(header: list[str], rows: list[list[str]], left_columns: int = 0) -> str:
+    """Return a table as text, the first ``left_columns`` aligned left and the others right.
+
+    Cells may hold text from files: line breaks and control characters in them are escaped.
     """
-    header, rows = [*map(one_line, header)], [[*map(one_line, row)] for row in rows]
-    widths = [max(len(row[k]) for row in [header, *rows]) for k in range(len(header))]
-    lines = [
-        "  ".join(
-            cell.ljust(w) if k < left else cell.rjust(w)
-            for k, (cell, w) in enumerate(zip(row, widths, strict=True))
-        ).rstrip()
-        for row in [header, *rows]
-    ]
+    rows = [[one_line(cell) for cell in row] for row in [header, *rows]]
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    lines = []
+    for row in rows:
+        cells = [
+            cell.ljust(width) if k < left_columns else cell.rjust(width)
+            for k, (cell, width) in enumerate(zip(row, widths, strict=True))
+        ]
+        lines.append("  ".join(cells).rstrip())
     return "\n".join([lines[0], "-" * max(map(len, lines)), *lines[1:]])
 
 
-def shorten_rows(rows: list[list[str]], most: int) -> list[list[str]]:
-    """Return at most ``most`` rows, the first and the last, with a row that counts the rest."""
-    if len(rows) <= most:
+def shorten_rows(rows: list[list[str]], max_rows: int) -> list[list[str]]:
+    """Return the first and the last of more than ``max_rows`` rows, with a row between them that
+    says how many were omitted; return fewer rows unchanged.
+    """
+    if len(rows) <= max_rows:
         return rows
-    omitted = [f"({len(rows) - most} more)", *[""] * (len(rows[0]) - 1)]
-    return [*rows[: most // 2], omitted, *rows[-most // 2 :]]
+    omitted = [f"({len(rows) - max_rows} more)", *[""] * (len(rows[0]) - 1)]
+    return [*rows[: max_rows // 2], omitted, *rows[-max_rows // 2 :]]
 
 
 def summary_table(
     summary: dict[str, Any], limit: str = "limit S of H(13)", notes: Sequence[str] = ()
 ) -> str:
-    """Return the table that ends a run.
+    """Return the table that `netkf run` prints, from the contents of summary.json.
 
-    It has a row per node (the best and the worst of large networks), one for all nodes, the
-    ``notes`` on the bound, the limits (``limit`` names the first), and the messages.
+    It has a row for each node (the best and the worst of large networks) and one for all nodes,
+    followed by ``notes``, the limits to compare traces with (``limit`` is the name of the first),
+    NEES and messages.
     """
     lines = list(_node_table(summary))
     if all(row["bound"] is None for row in summary["nodes"]):
@@ -81,7 +87,7 @@ def summary_table(
 
 
 def _node_table(summary: dict[str, Any]) -> Iterator[str]:
-    """Yield the lines of the table of nodes."""
+    """Yield the table of nodes, what it omits, and an empty line."""
     nodes = sorted(summary["nodes"], key=lambda row: row["node"])
     listed = _best_and_worst(nodes) if len(nodes) > MAX_NODES else nodes
     omitted = len(nodes) - len(listed)
@@ -89,7 +95,7 @@ def _node_table(summary: dict[str, Any]) -> Iterator[str]:
     if omitted:
         rows.append([f"({omitted} more)", *[""] * len(COLUMNS)])
     rows.append(_row_cells("all", summary["overall"]))
-    yield table(["node", *COLUMNS.values()], rows)
+    yield format_table(["node", *COLUMNS.values()], rows)
     if omitted:
         half = MAX_NODES // 2
         yield (
@@ -100,39 +106,39 @@ def _node_table(summary: dict[str, Any]) -> Iterator[str]:
 
 
 def _best_and_worst(nodes: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return the rows with the largest and the smallest RMS errors, in their order."""
+    """Return the MAX_NODES rows with the largest and the smallest RMS errors, in their order."""
     ranked = sorted(nodes, key=lambda row: -_sort_key(row["rms_error"]))
     half = MAX_NODES // 2
-    chosen = {row["node"] for row in (*ranked[:half], *ranked[-half:])}
-    return [row for row in nodes if row["node"] in chosen]
+    extremes = {row["node"] for row in (*ranked[:half], *ranked[-half:])}
+    return [row for row in nodes if row["node"] in extremes]
 
 
 def _sort_key(value: float | None) -> float:
-    """Return the value, or inf for an error that is unknown: such a node is worth a look."""
+    """Return the value; inf if it is unknown, so that such a node is listed among the worst."""
     return math.inf if value is None or not math.isfinite(value) else value
 
 
 def _row_cells(name: str, row: dict[str, Any]) -> list[str]:
-    """Return the cells of a row."""
+    """Return the cells of a row of averages that begins with ``name``."""
     return [
         name,
-        *(format_number(row[key]) + standard_error(row.get(f"{key}_se")) for key in COLUMNS),
+        *(format_number(row[key]) + format_standard_error(row.get(f"{key}_se")) for key in COLUMNS),
     ]
 
 
 def _limit_lines(summary: dict[str, Any], limit: str) -> list[str]:
-    """Return the line of limits to compare with."""
+    """Return the line on the limits to compare traces with; no line if none is known."""
     traces = {limit: summary["limit"], "centralised filter": summary["central"]}
-    known = [
+    limits = [
         f"{label} {format_number(value)}"
         for label, value in traces.items()
         if value is not None and math.isfinite(value)
     ]
-    return ["traces to compare: " + ", ".join(known)] if known else []
+    return ["traces to compare: " + ", ".join(limits)] if limits else []
 
 
 def _nees_lines(nees: dict[str, Any]) -> list[str]:
-    """Return the line on the consistency of P."""
+    """Return the line on the NEES of an ensemble; no line for a single run."""
     if not math.isfinite(nees.get("inside", math.nan)):
         return []
     return [
@@ -143,7 +149,7 @@ def _nees_lines(nees: dict[str, Any]) -> list[str]:
 
 
 def _message_line(messages: dict[str, Any]) -> str:
-    """Return the line that counts messages."""
+    """Return the line on the numbers of messages and transmissions."""
     transmissions = messages.get("transmissions")
     if transmissions is None or math.isnan(transmissions):  # in slots they are not counted
         transmissions = messages["sent"]
@@ -159,17 +165,17 @@ def _message_line(messages: dict[str, Any]) -> str:
 
 
 def _describe_conserved(sums: dict[str, dict[str, float]]) -> str:
-    """Return the conserved sums with their relative drift, as text."""
+    """Return the conserved sums of summary.json with their relative drift, as text."""
     totals = [
-        f"{name} {format_number(found['total'])} of {format_number(found['exact'])} "
-        f"({found['drift']:+.1e})"
-        for name, found in sums.items()
+        f"{name} {format_number(entry['total'])} of {format_number(entry['exact'])} "
+        f"({entry['drift']:+.1e})"
+        for name, entry in sums.items()
     ]
-    worst = max(abs(found["drift"]) for found in sums.values())
+    worst = max(abs(entry["drift"]) for entry in sums.values())
     drifting = ", drifting: directions of a link do not fail together"
     return ", ".join(totals) + (drifting if worst > DRIFT_TOLERANCE else "")
 
 
 def _format_count(value: float) -> str:
-    """Format a count, or a mean of counts with one decimal."""
+    """Return a count as text, or a mean of counts (a float) with one decimal."""
     return f"{value:,}" if isinstance(value, int) else f"{value:,.1f}"

@@ -1,4 +1,4 @@
-"""A first scenario and its tests, for somebody to begin with."""
+"""``netkf new``: a first scenario and its tests, to start from."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ import re
 from pathlib import Path
 
 from netkf.core.errors import ScenarioError
-from netkf.runs.files import writing
+from netkf.runs.files import writing_file
 
-NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]{0,60}")
+NAME_PATTERN = re.compile(r"[A-Za-z][A-Za-z0-9_-]{0,60}")
 
 SCENARIO = """\
 # netkf run {name}.toml                  simulates it
@@ -87,10 +87,10 @@ def test_the_mean_covariance_stays_below_the_bound():
 def write_template(name: str, folder: Path) -> tuple[Path, Path]:
     """Write NAME.toml and test_NAME.py into a folder and return their paths.
 
-    Raises ScenarioError for a name that is none and where one of the files is there already, and
-    WriteError, which leaves neither.
+    Raises ScenarioError if the name is invalid or one of the files exists. If writing fails,
+    removes both and raises WriteError.
     """
-    if not NAME.fullmatch(name):
+    if not NAME_PATTERN.fullmatch(name):
         rule = "must be a letter, then letters, digits, - and _"
         raise ScenarioError("NAME", rule, name, "choose another name, without .toml")
     paths = folder / f"{name}.toml", folder / f"test_{name.replace('-', '_')}.py"
@@ -98,15 +98,15 @@ def write_template(name: str, folder: Path) -> tuple[Path, Path]:
         if path.exists():
             rule = "is there already, and nothing is overwritten"
             raise ScenarioError(str(path), rule, None, "choose another name or remove it")
-    made: list[Path] = []
+    created: list[Path] = []
     try:
         for path, text in zip(paths, (SCENARIO, TESTS), strict=True):
-            # Exclusively: another process may have written it meanwhile.
-            with writing(path), path.open("x", encoding="utf-8") as file:
-                made.append(path)
+            # Mode "x" fails if another process has written the file in the meantime.
+            with writing_file(path), path.open("x", encoding="utf-8") as file:
+                created.append(path)
                 file.write(text.format(name=name, file=paths[1].name))
     except BaseException:
-        for path in made:
+        for path in created:
             with contextlib.suppress(OSError):
                 path.unlink()
         raise

@@ -19,59 +19,72 @@ TRANSMIT = KINDS.index("transmit")
 class Transmissions:
     """Counts the messages and the transmissions of each node in blocks of EVENT rows.
 
-    Under clocks a broadcast has a ``transmit`` row; without such rows every message is a
-    transmission of its own. In slots all messages of a node in one step of an exchange are one
+    In continuous time a broadcast has a ``transmit`` row; without such rows every message is a
+    transmission by itself. In slots all messages of a node in one step of an exchange are one
     transmission.
+
+    ``sent`` has the number of messages of each node.
     """
 
     def __init__(self) -> None:
         self.sent: Counter[int] = Counter()
         self._broadcasts: Counter[int] = Counter()
-        self._in_slots: Counter[int] = Counter()
-        self._under_clocks: Counter[int] = Counter()
+        self._slot_transmissions: Counter[int] = Counter()
+        self._clock_messages: Counter[int] = Counter()
+        # The last (time, phase) of the rows counted so far, and the nodes that sent in it.
         self._step: tuple[float, int] = (np.nan, -1)
         self._senders: set[int] = set()
 
     def add(self, rows: np.ndarray) -> None:
-        """Count the next block of EVENT rows; blocks come in the order of the run."""
+        """Count the next block of EVENT rows; blocks must come in the order of the run."""
         sends = rows[rows["kind"] == SEND]
         _add_counts(self.sent, sends["node"])
         _add_counts(self._broadcasts, rows["node"][rows["kind"] == TRANSMIT])
         in_slots = sends["phase"] >= 0
-        _add_counts(self._under_clocks, sends["node"][~in_slots])
-        self._add_slots(sends[in_slots])
+        _add_counts(self._clock_messages, sends["node"][~in_slots])
+        self._add_slot_messages(sends[in_slots])
 
-    def _add_slots(self, sends: np.ndarray) -> None:
-        """Count senders of each step; a step that continues from the last block is counted once."""
+    def _add_slot_messages(self, sends: np.ndarray) -> None:
+        """Count the distinct senders of each step (time, phase) in ``send`` rows of slots.
+
+        The first step of a block may continue the last one of the block before: its senders are
+        counted once.
+        """
         if not len(sends):
             return
         t, phase = sends["t"], sends["phase"]
-        begins = np.flatnonzero((t[1:] != t[:-1]) | (phase[1:] != phase[:-1])) + 1
-        ends = [0, *begins.tolist(), len(sends)]
-        first, last = sends["node"][: ends[1]], sends["node"][ends[-2] :]
+        step_starts = np.flatnonzero((t[1:] != t[:-1]) | (phase[1:] != phase[:-1])) + 1
+        bounds = [0, *step_starts.tolist(), len(sends)]
         if (float(t[0]), int(phase[0])) != self._step:
             self._senders = set()
-        distinct = set(first.tolist())
-        self._in_slots.update(distinct - self._senders)
-        step = np.zeros(len(sends), dtype=np.int64)
-        step[begins] = 1
+        first_senders = set(sends["node"][: bounds[1]].tolist())
+        self._slot_transmissions.update(first_senders - self._senders)
+        # Pairs (step, sender), each once, as the number step * (number of senders) + sender index.
+        is_start = np.zeros(len(sends), dtype=np.int64)
+        is_start[step_starts] = 1
         nodes, index = np.unique(sends["node"], return_inverse=True)
-        pairs = np.unique(np.cumsum(step) * len(nodes) + index)  # (step, sender), once each
-        _add_counts(self._in_slots, nodes[pairs[pairs >= len(nodes)] % len(nodes)])
-        single = len(ends) == 2
-        self._senders = self._senders | distinct if single else set(last.tolist())
+        pairs = np.unique(np.cumsum(is_start) * len(nodes) + index)
+        later_pairs = pairs[pairs >= len(nodes)]  # step 0 has been counted above
+        _add_counts(self._slot_transmissions, nodes[later_pairs % len(nodes)])
+        if len(step_starts):
+            self._senders = set(sends["node"][bounds[-2] :].tolist())
+        else:
+            self._senders = self._senders | first_senders
         self._step = float(t[-1]), int(phase[-1])
 
-    def of(self, node: int) -> int:
+    def count_for(self, node: int) -> int:
         """Return the number of transmissions of a node."""
-        clocks = self._broadcasts if self._broadcasts else self._under_clocks
-        return self._in_slots[node] + clocks[node]
+        return self._slot_transmissions[node] + self._clock_transmissions[node]
 
     @property
     def total(self) -> int:
         """Number of transmissions of all nodes."""
-        clocks = self._broadcasts if self._broadcasts else self._under_clocks
-        return self._in_slots.total() + clocks.total()
+        return self._slot_transmissions.total() + self._clock_transmissions.total()
+
+    @property
+    def _clock_transmissions(self) -> Counter[int]:
+        """Number of transmissions of each node in continuous time."""
+        return self._broadcasts if self._broadcasts else self._clock_messages
 
 
 class SentPerLink(Sink):
@@ -83,7 +96,7 @@ class SentPerLink(Sink):
         self.sent: Counter[Link] = Counter()
 
     def events(self, rows: np.ndarray) -> None:
-        """Count the messages of a block of EVENT rows."""
+        """Count the messages in a block of EVENT rows."""
         sends = rows[rows["kind"] == SEND]
         ends = np.column_stack([sends["node"], sends["peer"]])
         pairs, counts = np.unique(ends, axis=0, return_counts=True)
@@ -97,7 +110,7 @@ class SentPerLink(Sink):
 
 
 def _add_counts(counter: Counter[int], nodes: np.ndarray) -> None:
-    """Add how often each node occurs."""
-    found, counts = np.unique(nodes, return_counts=True)
-    for node, count in zip(found.tolist(), counts.tolist(), strict=True):
+    """Add to ``counter`` how often each node occurs in ``nodes``."""
+    distinct, counts = np.unique(nodes, return_counts=True)
+    for node, count in zip(distinct.tolist(), counts.tolist(), strict=True):
         counter[node] += count

@@ -21,17 +21,17 @@ from netkf.core.notebook import NotebookTable
 from netkf.core.printable import shorten
 from netkf.runs.documents import (
     COUNT,
-    ENDED,
+    FINAL_STATUSES,
     NUMBER,
     SEAL,
     TEXT,
     TEXTS,
     DamagedError,
+    add_file_name,
     check_files,
     check_seal,
-    damage_in,
     read_document,
-    require,
+    require_form,
 )
 from netkf.runs.parquet_files import column_names, read_numbers
 from netkf.studies.metrics import mean_over_runs
@@ -166,12 +166,12 @@ def read_directory(directory: Path) -> RunDirectory:
         raise ScenarioError(where, "is not a directory", None, "name run directories")
     with damage_named(directory):
         manifest = _read(directory, "manifest.json", MANIFEST)
-        if manifest["status"] not in ENDED:
+        if manifest["status"] not in FINAL_STATUSES:
             rule = f"holds a run that did not finish ({shorten(manifest['status'], 30)})"
             raise ScenarioError(where, rule, None, "finish it with netkf run --resume")
         summary = _read(directory, "summary.json", SUMMARY)
         if SEAL in manifest:  # older versions wrote none
-            with damage_in("manifest.json"):
+            with add_file_name("manifest.json"):
                 check_seal(manifest)
         check_files(directory, manifest, ["scenario.toml", "summary.json"])
     return RunDirectory(directory, manifest, summary)
@@ -179,9 +179,9 @@ def read_directory(directory: Path) -> RunDirectory:
 
 def _read(directory: Path, name: str, form: dict[str, Any]) -> dict[str, Any]:
     """Return a JSON document of a run directory; raises DamagedError if its form is wrong."""
-    with damage_in(name):
+    with add_file_name(name):
         document = read_document(directory / name)
-        require(document, form)
+        require_form(document, form)
     return document
 
 

@@ -20,7 +20,7 @@ from netkf.ensembles.pools import Pool, PoolOptions
 from netkf.ensembles.replicas import replicate_blocks
 from netkf.runs.documents import file_digests, write_sealed
 from netkf.runs.failures import explain_failures
-from netkf.runs.files import check_sources, new_directory, write_scenario, write_text
+from netkf.runs.files import check_sources, create_output_directory, write_scenario, write_text
 from netkf.runs.parquet_files import write_table
 from netkf.runs.provenance import versions
 from netkf.runs.simulate import choose_engine
@@ -330,7 +330,7 @@ def write_comparison(
     Raises ScenarioError if ``out`` cannot be created or is not empty.
     """
     check_sources(scenario)
-    directory = new_directory(out, f"{scenario.name}-filters")
+    directory = create_output_directory(out, f"{scenario.name}-filters")
     write_scenario(directory, scenario)
     table = comparison.table
     write_table(directory / "filters.parquet", {str(k): column for k, column in table.items()})

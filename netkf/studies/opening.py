@@ -13,9 +13,9 @@ from netkf.core.fields import as_path
 from netkf.core.notebook import NotebookTable
 from netkf.core.printable import shorten
 from netkf.ensembles.stored import StoredEnsemble, read_ensemble
-from netkf.runs.documents import TEXT, DamagedError, check_files, require
+from netkf.runs.documents import TEXT, DamagedError, check_files, require_form
 from netkf.runs.parquet_files import column_names, is_numeric_column, read_numbers, read_texts
-from netkf.runs.stored import MANIFEST, StoredRun, read_form, read_run
+from netkf.runs.stored import MANIFEST_FORM, StoredRun, read_checked_document, read_run
 from netkf.scenario.reading import load
 from netkf.scenario.scenario import Scenario
 from netkf.studies.stored import StoredComparison, StoredVerdict, read_comparison, read_verdict
@@ -96,18 +96,18 @@ def _read_manifest(folder: Path) -> dict[str, Any]:
     """Return the manifest of a directory; raises DamagedError."""
     if not folder.is_dir():
         raise DamagedError("it is no directory" if folder.exists() else "it does not exist")
-    return read_form(folder, "manifest.json", MANIFEST)
+    return read_checked_document(folder, "manifest.json", MANIFEST_FORM)
 
 
 def _read_sweep(folder: Path, scenario: Scenario, manifest: dict[str, Any]) -> StoredSweep:
     """Return a sweep; one that was interrupted at once has a table without rows."""
     import pandas as pd
 
-    require(manifest["vary"], {}, "vary")
+    require_form(manifest["vary"], {}, "vary")
     keys = tuple(manifest["vary"])
     path = folder / "sweep.parquet"
     table = _read_table(path, keys) if path.exists() else pd.DataFrame(columns=[*keys, *RESULTS])
-    require(manifest["status"], TEXT, "status")
+    require_form(manifest["status"], TEXT, "status")
     return StoredSweep(folder, scenario, keys, table, manifest["status"], manifest)
 
 
@@ -125,6 +125,6 @@ def _read_table(path: Path, keys: tuple[str, ...]) -> pd.DataFrame:
     if texts:
         listed = ", ".join(sorted(texts))
         raise DamagedError(f"{path.name} has texts in columns of numbers: {listed}")
-    columns: dict[str, Any] = dict(read_numbers(path, numeric, missing=True))
+    columns: dict[str, Any] = dict(read_numbers(path, numeric, allow_empty=True))
     columns |= {n: read_texts(path, n).astype(str) for n in names if n not in numeric}
     return pd.DataFrame({name: columns[name] for name in names})

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any
 
 from netkf.core.notebook import NotebookTable
 from netkf.core.printable import one_line
-from netkf.runs.documents import COUNT, NUMBER, TEXT, TEXTS, DamagedError, check_files, require
+from netkf.runs.documents import COUNT, NUMBER, TEXT, TEXTS, DamagedError, check_files, require_form
 from netkf.runs.parquet_files import read_flags, read_numbers, read_texts
-from netkf.runs.stored import read_form
+from netkf.runs.stored import read_checked_document
 from netkf.scenario.reading import load
 from netkf.scenario.scenario import Scenario
 from netkf.studies.compare_filters import QUANTITIES, ComparedFilter, FilterComparison
@@ -57,12 +57,12 @@ def read_comparison(directory: Path, base: Scenario, manifest: dict[str, Any]) -
     """Return the comparison of filters in a directory, whose manifest has passed that of runs;
     raises DamagedError.
     """
-    require(manifest, COMPARISON)
+    require_form(manifest, COMPARISON)
     _require_confidence(manifest)
     check_files(directory, manifest, [FILTERS])
     path = directory / FILTERS
     parts = [f"{key}_{part}" for key in QUANTITIES for part in PARTS[:-1]]
-    numbers = read_numbers(path, [*QUANTITIES, *parts, *TRAFFIC], missing=True)
+    numbers = read_numbers(path, [*QUANTITIES, *parts, *TRAFFIC], allow_empty=True)
     columns: dict[str, Any] = {str(name): values.tolist() for name, values in numbers.items()}
     columns |= {name: read_flags(path, name).tolist() for name in FLAGS}
     columns |= {name: read_texts(path, name).astype(str).tolist() for name in TEXT_COLUMNS}
@@ -153,7 +153,7 @@ class StoredVerdict(NotebookTable):
 
 def read_verdict(directory: Path, trust: bool = False) -> StoredVerdict:
     """Return the verdict in a directory; raises DamagedError, or ScenarioError for its scenario."""
-    document = read_form(directory, "verdict.json", VERDICT)
+    document = read_checked_document(directory, "verdict.json", VERDICT)
     _require_confidence(document)
     check_files(directory, document, ["scenario.toml"])
     return StoredVerdict(directory, load(directory / "scenario.toml", trust=trust), document)

@@ -21,7 +21,7 @@ from netkf.runs.documents import write_sealed
 from netkf.runs.failures import InterruptedRunError, explain_failures
 from netkf.runs.files import (
     check_sources,
-    new_directory,
+    create_output_directory,
     write_scenario,
     write_text,
 )
@@ -194,7 +194,7 @@ def sweep_to_directory(
 
     started = time.perf_counter()
     check_sources(plan.base)
-    directory = new_directory(out, f"{plan.base.name}-sweep")
+    directory = create_output_directory(out, f"{plan.base.name}-sweep")
     write_scenario(directory, plan.base)
     rows: list[Row] = []
     status = "interrupted"

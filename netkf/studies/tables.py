@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from netkf.core.printable import shorten
-from netkf.runs.tables import format_number, shorten_rows, standard_error, table
+from netkf.runs.tables import format_number, format_standard_error, format_table, shorten_rows
 from netkf.studies.compare import Comparison, Entry
 from netkf.studies.compare_filters import QUANTITIES, FilterComparison
 from netkf.studies.consistency import Consistency
@@ -34,7 +34,7 @@ def sweep_text(lines: pd.DataFrame, keys: Sequence[str]) -> str:
         ]
         for row in lines.to_dict("records")
     ]
-    return table(header, shorten_rows(rows, MAX_ROWS))
+    return format_table(header, shorten_rows(rows, MAX_ROWS))
 
 
 def _format_short(value: Any) -> str:
@@ -45,7 +45,7 @@ def _format_short(value: Any) -> str:
 
 def _with_error(value: float | None, error: float | None) -> str:
     """Return a value with its standard error as text."""
-    return format_number(value) + standard_error(error)
+    return format_number(value) + format_standard_error(error)
 
 
 def sizing_text(sizing: Sizing) -> str:
@@ -66,7 +66,7 @@ def sizing_text(sizing: Sizing) -> str:
     if sizing.by == "theory":
         header = [header[0], f"{sizing.target.quantity} ({sizing.probes[0].by})", header[-2]]
         rows = [[f"{p.value:g}", f"{p.quantity:.7g}", p.target] for p in sorted(sizing.probes)]
-    lines = [table(header, rows), ""]
+    lines = [format_table(header, rows), ""]
     lines += [
         answer(sizing),
         f"{sizing.target.quantity}: {sizing.quantity}",
@@ -121,7 +121,7 @@ def consistency_text(consistency: Consistency) -> str:
     scaled = f"{consistency.low / consistency.n:.4g} .. {consistency.high / consistency.n:.4g}"
     return "\n".join(
         [
-            table(header, shorten_rows(rows, MAX_ROWS)),
+            format_table(header, shorten_rows(rows, MAX_ROWS)),
             "",
             f"{consistency.runs:,} runs, n = {consistency.n}; +-: half width of the interval on "
             f"the difference from what NEES should be, all nodes together at confidence {level}",
@@ -147,7 +147,7 @@ def filters_text(comparison: FilterComparison) -> str:
         ]
         for row in ran
     ]
-    lines = [table(header, rows, left=1), ""]
+    lines = [format_table(header, rows, left_columns=1), ""]
     noted = [row for row in comparison.rows if row.status != "complete"]
     lines += [f"{shorten(row.filter)}: {row.status}" for row in noted]
     runs = f"{comparison.runs:,} run{'s' if comparison.runs > 1 else ''} of each on the same draws"
@@ -194,7 +194,7 @@ def comparison_text(comparison: Comparison) -> str:
     if len(rows) > MAX_ROWS:
         left_out = f"({len(rows) - MAX_ROWS} more; --json has all)"
         rows = [*rows[: MAX_ROWS - 3], [left_out, *[""] * len(numbered)], *rows[-3:]]
-    lines += ["", table(["", *numbered], rows, left=1)]
+    lines += ["", format_table(["", *numbered], rows, left_columns=1)]
     notes = [
         f"note: {mark} {shorten(note, 500)}"
         for mark, texts in zip(numbered, comparison.notes, strict=True)

@@ -7,8 +7,8 @@ from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
 from netkf.core.printable import shorten
-from netkf.runs.files import finite
-from netkf.runs.tables import format_number, shorten_rows, table
+from netkf.runs.files import to_json_value
+from netkf.runs.tables import format_number, format_table, shorten_rows
 from netkf.studies.explanation import GOOD_ENOUGH, Explanation, InformationSource, WhatIf
 from netkf.studies.information import MessageKey
 from netkf.studies.message_sets import SmallestSet
@@ -84,7 +84,7 @@ def why_document(explanation: Explanation) -> dict[str, Any]:
             "best": _message_entries(explanation, smallest.best),
             "proven": smallest.proven,
         }
-    plain: dict[str, Any] = finite(document)
+    plain: dict[str, Any] = to_json_value(document)
     return plain
 
 
@@ -293,7 +293,7 @@ def _source_table(explanation: Explanation) -> str:
         ]
         for s in chosen
     ]
-    text = table(header, shorten_rows(rows, MAX_ROWS), left=1)
+    text = format_table(header, shorten_rows(rows, MAX_ROWS), left_columns=1)
     other_text = f"\n{others} other nodes have no sensor and no link to it." if others else ""
     explained = (
         f"times in seconds; +1 .. +{budget}: age of the newest reading with so many more messages"
@@ -315,7 +315,7 @@ def _replay_table(explanation: Explanation) -> str:
         ]
         for k, w in enumerate(explanation.what_ifs)
     ]
-    return table(header, shorten_rows(rows, MAX_ROWS), left=1)
+    return format_table(header, shorten_rows(rows, MAX_ROWS), left_columns=1)
 
 
 def _count_messages(what_if: WhatIf) -> str:

@@ -9,8 +9,8 @@ import scipy.stats
 import netkf
 from netkf.algorithms.models import FlowModel
 from netkf.figures.traffic import ages_of, messages_by_direction, wilson
-from netkf.runs.increments import Expectations
-from netkf.runs.innovations import autocorrelation, innovations
+from netkf.runs.increments import ExpectedIncrements
+from netkf.runs.innovations import autocorrelation, compute_innovations
 from netkf.studies.consistency import run_consistency
 from tests.conftest import SCENARIOS
 from tests.figures.conftest import one_node
@@ -67,12 +67,12 @@ def test_wilson_is_the_formula(k, n):
 def test_innovations_are_those_of_a_plain_kalman_filter(results):
     """One node, a scalar plant: xhat and P from the readings by the textbook recursion."""
     run = results("one node")
-    found = innovations(run)
+    found = compute_innovations(run)
     assert len(found.nis) == run.count("sense")
     np.testing.assert_array_equal(found.nodes, 0)
     a, R, q = -0.5, 0.5, 1.0
     now, xhat, P, nis = 0.0, 0.0, 1.0, []
-    again = innovations(netkf.simulate(one_node()))
+    again = compute_innovations(netkf.simulate(one_node()))
     for t, z in zip(found.times, found.whitened, strict=True):
         f = np.exp(a * (t - now))
         P = f * f * P + q * (f * f - 1.0) / (2.0 * a)
@@ -92,7 +92,9 @@ def test_increments_have_the_innovations_of_an_integrated_ornstein_uhlenbeck_pro
     """dx = a x ds + b dw and dy = h x ds + dv in closed form, over an interval of g seconds."""
     a, b, h, R, g, P, xhat, y = -0.7, 1.3, 0.8, 0.4, 0.6, 0.5, 2.0, 1.1
     model = FlowModel(*(np.array([[v]]) for v in (a, b * b, h, R)), 10.0, 1.0)
-    found = Expectations(model).innovation(np.array([xhat]), np.array([[P]]), np.array([y]), g)
+    found = ExpectedIncrements(model).whitened_innovation(
+        np.array([xhat]), np.array([[P]]), np.array([y]), g
+    )
     J = (math.exp(a * g) - 1.0) / a
     # int_0^g ((e^{a (g - s)} - 1) / a)^2 ds
     noise = ((math.exp(2.0 * a * g) - 1.0) / (2.0 * a) - 2.0 * J + g) / a**2
@@ -106,7 +108,7 @@ def test_increments_are_as_far_from_expectations_as_exact_covariances_say(believ
     sensors = [{"nodes": [0], "H": [[1.0, 0.2]], "R": [[2.0]]}]
     changes = {"sensors": sensors, "filter": {"kind": "local", "model": {"R": [[2.0 * believed]]}}}
     scenario = netkf.load(SCENARIOS / "poisson_ring.toml", {"horizon": 300.0, "probe": 0.5})
-    found = innovations(netkf.simulate(scenario.replace(changes)))
+    found = compute_innovations(netkf.simulate(scenario.replace(changes)))
     assert found.increments == len(found.nis) > 500
     deviation = math.sqrt(2.0 / len(found.nis))
     assert abs(found.nis.mean() / expected - 1.0) < 4.0 * deviation + (expected - 1.0) * 0.15
@@ -117,7 +119,7 @@ def test_increments_are_as_far_from_expectations_as_exact_covariances_say(believ
 
 def test_innovations_of_slots_have_the_nis_of_netkf_consistency():
     scenario = netkf.load(SCENARIOS / "diffusion_regression.toml", {"horizon": 40.0, "probe": 1.0})
-    found = innovations(netkf.simulate(scenario))
+    found = compute_innovations(netkf.simulate(scenario))
     expected = run_consistency(scenario, scenario.seed, 0).nis
     for node, nis in zip(scenario.nodes, expected, strict=True):
         mine = found.nis[(found.nodes == node) & (found.times > 0.0)]

@@ -28,7 +28,7 @@ from netkf.report.messages import MESSAGE, information_age, join_messages, keep_
 from netkf.report.page import make_page
 from netkf.report.tables import difference_curves
 from netkf.runs.documents import file_digests, write_sealed
-from netkf.runs.innovations import innovations
+from netkf.runs.innovations import compute_innovations
 from netkf.runs.run import run_to_directory
 from netkf.runs.tables import summary_table
 from netkf.studies.compare_filters import compare_filters, write_comparison
@@ -344,7 +344,7 @@ def test_innovations_are_those_of_the_run(name, request):
     """With and without truth; means and their intervals again with scipy."""
     directory = request.getfixturevalue(name)
     page, run = Page(make_page([directory])), netkf.open(directory)
-    shown, found = page.data["runs"][0]["innovations"], innovations(run)
+    shown, found = page.data["runs"][0]["innovations"], compute_innovations(run)
     columns = {key: page.column(c) for key, c in shown["columns"].items()}
     assert shown["step"] == 1
     np.testing.assert_array_equal(columns["t"], found.times)

@@ -10,14 +10,14 @@ import pytest
 
 import netkf
 from netkf.cli.main import main
-from netkf.runs.directory_lock import only_writer
+from netkf.runs.directory_lock import lock_directory
 
 RING = str(Path(__file__).parents[2] / "scenarios" / "poisson_ring.toml")
 HOLD = """
 import sys, time
 from pathlib import Path
-from netkf.runs.directory_lock import only_writer
-with only_writer(Path(sys.argv[1])):
+from netkf.runs.directory_lock import lock_directory
+with lock_directory(Path(sys.argv[1])):
     print("locked", flush=True)
     time.sleep(60)
 """
@@ -57,11 +57,14 @@ def test_the_second_command_on_a_directory_ends_with_one_line(holder, capsys):
 
 
 def test_a_directory_is_made_and_removed_again_if_nothing_was_written(tmp_path):
-    with only_writer(tmp_path / "a" / "b"):
+    with lock_directory(tmp_path / "a" / "b"):
         assert (tmp_path / "a" / "b").is_dir()
     assert not (tmp_path / "a" / "b").exists()
     (tmp_path / "file").touch()
-    with pytest.raises(netkf.ScenarioError, match="cannot be made"), only_writer(tmp_path / "file"):
+    with (
+        pytest.raises(netkf.ScenarioError, match="cannot be made"),
+        lock_directory(tmp_path / "file"),
+    ):
         pass
 
 
@@ -89,7 +92,7 @@ def test_a_file_system_without_locks_is_noted(tmp_path, monkeypatch, capsys):
     def refuse(opened):
         raise OSError(os.strerror(95))
 
-    monkeypatch.setattr("netkf.runs.directory_lock._lock", refuse)
-    with only_writer(tmp_path):
+    monkeypatch.setattr("netkf.runs.directory_lock._lock_file", refuse)
+    with lock_directory(tmp_path):
         pass
     assert "one command at a time" in capsys.readouterr().err

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from netkf.core.errors import WriteError
-from netkf.runs.files import finite, json_text, write_text
+from netkf.runs.files import json_text, to_json_value, write_text
 
 VALUES = [
     3,
@@ -24,7 +24,7 @@ VALUES = [
 
 @pytest.mark.parametrize("value", VALUES, ids=range(len(VALUES)))
 def test_json_text_is_that_of_the_standard_library(value):
-    assert json_text(value) == json.dumps(finite(value), indent=2)
+    assert json_text(value) == json.dumps(to_json_value(value), indent=2)
 
 
 def test_a_name_that_no_file_can_have_is_a_write_error(tmp_path):

@@ -10,7 +10,7 @@ import pytest
 import netkf
 from netkf.cli.main import main
 from netkf.engines.simpy.engine import SimpyEngine
-from netkf.runs.files import new_directory, write_atomically
+from netkf.runs.files import create_output_directory, write_atomically
 from netkf.runs.run import run_to_directory
 from tests.conftest import SCENARIOS, scenario_files
 
@@ -72,7 +72,7 @@ def test_tables_are_written_in_pieces(ring, tmp_path, monkeypatch, engine):
     monkeypatch.setattr("netkf.trace.recorder.BLOCK", 100)
     monkeypatch.setattr("netkf.engines.compiled.flow.FIRST_ROWS", 100)
     monkeypatch.setattr("netkf.engines.compiled.flow.MAX_BUFFERED_SAMPLES", 10)
-    monkeypatch.setattr("netkf.runs.parquet_files.ROWS", 50)
+    monkeypatch.setattr("netkf.runs.parquet_files.ROW_GROUP_ROWS", 50)
     import pyarrow.parquet as pq
 
     out = run_to_directory(ring, tmp_path / "pieces", engine=engine).directory
@@ -324,13 +324,13 @@ def test_a_file_has_its_name_when_it_is_whole(tmp_path):
 
 def test_directories_are_never_overwritten(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    first = new_directory(None, "a/b name")
+    first = create_output_directory(None, "a/b name")
     assert first == Path("runs/a-b-name-1")
-    assert new_directory(None, "a/b name") == Path("runs/a-b-name-2")
-    assert new_directory(first, "x") == first  # still empty
+    assert create_output_directory(None, "a/b name") == Path("runs/a-b-name-2")
+    assert create_output_directory(first, "x") == first  # still empty
     (first / "file").touch()
     with pytest.raises(netkf.ScenarioError, match="new or empty directory"):
-        new_directory(first, "x")
+        create_output_directory(first, "x")
 
 
 NONLINEAR = scenario_files()[0].parent / "nonlinear" / "range_tracking.toml"

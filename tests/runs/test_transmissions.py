@@ -35,7 +35,7 @@ def test_blocks_do_not_matter(file):
     for size in (1, 7, 5000):
         found = counted(log, size)
         assert found.sent == Counter(sends["node"].tolist())
-        assert {node: found.of(node) for node in expected} == expected
+        assert {node: found.count_for(node) for node in expected} == expected
         assert found.total == expected.total()
 
 
@@ -51,7 +51,11 @@ def broadcasts():
 def test_a_broadcast_by_a_clock_is_one_transmission(size):
     found = counted(broadcasts(), size)
     assert (found.sent[4], found.sent[5]) == (3, 0)
-    assert (found.of(4), found.of(5), found.of(6)) == (2, 1, 0)  # node 5 had no hearer
+    assert (found.count_for(4), found.count_for(5), found.count_for(6)) == (
+        2,
+        1,
+        0,
+    )  # node 5 had no hearer
     assert found.total == 3
 
 
