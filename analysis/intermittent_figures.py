@@ -50,7 +50,7 @@ def ten_states(axes, samples):
     """Fig. 2: distribution functions as the delivery probability goes to 1."""
     scenario = netkf.load(SCENARIOS / "intermittent_random10.toml")
     F, Q = scenario.slot_belief
-    H, R = scenario.observation(0)
+    H, R = scenario.observation_matrices(0)
     star = netkf.theory.steady_covariance(F, Q, H, R)
     lower, upper = netkf.theory.critical_probability(F, H)
     print(f"ten states: critical probability in [{lower:.6f}, {upper:.6f}]")

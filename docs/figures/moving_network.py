@@ -47,7 +47,7 @@ def picture(scenario, run, places, k):
     room.scatter(
         *places.T, c=error[k], cmap=COLOURS, vmin=0.0, vmax=WORST, s=46, zorder=3, lw=0.6, ec="w"
     )
-    readers = places[[index[i] for i in scenario.sensing]]
+    readers = places[[index[i] for i in scenario.sensing_nodes]]
     room.scatter(*readers.T, s=110, fc="none", ec="#222222", lw=1.0, zorder=3)
     room.scatter(run.xhat[k, :, 0], run.xhat[k, :, 2], s=5, color=GREY, zorder=4)
     room.scatter(run.x[k, 0], run.x[k, 2], marker="*", s=190, color="#B22222", ec="w", zorder=5)

@@ -246,7 +246,7 @@ class ConstantGain(Filter):
             rule = f"must be one matrix, or one for each of {len(nodes)} nodes"
             raise ScenarioError("filter.gain", rule, f"{len(self.gain)} matrices", "add or remove")
         for index, node in enumerate(nodes):
-            placed = scenario.placed.get(node, ())
+            placed = scenario.placed_sensors.get(node, ())
             _check_kinds(scenario, node, placed)
             p = sum(len(scenario.sensors[placed_sensor.entry].H) for placed_sensor in placed)
             shape = self.gain_of(index).shape

@@ -13,7 +13,7 @@ def require_common_start(scenario: Any, why: str, other: str) -> None:
     """Raise ScenarioError unless all nodes start with one mean and one covariance; ``why`` they
     must, and which ``other`` filter need not.
     """
-    starts = [scenario.start(node) for node in scenario.nodes]
+    starts = [scenario.initial_estimate(node) for node in scenario.nodes]
     mean, cov = starts[0]
     if all(np.array_equal(m, mean) and np.array_equal(C, cov) for m, C in starts):
         return

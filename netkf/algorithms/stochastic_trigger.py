@@ -77,7 +77,7 @@ def trigger_matrix(Y: float | FloatArray, rows: int) -> FloatArray:
 
 def entries_at(scenario: Any, node: int) -> list[int]:
     """Return the indices, in the scenario, of the sensors of a node."""
-    return [placed_sensor.entry for placed_sensor in scenario.placed.get(node, ())]
+    return [placed_sensor.entry for placed_sensor in scenario.placed_sensors.get(node, ())]
 
 
 def whitened_trigger(Y: float | FloatArray, R: FloatArray) -> FloatArray:

@@ -112,7 +112,7 @@ class ClockedChecks(PaperChecks):
 
         Push-sum conserves mass, but its P is no bound: a node counts its own samples N times.
         """
-        if with_promised_filter(scenario).hosted.combination == "sums":
+        if with_promised_filter(scenario).node_filter.combination == "sums":
             return (MASS_CONSERVED, *PROMISES)
         return (*PROMISES[:1], UPPER_BOUND, *PROMISES[1:])
 

@@ -232,7 +232,7 @@ class IntermittentSamples(RunSamples):
         # modes, since there may be 2^len(senders).
         codes = arrived @ (1 << np.arange(len(senders)))
         occurring, sequences = np.unique(codes, return_inverse=True)
-        own_reading = (node,) if node in scenario.placed else ()
+        own_reading = (node,) if node in scenario.placed_sensors else ()
         sets = [
             (*own_reading, *(sender for bit, sender in enumerate(senders) if code >> bit & 1))
             for code in occurring.tolist()
@@ -399,7 +399,7 @@ def _outage_factors(scenario: Scenario) -> dict[int, float]:
     factors, neighbours = {}, sensing_neighbours(scenario)
     alpha = float(np.abs(np.linalg.eigvals(scenario.slot_belief[0])).max())
     for node in sampled_nodes(scenario):
-        if node in scenario.placed:
+        if node in scenario.placed_sensors:
             continue
         try:
             missed = [
@@ -421,7 +421,7 @@ def _mean_diverges(samples: IntermittentSamples, level: float) -> Finding:
     alpha = float(np.abs(np.linalg.eigvals(F)).max())
     slots, nothing = check_slots(scenario)[-1], np.zeros((0, len(F)))
     g = 1.0 - factors[node] / alpha**2
-    start = scenario.start(node)[1]
+    start = scenario.initial_estimate(node)[1]
     lower = mean_covariance_bounds(F, Q, nothing, nothing[:, :0], g, 2 * slots, start).lower
     traces = np.trace(lower, axis1=1, axis2=2)
     median = np.median(np.trace(samples.runs.P[:, -1, samples.nodes.index(node)], axis1=1, axis2=2))
@@ -441,7 +441,7 @@ def _scalar_laws(scenario: Scenario) -> dict[int, ScalarLaw]:
     laws, neighbours = {}, sensing_neighbours(scenario)
     for k, node in enumerate(sampled_nodes(scenario)):
         peers = neighbours[node]
-        if scenario.plant.n != 1 or node in scenario.placed or len(peers) != 1:
+        if scenario.plant.n != 1 or node in scenario.placed_sensors or len(peers) != 1:
             continue
         model = scenario.slot_models[scenario.topology.index[peers[0]]]
         F, Q = scenario.slot_belief

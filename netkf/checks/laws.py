@@ -201,7 +201,7 @@ def exact_start(scenario: Scenario) -> Assumption:
     different = [
         node
         for node in scenario.nodes
-        for mean, cov in [scenario.start(node)]
+        for mean, cov in [scenario.initial_estimate(node)]
         if not (np.array_equal(mean, plant.start_mean) and np.array_equal(cov, plant.start_cov))
     ]
     evidence = "mean and covariance are the plant's"

@@ -109,7 +109,7 @@ def slots_until(distance: Callable[[int], float], slots: int, n: int, tolerance:
 
 def initial_roots(scenario: Scenario) -> FloatArray:
     """Return the roots (N, n, n) of P(0) of all nodes."""
-    return np.array([square_root(scenario.start(node)[1]) for node in scenario.nodes])
+    return np.array([square_root(scenario.initial_estimate(node)[1]) for node in scenario.nodes])
 
 
 class TokenHistory(NamedTuple):
@@ -182,7 +182,7 @@ class Arrivals(NamedTuple):
 
 def sensing_neighbours(scenario: Scenario) -> dict[int, tuple[int, ...]]:
     """Return the neighbours of each node that have sensors, in order."""
-    sensing, senders = set(scenario.sensing), dict[int, list[int]]()
+    sensing, senders = set(scenario.sensing_nodes), dict[int, list[int]]()
     for i, j in scenario.topology.links:
         for source, receiver in ((i, j), (j, i)):
             if source in sensing:
@@ -217,7 +217,7 @@ def find_arrivals(scenario: Scenario, run: Run, slots: int) -> Arrivals:
     sampled = sampled_nodes(scenario)
     sequences = np.empty((len(sampled), slots), dtype=int)
     for k, node in enumerate(sampled):
-        own_reading = (node,) if node in scenario.placed else ()
+        own_reading = (node,) if node in scenario.placed_sensors else ()
         for t in range(slots):
             nodes = tuple(sorted((*own_reading, *arrived.get((node, t), ()))))
             sequences[k, t] = modes.setdefault(nodes, len(modes))
@@ -231,7 +231,7 @@ def all_arrivals(scenario: Scenario, slots: int) -> Arrivals:
     sampled = sampled_nodes(scenario)
     sequences = np.empty((len(sampled), slots), dtype=int)
     for k, node in enumerate(sampled):
-        own_reading = (node,) if node in scenario.placed else ()
+        own_reading = (node,) if node in scenario.placed_sensors else ()
         nodes = tuple(sorted((*own_reading, *neighbours[node])))
         sequences[k] = modes.setdefault(nodes, len(modes))
     return Arrivals(intermittent_modes(scenario, list(modes)), sequences, list(modes))

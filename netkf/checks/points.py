@@ -30,7 +30,7 @@ def check_slots(scenario: Scenario) -> tuple[int, ...]:
     """
     period = scenario.slot_plant.period
     last = max(1, int(np.floor(scenario.horizon / period + 1e-9)))
-    if scenario.slotted and not scenario.hosted.predicts:
+    if scenario.slotted and not scenario.node_filter.predicts:
         last = max(1, int(np.ceil(scenario.horizon / period - 1e-9)) - 1)
     return tuple(sorted({min(2, last), min(5, last), max(1, last // 2), last}))
 

@@ -82,7 +82,7 @@ class RunSamples:
     @property
     def first_covariances(self) -> FloatArray:
         """P(0) (N', n, n) of all N' nodes of the network."""
-        return np.array([self.scenario.start(node)[1] for node in self.scenario.nodes])
+        return np.array([self.scenario.initial_estimate(node)[1] for node in self.scenario.nodes])
 
     @property
     def first_trace(self) -> float:

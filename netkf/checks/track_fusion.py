@@ -86,7 +86,9 @@ class FusionChecks(EquationChecks):
         Inverse covariance intersection has only the equations: its authors claim that P is a bound
         for one fusion of two tracks, not for a network.
         """
-        about_errors = BY_COMBINATION.get(with_promised_filter(scenario).hosted.combination, ())
+        about_errors = BY_COMBINATION.get(
+            with_promised_filter(scenario).node_filter.combination, ()
+        )
         return (*PROMISES[:1], *about_errors, *PROMISES[1:])
 
 

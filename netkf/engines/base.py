@@ -98,7 +98,7 @@ class Engine(ABC):
 def batch_sink(scenario: Scenario, replicas: range) -> BatchSink:
     """Return a sink for the samples of some recorded runs of a scenario."""
     # A pooled filter is sampled once, not once for each node.
-    filters = 1 if scenario.hosted.pooled else len(scenario.nodes)
+    filters = 1 if scenario.node_filter.pooled else len(scenario.nodes)
     return BatchSink(replicas, scenario.times, (filters, scenario.plant.n))
 
 

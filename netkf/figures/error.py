@@ -244,7 +244,7 @@ def _draw_ratios(
     values = scale * np.array([row[key] for row in rows])
     widths = scale * LEVEL * np.array([_known_or_zero(row.get(f"{key}_se")) for row in rows])
     axes.hlines(positions, np.minimum(values, 1.0), np.maximum(values, 1.0), color=FAINT, lw=0.8)
-    has = np.array([row["node"] in subject.scenario.placed for row in rows])
+    has = np.array([row["node"] in subject.scenario.placed_sensors for row in rows])
     for group, colour, marker, label in (
         (has, SENSING, "s", "with a sensor"),
         (~has, RELAY, "o", "without a sensor"),

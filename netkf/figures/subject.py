@@ -86,7 +86,7 @@ class Subject:
     @cached_property
     def sensing(self) -> np.ndarray:
         """(N,) bool: nodes with a sensor."""
-        return np.array([node in self.scenario.placed for node in self.nodes])
+        return np.array([node in self.scenario.placed_sensors for node in self.nodes])
 
     @cached_property
     def used(self) -> np.ndarray:

@@ -73,7 +73,7 @@ def run_data(
         "broadcasts": _is_broadcast(run),
         "n": run.x.shape[1],
         "nodes": list(run.nodes),
-        "sensors": [node for node in run.nodes if node in source.scenario.placed],
+        "sensors": [node for node in run.nodes if node in source.scenario.placed_sensors],
         "positions": positions(source, run),
         "knowledge": source.knowledge,
         "flow": _flow_kind(source),
@@ -181,10 +181,10 @@ def _flow_kind(source: Opened) -> str:
     """Return how information flows: nodes ``combine`` what they hear, ``swap`` it for their own,
     send ``readings`` that nobody passes on, or one filter has the readings of all (``pooled``).
     """
-    hosted = source.scenario.hosted
-    if hosted.pooled:
+    node_filter = source.scenario.node_filter
+    if node_filter.pooled:
         return "pooled"
-    return hosted.combination if hosted.combination in ("swap", "readings") else "combine"
+    return node_filter.combination if node_filter.combination in ("swap", "readings") else "combine"
 
 
 def _state_axes(source: Opened, run: StoredRun, worst: Worst | None) -> list[int]:

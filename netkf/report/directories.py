@@ -104,7 +104,7 @@ class Opened:
         """
         if not self.scenario.slotted:
             return "until"
-        return "before" if self.scenario.hosted.predicts else "slot"
+        return "before" if self.scenario.node_filter.predicts else "slot"
 
     @property
     def period(self) -> float:

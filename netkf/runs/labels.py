@@ -27,7 +27,7 @@ def covariance_bias(scenario: Scenario) -> str:
     the design of the filter; empty if neither is known.
     """
     algorithm = scenario.filter.algorithm
-    design = scenario.hosted.P_by_design[0 if scenario.slotted else 1]
+    design = scenario.node_filter.P_by_design[0 if scenario.slotted else 1]
     # P_by_design is about the steps of the built-in class, with links and linear readings.
     if overridden(algorithm) or not scenario.topology.links or not scenario.is_linear:
         return ""

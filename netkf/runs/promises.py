@@ -68,12 +68,12 @@ def compute_promises(scenario: Scenario) -> dict[str, Any]:
     if scenario.slotted:
         slot_promises = paper_function(scenario, "promises", "slot_promises")
         if slot_promises is not None:
-            promises[scenario.hosted.paper] = slot_promises(scenario)
+            promises[scenario.node_filter.paper] = slot_promises(scenario)
         else:
             promises["slot_central_covariance"] = _value_or_reason(
                 lambda: _slot_central_covariance(scenario)
             )
-    if has_linear_errors(scenario) and scenario.hosted.talks:
+    if has_linear_errors(scenario) and scenario.node_filter.talks:
         promises["steady_error"] = _steady_error(scenario)
     if not scenario.slotted:
         ends = np.array([scenario.horizon])
@@ -127,8 +127,8 @@ def _slot_central_covariance(scenario: Scenario) -> FloatArray:
     """Return P* (n, n), the steady prediction covariance of a Kalman filter with all readings in
     every slot; raises TheoryError if H is not constant.
     """
-    for node in scenario.sensing:
-        scenario.observation(node)  # raises TheoryError if H is not constant
+    for node in scenario.sensing_nodes:
+        scenario.observation_matrices(node)  # raises TheoryError if H is not constant
     model = scenario.pooled_slot_model
     return steady_covariance(model.F, model.Q, model.H, model.R)
 
@@ -176,7 +176,7 @@ def promises_text(scenario: Scenario, promises: dict[str, Any]) -> str:
     """Return the ``promises`` of :func:`compute_promises` as text for a terminal."""
     title = f"{scenario.name}: {scenario.claim}" if scenario.claim else scenario.name
     lines = [title, "", "assumptions", *_assumption_lines(promises["assumptions"])]
-    paper = scenario.hosted.paper
+    paper = scenario.node_filter.paper
     if paper and paper in promises:
         slot_lines = paper_function(scenario, "promises", "slot_lines")
         return "\n".join([*lines, "", *slot_lines(promises[paper], format_number)])

@@ -1,4 +1,7 @@
-"""The checks of a scenario as a whole; each raises ScenarioError in one line."""
+"""Checks that involve several parts of a scenario; each raises ScenarioError at the first mistake.
+
+Rules of a single part, such as the range of a number, are checked by the part's own class.
+"""
 
 from __future__ import annotations
 
@@ -23,15 +26,15 @@ from netkf.scenario.derived import DerivedScenario
 from netkf.scenario.records import check_records
 from netkf.scenario.registry import kind_name
 from netkf.scenario.sampling import check_sampling, uses_grid
-from netkf.scenario.shapes import demand_shape
+from netkf.scenario.shapes import require_shape
 
-MAX_SAMPLES = 10_000_000
+MAX_SAMPLES = 10_000_000  # state samples of one run
 MAX_ENTRIES = 100_000_000
-"""Entries of all sampled covariances of a run, of which it may hold a gigabyte."""
-MAX_STEPS = 100_000_000  # steps of one run; more are a slip in a unit of time
-MAX_TICKS = 1e9  # ticks of one clock; more are a slip in a unit of time
-MAX_CONSTANTS = 1e15  # as integers they can be counted
-MAX_GROWTH = 1e7  # the exponent: there is a frame for every seven
+"""Numbers in all sampled covariances of one run: 0.8 GB of memory."""
+MAX_STEPS = 100_000_000  # steps of one run; more suggest a wrong unit of time
+MAX_TICKS = 1e9  # ticks of one clock; more suggest a wrong unit of time
+MAX_CONSTANTS = 1e15  # time constants of one run; more have no exact count in floating point
+MAX_GROWTH = 1e7  # exponent g of growth by e^g; a run needs a new frame each time g rises by seven
 
 
 def check_scenario(scenario: DerivedScenario) -> None:
@@ -51,11 +54,14 @@ def check_scenario(scenario: DerivedScenario) -> None:
         _check_sensing_period(scenario)
     if not scenario.slotted:
         _check_speed(scenario)
-    scenario.hosted.check_scenario(scenario)
+    scenario.node_filter.check_scenario(scenario)
 
 
 def _check_times(scenario: DerivedScenario) -> None:
-    """Raise ScenarioError for a horizon or sample times beyond the limits."""
+    """Raise ScenarioError if there are too many slots or state samples, or samples after the end.
+
+    ``probe`` is the period of the state samples or an array (T,) of their times, in seconds.
+    """
     probe, horizon = scenario.probe, scenario.horizon
     if scenario.slotted and horizon / scenario.slot_plant.period > MAX_STEPS:
         raise ScenarioError(
@@ -92,7 +98,7 @@ def _check_times(scenario: DerivedScenario) -> None:
 
 
 def _check_entries(scenario: DerivedScenario, samples: float) -> None:
-    """Raise ScenarioError if ``samples`` samples of all nodes do not fit into memory."""
+    """Raise ScenarioError if the covariances of all nodes at ``samples`` times are too large."""
     nodes, n = len(scenario.nodes), scenario.plant.n
     if samples * nodes * n * n > MAX_ENTRIES:
         raise ScenarioError(
@@ -108,19 +114,19 @@ def _check_plant(scenario: DerivedScenario) -> None:
     plant, n = scenario.plant, scenario.plant.n
     if isinstance(plant, Diffusion):
         why = f"plant.A has {n} rows"
-        demand_shape("plant.B", plant.B, (n, None), why)
+        require_shape("plant.B", plant.B, (n, None), why)
     else:
         why = f"plant.F has {n} rows"
-        demand_shape("plant.Q", scenario.slot_plant.Q, (n, n), why)
+        require_shape("plant.Q", scenario.slot_plant.Q, (n, n), why)
     if plant.mean is not None:
-        demand_shape("plant.mean", plant.mean, (n,), why)
+        require_shape("plant.mean", plant.mean, (n,), why)
     if plant.cov is not None:
-        demand_shape("plant.cov", plant.cov, (n, n), why)
+        require_shape("plant.cov", plant.cov, (n, n), why)
 
 
 def _check_sensors(scenario: DerivedScenario) -> None:
     """Raise ScenarioError if a sensor does not fit the state or names an unknown node."""
-    n, known = scenario.plant.n, scenario.topology.index
+    n, index_of_node = scenario.plant.n, scenario.topology.index
     for k, sensor in enumerate(scenario.sensors):
         key = f"sensors[{k}]"
         if isinstance(sensor, RegressorSensor):
@@ -128,18 +134,17 @@ def _check_sensors(scenario: DerivedScenario) -> None:
         elif not sensor.linear:
             check_nonlinear(scenario, key, sensor)
         else:
-            demand_shape(f"{key}.H", sensor.H, (None, n), f"the state has {n} components")
+            require_shape(f"{key}.H", sensor.H, (None, n), f"the state has {n} components")
             p = len(sensor.H)
-            demand_shape(f"{key}.R", sensor.R, (p, p), f"H has {p} rows")
-        for index, node in enumerate(sensor.nodes):
-            if node not in known:
-                left_out = node in scenario.topology.left_out
-                why = "none of its links reaches network.graph.minimum, lower that; "
+            require_shape(f"{key}.R", sensor.R, (p, p), f"H has {p} rows")
+        for position, node in enumerate(sensor.nodes):
+            if node not in index_of_node:
+                remedy = f"node ids here are {_list_ids(scenario.nodes)}"
+                if node in scenario.topology.left_out:
+                    why = "none of its links reaches network.graph.minimum, lower that"
+                    remedy = f"{why}; {remedy}"
                 raise ScenarioError(
-                    f"{key}.nodes[{index}]",
-                    "must be a node of the graph",
-                    node,
-                    f"{why if left_out else ''}node ids here are {_list_ids(scenario.nodes)}",
+                    f"{key}.nodes[{position}]", "must be a node of the graph", node, remedy
                 )
         if len(set(sensor.nodes)) < len(sensor.nodes):
             raise ScenarioError(
@@ -151,15 +156,20 @@ def _check_sensors(scenario: DerivedScenario) -> None:
 
 
 def _check_speed(scenario: DerivedScenario) -> None:
-    """Raise ScenarioError if the plant or a filter is so fast that its steps cannot be counted."""
-    delay, A = scenario.network.channel.delay.fixed or 0.0, scenario.truth.A
+    """Raise ScenarioError if the plant or a filter is too fast for the horizon.
+
+    The rate of the plant is at most the norm ||A||_1. That of a Kalman-Bucy filter in steady state
+    is near sqrt(max|G| max|Q|), where G = H' R^-1 H.
+    """
+    delay, A = scenario.network.channel.delay.fixed or 0.0, scenario.diffusion.A
     longest = max(scenario.horizon, delay)
-    believed, Q = scenario.belief
-    linear = [sensor for sensor in scenario.sensors if sensor.linear]
-    gains = [sensor.H.T @ np.linalg.solve(sensor.R, sensor.H) for sensor in linear]
-    size = max((float(np.abs(G).max()) for G in gains), default=0.0) * float(np.abs(Q).max())
-    norm = max(float(np.abs(M).sum(axis=0).max()) for M in (A, believed))
-    if (norm + np.sqrt(size)) * longest > MAX_CONSTANTS:
+    believed_A, Q = scenario.belief
+    linear_sensors = [sensor for sensor in scenario.sensors if sensor.linear]
+    informations = [sensor.H.T @ np.linalg.solve(sensor.R, sensor.H) for sensor in linear_sensors]
+    max_information = max((float(np.abs(G).max()) for G in informations), default=0.0)
+    filter_rate = np.sqrt(max_information * float(np.abs(Q).max()))
+    plant_rate = max(float(np.abs(M).sum(axis=0).max()) for M in (A, believed_A))
+    if (plant_rate + filter_rate) * longest > MAX_CONSTANTS:
         raise ScenarioError(
             "plant.A",
             f"must have at most {MAX_CONSTANTS:g} time constants, or its filters must, within the "
@@ -178,14 +188,13 @@ def _check_speed(scenario: DerivedScenario) -> None:
 
 
 def _list_ids(nodes: tuple[int, ...]) -> str:
-    """Return node ids as text, only the ends of long lists."""
+    """Return node ids as text; of more than eight only the first and the last."""
     return ", ".join(map(str, nodes)) if len(nodes) <= 8 else f"{nodes[0]} .. {nodes[-1]}"
 
 
 def _check_network(scenario: DerivedScenario) -> None:
     """Raise ScenarioError if graph, activation, channel and filter do not fit."""
-    network, topology = scenario.network, scenario.topology
-    algorithm = scenario.hosted
+    network, topology, node_filter = scenario.network, scenario.topology, scenario.node_filter
     for key, part in (
         ("network.activation", network.activation),
         ("network.channel.loss", network.channel.loss),
@@ -196,7 +205,7 @@ def _check_network(scenario: DerivedScenario) -> None:
                 part.check(topology)
             except ScenarioError as error:
                 raise error.under(key) from None
-    if not algorithm.talks:
+    if not node_filter.talks:
         return
     name = kind_name(scenario.filter.algorithm)
     if network.activation is None:
@@ -210,42 +219,43 @@ def _check_network(scenario: DerivedScenario) -> None:
     if not scenario.slotted:
         check_activation(scenario)
         _check_ticks(scenario)
-    elif topology.directed and not algorithm.one_way:
+    elif topology.directed and not node_filter.one_way:
         raise ScenarioError(
             "network.graph.directed",
             f"must be false for the {name} filter, whose links work both ways in slots",
             True,
             "give an undirected graph",
         )
-    one_way = algorithm.one_way or topology.directed
+    one_way = node_filter.one_way or topology.directed
     if len(topology.components) > 1 and not one_way:
-        smallest = sorted(topology.components[-1])
+        smallest_component = sorted(topology.components[-1])
         raise ScenarioError(
             "network.graph",
             f"must be connected for the {name} filter",
-            f"{len(topology.components)} parts, one of them {smallest}",
+            f"{len(topology.components)} parts, one of them {smallest_component}",
             "add links, or connected = true for a random graph",
         )
 
 
 def _check_ticks(scenario: DerivedScenario) -> None:
-    """Raise ScenarioError if a clock would tick too often."""
+    """Raise ScenarioError if the clock of a link, direction or node would tick too often."""
     clock = scenario.network.activation
     assert isinstance(clock, LinkClock)
-    what = clock.at.removesuffix("s")
+    owner = clock.at.removesuffix("s")  # "link", "direction" or "node"
     for entity in clock.entities(scenario.topology):
         ticks = clock.mean_rate(entity) * scenario.horizon
         if ticks > MAX_TICKS:
+            ids = entity[0] if len(entity) == 1 else entity
             raise ScenarioError(
                 "network.activation",
-                f"must make at most {MAX_TICKS:g} ticks of a {what} up to the horizon",
-                f"{ticks:.3g} ticks of {what} {entity[0] if len(entity) == 1 else entity}",
+                f"must make at most {MAX_TICKS:g} ticks of a {owner} up to the horizon",
+                f"{ticks:.3g} ticks of {owner} {ids}",
                 "lower the rate or shorten the horizon",
             )
 
 
 def _check_filter(scenario: DerivedScenario) -> None:
-    """Raise ScenarioError if the filter's start or model does not fit the plant."""
+    """Raise ScenarioError if the filter's initial estimates, model or weights do not fit."""
     filtering, n = scenario.filter, scenario.plant.n
     why = f"the state has {n} components"
     for key, value, shape in (
@@ -268,9 +278,9 @@ def _check_filter(scenario: DerivedScenario) -> None:
                     "give one",
                 )
             for k, item in enumerate(value):
-                demand_shape(f"{key}[{k}]", item, shape, why)
+                require_shape(f"{key}[{k}]", item, shape, why)
         elif value is not None:
-            demand_shape(key, value, shape, why)
+            require_shape(key, value, shape, why)
     model = filtering.model
     for name in "ABFQ":
         value = getattr(model, name)
@@ -283,7 +293,7 @@ def _check_filter(scenario: DerivedScenario) -> None:
                 value,
                 "use F and Q for linear plants, A and B for diffusions",
             )
-        demand_shape(f"filter.model.{name}", value, (n, None if name == "B" else n), why)
+        require_shape(f"filter.model.{name}", value, (n, None if name == "B" else n), why)
     _check_believed_noise(scenario)
     check_weights(scenario)
     if filtering.algorithm.inverts:
@@ -307,9 +317,9 @@ def _check_believed_noise(scenario: DerivedScenario) -> None:
         p = len(sensor.R)
         reason = f"a reading of sensors[{k}] has {p} components"
         if isinstance(R, tuple):
-            demand_shape(f"filter.model.R[{k}]", R[k], (p, p), reason)
+            require_shape(f"filter.model.R[{k}]", R[k], (p, p), reason)
         else:
-            demand_shape("filter.model.R", R, (p, p), reason)
+            require_shape("filter.model.R", R, (p, p), reason)
 
 
 def _check_degrees(scenario: DerivedScenario) -> None:
@@ -328,8 +338,11 @@ def _check_degrees(scenario: DerivedScenario) -> None:
 
 
 def _check_sensing_period(scenario: DerivedScenario) -> None:
-    """Raise ScenarioError if the step of increments is too short or too long."""
-    period, horizon = scenario.truth.sensing_period, scenario.horizon
+    """Raise ScenarioError if the sensing period of increments is too short or too long.
+
+    The limits follow from the horizon, the plant, and the most precise node's filter.
+    """
+    period, horizon = scenario.diffusion.sensing_period, scenario.horizon
     assert period is not None
     if horizon / period > MAX_STEPS:
         raise ScenarioError(
@@ -338,17 +351,17 @@ def _check_sensing_period(scenario: DerivedScenario) -> None:
             period,
             "lengthen it, shorten the horizon, or use less precise sensors",
         )
-    if period > scenario.truth.longest_period * (1.0 + 1e-9):
+    if period > scenario.diffusion.longest_period * (1.0 + 1e-9):
         raise ScenarioError(
             "plant.sensing_period",
             "is too long for the plant",
             period,
-            f"give at most {scenario.truth.longest_period:.3g}, or leave it out",
+            f"give at most {scenario.diffusion.longest_period:.3g}, or leave it out",
         )
     pooled = scenario.filter.algorithm.pooled
     models = [scenario.pooled_model] if pooled else scenario.models
-    distinct = {id(model): model for model in models if len(model.H)}.values()
-    longest = min((_longest_step(scenario, model) for model in distinct), default=period)
+    distinct_models = {id(model): model for model in models if len(model.H)}.values()
+    longest = min((_longest_step(scenario, model) for model in distinct_models), default=period)
     if min(period, horizon) <= longest * (1.0 + 1e-9):
         return
     if getattr(scenario.plant, "sensing_period", None) is not None:
@@ -368,41 +381,41 @@ def _check_sensing_period(scenario: DerivedScenario) -> None:
 
 
 def _longest_step(scenario: DerivedScenario, model: FlowModel) -> float:
-    """Return the longest step in seconds for a model's increments."""
+    """Return the longest step in seconds in which a filter may use increments of ``model``."""
     return longest_interval(*scenario.belief, model.H, model.R)
 
 
 def _check_slots(scenario: DerivedScenario) -> None:
-    """Raise ScenarioError if times, activation or sensors do not fit slots."""
-    plant, algorithm = scenario.slot_plant, scenario.hosted
-    off = [
+    """Raise ScenarioError if sample times, activation or phases do not fit slots."""
+    plant, node_filter = scenario.slot_plant, scenario.node_filter
+    times_off_slots = [
         t
-        for t, k in zip(scenario.times.tolist(), scenario.slots, strict=True)
+        for t, k in zip(scenario.times.tolist(), scenario.sampled_slots, strict=True)
         if abs(t - k * plant.period) > 1e-9 * max(plant.period, t)
     ]
-    if off:
+    if times_off_slots:
         raise ScenarioError(
             "probe",
             f"times must be multiples of the plant's period {plant.period:g}",
-            off[0],
+            times_off_slots[0],
             "sample at slots only",
         )
     activation = scenario.network.activation
-    if not algorithm.talks:
+    if not node_filter.talks:
         return
-    name = kind_name(scenario.filter.algorithm)
-    pairs = isinstance(activation, Matching) or (
+    is_matching = isinstance(activation, Matching) or (
         isinstance(activation, RecordedSlots) and activation.matching
     )
-    if pairs != algorithm.pairwise:
+    if is_matching != node_filter.pairwise:
         assert activation is not None
+        form = "matching" if node_filter.pairwise else "broadcast"
         raise ScenarioError(
             "network.activation.kind",
-            f"must be a {'matching' if algorithm.pairwise else 'broadcast'} for the {name} filter",
+            f"must be a {form} for the {kind_name(scenario.filter.algorithm)} filter",
             _describe_activation(activation),
             "choose another activation or another filter",
         )
-    exchanges = (algorithm.schedule or ()).count("exchange")
+    exchanges = (node_filter.schedule or ()).count("exchange")
     if exchanges * scenario.phase_length >= plant.period * (1.0 - 1e-9):
         raise ScenarioError(
             "network.activation.phase",
@@ -413,7 +426,7 @@ def _check_slots(scenario: DerivedScenario) -> None:
 
 
 def _describe_activation(activation: Component) -> str:
-    """Return the kind of an activation, with the columns of a recorded one."""
+    """Return the kind of an activation, and of a recorded one the form that its columns give it."""
     name = kind_name(activation, "activation")
     if not isinstance(activation, RecordedSlots):
         return name

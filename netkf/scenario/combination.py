@@ -1,4 +1,4 @@
-"""Checks of regressors, weights of pairs, and filters that invert covariances."""
+"""Checks of regressor and nonlinear sensors, of combination weights, and of regular covariances."""
 
 from __future__ import annotations
 
@@ -9,11 +9,14 @@ from netkf.plants.nonlinear import NonlinearSensor
 from netkf.plants.regressors import RegressorSensor
 from netkf.scenario.derived import DerivedScenario
 from netkf.scenario.registry import kind_name
-from netkf.scenario.shapes import demand_shape
+from netkf.scenario.shapes import require_shape
 
 
 def check_regressor(scenario: DerivedScenario, key: str, sensor: RegressorSensor) -> None:
-    """Raise ScenarioError if the matrices of a regressor do not fit, or time is continuous."""
+    """Raise ScenarioError if a regressor's matrices have wrong shapes or the plant is continuous.
+
+    ``key`` is the key path of the sensor.
+    """
     if not scenario.slotted:
         raise ScenarioError(
             f"{key}.kind",
@@ -23,30 +26,33 @@ def check_regressor(scenario: DerivedScenario, key: str, sensor: RegressorSensor
         )
     m, q = len(sensor.A), sensor.B.shape[1]
     why = f"{key}.A has {m} rows"
-    demand_shape(f"{key}.B", sensor.B, (m, None), why)
-    demand_shape(
+    require_shape(f"{key}.B", sensor.B, (m, None), why)
+    require_shape(
         f"{key}.C", sensor.C, (scenario.plant.n, m), f"the state has {scenario.plant.n} components"
     )
-    demand_shape(f"{key}.start", sensor.start, (m,), why)
-    demand_shape(f"{key}.xi_cov", sensor.xi_cov, (q, q), f"{key}.B has {q} columns")
-    demand_shape(f"{key}.R", sensor.R, (1, 1), "a regressor gives one number a slot")
+    require_shape(f"{key}.start", sensor.start, (m,), why)
+    require_shape(f"{key}.xi_cov", sensor.xi_cov, (q, q), f"{key}.B has {q} columns")
+    require_shape(f"{key}.R", sensor.R, (1, 1), "a regressor gives one number a slot")
 
 
 def check_nonlinear(scenario: DerivedScenario, key: str, sensor: NonlinearSensor) -> None:
-    """Raise ScenarioError if a nonlinear sensor cannot read the state, or has no positions."""
+    """Raise ScenarioError if a nonlinear sensor cannot read the state, or has no positions.
+
+    ``key`` is the key path of the sensor.
+    """
     try:
-        for part in (sensor, sensor.located(scenario.topology.positions)):
-            part.check_state(scenario.plant.n)
+        for candidate in (sensor, sensor.located(scenario.topology.positions)):
+            candidate.check_state(scenario.plant.n)
     except ScenarioError as error:
         raise error.under(key) from None
 
 
 def check_weights(scenario: DerivedScenario) -> None:
-    """Raise ScenarioError if weights given for pairs do not fit the nodes and links."""
-    weights, nodes = scenario.hosted.pair_weights, scenario.nodes
+    """Raise ScenarioError if a matrix ``filter.weights`` (N, N) does not fit nodes and links."""
+    weights, nodes = scenario.node_filter.pair_weights, scenario.nodes
     if weights is None:
         return
-    demand_shape("filter.weights", weights, (len(nodes),) * 2, f"there are {len(nodes)} nodes")
+    require_shape("filter.weights", weights, (len(nodes),) * 2, f"there are {len(nodes)} nodes")
     links = set(scenario.topology.directions)
     for sender, receiver in np.argwhere(weights > 0.0).tolist():
         pair = (nodes[sender], nodes[receiver])
@@ -66,7 +72,7 @@ def check_invertible(scenario: DerivedScenario) -> None:
     if all covariances are regular at the start and no step is singular.
     """
     n = scenario.plant.n
-    starts = [scenario.start(node)[1] for node in scenario.nodes]
+    starts = [scenario.initial_estimate(node)[1] for node in scenario.nodes]
     regular_starts = all(np.linalg.matrix_rank(cov, hermitian=True) == n for cov in starts)
     if scenario.slotted:
         F, Q = scenario.slot_belief

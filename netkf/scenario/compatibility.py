@@ -1,4 +1,4 @@
-"""Checks that filter, activation, graph and sensors can be run together."""
+"""Checks that filter, activation, graph and sensors can run together."""
 
 from __future__ import annotations
 
@@ -16,37 +16,43 @@ SAMPLING = 'sampling = { kind = "periodic", period = ... }'
 
 
 def check_time(scenario: DerivedScenario) -> None:
-    """Raise ScenarioError if the filter or the activation belongs to the other kind of time."""
-    given, hosted, slotted = scenario.filter.algorithm, scenario.hosted, scenario.slotted
-    name = kind_name(given)
-    only_clocks = isinstance(given, FlowFilter) or hosted.schedule is None
-    only_slots = isinstance(given, SlotFilter) or (hosted.talks and not hosted.clocks)
-    if only_clocks if slotted else only_slots:
-        remedy = "change the plant or choose another kind"
-        raise ScenarioError("filter.kind", explain_kind_of_time(slotted), name, remedy)
+    """Raise ScenarioError if filter or activation need slots over a diffusion, or the reverse."""
+    algorithm, node_filter = scenario.filter.algorithm, scenario.node_filter
+    slotted, remedy = scenario.slotted, "change the plant or choose another kind"
+    if slotted:
+        fits = not isinstance(algorithm, FlowFilter) and node_filter.schedule is not None
+    else:
+        only_slots = node_filter.talks and not node_filter.clocks
+        fits = not isinstance(algorithm, SlotFilter) and not only_slots
+    if not fits:
+        rule = explain_kind_of_time(slotted)
+        raise ScenarioError("filter.kind", rule, kind_name(algorithm), remedy)
     activation = scenario.network.activation
     if activation is not None and isinstance(activation, SlotActivation) != slotted:
         kind = kind_name(activation, "activation")
-        remedy = "change the plant or choose another kind"
         raise ScenarioError("network.activation.kind", explain_kind_of_time(slotted), kind, remedy)
 
 
 def check_activation(scenario: DerivedScenario) -> None:
-    """Raise ScenarioError if the filter cannot run under the clocks, or these not on the graph."""
-    clock, hosted, topology = scenario.network.activation, scenario.hosted, scenario.topology
-    if not isinstance(clock, LinkClock) or not hosted.talks:
+    """Raise ScenarioError unless the clocks suit the filter, the graph and the sensors.
+
+    Does nothing in slots or for filters that exchange no messages.
+    """
+    clock, topology = scenario.network.activation, scenario.topology
+    node_filter = scenario.node_filter
+    if not isinstance(clock, LinkClock) or not node_filter.talks:
         return
     name = kind_name(scenario.filter.algorithm)
-    if topology.directed and (clock.at == "links" or hosted.clocks == ("links",)):
-        others = [f'at = "{at}"' for at in ("directions", "nodes") if at in hosted.clocks]
+    if topology.directed and (clock.at == "links" or node_filter.clocks == ("links",)):
+        remedies = [f'at = "{at}"' for at in ("directions", "nodes") if at in node_filter.clocks]
         raise ScenarioError(
             "network.graph.directed",
             f"must be false for the {name} filter at links, which work both ways",
             True,
-            " or ".join(["give an undirected graph", *others]),
+            " or ".join(["give an undirected graph", *remedies]),
         )
-    if clock.at not in hosted.clocks:
-        _reject_clock(clock.at, hosted.clocks, name)
+    if clock.at not in node_filter.clocks:
+        _reject_clock(clock.at, node_filter.clocks, name)
     if clock.at == "readings" and not any(map(takes_samples, scenario.sensors)):
         raise ScenarioError(
             "network.activation.kind",
@@ -57,25 +63,30 @@ def check_activation(scenario: DerivedScenario) -> None:
 
 
 def _reject_clock(at: str, clocks: tuple[str, ...], name: str) -> None:
-    """Raise ScenarioError: the filter does not run under clocks of this kind."""
-    kinds = [f'at = "{one}"' for one in clocks if one != "readings"]
-    kinds += ['kind = "readings"'] if "readings" in clocks else []
-    listed = " or ".join(kinds)
+    """Raise ScenarioError: the filter ``name`` runs under ``clocks`` only, not under those ``at``.
+
+    Both are of "links", "directions", "nodes" and "readings", see ``Filter.clocks``.
+    """
+    settings = [f'at = "{clock}"' for clock in clocks if clock != "readings"]
+    settings += ['kind = "readings"'] if "readings" in clocks else []
     key = "kind" if at == "readings" else "at"
-    rule = f"must be one that the {name} filter runs under: {listed}"
+    rule = f"must be one that the {name} filter runs under: {' or '.join(settings)}"
     raise ScenarioError(f"network.activation.{key}", rule, at, "write that, or change the filter")
 
 
 def check_readings(scenario: DerivedScenario) -> None:
-    """Raise ScenarioError if the filter cannot use the readings of a sensor."""
+    """Raise ScenarioError if the filter cannot use a sensor's readings (in slots it always can)."""
     if not scenario.slotted:
         for k, sensor in enumerate(scenario.sensors):
-            _check_readings(scenario, f"sensors[{k}]", sensor)
+            _check_readings_of(scenario, f"sensors[{k}]", sensor)
 
 
-def _check_readings(scenario: DerivedScenario, key: str, sensor: Sensor) -> None:
-    """Raise ScenarioError if the filter cannot use the readings of a sensor."""
-    algorithm, hosted = scenario.filter.algorithm, scenario.hosted
+def _check_readings_of(scenario: DerivedScenario, key: str, sensor: Sensor) -> None:
+    """Raise ScenarioError if the filter cannot use samples, or only samples, or a varying H.
+
+    ``key`` is the key path of the sensor, which is over a diffusion.
+    """
+    algorithm, node_filter = scenario.filter.algorithm, scenario.node_filter
     name = kind_name(algorithm)
     if isinstance(algorithm, FlowFilter) and takes_samples(sensor):
         raise ScenarioError(
@@ -84,14 +95,14 @@ def _check_readings(scenario: DerivedScenario, key: str, sensor: Sensor) -> None
             None,
             "remove it, or derive the class from netkf.parts.Filter",
         )
-    if sensor.varying and hosted.fixed_sensors:
+    if sensor.varying and node_filter.fixed_sensors:
         raise ScenarioError(
             key,
             f"must have a fixed H for the {name} filter, which adds up information",
             None,
             "leave out the columns phi0, ..., or use another filter",
         )
-    if hosted.needs_samples and not takes_samples(sensor):
+    if node_filter.needs_samples and not takes_samples(sensor):
         raise ScenarioError(
             f"{key}.sampling",
             f"is missing, and the {name} filter uses samples, no continuous increments",

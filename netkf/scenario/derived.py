@@ -29,7 +29,7 @@ from netkf.rng.streams import Streams
 from netkf.scenario.model import PlacedSensor, ScenarioModel
 from netkf.scenario.sampling import (
     all_sample_times,
-    demand_states,
+    require_states,
     sample_path,
     sample_rate,
     sample_times,
@@ -54,7 +54,7 @@ class DerivedScenario(ScenarioModel):
     def slot_models(self) -> tuple[SlotModel, ...]:
         """The model of each node in slots, in the order of ``nodes``; random H as in slot 0."""
         return tuple(
-            self._slot_model(self._stacked(self.placed.get(node, ()), believed=True))
+            self._slot_model(self._stacked(self.placed_sensors.get(node, ()), believed=True))
             for node in self.nodes
         )
 
@@ -86,13 +86,13 @@ class DerivedScenario(ScenarioModel):
     def _informations(self) -> Iterator[FloatArray]:
         """``H' R^-1 H`` (n, n) of the sensors of each node, as the filters believe it."""
         for node in self.nodes:
-            H, R = self._stacked(self.placed.get(node, ()), believed=True)
+            H, R = self._stacked(self.placed_sensors.get(node, ()), believed=True)
             yield symmetric(H.T @ np.linalg.solve(R, H))
 
     @property
     def _network_info(self) -> NetworkInfo | None:
         """The whole network, for filters that ask for it."""
-        if not self.hosted.needs_network:
+        if not self.node_filter.needs_network:
             return None
         heard: dict[int, list[int]] = {node: [] for node in self.nodes}
         for sender, receiver in self.topology.directions:
@@ -116,7 +116,7 @@ class DerivedScenario(ScenarioModel):
         return self._slot_model(self._stacked(self._everywhere, believed=True))
 
     @cached_property
-    def truth(self) -> Diffusion:
+    def diffusion(self) -> Diffusion:
         """The diffusion with every default filled in; raises TheoryError for a plant in slots."""
         plant = self.plant
         if not isinstance(plant, Diffusion):
@@ -150,9 +150,9 @@ class DerivedScenario(ScenarioModel):
         """
         frames = self.exact_errors if frames is None else frames
         times = sample_times(self, streams)
-        plant, horizon = self.truth, self.horizon
+        plant, horizon = self.diffusion, self.horizon
         if isinstance(plant, (RecordedDiffusion, UnknownDiffusion)):
-            demand_states(self, times)
+            require_states(self, times)
             return plant.recorded_truth
         sampled = all_sample_times(times)
         random, probing = streams.generator("plant"), streams.generator("probe")
@@ -173,27 +173,29 @@ class DerivedScenario(ScenarioModel):
         its A (in slots F) and commute with a shift of the state; see plants.truth.
         """
         # Readings that are not linear depend on where the origin is.
-        if not self.is_random or not self.is_linear or not commutes(self.hosted):
+        if not self.is_random or not self.is_linear or not commutes(self.node_filter):
             return False
         plant = self.plant
         if isinstance(plant, LinearPlant):
             same = np.array_equal(self.slot_belief[0], plant.F)
             return same and frame_slots(plant.F) is not None
-        same = np.array_equal(self.belief[0], self.truth.A)
-        return same and frame_period(self.truth.A) is not None
+        same = np.array_equal(self.belief[0], self.diffusion.A)
+        return same and frame_period(self.diffusion.A) is not None
 
     def move_back(self, offset: FloatArray, age: float) -> FloatArray:
         """Return the state (n,) that the plant without noise moves to ``offset`` in ``age`` s."""
         if self.slotted:
             return offset
-        return np.asarray(scipy.linalg.expm(-age * self.truth.A) @ offset)
+        return np.asarray(scipy.linalg.expm(-age * self.diffusion.A) @ offset)
 
-    def observation(self, node: int, believed: bool = False) -> tuple[FloatArray, FloatArray]:
+    def observation_matrices(
+        self, node: int, believed: bool = False
+    ) -> tuple[FloatArray, FloatArray]:
         """Return ``H`` (p, n) and ``R`` (p, p) of all sensors of a node together, over a diffusion
         of those that give increments; p may be 0. With ``believed``, R is what the filter takes it
         to be. Raises TheoryError where H differs from slot to slot.
         """
-        placed = (self.placed if self.slotted else self.increment_sensors).get(node, ())
+        placed = (self.placed_sensors if self.slotted else self.increment_sensors).get(node, ())
         for sensor in (self.sensors[placed_sensor.entry] for placed_sensor in placed):
             if sensor.varying:
                 what = (
@@ -213,7 +215,7 @@ class DerivedScenario(ScenarioModel):
         # Thousands of nodes may have the sensors of one [[sensors]] entry.
         if (entries, believed) not in self._stacks:
             H = [self.sensors[entry].matrix_of(self.plant.n) for entry in entries]
-            R = [self.noise(entry, believed=believed) for entry in entries]
+            R = [self.noise_covariance(entry, believed=believed) for entry in entries]
             empty = np.zeros((0, self.plant.n))
             self._stacks[entries, believed] = np.concatenate([empty, *H]), block_diagonal(R)
         return self._stacks[entries, believed]
@@ -243,7 +245,7 @@ class DerivedScenario(ScenarioModel):
     def belief(self) -> tuple[FloatArray, FloatArray]:
         """The matrices ``A`` and ``Q = B B'`` (n, n) that the filters use."""
         model = self.filter.model
-        plant = self.truth
+        plant = self.diffusion
         A = plant.A if model.A is None else model.A
         B = plant.B if model.B is None else model.B
         return A, np.asarray(B @ B.T)
@@ -257,9 +259,9 @@ class DerivedScenario(ScenarioModel):
         if isinstance(plant, LinearPlant):
             pairs = [*zip(self.slot_belief, (plant.F, plant.Q), strict=True)]
         else:
-            pairs = [*zip(self.belief, (self.truth.A, self.truth.Q), strict=True)]
+            pairs = [*zip(self.belief, (self.diffusion.A, self.diffusion.Q), strict=True)]
         pairs += [
-            (self.noise(k, believed=True), self.noise(k, believed=False))
+            (self.noise_covariance(k, believed=True), self.noise_covariance(k, believed=False))
             for k in range(len(self.sensors))
         ]
         return all(np.array_equal(believed, true) for believed, true in pairs)
@@ -269,7 +271,7 @@ class DerivedScenario(ScenarioModel):
         """The model of each node in continuous time; equal models are one object."""
         made: dict[bytes, FlowModel] = {}
         return tuple(
-            self._model(self.observation(node, believed=True), made) for node in self.nodes
+            self._model(self.observation_matrices(node, believed=True), made) for node in self.nodes
         )
 
     @cached_property
@@ -280,7 +282,7 @@ class DerivedScenario(ScenarioModel):
     @property
     def _everywhere(self) -> tuple[PlacedSensor, ...]:
         """All sensors that a pooled filter reads."""
-        placed = self.placed if self.slotted else self.increment_sensors
+        placed = self.placed_sensors if self.slotted else self.increment_sensors
         return tuple(one for sensors in placed.values() for one in sensors)
 
     def _model(
@@ -290,11 +292,11 @@ class DerivedScenario(ScenarioModel):
         H, R = observation
         key = b"".join((H.tobytes(), b"|", R.tobytes()))
         if key not in made:
-            interval = self.truth.sensing_period or 0.0
+            interval = self.diffusion.sensing_period or 0.0
             made[key] = FlowModel(*self.belief, H, R, self.horizon, min(interval, self.horizon))
         return made[key]
 
-    def start(self, node: int) -> tuple[FloatArray, FloatArray]:
+    def initial_estimate(self, node: int) -> tuple[FloatArray, FloatArray]:
         """Return ``xhat`` (n,) and ``P`` (n, n) of a node at time 0."""
         index, mean, cov = self.topology.index[node], self.filter.mean, self.filter.cov
         first = self.plant.start_mean if mean is None else mean
@@ -309,7 +311,7 @@ class DerivedScenario(ScenarioModel):
 
         It is pi_ij of H (7) and a_ji of D (8).
         """
-        algorithm, topology = self.hosted, self.topology
+        algorithm, topology = self.node_filter, self.topology
         given = algorithm.pair_weights
         if given is not None:
             return float(given[topology.index[sender], topology.index[receiver]])

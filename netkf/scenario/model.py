@@ -185,24 +185,24 @@ class ScenarioModel(Component):
         return self.plant
 
     @cached_property
-    def slots(self) -> tuple[int, ...]:
+    def sampled_slots(self) -> tuple[int, ...]:
         """Numbers of the slots that are sampled."""
         period = self.slot_plant.period
         return tuple(round(t / period) for t in self.times.tolist())
 
     @cached_property
-    def hosted(self) -> Filter:
+    def node_filter(self) -> Filter:
         """The filter of every node under the present contract."""
         return adapt(self.filter.algorithm)
 
     @property
-    def ends(self) -> float:
+    def end_time(self) -> float:
         """The time in seconds after which nothing happens.
 
         It is the horizon, or the end of the slot that begins there if samples are taken after the
         exchanges of their slot.
         """
-        if not self.slotted or self.hosted.predicts:
+        if not self.slotted or self.node_filter.predicts:
             return self.horizon
         return self.horizon + self.slot_plant.period
 
@@ -213,10 +213,14 @@ class ScenarioModel(Component):
         assert isinstance(activation, SlotActivation)
         if activation.phase is not None:
             return activation.phase
-        return 0.5 * self.slot_plant.period / max(1, (self.hosted.schedule or ()).count("exchange"))
+        return (
+            0.5
+            * self.slot_plant.period
+            / max(1, (self.node_filter.schedule or ()).count("exchange"))
+        )
 
     @cached_property
-    def placed(self) -> dict[int, tuple[PlacedSensor, ...]]:
+    def placed_sensors(self) -> dict[int, tuple[PlacedSensor, ...]]:
         """The sensors of each node that has any."""
         placed: dict[int, list[PlacedSensor]] = {}
         for entry, sensor in enumerate(self.sensors):
@@ -226,16 +230,16 @@ class ScenarioModel(Component):
         return {node: tuple(placed[node]) for node in sorted(placed)}
 
     @property
-    def sensing(self) -> tuple[int, ...]:
+    def sensing_nodes(self) -> tuple[int, ...]:
         """Ids of the nodes that have a sensor."""
-        return tuple(self.placed)
+        return tuple(self.placed_sensors)
 
     @property
     def is_random(self) -> bool:
         """True if runs draw the state and all readings; records of them follow no known law."""
         return self.plant.is_random and all(sensor.is_random for sensor in self.sensors)
 
-    def noise(self, entry: int, *, believed: bool) -> FloatArray:
+    def noise_covariance(self, entry: int, *, believed: bool) -> FloatArray:
         """Return the true or the believed R (p, p) of a ``[[sensors]]`` entry."""
         R = self.filter.model.R
         if not believed or R is None:
@@ -264,6 +268,6 @@ class ScenarioModel(Component):
             return {}
         chosen = {
             node: tuple(p for p in placed if takes_samples(self.sensors[p.entry]) == sampled)
-            for node, placed in self.placed.items()
+            for node, placed in self.placed_sensors.items()
         }
         return {node: placed for node, placed in chosen.items() if placed}

@@ -55,18 +55,18 @@ def _check_readings(scenario: DerivedScenario, key: str, sensor: RecordedSensor)
 
 def sensed_slots(scenario: DerivedScenario) -> range:
     """Return the slots in which a run hands readings to its filters."""
-    plant, algorithm = scenario.slot_plant, scenario.hosted
+    plant, algorithm = scenario.slot_plant, scenario.node_filter
     end = max(int(scenario.horizon / plant.period) - 1, 0)
     while not plant.over(end, scenario.horizon):
         end += 1
     if algorithm.predicts:
         return range(end)
-    return range(1, end + (end in scenario.slots))
+    return range(1, end + (end in scenario.sampled_slots))
 
 
 def _check_exchanges(scenario: DerivedScenario) -> None:
     """Raise ScenarioError if recorded exchanges do not fit the steps of the filter."""
-    activation, algorithm = scenario.network.activation, scenario.hosted
+    activation, algorithm = scenario.network.activation, scenario.node_filter
     if not isinstance(activation, RecordedSlots) or activation.matching:
         return
     phases = (algorithm.schedule or ()).count("exchange")
@@ -86,7 +86,7 @@ def _check_exchanges(scenario: DerivedScenario) -> None:
 
 def exchange_slots(scenario: DerivedScenario) -> range:
     """Return the slots in which nodes exchange."""
-    return range(scenario.hosted.first_slot, sensed_slots(scenario).stop)
+    return range(scenario.node_filter.first_slot, sensed_slots(scenario).stop)
 
 
 def used_states(scenario: DerivedScenario) -> tuple[str, int, int] | None:
@@ -114,7 +114,7 @@ def _used_rows(scenario: DerivedScenario, plant: RecordedDiffusion) -> int:
 def _state_slots(scenario: DerivedScenario) -> set[int]:
     """Return the slots in which a run needs the state."""
     drawn = any(sensor.is_random for sensor in scenario.sensors)
-    return {*scenario.slots, *(sensed_slots(scenario) if drawn else ())}
+    return {*scenario.sampled_slots, *(sensed_slots(scenario) if drawn else ())}
 
 
 def record_notes(scenario: DerivedScenario) -> tuple[str, ...]:

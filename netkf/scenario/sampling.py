@@ -85,7 +85,7 @@ def uses_grid(scenario: ScenarioModel) -> bool:
     return drawn and (bool(scenario.increment_sensors) or not scenario.sampled_sensors)
 
 
-def demand_states(scenario: ScenarioModel, times: dict[tuple[int, int], FloatArray]) -> None:
+def require_states(scenario: ScenarioModel, times: dict[tuple[int, int], FloatArray]) -> None:
     """Raise ScenarioError where a recorded truth lacks the state at a probe time, or at the sample
     time of a sensor that is drawn.
     """
@@ -131,7 +131,7 @@ def check_sampling(scenario: ScenarioModel) -> None:
                 except ScenarioError as error:
                     raise error.under(key) from None
     if not scenario.slotted and isinstance(scenario.plant, RecordedDiffusion):
-        demand_states(scenario, sample_times(scenario, Streams(scenario.seed)))
+        require_states(scenario, sample_times(scenario, Streams(scenario.seed)))
 
 
 def _check_clock(scenario: ScenarioModel, key: str, sensor: LinearSensor | NonlinearSensor) -> None:

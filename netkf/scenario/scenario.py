@@ -40,22 +40,21 @@ class Scenario(DerivedScenario):
     def __getstate__(self) -> dict[str, Any]:
         """Return the fields and the topology for pickle.
 
-        Derived values are computed again; the topology may come from a file that is elsewhere.
+        Derived values are computed anew when they are needed. The topology is kept because the
+        file it was read from may not exist where the pickle is loaded.
         """
-        kept = {field.name for field in dataclasses.fields(self)} | {
-            "_folder",
-            "_trust",
-            "topology",
-        }
-        return {name: value for name, value in self.__dict__.items() if name in kept}
+        names = {field.name for field in dataclasses.fields(self)}
+        names |= {"_folder", "_trust", "topology"}
+        return {name: value for name, value in self.__dict__.items() if name in names}
 
     def __repr__(self) -> str:
         kinds = (type(self.plant), type(self.network.graph), type(self.filter.algorithm))
         plant, graph, algorithm = (kind.__name__ for kind in kinds)
         return (
             f"<netkf.Scenario {self.name!r}: {plant} of {self.plant.n} states, {graph} of "
-            f"{len(self.nodes)} nodes and {len(self.topology.links)} links, {len(self.sensing)} "
-            f"with sensors, {algorithm} filters, {self.horizon:g} s, seed {self.seed}>"
+            f"{len(self.nodes)} nodes and {len(self.topology.links)} links, "
+            f"{len(self.sensing_nodes)} with sensors, {algorithm} filters, {self.horizon:g} s, "
+            f"seed {self.seed}>"
         )
 
     def replace(self, changes: Mapping[str, Any]) -> Scenario:
@@ -70,10 +69,10 @@ class Scenario(DerivedScenario):
 
     @cached_property
     def notes(self) -> tuple[str, ...]:
-        """One line for each thing that a user should know before anything runs."""
+        """Remarks for the user before a run, one line each, such as unused rows of a table."""
         return (
             *self.topology.notes,
-            *self.hosted.scenario_notes(self),
+            *self.node_filter.scenario_notes(self),
             *record_notes(self),
             *sampling_notes(self),
         )

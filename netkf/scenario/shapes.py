@@ -6,7 +6,7 @@ from netkf.core.errors import ScenarioError
 from netkf.linalg.arrays import FloatArray
 
 
-def demand_shape(key: str, value: FloatArray, shape: tuple[int | None, ...], why: str) -> None:
+def require_shape(key: str, value: FloatArray, shape: tuple[int | None, ...], why: str) -> None:
     """Raise ScenarioError unless an array has the shape; None stands for any length."""
     fits = len(value.shape) == len(shape) and all(
         want is None or have == want for have, want in zip(value.shape, shape, strict=True)

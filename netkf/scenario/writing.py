@@ -43,7 +43,7 @@ def resolve_defaults(scenario: DerivedScenario) -> dict[str, Any]:
 
 def _fill_start(scenario: DerivedScenario) -> Plant:
     """Return the plant with the mean and covariance of x(0) written out."""
-    plant = scenario.plant if scenario.slotted else scenario.truth
+    plant = scenario.plant if scenario.slotted else scenario.diffusion
     return dataclasses.replace(plant, mean=plant.start_mean, cov=plant.start_cov)
 
 

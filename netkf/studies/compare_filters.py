@@ -181,7 +181,7 @@ def compare_filters(
         row = _make_row(label, values[label], base, traffic[label], scenario.plant.n, level)
         rows.append(
             dataclasses.replace(
-                row, predicts=scenario_of_filter.slotted and scenario_of_filter.hosted.predicts
+                row, predicts=scenario_of_filter.slotted and scenario_of_filter.node_filter.predicts
             )
         )
     return FilterComparison(scenario.name, count, root, confidence, tuple(rows))

@@ -155,7 +155,7 @@ class _Innovations:
         self._scenario, self._run, self._sigma, self._blurred = scenario, run, sigma, blurred
         self._streams = Streams(run.seed, run.replica)
         # Samples of a predicting filter are predictions; others are predicted by one slot.
-        self._steps = 0 if scenario.hosted.predicts else 1
+        self._steps = 0 if scenario.node_filter.predicts else 1
         slots = np.round(run.times / scenario.slot_plant.period).astype(int).tolist()
         self._samples = [
             k
@@ -167,13 +167,15 @@ class _Innovations:
 
     def of_node(self, i: int) -> Iterator[tuple[float, float]]:
         """Yield the NIS and its expected value (nan if unknown) in each slot of the i-th node."""
-        placed = self._scenario.placed.get(self._run.nodes[i], ())
+        placed = self._scenario.placed_sensors.get(self._run.nodes[i], ())
         # A nonlinear reading has no H given the errors alone.
         if not placed or not self._scenario.is_linear:
             return
         sensors = [self._scenario.slot_path(self._streams, self._run.nodes[i], p) for p in placed]
         believed_R, true_R = (
-            block_diagonal([self._scenario.noise(p.entry, believed=believed) for p in placed])
+            block_diagonal(
+                [self._scenario.noise_covariance(p.entry, believed=believed) for p in placed]
+            )
             for believed in (True, False)
         )
         for k, slot, noise in zip(self._samples, self._slots, self._noise, strict=True):
@@ -312,10 +314,10 @@ def _without_horizon(scenario: Scenario) -> Scenario:
     """Return the scenario without a sample at the horizon for filtered estimates in slots, which
     has no exact covariance: the trace lacks the exchanges of the slot that begins there.
     """
-    hosted = scenario.hosted
-    if not scenario.slotted or not hosted.talks or hosted.predicts:
+    node_filter = scenario.node_filter
+    if not scenario.slotted or not node_filter.talks or node_filter.predicts:
         return scenario
-    over = [scenario.slot_plant.over(slot, scenario.horizon) for slot in scenario.slots]
+    over = [scenario.slot_plant.over(slot, scenario.horizon) for slot in scenario.sampled_slots]
     times = scenario.times[~np.array(over)]
     if all(over) or not (times > 0.0).any():
         return scenario

@@ -90,11 +90,11 @@ def count_traffic(scenario: Scenario, seed: int, engine: Engine) -> Traffic:
         sent = log[log["kind"] == CODES["transmit"]]
     rows = {
         node: sum(len(scenario.sensors[placed_sensor.entry].R) for placed_sensor in placed)
-        for node, placed in scenario.placed.items()
+        for node, placed in scenario.placed_sensors.items()
     }
     phases = sent["phase"].tolist() if slotted else [-1] * len(sent)
     numbers = sum(
-        scenario.hosted.payload_numbers(scenario.plant.n, rows.get(node, 0), phase)
+        scenario.node_filter.payload_numbers(scenario.plant.n, rows.get(node, 0), phase)
         for node, phase in zip(sent["node"].tolist(), phases, strict=True)
     )
     return Traffic(len(sent), BYTES * numbers)

@@ -171,7 +171,7 @@ def _count_events(scenario: DerivedScenario, times: FloatArray, at: float) -> in
     plant = scenario.slot_plant
     slot = round(at / plant.period)
     # A sample of a predicting filter is before the events of its slot, a filtered one after them.
-    end = plant.slot_time(slot if scenario.hosted.predicts else slot + 1)
+    end = plant.slot_time(slot if scenario.node_filter.predicts else slot + 1)
     return int(np.searchsorted(times, end, side="left"))
 
 
@@ -211,7 +211,7 @@ def find_flow(
     """
     used = messages.outcome == USED if used is None else used
     nodes = np.array(scenario.nodes)
-    combination = scenario.hosted.combination
+    combination = scenario.node_filter.combination
     if combination == "swap":
         return _swap_flow(nodes, len(log), messages, np.asarray(used))
     # One segment for each node, the whole run; its index is that of the node.
@@ -235,7 +235,7 @@ def find_flow(
         target=np.searchsorted(nodes, messages.receiver),
         cost=1 - used,
         last={n: k for k, n in enumerate(scenario.nodes)},
-        pooled=scenario.hosted.pooled,
+        pooled=scenario.node_filter.pooled,
     )
 
 
@@ -336,7 +336,7 @@ class KeptReadings:
         sensed = np.flatnonzero(log["kind"] == CODES["sense"])
         self._rows = {
             node: self._with_values(node, sensed[log["node"][sensed] == node])
-            for node in scenario.sensing
+            for node in scenario.sensing_nodes
         }
 
     def _with_values(self, node: int, rows: IntArray) -> IntArray:
@@ -345,7 +345,7 @@ class KeptReadings:
         In slots a node with sensors reads in every slot, but a record may lack rows.
         """
         scenario = self._scenario
-        sensors = [scenario.sensors[position.entry] for position in scenario.placed[node]]
+        sensors = [scenario.sensors[position.entry] for position in scenario.placed_sensors[node]]
         if not scenario.slotted or not all(isinstance(s, RecordedSensor) for s in sensors):
             return rows
         recorded = [s.row_times for s in sensors if isinstance(s, RecordedSensor)]

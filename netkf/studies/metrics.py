@@ -161,7 +161,7 @@ def bound_traces(scenario: Scenario) -> FloatArray:
     _require_fixed_H(scenario)
     pooled = scenario.filter.algorithm.pooled
     models = [scenario.pooled_slot_model] * len(scenario.nodes) if pooled else scenario.slot_models
-    starts = [scenario.start(node)[1] for node in scenario.nodes]
+    starts = [scenario.initial_estimate(node)[1] for node in scenario.nodes]
     columns = [_slot_traces(scenario, m, P) for m, P in zip(models, starts, strict=True)]
     return time_average(scenario, np.stack(columns, axis=1))
 
@@ -185,8 +185,8 @@ def _require_fixed_H(scenario: Scenario) -> None:
     """Raise TheoryError if readings are recorded or H is random."""
     if not scenario.is_random:
         raise TheoryError("the readings are recorded: nobody knows their law")
-    for node in scenario.sensing:
-        scenario.observation(node)  # raises where H is random
+    for node in scenario.sensing_nodes:
+        scenario.observation_matrices(node)  # raises where H is random
 
 
 def _slot_traces(scenario: Scenario, model: SlotModel, start: FloatArray) -> FloatArray:
@@ -195,7 +195,7 @@ def _slot_traces(scenario: Scenario, model: SlotModel, start: FloatArray) -> Flo
     """
     predicts = scenario.filter.algorithm.predicts  # type: ignore[union-attr]
     F, Q, H, R = model.F, model.Q, model.H, model.R
-    P, traces = start, np.empty(max(scenario.slots) + 1)
+    P, traces = start, np.empty(max(scenario.sampled_slots) + 1)
     traces[0] = np.trace(start)
     for slot in range(1, len(traces)):
         if predicts:
@@ -205,4 +205,4 @@ def _slot_traces(scenario: Scenario, model: SlotModel, start: FloatArray) -> Flo
             S = H @ P @ H.T + R
             P = P - P @ H.T @ np.linalg.solve(S, H @ P) if len(H) else P
         traces[slot] = np.trace(P)
-    return np.asarray(traces[np.array(scenario.slots)])
+    return np.asarray(traces[np.array(scenario.sampled_slots)])

@@ -187,7 +187,7 @@ class Replayer:
     def hurried(self) -> Chosen:
         """The messages that were not lost but not used by then: late, refused or under way."""
         scenario = self.scenario
-        swaps = scenario.hosted.combination == "swap"
+        swaps = scenario.node_filter.combination == "swap"
         messages = match_messages(self.log, swaps, scenario.slotted)
         unused = np.flatnonzero(np.isin(messages.outcome, (LATE, REFUSED, UNDER_WAY)))
         return frozenset(messages.key(m) for m in unused.tolist())

@@ -97,7 +97,7 @@ def _starts_with_the_truth(scenario: Scenario) -> bool:
     plant = scenario.plant
     return all(
         np.array_equal(P, plant.start_cov) and np.array_equal(x, plant.start_mean)
-        for x, P in map(scenario.start, scenario.nodes)
+        for x, P in map(scenario.initial_estimate, scenario.nodes)
     )
 
 

@@ -207,9 +207,9 @@ class _Evidence:
     def __init__(self, replayer: Replayer, node: int, most: int) -> None:
         self._replayer, self._node, self._most = replayer, node, most
         self.scenario = replayer.scenario
-        talks, links = self.scenario.hosted.talks, self.scenario.topology.directions
+        talks, links = self.scenario.node_filter.talks, self.scenario.topology.directions
         self._links = frozenset(links if talks else ())
-        swaps, slotted = self.scenario.hosted.combination == "swap", self.scenario.slotted
+        swaps, slotted = self.scenario.node_filter.combination == "swap", self.scenario.slotted
         self.messages = match_messages(replayer.log, swaps, slotted)
         full = match_messages(replayer.full_log, swaps, slotted)
         # What some filters send depends on the messages that they have received.
@@ -249,7 +249,7 @@ class _Evidence:
         ]
         log, reach = self._full_search
         without_losses = newest_information(reach, log, KeptReadings(scenario, log, at), 0)
-        nodes = [n for n in scenario.nodes if n != self._node or n in scenario.placed]
+        nodes = [n for n in scenario.nodes if n != self._node or n in scenario.placed_sensors]
         return tuple(
             self._make_source(n, [b.get(n) for b in by_budget], without_losses.get(n))
             for n in nodes
@@ -278,7 +278,7 @@ class _Evidence:
             missing = tuple(_describe_missing(self.messages, m) for m in path if self._flow.cost[m])
         return InformationSource(
             node=node,
-            sensor=node in self.scenario.placed,
+            sensor=node in self.scenario.placed_sensors,
             neighbour=(node, self._node) in self._links,
             heard=math.nan if last is None else float(self.messages.sent[last]),
             arrived=math.nan if last is None else float(self.messages.arrived[last]),

@@ -48,29 +48,29 @@ def check_filter(filter: Any, /, same_as_parent: bool | None = None, **settings:
     Raises AssertionError with one line: the method, the rule, the value got, what to do.
     """
     part = make_part(filter, (Filter, FlowFilter, SlotFilter), settings)
-    hosted = adapt(part)
-    watched = Watched(hosted, part, former_names(hosted))
+    node_filter = adapt(part)
+    watched = Watched(node_filter, part, former_names(node_filter))
     watched.pickle_copy()
     _class_variables(watched)
-    if hosted.talks:
+    if node_filter.talks:
         _check_weights(watched)
-    if hosted.schedule is not None:
+    if node_filter.schedule is not None:
         _check_schedule(watched)
     plain = list(all_trials(watched))
     for trial in plain:
         trial.run()
-    if commutes(hosted):
+    if commutes(node_filter):
         check_shift(watched, plain)
     watched.finish()
     if isinstance(part, Filter):
         check_parent(watched, same_as_parent)
 
 
-def former_names(hosted: Filter) -> dict[str, str]:
+def former_names(node_filter: Filter) -> dict[str, str]:
     """Return the names that a former contract has for methods of the present one."""
-    if isinstance(hosted, FlowAdapter):
+    if isinstance(node_filter, FlowAdapter):
         return {"predict": "flow", "update": "measure", "max_measurement_interval": "stretch"}
-    if isinstance(hosted, SlotAdapter):
+    if isinstance(node_filter, SlotAdapter):
         return {"update": "sense", "schedule": "programme", "redraws_links": "redraws"}
     return {}
 

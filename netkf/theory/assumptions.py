@@ -90,7 +90,7 @@ def _graph_rows(scenario: Scenario) -> list[AssumptionRow]:
 
 def _plant_rows(scenario: Scenario) -> list[AssumptionRow]:
     """Return the rows on controllability, observability, the filters' model and sampling."""
-    plant = scenario.truth
+    plant = scenario.diffusion
     # (A, B) is controllable if and only if (A', B') is observable; Q = B B' has the same kernel.
     idle = unobservable_mode(plant.A.T, plant.Q)
     driven = (
@@ -114,13 +114,13 @@ def _judge_observability(scenario: Scenario) -> tuple[bool | None, str]:
     """Return verdict and evidence on (A, H) with the sensors of all nodes."""
     if any(sensor.varying for sensor in scenario.sensors):
         return None, "H differs from reading to reading"
-    A, n = scenario.truth.A, scenario.plant.n
+    A, n = scenario.diffusion.A, scenario.plant.n
     # Thousands of nodes may have the sensors of one [[sensors]] entry.
     counts = Counter(_entries(scenario, node) for node in scenario.nodes)
     information_by_sensors = {entries: _information(scenario, entries) for entries in counts}
     # (A, H) is observable if and only if (A, sum H' R^-1 H) is: both hide the same modes.
     information = np.zeros((n, n))
-    for node in scenario.sensing:
+    for node in scenario.sensing_nodes:
         information += information_by_sensors[_entries(scenario, node)]
     hidden = unobservable_mode(A, information)
     if hidden is not None:
@@ -137,7 +137,7 @@ def _judge_observability(scenario: Scenario) -> tuple[bool | None, str]:
 
 def _entries(scenario: Scenario, node: int) -> tuple[int, ...]:
     """Return the numbers of the [[sensors]] entries of a node."""
-    return tuple(placed_sensor.entry for placed_sensor in scenario.placed.get(node, ()))
+    return tuple(placed_sensor.entry for placed_sensor in scenario.placed_sensors.get(node, ()))
 
 
 def _sampling_rows(scenario: Scenario) -> list[AssumptionRow]:
@@ -158,7 +158,7 @@ def _information(scenario: Scenario, entries: tuple[int, ...]) -> np.ndarray:
     """Return ``sum H' R^-1 H`` (n, n) over sensors; a sampled one counts by one sample."""
     information = np.zeros((scenario.plant.n, scenario.plant.n))
     for entry in entries:
-        H, R = scenario.sensors[entry].H, scenario.noise(entry, believed=False)
+        H, R = scenario.sensors[entry].H, scenario.noise_covariance(entry, believed=False)
         information += H.T @ np.linalg.solve(R, H)
     return information
 

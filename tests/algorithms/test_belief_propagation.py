@@ -154,9 +154,9 @@ def drifting(folder, graph, at, seed=0):
 
 def batch(scenario, run):
     """The posterior of each node at the end from the set of readings that have reached it."""
-    streams, A = Streams(run.seed, run.replica), scenario.truth.A
+    streams, A = Streams(run.seed, run.replica), scenario.diffusion.A
     rows = []
-    for node, places in scenario.placed.items():
+    for node, places in scenario.placed_sensors.items():
         for place in places:
             sensor = scenario.sensors[place.entry]
             times = scenario.sample_times(streams)[node, place.ordinal]

@@ -42,7 +42,9 @@ def gains_by_slot(scenario, slots):
     """
     F, Q = scenario.plant.F, scenario.plant.Q
     N, n, eye = len(scenario.nodes), len(F), np.eye(len(F))
-    info = [H.T @ np.linalg.inv(R) @ H for H, R in map(scenario.observation, scenario.nodes)]
+    info = [
+        H.T @ np.linalg.inv(R) @ H for H, R in map(scenario.observation_matrices, scenario.nodes)
+    ]
     G = sum(info)
     V = np.linalg.pinv(G)
     neighbours = [
@@ -174,7 +176,7 @@ def test_a_reading_of_which_a_row_is_missing_is_compared_with_the_rest(tmp_path)
     scenario = scenario_of(FILTER, tmp_path, 1, 3)
     node, algorithm = 2, scenario.filter.algorithm
     model, info = scenario.slot_models[node], scenario.node_infos[node]
-    state = algorithm.predict(algorithm.init(model, *scenario.start(node), info), 1.0)
+    state = algorithm.predict(algorithm.init(model, *scenario.initial_estimate(node), info), 1.0)
     y, H, R = np.array([0.7, -0.4]), model.H[1:], model.R[1:, 1:]
     after = algorithm.absorb(algorithm.update(state, Reading(y, H, R)), [], Exchange())
     z = H.T @ np.linalg.inv(R) @ (y - H @ state.pseudo.inverse @ state.yhat)

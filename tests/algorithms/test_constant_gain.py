@@ -80,7 +80,7 @@ def test_increments_against_the_lyapunov_equation_and_the_engine_s_own_map(ring)
     assert run.count("tick") == 0
     A, B, H = scenario.plant.A, scenario.plant.B, np.array([[1.0, 0.0]])
     for node in (0, 1):
-        L = np.array(gains[node]) if node in scenario.placed else np.zeros((2, 1))
+        L = np.array(gains[node]) if node in scenario.placed_sensors else np.zeros((2, 1))
         closed = A - L @ H
         Q = B @ B.T + 0.25 * L @ L.T
 
@@ -88,7 +88,7 @@ def test_increments_against_the_lyapunov_equation_and_the_engine_s_own_map(ring)
             P = P.reshape(2, 2)
             return (closed @ P + P @ closed.T + Q).reshape(-1)
 
-        first = scenario.start(node)[1].reshape(-1)
+        first = scenario.initial_estimate(node)[1].reshape(-1)
         solved = scipy.integrate.solve_ivp(change, (0.0, 1.0), first, rtol=1e-11, atol=1e-12)
         np.testing.assert_allclose(run.P[1, node].reshape(-1), solved.y[:, -1], rtol=1e-8)
     by_draws, again = engine_covariance(scenario)

@@ -78,7 +78,9 @@ def heard_by_slot(scenario, run, steps):
             slot = int(t)
             place = sent.setdefault((node, peer), {})
             silent = steps == 2 and scenario.filter.algorithm.combination.startswith("readings")
-            place[slot] = place.get(slot, int(silent and node not in scenario.placed) - 1) + 1
+            place[slot] = (
+                place.get(slot, int(silent and node not in scenario.placed_sensors) - 1) + 1
+            )
         if kind == CODES["deliver"]:
             slot = int(t)
             step = sent[peer, node][slot]
@@ -94,7 +96,7 @@ def textbook(scenario, run, step):
             (scenario.slot_path(streams, i, place), scenario.sensors[place.entry])
             for place in places
         ]
-        for i, places in scenario.placed.items()
+        for i, places in scenario.placed_sensors.items()
     }
     F, Q = scenario.plant.F, scenario.plant.Q
     x, P = [np.zeros(len(F)) for _ in nodes], [scenario.plant.cov for _ in nodes]

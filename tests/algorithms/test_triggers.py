@@ -88,7 +88,7 @@ def readings_of(scenario, run):
     streams = Streams(run.seed, run.replica)
     paths = {
         i: [(scenario.slot_path(streams, i, p), scenario.sensors[p.entry]) for p in places]
-        for i, places in scenario.placed.items()
+        for i, places in scenario.placed_sensors.items()
     }
 
     def read(slot):

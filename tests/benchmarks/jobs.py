@@ -65,7 +65,7 @@ def started(case):
 
 def whitened(case):
     """H (N, p, n) and numbers of rows (N,) of readings whose noise has variance 1."""
-    sensors = {node: case.observation(node) for node in case.sensing}
+    sensors = {node: case.observation_matrices(node) for node in case.sensing_nodes}
     most = max(len(R) for _, R in sensors.values())
     H, rows = np.zeros((len(case.nodes), most, case.plant.n)), np.zeros(len(case.nodes), np.int64)
     for k, node in enumerate(case.nodes):
@@ -131,11 +131,12 @@ def regressors_of(case):
 def diffusion(case):
     entries = range(len(case.sensors))
     (R,), (believed,) = (
-        {case.noise(k, believed=which).item() for k in entries} for which in (False, True)
+        {case.noise_covariance(k, believed=which).item() for k in entries}
+        for which in (False, True)
     )
     plant = np.array(case.plant.F), root_of(case.plant.Q)
     _, Q = case.slot_belief
-    mean, cov = case.start(case.nodes[0])
+    mean, cov = case.initial_estimate(case.nodes[0])
     start = np.array(case.plant.start_mean), root_of(case.plant.start_cov), mean.copy(), cov.copy()
     model = np.array(Q), np.sqrt(believed)
     rest = np.sqrt(R), start, regressors_of(case), senders_of(case)
@@ -178,7 +179,7 @@ def laws(A, B, H, V):
 
 
 def hybrid(case):
-    seen = {node: case.observation(node) for node in case.sensing}
+    seen = {node: case.observation_matrices(node) for node in case.sensing_nodes}
     H, V = (np.array(part) for part in next(iter(seen.values())))
     assert all((h == H).all() and (R == V).all() for h, R in seen.values()), "one kind of sensor"
     table, step_law = laws(np.array(case.plant.A), np.array(case.plant.B), H, V)

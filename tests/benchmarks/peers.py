@@ -50,7 +50,7 @@ def with_laws(case, ticks):
     for t, link, delivered in ticks:
         gaps = tuple(t - now[node] for node in link)
         now.update(dict.fromkeys(link, t))
-        laws = tuple(discrete(case.truth, gap) for gap in gaps)
+        laws = tuple(discrete(case.diffusion, gap) for gap in gaps)
         found.append(Tick(t, link, delivered, gaps, laws))
     return found
 
@@ -65,7 +65,7 @@ def discrete(truth, gap):
 
 def sensors(case):
     """node -> (H, R) of those that have a sensor."""
-    return {node: case.observation(node) for node in case.sensing}
+    return {node: case.observation_matrices(node) for node in case.sensing_nodes}
 
 
 def filterpy_job(case, ticks):
@@ -76,7 +76,7 @@ def filterpy_job(case, ticks):
     random, nodes = np.random.default_rng(2), {}
     for node in case.nodes:
         nodes[node] = KalmanFilter(dim_x=n, dim_z=len(seen[node][1]) if node in seen else 1)
-        nodes[node].P = np.array(case.start(node)[1])
+        nodes[node].P = np.array(case.initial_estimate(node)[1])
     for _, link, delivered, gaps, laws in ticks:
         for h, gap, (F, Q) in zip(link, gaps, laws, strict=True):
             nodes[h].predict(F=F, Q=Q)
@@ -116,7 +116,7 @@ def stone_soup_job(case, ticks):
     random, nodes, plant = np.random.default_rng(2), {}, Plant()
     predictor, updater = KalmanPredictor(plant), KalmanUpdater(None)
     for node in case.nodes:
-        cov = np.array(case.start(node)[1])
+        cov = np.array(case.initial_estimate(node)[1])
         nodes[node] = GaussianState(np.zeros((n, 1)), cov, timestamp=EPOCH)
     for t, link, delivered, gaps, laws in ticks:
         moment = EPOCH + datetime.timedelta(seconds=t)

@@ -27,7 +27,7 @@ def test_a_job_by_hand_makes_the_covariances_of_a_run(small, job):
     for tick in ticks:
         last.update(dict.fromkeys(tick.link, tick.t))
     for k, node in enumerate(case.nodes):  # a run goes on to its horizon
-        F, Q = peers.discrete(case.truth, case.horizon - last[node])
+        F, Q = peers.discrete(case.diffusion, case.horizon - last[node])
         np.testing.assert_allclose(F @ P[k] @ F.T + Q, run.P[-1, k], rtol=0, atol=1e-5)
 
 

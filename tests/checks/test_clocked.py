@@ -43,13 +43,13 @@ def test_exact_rows_hold_under_clocks(kind, clocked):
 
 def test_wrong_covariances_break_the_exact_rows(clocked, monkeypatch):
     scenario = clocked("gossip")
-    estimate = type(scenario.hosted).estimate
+    estimate = type(scenario.node_filter).estimate
 
     def sure(self, state):
         xhat, P = estimate(self, state)
         return xhat, 0.9 * P
 
-    monkeypatch.setattr(type(scenario.hosted), "estimate", sure)
+    monkeypatch.setattr(type(scenario.node_filter), "estimate", sure)
     monkeypatch.setattr(CompiledEngine, "refusal", lambda *_: "this filter is not the built-in one")
     verdict = netkf.check(scenario, runs=20, workers=1)
     assert list(verdict.table.verdict[:2]) == ["broken", "broken"]

@@ -51,7 +51,9 @@ def test_filters_of_the_literature_agree(first, tmp_path):
 @pytest.mark.slow
 def test_many_drawn_scenarios_agree_and_leave_nothing_out(tmp_path):
     runs = agree(range(FEW, FEW + MANY), tmp_path, range(1, 6))
-    filters = collections.Counter(type(scenario.hosted).__name__ for scenario, _ in runs.values())
+    filters = collections.Counter(
+        type(scenario.node_filter).__name__ for scenario, _ in runs.values()
+    )
     assert len(filters) == len(FILTERS)
     assert min(filters.values()) >= 30
     counts = collections.Counter()

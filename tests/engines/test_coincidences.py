@@ -223,7 +223,10 @@ def test_one_node_with_irregular_samples_is_filterpy(tmp_path):
 
     streams = Streams(made.seed)
     times = made.sample_times(streams)[0, 0]
-    truth, path = made.continuous_truth(streams), made.sample_path(streams, 0, made.placed[0][0])
+    truth, path = (
+        made.continuous_truth(streams),
+        made.sample_path(streams, 0, made.placed_sensors[0][0]),
+    )
     peer = KalmanFilter(dim_x=2, dim_z=1)
     peer.x, peer.P = np.zeros((2, 1)), np.array(made.plant.cov)
     peer.H, peer.R = np.array([[1.0, 0.4]]), np.array([[0.3]])

@@ -44,7 +44,7 @@ def test_every_scenario_agrees(file):
 
 @pytest.mark.parametrize(
     "file",
-    [file for file in scenario_files() if type(netkf.load(file).hosted) is Hybrid],
+    [file for file in scenario_files() if type(netkf.load(file).node_filter) is Hybrid],
     ids=lambda file: file.stem,
 )
 def test_every_scenario_in_continuous_time_agrees_with_covariance_intersection(file):

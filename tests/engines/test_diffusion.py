@@ -70,7 +70,7 @@ def test_cases(case, tmp_path):
 def readings_of(run, scenario):
     """(T, N) the readings and (T, N, n) the regressors of a run with one scalar sensor a node."""
     streams = Streams(run.seed, run.replica)
-    paths = [scenario.slot_path(streams, i, scenario.placed[i][0]) for i in scenario.nodes]
+    paths = [scenario.slot_path(streams, i, scenario.placed_sensors[i][0]) for i in scenario.nodes]
     seen, rows = [], []
     for k, x in enumerate(run.x):
         rows.append([path.matrix(k)[0] for path in paths])
@@ -206,7 +206,7 @@ def test_regressors_have_the_law_that_is_printed():
     """(x, 0, 0), (0, x, 0) with x <- x / 2 + xi; z (0, 1, 1), z = .8 x before, x <- .8 x + xi."""
     scenario = section_vi(horizon=4000.0)
     streams = Streams(3)
-    paths = [scenario.slot_path(streams, i, scenario.placed[i][0]) for i in range(3)]
+    paths = [scenario.slot_path(streams, i, scenario.placed_sensors[i][0]) for i in range(3)]
     phi = np.array([[path.matrix(k)[0] for path in paths] for k in range(4000)])
     np.testing.assert_array_equal(phi[0], [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 1.0, 1.0]])
     assert phi[1, 2].tolist() == [0.0, 0.8, 0.8]
@@ -360,7 +360,7 @@ def test_information_level_of_fixed_rows_is_a_formula(build):
 def test_theory_that_needs_a_fixed_H_says_so():
     scenario = section_vi()
     with pytest.raises(netkf.TheoryError, match="node 0 has a regressor sensor, whose H is random"):
-        scenario.observation(0)
+        scenario.observation_matrices(0)
     network = {
         "graph": {"kind": "cycle", "nodes": 3},
         "activation": {"kind": "matching", "protocol": "maximal"},

@@ -117,7 +117,7 @@ def test_nodes_default_to_those_of_the_table_and_other_nodes_rows_may_be_there(r
     named = scenario(folder, "local", {"kind": "unknown"}, from_files()[:1])
     entry = {"kind": "recorded", "path": "one.csv", "H": [[1.0, 0.0]], "R": [[0.5]]}
     unnamed = scenario(folder, "local", {"kind": "unknown"}, [entry])
-    assert unnamed.sensing == (0, 3)
+    assert unnamed.sensing_nodes == (0, 3)
     np.testing.assert_array_equal(netkf.simulate(unnamed).xhat, netkf.simulate(named).xhat)
 
 

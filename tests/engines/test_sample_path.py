@@ -106,5 +106,5 @@ def test_random_systems_with_large_first_covariances(build, seed):
         },
         filter={"kind": "hybrid", "epsilon": 0.3, "cov": first * eye},
     )
-    end = min(1.0, 12.0 * scenario.truth.sensing_period)
+    end = min(1.0, 12.0 * scenario.diffusion.sensing_period)
     assert deviation(scenario.replace({"horizon": end, "probe": end / 4.0})) < STATED

@@ -42,7 +42,7 @@ for sensors, frames in cases:
             add(truth.rebase(k))
             ahead, k = next(steps, np.inf), k + 1
         add(truth.absolute(t))
-    add(scenario.truth.moves.laws(np.array([0.01, 0.7, 30.0]))[1])
+    add(scenario.diffusion.moves.laws(np.array([0.01, 0.7, 30.0]))[1])
     path = scenario.sensors[0].path if not sensors[0].get("sampling") else None
     if path is not None:
         own = path(streams.generator("noise", 0, 0), streams.generator("cutting", 0, 0))
@@ -57,14 +57,14 @@ for name in ("gossip", "local"):
     scenario = gossip.replace({"plant": slots, "sensors": [sensor], "filter": {"kind": name}})
     streams = Streams(5)
     truth = scenario.slot_plant.truth(streams.generator("plant"), True)
-    readings = scenario.slot_path(streams, 0, scenario.placed[0][0])
+    readings = scenario.slot_path(streams, 0, scenario.placed_sensors[0][0])
     for slot in range(30):
         if slot and slot % (truth.frame_slots or 31) == 0:
             add(truth.rebase(slot))
         add(truth.absolute(slot), readings.reading(slot, truth.local(slot)))
 regression = netkf.load("scenarios/diffusion_regression.toml")
 streams = Streams(2)
-for node, placed in regression.placed.items():
+for node, placed in regression.placed_sensors.items():
     path = regression.slot_path(streams, node, placed[0])
     for slot in range(20):
         add(path.matrix(slot), path.reading(slot, np.ones(regression.plant.n)))

@@ -81,12 +81,12 @@ def test_detecting_walk_has_an_invertible_gramian():
         assert mean[i, j] > 0.0
     gramian = sum(
         np.linalg.matrix_power(F, k).T @ H.T @ H @ np.linalg.matrix_power(F, k)
-        for k, H in enumerate(scenario.observation(node)[0] for node in walk)
+        for k, H in enumerate(scenario.observation_matrices(node)[0] for node in walk)
     )
     assert np.linalg.eigvalsh(gramian)[0] > 1e-3
     # nobody alone detects: no node's own stays suffice
     for node in scenario.nodes:
-        H = scenario.observation(node)[0]
+        H = scenario.observation_matrices(node)[0]
         own = np.concatenate([H @ np.linalg.matrix_power(F, k) for k in range(4)])
         # numpy 2.0 knows no rank of nothing
         assert not len(H) or np.linalg.matrix_rank(own) < 4

@@ -119,7 +119,7 @@ def test_the_extended_kalman_filter(tmp_path):
     F, Q, R = scenario.plant.F, scenario.plant.Q, np.array(RANGES["R"])
     turned = 0
     for k in (0, 1):
-        path = scenario.slot_path(Streams(run.seed, run.replica), k, scenario.placed[k][0])
+        path = scenario.slot_path(Streams(run.seed, run.replica), k, scenario.placed_sensors[k][0])
         x, P, q = np.zeros(2), scenario.plant.cov, np.array(places[k])
         for slot in range(1, 13):
             x, P = F @ x, F @ P @ F.T + Q

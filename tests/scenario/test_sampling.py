@@ -83,10 +83,10 @@ def test_models_hold_the_sensors_of_increments_only(make):
         0: [0],
         1: [0],
     }
-    assert mixed.sensing == (0, 1)
-    assert mixed.truth.sensing_period == make([INCREMENTS]).truth.sensing_period
-    assert make().truth.sensing_period is None
-    assert make([]).truth.sensing_period is not None
+    assert mixed.sensing_nodes == (0, 1)
+    assert mixed.diffusion.sensing_period == make([INCREMENTS]).diffusion.sensing_period
+    assert make().diffusion.sensing_period is None
+    assert make([]).diffusion.sensing_period is not None
 
 
 def test_streams_of_samples_have_their_names(make):
@@ -151,7 +151,7 @@ def test_recorded_states_and_readings_over_a_diffusion(make):
     plant = {"kind": "recorded", "path": "x.csv"}
     scenario = make([RECORDED, {**SAMPLED, "sampling": {"kind": "periodic", "period": 0.5}}], plant)
     assert not scenario.is_random
-    assert scenario.sensing == (0, 1, 2)
+    assert scenario.sensing_nodes == (0, 1, 2)
     truth = scenario.continuous_truth(Streams(4), frames=False)
     assert isinstance(truth, RecordedTruth)
     np.testing.assert_array_equal(truth.absolute(3.5), [7.0, -7.0])

@@ -77,7 +77,10 @@ def test_replace_takes_paths_as_in_a_file(ring):
     assert ring.network.activation.rate == 2.0
     assert ring.replace({}) == ring != changed
     # derived defaults are derived again
-    assert ring.replace({"sensors.0.R": [[0.01]]}).truth.sensing_period < ring.truth.sensing_period
+    assert (
+        ring.replace({"sensors.0.R": [[0.01]]}).diffusion.sensing_period
+        < ring.diffusion.sensing_period
+    )
 
 
 def test_a_class_of_the_user_needs_no_registration(tmp_path, monkeypatch, ring):

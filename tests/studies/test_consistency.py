@@ -85,8 +85,8 @@ def test_nis_is_the_textbook_one(gossip):
     seen, run = run_consistency(local, 3, 2), netkf.simulate(local, seed=3, replica=2)
     from netkf.rng.streams import Streams
 
-    path = local.slot_path(Streams(3, 2), 0, local.placed[0][0])
-    F, Q, (H, R) = local.plant.F, local.plant.Q, local.observation(0)
+    path = local.slot_path(Streams(3, 2), 0, local.placed_sensors[0][0])
+    F, Q, (H, R) = local.plant.F, local.plant.Q, local.observation_matrices(0)
     values = []
     for k in range(1, 17):
         v = path.reading(k, run.x[k]) - H @ F @ run.xhat[k - 1, 0]

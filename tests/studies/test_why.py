@@ -99,7 +99,7 @@ class EventGraph:
 
     def __init__(self, scenario, events, used):
         self.graph = nx.DiGraph()
-        self.scenario, self.kind = scenario, scenario.hosted.combination
+        self.scenario, self.kind = scenario, scenario.node_filter.combination
         self.now = {node: (node, -1) for node in scenario.nodes}
         self.graph.add_nodes_from(self.now.values())
         self.cargo, self.waiting, self.reading = {}, {node: [] for node in scenario.nodes}, {}
@@ -171,7 +171,7 @@ def used_messages(scenario, events):
             waiting[row.node].append((row.peer, row.node, row.message))
         elif row.kind in ("absorb", "swap"):
             came, waiting[row.node] = waiting[row.node], []
-            used |= {max(came)} if scenario.hosted.combination == "swap" else set(came)
+            used |= {max(came)} if scenario.node_filter.combination == "swap" else set(came)
     return used
 
 
@@ -179,7 +179,7 @@ def rows_before(scenario, events, at):
     """The number of rows that a state shown at a time contains."""
     if not scenario.slotted:
         return int((events.t <= at).sum())
-    return int((events.t < (at if scenario.hosted.predicts else at + 0.5) - 1e-9).sum())
+    return int((events.t < (at if scenario.node_filter.predicts else at + 0.5) - 1e-9).sum())
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -194,7 +194,7 @@ def test_the_newest_readings_are_those_of_a_search_in_a_graph_of_events(runs, na
         count = rows_before(scenario, run.events, at)
         log = rows_until(scenario, run.log, at)
         assert len(log) == count
-        messages = match_messages(log, scenario.hosted.combination == "swap", scenario.slotted)
+        messages = match_messages(log, scenario.node_filter.combination == "swap", scenario.slotted)
         reach = search_back(find_flow(scenario, log, messages), node)
         found = newest_information(reach, log, KeptReadings(scenario, log, at), 0)
         ours = {n: f.reading for n, f in found.items() if not math.isnan(f.reading)}

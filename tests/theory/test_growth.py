@@ -148,12 +148,12 @@ def test_a_scenario_with_thousands_of_sensors_makes_no_matrix_of_all_readings(tm
     changes = {"sensors.0.nodes": list(range(nodes))}
 
     def build():
-        return scenario.replace(changes).truth.sensing_period
+        return scenario.replace(changes).diffusion.sensing_period
 
     # R of all readings together would take 8 nodes^2 bytes.
     assert peak(build) < nodes**2
     # A larger network with the same sensor in every place asks for a period no longer.
-    assert build() <= scenario.truth.sensing_period
+    assert build() <= scenario.diffusion.sensing_period
 
 
 def test_nodes_with_equal_sensors_share_their_observation_and_their_information(tmp_path):

@@ -98,7 +98,7 @@ def enumerated(made):
     p = made.network.channel.loss.delivery
     A, S, own = [], [], []
     for node, K in zip(made.nodes, limits.gains, strict=True):
-        H, R = made.observation(node)
+        H, R = made.observation_matrices(node)
         S.append(np.eye(n) - K @ H)
         A.append(S[-1] @ made.plant.F)
         own.append(K @ R @ K.T)
@@ -219,7 +219,7 @@ def simulated(made, slots, seed):
         drive = root_Q @ random.standard_normal(n)
         ahead = error @ made.plant.F.T + drive
         for k, K in enumerate(limits.gains):
-            H, R = made.observation(made.nodes[k])
+            H, R = made.observation_matrices(made.nodes[k])
             noise = np.linalg.cholesky(R) @ random.standard_normal(len(H))
             ahead[k] -= K @ (H @ ahead[k] + noise)
         for _ in range(filter_.gamma):
@@ -307,7 +307,7 @@ def test_units_do_not_matter():
         T1,
         (units @ made.plant.F @ back).tolist(),
         (units @ made.plant.Q @ units).tolist(),
-        {k: (made.observation(k)[0] @ back).tolist() for k in (4, 9)},
+        {k: (made.observation_matrices(k)[0] @ back).tolist() for k in (4, 9)},
         {4: [[0.01]], 9: [[0.01]]},
         2,
         4.01,

@@ -92,7 +92,7 @@ def test_observability_and_controllability_are_of_the_whole():
 
 def test_the_central_covariance_of_slots_is_that_after_the_reading():
     made = planar(2, 0.7)
-    H = np.concatenate([made.observation(node)[0] for node in (4, 9)])
+    H = np.concatenate([made.observation_matrices(node)[0] for node in (4, 9)])
     F, Q, R = made.plant.F, made.plant.Q, 0.01 * np.eye(2)
     P = scipy.linalg.solve_discrete_are(F.T, H.T, Q, R)
     after = P - P @ H.T @ np.linalg.solve(H @ P @ H.T + R, H @ P)

@@ -73,7 +73,7 @@ def test_the_transformed_noise_against_all_outcomes_of_the_links(gamma):
     h = np.zeros((3, 3))
     for i, j in itertools.product(range(3), repeat=2):
         (K, (H, R)), (L, (G, _)) = (
-            (limits.gains[k], made.observation(made.nodes[k])) for k in (i, j)
+            (limits.gains[k], made.observation_matrices(made.nodes[k])) for k in (i, j)
         )
         h[i, j] = ((1.0 - K @ H) * 0.1 * (1.0 - L @ G)).sum()
         h[i, j] += (K @ R @ K.T).sum() if i == j else 0.0

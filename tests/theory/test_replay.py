@@ -166,6 +166,6 @@ def test_the_joint_law_of_a_filter_without_readings_is_the_plants(tmp_path):
     scenario = scenario_of("local", None, {}, sensors, tmp_path, probe=[0.4, 1.5])
     run = netkf.simulate(scenario, engine="simpy")
     law = error_law(scenario, run)
-    C, A = theory.error_covariance(scenario, run)[:, 2], scenario.truth.A
+    C, A = theory.error_covariance(scenario, run)[:, 2], scenario.diffusion.A
     joint = law.covariance.reshape(2, 4, 2, 2, 4, 2)[:, 2, :, :, 2]
     close(joint[0, :, 1], C[0] @ scipy.linalg.expm(A * 1.1).T, 1e-10)

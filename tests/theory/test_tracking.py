@@ -27,9 +27,9 @@ def test_the_level_against_quadrature(regression, p, beta):
     scale = math.sqrt(nodes * Q[0, 0])
     assert np.array_equal(Q, Q[0, 0] * np.eye(len(Q)))
     sensors = [
-        regression.noise(place.entry, believed=False)[0, 0]
-        for node in regression.sensing
-        for place in regression.placed[node]
+        regression.noise_covariance(place.entry, believed=False)[0, 0]
+        for node in regression.sensing_nodes
+        for place in regression.placed_sensors[node]
     ]
     assert np.ptp(sensors) == 0.0
     r = math.sqrt(sensors[0])

@@ -119,7 +119,7 @@ def count_pairs(scenario: Scenario, run: Run) -> PairCounts | None:
     count = np.bincount(link_of_row, minlength=len(links))
     keys = slots * len(links) + link_of_row
     repeated = np.isin(keys - len(links), keys)
-    first = scenario.hosted.first_slot
+    first = scenario.node_filter.first_slot
     total = int(np.ceil(scenario.horizon / scenario.slot_plant.period - 1e-9)) - first
     return PairCounts(
         count, np.bincount(link_of_row[repeated], minlength=len(links)), np.array(float(total))

@@ -181,7 +181,7 @@ def _is_independent(scenario: Scenario) -> bool:
     The loss must state so, and every exchange must redraw the links: a filter may keep the outcome
     of a link for several exchanges of a slot.
     """
-    filter_ = scenario.hosted
+    filter_ = scenario.node_filter
     if scenario.slotted:
         phases = range((filter_.schedule or ()).count("exchange"))
         steps = [(phase, k) for phase in phases for k in range(filter_.exchange_steps(phase))]
@@ -448,7 +448,7 @@ def network_promises(samples: PartSamples) -> list[Promise]:
     """Return the promises about the network whose law is stated and that the runs can test."""
     promises = clock_promises(samples)
     scenario = samples.scenario
-    drawn = samples.pairs is not None and scenario.hosted.talks
+    drawn = samples.pairs is not None and scenario.node_filter.talks
     if drawn and pair_probabilities(scenario) is not None:
         promises.append(MATCHINGS)
     # A delay that depends on the message may lose it (nan), which the law of losses does not state.

@@ -142,7 +142,7 @@ def start_states(scenario: Scenario, seed: int, count: int) -> FloatArray:
         if isinstance(plant, LinearPlant):
             starts.append(plant.truth(random).absolute(0))
         else:
-            starts.append(scenario.truth.start(random))
+            starts.append(scenario.diffusion.start(random))
     return np.array(starts)
 
 
@@ -165,7 +165,7 @@ def sensor_laws(scenario: Scenario) -> tuple[SensorLaw, ...]:
     """Return the laws of the sensors with drawn noise, up to MAX_ROWS rows in all."""
     laws: list[SensorLaw] = []
     rows = 0
-    for node, placed_sensors in scenario.placed.items():
+    for node, placed_sensors in scenario.placed_sensors.items():
         for placed_sensor in placed_sensors:
             sensor = scenario.sensors[placed_sensor.entry]
             if not sensor.is_random or isinstance(sensor, RecordedSensor):
@@ -292,7 +292,7 @@ def _increment_noises(
     sensor: Any = scenario.sensors[law.placed_sensor.entry]
     node, ordinal = law.node, law.placed_sensor.ordinal
     path = sensor.path(*(streams.generator(p, node, ordinal) for p in ("noise", "cut")))
-    period = scenario.truth.sensing_period
+    period = scenario.diffusion.sensing_period
     assert period is not None
     assert law.H is not None
     for k in range(min(MAX_STEPS // 4, int(scenario.horizon / period))):

@@ -83,14 +83,14 @@ def is_immediate(scenario: Scenario) -> bool:
     """Return True if filters of a scenario can be simulated in lanes: convex combinations, messages
     without delay, Poisson clocks, and no sensors that take samples.
     """
-    hosted, network = scenario.hosted, scenario.network
+    node_filter, network = scenario.node_filter, scenario.network
     return (
-        hosted.combination == "convex"
-        and hosted.talks
+        node_filter.combination == "convex"
+        and node_filter.talks
         and not scenario.sampled_sensors
         and type(network.activation) is Poisson
         and delay_is_zero(network.channel)
-        and getattr(hosted, "max_age", math.inf) >= 0.0
+        and getattr(node_filter, "max_age", math.inf) >= 0.0
         and int(np.diff(senders_of(scenario).first).max(initial=0)) <= MAX_LINKS_OF_CLOCK
     )
 

@@ -75,7 +75,7 @@ def _simulate(scenario: Scenario, workspace: Workspace, seed: int, replicas: ran
         draws = BatchDraws(scenario, seed, replicas)
         # simulate_batch() handles neither state outside the Simulation (SPECIAL) nor moves of the
         # origin, which Python does run by run.
-        special = scenario.hosted.combination in SPECIAL
+        special = scenario.node_filter.combination in SPECIAL
         if len(draws.paths.frame_times) or special:
             return _run_by_run(scenario, workspace, draws.runs(), replicas)
         return _all_at_once(scenario, workspace, draws)
@@ -153,11 +153,11 @@ def batch_size(scenario: Scenario) -> int:
     if not drawn_together(scenario):
         return 1
     # An estimate of the floats that one run draws and stores as samples.
-    n, period = scenario.plant.n, scenario.truth.sensing_period
-    filters = 1 if scenario.hosted.pooled else len(scenario.nodes)
+    n, period = scenario.plant.n, scenario.diffusion.sensing_period
+    filters = 1 if scenario.node_filter.pooled else len(scenario.nodes)
     # One piece for each step, and one more for each sample that cuts a step.
     steps = BLOCK + len(scenario.times) + (scenario.horizon / period if period else 0.0)
-    sensors = sum(len(placed) for placed in scenario.placed.values())
+    sensors = sum(len(placed) for placed in scenario.placed_sensors.values())
     rows = max((len(sensor.R) for sensor in scenario.sensors), default=0)
     # Per piece: two states, two moments and the three coefficients of the cubic, of n entries each;
     # per step the two moments of each sensor's noise.
@@ -187,7 +187,7 @@ def _expected_ticks(scenario: Scenario) -> float:
     finite rate.
     """
     clock = scenario.network.activation
-    if not (scenario.hosted.talks and isinstance(clock, LinkClock)):
+    if not (scenario.node_filter.talks and isinstance(clock, LinkClock)):
         return 0.0
     entities = clock.entities(scenario.topology)
     ticks = sum(clock.mean_rate(entity) for entity in entities) * scenario.horizon

@@ -100,7 +100,7 @@ def combination_state_of(scenario: Scenario, state: Simulation) -> CombinationSt
     """Return the extra arrays that the filter's combination needs, None if it needs none."""
     if state.combination_kind not in (BEST, INVERSE, GAINS, PREDICTIONS, BELIEFS):
         return None
-    algorithm: Any = scenario.hosted
+    algorithm: Any = scenario.node_filter
     (N, n), root = state.xhat.shape, np.ascontiguousarray(state.root)
     assert root is state.root or np.shares_memory(root, state.root)
     prior_root = state.root.copy()
@@ -129,7 +129,7 @@ def combination_state_of(scenario: Scenario, state: Simulation) -> CombinationSt
 def _make_gains(scenario: Scenario, state: Simulation) -> dict[str, Any]:
     """Return the fields of constant gains, empty for filters of other combinations."""
     N, n = state.xhat.shape
-    algorithm: Any = scenario.hosted
+    algorithm: Any = scenario.node_filter
     node_gains = [
         algorithm.gain_of(k) if state.combination_kind == GAINS else np.zeros((n, 0))
         for k in range(N)
@@ -160,7 +160,7 @@ def _make_gains(scenario: Scenario, state: Simulation) -> dict[str, Any]:
             (placed_sensor,) = scenario.sampled_sensors[node]
             H, R = (
                 scenario.sensors[placed_sensor.entry].H,
-                scenario.noise(placed_sensor.entry, believed=True),
+                scenario.noise_covariance(placed_sensor.entry, believed=True),
             )
             fields["sampled"][k], fields["noise"][k] = sample_maps(node_gains[k], H, R)
     fields["table"] = stack_tables(tables) if tables else state.table

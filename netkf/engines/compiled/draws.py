@@ -39,7 +39,7 @@ def blocks_to_the_end(scenario: Scenario) -> int:
 
 def steps_to_the_end(scenario: Scenario) -> int:
     """Return the number of steps that reach the horizon."""
-    period = scenario.truth.sensing_period
+    period = scenario.diffusion.sensing_period
     assert period is not None
     # A first guess from below; the loop counts the rest.
     steps = max(1, int(scenario.horizon / period) - 1)
@@ -84,7 +84,7 @@ class Paths:
             StreamNormals(streams.seed_words(purpose, [()]))
             for purpose in ("plant", "probe", "samples")
         )
-        self._paths = scenario.truth.paths(
+        self._paths = scenario.diffusion.paths(
             plant,
             probe,
             scenario.times,
@@ -173,7 +173,7 @@ def _sensor_fields(scenario: Scenario) -> tuple[dict[str, np.ndarray], list[tupl
             scenario.sensors[placed_sensor.entry].H,
             roots[placed_sensor.entry],
         )
-    index, pooled = scenario.topology.index, scenario.hosted.pooled
+    index, pooled = scenario.topology.index, scenario.node_filter.pooled
     indices = [0 if pooled else index[node] for node in scenario.increment_sensors]
     shared = {
         "rows": rows,
@@ -194,7 +194,7 @@ class Noise:
         self._noise = StreamNormals(streams.seed_words("noise", keys))
         cuts = StreamNormals(streams.seed_words("cut", keys))
         # Without increment sensors the period is not used; it only must not be None.
-        self._period = float(scenario.truth.sensing_period or 1.0) if keys else 1.0
+        self._period = float(scenario.diffusion.sensing_period or 1.0) if keys else 1.0
         runs, ziggurat = streams.runs, normal_ziggurat()
         count, most = shared["H"].shape[:2]
         even = bool((shared["rows"] == most).all())

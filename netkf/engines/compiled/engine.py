@@ -66,8 +66,10 @@ class CompiledEngine(Engine):
                 return (
                     f'engine "compiled" cannot run the {family} {name_of(family, part)!r}; {remedy}'
                 )
-        hosted = scenario.hosted
-        if not (hosted.slot_kernel if scenario.slotted else hosted.combination in COMBINATIONS):
+        node_filter = scenario.node_filter
+        if not (
+            node_filter.slot_kernel if scenario.slotted else node_filter.combination in COMBINATIONS
+        ):
             time = "in slots" if scenario.slotted else "under clocks"
             name = name_of("filter", scenario.filter.algorithm)
             return f'engine "compiled" has no code for the filter {name!r} {time}; {remedy}'
@@ -77,7 +79,7 @@ class CompiledEngine(Engine):
         """Say on stderr that code is compiled, unless it is cached from an earlier run."""
         # Slots and continuous time are compiled separately.
         if scenario.slotted:
-            compiling.announce(scenario.hosted.slot_kernel)
+            compiling.announce(scenario.node_filter.slot_kernel)
         else:
             compiling.announce(simulate_agenda if is_immediate(scenario) else simulate_runs)
 

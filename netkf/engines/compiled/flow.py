@@ -186,7 +186,7 @@ class Workspace:
         self._pool = empty_pool(FIRST_MESSAGES, n)
         self._rows = np.empty(FIRST_ROWS, dtype=EVENT)
         self._probes = np.array(scenario.times, dtype=np.float64)
-        kind = COMBINATIONS.index(scenario.hosted.combination)
+        kind = COMBINATIONS.index(scenario.node_filter.combination)
         # Terms of conserved sums: weights held, totals sent and totals heard.
         terms = 2 * size + len(self._senders.directions) if kind == SUMS else 0
         # Space for many samples, within a budget of floats.
@@ -195,7 +195,7 @@ class Workspace:
         self._visits: Visits | None = None
         # Code compiled for each n makes filters that combine estimates 1.5 times faster. It does
         # not help filters of sums and of readings: these share one event loop for all n.
-        self._unrolled = scenario.hosted.combination not in SPECIAL
+        self._unrolled = scenario.node_filter.combination not in SPECIAL
 
     @property
     def filters(self) -> Filters:
@@ -265,7 +265,7 @@ class Workspace:
 
     def _scalar_fields(self, instants: Instants) -> dict[str, Any]:
         """Return the scalar fields of a Simulation by name."""
-        algorithm: Any = self._scenario.hosted
+        algorithm: Any = self._scenario.node_filter
         max_messages = int(np.diff(self._senders.first).max(initial=0))
         return {
             "combination_kind": COMBINATIONS.index(algorithm.combination),
@@ -352,7 +352,7 @@ class FlowRun:
         """Run the kernel that fits the filter until it needs something; return its request."""
         if self._visits is not None:
             return advance_alone(self._state, self._visits)
-        if self._scenario.hosted.combination not in SPECIAL:
+        if self._scenario.node_filter.combination not in SPECIAL:
             return run_alone(self._state)
         return int(event_loop(self._state, self._totals, self._history, self._combination))
 
@@ -466,7 +466,7 @@ def _sums(terms: FloatArray, receivers: np.ndarray) -> dict[str, tuple[float, fl
 
 def _make_totals(scenario: Scenario, state: Simulation) -> Totals | None:
     """Return the arrays of running sums, or None for filters that send none."""
-    if scenario.hosted.combination != "sums":
+    if scenario.node_filter.combination != "sums":
         return None
     receivers = np.array([info.receivers for info in scenario.node_infos], dtype=np.int64)
     model: FlowModel = scenario.models[0]
@@ -475,8 +475,8 @@ def _make_totals(scenario: Scenario, state: Simulation) -> Totals | None:
 
 def _make_history(scenario: Scenario, state: Simulation) -> History | None:
     """Return the history of all nodes, or None for filters that use no late readings."""
-    if scenario.hosted.combination != "readings":
+    if scenario.node_filter.combination != "readings":
         return None
-    algorithm: Any = scenario.hosted
+    algorithm: Any = scenario.node_filter
     delay = max((info.max_delay for info in scenario.node_infos), default=0.0)
     return empty_history(state, algorithm.history_span(delay), FIRST_PAST)

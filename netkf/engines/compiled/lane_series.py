@@ -56,7 +56,7 @@ class LaneSeries(Struct):
 def series_of_lanes(scenario: Scenario) -> tuple[LaneSeries, LaneSeries]:
     """Return the series for nodes without sensors and for nodes that read increments."""
     filters = filters_at_start(scenario)
-    period = float(scenario.truth.sensing_period or 0.0)
+    period = float(scenario.diffusion.sensing_period or 0.0)
     return unobserved_series(filters), sensing_series(filters, period)
 
 

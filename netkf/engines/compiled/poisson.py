@@ -269,7 +269,7 @@ def is_poisson(scenario: Scenario) -> bool:
     constant laws.
     """
     network = scenario.network
-    talks = scenario.hosted.talks and bool(scenario.topology.links)
+    talks = scenario.node_filter.talks and bool(scenario.topology.links)
     return talks and type(network.activation) is Poisson and has_table_law(network.channel)
 
 

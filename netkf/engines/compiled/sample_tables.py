@@ -92,10 +92,13 @@ def _make_instants(
     index of the ``sensor`` (K,) of each sample.
     """
     index = scenario.topology.index if placed else {}
-    pooled, n = scenario.hosted.pooled, scenario.plant.n
+    pooled, n = scenario.node_filter.pooled, scenario.plant.n
     node = np.array([node for node, _ in placed], dtype=np.int64)
     filters = np.array([0 if pooled else index[k] for k in node.tolist()], dtype=np.int64)
-    parts = [(scenario.sensors[p.entry], scenario.noise(p.entry, believed=True)) for _, p in placed]
+    parts = [
+        (scenario.sensors[p.entry], scenario.noise_covariance(p.entry, believed=True))
+        for _, p in placed
+    ]
     rows = np.array([len(R) for _, R in parts], dtype=np.int64)
     max_rows = int(rows.max(initial=1))
     root, H = np.zeros((len(parts), max_rows, max_rows)), np.zeros((len(parts), max_rows, n))

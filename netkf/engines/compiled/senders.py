@@ -44,7 +44,7 @@ def senders_of(scenario: Scenario) -> Senders:
     """Return the senders of a scenario; none if the filter sends no messages."""
     topology, clock = scenario.topology, scenario.network.activation
     # In slots there is no link clock.
-    if not scenario.hosted.talks or not isinstance(clock, LinkClock):
+    if not scenario.node_filter.talks or not isinstance(clock, LinkClock):
         no_links = np.zeros(0, dtype=np.int64)
         return Senders("links", (), (), np.zeros(1, dtype=np.int64), no_links, (), no_links)
     if clock.at == "links":

@@ -88,7 +88,7 @@ class SlotEvents:
     """Makes the messages and events of one run, slot after slot."""
 
     def __init__(self, scenario: Scenario, streams: Streams, setup: SlotSetup) -> None:
-        self._scenario, self._setup, self._algorithm = scenario, setup, scenario.hosted
+        self._scenario, self._setup, self._algorithm = scenario, setup, scenario.node_filter
         self._random = streams.generator("matching")
         self._directions = [
             DirectionDraws(scenario, streams, ends, k) for k, ends in enumerate(setup.directions)
@@ -180,7 +180,7 @@ class SlotEvents:
                 # Slot 0 of a filter that does not predict has no reading: its sample is the initial
                 # state.
                 if slot > 0 or self._algorithm.predicts:
-                    for node in self._scenario.sensing:
+                    for node in self._scenario.sensing_nodes:
                         self._append_row((now, SENSE, node, -1, -1, -1, NAN))
                 continue
             for exchange_step in islice(steps, 1):
@@ -308,7 +308,7 @@ class SlotEvents:
             # The inbox holds one message of each sender, the last to arrive.
             self._inbox.setdefault(receiver, {})[sender] = (number, 0.0)
         # A message that would arrive after the end leaves no event.
-        elif now + delay < self._scenario.ends:
+        elif now + delay < self._scenario.end_time:
             self._order += 1
             # Order in the heap: time, directed link, order of sending.
             entry = (

@@ -56,7 +56,7 @@ class SlotSetup:
     """Times, links and sensors of a scenario in slots, and the states of its filters at slot 0."""
 
     def __init__(self, scenario: Scenario) -> None:
-        algorithm, topology = scenario.hosted, scenario.topology
+        algorithm, topology = scenario.node_filter, scenario.topology
         self.algorithm: Filter = algorithm
         self.n, self.nodes = scenario.plant.n, np.array(scenario.nodes, dtype=np.int64)
         # Frames are for exact errors of unstable plants; 0: the origin never moves.
@@ -87,7 +87,7 @@ class SlotSetup:
         last = max(0, int(scenario.horizon / plant.period) - 2)
         while not plant.over(last, scenario.horizon):
             last += 1
-        self.samples = np.array(sorted(set(scenario.slots)), dtype=np.int64)
+        self.samples = np.array(sorted(set(scenario.sampled_slots)), dtype=np.int64)
         # The slot at the horizon exists only to be sampled.
         self.slots = last + bool(len(self.samples) and self.samples[-1] >= last)
         self.last = last
@@ -131,12 +131,12 @@ class SlotSetup:
         pooled = self.algorithm.pooled
         self.estimators = 1 if pooled else len(scenario.nodes)
         rows = np.zeros(self.estimators, dtype=np.int64)
-        self.sensing = np.array(scenario.sensing, dtype=np.int64)
+        self.sensing = np.array(scenario.sensing_nodes, dtype=np.int64)
         self.assigned: list[AssignedSensor] = []
-        for node in scenario.sensing:
+        for node in scenario.sensing_nodes:
             estimator = 0 if pooled else scenario.topology.index[node]
-            for placed_sensor in scenario.placed[node]:
-                R = scenario.noise(placed_sensor.entry, believed=True)
+            for placed_sensor in scenario.placed_sensors[node]:
+                R = scenario.noise_covariance(placed_sensor.entry, believed=True)
                 root = cholesky(R)
                 # A filter stacks the readings of its sensors, one below the other.
                 self.assigned.append(
@@ -214,7 +214,7 @@ class SlotSetup:
             infos, models = infos[:1], [scenario.pooled_slot_model]
         self.infos = infos
         self.states = [
-            self.algorithm.init(model, *scenario.start(info.node), info)
+            self.algorithm.init(model, *scenario.initial_estimate(info.node), info)
             for info, model in zip(infos, models, strict=True)
         ]
         # All filters of a scenario believe one F and Q.
@@ -269,7 +269,7 @@ class SlotSetup:
         # only from nodes that have sensors.
         sends = self.algorithm.sends_in_slots
         talks = [
-            [sends(phase, direction[0] in scenario.placed) for direction in self.directions]
+            [sends(phase, direction[0] in scenario.placed_sensors) for direction in self.directions]
             for phase in self.phases
         ]
         self.talks = np.array(talks, dtype=np.uint8).reshape(len(talks), len(self.directions))

@@ -349,12 +349,12 @@ class Filters(NamedTuple):
 def filters_at_start(scenario: Scenario) -> Filters:
     """Return the filters at time 0, or the one that reads all sensors if they are pooled."""
     # A pooled filter is one node with the id -1 and the sensors of all.
-    ids, pooled = scenario.nodes, scenario.hosted.pooled
+    ids, pooled = scenario.nodes, scenario.node_filter.pooled
     models = (scenario.pooled_model,) if pooled else scenario.models
     # Nodes that share a model share its table.
     distinct = list({id(model): model for model in models}.values())
     index = {id(model): k for k, model in enumerate(distinct)}
-    starts = [scenario.start(node) for node in (ids[:1] if pooled else ids)]
+    starts = [scenario.initial_estimate(node) for node in (ids[:1] if pooled else ids)]
     covariances = {id(cov): cov for _, cov in starts}  # nodes share them
     roots = {key: first_root(cov) for key, cov in covariances.items()}
     counts = [len(scenario.increment_sensors.get(node, ())) for node in ids]

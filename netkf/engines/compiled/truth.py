@@ -56,7 +56,9 @@ class PathStates:
     def __init__(self, scenario: Scenario, frame_times: FloatArray) -> None:
         self.frame_times = frame_times
         # Without frames the origin never moves, and no transition is needed.
-        self._moves = Transitions(scenario.truth.A, scenario.truth.B) if len(frame_times) else None
+        self._moves = (
+            Transitions(scenario.diffusion.A, scenario.diffusion.B) if len(frame_times) else None
+        )
         self._frame, self._frame_start, self._origin = 0, 0.0, np.zeros(scenario.plant.n)
 
     def local(self, times: FloatArray, path: PathBlock, pieces: np.ndarray) -> FloatArray:

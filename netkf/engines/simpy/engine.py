@@ -134,7 +134,7 @@ class _Simulation:
             for node in distinct(nodes):
                 node.shift(offset)
             # Payloads under way refer to the old origin too.
-            self._transmitter.shift(self._scenario.hosted, offset)
+            self._transmitter.shift(self._scenario.node_filter, offset)
 
     def slots(self) -> list[Process]:
         """Return the processes of a scenario in slots."""
@@ -150,12 +150,12 @@ class _Simulation:
         nodes = _nodes(scenario, make)
         # Filters, readers and the clock are processes that meet by time and rank only.
         processes = [node.run_process(self.timeline) for node in distinct(nodes)]
-        for node, placed in scenario.placed.items():
+        for node, placed in scenario.placed_sensors.items():
             sensors = [scenario.slot_path(streams, node, sensor) for sensor in placed]
             entity = scenario.topology.index[node]
             reader = Reader(recorder, schedule, node, entity, nodes[node])
             processes.append(reader.run_process(self.timeline, truth, sensors))
-        if scenario.hosted.talks:
+        if scenario.node_filter.talks:
             shared = (scenario, streams, recorder, schedule, self._transmitter, nodes)
             processes.append(SlotClock(*shared).run_process(self.timeline))
         sums = _Sums(distinct(nodes))
@@ -165,7 +165,7 @@ class _Simulation:
         self, truth: Any, schedule: SlotSchedule, nodes: dict[int, SlotNode], sums: _Sums
     ) -> Process:
         """Record the states of slots: predictions at their start, filtered states at their end."""
-        predicts, recorder, slot = self._scenario.hosted.predicts, self._recorder, 0
+        predicts, recorder, slot = self._scenario.node_filter.predicts, self._recorder, 0
 
         def sample() -> None:
             """Record a sample if the slot has one, and move the origin if a frame begins."""
@@ -231,8 +231,8 @@ class _Simulation:
 def _nodes(scenario: Scenario, make: Callable[[int, int, tuple[int, ...]], Any]) -> dict[int, Any]:
     """Return the node process of every node; the nodes of a pooled filter share one."""
     nodes = scenario.nodes
-    if scenario.hosted.pooled:
-        return dict.fromkeys(nodes, make(-1, 0, scenario.sensing))
+    if scenario.node_filter.pooled:
+        return dict.fromkeys(nodes, make(-1, 0, scenario.sensing_nodes))
     return {node: make(node, entity, (node,)) for entity, node in enumerate(nodes)}
 
 
@@ -243,11 +243,11 @@ def _identify(scenario: Scenario, node: int, entity: int) -> tuple[Any, ...]:
     if node < 0:
         model = scenario.believed_pooled_model
     return (
-        scenario.hosted,
+        scenario.node_filter,
         node,
         entity,
         model,
-        scenario.start(first),
+        scenario.initial_estimate(first),
         scenario.node_infos[entity],
     )
 

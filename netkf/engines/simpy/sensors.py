@@ -44,7 +44,7 @@ def sensor_processes(
         for placed_sensor in placed:
             samples = scenario.sample_path(streams, node, placed_sensor)
             # The filters' R, which may differ from that of the readings.
-            R = scenario.noise(placed_sensor.entry, believed=True)
+            R = scenario.noise_covariance(placed_sensor.entry, believed=True)
             sensor = SamplingProcess(node, entity, times[node, placed_sensor.ordinal], samples, R)
             processes.append(sensor.run(timeline, truth, nodes[node]))
             # Entities number sampled sensors over all nodes: they order samples of one instant.

@@ -54,7 +54,7 @@ class SlotSchedule:
     """Computes the stages of every slot from the schedule of the filter."""
 
     def __init__(self, scenario: Scenario) -> None:
-        self._algorithm, self._plant = scenario.hosted, scenario.slot_plant
+        self._algorithm, self._plant = scenario.node_filter, scenario.slot_plant
         self.horizon = scenario.horizon
         phases = self._algorithm.schedule or ()
         # Steps of each exchange; none if the filter does not talk.
@@ -64,7 +64,7 @@ class SlotSchedule:
         ]
         # Exchanges without steps take no time.
         self._length = scenario.phase_length if any(self._exchanges) else 0.0
-        self._samples = frozenset(scenario.slots)
+        self._samples = frozenset(scenario.sampled_slots)
         self._cache: dict[int, list[Stage]] = {}
 
     def over(self, slot: int) -> bool:
@@ -275,11 +275,11 @@ class SlotClock:
         nodes: dict[int, SlotNode],
     ) -> None:
         self._scenario, self._recorder, self._schedule = scenario, recorder, schedule
-        self._nodes, self._algorithm = nodes, scenario.hosted
+        self._nodes, self._algorithm = nodes, scenario.node_filter
         # A pooled filter appears once.
         self._distinct = distinct(nodes)
         self._matching_random = streams.generator("matching")
-        links = scenario.topology.links if scenario.hosted.talks else ()
+        links = scenario.topology.links if scenario.node_filter.talks else ()
         # Nodes without links are never asked for a message.
         self._talking = sorted({node for link in links for node in link})
         self._links = {

@@ -64,7 +64,7 @@ class Transmitter:
         self._scenario, self._streams = scenario, streams
         self._timeline, self._recorder = timeline, recorder
         self._channel = scenario.network.channel
-        self._horizon, self._until = scenario.horizon, scenario.ends
+        self._horizon, self._until = scenario.horizon, scenario.end_time
         # Payloads under way, by link and number, because a move of the origin shifts them.
         self._under_way: dict[tuple[Link, int], Envelope] = {}
 

@@ -24,13 +24,13 @@ def steady_gain(F: FloatArray, Q: FloatArray, H: FloatArray, R: FloatArray) -> F
 def silent_jumps(scenario: Scenario) -> SlotJumps:
     """Return the errors of each node by itself, or those of one filter that every node shows."""
     F, Q = scenario.slot_belief
-    if scenario.hosted.pooled:
+    if scenario.node_filter.pooled:
         model = scenario.pooled_slot_model
         sensors = [(model.H, model.R)]
-        true = [block_diagonal([scenario.observation(node)[1] for node in scenario.nodes])]
+        true = [block_diagonal([scenario.observation_matrices(node)[1] for node in scenario.nodes])]
     else:
-        sensors = [scenario.observation(node, believed=True) for node in scenario.nodes]
-        true = [scenario.observation(node)[1] for node in scenario.nodes]
+        sensors = [scenario.observation_matrices(node, believed=True) for node in scenario.nodes]
+        true = [scenario.observation_matrices(node)[1] for node in scenario.nodes]
     gains = [steady_gain(F, Q, *sensor) for sensor in sensors]
     closed = np.stack([np.eye(len(F)) - K @ H for K, (H, _) in zip(gains, sensors, strict=True)])
     noise = block_diagonal([K @ R @ K.T for K, R in zip(gains, true, strict=True)])

@@ -22,8 +22,8 @@ def arrivals_by_step(scenario: Scenario, run: Run) -> ArrivalsByStep:
     slot = scenario.slot_plant.slots_of(sent)
     # A message belongs to the step in which it was sent.
     since = sent - slot * period - rows["phase"] * length
-    phases = (scenario.hosted.schedule or ()).count("exchange")
-    steps = np.array([scenario.hosted.exchange_steps(phase) for phase in range(phases)])
+    phases = (scenario.node_filter.schedule or ()).count("exchange")
+    steps = np.array([scenario.node_filter.exchange_steps(phase) for phase in range(phases)])
     step = np.round(since * steps[rows["phase"]] / length).astype(int)
     if not len(rows):
         return {}

@@ -142,7 +142,7 @@ def _require_known_law(scenario: Scenario) -> None:
     believed, true = (
         (scenario.slot_belief[0], scenario.slot_plant.F)
         if scenario.slotted
-        else (scenario.belief[0], scenario.truth.A)
+        else (scenario.belief[0], scenario.diffusion.A)
     )
     if not np.array_equal(believed, true):
         raise TheoryError("the filters' plant is not the true one: errors follow the state")
@@ -169,14 +169,14 @@ def _choose_solver(
 ) -> Callable[[Scenario], tuple[float, FloatArray | None]] | None:
     """Return the paper's own function for radius and covariances in slots, None without one."""
     solver: Callable[[Scenario], tuple[float, FloatArray | None]] | None = paper_function(
-        scenario, "steady_errors", f"{scenario.hosted.combination}_in_slots".replace(" ", "_")
+        scenario, "steady_errors", f"{scenario.node_filter.combination}_in_slots".replace(" ", "_")
     )
     return solver if scenario.slotted else None
 
 
 def _system_maker(scenario: Scenario) -> Callable[[Scenario], LinearErrors] | None:
     """Return the function that makes the linear system of a scenario, if there is one."""
-    if scenario.hosted.combination == "none":
+    if scenario.node_filter.combination == "none":
         return silent_jumps if scenario.slotted else None
     name = "slot_jumps" if scenario.slotted else "clock_jumps"
     maker: Callable[[Scenario], LinearErrors] | None = paper_function(

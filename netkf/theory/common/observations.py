@@ -36,8 +36,8 @@ def _noises(scenario: Scenario) -> list[tuple[FloatArray, FloatArray]]:
     # The gain is computed from the R that the filter assumes, the noise drawn with the true one.
     return [
         (
-            as_kernel_array(scenario.noise(k, believed=True)),
-            np.asarray(np.linalg.cholesky(scenario.noise(k, believed=False))),
+            as_kernel_array(scenario.noise_covariance(k, believed=True)),
+            np.asarray(np.linalg.cholesky(scenario.noise_covariance(k, believed=False))),
         )
         for k in range(len(scenario.sensors))
     ]
@@ -70,7 +70,7 @@ def slot_observations(scenario: Scenario, run: Run) -> Callable[[int], Estimator
         [
             (sensor, scenario.slot_path(streams, node, sensor))
             for node in nodes
-            for sensor in scenario.placed.get(node, ())
+            for sensor in scenario.placed_sensors.get(node, ())
         ]
         for nodes in nodes_by_estimator(scenario)
     ]

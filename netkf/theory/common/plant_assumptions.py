@@ -37,7 +37,7 @@ def slot_plant_rows(scenario: Scenario) -> list[AssumptionRow]:
 def start_rows(scenario: Scenario, source: str) -> list[AssumptionRow]:
     """Return one row: each P_i(0) is at least the second moment of the node's first error."""
     plant, smallest = scenario.plant, np.inf
-    starts = (scenario.start(node) for node in scenario.nodes)
+    starts = (scenario.initial_estimate(node) for node in scenario.nodes)
     # Most networks have one start for all nodes.
     for mean, cov in {(id(mean), id(cov)): (mean, cov) for mean, cov in starts}.values():
         # E[(x - xhat)(x - xhat)'] = cov of x(0) + the square of the difference of the means

@@ -83,7 +83,7 @@ def require_known_filter(scenario: Scenario) -> None:
     name = type(algorithm).__name__
     if not scenario.is_linear:
         raise TheoryError(NONLINEAR)
-    if not scenario.hosted.combination:
+    if not scenario.node_filter.combination:
         raise TheoryError(f"no exact error covariance for {name}")
     overridden_names = overridden(algorithm)
     if overridden_names:
@@ -162,7 +162,7 @@ def _make_rule(
     scenario: Scenario, errors: StackedErrors, run: Run, messages: list[SentMessage]
 ) -> ErrorRule:
     """Return the error rule of the filter's paper, or that of filters without messages."""
-    if not scenario.hosted.paper:
+    if not scenario.node_filter.paper:
         return ErrorRule(scenario, errors)
     rule: ErrorRule = paper_module(scenario, "errors").error_rule(scenario, errors, run, messages)
     return rule
@@ -173,7 +173,7 @@ def _replay_slots(scenario: Scenario, run: Run, errors: StackedErrors) -> Iterat
 
     A sample shows the state before its slot for filters that predict, else the state after it.
     """
-    phases, plant = scenario.hosted.schedule or (), scenario.slot_plant
+    phases, plant = scenario.node_filter.schedule or (), scenario.slot_plant
     F, Q = scenario.slot_belief
     # In slots all predictions are the same: x+ = F x + w, e+ = F_f e + (F - F_f) x + w.
     noise = square_root(plant.Q)
@@ -184,7 +184,7 @@ def _replay_slots(scenario: Scenario, run: Run, errors: StackedErrors) -> Iterat
     processed = 0
     for until in np.round(run.times / plant.period).astype(int).tolist():
         while processed < until:
-            slot = processed if scenario.hosted.predicts else processed + 1
+            slot = processed if scenario.node_filter.predicts else processed + 1
             _replay_slot(rule, prediction, phases, slot, observe(slot), arrivals)
             processed += 1
         yield

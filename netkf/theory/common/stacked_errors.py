@@ -70,7 +70,7 @@ class StackedErrors:
             self.stack.put(estimator, np.zeros((self.n, 0)))
             self.stack.add(estimator, columns, first)
             self.owner[estimator] = estimator
-            self.roots[estimator] = square_root(np.asarray(scenario.start(node)[1]))
+            self.roots[estimator] = square_root(np.asarray(scenario.initial_estimate(node)[1]))
         self._add_offsets(scenario)
 
     def _add_offsets(self, scenario: Scenario) -> None:
@@ -82,7 +82,7 @@ class StackedErrors:
         """
         start, n = scenario.plant.start_mean, self.n
         offsets: dict[Hashable, FloatArray] = {
-            estimator: start - scenario.start(scenario.nodes[estimator])[0]
+            estimator: start - scenario.initial_estimate(scenario.nodes[estimator])[0]
             for estimator in range(self.estimators)
         }
         if self.follows:
@@ -210,7 +210,7 @@ def _errors_follow_state(scenario: Scenario) -> bool:
     """Return True if the filters' A (or F) differs from the plant's."""
     if scenario.slotted:
         return not np.array_equal(scenario.slot_belief[0], scenario.slot_plant.F)
-    return not np.array_equal(scenario.belief[0], scenario.truth.A)
+    return not np.array_equal(scenario.belief[0], scenario.diffusion.A)
 
 
 class IncrementFlows(NamedTuple):
@@ -232,7 +232,7 @@ class ErrorPropagator:
     def __init__(self, scenario: Scenario, errors: StackedErrors) -> None:
         self._errors, self._now = errors, 0.0
         self._flows = _increment_flows(scenario, errors.estimators)
-        A, B = scenario.truth.A, scenario.truth.B
+        A, B = scenario.diffusion.A, scenario.diffusion.B
         A_f, Q_f = scenario.belief
         # The filters' B is only known by B B' = Q; the plant's own is as good if it has that Q.
         B_f = B if np.array_equal(B @ B.T, Q_f) else square_root(Q_f)
@@ -335,7 +335,7 @@ def _increment_flows(scenario: Scenario, estimators: int) -> IncrementFlows | No
     if not any(len(observation.H) for observation in observations):
         return None
     A, Q = scenario.belief
-    plant = (scenario.truth.A, scenario.truth.B)
+    plant = (scenario.diffusion.A, scenario.diffusion.B)
     B = plant[1] if np.array_equal(plant[1] @ plant[1].T, Q) else square_root(Q)
     flows: dict[bytes, ErrorFlow] = {}
 

@@ -30,7 +30,9 @@ class PseudoStateRule(ErrorRule):
         algorithm: Any = scenario.filter.algorithm
         self._observations: EstimatorObservations = {}
         state = algorithm.init(
-            scenario.slot_models[0], *scenario.start(scenario.nodes[0]), scenario.node_infos[0]
+            scenario.slot_models[0],
+            *scenario.initial_estimate(scenario.nodes[0]),
+            scenario.node_infos[0],
         )
         self._design, self._pseudo = state.design, state.pseudo
         self._slot = 0

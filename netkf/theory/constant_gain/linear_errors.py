@@ -29,7 +29,7 @@ def link_weights(scenario: Scenario) -> dict[tuple[int, int], FloatArray]:
 def slot_jumps(scenario: Scenario) -> SlotJumps:
     """Return the system in slots: predict, ``e - L (H e + v)``, reset."""
     gains, n = _node_gains(scenario), scenario.plant.n
-    sensors = [scenario.observation(node) for node in scenario.nodes]
+    sensors = [scenario.observation_matrices(node) for node in scenario.nodes]
     closed = [np.eye(n) - L @ H for L, (H, _) in zip(gains, sensors, strict=True)]
     noise = block_diagonal([L @ R @ L.T for L, (_, R) in zip(gains, sensors, strict=True)])
     plant = scenario.slot_plant
@@ -106,7 +106,9 @@ def clock_jumps(scenario: Scenario) -> ClockJumps | DelayedJumps | SlotJumps:
     instant = ClockJumps(N, drift, noise, tuple(sampled_nodes), directions, ticks)
     if not delay or not ticks:
         return instant
-    return DelayedJumps(instant, scenario.truth.A, scenario.truth.B @ scenario.truth.B.T, delay)
+    return DelayedJumps(
+        instant, scenario.diffusion.A, scenario.diffusion.B @ scenario.diffusion.B.T, delay
+    )
 
 
 def _node_slice(k: int, n: int) -> slice:
@@ -116,11 +118,11 @@ def _node_slice(k: int, n: int) -> slice:
 
 def _error_flow(scenario: Scenario) -> JointErrorFlow:
     """Return the dynamics of the errors between events, with the correction by increments."""
-    gains, truth = _node_gains(scenario), scenario.truth
+    gains, truth = _node_gains(scenario), scenario.diffusion
     N, n = len(gains), len(truth.A)
     drift, noise = np.tile(truth.A, (N, 1, 1)), np.tile(truth.B @ truth.B.T, (N, N))
     for k, node in enumerate(scenario.nodes):
-        (H, R), L = scenario.observation(node), gains[k]
+        (H, R), L = scenario.observation_matrices(node), gains[k]
         if len(H):
             drift[k] -= L @ H
             noise[_node_slice(k, n), _node_slice(k, n)] += L @ R @ L.T
@@ -209,6 +211,6 @@ def _node_gains(scenario: Scenario) -> list[FloatArray]:
     algorithm: Any = scenario.filter.algorithm
     n = scenario.plant.n
     return [
-        algorithm.gain_of(k) if node in scenario.placed else np.zeros((n, 0))
+        algorithm.gain_of(k) if node in scenario.placed_sensors else np.zeros((n, 0))
         for k, node in enumerate(scenario.nodes)
     ]

@@ -91,15 +91,15 @@ class _Source(NamedTuple):
 def few_regressors(scenario: Scenario) -> bool:
     """Return True if the levels take seconds: pasts are drawn for each sensor whose H varies."""
     varying = [k for k, sensor in enumerate(scenario.sensors) if sensor.varying]
-    placed = itertools.chain.from_iterable(scenario.placed.values())
+    placed = itertools.chain.from_iterable(scenario.placed_sensors.values())
     return sum(placed_sensor.entry in varying for placed_sensor in placed) <= MAX_REGRESSORS
 
 
 def _make_sources(scenario: Scenario) -> list[_Source]:
     """Return the scalar readings of all nodes; raises TheoryError for recorded sensors."""
     sources = []
-    for node in scenario.sensing:
-        for placed_sensor in scenario.placed[node]:
+    for node in scenario.sensing_nodes:
+        for placed_sensor in scenario.placed_sensors[node]:
             sensor = scenario.sensors[placed_sensor.entry]
             if isinstance(sensor, RegressorSensor):
                 drive = sensor.B @ sensor.xi_cov @ sensor.B.T

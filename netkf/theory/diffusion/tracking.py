@@ -58,9 +58,9 @@ def _draw_noises(scenario: Scenario, samples: int, random: np.random.Generator) 
     if not scenario.slotted or not scenario.is_random:
         raise TheoryError("D (29) needs noises in slots with a law, not a record")
     squares = np.zeros(samples)
-    for node in scenario.sensing:
-        for placed_sensor in scenario.placed[node]:
-            root = square_root(scenario.noise(placed_sensor.entry, believed=False))
+    for node in scenario.sensing_nodes:
+        for placed_sensor in scenario.placed_sensors[node]:
+            root = square_root(scenario.noise_covariance(placed_sensor.entry, believed=False))
             squares += ((random.standard_normal((samples, len(root))) @ root.T) ** 2).sum(axis=1)
     root = square_root(scenario.slot_plant.Q)
     increment = random.standard_normal((samples, len(root))) @ root.T

@@ -107,7 +107,7 @@ def detecting_walk(scenario: Scenario) -> list[int] | None:
     mean, nodes = mean_matching(scenario), scenario.nodes
     F, _ = scenario.slot_belief
     n = len(F)
-    rows = [scenario.observation(node)[0] for node in scenario.nodes]
+    rows = [scenario.observation_matrices(node)[0] for node in scenario.nodes]
     neighbours = [np.flatnonzero(mean[i] > 1e-15).tolist() for i in range(len(nodes))]
     size = max(float(np.linalg.norm(F, 2)), 1e-300)
     step = F / size  # a positive factor changes no rank and avoids overflow of the powers

@@ -64,7 +64,7 @@ def _linear_equation(
     if equations.samples or equations.jumps or equations.delay:
         raise TheoryError("constant gains are for sensors in continuous time and no delay")
     A, N, n = equations.A, len(equations.start), len(equations.A)
-    observations = [scenario.observation(node, believed=True) for node in scenario.nodes]
+    observations = [scenario.observation_matrices(node, believed=True) for node in scenario.nodes]
     if gains is None:
         P = steady_covariance_bound(scenario)
         gains = [p @ np.linalg.solve(R, H).T for p, (H, R) in zip(P, observations, strict=True)]

@@ -96,7 +96,7 @@ def reason_without_bound(scenario: Scenario) -> str | None:
     if not scenario.slotted and not algorithm.talks:
         return _reason_of_samples(scenario)
     name = type(algorithm).__name__
-    if scenario.hosted.paper != "hybrid":
+    if scenario.node_filter.paper != "hybrid":
         return (
             f"H(12) is about the hybrid filter in continuous time, not about {kind_name(algorithm)}"
         )
@@ -190,10 +190,10 @@ def coupled_riccati(scenario: Scenario) -> CoupledRiccati:
         table = riccati_table(A, Q, np.zeros((n, n)), delay)
         q, _ = propagate_riccati(table, q, np.zeros(n), delay)
         T = np.column_stack([propagate_riccati(table, q, e, delay)[1] for e in np.eye(n)])
-    spread = scenario.start(scenario.nodes[0])[1]
+    spread = scenario.initial_estimate(scenario.nodes[0])[1]
     start = np.broadcast_to(spread, (len(scenario.nodes), n, n)).copy()
     if isinstance(scenario.filter.cov, tuple):
-        start = np.stack([scenario.start(node)[1] for node in scenario.nodes])
+        start = np.stack([scenario.initial_estimate(node)[1] for node in scenario.nodes])
     return CoupledRiccati(
         A,
         Q,

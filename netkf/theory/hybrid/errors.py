@@ -20,7 +20,7 @@ class ResetRule(EstimateExchangeRule):
     ) -> tuple[FloatArray, FloatArray]:
         """Average or intersect; the node's own estimate has the weight 1 - sum of ``weights``."""
         all_weights = [1.0 - sum(weights), *weights]
-        if self.scenario.hosted.combination == "intersection":
+        if self.scenario.node_filter.combination == "intersection":
             return intersect_covariances(all_weights, roots)
         return average_covariances(all_weights, roots)
 

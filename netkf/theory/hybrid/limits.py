@@ -56,7 +56,7 @@ def _require_limit(scenario: Scenario) -> None:
     algorithm = scenario.filter.algorithm
     if not algorithm.talks:
         return
-    if scenario.hosted.combination != "convex":
+    if scenario.node_filter.combination != "convex":
         raise TheoryError(f"H(13) is about the hybrid filter, not about {kind_name(algorithm)}")
     if overridden_names := overridden(algorithm):
         name = kind_name(algorithm)
@@ -76,7 +76,7 @@ def _shared_equation(
         silent = scipy.sparse.csr_array((1, len(group.nodes)))
         nodes, rate = np.zeros(len(group.nodes), dtype=int), group.rate * w[group.nodes]
         groups.append(PoissonSamples(nodes, group.H, group.R, rate, silent))
-    start = np.asarray(scenario.start(scenario.nodes[0])[1])[None]
+    start = np.asarray(scenario.initial_estimate(scenario.nodes[0])[1])[None]
     nothing, eye = scipy.sparse.csr_array((1, 1)), np.eye(len(A))
     return CoupledRiccati(A, Q, G[None], nothing, eye, 0.0 * eye, 0.0, start, tuple(groups))
 
@@ -92,15 +92,17 @@ def true_limit_covariance(scenario: Scenario) -> FloatArray:
     A, _ = scenario.belief
     if scenario.sampled_sensors:
         raise TheoryError("sampled sensors: P stays random, and the errors have no known limit")
-    if not np.array_equal(A, scenario.truth.A):
+    if not np.array_equal(A, scenario.diffusion.A):
         raise TheoryError("the filters' A differs from the plant's: the error follows the state")
     S, w = limit_covariance(scenario), left_weights(scenario)
     # All nodes have the error e with de = (A - S Gw) e dt + B dw - sum_i w_i S H_i' R_i^-1 dv_i.
     closed = A - S @ np.tensordot(w, increment_informations(scenario), 1)
-    noise = scenario.truth.Q.copy()  # plus the true noise of each sensor through the gains w_i S
+    noise = (
+        scenario.diffusion.Q.copy()
+    )  # plus the true noise of each sensor through the gains w_i S
     for weight, node in zip(w, scenario.nodes, strict=True):
-        H, R = scenario.observation(node)
-        gain = S @ np.linalg.solve(scenario.observation(node, believed=True)[1], H).T
+        H, R = scenario.observation_matrices(node)
+        gain = S @ np.linalg.solve(scenario.observation_matrices(node, believed=True)[1], H).T
         noise += weight**2 * gain @ R @ gain.T
     return lyapunov(closed, noise)
 
@@ -119,19 +121,19 @@ def central_covariance(scenario: Scenario) -> FloatArray:
             "sampled sensors: the central covariance goes up and down with the samples"
         )
     G = np.zeros((scenario.plant.n, scenario.plant.n))
-    for node in scenario.sensing:
-        H, R = scenario.observation(node)
+    for node in scenario.sensing_nodes:
+        H, R = scenario.observation_matrices(node)
         G += H.T @ np.linalg.solve(R, H)
-    return algebraic_riccati(scenario.truth.A, scenario.truth.Q, G)
+    return algebraic_riccati(scenario.diffusion.A, scenario.diffusion.Q, G)
 
 
 def _central_slot_covariance(scenario: Scenario) -> FloatArray:
     """Return the steady covariance (n, n) of the central filter in slots, after the reading."""
     plant = scenario.slot_plant
-    if scenario.hosted.predicts:
+    if scenario.node_filter.predicts:
         raise TheoryError("the filter's samples are predictions, the central filter's are not")
     if any(sensor.varying for sensor in scenario.sensors):
         raise TheoryError("H differs from slot to slot: there is no steady covariance")
-    truth = [scenario.observation(node) for node in scenario.sensing]
+    truth = [scenario.observation_matrices(node) for node in scenario.sensing_nodes]
     H = np.concatenate([np.zeros((0, plant.n)), *(H for H, _ in truth)])
     return filtered_covariance(plant.F, plant.Q, H, block_diagonal([R for _, R in truth]))

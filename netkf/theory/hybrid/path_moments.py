@@ -31,16 +31,18 @@ def expected_squares(scenario: Scenario, run: Run) -> FloatArray:
     nodes = scenario.nodes
     G, true_G = np.zeros((2, len(nodes), *A.shape))
     for i, node in enumerate(nodes):
-        H, R = scenario.observation(node, believed=True)
+        H, R = scenario.observation_matrices(node, believed=True)
         gain = np.linalg.solve(R, H).T
-        G[i], true_G[i] = gain @ H, gain @ scenario.observation(node)[1] @ gain.T
-    P = np.array([scenario.start(node)[1] for node in nodes], dtype=np.float64)
+        G[i], true_G[i] = gain @ H, gain @ scenario.observation_matrices(node)[1] @ gain.T
+    P = np.array([scenario.initial_estimate(node)[1] for node in nodes], dtype=np.float64)
     # All estimates start at known means: their first errors are x(0) less a constant.
-    means = np.array([scenario.start(node)[0] for node in nodes]) - scenario.plant.start_mean
+    means = (
+        np.array([scenario.initial_estimate(node)[0] for node in nodes]) - scenario.plant.start_mean
+    )
     S = np.einsum("ia,jb->ijab", means, means) + np.asarray(scenario.plant.start_cov)
     instants, ends, rows, columns, weights = _arrivals_in_order(scenario, run)
     fastest = max(float(np.abs(p @ g).max()) for p in P for g in G) + float(np.abs(A).max())
-    plain = [np.ascontiguousarray(x, dtype=np.float64) for x in (A, Q, scenario.truth.Q)]
+    plain = [np.ascontiguousarray(x, dtype=np.float64) for x in (A, Q, scenario.diffusion.Q)]
     model = (*plain, G, true_G)
     squares = np.empty((len(run.times), len(nodes)))
     step = STEP / max(fastest, 1e-9)
@@ -54,11 +56,11 @@ def _require_exact_model(scenario: Scenario) -> None:
     """Raise TheoryError unless the filters follow H with increments and instant messages."""
     if scenario.slotted or scenario.sampled_sensors or not scenario.is_random:
         raise TheoryError("mean squares by quadrature are for random increments")
-    if scenario.hosted.combination != "convex" or overridden(scenario.filter.algorithm):
+    if scenario.node_filter.combination != "convex" or overridden(scenario.filter.algorithm):
         raise TheoryError("mean squares by quadrature are for the hybrid filter")
     if scenario.network.channel.delay.fixed != 0.0:
         raise TheoryError("mean squares by quadrature are for messages that take no time")
-    if not np.array_equal(scenario.belief[0], scenario.truth.A):
+    if not np.array_equal(scenario.belief[0], scenario.diffusion.A):
         raise TheoryError("the filters' A differs from the plant's: the error follows the state")
     if len(scenario.nodes) * scenario.plant.n > MAX_ERRORS:
         raise TheoryError(f"mean squares by quadrature are for at most {MAX_ERRORS} errors")

@@ -131,7 +131,7 @@ def poisson_samples(scenario: Scenario) -> tuple[PoissonSamples, ...]:
         assert clock is not None
         rate, R = (
             clock.mean_rate((node, placed_sensor.ordinal)),
-            scenario.noise(placed_sensor.entry, believed=True),
+            scenario.noise_covariance(placed_sensor.entry, believed=True),
         )
         # All nodes have the covariance of a pooled filter, which uses the readings of each.
         for reader in range(size) if pooled else [index[node]]:
@@ -174,7 +174,7 @@ def sample_jumps(scenario: Scenario) -> tuple[SampleJump, ...]:
     for (node, ordinal), placed_sensor in placed_sensors.items():
         sensor = scenario.sensors[placed_sensor.entry]
         path = sample_path(scenario, streams, node, placed_sensor) if sensor.varying else None
-        R = scenario.noise(placed_sensor.entry, believed=True)
+        R = scenario.noise_covariance(placed_sensor.entry, believed=True)
         for k, time in enumerate(times[node, ordinal].tolist()):
             H = sensor.H if path is None else path.reading(k, np.zeros(n))[1]
             by_time.setdefault(time, {}).setdefault(index[node], []).append(Observation(H, R, R))

@@ -30,7 +30,7 @@ def slot_rows(scenario: Scenario) -> list[AssumptionRow]:
 def _judge_counts(scenario: Scenario) -> tuple[bool, str]:
     """Return verdict and evidence on the largest number of times that a node counts a reading."""
     weights, channel = step_weights(scenario), scenario.network.channel
-    steps = scenario.hosted.exchange_steps(0)
+    steps = scenario.node_filter.exchange_steps(0)
     # A node that hears nothing counts its own reading in full, whatever the weights.
     _, silent = effective_weights(scenario, [])
     lossless = channel.delay.fixed == 0.0 and all(

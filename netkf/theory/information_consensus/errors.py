@@ -40,7 +40,7 @@ def effective_weights(
     Entry (i, j) is the number of times that node i counts the information of node j.
     ``weights`` (N, N) of each step are those of the messages that arrived in it, 0 for others.
     """
-    algorithm: Any = scenario.hosted
+    algorithm: Any = scenario.node_filter
     N = len(scenario.nodes)
     mixing = np.eye(N)
     for heard in weights:
@@ -59,7 +59,7 @@ class ConsensusRule(ErrorRule):
     def __init__(self, scenario: Scenario, errors: StackedErrors, run: Run) -> None:
         super().__init__(scenario, errors)
         self._arrivals, self._weights = arrivals_by_step(scenario, run), step_weights(scenario)
-        self._steps = scenario.hosted.exchange_steps(0)
+        self._steps = scenario.node_filter.exchange_steps(0)
         self._observations: EstimatorObservations = {}
 
     def sense(self, time: float, observations: EstimatorObservations) -> None:

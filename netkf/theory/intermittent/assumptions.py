@@ -39,7 +39,7 @@ def _reachable_readings(scenario: Scenario) -> dict[int, FloatArray]:
     for i, j in scenario.topology.directions:
         neighbours[j].add(i)
     return {
-        node: np.concatenate([scenario.observation(peer)[0] for peer in sorted(peers)])
+        node: np.concatenate([scenario.observation_matrices(peer)[0] for peer in sorted(peers)])
         for node, peers in neighbours.items()
     }
 
@@ -93,10 +93,10 @@ def _arrival_rows(scenario: Scenario) -> list[AssumptionRow]:
 
 def _bounded_mean_row(scenario: Scenario) -> AssumptionRow:
     """Return the row on R (32), for the node at which arrivals are least sufficient."""
-    F, sensing = scenario.slot_plant.F, set(scenario.sensing)
+    F, sensing = scenario.slot_plant.F, set(scenario.sensing_nodes)
     least_sufficient: tuple[float, int, list[float]] | None = None
     for node, H in _reachable_readings(scenario).items():
-        own_H, _ = scenario.observation(node)
+        own_H, _ = scenario.observation_matrices(node)
         # Nodes that need no message, and those that no message can help, say nothing about (32).
         if undetectable_slot_mode(F, own_H) is None or undetectable_slot_mode(F, H) is not None:
             continue
@@ -140,7 +140,9 @@ def _arrival_sets(
     for arrived in itertools.product((False, True), repeat=len(heard)):
         p = np.prod([g if up else 1.0 - g for g, up in zip(probabilities, arrived, strict=True)])
         arrived_H = [
-            scenario.observation(i)[0] for (i, _), up in zip(heard, arrived, strict=True) if up
+            scenario.observation_matrices(i)[0]
+            for (i, _), up in zip(heard, arrived, strict=True)
+            if up
         ]
         sets.append((float(p), np.concatenate([own_H, *arrived_H])))
     return sets

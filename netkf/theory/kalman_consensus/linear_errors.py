@@ -32,10 +32,10 @@ def slot_jumps(scenario: Scenario) -> SlotJumps:
         _require_lossless(scenario)
         for sender, receiver in scenario.topology.directions:
             heard[index[receiver]].append(index[sender])
-    sensors = [scenario.observation(node, believed=True) for node in nodes]
+    sensors = [scenario.observation_matrices(node, believed=True) for node in nodes]
     # All readings of the network, and the columns of each node in them.
     rows = np.cumsum([0, *(len(H) for H, _ in sensors)])
-    true = block_diagonal([scenario.observation(node)[1] for node in nodes])
+    true = block_diagonal([scenario.observation_matrices(node)[1] for node in nodes])
     closed, gains, terms = [], np.zeros((len(nodes), len(F), rows[-1])), []
     for k, senders in enumerate(heard):
         H = np.concatenate([sensors[j][0] for j in senders])

@@ -33,9 +33,9 @@ def bit_covariances(scenario: Scenario, run: Run) -> FloatArray:
     """Return P (T, N, n, n) at the times of a run in slots, from the messages that arrived."""
     nodes, index, plant = scenario.nodes, scenario.topology.index, scenario.slot_plant
     F, Q = scenario.slot_belief
-    sensors = [scenario.observation(node, believed=True) for node in nodes]
+    sensors = [scenario.observation_matrices(node, believed=True) for node in nodes]
     used = _used_bits(scenario, run)
-    P, covariances, slot = [np.asarray(scenario.start(node)[1]) for node in nodes], [], 0
+    P, covariances, slot = [np.asarray(scenario.initial_estimate(node)[1]) for node in nodes], [], 0
     for until in np.round(run.times / plant.period).astype(int).tolist():
         while slot < until:
             slot += 1

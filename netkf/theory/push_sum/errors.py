@@ -140,7 +140,7 @@ class RunningTotalsRule(ErrorRule):
         super().__init__(scenario, errors, rounds)
         if errors.follows:
             raise TheoryError("the exact errors are known for filters that have the plant's A")
-        plant, n = scenario.truth, errors.n
+        plant, n = scenario.diffusion, errors.n
         self._A, self._rounds = plant.A, rounds
         self._rate = max(0.0, -float(np.linalg.eigvals(plant.A).real.min()))
         self._weights = [1.0] * errors.estimators

@@ -69,7 +69,7 @@ def estimation_steps(scenario: Scenario, averaging: Averaging | None = None) -> 
     plant = scenario.slot_plant
     if not np.array_equal(F, plant.F):
         raise TheoryError("the filters' F differs from the plant's: the error follows the state")
-    truth = [scenario.observation(node) for node in scenario.nodes]
+    truth = [scenario.observation_matrices(node) for node in scenario.nodes]
     pairs = list(zip(limits.gains, truth, strict=True))
     # e+ = (I - K H)(F e + w) - K v at each node, before averaging, P (27)
     process = np.stack([np.eye(len(F)) - K @ H for K, (H, _) in pairs])

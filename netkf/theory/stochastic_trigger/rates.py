@@ -39,10 +39,10 @@ def expected_sends(scenario: Scenario, run: Run) -> tuple[int, float]:
     algorithm: Any = scenario.filter.algorithm
     sent = decisions(scenario, run)
     (F, Q), Y = scenario.slot_belief, algorithm.Y
-    P = np.asarray(scenario.start(scenario.nodes[0])[1])
+    P = np.asarray(scenario.initial_estimate(scenario.nodes[0])[1])
     sensors = {
         k: Observation(H, R, np.asarray(np.linalg.cholesky(R)))
-        for k, (H, R) in enumerate(map(scenario.observation, scenario.nodes))
+        for k, (H, R) in enumerate(map(scenario.observation_matrices, scenario.nodes))
         if len(H)
     }
     count, expected, slot = 0, 0.0, 1

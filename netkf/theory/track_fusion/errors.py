@@ -78,7 +78,7 @@ class TrackRule(ErrorRule):
         self._models = scenario.slot_models
         self._sensors = [whitened_sensors(model) for model in self._models]
         nodes = range(errors.estimators)
-        start = scenario.start(scenario.nodes[0])[1]
+        start = scenario.initial_estimate(scenario.nodes[0])[1]
         # All tracks begin with one mean: their errors are equal, and so are all covariances.
         self._joint = np.tile(start, (len(nodes), len(nodes), 1, 1))
         for estimator in nodes:
@@ -131,6 +131,6 @@ def error_rule(
     """Return the rule of this filter for the errors of a run."""
     if scenario.slotted:
         require_traced_exchanges(scenario, run)
-    if scenario.hosted.combination == "tracks":
+    if scenario.node_filter.combination == "tracks":
         return TrackRule(scenario, errors)
     return PairRule(scenario, errors)

@@ -47,7 +47,7 @@ def steady_tracks(scenario: Scenario) -> tuple[FloatArray, float]:
     (F, Q), n = scenario.slot_belief, scenario.plant.n
     closed, noises = [], []
     for node in scenario.nodes:
-        H, R = scenario.observation(node)
+        H, R = scenario.observation_matrices(node)
         M = steady_covariance(F, Q, H, R)
         K = np.linalg.solve(H @ M @ H.T + R, H @ M).T if len(H) else np.zeros((n, 0))
         closed.append(np.eye(n) - K @ H)
