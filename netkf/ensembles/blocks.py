@@ -13,8 +13,8 @@ from netkf.core.errors import EngineError
 from netkf.ensembles.merge_tree import Merge, MergeTree
 from netkf.runs.failures import explain_failure
 from netkf.runs.provenance import versions
-from netkf.scenario.imports import forget_other
-from netkf.scenario.plugins import describe_error, plugged_in, unnamed_class
+from netkf.scenario.imports import unload_namesake
+from netkf.scenario.plugins import describe_error, find_unimportable_class, user_components
 from netkf.scenario.scenario import Scenario
 
 Task = Callable[[Scenario, int, int], Any]
@@ -82,9 +82,9 @@ def each_replica(task: Task, merge: Merge, scenario: Scenario, seed: int, replic
 
 def pack_scenario(scenario: Scenario) -> PackedScenario:
     """Return a scenario for other processes; raises EngineError where it cannot be pickled."""
-    unnamed = unnamed_class(scenario)
-    if unnamed is not None:
-        message = f"workers cannot import the class {unnamed} of a notebook, a prompt or a function"
+    name = find_unimportable_class(scenario)
+    if name is not None:
+        message = f"workers cannot import the class {name} of a notebook, a prompt or a function"
         raise EngineError(f"{message}; put it into a module (a .py file), or use workers=1")
     try:
         payload = pickle.dumps(scenario, protocol=pickle.HIGHEST_PROTOCOL)
@@ -99,7 +99,7 @@ def pack_scenario(scenario: Scenario) -> PackedScenario:
 def _plugged_in_modules(scenario: Scenario) -> set[tuple[str, str]]:
     """Return the module of each plugged-in class, with the folder that it can be imported from."""
     modules = set()
-    for part in plugged_in(scenario):
+    for part in user_components(scenario):
         name = type(part).__module__
         file = getattr(sys.modules.get(name), "__file__", None)
         if file is not None and name != "__main__":
@@ -142,7 +142,7 @@ def _unpickle(packed: PackedScenario) -> Scenario:
     if packed.versions:
         _check_versions(packed.versions)
     for name, folder in packed.modules:
-        forget_other(name, Path(folder))
+        unload_namesake(name, Path(folder))
         if folder not in sys.path:
             sys.path.insert(0, folder)
     try:

@@ -21,7 +21,7 @@ from netkf.runs.documents import (
 )
 from netkf.runs.files import create_output_directory, holds_only, remove_files, run_file_names
 from netkf.runs.provenance import machine, versions
-from netkf.scenario.plugins import module_files
+from netkf.scenario.plugins import find_module_files
 from netkf.scenario.scenario import Scenario
 from netkf.scenario.tables import source_files
 from netkf.scenario.writing import resolve_defaults, to_toml
@@ -157,7 +157,7 @@ def _check_sources_elsewhere(directory: Path, scenario: Scenario) -> None:
     is cleared: they may be the only copies.
     """
     files = [source.full for source in source_files(scenario)]
-    files += [file for file in module_files(scenario).values() if file is not None]
+    files += [file for file in find_module_files(scenario).values() if file is not None]
     for file in files:
         if Path(file).resolve().is_relative_to(directory.resolve()):
             rule = f"{file} is in the directory whose run is done again"

@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from netkf.core.errors import EngineError, NetkfError
-from netkf.scenario.plugins import blame
+from netkf.scenario.plugins import explain_user_error
 from netkf.scenario.scenario import Scenario
 
 
@@ -37,7 +37,7 @@ def explain_failure(
     # of a user's class.
     if not isinstance(error, Exception) or isinstance(error, (NetkfError, OSError)):
         return error
-    message = blame(scenario, error)
+    message = explain_user_error(scenario, error)
     where = "" if directory is None else f"; the traceback is in {directory / 'manifest.json'}"
     return error if message is None else EngineError(f"{message}{where}")
 

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from netkf.core.errors import ScenarioError, WriteError
-from netkf.scenario.plugins import module_files, unnamed_class
+from netkf.scenario.plugins import find_module_files, find_unimportable_class
 from netkf.scenario.scenario import Scenario
 from netkf.scenario.tables import source_files
 from netkf.scenario.writing import resolve_defaults, to_toml
@@ -182,7 +182,7 @@ def run_file_names(scenario: Scenario) -> list[str]:
 
 def copied_file_names(scenario: Scenario) -> list[str]:
     """Return the names of the Python modules and CSV files that :func:`write_scenario` copies."""
-    modules = [file.name for file in module_files(scenario).values() if file is not None]
+    modules = [file.name for file in find_module_files(scenario).values() if file is not None]
     return [*modules, *(source.name for source in source_files(scenario))]
 
 
@@ -220,9 +220,9 @@ def check_sources(scenario: Scenario) -> None:
     That is if a class is defined where scenario.toml cannot import it from, or if a file that the
     scenario names has the name of a file that netkf writes.
     """
-    unnamed = unnamed_class(scenario, in_script=False)
-    if unnamed is not None:
-        rule = f"cannot name the class {unnamed} of this script, notebook or function"
+    name = find_unimportable_class(scenario, in_script=False)
+    if name is not None:
+        rule = f"cannot name the class {name} of this script, notebook or function"
         remedy = "put it into a module (a .py file beside the scenario) and import it from there"
         raise ScenarioError("scenario.toml", rule, None, remedy)
     for source in source_files(scenario):
@@ -240,7 +240,7 @@ def write_scenario(directory: Path, scenario: Scenario, seed: int | None = None)
     """
     for source in source_files(scenario):
         _copy(source.full, directory / source.name)
-    for module in module_files(scenario).values():
+    for module in find_module_files(scenario).values():
         if module is not None:
             _copy(module, directory / module.name)
     table = resolve_defaults(scenario)
@@ -267,7 +267,7 @@ def scenario_digest(scenario: Scenario) -> str:
     """
     digest = hashlib.sha256(to_toml(resolve_defaults(scenario)).encode())
     files = {source.name: source.full for source in source_files(scenario)}
-    files |= {f"{name}.py": file for name, file in module_files(scenario).items() if file}
+    files |= {f"{name}.py": file for name, file in find_module_files(scenario).items() if file}
     for name, file in sorted(files.items()):
         digest.update(name.encode() + b"\0" + hashlib.sha256(file.read_bytes()).digest())
     return digest.hexdigest()
@@ -280,6 +280,6 @@ def missing_modules(scenario: Scenario) -> list[str]:
     return [
         f"the run directory needs the Python module {name}, which was not copied into it: it is no "
         "single file beside the scenario"
-        for name, file in module_files(scenario).items()
+        for name, file in find_module_files(scenario).items()
         if file is None
     ]

@@ -1,8 +1,9 @@
-"""Functions of a scenario: the models and weights of its nodes, and the truth of one run."""
+"""What engines and theory compute from a scenario: models, weights, true states, message rates."""
 
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -39,151 +40,168 @@ from netkf.scenario.sampling import (
 
 @dataclass(frozen=True, eq=False, repr=False)
 class DerivedScenario(ScenarioModel):
-    """A scenario with everything that engines and theory compute from its fields."""
+    """A scenario with everything that engines and theory compute from its fields.
+
+    A "believed" matrix is the one that the filters use: that of ``filter.model`` where it is given,
+    else the true one.
+    """
 
     @cached_property
     def slot_belief(self) -> tuple[FloatArray, FloatArray]:
         """The matrices ``F`` and ``Q`` (n, n) that the filters use in slots."""
         plant, model = self.slot_plant, self.filter.model
-        return (
-            plant.F if model.F is None else model.F,
-            plant.Q if model.Q is None else model.Q,
-        )
+        F = plant.F if model.F is None else model.F
+        Q = plant.Q if model.Q is None else model.Q
+        return F, Q
 
     @cached_property
     def slot_models(self) -> tuple[SlotModel, ...]:
-        """The model of each node in slots, in the order of ``nodes``; random H as in slot 0."""
+        """The believed model of each node in slots, in the order of ``nodes``.
+
+        A random H is that of slot 0.
+        """
         return tuple(
-            self._slot_model(self._stacked(self.placed_sensors.get(node, ()), believed=True))
+            self._slot_model(self._stack_sensors(self.placed_sensors.get(node, ()), believed=True))
             for node in self.nodes
         )
 
-    def _slot_model(self, observation: tuple[FloatArray, FloatArray]) -> SlotModel:
-        """Return the believed model in slots with these H and R."""
-        return SlotModel(*self.slot_belief, *observation, self.slot_plant.period)
+    def _slot_model(self, H_and_R: tuple[FloatArray, FloatArray]) -> SlotModel:
+        """Return the believed model in slots of a node with these H (p, n) and R (p, p)."""
+        return SlotModel(*self.slot_belief, *H_and_R, self.slot_plant.period)
 
     @cached_property
     def node_infos(self) -> tuple[NodeInfo, ...]:
         """The facts that each node may use about itself and the network, in order of ``nodes``."""
-        information = np.zeros((self.plant.n, self.plant.n))
-        for one in self._informations:
-            information = information + one
-        degrees, own, size = self.topology.degrees, self.own_weights, len(self.nodes)
-        receivers = dict.fromkeys(self.nodes, 0)
+        total_information = np.zeros((self.plant.n, self.plant.n))
+        for information in self._informations:
+            total_information = total_information + information
+        receiver_counts = dict.fromkeys(self.nodes, 0)
         for sender, _ in self.topology.directions:
-            receivers[sender] += 1
-        delay = 0.0 if self.slotted else self.network.channel.delay.longest
-        network = self._network_info
+            receiver_counts[sender] += 1
+        max_delay = 0.0 if self.slotted else self.network.channel.delay.longest
+        degrees, own_weights, network = self.topology.degrees, self.own_weights, self._network_info
         return tuple(
             NodeInfo(
-                node, degrees[node], receivers[node], size, own[node], information, delay, k,
-                network,
+                node, degrees[node], receiver_counts[node], len(self.nodes), own_weights[node],
+                total_information, max_delay, k, network,
             )
             for k, node in enumerate(self.nodes)
         )  # fmt: skip
 
     @property
     def _informations(self) -> Iterator[FloatArray]:
-        """``H' R^-1 H`` (n, n) of the sensors of each node, as the filters believe it."""
+        """Believed ``H' R^-1 H`` (n, n) of the sensors of each node, in the order of ``nodes``."""
         for node in self.nodes:
-            H, R = self._stacked(self.placed_sensors.get(node, ()), believed=True)
+            H, R = self._stack_sensors(self.placed_sensors.get(node, ()), believed=True)
             yield symmetric(H.T @ np.linalg.solve(R, H))
 
     @property
     def _network_info(self) -> NetworkInfo | None:
-        """The whole network, for filters that ask for it."""
+        """Information matrices and senders of all nodes; None if the filter does not need them."""
         if not self.node_filter.needs_network:
             return None
-        heard: dict[int, list[int]] = {node: [] for node in self.nodes}
+        senders: dict[int, list[int]] = {node: [] for node in self.nodes}
         for sender, receiver in self.topology.directions:
-            heard[receiver].append(self.topology.index[sender])
-        indices = tuple(tuple(sorted(heard[node])) for node in self.nodes)
-        return NetworkInfo(np.stack(list(self._informations)), indices)
+            senders[receiver].append(self.topology.index[sender])
+        sender_indices = tuple(tuple(sorted(senders[node])) for node in self.nodes)
+        return NetworkInfo(np.stack(list(self._informations)), sender_indices)
 
     @property
     def believed_models(self) -> tuple[SlotModel, ...] | tuple[FlowModel, ...]:
-        """The model of each node, in the order of ``nodes``."""
+        """The believed model of each node, in the order of ``nodes``."""
         return self.slot_models if self.slotted else self.models
 
     @property
     def believed_pooled_model(self) -> SlotModel | FlowModel:
-        """The model of a filter that reads the sensors of all nodes at once."""
+        """The believed model of a central filter, which reads the sensors of all nodes at once."""
         return self.pooled_slot_model if self.slotted else self.pooled_model
 
     @cached_property
     def pooled_slot_model(self) -> SlotModel:
-        """The model of a filter that reads the sensors of all nodes at once."""
-        return self._slot_model(self._stacked(self._everywhere, believed=True))
+        """``believed_pooled_model`` in slots."""
+        return self._slot_model(self._stack_sensors(self._pooled_sensors, believed=True))
 
     @cached_property
     def diffusion(self) -> Diffusion:
-        """The diffusion with every default filled in; raises TheoryError for a plant in slots."""
+        """The plant in continuous time, with the default mean, covariance and sensing period
+        filled in; raises TheoryError for a plant in slots.
+        """
         plant = self.plant
         if not isinstance(plant, Diffusion):
             raise TheoryError("this is about scenarios in continuous time, and this one has slots")
-        filled = dataclasses.replace(plant, mean=plant.start_mean, cov=plant.start_cov)
-        if filled.sensing_period is not None or not uses_grid(self):
-            return filled
-        sensing = Counter(
-            tuple(placed_sensor.entry for placed_sensor in placed)
-            for placed in self.increment_sensors.values()
+        plant = dataclasses.replace(plant, mean=plant.start_mean, cov=plant.start_cov)
+        if plant.sensing_period is not None or not uses_grid(self):
+            return plant
+        # Nodes with the same sensors are counted and not listed, and G = H' R^-1 H of all nodes is
+        # a sum: H and R of all nodes at once would grow with the square of the network.
+        counts = Counter(
+            tuple(placed_sensor.entry for placed_sensor in sensors)
+            for sensors in self.increment_sensors.values()
         )
-        informations = [self._true_information(entries) for entries in sensing]
-        # A matrix of all readings at once would grow with the square of the network.
-        G = sum((k * g for k, g in zip(sensing.values(), informations, strict=True)), 0.0 * plant.A)
-        longest = longest_interval_for(plant.A, plant.Q, G)
-        period = default_sensing_period(filled, informations, longest)
-        return dataclasses.replace(filled, sensing_period=period)
+        informations = [self._true_information(entries) for entries in counts]
+        weighted = (k * G for k, G in zip(counts.values(), informations, strict=True))
+        total_information = sum(weighted, 0.0 * plant.A)
+        max_period = longest_interval_for(plant.A, plant.Q, total_information)
+        period = default_sensing_period(plant, informations, max_period)
+        return dataclasses.replace(plant, sensing_period=period)
 
     def _true_information(self, entries: tuple[int, ...]) -> FloatArray:
-        """Return ``H' R^-1 H`` (n, n) of the increments of a node with these sensors."""
-        H, R = self._stack(entries, believed=False)
+        """Return the true ``H' R^-1 H`` (n, n) of a node with these ``[[sensors]]`` entries."""
+        H, R = self._stack_entries(entries, believed=False)
         return np.asarray(H.T @ np.linalg.solve(R, H))
 
     def continuous_truth(self, streams: Streams, frames: bool | None = None) -> Any:
-        """Return the state of one run in continuous time.
+        """Return the true state of one run in continuous time, a plants.truth.ContinuousTruth.
 
-        It can be asked, in increasing order, for sample times, probe times and frame times. Its
-        class is ``DiffusionPath`` with increments, else ``SampledTruth`` or ``RecordedTruth``
-        (plants.truth.ContinuousTruth). ``frames`` are used by default where errors are exact.
-        Raises ScenarioError if a recorded truth has no row for one of the times.
+        It can be asked, in increasing order, for the states at sample times, probe times and frame
+        times. Its class is ``DiffusionPath`` if sensors give increments, else ``SampledTruth`` or
+        ``RecordedTruth``. ``frames``, by default ``exact_errors``, says whether states are relative
+        to a moving origin. Raises ScenarioError if a recorded truth has no row for one of the
+        times.
         """
         frames = self.exact_errors if frames is None else frames
-        times = sample_times(self, streams)
+        times_of_sensors = sample_times(self, streams)
         plant, horizon = self.diffusion, self.horizon
         if isinstance(plant, (RecordedDiffusion, UnknownDiffusion)):
-            require_states(self, times)
+            require_states(self, times_of_sensors)
             return plant.recorded_truth
-        sampled = all_sample_times(times)
-        random, probing = streams.generator("plant"), streams.generator("probe")
+        instants = all_sample_times(times_of_sensors)
+        random, probe_random = streams.generator("plant"), streams.generator("probe")
         if not uses_grid(self):
-            return plant.sampled_truth(random, probing, sampled, self.times, horizon, frames)
-        sample_random = streams.generator("samples") if len(sampled) else None
-        return plant.path(random, probing, self.times, sample_random, sampled, horizon, frames)
+            return plant.sampled_truth(random, probe_random, instants, self.times, horizon, frames)
+        sample_random = streams.generator("samples") if len(instants) else None
+        return plant.path(
+            random, probe_random, self.times, sample_random, instants, horizon, frames
+        )
 
     def slot_truth(self, streams: Streams) -> Any:
-        """Return the state of one run in slots, in frames if errors are exact."""
+        """Return the true state of one run in slots, in frames (moving origins) if errors are."""
         return self.slot_plant.truth(streams.generator("plant"), self.exact_errors)
 
     @cached_property
     def exact_errors(self) -> bool:
         """True if errors are simulated in frames, so that they keep their digits.
 
-        This needs an unstable plant whose state and readings are all drawn, and filters that have
-        its A (in slots F) and commute with a shift of the state; see plants.truth.
+        On an unstable plant x and xhat grow beyond the size at which x - xhat has correct digits; a
+        frame is an interval in which both are taken relative to an origin near x (plants.truth).
+        This needs a plant whose state and readings are all drawn, linear sensors, and filters that
+        believe the true A (in slots F) and commute with a shift of the state.
         """
-        # Readings that are not linear depend on where the origin is.
+        # Nonlinear readings depend on the absolute state.
         if not self.is_random or not self.is_linear or not commutes(self.node_filter):
             return False
         plant = self.plant
         if isinstance(plant, LinearPlant):
-            same = np.array_equal(self.slot_belief[0], plant.F)
-            return same and frame_slots(plant.F) is not None
-        same = np.array_equal(self.belief[0], self.diffusion.A)
-        return same and frame_period(self.diffusion.A) is not None
+            F_is_true = np.array_equal(self.slot_belief[0], plant.F)
+            return F_is_true and frame_slots(plant.F) is not None
+        A_is_true = np.array_equal(self.belief[0], self.diffusion.A)
+        return A_is_true and frame_period(self.diffusion.A) is not None
 
     def move_back(self, offset: FloatArray, age: float) -> FloatArray:
-        """Return the state (n,) that the plant without noise moves to ``offset`` in ``age`` s."""
+        """Return exp(-A age) ``offset`` (n,): the offset of states ``age`` seconds earlier.
+
+        In slots this is ``offset`` itself: messages from slots before the present one are not used.
+        """
         if self.slotted:
             return offset
         return np.asarray(scipy.linalg.expm(-age * self.diffusion.A) @ offset)
@@ -191,28 +209,33 @@ class DerivedScenario(ScenarioModel):
     def observation_matrices(
         self, node: int, believed: bool = False
     ) -> tuple[FloatArray, FloatArray]:
-        """Return ``H`` (p, n) and ``R`` (p, p) of all sensors of a node together, over a diffusion
-        of those that give increments; p may be 0. With ``believed``, R is what the filter takes it
-        to be. Raises TheoryError where H differs from slot to slot.
+        """Return ``H`` (p, n) and ``R`` (p, p) of all sensors of a node together; p may be 0.
+
+        Over a diffusion these are the sensors that give increments. With ``believed``, R is the one
+        that the filter uses. Raises TheoryError if a sensor is nonlinear or its H varies.
         """
-        placed = (self.placed_sensors if self.slotted else self.increment_sensors).get(node, ())
-        for sensor in (self.sensors[placed_sensor.entry] for placed_sensor in placed):
+        sensors_of_nodes = self.placed_sensors if self.slotted else self.increment_sensors
+        placed_sensors = sensors_of_nodes.get(node, ())
+        for placed_sensor in placed_sensors:
+            sensor = self.sensors[placed_sensor.entry]
+            if sensor.varying and sensor.linear:
+                raise TheoryError(f"node {node} has a regressor sensor, whose H is random")
             if sensor.varying:
-                what = (
-                    "a regressor sensor, whose H is random" if sensor.linear else "no linear sensor"
-                )
-                raise TheoryError(f"node {node} has {what}")
-        return self._stacked(placed, believed)
+                raise TheoryError(f"node {node} has no linear sensor")
+        return self._stack_sensors(placed_sensors, believed)
 
-    def _stacked(
-        self, placed: tuple[PlacedSensor, ...], believed: bool
+    def _stack_sensors(
+        self, placed_sensors: tuple[PlacedSensor, ...], believed: bool
     ) -> tuple[FloatArray, FloatArray]:
-        """Return the stacked H (p, n) and block diagonal R (p, p) of some sensors of nodes."""
-        return self._stack(tuple(placed_sensor.entry for placed_sensor in placed), believed)
+        """Return the stacked H (p, n) and block diagonal R (p, p) of sensors of any nodes."""
+        entries = tuple(placed_sensor.entry for placed_sensor in placed_sensors)
+        return self._stack_entries(entries, believed)
 
-    def _stack(self, entries: tuple[int, ...], believed: bool) -> tuple[FloatArray, FloatArray]:
-        """Return the stacked H and R of some ``[[sensors]]`` entries, from the cache if known."""
-        # Thousands of nodes may have the sensors of one [[sensors]] entry.
+    def _stack_entries(
+        self, entries: tuple[int, ...], believed: bool
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return the stacked H (p, n) and block diagonal R (p, p) of ``[[sensors]]`` entries."""
+        # Cached, because thousands of nodes may have the sensors of one [[sensors]] entry.
         if (entries, believed) not in self._stacks:
             H = [self.sensors[entry].matrix_of(self.plant.n) for entry in entries]
             R = [self.noise_covariance(entry, believed=believed) for entry in entries]
@@ -226,7 +249,10 @@ class DerivedScenario(ScenarioModel):
         return {}
 
     def sample_times(self, streams: Streams) -> dict[tuple[int, int], FloatArray]:
-        """Return the times at which each sensor (node, ordinal) samples, below the horizon."""
+        """Return the sample times (K,) in seconds of each sensor (node, ordinal) in one run.
+
+        Only sensors that sample a diffusion are in it; times are below the horizon.
+        """
         return sample_times(self, streams)
 
     def sample_path(self, streams: Streams, node: int, placed_sensor: PlacedSensor) -> Samples:
@@ -243,7 +269,7 @@ class DerivedScenario(ScenarioModel):
 
     @cached_property
     def belief(self) -> tuple[FloatArray, FloatArray]:
-        """The matrices ``A`` and ``Q = B B'`` (n, n) that the filters use."""
+        """The matrices ``A`` and ``Q = B B'`` (n, n) that the filters use in continuous time."""
         model = self.filter.model
         plant = self.diffusion
         A = plant.A if model.A is None else model.A
@@ -252,7 +278,10 @@ class DerivedScenario(ScenarioModel):
 
     @property
     def filters_know_the_truth(self) -> bool:
-        """True if the filters use the plant's own matrices and the sensors' own R."""
+        """True if the filters use the plant's own matrices and the sensors' own R.
+
+        False if states or readings are recorded: their law is unknown.
+        """
         plant = self.plant
         if not self.is_random:
             return False
@@ -268,73 +297,87 @@ class DerivedScenario(ScenarioModel):
 
     @cached_property
     def models(self) -> tuple[FlowModel, ...]:
-        """The model of each node in continuous time; equal models are one object."""
-        made: dict[bytes, FlowModel] = {}
+        """The believed model of each node in continuous time; equal models are one object."""
+        models: dict[bytes, FlowModel] = {}
         return tuple(
-            self._model(self.observation_matrices(node, believed=True), made) for node in self.nodes
+            self._model(self.observation_matrices(node, believed=True), models)
+            for node in self.nodes
         )
 
     @cached_property
     def pooled_model(self) -> FlowModel:
-        """The model of a filter that reads the sensors of all nodes at once."""
-        return self._model(self._stacked(self._everywhere, believed=True), {})
+        """``believed_pooled_model`` in continuous time."""
+        return self._model(self._stack_sensors(self._pooled_sensors, believed=True), {})
 
     @property
-    def _everywhere(self) -> tuple[PlacedSensor, ...]:
-        """All sensors that a pooled filter reads."""
-        placed = self.placed_sensors if self.slotted else self.increment_sensors
-        return tuple(one for sensors in placed.values() for one in sensors)
+    def _pooled_sensors(self) -> tuple[PlacedSensor, ...]:
+        """The sensors of all nodes, those of one node after those of another.
+
+        Over a diffusion only the sensors that give increments: their readings enter the model.
+        """
+        sensors_of_nodes = self.placed_sensors if self.slotted else self.increment_sensors
+        return tuple(itertools.chain.from_iterable(sensors_of_nodes.values()))
 
     def _model(
-        self, observation: tuple[FloatArray, FloatArray], made: dict[bytes, FlowModel]
+        self, H_and_R: tuple[FloatArray, FloatArray], models: dict[bytes, FlowModel]
     ) -> FlowModel:
-        """Return the believed model in continuous time, one object for equal H and R."""
-        H, R = observation
+        """Return the believed model in continuous time of a node with these H (p, n) and R (p, p).
+
+        ``models`` holds the models made so far, by the bytes of H and R, and is added to.
+        """
+        H, R = H_and_R
         key = b"".join((H.tobytes(), b"|", R.tobytes()))
-        if key not in made:
-            interval = self.diffusion.sensing_period or 0.0
-            made[key] = FlowModel(*self.belief, H, R, self.horizon, min(interval, self.horizon))
-        return made[key]
+        if key not in models:
+            period = self.diffusion.sensing_period or 0.0
+            models[key] = FlowModel(*self.belief, H, R, self.horizon, min(period, self.horizon))
+        return models[key]
 
     def initial_estimate(self, node: int) -> tuple[FloatArray, FloatArray]:
-        """Return ``xhat`` (n,) and ``P`` (n, n) of a node at time 0."""
+        """Return ``xhat`` (n,) and ``P`` (n, n) of a node at time 0.
+
+        ``filter.mean`` and ``filter.cov`` are one array for all nodes, or a tuple of one for each
+        node; where they are not given, mean and covariance of x(0) are used.
+        """
         index, mean, cov = self.topology.index[node], self.filter.mean, self.filter.cov
-        first = self.plant.start_mean if mean is None else mean
-        spread = self.plant.start_cov if cov is None else cov
-        return (
-            first[index] if isinstance(first, tuple) else first,
-            spread[index] if isinstance(spread, tuple) else spread,
-        )
+        if mean is None:
+            mean = self.plant.start_mean
+        if cov is None:
+            cov = self.plant.start_cov
+        xhat = mean[index] if isinstance(mean, tuple) else mean
+        P = cov[index] if isinstance(cov, tuple) else cov
+        return xhat, P
 
     def weight(self, receiver: int, sender: int) -> float:
         """Return the weight that ``receiver`` gives to messages of ``sender``.
 
         It is pi_ij of H (7) and a_ji of D (8).
         """
-        algorithm, topology = self.node_filter, self.topology
-        given = algorithm.pair_weights
-        if given is not None:
-            return float(given[topology.index[sender], topology.index[receiver]])
-        return algorithm.weight(topology.degrees[receiver], topology.degrees[sender])
+        node_filter, topology = self.node_filter, self.topology
+        pair_weights = node_filter.pair_weights
+        if pair_weights is not None:
+            return float(pair_weights[topology.index[sender], topology.index[receiver]])
+        return node_filter.weight(topology.degrees[receiver], topology.degrees[sender])
 
     @cached_property
     def own_weights(self) -> dict[int, float]:
-        """The weight that remains to each node if messages of all its neighbours arrive."""
-        own = dict.fromkeys(self.nodes, 1.0)
+        """The weight of each node's own estimate if messages of all its neighbours arrive."""
+        own_weights = dict.fromkeys(self.nodes, 1.0)
         for sender, receiver in self.topology.directions:
-            own[receiver] -= self.weight(receiver, sender)
-        return {node: max(value, 0.0) for node, value in own.items()}
+            own_weights[receiver] -= self.weight(receiver, sender)
+        # Weights that sum to 1 may leave a rounding error below 0.
+        return {node: max(weight, 0.0) for node, weight in own_weights.items()}
 
     def effective_rates(self) -> dict[Link, float]:
-        """Return the messages per second that arrive on each direction in the long run.
+        """Return the mean rate of delivered messages on each directed link, per second.
 
-        Keys are (sender, receiver); values are nan if they are unknown before a run.
+        Keys are (sender, receiver); values are nan if they are unknown before a run. Empty in slots
+        and for filters that exchange no messages.
         """
         return dict(self._effective_rates)
 
     @cached_property
     def _effective_rates(self) -> dict[Link, float]:
-        """Rates at which messages arrive on each direction, per second; empty in slots."""
+        """Cache of ``effective_rates``: rate of sending times probability of delivery."""
         clock, loss = self.network.activation, self.network.channel.loss
         if not isinstance(clock, LinkClock) or not self.filter.algorithm.talks:
             return {}
@@ -345,7 +388,10 @@ class DerivedScenario(ScenarioModel):
         }
 
     def _send_rate(self, clock: LinkClock, direction: Link) -> float:
-        """Return the messages per second that a direction carries."""
+        """Return the mean rate of messages sent on a directed link, per second, lost ones included.
+
+        ``clock.at`` names the owner of a clock: a node's samples, a link, a directed link, a node.
+        """
         sender, receiver = direction
         if clock.at == "readings":
             return sample_rate(self, sender)

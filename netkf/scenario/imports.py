@@ -1,8 +1,8 @@
-"""Modules of users' classes: which of them may be imported for a scenario, and what they hold.
+"""Importing the classes of users that a scenario names, and the rules for files without trust.
 
 Importing a module executes it. Without trust only modules of installed packages are imported, and
 only if their source shows that the class is derived from one of netkf's. Everything here but
-``import_class`` reads files and executes nothing.
+``find_class`` only reads files and executes nothing.
 """
 
 from __future__ import annotations
@@ -25,14 +25,15 @@ from netkf.core.errors import ScenarioError, quote
 
 REMEDY = "add --trust if you trust its author (in Python: trust=True)"
 MAX_HOPS = 50
-"""Names that are followed from one source text to the next."""
+"""Pairs of module and name that are looked up to find out what a class is derived from."""
 
 
 class Origin(NamedTuple):
-    """The folder of a scenario's tables, and what may be imported for them.
+    """The ``folder`` of a scenario's files, and what may be imported for it.
 
-    ``trust`` allows modules in that folder, in the current folder and all others; without
-    ``imports`` nothing is imported, and parts whose classes are not loaded yet wait.
+    With ``trust`` any module may be imported, also those in that folder and the current folder;
+    else see ``_AllowedPaths``. Without ``imports`` nothing is imported: ``find_class`` returns None
+    for a class that is not loaded yet.
     """
 
     folder: Path
@@ -41,29 +42,34 @@ class Origin(NamedTuple):
 
 
 def find_class(kind: str, origin: Origin) -> Any:
-    """Return the object that ``kind``, "package.module:Class", names; None if it has to wait.
+    """Return the object that ``kind``, "package.module:Class", names.
 
-    Raises ScenarioError if it may not be imported, or cannot be.
+    Returns None if it is not loaded yet and ``origin.imports`` is false. Raises ScenarioError if it
+    may not be imported, or if the import fails.
     """
     module_name, _, class_name = kind.partition(":")
     allowed = None if origin.trust else _AllowedPaths(origin.folder)
     if allowed is not None:
-        allowed.demand(kind, module_name, class_name)
+        allowed.require_part(kind, module_name, class_name)
     if not origin.imports and not is_loaded(module_name, class_name, origin.folder):
         return None
-    beside = [p for p in (str(origin.folder), str(Path.cwd())) if p not in sys.path]
-    with _import_path([*beside, *sys.path] if allowed is None else allowed.path):
+    if allowed is None:
+        folders = (str(origin.folder), str(Path.cwd()))
+        import_path = [*(folder for folder in folders if folder not in sys.path), *sys.path]
+    else:
+        import_path = allowed.path
+    with _replace_import_path(import_path):
         try:
             if allowed is None:
-                forget_other(module_name, origin.folder)
+                unload_namesake(module_name, origin.folder)
             return getattr(importlib.import_module(module_name), class_name)
         except (Exception, SystemExit) as error:
-            raise _failure(kind, error) from None
+            raise _import_error(kind, error) from None
 
 
 @contextmanager
-def _import_path(entries: list[str]) -> Iterator[None]:
-    """Set ``sys.path`` for a while; what modules add to it meanwhile stays."""
+def _replace_import_path(entries: list[str]) -> Iterator[None]:
+    """Set ``sys.path`` to ``entries`` in a block; entries that modules add meanwhile stay."""
     before = list(sys.path)
     sys.path[:] = entries
     try:
@@ -72,145 +78,173 @@ def _import_path(entries: list[str]) -> Iterator[None]:
         sys.path[:] = [*(entry for entry in sys.path if entry not in entries), *before]
 
 
-def _failure(kind: str, error: BaseException) -> ScenarioError:
-    """Return the error for a class that could not be imported."""
+def _import_error(kind: str, error: BaseException) -> ScenarioError:
+    """Return the error for a class "package.module:Class" that could not be imported."""
     rule = f"could not be imported ({type(error).__name__}: {quote(str(error))})"
     remedy = "put the module beside the scenario file or on the Python path"
     return ScenarioError("kind", rule, kind, remedy)
 
 
 def is_loaded(module_name: str, class_name: str, folder: Path) -> bool:
-    """Return True if a class is there already, so that finding it executes nothing."""
-    loaded = sys.modules.get(module_name)
-    return hasattr(loaded, class_name) and not _is_other(loaded, module_name, folder)
+    """Return True if a class is loaded already, so that finding it executes nothing.
+
+    A module in ``folder``, that of the scenario, takes precedence over a loaded one of its name.
+    """
+    module = sys.modules.get(module_name)
+    return hasattr(module, class_name) and not _is_namesake(module, module_name, folder)
 
 
-def forget_other(module_name: str, folder: Path) -> None:
-    """Forget a module imported from elsewhere whose name a module beside the scenario has."""
-    if _is_other(sys.modules.get(module_name), module_name, folder):
+def unload_namesake(module_name: str, folder: Path) -> None:
+    """Remove a loaded module if another file of its name is in ``folder``, that of a scenario."""
+    if _is_namesake(sys.modules.get(module_name), module_name, folder):
         del sys.modules[module_name]
         importlib.invalidate_caches()
 
 
-def _is_other(loaded: ModuleType | None, module_name: str, folder: Path) -> bool:
-    """Return True if a loaded module is another one than the file beside the scenario."""
-    beside = folder / f"{module_name}.py"
-    if loaded is None or not beside.exists():
+def _is_namesake(module: ModuleType | None, module_name: str, folder: Path) -> bool:
+    """Return True if ``folder`` has a module of this name and the loaded one is not that file."""
+    file_in_folder = folder / f"{module_name}.py"
+    if module is None or not file_in_folder.exists():
         return False
-    other = getattr(loaded, "__file__", None)
-    return other is None or not Path(other).exists() or not beside.samefile(other)
+    file = getattr(module, "__file__", None)
+    return file is None or not Path(file).exists() or not file_in_folder.samefile(file)
 
 
 class _AllowedPaths:
-    """The folders from which modules are imported for a scenario without trust.
+    """The rules for imports without trust: what may be imported, and from which folders.
 
-    These are the import path without the scenario's folder, the current folder, and what lies
+    ``path`` is the import path without the scenario's folder, the current folder, and the folders
     below them; packages installed there (site-packages, editable installs) remain.
     """
 
     def __init__(self, folder: Path) -> None:
-        self._scenario, self._current = folder.resolve(), Path.cwd().resolve()
-        self.path = [entry for entry in sys.path if self._may_hold(entry)]
+        self._scenario_folder, self._current_folder = folder.resolve(), Path.cwd().resolve()
+        self.path = [entry for entry in sys.path if self._may_import_from(entry)]
 
-    def demand(self, kind: str, module_name: str, class_name: str) -> None:
-        """Raise ScenarioError unless the class may be imported and is a part of netkf's."""
-        absent = ModuleNotFoundError(f"No module named {module_name!r}")
+    def require_part(self, kind: str, module_name: str, class_name: str) -> None:
+        """Raise ScenarioError unless a class may be imported and is derived from one of netkf's.
+
+        ``kind`` is "module_name:class_name" as the scenario has it, for the message.
+        """
+        not_found = ModuleNotFoundError(f"No module named {module_name!r}")
         names = [*module_name.split("."), class_name]
         if not all(name.isidentifier() for name in names):
-            raise _failure(kind, absent)
+            raise _import_error(kind, not_found)
         if names[0] == "netkf":
             if module_name not in sys.modules and module_name != "netkf.parts":
-                raise _failure(kind, absent)
+                raise _import_error(kind, not_found)
             return
-        specs = self._specs(module_name)
-        if specs is None and self._is_somewhere(names[0]):
+        specs = self._find_allowed_specs(module_name)
+        if specs is None and self._exists_anywhere(names[0]):
             rule = "names a module in the scenario's or the current folder, whose code would run"
             raise ScenarioError("kind", rule, kind, REMEDY)
         if specs is None:
-            raise _failure(kind, absent)
-        if any(_is_replaced(spec) for spec in specs):
-            raise _failure(kind, ImportError("another module of that name is loaded"))
-        if not self._is_part(module_name, class_name, set()):
+            raise _import_error(kind, not_found)
+        if any(_is_loaded_from_elsewhere(spec) for spec in specs):
+            raise _import_error(kind, ImportError("another module of that name is loaded"))
+        if not self._is_derived_from_netkf(module_name, class_name, set()):
             rule = "must be a class whose source derives it from a class of netkf"
             raise ScenarioError("kind", rule, kind, f"choose another, or {REMEDY}")
 
-    def _may_hold(self, entry: str) -> bool:
-        """Return True if modules may be imported from an entry of the path."""
+    def _may_import_from(self, path: str) -> bool:
+        """Return True if modules may be imported from a file or folder, given as text."""
         try:
-            return self._allows(Path(entry).resolve())
+            return self._is_allowed(Path(path).resolve())
         except (OSError, ValueError):
             return False
 
-    def _allows(self, location: Path) -> bool:
-        """Return True if code at a resolved location belongs to an installed package, or lies
-        outside of both folders.
+    def _is_allowed(self, location: Path) -> bool:
+        """Return True if modules may be imported from a resolved file or folder.
+
+        That is: it belongs to an installed package, or it is neither in the scenario's folder nor
+        in the current folder, or a folder further down that contains it was made importable by the
+        user, through an editable install or an absolute entry of PYTHONPATH.
         """
-        if any(location.is_relative_to(root) for root in _site_folders()):
+        if any(location.is_relative_to(folder) for folder in _site_folders()):
             return True
-        named = [root for root in self._editable if location.is_relative_to(root)]
-        chosen = [root for root in _python_path() if location.is_relative_to(root)]
-        if location.is_relative_to(self._scenario):
-            return any(_is_below(root, self._scenario) for root in (*named, *chosen))
-        if location.is_relative_to(self._current):
-            return bool(named) or any(_is_below(root, self._current) for root in chosen)
+        editable = [root for root in self._editable_roots if location.is_relative_to(root)]
+        on_python_path = [root for root in _python_path() if location.is_relative_to(root)]
+        if location.is_relative_to(self._scenario_folder):
+            # A root above the scenario's folder does not vouch for the modules in that folder.
+            roots = (*editable, *on_python_path)
+            return any(_is_below(root, self._scenario_folder) for root in roots)
+        if location.is_relative_to(self._current_folder):
+            below = any(_is_below(root, self._current_folder) for root in on_python_path)
+            return bool(editable) or below
         return True
 
     @cached_property
-    def _editable(self) -> list[Path]:
-        """Folders of packages that are installed in place."""
-        return list(_path_files())
+    def _editable_roots(self) -> list[Path]:
+        """Import folders of editable installs; ``_find_editable`` adds those of import hooks."""
+        return list(_iterate_path_file_folders())
 
-    def _specs(self, module_name: str) -> list[ModuleSpec] | None:
-        """Return the specifications of a module and its packages; None if one is not allowed."""
+    def _find_allowed_specs(self, module_name: str) -> list[ModuleSpec] | None:
+        """Return the specs of the packages that contain a module, outermost first, and its own.
+
+        Returns None if one of them is not found or may not be imported.
+        """
         specs: list[ModuleSpec] = []
         path, names = self.path, module_name.split(".")
         for k in range(len(names)):
             name = ".".join(names[: k + 1])
-            spec = (None if specs else self._map_editable(name)) or _spec(name, path)
+            spec = (None if specs else self._find_editable(name)) or _find_spec(name, path)
             if spec is None:
                 return None
             path = [
                 location
                 for location in spec.submodule_search_locations or ()
-                if self._may_hold(location)
+                if self._may_import_from(location)
             ]
+            # A namespace package has no file of its own, only folders.
             files = [spec.origin or ""] if spec.has_location else path
-            if not files or not all(map(self._may_hold, files)):
+            if not files or not all(map(self._may_import_from, files)):
                 return None
             specs.append(spec)
         return specs
 
-    def _map_editable(self, name: str) -> ModuleSpec | None:
-        """Return what the import hook of an editable install maps a name to."""
+    def _find_editable(self, name: str) -> ModuleSpec | None:
+        """Return the spec of a top-level module that an import hook of an editable install finds.
+
+        Its folder is added to ``_editable_roots``. Returns None if no hook finds it.
+        """
         for finder in sys.meta_path:
             hook = finder if isinstance(finder, type) else type(finder)
             if "editable" not in hook.__module__:
                 continue
             spec = finder.find_spec(name, None)
             if spec is not None and spec.origin is not None:
-                location = Path(spec.origin).resolve()
-                self._editable.append(
-                    location.parent if spec.submodule_search_locations else location
-                )
+                file = Path(spec.origin).resolve()
+                is_package = bool(spec.submodule_search_locations)
+                self._editable_roots.append(file.parent if is_package else file)
                 return spec
         return None
 
-    def _is_somewhere(self, top: str) -> bool:
-        """Return True if a top-level module can be found at all."""
-        return _spec(top, [str(self._scenario), str(self._current), *sys.path]) is not None
+    def _exists_anywhere(self, top_level_name: str) -> bool:
+        """Return True if a top-level module exists, be it in a folder that is not allowed."""
+        folders = [str(self._scenario_folder), str(self._current_folder)]
+        return _find_spec(top_level_name, [*folders, *sys.path]) is not None
 
-    def _is_part(self, module_name: str, name: str, visited: set[tuple[str, str]]) -> bool:
-        """Return True if the source of a module binds a name to a class derived from netkf's."""
+    def _is_derived_from_netkf(
+        self, module_name: str, name: str, visited: set[tuple[str, str]]
+    ) -> bool:
+        """Return True if the source of a module binds a name to a class derived from netkf's.
+
+        The name is followed through imports, assignments and base classes; ``visited`` holds the
+        pairs (module, name) seen on the way, which ends circles.
+        """
         if module_name.partition(".")[0] == "netkf":
             return True
         if (module_name, name) in visited or len(visited) >= MAX_HOPS:
             return False
         visited.add((module_name, name))
-        specs = self._specs(module_name)
+        specs = self._find_allowed_specs(module_name)
         if specs is None:
             return False
         source = _Source(module_name, specs[-1])
-        return any(self._is_part(*found, visited) for found in source.ancestors(name))
+        return any(
+            self._is_derived_from_netkf(origin_module, origin_name, visited)
+            for origin_module, origin_name in source.find_origins(name)
+        )
 
 
 def _is_below(location: Path, folder: Path) -> bool:
@@ -218,17 +252,17 @@ def _is_below(location: Path, folder: Path) -> bool:
     return location != folder and location.is_relative_to(folder)
 
 
-def _is_replaced(spec: ModuleSpec) -> bool:
-    """Return True if a module of that name was loaded from another file."""
-    loaded = sys.modules.get(spec.name)
-    if loaded is None or not spec.has_location:
+def _is_loaded_from_elsewhere(spec: ModuleSpec) -> bool:
+    """Return True if a module of that name is loaded already, but from another file."""
+    module = sys.modules.get(spec.name)
+    if module is None or not spec.has_location:
         return False
-    file = getattr(loaded, "__file__", None)
+    file = getattr(module, "__file__", None)
     return file is None or Path(file).resolve() != Path(spec.origin or "").resolve()
 
 
-def _spec(name: str, path: list[str]) -> ModuleSpec | None:
-    """Return the spec of a module on this path, None if there is none."""
+def _find_spec(name: str, path: list[str]) -> ModuleSpec | None:
+    """Return the spec of a module on an import path, None if it is not found."""
     try:
         return PathFinder.find_spec(name, path)
     except (OSError, ImportError, ValueError):
@@ -251,8 +285,8 @@ def _package_folders() -> list[Path]:
     return sorted(Path(folder).resolve() for folder in folders)
 
 
-def _path_files() -> Iterator[Path]:
-    """Yield the folders that ``.pth`` files name, as those of editable installs do."""
+def _iterate_path_file_folders() -> Iterator[Path]:
+    """Yield the folders that ``.pth`` files add to the import path, as editable installs do."""
     for folder in _package_folders():
         for file in sorted(folder.glob("*.pth")):
             for line in file.read_text(encoding="utf-8", errors="replace").splitlines():
@@ -262,17 +296,21 @@ def _path_files() -> Iterator[Path]:
 
 def _python_path() -> list[Path]:
     """Return the absolute folders of PYTHONPATH: relative ones depend on the current folder."""
-    given = "" if sys.flags.ignore_environment else os.environ.get("PYTHONPATH", "")
-    return [Path(entry).resolve() for entry in given.split(os.pathsep) if os.path.isabs(entry)]
+    text = "" if sys.flags.ignore_environment else os.environ.get("PYTHONPATH", "")
+    return [Path(entry).resolve() for entry in text.split(os.pathsep) if os.path.isabs(entry)]
 
 
 class _Source:
-    """The names that the source text of a module binds, without its execution."""
+    """The origins of the names in a module, read from its source text without executing it.
+
+    The text is that of the module ``module_name`` with the given spec; a module without readable
+    Python source counts as empty.
+    """
 
     def __init__(self, module_name: str, spec: ModuleSpec) -> None:
-        self._module = module_name
-        package = spec.submodule_search_locations is not None
-        self._package = module_name if package else module_name.rpartition(".")[0]
+        self._module_name = module_name
+        is_package = spec.submodule_search_locations is not None
+        self._package = module_name if is_package else module_name.rpartition(".")[0]
         loader: Any = spec.loader  # not all loaders have a source
         try:
             text = loader.get_source(module_name)
@@ -280,64 +318,87 @@ class _Source:
         except (AttributeError, ImportError, OSError, SyntaxError, ValueError, RecursionError):
             self._body = []
 
-    def ancestors(self, name: str) -> Iterator[tuple[str, str]]:
-        """Yield (module, class) of what a name was imported from, or is derived from."""
-        for node in _statements(self._body):
-            if isinstance(node, ast.ClassDef) and node.name == name:
-                for base in node.bases:
+    def find_origins(self, name: str) -> Iterator[tuple[str, str]]:
+        """Yield (module, name) of everything that a module-level name may come from.
+
+        For a class these are its bases, for an imported name its original, for a variable the name
+        assigned to it.
+        """
+        for statement in _iterate_statements(self._body):
+            if isinstance(statement, ast.ClassDef) and statement.name == name:
+                for base in statement.bases:
                     yield from self._resolve(base, name)
-            elif isinstance(node, ast.ImportFrom):
-                yield from self._imported_names(node, name)
-            elif isinstance(node, ast.Assign) and name in map(_name, node.targets):
-                yield from self._resolve(node.value, name)
+            elif isinstance(statement, ast.ImportFrom):
+                yield from self._resolve_import(statement, name)
+            elif isinstance(statement, ast.Assign) and name in map(_identifier, statement.targets):
+                yield from self._resolve(statement.value, name)
 
-    def _imported_names(self, node: ast.ImportFrom, name: str) -> Iterator[tuple[str, str]]:
-        """Yield the modules and names by which an import statement may bring ``name``."""
-        for alias in node.names:
-            if alias.name == "*" or (alias.asname or alias.name) == name:
-                yield self._absolute(node), name if alias.name == "*" else alias.name
+    def _resolve_import(self, statement: ast.ImportFrom, name: str) -> Iterator[tuple[str, str]]:
+        """Yield (module, original name) if ``from module import ...`` may bind ``name``."""
+        for alias in statement.names:
+            if alias.name == "*":
+                yield self._absolute_module(statement), name
+            elif (alias.asname or alias.name) == name:
+                yield self._absolute_module(statement), alias.name
 
-    def _absolute(self, node: ast.ImportFrom) -> str:
-        """Return the absolute name of the module that an import statement names."""
-        above = self._package.split(".")
-        kept = above[: len(above) - node.level + 1] if node.level else []
-        return ".".join([*kept, *([node.module] if node.module else [])])
+    def _absolute_module(self, statement: ast.ImportFrom) -> str:
+        """Return the absolute name of ``module`` in ``from module import ...``."""
+        packages: list[str] = []
+        if statement.level:  # dots before the name: one is this package, two the one around it
+            packages = self._package.split(".")
+            packages = packages[: len(packages) - statement.level + 1]
+        return ".".join([*packages, *([statement.module] if statement.module else [])])
 
-    def _resolve(self, node: ast.expr, own: str) -> Iterator[tuple[str, str]]:
-        """Yield what an expression ``Name`` or ``package.module.Name`` refers to."""
-        names: list[str] = []
-        while isinstance(node, ast.Attribute):
-            names.insert(0, node.attr)
-            node = node.value
-        first = _name(node)
-        if not names and first not in ("", own):
-            yield self._module, first
-        elif names and first:
-            for module in self._modules(first):
-                yield ".".join([module, *names[:-1]]), names[-1]
+    def _resolve(self, expression: ast.expr, bound_name: str) -> Iterator[tuple[str, str]]:
+        """Yield (module, name) for an expression ``name`` or ``package.module.name``.
 
-    def _modules(self, name: str) -> Iterator[str]:
-        """Yield the modules that a name may refer to."""
-        for node in _statements(self._body):
-            for alias in node.names if isinstance(node, ast.Import | ast.ImportFrom) else ():
-                bound = alias.asname or alias.name
-                if isinstance(node, ast.ImportFrom) and bound == name:
-                    yield f"{self._absolute(node)}.{alias.name}"
-                elif isinstance(node, ast.Import) and bound.partition(".")[0] == name:
-                    yield alias.name if alias.asname else name
+        ``bound_name`` is the name that the statement binds: ``x = x`` leads nowhere. Other
+        expressions yield nothing.
+        """
+        attributes: list[str] = []
+        while isinstance(expression, ast.Attribute):
+            attributes.insert(0, expression.attr)
+            expression = expression.value
+        first = _identifier(expression)
+        if not first:
+            return
+        if attributes:
+            for module in self._find_modules(first):
+                yield ".".join([module, *attributes[:-1]]), attributes[-1]
+        elif first != bound_name:
+            yield self._module_name, first
+
+    def _find_modules(self, name: str) -> Iterator[str]:
+        """Yield the absolute names of the modules that import statements may bind ``name`` to."""
+        for statement in _iterate_statements(self._body):
+            if isinstance(statement, ast.ImportFrom):
+                for alias in statement.names:
+                    if (alias.asname or alias.name) == name:
+                        yield f"{self._absolute_module(statement)}.{alias.name}"
+            elif isinstance(statement, ast.Import):
+                for alias in statement.names:
+                    if alias.asname == name:
+                        yield alias.name
+                    # ``import a.b`` binds ``a``.
+                    elif not alias.asname and alias.name.partition(".")[0] == name:
+                        yield name
 
 
-def _name(node: ast.expr) -> str:
-    """Return the identifier of an expression, empty for other expressions."""
-    return node.id if isinstance(node, ast.Name) else ""
+def _identifier(expression: ast.expr) -> str:
+    """Return the identifier of an expression that is a plain name, else an empty text."""
+    return expression.id if isinstance(expression, ast.Name) else ""
 
 
-def _statements(body: list[Any]) -> Iterator[ast.stmt]:
-    """Yield the statements of a module, and those inside ``if``, ``try`` and ``with``."""
+def _iterate_statements(body: list[Any]) -> Iterator[ast.stmt]:
+    """Yield the statements that a module executes when it is imported.
+
+    Those inside ``if``, ``try``, ``with`` and loops are among them, those inside functions and
+    classes are not.
+    """
     for node in body:
         if isinstance(node, ast.stmt):
             yield node
         if not isinstance(node, ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
-            for part in ("body", "orelse", "handlers", "finalbody"):
-                inside = getattr(node, part, None)
-                yield from _statements(inside if isinstance(inside, list) else [])
+            for block in ("body", "orelse", "handlers", "finalbody"):
+                statements = getattr(node, block, None)
+                yield from _iterate_statements(statements if isinstance(statements, list) else [])

@@ -1,4 +1,4 @@
-"""The parts of a scenario as dataclasses: network, filter, sensors on nodes, and all fields."""
+"""The fields of a scenario as dataclasses: network, filter, sensors on nodes, and the whole."""
 
 from __future__ import annotations
 
@@ -113,7 +113,10 @@ class PlacedSensor(NamedTuple):
 
 
 def takes_samples(sensor: Sensor) -> bool:
-    """Return True if a sensor over a diffusion samples it, False if it gives increments."""
+    """Return True if a sensor of a diffusion takes samples, False if it gives increments.
+
+    A sample is y = H x + v at an instant; increments are those of dy = H x dt + dv.
+    """
     return isinstance(sensor, RecordedSensor) or (
         isinstance(sensor, (LinearSensor, NonlinearSensor)) and sensor.sampling is not None
     )
@@ -121,10 +124,10 @@ def takes_samples(sensor: Sensor) -> bool:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ScenarioModel(Component):
-    """The fields of a scenario, and what follows from them without any mathematics.
+    """The fields of a scenario, and properties that need no numerical computation.
 
     ``horizon`` and ``probe`` are in simulated seconds; ``probe`` is the period of the state
-    samples or a tuple of increasing times.
+    samples, or an array (T,) of their increasing times.
     """
 
     name: str = field(text)
@@ -144,7 +147,7 @@ class ScenarioModel(Component):
 
     @cached_property
     def located_sensors(self) -> tuple[Any, ...]:
-        """The sensors, nonlinear ones at the positions of the graph where they name no others."""
+        """``sensors``, nonlinear ones with the positions of nodes: their own, else the graph's."""
         return tuple(
             sensor if sensor.linear else sensor.located(self.topology.positions)
             for sensor in self.sensors
@@ -169,8 +172,9 @@ class ScenarioModel(Component):
         if isinstance(self.probe, np.ndarray):
             return self.probe
         count = int(np.floor(self.horizon / self.probe * (1.0 + 1e-12)))
-        digits = 12 - min(0, int(np.floor(np.log10(self.probe))))
-        return np.minimum(np.round(self.probe * np.arange(count + 1), digits), self.horizon)
+        # Rounded, so that 3 x 0.1 is 0.3: at most 12 decimals, or 12 digits of a period below 1 s.
+        decimals = 12 - min(0, int(np.floor(np.log10(self.probe))))
+        return np.minimum(np.round(self.probe * np.arange(count + 1), decimals), self.horizon)
 
     @property
     def slotted(self) -> bool:
@@ -186,21 +190,21 @@ class ScenarioModel(Component):
 
     @cached_property
     def sampled_slots(self) -> tuple[int, ...]:
-        """Numbers of the slots that are sampled."""
+        """Numbers (T,) of the slots whose states are sampled, those at ``times``."""
         period = self.slot_plant.period
         return tuple(round(t / period) for t in self.times.tolist())
 
     @cached_property
     def node_filter(self) -> Filter:
-        """The filter of every node under the present contract."""
+        """The filter of every node as a Filter; a FlowFilter or SlotFilter of a user is wrapped."""
         return adapt(self.filter.algorithm)
 
     @property
     def end_time(self) -> float:
-        """The time in seconds after which nothing happens.
+        """The time in seconds after which nothing is simulated.
 
-        It is the horizon, or the end of the slot that begins there if samples are taken after the
-        exchanges of their slot.
+        It is the horizon, or in slots one period later if states are sampled after the exchanges of
+        their slot.
         """
         if not self.slotted or self.node_filter.predicts:
             return self.horizon
@@ -208,26 +212,26 @@ class ScenarioModel(Component):
 
     @property
     def phase_length(self) -> float:
-        """Seconds that an exchange of a slot lasts; its steps share them evenly."""
+        """Seconds that an exchange phase of a slot lasts; its steps share them evenly.
+
+        By default all exchange phases together last half a period.
+        """
         activation = self.network.activation
         assert isinstance(activation, SlotActivation)
         if activation.phase is not None:
             return activation.phase
-        return (
-            0.5
-            * self.slot_plant.period
-            / max(1, (self.node_filter.schedule or ()).count("exchange"))
-        )
+        exchanges = (self.node_filter.schedule or ()).count("exchange")
+        return 0.5 * self.slot_plant.period / max(1, exchanges)
 
     @cached_property
     def placed_sensors(self) -> dict[int, tuple[PlacedSensor, ...]]:
-        """The sensors of each node that has any."""
-        placed: dict[int, list[PlacedSensor]] = {}
+        """The sensors of each node that has any, by node id in increasing order."""
+        sensors_of_nodes: dict[int, list[PlacedSensor]] = {}
         for entry, sensor in enumerate(self.sensors):
             for node in sensor.nodes:
-                sensors = placed.setdefault(node, [])
+                sensors = sensors_of_nodes.setdefault(node, [])
                 sensors.append(PlacedSensor(entry, len(sensors)))
-        return {node: tuple(placed[node]) for node in sorted(placed)}
+        return {node: tuple(sensors_of_nodes[node]) for node in sorted(sensors_of_nodes)}
 
     @property
     def sensing_nodes(self) -> tuple[int, ...]:
@@ -236,19 +240,22 @@ class ScenarioModel(Component):
 
     @property
     def is_random(self) -> bool:
-        """True if runs draw the state and all readings; records of them follow no known law."""
+        """True if runs draw the state and all readings at random; False if any is recorded."""
         return self.plant.is_random and all(sensor.is_random for sensor in self.sensors)
 
     def noise_covariance(self, entry: int, *, believed: bool) -> FloatArray:
-        """Return the true or the believed R (p, p) of a ``[[sensors]]`` entry."""
-        R = self.filter.model.R
-        if not believed or R is None:
-            true: FloatArray = self.sensors[entry].R
-            return true
-        return R[entry] if isinstance(R, tuple) else R
+        """Return R (p, p) of a ``[[sensors]]`` entry: the true one, or the one filters believe."""
+        believed_R = self.filter.model.R
+        if not believed or believed_R is None:
+            true_R: FloatArray = self.sensors[entry].R
+            return true_R
+        return believed_R[entry] if isinstance(believed_R, tuple) else believed_R
 
     def table_probability(self, link: Link) -> float:
-        """Return the delivery probability of a direction by the graph's table, 1 without one."""
+        """Return the delivery probability of a directed link in the graph's CSV table.
+
+        It is 1 if the graph has no such table, 0 if the table does not list the link.
+        """
         delivery = self.topology.delivery
         return 1.0 if delivery is None else delivery.get(link, 0.0)
 
@@ -263,11 +270,14 @@ class ScenarioModel(Component):
         return self._sensors_over_diffusion(sampled=True)
 
     def _sensors_over_diffusion(self, sampled: bool) -> dict[int, tuple[PlacedSensor, ...]]:
-        """Return the sensors of each node that take samples, or those that give increments."""
+        """Return the sensors by node that take samples (``sampled``) or that give increments.
+
+        Nodes without any are left out.
+        """
         if self.slotted:
             return {}
-        chosen = {
-            node: tuple(p for p in placed if takes_samples(self.sensors[p.entry]) == sampled)
-            for node, placed in self.placed_sensors.items()
+        sensors_of_nodes = {
+            node: tuple(p for p in sensors if takes_samples(self.sensors[p.entry]) == sampled)
+            for node, sensors in self.placed_sensors.items()
         }
-        return {node: placed for node, placed in chosen.items() if placed}
+        return {node: sensors for node, sensors in sensors_of_nodes.items() if sensors}

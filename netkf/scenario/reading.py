@@ -1,4 +1,4 @@
-"""Scenario files: TOML text to a checked scenario."""
+"""Reading of scenario files: TOML text to a checked scenario."""
 
 from __future__ import annotations
 
@@ -16,37 +16,44 @@ from netkf.scenario.imports import Origin
 from netkf.scenario.scenario import Scenario
 from netkf.scenario.tables import MAX_DEPTH, build_scenario, explain_left_over, with_changes
 
-MAX_BYTES = 64 << 20
-MAX_DOTS = 100  # parts of a key: tomllib takes minutes and gigabytes for very many
-# Characters from which on lists of numbers are read by numpy instead of by tomllib.
+MAX_BYTES = 64 << 20  # of a scenario file
+MAX_DOTS = 100  # in a dotted key: tomllib takes minutes and gigabytes for very many
+# In texts of more characters than LONG_TEXT, lists of numbers on lines of more than LONG_LINE are
+# read by the json module instead of by tomllib.
 LONG_TEXT, LONG_LINE = 100_000, 1000
-_NUMBERS = re.compile(r"([A-Za-z0-9_-]+)[ \t]*=[ \t]*(\[[0-9eE+\-., \t\[\]]*\])[ \t]*")
-_LAST_COMMA, _FIRST_COMMA = re.compile(r",[ \t]*\]"), re.compile(r"\[[ \t]*,")
-_PART = r"""(?:[\w-]++|"[^"]*+"|'[^']*+')[ \t]*+"""
-_MANY_PARTS = re.compile(rf"(?<![\w-])(?:{_PART}\.[ \t]*+){{{MAX_DOTS}}}")
+_NUMBER_ARRAY = re.compile(r"([A-Za-z0-9_-]+)[ \t]*=[ \t]*(\[[0-9eE+\-., \t\[\]]*\])[ \t]*")
+"""A whole line ``key = [numbers, possibly nested]``; groups: key, array."""
+_TRAILING_COMMA, _LEADING_COMMA = re.compile(r",[ \t]*\]"), re.compile(r"\[[ \t]*,")
+_KEY_PART = r"""(?:[\w-]++|"[^"]*+"|'[^']*+')[ \t]*+"""
+_LONG_KEY = re.compile(rf"(?<![\w-])(?:{_KEY_PART}\.[ \t]*+){{{MAX_DOTS}}}")
+"""MAX_DOTS parts of a dotted key, bare or quoted, with the dots after them."""
 
 
 def load(
     path: str | Path, changes: Mapping[str, Any] | None = None, *, trust: bool = True
 ) -> Scenario:
-    """Return the scenario of a file, with some keys changed.
+    """Return the scenario of a TOML file.
 
-    A file can name classes of modules in its own folder or the current folder; with ``trust``, the
-    default, they are imported, which executes them, as a script of yours would. Give
-    ``trust=False`` for files whose author you do not trust: such classes are refused then, those of
-    installed packages are not. ``netkf`` on a command line does so unless ``--trust`` is given.
+    ``changes`` maps key paths to values that replace those of the file or are added to them, e.g.
+    ``{"network.activation.rate": 5.0}``.
+
+    A file can name classes of modules in its own folder or the current folder. With ``trust``, the
+    default, these modules are imported, which executes their code. Give ``trust=False`` for files
+    whose author you do not trust: such classes are refused then, those of installed packages are
+    not. The command ``netkf`` does so unless ``--trust`` is given.
 
     Raises ScenarioError with one line for the first mistake.
     """
     path = as_path("path", path, "load takes the path of a scenario file")
-    given: object = changes or {}
-    if not isinstance(given, Mapping):
+    changes = changes or {}
+    value: object = changes  # of any type in a script without annotations
+    if not isinstance(value, Mapping):
         rule, remedy = "must be a table", 'give values by key: {"horizon": 10.0}'
-        raise ScenarioError("changes", rule, given, remedy)
+        raise ScenarioError("changes", rule, value, remedy)
     try:
-        return from_table(with_changes(_parse_file(path), changes or {}), path.parent, trust)
+        return from_table(with_changes(_parse_file(path), changes), path.parent, trust)
     except ScenarioError as error:
-        raise explain_left_over(error, changes or {}).in_file(str(path)) from None
+        raise explain_left_over(error, changes).in_file(str(path)) from None
 
 
 def from_table(table: Mapping[str, Any], folder: Path, trust: bool = True) -> Scenario:
@@ -55,7 +62,7 @@ def from_table(table: Mapping[str, Any], folder: Path, trust: bool = True) -> Sc
 
 
 def _parse_file(path: Path) -> dict[str, Any]:
-    """Return the table of a TOML file; raises ScenarioError if it cannot be read."""
+    """Return the tables of a TOML file; raises ScenarioError if it cannot be read."""
     try:
         return parse_toml(_read_text(path))
     except UnicodeDecodeError:
@@ -74,12 +81,12 @@ def _parse_file(path: Path) -> dict[str, Any]:
 
 
 def _read_text(path: Path) -> str:
-    """Return the text of a file up to MAX_BYTES."""
-    # Not all at once: the file may be a device that never ends.
+    """Return the text of a file; raises ScenarioError if it has more than MAX_BYTES."""
+    # Read piece by piece: the size of a device such as /dev/zero is known only by reading it.
     content = b""
     with path.open("rb") as file:
-        while len(content) <= MAX_BYTES and (part := file.read(1 << 20)):
-            content += part
+        while len(content) <= MAX_BYTES and (piece := file.read(1 << 20)):
+            content += piece
     if len(content) > MAX_BYTES:
         rule = f"must have at most {MAX_BYTES >> 20} MiB"
         raise ScenarioError("", rule, None, "put long lists into CSV files")
@@ -87,45 +94,49 @@ def _read_text(path: Path) -> str:
 
 
 def parse_toml(text: str) -> dict[str, Any]:
-    """Return the tables of a TOML text.
+    """Return the tables of a TOML text, as ``tomllib.loads`` does.
 
-    Raises ScenarioError for keys of very many parts, which tomllib takes minutes and gigabytes for,
-    and for deep tables; ValueError and RecursionError as tomllib does.
+    Raises ScenarioError for a key of more than MAX_DOTS parts and for tables and lists nested
+    deeper than MAX_DEPTH, ValueError and RecursionError for other invalid texts.
     """
     lines = text.splitlines()
     for number, line in enumerate(lines, 1):
-        if line.count(".") > MAX_DOTS and _MANY_PARTS.search(line):
+        if line.count(".") > MAX_DOTS and _LONG_KEY.search(line):
             rule = f"line {number} has a key of more than {MAX_DOTS} parts"
             raise ScenarioError("", rule, None, "correct that line")
+    # The lines of a multi-line string must stay as they are, even if they look like arrays.
+    has_multiline_string = '"""' in text or "'''" in text
     arrays: dict[str, Any] = {}
-    if len(text) > LONG_TEXT and '"""' not in text and "'''" not in text:
-        mark = secrets.token_hex(16)
-        text = "\n".join(_shorten_array(line, arrays, mark) for line in lines)
-    found: dict[str, Any] = _insert_arrays(tomllib.loads(text), arrays)
-    if _nesting_depth(found) > MAX_DEPTH:
+    if len(text) > LONG_TEXT and not has_multiline_string:
+        prefix = secrets.token_hex(16)  # random, so that no text in the file begins with it
+        text = "\n".join(_extract_array(line, arrays, prefix) for line in lines)
+    tables: dict[str, Any] = _insert_arrays(tomllib.loads(text), arrays)
+    if _nesting_depth(tables) > MAX_DEPTH:
         raise ScenarioError("", "is nested too deep", None, "see the keys of a scenario file")
-    return found
+    return tables
 
 
-def _shorten_array(line: str, arrays: dict[str, Any], mark: str) -> str:
-    """Return a line ``key = [numbers]`` with a key of ``arrays`` for its value; others unchanged.
+def _extract_array(line: str, arrays: dict[str, Any], prefix: str) -> str:
+    """Return a long line ``key = [numbers]`` as ``key = "placeholder"``, other lines unchanged.
 
-    The json module reads such arrays fifty times faster than tomllib.
+    The array is added to ``arrays`` by its placeholder, a text that begins with ``prefix``. The
+    json module reads such arrays fifty times faster than tomllib.
     """
-    found = _NUMBERS.fullmatch(line) if len(line) > LONG_LINE else None
-    if found is None or _FIRST_COMMA.search(found[2]):
+    match = _NUMBER_ARRAY.fullmatch(line) if len(line) > LONG_LINE else None
+    # "[,]" is not valid TOML, but would be valid JSON once trailing commas are removed.
+    if match is None or _LEADING_COMMA.search(match[2]):
         return line
     try:
-        value = json.loads(_LAST_COMMA.sub("]", found[2]))
+        array = json.loads(_TRAILING_COMMA.sub("]", match[2]))
     except (ValueError, RecursionError):
-        return line
-    index = f"{mark} {len(arrays)}"
-    arrays[index] = value
-    return f'{found[1]} = "{index}"'
+        return line  # tomllib reads it, or explains what is wrong with it
+    placeholder = f"{prefix} {len(arrays)}"
+    arrays[placeholder] = array
+    return f'{match[1]} = "{placeholder}"'
 
 
 def _insert_arrays(value: Any, arrays: dict[str, Any]) -> Any:
-    """Return tables with arrays instead of their keys."""
+    """Return a TOML value with ``arrays`` in place of their placeholders."""
     if not arrays:
         return value
     if isinstance(value, dict):
@@ -136,11 +147,13 @@ def _insert_arrays(value: Any, arrays: dict[str, Any]) -> Any:
 
 
 def _nesting_depth(value: Any) -> int:
-    """Return how many tables and lists are inside one another, without recursion."""
+    """Return how deep tables and lists are nested, counted up to MAX_DEPTH + 1."""
+    # Level by level: recursion would fail for the very values that this is to find.
     depth, level = 0, [value]
     while level and depth <= MAX_DEPTH:
-        inside = [entry for entry in level if isinstance(entry, (dict, list))]
-        parts = (entry.values() if isinstance(entry, dict) else entry for entry in inside)
-        level = [entry for part in parts for entry in part]
-        depth += bool(inside)
+        containers = [entry for entry in level if isinstance(entry, (dict, list))]
+        level = []
+        for container in containers:
+            level.extend(container.values() if isinstance(container, dict) else container)
+        depth += bool(containers)
     return depth

@@ -14,7 +14,7 @@ from netkf.network.channels import Channel
 from netkf.scenario.derived import DerivedScenario
 from netkf.scenario.imports import Origin
 from netkf.scenario.model import Belief, Filtering, Network
-from netkf.scenario.plugins import blame, describe_error, is_ours
+from netkf.scenario.plugins import describe_error, explain_user_error, is_netkf_class
 from netkf.scenario.registry import KINDS, SLOTTED, find, names_of_kind
 from netkf.scenario.writing import as_table, part_as_table
 
@@ -193,8 +193,8 @@ def _make_part(cls: type[Any], values: dict[str, Any]) -> Any:
     except Exception as error:
         # A class of the user's failed, this one or one that the scenario asked.
         rule = f"{cls.__name__} could not be made ({describe_error(error)})"
-        if is_ours(cls):
-            rule = blame(tuple(values.values()), error) or ""
+        if is_netkf_class(cls):
+            rule = explain_user_error(tuple(values.values()), error) or ""
         if not rule:
             raise
         raise ScenarioError("", rule, None, "correct the class or its settings") from error

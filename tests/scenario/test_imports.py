@@ -12,7 +12,7 @@ import pytest
 import netkf
 from netkf.cli.main import main
 from netkf.scenario import imports
-from netkf.scenario.plugins import module_files
+from netkf.scenario.plugins import find_module_files
 from netkf.scenario.writing import as_table, to_toml
 from tests.conftest import SCENARIOS
 
@@ -252,7 +252,7 @@ def test_installed_packages_win_over_the_folder_and_do_not_import_from_it(
     loaded = netkf.load(scenario(folder, "good:P"), trust=False)
     assert ran(site) == ["good.ran", "helper.ran"]
     assert not list(folder.glob("*.ran"))
-    assert module_files(loaded) == {"good": None}  # the one beside the scenario is not copied
+    assert find_module_files(loaded) == {"good": None}  # the one beside the scenario is not copied
 
 
 @pytest.mark.parametrize(
