@@ -1,4 +1,4 @@
-"""Checks of recorded states, readings and exchanges, and the slots that use them."""
+"""Checks of tables of recorded states, readings and exchanges, and the rows that a run uses."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from netkf.scenario.sampling import all_sample_times, sample_times
 
 
 def check_records(scenario: DerivedScenario) -> None:
-    """Raise ScenarioError if a table does not fit or lacks a row that a run needs."""
+    """Raise ScenarioError if a recorded table does not fit the scenario or lacks a needed row."""
     for k, sensor in enumerate(scenario.sensors):
         key = f"sensors[{k}]"
         if isinstance(sensor, RecordedSensor):
@@ -36,7 +36,7 @@ def check_records(scenario: DerivedScenario) -> None:
 
 
 def _check_under(key: str, check: Callable[[], None]) -> None:
-    """Call a check; errors that it raises get ``key`` in front of their own."""
+    """Call ``check``; put ``key`` before the keys of ScenarioErrors that it raises."""
     try:
         check()
     except ScenarioError as error:
@@ -44,7 +44,10 @@ def _check_under(key: str, check: Callable[[], None]) -> None:
 
 
 def _check_readings(scenario: DerivedScenario, key: str, sensor: RecordedSensor) -> None:
-    """Raise ScenarioError if recorded readings do not fit nodes or slots."""
+    """Raise ScenarioError if recorded readings do not fit the nodes of the graph, or the slots.
+
+    ``key`` is the key path of the sensor.
+    """
     for node in sensor.listed:
         if node not in scenario.topology.index:
             rule = f"{sensor.path.name} names a node that the graph does not have"
@@ -54,27 +57,32 @@ def _check_readings(scenario: DerivedScenario, key: str, sensor: RecordedSensor)
 
 
 def sensed_slots(scenario: DerivedScenario) -> range:
-    """Return the slots in which a run hands readings to its filters."""
-    plant, algorithm = scenario.slot_plant, scenario.node_filter
+    """Return the slots in which a run gives readings to its filters.
+
+    Prediction filters use the readings of all slots before the horizon. Others start with the
+    estimate of slot 0 and use readings from slot 1 on, that of a slot at the horizon only if its
+    state is sampled.
+    """
+    plant = scenario.slot_plant
     end = max(int(scenario.horizon / plant.period) - 1, 0)
     while not plant.over(end, scenario.horizon):
         end += 1
-    if algorithm.predicts:
+    if scenario.node_filter.predicts:
         return range(end)
     return range(1, end + (end in scenario.sampled_slots))
 
 
 def _check_exchanges(scenario: DerivedScenario) -> None:
     """Raise ScenarioError if recorded exchanges do not fit the steps of the filter."""
-    activation, algorithm = scenario.network.activation, scenario.node_filter
+    activation, node_filter = scenario.network.activation, scenario.node_filter
     if not isinstance(activation, RecordedSlots) or activation.matching:
         return
-    phases = (algorithm.schedule or ()).count("exchange")
+    phases = (node_filter.schedule or ()).count("exchange")
     for slot, phase, step in activation.recorded:
-        steps = algorithm.exchange_steps(phase) if phase < phases else 0
+        steps = node_filter.exchange_steps(phase) if phase < phases else 0
         if step >= steps:
             limits = " and ".join(
-                f"{algorithm.exchange_steps(k)} in phase {k}" for k in range(phases)
+                f"{node_filter.exchange_steps(k)} in phase {k}" for k in range(phases)
             )
             raise ScenarioError(
                 "network.activation.path",
@@ -85,49 +93,54 @@ def _check_exchanges(scenario: DerivedScenario) -> None:
 
 
 def exchange_slots(scenario: DerivedScenario) -> range:
-    """Return the slots in which nodes exchange."""
+    """Return the slots in which nodes exchange messages."""
     return range(scenario.node_filter.first_slot, sensed_slots(scenario).stop)
 
 
-def used_states(scenario: DerivedScenario) -> tuple[str, int, int] | None:
-    """Return (file, rows, used rows) of recorded states; None if states are not recorded."""
+def count_state_rows(scenario: DerivedScenario) -> tuple[str, int, int] | None:
+    """Return (file name, rows, used rows) of recorded states; None if states are not recorded."""
     plant = scenario.plant
     if isinstance(plant, RecordedDiffusion):
-        return plant.path.name, len(plant.table[0]), _used_rows(scenario, plant)
+        return plant.path.name, len(plant.table[0]), _count_used_rows(scenario, plant)
     if not isinstance(plant, RecordedPlant):
         return None
-    return plant.path.name, len(plant.table), len(_state_slots(scenario) & plant.table.keys())
+    used_slots = _state_slots(scenario) & plant.table.keys()
+    return plant.path.name, len(plant.table), len(used_slots)
 
 
-def _used_rows(scenario: DerivedScenario, plant: RecordedDiffusion) -> int:
-    """Count the rows at probe times, and at random sensors' sample times, in replica 0."""
+def _count_used_rows(scenario: DerivedScenario, plant: RecordedDiffusion) -> int:
+    """Return how many rows of a recorded diffusion replica 0 uses.
+
+    These are the rows at probe times and, if a sensor draws its readings, at sample times, up to
+    TOLERANCE seconds.
+    """
     times = [scenario.times]
     if any(sensor.is_random for sensor in scenario.sensors):
         times.append(all_sample_times(sample_times(scenario, Streams(scenario.seed))))
-    asked, rows = np.unique(np.concatenate(times)), plant.table[0]
-    near = np.searchsorted(asked, rows - TOLERANCE)
-    return int(
-        (asked[np.minimum(near, len(asked) - 1)] <= rows + TOLERANCE)[near < len(asked)].sum()
-    )
+    needed_times, row_times = np.unique(np.concatenate(times)), plant.table[0]
+    # A row is used if a needed time lies in [t - TOLERANCE, t + TOLERANCE].
+    first = np.searchsorted(needed_times, row_times - TOLERANCE)
+    end = np.searchsorted(needed_times, row_times + TOLERANCE, side="right")
+    return int((first < end).sum())
 
 
 def _state_slots(scenario: DerivedScenario) -> set[int]:
-    """Return the slots in which a run needs the state."""
-    drawn = any(sensor.is_random for sensor in scenario.sensors)
-    return {*scenario.sampled_slots, *(sensed_slots(scenario) if drawn else ())}
+    """Return the slots whose states a run needs: the sampled ones and those with drawn readings."""
+    has_drawn_readings = any(sensor.is_random for sensor in scenario.sensors)
+    return {*scenario.sampled_slots, *(sensed_slots(scenario) if has_drawn_readings else ())}
 
 
 def record_notes(scenario: DerivedScenario) -> tuple[str, ...]:
-    """Return a line if recorded exchanges are in slots without exchanges."""
+    """Return one line if recorded exchanges are in slots without exchanges, else nothing."""
     activation = scenario.network.activation
     if not isinstance(activation, RecordedSlots) or not scenario.slotted:
         return ()
-    used = exchange_slots(scenario)
-    unused = sorted({slot for slot, _, _ in activation.recorded} - set(used))
-    if not unused:
+    used_slots = exchange_slots(scenario)
+    unused_slots = sorted({slot for slot, _, _ in activation.recorded} - set(used_slots))
+    if not unused_slots:
         return ()
-    listed = ", ".join(map(str, unused[:3])) + (", ..." if len(unused) > 3 else "")
+    listed = ", ".join(map(str, unused_slots[:3])) + (", ..." if len(unused_slots) > 3 else "")
     return (
         f"{activation.path.name}: rows of slot {listed} are not used; there are exchanges in slots "
-        f"{used.start} to {used.stop - 1}",
+        f"{used_slots.start} to {used_slots.stop - 1}",
     )

@@ -15,7 +15,7 @@ from netkf.plants.recorded import RecordedSensor
 from netkf.plants.sampling import RecordedSampling
 from netkf.plants.sensors import LinearSensor
 from netkf.scenario.derived import DerivedScenario
-from netkf.scenario.records import exchange_slots, sensed_slots, used_states
+from netkf.scenario.records import count_state_rows, exchange_slots, sensed_slots
 
 Use = dict[str, Any]
 OUTCOMES = {
@@ -45,7 +45,7 @@ def record_usage(scenario: DerivedScenario, sent: Mapping[Link, int] | None) -> 
             beyond = {"beyond": use.beyond, "after": part.after}
             found[f"network.channel.{key}"] = _use(part.path.name, use.rows, use.unused) | beyond
     found |= _sensors(scenario)
-    states = used_states(scenario)
+    states = count_state_rows(scenario)
     if states is not None:
         path, rows, used = states
         found["plant"] = _use(path, rows, rows - used)
