@@ -57,11 +57,11 @@ def _run(options: argparse.Namespace) -> int:
 
 def _compare(options: argparse.Namespace) -> int:
     """Compare filters, print the table and save it if asked; return the exit status."""
-    from netkf.scenario.values import typed_values
+    from netkf.scenario.values import parse_values
     from netkf.studies.compare_filters import compare_filters, write_comparison
     from netkf.studies.tables import filters_text
 
-    filters = typed_values("--filters", "filters", options.filters)
+    filters = parse_values("--filters", "filters", options.filters)
     scenario = load_scenario(options)
     with ProgressLine() as line:
         comparison = compare_filters(

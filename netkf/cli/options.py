@@ -169,10 +169,10 @@ def parse_changes(settings: Sequence[str]) -> dict[str, Any]:
 
     Raises ScenarioError for a text without ``=`` or a value that is not TOML.
     """
-    from netkf.scenario.values import split_setting, typed_value
+    from netkf.scenario.values import parse_value, split_setting
 
     pairs = [split_setting("--set", setting) for setting in settings]
-    return {key: typed_value("--set", key, text) for key, text in pairs}
+    return {key: parse_value("--set", key, text) for key, text in pairs}
 
 
 def load_scenario(

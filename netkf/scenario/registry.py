@@ -1,4 +1,4 @@
-"""The one table that turns the names of a scenario file into classes, and back."""
+"""The table of the classes that a scenario file can name, by family and kind."""
 
 from __future__ import annotations
 
@@ -43,10 +43,10 @@ FAMILIES: dict[str, type[Component]] = {
     "slot activation": matchings.SlotActivation,
     "slot filter": Filter,
 }
-"""The contract that the classes of each family keep."""
+"""The base class of the classes of each family."""
 
 FORMER: dict[str, tuple[type[Component], ...]] = {"filter": (FlowFilter, SlotFilter)}
-"""Contracts that classes of users may still keep (algorithms.adapters)."""
+"""Deprecated base classes that users' classes may still have (algorithms.adapters)."""
 
 KINDS: dict[str, dict[str, type[Component]]] = {
     "plant": {
@@ -114,16 +114,22 @@ KINDS: dict[str, dict[str, type[Component]]] = {
 KINDS["slot filter"] = {
     name: cls for name, cls in KINDS["filter"].items() if getattr(cls, "schedule", None)
 }
-"""The classes by family and name: the kind, with a choice (algorithms.registry.choice_name) where
-several classes share it. "slot activation" is for plants in slots; "slot filter" is the
-part of "filter" that runs in slots.
+"""The classes by family and name.
+
+The name is the kind. Where several classes share a kind, it is the kind and the value of another
+key that chooses the class (algorithms.registry.choice_name). "slot activation" is for plants in
+slots; "slot filter" holds those of "filter" that run in slots.
 """
 
 SLOTTED = (LinearPlant,)
+"""Base classes of plants in slots."""
 
 
-def other_time(family: str, kind: object) -> str | None:
-    """Return why a kind is unknown that exists in the other kind of time only, or None."""
+def explain_if_other_time(family: str, kind: object) -> str | None:
+    """Return the reason if a kind exists for the other kind of time only, else None.
+
+    The kinds of time are slots (``family`` begins with "slot ") and continuous time.
+    """
     other = family.removeprefix("slot ") if family.startswith("slot ") else f"slot {family}"
     if not isinstance(kind, str) or kind not in KINDS.get(other, {}) or kind in KINDS[family]:
         return None
@@ -131,43 +137,53 @@ def other_time(family: str, kind: object) -> str | None:
 
 
 def explain_kind_of_time(slotted: bool) -> str:
-    """Return the rule that a part of the other kind of time than the plant breaks."""
-    slots, flow = "in slots (linear)", "in continuous time (diffusion)"
-    needs, has = (flow, slots) if slotted else (slots, flow)
-    return f"belongs to plants {needs}, and this plant is {has}"
+    """Return the text of the rule that a component breaks which does not fit the plant's time.
 
-
-def names_of_kind(family: str, kind: object) -> dict[str, dict[str, str]]:
-    """Return the names of the table that are of a kind, with the choice that each one is; more than
-    one where a key beside ``kind`` chooses the class.
+    ``slotted`` is True if the plant is in slots and the component needs continuous time.
     """
-    split = {name: split_choice(name) for name in KINDS[family]}
-    return {name: choice for name, (known, choice) in split.items() if known == kind}
+    slots, flow = "in slots (linear)", "in continuous time (diffusion)"
+    needed_time, plant_time = (flow, slots) if slotted else (slots, flow)
+    return f"belongs to plants {needed_time}, and this plant is {plant_time}"
 
 
-def kinds_of(family: str) -> list[str]:
+def list_names_of_kind(family: str, kind: object) -> dict[str, dict[str, str]]:
+    """Return the names in KINDS[family] of one kind, each with the keys that choose it.
+
+    For example, track fusion has one name for each value of ``rule``, chosen by {"rule": "ci"}; a
+    kind with a single class has one name, chosen by {}.
+    """
+    choices: dict[str, dict[str, str]] = {}
+    for name in KINDS[family]:
+        kind_of_name, choice = split_choice(name)
+        if kind_of_name == kind:
+            choices[name] = choice
+    return choices
+
+
+def list_kinds(family: str) -> list[str]:
     """Return the kinds of a family, each once."""
     return list(dict.fromkeys(split_choice(name)[0] for name in KINDS[family]))
 
 
-def find(
-    family: str, kind: object, origin: Origin, choices: Mapping[str, Any] = MappingProxyType({})
+def find_kind(
+    family: str, kind: object, origin: Origin, table: Mapping[str, Any] = MappingProxyType({})
 ) -> type[Component] | None:
-    """Return the class of ``kind``: a kind of the table, or ``"package.module:Class"``. Where
-    several classes share the kind, ``choices`` has the key that tells which.
+    """Return the class that ``kind`` names: a kind of the family, or ``"package.module:Class"``.
 
-    It is None if the class waits for its import, see :class:`Origin`. Raises ScenarioError if there
-    is no such class, or if it may not be imported.
+    ``table`` has the other keys beside ``kind``; where several classes share the kind, one of these
+    chooses the class. Returns None for a user's class that is not loaded yet and must not be
+    imported (:class:`Origin`). Raises ScenarioError if the class does not exist or may not be
+    imported.
     """
-    named = names_of_kind(family, kind)
-    if named:
-        return KINDS[family][_chosen_name(named, choices)]
+    choices = list_names_of_kind(family, kind)
+    if choices:
+        return KINDS[family][_choose_name(choices, table)]
     if isinstance(kind, str) and ":" in kind:
-        return _custom(family, kind, origin)
-    reason = other_time(family, kind)
+        return _find_user_class(family, kind, origin)
+    reason = explain_if_other_time(family, kind)
     if reason is not None:
         raise ScenarioError("kind", reason, kind, "change the plant or choose another kind")
-    kinds = kinds_of(family)
+    kinds = list_kinds(family)
     listed = ", ".join(f'"{name}"' for name in kinds)
     raise ScenarioError(
         "kind",
@@ -177,39 +193,45 @@ def find(
     )
 
 
-def _chosen_name(named: Mapping[str, Mapping[str, str]], choices: Mapping[str, Any]) -> str:
-    """Return the one of several names that is chosen; raises ScenarioError if none is."""
-    for name, choice in named.items():
-        if all(choices.get(key) == value for key, value in choice.items()):
+def _choose_name(choices: Mapping[str, Mapping[str, str]], table: Mapping[str, Any]) -> str:
+    """Return the first name in ``choices`` whose keys and values are all in ``table``.
+
+    Raises ScenarioError if the table has none of them.
+    """
+    for name, choice in choices.items():
+        if all(table.get(key) == value for key, value in choice.items()):
             return name
-    key = next(iter(next(iter(named.values()))))
-    values = [choice[key] for choice in named.values()]
-    listed = ", ".join(f'"{value}"' for value in values)
-    if key not in choices:
+    first_choice = next(iter(choices.values()))
+    key = next(iter(first_choice))
+    listed = ", ".join(f'"{choice[key]}"' for choice in choices.values())
+    if key not in table:
         raise ScenarioError(key, "is missing", None, f"add {key}, one of {listed}")
-    raise ScenarioError(key, f"must be one of {listed}", choices[key], "choose one of them")
+    raise ScenarioError(key, f"must be one of {listed}", table[key], "choose one of them")
 
 
-def _custom(family: str, kind: str, origin: Origin) -> type[Component] | None:
-    """Return a user's class given as "package.module:Class", None if ``kind`` has another form."""
-    found = find_class(kind, origin)
-    if found is None:
+def _find_user_class(family: str, kind: str, origin: Origin) -> type[Component] | None:
+    """Return the class "package.module:Class"; None if it must not be imported, see ``find_class``.
+
+    Raises ScenarioError if it is not a class of the family or lacks a method that it must define.
+    """
+    cls = find_class(kind, origin)
+    if cls is None:
         return None
-    contract = FAMILIES[family]
-    allowed = (contract, *FORMER.get(family, ()))
-    if not (isinstance(found, type) and issubclass(found, allowed)):
+    base = FAMILIES[family]
+    bases = (base, *FORMER.get(family, ()))
+    if not (isinstance(cls, type) and issubclass(cls, bases)):
         raise ScenarioError(
             "kind",
-            f"must be a subclass of netkf's {contract.__name__}",
+            f"must be a subclass of netkf's {base.__name__}",
             kind,
-            f"derive the class from {contract.__module__}.{contract.__name__}",
+            f"derive the class from {base.__module__}.{base.__name__}",
         )
-    missing = sorted(name for name in dir(found) if _is_abstract(getattr(found, name, None)))
+    missing = sorted(name for name in dir(cls) if _is_abstract(getattr(cls, name, None)))
     if missing:
         raise ScenarioError(
             "kind", f"must define {', '.join(missing)}", kind, "write what the contract asks for"
         )
-    return found
+    return cls
 
 
 def _is_abstract(attribute: object) -> bool:
@@ -217,17 +239,20 @@ def _is_abstract(attribute: object) -> bool:
     return bool(getattr(attribute, "__isabstractmethod__", False))
 
 
-def name_of(family: str, part: Component) -> str:
-    """Return the name of the class of ``part`` in the table, or its ``package.module:Class``."""
+def name_of(family: str, component: Component) -> str:
+    """Return the name of a component's class in KINDS, or its ``package.module:Class``.
+
+    ``family`` may be that without "slot" or "continuous": these families are searched too.
+    """
     others = (KINDS.get(f"{time} {family}", {}) for time in ("slot", "continuous"))
-    for table in (KINDS[family], *others):
-        for name, candidate in table.items():
-            if type(part) is candidate:
+    for classes in (KINDS[family], *others):
+        for name, cls in classes.items():
+            if type(component) is cls:
                 return name
-    return f"{type(part).__module__}:{type(part).__qualname__}"
+    return f"{type(component).__module__}:{type(component).__qualname__}"
 
 
-def kind_name(part: Component, family: str = "filter") -> str:
-    """Return the kind of a part in a sentence: its name, or that of a user's class."""
-    name = name_of(family, part)
-    return type(part).__name__.lower() if ":" in name else name
+def kind_name(component: Component, family: str = "filter") -> str:
+    """Return the name of a component for messages: that in KINDS, else that of its class."""
+    name = name_of(family, component)
+    return type(component).__name__.lower() if ":" in name else name

@@ -20,17 +20,18 @@ from netkf.plants.sensors import LinearSensor, Sensor
 from netkf.rng.streams import Streams
 from netkf.scenario.model import PlacedSensor, ScenarioModel, takes_samples
 
-MAX_SAMPLES = 1e9  # samples of one sensor; more are a slip in a unit of time
+MAX_SAMPLES = 1e9  # samples of one sensor; more suggest a wrong unit of time
 
 
 def sample_times(scenario: ScenarioModel, streams: Streams) -> dict[tuple[int, int], FloatArray]:
-    """Return the times at which each sensor (node, ordinal) samples, below the horizon."""
+    """Return the sample times (K,) in seconds of each sensor (node, ordinal) in one run.
+
+    Only sensors that sample a diffusion are in it; times are below the horizon.
+    """
     times_of_sensors = {}
-    for node, placed_sensor in _iterate_placed(scenario):
-        sensor, generator = (
-            scenario.sensors[placed_sensor.entry],
-            _generator(streams, node, placed_sensor),
-        )
+    for node, placed_sensor in _iterate_sampled_sensors(scenario):
+        sensor = scenario.sensors[placed_sensor.entry]
+        generator = _make_generator(streams, node, placed_sensor)
         try:
             times = sensor.sample_times(node, placed_sensor.ordinal, generator, scenario.horizon)
         except ScenarioError as error:
@@ -42,29 +43,32 @@ def sample_times(scenario: ScenarioModel, streams: Streams) -> dict[tuple[int, i
 def sample_path(
     scenario: ScenarioModel, streams: Streams, node: int, placed_sensor: PlacedSensor
 ) -> Samples:
-    """Return the samples of one sensor of a node in one run."""
+    """Return the samples of one sensor of a node in one run in continuous time."""
     sensor: Sensor = scenario.located_sensors[placed_sensor.entry]
-    return sensor.samples(node, _generator(streams, node, placed_sensor), scenario.horizon)
+    return sensor.samples(node, _make_generator(streams, node, placed_sensor), scenario.horizon)
 
 
-def _iterate_placed(scenario: ScenarioModel) -> Iterator[tuple[int, PlacedSensor]]:
-    """Yield each sensor that takes samples, with its node."""
+def _iterate_sampled_sensors(scenario: ScenarioModel) -> Iterator[tuple[int, PlacedSensor]]:
+    """Yield (node, sensor) for each sensor that takes samples."""
     for node, placed_sensors in scenario.sampled_sensors.items():
         for placed_sensor in placed_sensors:
             yield node, placed_sensor
 
 
-def _generator(
+def _make_generator(
     streams: Streams, node: int, placed_sensor: PlacedSensor
 ) -> Callable[[str], np.random.Generator]:
-    """Return a function from a purpose to the random generator of a sensor."""
+    """Return a function that returns a sensor's own random generator for a purpose."""
     return lambda purpose: streams.generator(purpose, node, placed_sensor.ordinal)
 
 
 def sample_rate(scenario: ScenarioModel, node: int) -> float:
-    """Return the samples per second of a node in the long run; nan if unknown before a run."""
+    """Return the mean rate at which a node takes samples, per second.
+
+    It is nan if unknown before a run, and for several sensors, which may sample at one instant.
+    """
     placed_sensors = scenario.sampled_sensors.get(node, ())
-    if len(placed_sensors) != 1:  # several may sample at one instant
+    if len(placed_sensors) != 1:
         return math.nan if placed_sensors else 0.0
     sensor = scenario.sensors[placed_sensors[0].entry]
     clock = getattr(sensor, "sampling", None)
@@ -77,24 +81,26 @@ def all_sample_times(times: dict[tuple[int, int], FloatArray]) -> FloatArray:
 
 
 def uses_grid(scenario: ScenarioModel) -> bool:
-    """Return True if the truth in continuous time is drawn on a sensing grid.
+    """Return True if the states of a diffusion are drawn on a grid of sensing periods.
 
-    That is so if sensors give increments, or if nothing samples.
+    They are if sensors give increments, or if no sensor takes samples.
     """
-    drawn = not scenario.slotted and scenario.plant.is_random
-    return drawn and (bool(scenario.increment_sensors) or not scenario.sampled_sensors)
+    is_drawn = not scenario.slotted and scenario.plant.is_random
+    return is_drawn and (bool(scenario.increment_sensors) or not scenario.sampled_sensors)
 
 
 def require_states(scenario: ScenarioModel, times: dict[tuple[int, int], FloatArray]) -> None:
-    """Raise ScenarioError where a recorded truth lacks the state at a probe time, or at the sample
-    time of a sensor that is drawn.
+    """Raise ScenarioError if a recorded diffusion lacks the state at a time that a run needs.
+
+    These are the probe times, and the sample times of sensors whose readings are drawn. ``times``
+    are the sample times (K,) in seconds by (node, ordinal).
     """
     plant = scenario.plant
     if not isinstance(plant, RecordedDiffusion):
         return
     try:
         plant.demand(scenario.times, "the probe")
-        for node, placed_sensor in _iterate_placed(scenario):
+        for node, placed_sensor in _iterate_sampled_sensors(scenario):
             if scenario.sensors[placed_sensor.entry].is_random:
                 plant.demand(times[node, placed_sensor.ordinal], f"a sample of node {node}")
     except ScenarioError as error:
@@ -102,8 +108,10 @@ def require_states(scenario: ScenarioModel, times: dict[tuple[int, int], FloatAr
 
 
 def check_sampling(scenario: ScenarioModel) -> None:
-    """Raise ScenarioError where sampled sensors, or a recorded or unknown diffusion, do not fit the
-    rest of the scenario.
+    """Raise ScenarioError if the sampling of a sensor does not fit the plant or the graph.
+
+    Sensors of a recorded or unknown diffusion must take samples, and a recorded diffusion must have
+    the states that replica 0 needs.
     """
     for k, sensor in enumerate(scenario.sensors):
         key = f"sensors[{k}]"
@@ -135,7 +143,10 @@ def check_sampling(scenario: ScenarioModel) -> None:
 
 
 def _check_clock(scenario: ScenarioModel, key: str, sensor: LinearSensor | NonlinearSensor) -> None:
-    """Raise ScenarioError if a sampling clock does not fit its sensor."""
+    """Raise ScenarioError if a sensor's sampling clock does not fit it, the plant or the graph.
+
+    ``key`` is the key path of the sensor.
+    """
     clock = sensor.sampling
     assert clock is not None
     if scenario.slotted:
@@ -175,14 +186,13 @@ def _check_clock(scenario: ScenarioModel, key: str, sensor: LinearSensor | Nonli
 
 
 def sampling_notes(scenario: ScenarioModel) -> tuple[str, ...]:
-    """Return a line for each table without readings of some node of its sensor."""
+    """Return a line for each recorded sensor whose table has no readings of some of its nodes."""
     notes: list[str] = []
     for sensor in scenario.sensors:
         if not isinstance(sensor, RecordedSensor):
             continue
-        times = {node: sensor.recorded_times(node) for node in sensor.nodes}
-        empty = [node for node, t in times.items() if not len(t)]
-        if empty:
-            listed = ", ".join(map(str, empty[:3])) + (", ..." if len(empty) > 3 else "")
+        nodes = [node for node in sensor.nodes if not len(sensor.recorded_times(node))]
+        if nodes:
+            listed = ", ".join(map(str, nodes[:3])) + (", ..." if len(nodes) > 3 else "")
             notes.append(f"{sensor.path.name} has no readings of node {listed}")
     return tuple(notes)

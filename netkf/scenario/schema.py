@@ -18,7 +18,7 @@ from netkf.algorithms.registry import split_choice
 from netkf.core.fields import Component, Rule
 from netkf.network.channels import Channel
 from netkf.scenario.model import Belief, Filtering, Network, ScenarioModel
-from netkf.scenario.registry import KINDS, kinds_of
+from netkf.scenario.registry import KINDS, list_kinds
 from netkf.scenario.scenario import Scenario
 from netkf.scenario.tables import FORMAT
 
@@ -180,7 +180,7 @@ def _kinds_of_time() -> list[Schema]:
 
     def then(activations: str, filters: Sequence[str]) -> Schema:
         """Return the schema that limits activation and filter to these kinds."""
-        limits = {"activation": _kind_among(kinds_of(activations))}
+        limits = {"activation": _kind_among(list_kinds(activations))}
         network = {"type": "object", "properties": limits}
         return {"properties": {"network": network, "filter": _kind_among(filters)}}
 
@@ -192,7 +192,7 @@ def _kinds_of_time() -> list[Schema]:
         if getattr(cls, "clocks", ()) or not getattr(cls, "talks", True)
     }
     return [
-        {"if": slots, "then": then("slot activation", kinds_of("slot filter"))},
+        {"if": slots, "then": then("slot activation", list_kinds("slot filter"))},
         {"if": flow, "then": then("activation", [*clocked])},
     ]
 

@@ -7,13 +7,16 @@ from netkf.linalg.arrays import FloatArray
 
 
 def require_shape(key: str, value: FloatArray, shape: tuple[int | None, ...], why: str) -> None:
-    """Raise ScenarioError unless an array has the shape; None stands for any length."""
+    """Raise ScenarioError at ``key`` unless an array has the shape, in which None is any length.
+
+    ``why`` is the reason in the message.
+    """
     fits = len(value.shape) == len(shape) and all(
-        want is None or have == want for have, want in zip(value.shape, shape, strict=True)
+        length is None or actual == length
+        for actual, length in zip(value.shape, shape, strict=True)
     )
     if not fits:
-        wanted = " x ".join("any" if want is None else str(want) for want in shape)
-        got = " x ".join(map(str, value.shape))
-        raise ScenarioError(
-            key, f"must be {wanted}, not {got}, because {why}", value, "correct the shape"
-        )
+        expected = " x ".join("any" if length is None else str(length) for length in shape)
+        actual_shape = " x ".join(map(str, value.shape))
+        rule = f"must be {expected}, not {actual_shape}, because {why}"
+        raise ScenarioError(key, rule, value, "correct the shape")

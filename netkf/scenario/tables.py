@@ -15,7 +15,7 @@ from netkf.scenario.derived import DerivedScenario
 from netkf.scenario.imports import Origin
 from netkf.scenario.model import Belief, Filtering, Network
 from netkf.scenario.plugins import describe_error, explain_user_error, is_netkf_class
-from netkf.scenario.registry import KINDS, SLOTTED, find, names_of_kind
+from netkf.scenario.registry import KINDS, SLOTTED, find_kind, list_names_of_kind
 from netkf.scenario.writing import as_table, part_as_table
 
 FORMAT = 1
@@ -216,8 +216,8 @@ def _kind(
     kind = table.pop("kind", default)
     if kind is None:
         raise ScenarioError("kind", "is missing", None, 'add kind = "..."')
-    cls = find(family, kind, origin, table)
-    keys = [key for choice in names_of_kind(family, kind).values() for key in choice]
+    cls = find_kind(family, kind, origin, table)
+    keys = [key for choice in list_names_of_kind(family, kind).values() for key in choice]
     others = ("kind", *dict.fromkeys(keys))
     for key in others[1:]:
         del table[key]

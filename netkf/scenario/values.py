@@ -1,4 +1,4 @@
-"""Values of scenario keys on a command line: TOML, or bare words."""
+"""Values of scenario keys on a command line: TOML expressions, or words without quotes."""
 
 from __future__ import annotations
 
@@ -7,13 +7,16 @@ from typing import Any
 from netkf.core.errors import ScenarioError
 from netkf.scenario.reading import parse_toml
 
-MAX_WORD = 1000
+MAX_WORD = 1000  # characters of a value that is not TOML and is taken as a text
 MAX_SETTING = 100_000
 """Characters of a setting; Linux passes no argument of more than 131,071."""
 
 
 def split_setting(option: str, setting: str) -> tuple[str, str]:
-    """Return key path and text of ``key.path=value``; raises ScenarioError at the ``option``."""
+    """Return the key path and the value's text of ``key.path=value``.
+
+    Raises ScenarioError, with the name of the ``option`` as its key, for another form.
+    """
     _require_short(option, setting)
     key, equals, text = (part.strip() for part in setting.partition("="))
     if not equals or not key or not text:
@@ -24,10 +27,13 @@ def split_setting(option: str, setting: str) -> tuple[str, str]:
     return key, text
 
 
-def typed_value(option: str, key: str, text: str) -> Any:
-    """Return the value of a text: TOML, or a string for bare words."""
+def parse_value(option: str, key: str, text: str) -> Any:
+    """Return the value of a TOML expression, or the text itself if it is words without quotes.
+
+    Raises ScenarioError at ``option`` for a text that is neither; ``key`` is named in the message.
+    """
     try:
-        return _parse_value(text)
+        return _parse_toml_value(text)
     except (ValueError, RecursionError):
         if text[0] in "[{\"'" or not text.isprintable() or len(text) > MAX_WORD:
             rule = f"value of {key} is not valid TOML"
@@ -36,42 +42,47 @@ def typed_value(option: str, key: str, text: str) -> Any:
         return text
 
 
-def typed_values(option: str, key: str, text: str) -> list[Any]:
-    """Return the values of ``v1,v2,...``; commas inside brackets and quotes separate nothing."""
+def parse_values(option: str, key: str, text: str) -> list[Any]:
+    """Return the values of ``v1,v2,...``, each as :func:`parse_value` reads it.
+
+    Commas inside brackets and quotes do not separate values.
+    """
     _require_short(option, text)
     try:
-        values = _parse_value(f"[{text}]")
+        values = _parse_toml_value(f"[{text}]")
     except (ValueError, RecursionError):
-        return [typed_value(option, key, part.strip() or " ") for part in _split_list(text)]
+        items = _split_at_commas(text)
+        return [parse_value(option, key, item.strip() or " ") for item in items]
     return list(values)
 
 
 def _require_short(option: str, text: str) -> None:
-    """Raise ScenarioError for a setting that is too long."""
+    """Raise ScenarioError at ``option`` for a text of more than MAX_SETTING characters."""
     if len(text) > MAX_SETTING:
         rule = f"must have at most {MAX_SETTING:,} characters"
         raise ScenarioError(option, rule, len(text), "write long values into the file")
 
 
-def _parse_value(text: str) -> Any:
-    """Return the value of a TOML expression."""
+def _parse_toml_value(text: str) -> Any:
+    """Return the value of a TOML expression; raises ValueError or RecursionError if invalid."""
     table = parse_toml(f"value = {text}")
-    if list(table) != ["value"]:
+    if list(table) != ["value"]:  # the text has a line break and further keys
         raise ValueError
     return table["value"]
 
 
-def _split_list(text: str) -> list[str]:
-    """Return the parts of a text between its commas, except those in quotes and brackets."""
-    parts, depth, quote = [""], 0, ""
-    for letter in text:
-        if quote:
-            quote = "" if letter == quote else quote
-        elif letter in "\"'":
-            quote = letter
-        depth += (letter in "[{") - (letter in "]}") if not quote else 0
-        if letter == "," and depth == 0 and not quote:
-            parts.append("")
+def _split_at_commas(text: str) -> list[str]:
+    """Return the items between the commas of a text that are not inside quotes or brackets."""
+    items, depth, open_quote = [""], 0, ""
+    for character in text:
+        if open_quote:
+            open_quote = "" if character == open_quote else open_quote
+        elif character in "\"'":
+            open_quote = character
+        if not open_quote:
+            depth += (character in "[{") - (character in "]}")
+        if character == "," and depth == 0 and not open_quote:
+            items.append("")
         else:
-            parts[-1] += letter
-    return parts
+            items[-1] += character
+    return items

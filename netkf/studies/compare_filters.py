@@ -24,7 +24,7 @@ from netkf.runs.files import check_sources, create_output_directory, write_scena
 from netkf.runs.parquet_files import write_table
 from netkf.runs.provenance import versions
 from netkf.runs.simulate import choose_engine
-from netkf.scenario.registry import kinds_of, name_of
+from netkf.scenario.registry import list_kinds, name_of
 from netkf.scenario.scenario import Scenario
 from netkf.scenario.writing import as_table, part_as_table
 from netkf.studies.filter_values import (
@@ -302,7 +302,7 @@ def _filter_table(scenario: Scenario, choice: Any) -> dict[str, Any]:
     own_table = as_table(scenario)["filter"]
     table = {"kind": choice} if isinstance(choice, str) else dict(choice)
     kind = table.get("kind")
-    kinds = sorted(kinds_of("filter"))
+    kinds = sorted(list_kinds("filter"))
     if not isinstance(kind, str) or (":" not in kind and kind not in kinds):
         hint = nearest(kind, kinds) if isinstance(kind, str) else ""
         raise ScenarioError(

@@ -13,7 +13,7 @@ import numpy as np
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import Component
 from netkf.scenario.scenario import Scenario
-from netkf.scenario.values import split_setting, typed_values
+from netkf.scenario.values import parse_values, split_setting
 from netkf.scenario.writing import part_as_table, resolve_defaults, toml_text
 
 MAX_POINTS = 10_000  # more are a slip
@@ -32,7 +32,7 @@ def parse_grid(settings: Sequence[str]) -> dict[str, list[Any]]:
             raise ScenarioError("--vary", f"{key} is varied twice", setting, "give all in one list")
         evenly = _RANGE.match(text)
         grid[key] = (
-            _even_values(key, *evenly.groups()) if evenly else typed_values("--vary", key, text)
+            _even_values(key, *evenly.groups()) if evenly else parse_values("--vary", key, text)
         )
     return grid
 
