@@ -1,4 +1,4 @@
-"""What the live part of a page knows of a run: columns of numbers, thinned by a stated rule."""
+"""The data of a run for the live views of a page: columns of numbers, thinned if there are many."""
 
 from __future__ import annotations
 
@@ -10,59 +10,65 @@ import networkx
 import numpy as np
 import scipy.special
 
-from netkf.report.directories import Opened
+from netkf.report.directories import ReportSource
 from netkf.report.innovations import innovation_columns
 from netkf.report.messages import (
-    Kept,
+    ThinnedMessages,
+    count_traffic,
     information_age,
-    keep_messages,
-    traffic,
+    thin_messages,
 )
 from netkf.report.packing import Packer
-from netkf.report.worst import Worst
+from netkf.report.worst import WorstSample
 from netkf.runs.innovations import Innovations
 from netkf.runs.stored import StoredRun
 from netkf.runs.summary import nees_bounds
 from netkf.trace.schema import CODES
 
 BINS = 60
-"""Parts of a run over which traffic is counted."""
+"""Equal intervals of a run in which traffic is counted."""
 MAX_KAMADA_KAWAI = 150
-"""Nodes up to which links are drawn about equally long; above, a spring layout is faster."""
+"""Nodes up to which the layout of Kamada and Kawai is computed, which draws links of about equal
+length; for more nodes a spring layout is faster.
+"""
 MAX_LINKS = 20_000
+"""Directed links that a page draws."""
 MAX_MARKS = 5_000
+"""Events of the kinds MARKS that a page holds."""
 MARKS = ("stop", "crash", "restart", "diverged", "swap")
-"""Events of nodes that views mark beside samples and messages."""
+"""Kinds of events of nodes that views mark beside samples and messages."""
 ELLIPSE_LEVEL = 0.95  # probability within the ellipses and intervals that are drawn
 
 
 class Budget(NamedTuple):
-    """The most messages and sample values (numbers) of one run that a page holds."""
+    """The largest numbers of messages and of sample values (numbers) of one run on a page."""
 
     messages: int
     values: int
 
     def halve(self) -> Budget:
-        """Return half of it."""
+        """Return a budget of half the size."""
         return Budget(self.messages // 2, self.values // 2)
 
 
 def run_data(
-    source: Opened,
+    source: ReportSource,
     run: StoredRun,
     messages: np.ndarray,
     readings: Innovations | str | None,
     budget: Budget,
     packer: Packer,
 ) -> dict[str, Any]:
-    """Return what the views show of the trace of a source with these MESSAGE rows and innovations
-    of its ``readings``; columns go to ``packer``.
+    """Return the data of a recorded run for the live views, as JSON values.
+
+    ``messages`` are the MESSAGE rows of the run, ``readings`` its innovations or the reason why
+    there are none. Columns of numbers are added to ``packer``, and the data refer to them.
     """
     worst = None if source.worst is None else source.worst.explained
     horizon = float(source.scenario.horizon)
     instant = worst.time if worst is not None else horizon
-    times = sample_indices(run, budget.values, instant)
-    kept = keep_messages(messages, budget.messages, instant)
+    rows = sample_indices(run, budget.values, instant)
+    thinned = thin_messages(messages, budget.messages, instant)
     return {
         "label": source.label,
         "name": source.scenario.name,
@@ -83,12 +89,12 @@ def run_data(
         "links": [list(pair) for pair in source.scenario.topology.directions[:MAX_LINKS]],
         "worst": _worst_data(worst),
         "scale": _interval_scales(),
-        "samples": _sample_columns(source, run, times, messages, packer),
-        "messages": _message_columns(kept, run, packer),
+        "samples": _sample_columns(source, run, rows, messages, packer),
+        "messages": _message_columns(thinned, run, packer),
         "senses": _event_columns(run, ("sense",), budget.messages // 2, packer),
         "marks": _event_columns(run, MARKS, MAX_MARKS, packer),
         "innovations": innovation_columns(readings, run.nodes, budget.messages // 4, packer),
-        "traffic": traffic(messages, horizon, BINS),
+        "traffic": count_traffic(messages, horizon, BINS),
         "totals": {
             "events": len(run.log),
             "messages": len(messages),
@@ -100,7 +106,7 @@ def run_data(
 
 
 def thinning_rules(data: dict[str, Any]) -> list[str]:
-    """Return sentences on the parts of a run that the page leaves out, if any."""
+    """Return sentences on the rows that ``run_data`` left out of the data of a run, if any."""
     rules = []
     messages, totals = data["messages"], data["totals"]
     if messages["step"] > 1:
@@ -125,39 +131,46 @@ def thinning_rules(data: dict[str, Any]) -> list[str]:
         ("marks", "other events of nodes"),
         ("innovations", "innovations"),
     ):
-        part = data[name]
-        if part is not None and part["step"] > 1:
-            rules.append(f"of {part['total']:,} {label} the page holds every {part['step']}th")
+        columns = data[name]
+        if columns is not None and columns["step"] > 1:
+            rules.append(
+                f"of {columns['total']:,} {label} the page holds every {columns['step']}th"
+            )
     return rules
 
 
-def sample_indices(run: StoredRun, values: int, instant: float) -> np.ndarray:
-    """Return the indices of the samples to keep, so that there are at most about ``values``
-    numbers: every k-th, the last one, that at ``instant``, and the worst instant of each node.
+def sample_indices(run: StoredRun, max_values: int, instant: float) -> np.ndarray:
+    """Return the sorted indices of the samples that a page holds.
+
+    They are all samples, or if these have more than ``max_values`` numbers every k-th, the last
+    one, the one at ``instant`` (seconds), and that with the largest error of each node.
     """
     n, count = run.x.shape[1], len(run.nodes)
-    each = count * (n + n * (n + 1) // 2 + 4) + n + 1
-    most = max(2, values // max(1, each))
+    # The numbers of a sample: for each node xhat, the upper triangle of P, squared error, NEES,
+    # bound and age of information; for all nodes x and the time.
+    values_per_sample = count * (n + n * (n + 1) // 2 + 4) + n + 1
+    max_samples = max(2, max_values // max(1, values_per_sample))
     total = len(run.times)
-    if total <= most:
+    if total <= max_samples:
         return np.arange(total)
-    step = -(-total // max(1, most - 1))
+    step = -(-total // max(1, max_samples - 1))
     at_instant = min(int(np.searchsorted(run.times, instant)), total - 1)
-    chosen = {*range(0, total, step), at_instant, total - 1}
+    indices = {*range(0, total, step), at_instant, total - 1}
     if run.truth_known:
         error = np.where(np.isfinite(run.sq_error), run.sq_error, -1.0)
-        chosen |= set(error.argmax(axis=0).tolist())
-    return np.array(sorted(chosen))
+        indices |= set(error.argmax(axis=0).tolist())
+    return np.array(sorted(indices))
 
 
-def positions(source: Opened, run: StoredRun) -> list[list[float]]:
-    """Return a place (x, y) between 0 and 1 for each node, y downwards: the scenario's positions to
-    scale, or a layout by the links.
+def positions(source: ReportSource, run: StoredRun) -> list[list[float]]:
+    """Return a position [x, y] between 0 and 1 for each node, y downwards.
+
+    They are the positions of the scenario to scale or, if a node has none, a layout by the links.
     """
-    given: Mapping[int, Any] | None = source.scenario.topology.positions
-    if given is None or any(node not in given for node in run.nodes):
-        given = _make_layout(source, run)
-    points = np.array([given[node] for node in run.nodes], dtype=float).reshape(-1, 2)
+    coordinates: Mapping[int, Any] | None = source.scenario.topology.positions
+    if coordinates is None or any(node not in coordinates for node in run.nodes):
+        coordinates = _make_layout(source, run)
+    points = np.array([coordinates[node] for node in run.nodes], dtype=float).reshape(-1, 2)
     if not len(points) or not np.isfinite(points).all():
         return [[0.5, 0.5] for _ in run.nodes]
     low, high = points.min(axis=0), points.max(axis=0)
@@ -166,20 +179,23 @@ def positions(source: Opened, run: StoredRun) -> list[list[float]]:
     return [[round(0.5 + x, 5), round(0.5 - y, 5)] for x, y in points.tolist()]
 
 
-def _make_layout(source: Opened, run: StoredRun) -> dict[int, Any]:
-    """Return coordinates for the nodes of a graph that has none of its own."""
+def _make_layout(source: ReportSource, run: StoredRun) -> dict[int, Any]:
+    """Return coordinates (2,) for each node, computed from the links."""
     graph: networkx.Graph[int] = networkx.Graph()
     graph.add_nodes_from(run.nodes)
     graph.add_edges_from(source.scenario.topology.links)
-    few = len(graph) <= MAX_KAMADA_KAWAI and networkx.is_connected(graph) if graph else False
-    if few:
+    # The layout of Kamada and Kawai needs a path between all nodes, and time of order N^3.
+    if 0 < len(graph) <= MAX_KAMADA_KAWAI and networkx.is_connected(graph):
         return networkx.kamada_kawai_layout(graph)
     return networkx.spring_layout(graph, seed=1, iterations=30)
 
 
-def _flow_kind(source: Opened) -> str:
-    """Return how information flows: nodes ``combine`` what they hear, ``swap`` it for their own,
-    send ``readings`` that nobody passes on, or one filter has the readings of all (``pooled``).
+def _flow_kind(source: ReportSource) -> str:
+    """Return how messages change the information of their receivers.
+
+    ``combine``: receivers combine the estimates with their own; ``swap``: two nodes exchange their
+    estimates; ``readings``: messages carry readings, which receivers do not forward; ``pooled``:
+    one filter uses the readings of all nodes.
     """
     node_filter = source.scenario.node_filter
     if node_filter.pooled:
@@ -187,9 +203,11 @@ def _flow_kind(source: Opened) -> str:
     return node_filter.combination if node_filter.combination in ("swap", "readings") else "combine"
 
 
-def _state_axes(source: Opened, run: StoredRun, worst: Worst | None) -> list[int]:
-    """Return the two components of the state to show first: the two that sensors see if one of
-    them was furthest off at the worst instant, else those that were furthest off.
+def _state_axes(source: ReportSource, run: StoredRun, worst: WorstSample | None) -> list[int]:
+    """Return the indices of the two components of the state to show first.
+
+    They are the first two that sensors measure, unless another component had the largest error at
+    the worst sample: then the two components with the largest errors.
     """
     n = run.x.shape[1]
     observed_states: set[int] = set()
@@ -197,78 +215,89 @@ def _state_axes(source: Opened, run: StoredRun, worst: Worst | None) -> list[int
         H = getattr(sensor, "H", None)
         if H is not None:
             observed_states |= set(np.flatnonzero(np.any(np.asarray(H) != 0.0, axis=0)).tolist())
-    first = sorted(observed_states)[:2] if len(observed_states) >= 2 else [0, min(1, n - 1)]
+    axes = sorted(observed_states)[:2] if len(observed_states) >= 2 else [0, min(1, n - 1)]
     if worst is None or not worst.by_error:
-        return first
-    k, column = int(np.searchsorted(run.times, worst.time)), run.nodes.index(worst.node)
-    off = np.argsort(-np.abs(run.error[k, column]), kind="stable").tolist()
-    return first if off[0] in first else sorted(off[:2])
+        return axes
+    row, column = int(np.searchsorted(run.times, worst.time)), run.nodes.index(worst.node)
+    by_error = np.argsort(-np.abs(run.error[row, column]), kind="stable").tolist()
+    return axes if by_error[0] in axes else sorted(by_error[:2])
 
 
 def _is_broadcast(run: StoredRun) -> bool:
-    """Return True if the messages of one node at one instant are one transmission."""
+    """Return True if the messages that a node sends at the same time are one transmission."""
+    # Messages in slots have a phase of 0 or more.
     in_slots = bool((run.log["phase"][run.log["kind"] == CODES["send"]] >= 0).any())
     return in_slots or run.count("transmit") > 0
 
 
-def _worst_data(worst: Worst | None) -> dict[str, Any] | None:
-    """Return the worst sample as an entry of the page's data."""
+def _worst_data(worst: WorstSample | None) -> dict[str, Any] | None:
+    """Return the worst sample as JSON values, None without one."""
     return None if worst is None else worst._asdict()
 
 
 def _interval_scales() -> dict[str, float]:
-    """Return the half axes of 95 % ellipses and intervals, in standard deviations."""
+    """Return the half axes of ellipses and intervals of probability ELLIPSE_LEVEL, in standard
+    deviations of a normal distribution.
+    """
     return {
         "ellipse": math.sqrt(float(scipy.special.chdtri(2, 1.0 - ELLIPSE_LEVEL))),
         "interval": float(scipy.special.ndtri(0.5 + 0.5 * ELLIPSE_LEVEL)),
     }
 
 
-def _drawing_limits(source: Opened) -> dict[str, Any]:
-    """Return the horizontal lines of curves: limits of the bound and the interval of NEES."""
+def _drawing_limits(source: ReportSource) -> dict[str, Any]:
+    """Return the finite limits of trace P, by the labels of the horizontal lines that show them."""
     promised = source.promised
     if promised is None:
         return {}
-    known = {promised.limit_label: promised.limit, "centralised filter": promised.central}
-    return {name: value for name, value in known.items() if math.isfinite(value)}
+    limits = {promised.limit_label: promised.limit, "centralised filter": promised.central}
+    return {name: value for name, value in limits.items() if math.isfinite(value)}
 
 
 def _sample_columns(
-    source: Opened, run: StoredRun, chosen: np.ndarray, messages: np.ndarray, packer: Packer
+    source: ReportSource, run: StoredRun, rows: np.ndarray, messages: np.ndarray, packer: Packer
 ) -> dict[str, Any]:
-    """Return the ``chosen`` samples as packed columns."""
+    """Return the samples with the indices ``rows`` as packed columns, their number, the step
+    between them, and the interval of NEES.
+    """
     n = run.x.shape[1]
     i, j = np.triu_indices(n)
     total = len(run.times)
-    times = run.times[chosen]
-    ages = information_age(messages, run.nodes, times, source.cuts(times))
+    times = run.times[rows]
+    ages = information_age(messages, run.nodes, times, source.cutoffs(times))
     columns = {
         "t": packer.add(times, "f8"),
-        "xhat": packer.add(run.xhat[chosen], "f8"),
-        "P": packer.add(run.P[chosen][..., i, j], "f8"),
+        "xhat": packer.add(run.xhat[rows], "f8"),
+        "P": packer.add(run.P[rows][..., i, j], "f8"),
         "age": packer.add(ages, "f8"),
     }
     if run.truth_known:
-        columns["x"] = packer.add(run.x[chosen], "f8")
-        columns["sq_error"] = packer.add(run.sq_error[chosen], "f8")
-        columns["nees"] = packer.add(run.nees[chosen], "f8")
+        columns["x"] = packer.add(run.x[rows], "f8")
+        columns["sq_error"] = packer.add(run.sq_error[rows], "f8")
+        columns["nees"] = packer.add(run.nees[rows], "f8")
     bound = source.promised.bound if source.promised is not None else None
     if bound is not None and bound.shape == (total, len(run.nodes)):
-        columns["bound"] = packer.add(bound[chosen], "f8")
+        columns["bound"] = packer.add(bound[rows], "f8")
     low, high = nees_bounds(n)
-    step = 1 if len(chosen) == total else int(chosen[1] - chosen[0]) if len(chosen) > 1 else 1
-    step = max(step, 2) if len(chosen) < total else 1
-    return {"columns": columns, "count": len(chosen), "step": step, "nees_interval": [low, high]}
+    step = 1
+    if len(rows) < total:
+        # Thinned samples are said to be thinned, even if the first two are neighbours.
+        step = max(int(rows[1] - rows[0]), 2) if len(rows) > 1 else 2
+    return {"columns": columns, "count": len(rows), "step": step, "nees_interval": [low, high]}
 
 
-def _message_columns(kept: Kept, run: StoredRun, packer: Packer) -> dict[str, Any]:
-    """Return the messages as packed columns."""
-    messages = kept.messages
+def _message_columns(thinned: ThinnedMessages, run: StoredRun, packer: Packer) -> dict[str, Any]:
+    """Return messages as packed columns, with the rule by which they were thinned.
+
+    ``travel`` is 0 for a message that took no time, else the time (s) at which it ended; ``number``
+    is the difference from the previous row modulo 2^32.
+    """
+    messages = thinned.messages
     nodes = np.array(run.nodes)
     ended = np.where(np.isnan(messages["ended"]), np.inf, messages["ended"])
     columns = {
         "sent": packer.add(messages["sent"], "f8"),
-        # Most messages take no time: zeros cost nothing.
+        # Most messages take no time, and zeros compress to almost nothing.
         "travel": packer.add(np.where(ended == messages["sent"], 0.0, ended), "f8"),
         "age": packer.add(np.nan_to_num(messages["age"], nan=0.0), "f8"),
         "sender": packer.add(np.searchsorted(nodes, messages["sender"]), "u2"),
@@ -277,28 +306,30 @@ def _message_columns(kept: Kept, run: StoredRun, packer: Packer) -> dict[str, An
         "phase": packer.add(np.clip(messages["phase"], -1, 32767), "i2"),
         "outcome": packer.add(messages["outcome"], "u1"),
     }
-    bounded = kept.step > 1
+    is_thinned = thinned.step > 1
     return {
         "columns": columns,
         "count": len(messages),
-        "step": kept.step,
-        "start": kept.start if bounded else None,
-        "end": kept.end if bounded else None,
+        "step": thinned.step,
+        "start": thinned.start if is_thinned else None,
+        "end": thinned.end if is_thinned else None,
     }
 
 
 def _event_columns(
-    run: StoredRun, kinds: tuple[str, ...], most: int, packer: Packer
+    run: StoredRun, kinds: tuple[str, ...], max_events: int, packer: Packer
 ) -> dict[str, Any]:
-    """Return the events of some kinds, every k-th if there are more than ``most``."""
+    """Return the events of these kinds as packed columns, every k-th if there are more than
+    ``max_events``.
+    """
     codes = [CODES[kind] for kind in kinds]
     rows = run.log[np.isin(run.log["kind"], codes)]
-    step = max(1, -(-len(rows) // max(1, most)))
-    kept = rows[::step]
+    step = max(1, -(-len(rows) // max(1, max_events)))
+    events = rows[::step]
     columns = {
-        "t": packer.add(kept["t"], "f8"),
-        "node": packer.add(np.searchsorted(np.array(run.nodes), kept["node"]), "u2"),
-        "kind": packer.add(kept["kind"], "u1"),
+        "t": packer.add(events["t"], "f8"),
+        "node": packer.add(np.searchsorted(np.array(run.nodes), events["node"]), "u2"),
+        "kind": packer.add(events["kind"], "u1"),
     }
     names = {CODES[kind]: kind for kind in kinds}
     return {"columns": columns, "step": step, "total": len(rows), "names": names}

@@ -1,4 +1,6 @@
-"""What a page shows of one directory: a run, an ensemble, a sweep, a verdict or a comparison."""
+"""The contents of a directory for a page: a run, an ensemble, a sweep, a verdict or a comparison
+of filters.
+"""
 
 from __future__ import annotations
 
@@ -13,9 +15,9 @@ from netkf.core.errors import ScenarioError
 from netkf.core.printable import shorten
 from netkf.ensembles.stored import StoredEnsemble
 from netkf.linalg.arrays import FloatArray
-from netkf.report.worst import WorstSample, worst_sample
-from netkf.runs.documents import NUMBER, TEXT, TEXTS, require_form
-from netkf.runs.stored import StoredRun, read_checked_document
+from netkf.report.worst import WorstSamples, find_worst_samples
+from netkf.runs.documents import NUMBER, TEXT, TEXTS, require
+from netkf.runs.stored import StoredRun, read_form
 from netkf.runs.summary import PromisedTraces
 from netkf.runs.tables import COLUMNS
 from netkf.scenario.scenario import Scenario
@@ -27,7 +29,7 @@ from netkf.studies.stored import VERDICT, StoredComparison, StoredVerdict
 MAX_TEXT = 200_000
 """Characters of a scenario file that a page repeats."""
 SLOT_ROUNDING = 1e-6
-"""Share of a slot by which the time of a sample may lie before the slot begins."""
+"""Fraction of a slot by which rounding may put the time of a sample before the slot begins."""
 ROW: dict[str, Any] = dict.fromkeys(COLUMNS, NUMBER)
 SUMMARY: dict[str, Any] = {
     "nodes": [ROW],
@@ -37,15 +39,19 @@ SUMMARY: dict[str, Any] = {
     "notes": TEXTS,
     "messages": {"in_flight?": NUMBER},
 }
-"""What a page needs of summary.json, beside what ``netkf.open`` has checked."""
+"""The form of the entries of summary.json that a page reads and ``netkf.open`` does not check."""
 
 
 @dataclass(frozen=True, eq=False)
-class Opened:
-    """A directory as a page shows it; what it does not have is None or empty.
+class ReportSource:
+    """The contents of a directory for a page; None or empty if the directory does not have them.
 
-    ``label`` is the directory as the user has named it; ``run`` a recorded run with its trace, of
-    an ensemble too; ``filters`` a comparison of filters; ``verdict`` the contents of verdict.json.
+    label         : the directory as the user has named it
+    manifest      : the contents of manifest.json
+    scenario_text : the scenario file
+    run           : the recorded run, or one recorded run of an ensemble, with its trace
+    filters       : a comparison of filters
+    verdict       : the contents of verdict.json
     """
 
     label: str
@@ -60,7 +66,7 @@ class Opened:
 
     @property
     def kind(self) -> str:
-        """Return the kind of the directory: run, ensemble, sweep, filters or verdict."""
+        """The kind of the directory: run, ensemble, sweep, filters or verdict."""
         if self.sweep is not None:
             return "sweep"
         if self.filters is not None:
@@ -71,36 +77,36 @@ class Opened:
 
     @property
     def summary(self) -> dict[str, Any]:
-        """Return the contents of summary.json, empty if there is none."""
-        found = self.ensemble if self.ensemble is not None else self.run
-        return {} if found is None else found.summary
+        """The contents of summary.json, empty if there is none."""
+        stored = self.ensemble if self.ensemble is not None else self.run
+        return {} if stored is None else stored.summary
 
     @property
     def promised(self) -> PromisedTraces | None:
-        """Return bounds and limits at the sample times, None without samples."""
-        found = self.ensemble if self.ensemble is not None else self.run
-        return None if found is None or not len(found.times) else found.promised
+        """Bounds and limits of trace P at the sample times, None without samples."""
+        stored = self.ensemble if self.ensemble is not None else self.run
+        return None if stored is None or not len(stored.times) else stored.promised
 
     @cached_property
-    def worst(self) -> WorstSample | None:
-        """Return the worst sample of the run, None without one."""
-        return None if self.run is None else worst_sample(self.run, self.summary)
+    def worst(self) -> WorstSamples | None:
+        """The worst samples of the run, None without a run or a finite sample."""
+        return None if self.run is None else find_worst_samples(self.run, self.summary)
 
     @property
     def runs(self) -> int:
-        """Return the number of runs that are done."""
+        """The number of finished runs."""
         return int(self.manifest["runs"]["done"])
 
     @property
     def status(self) -> str:
-        """Return the status of the manifest, such as ``complete`` or ``interrupted``."""
+        """The status in the manifest, such as ``complete`` or ``interrupted``."""
         return str(self.manifest["status"])
 
     @property
     def knowledge(self) -> str:
-        """Return what a sample at t knows: what arrived ``until`` t, ``before`` t (slots whose
-        samples are predictions), or in the ``slot`` that begins at t (slots whose samples are
-        filtered).
+        """Which messages the estimates sampled at t include: ``until`` (arrived at t or earlier),
+        ``before`` (earlier than t: slots whose samples are predictions) or ``slot`` (also those of
+        the slot that begins at t: slots whose samples are filtered).
         """
         if not self.scenario.slotted:
             return "until"
@@ -108,74 +114,79 @@ class Opened:
 
     @property
     def period(self) -> float:
-        """Return the seconds of a slot, 0 under clocks."""
+        """The length of a slot in seconds, 0 under clocks."""
         return float(self.scenario.slot_plant.period) if self.scenario.slotted else 0.0
 
-    def cuts(self, times: FloatArray) -> FloatArray:
-        """Return, for samples at ``times`` (T,), the last instants (T,) that they know of."""
-        kind = self.knowledge
-        if kind == "until":
+    def cutoffs(self, times: FloatArray) -> FloatArray:
+        """Return the latest arrival times (T,) of messages that samples at ``times`` (T,) include,
+        in seconds.
+        """
+        knowledge = self.knowledge
+        if knowledge == "until":
             return times
-        if kind == "before":
+        if knowledge == "before":
             return np.nextafter(times, -np.inf)
         ends = (np.floor(times / self.period + SLOT_ROUNDING) + 1.0) * self.period
         return np.asarray(np.nextafter(ends, -np.inf))
 
 
-def read_source(directory: Path, replica: int | None = None, trust: bool = False) -> Opened:
-    """Return what a page shows of a directory of ``netkf run``, ``sweep``, ``check`` or
-    ``compare-filters``.
+def read_source(directory: Path, replica: int | None = None, trust: bool = False) -> ReportSource:
+    """Return the contents of a directory that ``netkf run``, ``sweep``, ``check`` or
+    ``compare-filters`` wrote.
 
-    ``replica`` chooses one of the recorded runs of an ensemble, by default the first. Runs that
-    were interrupted or failed are read as far as they came. ``trust`` imports classes that the
-    scenario names. Raises ScenarioError if the directory is not one of netkf's, or if its files
-    were changed since they were written.
+    ``replica`` chooses one of the recorded runs of an ensemble, by default the first. Of runs that
+    were interrupted or failed the part that was written is read. ``trust`` imports classes that
+    the scenario names. Raises ScenarioError if netkf did not write the directory, or if its files
+    were changed since.
     """
-    found = open_directory(directory, trust=trust)
-    text = _read_text(directory / "scenario.toml")
-    if isinstance(found, StoredSweep):
-        return Opened(str(directory), found.manifest, found.scenario, text, sweep=found)
-    if isinstance(found, StoredComparison):
-        return Opened(str(directory), found.manifest, found.base, text, filters=found)
-    if isinstance(found, StoredVerdict):
-        manifest = _verdict_manifest(found)
-        document = found.document
-        return Opened(str(directory), manifest, found.scenario, text, verdict=document)
+    stored = open_directory(directory, trust=trust)
+    label, text = str(directory), _read_scenario_text(directory / "scenario.toml")
+    if isinstance(stored, StoredSweep):
+        return ReportSource(label, stored.manifest, stored.scenario, text, sweep=stored)
+    if isinstance(stored, StoredComparison):
+        return ReportSource(label, stored.manifest, stored.base, text, filters=stored)
+    if isinstance(stored, StoredVerdict):
+        manifest = _verdict_manifest(stored)
+        return ReportSource(label, manifest, stored.scenario, text, verdict=stored.document)
     verdict = None
     if (directory / "verdict.json").exists():
         with damage_named(directory):
-            verdict = read_checked_document(directory, "verdict.json", VERDICT)
-    if found.summary:
+            verdict = read_form(directory, "verdict.json", VERDICT)
+    if stored.summary:
         with damage_named(directory):
-            require_form(found.summary, SUMMARY, "summary.json")
-    run, ensemble = _choose_run(found, replica)
-    scenario = found.scenario
+            require(stored.summary, SUMMARY, "summary.json")
+    run, ensemble = _choose_run(stored, replica)
+    scenario = stored.scenario
     assert isinstance(scenario, Scenario)
-    return Opened(str(directory), found.manifest, scenario, text, run, ensemble, verdict=verdict)
+    return ReportSource(label, stored.manifest, scenario, text, run, ensemble, verdict=verdict)
 
 
 def _choose_run(
-    found: StoredRun | StoredEnsemble, replica: int | None
+    stored: StoredRun | StoredEnsemble, replica: int | None
 ) -> tuple[StoredRun | None, StoredEnsemble | None]:
-    """Return the run to show in motion, and the ensemble that it is of."""
-    if isinstance(found, StoredRun):
-        if replica is not None and replica != found.replica:
-            where = shorten(found.directory)
+    """Return the run to animate, None if none was recorded, and its ensemble, None for a run of its
+    own.
+
+    Raises ScenarioError if ``replica`` is not in the directory.
+    """
+    if isinstance(stored, StoredRun):
+        if replica is not None and replica != stored.replica:
+            where = shorten(stored.directory)
             raise ScenarioError(where, "holds no replica", replica, "leave out --replica")
-        return found, None
-    if replica is None and not (found.directory / "states.parquet").exists():
-        return None, found
-    return found.replica(replica or 0), found
+        return stored, None
+    if replica is None and not (stored.directory / "states.parquet").exists():
+        return None, stored
+    return stored.replica(replica or 0), stored
 
 
-def _verdict_manifest(found: StoredVerdict) -> dict[str, Any]:
-    """Return what stands for the manifest of a directory that holds a verdict only."""
-    runs = {"done": found.runs, "wanted": found.runs}
-    versions = found.document.get("versions", {})
-    return {"seed": found.seed, "status": "complete", "runs": runs, "versions": versions}
+def _verdict_manifest(stored: StoredVerdict) -> dict[str, Any]:
+    """Return the manifest entries of a verdict: such a directory has no manifest.json."""
+    runs = {"done": stored.runs, "wanted": stored.runs}
+    versions = stored.document.get("versions", {})
+    return {"seed": stored.seed, "status": "complete", "runs": runs, "versions": versions}
 
 
-def _read_text(path: Path) -> str:
-    """Return the text of a scenario file that could be loaded."""
+def _read_scenario_text(path: Path) -> str:
+    """Return the text of a scenario file, cut after MAX_TEXT characters."""
     text = path.read_text(encoding="utf-8")
     return text if len(text) <= MAX_TEXT else f"{text[:MAX_TEXT]}\n# ({len(text):,} characters)"

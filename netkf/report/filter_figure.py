@@ -1,4 +1,4 @@
-"""The figure of a comparison of filters: errors with their intervals, as SVG without a script."""
+"""The figure of a comparison of filters: RMS errors with error bars, as SVG without a script."""
 
 from __future__ import annotations
 
@@ -10,32 +10,41 @@ from netkf.runs.tables import format_number
 from netkf.studies.compare_filters import ComparedFilter
 from netkf.studies.stored import StoredComparison
 
-WIDTH, ROW, LABELS, VALUES = 620, 26, 190, 130
-"""Pixels: the whole figure, the height of a filter, the columns of labels and of numbers."""
+WIDTH, ROW_HEIGHT, LABEL_WIDTH, NUMBER_WIDTH = 620, 26, 190, 130
+"""Pixels: the whole figure, the row of a filter, the columns of labels and of numbers."""
 MAX_LABEL = 26
+"""Characters of a filter's label."""
+MAX_RATIO = 10.0
+"""Ratio of the largest to the smallest bar end on the axis: larger errors are drawn at its end."""
 
 
-def filters_figure(found: StoredComparison) -> str:
-    """Return the RMS error of each filter with a bar of two standard errors; empty without any."""
+def filters_figure(comparison: StoredComparison) -> str:
+    """Return an SVG figure with the RMS error of each filter and a bar of two standard errors.
+
+    It is empty if no filter has a finite error.
+    """
     rows = [
-        row for row in found.rows if row.ran and math.isfinite(row.quantities["rms_error"].value)
+        row
+        for row in comparison.rows
+        if row.ran and math.isfinite(row.quantities["rms_error"].value)
     ]
     if not rows:
         return ""
-    ends = [_bar(row) for row in rows]
-    # The error of one that runs away leaves nothing to see of the others.
-    scale = (WIDTH - LABELS - VALUES) / min(max(ends), 10.0 * min(ends)) if min(ends) > 0 else 0.0
-    lines = "".join(_row(row, k, scale) for k, row in enumerate(rows))
-    height = ROW * len(rows) + 8
+    ends = [_bar_end(row) for row in rows]
+    # One diverging filter would compress the bars of all others to nothing.
+    axis_end = min(max(ends), MAX_RATIO * min(ends))
+    scale = (WIDTH - LABEL_WIDTH - NUMBER_WIDTH) / axis_end if min(ends) > 0 else 0.0
+    lines = "".join(_draw_row(row, k, scale) for k, row in enumerate(rows))
+    height = ROW_HEIGHT * len(rows) + 8
     label = (
-        f"RMS error of {len(rows)} filters over {found.runs:,} runs of each on the same draws; "
-        "bars: two standard errors, the axis begins at 0. Which differences are certain stands in "
-        "the table"
+        f"RMS error of {len(rows)} filters over {comparison.runs:,} runs of each on the same "
+        "draws; bars: two standard errors, the axis begins at 0. The table says which differences "
+        "are certain"
     )
     picture = (
         f'<svg id="filters-figure" width="{WIDTH}" height="{height}" role="img" '
         f'aria-label="{text(label)}" fill="currentColor" stroke="none" font-size="13">'
-        f'<line x1="{LABELS}" x2="{LABELS}" y1="0" y2="{height}" stroke="currentColor"/>'
+        f'<line x1="{LABEL_WIDTH}" x2="{LABEL_WIDTH}" y1="0" y2="{height}" stroke="currentColor"/>'
         f"{lines}</svg>"
     )
     return (
@@ -43,24 +52,26 @@ def filters_figure(found: StoredComparison) -> str:
     )
 
 
-def _bar(row: ComparedFilter) -> float:
-    """Return the upper end of the bar of a filter."""
-    found = row.quantities["rms_error"]
-    return found.value + (2.0 * found.se if math.isfinite(found.se) else 0.0)
+def _bar_end(row: ComparedFilter) -> float:
+    """Return the upper end of a filter's bar: its RMS error plus two standard errors."""
+    error = row.quantities["rms_error"]
+    return error.value + (2.0 * error.se if math.isfinite(error.se) else 0.0)
 
 
-def _row(row: ComparedFilter, k: int, scale: float) -> str:
-    """Return label, bar, dot and number of a filter."""
-    found, y = row.quantities["rms_error"], ROW * k + ROW // 2 + 4
-    most, high = WIDTH - VALUES, _bar(row)
-    low = max(0.0, 2.0 * found.value - high)
-    x, left, right = (min(most, LABELS + scale * value) for value in (found.value, low, high))
-    outside = LABELS + scale * found.value > most
-    number = format_number(found.value) + (" (off the axis)" if outside else "")
+def _draw_row(row: ComparedFilter, k: int, scale: float) -> str:
+    """Return label, bar, dot and number of a filter as SVG elements of row ``k`` from the top;
+    ``scale`` is in pixels per unit of error.
+    """
+    error, y = row.quantities["rms_error"].value, ROW_HEIGHT * k + ROW_HEIGHT // 2 + 4
+    axis_end, high = WIDTH - NUMBER_WIDTH, _bar_end(row)
+    low = max(0.0, 2.0 * error - high)
+    x, left, right = (min(axis_end, LABEL_WIDTH + scale * value) for value in (error, low, high))
+    is_outside = LABEL_WIDTH + scale * error > axis_end
+    number = format_number(error) + (" (off the axis)" if is_outside else "")
     return (
-        f'<text x="{LABELS - 8}" y="{y + 4}" text-anchor="end">'
+        f'<text x="{LABEL_WIDTH - 8}" y="{y + 4}" text-anchor="end">'
         f"{text(shorten(row.filter, MAX_LABEL))}</text>"
         f'<line x1="{left:.2f}" x2="{right:.2f}" y1="{y}" y2="{y}" stroke="currentColor" '
         f'stroke-width="2"/><circle cx="{x:.2f}" cy="{y}" r="4"/>'
-        f'<text x="{most + 8}" y="{y + 4}">{text(number)}</text>'
+        f'<text x="{axis_end + 8}" y="{y + 4}">{text(number)}</text>'
     )

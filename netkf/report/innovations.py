@@ -1,4 +1,4 @@
-"""Innovations on a page: are readings as far from their predictions as the covariances say?"""
+"""Innovations of a run for a page: normalised innovations squared (NIS) and autocorrelations."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 
 from netkf.core.errors import NetkfError
 from netkf.linalg.arrays import FloatArray
-from netkf.report.directories import Opened
+from netkf.report.directories import ReportSource
 from netkf.report.packing import Packer
 from netkf.runs.innovations import (
     Innovations,
@@ -19,16 +19,19 @@ from netkf.runs.innovations import (
 from netkf.runs.tables import format_number
 
 MAX_EVENTS = 200_000
-"""Events of a run up to which a page replays it for its readings, some seconds."""
+"""Events of a run up to which a page replays it for its readings, which takes some seconds."""
 CONFIDENCE = 0.99
-"""Probability that the interval of every node holds its mean, where P is exact."""
-LEVEL = 1.96  # standard deviations of a normal number that hold 95 %
+"""Probability that the intervals of all nodes contain their means if P is exact."""
+NORMAL_QUANTILE = 1.96  # 95 % of a normal distribution lie within as many standard deviations
 
 
 class NodeMeans(NamedTuple):
-    """NIS over degrees of freedom of M nodes with readings: their ids (-1: readings that one filter
-    uses together), ``means`` (M,), and the ends of the intervals that hold all of them with
-    probability CONFIDENCE where P is exact.
+    """The mean NIS of M nodes with readings, divided by the degrees of freedom.
+
+    nodes     : (M,) ids, -1 for readings that one filter uses together
+    means     : (M,) sums of NIS divided by the number of scalar readings, 1 on average if P is
+                exact
+    low, high : (M,) limits that hold for all nodes with probability CONFIDENCE if P is exact
     """
 
     nodes: np.ndarray
@@ -37,9 +40,9 @@ class NodeMeans(NamedTuple):
     high: FloatArray
 
 
-def read_innovations(source: Opened) -> Innovations | str | None:
+def read_innovations(source: ReportSource) -> Innovations | str | None:
     """Return the innovations of the run of a source, by a replay, or the reason why there are none;
-    None where there is no run.
+    None without a run that has samples.
     """
     if source.run is None or not len(source.run.times):
         return None
@@ -51,87 +54,93 @@ def read_innovations(source: Opened) -> Innovations | str | None:
         return str(error)
 
 
-def node_means(found: Innovations) -> NodeMeans:
-    """Return the mean NIS of each node with readings; sums of NIS are chi-square if P is exact."""
-    known = np.isfinite(found.nis)
-    nodes, which = np.unique(found.nodes[known], return_inverse=True)
-    rows, sums = (
-        np.asarray(np.bincount(which, weights=values[known], minlength=len(nodes)), np.float64)
-        for values in (found.rows, found.nis)
+def node_means(readings: Innovations) -> NodeMeans:
+    """Return the mean NIS of each node with readings, with limits that hold if P is exact."""
+    finite = np.isfinite(readings.nis)
+    nodes, columns = np.unique(readings.nodes[finite], return_inverse=True)
+    freedom, sums = (
+        np.asarray(np.bincount(columns, weights=values[finite], minlength=len(nodes)), np.float64)
+        for values in (readings.rows, readings.nis)
     )
-    # Bonferroni: nodes share the noise of the plant, so their sums are dependent.
-    low, high = chi_square_interval(rows, 1.0 - (1.0 - CONFIDENCE) / max(1, len(nodes)))
-    return NodeMeans(nodes, sums / rows, low, high)
+    # Sums of NIS are chi-square if P is exact. Nodes share the noise of the plant, so the sums are
+    # dependent: Bonferroni's inequality makes the limits hold together.
+    low, high = chi_square_means(freedom, 1.0 - (1.0 - CONFIDENCE) / max(1, len(nodes)))
+    return NodeMeans(nodes, sums / freedom, low, high)
 
 
-def innovation_claim(found: Innovations) -> str:
-    """Return a sentence on how far readings were from their predictions, and which node's P says
-    otherwise.
-    """
-    nodes, means, low, high = node_means(found)
-    count = int(np.isfinite(found.nis).sum())
-    said = f"Over {count:,} readings"
-    if found.increments:
-        some = found.increments < len(found.nis)
-        among = f"{found.increments:,} of them" if some else "which are"
-        said += f", {among} increments between two events of a node,"
-    said += " the squared innovation in units of its covariance (NIS per row; "
-    said += "1 where P is exact) is "
+def describe_innovations(readings: Innovations) -> str:
+    """Return a sentence on the mean NIS of the nodes, and on how many of them contradict P."""
+    nodes, means, low, high = node_means(readings)
+    count = int(np.isfinite(readings.nis).sum())
+    sentence = f"Over {count:,} readings"
+    if readings.increments:
+        all_are = readings.increments == len(readings.nis)
+        share = "which are" if all_are else f"{readings.increments:,} of them"
+        sentence += f", {share} increments between two events of a node,"
+    sentence += " the squared innovation in units of its covariance (NIS per row; "
+    sentence += "1 if P is exact) is "
     if len(nodes) == 1:
-        where = f"at node {nodes[0]}" if nodes[0] >= 0 else "of the filter of all readings"
-        return f"{said}{format_number(means[0])} {where}, {_judge_means(means[0], low[0], high[0])}"
-    least, most = int(np.argmin(means)), int(np.argmax(means))
-    said += f"{format_number(means[least])} (node {nodes[least]}) to "
-    said += f"{format_number(means[most])} (node {nodes[most]})"
+        place = f"at node {nodes[0]}" if nodes[0] >= 0 else "of the filter of all readings"
+        judgement = _judge_mean(means[0], low[0], high[0])
+        return f"{sentence}{format_number(means[0])} {place}, {judgement}"
+    smallest, largest = int(np.argmin(means)), int(np.argmax(means))
+    sentence += f"{format_number(means[smallest])} (node {nodes[smallest]}) to "
+    sentence += f"{format_number(means[largest])} (node {nodes[largest]})"
     above, below = int((means > high).sum()), int((means < low).sum())
     if not above and not below:
-        return f"{said}: at all {len(nodes)} nodes with readings as exact covariances allow"
-    parts = [f"too sure at {above} of {len(nodes)} nodes with readings"] if above else []
-    parts += [f"more careful than readings need at {below} of {len(nodes)}"] if below else []
-    return f"{said}: P is {' and '.join(parts)}"
+        return f"{sentence}: at all {len(nodes)} nodes with readings as exact covariances allow"
+    judgements = []
+    if above:
+        judgements.append(f"too sure at {above} of {len(nodes)} nodes with readings")
+    if below:
+        judgements.append(f"more careful than needed at {below} of {len(nodes)}")
+    return f"{sentence}: P is {' and '.join(judgements)}"
 
 
-def _judge_means(mean: float, low: float, high: float) -> str:
-    """Return whether a mean squared innovation fits P, as text."""
-    inside = f"{format_number(low)} .. {format_number(high)}"
+def _judge_mean(mean: float, low: float, high: float) -> str:
+    """Return as text whether P is consistent with a node's mean NIS, whose limits are given."""
+    interval = f"{format_number(low)} .. {format_number(high)}"
     if mean > high:
-        return f"P is too sure: {CONFIDENCE:.0%} of such means would lie in {inside}"
+        return f"P is too sure: {CONFIDENCE:.0%} of such means would lie in {interval}"
     if mean < low:
         return (
-            f"P is more careful than needed: {CONFIDENCE:.0%} of such means would lie in {inside}"
+            f"P is more careful than needed: {CONFIDENCE:.0%} of such means would lie in {interval}"
         )
-    return f"as exact covariances allow ({CONFIDENCE:.0%}: {inside})"
+    return f"as exact covariances allow ({CONFIDENCE:.0%}: {interval})"
 
 
 def innovation_columns(
-    found: Innovations | str | None, nodes: tuple[int, ...], most: int, packer: Packer
+    readings: Innovations | str | None, nodes: tuple[int, ...], max_readings: int, packer: Packer
 ) -> dict[str, Any] | None:
-    """Return what the curves show of innovations, every k-th reading if there are more than
-    ``most``; None without any.
+    """Return the NIS of the readings as packed columns, with the means and the autocorrelations of
+    each node; every k-th reading if there are more than ``max_readings``; None without innovations.
+
+    Nodes are given by their index in ``nodes``, -1 for readings that one filter uses together.
     """
-    if not isinstance(found, Innovations):
+    if not isinstance(readings, Innovations):
         return None
-    known = np.flatnonzero(np.isfinite(found.nis))
-    step = max(1, -(-len(known) // max(1, most)))
-    kept = known[::step]
-    curves, counts = autocorrelations(found)
+    finite = np.flatnonzero(np.isfinite(readings.nis))
+    step = max(1, -(-len(finite) // max(1, max_readings)))
+    rows = finite[::step]
+    curves, counts = autocorrelations(readings)
     index = {node: k for k, node in enumerate(nodes)}
-    means = node_means(found)
+    row_nodes = [index.get(node, -1) for node in readings.nodes[rows].tolist()]
+    means = zip(*(column.tolist() for column in node_means(readings)), strict=True)
     return {
         "columns": {
-            "t": packer.add(found.times[kept], "f8"),
-            "node": packer.add([index.get(node, -1) for node in found.nodes[kept].tolist()], "i2"),
-            "nis": packer.add(found.nis[kept] / found.rows[kept], "f8"),
+            "t": packer.add(readings.times[rows], "f8"),
+            "node": packer.add(row_nodes, "i2"),
+            "nis": packer.add(readings.nis[rows] / readings.rows[rows], "f8"),
         },
         "step": step,
-        "total": len(known),
+        "total": len(finite),
         "means": {
-            str(index.get(node, -1)): [float(value) for value in values]
-            for node, *values in zip(*(part.tolist() for part in means), strict=True)
+            str(index.get(node, -1)): [float(mean), float(low), float(high)]
+            for node, mean, low, high in means
         },
         "correlations": {
             str(index.get(node, -1)): {
-                "band": LEVEL / float(np.sqrt(counts[node])),
+                "band": NORMAL_QUANTILE / float(np.sqrt(counts[node])),
                 "values": curve.tolist(),
             }
             for node, curve in curves.items()

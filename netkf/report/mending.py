@@ -1,4 +1,6 @@
-"""What would have mended the worst sample of a run: replays in which missing messages came."""
+"""What would have reduced the worst error of a run: replays in which missing messages arrive, and
+the centralised filter.
+"""
 
 from __future__ import annotations
 
@@ -11,9 +13,9 @@ import numpy as np
 from netkf.algorithms.baselines import Central
 from netkf.core.errors import NetkfError
 from netkf.network.clocks import LinkClock
-from netkf.report.directories import Opened
+from netkf.report.directories import ReportSource
 from netkf.report.markup import bullets, paragraph, table_box
-from netkf.report.worst import Worst
+from netkf.report.worst import WorstSample
 from netkf.runs.innovations import with_filter
 from netkf.runs.simulate import simulate
 from netkf.runs.tables import format_number
@@ -21,17 +23,19 @@ from netkf.studies.explanation import Explanation
 from netkf.studies.why import why
 from netkf.studies.why_text import relative_change, sentences
 
-EQUAL_NUMBERS = 1e-4
-"""Relative difference of numbers that look the same with four digits."""
+SAME_NUMBERS = 1e-4
+"""Relative difference below which numbers of four digits look the same."""
 MAX_EVENTS = 60_000
-"""Events until the worst instant up to which a page replays a run, a second or two."""
+"""Events until the worst sample up to which a page replays a run, which takes a second or two."""
 REPLAYED_EVENTS, MIN_REPLAYS, MAX_REPLAYS = 300_000, 5, 60
-"""Events of all replays of a page together, and the replays of a search at least and at most."""
+"""Events that the replays of a page may have together, and the limits of the number of replays."""
 
 
-def explain_worst(source: Opened) -> Explanation | str | None:
-    """Return why the worst sample of a single run after the start-up was what it was, by replays;
-    or the reason why it cannot be said here, or None where there is nothing to explain.
+def explain_worst(source: ReportSource) -> Explanation | str | None:
+    """Return the explanation of ``netkf why`` for the worst sample of a single run after the
+    start-up, or the reason why there is none.
+
+    It is None without a single recorded run in which nodes send messages.
     """
     run = source.run
     if source.worst is None or run is None or source.kind != "run":
@@ -42,7 +46,7 @@ def explain_worst(source: Opened) -> Explanation | str | None:
     events = int(np.searchsorted(run.log["t"], worst.time, side="right"))
     if events > MAX_EVENTS:
         command = _why_command(source, worst)
-        return f"{events:,} events until then are many to replay; {command} does it"
+        return f"the {events:,} events until then take too long to replay here; {command} does it"
     replays = max(MIN_REPLAYS, min(MAX_REPLAYS, REPLAYED_EVENTS // max(1, events)))
     try:
         return why(run, worst.node, worst.time, replays=replays)
@@ -50,37 +54,44 @@ def explain_worst(source: Opened) -> Explanation | str | None:
         return str(error)
 
 
-def _why_command(source: Opened, worst: Worst) -> str:
-    """Return the command that explains the worst sample."""
+def _why_command(source: ReportSource, worst: WorstSample) -> str:
+    """Return the command line of ``netkf why`` that explains the worst sample."""
     return f"netkf why {source.label} --node {worst.node} --at {worst.time:.10g}"
 
 
-def mending_claim(found: Explanation) -> str:
-    """Return a sentence on the messages that would have mended the worst sample."""
-    was, best = found.what_ifs[0], found.what_ifs[-1]
-    same = math.isclose(was.trace, best.trace, rel_tol=EQUAL_NUMBERS) or math.isnan(was.trace)
-    if same and not abs(best.error - was.error) > EQUAL_NUMBERS * was.error:
+def describe_mending(explanation: Explanation) -> str:
+    """Return a sentence on how much better the worst sample would be with the missing messages."""
+    # The first replay is the run as it was, the last one has no message missing.
+    actual, best = explanation.what_ifs[0], explanation.what_ifs[-1]
+    same_trace = math.isnan(actual.trace) or math.isclose(
+        actual.trace, best.trace, rel_tol=SAME_NUMBERS
+    )
+    if same_trace and not abs(best.error - actual.error) > SAME_NUMBERS * actual.error:
         return "Messages would not have mended it: a replay in which none is missing is no better"
-    error = _describe_change("error", was.error, best.error)
-    if same:
-        change = f"{error} at the same trace P, {format_number(was.trace)}"
+    error = _describe_change("error", actual.error, best.error)
+    if same_trace:
+        change = f"{error} at the same trace P, {format_number(actual.trace)}"
     else:
-        change = _describe_change("trace P", was.trace, best.trace)
+        change = _describe_change("trace P", actual.trace, best.trace)
         change += f" and {error}" if math.isfinite(best.error) else ""
-        change += _describe_cost(found)
+        change += _describe_smallest_set(explanation)
     return f"To mend it: with no message missing, a replay gives {change}"
 
 
 class CentralSample(NamedTuple):
-    """Trace of P and error of the centralised filter at the worst sample of a run."""
+    """Trace of P and length of the error of the centralised filter at the worst sample of a run;
+    the error is nan without ground truth.
+    """
 
     trace: float
     error: float
 
 
-def central_sample(source: Opened) -> CentralSample | None:
-    """Return what the centralised filter with the same truth and readings had at the worst sample
-    after the start-up; None where there is no such filter or run.
+def central_sample(source: ReportSource) -> CentralSample | None:
+    """Return the centralised filter's sample at the time of the worst sample after the start-up.
+
+    It is simulated with the truth and the readings of the run. None without a run in which nodes
+    send messages, or if the scenario does not allow that filter.
     """
     run = source.run
     if source.worst is None or run is None or not run.scenario.filter.algorithm.talks:
@@ -88,75 +99,88 @@ def central_sample(source: Opened) -> CentralSample | None:
     filtering = dataclasses.replace(run.scenario.filter, algorithm=Central())
     try:
         scenario = with_filter(run.scenario, filtering)
-        other = simulate(scenario, run.seed, run.replica, "simpy")
+        central_run = simulate(scenario, run.seed, run.replica, "simpy")
     except NetkfError:
         return None
-    at = int(np.searchsorted(run.times, source.worst.explained.time))
-    if at >= len(other.times):
+    row = int(np.searchsorted(run.times, source.worst.explained.time))
+    if row >= len(central_run.times):  # the centralised filter diverged before
         return None
-    error = float(np.linalg.norm(other.x[at] - other.xhat[at, 0])) if run.truth_known else math.nan
-    return CentralSample(float(np.trace(other.P[at, 0])), error)
+    error = math.nan
+    if run.truth_known:
+        error = float(np.linalg.norm(central_run.x[row] - central_run.xhat[row, 0]))
+    return CentralSample(float(np.trace(central_run.P[row, 0])), error)
 
 
-def price_claim(source: Opened, found: Explanation, central: CentralSample) -> str:
-    """Return a sentence on what even all messages would leave: the price of the network."""
-    best = found.what_ifs[-1]
-    had = [f"trace P {format_number(central.trace)}"] if math.isfinite(central.trace) else []
-    had += [f"error {format_number(central.error)}"] if math.isfinite(central.error) else []
-    said = (
+def describe_central(source: ReportSource, explanation: Explanation, central: CentralSample) -> str:
+    """Return sentences that compare the worst sample, with no message missing, with the centralised
+    filter: their difference is the price of the network.
+    """
+    best = explanation.what_ifs[-1]
+    numbers = [f"trace P {format_number(central.trace)}"] if math.isfinite(central.trace) else []
+    numbers += [f"error {format_number(central.error)}"] if math.isfinite(central.error) else []
+    sentence = (
         "With all readings at once: the centralised filter, on the same truth and readings, had "
-        f"{' and '.join(had)} then"
+        f"{' and '.join(numbers)} then"
     )
-    if not central.trace < best.trace * (1.0 - EQUAL_NUMBERS):
-        return f"{said}. Its trace P is no less than that of this node with no message missing"
-    what = "how rarely nodes exchange, and of how they combine what they hear"
+    if not central.trace < best.trace * (1.0 - SAME_NUMBERS):
+        return f"{sentence}. Its trace P is no less than that of this node with no message missing"
     clock = source.scenario.network.activation
-    rates = isinstance(clock, LinkClock) and hasattr(clock, "rate")
-    ask = "netkf size finds the rate that would do, " if rates else ""
+    has_rate = isinstance(clock, LinkClock) and hasattr(clock, "rate")
+    advice = "netkf size finds the rate that would suffice, " if has_rate else ""
     return (
-        f"{said}. The rest of trace P {format_number(best.trace)} is the price of {what}: {ask}"
-        "netkf compare-filters a filter that loses less"
+        f"{sentence}. The rest of trace P {format_number(best.trace)} is the price of rare "
+        "exchanges and of the way nodes combine the information that they receive: "
+        f"{advice}netkf compare-filters a filter that loses less"
     )
 
 
-def _describe_change(name: str, was: float, now: float) -> str:
-    """Return a value and its relative change as text."""
-    change = f"{name} {format_number(now)} in place of {format_number(was)}"
-    return f"{change} ({relative_change(now, was)})" if was > 0.0 else change
+def _describe_change(name: str, before: float, after: float) -> str:
+    """Return text such as ``error 1.5 in place of 2 (-25.0 %)``; the change only if it is
+    defined.
+    """
+    change = f"{name} {format_number(after)} in place of {format_number(before)}"
+    return f"{change} ({relative_change(after, before)})" if before > 0.0 else change
 
 
-def _describe_cost(found: Explanation) -> str:
-    """Return how few messages would have done it, or the best that was tried."""
-    smallest = found.smallest
+def _describe_smallest_set(explanation: Explanation) -> str:
+    """Return text on the smallest set of missing messages that would have sufficed, or on the best
+    set that was tried; empty if no search was made or no message was needed.
+    """
+    smallest = explanation.smallest
     if smallest is None or smallest.messages == ():
         return ""
-    chosen = smallest.best if smallest.messages is None else smallest.messages
-    if not chosen:
-        return f"; none of the {smallest.considered:,} messages alone that were tried helps"
-    value = smallest.best_trace if smallest.messages is None else smallest.trace
-    count = f"{len(chosen)} message{'s' if len(chosen) > 1 else ''}"
+    messages = smallest.best if smallest.messages is None else smallest.messages
+    if not messages:
+        return f"; none of the {smallest.considered:,} messages tried one by one helps"
+    trace = smallest.best_trace if smallest.messages is None else smallest.trace
+    count = f"{len(messages)} message{'s' if len(messages) > 1 else ''}"
     return (
         f"; {count} alone, of {smallest.candidates:,} that could have mattered, would have brought "
-        f"trace P to {format_number(value)}"
+        f"trace P to {format_number(trace)}"
     )
 
 
-def mending_section(source: Opened, found: Explanation | str) -> str:
-    """Return the answer of ``netkf why`` about the worst sample: sentences, and a row a replay."""
-    if isinstance(found, str) or source.worst is None:
-        return paragraph(f"The worst sample is not explained here: {found}", "note")
+def mending_section(source: ReportSource, explanation: Explanation | str) -> str:
+    """Return the explanation of the worst sample as HTML: sentences, and a table of its replays; or
+    a paragraph with the reason why there is none.
+    """
+    if isinstance(explanation, str) or source.worst is None:
+        return paragraph(f"The worst sample is not explained here: {explanation}", "note")
     rows = [
         (
-            what.label,
-            "all" if what.messages is None else len(what.messages),
-            format_number(what.trace),
-            "" if k == 0 else relative_change(what.trace, found.trace),
-            format_number(what.error),
+            what_if.label,
+            "all" if what_if.messages is None else len(what_if.messages),
+            format_number(what_if.trace),
+            "" if k == 0 else relative_change(what_if.trace, explanation.trace),
+            format_number(what_if.error),
         )
-        for k, what in enumerate(found.what_ifs)
+        for k, what_if in enumerate(explanation.what_ifs)
     ]
-    caption = f"Node {found.node} at {found.at:.10g} s, replayed with messages that did not come"
+    caption = (
+        f"Node {explanation.node} at {explanation.at:.10g} s, replayed with messages that did not "
+        "arrive"
+    )
     replays = table_box(caption, ("replayed with", "messages", "trace P", "change", "error"), rows)
     command = _why_command(source, source.worst.explained)
-    more = f"By replays of the run, nothing is guessed: {command} says more"
-    return bullets(sentences(found)) + replays + paragraph(more, "note")
+    note = f"All numbers are from replays of the run, none is estimated. For more: {command}"
+    return bullets(sentences(explanation)) + replays + paragraph(note, "note")

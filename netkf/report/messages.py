@@ -1,4 +1,4 @@
-"""Messages of a run: each send event joined with what became of it, and thinned for a page."""
+"""Messages of a run for a page: each send event joined with its outcome, thinned, and counted."""
 
 from __future__ import annotations
 
@@ -22,12 +22,15 @@ MESSAGE = np.dtype(
         ("outcome", "u1"),
     ]
 )
-"""sent, ended: seconds, ended is nan under way; age: seconds of travel as recorded, nan if lost."""
+"""A message. sent, ended: seconds, ``ended`` is nan for a message under way; age: seconds of travel
+as recorded, nan for a lost one; sender, receiver: ids; number: counts the messages of a directed
+link; phase: that of its slot, -1 under clocks; outcome: DELIVERED, LOST, LATE or UNDER_WAY.
+"""
 
 
-class Kept(NamedTuple):
-    """Messages that a page holds: all from ``start`` to ``end`` seconds, and outside of that every
-    ``step``-th of each directed link, by its number.
+class ThinnedMessages(NamedTuple):
+    """MESSAGE rows that a page holds: all sent from ``start`` to ``end`` seconds, and of the others
+    those whose number on their directed link is a multiple of ``step``.
     """
 
     messages: np.ndarray
@@ -37,9 +40,9 @@ class Kept(NamedTuple):
 
 
 def join_messages(log: np.ndarray) -> np.ndarray:
-    """Return MESSAGE rows, ordered by sender, receiver and number, from EVENT rows.
+    """Return MESSAGE rows, ordered by sender, receiver and number, from the EVENT rows of a run.
 
-    Raises ValueError if an outcome belongs to no send event.
+    Raises ValueError if an outcome belongs to no send event, or if ids or numbers are too large.
     """
     sends = log[log["kind"] == CODES["send"]]
     messages = np.zeros(len(sends), dtype=MESSAGE)
@@ -48,67 +51,81 @@ def join_messages(log: np.ndarray) -> np.ndarray:
     messages["sent"], messages["phase"] = sends["t"], sends["phase"]
     messages["ended"] = messages["age"] = np.nan
     messages["outcome"] = UNDER_WAY
-    messages = messages[np.argsort(_keys(messages, ("sender", "receiver")), kind="stable")]
+    order = np.argsort(_message_keys(messages, ("sender", "receiver")), kind="stable")
+    messages = messages[order]
+    # A loss is an event of the sender, an arrival one of the receiver.
     lost = log[log["kind"] == CODES["lost"]]
-    _add_outcomes(messages, lost, LOST, ("node", "peer"))
+    _set_outcomes(messages, lost, LOST, ("node", "peer"))
     for kind, outcome in (("deliver", DELIVERED), ("late", LATE)):
         rows = log[log["kind"] == CODES[kind]]
-        _add_outcomes(messages, rows, outcome, ("peer", "node"))
+        _set_outcomes(messages, rows, outcome, ("peer", "node"))
     return messages
 
 
-def _keys(rows: np.ndarray, ends: tuple[str, str], number: str = "number") -> np.ndarray:
-    """Return a number for each message that orders by sender, receiver and number: node ids are
-    below 2^20 and a link has fewer than 2^24 messages in what fits in memory, else ValueError.
+def _message_keys(
+    rows: np.ndarray, node_columns: tuple[str, str], number_column: str = "number"
+) -> np.ndarray:
+    """Return one integer (M,) for each row, which identifies its message and orders by sender,
+    receiver and number.
+
+    ``node_columns`` are the names of the columns of sender and receiver. Raises ValueError for ids
+    of 2^20 and more, or numbers of 2^24 and more, which runs that fit in memory do not reach.
     """
-    sender, receiver = (rows[name].astype(np.uint64) for name in ends)
-    count = rows[number].astype(np.uint64)
-    if len(rows) and (max(sender.max(), receiver.max()) >> 20 or count.max() >> 24):
+    sender, receiver = (rows[name].astype(np.uint64) for name in node_columns)
+    number = rows[number_column].astype(np.uint64)
+    if len(rows) and (max(sender.max(), receiver.max()) >> 20 or number.max() >> 24):
         raise ValueError("node ids or message numbers are too large for a page")
-    return np.asarray((sender << np.uint64(44)) | (receiver << np.uint64(24)) | count)
+    return np.asarray((sender << np.uint64(44)) | (receiver << np.uint64(24)) | number)
 
 
-def _add_outcomes(
-    messages: np.ndarray, rows: np.ndarray, outcome: int, ends: tuple[str, str]
+def _set_outcomes(
+    messages: np.ndarray, rows: np.ndarray, outcome: int, node_columns: tuple[str, str]
 ) -> None:
-    """Write the outcomes of EVENT rows; ``ends`` names their columns of sender and receiver."""
+    """Set the outcome, the end and the age of the messages that EVENT ``rows`` are about.
+
+    ``node_columns`` are the names of their columns of sender and receiver. Raises ValueError if a
+    row is about none of the messages.
+    """
     if not len(rows):
         return
-    known = _keys(messages, ("sender", "receiver"))
-    wanted = _keys(rows, ends, "message")
-    at = np.minimum(np.searchsorted(known, wanted), max(0, len(known) - 1))
-    if not len(known) or (known[at] != wanted).any():
+    keys = _message_keys(messages, ("sender", "receiver"))
+    row_keys = _message_keys(rows, node_columns, "message")
+    indices = np.minimum(np.searchsorted(keys, row_keys), max(0, len(keys) - 1))
+    if not len(keys) or (keys[indices] != row_keys).any():
         raise ValueError("an outcome belongs to no message")
-    messages["outcome"][at] = outcome
-    messages["ended"][at] = rows["t"]
-    messages["age"][at] = rows["age"]
+    messages["outcome"][indices] = outcome
+    messages["ended"][indices] = rows["t"]
+    messages["age"][indices] = rows["age"]
 
 
-def keep_messages(messages: np.ndarray, most: int, instant: float) -> Kept:
-    """Return at most about ``most`` messages: half of them all those sent around ``instant``
-    seconds, most of them before, the other half spread over the run.
+def thin_messages(messages: np.ndarray, max_messages: int, instant: float) -> ThinnedMessages:
+    """Return at most about ``max_messages`` messages.
+
+    If there are more, half of those returned are all messages of an interval around ``instant``
+    (seconds), and the other half is spread over the run.
     """
-    if len(messages) <= most:
-        return Kept(messages, -np.inf, np.inf, 1)
+    if len(messages) <= max_messages:
+        return ThinnedMessages(messages, -np.inf, np.inf, 1)
     sent = np.sort(messages["sent"])
-    whole = most // 2
-    # A fifth of them after the instant, so that a chart around it is whole.
-    last = int(np.searchsorted(sent, instant, side="right")) + whole // 5
-    last = min(max(last, whole), len(sent))
-    start, end = float(sent[last - whole]), float(sent[last - 1])
+    half = max_messages // 2
+    # A fifth of the interval's messages are after the instant, so that a chart around it is whole.
+    last = int(np.searchsorted(sent, instant, side="right")) + half // 5
+    last = min(max(last, half), len(sent))
+    start, end = float(sent[last - half]), float(sent[last - 1])
     inside = (messages["sent"] >= start) & (messages["sent"] <= end)
-    step = -(-len(messages) // max(1, whole))
-    return Kept(messages[inside | (messages["number"] % step == 0)], start, end, step)
+    step = -(-len(messages) // max(1, half))
+    return ThinnedMessages(messages[inside | (messages["number"] % step == 0)], start, end, step)
 
 
 def information_age(
-    messages: np.ndarray, nodes: tuple[int, ...], times: FloatArray, cuts: FloatArray
+    messages: np.ndarray, nodes: tuple[int, ...], times: FloatArray, cutoffs: FloatArray
 ) -> FloatArray:
-    """Return the age of information (T, N) in seconds at sample ``times`` (T,): the time since the
-    newest delivered message of a link was sent, averaged over the links into a node.
+    """Return the age of information (T, N) in seconds of ``nodes`` at sample ``times`` (T,): the
+    time since the newest delivered message of a link was sent, averaged over the links into a node.
 
-    A sample knows what has arrived by its cut (T,). Before the first delivery the age is the time
-    since the start; it is nan where no link leads to a node.
+    A sample includes the messages that arrived until its cutoff (T,). Before the first delivery the
+    age is the time since the start; it is nan for a node without incoming links. MESSAGE rows are
+    ordered as by ``join_messages``.
     """
     total = np.zeros((len(times), len(nodes)))
     links = np.zeros(len(nodes))
@@ -117,17 +134,19 @@ def information_age(
         column = int(np.searchsorted(nodes, link["receiver"][0]))
         arrived = link[link["outcome"] == DELIVERED]
         arrived = arrived[np.argsort(arrived["ended"], kind="stable")]
-        newest = np.concatenate([[0.0], np.maximum.accumulate(arrived["sent"])])
-        known = newest[np.searchsorted(arrived["ended"], cuts, side="right")]
-        total[:, column] += np.maximum(0.0, times - known)
+        # A message that overtakes another one is newer: the age does not grow when the late one
+        # arrives. The first entry is for times before the first arrival.
+        newest_sent = np.concatenate([[0.0], np.maximum.accumulate(arrived["sent"])])
+        last_sent = newest_sent[np.searchsorted(arrived["ended"], cutoffs, side="right")]
+        total[:, column] += np.maximum(0.0, times - last_sent)
         links[column] += 1.0
     with np.errstate(invalid="ignore"):
         return np.asarray(total / np.where(links > 0.0, links, np.nan))
 
 
-def traffic(messages: np.ndarray, horizon: float, bins: int) -> dict[str, list[int]]:
-    """Return the messages sent in each of ``bins`` equal parts of the run, by what became of
-    them.
+def count_traffic(messages: np.ndarray, horizon: float, bins: int) -> dict[str, list[int]]:
+    """Return the numbers of messages sent in each of ``bins`` equal intervals of a run of
+    ``horizon`` seconds, for each outcome.
     """
     edges = np.linspace(0.0, max(horizon, 1e-300), bins + 1)
     names = {"delivered": DELIVERED, "lost": LOST, "late": LATE, "under way": UNDER_WAY}

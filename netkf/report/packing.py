@@ -9,31 +9,34 @@ from typing import Any
 import numpy as np
 
 TYPES = {"f8": "<f8", "u4": "<u4", "u2": "<u2", "u1": "u1", "i2": "<i2"}
+"""NumPy types of columns by the names that a page uses."""
 
 
 class Packer:
-    """Collects columns and returns them as one text.
+    """Collects columns of numbers and returns them as one text, without loss.
 
     The bytes of a column are transposed, all first bytes before all second bytes: neighbouring
-    numbers share their leading bytes, which gzip then finds. Numbers keep all their digits.
+    numbers share their leading bytes, which gzip compresses better side by side.
     """
 
     def __init__(self) -> None:
-        self._parts: list[bytes] = []
+        self._columns: list[bytes] = []
 
-    def add(self, values: Any, kind: str) -> dict[str, Any]:
-        """Append a column of numbers of a type (a key of TYPES); return what finds it again."""
-        column = np.ascontiguousarray(values, dtype=TYPES[kind])
-        self._parts.append(_planes(column))
-        return {"part": len(self._parts) - 1, "type": kind, "shape": list(column.shape)}
+    def add(self, values: Any, dtype: str) -> dict[str, Any]:
+        """Append an array of a type (a key of TYPES); return its index, type and shape as JSON
+        values, from which the page reads it.
+        """
+        column = np.ascontiguousarray(values, dtype=TYPES[dtype])
+        self._columns.append(_transpose_bytes(column))
+        return {"part": len(self._columns) - 1, "type": dtype, "shape": list(column.shape)}
 
     def text(self) -> tuple[str, list[int]]:
-        """Return all columns as text, and the number of bytes of each column."""
-        packed = gzip.compress(b"".join(self._parts), compresslevel=9, mtime=0)
-        return base64.b64encode(packed).decode("ascii"), [len(part) for part in self._parts]
+        """Return all columns as base64 text, and the number of uncompressed bytes of each one."""
+        compressed = gzip.compress(b"".join(self._columns), compresslevel=9, mtime=0)
+        return base64.b64encode(compressed).decode("ascii"), list(map(len, self._columns))
 
 
-def _planes(column: np.ndarray) -> bytes:
-    """Return the bytes of a column, the first of all numbers, then the second, and so on."""
+def _transpose_bytes(column: np.ndarray) -> bytes:
+    """Return the bytes of an array: the first byte of all numbers, then the second, and so on."""
     octets = np.frombuffer(column.tobytes(), dtype=np.uint8)
     return octets.reshape(column.size, column.itemsize).T.tobytes()

@@ -15,18 +15,18 @@ import numpy as np
 from netkf.core.errors import ScenarioError, WriteError
 from netkf.core.version import __version__
 from netkf.report import tables
-from netkf.report.claims import difference_findings, findings
+from netkf.report.claims import describe_differences, describe_source
 from netkf.report.data import Budget, run_data, thinning_rules
-from netkf.report.directories import Opened, read_source
+from netkf.report.directories import ReportSource, read_source
 from netkf.report.filter_figure import filters_figure
 from netkf.report.innovations import read_innovations
 from netkf.report.markup import bullets, content_hash, paragraph, script_json, section, text
 from netkf.report.mending import (
     central_sample,
+    describe_central,
+    describe_mending,
     explain_worst,
-    mending_claim,
     mending_section,
-    price_claim,
 )
 from netkf.report.messages import MESSAGE, join_messages
 from netkf.report.packing import Packer
@@ -42,8 +42,9 @@ from netkf.trace.schema import KINDS
 MAX_BYTES = 4_800_000
 """Size of a page above which its data are thinned further."""
 BUDGET = Budget(messages=100_000, values=400_000)
+"""What a page holds of one run at first; half of it for each of two runs."""
 MAX_NODES = 2_000
-"""Nodes up to which there are live views."""
+"""Nodes up to which a page has live views."""
 SCRIPTS = (
     "format.js",
     "decode.js",
@@ -62,25 +63,30 @@ POLICY = (
     "default-src 'none'; script-src {script}; style-src {style}; img-src data:; "
     "base-uri 'none'; form-action 'none'"
 )
+"""Content security policy of a page, with the hashes of its script and its style sheet."""
 MIN_BUDGET = 500
+"""Messages below which a budget is not halved again."""
 MARK = b'<meta name="generator" content="netkf '
-"""What every page has among its first HEAD bytes, and other files have not."""
+"""Bytes among the first HEAD ones of every page, by which a page is told from other files."""
 HEAD = 4096
 
 
 class _Entry(NamedTuple):
-    """A source with its MESSAGE rows, why its worst sample was what it was, and the innovations of
-    its readings (or why these are not said).
+    """A source of a page and the results of the computations that take long.
+
+    messages : the MESSAGE rows of its run, none without a run
+    worst    : the explanation of its worst sample, or the reason why there is none
+    readings : the innovations of its run, or the reason why there are none
     """
 
-    source: Opened
+    source: ReportSource
     messages: np.ndarray
     worst: Explanation | str | None = None
     readings: Innovations | str | None = None
 
     @property
-    def moves(self) -> bool:
-        """True if there is something to show in the live views."""
+    def is_live(self) -> bool:
+        """True if the run can be shown in the live views."""
         run = self.source.run
         return run is not None and len(run.times) > 0 and len(run.nodes) <= MAX_NODES
 
@@ -94,18 +100,17 @@ def write_report(
     """Write the page of one directory, or of two side by side, and return its path.
 
     The path is ``out``, by default ``report.html`` in the first directory. A second directory may
-    hold the verdict of ``netkf check`` on the first. Raises ScenarioError for a directory that is
-    not one of netkf's or a ``path`` that holds anything but a page, WriteError if the page cannot
-    be written.
+    hold the verdict of ``netkf check`` on the first. Raises ScenarioError if netkf did not write a
+    directory or ``out`` is a file other than a page, WriteError if the page cannot be written.
     """
     path = Path(directories[0]) / "report.html" if out is None else out
-    _refuse_other_files(path)
+    _require_page(path)
     write_text(path, make_page(directories, replica, trust, path))
     return path
 
 
-def _refuse_other_files(path: Path) -> None:
-    """Raise ScenarioError if there is a file that is not a page: it would be lost."""
+def _require_page(path: Path) -> None:
+    """Raise ScenarioError if ``path`` is a file other than a page, which would be overwritten."""
     if not path.is_file():
         return
     try:
@@ -131,20 +136,22 @@ def make_page(
     entries = _merge_verdict(entries)
     command = _report_command(directories, replica, trust, out)
     comparison = _compare(entries, directories)
-    budget = Budget(*(part // len(entries) for part in BUDGET))
+    budget = Budget(BUDGET.messages // len(entries), BUDGET.values // len(entries))
     while True:
-        page = _assemble(entries, comparison, command, budget)
+        page = _assemble_page(entries, comparison, command, budget)
         if len(page.encode("utf-8")) <= MAX_BYTES or budget.messages < MIN_BUDGET:
             return page
         budget = budget.halve()
 
 
 def _read_entry(directory: Path, replica: int | None, trust: bool) -> _Entry:
-    """Return the contents of a directory, read for the page."""
+    """Return the contents of a directory, with its messages, explanation and innovations.
+
+    Raises ScenarioError if netkf did not write the directory, or if its files are damaged.
+    """
     source = read_source(directory, replica, trust)
-    none = np.empty(0, dtype=MESSAGE)
     if source.run is None:
-        return _Entry(source, none)
+        return _Entry(source, np.empty(0, dtype=MESSAGE))
     with damage_named(directory):
         try:
             messages = join_messages(source.run.log)
@@ -154,14 +161,17 @@ def _read_entry(directory: Path, replica: int | None, trust: bool) -> _Entry:
 
 
 def _merge_verdict(entries: list[_Entry]) -> list[_Entry]:
-    """Return the entries, a verdict as part of the run beside it."""
+    """Return the entries; if they are a run or an ensemble and a verdict, one entry of both.
+
+    Raises ScenarioError if two directories of other kinds are not runs and ensembles.
+    """
     kinds = [entry.source.kind for entry in entries]
     if len(entries) == 2 and kinds[1] == "verdict" and kinds[0] in ("run", "ensemble"):
         first, verdict = entries
         source = replace(first.source, verdict=verdict.source.verdict)
         return [first._replace(source=source)]
     if len(entries) == 2 and not {*kinds} <= {"run", "ensemble"}:
-        rule = "compares runs and ensembles; a verdict can stand behind a run"
+        rule = "compares runs and ensembles, and takes a verdict only after its run"
         raise ScenarioError("report", rule, " and ".join(kinds), "give one directory for each page")
     return entries
 
@@ -169,7 +179,7 @@ def _merge_verdict(entries: list[_Entry]) -> list[_Entry]:
 def _report_command(
     directories: Sequence[str | Path], replica: int | None, trust: bool, out: Path | None
 ) -> str:
-    """Return the command that made the page."""
+    """Return the command line that makes the page."""
     command = ["netkf", "report", *map(str, directories)]
     command += ["--replica", str(replica)] if replica is not None else []
     command += ["--trust"] if trust else []
@@ -178,41 +188,42 @@ def _report_command(
 
 
 def _compare(entries: list[_Entry], directories: Sequence[str | Path]) -> Comparison | str | None:
-    """Return the comparison of two entries, or why there is none."""
+    """Return the comparison of two entries, the reason why there is none, or None for one entry."""
     if len(entries) < 2:
         return None
-    ended = all(entry.source.status in FINAL_STATUSES and entry.source.summary for entry in entries)
-    return compare(directories) if ended else "A run did not finish, so nothing is compared"
+    have_ended = all(entry.source.status in ENDED and entry.source.summary for entry in entries)
+    return compare(directories) if have_ended else "A run did not finish, so nothing is compared"
 
 
-def _assemble(
+def _assemble_page(
     entries: list[_Entry], comparison: Comparison | str | None, command: str, budget: Budget
 ) -> str:
-    """Return the page with at most as much data as the budget allows."""
+    """Return the page as HTML, with at most about as much data of each run as ``budget`` allows.
+
+    ``command`` is the command line that makes the page.
+    """
     packer = Packer()
-    moving = [entry for entry in entries if entry.moves]
     runs = [
         run_data(entry.source, entry.source.run, entry.messages, entry.readings, budget, packer)
-        for entry in moving
-        if entry.source.run is not None
+        for entry in entries
+        if entry.is_live and entry.source.run is not None
     ]
     rules = [rule for data in runs for rule in thinning_rules(data)]
     packed, sizes = packer.text()
+    sources = [entry.source for entry in entries]
     data = {
         "runs": runs,
         "sizes": sizes,
-        "ensembles": [tables.ensemble_curves(entry.source) for entry in entries],
-        "summaries": [tables.averages(entry.source) for entry in entries],
-        "difference": tables.difference_curves(*(entry.source for entry in entries))
-        if len(entries) == 2
-        else None,
-        "labels": [entry.source.label for entry in entries],
-        "sweep": tables.sweep_curves(entries[0].source),
+        "ensembles": [tables.ensemble_curves(source) for source in sources],
+        "summaries": [tables.averages(source) for source in sources],
+        "difference": tables.difference_curves(*sources) if len(sources) == 2 else None,
+        "labels": [source.label for source in sources],
+        "sweep": tables.sweep_curves(sources[0]),
     }
     body = _page_header(entries, comparison) + _main_sections(
         entries, comparison, command, rules, bool(runs)
     )
-    title = " and ".join(dict.fromkeys(entry.source.scenario.name for entry in entries))
+    title = " and ".join(dict.fromkeys(source.scenario.name for source in sources))
     script, style = _script(), _style()
     policy = POLICY.format(script=content_hash(script), style=content_hash(style))
     return _asset("page.html").format(
@@ -228,31 +239,39 @@ def _assemble(
 
 
 def _page_header(entries: list[_Entry], comparison: Comparison | str | None) -> str:
-    """Return the head of the page: names, claims and notes on the data."""
+    """Return the head of the page as HTML: the names of the scenarios and the sentences on the
+    sources and their differences.
+    """
     parts = []
-    for letter, (source, messages, worst, readings) in zip("AB", entries, strict=False):
-        mark = f"{letter}: " if len(entries) > 1 else ""
-        level = "h2" if len(entries) > 1 else "h1"
-        title = f"{mark}{source.scenario.name}"
+    for letter, entry in zip("AB", entries, strict=False):
+        source = entry.source
+        prefix = f"{letter}: " if len(entries) > 1 else ""
+        element = "h2" if len(entries) > 1 else "h1"
         status = "" if source.status == "complete" else f" ({source.status})"
-        parts.append(f"<{level}>{text(title + status)}</{level}>")
+        title = f"{prefix}{source.scenario.name}{status}"
+        parts.append(f"<{element}>{text(title)}</{element}>")
         if source.scenario.claim:
             parts.append(paragraph(f"Claim of the scenario: {source.scenario.claim}", "claim"))
-        lines = findings(source, messages, readings)
-        if isinstance(worst, Explanation):
-            why = (k for k, line in enumerate(lines, 1) if line.startswith("Why: "))
-            index = next(why, len(lines))
-            lines.insert(index, mending_claim(worst))
-            central = central_sample(source)
-            if central is not None:
-                lines.insert(index + 1, price_claim(source, worst, central))
-        parts.append(bullets((line + "." for line in lines), "findings"))
+        parts.append(bullets((line + "." for line in _source_sentences(entry)), "findings"))
     heading = "<h1>Two runs on one clock</h1>" if len(entries) > 1 else ""
     if comparison is not None:
-        sources = [entry.source for entry in entries]
-        lines = difference_findings(comparison, sources[0], sources[1])
-        heading += bullets((line + "." for line in lines), "findings")
+        first, second = (entry.source for entry in entries)
+        sentences = describe_differences(comparison, first, second)
+        heading += bullets((line + "." for line in sentences), "findings")
     return f'<header class="top">{heading}{"".join(parts)}</header>'
+
+
+def _source_sentences(entry: _Entry) -> list[str]:
+    """Return the sentences on a source, those from replays after the one that begins with Why."""
+    sentences = describe_source(entry.source, entry.messages, entry.readings)
+    if isinstance(entry.worst, Explanation):
+        after_why = (k for k, line in enumerate(sentences, 1) if line.startswith("Why: "))
+        index = next(after_why, len(sentences))
+        sentences.insert(index, describe_mending(entry.worst))
+        central = central_sample(entry.source)
+        if central is not None:
+            sentences.insert(index + 1, describe_central(entry.source, entry.worst, central))
+    return sentences
 
 
 def _main_sections(
@@ -262,62 +281,67 @@ def _main_sections(
     rules: list[str],
     live: bool,
 ) -> str:
-    """Return the sections of the page as HTML."""
+    """Return the sections of the page as HTML.
+
+    ``rules`` are the sentences on data that were left out; ``live`` is True with live views.
+    """
     sources = [entry.source for entry in entries]
-    parts = [_asset("live.html") if live else _still_section(sources)]
-    mended = [mending_section(e.source, e.worst) for e in entries if e.worst is not None]
-    if mended:
-        parts.append(section("mending", "What would have mended the worst sample", "".join(mended)))
+    parts = [_asset("live.html") if live else _explain_no_live_views(sources)]
+    explanations = [mending_section(e.source, e.worst) for e in entries if e.worst is not None]
+    if explanations:
+        title = "What would have mended the worst sample"
+        parts.append(section("mending", title, "".join(explanations)))
     if comparison is not None:
-        parts.append(section("comparison", "What differs", _difference_section(comparison)))
+        parts.append(section("comparison", "What differs", _difference_tables(comparison)))
     if any(source.kind not in ("filters", "verdict") for source in sources):
-        parts.append(section("figures", "Figures", _figure_section(entries)))
-    drawn = "".join(filters_figure(s.filters) for s in sources if s.filters is not None)
-    if drawn:
-        parts.append(section("figures", "Errors of the filters", drawn))
-    parts.append(
-        section("verdicts", "Verdicts and averages", "".join(map(_result_tables, sources)))
-    )
-    parts.append(section("scenario", "Scenario", "".join(map(_scenario_text, sources))))
-    parts.append(
-        section("origin", "Versions and command", _origin_section(sources, command, rules))
-    )
+        parts.append(section("figures", "Figures", _curve_area(entries)))
+    figures = "".join(filters_figure(s.filters) for s in sources if s.filters is not None)
+    if figures:
+        parts.append(section("figures", "Errors of the filters", figures))
+    results = "".join(_result_tables(source) for source in sources)
+    parts.append(section("verdicts", "Verdicts and averages", results))
+    scenarios = "".join(_scenario_text(source) for source in sources)
+    parts.append(section("scenario", "Scenario", scenarios))
+    origin = _describe_origin(sources, command, rules)
+    parts.append(section("origin", "Versions and command", origin))
     return "<main>" + "".join(parts) + "</main>"
 
 
-def _figure_section(entries: list[_Entry]) -> str:
-    """Return the place of the curves, and why there are none of innovations."""
+def _curve_area(entries: list[_Entry]) -> str:
+    """Return the element in which the page's script draws the curves, and notes on innovations that
+    could not be computed, as HTML.
+    """
     reasons = dict.fromkeys(entry.readings for entry in entries if isinstance(entry.readings, str))
     notes = [paragraph(f"No innovations are shown: {reason}.", "note") for reason in reasons]
     return '<div id="curves" class="curves"></div>' + "".join(notes)
 
 
-def _difference_section(comparison: Comparison | str) -> str:
-    """Return the section on differences as HTML."""
+def _difference_tables(comparison: Comparison | str) -> str:
+    """Return the table of differences as HTML, or the reason why there is none."""
     if isinstance(comparison, str):
         return paragraph(comparison)
     return tables.comparison_section(comparison)
 
 
-def _still_section(sources: list[Opened]) -> str:
-    """Return the section that says why nothing is shown in motion."""
-    kept_nothing = {"sweep": "sweep", "verdict": "verdict", "filters": "comparison of filters"}
-    if sources[0].kind in kept_nothing:
+def _explain_no_live_views(sources: list[ReportSource]) -> str:
+    """Return a section with the reason why the page has no live views, as HTML."""
+    untraced_kinds = {"sweep": "sweep", "verdict": "verdict", "filters": "comparison of filters"}
+    if sources[0].kind in untraced_kinds:
         reason = (
-            f"A {kept_nothing[sources[0].kind]} keeps no trace of single runs. To see one move: "
+            f"A {untraced_kinds[sources[0].kind]} keeps no trace of single runs. To see one move: "
             "netkf run SCENARIO --trace full --out DIR, then netkf report DIR."
         )
     elif all(source.run is None for source in sources):
-        reason = "No run was recorded here, so nothing moves: run again with --trace full."
+        reason = "No run was recorded, so there is nothing to animate: run again with --trace full."
     elif all(source.run is None or not len(source.run.times) for source in sources):
-        reason = "The run has no sample, so there is nothing to show in motion."
+        reason = "The run has no sample, so there is nothing to animate."
     else:
-        reason = f"Networks of more than {MAX_NODES:,} nodes are not shown in motion."
+        reason = f"Networks of more than {MAX_NODES:,} nodes are not animated."
     return section("live", "The network in motion", paragraph(reason, "note"))
 
 
-def _result_tables(source: Opened) -> str:
-    """Return the tables of a source as HTML."""
+def _result_tables(source: ReportSource) -> str:
+    """Return the tables of a source's verdict, sweep, filters or averages as HTML."""
     parts = []
     if source.verdict is not None:
         parts.append(tables.verdict_table(source))
@@ -330,15 +354,15 @@ def _result_tables(source: Opened) -> str:
         if source.verdict is None:
             parts.append(
                 paragraph(
-                    "No verdict stands here. netkf check SCENARIO --out VERDICT holds the promises "
-                    "of the paper against many runs; netkf report DIR VERDICT shows both.",
+                    "There is no verdict yet. netkf check SCENARIO --out VERDICT tests the "
+                    "promises of the paper on many runs; netkf report DIR VERDICT shows both.",
                     "note",
                 )
             )
     return "".join(parts)
 
 
-def _scenario_text(source: Opened) -> str:
+def _scenario_text(source: ReportSource) -> str:
     """Return the scenario file of a source as HTML."""
     label = f"scenario.toml of {source.label}"
     return (
@@ -349,71 +373,83 @@ def _scenario_text(source: Opened) -> str:
 
 
 def _event_counts(run: StoredRun) -> str:
-    """Return how many events of each kind a run has."""
+    """Return a sentence that counts the events of a run, in total and by kind."""
     counts = [f"{run.count(kind):,} {kind}" for kind in KINDS if run.count(kind)]
-    listed = f" ({', '.join(counts)})" if counts else ""
-    return f"Events of replica {run.replica}: {len(run.log):,}{listed}"
+    by_kind = f" ({', '.join(counts)})" if counts else ""
+    return f"Events of replica {run.replica}: {len(run.log):,}{by_kind}"
 
 
-def _origin_section(sources: list[Opened], command: str, rules: list[str]) -> str:
-    """Return the section on how the page and its sources were made."""
-    parts = [
-        paragraph("This page was made by:"),
-        f'<pre tabindex="0" role="group" aria-label="command">{text(command)}</pre>',
-    ]
+def _describe_origin(sources: list[ReportSource], command: str, rules: list[str]) -> str:
+    """Return the commands that make the page and its sources, the versions, the counts of events,
+    and the ``rules`` by which data were left out, as HTML.
+    """
+    parts = [paragraph("This page was made by:"), _command_box(command)]
     for source in sources:
-        runs = f" --runs {source.runs}" if source.kind in ("ensemble", "filters") else ""
-        verbs = {"sweep": "sweep", "verdict": "check", "filters": "compare-filters"}
-        verb = verbs.get(source.kind, "run")
-        again = f"netkf {verb} {shlex.quote(source.label + '/scenario.toml')}{runs}"
-        if verb == "sweep":
-            again += "".join(
-                f" --vary {shlex.quote(key + '=' + ','.join(map(str, values)))}"
-                for key, values in source.manifest.get("vary", {}).items()
-            )
-        if source.filters is not None:
-            again += f" --filters {shlex.quote(_filter_option(source.filters))}"
         parts.append(paragraph("The results can be computed again by:"))
-        parts.append(f'<pre tabindex="0" role="group" aria-label="command">{text(again)}</pre>')
+        parts.append(_command_box(_source_command(source)))
         parts.append(tables.versions_table(source))
         if source.run is not None:
             parts.append(paragraph(_event_counts(source.run)))
     if rules:
         parts.append(bullets(f"Left out: {rule}." for rule in rules))
     elif any(source.run is not None for source in sources):
-        whole = "Nothing was left out: the page holds every sample and every message of these runs."
-        parts.append(paragraph(whole))
+        note = "Nothing was left out: the page holds every sample and every message of these runs."
+        parts.append(paragraph(note))
     return "".join(parts)
 
 
-def _filter_option(found: StoredComparison) -> str:
-    """Return the filters of a comparison as an option; labels are a kind and its settings."""
-    tables_of = []
-    for row in found.rows:
+def _command_box(command: str) -> str:
+    """Return a command line as HTML, in a box that scrolls by itself."""
+    return f'<pre tabindex="0" role="group" aria-label="command">{text(command)}</pre>'
+
+
+def _source_command(source: ReportSource) -> str:
+    """Return the command line that computes the results of a source again."""
+    subcommands = {"sweep": "sweep", "verdict": "check", "filters": "compare-filters"}
+    subcommand = subcommands.get(source.kind, "run")
+    command = f"netkf {subcommand} {shlex.quote(source.label + '/scenario.toml')}"
+    if source.kind in ("ensemble", "filters"):
+        command += f" --runs {source.runs}"
+    if source.kind == "sweep":
+        for key, values in source.manifest.get("vary", {}).items():
+            command += f" --vary {shlex.quote(key + '=' + ','.join(map(str, values)))}"
+    if source.filters is not None:
+        command += f" --filters {shlex.quote(_filter_option(source.filters))}"
+    return command
+
+
+def _filter_option(comparison: StoredComparison) -> str:
+    """Return the value of ``--filters`` for a comparison: kinds, or inline TOML tables of a kind
+    and its settings.
+    """
+    options = []
+    for row in comparison.rows:
+        # The label of a filter is its kind, then its settings as key=value.
         kind, *settings = row.filter.split(" ")
         table = ", ".join([f'kind="{kind}"', *settings])
-        tables_of.append(f"{{{table}}}" if settings else kind)
-    return ",".join(tables_of)
+        options.append(f"{{{table}}}" if settings else kind)
+    return ",".join(options)
 
 
 @cache
 def _asset(name: str) -> str:
-    """Return the text of a file of this package."""
+    """Return the text of a file in the folder ``assets``."""
     return (resources.files("netkf.report") / "assets" / name).read_text(encoding="utf-8")
 
 
 @cache
 def _script() -> str:
-    """Return all scripts as one: uPlot, then the page's own modules in a scope of their own."""
-    # The licence of uPlot asks for its text in every copy.
+    """Return uPlot and the page's own scripts as one; the latter share a function's scope."""
+    # The licence of uPlot requires its text in every copy.
     licence = "/*! uPlot\n" + _asset("uPlot.LICENSE.txt").replace("*/", "") + "*/\n"
-    own = "\n".join(_asset(name) for name in SCRIPTS)
+    scripts = "\n".join(_asset(name) for name in SCRIPTS)
     return (
-        f'{licence}{_asset("uPlot.iife.min.js")}\n(function () {{\n"use strict";\n{own}\n}})();\n'
+        f'{licence}{_asset("uPlot.iife.min.js")}\n(function () {{\n"use strict";\n{scripts}\n'
+        "})();\n"
     )
 
 
 @cache
 def _style() -> str:
-    """Return the style sheet."""
+    """Return the style sheets of uPlot and of the page as one."""
     return _asset("uPlot.min.css") + "\n" + _asset("page.css")

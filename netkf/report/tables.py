@@ -1,4 +1,6 @@
-"""Tables of a page: verdicts, summaries, comparisons, sweeps, versions."""
+"""Tables of a page as HTML (verdicts, summaries, comparisons, sweeps, versions), and the data of
+curves that show the same numbers.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +11,7 @@ import numpy as np
 from scipy.special import stdtrit
 
 from netkf.linalg.arrays import FloatArray
-from netkf.report.directories import Opened
+from netkf.report.directories import ReportSource
 from netkf.report.markup import bullets, paragraph, table_box
 from netkf.runs.files import to_json_value
 from netkf.runs.summary import CONFIDENCE, nees_bounds
@@ -20,19 +22,19 @@ from netkf.studies.filter_values import Quantity
 from netkf.studies.stored import StoredComparison
 
 MAX_ROWS = 2_000
-"""Rows of a table on a page; what is left out is counted."""
-ORDER = ("broken", "undecided", "holds", "not promised")
-INTERVAL = 2.0
+"""Rows of a table on a page."""
+VERDICT_ORDER = ("broken", "undecided", "holds", "not promised")
+INTERVAL_WIDTH = 2.0
 """Standard errors on each side of an interval in a curve."""
 
 
-def verdict_table(source: Opened) -> str:
-    """Return the rows of a verdict, broken ones first."""
+def verdict_table(source: ReportSource) -> str:
+    """Return the rows of the verdict of ``netkf check`` as a table, broken promises first."""
     verdict = source.verdict or {}
     rows = sorted(verdict.get("rows", []), key=_verdict_rank)
     cells = [
         (
-            f"{row['verdict'].upper() if row['verdict'] == 'broken' else row['verdict']}",
+            "BROKEN" if row["verdict"] == "broken" else row["verdict"],
             row["promise"],
             row["source"],
             format_number(row["seen"]),
@@ -43,26 +45,27 @@ def verdict_table(source: Opened) -> str:
         )
         for row in rows
     ]
-    caption = f"Promises held against {verdict.get('runs', 0):,} runs by netkf check"
+    caption = f"Promises tested on {verdict.get('runs', 0):,} runs by netkf check"
     header = ("verdict", "promise", "source", "seen", "expected", "off by", "would see", "evidence")
     return table_box(caption, header, cells, "words")
 
 
 def _verdict_rank(row: dict[str, Any]) -> int:
-    """Return a key that sorts rows by verdict."""
-    return ORDER.index(row["verdict"]) if row["verdict"] in ORDER else len(ORDER)
+    """Return the index of a row's verdict in VERDICT_ORDER, the last for other verdicts."""
+    verdict = row["verdict"]
+    return VERDICT_ORDER.index(verdict) if verdict in VERDICT_ORDER else len(VERDICT_ORDER)
 
 
-def summary_section(source: Opened) -> str:
-    """Return the table that ends ``netkf run``, with its notes."""
+def summary_section(source: ReportSource) -> str:
+    """Return the table of averages that ``netkf run`` prints, with its notes."""
     summary = source.summary
     if not summary:
         return paragraph("There is no summary: the runs ended before it was written")
-    rows = [[str(row["node"]), *_cells(row)] for row in summary["nodes"]]
+    rows = [[str(row["node"]), *_summary_cells(row)] for row in summary["nodes"]]
     listed = rows[:MAX_ROWS]
     if len(rows) > MAX_ROWS:
         listed.append([f"({len(rows) - MAX_ROWS:,} more)", *[""] * len(COLUMNS)])
-    listed.append(["all", *_cells(summary["overall"])])
+    listed.append(["all", *_summary_cells(summary["overall"])])
     runs = f"averages over {source.runs:,} runs, +- one standard error" if source.runs > 1 else ""
     caption = f"Averages over time{'; ' + runs if runs else ''}: {source.label}"
     messages = summary["messages"]
@@ -80,30 +83,28 @@ def summary_section(source: Opened) -> str:
     return table_box(caption, ["node", *COLUMNS.values()], listed) + bullets(notes)
 
 
-def _cells(row: dict[str, Any]) -> list[str]:
-    """Return the cells of a row of the summary."""
-    return [
-        format_number(row[key]) + format_standard_error(row.get(f"{key}_se")) for key in COLUMNS
-    ]
+def _summary_cells(row: dict[str, Any]) -> list[str]:
+    """Return the values of a row of the summary with their standard errors as text."""
+    return [format_number(row[key]) + standard_error(row.get(f"{key}_se")) for key in COLUMNS]
 
 
-def _bound_notes(source: Opened) -> list[str]:
-    """Return the notes on bound and limits."""
+def _bound_notes(source: ReportSource) -> list[str]:
+    """Return notes on the bound of trace P, its limit and the centralised filter."""
     summary = source.summary
-    found = [] if any(row["bound"] for row in summary["nodes"]) else [f"bound: {summary['bound']}"]
+    notes = [] if any(row["bound"] for row in summary["nodes"]) else [f"bound: {summary['bound']}"]
     if source.promised is not None:
         label = source.promised.limit_label
-        traces = {label: summary["limit"], "centralised filter": summary["central"]}
-        known = [f"{name} {format_number(value)}" for name, value in traces.items() if value]
-        found += [f"traces to compare: {', '.join(known)}"] if known else []
-        found += [_limit_note(label)] if summary["limit"] else []
-        found += source.promised.notes
-    return found
+        limits = {label: summary["limit"], "centralised filter": summary["central"]}
+        traces = [f"{name} {format_number(value)}" for name, value in limits.items() if value]
+        notes += [f"traces to compare: {', '.join(traces)}"] if traces else []
+        notes += [_explain_limit(label)] if summary["limit"] else []
+        notes += source.promised.notes
+    return notes
 
 
-def _limit_note(label: str) -> str:
-    """Return a sentence that defines the limit of the bound, and says why it is not the centralised
-    covariance.
+def _explain_limit(label: str) -> str:
+    """Return sentences that define the limit of the bound, which is called ``label``, and compare
+    it with the centralised covariance.
     """
     weights = "1/N" if label.startswith("limit S") else "their weights"
     return (
@@ -115,30 +116,35 @@ def _limit_note(label: str) -> str:
 
 
 def _format_count(value: Any) -> str:
-    """Return a count as text."""
+    """Return a count as text, with one decimal if it is a mean over runs."""
     return f"{value:,}" if isinstance(value, int) else f"{value:,.1f}"
 
 
 def comparison_section(comparison: Comparison) -> str:
-    """Return the differences of two directories; certain ones are marked in words."""
+    """Return a table of the differences of two directories, A and B, below a sentence that counts
+    the certain ones.
+    """
     rows = []
-    for quantity, node, entries in comparison.rows:
-        one, other = entries[0], entries[1]
-        where = quantity if node < 0 else f"{quantity} of node {node}"
-        rows.append([where, _format_value(one), _format_value(other), *_difference_cells(other)])
+    for quantity, node, (first, second) in comparison.rows:
+        label = quantity if node < 0 else f"{quantity} of node {node}"
+        values = (_format_value(first), _format_value(second))
+        rows.append([label, *values, *_difference_cells(second)])
     names = [
         f"{letter}: {label}" for letter, label in zip("AB", comparison.directories, strict=True)
     ]
     header = ["quantity", *names, "B - A", "interval", "certain?"]
-    count = sum(entries[1].real is True for _, _, entries in comparison.rows)
-    certain = (
-        f"{count} differences are certain: their intervals, which hold together with probability "
-        f"{comparison.confidence:.6g}, leave out 0"
-        if min(comparison.runs) > 1
-        else "One run says nothing about certainty: compare ensembles (netkf run --runs 100) to "
-        "see which differences are certain"
-    )
-    return paragraph(certain) + table_box("Differences of B from A", header, rows)
+    if min(comparison.runs) > 1:
+        count = sum(entries[1].real is True for _, _, entries in comparison.rows)
+        sentence = (
+            f"{count} differences are certain: their intervals, which hold together with "
+            f"probability {comparison.confidence:.6g}, exclude 0"
+        )
+    else:
+        sentence = (
+            "Single runs have no intervals: compare ensembles (netkf run --runs 100) to see which "
+            "differences are certain"
+        )
+    return paragraph(sentence) + table_box("Differences of B from A", header, rows)
 
 
 def _format_value(entry: Entry) -> str:
@@ -147,7 +153,7 @@ def _format_value(entry: Entry) -> str:
 
 
 def _difference_cells(entry: Entry) -> list[str]:
-    """Return the cells of a difference: value, interval, mark."""
+    """Return the difference, its interval and whether it is certain as three texts."""
     if entry.difference is None:
         return ["-", "-", "-"]
     interval = "-"
@@ -157,11 +163,11 @@ def _difference_cells(entry: Entry) -> list[str]:
     return [format_number(entry.difference), interval, mark]
 
 
-def filters_table(found: StoredComparison) -> str:
-    """Return the filters of a comparison, with their differences from the first one."""
+def filters_table(comparison: StoredComparison) -> str:
+    """Return a table of the compared filters, with their differences from the first one."""
     header = ["filter"]
     for name in ("RMS error", "worst instant", "NEES / n"):
-        header += [name, f"difference from {found.first}", "certain?"]
+        header += [name, f"difference from {comparison.first}", "certain?"]
     header += ["consistency", "transmissions", "kB"]
     rows = [
         [
@@ -171,47 +177,47 @@ def filters_table(found: StoredComparison) -> str:
             f"{row.transmissions:,.0f}",
             f"{row.bytes / 1000.0:,.6g}",
         ]
-        for row in found.rows
+        for row in comparison.rows
         if row.ran
     ]
-    caption = f"{found.runs:,} runs of each filter on the same draws, +- one standard error"
+    caption = f"{comparison.runs:,} runs of each filter on the same draws, +- one standard error"
     notes = [
-        f"All marks are right together with probability {found.confidence:.6g}; differences are "
-        "taken run by run",
+        f"All marks are right together with probability {comparison.confidence:.6g}; differences "
+        "are taken run by run",
         "Worst instant: the largest error of any node at any sample; traffic is of replica 0",
     ]
-    ahead = [row.filter for row in found.rows if row.ran and row.predicts]
-    if ahead and len(ahead) < len(rows):
-        notes.append(f"Samples of {', '.join(ahead)} are predictions, the others are filtered")
+    predictors = [row.filter for row in comparison.rows if row.ran and row.predicts]
+    if predictors and len(predictors) < len(rows):
+        notes.append(f"Samples of {', '.join(predictors)} are predictions, the others are filtered")
     return table_box(caption, header, rows) + bullets(notes)
 
 
-def _quantity_cells(found: Quantity) -> list[str]:
-    """Return the cells of a quantity: value, difference, mark."""
-    value = format_number(found.value) + format_standard_error(found.se)
-    if not math.isfinite(found.difference):
+def _quantity_cells(quantity: Quantity) -> list[str]:
+    """Return the value, its difference and whether the difference is certain as three texts."""
+    value = format_number(quantity.value) + standard_error(quantity.se)
+    if not math.isfinite(quantity.difference):
         return [value, "-", "-"]
-    interval = f"{format_number(found.low)} .. {format_number(found.high)}"
-    difference = f"{format_number(found.difference)} ({interval})"
-    return [value, difference, "\u25c6 certain" if found.real else "no"]
+    interval = f"{format_number(quantity.low)} .. {format_number(quantity.high)}"
+    difference = f"{format_number(quantity.difference)} ({interval})"
+    return [value, difference, "\u25c6 certain" if quantity.real else "no"]
 
 
-def sweep_table(source: Opened) -> str:
-    """Return the points of a sweep."""
+def sweep_table(source: ReportSource) -> str:
+    """Return a table of the first MAX_ROWS points of a sweep."""
     assert source.sweep is not None
-    found = source.sweep.table
-    if not len(found):
+    points = source.sweep.table
+    if not len(points):
         return paragraph("No point of the sweep is finished yet")
-    names = [str(name) for name in found.columns if not str(name).endswith("_se")]
+    names = [str(name) for name in points.columns if not str(name).endswith("_se")]
     rows = [
         [_format_cell(record[name], record.get(f"{name}_se")) for name in names]
-        for record in found.to_dict("records")[:MAX_ROWS]
+        for record in points.to_dict("records")[:MAX_ROWS]
     ]
     return table_box("Points of the sweep, +- one standard error", names, rows)
 
 
 def _format_cell(value: Any, error: Any) -> str:
-    """Return a value of a sweep with its standard error as text."""
+    """Return a value of a sweep as text, a number with its standard error (None if it has none)."""
     if isinstance(value, (int, np.integer)):
         return f"{int(value):,}"
     if isinstance(value, (float, np.floating)):
@@ -221,8 +227,8 @@ def _format_cell(value: Any, error: Any) -> str:
     return str(value)
 
 
-def versions_table(source: Opened) -> str:
-    """Return the versions that the results depend on, and what else the manifest says."""
+def versions_table(source: ReportSource) -> str:
+    """Return a table of the versions, the seed and the status in the manifest of a source."""
     manifest = source.manifest
     rows = [(name, value) for name, value in manifest.get("versions", {}).items()]
     keys = ("seed", "replica", "engine", "status", "events", "fingerprint")
@@ -230,49 +236,51 @@ def versions_table(source: Opened) -> str:
     return table_box("Versions and identity of the run", ("what", "value"), rows, "words")
 
 
-def ensemble_curves(source: Opened) -> dict[str, Any] | None:
-    """Return curves of an ensemble with their intervals for the page: for each node the mean of
+def ensemble_curves(source: ReportSource) -> dict[str, Any] | None:
+    """Return curves of an ensemble with their intervals as JSON values: for each node the mean of
     trace P, the mean squared error and the mean NEES, as lists over times; None for single runs.
-
-    The standard error of a trace is at most the sum of those of its diagonal, which is used.
     """
-    found = source.ensemble
-    if found is None:
+    ensemble = source.ensemble
+    if ensemble is None:
         return None
-    trace, trace_se = _matrix_traces(found.mean_P), _matrix_traces(found.se_P)
-    square, square_se = _matrix_traces(found.mean_error), _matrix_traces(found.se_error)
+    # The standard error of a trace is at most the sum of the standard errors of the diagonal.
+    trace, trace_se = _matrix_traces(ensemble.mean_P), _matrix_traces(ensemble.se_P)
+    square, square_se = _matrix_traces(ensemble.mean_error), _matrix_traces(ensemble.se_error)
     nodes: dict[str, Any] = {}
-    for k, node in enumerate(found.nodes):
+    for k, node in enumerate(ensemble.nodes):
         nodes[str(node)] = {
-            "trace": _with_interval(trace[:, k], trace_se[:, k]),
-            "square": _with_interval(square[:, k], square_se[:, k]),
-            "nees": _with_interval(found.mean_nees[:, k], found.se_nees[:, k]),
+            "trace": _interval_curves(trace[:, k], trace_se[:, k]),
+            "square": _interval_curves(square[:, k], square_se[:, k]),
+            "nees": _interval_curves(ensemble.mean_nees[:, k], ensemble.se_nees[:, k]),
         }
-        if found.bound is not None:
-            nodes[str(node)]["bound"] = to_json_value(found.bound[:, k].tolist())
+        if ensemble.bound is not None:
+            nodes[str(node)]["bound"] = finite(ensemble.bound[:, k].tolist())
     interval = list(nees_bounds(source.scenario.plant.n, max(1, source.runs)))
-    return {"times": found.times.tolist(), "nodes": nodes, "nees_interval": interval}
+    return {"times": ensemble.times.tolist(), "nodes": nodes, "nees_interval": interval}
 
 
-def difference_curves(one: Opened, other: Opened) -> dict[str, Any] | None:
-    """Return the difference of mean squared errors of two ensembles, for each node a list of means
-    and of both ends of their intervals over time; None if their nodes or times differ.
+def difference_curves(source_a: ReportSource, source_b: ReportSource) -> dict[str, Any] | None:
+    """Return the difference, B minus A, of the mean squared errors of two ensembles.
 
-    The intervals are Welch's, and hold together for all nodes and times (Bonferroni). The standard
-    error of a sum is at most the sum of the standard errors, which is used.
+    For each node there are three lists over time: the differences and the lower and upper limits of
+    their intervals. None if a source is not an ensemble of two runs or more, or if their nodes or
+    times differ. The intervals are Welch's, and hold together for all nodes and times (Bonferroni).
     """
-    first, second = one.ensemble, other.ensemble
+    first, second = source_a.ensemble, source_b.ensemble
     if first is None or second is None or first.nodes != second.nodes:
         return None
-    freedom = min(one.runs, other.runs) - 1
+    # Welch's degrees of freedom are at least those of the smaller ensemble.
+    freedom = min(source_a.runs, source_b.runs) - 1
     if not np.array_equal(first.times, second.times) or freedom < 1:
         return None
-    gap = _matrix_traces(second.mean_error) - _matrix_traces(first.mean_error)
+    difference = _matrix_traces(second.mean_error) - _matrix_traces(first.mean_error)
+    # The standard error of a trace is at most the sum of the standard errors of the diagonal.
     error = np.hypot(_matrix_traces(first.se_error), _matrix_traces(second.se_error))
-    level = (1.0 - CONFIDENCE) / (2.0 * gap.size)
-    wide = float(stdtrit(freedom, 1.0 - level)) * error
+    level = (1.0 - CONFIDENCE) / (2.0 * difference.size)
+    half_width = float(stdtrit(freedom, 1.0 - level)) * error
+    curves = (difference, difference - half_width, difference + half_width)
     nodes = {
-        str(node): [to_json_value(part[:, k].tolist()) for part in (gap, gap - wide, gap + wide)]
+        str(node): [finite(curve[:, k].tolist()) for curve in curves]
         for k, node in enumerate(first.nodes)
     }
     return {"confidence": CONFIDENCE, "times": first.times.tolist(), "nodes": nodes}
@@ -283,37 +291,45 @@ def _matrix_traces(matrices: FloatArray) -> FloatArray:
     return np.asarray(np.trace(matrices, axis1=2, axis2=3))
 
 
-def averages(source: Opened) -> list[dict[str, Any]] | None:
-    """Return the averages of each node as in summary.json, None without a summary."""
+def averages(source: ReportSource) -> list[dict[str, Any]] | None:
+    """Return the averages of each node and their standard errors, by the names in summary.json;
+    None without a summary.
+    """
     if not source.summary:
         return None
     names = ["node", *COLUMNS, *(f"{name}_se" for name in COLUMNS)]
     return [{name: row[name] for name in names if name in row} for row in source.summary["nodes"]]
 
 
-def _with_interval(mean: Any, error: Any) -> list[list[float | None]]:
-    """Return mean, lower and upper end as JSON values."""
-    wide = INTERVAL * np.asarray(error, dtype=float)
-    return [
-        to_json_value(column.tolist())
-        for column in (np.asarray(mean, dtype=float), mean - wide, mean + wide)
-    ]
+def _interval_curves(mean: Any, error: Any) -> list[list[float | None]]:
+    """Return the mean (T,) and its lower and upper limit, from standard errors (T,), as lists in
+    which numbers that are not finite are None.
+    """
+    half_width = INTERVAL_WIDTH * np.asarray(error, dtype=float)
+    curves = (np.asarray(mean, dtype=float), mean - half_width, mean + half_width)
+    return [finite(curve.tolist()) for curve in curves]
 
 
-def sweep_curves(source: Opened) -> dict[str, Any] | None:
-    """Return the results of a sweep over its first varied key if that has numbers, else None."""
+def sweep_curves(source: ReportSource) -> dict[str, Any] | None:
+    """Return the worst RMS error of a sweep over its first varied key, as JSON values, with one
+    curve for each combination of values of the other keys.
+
+    None without a finished point, or if the values of the first key are not numbers.
+    """
     if source.sweep is None or not len(source.sweep.table):
         return None
-    found, keys = source.sweep.table, list(source.sweep.keys)
-    if not np.issubdtype(found[keys[0]].to_numpy().dtype, np.number):
+    table, keys = source.sweep.table, list(source.sweep.keys)
+    first_key, other_keys = keys[0], keys[1:]
+    if not np.issubdtype(table[first_key].to_numpy().dtype, np.number):
         return None
     series = []
-    groups = found.groupby(keys[1:], sort=False) if len(keys) > 1 else [((), found)]
-    for where, points in groups:
-        rows = points.sort_values(keys[0])
-        values = tuple(where)
-        label = ", ".join(f"{k} = {v}" for k, v in zip(keys[1:], values, strict=True))
+    groups = table.groupby(other_keys, sort=False) if other_keys else [((), table)]
+    for values, points in groups:
+        rows = points.sort_values(first_key)
+        settings = zip(other_keys, tuple(values), strict=True)
+        label = ", ".join(f"{key} = {value}" for key, value in settings)
         mean, error = rows["worst_rms"].to_numpy(), rows["worst_rms_se"].to_numpy()
-        x = rows[keys[0]].astype(float).tolist()
-        series.append({"label": label or "worst node", "x": x, "y": _with_interval(mean, error)})
-    return {"key": keys[0], "series": series}
+        x = rows[first_key].astype(float).tolist()
+        y = _interval_curves(mean, error)
+        series.append({"label": label or "worst node", "x": x, "y": y})
+    return {"key": first_key, "series": series}

@@ -1,4 +1,4 @@
-"""The node of a run that was most off, and when: overall, and after the filters had started."""
+"""The worst node of a run and its worst sample: overall, and after the start-up of the filters."""
 
 from __future__ import annotations
 
@@ -11,16 +11,18 @@ import numpy as np
 from netkf.runs.stored import StoredRun
 from netkf.runs.summary import SampleIndices, select_averaged_samples
 
-COME_DOWN, LATE_SHARE = 0.8, 0.25
+START_UP_RATIO, LATE_SHARE = 0.8, 0.25
 """Trace P has a start-up if its mean over the last quarter of the samples is below this share of
 its first value."""
 
 
-class Worst(NamedTuple):
-    """The node that was worst over time and its worst sample.
+class WorstSample(NamedTuple):
+    """The worst sample, at ``time`` seconds, of a node.
 
-    value, peak : with truth the RMS error over time and the error at ``time``; without it the
-    square roots of the mean trace of P and of the trace at ``time``
+    value    : with ground truth the RMS error of the node over time, else the square root of its
+               mean trace of P
+    peak     : with ground truth the error at ``time``, else the square root of the trace of P then
+    by_error : True with ground truth
     """
 
     node: int
@@ -30,90 +32,100 @@ class Worst(NamedTuple):
     by_error: bool
 
 
-def node_most_off(run: StoredRun, summary: Mapping[str, Any]) -> Worst | None:
-    """Return the worst node of a run with the contents of its summary.json: the one with the
-    largest RMS error over time, or, without ground truth, with the largest mean trace of P. None
-    without a finite number.
+def find_worst_sample(run: StoredRun, summary: Mapping[str, Any]) -> WorstSample | None:
+    """Return the worst sample of the worst node of a run; None if no node has a finite mean.
+
+    The worst node has the largest RMS error over time or, without ground truth, the largest mean
+    trace of P. ``summary`` is the contents of summary.json.
     """
     if not len(run.times) or not run.nodes:
         return None
     by_error = run.truth_known
     traces = np.trace(run.P, axis1=2, axis2=3)
     square = run.sq_error if by_error else traces
-    used = samples_averaged(run, summary)
-    chosen = used.errors if by_error else used.covariances
-    if not len(chosen):
+    averaged = summary_samples(run, summary)
+    rows = averaged.errors if by_error else averaged.covariances
+    if not len(rows):
         return None
     with np.errstate(all="ignore"):
-        means = square[chosen].mean(axis=0)
+        means = square[rows].mean(axis=0)
     if not np.isfinite(means).any():
         return None
-    k = int(np.nanargmax(np.where(np.isfinite(means), means, -np.inf)))
-    at = int(chosen[np.argmax(square[chosen, k])])
-    return Worst(
-        run.nodes[k],
-        float(run.times[at]),
-        math.sqrt(max(0.0, float(means[k]))),
-        math.sqrt(max(0.0, float(square[at, k]))),
+    column = int(np.nanargmax(np.where(np.isfinite(means), means, -np.inf)))
+    row = int(rows[np.argmax(square[rows, column])])
+    return WorstSample(
+        run.nodes[column],
+        float(run.times[row]),
+        math.sqrt(max(0.0, float(means[column]))),
+        math.sqrt(max(0.0, float(square[row, column]))),
         by_error,
     )
 
 
 class StartUp(NamedTuple):
-    """Trace P of a node at its first sample, ``now``, and its mean over its last samples."""
+    """The start-up of a node's filter: trace P at the ``first`` sample and at the worst one
+    (``now``), and its mean over the ``last`` quarter of the samples.
+    """
 
     first: float
     now: float
     last: float
 
 
-def after_start_up(
-    run: StoredRun, summary: Mapping[str, Any], worst: Worst
-) -> tuple[Worst, StartUp | None]:
-    """Return the worst sample of the worst node after its start-up, and, if its worst sample of all
-    was in the start-up, its trace P then.
+def find_worst_after_start_up(
+    run: StoredRun, summary: Mapping[str, Any], worst: WorstSample
+) -> tuple[WorstSample, StartUp | None]:
+    """Return the worst sample of a node after its start-up, and the start-up if ``worst``, its
+    worst sample of all, lies in it; else ``worst`` itself and None.
 
-    The start-up lasts until trace P has come down halfway from its first value to its last ones.
+    The start-up ends when trace P has decreased halfway from its first value to the mean of its
+    last ones.
     """
-    k, at = run.nodes.index(worst.node), int(np.searchsorted(run.times, worst.time))
-    traces = np.trace(run.P[:, k], axis1=1, axis2=2)
-    first, now = float(traces[0]), float(traces[at])
+    column, row = run.nodes.index(worst.node), int(np.searchsorted(run.times, worst.time))
+    traces = np.trace(run.P[:, column], axis1=1, axis2=2)
+    first, now = float(traces[0]), float(traces[row])
     last = float(traces[-max(1, int(LATE_SHARE * len(traces))) :].mean())
     low = np.flatnonzero(traces <= 0.5 * (first + last))
-    if not last < COME_DOWN * first or not len(low) or low[0] <= at:
+    if not last < START_UP_RATIO * first or not len(low) or low[0] <= row:
         return worst, None
-    used = samples_averaged(run, summary)
-    chosen = used.errors if worst.by_error else used.covariances
-    rest = chosen[chosen >= low[0]]
+    averaged = summary_samples(run, summary)
+    rows = averaged.errors if worst.by_error else averaged.covariances
+    later_rows = rows[rows >= low[0]]
     start = StartUp(first, now, last)
-    if not len(rest):
+    if not len(later_rows):
         return worst, start
-    square = run.sq_error[:, k] if worst.by_error else traces
-    then = int(rest[np.argmax(square[rest])])
-    peak = math.sqrt(max(0.0, float(square[then])))
-    return worst._replace(time=float(run.times[then]), peak=peak), start
+    square = run.sq_error[:, column] if worst.by_error else traces
+    later_row = int(later_rows[np.argmax(square[later_rows])])
+    peak = math.sqrt(max(0.0, float(square[later_row])))
+    return worst._replace(time=float(run.times[later_row]), peak=peak), start
 
 
-def samples_averaged(run: StoredRun, summary: Mapping[str, Any]) -> SampleIndices:
-    """Return the indices of the samples that the summary averages over."""
-    found = summary.get("rounding_from")
-    blurred = math.inf if found is None else float(found)
-    return select_averaged_samples(run.times, blurred, run.count("diverged") > 0)
+def summary_samples(run: StoredRun, summary: Mapping[str, Any]) -> SampleIndices:
+    """Return the indices of the samples that the averages in summary.json are taken over."""
+    rounding_from = summary.get("rounding_from")
+    end = math.inf if rounding_from is None else float(rounding_from)
+    return averaged_samples(run.times, end, run.count("diverged") > 0)
 
 
-class WorstSample(NamedTuple):
-    """The worst node and its worst sample, ``overall`` and after the ``start`` of the filters: that
-    one is ``explained``; ``start`` is None if the worst sample was not in it.
+class WorstSamples(NamedTuple):
+    """The worst sample of a run.
+
+    overall   : the worst sample of the worst node
+    explained : its worst sample after the start-up of its filter, which a page explains
+    start     : the start-up if the overall worst sample lies in it, else None
     """
 
-    overall: Worst
-    explained: Worst
+    overall: WorstSample
+    explained: WorstSample
     start: StartUp | None
 
 
-def worst_sample(run: StoredRun, summary: Mapping[str, Any]) -> WorstSample | None:
-    """Return the worst sample of a run with the contents of its summary.json, None without one."""
-    worst = node_most_off(run, summary)
+def find_worst_samples(run: StoredRun, summary: Mapping[str, Any]) -> WorstSamples | None:
+    """Return the worst samples of a run overall and after the start-up; None if all are nan.
+
+    ``summary`` is the contents of summary.json.
+    """
+    worst = find_worst_sample(run, summary)
     if worst is None:
         return None
-    return WorstSample(worst, *after_start_up(run, summary, worst))
+    return WorstSamples(worst, *find_worst_after_start_up(run, summary, worst))

@@ -19,12 +19,12 @@ from netkf.ensembles.directory import EnsembleOptions, runs_to_directory
 from netkf.ensembles.pools import PoolOptions
 from netkf.figures.style import SEQUENTIAL
 from netkf.report import page as pages
-from netkf.report.claims import findings
+from netkf.report.claims import describe_source
 from netkf.report.data import Budget
 from netkf.report.directories import read_source
 from netkf.report.markup import script_json
 from netkf.report.mending import explain_worst
-from netkf.report.messages import MESSAGE, information_age, join_messages, keep_messages
+from netkf.report.messages import MESSAGE, information_age, join_messages, thin_messages
 from netkf.report.page import make_page
 from netkf.report.tables import difference_curves
 from netkf.runs.documents import file_digests, write_sealed
@@ -40,7 +40,7 @@ from tests.report.oracle import plain_messages
 
 def findings_of(directory):
     source = read_source(directory)
-    return findings(source, join_messages(source.run.log))
+    return describe_source(source, join_messages(source.run.log))
 
 
 @pytest.mark.parametrize("name", ["ring", "delayed", "slots", "library"])
@@ -307,11 +307,11 @@ def test_no_message_is_left_out_below_the_limit_and_few_beyond():
     messages = np.zeros(1000, dtype=MESSAGE)
     messages["sent"] = np.arange(1000.0)
     messages["number"] = np.arange(1000)
-    assert keep_messages(messages, 1000, 500.0).step == 1
+    assert thin_messages(messages, 1000, 500.0).step == 1
     for instant in (0.0, 500.0, 999.0):
-        kept = keep_messages(messages, 100, instant)
-        assert kept.start <= instant <= kept.end
-        assert len(kept.messages) <= 110
+        thinned = thin_messages(messages, 100, instant)
+        assert thinned.start <= instant <= thinned.end
+        assert len(thinned.messages) <= 110
 
 
 def test_a_page_of_fifty_nodes_and_100_000_events_is_small_and_complete(tmp_path):
