@@ -17,9 +17,9 @@ from netkf.figures.style import (
     MUTED,
     draw_legend,
     finish_figure,
-    look,
     new_figure,
-    write,
+    style_context,
+    write_figure,
 )
 
 MAX_LABEL_LENGTH = 72
@@ -48,7 +48,7 @@ def verdict_picture(path: Path, verdict: Verdict, claim: str) -> bool:
     rows = [row for row in verdict.rows if row.low < row.high and row.tolerance > 0.0]
     if not rows:
         return False
-    with look():
+    with style_context():
         figure = new_figure(8.8, 1.7 + 0.27 * len(rows))
         axes = figure.add_subplot()
         for height, row in enumerate(reversed(rows)):
@@ -70,7 +70,7 @@ def verdict_picture(path: Path, verdict: Verdict, claim: str) -> bool:
         note = f"{verdict.scenario}: {verdict.runs:,} runs. Intervals hold together with "
         note += f"probability {verdict.confidence:.6g}."
         finish_figure(figure, _make_title(rows, claim or verdict.scenario), [note])
-    write(figure, path)
+    write_figure(figure, path)
     return True
 
 

@@ -60,41 +60,49 @@ def _declare(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(options: argparse.Namespace) -> int:
-    """Return the exit status: 1 if a promise is broken."""
-    from netkf.runs.directory_lock import lock_directory
+    """Check the promises of a scenario; return the exit status, 1 if one is broken."""
+    from netkf.runs.directory_lock import only_writer
 
-    # Promises are checked at times of their own, so that the file's may not fit the horizon.
+    # Promises are checked at other times than those of ``probe``, which therefore need not fit the
+    # horizon; ``--set`` may have changed it.
     scenario = load_scenario(options, {"probe": [0.0]})
     with lock_directory(options.out):
         return _check(scenario, options)
 
 
 def _check(scenario: Scenario, options: argparse.Namespace) -> int:
-    """Check the promises, print the verdict and save it if asked; return the exit status."""
+    """Check the promises, write the verdict with ``--out``, and print it; return the exit status.
+
+    It is printed even if its files cannot be written.
+    """
     from netkf.checks.points import sampling_note
     from netkf.checks.report import verdict_json, verdict_text
 
-    earlier = _read_earlier(scenario, options)
-    # A command that was stopped after it had written its verdict is given again.
-    done = earlier is not None and options.until is None and earlier.runs == options.runs
-    verdict = earlier if earlier is not None and done else _run_check(scenario, options, earlier)
+    earlier = _open_verdict_directory(scenario, options)
+    # The same command again: it may have been stopped after it wrote its verdict.
+    is_complete = earlier is not None and options.until is None and earlier.runs == options.runs
+    if earlier is not None and is_complete:
+        verdict = earlier
+    else:
+        verdict = _run_check(scenario, options, earlier)
     text = verdict_text(verdict, scenario.claim, _replay_command(options))
     print_notes((*scenario.notes, *filter(None, [sampling_note(scenario)])))
     try:
         if options.out is not None:
-            _save(scenario, verdict, "" if done else text, options)
-    finally:  # a verdict whose files cannot be written is an answer too
+            _write_verdict(scenario, verdict, "" if is_complete else text, options)
+    finally:
         if options.json:
             print_json(verdict_json(verdict))
         else:
             print(text)
     if options.out is not None and not options.json:
-        print(f"nothing left to do in {options.out}" if done else f"written to {options.out}")
+        result = "nothing left to do in" if is_complete else "written to"
+        print(f"{result} {options.out}")
     return 0 if verdict else FAILED
 
 
 def _run_check(scenario: Scenario, options: argparse.Namespace, earlier: Verdict | None) -> Verdict:
-    """Return the verdict on --runs runs, those of an ``earlier`` one included."""
+    """Return the verdict on ``--runs`` runs, which include those of an ``earlier`` verdict."""
     from netkf.checks.check import check
     from netkf.checks.looks import MAX_LOOKED_RUNS
 
@@ -114,19 +122,27 @@ def _run_check(scenario: Scenario, options: argparse.Namespace, earlier: Verdict
 
 @contextlib.contextmanager
 def _explain_interrupt(options: argparse.Namespace, earlier: Verdict | None) -> Iterator[None]:
-    """Say in the interrupt of the body that runs are kept with their verdict only."""
+    """Add to a KeyboardInterrupt of the block, with ``--out``, a message on what is in the
+    directory: runs are written only together with their verdict.
+    """
     try:
         yield
     except KeyboardInterrupt:
         if options.out is None:
             raise
-        kept = f"{options.out} has the verdict on {earlier.runs:,} runs" if earlier else ""
-        message = f"new runs are kept with their verdict only; {kept or 'nothing was written'}"
+        content = "nothing was written"
+        if earlier:
+            content = f"{options.out} has the verdict on {earlier.runs:,} runs"
+        message = f"new runs are kept with their verdict only; {content}"
         raise KeyboardInterrupt(message) from None
 
 
-def _read_earlier(scenario: Scenario, options: argparse.Namespace) -> Verdict | None:
-    """Make the directory of the verdict, or return the earlier verdict in it."""
+def _open_verdict_directory(scenario: Scenario, options: argparse.Namespace) -> Verdict | None:
+    """Make the directory of ``--out``, or, with ``--resume``, return the verdict in it if it is
+    complete.
+
+    Raises ScenarioError for ``--resume`` without ``--out``, and if the directory does not fit.
+    """
     if options.out is None:
         if options.resume:
             remedy = "add --out DIR with the directory of the verdict"
@@ -141,8 +157,13 @@ def _read_earlier(scenario: Scenario, options: argparse.Namespace) -> Verdict | 
     return None
 
 
-def _save(scenario: Scenario, verdict: Verdict, text: str, options: argparse.Namespace) -> None:
-    """Write the files of a verdict unless ``text`` is empty, and its picture if it is missing."""
+def _write_verdict(
+    scenario: Scenario, verdict: Verdict, text: str, options: argparse.Namespace
+) -> None:
+    """Write the files of a verdict unless ``text`` is empty, and its picture if it is missing.
+
+    Raises WriteError if a file cannot be written.
+    """
     from netkf.checks.storage import PICTURE, save_verdict
 
     if text:
@@ -153,7 +174,9 @@ def _save(scenario: Scenario, verdict: Verdict, text: str, options: argparse.Nam
 
 
 def _replay_command(options: argparse.Namespace) -> str:
-    """Return the command that runs a replica of this check, without the number of the replica."""
+    """Return the command line that simulates a replica of this check, up to the replica's number,
+    which is to be appended.
+    """
     command = ["netkf", "run", str(options.scenario)]
     for change in options.set:
         command += ["--set", change]

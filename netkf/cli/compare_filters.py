@@ -28,7 +28,7 @@ def _declare(parser: argparse.ArgumentParser) -> None:
         required=True,
         metavar="F1,F2,...",
         help='kinds of filters, or tables such as {kind="hcmci",steps=3}; the first is compared '
-        "with the others",
+        "with each of the others",
     )
     parser.add_argument(
         "--runs", type=parse_count, default=100, help="runs of each filter (default: 100)"
@@ -48,16 +48,19 @@ def _declare(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(options: argparse.Namespace) -> int:
-    """Compare filters; return the exit status."""
-    from netkf.runs.directory_lock import lock_directory
+    """Compare filters in the directory of ``--out``, if any; return the exit status."""
+    from netkf.runs.directory_lock import only_writer
 
     with lock_directory(options.out, must_be_empty=True):
         return _compare(options)
 
 
 def _compare(options: argparse.Namespace) -> int:
-    """Compare filters, print the table and save it if asked; return the exit status."""
-    from netkf.scenario.values import parse_values
+    """Compare filters, write the files of ``--out``, and print the table; return the exit status.
+
+    The table is printed even if its files cannot be written.
+    """
+    from netkf.scenario.values import typed_values
     from netkf.studies.compare_filters import compare_filters, write_comparison
     from netkf.studies.tables import filters_text
 
@@ -79,7 +82,7 @@ def _compare(options: argparse.Namespace) -> int:
             written = write_comparison(scenario, comparison, options.out)
             if not options.no_plot:
                 pictures.draw_picture(pictures.FILTERS, scenario, written)
-    finally:  # a comparison whose files cannot be written is an answer too
+    finally:
         if options.json:
             print_json(comparison.document())
         else:

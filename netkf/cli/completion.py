@@ -1,4 +1,4 @@
-"""``netkf --print-completion``: completion for shells, by shtab."""
+"""``netkf --print-completion``: completion scripts for shells, made by the package shtab."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ SHELLS = ("bash", "zsh")
 
 
 class PrintCompletion(argparse.Action):
-    """Print the completion script of a shell and end."""
+    """Action of an option that prints the completion script of a shell and exits."""
 
     def __call__(
         self,
@@ -20,25 +20,27 @@ class PrintCompletion(argparse.Action):
         values: Any,
         option_string: str | None = None,
     ) -> None:
-        """Print the script; ends the program."""
+        """Print the script for the shell ``values`` and raise SystemExit; with status 2 if shtab is
+        missing.
+        """
         try:
             import shtab
         except ImportError:
             parser.error("--print-completion needs shtab: pip install shtab")
-        for action in _actions(parser):
+        for action in _iterate_actions(parser):
             if action.type is Path:
                 action.complete = shtab.FILE  # type: ignore[attr-defined]
         print(shtab.complete(parser, shell=values))
         parser.exit()
 
 
-def _actions(parser: argparse.ArgumentParser) -> Iterator[argparse.Action]:
-    """Yield all arguments of a parser and of its commands."""
+def _iterate_actions(parser: argparse.ArgumentParser) -> Iterator[argparse.Action]:
+    """Yield all options and arguments of a parser and of its subparsers."""
     for action in parser._actions:
         yield action
         if isinstance(action, argparse._SubParsersAction):
-            for command in action.choices.values():
-                yield from _actions(command)
+            for command_parser in action.choices.values():
+                yield from _iterate_actions(command_parser)
 
 
 def add_completion(parser: argparse.ArgumentParser) -> None:

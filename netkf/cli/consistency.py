@@ -34,11 +34,13 @@ def _declare(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(options: argparse.Namespace) -> int:
-    """Return the exit status: 1 if the errors of a node are inconsistent."""
+    """Test the consistency of a filter and print the table; return the exit status, 1 if the errors
+    of a node are inconsistent with its P.
+    """
     from netkf.studies.consistency import consistency
     from netkf.studies.tables import consistency_text
 
-    found = consistency(
+    result = consistency(
         load_scenario(options),
         options.runs,
         confidence=options.confidence,
@@ -47,13 +49,13 @@ def _run(options: argparse.Namespace) -> int:
         engine=options.engine,
     )
     if options.json:
-        print_json({**vars(found), "rows": [vars(row) for row in found.rows]})
+        print_json({**vars(result), "rows": [vars(row) for row in result.rows]})
     else:
-        print(f"{found.scenario}\n\n{consistency_text(found)}")
-    if not found:
-        nodes = ", ".join(str(row.node) for row in found.rows if row.verdict.startswith("BROKEN"))
-        print(f"netkf: errors are not what they should be at node {nodes}", file=sys.stderr)
-    return 0 if found else FAILED
+        print(f"{result.scenario}\n\n{consistency_text(result)}")
+    if not result:
+        nodes = ", ".join(str(row.node) for row in result.rows if row.verdict.startswith("BROKEN"))
+        print(f"netkf: errors are inconsistent with P at node {nodes}", file=sys.stderr)
+    return 0 if result else FAILED
 
 
 COMMAND = Command(

@@ -1,6 +1,7 @@
-"""The entry point of ``netkf``: the parser, and what each kind of error looks like to a user.
+"""The entry point of ``netkf``: the parser, and the message and exit status of each kind of error.
 
-Imports little before signals are handled: an interrupt has to find a handler from the start.
+The module imports little, so that handlers of signals are installed early: an interrupt during
+imports would end in a traceback.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
     from typing import Any
 
 BAD_USAGE = 2
+"""Exit status of bad usage, bad files and failures."""
 COMMANDS = (
     *("run", "check", "theory", "sweep", "size", "consistency", "compare", "compare_filters"),
     *("plot", "report", "why", "schema", "new"),
@@ -35,98 +37,106 @@ COMMANDS = (
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one command and return the exit status.
+    """Run one command and return its exit status.
 
     0: done. 1: a promise is broken or a target is not reached. 2: bad usage, a bad file, or a
-    failure: reported in one line, or with a traceback where nobody foresaw it. 130: interrupted.
+    failure, reported in one line, with a traceback if the error was unexpected. 130: interrupted.
 
     Without ``arguments`` it runs the command line of this process, and ends the process.
     """
     if arguments is None:
-        # Processes that Python starts for workers would import from the current folder before they
-        # are told the path of this one; it may be that of a scenario of someone else.
+        # Worker processes search the current folder for modules before they receive the path of
+        # this process, and it may be the folder of a scenario from someone else.
         os.environ["PYTHONSAFEPATH"] = "1"
-        # Figures go to files; for the name of a window that it lacks matplotlib raises ValueError.
+        # Figures are only written to files. A user's setting of a window system that is missing
+        # here would make matplotlib raise ValueError.
         os.environ["MPLBACKEND"] = "agg"
         run_as_process(partial(_run_command, sys.argv[1:]))
     with Interruption() as interruption:
         return _run_command(arguments, interruption)
 
 
-class _Ending:
-    """The exit status of a command and its line on standard error, if any."""
+class _Outcome:
+    """The exit status of a command and its message on standard error, empty if there is none."""
 
-    def __init__(self, status: int, line: str = "") -> None:
-        self.status, self.line = status, line
+    def __init__(self, status: int, message: str = "") -> None:
+        self.status, self.message = status, message
 
 
 def _run_command(arguments: Sequence[str], interruption: Interruption) -> int:
-    """Run a command, print its line on standard error, and return the exit status."""
+    """Run a command, print its message on standard error, and return the exit status."""
     with safe_streams():
         try:
             interruption.arm()
-            ending = _attempt(arguments, interruption)
+            outcome = _execute(arguments, interruption)
             interruption.disarm()
-        except KeyboardInterrupt as stop:
-            ending = _interrupted(str(stop))
-        if ending.line:
-            print(f"netkf: {one_line(ending.line)}", file=sys.stderr)
-    return ending.status
+        except KeyboardInterrupt as interrupt:
+            outcome = _report_interrupt(str(interrupt))
+        if outcome.message:
+            print(f"netkf: {one_line(outcome.message)}", file=sys.stderr)
+    return outcome.status
 
 
-def _attempt(arguments: Sequence[str], interruption: Interruption) -> _Ending:
-    """Run a command; raises KeyboardInterrupt, and SystemExit for bad usage."""
+def _execute(arguments: Sequence[str], interruption: Interruption) -> _Outcome:
+    """Run a command and return its outcome, also of its errors.
+
+    Raises KeyboardInterrupt if it is interrupted, and SystemExit for bad usage.
+    """
     try:
         options = make_parser().parse_args(arguments)
         status: int = options.run(options)
-        # A full disk or a closed pipe must show here, where it can be reported in one line.
+        # A full disk or a closed pipe raises its error here at the latest, where it can be reported
+        # in one line.
         sys.stdout.flush()
     except OutputError as error:
         discard_output()
-        return _Ending(BAD_USAGE, f"cannot write: {_reason(error.__cause__)}")
+        return _Outcome(BAD_USAGE, f"cannot write: {_error_reason(error.__cause__)}")
     except Exception as error:
-        line = _explain(error)
-        if interruption.received:  # while it ended, or because a library met the interrupt
-            return _interrupted(line or "")
-        if line is None:
-            return _Ending(BAD_USAGE, _print_traceback(error))
-        return _Ending(BAD_USAGE, line)
-    return _Ending(status)
+        message = _describe_error(error)
+        # A library may turn an interrupt into an error of its own, or fail while the command ends.
+        if interruption.received:
+            return _report_interrupt(message or "")
+        if message is None:
+            return _Outcome(BAD_USAGE, _print_traceback(error))
+        return _Outcome(BAD_USAGE, message)
+    return _Outcome(status)
 
 
-def _interrupted(what: str) -> _Ending:
-    """Return the ending of a command that was interrupted."""
-    return _Ending(INTERRUPTED, f"interrupted; {what}" if what else "interrupted")
+def _report_interrupt(detail: str) -> _Outcome:
+    """Return the outcome of an interrupted command; ``detail`` says what was kept, if known."""
+    return _Outcome(INTERRUPTED, f"interrupted; {detail}" if detail else "interrupted")
 
 
-def _explain(error: Exception) -> str | None:
-    """Return the line about an error, None if nobody foresaw it."""
+def _describe_error(error: Exception) -> str | None:
+    """Return the message about an expected error, None for an unexpected one."""
     if isinstance(error, NetkfError):
         return str(error)
     if isinstance(error, OSError):
         path = f" ({shorten(error.filename, 1000)})" if error.filename else ""
-        return f"{_reason(error)}{path}"
+        return f"{_error_reason(error)}{path}"
     if isinstance(error, MemoryError):
         return "the memory is too small; take fewer nodes, a shorter horizon or fewer probe times"
     return None
 
 
-def _reason(error: BaseException | None) -> str:
-    """Return the reason of an error on one line."""
+def _error_reason(error: BaseException | None) -> str:
+    """Return the operating system's text for an error, else its class and message."""
     return getattr(error, "strerror", None) or f"{type(error).__name__}: {error}"
 
 
 def _print_traceback(error: Exception) -> str:
-    """Print the traceback of an unexpected error; return the line that ends the command."""
+    """Print the traceback of an unexpected error; return the message that ends the command."""
     import traceback
 
     traceback.print_exception(error)
-    # Python's own exit status would be 1, which says that a promise is broken.
     return f"failed with {type(error).__name__}, see above"
 
 
 def make_parser() -> argparse.ArgumentParser:
-    """Return the parser; each command puts its function ``run`` into the namespace."""
+    """Return the parser of the command line, with one subparser for each of COMMANDS.
+
+    A parsed namespace has the function of its command as ``run``.
+    """
     from importlib import import_module
 
     import netkf

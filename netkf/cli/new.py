@@ -1,4 +1,4 @@
-"""``netkf new``: write a commented scenario and its tests to begin with."""
+"""``netkf new``: write a commented scenario and tests of it, as a first draft."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ def _declare(parser: argparse.ArgumentParser) -> None:
     """Declare the options of ``netkf new``."""
     parser.add_argument("name", metavar="NAME", help="NAME.toml and test_NAME.py are written")
     parser.add_argument(
-        "--folder", type=Path, default=Path(), help="where (default: the current folder)"
+        "--folder", type=Path, default=Path(), help="folder of the files (default: the current one)"
     )
 
 
 def _run(options: argparse.Namespace) -> int:
-    """Write a scenario and its tests; return the exit status."""
+    """Write a scenario and its tests, and print how to run them; return the exit status."""
     from netkf.runs.template import write_template
 
     scenario, tests = write_template(options.name, options.folder)
     print(f"written: {scenario} and {tests}")
-    first = "" if find_spec("pytest") else "pip install pytest; "
-    print(f"next: netkf run {scenario}; {first}pytest {tests}")
+    installation = "" if find_spec("pytest") else "pip install pytest; "
+    print(f"next: netkf run {scenario}; {installation}pytest {tests}")
     return 0
 
 

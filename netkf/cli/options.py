@@ -1,4 +1,4 @@
-"""Options that several commands share, and how the command line reads and prints values.
+"""Options that several commands share, and functions that parse and print values.
 
 Modules of this package import the rest of netkf inside functions, so that ``netkf --help`` and
 usage errors do not wait for numpy and numba.
@@ -23,30 +23,34 @@ if TYPE_CHECKING:
     from netkf.scenario.scenario import Scenario
 
 FAILED = 1
-"""Exit status of a command that ran and whose answer is no."""
+"""Exit status of a command that ran without an error and whose answer is negative."""
 ENGINES = ("auto", "simpy", "processes", "compiled")
 
 
 class Parser(argparse.ArgumentParser):
-    """A parser whose errors are one line, without the usage text, and exit status 2."""
+    """A parser that reports an error in one line, without the usage text, and exits with 2."""
 
     def error(self, message: str) -> Any:
-        """Print the line and end with SystemExit."""
+        """Print an error in one line on standard error, and raise SystemExit."""
         print(f"{self.prog}: {shorten(message, 1000)}; see {self.prog} --help", file=sys.stderr)
         raise SystemExit(2)
 
     def _check_value(self, action: argparse.Action, value: Any) -> None:
-        """Raise ArgumentError for a value that is no choice, with the nearest one that is."""
+        """Raise ArgumentError if a value is not one of the choices, suggesting the nearest one."""
         if action.choices is not None and value not in action.choices:
-            known = [str(choice) for choice in action.choices]
-            remedy = f"{nearest(value, known)}choose from {', '.join(known)}"
+            choices = [str(choice) for choice in action.choices]
+            remedy = f"{nearest(value, choices)}choose from {', '.join(choices)}"
             raise argparse.ArgumentError(action, f"invalid choice: {quote(value)} ({remedy})")
 
 
 @dataclass(frozen=True)
 class Command:
-    """A command of ``netkf``: its name and help, and the functions that declare its options and run
-    it. ``run`` returns the exit status. ``takes_scenario`` adds the scenario file and ``--set``.
+    """A command of ``netkf``.
+
+    name, help     : as the command line shows them
+    declare        : adds the options of the command to a parser
+    run            : runs the command with the parsed options and returns the exit status
+    takes_scenario : adds the scenario file, ``--set`` and ``--trust`` to the options
     """
 
     name: str
@@ -56,7 +60,9 @@ class Command:
     takes_scenario: bool = True
 
     def add_to(self, commands: Any) -> None:
-        """Add the parser of the command; the namespace gets its ``run`` function."""
+        """Add the parser of the command to the subparsers ``commands``; parsed namespaces have the
+        function ``run``.
+        """
         parser = commands.add_parser(self.name, help=self.help, description=self.help)
         if self.takes_scenario:
             _add_scenario(parser)
@@ -65,7 +71,7 @@ class Command:
 
 
 def _add_scenario(parser: argparse.ArgumentParser) -> None:
-    """Add the scenario file and the options that change it."""
+    """Add the scenario file, ``--set`` and ``--trust``."""
     parser.add_argument("scenario", type=Path, help="scenario file (TOML)")
     parser.add_argument(
         "--set",
@@ -78,7 +84,9 @@ def _add_scenario(parser: argparse.ArgumentParser) -> None:
 
 
 def add_trust(parser: argparse.ArgumentParser, folder: str) -> None:
-    """Add ``--trust``; ``folder`` is where the modules may be besides the current folder."""
+    """Add ``--trust``; ``folder`` names, in its help, the folder from which modules are imported
+    besides the current one.
+    """
     parser.add_argument(
         "--trust",
         action="store_true",
@@ -102,7 +110,7 @@ def add_engine(parser: argparse.ArgumentParser) -> None:
 
 
 def add_pool(parser: argparse.ArgumentParser) -> None:
-    """Add ``--workers`` and ``--scheduler``, of which one may be given."""
+    """Add ``--workers`` and ``--scheduler``, which exclude each other."""
     pool = parser.add_mutually_exclusive_group()
     pool.add_argument(
         "--workers", type=parse_workers, help="number of processes (default: one per core)"
@@ -121,12 +129,12 @@ def add_no_plot(parser: argparse.ArgumentParser) -> None:
 
 
 def add_vary(parser: argparse.ArgumentParser, metavar: str, text: str) -> None:
-    """Add ``--vary``, which can be repeated."""
+    """Add ``--vary``, which can be repeated, with the help ``text``."""
     parser.add_argument("--vary", action="append", required=True, metavar=metavar, help=text)
 
 
 def parse_seed(text: str) -> int:
-    """Return the integer of ``--seed``; raises ArgumentTypeError."""
+    """Return the value of ``--seed``; raises ArgumentTypeError for any text but digits."""
     if not text.isdecimal() or len(text) > 30:
         rule = "must be a non-negative integer of at most 30 digits"
         raise argparse.ArgumentTypeError(f"{rule}, got {quote(text)}")
@@ -134,38 +142,42 @@ def parse_seed(text: str) -> int:
 
 
 def parse_replica(text: str) -> int:
-    """Return the integer of ``--replica``; raises ArgumentTypeError."""
+    """Return the value of ``--replica``; raises ArgumentTypeError unless it is an integer from 0
+    on.
+    """
     if not text.isdecimal() or len(text) > 12:
         rule = "must be an integer of at least 0"
         raise argparse.ArgumentTypeError(f"{rule}, got {quote(text)}")
     return int(text)
 
 
-MAX_RUNS = 100_000_000  # more are a slip
-WORKERS_PER_CORE = 8  # beyond that processes only fill the memory
+MAX_RUNS = 100_000_000  # larger numbers are typing errors
+WORKERS_PER_CORE = 8  # more processes only fill the memory
 
 
 def parse_count(text: str) -> int:
-    """Return the positive integer of ``--runs``; raises ArgumentTypeError."""
+    """Return a number of runs or replays; raises ArgumentTypeError unless it is 1 .. MAX_RUNS."""
     return _parse_positive(text, MAX_RUNS)
 
 
 def parse_workers(text: str) -> int:
-    """Return the positive integer of ``--workers``; raises ArgumentTypeError."""
-    # More processes than that only fill the memory.
+    """Return the value of ``--workers``; raises ArgumentTypeError unless it is a positive integer
+    of at most WORKERS_PER_CORE per core, or 64.
+    """
     return _parse_positive(text, max(64, WORKERS_PER_CORE * (os.cpu_count() or 1)))
 
 
-def _parse_positive(text: str, most: int) -> int:
-    """Return an integer from 1 to ``most``; raises ArgumentTypeError."""
-    if not text.isdecimal() or not 1 <= int(text[:20]) <= most:
-        rule = f"must be an integer of at least 1 and at most {most:,}"
+def _parse_positive(text: str, largest: int) -> int:
+    """Return an integer from 1 to ``largest``; raises ArgumentTypeError."""
+    # Twenty digits suffice to compare: Python refuses to convert texts of thousands.
+    if not text.isdecimal() or not 1 <= int(text[:20]) <= largest:
+        rule = f"must be an integer of at least 1 and at most {largest:,}"
         raise argparse.ArgumentTypeError(f"{rule}, got {quote(text)}")
     return int(text)
 
 
 def parse_changes(settings: Sequence[str]) -> dict[str, Any]:
-    """Return the values of ``key.path=value`` texts by key; unquoted words become strings.
+    """Return the values of texts ``key.path=value`` by key; values are TOML, or unquoted strings.
 
     Raises ScenarioError for a text without ``=`` or a value that is not TOML.
     """
@@ -178,8 +190,10 @@ def parse_changes(settings: Sequence[str]) -> dict[str, Any]:
 def load_scenario(
     options: argparse.Namespace, ignored: Mapping[str, Any] = MappingProxyType({})
 ) -> Scenario:
-    """Return the scenario of the command line, with ``--set`` and ``--seed`` applied, and then the
-    values of keys that the command ignores.
+    """Return the scenario of the command line with ``--set`` and ``--seed`` applied.
+
+    ``ignored`` has values, by key, for keys that the command does not use: they replace those of
+    the file, which may be invalid together with other options. Raises ScenarioError.
     """
     from netkf.scenario.reading import load
 
@@ -190,13 +204,13 @@ def load_scenario(
 
 
 def print_notes(notes: Sequence[str]) -> None:
-    """Print notes to stderr, one per line."""
+    """Print notes on standard error, one per line."""
     for note in notes:
         print(f"note: {one_line(note)}", file=sys.stderr)
 
 
 def print_title(scenario: Scenario) -> None:
-    """Print the name of a scenario and its claim."""
+    """Print the name of a scenario and its claim on one line."""
     print(one_line(f"{scenario.name}: {scenario.claim}" if scenario.claim else scenario.name))
 
 

@@ -1,4 +1,8 @@
-"""Pictures of finished runs, which are complete without one: it never decides the exit status."""
+"""Pictures of finished commands. They are optional: a missing one never changes the exit status.
+
+Drawing functions are named as (module, function), since importing their modules imports
+matplotlib.
+"""
 
 from __future__ import annotations
 
@@ -14,30 +18,34 @@ ENSEMBLE = "netkf.figures.pictures", "ensemble_picture"
 SWEEP = "netkf.studies.picture", "sweep_picture"
 FILTERS = "netkf.studies.filter_picture", "filter_picture"
 VERDICT = "netkf.checks.picture", "verdict_picture"
-UNSHOWN = {SWEEP: "it shows one or two keys", VERDICT: "no row has an interval"}
-"""Why a drawing function has returned False."""
+REASONS = {SWEEP: "it shows one or two keys", VERDICT: "no row has an interval"}
+"""The reason for which a drawing function returns False, which means that it drew nothing."""
 
 
-def load_drawing(function: tuple[str, str]) -> Callable[..., Any] | None:
-    """Return a drawing function given as (module, name); None if matplotlib is missing."""
+def load_drawing(name: tuple[str, str]) -> Callable[..., Any] | None:
+    """Import and return a drawing function (module, function); None if matplotlib is missing."""
+    module_name, function_name = name
     try:
-        module = importlib.import_module(function[0])
+        module = importlib.import_module(module_name)
     except ImportError:
         return None
-    draw: Callable[..., Any] = getattr(module, function[1])
+    draw: Callable[..., Any] = getattr(module, function_name)
     return draw
 
 
-def draw_picture(function: tuple[str, str], *results: Any) -> None:
-    """Draw a picture of ``results``, or print a note that says why there is none."""
-    draw = load_drawing(function)
+def draw_picture(name: tuple[str, str], *results: Any) -> None:
+    """Call a drawing function (module, function) with ``results``; print a note with the reason if
+    there is no picture.
+    """
+    draw = load_drawing(name)
     if draw is None:
         print_notes(["no picture: matplotlib is missing (pip install matplotlib)"])
         return
     try:
-        drawn = draw(*results)
+        is_drawn = draw(*results)
     except WriteError as error:
         print_notes([f"no picture: {error}"])
     else:
-        if drawn is False:
-            print_notes([f"no picture: {UNSHOWN[function]}"])
+        # Functions that always draw return None.
+        if is_drawn is False:
+            print_notes([f"no picture: {REASONS[name]}"])

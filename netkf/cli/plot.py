@@ -9,6 +9,7 @@ from netkf.cli.options import Command, add_trust
 from netkf.core.errors import ScenarioError
 
 FORMATS = ("png", "svg", "pdf")
+"""As in netkf.figures.style, which imports matplotlib."""
 
 
 def _declare(parser: argparse.ArgumentParser) -> None:
@@ -30,7 +31,11 @@ def _declare(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(options: argparse.Namespace) -> int:
-    """Draw figures of directories into files; return the exit status."""
+    """Draw figures of directories into files and print their paths; return the exit status.
+
+    Raises ScenarioError without matplotlib, for unknown figures, and for one file of several
+    figures.
+    """
     try:
         from netkf.figures.catalogue import plot_to_files
     except ImportError:
@@ -39,14 +44,15 @@ def _run(options: argparse.Namespace) -> int:
     from netkf.studies.opening import open as open_directory
 
     names = tuple(name for text in options.figure for name in _figure_names(text))
-    several = len(options.directories) > 1
-    if several and options.out is not None and options.out.suffix.removeprefix(".") in FORMATS:
+    has_several = len(options.directories) > 1
+    if has_several and options.out is not None and options.out.suffix.removeprefix(".") in FORMATS:
         rule, remedy = "is one file for several directories", "name a directory"
         raise ScenarioError("--out", rule, str(options.out), remedy)
     for directory in options.directories:
-        out = directory / "figures" if options.out is None else options.out
-        if options.out is not None and several:
-            out = options.out / directory.name
+        if options.out is None:
+            out = directory / "figures"
+        else:
+            out = options.out / directory.name if has_several else options.out
         result = open_directory(directory, trust=options.trust)
         for path in plot_to_files(result, names, out, options.format or "png"):
             print(path)
@@ -54,7 +60,7 @@ def _run(options: argparse.Namespace) -> int:
 
 
 def _figure_names(text: str) -> list[str]:
-    """Return the names in a text with commas; raises ScenarioError if there is none."""
+    """Return the names of a list separated by commas; raises ScenarioError if it is empty."""
     names = [name.strip() for name in text.split(",") if name.strip()]
     if not names:
         raise ScenarioError("--figure", "must name figures", text, "leave it out to draw all")

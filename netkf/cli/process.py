@@ -1,4 +1,4 @@
-"""How the process of a command begins and ends: standard streams, signals, the exit status."""
+"""The process of a command: signals, standard streams, and its end with an exit status."""
 
 from __future__ import annotations
 
@@ -20,86 +20,85 @@ if TYPE_CHECKING:
     from typing import Any, NoReturn, TextIO
 
 INTERRUPTED = 130
+"""Exit status of an interrupted command."""
 END_SECONDS = 8.0
-"""Seconds in which an interrupted command ends by itself; then it is ended."""
+"""Seconds after which the process of an interrupted command is ended if it has not ended itself."""
 EXIT_SECONDS = 4.0
-"""Seconds that functions registered with ``atexit`` have."""
-AGAIN_SECONDS = 0.02  # long enough for the frame that swallowed the exception to return
+"""Seconds after which functions registered with ``atexit`` are not waited for."""
+RESEND_SECONDS = 0.02  # long enough for the frame that swallowed the exception to return
 
 
 class Interruption:
-    """Ctrl-C and SIGTERM raise one KeyboardInterrupt between ``arm`` and ``disarm``; use it as a
-    context manager.
+    """Context manager in which Ctrl-C and SIGTERM raise one KeyboardInterrupt.
 
-    Batch systems stop jobs with SIGTERM: it means the same as Ctrl-C. Later signals are ignored:
-    the command is ending. Where it ``ends_process``, the process ends after END_SECONDS anyway.
-    A signal that comes before ``arm`` raises there; one that comes after ``disarm`` does nothing.
+    They raise it between ``arm`` and ``disarm``: a signal before ``arm`` raises there, and one
+    after ``disarm`` does nothing, nor do signals after the first. SIGTERM, with which batch systems
+    stop jobs, means the same as Ctrl-C. With ``ends_process`` the process ends END_SECONDS after
+    the signal at the latest. ``received`` is True after a signal.
     """
 
     def __init__(self, ends_process: bool = False) -> None:
-        self.received = self._armed = self._ended = False
-        self._before: dict[signal.Signals, Any] = {}
-        self._hook = sys.unraisablehook
-        self._watched = not ends_process
+        self.received = self._armed = self._disarmed = False
+        self._previous_handlers: dict[signal.Signals, Any] = {}
+        self._previous_hook = sys.unraisablehook
+        self._needs_deadline = ends_process
 
     def __enter__(self) -> Interruption:
         if threading.current_thread() is not threading.main_thread():
-            return self
-        self._hook, sys.unraisablehook = sys.unraisablehook, self._raise_again
+            return self  # Python lets only the main thread handle signals
+        self._previous_hook, sys.unraisablehook = sys.unraisablehook, self._handle_unraisable
         for number in (signal.SIGINT, signal.SIGTERM):
-            found = signal.getsignal(number)
-            # What a shell or nohup made the process ignore stays ignored.
-            if found not in (signal.SIG_IGN, None):
-                self._before[number] = signal.signal(number, self._receive)
+            # A signal that a shell or nohup made the process ignore stays ignored.
+            if signal.getsignal(number) not in (signal.SIG_IGN, None):
+                self._previous_handlers[number] = signal.signal(number, self._receive)
         return self
 
     def __exit__(self, *_: object) -> None:
         self._armed = False
-        for number, handler in self._before.items():
+        for number, handler in self._previous_handlers.items():
             signal.signal(number, handler)
-        if sys.unraisablehook == self._raise_again:
-            sys.unraisablehook = self._hook
+        if sys.unraisablehook == self._handle_unraisable:
+            sys.unraisablehook = self._previous_hook
 
     def arm(self) -> None:
-        """Let signals raise from now on."""
+        """Make signals raise KeyboardInterrupt from now on, and at once if one was received."""
         self._armed = True
         if self.received:
             raise KeyboardInterrupt
 
     def disarm(self) -> None:
-        """Let signals do nothing from now on: the command has ended."""
-        self._ended, self._armed = True, False
+        """Ignore signals from now on, because the command has ended."""
+        self._disarmed, self._armed = True, False
 
     def _receive(self, number: int, frame: FrameType | None) -> None:
-        """Handle a signal: raise KeyboardInterrupt if armed, and remember it."""
-        if self.received or self._ended:
+        """Handle the first signal: note that it was received, and raise KeyboardInterrupt if
+        armed.
+        """
+        if self.received or self._disarmed:
             return
         self.received = True
-        self._watch()
+        if self._needs_deadline:
+            self._needs_deadline = False
+            message = "netkf: interrupted; what was finished is kept"
+            end_later(INTERRUPTED, END_SECONDS, message)
         if self._armed:
             raise KeyboardInterrupt
 
-    def _watch(self) -> None:
-        """End the process later, if it is still there."""
-        if not self._watched:
-            self._watched = True
-            line = "netkf: interrupted; what was finished is kept"
-            end_later(INTERRUPTED, END_SECONDS, line)
-
-    def _raise_again(self, unraisable: Any) -> None:
-        """Raise an interrupt again that Python has dropped, as it does in finalizers and callbacks
-        of C code.
+    def _handle_unraisable(self, unraisable: Any) -> None:
+        """Send a signal again if Python has dropped its KeyboardInterrupt, as it does in finalizers
+        and callbacks of C code; other exceptions go to the previous hook.
         """
         if unraisable.exc_type is None or not issubclass(unraisable.exc_type, KeyboardInterrupt):
-            self._hook(unraisable)
-        elif self._armed and self._before:
-            _thread.start_new_thread(self._send_again, (next(iter(self._before)),))
+            self._previous_hook(unraisable)
+        elif self._armed and self._previous_handlers:
+            number = next(iter(self._previous_handlers))
+            _thread.start_new_thread(self._send_again, (number,))
 
     def _send_again(self, number: signal.Signals) -> None:
-        """Send the signal once more after a while, in case its exception was swallowed."""
-        time.sleep(AGAIN_SECONDS)
+        """Send a signal to the main thread after RESEND_SECONDS."""
+        time.sleep(RESEND_SECONDS)
         self.received = False
-        # To the main thread itself: that ends what it waits for.
+        # A signal to that very thread also ends its blocking system calls.
         main = threading.main_thread().ident
         if main is not None and hasattr(signal, "pthread_kill"):
             signal.pthread_kill(main, number)
@@ -107,32 +106,36 @@ class Interruption:
             _thread.interrupt_main(number)
 
 
-def end_later(status: int, seconds: float, line: str = "") -> None:
-    """End the process with ``status`` after some seconds, whatever its main thread waits for."""
+def end_later(status: int, seconds: float, message: str = "") -> None:
+    """End the process with ``status`` after some seconds, even if its main thread is blocked.
+
+    Then ``message`` is written to standard error.
+    """
 
     def end() -> None:
-        """End the process after the delay."""
+        """Wait, write the message and end the process."""
         time.sleep(seconds)
-        if line:
+        if message:
             with contextlib.suppress(Exception):
-                os.write(2, f"{line}\n".encode())
+                os.write(2, f"{message}\n".encode())
         os._exit(status)
 
-    # A plain thread: threading.Thread takes locks that the main thread may hold.
+    # Not threading.Thread: it takes locks that the main thread may hold.
     _thread.start_new_thread(end, ())
 
 
 def end_process(status: int) -> NoReturn:
-    """Call the functions registered with ``atexit``, and end the process without waiting for
-    threads.
+    """Call the functions registered with ``atexit``, flush the standard streams, and end the
+    process without waiting for threads.
 
-    A command has written everything by now. The interpreter's own way to end joins threads, and
-    writes to closed streams once more.
+    ``sys.exit`` would join threads and write to closed streams again; all results are written by
+    now.
     """
     end_later(status, EXIT_SECONDS)
-    starting = sys.modules.get("netkf.ensembles.process_start")
-    if starting is not None:
-        starting.kill_server()
+    # Nothing is imported here: if the module is missing, no server was started.
+    process_start = sys.modules.get("netkf.ensembles.process_start")
+    if process_start is not None:
+        process_start.kill_server()
     with contextlib.suppress(BaseException):
         atexit._run_exitfuncs()
     for stream in (sys.stdout, sys.stderr):
@@ -142,8 +145,10 @@ def end_process(status: int) -> NoReturn:
 
 
 def open_missing_streams() -> None:
-    """Open the null device for standard streams that are closed: files would get their numbers
-    otherwise, and printed text would end in files.
+    """Open the null device as each standard stream that is closed.
+
+    Otherwise the next files that are opened would get the descriptors 0, 1 and 2, and printed text
+    would be written to them.
     """
     for number, flags in enumerate((os.O_RDONLY, os.O_WRONLY, os.O_WRONLY)):
         try:
@@ -160,12 +165,11 @@ class OutputError(OSError):
 
 
 class SafeStream:
-    """A text stream through which no control characters of files reach a terminal.
+    """A text stream that escapes control characters, so that text from files cannot control the
+    terminal.
 
-    write  : a text with its control characters escaped, as far as the stream can encode it
-    direct : a text as it is
-    A ``lossy`` stream drops what cannot be written; else OutputError is raised, but where nobody
-    reads any more: that stops no command
+    A ``lossy`` stream ignores errors of writing. Others raise OutputError, except for a broken
+    pipe: the reader, such as ``head``, needs no more output, so that the rest is discarded.
     """
 
     def __init__(self, stream: TextIO, lossy: bool) -> None:
@@ -175,12 +179,12 @@ class SafeStream:
         return getattr(self._stream, name)
 
     def write(self, text: str) -> int:
-        """Write a text and return its length."""
+        """Write a text with its control characters escaped; return the length written."""
         return self.direct(printable(text))
 
     def direct(self, text: str) -> int:
-        """Write a text of netkf's own that may move the cursor."""
-        with self._failures():
+        """Write a text as it is, such as one that moves the cursor; return its length."""
+        with self._handle_failures():
             try:
                 self._stream.write(text)
             except UnicodeEncodeError:
@@ -190,12 +194,12 @@ class SafeStream:
 
     def flush(self) -> None:
         """Flush the stream."""
-        with self._failures():
+        with self._handle_failures():
             self._stream.flush()
 
     @contextlib.contextmanager
-    def _failures(self) -> Iterator[None]:
-        """Turn failures into OutputError, or ignore them where output may be lost."""
+    def _handle_failures(self) -> Iterator[None]:
+        """Raise OutputError for failures of writing in the block, or ignore them."""
         try:
             yield
         except BrokenPipeError:
@@ -208,37 +212,42 @@ class SafeStream:
 
 @contextlib.contextmanager
 def safe_streams() -> Iterator[None]:
-    """Put SafeStreams in place of the standard streams: errors and notes that nobody can read do
-    not stop a command, results that cannot be written do.
+    """Replace the standard streams by SafeStreams within the block.
+
+    Standard error is lossy: a command goes on if its notes cannot be written, and stops if its
+    results cannot.
     """
-    before = sys.stdout, sys.stderr
-    sys.stdout, sys.stderr = SafeStream(before[0], False), SafeStream(before[1], True)
+    stdout, stderr = sys.stdout, sys.stderr
+    sys.stdout, sys.stderr = SafeStream(stdout, lossy=False), SafeStream(stderr, lossy=True)
     try:
         yield
     finally:
-        sys.stdout, sys.stderr = before
+        sys.stdout, sys.stderr = stdout, stderr
 
 
 def discard_output(stream: Any = None) -> None:
-    """Send the rest of standard output to the null device; it would fail again at the end."""
+    """Redirect a stream, by default standard output, to the null device: what is left in its buffer
+    would fail again when the process ends.
+    """
     with contextlib.suppress(OSError, ValueError, AttributeError):
         os.dup2(os.open(os.devnull, os.O_WRONLY), (stream or sys.stdout).fileno())
 
 
 def run_as_process(command: Callable[[Interruption], int]) -> NoReturn:
-    """Run the command of this process, and end the process with its status."""
+    """Run a command as the only one of this process, and end the process with its exit status."""
     with Interruption(ends_process=True) as interruption:
         open_missing_streams()
-        # Imported when signals are handled: an interrupt before that ends Python in its own way.
+        # Imported only now, when signals are handled: an interrupt during imports would end in a
+        # traceback.
         import logging
         import warnings
 
-        # Warnings and logs of libraries are for those who write code.
+        # Warnings and logs of libraries are for programmers, not for users of the command line.
         if not sys.warnoptions:
             warnings.simplefilter("ignore")
         logging.disable()
         try:
             status = command(interruption)
-        except SystemExit as stop:  # of the parser, which has printed its line
+        except SystemExit as stop:  # raised by the parser, which has printed its message
             status = stop.code if isinstance(stop.code, int) else 0
         end_process(status)

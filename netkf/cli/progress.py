@@ -10,13 +10,12 @@ from netkf.core.printable import one_line
 
 CLEAR_LINE = "\r\033[K"
 REPORT_SECONDS = 20.0
-"""Seconds between two reports of a command that prints to a file or a pipe."""
+"""Seconds between two reports of a command whose standard error is a file or a pipe."""
 
 
 class ProgressLine:
-    """A line on stderr that each update overwrites and that is cleared at the end.
-
-    Nothing is printed if stderr is not a terminal. Use it as a context manager.
+    """Context manager with a line on standard error that each update overwrites; it is cleared at
+    the end. Nothing but reports is printed if standard error is not a terminal.
     """
 
     def __init__(self) -> None:
@@ -45,12 +44,12 @@ class ProgressLine:
             print(f"netkf: {text}", file=sys.stderr, flush=True)
 
     def simulated_time(self, horizon: float) -> Callable[[float], None]:
-        """Return a function of the simulated time (seconds) that shows the percentage done."""
+        """Return a function of the simulated time (s) that shows its percentage of ``horizon``."""
         last_percent = -1
 
         def update(seconds: float) -> None:
-            """Show the share of the horizon that has been simulated."""
-            # Engines report far more often than the percentage changes.
+            """Show the percentage of the horizon that has been simulated, if it has changed."""
+            # Engines call this far more often than the percentage changes.
             nonlocal last_percent
             percent = int(100.0 * seconds / horizon)
             if percent != last_percent:
@@ -60,17 +59,19 @@ class ProgressLine:
         return update
 
     def counter(self, unit: str) -> Callable[[int, int], None]:
-        """Return a function of (done, wanted) that shows both and the time that is left."""
-        began: tuple[float, int] | None = None
+        """Return a function of the numbers (done, wanted) that shows both, in ``unit``, and the
+        estimated time left.
+        """
+        first_update: tuple[float, int] | None = None
 
         def update(done: int, wanted: int) -> None:
-            """Show how much is done, and the estimated time left."""
-            nonlocal began
+            """Show the numbers and the estimated time left."""
+            nonlocal first_update
             now = time.monotonic()
-            # The rate counts from the first report: a resumed ensemble does not begin at 0.
-            if began is None:
-                began = now, done
-            seconds, finished = now - began[0], done - began[1]
+            # The rate counts from the first update: a resumed ensemble does not begin at 0.
+            if first_update is None:
+                first_update = now, done
+            seconds, finished = now - first_update[0], done - first_update[1]
             left = f", about {seconds * (wanted - done) / finished:.0f} s left" if finished else ""
             self.show(f"{done:,} of {wanted:,} {unit}{left}")
 
@@ -78,7 +79,8 @@ class ProgressLine:
 
 
 def _print_direct(text: str) -> None:
-    """Replace the present line of the terminal by a text."""
+    """Replace the current line of the terminal by a text."""
+    # SafeStream.write would escape the control characters that clear the line.
     write = getattr(sys.stderr, "direct", sys.stderr.write)
     write(f"{CLEAR_LINE}{text}")
     sys.stderr.flush()

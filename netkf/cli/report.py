@@ -26,7 +26,7 @@ def _declare(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(options: argparse.Namespace) -> int:
-    """Write the page; return the exit status."""
+    """Write the page and print its path; return the exit status."""
     from netkf.report.page import write_report
 
     path = write_report(options.directories, options.out, options.replica, options.trust)

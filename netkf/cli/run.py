@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from netkf.runs.run import CompletedRun
     from netkf.scenario.scenario import Scenario
 
-MAX_LISTED_NODES = 12  # nodes that a note names
+MAX_LISTED_NODES = 12  # nodes that a note lists
 
 
 def _declare(parser: argparse.ArgumentParser) -> None:
@@ -54,35 +54,38 @@ def _declare(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(options: argparse.Namespace) -> int:
-    """Simulate one run or several; return the exit status."""
-    many = (options.runs or 1) > 1
-    if many and options.replica is not None:
+    """Simulate one run or several into a directory; return the exit status.
+
+    Raises ScenarioError for options that exclude each other.
+    """
+    is_ensemble = (options.runs or 1) > 1
+    if is_ensemble and options.replica is not None:
         remedy = "leave out --runs or --replica"
         raise ScenarioError("--replica", "is for a single run", options.replica, remedy)
-    if many and (options.workers or 1) > 1:
-        # Worker processes import netkf while this one reads the scenario.
+    if is_ensemble and (options.workers or 1) > 1:
+        # The server of worker processes imports netkf while this process reads the scenario.
         from netkf.ensembles.process_start import start_server
 
         start_server()
     scenario = load_scenario(options)
     if options.resume and options.out is None:
         remedy = "add --out DIR with the directory of the run that was stopped"
-        raise ScenarioError("--resume", "needs the directory to go on in", None, remedy)
-    from netkf.runs.directory_lock import lock_directory
+        raise ScenarioError("--resume", "needs the directory of the runs", None, remedy)
+    from netkf.runs.directory_lock import only_writer
 
-    with lock_directory(options.out):
-        return _run_many(scenario, options) if many else _run_once(scenario, options)
+    with only_writer(options.out):
+        return _run_ensemble(scenario, options) if is_ensemble else _run_once(scenario, options)
 
 
 def _run_once(scenario: Scenario, options: argparse.Namespace) -> int:
-    """Simulate one run into a directory; return the exit status."""
+    """Simulate one run into a directory and print its summary; return the exit status."""
     from netkf.ensembles.resume import clear_unfinished_runs
     from netkf.runs.run import run_to_directory
 
     if options.scheduler is not None:
         raise ScenarioError("--scheduler", "is for several runs", options.scheduler, "add --runs R")
-    chosen = options.replica or 0
-    if options.resume and not clear_unfinished_runs(options.out, scenario, chosen, _print_note):
+    replica = options.replica or 0
+    if options.resume and not clear_unfinished_runs(options.out, scenario, replica, _print_note):
         print(f"nothing left to do in {options.out}")
         return 0
     draw = None if options.no_plot else partial(pictures.draw_picture, pictures.RUN, scenario)
@@ -94,12 +97,12 @@ def _run_once(scenario: Scenario, options: argparse.Namespace) -> int:
             options.trace or "full",
             line.simulated_time(scenario.horizon),
             draw,
-            chosen,
+            replica,
         )
     _print_summary(scenario, completed)
     rate = completed.events / max(completed.seconds, 1e-9)
-    cost = f"{completed.seconds:.2f} s, {rate:,.0f} per second, engine {completed.engine}"
-    print(f"events: {completed.events:,} in {cost}")
+    duration = f"{completed.seconds:.2f} s, {rate:,.0f} per second"
+    print(f"events: {completed.events:,} in {duration}, engine {completed.engine}")
     if completed.status != "complete":
         message = _describe_divergence(completed)
         print(f"status: {message}")
@@ -108,25 +111,27 @@ def _run_once(scenario: Scenario, options: argparse.Namespace) -> int:
     return 0
 
 
-def _run_many(scenario: Scenario, options: argparse.Namespace) -> int:
-    """Simulate several runs into a directory; return the exit status."""
+def _run_ensemble(scenario: Scenario, options: argparse.Namespace) -> int:
+    """Simulate several runs into a directory and print their summary; return the exit status."""
     from netkf.ensembles.directory import EnsembleOptions, runs_to_directory
     from netkf.ensembles.pools import PoolOptions
 
     pool = PoolOptions(options.workers, None, options.scheduler)
-    how = EnsembleOptions(options.engine, options.trace or "first", options.resume, pool)
+    ensemble_options = EnsembleOptions(
+        options.engine, options.trace or "first", options.resume, pool
+    )
     draw = None
     if not options.no_plot:
         draw = partial(pictures.draw_picture, pictures.ENSEMBLE, scenario)
         # Importing matplotlib takes a second, in which the workers already simulate.
-        loading = partial(pictures.load_drawing, pictures.ENSEMBLE)
-        threading.Thread(target=loading, daemon=True).start()
+        load = partial(pictures.load_drawing, pictures.ENSEMBLE)
+        threading.Thread(target=load, daemon=True).start()
     with ProgressLine() as line:
         completed = runs_to_directory(
             scenario,
             options.runs,
             options.out,
-            how,
+            ensemble_options,
             progress=line.counter("runs"),
             finish=draw,
             note=_print_note,
@@ -139,13 +144,15 @@ def _run_many(scenario: Scenario, options: argparse.Namespace) -> int:
     return 0
 
 
-def _print_note(line: str) -> None:
+def _print_note(note: str) -> None:
     """Print a note on standard error."""
-    print_notes([line])
+    print_notes([note])
 
 
 def _print_summary(scenario: Scenario, completed: Any) -> None:
-    """Print the notes on a scenario and the summary of a completed run or ensemble."""
+    """Print the notes on a scenario, its title, and the table of averages of a completed run or
+    ensemble.
+    """
     from netkf.runs.files import missing_modules
     from netkf.runs.tables import summary_table
 
@@ -157,7 +164,9 @@ def _print_summary(scenario: Scenario, completed: Any) -> None:
 
 
 def _print_ensemble(completed: Any, runs: int) -> None:
-    """Print the cost of an ensemble, how many runs diverged, and its directory."""
+    """Print the duration of an ensemble of ``runs`` runs, the number of diverged runs, and its
+    directory.
+    """
     ensemble, seconds = completed.ensemble, max(completed.seconds, 1e-9)
     print(
         f"averages over {runs:,} runs, +- one standard error; {completed.simulated:,} "
@@ -172,21 +181,21 @@ def _print_ensemble(completed: Any, runs: int) -> None:
 
 
 def _describe_divergence(completed: CompletedRun) -> str:
-    """Return a sentence that says which nodes diverged and when."""
+    """Return a sentence on which nodes diverged and when."""
     samples = completed.samples
-    nodes = samples.diverged
-    listed = ", ".join(map(str, nodes[:MAX_LISTED_NODES]))
-    listed += ", ..." if len(nodes) > MAX_LISTED_NODES else ""
-    which = f"node{'s' if len(nodes) > 1 else ''} {listed}"
-    problem = f"estimate or covariance of {which} is no longer finite"
-    if samples.is_finite_at_end:
-        problem = f"covariance of {which} is no longer positive semidefinite"
-    left_out = ""
+    ids = samples.diverged
+    listed = ", ".join(map(str, ids[:MAX_LISTED_NODES]))
+    listed += ", ..." if len(ids) > MAX_LISTED_NODES else ""
+    nodes = f"node{'s' if len(ids) > 1 else ''} {listed}"
+    problem = f"estimate or covariance of {nodes} is no longer finite"
+    if samples.ended_finite:
+        problem = f"covariance of {nodes} is no longer positive semidefinite"
+    rounding = ""
     if samples.rounding_from is not None:
-        left_out = f"; errors are averaged before {samples.rounding_from:g} s"
+        rounding = f"; errors are averaged before {samples.rounding_from:g} s"
     return (
         f"{completed.status}, the {problem} at {samples.times[-1]:g} s and the run ended "
-        f"there{left_out}"
+        f"there{rounding}"
     )
 
 

@@ -16,7 +16,7 @@ def _declare(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(options: argparse.Namespace) -> int:
-    """Print the schema or the page of keys; return the exit status."""
+    """Print the JSON Schema, or the reference of keys in Markdown; return the exit status."""
     if options.markdown:
         from netkf.scenario.schema_page import schema_page
 

@@ -55,7 +55,9 @@ def _declare(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(options: argparse.Namespace) -> int:
-    """Return the exit status: 1 if no value meets the target."""
+    """Search a value that meets the target and print it; return the exit status, 1 if there is
+    none.
+    """
     from netkf.studies.parameter_grid import parse_interval
     from netkf.studies.size import size
     from netkf.studies.tables import answer, sizing_text

@@ -47,7 +47,10 @@ def _declare(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(options: argparse.Namespace) -> int:
-    """Simulate a grid of scenarios into a directory; return the exit status."""
+    """Simulate a grid of scenarios into a directory and print the table; return the exit status.
+
+    The table is printed even if its files cannot be written.
+    """
     from netkf.ensembles.pools import PoolOptions
     from netkf.runs.directory_lock import lock_directory
     from netkf.studies.parameter_grid import parse_grid
@@ -66,9 +69,10 @@ def _run(options: argparse.Namespace) -> int:
                 finish=None if options.no_plot else draw,
                 take=completed.append,
             )
-    finally:  # a sweep whose files cannot be written is an answer too
-        for one in completed:
-            _print_sweep(scenario, one, options)
+    finally:
+        # Without a completed sweep the list is empty.
+        for completed_sweep in completed:
+            _print_sweep(scenario, completed_sweep, options)
     if not options.json:
         print(f"written to {completed[0].directory}")
     return 0
@@ -77,7 +81,7 @@ def _run(options: argparse.Namespace) -> int:
 def _print_sweep(
     scenario: Scenario, completed: CompletedSweep, options: argparse.Namespace
 ) -> None:
-    """Print the table of a finished sweep."""
+    """Print the table of a finished sweep and its duration, or JSON with ``--json``."""
     from netkf.studies.tables import sweep_text
 
     if options.json:

@@ -1,4 +1,4 @@
-"""``netkf theory``: what is promised for a scenario, computed without a simulation."""
+"""``netkf theory``: assumptions, bounds and limits of a scenario, without a simulation."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ def _declare(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(options: argparse.Namespace) -> int:
-    """Print the promises about a scenario; return the exit status."""
+    """Print the promises of the theory for a scenario; return the exit status."""
     scenario = load_scenario(options)
-    # Afterwards: a scenario that is refused needs no theory, whose imports take half a second.
+    # These imports take half a second, which an invalid scenario need not wait for.
     from netkf.runs.failures import explain_failures
     from netkf.runs.promises import compute_promises, promises_text
 
     with explain_failures(scenario):
-        found = compute_promises(scenario)
+        promises = compute_promises(scenario)
     print_notes(scenario.notes)
     if options.json:
-        print_json(found)
+        print_json(promises)
     else:
-        print(promises_text(scenario, found))
+        print(promises_text(scenario, promises))
     return 0
 
 

@@ -1,4 +1,4 @@
-"""``netkf why``: explain what a node of a finished run knew at an instant."""
+"""``netkf why``: explain the estimate of a node of a finished run at a sample time."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ def _declare(parser: argparse.ArgumentParser) -> None:
     """Declare the options of ``netkf why``."""
     parser.add_argument("directory", type=Path, metavar="DIR", help="run directory")
     parser.add_argument(
-        "--node", type=int, metavar="I", help="id of the node (default: the one that is most off)"
+        "--node", type=int, metavar="I", help="id of the node (default: the worst node)"
     )
     parser.add_argument(
         "--at",
         type=float,
         metavar="T",
-        help="simulated time in seconds (default: when that node is most off)",
+        help="simulated time in seconds (default: the worst sample of that node)",
     )
     parser.add_argument(
         "--replica", type=parse_replica, help="run of an ensemble with all traces (default: 0)"
@@ -50,16 +50,20 @@ def _declare(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--replays",
         type=parse_count,
-        help="replays that look for the set at most (default: 100 to 1000, by the events of one)",
+        help="largest number of replays that search the set (default: 100 to 1000, by the events "
+        "of the run)",
     )
     add_trust(parser, "DIR")
-    parser.add_argument("--out", type=Path, help="keep the answer in this directory")
+    parser.add_argument("--out", type=Path, help="directory for the answer and its table")
     add_json(parser)
 
 
 def _run(options: argparse.Namespace) -> int:
-    """Explain a sample of a run; return the exit status."""
-    from netkf.runs.directory_lock import lock_directory
+    """Explain a sample of a run; return the exit status.
+
+    Raises ScenarioError for ``--node`` without ``--at``, or the reverse.
+    """
+    from netkf.runs.directory_lock import only_writer
 
     if (options.node is None) != (options.at is None):
         remedy = "give both, or neither for the worst sample"
@@ -69,13 +73,16 @@ def _run(options: argparse.Namespace) -> int:
 
 
 def _explain(options: argparse.Namespace) -> int:
-    """Explain a sample, print the text and save it if asked; return the exit status."""
+    """Explain a sample, write the files of ``--out``, and print the text; return the exit status.
+
+    The text is printed even if its files cannot be written.
+    """
     from netkf.studies.why import why
 
     node, at = options.node, options.at
     if node is None:
-        node, at = _worst_sample(options)
-    found = why(
+        node, at = _find_worst_sample(options)
+    explanation = why(
         options.directory,
         node,
         at,
@@ -87,51 +94,51 @@ def _explain(options: argparse.Namespace) -> int:
     )
     try:
         if options.out is not None:
-            _keep(found, options.out)
-    finally:  # an answer that cannot be kept is one too
+            _write_explanation(explanation, options.out)
+    finally:
         if options.json:
-            print_json(found.to_dict())
+            print_json(explanation.to_dict())
         else:
-            print(found)
+            print(explanation)
     return 0
 
 
-def _worst_sample(options: argparse.Namespace) -> tuple[int, float]:
-    """Return the node and the time of the worst sample after the start-up, and print a note.
+def _find_worst_sample(options: argparse.Namespace) -> tuple[int, float]:
+    """Return the node and the time (s) of the worst sample after the start-up, and print a note.
 
-    Raises ScenarioError if the directory has no samples of one run.
+    Raises ScenarioError if the directory has no samples of a single run.
     """
     from netkf.report.directories import read_source
 
-    found = read_source(options.directory, options.replica, options.trust).worst
-    if found is None:
+    samples = read_source(options.directory, options.replica, options.trust).worst
+    if samples is None:
         rule = "has no samples of a run, of which the worst could be explained"
         remedy = "name a run, or an ensemble with --trace full"
         raise ScenarioError(shorten(options.directory), rule, None, remedy)
-    worst = found.explained
-    largest = "error" if worst.by_error else "trace of P"
+    worst = samples.explained
+    quantity = "error" if worst.by_error else "trace of P"
     print_notes(
         [
-            f"node {worst.node} at {worst.time:.10g} s: the largest {largest} after the start-up "
-            f"of the node that is most off; --node and --at ask about another"
+            f"node {worst.node} at {worst.time:.10g} s: the largest {quantity} of the worst node "
+            "after the start-up; --node and --at choose another sample"
         ]
     )
     return worst.node, worst.time
 
 
-def _keep(found: Why, directory: Path) -> None:
-    """Write why.txt, why.json and why.csv."""
+def _write_explanation(explanation: Why, directory: Path) -> None:
+    """Write why.txt, why.json and why.csv; raises WriteError if a file cannot be written."""
     from netkf.runs.files import write_atomically, write_json, write_text
 
-    write_text(directory / "why.txt", f"{found}\n")
-    write_json(directory / "why.json", found.to_dict())
-    with write_atomically(directory / "why.csv") as part:
-        found.table.to_csv(part, index=False)
+    write_text(directory / "why.txt", f"{explanation}\n")
+    write_json(directory / "why.json", explanation.to_dict())
+    with write_atomically(directory / "why.csv") as temporary:
+        explanation.table.to_csv(temporary, index=False)
 
 
 COMMAND = Command(
     "why",
-    "explain what a node knew at an instant: whom it heard, and which messages were missing",
+    "explain the estimate of a node at a time: the messages that it received, and those missing",
     _declare,
     _run,
     takes_scenario=False,

@@ -60,7 +60,7 @@ def ensemble_to_resume(
     """
     if out is None:
         remedy = "add --out DIR with the directory of the run that was stopped"
-        raise ScenarioError("--resume", "needs the directory to go on in", None, remedy)
+        raise ScenarioError("--resume", "needs the directory of the runs", None, remedy)
     size = BlockCheckpoints(out, scenario).begun_with() or plan.block
     if not (out / "manifest.json").exists():
         if not _has_own_files(out, scenario):

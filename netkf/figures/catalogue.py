@@ -1,4 +1,4 @@
-"""The list of figures by name, and the one function that draws them."""
+"""The list of figures by name, and the functions that draw or write them."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ from typing import Any
 from netkf.core.errors import ScenarioError, nearest
 from netkf.figures.consistency import nees_figure, nis_figure, whiteness_figure
 from netkf.figures.error import error_figure, quantiles_figure, ratios_figure
+from netkf.figures.figure_data import FigureData, UnavailableError, reduce_result
 from netkf.figures.network import network_figure
 from netkf.figures.pictures import overview
 from netkf.figures.stability import law_figure, stability_figure, sweep_figure
-from netkf.figures.style import FORMATS, Picture, look, message_figure, write
-from netkf.figures.subject import Subject, UnavailableError, subject_of
+from netkf.figures.style import FORMATS, Picture, message_figure, style_context, write_figure
 from netkf.figures.traffic import age_figure, delivery_figure, links_figure
 from netkf.runs.files import make_directory
 
-FIGURES: Mapping[str, Callable[[Subject], Picture]] = {
+FIGURES: Mapping[str, Callable[[FigureData], Picture]] = {
     "overview": overview,
     "error": error_figure,
     "quantiles": quantiles_figure,
@@ -35,68 +35,76 @@ FIGURES: Mapping[str, Callable[[Subject], Picture]] = {
 """The figures of runs and ensembles; a sweep has ``stability`` only."""
 
 ACRONYMS = ("nees", "nis")
+"""Names of figures that sentences write in capitals."""
 
 
 def plot(result: Any, figure: str = "error") -> Picture:
     """Return a figure of a run, an ensemble or a sweep that was read from its directory, as a
-    matplotlib Figure (``savefig`` writes it); if it cannot be drawn it says why.
+    matplotlib Figure (``savefig`` writes it).
 
-    Raises ScenarioError for an unknown name and for anything that is no result.
+    If the result lacks the data of that figure, it shows a sentence that says so. Raises
+    ScenarioError for an unknown name, and if ``result`` is not a result.
     """
     return FigureSet(result).draw(figure)
 
 
 class FigureSet:
-    """Draws several figures of one result, which is reduced once."""
+    """Draws several figures of one result, whose data are computed only once."""
 
     def __init__(self, result: Any) -> None:
+        # A sweep is known by its attributes: its class is in a room above this one.
         is_sweep = hasattr(result, "keys") and hasattr(result, "table")
         self._sweep: Any = result if is_sweep else None
-        self._subject = None if is_sweep else subject_of(result)
+        self._data = None if is_sweep else reduce_result(result)
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the figures that can be asked for."""
+        """The names of the figures of this kind of result."""
         return ("stability",) if self._sweep is not None else tuple(FIGURES)
 
     def draw(self, name: str) -> Picture:
-        """Return the figure of this name; raises ScenarioError for an unknown name."""
+        """Return the figure of this name, or one with the reason why it cannot be drawn.
+
+        Raises ScenarioError for an unknown name.
+        """
         if name not in self.names:
             hint = nearest(name, self.names)
-            remedy = f"{hint}figures of it are {', '.join(self.names)}"
+            remedy = f"{hint}its figures are {', '.join(self.names)}"
             raise ScenarioError("figure", "is not known", name, remedy)
-        with look():
+        with style_context():
             try:
                 if self._sweep is not None:
                     sweep = self._sweep
                     return sweep_figure(sweep.scenario.name, sweep.table, sweep.keys, sweep.status)
-                assert self._subject is not None
-                return FIGURES[name](self._subject)
+                assert self._data is not None
+                return FIGURES[name](self._data)
             except UnavailableError as reason:
                 return message_figure(*self._explain(name, str(reason)))
 
     def _explain(self, name: str, reason: str) -> tuple[str, str, list[str]]:
-        """Return claim, message and caption of a figure that cannot be drawn."""
+        """Return title, message and caption of a figure that cannot be drawn for this reason."""
         claim = f"No {name.upper() if name in ACRONYMS else name} to show"
-        if self._subject is None:
+        if self._data is None:
             return claim, reason, [f"{self._sweep.scenario.name}, a sweep."]
-        return self._subject.claim(claim), reason, self._subject.caption()
+        return self._data.title(claim), reason, self._data.caption()
 
 
-def plot_to_files(result: Any, names: tuple[str, ...], out: Path, kind: str) -> list[Path]:
-    """Write figures as OUT if that is the name of a file, else as OUT/NAME.kind; return the paths.
+def plot_to_files(result: Any, names: tuple[str, ...], out: Path, file_format: str) -> list[Path]:
+    """Write the figures of these names, all of them if there are no names, and return their paths.
 
-    Raises ScenarioError for unknown names, before anything is written, and WriteError.
+    They are written as ``out`` if its suffix is that of a picture file, else as
+    ``out``/NAME.``file_format``. Raises ScenarioError for unknown names, before any file is
+    written, and WriteError if a file cannot be written.
     """
-    drawing = FigureSet(result)
-    wanted = names or drawing.names
-    single = out.suffix.removeprefix(".").lower() in FORMATS and not out.is_dir()
-    if single and len(wanted) > 1:
+    figure_set = FigureSet(result)
+    names = names or figure_set.names
+    is_file = out.suffix.removeprefix(".").lower() in FORMATS and not out.is_dir()
+    if is_file and len(names) > 1:
         rule, remedy = "is one file for several figures", "name a directory, or one --figure"
         raise ScenarioError("--out", rule, str(out), remedy)
-    figures = {name: drawing.draw(name) for name in wanted}
-    paths = {name: out if single else out / f"{name}.{kind}" for name in wanted}
+    figures = {name: figure_set.draw(name) for name in names}
+    paths = {name: out if is_file else out / f"{name}.{file_format}" for name in names}
     for name, figure in figures.items():
         make_directory(paths[name].parent)
-        write(figure, paths[name])
+        write_figure(figure, paths[name])
     return list(paths.values())

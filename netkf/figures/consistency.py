@@ -1,4 +1,4 @@
-"""The figures ``nees``, ``nis`` and ``whiteness``: do the errors fit the covariances?"""
+"""The figures ``nees``, ``nis`` and ``whiteness``: are errors and innovations consistent with P?"""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from netkf.core.errors import NetkfError
+from netkf.figures.figure_data import NORMAL_QUANTILE, FigureData, UnavailableError
 from netkf.figures.panels import draw_nees
 from netkf.figures.style import (
     EXACT,
@@ -20,7 +21,6 @@ from netkf.figures.style import (
     new_figure,
     set_scale,
 )
-from netkf.figures.subject import LEVEL, Subject, UnavailableError
 from netkf.linalg.arrays import FloatArray
 from netkf.runs.innovations import (
     MIN_READINGS,
@@ -31,85 +31,93 @@ from netkf.runs.innovations import (
 from netkf.runs.summary import CONFIDENCE, nees_bounds
 
 BINS = 40  # of time, few enough that each has many readings
+MAX_DOTS = 4000  # readings that are drawn one by one
+WHITE_SHARE = 0.1
+"""Largest share of autocorrelations outside their 95% band that is taken for white noise."""
 
 
-def nees_figure(subject: Subject) -> Picture:
-    """Draw NEES over time with the interval that holds it if P is exact."""
-    subject.require_samples()
-    subject.require_truth()
-    subject.require_covariance()
-    n = subject.scenario.plant.n
-    low, high = nees_bounds(n, subject.runs)
-    values = subject.nees[subject.used]
+def nees_figure(data: FigureData) -> Picture:
+    """Draw NEES over time with the interval that contains it if P is exact.
+
+    Raises UnavailableError without samples, ground truth or covariances.
+    """
+    data.require_samples()
+    data.require_truth()
+    data.require_covariance()
+    n = data.scenario.plant.n
+    low, high = nees_bounds(n, data.runs)
+    values = data.nees[data.averaged]
     values = values[np.isfinite(values)]
     if not values.size:
         raise UnavailableError("NEES is unavailable: it needs an error and a regular P.")
     figure = new_figure(7.4, 4.2)
-    draw_nees(figure.add_subplot(), subject)
+    draw_nees(figure.add_subplot(), data)
     inside = float(((values >= low) & (values <= high)).mean())
-    over = f" over {subject.runs:,} runs" if subject.runs > 1 else ""
-    note = f"Band: chi-square with {subject.runs * n:,} degrees of freedom{over}."
+    divisor = f" over {data.runs:,} runs" if data.runs > 1 else ""
+    note = f"Band: chi-square with {data.runs * n:,} degrees of freedom{divisor}."
     finish_figure(
         figure,
-        subject.claim(_nees_claim(inside, float(values.mean()), n)),
-        subject.caption(note, notes="nees"),
+        data.title(_nees_claim(inside, float(values.mean()), n)),
+        data.caption(note, notes="nees"),
     )
     return figure
 
 
 def _nees_claim(inside: float, mean: float, n: int) -> str:
-    """Return the claim of the figure of NEES."""
+    """Return a sentence on the share of samples ``inside`` the band and on their mean."""
     claim = f"{inside:.0%} of the samples lie in the {CONFIDENCE:.0%} band of NEES"
     return f"{claim}; their mean is {mean:.3g} where exact covariances give {n}"
 
 
-def innovations_of(subject: Subject) -> Innovations:
+def require_innovations(data: FigureData) -> Innovations:
     """Return the innovations of a run; raises UnavailableError if there are none."""
-    if subject.run is None:
+    if data.run is None:
         raise UnavailableError(
-            "Innovations are those of single runs: draw netkf.open(DIR).replica(0)."
+            "Only single runs have innovations: draw netkf.open(DIR).replica(0)."
         )
-    if subject.status in ("interrupted", "failed"):
-        raise UnavailableError(
-            f"The run was {subject.status}, so that its readings are not replayed."
-        )
+    if data.status in ("interrupted", "failed"):
+        raise UnavailableError(f"The run was {data.status}, so its readings are not replayed.")
     try:
-        return subject.innovations
+        return data.innovations
     except NetkfError as error:
         raise UnavailableError(f"There are no innovations to draw: {error}.") from None
 
 
-def nis_figure(subject: Subject) -> Picture:
-    """Draw the NIS of the readings over time with the interval of its means."""
-    found = innovations_of(subject)
+def nis_figure(data: FigureData) -> Picture:
+    """Draw the NIS of the readings over time with the interval of its means.
+
+    Raises UnavailableError if there are no innovations.
+    """
+    innovations = require_innovations(data)
     figure = new_figure(7.4, 4.2)
-    share, mean = draw_nis(figure.add_subplot(), found)
+    share, mean = draw_nis(figure.add_subplot(), innovations)
+    count = len(innovations.nis)
     claim = f"NIS per row of a reading is {mean:.3g} where exact covariances give 1; "
-    claim += f"{share:.0%} of {len(found.nis):,} readings lie in their {CONFIDENCE:.0%} interval"
+    claim += f"{share:.0%} of {count:,} readings lie in their {CONFIDENCE:.0%} interval"
     note = "Dots: single readings; line: means of bins, with the interval of each if P is exact."
-    finish_figure(figure, subject.claim(claim), subject.caption(note))
+    finish_figure(figure, data.title(claim), data.caption(note))
     return figure
 
 
-def draw_nis(axes: Any, found: Innovations) -> tuple[float, float]:
-    """Draw NIS over its degrees of freedom; return the share of readings in their interval and the
-    mean.
+def draw_nis(axes: Any, innovations: Innovations) -> tuple[float, float]:
+    """Draw NIS divided by its degrees of freedom over time, reading by reading and as means of
+    bins; return the share of readings in their interval and the mean.
     """
-    known = np.isfinite(found.nis)
-    times, nis = found.times[known], found.nis[known]
-    rows = found.rows[known].astype(np.float64)
-    chosen = np.linspace(0, len(nis) - 1, min(len(nis), 4000)).astype(int)
+    finite = np.isfinite(innovations.nis)
+    times, nis = innovations.times[finite], innovations.nis[finite]
+    rows = innovations.rows[finite].astype(np.float64)  # degrees of freedom of each reading
+    dots = np.linspace(0, len(nis) - 1, min(len(nis), MAX_DOTS)).astype(int)
     style = {"ls": "", "marker": ".", "ms": 2.5, "color": SKY, "alpha": 0.7}
-    axes.plot(times[chosen], (nis / rows)[chosen], label="readings", **style)
+    axes.plot(times[dots], (nis / rows)[dots], label="readings", **style)
     edges = np.linspace(0.0, max(float(times.max()), 1e-12), BINS + 1)
-    which = np.clip(np.digitize(times, edges[1:-1]), 0, BINS - 1)
+    bins = np.clip(np.digitize(times, edges[1:-1]), 0, BINS - 1)
     sums, freedom = (
-        np.asarray(np.bincount(which, weights=v, minlength=BINS), dtype=np.float64)
-        for v in (nis, rows)
+        np.asarray(np.bincount(bins, weights=values, minlength=BINS), dtype=np.float64)
+        for values in (nis, rows)
     )
-    full = freedom > 0.0
-    centres = 0.5 * (edges[1:] + edges[:-1])[full]
-    low, high = chi_square_interval(freedom[full], CONFIDENCE)
+    has_readings = freedom > 0.0
+    centres = 0.5 * (edges[1:] + edges[:-1])[has_readings]
+    low, high = chi_square_means(freedom[has_readings], CONFIDENCE)
     axes.fill_between(
         centres,
         low,
@@ -119,64 +127,77 @@ def draw_nis(axes: Any, found: Innovations) -> tuple[float, float]:
         lw=0,
         label=f"{CONFIDENCE:.0%} of means if P is exact",
     )
-    axes.plot(centres, sums[full] / freedom[full], color=INK, lw=1.6, label="mean of each bin")
+    means = sums[has_readings] / freedom[has_readings]
+    axes.plot(centres, means, color=INK, lw=1.6, label="mean of each bin")
     axes.axhline(1.0, color=EXACT, ls="-.", lw=1.1, label="expected")
     set_scale(axes, np.concatenate([nis / rows, high]))
     if axes.get_yscale() == "log":
+        # Single NIS may be arbitrarily close to 0.
         axes.set_ylim(bottom=max(axes.get_ylim()[0], 1e-3))
     axes.set(ylabel="NIS / rows of a reading", xlabel=SECONDS)
     draw_legend(axes)
-    ends = chi_square_interval(rows, CONFIDENCE)
-    share = float(((nis / rows >= ends[0]) & (nis / rows <= ends[1])).mean())
+    low, high = chi_square_means(rows, CONFIDENCE)
+    share = float(((nis / rows >= low) & (nis / rows <= high)).mean())
     return share, float(nis.sum() / rows.sum())
 
 
-def whiteness_figure(subject: Subject) -> Picture:
-    """Draw the autocorrelation of the whitened innovations: the mean node and the worst one."""
-    curves, counts = autocorrelations(innovations_of(subject))
+def whiteness_figure(data: FigureData) -> Picture:
+    """Draw the autocorrelations of the whitened innovations over the lag: mean and range of the
+    nodes, and the node with the largest one.
+
+    Raises UnavailableError if there are no innovations, or too few.
+    """
+    curves, counts = autocorrelations(require_innovations(data))
     if not curves:
         raise UnavailableError(f"No node has {MIN_READINGS} readings of one kind.")
     smallest, lags = min(counts.values()), len(next(iter(curves.values())))
-    band = LEVEL / np.sqrt(smallest)
+    # An autocorrelation of white noise has a standard deviation of about 1 / sqrt(count).
+    band = NORMAL_QUANTILE / np.sqrt(smallest)
     outside = sum(
-        int((np.abs(c) > LEVEL / np.sqrt(counts[node])).sum()) for node, c in curves.items()
+        int((np.abs(curve) > NORMAL_QUANTILE / np.sqrt(counts[node])).sum())
+        for node, curve in curves.items()
     )
     worst = max(curves, key=lambda node: float(np.abs(curves[node]).max()))
     figure = new_figure(7.4, 4.2)
     axes = figure.add_subplot()
     _draw_correlations(axes, curves, worst, band, lags)
     share = outside / (lags * len(curves))
-    white = "as white noise would" if share <= 0.1 else "so innovations are not white"
-    claim = f"{share:.0%} of autocorrelations are outside their 95% band, {white}"
+    verdict = (
+        "as expected of white noise" if share <= WHITE_SHARE else "so innovations are not white"
+    )
+    claim = f"{share:.0%} of autocorrelations are outside their 95% band, {verdict}"
     note = f"Band: 1.96 / root of {smallest:,}, the fewest readings of a node. Lags count readings."
-    finish_figure(figure, subject.claim(claim), subject.caption(note))
+    finish_figure(figure, data.title(claim), data.caption(note))
     return figure
 
 
 def _draw_correlations(
     axes: Any, curves: dict[int, FloatArray], worst: int, band: float, lags: int
 ) -> None:
-    """Draw the autocorrelations of innovations (lags,) of the nodes, by lag."""
+    """Draw the autocorrelations (lags,) of each node over the lag, that of the ``worst`` node as a
+    line of its own, and the 95% band of white noise, 0 +- ``band``.
+    """
     positions = np.arange(1, lags + 1)
     axes.axhspan(-band, band, color=EXACT, alpha=0.2, lw=0, label="95% if white")
     axes.axhline(0.0, color=EXACT, lw=0.8)
-    whole = np.array(list(curves.values()))
+    all_curves = np.array(list(curves.values()))
     if len(curves) > 1:
         axes.fill_between(
             positions,
-            whole.min(axis=0),
-            whole.max(axis=0),
+            all_curves.min(axis=0),
+            all_curves.max(axis=0),
             color=SKY,
             alpha=0.35,
             lw=0,
             label="range of all nodes",
         )
-        axes.plot(positions, whole.mean(axis=0), "-o", color=INK, ms=3.5, label="mean of all nodes")
+        mean = all_curves.mean(axis=0)
+        axes.plot(positions, mean, "-o", color=INK, ms=3.5, label="mean of all nodes")
     name = "all readings" if worst < 0 else f"node {worst}"
     label = f"{name}, the largest" if len(curves) > 1 else name
     axes.plot(positions, curves[worst], "--s", color=SENSING, ms=3.5, label=label)
     axes.set(xlabel="lag, readings of the node", ylabel="autocorrelation of innovations")
     axes.xaxis.get_major_locator().set_params(integer=True)
-    top = max(1.3 * float(np.abs(whole).max()), 2.0 * band)
-    axes.set_ylim(-top, top)
+    limit = max(1.3 * float(np.abs(all_curves).max()), 2.0 * band)
+    axes.set_ylim(-limit, limit)
     draw_legend(axes)

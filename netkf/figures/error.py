@@ -1,4 +1,4 @@
-"""The figures ``error``, ``quantiles`` and ``ratios``: how large errors are, and where and when."""
+"""The figures ``error``, ``quantiles`` and ``ratios``: errors over time, over nodes, and over P."""
 
 from __future__ import annotations
 
@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from netkf.figures.consistency import draw_nis, innovations_of
+from netkf.figures.consistency import draw_nis, require_innovations
+from netkf.figures.figure_data import NORMAL_QUANTILE, FigureData, UnavailableError
 from netkf.figures.panels import draw_covariances, draw_errors
 from netkf.figures.style import (
     EXACT,
@@ -23,66 +24,69 @@ from netkf.figures.style import (
     new_figure,
     set_scale,
 )
-from netkf.figures.subject import LEVEL, Subject, UnavailableError
 from netkf.linalg.arrays import FloatArray
 
 QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
-WORST = 3  # instants that are marked
+MARKED_SAMPLES = 3  # worst samples that the figure of quantiles marks
 MAX_ROWS = 60  # nodes whose labels still fit beside each other
 
 
-def error_figure(subject: Subject) -> Picture:
-    """Draw errors beside the bound over time, and covariances beside it; without ground truth
-    estimates and the NIS of the innovations.
+def error_figure(data: FigureData) -> Picture:
+    """Draw the errors, and below them the roots of trace P, over time with the bound; without
+    ground truth the estimates and the NIS.
+
+    Raises UnavailableError without samples.
     """
-    subject.require_samples()
+    data.require_samples()
     figure = new_figure(7.4, 6.6)
-    above, below = figure.subplots(2, 1, sharex=True)
-    draw_errors(above, subject, bound=True)
-    if subject.shows_errors:
-        draw_covariances(below, subject)
-        above.set_xlabel("")
-        sentences = _interval_notes(subject)
+    upper, lower = figure.subplots(2, 1, sharex=True)
+    draw_errors(upper, data, bound=True)
+    if data.shows_errors:
+        draw_covariances(lower, data)
+        upper.set_xlabel("")
+        sentences = _interval_notes(data)
     else:
-        sentences = _draw_innovations(below, subject)
-    finish_figure(
-        figure, subject.claim(bound_claim(subject)), subject.caption(*sentences, notes="bound")
-    )
+        sentences = _draw_innovations(lower, data)
+    finish_figure(figure, data.title(bound_claim(data)), data.caption(*sentences, notes="bound"))
     return figure
 
 
-def _interval_notes(subject: Subject) -> list[str]:
-    """Return the sentences on bands and bound."""
-    if subject.runs > 1:
+def _interval_notes(data: FigureData) -> list[str]:
+    """Return the sentences of the caption on intervals and the bound."""
+    if data.runs > 1:
         return ["Bands: 95% intervals of the means (1.96 standard errors)."]
-    if subject.promised.bound is None:
-        return [f"No bound: {subject.promised.reason}."]
+    if data.promised.bound is None:
+        return [f"No bound: {data.promised.reason}."]
     return ["Lines of nodes are single runs; the bound holds for the mean over runs."]
 
 
-def _draw_innovations(axes: Any, subject: Subject) -> list[str]:
-    """Draw normalised innovations where there is no ground truth; return the sentences."""
+def _draw_innovations(axes: Any, data: FigureData) -> list[str]:
+    """Draw the NIS, or the reason why there is none, and return the sentences of the caption."""
     try:
-        found = innovations_of(subject)
+        innovations = require_innovations(data)
     except UnavailableError as error:
         draw_message(axes, str(error))
         return ["There is no ground truth."]
-    draw_nis(axes, found)
-    return ["There is no ground truth: readings are held against their predictions instead (NIS)."]
+    draw_nis(axes, innovations)
+    return ["There is no ground truth: readings are compared with their predictions (NIS)."]
 
 
-def bound_claim(subject: Subject) -> str:
-    """Return a sentence on how many nodes stay below the bound, or what else can be said."""
-    rows = [row for row in subject.rows if _is_known(row.get("ratio"))]
+def bound_claim(data: FigureData) -> str:
+    """Return a sentence on how many nodes stay below the bound; without a bound on the range of the
+    errors.
+    """
+    rows = [row for row in data.node_averages if _is_known(row.get("ratio"))]
     if rows:
-        return (_mean_claim if subject.runs > 1 else _run_claim)(rows)
-    if subject.shows_errors:
-        return _size_claim(subject)
-    return "Without ground truth: what the nodes estimate, and what readings say about it"
+        return (_mean_claim if data.runs > 1 else _run_claim)(rows)
+    if data.shows_errors:
+        return _size_claim(data)
+    return "Without ground truth: the estimates of the nodes and their innovations"
 
 
 def _run_claim(rows: list[dict[str, Any]]) -> str:
-    """Return a sentence on one run: a bound on the mean over runs may be exceeded in it."""
+    """Return a sentence on how many nodes of one run have a trace P below the bound, from their
+    averages. It is no verdict, because the bound is on the mean over runs.
+    """
     below, count = sum(row["ratio"] <= 1.0 for row in rows), len(rows)
     if count == 1:
         return f"In this run the node claims {'no more' if below else 'more'} than the bound"
@@ -90,22 +94,24 @@ def _run_claim(rows: list[dict[str, Any]]) -> str:
 
 
 def _mean_claim(rows: list[dict[str, Any]]) -> str:
-    """Return a sentence on the mean over runs, which counts the intervals of the ratios."""
-    margins = [LEVEL * _known_or_zero(row.get("ratio_se")) for row in rows]
+    """Return a sentence on how many nodes have a mean trace P below or above the bound, by the 95%
+    intervals of the ratios in the averages ``rows``.
+    """
+    margins = [NORMAL_QUANTILE * _known_or_zero(row.get("ratio_se")) for row in rows]
     above = sum(row["ratio"] - m > 1.0 for row, m in zip(rows, margins, strict=True))
     below = sum(row["ratio"] + m <= 1.0 for row, m in zip(rows, margins, strict=True))
     count = len(rows)
     if below == count:
-        who = f"All {count} nodes stay" if count > 1 else "The node stays"
-        return f"{who} below the bound in the mean"
+        nodes = f"All {count} nodes stay" if count > 1 else "The node stays"
+        return f"{nodes} below the bound in the mean"
     if above:
         return f"{above} of {count} nodes exceed the bound in the mean"
     return f"{below} of {count} nodes stay below the bound in the mean, the others are undecided"
 
 
-def _size_claim(subject: Subject) -> str:
-    """Return the claim of the figure: the range of RMS errors."""
-    values = [row["rms_error"] for row in subject.rows if _is_known(row.get("rms_error"))]
+def _size_claim(data: FigureData) -> str:
+    """Return a sentence on the range of the nodes' RMS errors."""
+    values = [row["rms_error"] for row in data.node_averages if _is_known(row.get("rms_error"))]
     if not values:
         return "The errors of the nodes over time"
     if len(values) == 1:
@@ -114,62 +120,70 @@ def _size_claim(subject: Subject) -> str:
 
 
 def _is_known(value: Any) -> bool:
-    """Return True for a finite number."""
+    """Return True if a value is a finite number, not None."""
     return value is not None and math.isfinite(value)
 
 
 def _known_or_zero(value: Any) -> float:
-    """Return the value, 0 if unknown."""
+    """Return a value as a number, 0 if it is None or not finite."""
     return float(value) if _is_known(value) else 0.0
 
 
-def quantiles_figure(subject: Subject) -> Picture:
-    """Draw quantiles of the errors over the nodes at each time, and mark the worst instants."""
-    subject.require_samples()
-    if subject.shows_errors:
-        values, label = np.sqrt(subject.sq_error), "error |x - xhat|"
+def quantiles_figure(data: FigureData) -> Picture:
+    """Draw quantiles over the nodes of the errors at each time, and mark the largest errors;
+    without ground truth of the roots of trace P.
+
+    Raises UnavailableError without samples or finite values.
+    """
+    data.require_samples()
+    if data.shows_errors:
+        values, label = np.sqrt(data.sq_error), "error |x - xhat|"
     else:
-        subject.require_covariance()
-        values, label = np.sqrt(subject.trace), "root of trace P"
-    if subject.runs > 1:
-        label = f"root mean square of {label}" if subject.shows_errors else label
+        data.require_covariance()
+        values, label = np.sqrt(data.trace), "root of trace P"
+    if data.runs > 1:
+        label = f"root mean square of {label}" if data.shows_errors else label
     figure = new_figure(7.4, 4.4)
     axes = figure.add_subplot()
     finite = np.isfinite(values).any(axis=1)
     if not finite.any():
         raise UnavailableError("No sample has a finite error.")
-    times, values = subject.times[finite], values[finite]
+    times, values = data.times[finite], values[finite]
     with np.errstate(invalid="ignore"):
-        low, quarter, median, three, high = np.nanquantile(values, QUANTILES, axis=1)
-    axes.fill_between(times, low, high, color=RELAY, alpha=0.3, lw=0, label="90% of nodes")
-    axes.fill_between(times, quarter, three, color=RELAY, alpha=0.6, lw=0, label="50% of nodes")
+        q05, q25, median, q75, q95 = np.nanquantile(values, QUANTILES, axis=1)
+    axes.fill_between(times, q05, q95, color=RELAY, alpha=0.3, lw=0, label="90% of nodes")
+    axes.fill_between(times, q25, q75, color=RELAY, alpha=0.6, lw=0, label="50% of nodes")
     axes.plot(times, median, color=INK, lw=1.6, label="median node")
-    worst = np.nanmax(values, axis=1)
-    axes.plot(times, worst, color=SENSING, ls="--", lw=1.1, label="worst node")
-    name = "error" if subject.shows_errors else "root of trace P"
-    claim = _mark_worst(axes, subject, times, values, name)
+    largest = np.nanmax(values, axis=1)
+    axes.plot(times, largest, color=SENSING, ls="--", lw=1.1, label="worst node")
+    name = "error" if data.shows_errors else "root of trace P"
+    claim = _mark_worst(axes, data, times, values, name)
     set_scale(axes, values)
     axes.margins(y=0.15)
     axes.set(xlabel=SECONDS, ylabel=f"{label}, units of the state")
     draw_legend(axes)
-    over = "means over the runs" if subject.runs > 1 else "this run"
-    caption = subject.caption(f"Quantiles over the nodes of {over}, at each sample.")
-    finish_figure(figure, subject.claim(claim), caption)
+    values_of = "means over the runs" if data.runs > 1 else "this run"
+    caption = data.caption(f"Quantiles over the nodes of {values_of}, at each sample.")
+    finish_figure(figure, data.title(claim), caption)
     return figure
 
 
 def _mark_worst(
-    axes: Any, subject: Subject, times: FloatArray, values: FloatArray, name: str
+    axes: Any, data: FigureData, times: FloatArray, values: FloatArray, name: str
 ) -> str:
-    """Mark the worst instants, each of another node, and return a sentence on the first."""
-    used = np.flatnonzero(np.isin(times, subject.times[subject.used]))
-    used = used if len(used) else np.arange(len(times))
-    errors = np.where(np.isfinite(values[used]), values[used], -np.inf)
-    order = np.argsort(-errors.max(axis=0), kind="stable")[:WORST]
+    """Mark the largest value of each of the three worst nodes, and return a sentence on the largest
+    of all, which is called ``name``.
+
+    ``values`` (T, N) are those at ``times`` (T,); samples that are not averaged are not marked.
+    """
+    rows = np.flatnonzero(np.isin(times, data.times[data.averaged]))
+    rows = rows if len(rows) else np.arange(len(times))
+    averaged = np.where(np.isfinite(values[rows]), values[rows], -np.inf)
+    worst_nodes = np.argsort(-averaged.max(axis=0), kind="stable")[:MARKED_SAMPLES]
     claim = ""
-    for rank, k in enumerate(order.tolist()):
-        at = int(used[int(np.argmax(errors[:, k]))])
-        t, value = times[at], values[at, k]
+    for rank, k in enumerate(worst_nodes.tolist()):
+        row = int(rows[int(np.argmax(averaged[:, k]))])
+        t, value = times[row], values[row, k]
         if not math.isfinite(value):
             continue
         axes.plot(
@@ -180,77 +194,91 @@ def _mark_worst(
             mfc="none",
             mec=INK,
             ls="",
-            label=f"worst of node {subject.nodes[k]}: {value:.3g} at {t:g} s",
+            label=f"worst of node {data.nodes[k]}: {value:.3g} at {t:g} s",
         )
-        of_node = f"of node {subject.nodes[k]} at {t:g} s"
+        of_node = f"of node {data.nodes[k]} at {t:g} s"
         claim = claim or f"The largest {name} after the start is {value:.3g}, {of_node}"
-    typical = float(np.nanmedian(values[used]))
-    return f"{claim}, {value_ratio(values[used], typical)}" if claim else "No error is finite"
+    if not claim:
+        return "No error is finite"
+    median = float(np.nanmedian(values[rows]))
+    return f"{claim}, {_compare_with_median(values[rows], median)}"
 
 
-def value_ratio(values: FloatArray, typical: float) -> str:
-    """Return how many times the ``typical`` value the largest one is, in words."""
+def _compare_with_median(values: FloatArray, median: float) -> str:
+    """Return text with the ratio of the largest value to the median, or with the median if it is
+    0.
+    """
     largest = float(np.nanmax(values))
-    return f"{largest / typical:.3g} times the median" if typical > 0.0 else f"median {typical:.3g}"
+    return f"{largest / median:.3g} times the median" if median > 0.0 else f"median {median:.3g}"
 
 
-def ratios_figure(subject: Subject) -> Picture:
-    """Draw for each node its mean trace of P over the bound; without a bound NEES over n."""
-    rows = [row for row in subject.rows if _is_known(row.get("ratio"))]
-    key, label, line = "ratio", "mean trace P / mean bound H(12)", "the bound"
+def ratios_figure(data: FigureData) -> Picture:
+    """Draw for each node its mean trace of P divided by the bound; without a bound its mean NEES
+    divided by n.
+
+    Raises UnavailableError if neither is known.
+    """
+    rows = [row for row in data.node_averages if _is_known(row.get("ratio"))]
+    key, label, reference_label = "ratio", "mean trace P / mean bound H(12)", "the bound"
+    scale = 1.0
     if not rows:
-        subject.require_truth()
-        key, n = "mean_nees", subject.scenario.plant.n
-        label, line = f"mean NEES / n, n = {n}", "errors as P says"
-        rows = [row for row in subject.rows if _is_known(row.get(key))]
+        data.require_truth()
+        key, n = "mean_nees", data.scenario.plant.n
+        label, reference_label = f"mean NEES / n, n = {n}", "errors as P says"
+        scale = 1.0 / n
+        rows = [row for row in data.node_averages if _is_known(row.get(key))]
         if not rows:
             raise UnavailableError("There are no ratios: no bound applies and NEES is unknown.")
-        scale = 1.0 / n
-    else:
-        scale = 1.0
     rows = sorted(rows, key=lambda row: row[key])
-    rows = [*rows[: MAX_ROWS // 2], *rows[-MAX_ROWS // 2 :]] if len(rows) > MAX_ROWS else rows
+    if len(rows) > MAX_ROWS:
+        rows = [*rows[: MAX_ROWS // 2], *rows[-MAX_ROWS // 2 :]]
     figure = new_figure(7.4, min(9.0, 1.7 + 0.17 * len(rows)))
     axes = figure.add_subplot()
-    _draw_ratios(axes, subject, rows, key, scale)
-    axes.axvline(1.0, color=EXACT, ls="--", lw=1.2, label=line)
+    _draw_ratios(axes, data, rows, key, scale)
+    axes.axvline(1.0, color=EXACT, ls="--", lw=1.2, label=reference_label)
     axes.set(xlabel=label, ylabel="node")
     draw_legend(axes)
-    bars = "Bars: 95% intervals. " if subject.runs > 1 else "One run has no intervals. "
-    cut = (
-        f"The {MAX_ROWS // 2} smallest and largest ratios." if len(subject.rows) > MAX_ROWS else ""
+    bars = "Bars: 95% intervals. " if data.runs > 1 else "One run has no intervals. "
+    selection = (
+        f"The {MAX_ROWS // 2} smallest and largest ratios."
+        if len(data.node_averages) > MAX_ROWS
+        else ""
     )
-    claim = bound_claim(subject) if key == "ratio" else _nees_claim(rows, key, scale)
+    claim = bound_claim(data) if key == "ratio" else _nees_claim(rows, key, scale)
     finish_figure(
         figure,
-        subject.claim(claim),
-        subject.caption(bars, cut, notes="bound" if key == "ratio" else "nees"),
+        data.title(claim),
+        data.caption(bars, selection, notes="bound" if key == "ratio" else "nees"),
     )
     return figure
 
 
 def _nees_claim(rows: list[dict[str, Any]], key: str, scale: float) -> str:
-    """Return the claim where no bound applies: squared errors against P."""
-    values = [row[key] * scale for row in rows]
-    where = f"{min(values):.3g} to {max(values):.3g}" if len(values) > 1 else f"{values[0]:.3g}"
-    return f"Squared errors are {where} times what P says; no bound applies"
+    """Return a sentence on the range of the ratios of squared errors to P, without a bound."""
+    ratios = [row[key] * scale for row in rows]
+    span = f"{min(ratios):.3g} to {max(ratios):.3g}" if len(ratios) > 1 else f"{ratios[0]:.3g}"
+    return f"Squared errors are {span} times what P says; no bound applies"
 
 
 def _draw_ratios(
-    axes: Any, subject: Subject, rows: list[dict[str, Any]], key: str, scale: float
+    axes: Any, data: FigureData, rows: list[dict[str, Any]], key: str, scale: float
 ) -> None:
-    """Draw the ratio of each node, with bars of 1.96 standard errors, against 1."""
+    """Draw ``scale`` times the column ``key`` of each row, as a line from 1, with a bar of 1.96
+    standard errors.
+    """
     positions = np.arange(len(rows))
     values = scale * np.array([row[key] for row in rows])
-    widths = scale * LEVEL * np.array([_known_or_zero(row.get(f"{key}_se")) for row in rows])
+    widths = (
+        scale * NORMAL_QUANTILE * np.array([_known_or_zero(row.get(f"{key}_se")) for row in rows])
+    )
     axes.hlines(positions, np.minimum(values, 1.0), np.maximum(values, 1.0), color=FAINT, lw=0.8)
-    has = np.array([row["node"] in subject.scenario.placed_sensors for row in rows])
+    has_sensor = np.array([row["node"] in data.scenario.placed for row in rows])
     for group, colour, marker, label in (
-        (has, SENSING, "s", "with a sensor"),
-        (~has, RELAY, "o", "without a sensor"),
+        (has_sensor, SENSING, "s", "with a sensor"),
+        (~has_sensor, RELAY, "o", "without a sensor"),
     ):
         if group.any():
-            bars = widths[group] if subject.runs > 1 else None
+            bars = widths[group] if data.runs > 1 else None
             style = {"fmt": marker, "color": colour, "mec": INK, "mew": 0.5, "ms": 4.5, "lw": 1.2}
             axes.errorbar(values[group], positions[group], xerr=bars, label=label, **style)
     axes.set_yticks(positions, [str(row["node"]) for row in rows], fontsize=6.5)

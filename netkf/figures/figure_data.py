@@ -1,4 +1,4 @@
-"""What figures draw: one run or many of a scenario, reduced to arrays over time and node."""
+"""The data of figures: one run or many of a scenario, reduced to arrays over time and node."""
 
 from __future__ import annotations
 
@@ -26,22 +26,30 @@ from netkf.trace.run import Run
 
 SIMULATE = "get it from netkf.simulate, netkf.monte_carlo or netkf.open"
 NO_TRUTH = "There is no ground truth in this run, so that its errors are unknown."
-LEVEL = 1.96
-"""Standard errors on both sides of a mean that make an interval of 95%."""
+NORMAL_QUANTILE = 1.96
+"""Standard errors on each side of a mean in a 95% interval."""
 
 
 class UnavailableError(Exception):
-    """A figure cannot be drawn of this run; the message is a sentence that says why."""
+    """A figure cannot be drawn from this result; the message is a sentence with the reason."""
 
 
 @dataclass(frozen=True, eq=False)
-class Subject:
-    """One run, or the means of ``runs`` runs, of a scenario.
+class FigureData:
+    """One run of a scenario, or the means over ``runs`` runs, at T sample times of N nodes.
 
-    times (T,); sq_error, trace, nees (T, N): squared errors, traces of P, NEES, nan if unknown, in
-    an ensemble their means over the runs with standard errors ``se_error``, ``se_trace``,
-    ``se_nees``; ``first`` (T, N): first component of the estimates, without meaning in an ensemble;
-    ``rows``: averages over time of the nodes, as in summary.json; ``ended``: what stopped it early.
+    times                      : (T,) seconds
+    sq_error, trace, nees      : (T, N) squared errors, traces of P, NEES, nan if unknown; of an
+                                 ensemble their means over runs
+    node_averages              : averages over time of each node, as in summary.json
+    status                     : how the runs ended, as in manifest.json
+    diverged                   : number of runs of an ensemble that diverged
+    rounding_from              : time (s) from which on rounding blurs errors
+    se_error, se_trace, se_nees: (T, N) standard errors of those means, None for a single run
+    first_component            : (T, N) first component of the estimates, None for an ensemble
+    delivered                  : messages delivered over each link, by its two nodes
+    messages                   : counts of messages, as in summary.json
+    run                        : the run with its events, None if it is not at hand
     """
 
     scenario: Scenario
@@ -49,7 +57,7 @@ class Subject:
     sq_error: FloatArray
     trace: FloatArray
     nees: FloatArray
-    rows: list[dict[str, Any]]
+    node_averages: list[dict[str, Any]]
     promised: PromisedTraces
     seed: int
     status: str
@@ -59,59 +67,59 @@ class Subject:
     se_error: FloatArray | None = None
     se_trace: FloatArray | None = None
     se_nees: FloatArray | None = None
-    first: FloatArray | None = None
+    first_component: FloatArray | None = None
     delivered: dict[tuple[int, int], int] = field(default_factory=dict)
     messages: dict[str, Any] = field(default_factory=dict)
     run: Run | None = None
 
     @property
     def nodes(self) -> tuple[int, ...]:
-        """Node ids."""
+        """The ids of the N nodes."""
         return self.scenario.nodes
 
     @property
     def shows_errors(self) -> bool:
-        """True if errors are known."""
+        """True if there is ground truth, so that errors are known."""
         return self.scenario.plant.truth_known
 
     @cached_property
     def innovations(self) -> Innovations:
         """The innovations of the run, which is replayed once for all figures.
 
-        Raises NetkfError where they cannot be computed.
+        Raises NetkfError if they cannot be computed.
         """
         assert self.run is not None
         return compute_innovations(self.run)
 
     @cached_property
-    def sensing(self) -> np.ndarray:
-        """(N,) bool: nodes with a sensor."""
-        return np.array([node in self.scenario.placed_sensors for node in self.nodes])
+    def has_sensor(self) -> np.ndarray:
+        """(N,) bool: True for nodes with a sensor."""
+        return np.array([node in self.scenario.placed for node in self.nodes])
 
     @cached_property
-    def used(self) -> np.ndarray:
+    def averaged(self) -> np.ndarray:
         """Indices of the samples that averages of errors are taken over."""
         diverged = self.status == "diverged" and self.runs == 1
         return select_averaged_samples(self.times, self.rounding_from, diverged).errors
 
     @property
     def log(self) -> np.ndarray:
-        """Events as EVENT rows; raises UnavailableError if they were not kept."""
+        """The events of the run as EVENT rows; raises UnavailableError if there are none."""
         if self.run is None:
             raise UnavailableError(
-                "Events are those of single runs: draw one of them, netkf.open(DIR).replica(0)."
+                "Only single runs have events: draw one of them, netkf.open(DIR).replica(0)."
             )
         if not len(self.run.log):
-            raise UnavailableError("There are no events: none happened, or none were kept.")
+            raise UnavailableError("There are no events: none occurred, or none were recorded.")
         return self.run.log
 
     def require_samples(self) -> None:
         """Raise UnavailableError unless there are samples."""
         if not len(self.times):
-            raise UnavailableError("There are no samples: none was taken, or none were kept.")
+            raise UnavailableError("There are no samples: none was taken, or none were recorded.")
 
     def require_truth(self) -> None:
-        """Raise UnavailableError unless errors are known."""
+        """Raise UnavailableError without ground truth."""
         if not self.shows_errors:
             raise UnavailableError(NO_TRUTH)
 
@@ -122,89 +130,103 @@ class Subject:
 
     @property
     def count_text(self) -> str:
-        """The number of runs and their seed in words."""
+        """The number of runs and their seed as text, such as ``1 run, seed 3``."""
         if self.runs == 1:
             replica = f", replica {self.run.replica}" if self.run and self.run.replica else ""
             return f"1 run, seed {self.seed}{replica}"
         return f"{self.runs:,} runs, seed {self.seed}"
 
     def caption(self, *sentences: str, notes: str = "") -> list[str]:
-        """Return the caption: the scenario, the runs, how they ended, more ``sentences``, and what
-        differs from the papers where the figure shows the "bound", "nees", or "both".
+        """Return the paragraphs of a caption: the scenario, the runs, how they ended and the
+        ``sentences``; then notes on departures from the papers.
+
+        ``notes`` selects those on the "bound", on "nees", or on "both"; none if empty.
         """
         n = len(self.nodes)
-        about = f"{self.scenario.name}: {n} node{'s' if n > 1 else ''}, {self.count_text}."
-        left_out = ""
+        origin = f"{self.scenario.name}: {n} node{'s' if n > 1 else ''}, {self.count_text}."
+        rounding = ""
         if np.isfinite(self.rounding_from) and self.shows_errors:
-            left_out = f"Rounding of a large state blurs errors from {self.rounding_from:g} s on."
-        whole = " ".join(filter(None, (about, self.ending, left_out, *sentences)))
-        return [whole, *self._departures(notes)]
+            rounding = f"Rounding of a large state blurs errors from {self.rounding_from:g} s on."
+        paragraph = " ".join(filter(None, (origin, self.ending, rounding, *sentences)))
+        return [paragraph, *self._paper_notes(notes)]
 
     @property
     def ending(self) -> str:
-        """How the runs ended, if that was early; else empty."""
+        """Sentences on runs that ended early, empty if all ended as planned."""
         last = f"{self.times[-1]:g}" if len(self.times) else "0"
         horizon = f"{self.scenario.horizon:g} s"
         if self.runs > 1:
-            note = f"{self.diverged:,} of {self.runs:,} runs diverged and ended early."
-            stopped = f"The ensemble was {self.status}: these are the runs that were kept."
-            early = self.status in ("interrupted", "failed")
-            return " ".join([note] * bool(self.diverged) + [stopped] * early)
+            sentences = []
+            if self.diverged:
+                sentences.append(
+                    f"{self.diverged:,} of {self.runs:,} runs diverged and ended early."
+                )
+            if self.status in ("interrupted", "failed"):
+                sentences.append(f"The ensemble was {self.status}: these are its finished runs.")
+            return " ".join(sentences)
         if self.status == "diverged":
             return f"It diverged and ended at {last} s of {horizon}."
         if self.status in ("interrupted", "failed"):
             return f"It was {self.status}: the last sample is at {last} s of {horizon}."
         return ""
 
-    def _departures(self, about: str) -> list[str]:
-        """Return sentences on how a run differs from the assumptions of its paper."""
+    def _paper_notes(self, topic: str) -> list[str]:
+        """Return the notes on departures from the paper's assumptions about a topic: "bound",
+        "nees" or "both".
+        """
         notes = [(note, "nees" if "NEES" in note else "bound") for note in self.promised.notes]
-        return [f"Note: {note}." for note, kind in notes if about in (kind, "both")]
+        return [f"Note: {note}." for note, kind in notes if topic in (kind, "both")]
 
-    def claim(self, statement: str) -> str:
-        """Return a title that says first if the run did not end as planned."""
-        broken = {"diverged": "Diverged: ", "interrupted": "Interrupted: ", "failed": "Failed: "}
+    def title(self, claim: str) -> str:
+        """Return a claim as the title of a figure, which says first if the run ended early."""
+        prefixes = {"diverged": "Diverged: ", "interrupted": "Interrupted: ", "failed": "Failed: "}
         if self.status == "diverged" and self.runs > 1:
-            return statement  # the caption says how many
-        return broken.get(self.status, "") + statement
+            return claim  # some runs diverged: the caption says how many
+        return prefixes.get(self.status, "") + claim
 
 
-def subject_of(result: Any) -> Subject:
+def reduce_result(result: Any) -> FigureData:
     """Return the data to draw of a ``netkf.Run`` or a ``netkf.Ensemble``.
 
-    Raises ScenarioError for anything else, and if the scenario is not known.
+    Raises ScenarioError for anything else, and if the result has no scenario.
     """
     if not isinstance(result, (Run, Ensemble)):
         raise ScenarioError("", "plot takes a run, an ensemble or a sweep", result, SIMULATE)
     if result.scenario is None:
         raise ScenarioError("", "plot needs to know the scenario", result, SIMULATE)
-    return _of_run(result) if isinstance(result, Run) else _of_ensemble(result)
+    if isinstance(result, Run):
+        return _reduce_run(result)
+    promised = promise_traces(result.scenario, result.times)
+    return reduce_ensemble(result.scenario, result, promised)
 
 
-def _of_run(run: Run) -> Subject:
-    """Return the subject of a run."""
+def _reduce_run(run: Run) -> FigureData:
+    """Return the data to draw of a run, simulated or read from a directory."""
     sink = SummarySink()
     sink.exact_errors = run.exact_errors
     sink.events(run.log)
     sink.states(run.times, run.x, run.xhat, run.P, run.error)
-    stored = getattr(run, "summary", None)
-    if stored is not None:  # what was written has more digits than x - xhat
+    stored_summary = getattr(run, "summary", None)
+    if stored_summary is not None:
+        # Stored errors have more digits than x - xhat of the stored states.
         sink.sq_error, sink.nees = list(run.sq_error), list(run.nees)
-        sink.rounding_from = stored.get("rounding_from")
+        sink.rounding_from = stored_summary.get("rounding_from")
     promised = promise_traces(run.scenario, run.times)
-    sent = run.count("send")
-    messages = {"sent": sent, "delivered": run.count("deliver")}
-    messages["lost"] = run.count("lost") + run.count("late")
-    summary = stored or summarise(run.scenario, sink, promised, messages)
-    return subject_of_samples(
+    messages = {
+        "sent": run.count("send"),
+        "delivered": run.count("deliver"),
+        "lost": run.count("lost") + run.count("late"),
+    }
+    summary = stored_summary or summarise(run.scenario, sink, promised, messages)
+    return reduce_samples(
         run.scenario, sink, promised, summary, seed=run.seed, status=run.status, run=run
     )
 
 
-def subject_of_completed(scenario: Scenario, completed: CompletedRun) -> Subject:
-    """Return the data to draw of a run that was written to a directory just now."""
+def reduce_completed_run(scenario: Scenario, completed: CompletedRun) -> FigureData:
+    """Return the data to draw of a run that was just simulated and written to a directory."""
     status = "diverged" if completed.samples.diverged else completed.status
-    return subject_of_samples(
+    return reduce_samples(
         scenario,
         completed.samples,
         completed.promised,
@@ -214,20 +236,22 @@ def subject_of_completed(scenario: Scenario, completed: CompletedRun) -> Subject
     )
 
 
-def subject_of_samples(
+def reduce_samples(
     scenario: Scenario,
     sink: SummarySink,
     promised: PromisedTraces,
     summary: dict[str, Any],
-    **others: Any,
-) -> Subject:
-    """Return the data to draw of the samples of one run and its summary."""
+    **attributes: Any,
+) -> FigureData:
+    """Return the data to draw of the samples of one run and its summary; ``attributes`` are further
+    ones of FigureData.
+    """
     shape = len(sink.times), len(scenario.nodes)
-    error, trace, nees, first = (
+    error, trace, nees, first_component = (
         np.array(values, dtype=np.float64).reshape(shape)
         for values in (sink.sq_error, sink.trace, sink.nees, sink.first_component)
     )
-    return Subject(
+    return FigureData(
         scenario,
         np.array(sink.times),
         error,
@@ -236,40 +260,31 @@ def subject_of_samples(
         summary["nodes"],
         promised,
         rounding_from=np.inf if sink.rounding_from is None else sink.rounding_from,
-        first=first,
+        first_component=first_component,
         delivered=sink.delivered,
         messages=summary["messages"],
-        **others,
+        **attributes,
     )
 
 
-def _of_ensemble(ensemble: Ensemble) -> Subject:
-    """Return the subject of an ensemble."""
-    scenario = ensemble.scenario
-    assert scenario is not None
-    promised = promise_traces(scenario, ensemble.times)
-    return subject_of_ensemble(scenario, ensemble, promised)
-
-
-def subject_of_ensemble(
-    scenario: Scenario, ensemble: Ensemble, promised: PromisedTraces
-) -> Subject:
-    """Return the data to draw of an ensemble."""
-    diverged = "diverged" if ensemble.diverged else "complete"
-    return Subject(
+def reduce_ensemble(scenario: Scenario, ensemble: Ensemble, promised: PromisedTraces) -> FigureData:
+    """Return the data to draw of an ensemble with its bounds and limits."""
+    default_status = "diverged" if ensemble.diverged else "complete"
+    return FigureData(
         scenario,
         ensemble.times,
         np.trace(ensemble.mean_error, axis1=2, axis2=3),
         np.trace(ensemble.mean_P, axis1=2, axis2=3),
         ensemble.mean_nees,
-        _rows(scenario, ensemble, promised),
+        _average_rows(scenario, ensemble, promised),
         promised,
         ensemble.seed,
-        getattr(ensemble, "status", diverged),
+        # Only ensembles that were read from a directory have a status.
+        getattr(ensemble, "status", default_status),
         runs=int(ensemble.runs.max(initial=0)),
         diverged=ensemble.diverged,
         rounding_from=ensemble.rounding_from,
-        # The standard error of a trace is at most the sum of those of its terms.
+        # The standard error of a trace is at most the sum of the standard errors of the diagonal.
         se_error=np.trace(ensemble.se_error, axis1=2, axis2=3),
         se_trace=np.trace(ensemble.se_P, axis1=2, axis2=3),
         se_nees=ensemble.se_nees,
@@ -277,10 +292,12 @@ def subject_of_ensemble(
     )
 
 
-def _rows(scenario: Scenario, ensemble: Ensemble, promised: PromisedTraces) -> list[dict[str, Any]]:
-    """Return the averages of the nodes over time, with standard errors."""
-    after = ensemble.times > 0.0
-    bound = None if promised.bound is None else promised.bound[after].mean(axis=0)
+def _average_rows(
+    scenario: Scenario, ensemble: Ensemble, promised: PromisedTraces
+) -> list[dict[str, Any]]:
+    """Return the averages of each node over time with their standard errors, as in summary.json."""
+    after_start = ensemble.times > 0.0
+    bound = None if promised.bound is None else promised.bound[after_start].mean(axis=0)
     rows = []
     for k, node in enumerate(scenario.nodes):
         square, trace, nees = ensemble.average[k].tolist()

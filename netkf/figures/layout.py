@@ -11,45 +11,58 @@ import scipy.sparse.csgraph
 
 from netkf.network.graphs import Topology
 
-# Above so many nodes distances to some pivots replace those between all pairs.
 MAX_KAMADA_KAWAI, PIVOTS = 150, 50
+"""Nodes up to which the layout of Kamada and Kawai is computed, from distances between all pairs of
+nodes; for larger networks only distances to so many pivots are.
+"""
+MAX_RING = 30
+"""Nodes of a ring up to which it is drawn as a circle."""
 Positions = dict[int, tuple[float, float]]
+"""Coordinates (x, y) by node id, y upwards."""
 
 
-def positions_of(topology: Topology) -> Positions:
-    """Return the positions of the nodes: those of the network, or computed ones."""
-    return topology.positions or _layout(topology)
+def get_positions(topology: Topology) -> Positions:
+    """Return the positions of the nodes: those of the topology, or computed ones if it has none."""
+    return topology.positions or _compute_layout(topology)
 
 
-def _layout(topology: Topology) -> Positions:
-    """Return positions of the nodes for a topology that has none of its own."""
-    if len(topology.nodes) > MAX_KAMADA_KAWAI:  # it needs the paths between all pairs of nodes
+def _compute_layout(topology: Topology) -> Positions:
+    """Return positions computed from the links: rings as a circle, other small networks by Kamada
+    and Kawai, large ones by distances to pivots.
+    """
+    if len(topology.nodes) > MAX_KAMADA_KAWAI:
         return _pivot_layout(topology)
     graph: networkx.Graph[int] = networkx.Graph()
-    graph.add_nodes_from(topology.nodes)  # in their order, which is that around a circle
+    # The order of the nodes is that around the circle.
+    graph.add_nodes_from(topology.nodes)
     graph.add_edges_from(topology.links)
     degrees = set(topology.degrees.values())
-    if len(topology.nodes) <= 30 and degrees <= {0, 2}:
-        placed: dict[int, Any] = networkx.circular_layout(graph)
+    if len(topology.nodes) <= MAX_RING and degrees <= {0, 2}:
+        points: dict[int, Any] = networkx.circular_layout(graph)
     else:
-        placed = networkx.kamada_kawai_layout(graph)
-    return {node: (float(x), float(y)) for node, (x, y) in placed.items()}
+        points = networkx.kamada_kawai_layout(graph)
+    return {node: (float(x), float(y)) for node, (x, y) in points.items()}
 
 
 def _pivot_layout(topology: Topology) -> Positions:
-    """Return the two principal axes of the distances to a few nodes (Pivot MDS: Brandes and Pich,
-    Graph Drawing 2006), which takes one search of the network per pivot.
+    """Return positions along the two principal axes of the distances to PIVOTS nodes.
+
+    Each pivot takes one search of the network. Source: Brandes and Pich, Eigensolver methods for
+    progressive multidimensional scaling (Pivot MDS), Graph Drawing 2006.
     """
     pairs = [(topology.index[i], topology.index[j]) for i, j in topology.links]
-    ends = np.array(pairs, dtype=np.int32)  # the only indices that scipy 1.13 searches graphs with
+    # scipy 1.13 searches only graphs with 32-bit indices.
+    ends = np.array(pairs, dtype=np.int32)
     size, (rows, columns) = len(topology.nodes), ends.reshape(-1, 2).T
     adjacency = scipy.sparse.csr_array((np.ones(len(ends)), (rows, columns)), shape=(size, size))
     pivots = np.linspace(0, size - 1, PIVOTS).astype(int)
     distances = scipy.sparse.csgraph.dijkstra(
         adjacency, directed=False, unweighted=True, indices=pivots
     )
-    reached = np.isfinite(distances)
-    distances[~reached] = 1.5 * max(float(distances[reached].max()), 1.0)
+    # Nodes without a path to a pivot are drawn beyond all others.
+    is_reached = np.isfinite(distances)
+    distances[~is_reached] = 1.5 * max(float(distances[is_reached].max()), 1.0)
+    # Double centring of the squared distances (N, PIVOTS), then the two leading singular vectors.
     squares = distances.T**2
     centred = squares - squares.mean(axis=0) - squares.mean(axis=1)[:, None] + squares.mean()
     _, axes = np.linalg.eigh(centred.T @ centred)

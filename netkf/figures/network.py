@@ -1,4 +1,4 @@
-"""The figure ``network``: nodes coloured by error, by traffic and by energy."""
+"""The figure ``network``: nodes coloured by their errors and by the messages that they sent."""
 
 from __future__ import annotations
 
@@ -11,98 +11,104 @@ import numpy as np
 from matplotlib.collections import LineCollection
 from matplotlib.ticker import FuncFormatter
 
-from netkf.figures.layout import Positions, positions_of
+from netkf.figures.figure_data import FigureData
+from netkf.figures.layout import Positions, get_positions
 from netkf.figures.style import INK, MUTED, SEQUENTIAL, Picture, finish_figure, new_figure
-from netkf.figures.subject import Subject
 
 MAX_LINKS = 20_000
 MAX_LABELLED_NODES = 60
-MAX_BESIDE = 2.2
-"""Networks wider than so many heights have their panels above each other."""
+MAX_ASPECT = 2.2
+"""Ratio of width to height above which the panels of a network are drawn below each other."""
 
 
-def network_figure(subject: Subject) -> Picture:
-    """Draw the network once for each quantity of the nodes that is known."""
-    positions = positions_of(subject.scenario.topology)
-    quantities = _colour_quantities(subject)
-    aspect = _figure_aspect(positions)
-    across = 1 if aspect > MAX_BESIDE else len(quantities)
-    down = len(quantities) // across
-    size = (7.4, 1.4 + 6.6 / aspect * down) if across == 1 else (3.7 * across, 4.4)
-    if len(quantities) == 1 and aspect <= MAX_BESIDE:
-        size = (6.0, 5.2)
-    figure = new_figure(size[0], min(max(size[1], 2.6), 12.0))
-    panels = figure.subplots(down, across, squeeze=False).ravel()
-    for axes, (label, shades) in zip(panels, quantities.items(), strict=True):
-        draw_network(axes, subject, shades, label, positions)
+def network_figure(data: FigureData) -> Picture:
+    """Draw the network once for each known quantity of the nodes."""
+    positions = get_positions(data.scenario.topology)
+    quantities = _colour_quantities(data)
+    aspect = _network_aspect(positions)
+    is_wide = aspect > MAX_ASPECT
+    columns = 1 if is_wide else len(quantities)
+    rows = len(quantities) // columns
+    if len(quantities) == 1 and not is_wide:
+        width, height = 6.0, 5.2
+    elif columns == 1:
+        width, height = 7.4, 1.4 + 6.6 / aspect * rows
+    else:
+        width, height = 3.7 * columns, 4.4
+    figure = new_figure(width, min(max(height, 2.6), 12.0))
+    panels = figure.subplots(rows, columns, squeeze=False).ravel()
+    for axes, (label, values) in zip(panels, quantities.items(), strict=True):
+        draw_network(axes, data, values, label, positions)
     panels[0].legend(loc="upper left", bbox_to_anchor=(0.0, 0.0), ncols=2)
-    finish_figure(
-        figure, subject.claim(_make_claim(subject)), subject.caption(_explanation(subject))
-    )
+    finish_figure(figure, data.title(_make_claim(data)), data.caption(_explain_widths(data)))
     return figure
 
 
-def error_label(subject: Subject) -> tuple[str, str]:
-    """Return the column of a summary that shows how well a node does, and its label."""
-    if subject.shows_errors:
+def error_label(data: FigureData) -> tuple[str, str]:
+    """Return the key of the node averages that measures the errors, and a label with its unit;
+    without ground truth that of trace P.
+    """
+    if data.shows_errors:
         return "rms_error", "RMS error, units of the state"
     return "mean_trace", "mean trace P, squared units of the state"
 
 
-def shades_of(subject: Subject, key: str) -> dict[int, float]:
-    """Return a column of the averages by node; nan if it is unknown."""
-    values = ((row["node"], row.get(key)) for row in subject.rows)
+def node_values(data: FigureData, key: str) -> dict[int, float]:
+    """Return the entry ``key`` of the averages of each node, nan if it is unknown."""
+    values = ((row["node"], row.get(key)) for row in data.node_averages)
     return {node: math.nan if value is None else float(value) for node, value in values}
 
 
-def _colour_quantities(subject: Subject) -> dict[str, dict[int, float]]:
-    """Return the quantities that may colour the nodes, by label and node."""
-    key, label = error_label(subject)
-    found = {label: shades_of(subject, key)}
-    if subject.runs == 1 and any("sent" in row for row in subject.rows):
-        size = _message_bytes(subject)
-        found["messages sent, all hearers counted"] = shades_of(subject, "sent")
-        sent = shades_of(subject, "transmissions")
-        found["kilobytes transmitted"] = {n: v * size / 1000.0 for n, v in sent.items()}
-    return found
+def _colour_quantities(data: FigureData) -> dict[str, dict[int, float]]:
+    """Return the known quantities of the nodes: for each label the values by node."""
+    key, label = error_label(data)
+    quantities = {label: node_values(data, key)}
+    if data.runs == 1 and any("sent" in row for row in data.node_averages):
+        kilobytes = _message_bytes(data) / 1000.0
+        quantities["messages sent, all hearers counted"] = node_values(data, "sent")
+        transmissions = node_values(data, "transmissions")
+        quantities["kilobytes transmitted"] = {
+            node: count * kilobytes for node, count in transmissions.items()
+        }
+    return quantities
 
 
-def _message_bytes(subject: Subject) -> int:
-    """Return the bytes of an estimate with its covariance, as float64."""
-    n = subject.scenario.plant.n
+def _message_bytes(data: FigureData) -> int:
+    """Return the bytes of an estimate with the upper triangle of its covariance, as float64."""
+    n = data.scenario.plant.n
     return 8 * (n + n * (n + 1) // 2)
 
 
-def _explanation(subject: Subject) -> str:
-    """Return the sentences on links and energy."""
-    size = _message_bytes(subject)
-    links = "Links are as wide as the messages that they delivered. " if subject.delivered else ""
-    if len(subject.scenario.topology.links) > MAX_LINKS:
+def _explain_widths(data: FigureData) -> str:
+    """Return the sentences of the caption on widths of links and bytes of transmissions."""
+    size = _message_bytes(data)
+    links = "Links are as wide as the messages that they delivered. " if data.delivered else ""
+    if len(data.scenario.topology.links) > MAX_LINKS:
         links += f"{MAX_LINKS:,} links are drawn. "
     energy = (
         f"A transmission counts {size} bytes, an estimate with its covariance; a broadcast once."
     )
-    return links + (energy if subject.runs == 1 else "")
+    return links + (energy if data.runs == 1 else "")
 
 
-def _make_claim(subject: Subject) -> str:
-    """Return the claim of the figure: the worst and the best node."""
-    key, _ = error_label(subject)
-    shades = {n: v for n, v in shades_of(subject, key).items() if math.isfinite(v)}
-    what = "RMS error" if subject.shows_errors else "mean trace of P"
-    if not shades:
-        return f"The {what} of the nodes is not known"
-    worst, best = max(shades, key=lambda n: shades[n]), min(shades, key=lambda n: shades[n])
-    if len(shades) == 1:
-        return f"The only node, {worst}, has the {what} {shades[worst]:.3g}"
-    claim = (
-        f"Node {worst} has the largest {what}, {shades[worst]:.3g}, and node {best} the smallest"
+def _make_claim(data: FigureData) -> str:
+    """Return a sentence that names the nodes with the largest and the smallest error."""
+    key, _ = error_label(data)
+    values = {n: v for n, v in node_values(data, key).items() if math.isfinite(v)}
+    quantity = "RMS error" if data.shows_errors else "mean trace of P"
+    if not values:
+        return f"The {quantity} of the nodes is not known"
+    worst, best = max(values, key=lambda n: values[n]), min(values, key=lambda n: values[n])
+    if len(values) == 1:
+        return f"The only node, {worst}, has the {quantity} {values[worst]:.3g}"
+    return (
+        f"Node {worst} has the largest {quantity}, {values[worst]:.3g}, "
+        f"and node {best} the smallest, {values[best]:.3g}"
     )
-    return f"{claim}, {shades[best]:.3g}"
 
 
-def _figure_aspect(positions: Positions) -> float:
-    """Return the width of a network over its height, at least 1."""
+def _network_aspect(positions: Positions) -> float:
+    """Return the ratio of width to height of a network, clipped to 1 .. 8."""
     xy = np.array(list(positions.values()), dtype=np.float64)
     width, height = np.ptp(xy, axis=0) if len(xy) else (1.0, 1.0)
     return float(np.clip(width / height if height > 0.0 else 8.0, 1.0, 8.0))
@@ -110,23 +116,23 @@ def _figure_aspect(positions: Positions) -> float:
 
 def draw_network(
     axes: Any,
-    subject: Subject,
-    shades: Mapping[int, float],
+    data: FigureData,
+    values: Mapping[int, float],
     label: str,
     positions: Positions | None = None,
 ) -> None:
-    """Draw the links as wide as they delivered, and the nodes in the colours of their ``shades``
-    with a colour bar: squares with a sensor, circles without.
+    """Draw the links, as wide as the messages they delivered, and the nodes, coloured by their
+    ``values``, with a colour bar of this ``label``: squares with a sensor, circles without.
     """
     if positions is None:
-        positions = positions_of(subject.scenario.topology)
-    _draw_links(axes, subject, positions)
-    dots = _draw_nodes(axes, subject, positions, shades)
-    away = 1.0 + 0.5 * math.sqrt(_dot_size(subject))
-    if len(subject.nodes) <= MAX_LABELLED_NODES:
-        for node in subject.nodes:
+        positions = get_positions(data.scenario.topology)
+    _draw_links(axes, data, positions)
+    dots = _draw_nodes(axes, data, positions, values)
+    distance = 1.0 + 0.5 * math.sqrt(_dot_area(data))
+    if len(data.nodes) <= MAX_LABELLED_NODES:
+        for node in data.nodes:
             style: dict[str, Any] = {"fontsize": 6.5, "color": MUTED, "zorder": 3}
-            offset: dict[str, Any] = {"xytext": (away, away), "textcoords": "offset points"}
+            offset: dict[str, Any] = {"xytext": (distance,) * 2, "textcoords": "offset points"}
             axes.annotate(str(node), positions[node], **offset, **style)
     axes.set_aspect("equal", adjustable="datalim")
     axes.margins(0.13)
@@ -137,26 +143,26 @@ def draw_network(
         )
         bar.outline.set_linewidth(0.5)
         bar.ax.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.4g}"))
-        finite = {value for value in shades.values() if math.isfinite(value)}
+        finite = {value for value in values.values() if math.isfinite(value)}
         if len(finite) > 1:
             bar.ax.locator_params(nbins=5)
-        else:  # all nodes are alike
+        else:  # a scale without length has one tick
             bar.set_ticks([*finite], labels=[f"{value:.4g}" for value in finite])
 
 
-def _dot_size(subject: Subject) -> float:
-    """Return the area of a node in square points."""
-    return max(10.0, min(80.0, 3000.0 / len(subject.nodes)))
+def _dot_area(data: FigureData) -> float:
+    """Return the area of a node's marker in square points."""
+    return max(10.0, min(80.0, 3000.0 / len(data.nodes)))
 
 
-def _draw_links(axes: Any, subject: Subject, positions: Positions) -> None:
-    """Draw links, as wide as the messages that they delivered."""
-    pairs = sorted({(min(i, j), max(i, j)) for i, j in subject.scenario.topology.links})
+def _draw_links(axes: Any, data: FigureData, positions: Positions) -> None:
+    """Draw at most MAX_LINKS links, evenly selected, as wide as the messages they delivered."""
+    pairs = sorted({(min(i, j), max(i, j)) for i, j in data.scenario.topology.links})
     if len(pairs) > MAX_LINKS:
         pairs = [pairs[k] for k in np.linspace(0, len(pairs) - 1, MAX_LINKS).astype(int).tolist()]
     if not pairs:
         return
-    counts = np.array([subject.delivered.get(pair, 0) for pair in pairs], dtype=float)
+    counts = np.array([data.delivered.get(pair, 0) for pair in pairs], dtype=float)
     axes.add_collection(
         LineCollection(
             [(positions[i], positions[j]) for i, j in pairs],
@@ -169,25 +175,30 @@ def _draw_links(axes: Any, subject: Subject, positions: Positions) -> None:
 
 
 def _draw_nodes(
-    axes: Any, subject: Subject, positions: Positions, shades: Mapping[int, float]
+    axes: Any, data: FigureData, positions: Positions, values: Mapping[int, float]
 ) -> Any:
-    """Draw the nodes, white if their shade is unknown; return the mappable of the colour bar."""
-    finite = [value for value in shades.values() if math.isfinite(value)]
+    """Draw the nodes, white if their value is nan; return the mappable of the colour bar, None if
+    all values are nan.
+    """
+    finite = [value for value in values.values() if math.isfinite(value)]
     low, high = (min(finite), max(finite)) if finite else (0.0, 1.0)
     dots = None
-    for sensing, marker, label in ((False, "o", "without a sensor"), (True, "s", "with a sensor")):
-        nodes = [n for n, has in zip(subject.nodes, subject.sensing, strict=True) if has == sensing]
+    for group, marker, label in (
+        (~data.has_sensor, "o", "without a sensor"),
+        (data.has_sensor, "s", "with a sensor"),
+    ):
+        nodes = [data.nodes[k] for k in np.flatnonzero(group)]
         if not nodes:
             continue
         xy = np.array([positions[n] for n in nodes])
         dots = axes.scatter(
             *xy.T,
-            c=[shades.get(n, math.nan) for n in nodes],
+            c=[values.get(n, math.nan) for n in nodes],
             marker=marker,
             cmap=mpl.colormaps[SEQUENTIAL].with_extremes(bad="white"),
             vmin=low,
             vmax=high,
-            s=_dot_size(subject),
+            s=_dot_area(data),
             edgecolors=INK,
             linewidths=0.5,
             zorder=2,

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from matplotlib.collections import LineCollection
 
+from netkf.figures.figure_data import NO_TRUTH, NORMAL_QUANTILE, FigureData
 from netkf.figures.style import (
     EXACT,
     INK,
@@ -18,102 +19,109 @@ from netkf.figures.style import (
     draw_message,
     set_scale,
 )
-from netkf.figures.subject import LEVEL, NO_TRUTH, Subject
 from netkf.linalg.arrays import FloatArray
 from netkf.runs.labels import covariance_bias
 from netkf.runs.summary import CONFIDENCE, NO_COVARIANCE, PromisedTraces, nees_bounds
 
 MAX_LINES = 60
-"""Curves of single nodes in one panel; of larger networks an even selection is drawn."""
+"""Curves of single nodes in one panel; of larger networks evenly spaced nodes are drawn."""
 RMS_ERROR = "RMS error, units of the state"
 ROOT_TRACE = "root of trace P, units of the state"
 
 
-def select_evenly(indices: np.ndarray, most: int = MAX_LINES) -> np.ndarray:
-    """Return at most ``most`` of the indices, evenly spaced."""
-    if len(indices) <= most:
+def select_evenly(indices: np.ndarray, max_count: int = MAX_LINES) -> np.ndarray:
+    """Return at most ``max_count`` of the indices, evenly spaced."""
+    if len(indices) <= max_count:
         return indices
-    return np.asarray(indices[np.linspace(0, len(indices) - 1, most).astype(int)])
+    return np.asarray(indices[np.linspace(0, len(indices) - 1, max_count).astype(int)])
 
 
-def draw_nodes(axes: Any, subject: Subject, values: FloatArray, se: FloatArray | None) -> None:
-    """Draw the columns of ``values`` (T, N), roots of mean squares, one line a node, those with a
-    sensor on top; with standard errors ``se`` of the squares each has its interval.
+def draw_nodes(axes: Any, data: FigureData, values: FloatArray, se: FloatArray | None) -> None:
+    """Draw one line for each column of ``values`` (T, N), those of nodes with a sensor on top.
+
+    With ``se`` (T, N) the values are roots, ``se`` are the standard errors of their squares, and
+    each line has its 95% interval.
     """
-    width = 1.1 if len(subject.nodes) <= 12 else 0.6
+    width = 1.1 if len(data.nodes) <= 12 else 0.6
     groups = (
-        (~subject.sensing, RELAY, 1, "without a sensor"),
-        (subject.sensing, SENSING, 2, "with a sensor"),
+        (~data.has_sensor, RELAY, 1, "without a sensor"),
+        (data.has_sensor, SENSING, 2, "with a sensor"),
     )
-    several = subject.sensing.any() and not subject.sensing.all()
-    for group, colour, order, which in groups:
+    has_both = data.has_sensor.any() and not data.has_sensor.all()
+    for group, colour, order, description in groups:
         indices = select_evenly(np.flatnonzero(group))
         if not len(indices):
             continue
-        # One collection is far faster than a line for each node.
-        lines = [np.column_stack([subject.times, values[:, k]]) for k in indices]
+        # matplotlib draws one collection far faster than as many lines.
+        lines = [np.column_stack([data.times, values[:, k]]) for k in indices]
         style = {"linewidths": width, "alpha": 0.75, "zorder": order}
         axes.add_collection(LineCollection(lines, colors=colour, **style))
         if se is not None:
             for k in indices:
-                low, high = interval_of_root(values[:, k], se[:, k])
-                axes.fill_between(subject.times, low, high, color=colour, alpha=0.2, lw=0)
-        label = f"nodes {which}" if several else ("nodes" if len(indices) > 1 else "the node")
+                low, high = root_interval(values[:, k], se[:, k])
+                axes.fill_between(data.times, low, high, color=colour, alpha=0.2, lw=0)
+        label = "nodes" if len(indices) > 1 else "the node"
+        if has_both:
+            label = f"nodes {description}"
         axes.plot([], [], color=colour, lw=1.4, label=label)
-    if len(subject.times) == 1:  # a line of one sample is invisible
-        count = len(subject.nodes)
-        axes.plot(np.repeat(subject.times, count), values.ravel(), ".", color=INK, ms=4)
+    if len(data.times) == 1:  # a line of one sample is invisible
+        count = len(data.nodes)
+        axes.plot(np.repeat(data.times, count), values.ravel(), ".", color=INK, ms=4)
     axes.autoscale()
 
 
-def interval_of_root(root: FloatArray, se: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the ends of the 95% interval of a root whose square has standard errors ``se``."""
-    low, high = (np.maximum(root**2 + s * LEVEL * se, 0.0) for s in (-1.0, 1.0))
+def root_interval(root: FloatArray, se: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the limits (T,) of the 95% intervals of roots (T,) whose squares have the standard
+    errors ``se`` (T,).
+    """
+    low, high = (np.maximum(root**2 + s * NORMAL_QUANTILE * se, 0.0) for s in (-1.0, 1.0))
     return np.sqrt(low), np.sqrt(high)
 
 
-def draw_errors(axes: Any, subject: Subject, bound: bool = False) -> None:
-    """Draw the RMS error of each node and of all over time, with the root of the mean bound if
-    ``bound``; without ground truth the estimates instead, of which only agreement can be seen.
+def draw_errors(axes: Any, data: FigureData, bound: bool = False) -> None:
+    """Draw the error of each node and the RMS error of all over time, with the root of the bound if
+    ``bound``; without ground truth the first component of the estimates instead.
     """
-    if not subject.shows_errors:
-        _draw_estimates(axes, subject)
+    if not data.shows_errors:
+        _draw_estimates(axes, data)
         return
-    error = np.sqrt(subject.sq_error)
-    draw_nodes(axes, subject, error, subject.se_error)
-    rms = np.sqrt(subject.sq_error.mean(axis=1))
-    if len(subject.nodes) > 1:
-        axes.plot(subject.times, rms, color=INK, lw=2.0, label="RMS of all nodes", zorder=4)
+    error = np.sqrt(data.sq_error)
+    draw_nodes(axes, data, error, data.se_error)
+    rms = np.sqrt(data.sq_error.mean(axis=1))
+    if len(data.nodes) > 1:
+        axes.plot(data.times, rms, color=INK, lw=2.0, label="RMS of all nodes", zorder=4)
     curves = [error]
-    promised = subject.promised.bound
+    promised = data.promised.bound
     if bound and promised is not None:
         roots = np.sqrt(promised)
         curves.append(roots)
-        _draw_bound(axes, subject.times, roots)
+        _draw_bound(axes, data.times, roots)
     set_scale(axes, np.concatenate(curves))
-    axes.set(ylabel="error |x - xhat|" if subject.runs == 1 else RMS_ERROR, xlabel=SECONDS)
+    axes.set(ylabel="error |x - xhat|" if data.runs == 1 else RMS_ERROR, xlabel=SECONDS)
     draw_legend(axes)
 
 
-def _draw_estimates(axes: Any, subject: Subject) -> None:
-    """Draw the first component of all estimates over time."""
-    if subject.first is None:
+def _draw_estimates(axes: Any, data: FigureData) -> None:
+    """Draw the first component of each node's estimate over time, or a message if it is unknown."""
+    if data.first_component is None:
         draw_message(axes, NO_TRUTH)
         return
-    draw_nodes(axes, subject, subject.first, None)
+    draw_nodes(axes, data, data.first_component, None)
     axes.set(ylabel="estimate, first component", xlabel=SECONDS)
     draw_legend(axes)
 
 
-def draw_covariances(axes: Any, subject: Subject) -> None:
-    """Draw the roots of the traces of P over time, the bound and the limits."""
-    if not np.isfinite(subject.trace).any():
+def draw_covariances(axes: Any, data: FigureData) -> None:
+    """Draw the roots of the traces of P over time, with the bound and the limits, or a message if
+    the filter gives no covariance.
+    """
+    if not np.isfinite(data.trace).any():
         draw_message(axes, f"{NO_COVARIANCE}: trace P is unavailable")
         return
-    root = np.sqrt(np.maximum(subject.trace, 0.0))
-    draw_nodes(axes, subject, root, subject.se_trace)
-    draw_promises(axes, subject.times, subject.promised)
-    bound = subject.promised.bound
+    root = np.sqrt(np.maximum(data.trace, 0.0))
+    draw_nodes(axes, data, root, data.se_trace)
+    draw_promises(axes, data.times, data.promised)
+    bound = data.promised.bound
     set_scale(axes, root if bound is None else np.concatenate([root, np.sqrt(bound)]))
     axes.set(ylabel=ROOT_TRACE, xlabel=SECONDS)
     draw_legend(axes)
@@ -143,22 +151,22 @@ def _draw_bound(axes: Any, times: FloatArray, roots: FloatArray) -> None:
         )
 
 
-def draw_nees(axes: Any, subject: Subject) -> None:
-    """Draw the NEES of each node, in an ensemble its mean, and the interval that holds it with
-    probability CONFIDENCE if P is exact.
+def draw_nees(axes: Any, data: FigureData) -> None:
+    """Draw the NEES of each node over time, of an ensemble its mean, and the interval that contains
+    it with probability CONFIDENCE if P is exact; or a message if NEES is unknown.
     """
-    values, n, runs = subject.nees, subject.scenario.plant.n, subject.runs
+    values, n, runs = data.nees, data.scenario.plant.n, data.runs
     if not np.isfinite(values).any():
         draw_message(axes, "NEES is unavailable: it needs an error and a regular P")
         return
-    draw_nodes(axes, subject, values, None)
-    if len(subject.nodes) > 1:
+    draw_nodes(axes, data, values, None)
+    if len(data.nodes) > 1:
         mean = values.mean(axis=1)
-        axes.plot(subject.times, mean, color=INK, lw=2.0, label="mean of all nodes", zorder=4)
+        axes.plot(data.times, mean, color=INK, lw=2.0, label="mean of all nodes", zorder=4)
     low, high = nees_bounds(n, runs)
     axes.axhspan(low, high, color=EXACT, alpha=0.15, lw=0, label=f"{CONFIDENCE:.0%} if P is exact")
-    design = covariance_bias(subject.scenario)
-    label = f"n = {n}" + (f", P is {design} by design" if design else "")
+    bias = covariance_bias(data.scenario)
+    label = f"n = {n}" + (f", P is {bias} by design" if bias else "")
     axes.axhline(n, color=EXACT, lw=1.1, ls="-.", label=label)
     set_scale(axes, np.append(values, high))
     axes.set(ylabel="NEES" if runs == 1 else f"mean NEES of {runs:,} runs", xlabel=SECONDS)

@@ -1,36 +1,42 @@
-"""``run.png``: what ``netkf run`` leaves beside the files of a run or an ensemble."""
+"""``run.png``: the picture that ``netkf run`` writes beside the files of a run or an ensemble."""
 
 from __future__ import annotations
 
 from netkf.ensembles.directory import FinishedEnsemble
-from netkf.figures.network import draw_network, error_label, shades_of
+from netkf.figures.figure_data import FigureData, reduce_completed_run, reduce_ensemble
+from netkf.figures.network import draw_network, error_label, node_values
 from netkf.figures.panels import draw_covariances, draw_errors, draw_nees
-from netkf.figures.style import Picture, finish_figure, look, new_figure, write
-from netkf.figures.subject import Subject, subject_of_completed, subject_of_ensemble
+from netkf.figures.style import Picture, finish_figure, new_figure, style_context, write_figure
 from netkf.runs.run import CompletedRun
 from netkf.scenario.scenario import Scenario
 
 
 def run_picture(scenario: Scenario, completed: CompletedRun) -> None:
-    """Write ``run.png``: errors, roots of trace P beside the bound and the limits, NEES, and the
-    network; without ground truth estimates, and no NEES.
+    """Write ``run.png`` to the directory of a run: its overview.
+
+    Raises WriteError if the file cannot be written.
     """
-    with look():
-        figure = overview(subject_of_completed(scenario, completed))
-    write(figure, completed.directory / "run.png")
+    with style_context():
+        figure = overview(reduce_completed_run(scenario, completed))
+    write_figure(figure, completed.directory / "run.png")
 
 
 def ensemble_picture(scenario: Scenario, finished: FinishedEnsemble) -> None:
-    """Write ``run.png``: the same of the means of many runs, with intervals."""
-    with look():
-        figure = overview(subject_of_ensemble(scenario, finished.ensemble, finished.promised))
-    write(figure, finished.directory / "run.png")
+    """Write ``run.png`` to the directory of an ensemble: the overview of its means with intervals.
+
+    Raises WriteError if the file cannot be written.
+    """
+    with style_context():
+        figure = overview(reduce_ensemble(scenario, finished.ensemble, finished.promised))
+    write_figure(figure, finished.directory / "run.png")
 
 
-def overview(subject: Subject) -> Picture:
-    """Return the picture of a run or an ensemble in four panels, or three without errors."""
+def overview(data: FigureData) -> Picture:
+    """Return a figure of a run or an ensemble: the errors, the roots of trace P with bound and
+    limits, NEES, and the network; without ground truth the estimates, and no NEES.
+    """
     figure = new_figure(11.0, 8.2)
-    if subject.shows_errors:
+    if data.shows_errors:
         grid = figure.add_gridspec(2, 2)
         cells = [grid[0, 0], grid[0, 1], grid[1, 0], grid[1, 1]]
         drawings = [draw_errors, draw_covariances, draw_nees]
@@ -40,26 +46,24 @@ def overview(subject: Subject) -> Picture:
         drawings = [draw_errors, draw_covariances]
     *panels, network = (figure.add_subplot(cell) for cell in cells)
     for axes, draw in zip(panels, drawings, strict=True):
-        draw(axes, subject)
-    key, label = error_label(subject)
-    draw_network(network, subject, shades_of(subject, key), label)
+        draw(axes, data)
+    key, label = error_label(data)
+    draw_network(network, data, node_values(data, key), label)
     network.legend(loc="lower left", bbox_to_anchor=(0.0, 1.04), ncols=2, borderaxespad=0.2)
-    scenario = subject.scenario
+    scenario = data.scenario
     title = f"{scenario.name}: {scenario.claim}" if scenario.claim else scenario.name
-    finish_figure(
-        figure, subject.claim(title), subject.caption(*_caption_sentences(subject), notes="both")
-    )
+    finish_figure(figure, data.title(title), data.caption(*_caption_sentences(data), notes="both"))
     return figure
 
 
-def _caption_sentences(subject: Subject) -> list[str]:
-    """Return the sentences on bands, links and messages."""
+def _caption_sentences(data: FigureData) -> list[str]:
+    """Return the sentences of the caption on intervals, widths of links and counts of messages."""
     sentences = []
-    if subject.runs > 1:
+    if data.runs > 1:
         sentences.append("Bands: 95% intervals of the means (1.96 standard errors).")
-    if subject.delivered:
+    if data.delivered:
         sentences.append("Links are as wide as the messages that they delivered.")
-    messages = subject.messages
+    messages = data.messages
     if messages.get("sent"):
         sent = f"{messages['sent']:,.0f} messages"
         if 0 < messages.get("transmissions", 0) < messages["sent"]:

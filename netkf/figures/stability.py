@@ -1,4 +1,7 @@
-"""The figures ``stability`` and ``law``: where covariances stay bounded, and how they vary."""
+"""The figures ``stability`` and ``law``: where covariances stay bounded, and their distribution.
+
+The figure of a sweep is here too: it is called ``stability`` as well.
+"""
 
 from __future__ import annotations
 
@@ -9,6 +12,7 @@ import numpy as np
 
 from netkf.algorithms.registry import built_in_filters
 from netkf.core.errors import NetkfError, TheoryError
+from netkf.figures.figure_data import NORMAL_QUANTILE, FigureData, UnavailableError
 from netkf.figures.style import (
     EXACT,
     INK,
@@ -22,7 +26,6 @@ from netkf.figures.style import (
     finish_figure,
     new_figure,
 )
-from netkf.figures.subject import Subject, UnavailableError
 from netkf.linalg.arrays import FloatArray
 from netkf.network.channels import Bernoulli
 from netkf.scenario.scenario import Scenario
@@ -32,17 +35,28 @@ from netkf.theory.hybrid.steady import has_steady_state
 
 RATE, DELIVERY = "network.activation.rate", "network.channel.loss.delivery"
 FACTORS = tuple(2.0**k for k in range(-4, 5))
+"""Link rates of the map, as multiples of that of the scenario."""
 DELIVERIES = tuple(k / 8 for k in range(1, 9))
+"""Delivery probabilities of the map."""
 LAW_SAMPLES = 2000
+"""Samples of the invariant law of P."""
+START_SHARE = 0.2
+"""Share of a run whose samples are left out of the distribution of P."""
 MAX_TRACE = 1e100
-"""Traces of P that are drawn; logarithmic axes overflow beyond."""
-SPREAD = 20.0
-"""Ratio of the largest to the smallest value beyond which an axis is logarithmic."""
+"""Largest trace of P that is drawn: logarithmic axes overflow beyond."""
+LOG_RATIO = 20.0
+"""Ratio of the largest to the smallest value above which an axis is logarithmic."""
+MAX_TEXT = 24
+"""Characters of a value on an axis."""
 
 
-def stability_figure(subject: Subject) -> Picture:
-    """Draw for which link rates and delivery probabilities the bound H(12) has a steady state."""
-    scenario = subject.scenario
+def stability_figure(data: FigureData) -> Picture:
+    """Draw for which link rates and delivery probabilities the bound H(12) has a steady state.
+
+    Raises UnavailableError if the bound does not apply, or without a rate and a delivery
+    probability.
+    """
+    scenario = data.scenario
     reason = "clocks in slots have no rate" if scenario.slotted else reason_without_bound(scenario)
     rate = getattr(scenario.network.activation, "rate", None)
     loss = scenario.network.channel.loss
@@ -59,17 +73,18 @@ def stability_figure(subject: Subject) -> Picture:
         (~stable, "x", LOST, "the bound grows without end"),
     ):
         axes.plot(x[group], y[group], ls="", marker=marker, ms=9, color=colour, label=label)
-    here = float(loss.delivery)
-    axes.plot([rate], [here], marker="*", ls="", ms=13, mfc="none", mec=INK, label="this scenario")
+    delivery = float(loss.delivery)
+    style: dict[str, Any] = {"marker": "*", "ls": "", "ms": 13, "mfc": "none", "mec": INK}
+    axes.plot([rate], [delivery], label="this scenario", **style)
     axes.set_xscale("log", base=2)
     axes.set_xticks(rates, [f"{r:.3g}" for r in rates])
     axes.minorticks_off()
     axes.set(xlabel=f"{RATE}, 1/s", ylabel=DELIVERY)
     draw_legend(axes)
-    holds = _is_stable(scenario, rate, here)
-    claim = f"The bound of this scenario {'has a' if holds else 'has no'} steady state; it has one "
+    verb = "has a" if _is_stable(scenario, rate, delivery) else "has no"
+    claim = f"The bound of this scenario {verb} steady state; it has one "
     claim += f"at {int(stable.sum())} of {stable.size} points of rate and delivery"
-    caption = subject.caption(
+    caption = data.caption(
         "From theory alone: no simulation. Existence of the steady state of H(12)."
     )
     finish_figure(figure, claim, caption)
@@ -77,223 +92,243 @@ def stability_figure(subject: Subject) -> Picture:
 
 
 def _is_stable(scenario: Scenario, rate: float, delivery: float) -> bool:
-    """Return True if H(12) has a steady state at this rate and delivery probability."""
+    """Return True if H(12) has a steady state with this link rate (1/s) and delivery
+    probability.
+    """
     return has_steady_state(scenario.replace({RATE: rate, DELIVERY: delivery}))
 
 
 def sweep_figure(name: str, table: Any, keys: Sequence[str], status: str) -> Picture:
-    """Draw the largest RMS error of a sweep over one or two keys, and where runs diverged or the
-    bound has no steady state. Raises UnavailableError for more keys, and without a finished point.
+    """Draw the largest RMS error of a sweep over one or two keys, and mark points at which runs
+    diverged or there is no bound.
+
+    ``name`` is that of the scenario, ``table`` has a row for each point, ``status`` is that of the
+    manifest. Raises UnavailableError for more keys, and without a finished point.
     """
-    about = f"{name}: {len(table)} points"
+    points = f"{name}: {len(table)} points"
     if status != "complete":
-        about += f"; the sweep was {status}"
+        points += f"; the sweep was {status}"
     runs = int(table["runs"].max()) if len(table) else 0
     bars = " Bars: 95% intervals." if runs > 1 and len(keys) == 1 else ""
-    each = f"{runs} run{'s' if runs != 1 else ''} each, the same draws at all of them"
-    caption = [f"{about}, {each}.{bars}"]
+    replicas = f"{runs} run{'s' if runs != 1 else ''} each, the same draws at all of them"
+    caption = [f"{points}, {replicas}.{bars}"]
     if not len(table) or len(keys) > 2:
-        why = "has no finished point" if not len(table) else "has more than two keys"
-        raise UnavailableError(f"The sweep {why}.")
+        reason = "has no finished point" if not len(table) else "has more than two keys"
+        raise UnavailableError(f"The sweep {reason}.")
     figure = new_figure(7.4, 4.6)
     axes = figure.add_subplot()
-    claim = (_draw_curve if len(keys) == 1 else _draw_map)(axes, table, list(keys))
+    draw = _draw_sweep_curves if len(keys) == 1 else _draw_sweep_map
+    draw(axes, table, list(keys))
     prefix = "" if status == "complete" else "Interrupted: "
-    finish_figure(figure, prefix + claim, caption)
+    finish_figure(figure, prefix + _describe_best(table, keys), caption)
     return figure
 
 
-def _draw_curve(axes: Any, table: Any, keys: list[str]) -> str:
-    """Draw the errors of a sweep over one key; return the claim."""
+def _draw_sweep_curves(axes: Any, table: Any, keys: list[str]) -> None:
+    """Draw the largest and the mean RMS error of a sweep over one key with 95% intervals, and the
+    root of the bound.
+    """
     positions, labels = _axis_positions(axes.set_xscale, table[keys[0]])
     order = np.argsort(positions, kind="stable")
-    series = (("worst_rms", "node with the largest error"), ("mean_rms", "all nodes"))
-    for (name, label), look in zip(series, SERIES, strict=False):
-        bars = 1.96 * table[f"{name}_se"].fillna(0.0).to_numpy()[order]
+    columns = (("worst_rms", "node with the largest error"), ("mean_rms", "all nodes"))
+    for (column, label), series in zip(columns, SERIES, strict=False):
+        bars = NORMAL_QUANTILE * table[f"{column}_se"].fillna(0.0).to_numpy()[order]
         style = {
-            "color": look.colour,
-            "ls": look.dashes,
-            "marker": look.marker,
+            "color": series.colour,
+            "ls": series.dashes,
+            "marker": series.marker,
             "ms": 4,
             "capsize": 2,
         }
-        axes.errorbar(
-            positions[order], table[name].to_numpy()[order], yerr=bars, label=label, **style
-        )
+        errors = table[column].to_numpy()[order]
+        axes.errorbar(positions[order], errors, yerr=bars, label=label, **style)
     bound = np.sqrt(table["bound"].to_numpy(dtype=np.float64))[order]
     if np.isfinite(bound).any():
         axes.plot(
             positions[order], bound, color=EXACT, ls=":", marker="_", label="root of the bound"
         )
     if labels:
-        axes.set_xticks(
-            range(len(labels)), labels, rotation=15 if sum(map(len, labels)) > 70 else 0
-        )
+        # Long labels overlap unless they are tilted.
+        rotation = 15 if sum(map(len, labels)) > 70 else 0
+        axes.set_xticks(range(len(labels)), labels, rotation=rotation)
     axes.set(xlabel=keys[0], ylabel="RMS error, units of the state")
     axes.set_ylim(bottom=0.0)
     draw_legend(axes)
-    return _describe_best(table, keys)
 
 
-def _draw_map(axes: Any, table: Any, keys: list[str]) -> str:
-    """Draw a cell a point, shaded by the largest RMS error; crosses where runs diverged, circles
-    where there is no bound.
+def _draw_sweep_map(axes: Any, table: Any, keys: list[str]) -> None:
+    """Draw a cell for each point of a sweep over two keys, coloured by the largest RMS error, with
+    crosses where runs diverged and circles where there is no bound.
     """
-    columns, rows = (list(dict.fromkeys(table[key].tolist())) for key in keys)
-    values = np.full((len(rows), len(columns)), np.nan)
-    diverged, unbounded = (np.zeros(values.shape, dtype=bool) for _ in range(2))
+    x_values, y_values = (list(dict.fromkeys(table[key].tolist())) for key in keys)
+    errors = np.full((len(y_values), len(x_values)), np.nan)
+    diverged, unbounded = (np.zeros(errors.shape, dtype=bool) for _ in range(2))
     for point in table.to_dict("records"):
-        at = rows.index(point[keys[1]]), columns.index(point[keys[0]])
-        values[at] = point["worst_rms"]
-        diverged[at] = "diverged" in str(point["status"])
-        unbounded[at] = not np.isfinite(point["bound"])
-    finite = values[np.isfinite(values) & (values > 0.0)]
-    spread = finite.size and finite.max() > SPREAD * finite.min()
-    image = axes.imshow(
-        values, aspect="auto", origin="lower", cmap=SEQUENTIAL, norm="log" if spread else "linear"
-    )
+        cell = y_values.index(point[keys[1]]), x_values.index(point[keys[0]])
+        errors[cell] = point["worst_rms"]
+        diverged[cell] = "diverged" in str(point["status"])
+        unbounded[cell] = not np.isfinite(point["bound"])
+    positive = errors[np.isfinite(errors) & (errors > 0.0)]
+    is_log = positive.size and positive.max() > LOG_RATIO * positive.min()
+    norm = "log" if is_log else "linear"
+    image = axes.imshow(errors, aspect="auto", origin="lower", cmap=SEQUENTIAL, norm=norm)
     for group, marker, label in (
         (diverged, "x", "runs diverged"),
         (unbounded, "o", "no bound H(12)"),
     ):
-        up, along = np.nonzero(group)
-        if len(up):
+        rows, columns = np.nonzero(group)
+        if len(rows):
             style = {"marker": marker, "ls": "", "ms": 8, "mec": LOST, "mfc": "none", "mew": 1.5}
-            axes.plot(along, up, label=label, **style)
-    axes.set_xticks(range(len(columns)), [_short(v) for v in columns])
-    axes.set_yticks(range(len(rows)), [_short(v) for v in rows])
+            axes.plot(columns, rows, label=label, **style)
+    axes.set_xticks(range(len(x_values)), [_format_value(value) for value in x_values])
+    axes.set_yticks(range(len(y_values)), [_format_value(value) for value in y_values])
     axes.set(xlabel=keys[0], ylabel=keys[1])
     axes.figure.colorbar(image, ax=axes, label="largest RMS error, units of the state")
     draw_legend(axes)
-    return _describe_best(table, keys)
 
 
 def _describe_best(table: Any, keys: Sequence[str]) -> str:
-    """Return the claim of a sweep: the point with the smallest worst error."""
+    """Return a sentence on the point of a sweep whose largest RMS error is smallest, and on the
+    number of points at which runs diverged.
+    """
     finite = table[np.isfinite(table["worst_rms"])]
     diverged = int(table["status"].astype(str).str.contains("diverged").sum())
     if not len(finite):
         return "No point has a finite error"
     best = finite.loc[finite["worst_rms"].idxmin()]
-    where = ", ".join(f"{key.rpartition('.')[2]} = {_short(best[key])}" for key in keys)
-    claim = f"The largest RMS error is smallest, {best['worst_rms']:.3g}, at {where}"
+    settings = ", ".join(f"{key.rpartition('.')[2]} = {_format_value(best[key])}" for key in keys)
+    claim = f"The largest RMS error is smallest, {best['worst_rms']:.3g}, at {settings}"
     return claim + (f"; runs diverge at {diverged} of {len(table)} points" if diverged else "")
 
 
 def _axis_positions(set_scale: Callable[[str], Any], values: Any) -> tuple[FloatArray, list[str]]:
-    """Return positions on the axis: numbers on a scale, others side by side with labels."""
+    """Return the positions (K,) of a column of values on an axis, and the labels of the positions
+    0, 1, ..; numbers are their own positions and have no labels.
+
+    ``set_scale`` is called with "log" if the numbers need a logarithmic axis.
+    """
     if values.dtype.kind in "iuf":
         positions = values.to_numpy(dtype=np.float64)
-        if positions.min() > 0.0 and positions.max() > SPREAD * positions.min():
+        if positions.min() > 0.0 and positions.max() > LOG_RATIO * positions.min():
             set_scale("log")
         return positions, []
     names = list(dict.fromkeys(values.astype(str)))
-    positions = np.array([names.index(str(v)) for v in values], dtype=np.float64)
-    return positions, [_short(name) for name in names]
+    positions = np.array([names.index(str(value)) for value in values], dtype=np.float64)
+    return positions, [_format_value(name) for name in names]
 
 
-def _short(value: Any) -> str:
-    """Return a value as a text of at most 24 characters."""
+def _format_value(value: Any) -> str:
+    """Return a value of a varied key as text of at most MAX_TEXT characters."""
     text = f"{value:.4g}" if isinstance(value, (int, float, np.number)) else str(value)
-    return text if len(text) <= 24 else text[:21] + "..."
+    return text if len(text) <= MAX_TEXT else text[: MAX_TEXT - 3] + "..."
 
 
-EQUAL_TRACES = 1e-6
-"""Relative range of traces of P below which they are one value."""
+SAME_TRACES = 1e-6
+"""Relative range of traces of P below which they differ by rounding only."""
 
 
-def law_figure(subject: Subject) -> Picture:
-    """Draw the share of samples whose trace of P exceeds a value, and the invariant law where the
-    readings of one sensor arrive independently (R).
+def law_figure(data: FigureData) -> Picture:
+    """Draw the share of samples whose trace of P exceeds a value, and that of the invariant law of
+    P if the paper R applies: readings of one sensor that arrive independently.
+
+    Raises UnavailableError without samples and covariances, and for an ensemble.
     """
-    subject.require_samples()
-    subject.require_covariance()
-    if subject.runs > 1:
+    data.require_samples()
+    data.require_covariance()
+    if data.runs > 1:
         raise UnavailableError("The law of P is that of single runs, and these are means of many.")
-    late = subject.times >= 0.2 * subject.times[-1]
-    values = np.where(subject.trace[late] < MAX_TRACE, subject.trace[late], np.nan)
-    if not np.isfinite(values).any():
+    after_start = data.times >= START_SHARE * data.times[-1]
+    traces = data.trace[after_start]
+    traces = np.where(traces < MAX_TRACE, traces, np.nan)
+    if not np.isfinite(traces).any():
         raise UnavailableError(f"All traces of P are above {MAX_TRACE:g} or not finite.")
     figure = new_figure(7.4, 4.4)
     axes = figure.add_subplot()
     groups = (
-        (subject.sensing, SENSING, "--", "with a sensor"),
-        (~subject.sensing, INK, "-", "without"),
+        (data.has_sensor, SENSING, "--", "with a sensor"),
+        (~data.has_sensor, INK, "-", "without"),
     )
-    several = subject.sensing.any() and not subject.sensing.all()
-    for group, colour, dashes, which in groups:
-        sample = values[:, group].ravel()
+    has_both = data.has_sensor.any() and not data.has_sensor.all()
+    for group, colour, dashes, description in groups:
+        sample = traces[:, group].ravel()
         sample = np.sort(sample[np.isfinite(sample)])
         if sample.size:
-            label = f"run, nodes {which}" if several else "run, all nodes"
+            label = f"run, nodes {description}" if has_both else "run, all nodes"
             _draw_tail(axes, sample, colour, dashes, label)
-    claim = _tail_claim(values)
-    laws = _invariant_law(subject)
-    if laws is not None:
-        _draw_tail(axes, np.sort(laws), EXACT, ":", f"invariant law, {LAW_SAMPLES:,} draws")
-        own = values[:, _hears_one(subject.scenario)]
+    claim = _tail_claim(traces)
+    law_traces = _sample_invariant_law(data)
+    if law_traces is not None:
+        label = f"invariant law, {LAW_SAMPLES:,} draws"
+        _draw_tail(axes, np.sort(law_traces), EXACT, ":", label)
+        run_mean = traces[:, _hears_one_sensor(data.scenario)].mean()
         claim = (
-            f"Mean trace of P {own.mean():.3g} in the run; the invariant law has {laws.mean():.3g}"
+            f"Mean trace of P {run_mean:.3g} in the run; the invariant law has "
+            f"{law_traces.mean():.3g}"
         )
-    positive = values[np.isfinite(values) & (values > 0.0)]
-    if positive.size and positive.max() > SPREAD * positive.min():
-        axes.set_xscale("log")
-    elif (
-        positive.size and positive.max() - positive.min() < EQUAL_TRACES * positive.max()
-    ):  # rounding alone
-        axes.set_xlim(0.9 * positive.min(), 1.1 * positive.max())
+    positive = traces[np.isfinite(traces) & (traces > 0.0)]
+    if positive.size:
+        low, high = positive.min(), positive.max()
+        if high > LOG_RATIO * low:
+            axes.set_xscale("log")
+        elif high - low < SAME_TRACES * high:
+            # An axis over rounding errors would suggest a spread.
+            axes.set_xlim(0.9 * low, 1.1 * high)
     axes.set_yscale("log")
     axes.set(xlabel="trace of P, squared units of the state", ylabel="share of samples above")
     draw_legend(axes)
     note = "The first fifth of the samples is left out. Samples of one run are not independent."
-    finish_figure(figure, subject.claim(claim), subject.caption(note))
+    finish_figure(figure, data.title(claim), data.caption(note))
     return figure
 
 
 def _draw_tail(axes: Any, sample: FloatArray, colour: str, dashes: str, label: str) -> None:
-    """Draw the share of a sorted ``sample`` (K,) above each value."""
+    """Draw the share of a sorted ``sample`` (K,) that is at least as large as each of its values,
+    as a step function.
+    """
     share = 1.0 - np.arange(len(sample)) / len(sample)
     axes.plot(sample, share, color=colour, ls=dashes, label=label, drawstyle="steps-post")
 
 
 def _tail_claim(values: FloatArray) -> str:
-    """Return the claim on the tail of the trace of P."""
-    known = values[np.isfinite(values)]
-    median, high = np.quantile(known, (0.5, 0.99))
+    """Return a sentence on the median and the 99% quantile of the finite traces of P."""
+    finite = values[np.isfinite(values)]
+    median, high = np.quantile(finite, (0.5, 0.99))
     return f"The median trace of P is {median:.3g}; 1% of samples exceed {high:.3g}"
 
 
-def _hears_one(scenario: Scenario) -> np.ndarray:
-    """Return (N,) bool: nodes without a sensor that hear exactly one node with one."""
-    heard = {
+def _hears_one_sensor(scenario: Scenario) -> np.ndarray:
+    """Return (N,) bool: True for nodes without a sensor whose neighbours have one sensor in all."""
+    neighbours = {
         node: [i for i, j in scenario.topology.directions if j == node] for node in scenario.nodes
     }
     return np.array(
         [
-            node not in scenario.placed_sensors
-            and sum(len(scenario.placed_sensors.get(i, ())) for i in heard[node]) == 1
+            node not in scenario.placed
+            and sum(len(scenario.placed.get(i, ())) for i in neighbours[node]) == 1
             for node in scenario.nodes
         ]
     )
 
 
-def _invariant_law(subject: Subject) -> FloatArray | None:
-    """Return draws of the trace of P by the invariant law, None if R's model is not this one."""
-    scenario = subject.scenario
+def _sample_invariant_law(data: FigureData) -> FloatArray | None:
+    """Return traces (LAW_SAMPLES,) of P drawn from its invariant law, None unless the scenario is
+    the model of the paper R: one sensor, linear readings, and independent losses.
+    """
+    scenario = data.scenario
     loss = scenario.network.channel.loss
-    # Exactly the built-in class: a class derived from it may have another law.
-    intermittent = type(scenario.filter.algorithm) is built_in_filters()["intermittent"]
-    if not (intermittent and scenario.slotted and len(scenario.sensors) == 1):
+    # A class derived from the built-in filter may have another law.
+    is_intermittent = type(scenario.filter.algorithm) is built_in_filters()["intermittent"]
+    if not (is_intermittent and scenario.slotted and len(scenario.sensors) == 1):
         return None
     if not isinstance(loss, Bernoulli):
         return None
     H = getattr(scenario.sensors[0], "H", None)
-    if H is None or not _hears_one(scenario).any() or not scenario.filters_know_the_truth:
+    if H is None or not _hears_one_sensor(scenario).any() or not scenario.filters_know_the_truth:
         return None
     plant = scenario.slot_plant
     R = scenario.sensors[0].R
     try:
-        drawn = invariant_samples(plant.F, plant.Q, H, R, loss.delivery, LAW_SAMPLES, subject.seed)
+        samples = invariant_samples(plant.F, plant.Q, H, R, loss.delivery, LAW_SAMPLES, data.seed)
     except (TheoryError, NetkfError):
         return None
-    return np.asarray(np.trace(drawn, axis1=1, axis2=2))
+    return np.asarray(np.trace(samples, axis1=1, axis2=2))

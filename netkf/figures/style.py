@@ -1,7 +1,8 @@
-"""The one look of all figures: colours, line styles, titles with a claim, captions, files.
+"""The style of all figures: colours, line styles, titles, captions and legends; and their files.
 
 Colours are those of Okabe and Ito (Color Universal Design, 2008), which people with any common
-colour blindness tell apart. Series differ in lightness, dashes or markers too, for prints in grey.
+colour blindness can tell apart. Series also differ in lightness, dashes or markers, for prints in
+grey.
 """
 
 from __future__ import annotations
@@ -28,10 +29,11 @@ INK, MUTED, FAINT = "#222222", "#555555", "#bbbbbb"
 VERMILLION, SKY, GREEN, ORANGE = "#D55E00", "#56B4E9", "#009E73", "#E69F00"
 BLUE, PURPLE, YELLOW = "#0072B2", "#CC79A7", "#F0E442"
 SENSING, RELAY, EXACT, LOST = VERMILLION, SKY, GREEN, VERMILLION
+"""Colours of nodes with and without a sensor, of exact values of theory, and of lost messages."""
 
 
-class Look(NamedTuple):
-    """How a series is drawn, so that no two look alike even without colour."""
+class SeriesStyle(NamedTuple):
+    """The style of a series of data; no two of SERIES look alike even without colour."""
 
     colour: str
     dashes: str
@@ -39,17 +41,17 @@ class Look(NamedTuple):
 
 
 SERIES = (
-    Look(INK, "-", "o"),
-    Look(VERMILLION, "--", "s"),
-    Look(SKY, "-.", "^"),
-    Look(GREEN, ":", "D"),
-    Look(ORANGE, (0, (6, 1, 1, 1, 1, 1)), "v"),  # type: ignore[arg-type]
-    Look(BLUE, (0, (3, 3)), "P"),  # type: ignore[arg-type]
-    Look(PURPLE, (0, (1, 3)), "X"),  # type: ignore[arg-type]
-    Look(MUTED, (0, (8, 3)), "*"),  # type: ignore[arg-type]
+    SeriesStyle(INK, "-", "o"),
+    SeriesStyle(VERMILLION, "--", "s"),
+    SeriesStyle(SKY, "-.", "^"),
+    SeriesStyle(GREEN, ":", "D"),
+    SeriesStyle(ORANGE, (0, (6, 1, 1, 1, 1, 1)), "v"),  # type: ignore[arg-type]
+    SeriesStyle(BLUE, (0, (3, 3)), "P"),  # type: ignore[arg-type]
+    SeriesStyle(PURPLE, (0, (1, 3)), "X"),  # type: ignore[arg-type]
+    SeriesStyle(MUTED, (0, (8, 3)), "*"),  # type: ignore[arg-type]
 )
 SEQUENTIAL = "cividis_r"
-"""Colour map of quantities: its lightness falls as the quantity grows, in grey and for all eyes."""
+"""Colour map of quantities: its lightness decreases as the quantity grows, also without colour."""
 
 RC: dict[str, Any] = {
     "font.size": 9.0,
@@ -68,24 +70,28 @@ RC: dict[str, Any] = {
 }
 FORMATS = ("png", "svg", "pdf")
 RESOLUTION = 130  # dots per inch
+LOG_MEDIANS = 100.0
+"""Ratio of the largest value to the median above which a y axis is logarithmic."""
+POINTS_PER_INCH = 72.0
 SECONDS = "simulated seconds"
 TITLE_SIZE, CAPTION_SIZE, LEGEND_SIZE = 10.5, 7.5, 7.5
+"""Font sizes in points."""
 
 
 class Picture(Figure):
-    """A figure that shows itself in a notebook, without pyplot."""
+    """A figure that notebooks display without pyplot."""
 
     def _repr_png_(self) -> bytes:
         """Return the PNG that notebooks display."""
         buffer = io.BytesIO()
-        with look():
+        with style_context():
             self.savefig(buffer, format="png", dpi=RESOLUTION)
         return buffer.getvalue()
 
 
 @contextlib.contextmanager
-def look() -> Iterator[None]:
-    """Draw the body's figures with the look of netkf, whatever the user's settings are."""
+def style_context() -> Iterator[None]:
+    """Set the style of netkf's figures within the block, whatever the user's settings are."""
     with mpl.rc_context():
         mpl.rcdefaults()
         parameters: Any = mpl.rcParams
@@ -94,17 +100,19 @@ def look() -> Iterator[None]:
 
 
 def new_figure(width: float = 7.4, height: float = 4.4) -> Picture:
-    """Return an empty figure, in inches, that lays its parts out by itself."""
+    """Return an empty figure, ``width`` x ``height`` inches, with matplotlib's constrained
+    layout.
+    """
     figure = Picture(figsize=(width, height), layout="constrained")
     FigureCanvasAgg(figure)
     return figure
 
 
 def finish_figure(figure: Figure, claim: str, caption: Sequence[str]) -> None:
-    """Put the claim above a figure and the sentences of its caption below, in as many lines as fit
-    its width.
+    """Put the claim above a figure and the paragraphs of its caption below, broken into lines that
+    fit its width.
     """
-    width = 0.94 * float(figure.get_size_inches()[0]) * 72.0
+    width = 0.94 * float(figure.get_size_inches()[0]) * POINTS_PER_INCH
     title = break_lines(claim, width, TITLE_SIZE, "bold")
     figure.suptitle(title, x=0.01, ha="left", fontsize=TITLE_SIZE, color=INK, fontweight="bold")
     lines = [break_lines(sentence, width, CAPTION_SIZE) for sentence in caption if sentence]
@@ -112,8 +120,10 @@ def finish_figure(figure: Figure, claim: str, caption: Sequence[str]) -> None:
 
 
 def break_lines(text: str, width: float, size: float, weight: str = "normal") -> str:
-    """Return a text on one line or more, none of them wider than ``width`` points where words allow
-    it; names from files have no control characters and no formulas then.
+    """Return a text broken into lines of at most ``width`` points, in a font of ``size`` points.
+
+    Control characters are removed and dollar signs escaped, since names come from files and
+    matplotlib would draw text between dollar signs as a formula.
     """
     lines = [""]
     for word in one_line(text).split():
@@ -122,79 +132,90 @@ def break_lines(text: str, width: float, size: float, weight: str = "normal") ->
             lines.append(word)
         else:
             lines[-1] = longer
-    pieces = [piece for line in lines for piece in _cut(line, width, size, weight)]
+    pieces = [piece for line in lines for piece in _split_word(line, width, size, weight)]
     return "\n".join(pieces).replace("$", r"\$")
 
 
-def _cut(line: str, width: float, size: float, weight: str) -> list[str]:
-    """Return pieces of a line that is a single word wider than ``width``."""
+def _split_word(line: str, width: float, size: float, weight: str) -> list[str]:
+    """Return pieces of at most ``width`` points of a line: only a line of a single long word has
+    more than one.
+    """
     pieces = []
     while len(line) > 1 and text_width(line, size, weight) > width:
-        fits = max(1, int(len(line) * width / text_width(line, size, weight)) - 1)
-        pieces.append(line[:fits])
-        line = line[fits:]
+        count = max(1, int(len(line) * width / text_width(line, size, weight)) - 1)
+        pieces.append(line[:count])
+        line = line[count:]
     return [*pieces, line]
 
 
 @lru_cache(maxsize=4096)
 def text_width(text: str, size: float, weight: str = "normal") -> float:
-    """Return the width of a text in points."""
+    """Return the width of a text in points, in a font of ``size`` points."""
     font = FontProperties(size=size, weight=weight)
-    measured = TextToPath().get_text_width_height_descent(text, font, ismath=False)
-    return float(measured[0])
+    width, _, _ = TextToPath().get_text_width_height_descent(text, font, ismath=False)
+    return float(width)
 
 
-def write(figure: Figure, path: Path) -> None:
-    """Write a figure, whole or not at all, in the format of the name of its file."""
-    kind = path.suffix.removeprefix(".").lower() or "png"
-    # Files of the same figure are equal.
-    metadata: dict[str, Any] = {"png": {}, "svg": {"Date": None}, "pdf": {"CreationDate": None}}[
-        kind
-    ]
-    with look(), write_atomically(path) as part:
-        figure.savefig(part, dpi=RESOLUTION, format=kind, metadata=metadata)
+def write_figure(figure: Figure, path: Path) -> None:
+    """Write a figure, whole or not at all, in the format of the suffix, one of FORMATS.
+
+    Raises WriteError if the file cannot be written.
+    """
+    file_format = path.suffix.removeprefix(".").lower() or "png"
+    # Without dates, the same figure always has the same bytes.
+    undated: dict[str, Any] = {"png": {}, "svg": {"Date": None}, "pdf": {"CreationDate": None}}
+    metadata = undated[file_format]
+    with style_context(), write_atomically(path) as temporary:
+        figure.savefig(temporary, dpi=RESOLUTION, format=file_format, metadata=metadata)
 
 
 def draw_legend(axes: Any, columns: int | None = None) -> None:
-    """Draw the legend of all labelled series above the axes, where it hides none of them."""
+    """Draw the legend of all labelled series above the axes, where it covers none of them, in as
+    many columns as fit unless ``columns`` is given.
+    """
     handles, labels = axes.get_legend_handles_labels()
     if not labels:
         return
-    figure = axes.figure
-    share = axes.get_subplotspec().get_position(figure).width if axes.get_subplotspec() else 1.0
-    scratch = share * float(figure.get_size_inches()[0]) * 72.0 * 1.08
     axes.legend(
         handles,
         labels,
         loc="lower left",
         bbox_to_anchor=(0.0, 1.0),
-        ncols=columns or _columns(labels, scratch),
+        # A legend may be a little wider than its axes: margins and tick labels are beside them.
+        ncols=columns or _legend_columns(labels, 1.08 * _axes_width(axes)),
         columnspacing=1.4,
         borderaxespad=0.2,
     )
 
 
-def _columns(labels: Sequence[str], scratch: float) -> int:
-    """Return the largest number of columns of a legend that fits ``scratch`` points."""
+def _axes_width(axes: Any) -> float:
+    """Return the width of the cell of the figure's grid that the axes are in, in points."""
+    cell = axes.get_subplotspec()
+    share = cell.get_position(axes.figure).width if cell else 1.0
+    return share * float(axes.figure.get_size_inches()[0]) * POINTS_PER_INCH
+
+
+def _legend_columns(labels: Sequence[str], width: float) -> int:
+    """Return the largest number of columns in which a legend fits ``width`` points."""
+    # Handle, gaps and column spacing take about six font sizes.
     widths = [text_width(label, LEGEND_SIZE) + 6.0 * LEGEND_SIZE for label in labels]
     for count in range(len(labels), 1, -1):
-        # Legends split their labels so: the first columns have one more where they are not equal.
-        if sum(column.max() for column in np.array_split(widths, count)) <= scratch:
+        # matplotlib fills columns as array_split does: the first ones may have one label more.
+        if sum(column.max() for column in np.array_split(widths, count)) <= width:
             return count
     return 1
 
 
 def draw_message(axes: Any, message: str) -> None:
-    """Replace a panel without data by a message in as many lines as fit."""
-    share = axes.get_subplotspec().get_position(axes.figure).width
-    width = share * float(axes.figure.get_size_inches()[0]) * 72.0 * 0.9
+    """Draw a message, broken into lines, in place of the axes of a panel."""
+    width = 0.9 * _axes_width(axes)
     text = break_lines(message, width, 9.0)
     axes.text(0.02, 0.5, text, color=MUTED, va="center", transform=axes.transAxes)
     axes.axis("off")
 
 
 def message_figure(claim: str, message: str, caption: Sequence[str]) -> Picture:
-    """Return a figure that says why there is nothing to draw."""
+    """Return a figure that shows only a message, such as the reason why there are no data."""
     figure = new_figure(7.4, 2.2)
     draw_message(figure.add_subplot(), message)
     finish_figure(figure, claim, caption)
@@ -202,9 +223,11 @@ def message_figure(claim: str, message: str, caption: Sequence[str]) -> Picture:
 
 
 def set_scale(axes: Any, values: FloatArray) -> None:
-    """Choose a logarithmic scale if the largest value is more than 100 times the median."""
+    """Set the scale and the limits of the y axis for ``values``: logarithmic if the largest one is
+    more than LOG_MEDIANS times their median.
+    """
     positive = values[np.isfinite(values) & (values > 0.0)]
-    if positive.size and positive.max() > 100.0 * np.median(positive):
+    if positive.size and positive.max() > LOG_MEDIANS * np.median(positive):
         axes.set_yscale("log")
         axes.set_ylim(positive.min() * 0.7, positive.max() * 1.5)
     elif positive.size:

@@ -1,4 +1,7 @@
-"""The figures ``age``, ``links`` and ``delivery``: what happened to the messages."""
+"""The figures ``age``, ``links`` and ``delivery``: age of information, messages and their losses.
+
+Here a direction is a directed link, from a sender to a receiver.
+"""
 
 from __future__ import annotations
 
@@ -7,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.stats import binomtest
 
+from netkf.figures.figure_data import FigureData, UnavailableError
 from netkf.figures.panels import select_evenly
 from netkf.figures.style import (
     EXACT,
@@ -22,30 +26,34 @@ from netkf.figures.style import (
     finish_figure,
     new_figure,
 )
-from netkf.figures.subject import Subject, UnavailableError
 from netkf.linalg.arrays import FloatArray
 from netkf.trace.schema import CODES
 
 AGE_BINS = 160  # of time, for means and maxima of the age
 AGE_LEVELS = 400  # levels at which the distribution of ages is drawn
+MIN_SHARE = 1e-4  # smallest share of time on the axis of that distribution
 MAX_DIRECTIONS = 40  # rows that can still be told apart
+MAX_LABELLED = 16  # directions whose names fit below the axis
 MAX_MARKS = 3000  # messages that can still be told apart
 CONFIDENCE = 0.95
 TIME_BINS = 30  # of time: each has enough messages for an interval
 
 
-def freshest(log: np.ndarray, node: int) -> tuple[FloatArray, FloatArray]:
-    """Return the times at which a node heard a message, and for each the time at which the freshest
-    message so far was sent, both (K,) in seconds.
+def newest_arrivals(log: np.ndarray, node: int) -> tuple[FloatArray, FloatArray]:
+    """Return the times (K,) at which messages arrived at a node, and for each the time (K,) at
+    which the newest message so far was sent, in seconds, from EVENT rows.
     """
-    heard = log[(log["kind"] == CODES["deliver"]) & (log["node"] == node)]
-    sent = np.maximum.accumulate(heard["t"] - np.nan_to_num(heard["age"]))
-    return heard["t"], sent
+    arrivals = log[(log["kind"] == CODES["deliver"]) & (log["node"] == node)]
+    # A message that overtakes others makes them old before they arrive.
+    sent = np.maximum.accumulate(arrivals["t"] - np.nan_to_num(arrivals["age"]))
+    return arrivals["t"], sent
 
 
-class Ages(NamedTuple):
-    """Age of information of a node as a sawtooth: segments between ``start`` and ``stop`` (K,),
-    seconds, in which it grows from ``low`` to ``low + stop - start``.
+class AgeSawtooth(NamedTuple):
+    """The age of information of a node over time, a sawtooth of K segments, in seconds.
+
+    Within a segment, between ``start`` (K,) and ``stop`` (K,), it grows from ``low`` (K,) to
+    ``low + stop - start``.
     """
 
     start: FloatArray
@@ -55,59 +63,67 @@ class Ages(NamedTuple):
     def mean(self, edges: FloatArray) -> FloatArray:
         """Return the time averages (B,) between ``edges`` (B + 1,), which begin at time 0."""
         length = self.stop - self.start
-        before = np.concatenate([[0.0], np.cumsum(length * (self.low + 0.5 * length))])
+        # The integral of the age up to each segment, then up to each edge within its segment.
+        at_start = np.concatenate([[0.0], np.cumsum(length * (self.low + 0.5 * length))])
         k = np.clip(np.searchsorted(self.start, edges, side="right") - 1, 0, None)
-        gone = edges - self.start[k]
-        return np.asarray(np.diff(before[k] + gone * (self.low[k] + 0.5 * gone)) / np.diff(edges))
+        elapsed = edges - self.start[k]
+        integral = at_start[k] + elapsed * (self.low[k] + 0.5 * elapsed)
+        return np.asarray(np.diff(integral) / np.diff(edges))
 
     def largest(self, edges: FloatArray) -> FloatArray:
         """Return the largest age (B,) between ``edges`` (B + 1,)."""
-        # An age is largest where a segment ends, or the bin.
+        # The age is largest at the end of the bin, or of a segment within it.
         last = np.searchsorted(self.start, edges[1:], side="left") - 1
-        found = self.low[last] + edges[1:] - self.start[last]
-        bins = np.clip(np.searchsorted(edges, self.stop, side="left") - 1, 0, len(found) - 1)
-        np.maximum.at(found, bins, self.low + self.stop - self.start)
-        return np.asarray(found)
+        largest = self.low[last] + edges[1:] - self.start[last]
+        bins = np.clip(np.searchsorted(edges, self.stop, side="left") - 1, 0, len(largest) - 1)
+        np.maximum.at(largest, bins, self.low + self.stop - self.start)
+        return np.asarray(largest)
 
     def time_above(self, levels: FloatArray) -> FloatArray:
-        """Return for how many seconds the age is above each of the ``levels`` (L,)."""
-        top = self.low + self.stop - self.start
-        # Seconds above a level: sums of (top - level) where that is positive, less the same of low.
-        return _excess_time(top, levels) - _excess_time(self.low, levels)
+        """Return the seconds (L,) for which the age is above each of the ``levels`` (L,)."""
+        high = self.low + self.stop - self.start
+        # The age grows by 1 s per second, so a segment from low to high is above a level for
+        # max(0, high - level) - max(0, low - level) seconds.
+        return _sum_excess(high, levels) - _sum_excess(self.low, levels)
 
 
-def _excess_time(values: FloatArray, levels: FloatArray) -> FloatArray:
+def _sum_excess(values: FloatArray, levels: FloatArray) -> FloatArray:
     """Return the sum of ``max(0, value - level)`` over the values (K,) for each level (L,)."""
-    ordered = np.sort(values)[::-1]
-    sums = np.concatenate([[0.0], np.cumsum(ordered)])
-    above = len(ordered) - np.searchsorted(ordered[::-1], levels, side="right")
+    descending = np.sort(values)[::-1]
+    sums = np.concatenate([[0.0], np.cumsum(descending)])
+    above = len(descending) - np.searchsorted(descending[::-1], levels, side="right")
     return np.asarray(sums[above] - above * levels)
 
 
-def ages_of(log: np.ndarray, node: int, end: float) -> Ages:
-    """Return the age of information of a node up to ``end``: the time since the freshest message
-    that it has heard was sent; since time 0 before the first one.
+def age_of_information(log: np.ndarray, node: int, end: float) -> AgeSawtooth:
+    """Return the age of information of a node from time 0 to ``end`` seconds, from EVENT rows.
+
+    It is the time since the newest message that has arrived was sent; before the first arrival the
+    time since 0.
     """
-    heard, sent = freshest(log, node)
-    before = heard < end
-    start = np.concatenate([[0.0], heard[before]])
-    stop = np.concatenate([heard[before], [end]])
-    return Ages(start, stop, start - np.concatenate([[0.0], sent[before]]))
+    arrived, sent = newest_arrivals(log, node)
+    before_end = arrived < end
+    start = np.concatenate([[0.0], arrived[before_end]])
+    stop = np.concatenate([arrived[before_end], [end]])
+    return AgeSawtooth(start, stop, start - np.concatenate([[0.0], sent[before_end]]))
 
 
-def age_figure(subject: Subject) -> Picture:
-    """Draw the age of information over time, means and maxima over the nodes, and its law."""
-    end = _last_time(subject)
-    degrees = subject.scenario.topology.degrees
-    receivers = [node for node in subject.nodes if degrees.get(node, 0)]
+def age_figure(data: FigureData) -> Picture:
+    """Draw the age of information over time, means and maxima over the nodes, and its distribution.
+
+    Raises UnavailableError without events, or if no node can receive messages.
+    """
+    end = _last_time(data)
+    degrees = data.scenario.topology.degrees
+    receivers = [node for node in data.nodes if degrees.get(node, 0)]
     if not receivers:
         raise UnavailableError("No node can hear another one.")
-    ages = [ages_of(subject.log, node, end) for node in receivers]
-    means = np.array([float(each.mean(np.array([0.0, end]))[0]) for each in ages])
+    ages = [age_of_information(data.log, node, end) for node in receivers]
+    means = np.array([float(age.mean(np.array([0.0, end]))[0]) for age in ages])
     figure = new_figure(8.4, 4.2)
     left, right = figure.subplots(1, 2, width_ratios=[1.6, 1.0])
     _draw_ages(left, np.linspace(0.0, end, AGE_BINS + 1), ages)
-    _draw_age_law(right, ages, means, end)
+    _draw_age_distribution(right, ages, means, end)
     worst = int(means.argmax())
     claim = f"On average the freshest message that a node has heard is {means.mean():.3g} s old"
     if len(means) > 1:
@@ -116,63 +132,67 @@ def age_figure(subject: Subject) -> Picture:
         "Age of information: time since the freshest message that a node has heard was sent. "
         f"Left: means and maxima over {end / AGE_BINS:.3g} s."
     )
-    finish_figure(figure, subject.claim(claim), subject.caption(note))
+    finish_figure(figure, data.title(claim), data.caption(note))
     return figure
 
 
-def _draw_ages(axes: Any, edges: FloatArray, ages: list[Ages]) -> None:
-    """Draw mean and largest age of information within bins of time."""
-    # Ages are sawtooths: instants of a grid would beat with the clocks, means over bins do not.
+def _draw_ages(axes: Any, edges: FloatArray, ages: list[AgeSawtooth]) -> None:
+    """Draw the median of the nodes' mean ages and the largest age within bins between ``edges``."""
+    # Samples of a sawtooth at the times of a grid would alias with the clocks; means do not.
     centres = 0.5 * (edges[:-1] + edges[1:])
-    means = np.array([each.mean(edges) for each in ages])
-    largest = np.max([each.largest(edges) for each in ages], axis=0)
+    means = np.array([age.mean(edges) for age in ages])
+    largest = np.max([age.largest(edges) for age in ages], axis=0)
     if len(ages) > 1:
         low, median, high = np.quantile(means, (0.05, 0.5, 0.95), axis=0)
         axes.fill_between(centres, low, high, color=SKY, alpha=0.5, lw=0, label="90% of nodes")
     else:
         median = means[0]
-    text = ("worst node", "median node") if len(ages) > 1 else ("the node", "the node")
-    label = f"{text[0]}, at its worst moment"
+    worst, typical = ("worst node", "median node") if len(ages) > 1 else ("the node", "the node")
+    label = f"{worst}, at its worst moment"
     axes.plot(centres, largest, color=SENSING, ls="--", lw=1.0, label=label)
-    axes.plot(centres, median, color=INK, lw=1.2, label=f"{text[1]}, on average")
+    axes.plot(centres, median, color=INK, lw=1.2, label=f"{typical}, on average")
     axes.set(xlabel=SECONDS, ylabel="age of information, seconds")
     axes.set_ylim(0.0, 1.05 * max(float(largest.max()), 1e-12))
     draw_legend(axes)
 
 
-def _draw_age_law(axes: Any, ages: list[Ages], means: FloatArray, end: float) -> None:
-    """Draw the share of time for which the age exceeds a value: of all nodes, best and worst."""
-    levels = np.linspace(
-        0.0, max(float((a.low + a.stop - a.start).max()) for a in ages), AGE_LEVELS
-    )
-    shares = np.array([each.time_above(levels) for each in ages]) / end
+def _draw_age_distribution(
+    axes: Any, ages: list[AgeSawtooth], means: FloatArray, end: float
+) -> None:
+    """Draw the share of the time until ``end`` for which the age exceeds a value: of all nodes, and
+    of those with the largest and the smallest of the mean ages ``means`` (N,).
+    """
+    largest = max(float((age.low + age.stop - age.start).max()) for age in ages)
+    levels = np.linspace(0.0, largest, AGE_LEVELS)
+    shares = np.array([age.time_above(levels) for age in ages]) / end
     rows: list[tuple[FloatArray, str, str, str]] = [(shares.mean(axis=0), INK, "-", "all nodes")]
     if len(ages) > 1:
         rows += [
             (shares[int(means.argmax())], SENSING, "--", "worst node"),
             (shares[int(means.argmin())], EXACT, "-.", "best node"),
         ]
-    least = 1e-4
     for share, colour, dashes, label in rows:
-        # The axis is logarithmic: smaller shares only stretch it.
-        visible = share > 0.1 * least
+        # Shares of 0 have no place on a logarithmic axis.
+        visible = share > 0.1 * MIN_SHARE
         axes.plot(levels[visible], share[visible], color=colour, ls=dashes, label=label)
     axes.set_yscale("log")
-    axes.set_ylim(least, 1.3)
+    axes.set_ylim(MIN_SHARE, 1.3)
     axes.set(xlabel="age, seconds", ylabel="share of time above")
     draw_legend(axes, 1)
 
 
-def _last_time(subject: Subject) -> float:
-    """Return the last recorded time in seconds."""
-    last = float(subject.log["t"][-1])
-    if len(subject.times):
-        last = max(last, float(subject.times[-1]))
-    return last if last > 0.0 else subject.scenario.horizon
+def _last_time(data: FigureData) -> float:
+    """Return the time of the last event or sample in seconds; the horizon if that is 0."""
+    last = float(data.log["t"][-1])
+    if len(data.times):
+        last = max(last, float(data.times[-1]))
+    return last if last > 0.0 else data.scenario.horizon
 
 
 class DirectedMessages(NamedTuple):
-    """Messages from ``sender`` to ``receiver``: when they were sent or lost, and delivered."""
+    """The messages from ``sender`` to ``receiver``: the times (s) at which they were ``delivered``,
+    and at which they were ``lost`` or arrived late.
+    """
 
     sender: int
     receiver: int
@@ -181,184 +201,191 @@ class DirectedMessages(NamedTuple):
 
 
 def messages_by_direction(log: np.ndarray) -> list[DirectedMessages]:
-    """Return the messages of each direction over which some were sent, by delivery and loss."""
-    arrived = log[log["kind"] == CODES["deliver"]]
-    missed = log[np.isin(log["kind"], (CODES["lost"], CODES["late"]))]
-    # A message that arrived stands with its receiver first, one that was lost with its sender.
-    late = missed["kind"] == CODES["late"]
-    sender = np.where(late, missed["peer"], missed["node"])
-    receiver = np.where(late, missed["node"], missed["peer"])
-    pairs = {(int(i), int(j)) for i, j in zip(arrived["peer"], arrived["node"], strict=True)}
-    pairs |= {(int(i), int(j)) for i, j in zip(sender, receiver, strict=True)}
-    heard, gone = (
-        _by_pair(arrived["peer"], arrived["node"], arrived["t"]),
-        _by_pair(sender, receiver, missed["t"]),
-    )
+    """Return the messages of each direction that have an outcome, from EVENT rows, ordered by
+    sender and receiver.
+    """
+    arrivals = log[log["kind"] == CODES["deliver"]]
+    losses = log[np.isin(log["kind"], (CODES["lost"], CODES["late"]))]
+    # The node of an arrival, late ones included, is the receiver; that of a loss is the sender.
+    is_late = losses["kind"] == CODES["late"]
+    sender = np.where(is_late, losses["peer"], losses["node"])
+    receiver = np.where(is_late, losses["node"], losses["peer"])
+    delivered = _times_by_direction(arrivals["peer"], arrivals["node"], arrivals["t"])
+    lost = _times_by_direction(sender, receiver, losses["t"])
     none = np.empty(0)
     return [
-        DirectedMessages(*pair, heard.get(pair, none), gone.get(pair, none))
-        for pair in sorted(pairs)
+        DirectedMessages(*direction, delivered.get(direction, none), lost.get(direction, none))
+        for direction in sorted({*delivered, *lost})
     ]
 
 
-def _by_pair(
+def _times_by_direction(
     senders: np.ndarray, receivers: np.ndarray, times: FloatArray
 ) -> dict[tuple[int, int], FloatArray]:
-    """Return the times of each pair of nodes."""
+    """Return the sorted times of each pair (sender, receiver), from one row (K,) for each event."""
     if not len(times):
         return {}
     order = np.lexsort((times, receivers, senders))
     i, j, t = senders[order], receivers[order], times[order]
-    begins = np.flatnonzero((i[1:] != i[:-1]) | (j[1:] != j[:-1])) + 1
-    starts = [0, *begins.tolist()]
-    parts = np.split(t, begins)
-    return {(int(i[s]), int(j[s])): part for s, part in zip(starts, parts, strict=True)}
+    boundaries = np.flatnonzero((i[1:] != i[:-1]) | (j[1:] != j[:-1])) + 1
+    starts = [0, *boundaries.tolist()]
+    groups = np.split(t, boundaries)
+    return {(int(i[s]), int(j[s])): group for s, group in zip(starts, groups, strict=True)}
 
 
-def links_figure(subject: Subject) -> Picture:
-    """Draw every message of each direction at its time: ticks for delivered, crosses for lost."""
-    found = _with_messages(subject)
-    chosen = [found[k] for k in select_evenly(np.arange(len(found)), MAX_DIRECTIONS).tolist()]
-    begin, end = _readable_window(chosen, _last_time(subject))
-    figure = new_figure(8.4, min(9.0, 2.0 + 0.16 * len(chosen)))
+def links_figure(data: FigureData) -> Picture:
+    """Draw the messages of each direction at their times: ticks for delivered ones, crosses for
+    lost ones. Of long runs and large networks an interval and a selection of directions are drawn.
+
+    Raises UnavailableError without messages.
+    """
+    directions = _require_messages(data)
+    rows = select_evenly(np.arange(len(directions)), MAX_DIRECTIONS)
+    selection = [directions[k] for k in rows.tolist()]
+    end = _readable_end(selection, _last_time(data))
+    figure = new_figure(8.4, min(9.0, 2.0 + 0.16 * len(selection)))
     axes = figure.add_subplot()
-    for row, one in enumerate(chosen):
+    for row, direction in enumerate(selection):
         for times, marker, colour, size in (
-            (one.delivered, "|", INK, 5.0),
-            (one.lost, "x", LOST, 4.0),
+            (direction.delivered, "|", INK, 5.0),
+            (direction.lost, "x", LOST, 4.0),
         ):
-            inside = times[(times >= begin) & (times <= end)]
-            style: dict[str, Any] = {
-                "ls": "",
-                "marker": marker,
-                "ms": size,
-                "color": colour,
-                "mew": 0.9,
-            }
-            axes.plot(inside, np.full(len(inside), row), **style)
+            shown = times[times <= end]
+            style: dict[str, Any] = {"ls": "", "marker": marker, "ms": size, "mew": 0.9}
+            axes.plot(shown, np.full(len(shown), row), color=colour, **style)
     axes.plot([], [], "|", color=INK, label="delivered")
     axes.plot([], [], "x", color=LOST, label="lost")
-    axes.set_yticks(
-        range(len(chosen)), [f"{d.sender} to {d.receiver}" for d in chosen], fontsize=6.5
-    )
-    axes.set_ylim(-0.8, len(chosen) - 0.2)
+    labels = [f"{direction.sender} to {direction.receiver}" for direction in selection]
+    axes.set_yticks(range(len(selection)), labels, fontsize=6.5)
+    axes.set_ylim(-0.8, len(selection) - 0.2)
     axes.invert_yaxis()
-    axes.set_xlim(begin, end)
+    axes.set_xlim(0.0, end)
     axes.set(xlabel=SECONDS, ylabel="sender to receiver")
     draw_legend(axes)
-    lost, total = (
-        sum(len(d.lost) for d in found),
-        sum(len(d.lost) + len(d.delivered) for d in found),
-    )
+    lost = sum(len(direction.lost) for direction in directions)
+    total = lost + sum(len(direction.delivered) for direction in directions)
     claim = f"{lost:,} of {total:,} messages were lost ({lost / total:.1%})"
-    directions = f"{len(chosen)} of {len(found)} directions" if len(chosen) < len(found) else ""
-    part = f"the first {end:,.4g} s" if end < _last_time(subject) else ""
-    cut = " of ".join(filter(None, (directions, part)))
-    sentence = f"Shown: {cut}; the claim counts all." if cut else "All messages are shown."
-    finish_figure(figure, subject.claim(claim), subject.caption(sentence))
+    omissions = []
+    if len(selection) < len(directions):
+        omissions.append(f"{len(selection)} of {len(directions)} directions")
+    if end < _last_time(data):
+        omissions.append(f"the first {end:,.4g} s")
+    note = "All messages are shown."
+    if omissions:
+        note = f"Shown: {' of '.join(omissions)}; the claim counts all."
+    finish_figure(figure, data.title(claim), data.caption(note))
     return figure
 
 
-def _with_messages(subject: Subject) -> list[DirectedMessages]:
+def _require_messages(data: FigureData) -> list[DirectedMessages]:
     """Return the messages by direction; raises UnavailableError without any."""
-    found = messages_by_direction(subject.log)
-    if not found:
+    directions = messages_by_direction(data.log)
+    if not directions:
         raise UnavailableError("No message was delivered or lost.")
-    return found
+    return directions
 
 
-def _readable_window(chosen: list[DirectedMessages], end: float) -> tuple[float, float]:
-    """Return the longest time from 0 on with at most MAX_MARKS messages, seconds."""
-    times = np.sort(np.concatenate([np.concatenate([d.delivered, d.lost]) for d in chosen]))
-    return 0.0, float(times[MAX_MARKS]) if len(times) > MAX_MARKS else end
+def _readable_end(directions: list[DirectedMessages], end: float) -> float:
+    """Return the time (s), at most ``end``, up to which there are about MAX_MARKS messages."""
+    times = np.sort(np.concatenate([np.concatenate([d.delivered, d.lost]) for d in directions]))
+    return float(times[MAX_MARKS]) if len(times) > MAX_MARKS else end
 
 
-def wilson(delivered: int, total: int) -> tuple[float, float]:
-    """Return Wilson's interval of a probability with CONFIDENCE."""
-    found = binomtest(delivered, total).proportion_ci(CONFIDENCE, "wilson")
-    return float(found.low), float(found.high)
+def wilson_interval(delivered: int, total: int) -> tuple[float, float]:
+    """Return Wilson's interval of a delivery probability, at the level CONFIDENCE, from the number
+    of delivered messages and of all.
+    """
+    interval = binomtest(delivered, total).proportion_ci(CONFIDENCE, "wilson")
+    return float(interval.low), float(interval.high)
 
 
-def delivery_figure(subject: Subject) -> Picture:
-    """Draw the delivered fraction of each direction with its interval, and the loss over time."""
-    found = _with_messages(subject)
-    shares = np.array([len(d.delivered) / (len(d.delivered) + len(d.lost)) for d in found])
-    ends = np.array([wilson(len(d.delivered), len(d.delivered) + len(d.lost)) for d in found])
+def delivery_figure(data: FigureData) -> Picture:
+    """Draw the share of messages delivered in each direction with its interval, and the share lost
+    over time.
+
+    Raises UnavailableError without messages.
+    """
+    directions = _require_messages(data)
+    delivered = np.array([len(direction.delivered) for direction in directions])
+    totals = delivered + np.array([len(direction.lost) for direction in directions])
+    shares = delivered / totals
     figure = new_figure(8.4, 4.2)
     left, right = figure.subplots(1, 2, width_ratios=[1.3, 1.0])
-    outside = _draw_shares(left, subject, found, shares, ends)
-    _draw_loss(right, found, _last_time(subject))
-    total = sum(len(d.delivered) + len(d.lost) for d in found)
-    arrived = sum(len(d.delivered) for d in found)
-    claim = f"{arrived / total:.1%} of {total:,} messages arrived"
+    misses = _draw_shares(left, data, directions, shares)
+    _draw_losses(right, directions, _last_time(data))
+    claim = f"{delivered.sum() / totals.sum():.1%} of {totals.sum():,} messages arrived"
     if shares.min() < shares.max():
         claim += f"; by direction between {shares.min():.0%} and {shares.max():.0%}"
     note = "Intervals: Wilson, 95%."
-    if outside is not None:
-        note += f" {outside} of {len(found)} intervals miss what the channel of the scenario says."
-    finish_figure(figure, subject.claim(claim), subject.caption(note))
+    if misses is not None:
+        note += f" {misses} of {len(directions)} intervals exclude the scenario's probability."
+    finish_figure(figure, data.title(claim), data.caption(note))
     return figure
 
 
 def _draw_shares(
-    axes: Any, subject: Subject, found: list[DirectedMessages], shares: FloatArray, ends: FloatArray
+    axes: Any, data: FigureData, directions: list[DirectedMessages], shares: FloatArray
 ) -> int | None:
-    """Draw the directions in the order of their shares; return how many intervals miss the stated
-    probability, None if none is stated.
+    """Draw the delivered ``shares`` (L,) of the directions in increasing order, with intervals.
+
+    Return the number of intervals that exclude the delivery probability of the scenario, None if it
+    has none.
     """
     order = np.argsort(shares, kind="stable")
-    positions = np.arange(len(order))
-    axes.vlines(
-        positions,
-        *ends[order].T,
-        color=SKY,
-        lw=max(0.4, min(3.0, 150.0 / len(order))),
-        label="95% interval",
+    directions = [directions[k] for k in order.tolist()]
+    low, high = np.transpose(
+        [wilson_interval(len(d.delivered), len(d.delivered) + len(d.lost)) for d in directions]
     )
+    positions = np.arange(len(order))
+    width = max(0.4, min(3.0, 150.0 / len(order)))
+    axes.vlines(positions, low, high, color=SKY, lw=width, label="95% interval")
     axes.plot(positions, shares[order], ls="", marker=".", color=INK, ms=4, label="delivered")
-    said = np.array([_stated_delivery(subject, found[k]) for k in order.tolist()])
-    outside = None
-    if np.isfinite(said).any():
+    probabilities = np.array([_delivery_probability(data, d) for d in directions])
+    misses = None
+    if np.isfinite(probabilities).any():
         style = {"ls": "", "marker": "_", "ms": 5, "color": SENSING}
-        axes.plot(positions, said, **style, label="the channel of the scenario")
-        outside = int(((said < ends[order, 0]) | (said > ends[order, 1])).sum())
+        axes.plot(positions, probabilities, **style, label="the channel of the scenario")
+        misses = int(((probabilities < low) | (probabilities > high)).sum())
     axes.set_ylim(-0.02, 1.04)
-    if len(found) <= 16:
-        names = [f"{found[k].sender}>{found[k].receiver}" for k in order.tolist()]
-        axes.set_xticks(positions, names, fontsize=6.5, rotation=90 if len(found) > 8 else 0)
+    if len(directions) <= MAX_LABELLED:
+        names = [f"{d.sender}>{d.receiver}" for d in directions]
+        rotation = 90 if len(directions) > 8 else 0
+        axes.set_xticks(positions, names, fontsize=6.5, rotation=rotation)
         axes.set_xlabel("direction, sender > receiver")
     else:
-        axes.set_xlabel(f"{len(found)} directions, in the order of their share")
+        axes.set_xlabel(f"{len(directions)} directions, in the order of their share")
     axes.set_ylabel("share of messages delivered")
     draw_legend(axes)
-    return outside
+    return misses
 
 
-def _stated_delivery(subject: Subject, one: DirectedMessages) -> float:
-    """Return the delivery probability that the scenario gives a direction; nan if it varies."""
-    link = one.sender, one.receiver
-    loss = subject.scenario.network.channel.loss
+def _delivery_probability(data: FigureData, direction: DirectedMessages) -> float:
+    """Return the mean delivery probability of a direction by the scenario's channel, nan if the
+    channel does not say it.
+    """
+    link = direction.sender, direction.receiver
+    loss = data.scenario.network.channel.loss
     try:
-        return float(loss.mean_delivery(link, subject.scenario.table_probability(link)))
-    except (ArithmeticError, LookupError, TypeError, ValueError):  # a loss of the user's
+        return float(loss.mean_delivery(link, data.scenario.table_probability(link)))
+    except (ArithmeticError, LookupError, TypeError, ValueError):  # in a user's class of losses
         return float("nan")
 
 
-def _draw_loss(axes: Any, found: list[DirectedMessages], end: float) -> None:
-    """Draw the share of messages that were lost in each of TIME_BINS bins, with intervals."""
+def _draw_losses(axes: Any, directions: list[DirectedMessages], end: float) -> None:
+    """Draw the share of messages lost in each of TIME_BINS equal intervals until ``end`` seconds,
+    with intervals of confidence.
+    """
     edges = np.linspace(0.0, end, TIME_BINS + 1)
-    lost, arrived = (
-        np.histogram(np.concatenate([getattr(d, name) for d in found]), edges)[0]
-        for name in ("lost", "delivered")
-    )
-    full = np.flatnonzero(lost + arrived)
-    ends = np.array([wilson(int(lost[k]), int(lost[k] + arrived[k])) for k in full.tolist()])
-    centres = 0.5 * (edges[1:] + edges[:-1])[full]
-    axes.fill_between(centres, *ends.T, color=FAINT, alpha=0.6, lw=0, label="95% interval")
-    share = (lost / np.maximum(lost + arrived, 1))[full]
-    axes.plot(centres, share, color=LOST, marker=".", label="lost in each part of the time")
-    whole = lost.sum() / max(int((lost + arrived).sum()), 1)
-    axes.axhline(whole, color=MUTED, ls="--", lw=1.0, label="lost in all")
-    axes.set_ylim(0.0, min(1.02, 1.3 * max(float(ends.max()), 0.02)))
+    lost = np.histogram(np.concatenate([d.lost for d in directions]), edges)[0]
+    totals = lost + np.histogram(np.concatenate([d.delivered for d in directions]), edges)[0]
+    bins = np.flatnonzero(totals)
+    low, high = np.transpose([wilson_interval(int(lost[k]), int(totals[k])) for k in bins.tolist()])
+    centres = 0.5 * (edges[1:] + edges[:-1])[bins]
+    axes.fill_between(centres, low, high, color=FAINT, alpha=0.6, lw=0, label="95% interval")
+    shares = lost[bins] / totals[bins]
+    axes.plot(centres, shares, color=LOST, marker=".", label="lost in each part of the time")
+    overall = lost.sum() / max(int(totals.sum()), 1)
+    axes.axhline(overall, color=MUTED, ls="--", lw=1.0, label="lost in all")
+    axes.set_ylim(0.0, min(1.02, 1.3 * max(float(high.max()), 0.02)))
     axes.set(xlabel=SECONDS, ylabel="share of messages lost")
     draw_legend(axes, 1)

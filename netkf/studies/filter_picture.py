@@ -6,7 +6,14 @@ import math
 from typing import Any
 
 from netkf.core.printable import shorten
-from netkf.figures.style import BLUE, MUTED, finish_figure, look, new_figure, write
+from netkf.figures.style import (
+    BLUE,
+    MUTED,
+    finish_figure,
+    new_figure,
+    style_context,
+    write_figure,
+)
 from netkf.scenario.scenario import Scenario
 from netkf.studies.compare_filters import ComparedFilter, CompletedComparison
 
@@ -23,7 +30,7 @@ def filter_picture(scenario: Scenario, completed: CompletedComparison) -> None:
     side; bars are two standard errors.
     """
     rows = [row for row in completed.comparison.rows if row.ran]
-    with look():
+    with style_context():
         figure = new_figure(9.6, 1.7 + 0.34 * len(rows))
         panels = figure.subplots(1, len(PANELS) + 1, sharey=True)
         for axes, (name, label) in zip(panels, PANELS, strict=False):
@@ -34,7 +41,7 @@ def filter_picture(scenario: Scenario, completed: CompletedComparison) -> None:
         panels[0].invert_yaxis()
         runs = f"{completed.comparison.runs:,} runs on the same draws; bars: two standard errors."
         finish_figure(figure, _claim(rows), [f"{scenario.name}: {runs}"])
-    write(figure, completed.directory / "filters.png")
+    write_figure(figure, completed.directory / "filters.png")
 
 
 def _claim(rows: list[ComparedFilter]) -> str:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+from netkf.figures.figure_data import UnavailableError
 from netkf.figures.stability import sweep_figure
-from netkf.figures.style import look, write
-from netkf.figures.subject import UnavailableError
+from netkf.figures.style import style_context, write_figure
 from netkf.studies.sweep import CompletedSweep
 
 
@@ -15,9 +15,9 @@ def sweep_picture(title: str, completed: CompletedSweep) -> bool:
     bound; over two keys a map of the largest RMS error.
     """
     try:
-        with look():
+        with style_context():
             figure = sweep_figure(title, completed.table, completed.keys, "complete")
     except UnavailableError:
         return False
-    write(figure, completed.directory / "sweep.png")
+    write_figure(figure, completed.directory / "sweep.png")
     return True

@@ -9,7 +9,7 @@ import pytest
 import netkf
 from netkf.cli.main import main
 from netkf.figures.catalogue import FIGURES, FigureSet
-from netkf.figures.style import look
+from netkf.figures.style import style_context
 from tests.figures.conftest import KINDS
 
 SLACK = 1.0
@@ -44,7 +44,7 @@ def shown_texts(figure):
 
 
 def assert_well_laid_out(figure):
-    with look():
+    with style_context():
         figure.draw(figure.canvas.get_renderer())
     texts = shown_texts(figure)
     width, height = figure.bbox.width, figure.bbox.height
@@ -83,7 +83,7 @@ SAYS = {
     "interrupted": ("error", "Interrupted: "),
     "diverged": ("error", "Diverged: "),
     "ring": ("nis", "NIS per row of a reading is"),
-    "ensemble": ("age", "Events are those of single runs"),
+    "ensemble": ("age", "Only single runs have events"),
     "slots": ("stability", "There is no map of the bound H(12)"),
 }
 

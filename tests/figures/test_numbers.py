@@ -8,9 +8,9 @@ import scipy.stats
 
 import netkf
 from netkf.algorithms.models import FlowModel
-from netkf.figures.traffic import ages_of, messages_by_direction, wilson
-from netkf.runs.increments import ExpectedIncrements
-from netkf.runs.innovations import autocorrelation, compute_innovations
+from netkf.figures.traffic import age_of_information, messages_by_direction, wilson_interval
+from netkf.runs.increments import Expectations
+from netkf.runs.innovations import autocorrelation, innovations
 from netkf.studies.consistency import run_consistency
 from tests.conftest import SCENARIOS
 from tests.figures.conftest import one_node
@@ -29,7 +29,7 @@ def test_the_age_of_information_is_that_of_a_plain_loop(results, kind):
         for e in heard.itertuples():
             newest[fine >= e.t] = np.maximum(newest[fine >= e.t], e.t - np.nan_to_num(e.age))
         expected = fine - newest
-        found = ages_of(run.log, node, end)
+        found = age_of_information(run.log, node, end)
         edges = np.linspace(0.0, end, 9)
         parts = np.split(expected, 8)
         step = 2.0 * end / len(fine)
@@ -61,7 +61,7 @@ def test_wilson_is_the_formula(k, n):
     z, p = scipy.stats.norm.ppf(0.975), k / n
     centre = (p + z * z / (2 * n)) / (1 + z * z / n)
     half = z / (1 + z * z / n) * np.sqrt(p * (1 - p) / n + z * z / (4 * n * n))
-    np.testing.assert_allclose(wilson(k, n), (centre - half, centre + half), atol=1e-12)
+    np.testing.assert_allclose(wilson_interval(k, n), (centre - half, centre + half), atol=1e-12)
 
 
 def test_innovations_are_those_of_a_plain_kalman_filter(results):

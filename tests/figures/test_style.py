@@ -8,7 +8,15 @@ import pytest
 from matplotlib.colors import to_rgb
 
 from netkf.figures.catalogue import FigureSet
-from netkf.figures.style import RELAY, SENSING, SERIES, break_lines, look, new_figure, text_width
+from netkf.figures.style import (
+    RELAY,
+    SENSING,
+    SERIES,
+    break_lines,
+    new_figure,
+    style_context,
+    text_width,
+)
 
 # Machado, Oliveira and Fernandes (2009), severity 1.0, on linear RGB.
 EYES = {
@@ -101,7 +109,7 @@ def test_names_are_no_formulas_and_have_no_control_characters():
     figure = new_figure()
     written = break_lines("costs $5$ \x1b[31m \n and _{x}", 300.0, 9.0)
     text = figure.text(0.1, 0.5, written)
-    with look():
+    with style_context():
         figure.draw(figure.canvas.get_renderer())
     assert "\x1b" not in text.get_text()
     assert mpl.cbook.is_math_text(text.get_text()) is False

@@ -47,13 +47,13 @@ def test_a_limit_without_the_delay_says_so(build, tmp_path):
 def test_the_picture_uses_the_words_of_the_table(build, tmp_path):
     from matplotlib.figure import Figure
 
+    from netkf.figures.figure_data import reduce_completed_run
     from netkf.figures.panels import draw_covariances
-    from netkf.figures.subject import subject_of_completed
 
     scenario = weighted(build, tmp_path)
     axes = Figure().add_subplot()
     completed = run_to_directory(scenario, tmp_path / "out")
-    draw_covariances(axes, subject_of_completed(scenario, completed))
+    draw_covariances(axes, reduce_completed_run(scenario, completed))
     assert "weighted limit (not S of H(13))" in axes.get_legend_handles_labels()[1]
 
 
