@@ -61,7 +61,7 @@ def _declare(parser: argparse.ArgumentParser) -> None:
 
 def _run(options: argparse.Namespace) -> int:
     """Check the promises of a scenario; return the exit status, 1 if one is broken."""
-    from netkf.runs.directory_lock import only_writer
+    from netkf.runs.directory_lock import lock_directory
 
     # Promises are checked at other times than those of ``probe``, which therefore need not fit the
     # horizon; ``--set`` may have changed it.

@@ -49,7 +49,7 @@ def _declare(parser: argparse.ArgumentParser) -> None:
 
 def _run(options: argparse.Namespace) -> int:
     """Compare filters in the directory of ``--out``, if any; return the exit status."""
-    from netkf.runs.directory_lock import only_writer
+    from netkf.runs.directory_lock import lock_directory
 
     with lock_directory(options.out, must_be_empty=True):
         return _compare(options)
@@ -60,7 +60,7 @@ def _compare(options: argparse.Namespace) -> int:
 
     The table is printed even if its files cannot be written.
     """
-    from netkf.scenario.values import typed_values
+    from netkf.scenario.values import parse_values
     from netkf.studies.compare_filters import compare_filters, write_comparison
     from netkf.studies.tables import filters_text
 

@@ -71,9 +71,9 @@ def _run(options: argparse.Namespace) -> int:
     if options.resume and options.out is None:
         remedy = "add --out DIR with the directory of the run that was stopped"
         raise ScenarioError("--resume", "needs the directory of the runs", None, remedy)
-    from netkf.runs.directory_lock import only_writer
+    from netkf.runs.directory_lock import lock_directory
 
-    with only_writer(options.out):
+    with lock_directory(options.out):
         return _run_ensemble(scenario, options) if is_ensemble else _run_once(scenario, options)
 
 
@@ -188,7 +188,7 @@ def _describe_divergence(completed: CompletedRun) -> str:
     listed += ", ..." if len(ids) > MAX_LISTED_NODES else ""
     nodes = f"node{'s' if len(ids) > 1 else ''} {listed}"
     problem = f"estimate or covariance of {nodes} is no longer finite"
-    if samples.ended_finite:
+    if samples.is_finite_at_end:
         problem = f"covariance of {nodes} is no longer positive semidefinite"
     rounding = ""
     if samples.rounding_from is not None:

@@ -63,7 +63,7 @@ def _run(options: argparse.Namespace) -> int:
 
     Raises ScenarioError for ``--node`` without ``--at``, or the reverse.
     """
-    from netkf.runs.directory_lock import only_writer
+    from netkf.runs.directory_lock import lock_directory
 
     if (options.node is None) != (options.at is None):
         remedy = "give both, or neither for the worst sample"

@@ -117,7 +117,7 @@ def draw_nis(axes: Any, innovations: Innovations) -> tuple[float, float]:
     )
     has_readings = freedom > 0.0
     centres = 0.5 * (edges[1:] + edges[:-1])[has_readings]
-    low, high = chi_square_means(freedom[has_readings], CONFIDENCE)
+    low, high = chi_square_interval(freedom[has_readings], CONFIDENCE)
     axes.fill_between(
         centres,
         low,
@@ -136,7 +136,7 @@ def draw_nis(axes: Any, innovations: Innovations) -> tuple[float, float]:
         axes.set_ylim(bottom=max(axes.get_ylim()[0], 1e-3))
     axes.set(ylabel="NIS / rows of a reading", xlabel=SECONDS)
     draw_legend(axes)
-    low, high = chi_square_means(rows, CONFIDENCE)
+    low, high = chi_square_interval(rows, CONFIDENCE)
     share = float(((nis / rows >= low) & (nis / rows <= high)).mean())
     return share, float(nis.sum() / rows.sum())
 

@@ -272,7 +272,7 @@ def _draw_ratios(
         scale * NORMAL_QUANTILE * np.array([_known_or_zero(row.get(f"{key}_se")) for row in rows])
     )
     axes.hlines(positions, np.minimum(values, 1.0), np.maximum(values, 1.0), color=FAINT, lw=0.8)
-    has_sensor = np.array([row["node"] in data.scenario.placed for row in rows])
+    has_sensor = np.array([row["node"] in data.scenario.placed_sensors for row in rows])
     for group, colour, marker, label in (
         (has_sensor, SENSING, "s", "with a sensor"),
         (~has_sensor, RELAY, "o", "without a sensor"),

@@ -94,7 +94,7 @@ class FigureData:
     @cached_property
     def has_sensor(self) -> np.ndarray:
         """(N,) bool: True for nodes with a sensor."""
-        return np.array([node in self.scenario.placed for node in self.nodes])
+        return np.array([node in self.scenario.placed_sensors for node in self.nodes])
 
     @cached_property
     def averaged(self) -> np.ndarray:

@@ -303,8 +303,8 @@ def _hears_one_sensor(scenario: Scenario) -> np.ndarray:
     }
     return np.array(
         [
-            node not in scenario.placed
-            and sum(len(scenario.placed.get(i, ())) for i in neighbours[node]) == 1
+            node not in scenario.placed_sensors
+            and sum(len(scenario.placed_sensors.get(i, ())) for i in neighbours[node]) == 1
             for node in scenario.nodes
         ]
     )

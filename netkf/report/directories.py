@@ -16,8 +16,8 @@ from netkf.core.printable import shorten
 from netkf.ensembles.stored import StoredEnsemble
 from netkf.linalg.arrays import FloatArray
 from netkf.report.worst import WorstSamples, find_worst_samples
-from netkf.runs.documents import NUMBER, TEXT, TEXTS, require
-from netkf.runs.stored import StoredRun, read_form
+from netkf.runs.documents import NUMBER, TEXT, TEXTS, require_form
+from netkf.runs.stored import StoredRun, read_checked_document
 from netkf.runs.summary import PromisedTraces
 from netkf.runs.tables import COLUMNS
 from netkf.scenario.scenario import Scenario
@@ -151,10 +151,10 @@ def read_source(directory: Path, replica: int | None = None, trust: bool = False
     verdict = None
     if (directory / "verdict.json").exists():
         with damage_named(directory):
-            verdict = read_form(directory, "verdict.json", VERDICT)
+            verdict = read_checked_document(directory, "verdict.json", VERDICT)
     if stored.summary:
         with damage_named(directory):
-            require(stored.summary, SUMMARY, "summary.json")
+            require_form(stored.summary, SUMMARY, "summary.json")
     run, ensemble = _choose_run(stored, replica)
     scenario = stored.scenario
     assert isinstance(scenario, Scenario)

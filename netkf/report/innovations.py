@@ -64,7 +64,7 @@ def node_means(readings: Innovations) -> NodeMeans:
     )
     # Sums of NIS are chi-square if P is exact. Nodes share the noise of the plant, so the sums are
     # dependent: Bonferroni's inequality makes the limits hold together.
-    low, high = chi_square_means(freedom, 1.0 - (1.0 - CONFIDENCE) / max(1, len(nodes)))
+    low, high = chi_square_interval(freedom, 1.0 - (1.0 - CONFIDENCE) / max(1, len(nodes)))
     return NodeMeans(nodes, sums / freedom, low, high)
 
 

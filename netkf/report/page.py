@@ -191,7 +191,9 @@ def _compare(entries: list[_Entry], directories: Sequence[str | Path]) -> Compar
     """Return the comparison of two entries, the reason why there is none, or None for one entry."""
     if len(entries) < 2:
         return None
-    have_ended = all(entry.source.status in ENDED and entry.source.summary for entry in entries)
+    have_ended = all(
+        entry.source.status in FINAL_STATUSES and entry.source.summary for entry in entries
+    )
     return compare(directories) if have_ended else "A run did not finish, so nothing is compared"
 
 

@@ -85,7 +85,9 @@ def summary_section(source: ReportSource) -> str:
 
 def _summary_cells(row: dict[str, Any]) -> list[str]:
     """Return the values of a row of the summary with their standard errors as text."""
-    return [format_number(row[key]) + standard_error(row.get(f"{key}_se")) for key in COLUMNS]
+    return [
+        format_number(row[key]) + format_standard_error(row.get(f"{key}_se")) for key in COLUMNS
+    ]
 
 
 def _bound_notes(source: ReportSource) -> list[str]:
@@ -194,7 +196,7 @@ def filters_table(comparison: StoredComparison) -> str:
 
 def _quantity_cells(quantity: Quantity) -> list[str]:
     """Return the value, its difference and whether the difference is certain as three texts."""
-    value = format_number(quantity.value) + standard_error(quantity.se)
+    value = format_number(quantity.value) + format_standard_error(quantity.se)
     if not math.isfinite(quantity.difference):
         return [value, "-", "-"]
     interval = f"{format_number(quantity.low)} .. {format_number(quantity.high)}"
@@ -254,7 +256,7 @@ def ensemble_curves(source: ReportSource) -> dict[str, Any] | None:
             "nees": _interval_curves(ensemble.mean_nees[:, k], ensemble.se_nees[:, k]),
         }
         if ensemble.bound is not None:
-            nodes[str(node)]["bound"] = finite(ensemble.bound[:, k].tolist())
+            nodes[str(node)]["bound"] = to_json_value(ensemble.bound[:, k].tolist())
     interval = list(nees_bounds(source.scenario.plant.n, max(1, source.runs)))
     return {"times": ensemble.times.tolist(), "nodes": nodes, "nees_interval": interval}
 
@@ -280,7 +282,7 @@ def difference_curves(source_a: ReportSource, source_b: ReportSource) -> dict[st
     half_width = float(stdtrit(freedom, 1.0 - level)) * error
     curves = (difference, difference - half_width, difference + half_width)
     nodes = {
-        str(node): [finite(curve[:, k].tolist()) for curve in curves]
+        str(node): [to_json_value(curve[:, k].tolist()) for curve in curves]
         for k, node in enumerate(first.nodes)
     }
     return {"confidence": CONFIDENCE, "times": first.times.tolist(), "nodes": nodes}
@@ -307,7 +309,7 @@ def _interval_curves(mean: Any, error: Any) -> list[list[float | None]]:
     """
     half_width = INTERVAL_WIDTH * np.asarray(error, dtype=float)
     curves = (np.asarray(mean, dtype=float), mean - half_width, mean + half_width)
-    return [finite(curve.tolist()) for curve in curves]
+    return [to_json_value(curve.tolist()) for curve in curves]
 
 
 def sweep_curves(source: ReportSource) -> dict[str, Any] | None:

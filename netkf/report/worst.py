@@ -104,7 +104,7 @@ def summary_samples(run: StoredRun, summary: Mapping[str, Any]) -> SampleIndices
     """Return the indices of the samples that the averages in summary.json are taken over."""
     rounding_from = summary.get("rounding_from")
     end = math.inf if rounding_from is None else float(rounding_from)
-    return averaged_samples(run.times, end, run.count("diverged") > 0)
+    return select_averaged_samples(run.times, end, run.count("diverged") > 0)
 
 
 class WorstSamples(NamedTuple):
