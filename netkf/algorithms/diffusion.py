@@ -203,6 +203,7 @@ class DiffusionFilter(Filter):
     one_way: ClassVar[bool] = True
     inverts: ClassVar[bool] = True
     slot_kernel = staticmethod(diffusion_slots)
+    unrolled: ClassVar[bool] = True
 
     def slot_arrays(
         self, states: Sequence[Any], infos: Sequence[NodeInfo], runs: int

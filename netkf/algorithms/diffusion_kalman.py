@@ -115,6 +115,7 @@ class DiffusionKalman(Filter):
     first_slot: ClassVar[int] = 1
     one_way: ClassVar[bool] = True
     slot_kernel = staticmethod(diffusion_kalman_slots)
+    unrolled: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         super().__post_init__()

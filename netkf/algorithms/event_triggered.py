@@ -348,6 +348,7 @@ class EventTriggeredCi(Filter):
     one_way: ClassVar[bool] = True
     inverts: ClassVar[bool] = True
     slot_kernel = staticmethod(triggered_ci_slots)
+    unrolled: ClassVar[bool] = True
 
     def decides_in_slots(self) -> bool:
         """Return True."""

@@ -101,6 +101,7 @@ class Gossip(Filter):
     first_slot: ClassVar[int] = 1
     pairwise: ClassVar[bool] = True
     slot_kernel = staticmethod(gossip_slots)
+    unrolled: ClassVar[bool] = True
 
     def absorb(self, state: State, messages: Sequence[Message], exchange: Exchange) -> State:
         """Replace the node's pair by the partner's, predicted to now."""

@@ -365,7 +365,7 @@ def first_parts(state: ConsensusState, reading: Reading) -> FloatArray:
     shares, counts = state.recipe
     parts = np.zeros((2, len(shares), 1, n, n + 1, 1))
     begin_part_single(
-        nodes, readings, slot_scratch(1, n, ONE), ConsensusArrays(1, shares, counts, parts)
+        nodes, readings, slot_scratch(1, n, False, ONE), ConsensusArrays(1, shares, counts, parts)
     )
     return parts[0, :, 0, :, :, 0]
 

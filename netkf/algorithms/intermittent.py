@@ -124,6 +124,7 @@ class Intermittent(Filter):
     needs_samples: ClassVar[bool] = True
     newest_only: ClassVar[bool] = False
     slot_kernel = staticmethod(intermittent_slots)
+    unrolled: ClassVar[bool] = True
 
     def sends_in_slots(self, phase: int, has_sensor: bool) -> bool:
         """Return True: nodes send their readings."""

@@ -144,6 +144,7 @@ class Kcf(Filter):
     one_way: ClassVar[bool] = True
     needs_samples: ClassVar[bool] = True
     slot_kernel = staticmethod(kcf_slots)
+    unrolled: ClassVar[bool] = True
 
     def slot_arrays(
         self, states: Sequence[Any], infos: Sequence[NodeInfo], runs: int

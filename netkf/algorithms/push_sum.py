@@ -855,7 +855,9 @@ def correct_root_alone(root: FloatArray, information: FloatArray) -> FloatArray:
     """
     n = len(root)
     result, information_lanes = (np.array(a).reshape(1, 1, n, n, 1) for a in (root, information))
-    correct_root_single(result, information_lanes, np.empty((n, n, 1)), slot_scratch(1, n, ONE))
+    correct_root_single(
+        result, information_lanes, np.empty((n, n, 1)), slot_scratch(1, n, False, ONE)
+    )
     return np.asarray(result.reshape(n, n))
 
 

@@ -423,6 +423,7 @@ class BarShalomCampo(Filter):
     fixed_sensors: ClassVar[bool] = True
     needs_network: ClassVar[bool] = True  # for the compiled slots alone
     slot_kernel = staticmethod(track_slots)
+    unrolled: ClassVar[bool] = True
 
     def slot_arrays(
         self, states: Sequence[Any], infos: Sequence[NodeInfo], runs: int

@@ -49,7 +49,7 @@ def test_prediction(seed, n):
     random = np.random.default_rng(seed)
     nodes, _ = filters(random, n, 1)
     before = [estimates(nodes, 1, q) for q in range(LANES)]
-    slots.predict_all(nodes, slots.slot_scratch(2, n), 0)
+    slots.predict_all(nodes, slots.slot_scratch(2, n, unrolled=True), 0)
     for q, (x, P) in enumerate(before):
         found, cov = estimates(nodes, 1, q)
         expected = nodes.F @ P @ nodes.F.T + nodes.root_Q @ nodes.root_Q.T
@@ -64,7 +64,7 @@ def test_a_lane_is_the_same_in_any_company(n):
     random = np.random.default_rng(n)
     nodes, _ = filters(random, n, 1)
     roots = nodes.root[0, 0].copy()
-    slots.predict_all(nodes, slots.slot_scratch(2, n), 0)
+    slots.predict_all(nodes, slots.slot_scratch(2, n, unrolled=True), 0)
     for q in range(LANES):
         alone = slots.predict_root_alone(roots[:, :, q], nodes.F, nodes.root_Q)
         np.testing.assert_array_equal(np.tril(alone), np.tril(nodes.root[0, 0, :, :, q]))
@@ -83,7 +83,7 @@ def test_update_with_a_whitened_reading(seed, n, p):
     random = np.random.default_rng(seed)
     nodes, readings = filters(random, n, p)
     before = [estimates(nodes, 0, q) for q in range(LANES)]
-    slots.read_all(nodes, readings, slots.slot_scratch(2, n), 0, 0)
+    slots.read_all(nodes, readings, slots.slot_scratch(2, n, unrolled=True), 0, 0)
     for q, (x, P) in enumerate(before):
         y, H = readings.y[0, 0, 0, :, q], readings.H[0, 0, 0, :, :, q]
         gain = P @ H.T @ np.linalg.inv(H @ P @ H.T + np.eye(p))
@@ -136,7 +136,7 @@ def test_samples_show_the_covariance_and_frames_move_estimates(seed, n, framed):
     # Who sends is nobody's choice.
     nothing = np.zeros((0,) * 5, dtype=np.uint8), np.zeros((0,) * 5), slots.WHOLE
     plan = slots.SlotPlan(0, flags, flags, np.array([0]), up, *nothing)
-    room = slots.slot_scratch(2, n)
+    room = slots.slot_scratch(2, n, unrolled=True)
     slots.store_sample_of_slot(nodes, plan, samples, room, 0, 0)
     xhat, error = (v.reshape(runs, 2, n) for v in (samples.xhat, samples.error))
     P, before = samples.P.reshape(runs, 2, n, n), nodes.xhat.copy()

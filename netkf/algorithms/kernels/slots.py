@@ -176,17 +176,16 @@ class SlotScratch(NamedTuple):
     sample_rows: np.ndarray
 
 
-def slot_scratch(H: int, n: int, lanes: Lanes = MANY) -> SlotScratch:
-    """Return scratch for H filters of n states."""
+def slot_scratch(H: int, n: int, unrolled: bool, lanes: Lanes = MANY) -> SlotScratch:
+    """Return scratch for H filters of n states; ``unrolled``: of a type that knows a small n."""
     L = len(lanes)
     shapes: list[tuple[int, ...]] = [*[(n, L)] * 3, *[(n, n, L)] * 2, *[(n, n + 1, L)] * 2]
     shapes += [(H, n, L), (H, n, n, L)]
     # L entries are copied at a time, so that the last copy may go beyond the last entry.
     shapes += [(H * n + L, L), (H * n + L, L), (H * n * n + L, L)]
     scratch: list[Any] = [aligned(shape) for shape in shapes]
-    # Compile for each small n separately only for batches of runs, where it pays off; not for n =
-    # 1.
-    size = sized(n) if n > 1 and lanes == MANY else np.zeros(n)
+    # Loops over one state need no unrolling.
+    size = sized(n) if unrolled and n > 1 else np.zeros(n)
     return SlotScratch._make([size, lanes, *scratch, np.zeros(L, dtype=np.int64)])
 
 

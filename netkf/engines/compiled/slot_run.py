@@ -114,7 +114,7 @@ class SlotRuns:
             setup.root_Q,
             setup.rows,
         )
-        self._scratch = slot_scratch(setup.estimators, setup.n)
+        self._scratch = slot_scratch(setup.estimators, setup.n, setup.algorithm.unrolled)
         self._filter_arrays = setup.algorithm.slot_arrays(setup.states, setup.infos, runs)
         # NEVER: a slot that no run reaches, for a node that never stops.
         self._stopped = np.full((blocks, setup.estimators, LANES), NEVER)
