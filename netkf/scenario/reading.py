@@ -14,7 +14,7 @@ from netkf.core.errors import ScenarioError
 from netkf.core.fields import as_path
 from netkf.scenario.imports import Origin
 from netkf.scenario.scenario import Scenario
-from netkf.scenario.tables import MAX_DEPTH, build_scenario, explain_left_over, with_changes
+from netkf.scenario.tables import MAX_DEPTH, build_scenario, change_table, explain_left_over
 
 MAX_BYTES = 64 << 20  # of a scenario file
 MAX_DOTS = 100  # in a dotted key: tomllib takes minutes and gigabytes for very many
@@ -51,7 +51,7 @@ def load(
         rule, remedy = "must be a table", 'give values by key: {"horizon": 10.0}'
         raise ScenarioError("changes", rule, value, remedy)
     try:
-        return from_table(with_changes(_parse_file(path), changes), path.parent, trust)
+        return from_table(change_table(_parse_file(path), changes), path.parent, trust)
     except ScenarioError as error:
         raise explain_left_over(error, changes).in_file(str(path)) from None
 

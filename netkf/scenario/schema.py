@@ -1,7 +1,7 @@
-"""A JSON Schema of scenario files, made of the dataclasses and the rules of their fields.
+"""A JSON Schema of scenario files, built from the dataclasses and the rules of their fields.
 
-It is for editors: it knows keys, kinds, types and ranges. What only the scenario as a whole can
-tell (shapes, positive definiteness, nodes that exist, files) is checked when it is loaded.
+It is for editors: it covers keys, kinds, types and ranges. Shapes of matrices, positive
+definiteness, ids of nodes and files are only checked when a scenario is loaded.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ from netkf.scenario.tables import FORMAT
 
 Schema = dict[str, Any]
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
-CUSTOM = "^[A-Za-z_][\\w.]*:[A-Za-z_]\\w*$"
-"""Pattern of a kind that is a class of the user."""
-OPTIONAL_KIND = {"sensor": "linear"}
-"""Kinds that are meant where a table of the family names none."""
-OWN_TABLES: dict[tuple[type[Component], str], Schema] = {
+USER_CLASS = "^[A-Za-z_][\\w.]*:[A-Za-z_]\\w*$"
+"""Pattern of a kind that is a user's class, "package.module:Class"."""
+DEFAULT_KINDS = {"sensor": "linear"}
+"""The kind of a table without the key ``kind``, by family; other families need the key."""
+NESTED_TABLES: dict[tuple[type[Component], str], Schema] = {
     (ScenarioModel, "plant"): {"$ref": "#/$defs/plant"},
     (ScenarioModel, "sensors"): {"type": "array", "items": {"$ref": "#/$defs/sensor"}},
     (ScenarioModel, "network"): {"$ref": "#/$defs/network"},
@@ -41,7 +41,7 @@ OWN_TABLES: dict[tuple[type[Component], str], Schema] = {
     (Filtering, "model"): {"$ref": "#/$defs/model"},
     (Filter, "inner"): {"$ref": "#/$defs/filter"},
 }
-"""Keys whose values are tables with kinds of their own, or with keys of another class."""
+"""Schemas of keys (class, key) whose values are tables of components."""
 SAMPLING: Schema = {"anyOf": [{"const": "continuous"}, {"$ref": "#/$defs/sampling"}]}
 FAMILIES = {
     "plant": ("plant", "continuous plant"),
@@ -53,12 +53,18 @@ FAMILIES = {
     "delay": ("delay",),
     "filter": ("filter",),
 }
-"""The families of registry.KINDS that one table of a file can be of."""
+"""The families of registry.KINDS that a table can belong to, by the table's name in ``$defs``."""
 
 
-class KeyOf(NamedTuple):
-    """A key of a table: its ``name``, the ``schema`` of its value, the text of its ``rule`` and the
-    ``description`` of its class; ``required`` if it has no default.
+class TableKey(NamedTuple):
+    """A key of a table in a scenario file.
+
+    name        the key
+    schema      JSON Schema of its value
+    rule        what its value must be, as text; "" if anything
+    description sentences of the docstring of its class; "" if there are none
+    required    True if it has no default
+    default     its default, None if it has none
     """
 
     name: str
@@ -71,166 +77,174 @@ class KeyOf(NamedTuple):
 
 def scenario_schema() -> Schema:
     """Return the JSON Schema (draft 2020-12) of scenario files."""
-    keys = keys_of(Scenario)
-    whole = _table_schema(
-        keys, first={"format": {"const": FORMAT, "description": "The file format."}}
-    )
-    whole["required"] = ["format", *(name for name in whole["required"] if name != "sensors")]
-    families = {name: _family_schema(name, parts) for name, parts in FAMILIES.items()}
-    tables = {
-        "network": _table_schema(keys_of(Network)),
-        "channel": _table_schema(keys_of(Channel)),
-        "model": _table_schema(keys_of(Belief)),
-    }
+    scenario_keys = list_keys(Scenario)
+    file_format = {"const": FORMAT, "description": "The file format."}
+    file_schema = _table_schema(scenario_keys, constants={"format": file_format})
+    # A scenario without sensors may leave out the list.
+    required = [name for name in file_schema["required"] if name != "sensors"]
+    file_schema["required"] = ["format", *required]
+    definitions = {name: _family_schema(name, families) for name, families in FAMILIES.items()}
+    definitions["network"] = _table_schema(list_keys(Network))
+    definitions["channel"] = _table_schema(list_keys(Channel))
+    definitions["model"] = _table_schema(list_keys(Belief))
     return {
         "$schema": DIALECT,
         "title": "netkf scenario",
         "description": summary(Scenario),
-        **whole,
-        "allOf": _kinds_of_time(),
-        "$defs": {**families, **tables},
+        **file_schema,
+        "allOf": _kind_of_time_rules(),
+        "$defs": definitions,
     }
 
 
-def keys_of(cls: type[Component]) -> list[KeyOf]:
+def list_keys(cls: type[Component]) -> list[TableKey]:
     """Return the keys of a table that is read as an object of this class."""
-    text = documentation(cls)
+    docstring = plain_docstring(cls)
     keys = []
     for field in dataclasses.fields(cls):
         if not field.init:
             continue
         rule: Rule | None = field.metadata.get("rule")
-        own = _own_table(cls, field.name)
-        schema = own or ({} if rule is None else dict(rule.schema))
+        schema = _nested_table_schema(cls, field.name)
+        requirement = "a table"
+        if schema is None:
+            schema = {} if rule is None else dict(rule.schema)
+            requirement = "" if rule is None else rule.requirement.removeprefix("must be ")
         required = field.default is dataclasses.MISSING
         default = None if required else field.default
-        requirement = "a table" if own else ""
-        if rule is not None and not own:
-            requirement = rule.requirement.removeprefix("must be ")
-        description = describe(text, field.name)
-        keys.append(KeyOf(field.name, schema, requirement, description, required, default))
+        description = describe_field(docstring, field.name)
+        keys.append(TableKey(field.name, schema, requirement, description, required, default))
     return keys
 
 
-def _own_table(cls: type[Component], name: str) -> Schema | None:
-    """Return the schema of a key that is a table of its own, None for other keys."""
-    if name == "sampling":
+def _nested_table_schema(cls: type[Component], key: str) -> Schema | None:
+    """Return the schema of a key of ``cls`` whose value is a component's table, else None."""
+    if key == "sampling":
         return SAMPLING
-    return next((s for (c, n), s in OWN_TABLES.items() if issubclass(cls, c) and n == name), None)
+    for (owner, name), schema in NESTED_TABLES.items():
+        if issubclass(cls, owner) and name == key:
+            return schema
+    return None
 
 
 def _table_schema(
-    keys: Sequence[KeyOf], first: Mapping[str, Schema] = MappingProxyType({})
+    keys: Sequence[TableKey], constants: Mapping[str, Schema] = MappingProxyType({})
 ) -> Schema:
-    """Return the schema of a table with these keys and no others."""
+    """Return the schema of a table with these keys and no others.
+
+    ``constants`` are schemas of further keys, not required, which come first.
+    """
     return {
         "type": "object",
-        "properties": {**first, **{key.name: _key_schema(key) for key in keys}},
+        "properties": {**constants, **{key.name: _value_schema(key) for key in keys}},
         "required": [key.name for key in keys if key.required],
         "additionalProperties": False,
     }
 
 
-def _key_schema(key: KeyOf) -> Schema:
+def _value_schema(key: TableKey) -> Schema:
     """Return the schema of the value of a key, with its description and its default."""
-    known = key.rule and key.rule != "a table"
-    sentences = [key.description, f"Must be {key.rule}." if known else ""]
-    found = {**key.schema, "description": " ".join(filter(None, sentences))}
-    if not found["description"]:
-        del found["description"]
+    has_rule = key.rule and key.rule != "a table"
+    sentences = [key.description, f"Must be {key.rule}." if has_rule else ""]
+    schema = dict(key.schema)
+    if any(sentences):
+        schema["description"] = " ".join(filter(None, sentences))
     if isinstance(key.default, (bool, int, float, str)):
-        found["default"] = key.default
-    return found
+        schema["default"] = key.default
+    return schema
 
 
-def _family_schema(name: str, parts: Sequence[str]) -> Schema:
-    """Return the schema of a table whose ``kind`` says which keys it has."""
-    shared = [key for key in keys_of(Filtering) if key.name != "algorithm"]
-    shared = shared if name == "filter" else []
+def _family_schema(name: str, families: Sequence[str]) -> Schema:
+    """Return the schema of a table whose ``kind`` decides which keys it has.
+
+    ``name`` is that of the table, ``families`` are those of its kinds in registry.KINDS.
+    """
+    shared_keys: list[TableKey] = []
+    if name == "filter":  # the table also has the initial estimate and the model
+        shared_keys = [key for key in list_keys(Filtering) if key.name != "algorithm"]
     variants = [
-        _kind_schema(kind, cls, shared, OPTIONAL_KIND.get(name) == kind)
-        for part in parts
-        for kind, cls in KINDS[part].items()
+        _kind_schema(kind, cls, shared_keys, is_default=DEFAULT_KINDS.get(name) == kind)
+        for family in families
+        for kind, cls in KINDS[family].items()
     ]
-    custom = {"type": "string", "pattern": CUSTOM, "description": "A class, package.module:Class."}
-    own = {"type": "object", "properties": {"kind": custom}, "required": ["kind"]}
-    return {"anyOf": [*variants, {"title": "a class of your own", **own}]}
+    description = "A class, package.module:Class."
+    kind_schema = {"type": "string", "pattern": USER_CLASS, "description": description}
+    user_class = {"type": "object", "properties": {"kind": kind_schema}, "required": ["kind"]}
+    return {"anyOf": [*variants, {"title": "a class of your own", **user_class}]}
 
 
 def _kind_schema(
-    kind: str, cls: type[Component], shared: Sequence[KeyOf], optional: bool
+    name: str, cls: type[Component], shared_keys: Sequence[TableKey], is_default: bool
 ) -> Schema:
-    """Return the schema of one kind of a family."""
-    name, choice = split_choice(kind)
-    first = {key: {"const": value} for key, value in {"kind": name, **choice}.items()}
-    found = _table_schema([*keys_of(cls), *shared], first=first)
-    if not optional:
-        found["required"] = [*first, *found["required"]]
-    return {"title": kind, "description": summary(cls), **found}
+    """Return the schema of a table of one name in registry.KINDS, read as an object of ``cls``.
+
+    Its key ``kind`` may be missing if ``is_default``.
+    """
+    kind, choice = split_choice(name)
+    constants = {key: {"const": value} for key, value in {"kind": kind, **choice}.items()}
+    schema = _table_schema([*list_keys(cls), *shared_keys], constants=constants)
+    if not is_default:
+        schema["required"] = [*constants, *schema["required"]]
+    return {"title": name, "description": summary(cls), **schema}
 
 
-def _kinds_of_time() -> list[Schema]:
-    """Return the rules that bind activations and filters to the kind of time of the plant."""
+def _kind_of_time_rules() -> list[Schema]:
+    """Return if-then schemas: the kind of time of the plant limits activation and filter."""
     recorded = {"enum": ["recorded", "unknown"]}
 
-    def plant(kind: Schema, *keys: str) -> Schema:
+    def plant_schema(kind: Schema, *keys: str) -> Schema:
         """Return the schema of scenarios whose plant is of this kind and has these keys."""
-        has = {"properties": {"kind": kind}, "required": ["kind", *keys]}
-        return {"properties": {"plant": has}, "required": ["plant"]}
+        plant = {"properties": {"kind": kind}, "required": ["kind", *keys]}
+        return {"properties": {"plant": plant}, "required": ["plant"]}
 
-    def then(activations: str, filters: Sequence[str]) -> Schema:
-        """Return the schema that limits activation and filter to these kinds."""
-        limits = {"activation": _kind_among(list_kinds(activations))}
-        network = {"type": "object", "properties": limits}
-        return {"properties": {"network": network, "filter": _kind_among(filters)}}
+    def limit_kinds(activations: Sequence[str], filters: Sequence[str]) -> Schema:
+        """Return the schema of scenarios whose activation and filter are of these kinds."""
+        activation = {"activation": _component_schema(activations)}
+        network = {"type": "object", "properties": activation}
+        return {"properties": {"network": network, "filter": _component_schema(filters)}}
 
-    slots = {"anyOf": [plant({"const": "linear"}), plant(recorded, "F")]}
-    flow = {"anyOf": [plant({"const": "diffusion"}), plant(recorded, "A")]}
-    clocked = {
-        split_choice(name)[0]: None
+    in_slots = {"anyOf": [plant_schema({"const": "linear"}), plant_schema(recorded, "F")]}
+    continuous = {"anyOf": [plant_schema({"const": "diffusion"}), plant_schema(recorded, "A")]}
+    clocked_filters = dict.fromkeys(
+        split_choice(name)[0]
         for name, cls in KINDS["filter"].items()
         if getattr(cls, "clocks", ()) or not getattr(cls, "talks", True)
-    }
-    return [
-        {"if": slots, "then": then("slot activation", list_kinds("slot filter"))},
-        {"if": flow, "then": then("activation", [*clocked])},
-    ]
+    )
+    slot_limits = limit_kinds(list_kinds("slot activation"), list_kinds("slot filter"))
+    clock_limits = limit_kinds(list_kinds("activation"), [*clocked_filters])
+    return [{"if": in_slots, "then": slot_limits}, {"if": continuous, "then": clock_limits}]
 
 
-def _kind_among(kinds: Sequence[str]) -> Schema:
+def _component_schema(kinds: Sequence[str]) -> Schema:
     """Return the schema of a table whose kind is one of these or a user's class."""
-    kind = {"anyOf": [{"enum": [*kinds]}, {"type": "string", "pattern": CUSTOM}]}
+    kind = {"anyOf": [{"enum": [*kinds]}, {"type": "string", "pattern": USER_CLASS}]}
     return {"type": "object", "properties": {"kind": kind}}
 
 
-def documentation(cls: type) -> str:
-    """Return the docstring of a class, plain text."""
+def plain_docstring(cls: type) -> str:
+    """Return the docstring of a class without indentation, `code` in single backquotes."""
     return inspect.cleandoc(cls.__doc__ or "").replace("``", "`")
 
 
 def summary(cls: type) -> str:
     """Return the first paragraph of the docstring of a class as one line."""
-    return " ".join(documentation(cls).split("\n\n")[0].split())
+    return " ".join(plain_docstring(cls).split("\n\n")[0].split())
 
 
-def describe(text: str, name: str) -> str:
-    """Return what a docstring says about a field: its entry in a list of fields, or the sentences
-    that name it.
+def describe_field(docstring: str, name: str) -> str:
+    """Return the sentences of a docstring about the field ``name`` on one line, "" if none.
+
+    They are its entry in a list of fields, ``name  description``, where continuation lines are
+    indented, or else all sentences that contain its name in backquotes.
     """
-    entry = re.search(rf"^{re.escape(name)}  +(.+(?:\n +.*)*)", text, flags=re.MULTILINE)
+    entry = re.search(rf"^{re.escape(name)}  +(.+(?:\n +.*)*)", docstring, flags=re.MULTILINE)
     if entry:
-        return _sentence(entry.group(1))
-    found = [sentence for sentence in _sentences(text) if f"`{name}`" in sentence]
-    return " ".join(found)
+        line = " ".join(entry.group(1).split())
+        return line if line.endswith(".") else f"{line}."
+    return " ".join(s for s in _iterate_sentences(docstring) if f"`{name}`" in s)
 
 
-def _sentences(text: str) -> Iterator[str]:
-    """Yield the sentences of a docstring."""
-    for paragraph in text.split("\n\n"):
+def _iterate_sentences(docstring: str) -> Iterator[str]:
+    """Yield the sentences of a docstring, each on one line; a colon may end one too."""
+    for paragraph in docstring.split("\n\n"):
         yield from re.split(r"(?<=[.:])\s+(?=[A-Z`])", " ".join(paragraph.split()))
-
-
-def _sentence(text: str) -> str:
-    """Return the text on one line with a full stop."""
-    plain = " ".join(text.split())
-    return plain if plain.endswith(".") else f"{plain}."

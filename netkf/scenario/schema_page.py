@@ -1,4 +1,4 @@
-"""The reference of scenario files as a Markdown page, from the same source as their schema."""
+"""The reference page of all keys of scenario files (Markdown), built from their schema."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from netkf.network.channels import Channel
 from netkf.scenario.model import Belief, Filtering, Network
 from netkf.scenario.registry import KINDS
 from netkf.scenario.scenario import Scenario
-from netkf.scenario.schema import KeyOf, keys_of, summary
+from netkf.scenario.schema import TableKey, list_keys, summary
 from netkf.scenario.writing import part_as_table, toml_text
 
 TABLES: dict[str, type[Component]] = {
@@ -19,6 +19,7 @@ TABLES: dict[str, type[Component]] = {
     "filter, beside its kind": Filtering,
     "filter.model": Belief,
 }
+"""Classes of the tables without a kind, by heading."""
 SECTIONS = {
     "plant": "plant.kind",
     "continuous plant": "plant.kind in continuous time, with A and B",
@@ -31,45 +32,46 @@ SECTIONS = {
     "delay": "network.channel.delay.kind",
     "filter": "filter.kind",
 }
-"""Headings by the families of registry.KINDS."""
+"""Headings of the tables with a kind, by their families in registry.KINDS."""
 
 
 def schema_page() -> str:
-    """Return the page: a section for each table, with its kinds and their keys."""
-    return "\n".join(_page_lines())
+    """Return the page as Markdown: a section for each table, with its kinds and their keys."""
+    return "\n".join(_iterate_page_lines())
 
 
-def _page_lines() -> Iterator[str]:
+def _iterate_page_lines() -> Iterator[str]:
     """Yield the lines of the page."""
     yield "# Keys of scenario files"
     yield ""
     yield "`netkf schema --markdown` prints this page. Keys whose default is a dash must be given."
     for heading, cls in TABLES.items():
-        keys = [key for key in keys_of(cls) if key.name != "algorithm"]
+        keys = [key for key in list_keys(cls) if key.name != "algorithm"]
         yield from ("", f"## {heading}", "", summary(cls), "")
-        yield from _table_lines(keys)
+        yield from _iterate_table_lines(keys)
     for family, heading in SECTIONS.items():
         yield from ("", f"## {heading}")
         for kind, cls in KINDS[family].items():
             yield from ("", f"### {kind}", "", summary(cls))
-            keys = keys_of(cls)
+            keys = list_keys(cls)
             if keys:
                 yield ""
-                yield from _table_lines(keys)
+                yield from _iterate_table_lines(keys)
     yield ""
 
 
-def _table_lines(keys: Sequence[KeyOf]) -> Iterator[str]:
-    """Yield the lines of a table of keys."""
+def _iterate_table_lines(keys: Sequence[TableKey]) -> Iterator[str]:
+    """Yield the lines of a Markdown table with one row per key."""
     yield "| key | value | default | |"
     yield "|---|---|---|---|"
     for key in keys:
         cells = [f"`{key.name}`", key.rule, _format_default(key), key.description]
-        yield f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells)} |"
+        escaped = [cell.replace("|", "\\|") for cell in cells]
+        yield f"| {' | '.join(escaped)} |"
 
 
-def _format_default(key: KeyOf) -> str:
-    """Return the default of a key as text."""
+def _format_default(key: TableKey) -> str:
+    """Return the default of a key as text: "-" if it must be given, "none" if it may be absent."""
     if key.required:
         return "-"
     if isinstance(key.default, Component):

@@ -1,4 +1,9 @@
-"""Tables of TOML to a scenario: every mistake is found here, with the path of its key."""
+"""Building a scenario from the tables of a file; errors name the path of the wrong key.
+
+Tables are built from the inside out. A table whose class must not be imported yet gives WAITING
+instead of an object, and so does every table that contains it; the other keys are checked all the
+same.
+"""
 
 from __future__ import annotations
 
@@ -18,16 +23,16 @@ from netkf.scenario.plugins import describe_error, explain_user_error, is_netkf_
 from netkf.scenario.registry import KINDS, SLOTTED, find_kind, list_names_of_kind
 from netkf.scenario.writing import as_table, part_as_table
 
-FORMAT = 1
-MAX_DEPTH = 30
-"""Tables and lists within one another."""
+FORMAT = 1  # version of scenario files
+MAX_DEPTH = 30  # of tables and lists inside one another
 UNKNOWN = "is not a key here"
 TABLES = ("plant", "network", "filter")
+FILTERING_KEYS = ("mean", "cov", "model")  # in the table of a filter, beside those of its kind
 
 WAITING = object()
-"""Stands for a part whose class waits for its import, and for what holds such a part."""
+"""Stands for an object whose class is not imported yet, or that contains such an object."""
 
-# The class to build is a parameter, so that Scenario.replace can call this module.
+# The class to build is a parameter: this module cannot import Scenario, which imports it.
 S = TypeVar("S", bound=DerivedScenario)
 
 
@@ -38,13 +43,16 @@ def change_keys(scenario: S, changes: Mapping[str, Any]) -> S:
         folder = next((s.folder for s in source_files(scenario)), Path.cwd())
     try:
         origin = Origin(folder, getattr(scenario, "_trust", True))
-        return build_scenario(type(scenario), with_changes(as_table(scenario), changes), origin)
+        return build_scenario(type(scenario), change_table(as_table(scenario), changes), origin)
     except ScenarioError as error:
         raise explain_left_over(error, changes) from None
 
 
 def explain_left_over(error: ScenarioError, changes: Mapping[str, Any]) -> ScenarioError:
-    """Return the error, reworded if a change of kind left keys of the former kind behind."""
+    """Return ``error``, reworded if it is about a key that a change of kind left behind.
+
+    ``changes`` are the changed values by key path.
+    """
     table = error.key.rpartition(".")[0]
     if error.rule != UNKNOWN or f"{table}.kind" not in changes or error.key in changes:
         return error
@@ -53,20 +61,23 @@ def explain_left_over(error: ScenarioError, changes: Mapping[str, Any]) -> Scena
     return ScenarioError(error.key, rule, error.value, remedy, error.file)
 
 
-def source_files(part: Any) -> list[SourceFile]:
-    """Return every file that a scenario names."""
-    if isinstance(part, SourceFile):
-        return [part]
-    if isinstance(part, tuple):
-        return [source for item in part for source in source_files(item)]
-    if isinstance(part, Component):
-        values = [getattr(part, field.name) for field in dataclasses.fields(part)]
-        return [source for value in values for source in source_files(value)]
+def source_files(value: Any) -> list[SourceFile]:
+    """Return all files that a scenario, or a value inside one, refers to."""
+    if isinstance(value, SourceFile):
+        return [value]
+    if isinstance(value, tuple):
+        return [source for item in value for source in source_files(item)]
+    if isinstance(value, Component):
+        items = [getattr(value, field.name) for field in dataclasses.fields(value)]
+        return [source for item in items for source in source_files(item)]
     return []
 
 
-def with_changes(table: dict[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a copy of the table with the values at some key paths replaced or added."""
+def change_table(table: dict[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a copy of the tables of a file with the values at key paths replaced or added.
+
+    Raises ScenarioError for a path through a value that is neither a table nor a list.
+    """
     for path, value in changes.items():
         keys = path.replace("[", ".").replace("]", "").split(".")
         if len(keys) > MAX_DEPTH:
@@ -77,25 +88,30 @@ def with_changes(table: dict[str, Any], changes: Mapping[str, Any]) -> dict[str,
     return table
 
 
-def _set_key(node: Any, keys: list[str], value: Any, path: str) -> Any:
-    """Return a copy of a nested table in which the value at a key path is replaced or added."""
+def _set_key(target: Any, keys: list[str], value: Any, path: str) -> Any:
+    """Return a copy of a table, list or component in which one inner value is replaced or added.
+
+    ``keys`` lead to that value; a missing table on the way is added. ``path`` names the key path
+    in errors.
+    """
     if not keys:
         return value
-    if isinstance(node, Component):
-        node = part_as_table(node)
-    key, rest = keys[0], keys[1:]
-    if isinstance(node, (list, tuple)):
-        if not key.isdecimal() or int(key) >= len(node):
+    if isinstance(target, Component):
+        target = part_as_table(target)
+    key, inner_keys = keys[0], keys[1:]
+    if isinstance(target, (list, tuple)):
+        if not key.isdecimal() or int(key) >= len(target):
             raise ScenarioError(
-                path, f"has no entry {key!r} in a list of {len(node)}", None, "count from 0"
+                path, f"has no entry {key!r} in a list of {len(target)}", None, "count from 0"
             )
         index = int(key)
-        return [*node[:index], _set_key(node[index], rest, value, path), *node[index + 1 :]]
-    if node is None:
-        node = {}
-    if not isinstance(node, dict) or not key:
+        entry = _set_key(target[index], inner_keys, value, path)
+        return [*target[:index], entry, *target[index + 1 :]]
+    if target is None:
+        target = {}
+    if not isinstance(target, dict) or not key:
         raise ScenarioError(path, "is not a key path of a scenario", None, "see the file's keys")
-    return {**node, key: _set_key(node.get(key), rest, value, path)}
+    return {**target, key: _set_key(target.get(key), inner_keys, value, path)}
 
 
 def build_scenario(cls: type[S], table: Mapping[str, Any], origin: Origin) -> S:
@@ -103,95 +119,98 @@ def build_scenario(cls: type[S], table: Mapping[str, Any], origin: Origin) -> S:
 
     Raises ScenarioError, with the path of the key, for the first mistake.
     """
-    # Importing a module executes it, and a file that is refused must execute nothing.
+    # Importing a module executes it, and a file that is refused must execute nothing: everything
+    # is checked without imports first.
     scenario = _build(cls, table, origin._replace(imports=False))
     if scenario is WAITING:
         scenario = _build(cls, table, origin)
-    # What replace needs to look up files and modules.
+    # Scenario.replace needs these to look up files and modules.
     object.__setattr__(scenario, "_folder", origin.folder)
     object.__setattr__(scenario, "_trust", origin.trust)
-    made: S = scenario
-    return made
+    result: S = scenario
+    return result
 
 
-def _build(cls: type[S], given: Mapping[str, Any], origin: Origin) -> Any:
-    """Return the scenario of a table."""
-    table = dict(given)
-    version = table.pop("format", None)
+def _build(cls: type[S], table: Mapping[str, Any], origin: Origin) -> Any:
+    """Return a scenario of class ``cls`` from the tables of a file, or WAITING."""
+    values = dict(table)
+    version = values.pop("format", None)
     if version is None:
         raise ScenarioError("format", "is missing", None, f"write format = {FORMAT} first")
     if integer()("format", version) != FORMAT:
         raise ScenarioError("format", f"must be {FORMAT}", version, "this netkf reads no other")
-    table.setdefault("sensors", [])
-    time = ""
-    if "plant" in table:
-        table["plant"] = _read_under("plant", lambda value: _plant(value, origin), table["plant"])
-        time = "slot " if isinstance(table["plant"], SLOTTED) else ""
-        time = "unknown" if table["plant"] is WAITING else time
-    readers: dict[str, Callable[[Any], Any]] = {
-        "sensors": lambda value: _list(value, origin),
-        "network": lambda value: _network(value, origin, time),
-        "filter": lambda value: _filtering(value, origin),
+    values.setdefault("sensors", [])
+    if "plant" in values:
+        values["plant"] = _call_under("plant", partial(_build_plant, origin), values["plant"])
+    plant = values.get("plant")
+    time = "slot " if isinstance(plant, SLOTTED) else ""
+    if plant is WAITING:
+        time = "unknown"
+    builders: dict[str, Callable[[Any], Any]] = {
+        "sensors": partial(_build_sensors, origin),
+        "network": partial(_build_network, origin, time),
+        "filter": partial(_build_filtering, origin),
     }
-    for key, reader in readers.items():
-        if key in table:
-            table[key] = _read_under(key, reader, table[key])
-    return _part(cls, table, origin, ("format",))
+    for key, builder in builders.items():
+        if key in values:
+            values[key] = _call_under(key, builder, values[key])
+    return _build_object(cls, values, origin, ("format",))
 
 
-def _read_under(key: str, reader: Any, value: Any) -> Any:
-    """Return ``reader(value)``; errors that it raises get ``key`` in front of their own."""
+def _call_under(key: str, builder: Callable[[Any], Any], value: Any) -> Any:
+    """Return ``builder(value)``; put ``key`` before the keys of ScenarioErrors that it raises."""
     try:
-        return reader(value)
+        return builder(value)
     except ScenarioError as error:
         raise error.under(key) from None
 
 
-def _part(
-    cls: type[Any], table: dict[str, Any], origin: Origin, others: tuple[str, ...] = ()
+def _build_object(
+    cls: type[Any], values: dict[str, Any], origin: Origin, other_keys: tuple[str, ...] = ()
 ) -> Any:
-    """Return an object of a class, or WAITING if a part of it waits.
+    """Return an object of class ``cls`` with fields ``values``, or WAITING if one of them waits.
 
-    ``others`` are keys that stand in the same table and are read elsewhere.
+    ``other_keys`` are keys of the same table in the file that were taken out of ``values``; an
+    error about an unknown key lists them too.
     """
     fields = {f.name: f for f in dataclasses.fields(cls) if f.init}
-    for key, value in table.items():
+    for key, value in values.items():
         if key not in fields:
-            known = ", ".join([*others, *fields])
-            hint = nearest(key, [*others, *fields])
-            raise ScenarioError(key, UNKNOWN, value, f"{hint}keys are {known}")
+            allowed_keys = [*other_keys, *fields]
+            remedy = f"{nearest(key, allowed_keys)}keys are {', '.join(allowed_keys)}"
+            raise ScenarioError(key, UNKNOWN, value, remedy)
     for name, field in fields.items():
-        if field.default is dataclasses.MISSING and name not in table:
+        if field.default is dataclasses.MISSING and name not in values:
             remedy = f"add [{name}]" if name in TABLES else f"add {name} = ..."
             raise ScenarioError(name, "is missing", None, remedy)
-    values = {
-        name: SourceFile(value, origin.folder)
-        if fields[name].metadata.get("rule") is source_file and isinstance(value, str)
-        else value
-        for name, value in table.items()
-    }
+    rules = {name: fields[name].metadata.get("rule") for name in values}
+    values = dict(values)
+    for name, value in values.items():
+        if rules[name] is source_file and isinstance(value, str):
+            values[name] = SourceFile(value, origin.folder)
     if any(map(_is_waiting, values.values())):
+        # No object can be made yet, but mistakes in other fields are found before any import.
         for name, value in values.items():
-            rule = fields[name].metadata.get("rule")
+            rule = rules[name]
             if rule is not None and not _is_waiting(value):
                 rule(name, value)
         return WAITING
-    return _make_part(cls, values)
+    return _construct(cls, values)
 
 
 def _is_waiting(value: Any) -> bool:
-    """Return True if a class of the value is not known yet."""
+    """Return True if a value is WAITING or a tuple that contains it."""
     return value is WAITING or (isinstance(value, tuple) and any(map(_is_waiting, value)))
 
 
-def _make_part(cls: type[Any], values: dict[str, Any]) -> Any:
-    """Return an object of the class with these fields; other errors become ScenarioError."""
+def _construct(cls: type[Any], values: dict[str, Any]) -> Any:
+    """Return ``cls(**values)``; errors in users' classes are raised as ScenarioError."""
     try:
         return cls(**values)
     except ScenarioError:
         raise
     except Exception as error:
-        # A class of the user's failed, this one or one that the scenario asked.
+        # The user's class is this one, or one of the values, whose methods a check called.
         rule = f"{cls.__name__} could not be made ({describe_error(error)})"
         if is_netkf_class(cls):
             rule = explain_user_error(tuple(values.values()), error) or ""
@@ -200,38 +219,48 @@ def _make_part(cls: type[Any], values: dict[str, Any]) -> Any:
         raise ScenarioError("", rule, None, "correct the class or its settings") from error
 
 
-def _plant(value: Any, origin: Origin) -> Any:
-    """Return the plant of a table."""
-    table = _table(value)
-    known = table.get("kind") in ("recorded", "unknown")
-    continuous = known and ("A" in table or "B" in table)
-    return _kind("continuous plant" if continuous else "plant", origin, table)
+def _build_plant(origin: Origin, value: Any) -> Any:
+    """Return the plant of a table, or WAITING."""
+    table = _as_dict(value)
+    # Two kinds exist for both kinds of time; the keys tell which one is meant.
+    in_both_times = table.get("kind") in ("recorded", "unknown")
+    continuous = in_both_times and ("A" in table or "B" in table)
+    return _build_component("continuous plant" if continuous else "plant", origin, table)
 
 
-def _kind(
-    family: str, origin: Origin, value: Any, default: str | None = None, inner: bool = False
+def _build_component(
+    family: str,
+    origin: Origin,
+    value: Any,
+    default_kind: str | None = None,
+    is_inner: bool = False,
 ) -> Any:
-    """Read a part by its kind; an ``inner`` one stands inside another of its family."""
-    table = _table(value)
-    kind = table.pop("kind", default)
+    """Return the component of a table with the key ``kind``, or WAITING.
+
+    ``family`` is one of registry.KINDS. ``is_inner`` says that the table is the key ``inner`` of
+    another filter; it then has no keys of ``Filtering``.
+    """
+    table = _as_dict(value)
+    kind = table.pop("kind", default_kind)
     if kind is None:
         raise ScenarioError("kind", "is missing", None, 'add kind = "..."')
     cls = find_kind(family, kind, origin, table)
-    keys = [key for choice in list_names_of_kind(family, kind).values() for key in choice]
-    others = ("kind", *dict.fromkeys(keys))
-    for key in others[1:]:
+    # Keys that choose among classes of one kind have done their work; they are no fields.
+    choices = list_names_of_kind(family, kind).values()
+    choice_keys = dict.fromkeys(key for choice in choices for key in choice)
+    for key in choice_keys:
         del table[key]
-    if family == "filter" and not inner:
-        others = (*others, "mean", "cov", "model")
+    other_keys = ("kind", *choice_keys)
+    if family == "filter" and not is_inner:
+        other_keys = (*other_keys, *FILTERING_KEYS)
     if family == "filter" and isinstance(table.get("inner"), (Mapping, Component)):
-        table["inner"] = _read_under(
-            "inner", partial(_kind, family, origin, inner=True), table["inner"]
-        )
-    return WAITING if cls is None else _part(cls, table, origin, others)
+        builder = partial(_build_component, family, origin, is_inner=True)
+        table["inner"] = _call_under("inner", builder, table["inner"])
+    return WAITING if cls is None else _build_object(cls, table, origin, other_keys)
 
 
-def _table(value: Any) -> dict[str, Any]:
-    """Return a value as a new dictionary; raises ScenarioError unless it is a table."""
+def _as_dict(value: Any) -> dict[str, Any]:
+    """Return a table or component as a new dictionary; raises ScenarioError for other values."""
     if isinstance(value, Component):
         return part_as_table(value)
     if not isinstance(value, Mapping):
@@ -239,72 +268,76 @@ def _table(value: Any) -> dict[str, Any]:
     return dict(value)
 
 
-def _list(value: Any, origin: Origin) -> tuple[Any, ...]:
-    """Return the sensors of a list of tables."""
+def _build_sensors(origin: Origin, value: Any) -> tuple[Any, ...]:
+    """Return the sensors of a list of tables; those whose class is not imported are WAITING."""
     if not isinstance(value, (list, tuple)):
         raise ScenarioError("", "must be a list of tables", value, "write [[sensors]]")
-    return tuple(
-        _read_under(f"[{k}]", lambda item: _sensor(item, origin), item)
-        for k, item in enumerate(value)
-    )
+    builder = partial(_build_sensor, origin)
+    return tuple(_call_under(f"[{k}]", builder, item) for k, item in enumerate(value))
 
 
-def _sensor(value: Any, origin: Origin) -> Any:
-    """Return the sensor of a table, with its sampling clock."""
-    table = _table(value)
+def _build_sensor(origin: Origin, value: Any) -> Any:
+    """Return the sensor of a table with its sampling clock, or WAITING."""
+    table = _as_dict(value)
     if isinstance(table.get("sampling"), (Mapping, Component)):
-        read = partial(_kind, "sampling", origin)
-        table["sampling"] = _read_under("sampling", read, table["sampling"])
-    return _kind("sensor", origin, table, "linear")
+        builder = partial(_build_component, "sampling", origin)
+        table["sampling"] = _call_under("sampling", builder, table["sampling"])
+    return _build_component("sensor", origin, table, default_kind="linear")
 
 
-def _network(value: Any, origin: Origin, time: str) -> Network:
-    """Return the network of a table; ``time`` tells plants in slots from continuous ones."""
-    table = _table(value)
-    if "graph" in table:
-        table["graph"] = _read_under("graph", partial(_kind, "graph", origin), table["graph"])
-    if "activation" in table:
-        read = partial(_activation, origin, time)
-        table["activation"] = _read_under("activation", read, table["activation"])
-    if "channel" in table:
-        table["channel"] = _read_under("channel", lambda v: _channel(v, origin), table["channel"])
-    network: Network = _part(Network, table, origin)
-    return network
+def _build_network(origin: Origin, time: str, value: Any) -> Any:
+    """Return the network of a table, or WAITING; ``time`` is as in ``_build_activation``."""
+    table = _as_dict(value)
+    builders: dict[str, Callable[[Any], Any]] = {
+        "graph": partial(_build_component, "graph", origin),
+        "activation": partial(_build_activation, origin, time),
+        "channel": partial(_build_channel, origin),
+    }
+    for key, builder in builders.items():
+        if key in table:
+            table[key] = _call_under(key, builder, table[key])
+    return _build_object(Network, table, origin)
 
 
-def _activation(origin: Origin, time: str, value: Any) -> Any:
-    """Return the activation of a table, of the plant's kind of time."""
-    if time == "unknown":  # the plant waits
-        kind = _table(value).get("kind")
-        homes = [
-            t for t in ("", "slot ") if isinstance(kind, str) and kind in KINDS[f"{t}activation"]
+def _build_activation(origin: Origin, time: str, value: Any) -> Any:
+    """Return the activation of a table, or WAITING.
+
+    ``time`` is the plant's kind of time as the prefix of the family "activation": "slot ", "" for
+    continuous time, or "unknown" if the plant is WAITING.
+    """
+    if time == "unknown":
+        kind = _as_dict(value).get("kind")
+        times = [
+            prefix
+            for prefix in ("", "slot ")
+            if isinstance(kind, str) and kind in KINDS[f"{prefix}activation"]
         ]
-        if len(homes) > 1:
+        if len(times) > 1:
             return WAITING
-        time = homes[0] if homes else ""
-    return _kind(f"{time}activation", origin, value)
+        time = times[0] if times else ""
+    return _build_component(f"{time}activation", origin, value)
 
 
-def _channel(value: Any, origin: Origin) -> Channel:
-    """Return the channel of a table."""
-    table = _table(value)
+def _build_channel(origin: Origin, value: Any) -> Any:
+    """Return the channel of a table, or WAITING."""
+    table = _as_dict(value)
     for family in ("loss", "delay"):
         if family in table:
-            table[family] = _read_under(family, partial(_kind, family, origin), table[family])
-    channel: Channel = _part(Channel, table, origin)
-    return channel
+            builder = partial(_build_component, family, origin)
+            table[family] = _call_under(family, builder, table[family])
+    return _build_object(Channel, table, origin)
 
 
-def _filtering(value: Any, origin: Origin) -> Filtering:
-    """Return the filter of a table with its start and model."""
-    table = _table(value)
-    shared: dict[str, Any] = {
-        key: table.pop(key) for key in ("mean", "cov", "model") if key in table
-    }
-    if "model" in shared:
-        shared["model"] = _read_under(
-            "model", lambda v: _part(Belief, _table(v), origin), shared["model"]
+def _build_filtering(origin: Origin, value: Any) -> Any:
+    """Return the filter of a table with its initial estimate and model, or WAITING.
+
+    The keys of ``Filtering`` and those of the algorithm are in one table of the file.
+    """
+    table = _as_dict(value)
+    values = {key: table.pop(key) for key in FILTERING_KEYS if key in table}
+    if "model" in values:
+        values["model"] = _call_under(
+            "model", lambda v: _build_object(Belief, _as_dict(v), origin), values["model"]
         )
-    algorithm = _kind("filter", origin, table)
-    filtering: Filtering = _part(Filtering, {"algorithm": algorithm, **shared}, origin)
-    return filtering
+    algorithm = _build_component("filter", origin, table)
+    return _build_object(Filtering, {"algorithm": algorithm, **values}, origin)

@@ -1,4 +1,4 @@
-"""A scenario as TOML, so that a run directory holds the scenario of the run."""
+"""Writing of scenarios: the tables of a scenario file, and their TOML text."""
 
 from __future__ import annotations
 
@@ -21,12 +21,17 @@ from netkf.scenario.registry import FAMILIES, FORMER, name_of
 
 
 def as_table(scenario: DerivedScenario) -> dict[str, Any]:
-    """Return the tables of a scenario file without fields at their defaults."""
-    return _scenario(scenario, scenario.plant, scenario.network, scenario.filter, defaults=False)
+    """Return the tables of the file of a scenario, without values equal to their defaults."""
+    return _scenario_table(
+        scenario, scenario.plant, scenario.network, scenario.filter, with_defaults=False
+    )
 
 
 def resolve_defaults(scenario: DerivedScenario) -> dict[str, Any]:
-    """Return the tables of a scenario file with all defaults; it gives the same runs."""
+    """Return the tables of the file of a scenario with all defaults written out.
+
+    It gives the same runs, also if defaults of netkf change.
+    """
     network = scenario.network
     if isinstance(network.graph, RandomGraph) and network.graph.seed is None:
         graph = dataclasses.replace(network.graph, seed=scenario.seed)
@@ -37,131 +42,158 @@ def resolve_defaults(scenario: DerivedScenario) -> dict[str, Any]:
         mean=plant.start_mean if filtering.mean is None else filtering.mean,
         cov=plant.start_cov if filtering.cov is None else filtering.cov,
     )
-    # No second scenario is made of the parts: it would build and check the whole network again.
-    return _scenario(scenario, _fill_start(scenario), network, filtering, defaults=True)
+    # A second Scenario of these parts would build and check the whole network again.
+    resolved_plant = _resolve_plant(scenario)
+    return _scenario_table(scenario, resolved_plant, network, filtering, with_defaults=True)
 
 
-def _fill_start(scenario: DerivedScenario) -> Plant:
-    """Return the plant with the mean and covariance of x(0) written out."""
+def _resolve_plant(scenario: DerivedScenario) -> Plant:
+    """Return the plant with the mean and covariance of x(0) and the sensing period filled in."""
     plant = scenario.plant if scenario.slotted else scenario.diffusion
     return dataclasses.replace(plant, mean=plant.start_mean, cov=plant.start_cov)
 
 
-def _scenario(
-    scenario: DerivedScenario, plant: Plant, network: Network, filtering: Filtering, defaults: bool
+def _scenario_table(
+    scenario: DerivedScenario,
+    plant: Plant,
+    network: Network,
+    filtering: Filtering,
+    with_defaults: bool,
 ) -> dict[str, Any]:
-    """Return the table of a scenario with these parts."""
-    table = _fields(scenario, defaults)
-    table["plant"] = _kind("plant", plant, defaults)
-    table["sensors"] = [_sensor(sensor, defaults) for sensor in scenario.sensors]
-    table["network"] = _network(network, defaults)
-    table["filter"] = _filtering(filtering, defaults)
+    """Return the tables of the file of a scenario, with these components instead of its own."""
+    table = _field_values(scenario, with_defaults)
+    table["plant"] = _kind_table("plant", plant, with_defaults)
+    table["sensors"] = [_sensor_table(sensor, with_defaults) for sensor in scenario.sensors]
+    table["network"] = _network_table(network, with_defaults)
+    table["filter"] = _filter_table(filtering, with_defaults)
     return {"format": 1, **table}
 
 
 def part_as_table(part: Component) -> dict[str, Any]:
-    """Return the table of a scenario file for a part: a plant, a sensor, a filter, a network and
-    everything inside one, or a Filtering or Belief; without fields at their defaults.
+    """Return the table of a component of a scenario, without values equal to their defaults.
+
+    ``part`` is a plant, sensor, filter or network, a component inside one of these, a Filtering or
+    a Belief.
     """
     if isinstance(part, Network):
-        return _network(part, defaults=False)
+        return _network_table(part, with_defaults=False)
     if isinstance(part, Channel):
-        return _channel(part, defaults=False)
+        return _channel_table(part, with_defaults=False)
     if isinstance(part, Filtering):
-        return _filtering(part, defaults=False)
+        return _filter_table(part, with_defaults=False)
     if isinstance(part, Sensor):
-        return _sensor(part, defaults=False)
-    families = (f for f, contract in FAMILIES.items() if isinstance(part, contract))
+        return _sensor_table(part, with_defaults=False)
+    families = (family for family, base in FAMILIES.items() if isinstance(part, base))
     family = next(families, "filter" if isinstance(part, FORMER["filter"]) else None)
     if family == "sampling" and isinstance(part, FAMILIES["activation"]):
-        family = "activation"  # a clock of links is a clock too
-    return _fields(part, False) if family is None else _kind(family, part, defaults=False)
+        family = "activation"  # every clock of links is of both families
+    if family is None:
+        return _field_values(part, with_defaults=False)
+    return _kind_table(family, part, with_defaults=False)
 
 
-def _network(network: Network, defaults: bool) -> dict[str, Any]:
-    """Return the table of a network."""
-    table = {"graph": _kind("graph", network.graph, defaults)}
+def _network_table(network: Network, with_defaults: bool) -> dict[str, Any]:
+    """Return the table ``network``."""
+    table = {"graph": _kind_table("graph", network.graph, with_defaults)}
     if network.activation is not None:
-        table["activation"] = _kind("activation", network.activation, defaults)
-    return {**table, "channel": _channel(network.channel, defaults)}
+        table["activation"] = _kind_table("activation", network.activation, with_defaults)
+    return {**table, "channel": _channel_table(network.channel, with_defaults)}
 
 
-def _channel(channel: Channel, defaults: bool) -> dict[str, Any]:
-    """Return the table of a channel."""
-    table = _fields(channel, True)
-    table["loss"] = _kind("loss", channel.loss, defaults)
-    table["delay"] = _kind("delay", channel.delay, defaults)
+def _channel_table(channel: Channel, with_defaults: bool) -> dict[str, Any]:
+    """Return the table ``network.channel``; all of its own keys are written."""
+    table = _field_values(channel, with_defaults=True)
+    table["loss"] = _kind_table("loss", channel.loss, with_defaults)
+    table["delay"] = _kind_table("delay", channel.delay, with_defaults)
     return table
 
 
-def _sensor(sensor: Sensor, defaults: bool) -> dict[str, Any]:
+def _sensor_table(sensor: Sensor, with_defaults: bool) -> dict[str, Any]:
     """Return the table of a sensor with its sampling clock."""
-    table, clock = _kind("sensor", sensor, defaults), getattr(sensor, "sampling", None)
+    table = _kind_table("sensor", sensor, with_defaults)
+    clock = getattr(sensor, "sampling", None)
     if clock is not None:
-        entries = _kind("sampling", clock, defaults)
-        table["sampling"] = {k: v for k, v in entries.items() if k not in ("at", "rates")}
+        clock_table = _kind_table("sampling", clock, with_defaults)
+        # Fields of clocks of links, which a sampling clock must not have.
+        table["sampling"] = {k: v for k, v in clock_table.items() if k not in ("at", "rates")}
     return table
 
 
-def _filtering(filtering: Filtering, defaults: bool) -> dict[str, Any]:
-    """Return the table of a filter with its start and model."""
-    table = _kind("filter", filtering.algorithm, defaults)
-    for name, value in _fields(filtering, defaults).items():
+def _filter_table(filtering: Filtering, with_defaults: bool) -> dict[str, Any]:
+    """Return the table ``filter``: the algorithm's keys, the initial estimate and the model."""
+    table = _kind_table("filter", filtering.algorithm, with_defaults)
+    for name, value in _field_values(filtering, with_defaults).items():
         if name in ("mean", "cov"):
             table[name] = value
-    model = _fields(filtering.model, defaults)
+    model = _field_values(filtering.model, with_defaults)
     return {**table, "model": model} if model else table
 
 
-def _kind(family: str, part: Component, defaults: bool) -> dict[str, Any]:
-    """Return the table of a part with its kind."""
+def _kind_table(family: str, part: Component, with_defaults: bool) -> dict[str, Any]:
+    """Return the table of a component of a family of registry.KINDS, with its key ``kind``."""
     kind, choice = split_choice(name_of(family, part))
-    return {"kind": kind, **choice, **_fields(part, defaults)}
+    return {"kind": kind, **choice, **_field_values(part, with_defaults)}
 
 
-def _fields(part: Component, defaults: bool) -> dict[str, Any]:
-    """Return the fields of a part as TOML values, those with default values only if asked."""
+def _field_values(part: Component, with_defaults: bool) -> dict[str, Any]:
+    """Return the fields of a component as TOML values by name.
+
+    Fields that are None are left out, and without ``with_defaults`` those equal to their defaults.
+    """
     table: dict[str, Any] = {}
-    for field in (field for field in dataclasses.fields(part) if field.init):
+    for field in dataclasses.fields(part):
+        if not field.init:
+            continue
         value = getattr(part, field.name)
         is_default = field.default is not dataclasses.MISSING and (
             value is field.default or (not isinstance(value, np.ndarray) and value == field.default)
         )
-        if value is not None and (defaults or not is_default):
-            table[field.name] = _toml_value(value, defaults)
+        if value is not None and (with_defaults or not is_default):
+            table[field.name] = _toml_value(value, with_defaults)
     return table
 
 
-def _toml_value(value: Any, defaults: bool) -> Any:
-    """Return a value of a field as TOML has it."""
+def _toml_value(value: Any, with_defaults: bool) -> Any:
+    """Return the value of a field with lists for arrays and tuples, and tables for filters."""
     if isinstance(value, np.ndarray):
         return value.tolist()
     if isinstance(value, tuple):
-        return [_toml_value(item, defaults) for item in value]
-    # A filter inside another one.
-    return _kind("filter", value, defaults) if isinstance(value, Filter) else value
+        return [_toml_value(item, with_defaults) for item in value]
+    if isinstance(value, Filter):  # a filter inside another one
+        return _kind_table("filter", value, with_defaults)
+    return value
 
 
 def to_toml(table: dict[str, Any]) -> str:
-    """Return nested tables of numbers, strings and lists as TOML; equal tables give equal text."""
+    """Return the TOML text of nested tables; equal tables give equal text.
+
+    Values are tables, lists, numbers, strings and source files. Tables and lists of tables at the
+    top level are written as sections ``[key]`` and ``[[key]]``, those below on one line.
+    """
     lines = [f"{key} = {toml_text(v)}" for key, v in table.items() if not _is_section(v)]
     for key, value in table.items():
         if isinstance(value, dict):
-            lines += ["", f"[{key}]", *(f"{k} = {toml_text(v)}" for k, v in value.items())]
+            lines += ["", f"[{key}]", *_key_lines(value)]
         elif _is_section(value):
             for entry in value:
-                lines += ["", f"[[{key}]]", *(f"{k} = {toml_text(v)}" for k, v in entry.items())]
+                lines += ["", f"[[{key}]]", *_key_lines(entry)]
     return "\n".join(lines) + "\n"
 
 
+def _key_lines(table: dict[str, Any]) -> list[str]:
+    """Return the lines ``key = value`` of a table."""
+    return [f"{key} = {toml_text(value)}" for key, value in table.items()]
+
+
 def _is_section(value: Any) -> bool:
-    """Return True if a value is written as a table of its own."""
-    tables = isinstance(value, list) and bool(value) and all(isinstance(v, dict) for v in value)
-    return isinstance(value, dict) or tables
+    """Return True if a value is a table or a list of tables, which is not empty."""
+    if isinstance(value, list):
+        return bool(value) and all(isinstance(item, dict) for item in value)
+    return isinstance(value, dict)
 
 
 def toml_text(value: Any) -> str:
-    """Return one value as TOML."""
+    """Return one value as a TOML expression on one line."""
     if isinstance(value, dict):
         return "{ " + ", ".join(f"{k} = {toml_text(v)}" for k, v in value.items()) + " }"
     if isinstance(value, list):

@@ -15,7 +15,7 @@ from netkf.core.fields import setting
 from netkf.parts import number
 from netkf.scenario.reading import from_table
 from netkf.scenario.registry import KINDS
-from netkf.scenario.schema import describe, keys_of, scenario_schema
+from netkf.scenario.schema import describe_field, list_keys, scenario_schema
 from netkf.scenario.writing import as_table
 from tests.conftest import ROOT, SCENARIOS, scenario_files
 
@@ -132,7 +132,7 @@ def test_rules_of_users_have_a_schema():
             """Return it."""
             return 0.5
 
-    (key,) = keys_of(Lossy)
+    (key,) = list_keys(Lossy)
     assert key.schema == {"type": "number", "exclusiveMinimum": 0.0, "maximum": 2.0}
     assert key.description == "Losses of a link whose `decay` is given."
     assert (key.required, key.default) == (False, 1.0)
@@ -140,10 +140,12 @@ def test_rules_of_users_have_a_schema():
 
 def test_descriptions_come_from_the_docstrings():
     text = "What it is.\n\nlate    how: one\n        or two\nwindow  seconds\n\nUses `p` and `q`."
-    assert describe(text, "late") == "how: one or two."
-    assert describe(text, "q") == "Uses `p` and `q`."
-    assert not describe(text, "r")
-    described = [key for table in KINDS.values() for cls in table.values() for key in keys_of(cls)]
+    assert describe_field(text, "late") == "how: one or two."
+    assert describe_field(text, "q") == "Uses `p` and `q`."
+    assert not describe_field(text, "r")
+    described = [
+        key for table in KINDS.values() for cls in table.values() for key in list_keys(cls)
+    ]
     assert sum(bool(key.description) for key in described) > 0.5 * len(described)
 
 
@@ -156,5 +158,5 @@ def test_the_command_prints_the_schema_or_the_page(validator, capsys):
         for kind, cls in kinds.items() if family != "slot filter" else ():
             _, found, rest = page.partition(f"\n### {kind}\n")
             assert found, kind
-            for key in keys_of(cls):
+            for key in list_keys(cls):
                 assert f"\n| `{key.name}` |" in rest
