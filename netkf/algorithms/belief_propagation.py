@@ -48,7 +48,7 @@ from netkf.algorithms.kernels.slots import (
 from netkf.algorithms.models import SlotModel, first_root
 from netkf.algorithms.registry import built_in
 from netkf.core.errors import ScenarioError
-from netkf.core.fields import choice, field, integer
+from netkf.core.fields import field, integer, one_of
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
 from netkf.linalg.lanes import LANES, ONE, aligned, blocks_of, in_lanes, load, store
@@ -275,7 +275,7 @@ class BeliefPropagation(Filter):
     """
 
     steps: int = field(integer(low=1, high=MAX_STEPS), default=1)  # type: ignore[assignment]
-    memory: str = field(choice(SLOT, ALL), default=SLOT)
+    memory: str = field(one_of(SLOT, ALL), default=SLOT)
 
     paper: ClassVar[str] = "belief_propagation"
     combination: ClassVar[str] = "beliefs"

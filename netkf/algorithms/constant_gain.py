@@ -36,7 +36,7 @@ from netkf.algorithms.models import FlowModel, SlotModel, first_root, usable
 from netkf.algorithms.pairs import weighted_pairs
 from netkf.algorithms.registry import built_in
 from netkf.core.errors import ScenarioError
-from netkf.core.fields import SourceFile, either, field, matrix, nested, several
+from netkf.core.fields import SourceFile, either, field, has_depth, list_of, matrix
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
 from netkf.linalg.lanes import load, store
@@ -147,7 +147,7 @@ class ConstantGain(Filter):
     """
 
     gain: FloatArray | tuple[FloatArray, ...] = field(
-        either(matrix, several(matrix, "matrices"), nested(3))
+        either(matrix, list_of(matrix, "matrices"), has_depth(3))
     )
 
     paper: ClassVar[str] = "constant_gain"

@@ -33,7 +33,7 @@ from netkf.algorithms.models import first_root
 from netkf.algorithms.pairs import pairs_now
 from netkf.algorithms.registry import built_in
 from netkf.algorithms.weights import METROPOLIS, check_columns
-from netkf.core.fields import choice, either, field, nested, square
+from netkf.core.fields import either, field, has_depth, one_of, square
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
 from netkf.linalg.lanes import ONE, Lanes, any_lane, load, load_flags, select, spread, store
@@ -190,9 +190,9 @@ class DiffusionFilter(Filter):
     """
 
     weights: str | FloatArray = field(
-        either(choice(METROPOLIS), square, nested(1)), default=METROPOLIS
+        either(one_of(METROPOLIS), square, has_depth(1)), default=METROPOLIS
     )
-    on_loss: str = field(choice("renormalise", "keep-own"), default="renormalise")
+    on_loss: str = field(one_of("renormalise", "keep-own"), default="renormalise")
 
     paper: ClassVar[str] = "diffusion"
     combination: ClassVar[str] = "shares"

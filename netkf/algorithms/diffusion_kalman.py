@@ -27,7 +27,7 @@ from netkf.algorithms.kernels.slots import (
 from netkf.algorithms.models import first_root, sample_update
 from netkf.algorithms.registry import built_in
 from netkf.algorithms.weights import METROPOLIS, check_columns
-from netkf.core.fields import choice, either, field, nested, square
+from netkf.core.fields import either, field, has_depth, one_of, square
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
 from netkf.linalg.lanes import ONE
@@ -105,7 +105,7 @@ class DiffusionKalman(Filter):
     """
 
     weights: str | FloatArray = field(
-        either(choice(METROPOLIS), square, nested(1)), default=METROPOLIS
+        either(one_of(METROPOLIS), square, has_depth(1)), default=METROPOLIS
     )
 
     paper: ClassVar[str] = "diffusion_kalman"

@@ -35,7 +35,7 @@ from netkf.algorithms.kernels.slots import (
 from netkf.algorithms.kernels.triggers import is_near
 from netkf.algorithms.models import first_root
 from netkf.algorithms.registry import built_in
-from netkf.core.fields import Rule, field, number, row
+from netkf.core.fields import Rule, field, number, tuple_of
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
 from netkf.linalg.lanes import (
@@ -316,8 +316,10 @@ INNER = Rule(
     'write inner = { kind = "hcmci", consensus = "information" }',
 )
 NOT_NEGATIVE = number(low=0.0)
-THRESHOLDS = row(
-    NOT_NEGATIVE, NOT_NEGATIVE, what="two numbers [estimate, covariance] that are not negative"
+THRESHOLDS = tuple_of(
+    NOT_NEGATIVE,
+    NOT_NEGATIVE,
+    description="two numbers [estimate, covariance] that are not negative",
 )
 
 

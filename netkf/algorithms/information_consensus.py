@@ -46,7 +46,7 @@ from netkf.algorithms.models import SlotModel, first_root
 from netkf.algorithms.pairs import weighted_pairs
 from netkf.algorithms.registry import built_in
 from netkf.core.errors import ScenarioError
-from netkf.core.fields import choice, field, integer, positive
+from netkf.core.fields import field, integer, one_of, positive
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
 from netkf.linalg.lanes import LANES, ONE, aligned, load, store
@@ -293,7 +293,7 @@ class Hcmci(InformationConsensus):
     Under clocks "information" alone: each message heard is one step of it.
     """
 
-    consensus: str = field(choice(HYBRID, INFORMATION, MEASUREMENTS), default=HYBRID)
+    consensus: str = field(one_of(HYBRID, INFORMATION, MEASUREMENTS), default=HYBRID)
     novelty_weight: float | None = field(positive, default=None)
 
     clocks: ClassVar[tuple[str, ...]] = ("links", "directions", "nodes", "readings")

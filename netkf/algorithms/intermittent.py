@@ -22,7 +22,7 @@ from netkf.algorithms.kernels.slots import (
 )
 from netkf.algorithms.models import first_root, sample_update
 from netkf.algorithms.registry import built_in
-from netkf.core.fields import choice, field, positive
+from netkf.core.fields import field, one_of, positive
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
 
@@ -112,7 +112,7 @@ class Intermittent(Filter):
             longest time a message may take
     """
 
-    late: str = field(choice("exact", "drop"), default="exact")
+    late: str = field(one_of("exact", "drop"), default="exact")
     window: float | None = field(positive, default=None)
 
     paper: ClassVar[str] = "intermittent"

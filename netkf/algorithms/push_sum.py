@@ -50,7 +50,7 @@ from netkf.algorithms.models import SlotModel, first_root
 from netkf.algorithms.registry import built_in
 from netkf.algorithms.running_sums import Offer, RunningSums
 from netkf.core.errors import ScenarioError
-from netkf.core.fields import boolean, choice, field, integer, number, positive
+from netkf.core.fields import boolean, field, integer, number, one_of, positive
 from netkf.linalg.arrays import FloatArray, square_root, symmetric
 from netkf.linalg.compiling import kernel
 from netkf.linalg.lanes import (
@@ -494,8 +494,8 @@ class PushSum(Filter):
     delta: float = field(positive, default=None)
     leader: int = field(integer(low=0), default=0)
     asymptotic: bool = field(boolean, default=False)
-    links: str = field(choice("fresh", "held"), default="fresh")
-    stop: str = field(choice(*RULES), default="never")
+    links: str = field(one_of("fresh", "held"), default="fresh")
+    stop: str = field(one_of(*RULES), default="never")
     tolerance: float = field(number(low=0.0), default=1e-6)
     running_sums: bool = field(boolean, default=False)
 

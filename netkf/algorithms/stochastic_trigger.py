@@ -44,8 +44,8 @@ from netkf.core.fields import (
     definite_covariance,
     either,
     field,
-    instance,
-    nested,
+    has_depth,
+    instance_of,
     positive,
 )
 from netkf.linalg.arrays import FloatArray
@@ -826,8 +826,8 @@ class StochasticTrigger(Delegate):
     clocks: ClassVar[tuple[str, ...]] = ()
     talks: ClassVar[bool] = True
 
-    inner: Filter = field(instance(Filter))
-    Y: float | FloatArray = field(either(positive, definite_covariance, nested(1)))
+    inner: Filter = field(instance_of(Filter))
+    Y: float | FloatArray = field(either(positive, definite_covariance, has_depth(1)))
 
     @cached_property
     def wrapped(self) -> Filter:

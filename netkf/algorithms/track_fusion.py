@@ -43,7 +43,7 @@ from netkf.algorithms.models import SlotModel, first_root
 from netkf.algorithms.registry import built_in
 from netkf.algorithms.starts import require_common_start
 from netkf.core.errors import ScenarioError
-from netkf.core.fields import choice, field
+from netkf.core.fields import field, one_of
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
 from netkf.linalg.lanes import blocks_of, in_lanes, load, store
@@ -149,7 +149,7 @@ class PairFusion(Filter):
     minimise  "trace" or "determinant" of P after each fusion
     """
 
-    minimise: str = field(choice(TRACE, DETERMINANT), default=TRACE)
+    minimise: str = field(one_of(TRACE, DETERMINANT), default=TRACE)
 
     paper: ClassVar[str] = "track_fusion"
     clocks: ClassVar[tuple[str, ...]] = ("links", "directions", "nodes", "readings")

@@ -16,7 +16,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
-from netkf.core.errors import nearest, quote
+from netkf.core.errors import quote, suggest_nearest
 from netkf.core.printable import one_line, shorten
 
 if TYPE_CHECKING:
@@ -39,7 +39,7 @@ class Parser(argparse.ArgumentParser):
         """Raise ArgumentError if a value is not one of the choices, suggesting the nearest one."""
         if action.choices is not None and value not in action.choices:
             choices = [str(choice) for choice in action.choices]
-            remedy = f"{nearest(value, choices)}choose from {', '.join(choices)}"
+            remedy = f"{suggest_nearest(value, choices)}choose from {', '.join(choices)}"
             raise argparse.ArgumentError(action, f"invalid choice: {quote(value)} ({remedy})")
 
 

@@ -15,21 +15,22 @@ from netkf.core.fields import Component
 from netkf.linalg.arrays import FloatArray
 
 Entity = Any
-"""A tuple of ids: those of a link's ends, (node,), or (node, ordinal of its sensor).
+"""The owner of a clock: (sender, receiver) of a link, (node,), or (node, ordinal of its sensor).
 
-Any, so that a subclass may say ``tuple[int, int]`` where it is for links only.
+Any, so that a subclass for links only may declare ``tuple[int, int]``.
 """
 
-# Ticks drawn at once, doubling: few for slow clocks, and never more than some MiB.
+# Ticks that are drawn at once: the number doubles from block to block, so that few are drawn in
+# vain for slow clocks, and a block takes at most 0.5 MiB.
 FIRST_BLOCK, MAX_BLOCK = 8, 1 << 16
 
 
 @dataclass(frozen=True, eq=False)
 class Clock(Component):
-    """The contract of a clock: a stateless generator of increasing tick times, all above 0.
+    """The contract of a clock: a stateless generator of increasing tick times in seconds, all > 0.
 
-    The caller owns the generator of each entity, so that the ticks of an entity depend on nothing
-    but its own stream.
+    The caller owns the random generator of each entity, so that the ticks of an entity depend on
+    nothing but its own stream.
     """
 
     @abstractmethod
@@ -42,14 +43,18 @@ class Clock(Component):
         random: np.random.Generator,
         count: int,
     ) -> FloatArray:
-        """Return times of up to ``count`` ticks from number ``index`` on; tick ``index - 1`` was at
-        ``now`` (0.0 before the first). Empty when the clock has stopped for good.
+        """Return the times of the next ticks, at most ``count``, from number ``index`` on.
 
-        ``count`` must not show in the values: two blocks are the same ticks as one.
+        Tick ``index - 1`` was at ``now`` (0.0 before the first); ``origin`` is the value of
+        :meth:`origin`. The result is empty if the clock has stopped for good. The times must not
+        depend on ``count``: two short blocks are the same ticks as a long one.
         """
 
     def origin(self, entity: Entity, random: Callable[[], np.random.Generator]) -> float:
-        """Return a value drawn once per entity from ``random()``, such as a phase; 0 for none."""
+        """Return a number that is drawn once per entity from ``random()``, such as a phase.
+
+        It is passed to every call of :meth:`ticks`; 0 if the clock needs none.
+        """
         return 0.0
 
     def mean_rate(self, entity: Entity) -> float:
@@ -63,7 +68,12 @@ class Clock(Component):
 
 
 class ClockPosition(NamedTuple):
-    """The position of one entity's clock: the next tick has ``number``, after ``now``."""
+    """The position of one entity's clock in a run, as :meth:`Clock.ticks` needs it.
+
+    origin : the value of ``Clock.origin`` for the entity
+    number : number of the next tick, from 0
+    now : time of the last tick in seconds, 0 before the first
+    """
 
     origin: float
     number: int = 0
@@ -78,42 +88,43 @@ def next_ticks(
     count: int,
     key: str = "network.activation",
 ) -> FloatArray:
-    """Return the times of ``clock.ticks``, checked; ``key`` names the clock in errors.
+    """Return the times (K,) of the next ticks of a clock in seconds, K <= ``count``, checked.
 
-    Raises ScenarioError if time does not advance, because the run would never end.
+    Raises ScenarioError at ``key`` if time does not advance: the run would never end.
     """
     now = position.now
-    t = np.asarray(clock.ticks(entity, *position, random, count), dtype=np.float64)
-    if len(t) and not (t[-1] > now and t[0] >= now and (np.diff(t) >= 0.0).all()):
-        whose = {1: "node", 2: "link"}.get(len(entity), "entity")
-        rule = f"{type(clock).__name__}: ticks of {whose} {list(entity)} must increase, "
+    times = np.asarray(clock.ticks(entity, *position, random, count), dtype=np.float64)
+    if len(times) and not (times[-1] > now and times[0] >= now and (np.diff(times) >= 0.0).all()):
+        owner = {1: "node", 2: "link"}.get(len(entity), "entity")
+        rule = f"{type(clock).__name__}: ticks of {owner} {list(entity)} must increase, "
         raise ScenarioError(
-            key, rule + f"after {now:g} s", t[:3].tolist(), "correct ticks of the class"
+            key, rule + f"after {now:g} s", times[:3].tolist(), "correct ticks of the class"
         )
-    return t
+    return times
 
 
 def generate_ticks(
     clock: Clock,
     entity: Entity,
-    phase: Callable[[], np.random.Generator],
+    make_origin_random: Callable[[], np.random.Generator],
     random: np.random.Generator,
     horizon: float,
     key: str = "network.activation",
 ) -> FloatArray:
-    """Return all ticks (K,) of an entity in (0, ``horizon``), in seconds.
+    """Return the times (K,) in seconds of all ticks of an entity in (0, ``horizon``).
 
-    ``phase`` makes the generator of the origin, and is called only if the clock draws one.
+    ``random`` draws the ticks. ``make_origin_random`` returns the generator of ``clock.origin``; it
+    is called only if the clock draws one. Raises ScenarioError at ``key``, see ``next_ticks``.
     """
-    position = ClockPosition(clock.origin(entity, phase))
-    found, count = [np.empty(0)], FIRST_BLOCK
+    position = ClockPosition(clock.origin(entity, make_origin_random))
+    blocks, count = [np.empty(0)], FIRST_BLOCK
     while position.now < horizon:
         block = next_ticks(clock, entity, position, random, count, key)
         if not len(block):
             break
-        found.append(block)
+        blocks.append(block)
         number = position.number + len(block)
         position = position._replace(number=number, now=float(block[-1]))
         count = min(2 * count, MAX_BLOCK)
-    times = np.concatenate(found)
+    times = np.concatenate(blocks)
     return times[: int(np.searchsorted(times, horizon))]

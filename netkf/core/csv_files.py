@@ -1,4 +1,4 @@
-"""CSV files of scenarios, read as a whole and checked column by column."""
+"""Reading of the CSV files of scenarios; errors name the file and the line."""
 
 from __future__ import annotations
 
@@ -14,25 +14,25 @@ from netkf.core.errors import ScenarioError
 from netkf.core.fields import MAX_MAGNITUDE, SourceFile
 from netkf.linalg.arrays import FloatArray
 
-MAX_BYTES = 256 << 20  # bounds the memory that reading takes
+MAX_BYTES = 256 << 20  # of a file; it limits the memory that reading takes
 MAX_ID = 2**53  # larger integers are not exact as floating-point numbers
 
 
 def read_columns(
     source: SourceFile, required: tuple[str, ...], optional: tuple[str, ...] = ()
 ) -> dict[str, FloatArray]:
-    """Return the named columns as float arrays of equal length.
+    """Return the named columns, each (rows,), by name; optional ones only if they are there.
 
-    Raises ScenarioError, with the file and the line, for a missing column, a row of another
-    length, or an entry that is not a finite number.
+    Raises ScenarioError, with the file and the line, for a missing column, a row of another length
+    than the header, or an entry that is not a finite number.
     """
     numbers = array("d")
     with _open_table(source) as (header, rows):
-        _demand(source, header, required)
+        _require_columns(source, header, required)
         names = [name for name in (*required, *optional) if name in header]
         indices = [header.index(name) for name in names]
         for line, row in rows:
-            numbers.extend(finite_numbers(source, line, header, row, indices))
+            numbers.extend(parse_finite_numbers(source, line, header, row, indices))
     columns = np.array(numbers, dtype=np.float64).reshape(-1, len(names)).T
     return dict(zip(names, columns, strict=True))
 
@@ -46,16 +46,16 @@ def read_header(source: SourceFile) -> list[str]:
 def read_rows(
     source: SourceFile, required: tuple[str, ...]
 ) -> tuple[list[str], list[tuple[int, list[str]]]]:
-    """Return the names of the columns, and (line, entries) of every row that is not empty.
+    """Return the names of the columns, and (line number, entries) of every row that is not empty.
 
     Raises ScenarioError if the file is not a table or lacks a required column.
     """
     with _open_table(source) as (header, rows):
-        _demand(source, header, required)
+        _require_columns(source, header, required)
         return header, list(rows)
 
 
-def _demand(source: SourceFile, header: list[str], required: tuple[str, ...]) -> None:
+def _require_columns(source: SourceFile, header: list[str], required: tuple[str, ...]) -> None:
     """Raise ScenarioError if the header lacks a required column."""
     missing = [name for name in required if name not in header]
     if missing:
@@ -67,8 +67,10 @@ def _demand(source: SourceFile, header: list[str], required: tuple[str, ...]) ->
 def _open_table(
     source: SourceFile,
 ) -> Iterator[tuple[list[str], Iterator[tuple[int, list[str]]]]]:
-    """Give the names of the columns, and an iterator of (line, entries) of rows that are not
-    empty; raises ScenarioError if the file cannot be read as a table.
+    """Open a CSV file for a block; give the names of its columns and an iterator of its rows.
+
+    The iterator gives (line number, entries) of rows that are not empty. Raises ScenarioError if
+    the file, also while it is iterated, cannot be read as a table.
     """
     try:
         size = source.full.stat().st_size
@@ -84,12 +86,13 @@ def _open_table(
         raise ScenarioError("path", rule, str(error), "correct the file") from None
 
 
-def finite_numbers(
+def parse_finite_numbers(
     source: SourceFile, line: int, header: list[str], entries: list[str], indices: list[int]
 ) -> list[float]:
-    """Return the entries of a row in the columns ``indices``, as numbers.
+    """Return the entries of a row in the columns ``indices`` as numbers.
 
-    Raises ScenarioError if one is not finite or the row is not as long as the header.
+    Raises ScenarioError if one is not a finite number of at most MAX_MAGNITUDE, or if the row is
+    not as long as the header. ``line`` is the row's line number in the file.
     """
     where = f"{source.name} line {line}"
     if len(entries) != len(header):
@@ -118,14 +121,17 @@ def finite_numbers(
     return numbers
 
 
-def whole(source: SourceFile, name: str, column: FloatArray) -> list[int]:
-    """Return a column of ids or counts as integers; raises ScenarioError for other values."""
-    wrong = np.flatnonzero((column != np.round(column)) | (column < 0) | (column > MAX_ID))
-    if wrong.size:
+def parse_integers(source: SourceFile, name: str, column: FloatArray) -> list[int]:
+    """Return the column ``name`` of a table, ids or counts, as integers.
+
+    Raises ScenarioError if a value is not an integer from 0 to MAX_ID.
+    """
+    invalid = (column != np.round(column)) | (column < 0) | (column > MAX_ID)
+    if invalid.any():
         raise ScenarioError(
             "path",
             f"{source.name}: {name} must hold integers from 0 to 2^53",
-            float(column[wrong[0]]),
+            float(column[invalid][0]),
             "correct the row",
         )
     return [int(value) for value in column]

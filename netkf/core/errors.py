@@ -1,4 +1,4 @@
-"""The exceptions that netkf raises on purpose, and the texts in them."""
+"""The exceptions that netkf raises on purpose, and helpers for their texts."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ class WriteError(NetkfError, OSError):
     """A file cannot be written; ``str(error)`` is one line with the reason and the path."""
 
     def __init__(self, cause: OSError, path: object) -> None:
-        # With three arguments OSError would choose a subclass by the number.
-        known = os.strerror(cause.errno) if cause.errno else str(cause)
-        super().__init__(cause.errno, known)
+        reason = os.strerror(cause.errno) if cause.errno else str(cause)
+        # The path is not passed on: with three arguments OSError would choose a subclass.
+        super().__init__(cause.errno, reason)
         self.filename = str(path)
 
     def __str__(self) -> str:
@@ -47,43 +47,43 @@ class ScenarioError(NetkfError, ValueError):
 
     def under(self, prefix: str) -> ScenarioError:
         """Return this error with ``prefix``, the table that holds the key, before the key."""
-        joint = "" if not self.key or self.key.startswith("[") else "."
-        return ScenarioError(
-            f"{prefix}{joint}{self.key}", self.rule, self.value, self.remedy, self.file
-        )
+        separator = "" if not self.key or self.key.startswith("[") else "."
+        key = f"{prefix}{separator}{self.key}"
+        return ScenarioError(key, self.rule, self.value, self.remedy, self.file)
 
     def in_file(self, file: str) -> ScenarioError:
         """Return this error with the name of its file, unless it has one."""
         return ScenarioError(self.key, self.rule, self.value, self.remedy, self.file or file)
 
     def __str__(self) -> str:
-        got = "" if self.value is None else f"; got {quote(self.value)}"
-        # Rules and remedies name keys and classes, which may be of any length.
+        # All texts are limited: they may contain names of keys, classes and files of any length.
+        file, key = shorten(self.file, 1000), shorten(self.key, 120)
         rule, remedy = shorten(self.rule, 1000), shorten(self.remedy, 700)
-        where = ": ".join(filter(None, (shorten(self.file, 1000), shorten(self.key, 120))))
+        got = "" if self.value is None else f"; got {quote(self.value)}"
         message = f"{rule}{got}; {remedy}" if remedy else f"{rule}{got}"
-        return f"{where}: {message}" if where else message
+        return ": ".join(text for text in (file, key, message) if text)
 
 
 MAX_WORD = 100
-"""Characters of a word that is compared with the known ones."""
+"""Longest word, in characters, for which a similar one is looked for."""
 
 
-def nearest(word: object, known: Iterable[str]) -> str:
-    """Return ``did you mean "..."?`` and a space if a known word is close, else an empty text."""
+def suggest_nearest(word: object, candidates: Iterable[str]) -> str:
+    """Return ``did you mean "..."? `` with the candidate nearest to ``word``; "" if none."""
+    # Imported here: only a wrong word needs it.
     import difflib
 
     if len(str(word)) > MAX_WORD:
         return ""
-    found = difflib.get_close_matches(str(word), list(known), n=1)
-    return f'did you mean "{found[0]}"? ' if found else ""
+    matches = difflib.get_close_matches(str(word), list(candidates), n=1)
+    return f'did you mean "{matches[0]}"? ' if matches else ""
 
 
-def quote(value: object, longest: int = 80) -> str:
-    """Return ``repr(value)`` on one line, shortened in the middle if it is long."""
+def quote(value: object, max_length: int = 80) -> str:
+    """Return ``repr(value)`` on one line, arrays as lists, shortened in the middle if long."""
     tolist = getattr(value, "tolist", None)
     try:
         text = " ".join(repr(tolist() if callable(tolist) else value).split())
-    except (ValueError, RecursionError):  # an integer of thousands of digits, tables within tables
+    except (ValueError, RecursionError):  # an integer of thousands of digits, deeply nested tables
         text = f"a large {type(value).__name__}"
-    return cut_middle(text, longest)
+    return cut_middle(text, max_length)

@@ -28,9 +28,10 @@ Method = TypeVar("Method", bound=Callable[..., Any])
 class Rule:
     """A requirement on a value: its text, the conversion that enforces it, and the remedy.
 
-    ``convert`` returns the value to store, or raises ``TypeError`` or ``ValueError``. ``remedy``
-    tells the user how to correct a value that breaks the rule. ``schema`` is a JSON Schema that
-    every value of a file which obeys the rule validates with; empty if nothing is known.
+    requirement  text that begins with "must be"
+    convert      returns the value to store, or raises TypeError, ValueError or OverflowError
+    remedy       text that tells the user how to correct a value that breaks the rule
+    schema       JSON Schema that accepts every value of a file that obeys the rule; empty: any
     """
 
     requirement: str
@@ -48,12 +49,12 @@ class Rule:
             remedy = error.remedy or self.remedy
             raise ScenarioError(key, str(error), value, remedy) from None
         except (TypeError, ValueError, OverflowError, RecursionError):
-            # These messages are Python's own; the requirement tells the user more.
+            # The requirement tells the user more than Python's own message.
             raise ScenarioError(key, self.requirement, value, self.remedy) from None
 
 
 class _SpecificError(ValueError):
-    """A broken requirement that is narrower than the rule's own; its ``remedy`` may be, too."""
+    """Raised by ``Rule.convert``: a requirement, and maybe a remedy, more precise than the rule's."""
 
     def __init__(self, requirement: str, remedy: str = "") -> None:
         super().__init__(requirement)
@@ -61,44 +62,48 @@ class _SpecificError(ValueError):
 
 
 def field(rule: Rule, default: Any = MISSING) -> Any:
-    """Declare a dataclass field whose values obey ``rule``; a default of None is not checked."""
+    """Return a dataclass field whose values ``rule`` checks and converts.
+
+    With a default the field is keyword-only; None is accepted if it is the default.
+    """
     return dataclasses.field(
         default=default, metadata={"rule": rule}, kw_only=default is not MISSING
     )
 
 
 setting = field
-"""The public name of ``field``: classes of users import it from netkf.parts."""
+"""The public name of ``field``: users' classes import it from netkf.parts."""
 
 
 def required(method: Method) -> Method:
     """Mark a method that subclasses must define, under its present or its former name.
 
-    It is an abstractmethod that type checkers do not see: they know nothing of former names.
+    It is ``abstractmethod``, hidden from type checkers: they would report a class that defines the
+    method under its former name.
     """
     return abstractmethod(method)
 
 
 @dataclass(frozen=True, eq=False)
 class Component:
-    """Base class of everything that a scenario is made of: an immutable set of checked fields.
+    """Base class of the parts of a scenario: an immutable dataclass with checked fields.
 
-    Components are equal when they have the same class and equal fields.
+    Components are equal if they have the same class and equal fields.
     """
 
     former_names: ClassVar[Mapping[str, str]] = {}
-    """The names that attributes of a contract had before, by their present names."""
+    """Deprecated names of methods that users' classes may still define, by their present names."""
 
     def __init_subclass__(cls) -> None:
-        """Give every attribute that has a former name both names, whichever the class defines."""
+        """Give a method that has a former name both names, whichever the class defines."""
         super().__init_subclass__()
-        own = vars(cls)
+        own_attributes = vars(cls)
         for name, former in cls.former_names.items():
             # Both names refer to one function, so super() reaches the base class under either.
-            if former in own and name not in own:
-                setattr(cls, name, own[former])
-            elif name in own:
-                setattr(cls, former, own[name])
+            if former in own_attributes and name not in own_attributes:
+                setattr(cls, name, own_attributes[former])
+            elif name in own_attributes:
+                setattr(cls, former, own_attributes[name])
 
     def __post_init__(self) -> None:
         for field in dataclasses.fields(self):
@@ -118,16 +123,16 @@ class Component:
         return hash((type(self), len(dataclasses.fields(self))))
 
 
-def _are_equal(one: Any, other: Any) -> bool:
+def _are_equal(a: Any, b: Any) -> bool:
     """Return True if two values of fields are equal, arrays and tuples entry by entry."""
-    # Scenarios that are made from each other share most parts: caches look them up often.
-    if one is other:
+    # Fast path: scenarios that are made from each other share most of their components.
+    if a is b:
         return True
-    if isinstance(one, np.ndarray) or isinstance(other, np.ndarray):
-        return one is not None and other is not None and np.array_equal(one, other)
-    if isinstance(one, tuple) and isinstance(other, tuple):
-        return len(one) == len(other) and all(map(_are_equal, one, other))
-    return bool(one == other)
+    if isinstance(a, np.ndarray) or isinstance(b, np.ndarray):
+        return a is not None and b is not None and np.array_equal(a, b)
+    if isinstance(a, tuple) and isinstance(b, tuple):
+        return len(a) == len(b) and all(map(_are_equal, a, b))
+    return bool(a == b)
 
 
 def number(
@@ -137,7 +142,7 @@ def number(
     below: float = math.inf,
     high: float = math.inf,
 ) -> Rule:
-    """Return the rule for a finite number inside the given bounds."""
+    """Return the rule for a finite number x with above < x < below and low <= x <= high."""
     bounds = [
         f"{relation} {bound:g}"
         for relation, bound in (
@@ -158,31 +163,27 @@ def number(
             raise ValueError
         return result
 
-    inside = " and ".join(bounds)
-    return Rule(
-        f"must be a finite number{' ' if inside else ''}{inside}",
-        convert,
-        f"give a number {inside}" if inside else "give a finite number",
-        {
-            "type": "number",
-            **_bounds(exclusiveMinimum=above, minimum=low),
-            **_bounds(exclusiveMaximum=below, maximum=high),
-        },
-    )
-
-
-def _bounds(**given: float) -> dict[str, float]:
-    """Return the finite ones of the bounds of a JSON Schema."""
-    return {name: bound for name, bound in given.items() if math.isfinite(bound)}
+    requirement, remedy = "must be a finite number", "give a finite number"
+    if bounds:
+        requirement = f"{requirement} {' and '.join(bounds)}"
+        remedy = f"give a number {' and '.join(bounds)}"
+    limits = {
+        "exclusiveMinimum": above,
+        "minimum": low,
+        "exclusiveMaximum": below,
+        "maximum": high,
+    }
+    finite_limits = {name: limit for name, limit in limits.items() if math.isfinite(limit)}
+    return Rule(requirement, convert, remedy, {"type": "number", **finite_limits})
 
 
 positive = number(above=0.0)
 MIN_SECONDS, MAX_SECONDS = 1e-9, 1e15
-"""Durations in seconds: times have 16 digits, and some are rounded to 1e-12 s."""
+"""Limits of durations: times have 16 digits, and some are rounded to 1e-12 s."""
 
 
-def _seconds(value: Any) -> float:
-    """Return a positive time in seconds within the limits of the simulator."""
+def _convert_seconds(value: Any) -> float:
+    """Return a duration in seconds from MIN_SECONDS to MAX_SECONDS."""
     result: float = positive.convert(value)
     if not MIN_SECONDS <= result <= MAX_SECONDS:
         requirement = f"must be from {MIN_SECONDS:g} to {MAX_SECONDS:g} seconds"
@@ -191,16 +192,16 @@ def _seconds(value: Any) -> float:
 
 
 _DURATION = {"type": "number", "minimum": MIN_SECONDS, "maximum": MAX_SECONDS}
-seconds = Rule(positive.requirement, _seconds, positive.remedy, _DURATION)
+seconds = Rule(positive.requirement, _convert_seconds, positive.remedy, _DURATION)
 probability = number(low=0.0, high=1.0)
 
 
 MAX_BITS = 12_000
-"""Longer integers could not be written: Python prints at most 4300 digits."""
+"""Bits of the longest integer: Python writes at most 4300 digits."""
 
 
 def integer(low: int | None = None, high: int | None = None) -> Rule:
-    """Return the rule for an integer from ``low`` to ``high``; None leaves that side open."""
+    """Return the rule for an integer from ``low`` to ``high``; None means no limit."""
 
     def convert(value: Any) -> int:
         """Return the value as an int within the limits."""
@@ -212,80 +213,75 @@ def integer(low: int | None = None, high: int | None = None) -> Rule:
             raise ValueError
         return int(value)
 
-    bound = "" if low is None else f" of at least {low}"
-    bound += "" if high is None else f" and at most {high:,}"
+    bounds = "" if low is None else f" of at least {low}"
+    bounds += "" if high is None else f" and at most {high:,}"
     limits = {"minimum": low, "maximum": high}
     schema = {"type": "integer", **{k: v for k, v in limits.items() if v is not None}}
-    return Rule(f"must be an integer{bound}", convert, f"give an integer{bound}", schema)
+    return Rule(f"must be an integer{bounds}", convert, f"give an integer{bounds}", schema)
 
 
 MAX_MAGNITUDE = 1e30
-"""Products of larger entries, or of inverses of smaller variances, could overflow."""
+"""Size of the largest number: products of larger ones, or inverses, could overflow."""
 
 
-def _instance_of(kind: type) -> Callable[[Any], Any]:
-    """Return a conversion that lets through nonempty values of one type only."""
-
-    def convert(value: Any) -> Any:
-        """Return the value if it has the type."""
-        if not isinstance(value, kind) or value == "":
-            raise TypeError
-        return value
-
-    return convert
+def _require_bool(value: Any) -> bool:
+    """Return the value if it is a bool."""
+    if not isinstance(value, bool):
+        raise TypeError
+    return value
 
 
 boolean = Rule(
     "must be true or false",
-    _instance_of(bool),
+    _require_bool,
     "write true or false without quotes",
     {"type": "boolean"},
 )
 
 
-def _one_line(value: Any) -> str:
+def _require_line(value: Any) -> str:
     """Return the value if it is printable text without line breaks."""
     if not isinstance(value, str) or not value.isprintable():
         raise TypeError
     return value
 
 
-def _nonempty_line(value: Any) -> str:
+def _require_text(value: Any) -> str:
     """Return the value if it is one nonempty line of printable text."""
-    if not _one_line(value):
+    if not _require_line(value):
         raise TypeError
     return str(value)
 
 
 line = Rule(
     "must be one line of text",
-    _one_line,
+    _require_line,
     'write it as "text" without line breaks',
     {"type": "string"},
 )
 text = Rule(
     "must be one line of text that is not empty",
-    _nonempty_line,
+    _require_text,
     'write it as "text"',
     {"type": "string", "minLength": 1},
 )
 
 
-def instance(*kinds: type) -> Rule:
-    """Return the rule for an object of one of the classes ``kinds``."""
+def instance_of(*classes: type) -> Rule:
+    """Return the rule for an object of one of the classes."""
 
     def convert(value: Any) -> Any:
         """Return the value if it is of one of the classes."""
-        if not isinstance(value, kinds):
+        if not isinstance(value, classes):
             raise TypeError
         return value
 
-    names = " or ".join(f"a {kind.__name__.lower()}" for kind in kinds)
+    names = " or ".join(f"a {cls.__name__.lower()}" for cls in classes)
     return Rule(f"must be {names}", convert, 'write a table { kind = "...", ... }')
 
 
-def choice(*names: str) -> Rule:
-    """Return the rule for one of the given strings."""
+def one_of(*names: str) -> Rule:
+    """Return the rule for a text that is one of ``names``."""
 
     def convert(value: Any) -> str:
         """Return the value if it is one of the names."""
@@ -298,56 +294,62 @@ def choice(*names: str) -> Rule:
 
 
 def either(first: Rule, second: Rule, is_second: Callable[[Any], bool]) -> Rule:
-    """Return a rule that applies ``second`` to values for which ``is_second``, else ``first``."""
+    """Return the rule ``second`` for values for which ``is_second`` is True, ``first`` for others.
+
+    A value that breaks its rule gets a message that names both.
+    """
 
     def convert(value: Any) -> Any:
-        """Return the value as converted by the rule whose form it has."""
+        """Return the value as converted by the rule that applies to it."""
         rule = second if is_second(value) else first
         try:
             return rule.convert(value)
         except (_SpecificError, ScenarioError):
             raise
         except (TypeError, ValueError, OverflowError):
-            # Either form would have been accepted, so the message names both.
             raise _SpecificError(requirement) from None
 
     requirement = f"{first.requirement}, or {second.requirement.removeprefix('must be ')}"
-    known = [dict(rule.schema) for rule in (first, second)]
-    return Rule(requirement, convert, first.remedy, {"anyOf": known} if all(known) else {})
+    schemas = [dict(rule.schema) for rule in (first, second)]
+    return Rule(requirement, convert, first.remedy, {"anyOf": schemas} if all(schemas) else {})
 
 
-def nested(depth: int) -> Callable[[Any], bool]:
-    """Return a test for lists or arrays that are nested at least ``depth`` deep."""
+def has_depth(depth: int) -> Callable[[Any], bool]:
+    """Return a predicate: whether a value is lists or an array nested at least ``depth`` deep."""
 
-    def measure(value: Any) -> int:
+    def measure_depth(value: Any) -> int:
         """Return how deep lists, tuples and arrays are nested, 0 for a number."""
         if isinstance(value, np.ndarray):
             return value.ndim
         if isinstance(value, (list, tuple)):
-            return 1 + max(map(measure, value), default=0)
+            return 1 + max(map(measure_depth, value), default=0)
         return 0
 
-    return lambda value: measure(value) >= depth
+    return lambda value: measure_depth(value) >= depth
 
 
-def array(dimensions: int, kind: str) -> Rule:
-    """Return the rule for a finite real array with that many dimensions, called a ``kind``."""
+def array(dimensions: int, name: str) -> Rule:
+    """Return the rule for an array of finite real numbers with 1 or 2 dimensions.
+
+    ``name`` is what messages call it, such as "vector".
+    """
 
     def convert(value: Any) -> FloatArray:
         """Return the value as a read-only array of finite float64 numbers."""
-        if isinstance(value, (str, bytes)) or _has_bool(value):
+        if isinstance(value, (str, bytes)) or _has_bool_or_text(value):
             raise TypeError
         result = readonly_array(value)
         if result.ndim == 0:
-            open_, close = "[" * dimensions, "]" * dimensions
-            raise _SpecificError(f"must be a {kind}", f"write {open_}{result.item():g}{close}")
+            opening, closing = "[" * dimensions, "]" * dimensions
+            remedy = f"write {opening}{result.item():g}{closing}"
+            raise _SpecificError(f"must be a {name}", remedy)
         if result.ndim != dimensions or result.size == 0:
-            raise _SpecificError(f"must be a {kind}")
+            raise _SpecificError(f"must be a {name}")
         if not np.isfinite(result).all():
-            raise _SpecificError(f"must be a {kind} with finite numbers")
+            raise _SpecificError(f"must be a {name} with finite numbers")
         if np.abs(result).max() > MAX_MAGNITUDE:
             raise _SpecificError(
-                f"must be a {kind} with numbers of at most {MAX_MAGNITUDE:g} in size"
+                f"must be a {name} with numbers of at most {MAX_MAGNITUDE:g} in size"
             )
         return result
 
@@ -355,14 +357,14 @@ def array(dimensions: int, kind: str) -> Rule:
     schema: dict[str, Any] = {"type": "number"}
     for _ in range(dimensions):
         schema = {"type": "array", "items": schema, "minItems": 1}
-    return Rule(f"must be a {kind} with finite numbers", convert, remedy, schema)
+    return Rule(f"must be a {name} with finite numbers", convert, remedy, schema)
 
 
-def _has_bool(value: Any) -> bool:
+def _has_bool_or_text(value: Any) -> bool:
     """Return True if a bool or a text is somewhere in nested lists."""
-    # numpy would convert True to 1.0 and "1" to 1.0.
+    # numpy would convert both True and "1" to 1.0.
     if isinstance(value, (list, tuple)):
-        return any(map(_has_bool, value))
+        return any(map(_has_bool_or_text, value))
     return isinstance(value, (bool, str))
 
 
@@ -370,86 +372,92 @@ vector = array(1, "vector")
 matrix = array(2, "matrix")
 
 
-def _square(value: Any) -> FloatArray:
-    """Return the value as a square matrix."""
+def _convert_square(value: Any) -> FloatArray:
+    """Return the value as a square matrix (n, n)."""
     result = matrix.convert(value)
     if result.shape[0] != result.shape[1]:
         raise _SpecificError(f"must be a square matrix, not {result.shape[0]} x {result.shape[1]}")
     return np.asarray(result)
 
 
-square = Rule("must be a square matrix of finite numbers", _square, matrix.remedy, matrix.schema)
+square = Rule(
+    "must be a square matrix of finite numbers", _convert_square, matrix.remedy, matrix.schema
+)
 
 
-def _symmetric(value: Any) -> FloatArray:
-    """Return the value as a symmetric matrix, up to rounding."""
-    result = _square(value)
+def _convert_symmetric(value: Any) -> FloatArray:
+    """Return the value as a matrix (n, n) that is symmetric up to rounding."""
+    result = _convert_square(value)
     if not np.allclose(result, result.T, rtol=1e-9, atol=1e-12 * np.abs(result).max()):
         raise _SpecificError("must be a symmetric matrix")
     return result
 
 
-def _covariance(value: Any) -> FloatArray:
-    """Return the value as a positive semidefinite matrix."""
-    result = _symmetric(value)
+def _convert_covariance(value: Any) -> FloatArray:
+    """Return the value as a symmetric positive semidefinite matrix (n, n)."""
+    result = _convert_symmetric(value)
     if not is_semidefinite(result):
-        least = np.linalg.eigvalsh(result)[0]
-        raise _SpecificError(f"must be positive semidefinite (least eigenvalue {least:.3g})")
+        smallest = np.linalg.eigvalsh(result)[0]
+        raise _SpecificError(f"must be positive semidefinite (least eigenvalue {smallest:.3g})")
     return result
 
 
-def _definite(value: Any) -> FloatArray:
-    """Return the value as a positive definite matrix that is not close to singular."""
-    result = _symmetric(value)
-    values = np.linalg.eigvalsh(result)
-    if not values[0] > max(1e-14 * abs(values[-1]), 1.0 / MAX_MAGNITUDE):
-        raise _SpecificError(f"must be positive definite (least eigenvalue {values[0]:.3g})")
+def _convert_definite_covariance(value: Any) -> FloatArray:
+    """Return the value as a symmetric positive definite matrix (n, n), not close to singular."""
+    result = _convert_symmetric(value)
+    eigenvalues = np.linalg.eigvalsh(result)
+    smallest, largest = eigenvalues[0], eigenvalues[-1]
+    if not smallest > max(1e-14 * abs(largest), 1.0 / MAX_MAGNITUDE):
+        raise _SpecificError(f"must be positive definite (least eigenvalue {smallest:.3g})")
     return result
 
 
 covariance = Rule(
     "must be a covariance matrix",
-    _covariance,
+    _convert_covariance,
     "give a symmetric matrix without negative eigenvalues",
     matrix.schema,
 )
 definite_covariance = Rule(
     "must be a positive definite covariance matrix",
-    _definite,
+    _convert_definite_covariance,
     "give a symmetric matrix with positive eigenvalues",
     matrix.schema,
 )
 
 
-def several(rule: Rule, what: str, least: int = 1) -> Rule:
-    """Return the rule for a list of at least ``least`` values that each obey ``rule``.
+def list_of(rule: Rule, items: str, min_length: int = 1) -> Rule:
+    """Return the rule for a list of at least ``min_length`` values that each obey ``rule``.
 
-    An error names the index of the wrong value in the list.
+    ``items`` is what messages call the values, such as "node ids". An error names the index of the
+    wrong value in the list.
     """
 
     def convert(value: Any) -> tuple[Any, ...]:
         """Return the items as a tuple, each converted by the rule."""
         if isinstance(value, (str, bytes)) or not isinstance(value, (Sequence, np.ndarray)):
             raise TypeError
-        if len(value) < least:
+        if len(value) < min_length:
             raise ValueError
         return tuple(rule(f"[{k}]", item) for k, item in enumerate(value))
 
-    some = "" if least == 0 else " that is not empty"
-    schema = {"type": "array", "items": dict(rule.schema), "minItems": least}
-    return Rule(f"must be a list of {what}{some}", convert, f"write a list of {what}", schema)
+    not_empty = "" if min_length == 0 else " that is not empty"
+    schema = {"type": "array", "items": dict(rule.schema), "minItems": min_length}
+    requirement = f"must be a list of {items}{not_empty}"
+    return Rule(requirement, convert, f"write a list of {items}", schema)
 
 
-def row(*rules: Rule, what: str) -> Rule:
-    """Return the rule for a list of fixed length whose entries obey one rule each."""
+def tuple_of(*rules: Rule, description: str) -> Rule:
+    """Return the rule for a list of fixed length; item k obeys ``rules[k]``.
+
+    ``description`` is what messages call the list, such as "a pair of node ids".
+    """
 
     def convert(value: Any) -> tuple[Any, ...]:
         """Return the items as a tuple, each converted by its own rule."""
         if not isinstance(value, (list, tuple, np.ndarray)) or len(value) != len(rules):
             raise TypeError
-        return tuple(
-            rule(f"[{k}]", v) for k, (rule, v) in enumerate(zip(rules, value, strict=True))
-        )
+        return tuple(rules[k](f"[{k}]", item) for k, item in enumerate(value))
 
     schema = {
         "type": "array",
@@ -457,12 +465,12 @@ def row(*rules: Rule, what: str) -> Rule:
         "minItems": len(rules),
         "maxItems": len(rules),
     }
-    return Rule(f"must be {what}", convert, f"write {what}", schema)
+    return Rule(f"must be {description}", convert, f"write {description}", schema)
 
 
 @dataclass(frozen=True, repr=False)
 class SourceFile:
-    """A file that a scenario refers to: its path as written, relative to ``folder``."""
+    """A file that a scenario refers to: its path ``name`` as written, relative to ``folder``."""
 
     name: str
     folder: Path
@@ -472,18 +480,24 @@ class SourceFile:
 
     @property
     def full(self) -> Path:
-        """Path of the file, relative to the working directory or absolute."""
+        """Path of the file, absolute or relative to the current folder."""
         return self.folder / self.name
 
 
-def _source_file(value: Any) -> SourceFile:
-    """Return the value as a SourceFile inside the folder of the scenario."""
+def _convert_source_file(value: Any) -> SourceFile:
+    """Return the value as an existing SourceFile inside its folder.
+
+    A path from Python is relative to the current folder; the folder of an absolute path is the one
+    that the file is in.
+    """
     if isinstance(value, SourceFile):
         source = value
     elif isinstance(value, (str, Path)) and str(value):
-        source = SourceFile(str(value), Path.cwd())
-        if Path(value).is_absolute():
-            source = SourceFile(Path(value).name, Path(value).parent)
+        path = Path(value)
+        if path.is_absolute():
+            source = SourceFile(path.name, path.parent)
+        else:
+            source = SourceFile(str(value), Path.cwd())
     else:
         raise TypeError
     # A scenario can come from someone else: it must not read files outside its own folder.
@@ -492,7 +506,7 @@ def _source_file(value: Any) -> SourceFile:
         raise _SpecificError("must stay inside the folder of the scenario file")
     try:
         folder = source.folder.resolve()
-        # A link inside the folder may still lead out of it.
+        # A symbolic link inside the folder may lead out of it.
         if not source.full.resolve().is_relative_to(folder):
             raise _SpecificError("must stay inside the folder of the scenario file")
         if not source.full.is_file():
@@ -503,9 +517,9 @@ def _source_file(value: Any) -> SourceFile:
 
 
 def as_path(name: str, value: object, remedy: str = "give it as text or a pathlib.Path") -> Path:
-    """Return a path that a script gives as a text or a path; raises ScenarioError for other types.
+    """Return the argument ``name`` of a public function as a path.
 
-    ``name`` is the argument.
+    Raises ScenarioError unless the value is a text or a path of text.
     """
     if not isinstance(value, (str, os.PathLike)):
         raise ScenarioError(name, "must be a path", value, remedy)
@@ -517,13 +531,13 @@ def as_path(name: str, value: object, remedy: str = "give it as text or a pathli
 
 source_file = Rule(
     "must be the path of a file",
-    _source_file,
+    _convert_source_file,
     "give a path relative to the scenario file",
     {"type": "string", "minLength": 1},
 )
 
 
 def as_class(part: Component, cls: type[Component]) -> Any:
-    """Return an object of a base class ``cls`` of a part, with the same fields."""
-    names = [one.name for one in dataclasses.fields(cls) if one.init]
+    """Return an object of ``cls``, a base class of the component's class, with the same fields."""
+    names = [f.name for f in dataclasses.fields(cls) if f.init]
     return cls(**{name: getattr(part, name) for name in names})

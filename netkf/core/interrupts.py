@@ -1,4 +1,4 @@
-"""Blocks of code that signals must not interrupt."""
+"""Blocks of code that SIGINT (Ctrl-C) and SIGTERM do not interrupt."""
 
 from __future__ import annotations
 
@@ -10,34 +10,39 @@ from contextlib import contextmanager
 from typing import Any
 
 DEFERRED = (signal.SIGINT, signal.SIGTERM)
-_inside = False
+_is_deferring = False  # the main thread is in a block of defer_signals
 
 
 @contextmanager
 def defer_signals() -> Iterator[None]:
-    """Defer SIGINT and SIGTERM until the outermost such block is left.
+    """Hold back SIGINT and SIGTERM in a block; their handlers are called when it is left.
 
-    In other threads than the main one this does nothing: Python delivers signals to that one.
+    Of blocks inside one another the outermost counts. In other threads than the main one this does
+    nothing, because Python calls handlers in the main thread only.
     """
-    global _inside  # noqa: PLW0603 - of the main thread alone
-    if _inside or threading.current_thread() is not threading.main_thread():
+    global _is_deferring  # noqa: PLW0603 - only the main thread uses it
+    if _is_deferring or threading.current_thread() is not threading.main_thread():
         yield
         return
     received: list[tuple[int, Any]] = []
-    found = {number: signal.getsignal(number) for number in DEFERRED}
-    before = {number: handler for number, handler in found.items() if handler is not None}
-    for number in before:  # one that is None is not Python's, and Python could not put it back
+    handlers: dict[signal.Signals, Any] = {}
+    for number in DEFERRED:
+        handler = signal.getsignal(number)
+        if handler is not None:  # None: set by other code than Python, which could not restore it
+            handlers[number] = handler
+    for number in handlers:
         signal.signal(number, lambda number, frame: received.append((number, frame)))
-    _inside = True
+    _is_deferring = True
     try:
         yield
     finally:
-        _inside = False
-        for number in reversed(before):  # a Ctrl-C from now on ends this loop: it comes last
-            signal.signal(number, before[number])
-        for code, frame in received:
-            handler: Any = before[signal.Signals(code)]
+        _is_deferring = False
+        # SIGINT comes last: once its handler is restored, a Ctrl-C raises inside this loop.
+        for number in reversed(handlers):
+            signal.signal(number, handlers[number])
+        for received_number, frame in received:
+            handler = handlers[signal.Signals(received_number)]
             if callable(handler):
-                handler(code, frame)
+                handler(received_number, frame)
             elif handler == signal.SIG_DFL:
-                os.kill(os.getpid(), code)
+                os.kill(os.getpid(), received_number)

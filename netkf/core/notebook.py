@@ -1,4 +1,4 @@
-"""How results show themselves: in a line at a prompt, with their table in a notebook."""
+"""Display of results: one line at a prompt, that line and a table in a notebook."""
 
 from __future__ import annotations
 
@@ -8,26 +8,26 @@ from typing import Any
 from netkf.core.printable import one_line
 
 MAX_ROWS = 60
-"""Rows of a table that a notebook shows; of longer ones the ends."""
+"""Rows of a table that a notebook shows; of longer tables it shows the beginning and the end."""
 
 
 class NotebookTable:
-    """Base class of results: ``repr`` is a line, a notebook shows that line and ``table``, and
-    completion offers public names only.
+    """Base class of results: a notebook shows ``repr`` and ``table``.
+
+    Completion at a prompt offers public names only.
     """
 
     def _notebook_table(self) -> Any:
-        """Return the pandas table that a notebook shows."""
+        """Return the pandas DataFrame that a notebook shows; None to show no table."""
         return getattr(self, "table", None)
 
     def _repr_html_(self) -> str:
         """Return the HTML that notebooks display."""
         line = f"<p><code>{html.escape(one_line(repr(self)))}</code></p>"
-        table = self._notebook_table()
-        # Texts in tables may come from files; pandas escapes them.
-        rows = (
-            "" if table is None else table.to_html(max_rows=MAX_ROWS, float_format="{:.4g}".format)
-        )
+        table, rows = self._notebook_table(), ""
+        if table is not None:
+            # Texts in tables may come from files; to_html escapes them.
+            rows = table.to_html(max_rows=MAX_ROWS, float_format="{:.4g}".format)
         return f"<div>{line}{rows}</div>"
 
     def __dir__(self) -> list[str]:

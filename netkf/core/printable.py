@@ -1,13 +1,14 @@
-"""Text that a terminal shows as it is: nothing in it moves the cursor or changes direction."""
+"""Texts that are safe to print in a terminal, and shortened texts."""
 
 from __future__ import annotations
 
 
 def printable(text: str, keep: str = "\n\t") -> str:
-    """Return a text whose control and format characters are escaped, those in ``keep`` excepted.
+    """Return a text with control and format characters escaped as in ``repr``, except ``keep``.
 
-    Escaped are C0 and C1 controls, so also ANSI sequences, bidirectional and invisible format
-    characters, line and paragraph separators, and surrogates: what ``repr`` escapes.
+    Nothing in it can move the cursor, change colors or the direction of writing: escaped are C0 and
+    C1 controls (which begin ANSI sequences), bidirectional and invisible format characters, line
+    and paragraph separators, and surrogates.
     """
     if text.isprintable():
         return text
@@ -15,19 +16,19 @@ def printable(text: str, keep: str = "\n\t") -> str:
 
 
 def one_line(text: object) -> str:
-    """Return a text as one line, whatever it contains: line breaks are escaped too."""
+    """Return a text as :func:`printable` does, with line breaks and tabs escaped too."""
     return printable(str(text), keep="")
 
 
-def shorten(text: object, longest: int = 200) -> str:
-    """Return a text as one line, without its middle if it is long."""
-    return cut_middle(one_line(text), longest)
+def shorten(text: object, max_length: int = 200) -> str:
+    """Return a text as one line of at most ``max_length`` characters, see :func:`cut_middle`."""
+    return cut_middle(one_line(text), max_length)
 
 
-def cut_middle(text: str, longest: int) -> str:
-    """Return a text of at most ``longest`` characters, without its middle if it is longer."""
-    half = (longest - 5) // 2
-    return text if len(text) <= longest else f"{text[:half]} ... {text[-half:]}"
+def cut_middle(text: str, max_length: int) -> str:
+    """Return a text of at most ``max_length`` characters: " ... " replaces the middle if needed."""
+    half = (max_length - 5) // 2
+    return text if len(text) <= max_length else f"{text[:half]} ... {text[-half:]}"
 
 
 def _escape(character: str) -> str:

@@ -9,7 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from netkf.core.fields import choice, integer
+from netkf.core.fields import integer, one_of
 from netkf.ensembles.checkpoints import BlockCheckpoints, RunIdentity
 from netkf.ensembles.monte_carlo import Ensemble, ensemble_of, ensemble_table
 from netkf.ensembles.pools import ANYWHERE, Pool, PoolOptions, block_size, make_pool
@@ -98,7 +98,7 @@ def runs_to_directory(
     """
     started = time.perf_counter()
     runs = integer(low=1)("runs", runs)
-    choice(*TRACES)("trace", options.trace)
+    one_of(*TRACES)("trace", options.trace)
     engine_used = choose_engine(options.engine, scenario, announce=False)
     check_sources(scenario)
     pool = make_pool(runs, options.pool)

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from netkf.core.errors import ScenarioError, nearest
+from netkf.core.errors import ScenarioError, suggest_nearest
 from netkf.figures.consistency import nees_figure, nis_figure, whiteness_figure
 from netkf.figures.error import error_figure, quantiles_figure, ratios_figure
 from netkf.figures.figure_data import FigureData, UnavailableError, reduce_result
@@ -68,7 +68,7 @@ class FigureSet:
         Raises ScenarioError for an unknown name.
         """
         if name not in self.names:
-            hint = nearest(name, self.names)
+            hint = suggest_nearest(name, self.names)
             remedy = f"{hint}its figures are {', '.join(self.names)}"
             raise ScenarioError("figure", "is not known", name, remedy)
         with style_context():

@@ -15,7 +15,7 @@ from netkf.core.fields import (
     Component,
     boolean,
     field,
-    instance,
+    instance_of,
     number,
     positive,
     probability,
@@ -351,8 +351,8 @@ class Channel(Component):
     has draws of its own. A link of a directed graph is a single direction.
     """
 
-    loss: Loss = field(instance(Loss), default=NoLoss())
-    delay: Delay = field(instance(Delay), default=NoDelay())
+    loss: Loss = field(instance_of(Loss), default=NoLoss())
+    delay: Delay = field(instance_of(Delay), default=NoDelay())
     symmetric: bool = field(boolean, default=True)
 
 

@@ -12,20 +12,20 @@ from typing import Any
 import numpy as np
 
 from netkf.core.clock import Clock, Entity
-from netkf.core.csv_files import read_columns, read_header, whole
+from netkf.core.csv_files import parse_integers, read_columns, read_header
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import (
     Rule,
     SourceFile,
-    choice,
     either,
     field,
     integer,
+    list_of,
     number,
+    one_of,
     positive,
-    row,
-    several,
     source_file,
+    tuple_of,
 )
 from netkf.linalg.arrays import FloatArray
 from netkf.network.graphs import Topology, demand_links, demand_nodes
@@ -43,7 +43,7 @@ class LinkClock(Clock):
     the node broadcasts to every neighbour; an entity is (node,).
     """
 
-    at: str = field(choice(*AT), default="links")
+    at: str = field(one_of(*AT), default="links")
 
     def entities(self, topology: Topology) -> tuple[Entity, ...]:
         """Return the ids of all entities that have a clock, in order."""
@@ -85,8 +85,8 @@ def _accumulate(now: float, gaps: FloatArray) -> FloatArray:
 
 
 _rate = number(above=0.0, high=1e9)
-_link_rate = row(integer(), integer(), _rate, what="a triple [i, j, rate]")
-_node_rate = row(integer(), _rate, what="a pair [i, rate]")
+_link_rate = tuple_of(integer(), integer(), _rate, description="a triple [i, j, rate]")
+_node_rate = tuple_of(integer(), _rate, description="a pair [i, rate]")
 
 
 def _one_rate(value: Any) -> tuple[float, ...]:
@@ -115,7 +115,7 @@ class Poisson(LinkClock):
 
     rate: float | None = field(_rate, default=None)
     rates: tuple[tuple[float, ...], ...] = field(
-        several(_entity_rate, "triples [i, j, rate]", least=0), default=()
+        list_of(_entity_rate, "triples [i, j, rate]", min_length=0), default=()
     )
 
     def __post_init__(self) -> None:
@@ -207,7 +207,7 @@ class Renewal(LinkClock):
     weibull gaps of shape 1 are the Poisson clock.
     """
 
-    distribution: str = field(choice(*PARAMETERS))
+    distribution: str = field(one_of(*PARAMETERS))
     mean: float | None = field(positive, default=None)
     rate: float | None = field(_rate, default=None)
     scale: float | None = field(positive, default=None)
@@ -297,7 +297,7 @@ class Periodic(LinkClock):
 
     period: float = field(number(low=MIN_GAP))
     phase: float | str = field(
-        either(number(low=0.0), choice("random"), lambda value: isinstance(value, str)), default=0.0
+        either(number(low=0.0), one_of("random"), lambda value: isinstance(value, str)), default=0.0
     )
     jitter: float = field(number(low=0.0), default=0.0)
 
@@ -366,7 +366,7 @@ class RecordedClock(LinkClock):
                 float(table["t"][early[0]]),
                 "shift the times or remove the row",
             )
-        ids = zip(*(whole(self.path, name, table[name]) for name in columns), strict=True)
+        ids = zip(*(parse_integers(self.path, name, table[name]) for name in columns), strict=True)
         times: dict[Entity, list[float]] = {}
         for t, entity in zip(table["t"].tolist(), ids, strict=True):
             key = tuple(sorted(entity)) if self.at == "links" else entity

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from netkf.core.csv_files import read_columns, read_header, whole
+from netkf.core.csv_files import parse_integers, read_columns, read_header
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import (
     Component,
@@ -20,12 +20,12 @@ from netkf.core.fields import (
     boolean,
     field,
     integer,
+    list_of,
     number,
     positive,
     probability,
-    row,
-    several,
     source_file,
+    tuple_of,
 )
 from netkf.network.spectra import largest_laplacian_eigenvalue
 
@@ -171,6 +171,7 @@ def _from_networkx(graph: networkx.Graph[Any], **more: Any) -> Topology:
 
 _count = integer(low=1, high=MAX_NODES)
 _node = integer(low=0, high=2**53)
+_node_pair = tuple_of(_node, _node, description="a pair of node ids")
 
 
 def _check_size(nodes: int, links: int) -> None:
@@ -364,9 +365,7 @@ def _probability_within(radius: float) -> float:
 class Edges(Graph):
     """A list of links; ``nodes = N`` names the nodes 0 .. N - 1, otherwise the links do."""
 
-    edges: tuple[Link, ...] = field(
-        several(row(_node, _node, what="a pair of node ids"), "pairs of node ids", least=0)
-    )
+    edges: tuple[Link, ...] = field(list_of(_node_pair, "pairs of node ids", min_length=0))
     nodes: int | None = field(_count, default=None)
     directed: bool = field(boolean, default=False)
 
@@ -448,8 +447,8 @@ class CsvGraph(Graph):
     def _table(self) -> _Table:
         """Return the table of the file; raises ScenarioError for wrong or repeated rows."""
         columns = read_columns(self.path, ("sender", "receiver"), ("delivery_probability",))
-        senders = whole(self.path, "sender", columns["sender"])
-        receivers = whole(self.path, "receiver", columns["receiver"])
+        senders = parse_integers(self.path, "sender", columns["sender"])
+        receivers = parse_integers(self.path, "receiver", columns["receiver"])
         has_probabilities = "delivery_probability" in columns
         ones = [1.0] * len(senders)
         values = columns["delivery_probability"].tolist() if has_probabilities else ones
@@ -512,7 +511,7 @@ class CsvGraph(Graph):
                 rule = f"{source.name} must have the columns node, x, y"
                 raise ScenarioError("", rule, list(names), "add what is missing")
             columns = read_columns(source, names)
-            ids = whole(source, names[0], columns[names[0]])
+            ids = parse_integers(source, names[0], columns[names[0]])
         except ScenarioError as error:
             # These errors name "path", which here is the key of the other table.
             raise ScenarioError("positions", error.rule, error.value, error.remedy) from None

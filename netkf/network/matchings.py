@@ -13,14 +13,14 @@ from functools import cache, cached_property, lru_cache
 
 import numpy as np
 
-from netkf.core.csv_files import read_columns, read_header, whole
+from netkf.core.csv_files import parse_integers, read_columns, read_header
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import (
     Component,
     SourceFile,
-    choice,
     field,
     number,
+    one_of,
     positive,
     source_file,
 )
@@ -60,7 +60,7 @@ class Matching(SlotActivation):
     independent     each link with probability ``p`` by itself; links that meet are all dropped
     """
 
-    protocol: str = field(choice(*PROTOCOLS))
+    protocol: str = field(one_of(*PROTOCOLS))
     lazy: float | None = field(number(low=0.0, below=1.0), default=None)
     p: float | None = field(number(above=0.0, high=1.0), default=None)
 
@@ -273,7 +273,7 @@ class RecordedSlots(SlotActivation):
         if not matching:
             names = ("slot", "phase", "step", "node", "peer")
         table = read_columns(self.path, names)
-        columns = {name: whole(self.path, name, table[name]) for name in names}
+        columns = {name: parse_integers(self.path, name, table[name]) for name in names}
         pairs: dict[tuple[int, int, int], list[Link]] = {}
         for row, (slot, i, j) in enumerate(
             zip(columns["slot"], columns["node"], columns["peer"], strict=True)

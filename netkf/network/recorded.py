@@ -10,16 +10,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from netkf.core.csv_files import read_columns, whole
+from netkf.core.csv_files import parse_integers, read_columns
 from netkf.core.errors import ScenarioError
-from netkf.core.fields import SourceFile, choice, field, source_file
+from netkf.core.fields import SourceFile, field, one_of, source_file
 from netkf.network.channels import Delay, Loss
 from netkf.network.graphs import Link, Topology, demand_links
 
 AFTER = ("deliver", "lose", "repeat", "refuse")
 """The treatments of a message that the table does not list."""
 
-_after = choice(*AFTER)
+_after = one_of(*AFTER)
 
 
 class MessageUse(NamedTuple):
@@ -82,7 +82,7 @@ def read_messages(
     """
     names = ("sender", "receiver", "message")
     table = read_columns(source, (*names, column))
-    keys = zip(*(whole(source, name, table[name]) for name in names), strict=True)
+    keys = zip(*(parse_integers(source, name, table[name]) for name in names), strict=True)
     values: dict[Link, dict[int, float]] = {}
     for (sender, receiver, message), value in zip(keys, table[column].tolist(), strict=True):
         listed = values.setdefault((sender, receiver), {})

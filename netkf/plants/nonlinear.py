@@ -18,14 +18,14 @@ import numpy as np
 from netkf.core.clock import Clock
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import (
-    choice,
     definite_covariance,
     either,
     field,
+    has_depth,
     integer,
+    list_of,
     matrix,
-    nested,
-    several,
+    one_of,
 )
 from netkf.linalg.arrays import FloatArray
 from netkf.plants.linear import SlotReadings
@@ -158,8 +158,8 @@ class PositionedSensor(NonlinearSensor):
     states     which components of the state are the target's position
     """
 
-    positions: str | FloatArray = field(either(choice(GRAPH), matrix, nested(1)), default=GRAPH)
-    states: tuple[int, ...] = field(several(integer(low=0), "numbers of states"), default=(0, 1))
+    positions: str | FloatArray = field(either(one_of(GRAPH), matrix, has_depth(1)), default=GRAPH)
+    states: tuple[int, ...] = field(list_of(integer(low=0), "numbers of states"), default=(0, 1))
 
     rows: ClassVar[int] = 0
     """Length of a reading."""

@@ -14,15 +14,21 @@ from typing import ClassVar
 
 import numpy as np
 
-from netkf.core.csv_files import finite_numbers, read_columns, read_header, read_rows, whole
+from netkf.core.csv_files import (
+    parse_finite_numbers,
+    parse_integers,
+    read_columns,
+    read_header,
+    read_rows,
+)
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import (
     SourceFile,
     definite_covariance,
     field,
     integer,
+    list_of,
     matrix,
-    several,
     source_file,
 )
 from netkf.linalg.arrays import FloatArray, readonly_array
@@ -182,7 +188,7 @@ class RecordedSensor(Sensor):
     path: SourceFile = field(source_file)
     H: FloatArray = field(matrix, default=None)
     R: FloatArray = field(definite_covariance)
-    nodes: tuple[int, ...] = field(several(integer(), "node ids"), default=None)
+    nodes: tuple[int, ...] = field(list_of(integer(), "node ids"), default=None)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -234,8 +240,10 @@ class RecordedSensor(Sensor):
         """Node and time (seconds) of every row."""
         header, lines = self._lines
         indices = [header.index("t"), header.index("node")]
-        numbers = [finite_numbers(self.path, line, header, row, indices) for line, row in lines]
-        nodes = whole(self.path, "node", np.array([node for _, node in numbers]))
+        numbers = [
+            parse_finite_numbers(self.path, line, header, row, indices) for line, row in lines
+        ]
+        nodes = parse_integers(self.path, "node", np.array([node for _, node in numbers]))
         return list(zip(nodes, (t for t, _ in numbers), strict=True))
 
     @property
@@ -254,7 +262,7 @@ class RecordedSensor(Sensor):
         rows: dict[int, list[tuple[float, FloatArray]]] = {node: [] for node in self.nodes}
         for node, (line, entries) in zip(self._ids, lines, strict=True):
             if node in rows:
-                t, *y = finite_numbers(self.path, line, header, entries, indices)
+                t, *y = parse_finite_numbers(self.path, line, header, entries, indices)
                 self._demand_empty(line, header, entries, surplus)
                 rows[node].append((t, np.array(y)))
         return rows

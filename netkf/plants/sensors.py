@@ -24,8 +24,8 @@ from netkf.core.fields import (
     definite_covariance,
     field,
     integer,
+    list_of,
     matrix,
-    several,
 )
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
@@ -46,7 +46,7 @@ class Sensor(Component):
     is_random: ClassVar[bool] = True
     """True if runs draw the readings from H and R; else H and R are only the filters' belief."""
 
-    nodes: tuple[int, ...] = field(several(integer(), "node ids"))
+    nodes: tuple[int, ...] = field(list_of(integer(), "node ids"))
 
     linear: ClassVar[bool] = True
     """Whether readings are linear in the state."""

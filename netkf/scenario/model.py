@@ -20,13 +20,13 @@ from netkf.core.fields import (
     definite_covariance,
     either,
     field,
-    instance,
+    has_depth,
+    instance_of,
     integer,
     line,
+    list_of,
     matrix,
-    nested,
     seconds,
-    several,
     square,
     text,
     vector,
@@ -52,11 +52,11 @@ class Network(Component):
     channel     losses and delays of messages
     """
 
-    graph: Graph = field(instance(Graph))
+    graph: Graph = field(instance_of(Graph))
     activation: LinkClock | SlotActivation | None = field(
-        instance(LinkClock, SlotActivation), default=None
+        instance_of(LinkClock, SlotActivation), default=None
     )
-    channel: Channel = field(instance(Channel), default=Channel())
+    channel: Channel = field(instance_of(Channel), default=Channel())
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +75,9 @@ class Belief(Component):
     F: FloatArray | None = field(square, default=None)
     Q: FloatArray | None = field(covariance, default=None)
     R: FloatArray | tuple[FloatArray, ...] | None = field(
-        either(definite_covariance, several(definite_covariance, "covariance matrices"), nested(3)),
+        either(
+            definite_covariance, list_of(definite_covariance, "covariance matrices"), has_depth(3)
+        ),
         default=None,
     )
 
@@ -90,15 +92,15 @@ class Filtering(Component):
     model  what the filters believe where it differs from the truth
     """
 
-    algorithm: AnyFilter = field(instance(Filter, FlowFilter, SlotFilter))
+    algorithm: AnyFilter = field(instance_of(Filter, FlowFilter, SlotFilter))
     mean: FloatArray | tuple[FloatArray, ...] | None = field(
-        either(vector, several(vector, "vectors, one per node"), nested(2)), default=None
+        either(vector, list_of(vector, "vectors, one per node"), has_depth(2)), default=None
     )
     cov: FloatArray | tuple[FloatArray, ...] | None = field(
-        either(covariance, several(covariance, "covariance matrices, one per node"), nested(3)),
+        either(covariance, list_of(covariance, "covariance matrices, one per node"), has_depth(3)),
         default=None,
     )
-    model: Belief = field(instance(Belief), default=Belief())
+    model: Belief = field(instance_of(Belief), default=Belief())
 
 
 class PlacedSensor(NamedTuple):
@@ -132,11 +134,11 @@ class ScenarioModel(Component):
 
     name: str = field(text)
     horizon: float = field(seconds)
-    plant: Plant = field(instance(Plant))
-    sensors: tuple[Any, ...] = field(several(instance(Sensor), "sensors", least=0))
-    network: Network = field(instance(Network))
-    filter: Filtering = field(instance(Filtering))
-    probe: float | FloatArray = field(either(seconds, array(1, "list of times"), nested(1)))
+    plant: Plant = field(instance_of(Plant))
+    sensors: tuple[Any, ...] = field(list_of(instance_of(Sensor), "sensors", min_length=0))
+    network: Network = field(instance_of(Network))
+    filter: Filtering = field(instance_of(Filtering))
+    probe: float | FloatArray = field(either(seconds, array(1, "list of times"), has_depth(1)))
     claim: str = field(line, default="")
     seed: int = field(integer(low=0), default=0)
 

@@ -11,7 +11,7 @@ from netkf.algorithms.flow import FlowFilter
 from netkf.algorithms.registry import built_in_filters, split_choice
 from netkf.algorithms.slot import SlotFilter
 from netkf.core.clock import Clock
-from netkf.core.errors import ScenarioError, nearest
+from netkf.core.errors import ScenarioError, suggest_nearest
 from netkf.core.fields import Component
 from netkf.network import channels, clocks, graphs, matchings, recorded
 from netkf.plants.diffusion import Diffusion
@@ -189,7 +189,7 @@ def find_kind(
         "kind",
         f"must be one of {listed}",
         kind,
-        f'{nearest(kind, kinds)}choose one, or write "package.module:Class"',
+        f'{suggest_nearest(kind, kinds)}choose one, or write "package.module:Class"',
     )
 
 

@@ -13,7 +13,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
-from netkf.core.errors import ScenarioError, nearest
+from netkf.core.errors import ScenarioError, suggest_nearest
 from netkf.core.fields import Component, SourceFile, integer, source_file
 from netkf.network.channels import Channel
 from netkf.scenario.derived import DerivedScenario
@@ -177,7 +177,7 @@ def _build_object(
     for key, value in values.items():
         if key not in fields:
             allowed_keys = [*other_keys, *fields]
-            remedy = f"{nearest(key, allowed_keys)}keys are {', '.join(allowed_keys)}"
+            remedy = f"{suggest_nearest(key, allowed_keys)}keys are {', '.join(allowed_keys)}"
             raise ScenarioError(key, UNKNOWN, value, remedy)
     for name, field in fields.items():
         if field.default is dataclasses.MISSING and name not in values:

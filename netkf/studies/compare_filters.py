@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from netkf.algorithms.filter import Filter
-from netkf.core.errors import EngineError, ScenarioError, nearest
+from netkf.core.errors import EngineError, ScenarioError, suggest_nearest
 from netkf.core.fields import integer, number
 from netkf.core.notebook import NotebookTable
 from netkf.core.printable import one_line, shorten
@@ -304,7 +304,7 @@ def _filter_table(scenario: Scenario, choice: Any) -> dict[str, Any]:
     kind = table.get("kind")
     kinds = sorted(list_kinds("filter"))
     if not isinstance(kind, str) or (":" not in kind and kind not in kinds):
-        hint = nearest(kind, kinds) if isinstance(kind, str) else ""
+        hint = suggest_nearest(kind, kinds) if isinstance(kind, str) else ""
         raise ScenarioError(
             "filters", "is no filter", kind, f"{hint}filters are {', '.join(kinds)}"
         )

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from netkf.core.fields import field, instance
+from netkf.core.fields import field, instance_of
 from netkf.linalg.arrays import FloatArray
 from netkf.network.channels import Channel, Delay, Loss, NoDelay
 from netkf.network.graphs import Link, Topology
@@ -54,9 +54,9 @@ class DeliveringLoss(Loss):
     All but the chosen messages have the same draws and fates as in the run.
     """
 
-    given: Loss = field(instance(Loss))
+    given: Loss = field(instance_of(Loss))
     # A mutable object, set before each replay: one scenario with its cached tables serves all.
-    deliveries: Deliveries = field(instance(Deliveries))
+    deliveries: Deliveries = field(instance_of(Deliveries))
 
     @property
     def deterministic(self) -> bool:
@@ -101,8 +101,8 @@ class HurryingDelay(Delay):
     time.
     """
 
-    given: Delay = field(instance(Delay))
-    deliveries: Deliveries = field(instance(Deliveries))
+    given: Delay = field(instance_of(Delay))
+    deliveries: Deliveries = field(instance_of(Deliveries))
 
     def draw(self, random: np.random.Generator) -> float:
         """Return a draw of the model ``given``."""

@@ -8,7 +8,7 @@ from concurrent.futures import Executor
 from functools import partial
 
 from netkf.core.errors import ScenarioError, TheoryError
-from netkf.core.fields import choice, integer, number
+from netkf.core.fields import integer, number, one_of
 from netkf.engines.base import Engine
 from netkf.ensembles.blocks import BlockTask, each_replica
 from netkf.ensembles.pools import PoolOptions
@@ -80,7 +80,7 @@ def size(
     if not isinstance(scenario, Scenario):
         raise ScenarioError("", "size takes a netkf.Scenario", scenario, LOAD)
     if by is not None:
-        choice("theory", "simulation")("--by", by)
+        one_of("theory", "simulation")("--by", by)
     parsed, confidence = (
         parse_target(target),
         number(above=0.0, below=1.0)("--confidence", confidence),

@@ -3,7 +3,7 @@
 import gc
 import threading
 
-from netkf.core.memory import LentMemory
+from netkf.core.memory import ReusableMemory
 
 
 def address(array):
@@ -11,7 +11,7 @@ def address(array):
 
 
 def test_memory_is_lent_again_when_the_last_part_of_it_is_gone():
-    memory = LentMemory(8000)
+    memory = ReusableMemory(8000)
     first = memory.array(1000)
     first[:] = 1.0
     # A part of a part still uses it.
@@ -28,7 +28,7 @@ def test_memory_is_lent_again_when_the_last_part_of_it_is_gone():
 
 
 def test_arrays_that_are_too_large_are_not_kept():
-    memory = LentMemory(800)
+    memory = ReusableMemory(800)
     assert len(memory.array(101)) == 101
     small = memory.array(100)
     assert small.base is not None
@@ -36,7 +36,7 @@ def test_arrays_that_are_too_large_are_not_kept():
 
 
 def test_threads_have_memory_of_their_own():
-    memory, places = LentMemory(8000), []
+    memory, places = ReusableMemory(8000), []
     mine = memory.array(1000)
     theirs = threading.Thread(target=lambda: places.append(address(memory.array(1000))))
     theirs.start()

@@ -25,7 +25,7 @@ from netkf.algorithms.kernels.slots import (
     SlotSamples,
     slot_scratch,
 )
-from netkf.core.memory import LentMemory, keep_freed_memory
+from netkf.core.memory import ReusableMemory, keep_freed_memory
 from netkf.engines.base import Progress
 from netkf.engines.compiled.samples import record_samples
 from netkf.engines.compiled.slot_events import SlotEvents
@@ -60,7 +60,7 @@ from netkf.trace.run import StateSamples
 from netkf.trace.schema import EVENT, KINDS
 
 NEVER = np.iinfo(np.int64).max
-_samples = LentMemory(BATCH_BYTES)
+_samples = ReusableMemory(BATCH_BYTES)
 
 
 class SampledStates(NamedTuple):
