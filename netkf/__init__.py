@@ -8,8 +8,8 @@ from netkf.core.errors import EngineError, NetkfError, ScenarioError, TheoryErro
 from netkf.core.version import __version__ as __version__
 
 TYPE_CHECKING = False
-"""Type checkers read it as True. ``typing`` itself takes half of the time in which a command of
-netkf does not handle signals yet.
+"""Type checkers take it as True. It is not imported from ``typing``, because that import takes half
+of the time in which a command of netkf does not handle signals yet.
 """
 if TYPE_CHECKING:
     from typing import Any
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from netkf.studies.why import why
     from netkf.trace.run import Run, first_difference
 
-_WHERE = {
+_MODULE_OF = {
     "Belief": "netkf.scenario.model",
     "Ensemble": "netkf.ensembles.monte_carlo",
     "Filtering": "netkf.scenario.model",
@@ -55,8 +55,9 @@ _WHERE = {
     "theory": "netkf.theory",
     "why": "netkf.studies.why",
 }
-
+"""The module of each public name that is imported at first use."""
 _MODULES = ("parts", "testing", "theory")
+"""The public names that are modules themselves."""
 
 __all__ = [
     "Belief",
@@ -88,13 +89,13 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    # Imported at first use, so that `import netkf` stays quick.
-    if name not in _WHERE:
+    """Return a public name, which is imported at first use so that `import netkf` stays quick."""
+    if name not in _MODULE_OF:
         raise AttributeError(f"module 'netkf' has no attribute {name!r}")
-    module = importlib.import_module(_WHERE[name])
+    module = importlib.import_module(_MODULE_OF[name])
     return module if name in _MODULES else getattr(module, name)
 
 
 def __dir__() -> list[str]:
-    # Not in __all__: ``from netkf import *`` must leave Python's own ``open`` alone.
+    # ``open`` is not in __all__: ``from netkf import *`` must leave Python's own ``open`` alone.
     return sorted([*__all__, "__version__", "open"])

@@ -1,8 +1,8 @@
-"""Everything that a scenario is built from in Python, under one roof.
+"""All classes from which a scenario is built in Python.
 
-``Scenario``, ``Network``, ``Filtering``, ``Belief`` and ``Channel``; the class of every kind that a
-scenario file can name (``kinds()`` lists them); the contracts that users' own classes derive from;
-``setting`` and the rules of its fields.
+They are ``Scenario``, ``Network``, ``Filtering``, ``Belief`` and ``Channel``; the class of every
+kind that a scenario file can name (``kinds()`` lists them); the base classes of users' own classes;
+``setting``, which declares fields of these, and the rules of fields.
 """
 
 from __future__ import annotations
@@ -106,12 +106,15 @@ from netkf.scenario.registry import KINDS
 from netkf.scenario.scenario import Scenario
 
 SlotLocal, SlotCentral = Local, Central
-"""Their former names in slots."""
+"""Former names of Local and Central in slots."""
 
 
 def kinds() -> dict[str, dict[str, type]]:
-    """Return the classes by family and kind, as scenario files name them."""
-    return {family: dict(names) for family, names in KINDS.items()}
+    """Return the classes by family ("plant", "filter", ...) and kind, as scenario files name them.
+
+    Where a further key chooses among classes of one kind, the name is "kind key=value".
+    """
+    return {family: dict(classes) for family, classes in KINDS.items()}
 
 
 def __dir__() -> list[str]:

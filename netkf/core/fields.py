@@ -54,7 +54,7 @@ class Rule:
 
 
 class _SpecificError(ValueError):
-    """Raised by ``Rule.convert``: a requirement, and maybe a remedy, more precise than the rule's."""
+    """Raised by ``Rule.convert``: a requirement, maybe a remedy, more precise than the rule's."""
 
     def __init__(self, requirement: str, remedy: str = "") -> None:
         super().__init__(requirement)
