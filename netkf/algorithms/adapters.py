@@ -1,7 +1,7 @@
 """Adapters from the deprecated contracts ``FlowFilter`` and ``SlotFilter`` to ``Filter``.
 
 User classes that derive from ``FlowFilter`` (continuous time) or ``SlotFilter`` (slots) keep
-working, each in the kind of time that it was written for.
+working, each in the model of time that it was written for.
 """
 
 from __future__ import annotations

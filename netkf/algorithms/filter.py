@@ -1,4 +1,4 @@
-"""The contract of node algorithms: one for every kind of time.
+"""The contract of node algorithms: one for every model of time.
 
 A filter is a frozen dataclass of parameters with pure functions on an immutable state (a NamedTuple
 of arrays that nothing changes in place). The engine calls ``predict`` for the time that passes,

@@ -1,4 +1,4 @@
-"""Models: what a node assumes about the plant and its own sensors, in both kinds of time."""
+"""Models: what a node assumes about the plant and its own sensors, in both models of time."""
 
 from __future__ import annotations
 

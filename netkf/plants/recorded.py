@@ -1,4 +1,4 @@
-"""Plants and sensors whose truth or readings come from tables, in both kinds of time.
+"""Plants and sensors whose truth or readings come from tables, in both models of time.
 
 ``demand`` raises, before a run starts, if the table lacks a state that the run needs. Readings may
 be missing: a node whose table has no row for a slot has no reading in that slot.
@@ -79,7 +79,7 @@ class RecordedPlant(LinearPlant):
         rows = list(zip(times.tolist(), states, strict=True))
         return by_slot(self.path, rows, self.period, "")
 
-    def demand(self, slots: Iterable[int]) -> None:
+    def require_slots(self, slots: Iterable[int]) -> None:
         """Raise ScenarioError if the table has no state for one of the slots."""
         _demand_rows(self.path, self.table, slots, self.period, "state")
 
@@ -102,7 +102,7 @@ class UnknownDiffusion(Diffusion):
         """The truth of a run: nan at all times."""
         return RecordedTruth(NO_TIMES, np.empty((0, self.n)), self.n)
 
-    def demand(self, times: FloatArray, what: str) -> None:
+    def require_times(self, times: FloatArray, what: str) -> None:
         """Accept any times: no state is known."""
 
 
@@ -137,7 +137,7 @@ class RecordedDiffusion(Diffusion):
         """The states of the table."""
         return RecordedTruth(*self.table, self.n)
 
-    def demand(self, times: FloatArray, what: str) -> None:
+    def require_times(self, times: FloatArray, what: str) -> None:
         """Raise ScenarioError if the table has no state at one of the times (seconds).
 
         ``what`` names the use of the states in the message.
@@ -286,7 +286,7 @@ class RecordedSensor(Sensor):
         """
         return by_slot(self.path, self._rows[node], period, f" of node {node}")
 
-    def demand(self, period: float) -> None:
+    def require_slot_times(self, period: float) -> None:
         """Raise ScenarioError if the table does not fit slots of ``period`` seconds."""
         for node in self.nodes:
             self.table(node, period)

@@ -24,7 +24,7 @@ from netkf.scenario.combination import (
 from netkf.scenario.compatibility import check_activation, check_readings, check_time
 from netkf.scenario.derived import DerivedScenario
 from netkf.scenario.records import check_records
-from netkf.scenario.registry import kind_name
+from netkf.scenario.registry import explain_time_mismatch, kind_name
 from netkf.scenario.sampling import check_sampling, uses_grid
 from netkf.scenario.shapes import require_shape
 
@@ -38,7 +38,10 @@ MAX_GROWTH = 1e7  # exponent g of growth by e^g; a run needs a new frame each ti
 
 
 def check_scenario(scenario: DerivedScenario) -> None:
-    """Check all rules that no single component can check alone; raises ScenarioError."""
+    """Raise ScenarioError if the components of a scenario do not fit together or exceed limits.
+
+    The order matters: later checks rely on what earlier ones found correct.
+    """
     _check_times(scenario)
     _check_plant(scenario)
     _check_sensors(scenario)
@@ -289,7 +292,7 @@ def _check_filter(scenario: DerivedScenario) -> None:
         if (name in "FQ") != scenario.slotted:
             raise ScenarioError(
                 f"filter.model.{name}",
-                "belongs to plants of the other kind of time",
+                explain_time_mismatch(scenario.slotted),
                 value,
                 "use F and Q for linear plants, A and B for diffusions",
             )

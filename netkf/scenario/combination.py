@@ -1,4 +1,4 @@
-"""Checks of regressor and nonlinear sensors, of combination weights, and of regular covariances."""
+"""Checks of regressor and nonlinear sensors, of weights, and of filters that invert covariances."""
 
 from __future__ import annotations
 
@@ -66,23 +66,25 @@ def check_weights(scenario: DerivedScenario) -> None:
 
 
 def check_invertible(scenario: DerivedScenario) -> None:
-    """Raise ScenarioError if a covariance may become singular.
+    """Raise ScenarioError if a filter's covariance P may be singular.
 
-    It stays regular if noise reaches every state (for a diffusion: if (A, Q) is controllable), or
-    if all covariances are regular at the start and no step is singular.
+    P is nonsingular if noise reaches every state (in slots: Q has full rank; in continuous time:
+    (A, Q) is controllable), or if all initial P are nonsingular and prediction keeps them so (in
+    slots: F has full rank).
     """
     n = scenario.plant.n
-    starts = [scenario.initial_estimate(node)[1] for node in scenario.nodes]
-    regular_starts = all(np.linalg.matrix_rank(cov, hermitian=True) == n for cov in starts)
+    initial_covs = [scenario.initial_estimate(node)[1] for node in scenario.nodes]
+    initially = all(np.linalg.matrix_rank(P, hermitian=True) == n for P in initial_covs)
     if scenario.slotted:
         F, Q = scenario.slot_belief
-        driven = np.linalg.matrix_rank(Q, hermitian=True) == n
-        regular = driven or (regular_starts and np.linalg.matrix_rank(F) == n)
+        noise_reaches_all = np.linalg.matrix_rank(Q, hermitian=True) == n
+        nonsingular = noise_reaches_all or (initially and np.linalg.matrix_rank(F) == n)
     else:
         A, Q = scenario.belief
-        blocks = [np.linalg.matrix_power(A, k) @ Q for k in range(n)]  # controllability matrix
-        regular = regular_starts or np.linalg.matrix_rank(np.concatenate(blocks, axis=1)) == n
-    if not regular:
+        blocks = [np.linalg.matrix_power(A, k) @ Q for k in range(n)]
+        controllability = np.concatenate(blocks, axis=1)
+        nonsingular = initially or np.linalg.matrix_rank(controllability) == n
+    if not nonsingular:
         name = kind_name(scenario.filter.algorithm)
         raise ScenarioError(
             "filter.cov",

@@ -10,7 +10,7 @@ from netkf.network.matchings import SlotActivation
 from netkf.plants.sensors import LinearSensor, Sensor
 from netkf.scenario.derived import DerivedScenario
 from netkf.scenario.model import takes_samples
-from netkf.scenario.registry import explain_kind_of_time, kind_name
+from netkf.scenario.registry import explain_time_mismatch, kind_name
 
 SAMPLING = 'sampling = { kind = "periodic", period = ... }'
 
@@ -25,12 +25,12 @@ def check_time(scenario: DerivedScenario) -> None:
         only_slots = node_filter.talks and not node_filter.clocks
         fits = not isinstance(algorithm, SlotFilter) and not only_slots
     if not fits:
-        rule = explain_kind_of_time(slotted)
+        rule = explain_time_mismatch(slotted)
         raise ScenarioError("filter.kind", rule, kind_name(algorithm), remedy)
     activation = scenario.network.activation
     if activation is not None and isinstance(activation, SlotActivation) != slotted:
         kind = kind_name(activation, "activation")
-        raise ScenarioError("network.activation.kind", explain_kind_of_time(slotted), kind, remedy)
+        raise ScenarioError("network.activation.kind", explain_time_mismatch(slotted), kind, remedy)
 
 
 def check_activation(scenario: DerivedScenario) -> None:

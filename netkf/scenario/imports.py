@@ -50,7 +50,7 @@ def find_class(kind: str, origin: Origin) -> Any:
     module_name, _, class_name = kind.partition(":")
     allowed = None if origin.trust else _AllowedPaths(origin.folder)
     if allowed is not None:
-        allowed.require_part(kind, module_name, class_name)
+        allowed.require_user_class(kind, module_name, class_name)
     if not origin.imports and not is_loaded(module_name, class_name, origin.folder):
         return None
     if allowed is None:
@@ -121,7 +121,7 @@ class _AllowedPaths:
         self._scenario_folder, self._current_folder = folder.resolve(), Path.cwd().resolve()
         self.path = [entry for entry in sys.path if self._may_import_from(entry)]
 
-    def require_part(self, kind: str, module_name: str, class_name: str) -> None:
+    def require_user_class(self, kind: str, module_name: str, class_name: str) -> None:
         """Raise ScenarioError unless a class may be imported and is derived from one of netkf's.
 
         ``kind`` is "module_name:class_name" as the scenario has it, for the message.
@@ -131,6 +131,7 @@ class _AllowedPaths:
         if not all(name.isidentifier() for name in names):
             raise _import_error(kind, not_found)
         if names[0] == "netkf":
+            # The modules of all classes for scenarios are loaded; no other code may be run.
             if module_name not in sys.modules and module_name != "netkf.parts":
                 raise _import_error(kind, not_found)
             return
@@ -169,8 +170,8 @@ class _AllowedPaths:
             roots = (*editable, *on_python_path)
             return any(_is_below(root, self._scenario_folder) for root in roots)
         if location.is_relative_to(self._current_folder):
-            below = any(_is_below(root, self._current_folder) for root in on_python_path)
-            return bool(editable) or below
+            is_below = any(_is_below(root, self._current_folder) for root in on_python_path)
+            return bool(editable) or is_below
         return True
 
     @cached_property
@@ -187,7 +188,9 @@ class _AllowedPaths:
         path, names = self.path, module_name.split(".")
         for k in range(len(names)):
             name = ".".join(names[: k + 1])
-            spec = (None if specs else self._find_editable(name)) or _find_spec(name, path)
+            # Import hooks are asked for top-level modules only; their submodules are on a path.
+            spec = self._find_editable(name) if k == 0 else None
+            spec = spec or _find_spec(name, path)
             if spec is None:
                 return None
             path = [
@@ -208,6 +211,7 @@ class _AllowedPaths:
         Its folder is added to ``_editable_roots``. Returns None if no hook finds it.
         """
         for finder in sys.meta_path:
+            # Build tools name the modules of their hooks so, "__editable___NAME_finder" for one.
             hook = finder if isinstance(finder, type) else type(finder)
             if "editable" not in hook.__module__:
                 continue

@@ -264,14 +264,14 @@ class ScenarioModel(Component):
     @cached_property
     def increment_sensors(self) -> dict[int, tuple[PlacedSensor, ...]]:
         """The sensors of each node that give increments of a diffusion; empty in slots."""
-        return self._sensors_over_diffusion(sampled=False)
+        return self._find_diffusion_sensors(sampled=False)
 
     @cached_property
     def sampled_sensors(self) -> dict[int, tuple[PlacedSensor, ...]]:
         """The sensors of each node that sample a diffusion; empty in slots."""
-        return self._sensors_over_diffusion(sampled=True)
+        return self._find_diffusion_sensors(sampled=True)
 
-    def _sensors_over_diffusion(self, sampled: bool) -> dict[int, tuple[PlacedSensor, ...]]:
+    def _find_diffusion_sensors(self, sampled: bool) -> dict[int, tuple[PlacedSensor, ...]]:
         """Return the sensors by node that take samples (``sampled``) or that give increments.
 
         Nodes without any are left out.

@@ -46,7 +46,7 @@ def load(
     """
     path = as_path("path", path, "load takes the path of a scenario file")
     changes = changes or {}
-    value: object = changes  # of any type in a script without annotations
+    value: object = changes  # scripts that no type checker reads may pass anything
     if not isinstance(value, Mapping):
         rule, remedy = "must be a table", 'give values by key: {"horizon": 10.0}'
         raise ScenarioError("changes", rule, value, remedy)

@@ -30,7 +30,7 @@ def check_records(scenario: DerivedScenario) -> None:
             )
     plant = scenario.plant
     if isinstance(plant, RecordedPlant):
-        _check_under("plant", lambda: plant.demand(sorted(_state_slots(scenario))))
+        _check_under("plant", lambda: plant.require_slots(sorted(_state_slots(scenario))))
     if scenario.slotted and scenario.filter.algorithm.talks:
         _check_exchanges(scenario)
 
@@ -53,7 +53,7 @@ def _check_readings(scenario: DerivedScenario, key: str, sensor: RecordedSensor)
             rule = f"{sensor.path.name} names a node that the graph does not have"
             raise ScenarioError(f"{key}.path", rule, node, "correct the row or the graph")
     if scenario.slotted:
-        _check_under(key, lambda: sensor.demand(scenario.slot_plant.period))
+        _check_under(key, lambda: sensor.require_slot_times(scenario.slot_plant.period))
 
 
 def sensed_slots(scenario: DerivedScenario) -> range:

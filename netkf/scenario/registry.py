@@ -125,18 +125,18 @@ SLOTTED = (LinearPlant,)
 """Base classes of plants in slots."""
 
 
-def explain_if_other_time(family: str, kind: object) -> str | None:
-    """Return the reason if a kind exists for the other kind of time only, else None.
+def explain_kind_mismatch(family: str, kind: object) -> str | None:
+    """Return the reason if a kind exists for the other model of time only, else None.
 
-    The kinds of time are slots (``family`` begins with "slot ") and continuous time.
+    The models of time are slots (``family`` begins with "slot ") and continuous time.
     """
     other = family.removeprefix("slot ") if family.startswith("slot ") else f"slot {family}"
     if not isinstance(kind, str) or kind not in KINDS.get(other, {}) or kind in KINDS[family]:
         return None
-    return explain_kind_of_time(slotted=family.startswith("slot "))
+    return explain_time_mismatch(slotted=family.startswith("slot "))
 
 
-def explain_kind_of_time(slotted: bool) -> str:
+def explain_time_mismatch(slotted: bool) -> str:
     """Return the text of the rule that a component breaks which does not fit the plant's time.
 
     ``slotted`` is True if the plant is in slots and the component needs continuous time.
@@ -180,7 +180,7 @@ def find_kind(
         return KINDS[family][_choose_name(choices, table)]
     if isinstance(kind, str) and ":" in kind:
         return _find_user_class(family, kind, origin)
-    reason = explain_if_other_time(family, kind)
+    reason = explain_kind_mismatch(family, kind)
     if reason is not None:
         raise ScenarioError("kind", reason, kind, "change the plant or choose another kind")
     kinds = list_kinds(family)

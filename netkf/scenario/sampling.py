@@ -99,10 +99,10 @@ def require_states(scenario: ScenarioModel, times: dict[tuple[int, int], FloatAr
     if not isinstance(plant, RecordedDiffusion):
         return
     try:
-        plant.demand(scenario.times, "the probe")
+        plant.require_times(scenario.times, "the probe")
         for node, placed_sensor in _iterate_sampled_sensors(scenario):
             if scenario.sensors[placed_sensor.entry].is_random:
-                plant.demand(times[node, placed_sensor.ordinal], f"a sample of node {node}")
+                plant.require_times(times[node, placed_sensor.ordinal], f"a sample of node {node}")
     except ScenarioError as error:
         raise error.under("plant") from None
 
@@ -135,7 +135,7 @@ def check_sampling(scenario: ScenarioModel) -> None:
         if isinstance(sensor, RecordedSensor) and not scenario.slotted:
             for node in sensor.nodes:
                 try:
-                    sensor.rows(node)
+                    sensor.rows(node)  # raises for wrong times
                 except ScenarioError as error:
                     raise error.under(key) from None
     if not scenario.slotted and isinstance(scenario.plant, RecordedDiffusion):

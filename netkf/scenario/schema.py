@@ -92,7 +92,7 @@ def scenario_schema() -> Schema:
         "title": "netkf scenario",
         "description": summary(Scenario),
         **file_schema,
-        "allOf": _kind_of_time_rules(),
+        "allOf": _time_model_rules(),
         "$defs": definitions,
     }
 
@@ -188,8 +188,8 @@ def _kind_schema(
     return {"title": name, "description": summary(cls), **schema}
 
 
-def _kind_of_time_rules() -> list[Schema]:
-    """Return if-then schemas: the kind of time of the plant limits activation and filter."""
+def _time_model_rules() -> list[Schema]:
+    """Return if-then schemas: the model of time of the plant limits activation and filter."""
     recorded = {"enum": ["recorded", "unknown"]}
 
     def plant_schema(kind: Schema, *keys: str) -> Schema:

@@ -222,7 +222,7 @@ def _construct(cls: type[Any], values: dict[str, Any]) -> Any:
 def _build_plant(origin: Origin, value: Any) -> Any:
     """Return the plant of a table, or WAITING."""
     table = _as_dict(value)
-    # Two kinds exist for both kinds of time; the keys tell which one is meant.
+    # Two kinds exist for both models of time; the keys tell which one is meant.
     in_both_times = table.get("kind") in ("recorded", "unknown")
     continuous = in_both_times and ("A" in table or "B" in table)
     return _build_component("continuous plant" if continuous else "plant", origin, table)
@@ -302,19 +302,20 @@ def _build_network(origin: Origin, time: str, value: Any) -> Any:
 def _build_activation(origin: Origin, time: str, value: Any) -> Any:
     """Return the activation of a table, or WAITING.
 
-    ``time`` is the plant's kind of time as the prefix of the family "activation": "slot ", "" for
+    ``time`` is the plant's model of time as the prefix of the family "activation": "slot ", "" for
     continuous time, or "unknown" if the plant is WAITING.
     """
     if time == "unknown":
+        # Build it if its kind exists for one model of time only.
         kind = _as_dict(value).get("kind")
-        times = [
+        prefixes = [
             prefix
             for prefix in ("", "slot ")
             if isinstance(kind, str) and kind in KINDS[f"{prefix}activation"]
         ]
-        if len(times) > 1:
+        if len(prefixes) > 1:
             return WAITING
-        time = times[0] if times else ""
+        time = prefixes[0] if prefixes else ""
     return _build_component(f"{time}activation", origin, value)
 
 

@@ -21,16 +21,16 @@ from netkf.scenario.registry import FAMILIES, FORMER, name_of
 
 
 def as_table(scenario: DerivedScenario) -> dict[str, Any]:
-    """Return the tables of the file of a scenario, without values equal to their defaults."""
+    """Return the tables of a scenario file, without values that are equal to their defaults."""
     return _scenario_table(
         scenario, scenario.plant, scenario.network, scenario.filter, with_defaults=False
     )
 
 
 def resolve_defaults(scenario: DerivedScenario) -> dict[str, Any]:
-    """Return the tables of the file of a scenario with all defaults written out.
+    """Return the tables of a scenario file with all defaults written out.
 
-    It gives the same runs, also if defaults of netkf change.
+    A scenario that is read from them has the same runs, even if defaults of netkf change.
     """
     network = scenario.network
     if isinstance(network.graph, RandomGraph) and network.graph.seed is None:
@@ -60,7 +60,7 @@ def _scenario_table(
     filtering: Filtering,
     with_defaults: bool,
 ) -> dict[str, Any]:
-    """Return the tables of the file of a scenario, with these components instead of its own."""
+    """Return the tables of a scenario file, with these components instead of the scenario's own."""
     table = _field_values(scenario, with_defaults)
     table["plant"] = _kind_table("plant", plant, with_defaults)
     table["sensors"] = [_sensor_table(sensor, with_defaults) for sensor in scenario.sensors]

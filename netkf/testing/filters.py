@@ -1,4 +1,4 @@
-"""Check that a filter keeps its contract in both kinds of time."""
+"""Check that a filter keeps its contract in both models of time."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a filter may do in every kind of time, on the SimPy engine, by filters that keep books."""
+"""What a filter may do in every model of time, on the SimPy engine, by filters that keep books."""
 
 import numpy as np
 import pytest

@@ -262,7 +262,7 @@ def test_truth_and_readings_do_not_depend_on_the_network():
         ({"network.activation.phase": 1.0}, "room within the period 1; got 1.0"),
         ({"network.activation.protocol": "best"}, 'must be one of "one-edge"'),
         ({"network.activation.lazy": 0.5}, "means nothing for maximal"),
-        ({"filter.model": {"A": [[1.0]]}}, "other kind of time"),
+        ({"filter.model": {"A": [[1.0]]}}, "this plant is in slots"),
         ({"plant.Q": [[1.0]]}, "must be 4 x 4, not 1 x 1"),
     ],
 )

@@ -654,7 +654,12 @@ FILTERS = [
         "filter that all nodes share; got '6 entries'",
     ),
     ("model-text", {"filter.model": '"same"'}, "filter.model", "must be a table; got 'same'"),
-    ("model-unknown", {"filter.model.Q": "[[1.0]]"}, "filter.model.Q", "other kind of time; got"),
+    (
+        "model-unknown",
+        {"filter.model.Q": "[[1.0]]"},
+        "filter.model.Q",
+        "this plant is in continuous time (diffusion); got",
+    ),
     ("model-A-shape", {"filter.model.A": "[[1.0]]"}, "filter.model.A", "2 x 2, not 1 x 1, because"),
     ("model-A-wide", {"filter.model.A": "[[1.0, 2.0]]"}, "filter.model.A", "matrix, not 1 x 2"),
     ("model-B-shape", {"filter.model.B": "[[1.0]]"}, "filter.model.B", "2 x any, not 1 x 1"),
