@@ -239,6 +239,8 @@ def judge_replicas(
     parts = stack_parts(
         scenario, seed, [result.parts for result in replicas if result.parts is not None]
     )
+    # The promises of the paper and the tests of the scenario's parts may each err with half of the
+    # error probability.
     rows = judge(
         checks.promises(scenario),
         checks.collect(scenario, stacked, seed),

@@ -204,12 +204,11 @@ class DiffusionChecks(PaperChecks):
             _require_few_regressors(scenario)
             levels = information_level(scenario, 100, 0)
             highest = float(levels.loc[levels["node"] != -1, "level"].max())
-            needs_others, evidence = (
-                highest <= 0.0,
-                f"the best sensor alone has level {highest:.3g} of D (5)",
-            )
+            needs_others = highest <= 0.0
+            evidence = f"the best sensor alone has level {highest:.3g} of D (5)"
         except TheoryError as error:
-            needs_others, evidence = False, str(error)
+            needs_others = False
+            evidence = str(error)
         model = "same F, Q and R" if models_agree else "filter.model differs from the truth"
         return [
             Assumption(

@@ -146,9 +146,8 @@ def judge(
             )
             evidence.append(_unpromised_row(promise, reason))
         else:
-            evidence.append(
-                _judge(promise, _run_test(promise, samples, level / max(statistical, 1)), runs)
-            )
+            finding = _run_test(promise, samples, level / max(statistical, 1))
+            evidence.append(_judge(promise, finding, runs))
     return evidence
 
 
@@ -167,7 +166,11 @@ def _is_needed(promise: Promise, row: Assumption) -> bool:
 
 
 def _judge(promise: Promise, finding: Finding, runs: int) -> Evidence:
-    """Return the verdict that follows from the interval of a finding."""
+    """Return the row with the verdict that follows from the interval of a finding.
+
+    A promise is broken if the whole interval of the margin is below 0, and holds if the interval is
+    above - tolerance. If neither, more runs may decide, and their number is forecast.
+    """
     (margin, low, high), tolerance, message = finding[:3]
     needed = None
     if finding.blurred:
@@ -182,14 +185,16 @@ def _judge(promise: Promise, finding: Finding, runs: int) -> Evidence:
         verdict = UNDECIDED
         runs_used = min(runs, finding.most_runs)
         forecast_runs = FORECAST_MARGIN * runs_used * _factor_needed(finding, MAX_RUNS / runs_used)
-        needed = (
-            math.ceil(forecast_runs) if forecast_runs < min(MAX_RUNS, finding.most_runs) else None
-        )
+        if forecast_runs < min(MAX_RUNS, finding.most_runs):
+            needed = math.ceil(forecast_runs)
         if forecast_runs > finding.most_runs:
             message = (
                 f"{message}; exact covariances are those of {finding.most_runs:,} runs at most, "
                 "too few to decide it"
             )
+    off = finding.off
+    if math.isnan(off) and low < high:
+        off = max(0.0, -margin)
     return Evidence(
         promise.statement,
         promise.source,
@@ -203,7 +208,7 @@ def _judge(promise: Promise, finding: Finding, runs: int) -> Evidence:
         message,
         finding.seen,
         finding.expected,
-        max(0.0, -margin) if math.isnan(finding.off) and low < high else finding.off,
+        off,
         finding.detectable,
         needed,
         finding.replica if verdict == BROKEN else None,

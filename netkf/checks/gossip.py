@@ -25,7 +25,7 @@ from netkf.checks.laws import (
     diagonal_distances,
     exact_start,
     find_largest,
-    growth,
+    growth_intervals,
 )
 from netkf.checks.mode_sequences import (
     MIN_CHAINS,
@@ -315,9 +315,9 @@ def _check_tokens(samples: GossipSamples, level: float) -> Finding:
         token_covariances = samples.runs.tokens[:, i]
         pairs.append(Pair(f"token {node}", token_covariances, chain, chain[origin == i]))
     finding = compare_laws(pairs, level, samples.first_trace)
-    return (
-        with_horizon(samples, finding, _token_memory, LAW_TOLERANCE) if finding.early else finding
-    )
+    if not finding.early:
+        return finding
+    return with_horizon(samples, finding, _token_memory, LAW_TOLERANCE)
 
 
 def _check_initial_condition(samples: GossipSamples, level: float) -> Finding:
@@ -350,7 +350,7 @@ def _check_bounded(samples: GossipSamples, level: float) -> Finding:
 
 def _growth_of(chain: ChainSamples) -> float:
     """Return the growth of the law of the chain between the last two numbers of slots."""
-    return max(interval.value for interval in growth(chain.P[-2], chain.P[-1], 0.5))
+    return max(interval.value for interval in growth_intervals(chain.P[-2], chain.P[-1], 0.5))
 
 
 def _start_memory(chain: ChainSamples) -> float:

@@ -28,7 +28,7 @@ from netkf.checks.laws import (
     diagonal_distances,
     exact_start,
     find_largest,
-    growth,
+    growth_intervals,
 )
 from netkf.checks.mode_sequences import (
     MIN_CHAINS,
@@ -362,8 +362,8 @@ def _check_initial_condition(samples: IntermittentSamples, level: float) -> Find
 
 
 def _growth_of(reference: ArrivalSamples) -> float:
-    """Return the largest growth (see :func:`growth`) between the last two numbers of slots."""
-    return max(g.value for P in reference.P for g in growth(P[-2], P[-1], 0.5))
+    """Return the largest growth (:func:`growth_intervals`) between the last two slot counts."""
+    return max(g.value for P in reference.P for g in growth_intervals(P[-2], P[-1], 0.5))
 
 
 def _memory_of(reference: ArrivalSamples) -> float:
@@ -419,10 +419,13 @@ def _mean_diverges(samples: IntermittentSamples, level: float) -> Finding:
     node = max(factors, key=lambda k: factors[k])
     F, Q = scenario.slot_belief
     alpha = float(np.abs(np.linalg.eigvals(F)).max())
-    slots, nothing = check_slots(scenario)[-1], np.zeros((0, len(F)))
+    slots = check_slots(scenario)[-1]
+    # The lower bound counts only the slots without a reading, so it needs no H. The outage factor
+    # is (1 - g) alpha^2, with g the probability that a reading arrives.
+    H = np.zeros((0, len(F)))
     g = 1.0 - factors[node] / alpha**2
     start = scenario.initial_estimate(node)[1]
-    lower = mean_covariance_bounds(F, Q, nothing, nothing[:, :0], g, 2 * slots, start).lower
+    lower = mean_covariance_bounds(F, Q, H, H[:, :0], g, 2 * slots, start).lower
     traces = np.trace(lower, axis1=1, axis2=2)
     median = np.median(np.trace(samples.runs.P[:, -1, samples.nodes.index(node)], axis1=1, axis2=2))
     message = (

@@ -39,7 +39,7 @@ def verdict_text(verdict: Verdict, claim: str = "", command: str = "") -> str:
         lines.append(f"{mark:<{len(INDENT)}}{row.promise}  [{row.source}]")
         message = _describe_row(row)
         lines += textwrap.wrap(message, WIDTH, initial_indent=INDENT, subsequent_indent=INDENT)
-    lines += ["", *_legend_lines(verdict), *_summary_line(verdict)]
+    lines += ["", *_legend_lines(verdict), *_summary_lines(verdict)]
     return "\n".join([*lines, *_broken_again(broken, command)])
 
 
@@ -54,8 +54,10 @@ def _legend_lines(verdict: Verdict) -> list[str]:
     ]
 
 
-def _summary_line(verdict: Verdict) -> list[str]:
-    """Return the lines that count the verdicts."""
+def _summary_lines(verdict: Verdict) -> list[str]:
+    """Return the lines below the table: the numbers of rows by verdict, and the runs that would
+    decide the undecided ones.
+    """
     counts = Counter(row.verdict for row in verdict.rows)
     counted_verdicts = ", ".join(f"{counts[v]} {v}" for v in VERDICTS if counts[v])
     looks = f" at all of {verdict.looks} looks" if verdict.looks > 1 else ""

@@ -117,7 +117,10 @@ class RunSamples:
 
 
 def check_replay(samples: RunSamples, level: float) -> Finding:
-    """Compare every covariance with the one that the equations give for the events of its run."""
+    """Compare every covariance with the one that the equations give for the events of its run.
+
+    The finding is undecided if no run could be replayed.
+    """
     replayed = ~np.isnan(samples.runs.replayed).all(axis=(1, 2, 3, 4))
     P, expected = samples.runs.P[replayed], samples.runs.replayed[replayed]
     if not len(P):
@@ -178,11 +181,10 @@ def check_growth(samples: RunSamples, level: float) -> Finding:
     by the equations; see :func:`compare_growth`.
     """
     P, replayed = samples.runs.P, samples.runs.replayed
-    known_replays = replayed[~np.isnan(replayed).all(axis=(1, 2, 3, 4))]
+    # Only some runs are replayed, the entries of the others are nan.
+    replays = replayed[~np.isnan(replayed).all(axis=(1, 2, 3, 4))]
     pairs, expected = [], []
     for i, node in enumerate(samples.nodes):
         pairs.append(Pair(f"node {node}", P[:, -2, i], P[:, -1, i]))
-        expected.append(
-            (known_replays[:, -2, i], known_replays[:, -1, i]) if len(known_replays) else None
-        )
+        expected.append((replays[:, -2, i], replays[:, -1, i]) if len(replays) else None)
     return compare_growth(pairs, expected, level)

@@ -48,7 +48,7 @@ EXACT = Promise(
 def check_steady(samples: RunSamples, level: float) -> Finding:
     """Compare P at the end of the runs with that of steady tracks.
 
-    The row is undecided, with the horizon that would do, while the start may still matter.
+    While the initial P may still matter, the row is undecided and has the horizon that suffices.
     """
     radius, steady = tracks_in_slots(samples.scenario)
     expected = steady[sampled_indices(samples.scenario)]

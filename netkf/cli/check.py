@@ -113,7 +113,7 @@ def _run_check(scenario: Scenario, options: argparse.Namespace, earlier: Verdict
             confidence=options.confidence,
             workers=options.workers,
             scheduler=options.scheduler,
-            progress=line.counter("runs"),
+            progress=line.make_count_update("runs"),
             until=options.until,
             most=options.most or MAX_LOOKED_RUNS,
             earlier=earlier,

@@ -75,7 +75,7 @@ def _compare(options: argparse.Namespace) -> int:
             engine=options.engine,
             workers=options.workers,
             scheduler=options.scheduler,
-            progress=line.counter("filters"),
+            progress=line.make_count_update("filters"),
         )
     try:
         if options.out is not None:

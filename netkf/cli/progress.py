@@ -43,7 +43,7 @@ class ProgressLine:
             self._reported = now
             print(f"netkf: {text}", file=sys.stderr, flush=True)
 
-    def simulated_time(self, horizon: float) -> Callable[[float], None]:
+    def make_time_update(self, horizon: float) -> Callable[[float], None]:
         """Return a function of the simulated time (s) that shows its percentage of ``horizon``."""
         last_percent = -1
 
@@ -58,7 +58,7 @@ class ProgressLine:
 
         return update
 
-    def counter(self, unit: str) -> Callable[[int, int], None]:
+    def make_count_update(self, unit: str) -> Callable[[int, int], None]:
         """Return a function of the numbers (done, wanted) that shows both, in ``unit``, and the
         estimated time left.
         """

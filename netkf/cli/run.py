@@ -95,7 +95,7 @@ def _run_once(scenario: Scenario, options: argparse.Namespace) -> int:
             options.out,
             options.engine,
             options.trace or "full",
-            line.simulated_time(scenario.horizon),
+            line.make_time_update(scenario.horizon),
             draw,
             replica,
         )
@@ -132,7 +132,7 @@ def _run_ensemble(scenario: Scenario, options: argparse.Namespace) -> int:
             options.runs,
             options.out,
             ensemble_options,
-            progress=line.counter("runs"),
+            progress=line.make_count_update("runs"),
             finish=draw,
             note=_print_note,
         )

@@ -65,7 +65,7 @@ def _run(options: argparse.Namespace) -> int:
                 plan_sweep(scenario, grid, options.runs, engine=options.engine),
                 options.out,
                 PoolOptions(options.workers, None, options.scheduler),
-                progress=line.counter("points"),
+                progress=line.make_count_update("points"),
                 finish=None if options.no_plot else draw,
                 take=completed.append,
             )

@@ -1,8 +1,8 @@
-"""Ask an address whether a Dask scheduler answers there, in a process of its own.
+"""Find out in a separate process whether a Dask scheduler answers at an address.
 
-What answers may be anything: a program of another kind, which never says a word or sends nonsense.
-The threads, tasks and messages that a failed attempt leaves end with this process, which
-``scheduler_answers`` starts and ends. Its exit status is 0 if a scheduler answered.
+The server there may be any program, which never answers or sends garbage. The threads, tasks and
+messages that a failed attempt leaves behind end with that process, which runs this module and is
+started by ``scheduler_answers``. Its exit status is 0 if a scheduler answered.
 """
 
 from __future__ import annotations
@@ -12,25 +12,28 @@ import sys
 from typing import Any, cast
 
 CONNECT_SECONDS = 5
-"""Seconds in which an address has to accept a connection; Dask tries again meanwhile."""
+"""Seconds in which the server has to accept a connection; Dask tries again until then."""
 
 
 def scheduler_answers(address: str, seconds: float) -> bool:
-    """Return True if a Dask scheduler answers at an address within some seconds."""
-    # -P: nothing is imported from the current folder.
+    """Return True if a Dask scheduler answers at ``address`` within some seconds."""
+    # -P keeps Python from importing modules of the current folder.
     command = [sys.executable, "-P", "-m", "netkf.ensembles.ask_scheduler", address]
-    nowhere = subprocess.DEVNULL
+    null = subprocess.DEVNULL
     try:
         process = subprocess.run(
-            command, check=False, timeout=seconds, stdin=nowhere, stdout=nowhere, stderr=nowhere
+            command, check=False, timeout=seconds, stdin=null, stdout=null, stderr=null
         )
-    except (subprocess.TimeoutExpired, ValueError):  # ValueError: a null character
+    except (subprocess.TimeoutExpired, ValueError):  # ValueError: the address has a null character
         return False
     return process.returncode == 0
 
 
-async def _kind(address: str) -> str:
-    """Return the name of the class of server that answers, of Dask's."""
+async def _server_class(address: str) -> str:
+    """Return the name of the class of Dask's server at an address, such as ``Scheduler``.
+
+    Raises an exception of Dask or of asyncio if no server of Dask's answers.
+    """
     from distributed import core, security
 
     connect, secure = cast(Any, core.rpc), cast(Any, security.Security)
@@ -43,4 +46,4 @@ async def _kind(address: str) -> str:
 if __name__ == "__main__":
     import asyncio
 
-    sys.exit(asyncio.run(_kind(sys.argv[1])) != "Scheduler")
+    sys.exit(asyncio.run(_server_class(sys.argv[1])) != "Scheduler")

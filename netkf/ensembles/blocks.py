@@ -59,7 +59,10 @@ class Job(NamedTuple):
 
 
 def work(job: Job) -> Any:
-    """Return the result of a block; raises EngineError that names a plugged-in class that fails."""
+    """Return the result of a block of work, in a worker or in this process.
+
+    Raises EngineError with the name of the class if a plugged-in class fails.
+    """
     scenario = job.scenario
     if isinstance(scenario, PackedScenario):
         scenario = unpack_scenario(scenario)
@@ -104,20 +107,21 @@ def _plugged_in_modules(scenario: Scenario) -> set[tuple[str, str]]:
         file = getattr(sys.modules.get(name), "__file__", None)
         if file is not None and name != "__main__":
             path = Path(file).resolve()
-            up = name.count(".") + (path.name == "__init__.py")
-            modules.add((name, str(path.parents[up])))
+            # The folder above the outermost package: the module a.b of a/b.py is two levels below.
+            level = name.count(".") + (path.name == "__init__.py")
+            modules.add((name, str(path.parents[level])))
     return modules
 
 
-MAX_KEPT = 4  # scenarios that a worker keeps unpickled: a sweep goes from one to the next
+MAX_SCENARIOS = 4  # scenarios that a worker keeps unpickled: those of a sweep alternate
 _scenarios: dict[str, Scenario] = {}
 
 
 def unpack_scenario(packed: PackedScenario) -> Scenario:
-    """Return the unpickled scenario; a worker keeps the last MAX_KEPT with their caches."""
+    """Return the unpickled scenario; a worker keeps the last MAX_SCENARIOS with their caches."""
     scenario = _scenarios.get(packed.digest)
     if scenario is None:
-        while len(_scenarios) >= MAX_KEPT:
+        while len(_scenarios) >= MAX_SCENARIOS:
             _scenarios.pop(next(iter(_scenarios)), None)
         scenario = _scenarios.setdefault(packed.digest, _unpickle(packed))
     return scenario
@@ -142,6 +146,7 @@ def _unpickle(packed: PackedScenario) -> Scenario:
     if packed.versions:
         _check_versions(packed.versions)
     for name, folder in packed.modules:
+        # A worker may have imported another module of this name for an earlier scenario.
         unload_namesake(name, Path(folder))
         if folder not in sys.path:
             sys.path.insert(0, folder)

@@ -71,7 +71,7 @@ class BlockCheckpoints:
         self._folder, self._scenario = directory / BLOCKS_FOLDER, scenario
         self._numbers: set[int] = set()
 
-    def begun_with(self) -> int | None:
+    def stored_block_size(self) -> int | None:
         """Return the number of runs in a block, from the first readable block; None without one."""
         for file in self._block_paths():
             with contextlib.suppress(DamagedError), _open_block(file) as arrays:

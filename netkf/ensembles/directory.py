@@ -14,7 +14,7 @@ from netkf.ensembles.checkpoints import BlockCheckpoints, RunIdentity
 from netkf.ensembles.monte_carlo import Ensemble, ensemble_of, ensemble_table
 from netkf.ensembles.pools import ANYWHERE, Pool, PoolOptions, block_size, make_pool
 from netkf.ensembles.replicas import NumberedBlocks, Progress, replicate_blocks
-from netkf.ensembles.resume import ensemble_to_resume
+from netkf.ensembles.resume import find_stored_blocks
 from netkf.ensembles.statistics import RunStatistics, block_statistics, merge
 from netkf.ensembles.summary import summarise_ensemble
 from netkf.runs.failures import InterruptedRunError, explain_failure
@@ -86,15 +86,17 @@ def runs_to_directory(
     note: Callable[[str], None] | None = None,
 ) -> FinishedEnsemble | None:
     """Simulate replicas 0 .. runs - 1 and write scenario.toml, manifest.json, ensemble.parquet,
-    summary.json and the events and states of the runs that leave a trace; return None where all was
-    done before.
+    summary.json and the events and states of the traced runs; return the ensemble, or None if
+    ``out`` was complete before.
 
-    Blocks of runs are kept in the directory as they are done; on resuming those that ``out`` has
-    are not done again, and the files come out the same to the last bit. Blocks that are not of this
-    run or damaged are done again, and ``note`` is called with a line that says so. ``finish`` adds
-    what else belongs to the directory, before the manifest says that it is complete. Raises
-    ScenarioError and EngineError before anything is written, WriteError, InterruptedRunError (a
-    KeyboardInterrupt) when interrupted, and EngineError where a plugged-in class fails.
+    Blocks of runs are stored in the directory as they complete. When resuming, the stored blocks
+    are not simulated again, and all files are bit-identical to those without interruption. Blocks
+    that are damaged or belong to another run are simulated again, and ``note`` is called with a
+    line about them. ``finish`` writes further files, before the manifest states that the directory
+    is complete.
+
+    Raises ScenarioError and EngineError before anything is written; later WriteError, EngineError
+    if a plugged-in class fails, and InterruptedRunError (a KeyboardInterrupt) when interrupted.
     """
     started = time.perf_counter()
     runs = integer(low=1)("runs", runs)
@@ -103,39 +105,39 @@ def runs_to_directory(
     check_sources(scenario)
     pool = make_pool(runs, options.pool)
     try:
-        keeper = _make_keeper(scenario, runs, out, options, engine_used.name, pool.width)
-        if keeper is None:
+        writer = _open_directory(scenario, runs, out, options, engine_used.name, pool.width)
+        if writer is None:
             return None
         try:
-            keeper.begin(note)
+            writer.begin(note)
             engine_used.announce(scenario)
-            task = partial(block_statistics, engine=engine_used, traces=keeper.traces)
-            statistics = keeper.simulate(task, pool, progress)
-            written = _write(keeper, statistics)
-            finished = FinishedEnsemble(*written, keeper.simulated, time.perf_counter() - started)
+            task = partial(block_statistics, engine=engine_used, traces=writer.traces)
+            statistics = writer.simulate(task, pool, progress)
+            written = _write_files(writer, statistics)
+            finished = FinishedEnsemble(*written, writer.simulated, time.perf_counter() - started)
             if finish is not None:
                 finish(finished)
-            keeper.end(finished.status, statistics)
+            writer.end(finished.status, statistics)
         except BaseException as error:
-            reason = keeper.stop(error)
+            reason = writer.stop(error)
             if reason is error:
                 raise
             raise reason from error
     finally:
         pool.close(at_once=True)
-    keeper.blocks.remove()
+    writer.blocks.remove()
     return finished
 
 
-def _make_keeper(
+def _open_directory(
     scenario: Scenario,
     runs: int,
     out: Path | None,
     options: EnsembleOptions,
     engine: str,
     width: int,
-) -> _Keeper | None:
-    """Return the keeper of a new directory, or of the one to resume; None if that is complete.
+) -> _DirectoryWriter | None:
+    """Return the writer of a new directory, or of the one to resume; None if that is complete.
 
     ``engine`` is the name of the engine, ``width`` the number of blocks that run at a time.
     """
@@ -146,30 +148,28 @@ def _make_keeper(
     plan = RunIdentity(
         digest, scenario.seed, runs, options.trace, engine, installation_digest(), size
     )
-    unfinished = ensemble_to_resume(out, scenario, plan) if options.resume else None
+    unfinished = find_stored_blocks(out, scenario, plan) if options.resume else None
     if unfinished is None:
-        return _Keeper(scenario, create_output_directory(out, scenario.name), plan)
+        return _DirectoryWriter(scenario, create_output_directory(out, scenario.name), plan)
     if unfinished.finished:
         BlockCheckpoints(unfinished.directory, scenario).remove()
         return None
     # Blocks on disk are only of use to a plan with blocks of the same size.
-    return _Keeper(scenario, unfinished.directory, replace(plan, block=unfinished.block))
+    return _DirectoryWriter(scenario, unfinished.directory, replace(plan, block=unfinished.block))
 
 
-def _write(
-    keeper: _Keeper, statistics: RunStatistics
+def _write_files(
+    writer: _DirectoryWriter, statistics: RunStatistics
 ) -> tuple[Path, str, dict[str, Any], Ensemble, PromisedTraces]:
-    """Write all files but the manifest.
-
-    Returns the directory, the status ("complete" or "diverged"), the summary, the ensemble and the
-    promised traces.
+    """Write all files but the manifest; return the directory, the status ("complete" or
+    "diverged"), the summary, the ensemble and the promised traces.
     """
-    directory, scenario, plan = keeper.directory, keeper.scenario, keeper.plan
+    directory, scenario, plan = writer.directory, writer.scenario, writer.plan
     ensemble = ensemble_of(scenario, statistics, plan.seed, plan.engine)
     write_table(directory / "ensemble.parquet", ensemble_table(ensemble))
     if plan.trace != "none":
         with TraceTables(directory, scenario) as tables:
-            for replica, log, *arrays in keeper.blocks.traces():
+            for replica, log, *arrays in writer.blocks.traces():
                 tables.add(replica, log, StateSamples(*arrays))
     promised = promise_traces(scenario, scenario.times)
     summary = summarise_ensemble(scenario, statistics, promised)
@@ -178,8 +178,11 @@ def _write(
     return directory, status, summary, ensemble, promised
 
 
-class _Keeper:
-    """Stores blocks as they complete, and keeps the manifest up to date."""
+class _DirectoryWriter:
+    """Writes the blocks of an ensemble to its directory as they complete, and updates the manifest.
+
+    ``simulated`` is the number of runs that this process has simulated.
+    """
 
     def __init__(self, scenario: Scenario, directory: Path, plan: RunIdentity) -> None:
         self.scenario, self.directory, self.plan = scenario, directory, plan
@@ -188,7 +191,7 @@ class _Keeper:
         self._manifest = Manifest(directory, name, seed, 0, plan.engine, plan.runs)
         self._known: list[int] = []
         self._done = self.simulated = 0
-        self._noted = 0.0
+        self._last_note = 0.0
         self._ended = False
 
     @property
@@ -197,8 +200,11 @@ class _Keeper:
         return {"full": self.plan.runs, "first": 1, "none": 0}[self.plan.trace]
 
     def begin(self, note: Callable[[str], None] | None) -> None:
-        """Write the manifest and the scenario, and find the blocks that are done."""
-        # The manifest first, so that a run that is killed outright says that it did not finish.
+        """Write the manifest and the scenario, and find the stored blocks.
+
+        ``note`` is called with a line about each block that is simulated again.
+        """
+        # The manifest comes first: if the process is killed, it states that the run is unfinished.
         self.note()
         write_scenario(self.directory, self.scenario)
         self._known, lines = self.blocks.find(self.plan)
@@ -211,7 +217,7 @@ class _Keeper:
     def simulate(
         self, task: Callable[..., RunStatistics], pool: Pool, progress: Progress | None
     ) -> RunStatistics:
-        """Return the statistics of all runs; those of kept blocks are read."""
+        """Return the statistics of all runs: stored blocks are read, the others simulated."""
         finished_blocks = {number: partial(self.blocks.load, number) for number in self._known}
         blocks = NumberedBlocks(self.plan.block, finished_blocks, self.save_block)
         statistics: RunStatistics = replicate_blocks(
@@ -224,24 +230,28 @@ class _Keeper:
         return min(self.plan.block, self.plan.runs - number * self.plan.block)
 
     def save_block(self, number: int, statistics: RunStatistics) -> RunStatistics:
-        """Save a block; its traces stay on disk."""
+        """Store a completed block, and return its statistics without the traces, which would fill
+        the memory.
+        """
         self.blocks.save(number, statistics, self.plan)
         self._done += self._runs_in_block(number)
         self.simulated += self._runs_in_block(number)
-        if time.monotonic() - self._noted >= NOTE_SECONDS:
+        if time.monotonic() - self._last_note >= NOTE_SECONDS:
             self.note()
         return statistics._replace(traces=())
 
     def note(self, status: str = "interrupted", error: BaseException | None = None) -> None:
-        """Write status and progress to the manifest, unless the final one is written."""
+        """Write status and progress to the manifest, unless the final manifest is written."""
         if not self._ended:
             self._manifest.write(
                 status, self._identity_entries(block=self.plan.block), self._done, error
             )
-            self._noted = time.monotonic()
+            self._last_note = time.monotonic()
 
     def stop(self, error: BaseException) -> BaseException:
-        """Write the reason of an early end to the manifest; return the exception to raise."""
+        """Write the status after an error or an interrupt to the manifest; return the exception to
+        raise in place of ``error``.
+        """
         self.note("failed" if isinstance(error, Exception) else "interrupted", error)
         if isinstance(error, KeyboardInterrupt):
             return InterruptedRunError(
@@ -250,7 +260,7 @@ class _Keeper:
         return explain_failure(self.scenario, error, self.directory)
 
     def end(self, status: str, statistics: RunStatistics) -> None:
-        """Write the manifest of all runs, with the digests of the other files."""
+        """Write the final manifest, with the digests of all other files."""
         entries = self._identity_entries(
             diverged=int(statistics.totals[1]), events=int(statistics.totals[0])
         )

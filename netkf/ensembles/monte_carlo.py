@@ -199,7 +199,9 @@ def _unpack_samples(values: FloatArray, n: int) -> tuple[FloatArray, FloatArray,
 
 
 def ensemble_table(ensemble: Ensemble) -> dict[str, np.ndarray]:
-    """Return named columns, a row a time and node; errors only where the truth is known."""
+    """Return the columns of ensemble.parquet by name, with one row for each time and node; those of
+    errors only with ground truth.
+    """
     n, rows = ensemble.mean_P.shape[-1], len(ensemble.times) * len(ensemble.nodes)
     i, j = np.triu_indices(n)
 

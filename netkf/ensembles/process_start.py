@@ -1,6 +1,7 @@
-"""How worker processes start: without this one's threads, memory and script, and early.
+"""The start of worker processes: early, and without the threads, memory and script of this one.
 
-Knows no numerics, so that a command can start them before it loads its own.
+The module does not import numpy, so that a command can start the server of workers before it loads
+numerical libraries itself.
 """
 
 from __future__ import annotations
@@ -20,12 +21,14 @@ ONE_THREAD = (
     "BLIS_NUM_THREADS",
     "VECLIB_MAXIMUM_THREADS",
 )
+"""Environment variables that limit the threads of numerical libraries."""
 PRELOADED = ["netkf.ensembles.statistics"]
+"""Modules that the server imports, so that the workers forked from it need not."""
 
 
-def context() -> Any:
+def process_context() -> Any:
     """Return a multiprocessing context whose processes do not inherit this one's threads and
-    memory: forkserver, which starts quickly, where it exists, else spawn.
+    memory: forkserver, which starts workers quickly, if the system has it, else spawn.
     """
     if "forkserver" not in multiprocessing.get_all_start_methods():
         return multiprocessing.get_context("spawn")
@@ -35,39 +38,38 @@ def context() -> Any:
 
 
 def start_server() -> None:
-    """Start the process that workers are forked from, if there is one and it does not run yet. It
-    loads what they need while this process goes on.
+    """Start the server that workers are forked from, unless it runs or the system has none. It
+    imports PRELOADED while this process goes on.
 
-    It and the workers never see Ctrl-C or SIGTERM, which reach all processes of a terminal or a
-    job: this process alone decides what they mean, and kills the workers.
+    Ctrl-C and SIGTERM reach all processes of a terminal or a job. The server and the workers block
+    them: this process alone handles them, and kills the workers.
     """
-    if context().get_start_method() != "forkserver":
+    if process_context().get_start_method() != "forkserver":
         return
     from multiprocessing import forkserver, resource_tracker
 
-    # Started first, because its start unblocks the signals again.
+    # Started first, because the start of the resource tracker unblocks the signals again.
     resource_tracker.ensure_running()
-    with one_blas_thread(), signals_blocked():
+    with limit_blas_threads(), block_signals():
         forkserver.ensure_running()
 
 
 def kill_server() -> None:
-    """Kill the process that workers are forked from, if this one has started it.
+    """Kill the server that workers are forked from, if this process has started it.
 
-    It would end by itself, but only once it has imported what workers need.
+    It would end by itself, but not before it has imported PRELOADED.
     """
     module = sys.modules.get("multiprocessing.forkserver")
-    number = getattr(getattr(module, "_forkserver", None), "_forkserver_pid", None)
-    if number is not None:
+    pid = getattr(getattr(module, "_forkserver", None), "_forkserver_pid", None)
+    if pid is not None:
         with suppress(OSError):
-            os.kill(number, signal.SIGKILL)
+            os.kill(pid, signal.SIGKILL)
 
 
 @contextmanager
-def signals_blocked() -> Iterator[None]:
-    """Block Ctrl-C and SIGTERM for processes that are started meanwhile, which inherit this.
-
-    Signals for this process wait until the block is left.
+def block_signals() -> Iterator[None]:
+    """Block Ctrl-C and SIGTERM within the block. Processes that are started in it inherit the mask
+    and never receive them; signals to this process are delivered after the block.
     """
     if not hasattr(signal, "pthread_sigmask"):
         yield
@@ -80,8 +82,10 @@ def signals_blocked() -> Iterator[None]:
 
 
 @contextmanager
-def one_blas_thread() -> Iterator[None]:
-    """Set the variables that numerical libraries read when a process loads them."""
+def limit_blas_threads() -> Iterator[None]:
+    """Limit the numerical libraries of processes that are started within the block to one thread
+    each, by environment variables that they read when they are loaded.
+    """
     old_values = {name: os.environ.get(name) for name in ONE_THREAD}
     os.environ.update(dict.fromkeys(ONE_THREAD, "1"))
     try:
@@ -95,14 +99,14 @@ def one_blas_thread() -> Iterator[None]:
 
 
 @contextmanager
-def main_hidden(hide: bool) -> Iterator[None]:
-    """Keep new processes from running the user's script once more."""
+def hide_main_module(hide: bool) -> Iterator[None]:
+    """With ``hide``, keep processes that are started within the block from importing the user's
+    script, which would run it again.
+    """
     main = sys.modules["__main__"]
-    attributes = {
-        name: main.__dict__[name] for name in ("__file__", "__spec__") if name in main.__dict__
-    }
-    if not hide:
-        attributes = {}
+    # multiprocessing finds the script by these attributes.
+    names = ("__file__", "__spec__") if hide else ()
+    attributes = {name: main.__dict__[name] for name in names if name in main.__dict__}
     for name in attributes:
         setattr(main, name, None)
     try:

@@ -39,10 +39,10 @@ MANIFEST = {
     "trace?": TEXT,
     "block?": COUNT,
 }
-ANOTHER = "start in a new directory"
+"""The form of a manifest that runs are resumed from."""
 
 
-class BegunEnsemble(NamedTuple):
+class StoredBlocks(NamedTuple):
     """A directory to resume in, the number of runs in its blocks, and whether it is complete."""
 
     directory: Path
@@ -50,49 +50,52 @@ class BegunEnsemble(NamedTuple):
     finished: bool
 
 
-def ensemble_to_resume(
+def find_stored_blocks(
     out: Path | None, scenario: Scenario, plan: RunIdentity
-) -> BegunEnsemble | None:
-    """Return the ensemble in the directory ``out``, None if that is new or empty.
+) -> StoredBlocks | None:
+    """Return the blocks of the ensemble in the directory ``out``, None if it is new or empty.
 
-    Raises ScenarioError if it holds something else than a run with this plan on this installation,
-    or one that was changed since it was written.
+    Raises ScenarioError unless the directory holds a run of this plan and of this installation
+    only, whose files were not changed since they were written.
     """
     if out is None:
         remedy = "add --out DIR with the directory of the run that was stopped"
         raise ScenarioError("--resume", "needs the directory of the runs", None, remedy)
-    size = BlockCheckpoints(out, scenario).begun_with() or plan.block
+    size = BlockCheckpoints(out, scenario).stored_block_size() or plan.block
     if not (out / "manifest.json").exists():
         if not _has_own_files(out, scenario):
             return None
+        # Each block names its run: blocks of other runs are removed when they are read.
         _check_scenario(out, scenario)
-        return BegunEnsemble(out, size, False)
+        return StoredBlocks(out, size, False)
     manifest = read_manifest(out)
     if manifest["runs"]["wanted"] != plan.runs:
         rule, value = "the run was begun with another number of runs", manifest["runs"]["wanted"]
         raise ScenarioError("--resume", rule, value, "give the same --runs")
-    same = {
+    # Another version or machine may round differently: the merged results would be those of no
+    # single run.
+    requirements = {
         "scenario": (plan.scenario, "give the same scenario, seed and settings"),
         "trace": (plan.trace, "give the same --trace"),
         "engine": (plan.engine, "give the same --engine"),
         "versions": (versions(), "go on with the versions that it was begun with"),
         "machine": (machine(), "go on where it was begun, or start in a new directory"),
     }
-    for key, (planned, remedy) in same.items():
+    for key, (planned, remedy) in requirements.items():
         if manifest.get(key) != planned:
             rule = f"{out} holds a run of another {key.removesuffix('s')}"
             raise ScenarioError(
                 "--resume", rule, _describe_difference(manifest.get(key), planned), remedy
             )
-    blocks_prove = "remove it: the blocks prove themselves"
-    _require(out / "manifest.json", lambda: check_seal(manifest), blocks_prove)
+    remedy = "remove it: the blocks prove themselves"
+    _require(out / "manifest.json", lambda: check_seal(manifest), remedy)
     _check_scenario(out, scenario)
     finished = manifest["status"] in FINAL_STATUSES
     if finished:
-        _require(out, lambda: check_files(out, manifest), ANOTHER)
-    return BegunEnsemble(
-        out, manifest["block"] if is_block_size(manifest.get("block")) else size, finished
-    )
+        _require(out, lambda: check_files(out, manifest), "start in a new directory")
+    if is_block_size(manifest.get("block")):
+        size = manifest["block"]
+    return StoredBlocks(out, size, finished)
 
 
 def _describe_difference(stored: Any, planned: Any) -> Any:
@@ -114,8 +117,8 @@ def clear_unfinished_runs(
 ) -> bool:
     """Remove the files of a single run that was stopped; return False if it is finished.
 
-    ``note`` is called with a line if a finished run was changed since: it is done again too. Raises
-    ScenarioError where the directory holds a run of another scenario or replica.
+    The files of a finished run that were changed since are removed too, and ``note`` is called with
+    a line about them. Raises ScenarioError if the directory holds another run.
     """
     if not (directory / "manifest.json").exists():
         if _has_own_files(directory, scenario):
@@ -173,7 +176,8 @@ def _has_own_files(directory: Path, scenario: Scenario) -> bool:
     if not directory.is_dir() or not any(directory.iterdir()):
         return False
     if not holds_only(directory, run_file_names(scenario)):
-        create_output_directory(directory, scenario.name)  # says that it is not empty
+        # Raises the ScenarioError of a directory that is not empty.
+        create_output_directory(directory, scenario.name)
     return True
 
 
@@ -199,7 +203,7 @@ def _require(path: Path, check: Callable[[], None], remedy: str) -> None:
 
 
 def read_manifest(directory: Path) -> dict[str, Any]:
-    """Return ``manifest.json`` of a directory; raises ScenarioError where it is not one."""
+    """Return ``manifest.json`` of a directory; raises ScenarioError if it is missing or damaged."""
     try:
         manifest = read_document(directory / "manifest.json")
         require_form(manifest, MANIFEST)

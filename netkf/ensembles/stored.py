@@ -130,11 +130,15 @@ def _read_averages(rows: list[dict[str, Any]]) -> tuple[FloatArray, FloatArray]:
 
 
 def _read_samples(path: Path, scenario: Scenario) -> dict[str, Any]:
-    """Return the arrays of an ensemble that stand in ensemble.parquet."""
+    """Return the arrays of an ensemble in ensemble.parquet, by the names of Ensemble's attributes.
+
+    Raises DamagedError if the table does not have the columns and rows of the scenario.
+    """
     n, N = scenario.plant.n, len(scenario.nodes)
     i, j = np.triu_indices(n)
     names = ensemble_columns(n)
     if not scenario.plant.truth_known:
+        # Time, node, runs, and means and standard errors of P only: no errors, no NEES.
         names = names[: 3 + 2 * len(i)]
     if column_names(path) != names:
         raise DamagedError(f"{path.name} does not have the columns of this scenario")
@@ -150,6 +154,7 @@ def _read_samples(path: Path, scenario: Scenario) -> dict[str, Any]:
     if runs.dtype.kind != "i" or (runs < 0).any():
         raise DamagedError(f"{path.name} has numbers of runs that are no counts")
     values = _select_columns(table, ensemble_columns(n)[3:], (T, N))
+    # The upper triangles of four matrices, then mean and standard error of NEES.
     matrices = np.empty((4, T, N, n, n))
     for matrix, upper in zip(matrices, np.split(values[:, :, :-2], 4, axis=2), strict=True):
         matrix[:, :, i, j] = matrix[:, :, j, i] = upper

@@ -24,7 +24,8 @@ def summarise_ensemble(
     mean = statistics.averages.mean.reshape(-1, 3)
     error = statistics.averages.standard_error().reshape(-1, 3)
     bound = _mean_bounds(scenario, promised)
-    blurred = statistics.rounding_from if np.isfinite(statistics.rounding_from) else None
+    # JSON has no infinity: None if rounding blurs no errors.
+    rounding_from = statistics.rounding_from if np.isfinite(statistics.rounding_from) else None
     rows = [_make_row(*values) for values in zip(mean, error, bound, strict=True)]
     messages = statistics.messages.mean[0].tolist()
     messages_se = statistics.messages.standard_error()[0].tolist()
@@ -37,8 +38,8 @@ def summarise_ensemble(
         "limit": promised.limit,
         "central": promised.central,
         "bound": promised.reason or "H(12), promised by H Theorem 2",
-        "rounding_from": blurred,
-        "notes": summary_notes(scenario, blurred, bool(np.isfinite(mean[:, 1]).any())),
+        "rounding_from": rounding_from,
+        "notes": summary_notes(scenario, rounding_from, bool(np.isfinite(mean[:, 1]).any())),
         "messages": dict(zip(MESSAGES, messages, strict=True)),
         "messages_se": dict(zip(MESSAGES, messages_se, strict=True)),
     }

@@ -24,10 +24,10 @@ from typing import Any, NamedTuple
 from netkf.core.errors import EngineError
 from netkf.ensembles.blocks import Job, PackedScenario, work
 from netkf.ensembles.process_start import (
-    context,
-    main_hidden,
-    one_blas_thread,
-    signals_blocked,
+    block_signals,
+    hide_main_module,
+    limit_blas_threads,
+    process_context,
     start_server,
 )
 
@@ -53,10 +53,10 @@ class _Worker:
         self.results, sender = multiprocessing.Pipe(duplex=False)
         self.task: _Task | None = None
         self._known = ""
-        self._process = context().Process(target=_serve, args=(receiver, sender))
+        self._process = process_context().Process(target=_serve, args=(receiver, sender))
         try:
             start_server()
-            with one_blas_thread(), signals_blocked(), main_hidden(hide_main):
+            with limit_blas_threads(), block_signals(), hide_main_module(hide_main):
                 self._process.start()
         except BaseException:
             self.end()

@@ -124,6 +124,7 @@ class ReportSource:
         knowledge = self.knowledge
         if knowledge == "until":
             return times
+        # nextafter excludes arrivals at the very instant.
         if knowledge == "before":
             return np.nextafter(times, -np.inf)
         ends = (np.floor(times / self.period + SLOT_ROUNDING) + 1.0) * self.period

@@ -62,7 +62,8 @@ def count_losses(scenario: Scenario, run: Run) -> LossCounts | None:
     sent = count_by_window(scenario, sends["t"], sent_at, size)
     lost = count_by_window(scenario, losses["t"], lost_at, size)
     number = losses["message"]
-    # One number for each message, with a gap after the last of each direction.
+    # One integer for each message: the message before it in its direction has that integer less 1,
+    # and the gap after the last of each direction keeps directions apart.
     width = int(sends["message"].max(initial=0)) + 2
     keys = lost_at * width + number
     after_loss = np.isin(keys - 1, keys) & (number > 0)

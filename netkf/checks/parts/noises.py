@@ -209,16 +209,14 @@ def reading_moments(scenario: Scenario, streams: Streams) -> NoiseMoments | None
     length = max(len(z) for z, _ in columns)
     n = scenario.plant.n
     z = np.full((length, sum(z.shape[1] for z, _ in columns)), np.nan)
-    shown_states = np.zeros((length, n, z.shape[1]))
+    state_columns = np.zeros((length, n, z.shape[1]))
     first_entry = 0
     for noises, states in columns:
         entries = slice(first_entry, first_entry + noises.shape[1])
-        z[: len(noises), entries], shown_states[: len(noises), :, entries] = (
-            noises,
-            states[:, :, None],
-        )
+        z[: len(noises), entries] = noises
+        state_columns[: len(noises), :, entries] = states[:, :, None]
         first_entry = entries.stop
-    return moments(z, shown_states)
+    return moments(z, state_columns)
 
 
 def _whitened_noises(

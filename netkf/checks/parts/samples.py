@@ -86,14 +86,14 @@ class PartSamples:
 
 
 def stack_parts(scenario: Scenario, seed: int, summaries: Sequence[PartSummary]) -> PartSamples:
-    """Return the samples of all runs, for each part of the runs that have it."""
-    columns = {}
+    """Return the summaries of R runs as arrays with a first axis of length R, part by part; None
+    for a part that no run has.
+    """
+    columns: dict[str, Any] = dict.fromkeys(PartSummary._fields)
     for name in PartSummary._fields:
         parts = [getattr(summary, name) for summary in summaries]
         present = [part for part in parts if part is not None]
-        columns[name] = (
-            type(present[0])(*(np.array(column) for column in zip(*present, strict=True)))
-            if present
-            else None
-        )
+        if present:
+            arrays = (np.array(column) for column in zip(*present, strict=True))
+            columns[name] = type(present[0])(*arrays)
     return PartSamples(scenario, seed, **columns)

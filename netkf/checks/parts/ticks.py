@@ -94,11 +94,11 @@ def count_ticks(scenario: Scenario, run: Run) -> TickCounts | None:
     index = {entity: k for k, entity in enumerate(group.entities)}
     rows = run.log[run.log["kind"] == CODES["tick"]]
     columns = ("node",) if clock.at == "nodes" else ("node", "peer")
-    ids = zip(*(rows[name].tolist() for name in columns), strict=True)
-    ordered = clock.at == "links"
-    clock_of_tick = np.array(
-        [index[tuple(sorted(e)) if ordered else e] for e in ids], dtype=np.int64
-    )
+    ids = list(zip(*(rows[name].tolist() for name in columns), strict=True))
+    if clock.at == "links":
+        # Both nodes share the clock of a link, whose entity has the smaller id first.
+        ids = [tuple(sorted(pair)) for pair in ids]
+    clock_of_tick = np.array([index[entity] for entity in ids], dtype=np.int64)
     return _count_in_windows(group, rows["t"], clock_of_tick, scenario.horizon)
 
 
@@ -161,32 +161,32 @@ def _by_window(times: np.ndarray, indices: np.ndarray, size: int, horizon: float
 def _count_in_windows(
     group: ClockGroup, times: np.ndarray, clock_of_tick: np.ndarray, horizon: float
 ) -> TickCounts:
-    """Return the counts of ticks at ``times`` (K,) of the clocks ``clock_of_tick`` (K,)."""
+    """Return the counts of K ticks in a run of ``horizon`` seconds, from their ``times`` (K,) in
+    seconds and the indices (K,) of their clocks in ``group``.
+    """
     size = len(group.entities)
     windows = _by_window(times, clock_of_tick, size, horizon)
     order = np.lexsort((times, clock_of_tick))
     sorted_times, sorted_clocks = times[order], clock_of_tick[order]
-    first = np.ones(len(sorted_times), dtype=bool)
-    first[1:] = sorted_clocks[1:] != sorted_clocks[:-1]
+    is_first = np.ones(len(sorted_times), dtype=bool)
+    is_first[1:] = sorted_clocks[1:] != sorted_clocks[:-1]
+    # The number of each tick among those of its clock.
     ticks_of_clock = np.bincount(sorted_clocks, minlength=size)
-    number = (
-        np.arange(len(sorted_times))
-        - np.concatenate([[0], np.cumsum(ticks_of_clock)])[sorted_clocks]
-    )
+    first_row = np.concatenate([[0], np.cumsum(ticks_of_clock)])
+    number = np.arange(len(sorted_times)) - first_row[sorted_clocks]
+    # Under the null hypothesis the gaps, transformed by their stated law, are uniform in [0, 1).
     uniform, largest_error = np.full(len(sorted_times), np.nan), 0.0
     for clock in dict.fromkeys(group.stated):
-        of_clock = np.array([stated is clock for stated in group.stated])[sorted_clocks]
+        rows = np.array([stated is clock for stated in group.stated])[sorted_clocks]
         ticks = TickSample(
-            sorted_times[of_clock],
-            number[of_clock],
-            ticks_of_clock[sorted_clocks[of_clock]],
-            first[of_clock],
+            sorted_times[rows], number[rows], ticks_of_clock[sorted_clocks[rows]], is_first[rows]
         )
-        uniform[of_clock] = _as_uniform(clock, ticks, horizon)
+        uniform[rows] = _as_uniform(clock, ticks, horizon)
         largest_error = max(largest_error, distance_from_lattice(clock, ticks))
     present = np.isfinite(uniform)
     cells = count_cells(np.where(present, uniform, 0.0)[:, None], present[:, None])
-    return TickCounts(windows, cells, correlate_neighbours(uniform, first), np.array(largest_error))
+    products = correlate_neighbours(uniform, is_first)
+    return TickCounts(windows, cells, products, np.array(largest_error))
 
 
 class TickSample(NamedTuple):
