@@ -1,5 +1,7 @@
-"""Checkers for classes of your own and assertions for pytest: each raises AssertionError with one
-line (what, where, the value got, what to do) and returns None where all is well.
+"""Checkers for classes of your own and assertions for pytest.
+
+Each raises AssertionError with one line (method, rule, the value got, what to do), and returns None
+if all is well.
 """
 
 from __future__ import annotations

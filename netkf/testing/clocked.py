@@ -1,4 +1,4 @@
-"""Trials of a filter in continuous time."""
+"""Trials of a filter in continuous time, where clocks decide when nodes transmit."""
 
 from __future__ import annotations
 
@@ -16,24 +16,25 @@ from netkf.linalg.arrays import FloatArray
 from netkf.testing.estimates import check_estimate
 from netkf.testing.systems import System
 from netkf.testing.trials import Trial
-from netkf.testing.watching import Watched, demand
+from netkf.testing.watching import WatchedPart, demand
 
-HORIZON = 4.0  # seconds: longer than all rounds together
-# Seconds: below, about and above the time scale of the system.
+HORIZON = 4.0  # seconds: longer than all rounds of a trial
+# Pairs of gaps in seconds: below, about and above the time scale of the system.
 GAPS = ((1e-3, 0.02), (0.3, 0.5), (1.0, 2.0))
-COMPOSES = 1e-6  # relative: above the rounding of any way to solve the Riccati equation
-# The truth is shifted late, when messages of all kinds are under way.
-ROUNDS, SHIFTED = 6, 4
-MAX_SAMPLE_GAP, MAX_INCREMENT_GAP = 0.5, 0.05
-SAMPLED = 0.8  # probability that a node samples: some rounds go without
-# More than enough for e^{A s} within one gap.
+# Relative: above the rounding error of any method for the Riccati equation.
+COMPOSITION_TOLERANCE = 1e-6
+# The truth is shifted late, when messages of all kinds are in flight.
+ROUNDS, SHIFT_ROUND = 6, 4
+MAX_SAMPLE_GAP, MAX_INCREMENT_GAP = 0.5, 0.05  # seconds of a round
+SAMPLE_PROBABILITY = 0.8  # of a node in a round: below 1, to have rounds without a sample
+# Gauss-Legendre quadrature, exact to rounding for e^{A s} within one gap.
 POINTS, WEIGHTS = np.polynomial.legendre.leggauss(12)
 
 
-class Flying(NamedTuple):
-    """A message that takes time: ``lands`` is the round in which it arrives."""
+class MessageInFlight(NamedTuple):
+    """A message that was sent at time ``sent`` (seconds) and arrives in round ``arrival``."""
 
-    lands: int
+    arrival: int
     sender: int
     receiver: int
     payload: Any
@@ -41,13 +42,16 @@ class Flying(NamedTuple):
 
 
 class ClockTrial(Trial):
-    """Some rounds in which time passes, sensors read and nodes transmit; in odd rounds messages are
-    lost or take time.
+    """A trial of ROUNDS rounds, in each of which time passes, sensors read and two nodes transmit.
+
+    In odd rounds messages may be lost or delayed. ``clock`` is the kind of clock by which nodes
+    transmit (see algorithms.filter.CLOCKS; None without messages); sensors give ``increments`` or
+    samples.
     """
 
     def __init__(
         self,
-        watched: Watched,
+        watched: WatchedPart,
         system: System,
         shift: FloatArray | None,
         clock: str | None,
@@ -56,115 +60,131 @@ class ClockTrial(Trial):
         self._clock, self._increments = clock, increments
         self._A = system.M - np.eye(len(system.M))
         self._time, self._count = 0.0, 0
-        self._flying: list[Flying] = []
+        self._in_flight: list[MessageInFlight] = []
         super().__init__(watched, system, shift)
 
     @classmethod
-    def each_reading(
-        cls, watched: Watched, system: System, shift: FloatArray | None, clock: str | None
+    def by_reading(
+        cls, watched: WatchedPart, system: System, shift: FloatArray | None, clock: str | None
     ) -> Iterator[ClockTrial]:
-        """Yield a trial with samples and one with increments, if the filter takes them."""
+        """Yield a trial with samples and one with increments, if the filter supports both."""
         part = watched.part
         if not isinstance(part, FlowAdapter):
             yield cls(watched, system, shift, clock, increments=False)
         if not part.needs_samples and clock != "readings":
             yield cls(watched, system, shift, clock, increments=True)
 
-    def model(self, sees: bool) -> FlowModel:
-        """Return the model of a node, with the matrices of increment sensors only."""
-        H, R = self.matrices(sees and self._increments)
+    def model(self, has_sensor: bool) -> FlowModel:
+        """Return the model of a node; H and R are those of sensors with increments only."""
+        H, R = self.matrices(has_sensor and self._increments)
         interval = min(0.1, longest_interval(self._A, self.system.Q, H, R))
         return FlowModel(self._A, self.system.Q, H, R, HORIZON, interval)
 
     def run(self) -> None:
-        """Carry out round after round."""
+        """Check that ``predict`` composes, under one of the clocks, and run all rounds."""
         if self._clock in (None, *self.part.clocks[:1]):
             for node in self.nodes:
-                self._check_composes(node)
+                self._check_composition(node)
         for k in range(ROUNDS):
-            self._pass_time(shift=k == SHIFTED)
+            self._pass_time(shift=k == SHIFT_ROUND)
             if self.part.talks:
-                self._exchange(k, quiet=k % 2 == 0)
-            self.end()
+                self._exchange(k, reliable=k % 2 == 0)
+            self.record_end()
 
-    def _check_composes(self, node: int) -> None:
-        """Check that predictions over two gaps give that over their sum."""
+    def _check_composition(self, node: int) -> None:
+        """Check that predictions over two gaps, one after the other, equal one over their sum, and
+        that ``max_measurement_interval`` is positive.
+        """
         watched, state = self.watched, self.states[node]
         for first, second in GAPS:
-            whole = watched.call("predict", state, first + second)
-            parts = watched.call("predict", watched.call("predict", state, first), second)
-            pairs = [check_estimate(watched, s, len(self._A), "predict") for s in (whole, parts)]
-            for name, one, other in zip(("xhat", "P"), *pairs, strict=True):
+            in_one_step = watched.call("predict", state, first + second)
+            in_two_steps = watched.call("predict", watched.call("predict", state, first), second)
+            estimates = [
+                check_estimate(watched, predicted, len(self._A), "predict")
+                for predicted in (in_one_step, in_two_steps)
+            ]
+            for name, one, other in zip(("xhat", "P"), *estimates, strict=True):
                 if one is not None and other is not None:
-                    self._compare(name, one, other, first, second)
+                    self._compare_predictions(name, one, other, first, second)
         if self._increments and len(self.models[node].H):
             method = "max_measurement_interval"
             seconds = watched.call(method, state)
             where = f"{watched.name}.{watched.defined_name(method)}"
             demand(seconds > 0.0, where, "must be above 0 seconds", seconds)
 
-    def _compare(
+    def _compare_predictions(
         self, name: str, one: FloatArray, other: FloatArray, first: float, second: float
     ) -> None:
-        """Check that two predictions are equal up to rounding."""
-        apart = float(np.abs(one - other).max())
+        """Check that arrays ``name`` of predictions over gaps ``first + second`` (seconds), in one
+        step and in two, are equal up to rounding.
+        """
+        difference = float(np.abs(one - other).max())
         size = max(float(np.abs(one).max()), float(np.abs(other).max()), 1e-300)
         method = self.watched.defined_name("predict")
         demand(
-            apart <= COMPOSES * size,
+            difference <= COMPOSITION_TOLERANCE * size,
             f"{self.watched.name}.{method}",
             f"must compose over gaps, {method}(a + b) = {method}(b) after {method}(a)",
-            f"{name} that differs by {apart / size:.2g} of its size at a = {first:g} and "
+            f"{name} that differs by {difference / size:.2g} of its size at a = {first:g} and "
             f"b = {second:g} s",
             "solve over the gap exactly, as state.model.predict does, and keep no count of calls",
         )
 
     def _pass_time(self, shift: bool) -> None:
-        """Let time pass: the truth may be shifted, and sensors are sampled."""
-        longest = MAX_SAMPLE_GAP
+        """Predict all nodes over a random gap, with the readings of their sensors; with ``shift``
+        the truth is shifted at its end, before samples.
+        """
+        max_gap = MAX_SAMPLE_GAP
         if self._increments:
-            longest = min(MAX_INCREMENT_GAP, *(model.interval for model in self.models))
-        gap = longest * self.random.uniform(0.5, 1.0)
+            max_gap = min(MAX_INCREMENT_GAP, *(model.interval for model in self.models))
+        gap = max_gap * self.random.uniform(0.5, 1.0)
         start, self.offset = self.offset, scipy.linalg.expm(gap * self._A) @ self.offset
         self._time += gap
         sensing = [node for node in self.nodes if node != 1 and len(self.system.H)]
         for node in self.nodes:
-            read = self._increments and node in sensing
-            self.step(node, "predict", gap, checks=not read)
-            if read:
+            has_increments = self._increments and node in sensing
+            self.step(node, "predict", gap, records=not has_increments)
+            if has_increments:
                 self.step(node, "update", Increments(self._moments(start, gap), gap))
         if shift:
-            self.shift()
+            self.shift_truth()
         if not self._increments:
             for node in sensing:
-                if self.random.random() < SAMPLED:
+                if self.random.random() < SAMPLE_PROBABILITY:
                     self.step(node, "update", self.sample(node, self._time))
 
     def _moments(self, start: FloatArray, gap: float) -> FloatArray:
-        """Return moments (2 p,) of noise, plus the effect of a truth that is shifted by ``start``
-        (n,) at first.
+        """Return moments (2 p,) of increments over ``gap`` seconds: noise, plus the effect of a
+        truth that is shifted by ``start`` (n,) at the beginning.
         """
         noise = self.random.normal(size=2 * len(self.system.H)) * np.sqrt(gap)
-        added = np.zeros((2, len(self.system.H)))
+        # Integrals of H e^{A s} start over s, weighted with the Legendre polynomials 1 and z.
+        effect = np.zeros((2, len(self.system.H)))
         for z, weight in zip(POINTS, WEIGHTS, strict=True):
-            effect = self.system.H @ scipy.linalg.expm(0.5 * gap * (1.0 + z) * self._A) @ start
-            added += 0.5 * gap * weight * np.outer([1.0, z], effect)
-        return np.asarray(noise + added.reshape(-1))
+            y = self.system.H @ scipy.linalg.expm(0.5 * gap * (1.0 + z) * self._A) @ start
+            effect += 0.5 * gap * weight * np.outer([1.0, z], y)
+        return np.asarray(noise + effect.reshape(-1))
 
-    def shift(self) -> None:
-        """Shift the messages under way by the shift of the truth when they were sent."""
+    def shift_truth(self) -> None:
+        """Shift the truth, the states of all nodes, and the messages in flight: these by the shift
+        that the truth would have had when they were sent.
+        """
         if self._shift is None:
             return
-        super().shift()
-        for k, flying in enumerate(self._flying):
-            earlier = scipy.linalg.expm((flying.sent - self._time) * self._A) @ self.offset
-            payload = self.watched.call("shift_payload", flying.payload, earlier)
-            self._flying[k] = flying._replace(payload=payload)
+        super().shift_truth()
+        for k, message in enumerate(self._in_flight):
+            earlier = scipy.linalg.expm((message.sent - self._time) * self._A) @ self.offset
+            payload = self.watched.call("shift_payload", message.payload, earlier)
+            self._in_flight[k] = message._replace(payload=payload)
 
-    def _exchange(self, k: int, quiet: bool) -> None:
-        """Let the nodes of round ``k`` send, and all messages of this round arrive."""
-        nothing_in_flight = quiet and not self._flying
-        before = self.sums() if nothing_in_flight else {}
+    def _exchange(self, k: int, reliable: bool) -> None:
+        """Let two nodes transmit in round ``k`` and all nodes absorb the messages that arrive.
+
+        Unless ``reliable``, every third message is lost and some arrive in the next round. Checks
+        that sums are conserved if no message is lost or in flight.
+        """
+        is_conserved = reliable and not self._in_flight
+        before = self.conserved_sums() if is_conserved else {}
         payloads = [
             (node, receivers, self.emit(node, Exchange(time=self._time, receivers=receivers)))
             for node, receivers in self._choose_transmissions(k)
@@ -174,41 +194,45 @@ class ClockTrial(Trial):
                 continue
             for receiver in receivers:
                 self._count += 1
-                if quiet or self._count % 3:
-                    lands = k if quiet or self._count % 2 else k + 1
-                    self._flying.append(Flying(lands, sender, receiver, payload, self._time))
-        self._absorb(k)
-        if nothing_in_flight:
-            self.compare(before, "none")
+                if reliable or self._count % 3:
+                    arrival = k if reliable or self._count % 2 else k + 1
+                    message = MessageInFlight(arrival, sender, receiver, payload, self._time)
+                    self._in_flight.append(message)
+        self._absorb_arrivals(k)
+        if is_conserved:
+            self.check_conserved(before, "none")
 
     def _choose_transmissions(self, k: int) -> list[tuple[int, tuple[int, ...]]]:
-        """Return the senders of a round, each with its receivers; two nodes send at once."""
-        one, other = sorted({k % len(self.nodes), (k + 1) % len(self.nodes)})
-        if self._clock == "links":
-            return [(one, (other,)), (other, (one,))]
-        if self._clock == "directions":
-            return [(one, (other,))] if k % 2 else [(other, (one,))]
-        return [(node, tuple(peer for peer in self.nodes if peer != node)) for node in (one, other)]
+        """Return the senders of round ``k``, each with its receivers.
 
-    def _absorb(self, k: int) -> None:
-        """Let every node absorb all messages that have arrived by now."""
-        landed = [flying for flying in self._flying if flying.lands <= k]
-        self._flying = [flying for flying in self._flying if flying.lands > k]
+        With a clock for each link both of its ends send, with one for each direction one of them;
+        otherwise two nodes broadcast to all others.
+        """
+        a, b = sorted({k % len(self.nodes), (k + 1) % len(self.nodes)})
+        if self._clock == "links":
+            return [(a, (b,)), (b, (a,))]
+        if self._clock == "directions":
+            return [(a, (b,))] if k % 2 else [(b, (a,))]
+        return [(node, tuple(peer for peer in self.nodes if peer != node)) for node in (a, b)]
+
+    def _absorb_arrivals(self, k: int) -> None:
+        """Let every node absorb the messages that arrive in round ``k``, in order of senders."""
+        arrivals = [message for message in self._in_flight if message.arrival <= k]
+        self._in_flight = [message for message in self._in_flight if message.arrival > k]
         for node in self.nodes:
-            inbox = [m for m in map(self._accept, landed) if m is not None and m[0] == node]
-            messages = [message for _, message in sorted(inbox, key=lambda m: m[1].sender)]
+            accepted = [self._accept(message) for message in arrivals if message.receiver == node]
+            messages = sorted((m for m in accepted if m is not None), key=lambda m: m.sender)
             if self.part.newest_only:
                 newest = {m.sender: m for m in sorted(messages, key=lambda m: -m.age)}
                 messages = [newest[sender] for sender in sorted(newest)]
             if messages:
                 self.absorb(node, messages, Exchange(time=self._time))
 
-    def _accept(self, flying: Flying) -> tuple[int, Message] | None:
-        """Return the receiver and the message, or None if the filter refuses its age."""
-        age = self._time - flying.sent
-        accepted = self.watched.call("accepts", flying.payload, age)
-        truth = accepted is True or accepted is False
-        demand(truth, f"{self.watched.name}.accepts", "must be True or False", accepted)
-        weight = float(self.weights[flying.sender, flying.receiver])
-        message = Message(flying.sender, weight, flying.payload, age)
-        return (flying.receiver, message) if accepted else None
+    def _accept(self, arrival: MessageInFlight) -> Message | None:
+        """Return the message as its receiver gets it, or None if the filter refuses its age."""
+        age = self._time - arrival.sent
+        accepts = self.watched.call("accepts", arrival.payload, age)
+        is_flag = accepts is True or accepts is False
+        demand(is_flag, f"{self.watched.name}.accepts", "must be True or False", accepts)
+        weight = float(self.weights[arrival.sender, arrival.receiver])
+        return Message(arrival.sender, weight, arrival.payload, age) if accepts else None

@@ -1,4 +1,4 @@
-"""Check the states of a filter and the estimates that it makes from them."""
+"""Checks of the states of a filter and of the estimates computed from them."""
 
 from __future__ import annotations
 
@@ -8,17 +8,19 @@ from typing import Any
 import numpy as np
 
 from netkf.linalg.arrays import FloatArray
-from netkf.testing.watching import Watched, demand, difference, leaves
+from netkf.testing.watching import WatchedPart, collect_leaves, demand, differing_path
 
-# Relative to the largest entry of P: some thousand roundings.
-SYMMETRY, SEMIDEFINITE = 1e-9, 1e-9
+# Relative to the largest entry of P: thousands of times the rounding error.
+SYMMETRY_TOLERANCE, EIGENVALUE_TOLERANCE = 1e-9, 1e-9
 
 
 def check_estimate(
-    watched: Watched, state: Any, n: int, after: str
+    watched: WatchedPart, state: Any, n: int, after: str
 ) -> tuple[FloatArray, FloatArray | None]:
-    """Return the checked result of ``estimate`` after a method: of the right shapes, finite, P None
-    or symmetric and positive semidefinite.
+    """Return ``estimate(state)``: xhat (n,), and P (n, n) or None.
+
+    Raises AssertionError unless both have these shapes and are finite, and P is symmetric and
+    positive semidefinite. ``after`` is the method that returned the state, for messages.
     """
     where = f"{watched.name}.estimate after {watched.defined_name(after)}"
     pair = watched.call("estimate", state)
@@ -34,7 +36,7 @@ def check_estimate(
 
 
 def _check_array(where: str, name: str, array: Any, shape: tuple[int, ...]) -> None:
-    """Check shape, type and finite values of an array."""
+    """Raise AssertionError unless an array is float64, finite and of this ``shape``."""
     demand(array.shape == shape, where, f"{name} must have the shape {shape}", str(array.shape))
     demand(array.dtype == np.float64, where, f"{name} must be float64", str(array.dtype))
     remedy = "return None where the filter has no P" if name == "P" else ""
@@ -42,28 +44,28 @@ def _check_array(where: str, name: str, array: Any, shape: tuple[int, ...]) -> N
 
 
 def _check_covariance(where: str, P: FloatArray) -> None:
-    """Check that P is symmetric and positive semidefinite up to rounding."""
+    """Raise AssertionError unless P is symmetric and positive semidefinite up to rounding."""
     size = max(float(np.abs(P).max()), np.finfo(float).tiny)
-    skew = float(np.abs(P - P.T).max())
+    asymmetry = float(np.abs(P - P.T).max())
     demand(
-        skew <= SYMMETRY * size,
+        asymmetry <= SYMMETRY_TOLERANCE * size,
         where,
         "P must be symmetric",
-        f"P - P' of up to {skew:.3g}",
+        f"P - P' of up to {asymmetry:.3g}",
         "return 0.5 * (P + P.T)",
     )
-    least = float(np.linalg.eigvalsh(P)[0])
+    smallest = float(np.linalg.eigvalsh(P)[0])
     demand(
-        least >= -SEMIDEFINITE * size,
+        smallest >= -EIGENVALUE_TOLERANCE * size,
         where,
         "P must be positive semidefinite",
-        f"least eigenvalue {least:.4g}",
+        f"least eigenvalue {smallest:.4g}",
         "look for a sign, or for weights that sum to more than 1",
     )
 
 
-def check_state_pickles(watched: Watched, state: Any) -> None:
-    """Check that a state that went through pickle gives the same estimate."""
+def check_state_pickles(watched: WatchedPart, state: Any) -> None:
+    """Check that a state can be pickled and that the copy gives the same estimate."""
     where = f"{watched.name}.init"
     try:
         copy = pickle.loads(pickle.dumps(state))
@@ -72,5 +74,5 @@ def check_state_pickles(watched: Watched, state: Any) -> None:
             f"{where}: states must be picklable; got {type(error).__name__}: {error}; make the "
             "state a NamedTuple of arrays at the top level of a module"
         ) from error
-    one, other = (leaves(watched.part.estimate(s)) for s in (state, copy))
-    demand(difference(one, other) is None, where, "states must be themselves after pickling")
+    one, other = (collect_leaves(watched.part.estimate(s)) for s in (state, copy))
+    demand(differing_path(one, other) is None, where, "states must be themselves after pickling")

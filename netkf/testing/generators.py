@@ -9,34 +9,35 @@ import numpy as np
 from netkf.rng.streams import Streams
 
 Calls = list[tuple[str, int]]
+"""Calls of a generator: method and number of values drawn."""
 
 
 class RecordingGenerator(np.random.Generator):
-    """A generator that lists the draws made from it: method and number of values."""
+    """A random generator that records each call of its methods in ``calls``."""
 
     def __init__(self, seed: int, *entity: int) -> None:
         super().__init__(Streams(seed).generator("testing", *entity).bit_generator)
         self.calls: Calls = []
 
     def __getattribute__(self, name: str) -> Any:
-        found = super().__getattribute__(name)
+        attribute = super().__getattribute__(name)
         if name.startswith("_") or name in ("calls", "take_calls", "bit_generator"):
-            return found
+            return attribute
 
-        def drawing(*arguments: Any, **named: Any) -> Any:
-            """Draw, and record method and number of values."""
-            values = found(*arguments, **named)
+        def draw(*arguments: Any, **keywords: Any) -> Any:
+            """Call the method ``name`` and record the number of values that it draws."""
+            values = attribute(*arguments, **keywords)
             self.calls.append((name, int(np.size(values))))
             return values
 
-        return drawing
+        return draw
 
     def take_calls(self) -> Calls:
-        """Return the draws since the last call."""
+        """Return the recorded calls and forget them."""
         calls, self.calls = self.calls, []
         return calls
 
 
 def describe_calls(calls: Calls) -> str:
-    """Return a text that lists calls of a generator."""
+    """Return calls as text, such as "2 x normal", or "nothing"."""
     return ", ".join(f"{count} x {name}" for name, count in calls) or "nothing"

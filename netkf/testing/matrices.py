@@ -1,4 +1,4 @@
-"""Matrices against matrices, as an assertion."""
+"""Assertions about matrices."""
 
 from __future__ import annotations
 
@@ -9,40 +9,36 @@ from netkf.testing.watching import demand, fail
 
 
 def assert_dominated(P: ArrayLike, bound: ArrayLike, tolerance: float = 1e-9) -> None:
-    """Assert ``P <= bound``: every eigenvalue of ``bound - P`` is at least ``-tolerance`` times the
-    largest entry of the bound at that index.
+    """Assert ``P <= bound``, in the order of symmetric matrices.
 
-    Both are (n, n), or stacks (..., n, n) that broadcast, such as (T, N, n, n). Raises
-    AssertionError that names the index where the least eigenvalue is furthest below.
+    Both are (n, n), or stacks (..., n, n) that broadcast, such as (T, N, n, n). Every eigenvalue of
+    ``bound - P`` must be at least ``-tolerance`` times the largest absolute entry of the bound at
+    that index. Raises AssertionError, which names the index with the lowest such ratio.
     """
     lower, upper = (np.asarray(a, dtype=np.float64) for a in (P, bound))
     for name, matrices in (("P", lower), ("bound", upper)):
-        square = matrices.ndim >= 2 and matrices.shape[-1] == matrices.shape[-2]
-        demand(square, name, "must be a square matrix or a stack of them", matrices.shape)
-        bad = np.argwhere(~np.isfinite(matrices).all(axis=(-2, -1)))
-        demand(
-            not bad.size,
-            name,
-            "must be finite",
-            f"nan or inf{_format_index(bad[0]) if bad.size else ''}",
-        )
+        is_square = matrices.ndim >= 2 and matrices.shape[-1] == matrices.shape[-2]
+        demand(is_square, name, "must be a square matrix or a stack of them", matrices.shape)
+        not_finite = np.argwhere(~np.isfinite(matrices).all(axis=(-2, -1)))
+        if not_finite.size:
+            fail(name, "must be finite", f"nan or inf{_format_index(not_finite[0])}")
     try:
         shape = np.broadcast_shapes(lower.shape, upper.shape)
     except ValueError:
         fail("bound", "must have the shape of P", f"{upper.shape} for {lower.shape}")
     gap = symmetric(np.broadcast_to(upper, shape) - lower)
-    least = np.linalg.eigvalsh(gap)[..., 0]
+    smallest = np.linalg.eigvalsh(gap)[..., 0]
     size = np.maximum(np.abs(upper).max(axis=(-2, -1)), np.finfo(float).tiny)
-    relative = np.asarray(least / size)
+    relative = np.asarray(smallest / size)
     if relative.size and float(relative.min()) < -tolerance:
         index = np.unravel_index(int(np.argmin(relative)), relative.shape)
-        text = f"the least eigenvalue of bound - P is {float(least[index]):.4g}"
+        text = f"the least eigenvalue of bound - P is {float(smallest[index]):.4g}"
         count = int((relative < -tolerance).sum())
         many = f", one of {count} places of {relative.size}" if relative.size > 1 else ""
         fail(f"P{_format_index(index)}", f"must stay below the bound; {text}{many}")
 
 
 def _format_index(index: object) -> str:
-    """Return an index as text."""
+    """Return an index as text, such as "[3, 0]"; empty for a single matrix."""
     numbers = [int(k) for k in index]  # type: ignore[attr-defined]
     return f"[{', '.join(map(str, numbers))}]" if numbers else ""

@@ -1,4 +1,4 @@
-"""Run a filter beside the built-in class that it derives from, and compare their numbers."""
+"""Comparison of a user's filter with the built-in class that it derives from."""
 
 from __future__ import annotations
 
@@ -9,97 +9,115 @@ from typing import NamedTuple
 from netkf.algorithms.filter import STEPS
 from netkf.algorithms.registry import base_filter, built_in_class, own_attributes
 from netkf.testing.clocked import ClockTrial
-from netkf.testing.shifts import differences
-from netkf.testing.slotted import SlotTrial, slots_of
-from netkf.testing.systems import System, systems
+from netkf.testing.shifts import estimate_differences
+from netkf.testing.slotted import SlotTrial, trial_slots
+from netkf.testing.systems import System, make_systems
 from netkf.testing.trials import Trial
-from netkf.testing.watching import Watched, demand
+from netkf.testing.watching import WatchedPart, fail
 
 TOLERANCE = 1e-6
-"""Differences in units of the size of an estimate that count as another order of operations."""
+"""Largest relative difference that another order of operations may cause."""
 
 
 class Difference(NamedTuple):
-    """The largest difference from the parent: relative to the size of ``what``, and where."""
+    """A difference of estimates from those of the parent.
 
-    apart: float
-    what: str
+    relative : difference divided by the size of the quantity
+    quantity : "xhat" or "P"
+    where    : node and time, as text
+    """
+
+    relative: float
+    quantity: str
     where: str
 
 
-def check_parent(watched: Watched, same_as_parent: bool | None) -> None:
-    """Compare a class with the built-in one that it derives from, with the same settings, on the
-    same readings and messages, in slots and under the clocks that both know.
+def check_parent(watched: WatchedPart, same_as_parent: bool | None) -> None:
+    """Compare the estimates of a filter with those of the built-in class that it derives from.
 
-    Raises AssertionError if numbers differ, unless ``same_as_parent`` is False; if it is None,
-    classes that define one of the methods STEPS warn instead.
+    Both run with the same settings, readings and messages, in slots and under the clocks that both
+    support. Nothing is compared if the class overrides nothing or ``same_as_parent`` is False.
+
+    Raises AssertionError if estimates differ by more than TOLERANCE; with ``same_as_parent`` None,
+    a class that defines one of the methods STEPS gets a UserWarning instead.
     """
     part = watched.part
-    known = built_in_class(part)
-    own = own_attributes(part)
-    if same_as_parent is False or known is None or not own:
+    parent_class = built_in_class(part)
+    overrides = own_attributes(part)
+    if same_as_parent is False or parent_class is None or not overrides:
         return
-    found = largest_difference(watched.once(), Watched(base_filter(part)).once())
-    if found is None or found.apart <= TOLERANCE:
+    parent = WatchedPart(base_filter(part))
+    worst = largest_difference(watched.unchecked(), parent.unchecked())
+    if worst is None or worst.relative <= TOLERANCE:
         return
-    size = f"{found.what} differs by {found.apart:.3g} of its size {found.where}"
-    listed = ", ".join(own)
-    rule = f"must have the numbers of {known.__name__}, which it derives from"
+    size = f"{worst.quantity} differs by {worst.relative:.3g} of its size {worst.where}"
+    rule = f"must have the numbers of {parent_class.__name__}, which it derives from"
     remedy = "say same_as_parent=False if it differs by design"
-    text = f"{size}; its own: {listed}"
-    if same_as_parent is None and set(own) & set(STEPS):
+    text = f"{size}; its own: {', '.join(overrides)}"
+    if same_as_parent is None and set(overrides) & set(STEPS):
         message = f"{watched.name}: {rule}, or say so; {text}; {remedy}"
         warnings.warn(message, UserWarning, stacklevel=4)
         return
-    demand(False, f"{watched.name}.{own[0]}", rule, text, remedy)
+    fail(f"{watched.name}.{overrides[0]}", rule, text, remedy)
 
 
-def largest_difference(own: Watched, parent: Watched) -> Difference | None:
-    """Return the largest difference at the end of any slot or round; None if they have no kind of
-    time in common.
+def largest_difference(child: WatchedPart, parent: WatchedPart) -> Difference | None:
+    """Return the largest relative difference of the estimates of two filters at the end of any slot
+    or round; None if they cannot run in the same kind of time.
     """
     worst: Difference | None = None
-    for one, other, kind in _pairs(own, parent):
-        one.run()
+    for child_trial, parent_trial, unit in _trial_pairs(child, parent):
+        child_trial.run()
         try:
-            other.run()
+            parent_trial.run()
         except AssertionError:
-            continue  # the parent asks for more than its heir, such as regular covariances
-        for k, (mine, theirs) in enumerate(zip(one.ends, other.ends, strict=False)):
-            for node in mine.keys() & theirs.keys():
-                for what, apart, size in differences(mine[node], theirs[node]):
-                    found = Difference(apart / size, what, f"at node {node} after {kind} {k}")
-                    worst = found if worst is None or found.apart > worst.apart else worst
+            continue  # the parent requires more than the child, such as regular covariances
+        ends = zip(child_trial.ends, parent_trial.ends, strict=False)
+        for k, (child_end, parent_end) in enumerate(ends):
+            for node in child_end.keys() & parent_end.keys():
+                where = f"at node {node} after {unit} {k}"
+                quantities = estimate_differences(child_end[node], parent_end[node])
+                for quantity, difference, size in quantities:
+                    relative = difference / size
+                    if worst is None or relative > worst.relative:
+                        worst = Difference(relative, quantity, where)
     return worst
 
 
-def _pairs(own: Watched, parent: Watched) -> Iterator[tuple[Trial, Trial, str]]:
-    """Yield trials of both classes on the same systems, with the same readings and messages."""
-    mine, theirs = own.part, parent.part
+def _trial_pairs(child: WatchedPart, parent: WatchedPart) -> Iterator[tuple[Trial, Trial, str]]:
+    """Yield pairs of trials of two filters with the same systems, readings and messages, each with
+    the unit of its time, "slot" or "round".
+    """
+    parts = child.part, parent.part
     slots = None
-    if mine.schedule is not None and theirs.schedule is not None:
-        slots = max(slots_of(mine), slots_of(theirs))
-    clocks: list[str | None] = [clock for clock in mine.clocks if clock in theirs.clocks]
-    clocks = clocks if mine.talks or theirs.talks else [None]
-    drawn = systems(mine.inverts or theirs.inverts)
-    for system in drawn:
+    if all(part.schedule is not None for part in parts):
+        slots = max(map(trial_slots, parts))
+    clocks: list[str | None] = [None]
+    if any(part.talks for part in parts):
+        clocks = [clock for clock in child.part.clocks if clock in parent.part.clocks]
+    systems = make_systems(any(part.inverts for part in parts))
+    for system in systems:
         if slots is not None:
-            pair = SlotTrial(own, system), SlotTrial(parent, system)
+            pair = SlotTrial(child, system), SlotTrial(parent, system)
             for trial in pair:
                 trial.slots = slots
             if len(pair[0].nodes) == len(pair[1].nodes):
                 yield *pair, "slot"
-        # What depends on the system shows under one clock as under another.
-        for clock in clocks if system is drawn[-1] else clocks[:1]:
-            yield from _clocked_pairs(own, parent, system, clock)
+        # All clocks on one system only: a fault that depends on the system shows under any clock.
+        for clock in clocks if system is systems[-1] else clocks[:1]:
+            yield from _clock_trial_pairs(child, parent, system, clock)
 
 
-def _clocked_pairs(
-    own: Watched, parent: Watched, system: System, clock: str | None
+def _clock_trial_pairs(
+    child: WatchedPart, parent: WatchedPart, system: System, clock: str | None
 ) -> Iterator[tuple[Trial, Trial, str]]:
-    """Yield trials of a class and of its parent under clocks, with the unit of their comparison."""
-    increments = not (own.part.needs_samples or parent.part.needs_samples or clock == "readings")
-    for with_increments in (False, True) if increments else (False,):
-        pair = tuple(ClockTrial(w, system, None, clock, with_increments) for w in (own, parent))
-        if len(pair[0].nodes) == len(pair[1].nodes):
-            yield pair[0], pair[1], "round"
+    """Yield pairs of trials in continuous time, with samples and, if both filters take them, with
+    increments.
+    """
+    needs_samples = child.part.needs_samples or parent.part.needs_samples or clock == "readings"
+    for increments in (False,) if needs_samples else (False, True):
+        first, second = (
+            ClockTrial(watched, system, None, clock, increments) for watched in (child, parent)
+        )
+        if len(first.nodes) == len(second.nodes):
+            yield first, second, "round"

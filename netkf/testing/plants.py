@@ -1,4 +1,4 @@
-"""Check that a plant moves as its matrices say."""
+"""``check_plant``: checks of the states of a plant against its matrices."""
 
 from __future__ import annotations
 
@@ -14,72 +14,80 @@ from netkf.core.errors import NetkfError
 from netkf.linalg.arrays import FloatArray, is_semidefinite
 from netkf.plants.diffusion import Diffusion
 from netkf.plants.linear import LinearPlant
+from netkf.plants.paths import BLOCK
 from netkf.plants.plant import Plant
 from netkf.rng.normals import GeneratorNormals
 from netkf.rng.streams import Streams
 from netkf.testing.noise import (
-    Stated,
+    NoiseLabels,
+    check_independent,
     check_uncorrelated,
-    check_unrelated,
     check_white,
-    whitening,
+    compute_whitening,
 )
 from netkf.testing.watching import (
-    Watched,
-    attempt,
+    WatchedPart,
+    call_user_function,
     demand,
     demand_array,
-    distance,
+    guard_user_code,
     make_part,
-    user_code,
+    relative_difference,
 )
 
 STARTS, STEPS, LENGTH = 40_000, 100_000, 400
+"""Draws of x(0), steps of the state in all runs together, and steps of a run, for statistics."""
 FEW_STARTS = 10
-GRID_RUNS, GRID_BLOCKS, MAX_RUNS = 100, 8, 2000
-SHORT = 130
-ROUNDING, FRAMED = 1e-9, 1e-6
-GROWTH = math.log(1e6)
-"""Logarithm of how much a state may grow in a run whose digits are looked at."""
+"""Draws of x(0) where it is not random."""
+GRID_STEPS, MAX_RUNS = 51_200, 2000
+SHORT_LENGTH = 130
+"""Slots in which paths are compared exactly."""
+ROUNDING, FRAME_TOLERANCE = 1e-9, 1e-6
+"""Relative differences of equal paths, and of paths in frames or of directions without noise."""
+MAX_LOG_GROWTH = math.log(1e6)
+"""Logarithm of the largest growth of the state of an unstable plant in a run."""
 GAPS = (0.7, 0.2, 1.0, 0.05)
-"""Gaps between the times of a path, in units of the plant's own time."""
+"""Gaps between the times of a path, in units of the time constant of the plant."""
 
 
 def check_plant(plant: Any, /, **settings: Any) -> None:
-    """Check a plant, or a class with its ``settings``: x(0) of ``mean`` and ``cov``, and
-    x[k+1] = F x[k] + w[k] with cov(w) = Q, or dx = A x dt + B dw.
+    """Check a plant, or a class with its ``settings``.
 
-    Exactly: shapes; equal streams give equal paths, whether states are asked for one by one or
-    with some left out, in frames or not, alone or with other runs, at more probe times or fewer;
-    a start that is moved moves the path by F^k or e^{A t} times as much (an error of F or A of any
-    size is found); directions in which Q or ``cov`` have no noise have none; only the given
+    Its law is x(0) of mean ``mean`` and covariance ``cov``, and x[k+1] = F x[k] + w[k] with
+    cov(w) = Q, or dx = A x dt + B dw.
+
+    Exact checks: shapes; equal streams give equal paths, whether states are read one by one or some
+    are left out, in frames or not, alone or with other runs, and with more probe times or fewer; a
+    start that is moved moves the path by F^k or e^{A t} times as much, which finds an error of F or
+    A of any size; there is no noise in directions in which Q or ``cov`` have none; only the given
     generators are used; the plant survives pickle.
 
-    By 40,000 starts, with probability 0.9: a mean of x(0) off by 0.04 standard deviations, a
-    variance that is wrong by 6 %, a correlation of 0.04. By 100,000 steps (a diffusion 51,200 on
-    its sensing grid, with the moments of x over each, and as many at sample and probe times): a
-    mean of the noise of 0.03 standard deviations (diffusion 0.04), a variance wrong by 4 % (6 %), a
-    correlation of 0.03 (0.04) between components, 1, 2, 3 or 7 steps apart, or with x(0) and
-    between runs; in one quarter of a run errors must be twice as large, and
-    for unstable plants, whose runs are short, up to three times. Recorded and unknown plants
-    are not drawn: form and pickle only. A sound class fails once in a million checks.
+    Statistical checks find these errors with probability 0.9. From 40,000 starts: a mean of x(0)
+    off by 0.04 standard deviations, a variance off by 6 %, a correlation of 0.04. From 100,000
+    steps (of a diffusion 51,200 on its sensing grid, with the moments of x over each, and as many
+    between sample and probe times): a mean of the noise of 0.03 standard deviations (diffusion
+    0.04), a variance off by 4 % (6 %), and a correlation of 0.03 (0.04) between components, between
+    steps 1, 2, 3 or 7 apart, with x(0), or between runs. Errors in only one quarter of a run must
+    be twice as large; for unstable plants, whose runs are short, up to three times. Recorded and
+    unknown plants are checked for form and pickle only. A correct class fails once in a million
+    checks.
 
     Raises AssertionError with one line: the method, the rule, the value got, what to do.
     """
     part = make_part(plant, (Plant,), settings)
-    check_made_plant(part, 0)
+    check_plant_object(part, 0)
 
 
-def check_made_plant(part: Any, seed: int) -> None:
-    """Run ``check_plant`` on an object, with streams of the given seed."""
-    watched = Watched(part)
+def check_plant_object(part: Any, seed: int) -> None:
+    """Check a Plant as ``check_plant`` does, with random streams of ``seed``."""
+    watched = WatchedPart(part)
     copy = watched.pickle_copy()
     name = watched.name
     _check_form(part, name)
     if not part.is_random:
         return
     before = watched.attributes()
-    with user_code(name):
+    with guard_user_code(name):
         if isinstance(part, LinearPlant):
             _check_slots(part, copy, name, seed)
         elif isinstance(part, Diffusion):
@@ -88,62 +96,68 @@ def check_made_plant(part: Any, seed: int) -> None:
 
 
 def _check_form(part: Any, name: str) -> None:
-    """Check the shapes of a plant's matrices and the covariance of x(0)."""
+    """Check the shapes of the matrices of a plant, and that the covariance of x(0) is one."""
     n = part.n
     matrix = part.F if isinstance(part, LinearPlant) else getattr(part, "A", np.zeros((n, n)))
-    square = isinstance(n, int) and matrix.shape == (n, n)
-    demand(square, f"{name}.n", "must be the number of rows of the plant's matrix", n)
+    fits = isinstance(n, int) and matrix.shape == (n, n)
+    demand(fits, f"{name}.n", "must be the number of rows of the plant's matrix", n)
     noise = getattr(part, "Q", np.zeros((n, n)))
     demand(noise.shape == (n, n), f"{name}.Q", f"must have the shape {(n, n)}", str(noise.shape))
     demand_array(f"{name}.start_mean", "the mean of x(0)", part.start_mean, (n,))
     where = f"{name}.start_cov"
     cov = demand_array(where, "the covariance of x(0)", part.start_cov, (n, n))
-    sound = np.allclose(cov, cov.T) and is_semidefinite(cov)
-    demand(sound, where, "must be symmetric and positive semidefinite", cov)
+    is_covariance = np.allclose(cov, cov.T) and is_semidefinite(cov)
+    demand(is_covariance, where, "must be symmetric and positive semidefinite", cov)
 
 
-def _with_other_start(part: Any) -> tuple[Any, FloatArray] | None:
-    """Return the plant with another mean of x(0), and by how much it moved; None where its class
-    fixes the mean.
+def _move_start(part: Any) -> tuple[Any, FloatArray] | None:
+    """Return a copy of the plant with another mean of x(0), and the difference (n,) of the means;
+    None if its class has no parameter for the mean.
     """
-    wanted = part.start_mean + 3.0 * (1.0 + np.sqrt(np.diag(part.start_cov)))
+    mean = part.start_mean + 3.0 * (1.0 + np.sqrt(np.diag(part.start_cov)))
     try:
-        moved = dataclasses.replace(part, mean=wanted)
+        moved = dataclasses.replace(part, mean=mean)
     except (NetkfError, TypeError, ValueError):
         return None
     offset = moved.start_mean - part.start_mean
     return (moved, offset) if offset.any() else None
 
 
-def _make_random(seed: int, run: int, purpose: str = "plant") -> np.random.Generator:
-    """Return the random generator of a run."""
+def _make_generator(seed: int, run: int, purpose: str = "plant") -> np.random.Generator:
+    """Return the random generator of a run for a purpose."""
     return Streams(seed, run).generator(purpose)
 
 
 def _demand_same(where: str, one: FloatArray, other: FloatArray, when: str) -> None:
-    """Check that two paths from equal streams are equal."""
-    apart = distance(one, other)
+    """Check that two paths from equal streams are equal; ``when`` says in messages how the second
+    one was drawn.
+    """
+    difference = relative_difference(one, other)
     demand(
-        apart <= ROUNDING,
+        difference <= ROUNDING,
         where,
         "must make the same path from equal streams",
-        f"a difference of {apart:.3g} of its size {when}",
+        f"a difference of {difference:.3g} of its size {when}",
         "use only the generators given, and draw for each step in order",
     )
 
 
-def _demand_follows(
-    where: str, one: FloatArray, two: FloatArray, Phi: FloatArray, offset: FloatArray, law: str
+def _demand_moved(
+    where: str, x: FloatArray, moved: FloatArray, Phi: FloatArray, offset: FloatArray, law: str
 ) -> None:
-    """Check that states (K, n) differ by ``Phi`` (K, n, n) times the offset of their starts."""
+    """Check that a path from a start moved by ``offset`` (n,), ``moved`` (K, n), differs from the
+    path ``x`` (K, n) by the transition matrices ``Phi`` (K, n, n) times the offset.
+
+    ``law`` is the name of these matrices for messages.
+    """
     expected = Phi @ offset
-    gap = float(np.abs(two - one - expected).max() / (1.0 + np.abs(two).max()))
-    worst = int(np.abs(two - one - expected).max(axis=1).argmax())
+    error = np.abs(moved - x - expected)
+    worst = int(error.max(axis=1).argmax())
     demand(
-        gap <= ROUNDING,
+        float(error.max() / (1.0 + np.abs(moved).max())) <= ROUNDING,
         where,
         f"a start that is moved must move the path by {law}, and the noise not at all",
-        f"{two[worst] - one[worst]} instead of {expected[worst]}",
+        f"{moved[worst] - x[worst]} instead of {expected[worst]}",
         "let the noise not depend on x, and use the matrix that the filters are told",
     )
 
@@ -153,32 +167,36 @@ def _check_starts(
     where: str,
     seed: int,
     start: Callable[[np.random.Generator], FloatArray],
-    inherited: bool,
+    is_inherited: bool,
 ) -> None:
-    """Check the law of x(0), of which ``start`` draws one; ``inherited``: by netkf's own method."""
-    white = whitening(part.start_cov)
-    count = STARTS if len(white.free) else FEW_STARTS
-    with user_code(where):
-        found = _draw_starts(part, seed, start, inherited, count)
-    demand_array(where, "x(0)", found[0], (part.n,))
-    gaps = np.array(found) - part.start_mean
+    """Check mean and covariance of x(0), which ``start`` draws from a generator.
+
+    ``is_inherited`` says that the class does not override the method behind ``start``.
+    """
+    whitening = compute_whitening(part.start_cov)
+    count = STARTS if len(whitening.factor) else FEW_STARTS
+    with guard_user_code(where):
+        starts = _draw_starts(part, seed, start, is_inherited, count)
+    demand_array(where, "x(0)", starts[0], (part.n,))
+    deviations = np.array(starts) - part.start_mean
     size = 1.0 + float(np.abs(part.start_mean).max())
-    off = float(np.abs(gaps @ white.certain.T).max(initial=0.0)) / size
+    error = float(np.abs(deviations @ whitening.null_space.T).max(initial=0.0)) / size
     rule = "x(0) must be its mean in the directions in which cov has no variance"
-    demand(off <= 1e-6, where, rule, f"{off:.3g} off", "start at mean + root of cov times normals")
-    unit = gaps @ white.free.T
+    remedy = "start at mean + root of cov times normals"
+    demand(error <= 1e-6, where, rule, f"{error:.3g} off", remedy)
+    unit = deviations @ whitening.factor.T
     if unit.size:
-        check_white(unit[:, None], Stated(where, "x(0) less its mean", "cov"))
+        check_white(unit[:, None], NoiseLabels(where, "x(0) less its mean", "cov"))
 
 
-class _NormalsInTurn:
-    """Standard normal numbers of ``count`` runs that take turns at one generator."""
+class _SharedNormals:
+    """Standard normal numbers for ``count`` runs, drawn from one generator run after run."""
 
     def __init__(self, random: np.random.Generator, count: int) -> None:
         self._random, self._count = random, count
 
     def draw(self, shape: tuple[int, ...]) -> FloatArray:
-        """Return the next numbers (count, *shape) of each run."""
+        """Return the next numbers (count, *shape) of all runs."""
         return self._random.standard_normal((self._count, *shape))
 
 
@@ -186,107 +204,123 @@ def _draw_starts(
     part: Any,
     seed: int,
     start: Callable[[np.random.Generator], FloatArray],
-    inherited: bool,
+    is_inherited: bool,
     count: int,
 ) -> Sequence[FloatArray]:
-    """Draw x(0) ``count`` times, all at once where ``start`` is ``inherited`` and gives the same
-    as ``starts``.
+    """Return ``count`` draws of x(0) (n,).
+
+    They are drawn all at once if the class overrides neither ``start`` nor ``starts`` and both give
+    the same first values.
     """
-    random = _make_random(seed, 0)
-    found = [start(random) for _ in range(min(count, FEW_STARTS))]
-    if inherited and type(part).starts is Plant.starts:
-        # One by one, they take most of the time of a check.
-        drawn = part.starts(_NormalsInTurn(_make_random(seed, 0), count))
-        first = drawn[: len(found)]
-        if np.shape(found) == first.shape and distance(np.array(found), first) <= ROUNDING:
-            return [*found, *drawn[len(found) :]]
-    return [*found, *(start(random) for _ in range(count - len(found)))]
+    random = _make_generator(seed, 0)
+    first = [start(random) for _ in range(min(count, FEW_STARTS))]
+    if is_inherited and type(part).starts is Plant.starts:
+        # Drawing them one by one would take most of the time of a check.
+        together = part.starts(_SharedNormals(_make_generator(seed, 0), count))
+        same = together[: len(first)]
+        if np.shape(first) == same.shape and relative_difference(np.array(first), same) <= ROUNDING:
+            return [*first, *together[len(first) :]]
+    return [*first, *(start(random) for _ in range(count - len(first)))]
 
 
 def _check_noise(
-    noise: FloatArray, S: FloatArray, states: FloatArray, stated: Stated, rule: str
+    noise: FloatArray, S: FloatArray, states: FloatArray, labels: NoiseLabels, rule: str
 ) -> None:
-    """Check noise (R, K, n) of covariance ``S`` that is added to ``states`` (R, K, n)."""
-    white = whitening(S)
+    """Check ``noise`` (R, K, q) of K steps of R runs, with the ``states`` (R, K, n) before each.
+
+    It must be white with the covariance S (q, q), and independent of the states. ``rule`` is the
+    message if it is not 0 in the directions in which S has no noise.
+    """
+    whitening = compute_whitening(S)
     size = 1.0 + float(np.abs(states).max())
-    off = float(np.abs(noise @ white.certain.T).max(initial=0.0)) / size
-    demand(off <= FRAMED, stated.where, rule, f"{off:.3g} of the state left over without noise")
-    e = noise @ white.free.T
+    error = float(np.abs(noise @ whitening.null_space.T).max(initial=0.0)) / size
+    text = f"{error:.3g} of the state left over without noise"
+    demand(error <= FRAME_TOLERANCE, labels.where, rule, text)
+    e = noise @ whitening.factor.T
     if not e.size:
         return
-    check_white(e, stated)
-    flat = states.reshape(-1, states.shape[-1])
-    check_unrelated(e.reshape(len(flat), -1), flat, stated, "the state before")
-    first = whitening(np.atleast_2d(np.cov(states[:, 0].T))).free
-    if first.size and len(e) > 1:
-        start = (states[:, 0] - states[:, 0].mean(axis=0)) @ first.T
-        check_uncorrelated(start, e[:, 0], stated._replace(noise="x(0) and the noise"), "after it")
+    check_white(e, labels)
+    flat_states = states.reshape(-1, states.shape[-1])
+    check_independent(e.reshape(len(flat_states), -1), flat_states, labels, "the state before")
+    start_factor = compute_whitening(np.atleast_2d(np.cov(states[:, 0].T))).factor
+    if start_factor.size and len(e) > 1:
+        start = (states[:, 0] - states[:, 0].mean(axis=0)) @ start_factor.T
+        check_uncorrelated(start, e[:, 0], labels._replace(noise="x(0) and the noise"), "after it")
 
 
 def _check_slots(part: LinearPlant, copy: LinearPlant, name: str, seed: int) -> None:
-    """Check a plant in slots: repeatable paths, moving frames, and the law of the noise."""
+    """Check a plant in slots: repeatable paths, moving frames, the law of x(0) and of the noise.
+
+    ``copy`` is the plant after pickling.
+    """
     where = f"{name}.truth"
 
-    def path(plant: Any, slots: Sequence[int], run: int = 0) -> FloatArray:
-        """Return the states (slots, n) of a run."""
-        with user_code(where):
-            truth = plant.truth(_make_random(seed, run))
-            found = [truth.state(slot) for slot in slots]
-        demand_array(where, "a state", found[0], (part.n,))
-        return np.array([np.asarray(x).reshape(-1) for x in found])
+    def draw_path(plant: Any, slots: Sequence[int], run: int = 0) -> FloatArray:
+        """Return the states (K, n) of a run in K slots."""
+        with guard_user_code(where):
+            truth = plant.truth(_make_generator(seed, run))
+            states = [truth.state(slot) for slot in slots]
+        demand_array(where, "a state", states[0], (part.n,))
+        return np.array([np.asarray(x).reshape(-1) for x in states])
 
     radius = float(np.abs(np.linalg.eigvals(part.F)).max())
-    length = LENGTH if radius <= 1.0 else max(8, min(LENGTH, int(GROWTH / math.log(radius))))
-    short = min(SHORT, length)
-    numbers = list(range(short + 1))
-    whole = path(part, numbers)
-    _demand_same(where, whole, path(part, numbers), "at the second call")
-    _demand_same(where, whole, path(copy, numbers), "of a pickled plant")
-    some = [0, 0, 3, short // 2, short // 2, short]
-    _demand_same(where, whole[some], path(part, some), "when slots are left out or asked for twice")
-    _check_frames(part, where, whole, seed)
-    other = _with_other_start(part)
-    if other is not None:
-        Phi = np.array([np.linalg.matrix_power(part.F, k) for k in numbers])
-        _demand_follows(where, whole, path(other[0], numbers), Phi, other[1], "powers of F")
-    inherited = type(part).truth is LinearPlant.truth
-    _check_starts(part, where, seed, lambda random: part.truth(random).state(0), inherited)
+    length = LENGTH
+    if radius > 1.0:
+        length = max(8, min(LENGTH, int(MAX_LOG_GROWTH / math.log(radius))))
+    last = min(SHORT_LENGTH, length)
+    slots = list(range(last + 1))
+    path = draw_path(part, slots)
+    _demand_same(where, path, draw_path(part, slots), "at the second call")
+    _demand_same(where, path, draw_path(copy, slots), "of a pickled plant")
+    gaps = [0, 0, 3, last // 2, last // 2, last]
+    when = "when slots are left out or asked for twice"
+    _demand_same(where, path[gaps], draw_path(part, gaps), when)
+    with guard_user_code(where):
+        _compare_frames(part, where, path, part.truth(_make_generator(seed, 0), True))
+    moved = _move_start(part)
+    if moved is not None:
+        plant, offset = moved
+        Phi = np.array([np.linalg.matrix_power(part.F, k) for k in slots])
+        _demand_moved(where, path, draw_path(plant, slots), Phi, offset, "powers of F")
+    is_inherited = type(part).truth is LinearPlant.truth
+    _check_starts(part, where, seed, lambda random: part.truth(random).state(0), is_inherited)
     runs = max(2, min(MAX_RUNS, STEPS // length))
-    states = np.array([path(part, range(length + 1), run) for run in range(runs)])
-    steps = states[:, 1:] - states[:, :-1] @ part.F.T
-    stated = Stated(where, "the noise x[k+1] - F x[k]", "Q")
-    _check_noise(
-        steps, part.Q, states[:, :-1], stated, "x[k+1] must be F x[k] where Q has no noise"
-    )
+    states = np.array([draw_path(part, range(length + 1), run) for run in range(runs)])
+    noise = states[:, 1:] - states[:, :-1] @ part.F.T
+    labels = NoiseLabels(where, "the noise x[k+1] - F x[k]", "Q")
+    rule = "x[k+1] must be F x[k] where Q has no noise"
+    _check_noise(noise, part.Q, states[:, :-1], labels, rule)
 
 
-def _check_frames(part: LinearPlant, where: str, whole: FloatArray, seed: int) -> None:
-    """Check that states in frames are those without, less the origin of the frame."""
-    with user_code(where):
-        _compare_frames(part, where, whole, part.truth(_make_random(seed, 0), True))
+def _compare_frames(part: LinearPlant, where: str, path: FloatArray, truth: Any) -> None:
+    """Check the ``truth`` of a run with moving frames against its ``path`` (K, n) without them.
 
-
-def _compare_frames(part: LinearPlant, where: str, whole: FloatArray, truth: Any) -> None:
-    """Check the absolute and local states of a truth with moving frames."""
+    Absolute states must be those of the path, and local states the same less the origin of the
+    frame, which moves by F and is the state where the frame begins.
+    """
     frame = truth.frame_slots
     origin = np.zeros(part.n)
-    for slot, x in enumerate(whole):
+    for slot, x in enumerate(path):
         origin = part.F @ origin if slot else origin
-        for text, state in (
+        for kind, state in (
             ("absolute", truth.absolute(slot)),
             ("local", truth.local(slot) + origin),
         ):
-            apart = distance(np.asarray(state), x)
-            rule = f"{text} states must be the same in frames, up to the origin"
-            demand(apart <= FRAMED, where, rule, f"{apart:.3g} of the state apart in slot {slot}")
+            error = relative_difference(np.asarray(state), x)
+            rule = f"{kind} states must be the same in frames, up to the origin"
+            text = f"{error:.3g} of the state apart in slot {slot}"
+            demand(error <= FRAME_TOLERANCE, where, rule, text)
         if frame and slot and slot % frame == 0:
             origin = origin + truth.rebase(slot)
-            zero = not np.any(truth.local(slot))
-            demand(zero, where, "the local state must be 0 where a frame begins", truth.local(slot))
+            is_zero = not np.any(truth.local(slot))
+            rule = "the local state must be 0 where a frame begins"
+            demand(is_zero, where, rule, truth.local(slot))
 
 
 def transition_law(A: FloatArray, B: FloatArray, gap: float) -> tuple[FloatArray, FloatArray]:
-    """Return ``e^{A g}`` and the covariance of the noise over ``gap`` seconds, Van Loan 1978."""
+    """Return the transition matrix ``e^{A g}`` (n, n) of dx = A x dt + B dw over g = ``gap``
+    seconds, and the covariance (n, n) of its noise (Van Loan, 1978).
+    """
     n = len(A)
     block = np.block([[-A, B @ B.T], [np.zeros((n, n)), A.T]]) * gap
     E = scipy.linalg.expm(block)
@@ -295,138 +329,158 @@ def transition_law(A: FloatArray, B: FloatArray, gap: float) -> tuple[FloatArray
 
 
 def moment_law(A: FloatArray, B: FloatArray, gap: float) -> tuple[FloatArray, FloatArray]:
-    """Return the response (3 n, n) to the state, and the covariance (3 n, 3 n) of the noise, of the
-    state after ``gap`` seconds with the two moments of x over them.
+    """Return the law of the state after ``gap`` seconds together with the two moments of x over
+    them: its response (3 n, n) to the state before, and the covariance (3 n, 3 n) of its noise.
+
+    The moments are the integrals of x and of x times the Legendre polynomial P_1 over the gap.
     """
-    n, zero, one = len(A), np.zeros_like(A), np.eye(len(A))
+    n, zero, eye = len(A), np.zeros_like(A), np.eye(len(A))
     # x, I = int x ds and J = int I ds: int s x ds = g I - J.
-    chain = np.block([[A, zero, zero], [one, zero, zero], [zero, one, zero]])
+    chain = np.block([[A, zero, zero], [eye, zero, zero], [zero, eye, zero]])
     Phi, S = transition_law(chain, np.concatenate([B, np.zeros((2 * n, B.shape[1]))]), gap)
     # int (2 s / g - 1) x ds = I - 2 J / g.
-    T = np.block([[one, zero, zero], [zero, one, zero], [zero, one, -2.0 / gap * one]])
+    T = np.block([[eye, zero, zero], [zero, eye, zero], [zero, eye, -2.0 / gap * eye]])
     return (T @ Phi)[:, :n], T @ S @ T.T
 
 
 def _check_diffusion(part: Diffusion, copy: Diffusion, name: str, seed: int) -> None:
-    """Check a plant in continuous time: first states, sampled truth and grid."""
-    speed = float(np.abs(np.linalg.eigvals(part.A)).max())
-    growth = float(np.linalg.eigvals(part.A).real.max())
-    second = 1.0 / speed if speed > 0.0 else 1.0
-    longest = GROWTH / growth if growth > 0.0 else math.inf
-    inherited = type(part).start is Diffusion.start
-    _check_starts(part, f"{name}.start", seed, part.start, inherited)
-    _check_sampled(part, copy, f"{name}.sampled_truth", seed, (second, longest))
-    period = part.sensing_period or min(0.1 * second, part.longest_period)
-    grid = dataclasses.replace(part, sensing_period=period)
-    _check_grid(grid, name, seed, max(2, int(min(longest / period, 64.0))))
+    """Check a plant in continuous time: x(0), paths at sample and probe times, and paths on the
+    sensing grid. ``copy`` is the plant after pickling.
+    """
+    eigenvalues = np.linalg.eigvals(part.A)
+    speed, growth = float(np.abs(eigenvalues).max()), float(eigenvalues.real.max())
+    time_constant = 1.0 / speed if speed > 0.0 else 1.0
+    max_seconds = MAX_LOG_GROWTH / growth if growth > 0.0 else math.inf
+    is_inherited = type(part).start is Diffusion.start
+    _check_starts(part, f"{name}.start", seed, part.start, is_inherited)
+    _check_sampled(part, copy, f"{name}.sampled_truth", seed, (time_constant, max_seconds))
+    period = part.sensing_period or min(0.1 * time_constant, part.longest_period)
+    with_grid = dataclasses.replace(part, sensing_period=period)
+    _check_grid(with_grid, name, seed, max(2, int(min(max_seconds / period, 64.0))))
 
 
 def _check_sampled(
     part: Diffusion, copy: Diffusion, where: str, seed: int, scale: tuple[float, float]
 ) -> None:
-    """Check paths at sample and probe times; ``scale`` is the plant's own time, and how long a
-    run may be without losing digits, in seconds.
+    """Check paths at sample and probe times: repeatable, the same without probes, and with noise of
+    the stated law.
+
+    ``scale`` is the time constant of the plant, and the longest run without loss of digits, both in
+    seconds.
     """
-    second, longest = scale
-    gaps = second * np.tile(GAPS, LENGTH // len(GAPS))
-    times = np.cumsum(gaps)
-    times = times[times <= max(longest, times[7])]
-    samples, probes = np.delete(times, np.s_[::3]), times[::3]
+    time_constant, max_seconds = scale
+    times = np.cumsum(time_constant * np.tile(GAPS, LENGTH // len(GAPS)))
+    times = times[times <= max(max_seconds, times[7])]
+    sample_times, probe_times = np.delete(times, np.s_[::3]), times[::3]
     horizon = float(times[-1]) * 1.01
 
-    def path(
-        plant: Any, at: FloatArray, run: int = 0, sample_times: FloatArray = probes
+    def draw_path(
+        plant: Any, at: FloatArray, run: int = 0, probes: FloatArray = probe_times
     ) -> FloatArray:
-        """Return the states (times, n) of a run."""
-        randoms = [_make_random(seed, run, purpose) for purpose in ("plant", "probe")]
-        truth = attempt(where, plant.sampled_truth, *randoms, samples, sample_times, horizon)
-        asked = np.concatenate([[0.0], at])
-        found = np.asarray(attempt(where, truth.states, asked)[1])
-        return demand_array(where, "states", found, (len(asked), part.n))
-
-    whole = path(part, times)
-    _demand_same(where, whole, path(part, times), "at the second call")
-    _demand_same(where, whole, path(copy, times), "of a pickled plant")
-    drawn = np.isin(np.concatenate([[0.0], times]), probes, invert=True)
-    fewer = path(part, samples, sample_times=probes[:0])
-    _demand_same(where, whole[drawn], fewer, "when nothing is probed")
-    laws = [transition_law(part.A, part.B, second * gap) for gap in GAPS]
-    other = _with_other_start(part)
-    if other is not None:
-        since = [np.eye(part.n)]
-        for k in range(len(times)):
-            since.append(laws[k % len(GAPS)][0] @ since[-1])
-        moved = path(other[0], times)
-        _demand_follows(where, whole, moved, np.array(since), other[1], "e^{A t}")
-    runs = max(2, min(MAX_RUNS, STEPS // (2 * len(times))))
-    states = np.array([path(part, times, run) for run in range(runs)])
-    for k, (Phi, S) in enumerate(laws):
-        steps = (
-            states[:, k + 1 :: 4] - states[:, k:-1:4][:, : states[:, k + 1 :: 4].shape[1]] @ Phi.T
+        """Return the states (1 + K, n) of a run at time 0 and K times ``at``."""
+        randoms = [_make_generator(seed, run, purpose) for purpose in ("plant", "probe")]
+        truth = call_user_function(
+            where, plant.sampled_truth, *randoms, sample_times, probes, horizon
         )
-        before = states[:, k:-1:4][:, : steps.shape[1]]
-        text = f"the noise x(t + g) - e^(A g) x(t) over {second * GAPS[k]:.3g} s"
+        with_start = np.concatenate([[0.0], at])
+        states = np.asarray(call_user_function(where, truth.states, with_start)[1])
+        return demand_array(where, "states", states, (len(with_start), part.n))
+
+    path = draw_path(part, times)
+    _demand_same(where, path, draw_path(part, times), "at the second call")
+    _demand_same(where, path, draw_path(copy, times), "of a pickled plant")
+    is_sampled = np.isin(np.concatenate([[0.0], times]), probe_times, invert=True)
+    unprobed = draw_path(part, sample_times, probes=probe_times[:0])
+    _demand_same(where, path[is_sampled], unprobed, "when nothing is probed")
+    laws = [transition_law(part.A, part.B, time_constant * gap) for gap in GAPS]
+    moved = _move_start(part)
+    if moved is not None:
+        plant, offset = moved
+        Phi_from_start = [np.eye(part.n)]
+        for k in range(len(times)):
+            Phi_from_start.append(laws[k % len(GAPS)][0] @ Phi_from_start[-1])
+        moved_path = draw_path(plant, times)
+        _demand_moved(where, path, moved_path, np.array(Phi_from_start), offset, "e^{A t}")
+    runs = max(2, min(MAX_RUNS, STEPS // (2 * len(times))))
+    states = np.array([draw_path(part, times, run) for run in range(runs)])
+    # The gaps repeat after four steps: one law for all steps of each gap.
+    for k, (Phi, S) in enumerate(laws):
+        after = states[:, k + 1 :: 4]
+        before = states[:, k:-1:4][:, : after.shape[1]]
+        text = f"the noise x(t + g) - e^(A g) x(t) over {time_constant * GAPS[k]:.3g} s"
         rule = "x(t + g) must be e^(A g) x(t) where B has no noise"
-        _check_noise(steps, S, before, Stated(where, text, "B"), rule)
+        _check_noise(after - before @ Phi.T, S, before, NoiseLabels(where, text, "B"), rule)
 
 
 def _check_grid(part: Diffusion, name: str, seed: int, steps: int) -> None:
-    """Check paths on the sensing grid, which are drawn together or alone, cut or not."""
+    """Check the first ``steps`` steps of paths on the sensing grid: the same for several runs at
+    once and for one, with cuts and without, and with noise of the stated law.
+    """
     where, period = f"{name}.paths", float(part.sensing_period or 0.0)
-    count = -(-steps // 64)
-    sample_times = period * np.array([1.3, 4.0, 5.5, 5.7])
-    sampled = period * np.array([2.5, 5.6])
+    blocks = -(-steps // BLOCK)
+    probe_times = period * np.array([1.3, 4.0, 5.5, 5.7])
+    sample_times = period * np.array([2.5, 5.6])
 
-    def drawn(runs: Sequence[int], cuts: bool = False, blocks: int = count) -> Any:
-        """Return the first paths of some runs on the grid."""
-        own, shows, samples = (
-            GeneratorNormals([_make_random(seed, run, purpose) for run in runs])
+    def draw_paths(runs: Sequence[int], cut: bool = False) -> Any:
+        """Return the steps of runs on the grid as a block (see plants.paths), with ``cut`` cut at
+        the probe and sample times.
+        """
+        plant_normals, probe_normals, sample_normals = (
+            GeneratorNormals([_make_generator(seed, run, purpose) for run in runs])
             for purpose in ("plant", "probe", "samples")
         )
-        none = np.empty(0)
-        at = (sample_times, samples, sampled) if cuts else (none, samples, none)
-        return attempt(where, part.paths, own, shows, *at).following(blocks)
+        no_times = np.empty(0)
+        cuts = (no_times, sample_normals, no_times)
+        if cut:
+            cuts = (probe_times, sample_normals, sample_times)
+        paths = call_user_function(where, part.paths, plant_normals, probe_normals, *cuts)
+        return paths.following(blocks)
 
-    whole = drawn(range(3))
-    alone = drawn([1])
-    _demand_same(where, whole.x_end[1], alone.x_end[0], "of a run by itself")
-    cut = drawn([1], cuts=True)
-    last = np.append(np.diff(cut.step) > 0, True)
-    _demand_same(where, alone.x_end[0], cut.x_end[0][last], "at the points of its grid when cut")
-    _check_one_path(part, f"{name}.path", cut, (sample_times, sampled), seed)
-    other = _with_other_start(part)
-    if other is not None:
-        moved = other[0].paths(
-            *(GeneratorNormals([_make_random(seed, 1, p)]) for p in ("plant", "probe")),
-            sample_times[:0],
-        )
+    together = draw_paths(range(3))
+    alone = draw_paths([1])
+    _demand_same(where, together.x_end[1], alone.x_end[0], "of a run by itself")
+    cut = draw_paths([1], cut=True)
+    is_last_piece = np.append(np.diff(cut.step) > 0, True)
+    when = "at the points of its grid when cut"
+    _demand_same(where, alone.x_end[0], cut.x_end[0][is_last_piece], when)
+    _check_one_path(part, f"{name}.path", cut, (probe_times, sample_times), seed)
+    moved = _move_start(part)
+    if moved is not None:
+        plant, offset = moved
+        normals = (GeneratorNormals([_make_generator(seed, 1, p)]) for p in ("plant", "probe"))
+        moved_path = plant.paths(*normals, probe_times[:0]).following(blocks)
         Phi = np.array([scipy.linalg.expm(part.A * period * k) for k in range(1, steps + 1)])
-        two = moved.following(count).x_end[0][:steps]
-        _demand_follows(where, alone.x_end[0][:steps], two, Phi, other[1], "e^{A t}")
-    runs = max(2, GRID_RUNS * GRID_BLOCKS * 64 // (64 * count))
-    found = drawn(range(runs))
-    start, end = found.x_start[:, :steps], found.x_end[:, :steps]
-    ends = np.concatenate([end, *(found.moments[:, :steps, m] for m in range(2))], axis=2)
+        x, moved_x = alone.x_end[0][:steps], moved_path.x_end[0][:steps]
+        _demand_moved(where, x, moved_x, Phi, offset, "e^{A t}")
+    runs = max(2, GRID_STEPS // (BLOCK * blocks))
+    drawn = draw_paths(range(runs))
+    start, end = drawn.x_start[:, :steps], drawn.x_end[:, :steps]
+    end_and_moments = np.concatenate([end, *(drawn.moments[:, :steps, m] for m in (0, 1))], axis=2)
     Phi, S = moment_law(part.A, part.B, period)
+    # Scaled, so that x and its moments are of one size.
+    scale = np.repeat([1.0, 1.0 / period, 1.0 / period], part.n)
+    noise = (end_and_moments - start @ Phi.T) * scale
     text = f"the noise of x and its two moments over steps of {period:g} s"
     rule = "x and its moments must follow from the state before where B has no noise"
-    # In units in which x and its moments are of one size.
-    units = np.repeat([1.0, 1.0 / period, 1.0 / period], part.n)
-    noise = (ends - start @ Phi.T) * units
-    _check_noise(noise, S * np.outer(units, units), start, Stated(where, text, "B"), rule)
+    labels = NoiseLabels(where, text, "B")
+    _check_noise(noise, S * np.outer(scale, scale), start, labels, rule)
 
 
 def _check_one_path(
-    part: Diffusion, where: str, cut: Any, at: tuple[FloatArray, FloatArray], seed: int
+    part: Diffusion, where: str, cut: Any, times: tuple[FloatArray, FloatArray], seed: int
 ) -> None:
-    """Check that the path of one run is the one that is drawn with others."""
-    randoms = [_make_random(seed, 1, purpose) for purpose in ("plant", "probe", "samples")]
-    own, shows, samples = randoms
-    path = attempt(where, part.path, own, shows, at[0], samples, at[1])
-    times = np.unique(np.concatenate([cut.end[:20], *at]))
-    with user_code(where):
-        x = np.array([path.local(time) for time in times.tolist()])
-    indices = np.searchsorted(cut.end, times)
-    _demand_same(
-        where, cut.x_end[0][indices], x, "from the one that `paths` draws for the same run"
+    """Check that ``path``, which draws one run, gives the states of ``cut``, the block that
+    ``paths`` drew for the same run; ``times`` are its probe and sample times in seconds.
+    """
+    plant_random, probe_random, sample_random = (
+        _make_generator(seed, 1, purpose) for purpose in ("plant", "probe", "samples")
     )
+    path = call_user_function(
+        where, part.path, plant_random, probe_random, times[0], sample_random, times[1]
+    )
+    all_times = np.unique(np.concatenate([cut.end[:20], *times]))
+    with guard_user_code(where):
+        x = np.array([path.local(time) for time in all_times.tolist()])
+    pieces = np.searchsorted(cut.end, all_times)
+    when = "from the one that `paths` draws for the same run"
+    _demand_same(where, cut.x_end[0][pieces], x, when)

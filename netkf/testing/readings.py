@@ -1,4 +1,6 @@
-"""The readings of a sensor in slots, at sample times and as increments, under one form."""
+"""Readers: one interface to the readings of a sensor in slots, at sample times, or as
+increments.
+"""
 
 from __future__ import annotations
 
@@ -12,13 +14,12 @@ from netkf.linalg.arrays import FloatArray
 from netkf.plants.diffusion import Diffusion
 from netkf.plants.sensors import LinearSensor, Sensor
 from netkf.rng.streams import Streams
-from netkf.testing.watching import attempt, demand, demand_array, user_code
+from netkf.testing.watching import call_user_function, demand, demand_array, guard_user_code
 
-# Seconds; no clock that is checked ticks up to this horizon.
-PERIOD, HORIZON = 1.0, 1e6
-STEP = 0.1  # seconds of an increment
+PERIOD, HORIZON = 1.0, 1e6  # seconds of a slot, and of a run: readings end before
+STEP = 0.1  # seconds of a step of increments
 CUTS: tuple[tuple[float, ...], ...] = ((), (0.3,), (0.2, 0.65), (0.9,))
-"""Shares of a step at which increments are cut, step after step."""
+"""Shares of a step at which increments are cut; steps take these entries in turn."""
 
 
 class ReadingSeries(NamedTuple):
@@ -29,7 +30,11 @@ class ReadingSeries(NamedTuple):
 
 
 class SensorReader:
-    """Makes readings of a sensor; ``method`` of its class makes the path of one run."""
+    """Reads a sensor in slots. ``name`` is that of the user's class.
+
+    A path, which the ``method`` of the sensor returns, gives the readings of one node in one run.
+    ``p`` is the number of rows of a reading, ``n`` that of states.
+    """
 
     method = "slot_path"
 
@@ -37,47 +42,49 @@ class SensorReader:
         self.sensor, self.where = sensor, f"{name}.{self.method}"
         self.p, self.n = len(sensor.R), sensor.H.shape[1]
 
-    def path(self, streams: Streams, node: int) -> Any:
-        """Make the path of one run."""
+    def make_path(self, streams: Streams, node: int) -> Any:
+        """Return the path of a node in a run with these random streams."""
 
         def generator(purpose: str) -> np.random.Generator:
-            """Return the random generator of a purpose."""
+            """Return the random generator for a purpose of the sensor at the node."""
             return streams.generator(purpose, node, 0)
 
-        return attempt(self.where, self._make_path, node, generator)
+        return call_user_function(self.where, self._make_path, node, generator)
 
     def _make_path(self, node: int, generator: Callable[[str], np.random.Generator]) -> Any:
-        """Return the path of the sensor's readings."""
+        """Call ``slot_path`` of the sensor and return its path."""
         return self.sensor.slot_path(node, PERIOD, generator)
 
-    def several(self, path: Any, ks: Sequence[int], x: FloatArray) -> ReadingSeries:
-        """Read a path at increasing numbers ``ks``, with states x (K, n), in one call."""
-        y, H = attempt(self.where, path.several, ks, x)
+    def read_several(self, path: Any, ks: Sequence[int], x: FloatArray) -> ReadingSeries:
+        """Return the readings with the increasing numbers ``ks`` (K,) at the states x (K, n), taken
+        in one call.
+        """
+        y, H = call_user_function(self.where, path.several, ks, x)
         y = demand_array(self.where, "y of several", y, (len(ks), self.p))
-        return ReadingSeries(
-            y, demand_array(self.where, "H of several", H, (len(ks), self.p, self.n))
-        )
+        H = demand_array(self.where, "H of several", H, (len(ks), self.p, self.n))
+        return ReadingSeries(y, H)
 
-    def one(self, path: Any, k: int, x: FloatArray) -> ReadingSeries:
-        """Read a path once, with state x (n,): y (1, p) and H (1, p, n)."""
-        with user_code(self.where):
+    def read_one(self, path: Any, k: int, x: FloatArray) -> ReadingSeries:
+        """Return reading ``k`` at the state x (n,), as a series of one reading."""
+        with guard_user_code(self.where):
             y, H = self._read_one(path, k, x)
         y = demand_array(self.where, "a reading", y, (self.p,))
-        return ReadingSeries(y[None], demand_array(self.where, "H", H, (self.p, self.n))[None])
+        H = demand_array(self.where, "H", H, (self.p, self.n))
+        return ReadingSeries(y[None], H[None])
 
     def _read_one(self, path: Any, k: int, x: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return reading ``k`` (p,) at the state x (n,), and its H (p, n)."""
-        # As the engines do: first the reading, then its matrix.
+        # In the order in which engines call them.
         return path.reading(k, x), path.matrix(k)
 
 
 class SampleReader(SensorReader):
-    """Samples of a sensor over a diffusion."""
+    """Reads the samples of a sensor over a diffusion."""
 
     method = "samples"
 
     def _make_path(self, node: int, generator: Callable[[str], np.random.Generator]) -> Any:
-        """Return the path of the sensor's samples."""
+        """Call ``samples`` of the sensor and return its path."""
         return self.sensor.samples(node, generator, HORIZON)
 
     def _read_one(self, path: Any, k: int, x: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -86,23 +93,28 @@ class SampleReader(SensorReader):
         return y, H
 
 
-def readers(sensor: Sensor, name: str) -> list[SensorReader]:
-    """Return the readers of the kinds of readings that a class gives."""
-    sampled = getattr(sensor, "sampling", None) is not None
-    own = type(sensor).samples not in (Sensor.samples, LinearSensor.samples)
-    if sampled or (own and not sensor.varying):
+def make_readers(sensor: Sensor, name: str) -> list[SensorReader]:
+    """Return the reader of a sensor, in a list: of its samples if it has a sampling clock or its
+    class overrides ``samples``, else of its readings in slots.
+    """
+    has_clock = getattr(sensor, "sampling", None) is not None
+    overrides_samples = type(sensor).samples not in (Sensor.samples, LinearSensor.samples)
+    if has_clock or (overrides_samples and not sensor.varying):
         return [SampleReader(sensor, name)]
     return [SensorReader(sensor, name)]
 
 
 def gives_increments(sensor: Sensor) -> bool:
-    """Return True for a sensor whose increments are integrated in continuous time."""
+    """Return True for a sensor that is read continuously: a linear one without a sampling clock."""
     return isinstance(sensor, LinearSensor) and sensor.sampling is None
 
 
-class Pieces(NamedTuple):
-    """Increments of the pieces of steps: ``moments`` (K, 2, p), the ``spans`` (K, 2) in seconds
-    from start to end, and whose ``step`` (K,) each is.
+class IncrementPieces(NamedTuple):
+    """Increments over K pieces of steps.
+
+    moments : (K, 2, p), integrals of dy and of P_1 dy over the piece (P_1: Legendre polynomial)
+    spans   : (K, 2), start and end of the piece, seconds
+    step    : (K,), index of the step that the piece belongs to
     """
 
     moments: FloatArray
@@ -111,29 +123,37 @@ class Pieces(NamedTuple):
 
 
 class IncrementReader:
-    """Increments of a sensor of a constant state, over steps that are cut or whole."""
+    """Reads the increments of a sensor of a constant state, over steps that may be cut into pieces.
+
+    ``name`` is that of the user's class; ``p`` is the number of rows of a reading, ``n`` of states.
+    """
 
     def __init__(self, sensor: Any, name: str) -> None:
         self.sensor, self.where = sensor, f"{name}.path"
         self.p, self.n = len(sensor.R), sensor.H.shape[1]
 
-    def pieces(self, streams: Streams, node: int, x: FloatArray, steps: int, cut: bool) -> Pieces:
-        """Return the pieces of ``steps`` steps with state x (n,)."""
-        with user_code(self.where):
+    def read_pieces(
+        self, streams: Streams, node: int, x: FloatArray, steps: int, cut: bool
+    ) -> IncrementPieces:
+        """Return the increments over ``steps`` steps at the state x (n,), ``cut`` at CUTS or
+        not.
+        """
+        with guard_user_code(self.where):
             return self._read_pieces(streams, node, x, steps, cut)
 
     def _read_pieces(
         self, streams: Streams, node: int, x: FloatArray, steps: int, cut: bool
-    ) -> Pieces:
-        """Return the moments of the increments at a constant state, with steps whole or cut."""
+    ) -> IncrementPieces:
+        """Return the increments as :meth:`read_pieces`, without its guard of the user's code."""
         plant = Diffusion(
             mean=x, A=np.zeros((self.n, self.n)), B=np.zeros((self.n, 1)), sensing_period=STEP
         )
-        own, probing = (streams.generator(purpose, node, 0) for purpose in ("plant", "probe"))
-        truth = plant.path(own, probing, np.empty(0))
-        noise, cutting = (streams.generator(purpose, node, 0) for purpose in ("noise", "cut"))
-        path = self.sensor.path(noise, cutting)
-        found, spans, whose = [], [], []
+        plant_random, probe_random, noise_random, cut_random = (
+            streams.generator(purpose, node, 0) for purpose in ("plant", "probe", "noise", "cut")
+        )
+        truth = plant.path(plant_random, probe_random, np.empty(0))
+        path = self.sensor.path(noise_random, cut_random)
+        all_moments, spans, step = [], [], []
         for k in range(steps):
             first, last = truth.grid(k), truth.grid(k + 1)
             shares = CUTS[k % len(CUTS)] if cut else ()
@@ -141,30 +161,34 @@ class IncrementReader:
             for start, end in pairwise(times):
                 x_moments = truth.moments(start, end)
                 moments = path.moments(truth, x_moments, start, end)
-                found.append(demand_array(self.where, "moments", moments, (2, self.p)))
+                all_moments.append(demand_array(self.where, "moments", moments, (2, self.p)))
                 spans.append((start, end))
-                whose.append(k)
-        return Pieces(np.array(found), np.array(spans), np.array(whose))
+                step.append(k)
+        return IncrementPieces(np.array(all_moments), np.array(spans), np.array(step))
 
-    def whole(self, pieces: Pieces) -> FloatArray:
-        """Return the moments (S, 2, p) of whole steps from those of their pieces."""
+    def combine(self, pieces: IncrementPieces) -> FloatArray:
+        """Return the moments (S, 2, p) of the increments over S steps from those of their
+        pieces.
+        """
         total = np.zeros((int(pieces.step[-1]) + 1, 2, self.p))
-        for part, (start, end), k in zip(*pieces, strict=True):
+        for moments, (start, end), k in zip(*pieces, strict=True):
             first, last = k * STEP, (k + 1) * STEP
-            # P_1 of the whole step on this part of it: moved by its middle, scaled by its share.
+            # On a piece, P_1 of the step is its value in the middle of the piece plus the share of
+            # the piece times P_1 of the piece.
             middle = ((start - first) - (last - end)) / STEP
-            total[k, 0] += part[0]
-            total[k, 1] += middle * part[0] + (end - start) / STEP * part[1]
+            total[k, 0] += moments[0]
+            total[k, 1] += middle * moments[0] + (end - start) / STEP * moments[1]
         return total
 
 
 def demand_matrices(sensor: Any, name: str) -> None:
-    """Check that H (p, n) and R (p, p) of a sensor fit each other."""
+    """Raise AssertionError unless H (p, n) and R (p, p) of a sensor are matrices of these
+    shapes.
+    """
     for field in ("H", "R"):
-        known = isinstance(getattr(sensor, field, None), np.ndarray)
-        rule = "must be a matrix: filters are told it"
-        demand(known and getattr(sensor, field).ndim == 2, f"{name}.{field}", rule)
+        matrix = getattr(sensor, field, None)
+        is_matrix = isinstance(matrix, np.ndarray) and matrix.ndim == 2
+        demand(is_matrix, f"{name}.{field}", "must be a matrix: filters are told it")
     H, R = sensor.H, sensor.R
-    square = R.shape == (len(H), len(H))
     rule = f"must have the shape {(len(H), len(H))}, one row for each of H"
-    demand(square, f"{name}.R", rule, str(R.shape))
+    demand(R.shape == (len(H), len(H)), f"{name}.R", rule, str(R.shape))

@@ -1,4 +1,4 @@
-"""Scenarios as parameters and promises as assertions of a pytest suite."""
+"""Scenario files as parameters, and promises as assertions, of a pytest suite."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from netkf.scenario.scenario import Scenario
 
 
 def scenario_files(folder: str | Path = "scenarios") -> list[Path]:
-    """Return the scenario files (``*.toml``) of a folder in order, for ``pytest.mark.parametrize``.
+    """Return the scenario files (``*.toml``) of a folder by name, for ``pytest.mark.parametrize``.
 
-    Raises ScenarioError if there is none: a test without parameters would pass unseen.
+    Raises ScenarioError if there are none: pytest skips a test without parameters.
     """
-    found = sorted(Path(folder).glob("*.toml"))
-    if not found:
+    files = sorted(Path(folder).glob("*.toml"))
+    if not files:
         text = "holds no scenario files" if Path(folder).is_dir() else "is not a folder"
         raise ScenarioError("scenario_files", text, str(folder), "name a folder of .toml files")
-    return found
+    return files
 
 
 def assert_promises(
@@ -28,17 +28,17 @@ def assert_promises(
     confidence: float = 0.99,
     workers: int | None = None,
 ) -> None:
-    """Assert that no promise of a scenario (or of the file at a path) is broken in ``runs``
-    replicas; rows that are undecided or not promised pass.
+    """Assert that ``runs`` replicas break no promise of a scenario, or of a scenario file.
 
-    Raises AssertionError whose text has a line for each broken promise, TheoryError where nothing
-    is promised of the filter, ScenarioError for a bad file or bad arguments.
+    Arguments are those of ``netkf.check``. Rows of the verdict that are undecided or about nothing
+    promised pass. Raises AssertionError with a line for each broken promise, TheoryError if theory
+    promises nothing about the filter, and ScenarioError for a bad file or bad arguments.
     """
     from netkf.checks.check import check
     from netkf.checks.evidence import BROKEN
 
-    chosen = scenario if isinstance(scenario, Scenario) else load(scenario)
-    verdict = check(chosen, runs, seed, confidence, workers)
+    checked = scenario if isinstance(scenario, Scenario) else load(scenario)
+    verdict = check(checked, runs, seed, confidence, workers)
     broken = [row for row in verdict.rows if row.verdict == BROKEN]
     if broken:
         lines = [
@@ -46,6 +46,6 @@ def assert_promises(
             f"{row.high:.3g}]; {row.evidence}"
             for row in broken
         ]
-        head = f"{chosen.name}: {len(broken)} of {len(verdict.rows)} promises are broken"
+        title = f"{checked.name}: {len(broken)} of {len(verdict.rows)} promises are broken"
         setting = f"{verdict.runs} runs from seed {verdict.seed}, confidence {confidence:g}"
-        raise AssertionError("\n".join([f"{head} ({setting})", *lines]))
+        raise AssertionError("\n".join([f"{title} ({setting})", *lines]))

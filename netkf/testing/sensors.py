@@ -1,4 +1,4 @@
-"""Check that a sensor reads what its matrices say."""
+"""``check_sensor``: checks of the readings of a sensor against its matrices."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from netkf.plants.regressors import RegressorSensor
 from netkf.plants.sensors import Sensor
 from netkf.rng.streams import Streams
 from netkf.testing.noise import (
-    Stated,
+    NoiseLabels,
+    check_independent,
     check_uncorrelated,
-    check_unrelated,
     check_white,
+    compute_whitening,
     largest_deviation,
-    whitening,
 )
 from netkf.testing.readings import (
     STEP,
@@ -28,50 +28,65 @@ from netkf.testing.readings import (
     SensorReader,
     demand_matrices,
     gives_increments,
-    readers,
+    make_readers,
 )
-from netkf.testing.watching import Watched, attempt, demand, distance, fail, make_part, user_code
+from netkf.testing.watching import (
+    WatchedPart,
+    call_user_function,
+    demand,
+    fail,
+    guard_user_code,
+    make_part,
+    relative_difference,
+)
 
 READINGS, LENGTH, MAX_NODES = 100_000, 250, 8
+"""Readings of all nodes together, readings in a run, and nodes that are checked, for statistics."""
 STEPS, RUNS = 500, 10
+"""Steps of increments in a run, and runs."""
 REGRESSOR_RUNS, REGRESSOR_SLOTS = 2000, 12
-SHORT = 40
-TIMES_RUNS, SAMPLES = 400, 50.0
+SHORT_LENGTH = 40
+"""Readings that are compared exactly."""
+TIMES_RUNS, EXPECTED_SAMPLES = 400, 50.0
+"""Runs in which samples are counted, and the mean number of them in a run."""
 ROUNDING = 1e-9
 DERIVATIVE_STEP, DERIVATIVE_TOLERANCE = 1e-5, 1e-6
 MAX_STATES = 12
-"""Components of a state that a nonlinear sensor is tried with."""
+"""Largest number of components of a state with which a nonlinear sensor is tried."""
 
 
 def check_sensor(sensor: Any, /, **settings: Any) -> None:
-    """Check a sensor, or a class with its ``settings``: y = H x + v, where v is white noise of
-    covariance R that depends on nothing else.
+    """Check a sensor, or a class with its ``settings``.
 
-    Exactly: shapes; equal streams give equal readings, whichever other sensors are read, whether
-    readings are taken one by one, several at once or with some left out, and however the steps of
-    increments are cut; another state changes a reading by H times the difference; only the given
-    generators are used; the sensor survives pickle; H is the same everywhere unless ``varying``.
-    At most 8 of its nodes are looked at.
+    Its law is y = H x + v, where v is white noise of covariance R that does not depend on anything
+    else. At most 8 of its nodes are checked.
 
-    By 100,000 readings of all nodes together (10,000 pieces of the steps of increments), with
-    probability 0.9 each: a bias of 0.03 standard deviations (increments 0.08), a variance that is
-    wrong by 4 % (increments 11 %), a correlation of 0.03 (increments 0.08) between components, in
-    time (1, 2, 3 or 7 readings apart) or between two nodes, and a mean or variance that depends on
-    a varying H by 0.05 of a standard deviation or 7 %. Errors at one of N nodes, or in one quarter
-    of a run, must be sqrt(N) times, or twice, as large. The law of a RegressorSensor's H: means
-    off by 0.18 standard deviations, variances by 24 %. Times of samples increase, lie inside the
-    run, do not depend on its length, and are as many as the clock states (off by 8 %). Recorded
-    sensors are not drawn: pickle only. A sound class fails once in a million checks.
+    Exact checks: shapes; equal streams give equal readings, whichever other sensors are read,
+    whether readings are taken one by one, several at once or with some left out, and however the
+    steps of increments are cut; another state changes a reading by H times the difference; only the
+    given generators are used; the sensor survives pickle; H is the same in all readings unless the
+    sensor is ``varying``.
+
+    Statistical checks find these errors with probability 0.9 each. From 100,000 readings of all
+    nodes together (of increments, 10,000 pieces of steps): a bias of 0.03 standard deviations
+    (increments 0.08), a variance off by 4 % (increments 11 %), a correlation of 0.03 (increments
+    0.08) between components, between readings 1, 2, 3 or 7 apart or between two nodes, and a mean
+    or variance that depends on a varying H by 0.05 of a standard deviation or 7 %. Errors at only
+    one of N nodes must be sqrt(N) times as large, in one quarter of a run twice as large. Of the H
+    of a RegressorSensor: a mean off by 0.18 standard deviations, a variance by 24 %. Sample times
+    must increase, lie inside the run, not depend on its length, and be as many as the clock states
+    (off by 8 %). Recorded sensors are checked for pickle only. A correct class fails once in a
+    million checks.
 
     Raises AssertionError with one line: the method, the rule, the value got, what to do.
     """
     part = make_part(sensor, (Sensor,), settings)
-    check_made_sensor(part, 0)
+    check_sensor_object(part, 0)
 
 
-def check_made_sensor(part: Any, seed: int) -> None:
-    """Run ``check_sensor`` on an object, with streams of the given seed."""
-    watched = Watched(part)
+def check_sensor_object(part: Any, seed: int) -> None:
+    """Check a Sensor as ``check_sensor`` does, with random streams of ``seed``."""
+    watched = WatchedPart(part)
     copy = watched.pickle_copy()
     if isinstance(part, NonlinearSensor):
         _check_nonlinear(part, watched.name, seed)
@@ -81,8 +96,8 @@ def check_made_sensor(part: Any, seed: int) -> None:
     demand_matrices(part, watched.name)
     before = watched.attributes()
     nodes = part.nodes[:MAX_NODES]
-    with user_code(watched.name):
-        for reader in readers(part, watched.name):
+    with guard_user_code(watched.name):
+        for reader in make_readers(part, watched.name):
             _check_same_readings(reader, type(reader)(copy, watched.name), nodes, seed)
             _check_linear(reader, nodes[0], seed)
             _check_laws(reader, nodes, seed)
@@ -95,276 +110,304 @@ def check_made_sensor(part: Any, seed: int) -> None:
     watched.demand_unchanged(before)
 
 
-def _make_states(seed: int, count: int, n: int, which: int = 0) -> FloatArray:
-    """Return states (count, n) at which sensors are read."""
-    return 3.0 * Streams(seed, which).generator("testing").normal(size=(count, n))
+def _make_states(seed: int, count: int, n: int, run: int = 0) -> FloatArray:
+    """Return random states (count, n) at which sensors are read, others for each ``run``."""
+    return 3.0 * Streams(seed, run).generator("testing").normal(size=(count, n))
 
 
 def _check_same_readings(
     reader: SensorReader, copy: SensorReader, nodes: tuple[int, ...], seed: int
 ) -> None:
-    """Check that readings depend on streams, numbers and states alone."""
-    node, streams, x = nodes[0], Streams(seed), _make_states(seed, SHORT, reader.n)
-    numbers = list(range(SHORT))
-    whole = reader.several(reader.path(streams, node), numbers, x)
-    # Others are made and read in between, as in a simulation.
-    path = reader.path(streams, node)
-    others = [reader.path(Streams(seed, 1 + k), other) for k, other in enumerate(nodes)]
-    between = []
+    """Check that readings depend only on their streams, numbers and states: they stay the same if
+    others are read in between, if some are left out or taken together, and for ``copy``, which
+    reads the sensor after pickling.
+    """
+    node, streams, x = nodes[0], Streams(seed), _make_states(seed, SHORT_LENGTH, reader.n)
+    numbers = list(range(SHORT_LENGTH))
+    series = reader.read_several(reader.make_path(streams, node), numbers, x)
+
+    # Paths of other nodes are made and read in between, as in a simulation.
+    path = reader.make_path(streams, node)
+    other_paths = [reader.make_path(Streams(seed, 1 + k), other) for k, other in enumerate(nodes)]
+    readings = []
     for k in numbers:
-        for other in others:
-            reader.one(other, k, x[k])
-        between.append(reader.one(path, k, x[k]))
-    apart = "when other sensors are read between its readings, one by one"
-    _demand_equal(reader, whole, _concatenate(between), apart)
-    path, some = reader.path(streams, node), [0, 1, 5, 6, 20, 39]
-    found = _concatenate([reader.one(path, k, x[k]) for k in some])
-    _demand_equal(reader, _select(whole, some), found, "when readings are left out")
-    path = reader.path(streams, node)
-    parts = [reader.several(path, ks, x[ks]) for ks in ([0, 3], [4, 5, 6, 17], [39])]
-    found = _concatenate(parts)
-    left = [0, 3, 4, 5, 6, 17, 39]
-    _demand_equal(reader, _select(whole, left), found, "when they are asked for in other groups")
-    _demand_equal(
-        reader, whole, copy.several(copy.path(streams, node), numbers, x), "of a pickled sensor"
-    )
+        for other_path in other_paths:
+            reader.read_one(other_path, k, x[k])
+        readings.append(reader.read_one(path, k, x[k]))
+    when = "when other sensors are read between its readings, one by one"
+    _demand_equal(reader, series, _concatenate(readings), when)
+
+    path, numbers_with_gaps = reader.make_path(streams, node), [0, 1, 5, 6, 20, 39]
+    readings = [reader.read_one(path, k, x[k]) for k in numbers_with_gaps]
+    expected = _select(series, numbers_with_gaps)
+    _demand_equal(reader, expected, _concatenate(readings), "when readings are left out")
+
+    path, groups = reader.make_path(streams, node), ([0, 3], [4, 5, 6, 17], [39])
+    readings = [reader.read_several(path, ks, x[ks]) for ks in groups]
+    expected = _select(series, [k for ks in groups for k in ks])
+    when = "when they are asked for in other groups"
+    _demand_equal(reader, expected, _concatenate(readings), when)
+
+    copied = copy.read_several(copy.make_path(streams, node), numbers, x)
+    _demand_equal(reader, series, copied, "of a pickled sensor")
 
 
 def _demand_equal(
     reader: SensorReader, one: ReadingSeries, other: ReadingSeries, when: str
 ) -> None:
-    """Check that two series of readings are equal."""
+    """Check that two series of readings are equal; ``when`` says in messages how the second one was
+    taken.
+    """
     for name, a, b in zip(("readings", "matrices H"), one, other, strict=True):
-        apart = distance(a, b)
+        difference = relative_difference(a, b)
         demand(
-            apart <= ROUNDING,
+            difference <= ROUNDING,
             reader.where,
             f"{name} must be the same for equal streams",
-            f"a difference of {apart:.3g} of their size {when}",
+            f"a difference of {difference:.3g} of their size {when}",
             "use only the generators given, and draw for each reading in order",
         )
 
 
-def _concatenate(parts: list[ReadingSeries]) -> ReadingSeries:
-    """Return several series one after the other."""
-    return ReadingSeries(*(np.concatenate(some) for some in zip(*parts, strict=True)))
+def _concatenate(series: list[ReadingSeries]) -> ReadingSeries:
+    """Return several series one after the other, as one."""
+    return ReadingSeries(*(np.concatenate(arrays) for arrays in zip(*series, strict=True)))
 
 
-def _select(whole: ReadingSeries, ks: list[int]) -> ReadingSeries:
-    """Return some readings of a series."""
-    return ReadingSeries(whole.y[ks], whole.H[ks])
+def _select(series: ReadingSeries, ks: list[int]) -> ReadingSeries:
+    """Return the readings of a series at the indices ``ks``."""
+    return ReadingSeries(series.y[ks], series.H[ks])
 
 
 def _check_linear(reader: SensorReader, node: int, seed: int) -> None:
-    """Check that another state changes a reading by H times the difference, and H not at all."""
+    """Check that another state changes a reading by H times the difference, and does not change H,
+    which is that of the sensor unless it is ``varying``.
+    """
     streams, numbers = Streams(seed), list(range(LENGTH))
-    x, other = (_make_states(seed, LENGTH, reader.n, which) for which in (0, 1))
-    one = reader.several(reader.path(streams, node), numbers, x)
-    two = reader.several(reader.path(streams, node), numbers, other)
-    apart = distance(one.H, two.H)
-    demand(apart <= ROUNDING, reader.where, "H must not depend on the state", f"{apart:.3g} apart")
-    added = np.einsum("kpn,kn->kp", one.H, other - x)
-    gap = np.abs(two.y - one.y - added).max() / (1.0 + np.abs(added).max())
+    x, other_x = (_make_states(seed, LENGTH, reader.n, run) for run in (0, 1))
+    series = reader.read_several(reader.make_path(streams, node), numbers, x)
+    other = reader.read_several(reader.make_path(streams, node), numbers, other_x)
+    difference = relative_difference(series.H, other.H)
+    rule = "H must not depend on the state"
+    demand(difference <= ROUNDING, reader.where, rule, f"{difference:.3g} apart")
+    expected = np.einsum("kpn,kn->kp", series.H, other_x - x)
+    error = np.abs(other.y - series.y - expected).max() / (1.0 + np.abs(expected).max())
     demand(
-        gap <= ROUNDING,
+        error <= ROUNDING,
         reader.where,
         "another state must change a reading by H times the difference, and the noise not at all",
-        f"{gap:.3g} of the change left over",
+        f"{error:.3g} of the change left over",
         "return H @ x plus noise that does not depend on x",
     )
-    varies = max(distance(one.H[k], reader.sensor.H) for k in range(LENGTH))
     if not reader.sensor.varying:
+        difference = max(relative_difference(H, reader.sensor.H) for H in series.H)
         demand(
-            varies <= ROUNDING,
+            difference <= ROUNDING,
             reader.where,
             "H must be the sensor's own unless varying is True",
-            f"{varies:.3g} of its size apart",
+            f"{difference:.3g} of its size apart",
         )
 
 
 def _check_laws(reader: SensorReader, nodes: tuple[int, ...], seed: int) -> None:
-    """Check the noise of all nodes, all together and each by itself."""
-    stated = Stated(reader.where, "the noise y - H x", "R")
+    """Check that the noise of readings is white with the stated R, for all nodes together and for
+    each; that it is uncorrelated between nodes; and that it does not depend on a varying H.
+    """
+    labels = NoiseLabels(reader.where, "the noise y - H x", "R")
     runs = max(2, READINGS // (LENGTH * len(nodes)))
-    white = whitening(reader.sensor.R).free
+    factor = compute_whitening(reader.sensor.R).factor
     noise = np.empty((len(nodes), runs, LENGTH, reader.p))
-    rows = np.empty((len(nodes), runs, LENGTH, reader.p, reader.n))
+    H = np.empty((len(nodes), runs, LENGTH, reader.p, reader.n))
     numbers = list(range(LENGTH))
     x = _make_states(seed, LENGTH, reader.n)
     for a, node in enumerate(nodes):
-        for r in range(runs):
-            found = reader.several(reader.path(Streams(seed, r), node), numbers, x)
-            residual = found.y - np.einsum("kpn,kn->kp", found.H, x)
-            noise[a, r], rows[a, r] = residual @ white.T, found.H
-    check_white(noise.reshape(-1, LENGTH, reader.p), stated)
+        for run in range(runs):
+            path = reader.make_path(Streams(seed, run), node)
+            series = reader.read_several(path, numbers, x)
+            residual = series.y - np.einsum("kpn,kn->kp", series.H, x)
+            noise[a, run], H[a, run] = residual @ factor.T, series.H
+    check_white(noise.reshape(-1, LENGTH, reader.p), labels)
     for a in range(len(nodes)) if len(nodes) > 1 else ():
-        check_white(noise[a], stated._replace(noise=f"the noise y - H x of node {nodes[a]}"))
+        check_white(noise[a], labels._replace(noise=f"the noise y - H x of node {nodes[a]}"))
         for b in range(a):
-            check_uncorrelated(noise[a], noise[b], stated, f"of nodes {nodes[a]} and {nodes[b]}")
+            check_uncorrelated(noise[a], noise[b], labels, f"of nodes {nodes[a]} and {nodes[b]}")
     if reader.sensor.varying:
-        flat = rows.reshape(-1, reader.p * reader.n)
-        check_unrelated(noise.reshape(len(flat), -1), flat, stated, "H")
+        flat_H = H.reshape(-1, reader.p * reader.n)
+        check_independent(noise.reshape(len(flat_H), -1), flat_H, labels, "H")
 
 
 def _check_increments(reader: IncrementReader, node: int, seed: int) -> None:
-    """Check the moments of increments: additive over cuts, linear, white."""
-    x, other = _make_states(seed, 2, reader.n)
+    """Check the moments of increments: those of pieces add up to those of steps, equal streams give
+    equal ones, another state changes them by H times its integral, and their noise is white.
+    """
+    x, other_x = _make_states(seed, 2, reader.n)
     streams = Streams(seed)
-    cut = reader.pieces(streams, node, x, SHORT, cut=True)
-    uncut = reader.pieces(streams, node, x, SHORT, cut=False)
-    apart = distance(reader.whole(cut), uncut.moments)
+    cut = reader.read_pieces(streams, node, x, SHORT_LENGTH, cut=True)
+    uncut = reader.read_pieces(streams, node, x, SHORT_LENGTH, cut=False)
+    difference = relative_difference(reader.combine(cut), uncut.moments)
     demand(
-        apart <= ROUNDING,
+        difference <= ROUNDING,
         reader.where,
         "increments of the pieces of a step must add up to those of the step",
-        f"{apart:.3g} of their size apart",
+        f"{difference:.3g} of their size apart",
         "draw the noise of the grid first, and cut it by its conditional law",
     )
-    again = reader.pieces(streams, node, x, SHORT, cut=True).moments
+    repeated = reader.read_pieces(streams, node, x, SHORT_LENGTH, cut=True)
+    difference = relative_difference(cut.moments, repeated.moments)
     demand(
-        distance(cut.moments, again) <= ROUNDING,
+        difference <= ROUNDING,
         reader.where,
         "increments must be the same for equal streams",
-        f"{distance(cut.moments, again):.3g} of their size apart",
+        f"{difference:.3g} of their size apart",
         "use only the generators given",
     )
-    moved, spans, _ = reader.pieces(streams, node, other, SHORT, cut=True)
-    added = (spans[:, 1] - spans[:, 0])[:, None] * (reader.sensor.H @ (other - x))
-    expected = cut.moments + np.stack([added, np.zeros_like(added)], axis=1)
+    other = reader.read_pieces(streams, node, other_x, SHORT_LENGTH, cut=True)
+    gaps = (other.spans[:, 1] - other.spans[:, 0])[:, None]
+    change = gaps * (reader.sensor.H @ (other_x - x))
+    expected = cut.moments + np.stack([change, np.zeros_like(change)], axis=1)
+    difference = relative_difference(other.moments, expected)
     demand(
-        distance(moved, expected) <= ROUNDING,
+        difference <= ROUNDING,
         reader.where,
         "another state must change increments by H times its integral, and the noise not at all",
-        f"{distance(moved, expected):.3g} of their size left over",
+        f"{difference:.3g} of their size left over",
     )
     _check_increment_noise(reader, node, x, seed)
 
 
 def _check_increment_noise(reader: IncrementReader, node: int, x: FloatArray, seed: int) -> None:
-    """Check that the noise of increments is white with the stated R."""
-    white = whitening(reader.sensor.R).free
-    found = []
-    for r in range(RUNS):
-        moments, spans, _ = reader.pieces(Streams(seed, r), node, x, STEPS, cut=True)
-        gaps = (spans[:, 1] - spans[:, 0])[:, None, None]
-        drift = np.stack([gaps[:, 0] * (reader.sensor.H @ x), np.zeros((len(gaps), reader.p))], 1)
+    """Check that the noise of increments at the state x (n,) is white with the stated R."""
+    factor = compute_whitening(reader.sensor.R).factor
+    whitened = []
+    for run in range(RUNS):
+        pieces = reader.read_pieces(Streams(seed, run), node, x, STEPS, cut=True)
+        gaps = (pieces.spans[:, 1] - pieces.spans[:, 0])[:, None]
+        drift = gaps * (reader.sensor.H @ x)
+        noise = pieces.moments - np.stack([drift, np.zeros_like(drift)], axis=1)
         # The moments of unit noise over g seconds have the variances g and g / 3.
-        unit = np.sqrt(gaps * np.array([[1.0], [1.0 / 3.0]]))
-        found.append(((moments - drift) / unit @ white.T).reshape(len(moments), -1))
-    noise = f"the noise of increments (their two moments, over steps of {STEP:g} s)"
-    check_white(np.array(found), Stated(reader.where, noise, "R"))
+        deviations = np.sqrt(gaps[:, :, None] * np.array([[1.0], [1.0 / 3.0]]))
+        whitened.append((noise / deviations @ factor.T).reshape(len(noise), -1))
+    text = f"the noise of increments (their two moments, over steps of {STEP:g} s)"
+    check_white(np.array(whitened), NoiseLabels(reader.where, text, "R"))
 
 
 def _check_regressors(
     sensor: RegressorSensor, reader: SensorReader, nodes: tuple[int, ...], seed: int
 ) -> None:
-    """Check that H is C s, with s[k+1] = A s[k] + B xi from ``start`` on."""
-    numbers, x = list(range(REGRESSOR_SLOTS)), np.zeros((REGRESSOR_SLOTS, reader.n))
+    """Check that H is C s, with s[k+1] = A s[k] + B xi and s[0] = ``start``: mean and covariance of
+    H in each slot, independence of the noise of readings and of two nodes.
+    """
+    slots, x = range(REGRESSOR_SLOTS), np.zeros((REGRESSOR_SLOTS, reader.n))
     pair = nodes[:2]
-    rows = np.empty((len(pair), REGRESSOR_RUNS, REGRESSOR_SLOTS, reader.n))
-    noise = np.empty(rows.shape[:-1])
+    H = np.empty((len(pair), REGRESSOR_RUNS, REGRESSOR_SLOTS, reader.n))
+    noise = np.empty(H.shape[:-1])
     for a, node in enumerate(pair):
-        for r in range(REGRESSOR_RUNS):
-            found = reader.several(reader.path(Streams(seed, r), node), numbers, x)
-            rows[a, r], noise[a, r] = found.H[:, 0], found.y[:, 0]
-    mean, spread = sensor.start, np.zeros_like(sensor.A)
-    drive = sensor.B @ sensor.xi_cov @ sensor.B.T
-    stated = Stated(reader.where, "the deviation of H from its mean", "A, B, C, xi_cov and start")
-    for k in numbers:
-        law = whitening(sensor.C @ spread @ sensor.C.T)
-        gap = rows[:, :, k] - sensor.C @ mean
-        off = float(np.abs(gap @ law.certain.T).max(initial=0.0)) / (
-            1.0 + float(np.abs(mean).max())
-        )
-        if off > 1e-6:
+        for run in range(REGRESSOR_RUNS):
+            path = reader.make_path(Streams(seed, run), node)
+            series = reader.read_several(path, list(slots), x)
+            H[a, run], noise[a, run] = series.H[:, 0], series.y[:, 0]  # x = 0: y is noise
+    mean, cov = sensor.start, np.zeros_like(sensor.A)
+    drive_cov = sensor.B @ sensor.xi_cov @ sensor.B.T
+    H_labels = NoiseLabels(
+        reader.where, "the deviation of H from its mean", "A, B, C, xi_cov and start"
+    )
+    noise_labels = NoiseLabels(reader.where, "the noise y - H x", "R")
+    for k in slots:
+        whitening = compute_whitening(sensor.C @ cov @ sensor.C.T)
+        deviation = H[:, :, k] - sensor.C @ mean
+        size = 1.0 + float(np.abs(mean).max())
+        error = float(np.abs(deviation @ whitening.null_space.T).max(initial=0.0)) / size
+        if error > 1e-6:
             rule = "H must be C s with s[0] = start and s[k+1] = A s[k] + B xi"
-            fail(reader.where, rule, f"{off:.3g} off where it is certain, in slot {k}")
-        unit = gap @ law.free.T
+            fail(reader.where, rule, f"{error:.3g} off where it is certain, in slot {k}")
+        unit = deviation @ whitening.factor.T
         v = noise[:, :, k].reshape(-1, 1) / np.sqrt(sensor.R[0, 0])
-        text = Stated(reader.where, "the noise y - H x", "R")
-        check_unrelated(v, rows[:, :, k].reshape(len(v), -1), text, f"H, in slot {k}")
+        flat_H = H[:, :, k].reshape(len(v), -1)
+        check_independent(v, flat_H, noise_labels, f"H, in slot {k}")
         if unit.size:
-            check_white(unit.reshape(-1, 1, unit.shape[-1]), stated)
+            check_white(unit.reshape(-1, 1, unit.shape[-1]), H_labels)
         if unit.size and len(pair) > 1:
-            check_uncorrelated(unit[0], unit[1], stated, f"of nodes {pair[0]} and {pair[1]}")
-        mean, spread = sensor.A @ mean, sensor.A @ spread @ sensor.A.T + drive
-    _check_steps_of_regressors(sensor, rows.reshape(-1, REGRESSOR_SLOTS, reader.n), stated)
+            check_uncorrelated(unit[0], unit[1], H_labels, f"of nodes {pair[0]} and {pair[1]}")
+        mean, cov = sensor.A @ mean, sensor.A @ cov @ sensor.A.T + drive_cov
+    _check_regressor_steps(sensor, H.reshape(-1, REGRESSOR_SLOTS, reader.n), H_labels)
 
 
-def _check_steps_of_regressors(sensor: RegressorSensor, rows: FloatArray, stated: Stated) -> None:
-    """Check what H does from slot to slot, where its state s can be told from it."""
+def _check_regressor_steps(sensor: RegressorSensor, H: FloatArray, labels: NoiseLabels) -> None:
+    """Check the noise s[k+1] - A s[k] of H = C s (runs, slots, n), if s follows from H: C has full
+    column rank.
+    """
     m = len(sensor.A)
     if len(sensor.C) < m or np.linalg.cond(sensor.C) > 1e6:
         return
-    s = rows @ np.linalg.pinv(sensor.C).T
+    s = H @ np.linalg.pinv(sensor.C).T
     steps = s[:, 1:] - s[:, :-1] @ sensor.A.T
-    drive = sensor.B @ sensor.xi_cov @ sensor.B.T
-    unit = steps @ whitening(drive).free.T
-    check_white(unit, stated._replace(noise="the steps of H"))
+    drive_cov = sensor.B @ sensor.xi_cov @ sensor.B.T
+    unit = steps @ compute_whitening(drive_cov).factor.T
+    check_white(unit, labels._replace(noise="the steps of H"))
 
 
 def _check_times(sensor: Any, name: str, nodes: tuple[int, ...], seed: int) -> None:
-    """Check the times of samples: inside the run, increasing, not dependent on its length."""
+    """Check the sample times of a sensor: inside the run, increasing, the same from equal streams,
+    independent of the length of the run, and as many as the clock states.
+    """
     where, horizon = f"{name}.sample_times", 30.0
     rate = sensor.sampling.mean_rate((nodes[0], 0)) if isinstance(sensor.sampling, Clock) else 1.0
     if rate > 0.0:
         horizon = 50.0 / rate
     _check_sampling_rate(sensor, where, nodes, seed)
     for node in nodes:
-        times = [
-            _read_times(sensor, where, node, seed, end) for end in (horizon, 0.4 * horizon, horizon)
-        ]
-        for some, end in zip(times, (horizon, 0.4 * horizon, horizon), strict=True):
-            inside = not len(some) or (some[0] > 0.0 and some[-1] < end)
-            demand(
-                inside,
-                where,
-                f"must lie in (0, {end:g}), the run",
-                some[[0, -1]] if len(some) else "",
-            )
-            demand((np.diff(some) > 0.0).all(), where, "must increase")
-        same = np.array_equal(times[0], times[2])
-        demand(same, where, "must be the same for equal streams", None, "use the generators given")
-        shorter = times[0][times[0] < 0.4 * horizon]
+        ends = (horizon, 0.4 * horizon, horizon)
+        runs = [_read_times(sensor, where, node, seed, end) for end in ends]
+        for times, end in zip(runs, ends, strict=True):
+            if len(times):
+                is_inside = times[0] > 0.0 and times[-1] < end
+                demand(is_inside, where, f"must lie in (0, {end:g}), the run", times[[0, -1]])
+            demand((np.diff(times) > 0.0).all(), where, "must increase")
+        first, shorter, repeated = runs
+        is_same = np.array_equal(first, repeated)
+        remedy = "use the generators given"
+        demand(is_same, where, "must be the same for equal streams", None, remedy)
+        is_same = np.array_equal(first[first < 0.4 * horizon], shorter)
         rule = "must not depend on the length of the run"
-        demand(
-            np.array_equal(shorter, times[1]), where, rule, f"{len(times[1])} times before 0.4 T"
-        )
+        demand(is_same, where, rule, f"{len(shorter)} times before 0.4 T")
 
 
 def _check_sampling_rate(sensor: Any, where: str, nodes: tuple[int, ...], seed: int) -> None:
-    """Check the number of samples against the mean rate of the clock, where it is known."""
+    """Check the number of samples of many runs against the mean rate of the clock, if it has
+    one.
+    """
     rate = sensor.sampling.mean_rate((nodes[0], 0))
     if not rate > 0.0:
         return
-    runs = 1 + TIMES_RUNS // len(nodes)
-    expected = SAMPLES
-    counts = np.array(
-        [
-            len(_read_times(sensor, where, node, seed + 1 + run, expected / rate))
-            for node in nodes
-            for run in range(runs)
-        ]
-    )
-    found = largest_deviation(counts[:, None] / expected - 1.0, fewest=TIMES_RUNS // 2)
-    # One tick more or less in a run is a matter of its phase.
-    if found is not None and abs(found.mean) > 1.0 / expected:
-        text = f"{1.0 + found.mean:.4g} (+- {found.error:.2g}) of the stated number of samples"
-        fail(where, "must be as many as the mean rate of `sampling` states", text)
+    runs, horizon = 1 + TIMES_RUNS // len(nodes), EXPECTED_SAMPLES / rate
+    counts = [
+        len(_read_times(sensor, where, node, seed + 1 + run, horizon))
+        for node in nodes
+        for run in range(runs)
+    ]
+    relative = np.array(counts)[:, None] / EXPECTED_SAMPLES - 1.0
+    deviation = largest_deviation(relative, min_values=TIMES_RUNS // 2)
+    # The phase of a clock may add or remove one tick in each run.
+    if deviation is not None and abs(deviation.mean) > 1.0 / EXPECTED_SAMPLES:
+        text = f"{1.0 + deviation.mean:.4g} (+- {deviation.error:.2g}) of the stated number of"
+        rule = "must be as many as the mean rate of `sampling` states"
+        fail(where, rule, f"{text} samples")
 
 
 def _read_times(sensor: Any, where: str, node: int, seed: int, horizon: float) -> FloatArray:
-    """Return the sampling times of a sensor after a check of their form."""
+    """Return the sample times (K,) of a sensor in a run of ``horizon`` seconds, which must be a
+    float64 vector.
+    """
     streams = Streams(seed)
 
     def generator(purpose: str) -> np.random.Generator:
-        """Return the random generator of a purpose."""
+        """Return the random generator for a purpose of the sensor at the node."""
         return streams.generator(purpose, node, 0)
 
-    found = np.asarray(attempt(where, sensor.sample_times, node, 0, generator, horizon))
-    vector = found.ndim == 1 and found.dtype == np.float64
-    demand(vector, where, "must be a vector of float64", f"{found.dtype} {found.shape}")
-    return found
+    times = np.asarray(call_user_function(where, sensor.sample_times, node, 0, generator, horizon))
+    is_vector = times.ndim == 1 and times.dtype == np.float64
+    demand(is_vector, where, "must be a vector of float64", f"{times.dtype} {times.shape}")
+    return times
 
 
 def _check_nonlinear(sensor: NonlinearSensor, name: str, seed: int) -> None:
@@ -373,39 +416,40 @@ def _check_nonlinear(sensor: NonlinearSensor, name: str, seed: int) -> None:
     """
     positions = {node: (0.7 * k, -0.4 * k) for k, node in enumerate(sensor.nodes)}
     sensor = sensor.located(positions)
-    p, n = len(sensor.R), _states_read(sensor, name)
+    p, n = len(sensor.R), _find_state_size(sensor, name)
     for node in sensor.nodes[:MAX_NODES]:
-        for x in _make_states(seed, SHORT, n):
-            with user_code(name):
+        for x in _make_states(seed, SHORT_LENGTH, n):
+            with guard_user_code(name):
                 value = np.asarray(sensor.h(x.copy(), node))
-                again = np.asarray(sensor.h(x.copy(), node))
+                repeated = np.asarray(sensor.h(x.copy(), node))
                 J = np.asarray(sensor.jacobian(x.copy(), node))
             demand(value.shape == (p,), f"{name}.h", f"must give {p} numbers, as R says", value)
+            is_same = np.array_equal(value, repeated)
             remedy = "return what is read without noise, which netkf adds"
-            demand(
-                np.array_equal(value, again), f"{name}.h", "must be one for a state", again, remedy
-            )
+            demand(is_same, f"{name}.h", "must be one for a state", repeated, remedy)
             demand(J.shape == (p, n), f"{name}.jacobian", f"must be {p} x {n}", str(J.shape))
-            apart = _derivative_error(sensor, node, x, J)
+            error = _derivative_error(sensor, node, x, J)
             demand(
-                apart <= DERIVATIVE_TOLERANCE * (1.0 + float(np.abs(J).max())),
+                error <= DERIVATIVE_TOLERANCE * (1.0 + float(np.abs(J).max())),
                 f"{name}.jacobian",
                 "must be the derivatives of h",
-                f"entries that are off by {apart:.2g} at x = {np.round(x, 3).tolist()}",
+                f"entries that are off by {error:.2g} at x = {np.round(x, 3).tolist()}",
                 "compare it with differences of h",
             )
 
 
-def _states_read(sensor: NonlinearSensor, name: str) -> int:
-    """Return the smallest number of components, up to MAX_STATES, of a state that h can read."""
+def _find_state_size(sensor: NonlinearSensor, name: str) -> int:
+    """Return the smallest number of states, up to MAX_STATES, that ``h`` and ``jacobian`` accept;
+    raises AssertionError if there is none.
+    """
     for n in range(1, MAX_STATES + 1):
-        if _can_read(sensor, n):
+        if _accepts_state_size(sensor, n):
             return n
     return fail(name, f"h and jacobian must read a state of at most {MAX_STATES} components")
 
 
-def _can_read(sensor: NonlinearSensor, n: int) -> bool:
-    """Return True if a sensor reads states of n components."""
+def _accepts_state_size(sensor: NonlinearSensor, n: int) -> bool:
+    """Return True if ``h`` and ``jacobian`` of a sensor accept states of n components."""
     try:
         sensor.check_state(n)
         sensor.h(np.ones(n), sensor.nodes[0])
@@ -415,9 +459,11 @@ def _can_read(sensor: NonlinearSensor, n: int) -> bool:
 
 
 def _derivative_error(sensor: NonlinearSensor, node: int, x: FloatArray, J: FloatArray) -> float:
-    """Return the largest difference of a Jacobian from central differences of h."""
-    found = np.empty_like(J)
+    """Return the largest absolute difference of a Jacobian J (p, n) at the state x (n,) from
+    central differences of ``h``.
+    """
+    numerical = np.empty_like(J)
     for k, step in enumerate(np.eye(len(x)) * DERIVATIVE_STEP):
-        ends = [np.asarray(sensor.h(x + sign * step, node)) for sign in (1.0, -1.0)]
-        found[:, k] = sensor.difference(*ends) / (2.0 * DERIVATIVE_STEP)
-    return float(np.abs(found - J).max())
+        ahead, behind = (np.asarray(sensor.h(x + sign * step, node)) for sign in (1.0, -1.0))
+        numerical[:, k] = sensor.difference(ahead, behind) / (2.0 * DERIVATIVE_STEP)
+    return float(np.abs(numerical - J).max())

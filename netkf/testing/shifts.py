@@ -1,4 +1,4 @@
-"""Run all trials of a filter, and check that it commutes with a shift of the truth."""
+"""All trials of a filter, and the check that it commutes with a shift of the truth."""
 
 from __future__ import annotations
 
@@ -10,65 +10,75 @@ from netkf.algorithms.adapters import SlotAdapter
 from netkf.linalg.arrays import FloatArray
 from netkf.testing.clocked import ClockTrial
 from netkf.testing.slotted import SlotTrial
-from netkf.testing.systems import systems
+from netkf.testing.systems import make_systems
 from netkf.testing.trials import CheckedEstimate, Trial
-from netkf.testing.watching import Watched, demand
+from netkf.testing.watching import WatchedPart, demand
 
-# Large beside the estimates, so that an error of one percent shows.
+# Large compared with the estimates, so that an error of one percent shows.
 SHIFT = np.array([7.0, -11.0, 5.0])
-ROUNDING = 1e-9  # relative to the estimates before they are moved back
+TOLERANCE = 1e-9  # relative to the estimates before the shift is subtracted
 
 
-def all_trials(watched: Watched, shift: FloatArray | None = None) -> Iterator[Trial]:
-    """Yield a trial of every kind that the class supports, on every system."""
+def make_trials(watched: WatchedPart, shift: FloatArray | None = None) -> Iterator[Trial]:
+    """Yield the trials of a filter on all systems, in every kind of time that it supports.
+
+    In each trial the truth is shifted by the first n components of ``shift``, unless that is None.
+    """
     part = watched.part
-    drawn = systems(part.inverts)
+    systems = make_systems(part.inverts)
     clocks: list[str | None] = list(part.clocks) if part.talks else [None]
     if isinstance(part, SlotAdapter):
         clocks = []
-    for system in drawn:
-        moved = None if shift is None else shift[: len(system.M)]
+    for system in systems:
+        system_shift = None if shift is None else shift[: len(system.M)]
         if part.schedule is not None:
-            yield SlotTrial(watched, system, moved)
+            yield SlotTrial(watched, system, system_shift)
         for clock in clocks:
-            # What depends on the system shows under one clock as under another.
-            if clock == clocks[0] or system is drawn[-1]:
-                yield from ClockTrial.each_reading(watched, system, moved, clock)
+            # All clocks on one system only: a fault that depends on it shows under any clock.
+            if clock == clocks[0] or system is systems[-1]:
+                yield from ClockTrial.by_reading(watched, system, system_shift, clock)
 
 
-def check_shift(watched: Watched, plain: Sequence[Trial]) -> None:
-    """Run everything again with a truth that is shifted on the way: estimates must be shifted like
-    it from those of the ``plain`` runs, covariances stay what they are.
+def check_shift(watched: WatchedPart, trials: Sequence[Trial]) -> None:
+    """Check that a filter commutes with a shift of the truth.
+
+    Each of the ``trials``, which have run, is repeated with a truth that is shifted on the way:
+    estimates must be shifted like the truth, and covariances must be the same.
     """
-    for before, shifted in zip(plain, all_trials(watched.once(), SHIFT), strict=True):
+    for trial, shifted in zip(trials, make_trials(watched.unchecked(), SHIFT), strict=True):
         shifted.run()
-        _compare(watched, before, shifted)
+        _compare_trials(watched, trial, shifted)
 
 
-def _compare(watched: Watched, plain: Trial, shifted: Trial) -> None:
-    """Check that all estimates of two trials are equal, one of which was shifted."""
-    # The shift itself shows each node once more.
-    moved = [estimate for estimate in shifted.estimates if estimate.after != "shift"]
-    for one, other in zip(plain.estimates, moved, strict=True):
-        for name, apart, size in differences(one, other):
+def _compare_trials(watched: WatchedPart, trial: Trial, shifted: Trial) -> None:
+    """Check that the estimates of a trial equal those of a shifted one less the shift."""
+    # The shift itself adds an estimate of each node.
+    others = [estimate for estimate in shifted.estimates if estimate.after != "shift"]
+    for one, other in zip(trial.estimates, others, strict=True):
+        for name, difference, size in estimate_differences(one, other):
             demand(
-                apart <= ROUNDING * size,
+                difference <= TOLERANCE * size,
                 f"{watched.name}.shift",
                 "a class that defines shift must commute with a shift of the truth",
-                f"{name} of node {one.node} after {one.after} that differs by {apart:.3g} "
+                f"{name} of node {one.node} after {one.after} that differs by {difference:.3g} "
                 "once truth, states and payloads are shifted",
                 "correct shift or shift_payload, or define neither of them",
             )
 
 
-def differences(one: CheckedEstimate, other: CheckedEstimate) -> list[tuple[str, float, float]]:
-    """Return for xhat and P by how much two estimates differ, and the size of their entries."""
-    found = [("xhat", _largest_difference(one.xhat, other.xhat), 1.0 + one.size + other.size)]
+def estimate_differences(
+    one: CheckedEstimate, other: CheckedEstimate
+) -> list[tuple[str, float, float]]:
+    """Return ("xhat" or "P", largest difference of the entries, size of the entries) for each of
+    them that both estimates have.
+    """
+    differences = [("xhat", _largest_difference(one.xhat, other.xhat), 1.0 + one.size + other.size)]
     if one.P is not None and other.P is not None:
-        found.append(("P", _largest_difference(one.P, other.P), 1.0 + float(np.abs(one.P).max())))
-    return found
+        size = 1.0 + float(np.abs(one.P).max())
+        differences.append(("P", _largest_difference(one.P, other.P), size))
+    return differences
 
 
 def _largest_difference(one: FloatArray, other: FloatArray) -> float:
-    """Return the largest difference of two arrays."""
+    """Return the largest absolute difference of two arrays of one shape."""
     return float(np.abs(one - other).max())

@@ -8,41 +8,43 @@ from netkf.algorithms.filter import Exchange, Message
 from netkf.algorithms.models import SlotModel
 from netkf.testing.trials import Trial
 
-# Few, since every method is called for every node and step.
-SLOTS, MAX_STEPS, MAX_WAIT = 5, 5, 20
-SHIFTED = 3  # slots before the end: enough for every kind of message after the shift
-PERIOD = 1.0
+# Slots with exchanges, steps of an exchange and slots before the first one at most: few, because
+# every method is called for every node and step.
+SLOTS, MAX_STEPS, MAX_FIRST_SLOT = 5, 5, 20
+SLOTS_AFTER_SHIFT = 3  # enough for every kind of message after the shift
+PERIOD = 1.0  # seconds of a slot
 
 
-def slots_of(part: Any) -> int:
-    """Return the number of slots of a trial: some with exchanges."""
-    return min(int(part.first_slot), MAX_WAIT) + SLOTS
+def trial_slots(part: Any) -> int:
+    """Return the number of slots of a trial: SLOTS from the first one with exchanges on."""
+    return min(int(part.first_slot), MAX_FIRST_SLOT) + SLOTS
 
 
 class SlotTrial(Trial):
-    """The schedule for a few slots (``slots`` of them if it is not 0); everything is lost in the
-    last one.
+    """A trial of a few slots; in the last one all messages are lost.
+
+    ``slots`` is the number of slots; 0: that of :func:`trial_slots`.
     """
 
     slots = 0
 
-    def model(self, sees: bool) -> SlotModel:
-        """Return the model of a node in slots of one second."""
-        return SlotModel(self.system.M, self.system.Q, *self.matrices(sees), PERIOD)
+    def model(self, has_sensor: bool) -> SlotModel:
+        """Return the model of a node in slots of PERIOD seconds."""
+        return SlotModel(self.system.M, self.system.Q, *self.matrices(has_sensor), PERIOD)
 
     def run(self) -> None:
-        """Carry out slot after slot, each from just before nodes exchange."""
-        part, slots = self.part, self.slots or slots_of(self.part)
+        """Run the phases of the schedule in all slots; the truth is shifted near the end."""
+        part, slots = self.part, self.slots or trial_slots(self.part)
         for slot in range(slots):
-            if part.predicts and slot == slots - SHIFTED:
-                self.shift()
+            if part.predicts and slot == slots - SLOTS_AFTER_SHIFT:
+                self.shift_truth()
             self._run_slot(slot, lost=slot == slots - 1)
-            if not part.predicts and slot == slots - SHIFTED:
-                self.shift()
-            self.end()
+            if not part.predicts and slot == slots - SLOTS_AFTER_SHIFT:
+                self.shift_truth()
+            self.record_end()
 
     def _run_slot(self, slot: int, lost: bool) -> None:
-        """Carry out the phases of a slot, with all messages delivered or ``lost``."""
+        """Run the phases of a slot, with all messages delivered or all ``lost``."""
         part, phase = self.part, 0
         for kind in part.schedule:
             if kind == "exchange":
@@ -50,28 +52,34 @@ class SlotTrial(Trial):
                     for step in range(min(part.exchange_steps(phase), MAX_STEPS)):
                         self._exchange(Exchange(PERIOD * slot, phase, step, slot), lost)
                 phase += 1
-            elif slot > 0 or part.predicts:  # a filtered one starts from before any reading
+            elif slot > 0 or part.predicts:  # else the first estimate is that before any reading
                 self._advance(kind, slot)
 
     def _advance(self, kind: str, slot: int) -> None:
-        """Predict, or use readings; the truth moves on where the filter does."""
+        """Run the phase ``kind``, "predict" or "sense", and move the shift of the truth with it.
+
+        Without a phase "predict", ``update`` also predicts: before the reading is used, or after
+        it if the filter ``predicts``.
+        """
         part = self.part
-        alone = kind == "sense" and "predict" not in part.schedule
-        if kind == "predict" or (alone and not part.predicts):
+        update_predicts = kind == "sense" and "predict" not in part.schedule
+        if kind == "predict" or (update_predicts and not part.predicts):
             self.offset = self.system.M @ self.offset
         if kind == "predict":
             for node in self.nodes:
                 self.step(node, "predict", PERIOD)
             return
         readings = [self.sample(node, PERIOD * slot) for node in self.nodes]
-        if alone and part.predicts:
+        if update_predicts and part.predicts:
             self.offset = self.system.M @ self.offset
         for node, reading in zip(self.nodes, readings, strict=True):
             self.step(node, "update", reading)
 
     def _exchange(self, exchange: Exchange, lost: bool) -> None:
-        """Carry out one step of an exchange, and check conserved sums."""
-        before = self.sums()
+        """Run one step of an exchange, with all messages ``lost`` or none, and check conserved
+        sums.
+        """
+        before = self.conserved_sums()
         payloads = {node: self.emit(node, exchange) for node in self._talking_nodes(exchange.slot)}
         for node, senders in enumerate(self._choose_senders(exchange.slot)):
             inbox = [
@@ -80,17 +88,21 @@ class SlotTrial(Trial):
                 if not lost and payloads[k] is not None
             ]
             self.absorb(node, inbox, exchange)
-        self.compare(before, "all" if lost else "none")
+        self.check_conserved(before, "all" if lost else "none")
 
     def _choose_senders(self, slot: int) -> list[list[int]]:
-        """Return the senders that each node hears: all others, or its partner in this slot."""
+        """Return the senders whose messages each node receives: all others, or, if messages are
+        pairwise, its partner in this slot.
+        """
         if not self.part.pairwise:
             return [[k for k in self.nodes if k != node] for node in self.nodes]
-        paired = self._talking_nodes(slot)
-        return [[k for k in paired if k != n] if n in paired else [] for n in self.nodes]
+        pair = self._talking_nodes(slot)
+        return [[k for k in pair if k != node] if node in pair else [] for node in self.nodes]
 
     def _talking_nodes(self, slot: int) -> list[int]:
-        """Return all nodes, or the pair of this slot."""
+        """Return the nodes that send: all of them, or, if messages are pairwise, the pair of this
+        slot.
+        """
         count = len(self.nodes)
         if not self.part.pairwise:
             return list(self.nodes)

@@ -11,8 +11,12 @@ from netkf.rng.streams import Streams
 
 
 class System(NamedTuple):
-    """A small random system: dynamics M and noise Q (n, n), a sensor H (p, n), R (p, p), and the
-    law of x(0), mean (n,) and cov (n, n).
+    """A small random system in slots of one second.
+
+    M, Q      : (n, n), transition matrix and noise covariance of a slot; A = M - I and Q per second
+                in continuous time
+    H, R      : (p, n) and (p, p), matrix and covariance of the noise of the sensor
+    mean, cov : (n,) and (n, n), mean and covariance of x(0)
     """
 
     M: FloatArray
@@ -23,24 +27,26 @@ class System(NamedTuple):
     cov: FloatArray
 
 
-def systems(inverts: bool) -> list[System]:
-    """Return systems of 1, 2 and 3 states with 0, 1 and 2 readings.
+def make_systems(inverts: bool) -> list[System]:
+    """Return four systems of n = 1, 2 and 3 states with p = 0, 1 and 2 rows of readings.
 
-    One starts from a certain state, unless the filter inverts covariances.
+    One has cov = 0, unless the filter ``inverts`` covariances.
     """
     random = Streams(0).generator("testing")
-    found = []
-    for n, p, certain in ((1, 1, False), (2, 1, True), (3, 0, False), (3, 2, False)):
-        noise, spread = random.normal(size=(2, n, n))
+    systems = []
+    for n, p, is_certain in ((1, 1, False), (2, 1, True), (3, 0, False), (3, 2, False)):
+        noise_factor, cov_factor = random.normal(size=(2, n, n))
         eye = np.eye(n)
-        found.append(
+        systems.append(
             System(
                 M=0.8 * eye + 0.3 * random.normal(size=(n, n)) / np.sqrt(n),
-                Q=noise @ noise.T / n + 0.1 * eye,
+                Q=noise_factor @ noise_factor.T / n + 0.1 * eye,
                 H=random.normal(size=(p, n)),
                 R=np.diag(random.uniform(0.5, 1.5, p)),
                 mean=random.normal(size=n),
-                cov=np.zeros((n, n)) if certain and not inverts else spread @ spread.T + eye,
+                cov=np.zeros((n, n))
+                if is_certain and not inverts
+                else cov_factor @ cov_factor.T + eye,
             )
         )
-    return found
+    return systems

@@ -1,33 +1,37 @@
-"""Networks on which losses, clocks and matchings are looked at link by link."""
+"""Small networks on which matchings are checked."""
 
 from __future__ import annotations
 
 from netkf.network.graphs import Complete, Cycle, Grid, Star, Topology
 
 
-def _renumbered(topology: Topology, ids: tuple[int, ...]) -> Topology:
-    """Return the same graph with other node ids, in increasing order."""
-    new = dict(zip(topology.nodes, ids, strict=True))
-    return Topology(nodes=ids, links=tuple((new[i], new[j]) for i, j in topology.links))
+def _renumber(topology: Topology, ids: tuple[int, ...]) -> Topology:
+    """Return the same graph with the node ``ids``, which must increase."""
+    new_ids = dict(zip(topology.nodes, ids, strict=True))
+    links = tuple((new_ids[i], new_ids[j]) for i, j in topology.links)
+    return Topology(nodes=ids, links=links)
 
 
 def small_networks() -> tuple[Topology, ...]:
-    """Return networks of a few nodes: a cycle, a star, a complete graph with gaps in its ids, and a
-    grid.
+    """Return networks of 4 to 6 nodes: a cycle, a star, a complete graph with gaps in its node ids,
+    and a grid.
     """
     return (
         Cycle(nodes=6).build(seed=0),
         Star(nodes=5).build(seed=0),
-        _renumbered(Complete(nodes=4).build(seed=0), (1, 4, 5, 9)),
+        _renumber(Complete(nodes=4).build(seed=0), (1, 4, 5, 9)),
         Grid(rows=2, columns=3).build(seed=0),
     )
 
 
-def edge_transitive(topology: Topology) -> bool:
-    """Return True for cycles, complete graphs and stars: no link differs from another there."""
+def is_edge_transitive(topology: Topology) -> bool:
+    """Return True for cycles, complete graphs and stars, whose links are all equivalent by
+    symmetry.
+    """
     count, degrees = len(topology.nodes), sorted(topology.degrees.values())
     if len(topology.components) > 1 or count < 2:
         return False
-    cycle = degrees == [2] * count
-    complete = len(topology.links) == count * (count - 1) // 2
-    return cycle or complete or degrees == [*[1] * (count - 1), count - 1]
+    is_cycle = degrees == [2] * count
+    is_complete = len(topology.links) == count * (count - 1) // 2
+    is_star = degrees == [*[1] * (count - 1), count - 1]
+    return is_cycle or is_complete or is_star

@@ -1,4 +1,4 @@
-"""The base class of trials: connected nodes that all run the filter that is checked."""
+"""The base class of trials: a few connected nodes that run the filter that is checked."""
 
 from __future__ import annotations
 
@@ -14,15 +14,18 @@ from netkf.linalg.arrays import FloatArray
 from netkf.rng.streams import Streams
 from netkf.testing.estimates import check_estimate, check_state_pickles
 from netkf.testing.systems import System
-from netkf.testing.watching import Watched, demand
+from netkf.testing.watching import WatchedPart, demand
 
-CONSERVED = 1e-9  # relative change of a sum that an exchange should conserve
-MAX_DELAY = 1.0  # seconds; no message of a trial takes longer
+CONSERVATION_TOLERANCE = 1e-9  # relative change of a sum that an exchange should conserve
+MAX_DELAY = 1.0  # seconds; longest delay of a message, as nodes are told
 
 
 class CheckedEstimate(NamedTuple):
-    """An estimate of a node after something happened; ``xhat`` and ``size`` (its largest entry)
-    before it was moved back by what the truth was shifted.
+    """An estimate of a node that passed its checks.
+
+    node, after : the node, and the method that was called before
+    xhat, P     : (n,) less the shift of the truth, and (n, n) or None
+    size        : largest absolute entry of the estimate with the shift
     """
 
     node: int
@@ -33,115 +36,128 @@ class CheckedEstimate(NamedTuple):
 
 
 class Trial(ABC):
-    """One run of nodes that hear each other, the second of them blind. With ``shift`` (n,) the
-    truth moves by so much in the middle of the run, with all states and messages under way.
+    """One run of a complete network of 2 or 3 nodes, of which node 1 has no sensor.
+
+    With ``shift`` (n,) the truth is shifted by it during the run, and states and messages in flight
+    with it. The truth is 0 otherwise: readings are noise plus the effect of the shift.
     """
 
-    def __init__(self, watched: Watched, system: System, shift: FloatArray | None = None) -> None:
+    def __init__(
+        self, watched: WatchedPart, system: System, shift: FloatArray | None = None
+    ) -> None:
         self.watched, self.part, self.system = watched, watched.part, system
         self.random = Streams(0).generator("testing")
         self.estimates: list[CheckedEstimate] = []
         self.ends: list[dict[int, CheckedEstimate]] = []
-        """The estimate of each node at the end of each slot, or of each round under clocks."""
+        """The estimates by node at the end of each slot, or of each round in continuous time."""
         self._last: dict[int, CheckedEstimate] = {}
         self._shift = shift
         self.offset = np.zeros(len(system.M))
         """The present shift of the truth (n,)."""
         self.nodes, self.weights = _make_network(self.part)
-        models = [self.model(sees=node != 1) for node in self.nodes]
+        models = [self.model(has_sensor=node != 1) for node in self.nodes]
         self.states = [self._start(node, models) for node in self.nodes]
         self.models = models
         check_state_pickles(watched, self.states[0])
 
     @abstractmethod
-    def model(self, sees: bool) -> Any:
-        """Return the model of a node; without sensors unless it ``sees``."""
+    def model(self, has_sensor: bool) -> Any:
+        """Return the model of a node with or without a sensor."""
 
     @abstractmethod
     def run(self) -> None:
-        """Let everything happen that may happen."""
+        """Run the trial once: time, readings, messages, and the shift of the truth."""
 
     def _start(self, node: int, models: Sequence[Any]) -> Any:
-        """Return the checked state of a node at time 0."""
-        others = len(self.nodes) - 1
-        own = max(0.0, 1.0 - float(self.weights[:, node].sum()))
-        parts = np.stack([model.information for model in models])
-        heard = tuple(tuple(j for j in self.nodes if j != i) for i in self.nodes)
+        """Return the state of a node at time 0, whose estimate was checked."""
+        degree = len(self.nodes) - 1
+        own_weight = max(0.0, 1.0 - float(self.weights[:, node].sum()))
+        information = np.stack([model.information for model in models])
+        neighbours = tuple(tuple(j for j in self.nodes if j != i) for i in self.nodes)
         info = NodeInfo(
-            node, others, others, others + 1, own, parts.sum(axis=0), MAX_DELAY, node,
-            NetworkInfo(parts, heard),
+            node, degree, degree, degree + 1, own_weight, information.sum(axis=0), MAX_DELAY, node,
+            NetworkInfo(information, neighbours),
         )  # fmt: skip
         state = self.watched.call("init", models[node], self.system.mean, self.system.cov, info)
-        self.show(node, state, "init")
+        self.record_estimate(node, state, "init")
         return state
 
-    def show(self, node: int, state: Any, after: str) -> None:
-        """Check the node's estimate and keep it."""
+    def record_estimate(self, node: int, state: Any, after: str) -> None:
+        """Check and record the estimate of a node from the state that method ``after`` returned."""
         xhat, P = check_estimate(self.watched, state, len(self.system.M), after)
         size = float(np.abs(xhat).max())
         self._last[node] = CheckedEstimate(node, after, xhat - self.offset, P, size)
         self.estimates.append(self._last[node])
 
-    def end(self) -> None:
-        """Keep the present estimates as those at the end of a slot or round."""
+    def record_end(self) -> None:
+        """Record the present estimates as those at the end of a slot or round."""
         self.ends.append(dict(self._last))
 
-    def step(self, node: int, method: str, *arguments: Any, checks: bool = True) -> None:
-        """Call a method that returns the node's next state."""
+    def step(self, node: int, method: str, *arguments: Any, records: bool = True) -> None:
+        """Call a method of the filter that returns the next state of a node, and record its
+        estimate unless not ``records``.
+        """
         self.states[node] = self.watched.call(method, self.states[node], *arguments)
-        if checks:
-            self.show(node, self.states[node], method)
+        if records:
+            self.record_estimate(node, self.states[node], method)
 
     def emit(self, node: int, exchange: Exchange) -> Any:
-        """Call emit and return the payload."""
+        """Call ``emit`` for a node and return the payload, or None if it sends nothing."""
         pair = self.watched.call("emit", self.states[node], exchange)
-        both = type(pair) is tuple and len(pair) == 2
+        is_pair = type(pair) is tuple and len(pair) == 2
         where = f"{self.watched.name}.emit"
-        demand(both, where, "must return (state, payload); payload None sends nothing")
+        demand(is_pair, where, "must return (state, payload); payload None sends nothing")
         self.states[node], payload = pair
-        self.show(node, self.states[node], "emit")
+        self.record_estimate(node, self.states[node], "emit")
         return payload
 
     def absorb(self, node: int, messages: Sequence[Message], exchange: Exchange) -> None:
-        """Hand over all messages of one instant."""
+        """Call ``absorb`` for a node with all messages of one instant, and check ``stopped``."""
         self.step(node, "absorb", messages, exchange)
         stopped = self.watched.call("stopped", self.states[node])
-        truth = stopped is True or stopped is False
-        demand(truth, f"{self.watched.name}.stopped", "must be True or False", stopped)
+        is_flag = stopped is True or stopped is False
+        demand(is_flag, f"{self.watched.name}.stopped", "must be True or False", stopped)
 
     def sample(self, node: int, time: float) -> Reading:
-        """Return a reading of the node's sensors at ``time``."""
+        """Return a reading of the sensors of a node at ``time`` (seconds): unit noise plus H times
+        the shift of the truth.
+        """
         H, R = self.matrices(node != 1)
         return Reading(self.random.normal(size=len(H)) + H @ self.offset, H, R, time)
 
-    def matrices(self, sees: bool) -> tuple[FloatArray, FloatArray]:
-        """Return ``H`` and ``R`` of a node, without rows if it has no sensor."""
+    def matrices(self, has_sensor: bool) -> tuple[FloatArray, FloatArray]:
+        """Return H (p, n) and R (p, p) of a node, with p = 0 if it has no sensor."""
         system = self.system
-        return (system.H, system.R) if sees else (system.H[:0], system.R[:0, :0])
+        return (system.H, system.R) if has_sensor else (system.H[:0], system.R[:0, :0])
 
-    def shift(self) -> None:
-        """Move the truth, in the run that does so."""
+    def shift_truth(self) -> None:
+        """Shift the truth and the states of all nodes, if this trial has a shift."""
         if self._shift is None:
             return
         self.offset = self._shift.copy()
         for node in self.nodes:
             self.step(node, "shift", self.offset)
 
-    def sums(self) -> dict[str, float]:
-        """Return the sums over all nodes of the quantities that ``conserved`` names."""
+    def conserved_sums(self) -> dict[str, float]:
+        """Return the sums over all nodes of the quantities that ``conserved`` returns, by name."""
         where = f"{self.watched.name}.conserved"
-        parts = [self.watched.call("conserved", state) for state in self.states]
-        same_keys = all(isinstance(p, dict) and p.keys() == parts[0].keys() for p in parts)
-        demand(same_keys, where, "must name the same quantities at every node", parts[0])
-        terms = {name: [np.atleast_1d(part[name]) for part in parts] for name in parts[0]}
-        return {name: math.fsum(np.concatenate(values)) for name, values in terms.items()}
+        by_node = [self.watched.call("conserved", state) for state in self.states]
+        names = by_node[0].keys() if isinstance(by_node[0], dict) else None
+        same_names = all(isinstance(terms, dict) and terms.keys() == names for terms in by_node)
+        demand(same_names, where, "must name the same quantities at every node", by_node[0])
+        return {
+            name: math.fsum(np.concatenate([np.atleast_1d(terms[name]) for terms in by_node]))
+            for name in by_node[0]
+        }
 
-    def compare(self, before: dict[str, float], lost: str) -> None:
-        """Check that the conserved sums are as they were before an exchange."""
-        after = self.sums()
+    def check_conserved(self, before: dict[str, float], lost: str) -> None:
+        """Check that the conserved sums are those ``before`` an exchange in which messages were
+        ``lost``: "all" or "none", for messages.
+        """
+        after = self.conserved_sums()
         for name, total in before.items():
             demand(
-                abs(after[name] - total) <= CONSERVED * max(abs(total), 1.0),
+                abs(after[name] - total) <= CONSERVATION_TOLERANCE * max(abs(total), 1.0),
                 f"{self.watched.name}.conserved",
                 f"the sum of {name} over all nodes must survive an exchange with {lost} lost",
                 f"{total:.6g} before and {after[name]:.6g} after",
@@ -150,13 +166,13 @@ class Trial(ABC):
 
 
 def _make_network(part: Any) -> tuple[range, FloatArray]:
-    """Return the nodes and weights (N, N) of a complete graph.
+    """Return the nodes and weights (N, N) of a complete graph for a filter.
 
-    N is the size of ``pair_weights``, else 3 if the weights allow two links, else 2. Entry [l, i]
-    is the weight that node i gives to messages of node l.
+    N is the size of ``pair_weights`` if the filter has them, else 3, or 2 if its weights allow only
+    one link at a node. Entry [l, i] is the weight that node i gives to messages of node l.
     """
-    given = part.pair_weights
-    count = (3 if part.largest_degree() >= 2.0 else 2) if given is None else len(given)
-    if given is None:
-        given = np.full((count, count), part.weight(count - 1, count - 1))
-    return range(count), np.asarray(given) * (1.0 - np.eye(count))
+    weights = part.pair_weights
+    if weights is None:
+        count = 3 if part.largest_degree() >= 2.0 else 2
+        weights = np.full((count, count), part.weight(count - 1, count - 1))
+    return range(len(weights)), np.asarray(weights) * (1.0 - np.eye(len(weights)))

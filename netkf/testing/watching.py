@@ -1,4 +1,4 @@
-"""Calls of a user's methods that check their side effects."""
+"""Calls of methods of users' classes that check for side effects."""
 
 from __future__ import annotations
 
@@ -22,18 +22,27 @@ from netkf.linalg.arrays import FloatArray
 from netkf.scenario.plugins import describe_error
 
 Leaves = dict[str, Any]
+"""Copies of the numbers, texts and arrays in a value, by their paths such as ``.P[0]``."""
 MERSENNE_BYTES = 4 * 625
-"""Size of the state of a Mersenne twister: 624 words and the position in them."""
+"""Size of the state of a Mersenne twister: 624 words of 32 bits and the position in them."""
 
 
 def fail(where: str, rule: str, got: object = None, remedy: str = "") -> NoReturn:
-    """Raise AssertionError with one line."""
-    found = "" if got is None else f"; got {got if isinstance(got, str) else quote(got)}"
-    raise AssertionError(f"{where}: {rule}{found}{f'; {remedy}' if remedy else ''}")
+    """Raise AssertionError with the line ``where: rule; got ...; remedy``.
+
+    ``where`` names a method or attribute of the user's class, ``rule`` what it must do, ``got`` the
+    wrong value (a text as it is, other values by repr; None omits it).
+    """
+    message = f"{where}: {rule}"
+    if got is not None:
+        message += f"; got {got if isinstance(got, str) else quote(got)}"
+    if remedy:
+        message += f"; {remedy}"
+    raise AssertionError(message)
 
 
 def demand(holds: object, where: str, rule: str, got: object = None, remedy: str = "") -> None:
-    """Raise the error of :func:`fail` unless ``holds``."""
+    """Raise AssertionError as :func:`fail` does unless ``holds``."""
     if not holds:
         fail(where, rule, got, remedy)
 
@@ -41,8 +50,10 @@ def demand(holds: object, where: str, rule: str, got: object = None, remedy: str
 def make_part(
     part: Any, contracts: tuple[type[Component], ...], settings: Mapping[str, Any]
 ) -> Any:
-    """Return an object of a user's class: ``part`` itself, or the class make_part with
-    ``settings``.
+    """Return the object to check: ``part`` itself, or ``part(**settings)`` if it is a class.
+
+    Raises AssertionError if the class is derived from none of the ``contracts``, is abstract or
+    refuses the settings.
     """
     cls = part if isinstance(part, type) else type(part)
     name = cls.__name__
@@ -70,40 +81,46 @@ def make_part(
 
 
 _PLAIN = frozenset((str, bytes, bool, int, float, complex, type(None)))
-"""Types of most leaves but arrays."""
+"""Exact types of most leaves that are not arrays."""
 
 
-def leaves(value: Any) -> Leaves:
-    """Return copies of every number, text and array that a value is made of, by their paths."""
-    found: Leaves = {}
-    _add_leaves([("", value)], "", set(), found)
-    return found
+def collect_leaves(value: Any) -> Leaves:
+    """Return copies of all numbers, texts and arrays in a value, by their paths.
+
+    Generators and callables are left out.
+    """
+    leaves: Leaves = {}
+    _add_leaves([("", value)], "", set(), leaves)
+    return leaves
 
 
 def _add_leaves(
-    parts: Iterable[tuple[str, Any]], path: str, whole: set[int], found: Leaves
+    members: Iterable[tuple[str, Any]], path: str, ancestors: set[int], leaves: Leaves
 ) -> None:
-    """Add the leaves of the parts of what is at a path; ``whole``: what they are parts of, by
-    identity.
+    """Add the leaves in the ``members`` (name, value) of the value at ``path`` to ``leaves``.
+
+    ``ancestors`` are the ids of the values that contain the members, so that cycles end.
     """
-    # Most parts are leaves: calls for each of them would take a third of a check.
-    for name, part in parts:
-        if type(part) in _PLAIN:
-            found[path + name] = part
-        elif isinstance(part, np.ndarray):
-            found[path + name] = part.copy()
-        elif id(part) in whole or isinstance(part, np.random.Generator) or callable(part):
+    # Most members are leaves: a call for each of them would take a third of a check.
+    for name, member in members:
+        if type(member) in _PLAIN:
+            leaves[path + name] = member
+        elif isinstance(member, np.ndarray):
+            leaves[path + name] = member.copy()
+        elif id(member) in ancestors or isinstance(member, np.random.Generator) or callable(member):
             continue
-        elif isinstance(part, (str, bytes, int, float, complex, np.generic)):
-            found[path + name] = part
+        elif isinstance(member, (str, bytes, int, float, complex, np.generic)):
+            leaves[path + name] = member
         else:
-            whole.add(id(part))
-            _add_leaves(_iterate_parts(part), path + name, whole, found)
-            whole.discard(id(part))
+            ancestors.add(id(member))
+            _add_leaves(_list_members(member), path + name, ancestors, leaves)
+            ancestors.discard(id(member))
 
 
-def _iterate_parts(value: Any) -> Iterable[tuple[str, Any]]:
-    """Return the parts of a value, with the text that names each."""
+def _list_members(value: Any) -> Iterable[tuple[str, Any]]:
+    """Return the members of a value, each with the text that it adds to a path: items of
+    collections, fields of tuples and dataclasses, else attributes.
+    """
     fields = getattr(value, "_fields", None)
     if fields is not None:
         return [(f".{name}", getattr(value, name)) for name in fields]
@@ -118,8 +135,8 @@ def _iterate_parts(value: Any) -> Iterable[tuple[str, Any]]:
     return [(f".{name}", item) for name, item in getattr(value, "__dict__", {}).items()]
 
 
-def difference(one: Leaves, other: Leaves) -> str | None:
-    """Return the path of the first leaf in which two values differ, None if all are equal."""
+def differing_path(one: Leaves, other: Leaves) -> str | None:
+    """Return the path of the first leaf in which two values differ; None if all are equal."""
     if one.keys() != other.keys():
         return (
             min(one.keys() ^ other.keys(), key=len, default="")
@@ -127,114 +144,120 @@ def difference(one: Leaves, other: Leaves) -> str | None:
         )
     for path, value in one.items():
         second = other[path]
-        # Arrays are copies: what is the same object is a number or a text.
+        # Arrays were copied, so that only numbers and texts can be the same object.
         if value is not second and not _are_equal(np.asarray(value), np.asarray(second)):
             return path or "it"
     return None
 
 
 def _are_equal(one: np.ndarray, other: np.ndarray) -> bool:
-    """Return True if two arrays are equal in type, shape and every entry."""
+    """Return True if two arrays have equal types, shapes and entries; nan equals nan."""
     same_type = one.dtype == other.dtype and one.shape == other.shape
-    # Nearly all are equal to the last bit, which is cheap to see.
+    # Comparing bytes is cheap, and nearly all are equal to the last bit.
     if same_type and one.dtype != object and one.tobytes() == other.tobytes():
         return True
     numeric = one.dtype.kind in "fc" and other.dtype.kind in "fc"
     return np.array_equal(one, other, equal_nan=numeric)
 
 
-def global_randomness() -> tuple[Any, Any]:
-    """Return the states of the generators that all of a process shares."""
+def global_generator_states() -> tuple[Any, Any]:
+    """Return the states of the global generators of Python and numpy, for comparisons."""
     shared = np.random.get_bit_generator()  # type: ignore[attr-defined]
     if not isinstance(shared, np.random.MT19937):
-        return _python_randomness(), repr(shared.state)
-    # Its memory: numpy takes 0.1 ms to list the state, and this is asked before and after each
-    # call of a user's method.
+        return _python_generator_state(), repr(shared.state)
+    # Copied from memory: numpy takes 0.1 ms to list the state, and this function runs before and
+    # after each call of a user's method.
     words = ctypes.string_at(shared.ctypes.state_address, MERSENNE_BYTES)
-    return _python_randomness(), (id(shared), words)
+    return _python_generator_state(), (id(shared), words)
 
 
-def _python_randomness() -> Any:
-    """Return the state of Python's shared generator."""
+def _python_generator_state() -> Any:
+    """Return the state of the global generator of Python's module ``random``."""
     address = _python_state_address()
     if address is None:
         return random.getstate()
-    # To list and compare 625 numbers takes most of the time of a check.
-    return ctypes.string_at(address, MERSENNE_BYTES), _shared_random().gauss_next
+    # getstate would list 625 numbers, which with their comparison takes most of a check.
+    return ctypes.string_at(address, MERSENNE_BYTES), _python_generator().gauss_next
 
 
-def _shared_random() -> Any:
-    """Return the generator behind Python's functions of ``random``."""
+def _python_generator() -> Any:
+    """Return the generator object behind the functions of Python's module ``random``."""
     return cast(Any, random.getstate).__self__
 
 
 @cache
 def _python_state_address() -> int | None:
-    """Return where the position and the 624 words of Python's shared generator are in memory; None
-    where an object's memory does not hold what ``getstate`` says.
+    """Return the address of the state of Python's global generator in memory: its position, then
+    624 words.
+
+    None if this interpreter lays out the object otherwise: the memory must agree with ``getstate``.
     """
-    head, size = object.__basicsize__, random.Random.__basicsize__
-    if sys.implementation.name != "cpython" or size < head + MERSENNE_BYTES:
+    header, size = object.__basicsize__, random.Random.__basicsize__
+    if sys.implementation.name != "cpython" or size < header + MERSENNE_BYTES:
         return None
-    address = id(_shared_random()) + head
+    address = id(_python_generator()) + header
     position, *words = struct.unpack("=625I", ctypes.string_at(address, MERSENNE_BYTES))
     return address if random.getstate()[1] == (*words, position) else None
 
 
 @cache
 def _static_attribute(cls: type, name: str) -> Any:
-    """Return an attribute of a class without calling descriptors."""
+    """Return an attribute of a class without calling descriptors; None if it is missing."""
     return inspect.getattr_static(cls, name, None)
 
 
-class Watched:
-    """A part whose methods are called with everything around them watched.
+class WatchedPart:
+    """A component of a scenario whose methods are called with checks for side effects.
 
-    What a method was given must be as before, also later; the part itself too; a second call must
-    give the same; numpy's and Python's global generators must not be used. Where the part is an
-    adapter, its ``owner`` is the object of the user's class, and ``former`` says how that one calls
-    the methods.
+    A call must change neither its arguments nor the component, nor results of earlier calls; a
+    second call must return the same; the global generators of numpy and Python must not be used.
+
+    If ``part`` is an adapter, ``owner`` is the object of the user's class, and ``former_names`` has
+    the names of methods in that class by their present names. ``name`` is that of the user's class.
     """
 
     def __init__(
-        self, part: Any, owner: Any = None, former: Mapping[str, str] | None = None
+        self, part: Any, owner: Any = None, former_names: Mapping[str, str] | None = None
     ) -> None:
         self.part, self._owner = part, part if owner is None else owner
         self.name = type(self._owner).__name__
-        self._former = former or {}
-        self._kept: list[tuple[str, Any, Leaves]] = []
+        self._former_names = former_names or {}
+        # Of each call: the method, the result, and its leaves at that time.
+        self._results: list[tuple[str, Any, Leaves]] = []
 
     def defined_name(self, method: str) -> str:
         """Return the name by which the user's class defines a method or property."""
-        if method in self._former:
-            return self._former[method]
+        if method in self._former_names:
+            return self._former_names[method]
         cls: Any = type(self._owner)
-        found = _static_attribute(cls, method)
-        defined = getattr(getattr(found, "fget", found), "__name__", method)
-        # Under a former name of the contract, see Component.former_names.
-        former = getattr(self._owner, "former_names", {}).get(method)
-        return former if defined == former else method
+        attribute = _static_attribute(cls, method)
+        defined_as = getattr(getattr(attribute, "fget", attribute), "__name__", method)
+        # A class may define the method by its former name, see Component.former_names.
+        former_name = getattr(self._owner, "former_names", {}).get(method)
+        return former_name if defined_as == former_name else method
 
     def call(self, method: str, *arguments: Any, repeatable: bool = True) -> Any:
-        """Return the result of a method; called twice and compared if it is ``repeatable``, drawing
-        nothing.
+        """Call a method, check for side effects and return the result.
+
+        A ``repeatable`` method, one that draws no random numbers, is called twice and must return
+        equal results. Raises AssertionError if a check or the method fails.
         """
         where = f"{self.name}.{self.defined_name(method)}"
-        before = [leaves(argument) for argument in arguments]
-        itself = self.attributes()
+        before = [collect_leaves(argument) for argument in arguments]
+        attributes = self.attributes()
         results = [self._call_method(where, method, arguments) for _ in range(1 + repeatable)]
-        for k, old in enumerate(before):
-            path = difference(old, leaves(arguments[k]))
+        for k, leaves in enumerate(before):
+            path = differing_path(leaves, collect_leaves(arguments[k]))
             if path is not None:
                 name = self._parameter_names(method, len(arguments))[k]
                 remedy = "return a new one; work on copies"
                 fail(
                     where,
-                    f"must leave what it is given as it is, and changed {name}{path}",
+                    f"must not change its arguments, and changed {name}{path}",
                     None,
                     remedy,
                 )
-        path = difference(itself, self.attributes())
+        path = differing_path(attributes, self.attributes())
         demand(
             path is None,
             where,
@@ -242,38 +265,38 @@ class Watched:
             None,
             "keep what changes in the state that is handed in and returned",
         )
-        found = [leaves(result) for result in results]
-        path = difference(found[0], found[-1])
+        result_leaves = [collect_leaves(result) for result in results]
+        path = differing_path(result_leaves[0], result_leaves[-1])
         demand(
             path is None,
             where,
-            "must give the same for the same arguments",
+            "must return the same for the same arguments",
             f"another {(path or '').lstrip('.') or 'value'} at the second call",
             "use no randomness, clock or memory of earlier calls",
         )
-        self._kept.append((where, results[0], found[0]))
+        self._results.append((where, results[0], result_leaves[0]))
         return results[0]
 
-    def once(self) -> Watched:
-        """Return the same component with unchecked calls, to compare with checked ones."""
-        return _Once(self.part, self._owner, self._former)
+    def unchecked(self) -> WatchedPart:
+        """Return the same component with calls that are made once and not checked."""
+        return _UncheckedPart(self.part, self._owner, self._former_names)
 
     def attributes(self) -> Leaves:
-        """Return the attributes of the component, except for cached properties."""
+        """Return the leaves of the attributes of the component, except for cached properties."""
         cls: Any = type(self._owner)
-        own = vars(self._owner)
-        kept = {
-            k: v
-            for k, v in own.items()
-            if not isinstance(_static_attribute(cls, k), cached_property)
+        attributes = {
+            name: value
+            for name, value in vars(self._owner).items()
+            if not isinstance(_static_attribute(cls, name), cached_property)
         }
-        return {path.strip("[]'"): leaf for path, leaf in leaves(kept).items()}
+        return {path.strip("[]'"): leaf for path, leaf in collect_leaves(attributes).items()}
 
     def _call_method(self, where: str, method: str, arguments: tuple[Any, ...]) -> Any:
-        """Return the result of a method; failures and uses of global generators are
-        AssertionErrors.
+        """Call a method and return the result.
+
+        Raises AssertionError if the method fails or uses a global generator.
         """
-        before = global_randomness()
+        before = global_generator_states()
         try:
             result = getattr(self.part, method)(*arguments)
         except NetkfError as error:
@@ -284,7 +307,7 @@ class Watched:
             text = f"{where}: failed with {describe_error(error)}{remedy if singular else ''}"
             raise AssertionError(text) from error
         demand(
-            global_randomness() == before,
+            global_generator_states() == before,
             where,
             "must not use or seed global generators (numpy.random.*, random.*)",
             None,
@@ -298,9 +321,9 @@ class Watched:
         return [*names, *["an argument"] * count][:count]
 
     def finish(self) -> None:
-        """Check that no result of an earlier call has changed since."""
-        for where, result, old in self._kept:
-            path = difference(old, leaves(result))
+        """Check that no result of a call was changed by a later one."""
+        for where, result, leaves in self._results:
+            path = differing_path(leaves, collect_leaves(result))
             demand(
                 path is None,
                 where,
@@ -310,8 +333,10 @@ class Watched:
             )
 
     def demand_unchanged(self, before: Leaves) -> None:
-        """Check that the attributes of the component are still those from ``before``."""
-        path = difference(before, self.attributes())
+        """Check that the attributes of the component are still those of ``before``, an earlier
+        result of :meth:`attributes`.
+        """
+        path = differing_path(before, self.attributes())
         demand(
             path is None,
             self.name,
@@ -321,7 +346,9 @@ class Watched:
         )
 
     def pickle_copy(self) -> Any:
-        """Return a copy of the part that went through pickle, as for worker processes."""
+        """Return a copy of the user's object made by pickle, as for worker processes; check that it
+        is equal.
+        """
         try:
             copy = pickle.loads(pickle.dumps(self._owner))
         except Exception as error:
@@ -331,23 +358,25 @@ class Watched:
                 describe_error(error),
                 "define the class at the top level of a module and keep no open files or lambdas",
             )
-        path = difference(leaves(self._owner), leaves(copy))
+        path = differing_path(collect_leaves(self._owner), collect_leaves(copy))
         demand(path is None, self.name, f"must be itself after pickling, and lost {path}")
         return copy
 
 
-class _Once(Watched):
-    """See ``Watched.once``."""
+class _UncheckedPart(WatchedPart):
+    """A component whose methods are called once and not checked for side effects."""
 
     def call(self, method: str, *arguments: Any, repeatable: bool = True) -> Any:
-        """Return the result of a method."""
+        """Call a method once and return the result."""
         return self._call_method(f"{self.name}.{self.defined_name(method)}", method, arguments)
 
 
 @contextmanager
-def user_code(where: str) -> Iterator[None]:
-    """Turn errors of a user's class into one line, and check that no global generator is used."""
-    before = global_randomness()
+def guard_user_code(where: str) -> Iterator[None]:
+    """Turn exceptions of a user's class into an AssertionError of one line, which begins with
+    ``where``, and check that the body uses no global generator.
+    """
+    before = global_generator_states()
     try:
         yield
     except AssertionError:
@@ -355,7 +384,7 @@ def user_code(where: str) -> Iterator[None]:
     except Exception as error:
         raise AssertionError(f"{where}: failed with {describe_error(error)}") from error
     demand(
-        global_randomness() == before,
+        global_generator_states() == before,
         where,
         "must not use or seed global generators (numpy.random.*, random.*)",
         None,
@@ -363,14 +392,16 @@ def user_code(where: str) -> Iterator[None]:
     )
 
 
-def attempt(where: str, function: Callable[..., Any], *arguments: Any) -> Any:
-    """Return the result of a function of a user's class, see ``user_code``."""
-    with user_code(where):
+def call_user_function(where: str, function: Callable[..., Any], *arguments: Any) -> Any:
+    """Call a function of a user's class and return the result, with :func:`guard_user_code`."""
+    with guard_user_code(where):
         return function(*arguments)
 
 
 def demand_array(where: str, name: str, value: Any, shape: tuple[int, ...]) -> FloatArray:
-    """Return a float64 array of that shape with finite numbers; fail otherwise."""
+    """Return ``value`` as an array; raises AssertionError unless it is float64, finite and of that
+    ``shape``. ``name`` is what messages call it.
+    """
     array = np.asarray(value)
     demand(array.shape == shape, where, f"{name} must have the shape {shape}", str(array.shape))
     demand(array.dtype == np.float64, where, f"{name} must be float64", str(array.dtype))
@@ -378,9 +409,9 @@ def demand_array(where: str, name: str, value: Any, shape: tuple[int, ...]) -> F
     return array
 
 
-def distance(one: FloatArray, other: FloatArray) -> float:
-    """Return the largest difference of two arrays of one shape, in units of 1 + their largest
-    entry.
+def relative_difference(one: FloatArray, other: FloatArray) -> float:
+    """Return the largest absolute difference of two arrays of one shape, divided by 1 + the largest
+    absolute entry of both.
     """
     size = 1.0 + max(np.abs(a).max(initial=0.0) for a in (one, other))
     return float(np.abs(one - other).max(initial=0.0) / size)

@@ -80,7 +80,7 @@ class Lazy(GilbertElliott):
         return super().next_state(random.random() < 2, random)
 
 
-@says(CHANNELS, "OwnLuck.chance: must give the same for the same arguments")
+@says(CHANNELS, "OwnLuck.chance: must return the same for the same arguments")
 class OwnLuck(Loss):
     def chance(self, link, message, bad, measured):
         return float(np.random.default_rng().random())
@@ -241,7 +241,7 @@ class AllAtOnce(Bernoulli):
 
 @says(
     CHANNELS,
-    "Coupled.delivery_probability: must give the same for the same arguments",
+    "Coupled.delivery_probability: must return the same for the same arguments",
     delivery=0.8,
 )
 class Coupled(Bernoulli):

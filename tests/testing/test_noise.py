@@ -9,10 +9,10 @@ from scipy.stats import binom, norm
 
 from netkf import parts
 from netkf.testing import noise
-from netkf.testing.channels import check_made_channel
-from netkf.testing.clocks import check_made_clock
+from netkf.testing.channels import check_channel_object
+from netkf.testing.clocks import check_clock_object
 
-STATED = noise.Stated("Some.path", "the noise", "R")
+LABELS = noise.NoiseLabels("Some.path", "the noise", "R")
 SEEDS = 10
 RUNS, LENGTH = 400, 250
 
@@ -56,7 +56,7 @@ def test_stated_errors_are_found_with_probability_nine_tenths(change, words):
     found = 0
     for seed in range(SEEDS):
         try:
-            noise.check_white(change(white(seed, 2 if change is related else 1)), STATED)
+            noise.check_white(change(white(seed, 2 if change is related else 1)), LABELS)
         except AssertionError as error:
             found += words in str(error)
     assert found >= 7  # with 0.9 each, fewer would be found once in 78 times
@@ -64,7 +64,7 @@ def test_stated_errors_are_found_with_probability_nine_tenths(change, words):
 
 def test_white_noise_passes_at_every_seed():
     for seed in range(SEEDS):
-        noise.check_white(white(seed, 2), STATED)
+        noise.check_white(white(seed, 2), LABELS)
 
 
 def test_skewed_noise_is_accused_no_more_often_than_stated(monkeypatch):
@@ -89,7 +89,7 @@ def test_the_bound_of_frequencies_holds():
 
 def test_the_level_of_a_family_is_shared_among_its_tests():
     for count in (1, 10, 1000):
-        assert 2.0 * norm.sf(noise.standard_errors(count)) * count == pytest.approx(5e-9)
+        assert 2.0 * norm.sf(noise.critical_value(count)) * count == pytest.approx(5e-9)
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,7 +130,7 @@ def found_by(checker, part):
 
 
 def test_one_lossier_direction_is_found():
-    assert found_by(check_made_channel, OneLossier(0.8)) >= 7
+    assert found_by(check_channel_object, OneLossier(0.8)) >= 7
 
 
 @pytest.mark.parametrize("cls", [Slower, OneSlower])
@@ -139,16 +139,16 @@ def test_slower_clocks_are_found(cls, monkeypatch):
     # in another order.
     monkeypatch.setattr("netkf.testing.clocks._check_entity", lambda *_: None)
     monkeypatch.setattr("netkf.testing.clocks._check_exponential", lambda *_: None)
-    assert found_by(check_made_clock, cls(rate=2.0)) >= 7
+    assert found_by(check_clock_object, cls(rate=2.0)) >= 7
 
 
 def test_sound_channels_and_clocks_pass_at_other_seeds(monkeypatch):
     monkeypatch.setattr(noise, "LEVEL", 1e-4)
     monkeypatch.setattr("netkf.testing.clocks._check_entity", lambda *_: None)
     for seed in range(3):
-        check_made_channel(parts.Bernoulli(0.7), None, seed)
-        check_made_channel(parts.GilbertElliott(mean_loss=0.1, mean_burst=20.0), None, seed)
-        check_made_channel(parts.LognormalDelay(0.3, 1.5), None, seed)
-        check_made_clock(parts.Poisson(rate=3.0), None, seed)
-        check_made_clock(parts.Renewal("gamma", rate=2.0, shape=0.2), None, seed)
-        check_made_clock(parts.Poisson(rate=3.0, at="nodes"), None, seed)
+        check_channel_object(parts.Bernoulli(0.7), None, seed)
+        check_channel_object(parts.GilbertElliott(mean_loss=0.1, mean_burst=20.0), None, seed)
+        check_channel_object(parts.LognormalDelay(0.3, 1.5), None, seed)
+        check_clock_object(parts.Poisson(rate=3.0), None, seed)
+        check_clock_object(parts.Renewal("gamma", rate=2.0, shape=0.2), None, seed)
+        check_clock_object(parts.Poisson(rate=3.0, at="nodes"), None, seed)

@@ -10,7 +10,7 @@ from netkf import parts
 from netkf.algorithms.registry import own_attributes
 from netkf.testing import check_filter
 from netkf.testing.parents import check_parent
-from netkf.testing.watching import Watched
+from netkf.testing.watching import WatchedPart
 
 ADJUSTED, DEFINED, SAME = {}, {}, {}
 
@@ -126,7 +126,7 @@ class OtherWeights(parts.Gossip):
 
 
 def compare(cls, settings, same_as_parent=None):
-    return check_parent(Watched(cls(**settings)), same_as_parent)
+    return check_parent(WatchedPart(cls(**settings)), same_as_parent)
 
 
 @pytest.mark.parametrize("name", ADJUSTED)

@@ -34,13 +34,16 @@ def test_a_use_changes_the_state(monkeypatch, name, listed):
     if listed:
         monkeypatch.setattr(watching, "_python_state_address", lambda: None)
     for _ in range(2):
-        before, kept = watching.global_randomness(), (random.getstate(), np.random.get_state())
-        assert watching.global_randomness() == before
+        before, kept = (
+            watching.global_generator_states(),
+            (random.getstate(), np.random.get_state()),
+        )
+        assert watching.global_generator_states() == before
         USES[name]()
-        assert watching.global_randomness() != before
+        assert watching.global_generator_states() != before
         random.setstate(kept[0])
         np.random.set_state(kept[1])
-        assert watching.global_randomness() == before
+        assert watching.global_generator_states() == before
         random.gauss()  # the next one is already drawn
 
 
