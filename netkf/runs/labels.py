@@ -1,4 +1,7 @@
-"""Names of limits and notes on covariances, shared by `netkf theory`, tables and pictures."""
+"""Names of limits and notes on covariances, shared by `netkf theory`, tables and pictures.
+
+H(13) is an equation of paper H on the hybrid filter, see theory/README.md.
+"""
 
 from __future__ import annotations
 

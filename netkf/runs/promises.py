@@ -1,4 +1,8 @@
-"""``netkf theory``: assumptions, bounds and limits of a scenario, without a simulation."""
+"""``netkf theory``: assumptions, bounds and limits of a scenario, without a simulation.
+
+H is the paper on the hybrid filter, see theory/README.md. S is the limit of its bound on the mean
+of P as link rates grow.
+"""
 
 from __future__ import annotations
 

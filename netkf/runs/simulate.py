@@ -21,8 +21,10 @@ LOAD_REMEDY = "load it first: netkf.simulate(netkf.load(path))"
 ENGINES = ("auto", "simpy", "compiled")
 
 
-def choose_engine(name: str | Engine, scenario: Scenario, announce: bool = True) -> Engine:
-    """Return the engine for a scenario, by ``name`` or given as an Engine.
+def choose_engine(
+    name_or_engine: str | Engine, scenario: Scenario, announce: bool = True
+) -> Engine:
+    """Return the engine for a scenario, given by its name or as an Engine.
 
     Names are ``simpy`` (or ``processes``), ``compiled``, and ``auto``: the compiled engine if it
     can run the scenario, and SimPy otherwise. With ``announce`` an engine that has to compile first
@@ -30,20 +32,20 @@ def choose_engine(name: str | Engine, scenario: Scenario, announce: bool = True)
 
     Raises EngineError if the name is unknown or the engine cannot run the scenario.
     """
-    if isinstance(name, Engine):
-        engine: Engine = name
-    elif name in ("auto", "compiled"):
+    if isinstance(name_or_engine, Engine):
+        engine: Engine = name_or_engine
+    elif name_or_engine in ("auto", "compiled"):
         engine = CompiledEngine()
-        if name == "auto" and engine.refusal(scenario) is not None:
+        if name_or_engine == "auto" and engine.refusal(scenario) is not None:
             engine = SimpyEngine()
-    elif name in ("simpy", "processes"):
+    elif name_or_engine in ("simpy", "processes"):
         engine = SimpyEngine()
     else:
-        raise EngineError(f"engine must be one of {', '.join(ENGINES)}; got {name!r}")
+        raise EngineError(f"engine must be one of {', '.join(ENGINES)}; got {name_or_engine!r}")
     refusal = engine.refusal(scenario)
     if refusal is not None:
         raise EngineError(refusal)
-    if announce and engine is not name:
+    if announce and engine is not name_or_engine:
         engine.announce(scenario)
     return engine
 

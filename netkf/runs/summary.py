@@ -1,4 +1,8 @@
-"""The summary of a run: errors and covariances of each node next to the bounds of theory."""
+"""The summary of a run: errors and covariances of each node next to the bounds of theory.
+
+H(12) and H(13) are equations of paper H on the hybrid filter, see theory/README.md: the bound on
+the mean of P over time, and its limit S for fast links.
+"""
 
 from __future__ import annotations
 
@@ -131,7 +135,7 @@ def nees_bounds(n: int, runs: int = 1) -> tuple[float, float]:
 
 @dataclass(frozen=True, eq=False)
 class PromisedTraces:
-    """Traces that theory promises for a run.
+    """Traces of covariances that theory promises for a run.
 
     bound       : (T, N) traces of H(12) at the sample times; None if it does not apply
     limit       : trace of the limit S of H(13), nan if it does not exist
@@ -173,7 +177,9 @@ def promise_traces(scenario: Scenario, times: FloatArray) -> PromisedTraces:
 
 
 def _require_small_bound(scenario: Scenario, samples: int) -> None:
-    """Raise TheoryError if H(12) at ``samples`` times takes more memory than MAX_BOUND_BYTES."""
+    """Raise TheoryError if the bound H(12) at so many ``samples`` takes more than
+    MAX_BOUND_BYTES.
+    """
     if reason_without_bound(scenario):
         return
     n = scenario.plant.n

@@ -92,7 +92,7 @@ class ClockTrial(Trial):
             self.record_end()
 
     def _check_composition(self, node: int) -> None:
-        """Check that predictions over two gaps, one after the other, equal one over their sum, and
+        """Check that a prediction over two gaps in turn equals that over their sum, and
         that ``max_measurement_interval`` is positive.
         """
         watched, state = self.watched, self.states[node]
@@ -223,6 +223,7 @@ class ClockTrial(Trial):
             accepted = [self._accept(message) for message in arrivals if message.receiver == node]
             messages = sorted((m for m in accepted if m is not None), key=lambda m: m.sender)
             if self.part.newest_only:
+                # The last entry of a sender stays: its message with the smallest age.
                 newest = {m.sender: m for m in sorted(messages, key=lambda m: -m.age)}
                 messages = [newest[sender] for sender in sorted(newest)]
             if messages:

@@ -75,4 +75,4 @@ def check_state_pickles(watched: WatchedPart, state: Any) -> None:
             "state a NamedTuple of arrays at the top level of a module"
         ) from error
     one, other = (collect_leaves(watched.part.estimate(s)) for s in (state, copy))
-    demand(differing_path(one, other) is None, where, "states must be themselves after pickling")
+    demand(differing_path(one, other) is None, where, "states must be equal after pickling")

@@ -191,7 +191,7 @@ def _check_pair_weights(watched: WatchedPart, weights: FloatArray) -> None:
     demand(
         (sums <= 1.0 + 1e-9).all(),
         where,
-        "columns, what a node gives, must sum to at most 1",
+        "columns, the weights that a node gives, must sum to at most 1",
         sums,
         "entry [l, i] is the weight node i gives to what node l sends",
     )

@@ -219,6 +219,7 @@ def _check_slots_independent(where: str, topology: Topology, is_paired: np.ndarr
     p, slots = is_paired.mean(axis=0), len(is_paired)
     expected = p[:, None] * p
     for lag in range(1, MAX_LAG + 1):
+        # Entry [l, m]: how often link l is paired and, lag slots later, link m.
         both = is_paired[:-lag].T.astype(float) @ is_paired[lag:] / (slots - lag)
         unlikely = (slots - lag) * divergence(both, expected) > minus_log_level(both.size)
         if not unlikely.any():

@@ -114,6 +114,7 @@ def _clock_trial_pairs(
     """Yield pairs of trials in continuous time, with samples and, if both filters take them, with
     increments.
     """
+    # The clock "readings" ticks when a node has taken a sample.
     needs_samples = child.part.needs_samples or parent.part.needs_samples or clock == "readings"
     for increments in (False,) if needs_samples else (False, True):
         first, second = (

@@ -96,7 +96,7 @@ def check_plant_object(part: Any, seed: int) -> None:
 
 
 def _check_form(part: Any, name: str) -> None:
-    """Check the shapes of the matrices of a plant, and that the covariance of x(0) is one."""
+    """Check the shapes of the matrices of a plant, and that ``start_cov`` is a covariance."""
     n = part.n
     matrix = part.F if isinstance(part, LinearPlant) else getattr(part, "A", np.zeros((n, n)))
     fits = isinstance(n, int) and matrix.shape == (n, n)

@@ -30,9 +30,10 @@ def assert_promises(
 ) -> None:
     """Assert that ``runs`` replicas break no promise of a scenario, or of a scenario file.
 
-    Arguments are those of ``netkf.check``. Rows of the verdict that are undecided or about nothing
-    promised pass. Raises AssertionError with a line for each broken promise, TheoryError if theory
-    promises nothing about the filter, and ScenarioError for a bad file or bad arguments.
+    Arguments are those of ``netkf.check``. Rows of the verdict that are undecided, or about
+    something that theory does not promise, pass. Raises AssertionError with a line for each broken
+    promise, TheoryError if theory promises nothing about the filter, and ScenarioError for a bad
+    file or bad arguments.
     """
     from netkf.checks.check import check
     from netkf.checks.evidence import BROKEN

@@ -426,7 +426,7 @@ def _check_nonlinear(sensor: NonlinearSensor, name: str, seed: int) -> None:
             demand(value.shape == (p,), f"{name}.h", f"must give {p} numbers, as R says", value)
             is_same = np.array_equal(value, repeated)
             remedy = "return what is read without noise, which netkf adds"
-            demand(is_same, f"{name}.h", "must be one for a state", repeated, remedy)
+            demand(is_same, f"{name}.h", "must be the same for a state", repeated, remedy)
             demand(J.shape == (p, n), f"{name}.jacobian", f"must be {p} x {n}", str(J.shape))
             error = _derivative_error(sensor, node, x, J)
             demand(

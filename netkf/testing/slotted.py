@@ -82,6 +82,7 @@ class SlotTrial(Trial):
         before = self.conserved_sums()
         payloads = {node: self.emit(node, exchange) for node in self._talking_nodes(exchange.slot)}
         for node, senders in enumerate(self._choose_senders(exchange.slot)):
+            # Ages of 0.01, 0.02, ... seconds: different for each sender.
             inbox = [
                 Message(k, float(self.weights[k, node]), payloads[k], 0.01 * (k + 1))
                 for k in senders

@@ -75,9 +75,16 @@ class Trial(ABC):
         information = np.stack([model.information for model in models])
         neighbours = tuple(tuple(j for j in self.nodes if j != i) for i in self.nodes)
         info = NodeInfo(
-            node, degree, degree, degree + 1, own_weight, information.sum(axis=0), MAX_DELAY, node,
-            NetworkInfo(information, neighbours),
-        )  # fmt: skip
+            node=node,
+            degree=degree,
+            receivers=degree,
+            nodes=degree + 1,
+            own_weight=own_weight,
+            information=information.sum(axis=0),
+            max_delay=MAX_DELAY,
+            place=node,
+            network=NetworkInfo(information, neighbours),
+        )
         state = self.watched.call("init", models[node], self.system.mean, self.system.cov, info)
         self.record_estimate(node, state, "init")
         return state
@@ -151,8 +158,9 @@ class Trial(ABC):
         }
 
     def check_conserved(self, before: dict[str, float], lost: str) -> None:
-        """Check that the conserved sums are those ``before`` an exchange in which messages were
-        ``lost``: "all" or "none", for messages.
+        """Check that the conserved sums are still those ``before`` an exchange.
+
+        ``lost``, "all" or "none", says in the message which messages of the exchange were lost.
         """
         after = self.conserved_sums()
         for name, total in before.items():

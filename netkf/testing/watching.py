@@ -253,7 +253,7 @@ class WatchedPart:
                 remedy = "return a new one; work on copies"
                 fail(
                     where,
-                    f"must not change its arguments, and changed {name}{path}",
+                    f"must not change its arguments, but changed {name}{path}",
                     None,
                     remedy,
                 )
@@ -261,7 +261,7 @@ class WatchedPart:
         demand(
             path is None,
             where,
-            f"must not change its own object, and changed {path}",
+            f"must not change its own object, but changed {path}",
             None,
             "keep what changes in the state that is handed in and returned",
         )
@@ -340,7 +340,7 @@ class WatchedPart:
         demand(
             path is None,
             self.name,
-            f"must not change its own object, and changed {path}",
+            f"must not change its own object, but changed {path}",
             None,
             "keep what changes in the paths and states that its methods return",
         )
@@ -359,7 +359,7 @@ class WatchedPart:
                 "define the class at the top level of a module and keep no open files or lambdas",
             )
         path = differing_path(collect_leaves(self._owner), collect_leaves(copy))
-        demand(path is None, self.name, f"must be itself after pickling, and lost {path}")
+        demand(path is None, self.name, f"must be equal after pickling, but lost {path}")
         return copy
 
 

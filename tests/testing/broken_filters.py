@@ -37,7 +37,7 @@ class EulerSteps(Hybrid):
 
 
 @says(
-    "TakesPayload.absorb: must not change its arguments, and changed messages[0]",
+    "TakesPayload.absorb: must not change its arguments, but changed messages[0]",
     epsilon=0.3,
 )
 class TakesPayload(Hybrid):
@@ -47,7 +47,7 @@ class TakesPayload(Hybrid):
         return super().absorb(state, messages, exchange)
 
 
-@says("InPlace.update: must not change its arguments, and changed state.xhat", epsilon=0.3)
+@says("InPlace.update: must not change its arguments, but changed state.xhat", epsilon=0.3)
 class InPlace(Hybrid):
     def update(self, state, reading):
         state.xhat[:] += reading[0][0]
@@ -55,7 +55,7 @@ class InPlace(Hybrid):
 
 
 @says(
-    "PredictsInPlace.predict: must not change its arguments, and changed state.root",
+    "PredictsInPlace.predict: must not change its arguments, but changed state.root",
     epsilon=0.3,
 )
 class PredictsInPlace(Hybrid):
@@ -298,7 +298,7 @@ class Picky(Hybrid):
         return None
 
 
-@says("SlotInPlace.update: must not change its arguments, and changed state.root")
+@says("SlotInPlace.update: must not change its arguments, but changed state.root")
 class SlotInPlace(Gossip):
     clocks = ()
 
@@ -314,7 +314,7 @@ class NeverFresh(Gossip):
         return False
 
 
-@says("ChangesReading.update: must not change its arguments, and changed reading.y")
+@says("ChangesReading.update: must not change its arguments, but changed reading.y")
 class ChangesReading(Gossip):
     clocks = ()
 
@@ -323,7 +323,7 @@ class ChangesReading(Gossip):
         return super().update(state, reading)
 
 
-@says("Lopsided.pair_weights: columns, what a node gives, must sum to at most 1")
+@says("Lopsided.pair_weights: columns, the weights that a node gives, must sum to at most 1")
 class Lopsided(Filter):
     @property
     def pair_weights(self):
@@ -423,7 +423,7 @@ class FormerEuler(FlowFilter):
         return state
 
 
-@says("FormerInPlace.measure: must not change its arguments, and changed state.xhat")
+@says("FormerInPlace.measure: must not change its arguments, but changed state.xhat")
 class FormerInPlace(FlowFilter):
     def measure(self, state, reading):
         state.xhat[:] += reading.moments[0]
@@ -450,7 +450,7 @@ class FormerProgramme(SlotFilter):
         return state
 
 
-@says("FormerSense.sense: must not change its arguments, and changed reading.y")
+@says("FormerSense.sense: must not change its arguments, but changed reading.y")
 class FormerSense(SlotFilter):
     def sense(self, state, reading):
         reading.y[:] = 0.0
