@@ -158,9 +158,8 @@ class Poisson(LinkClock):
         random: np.random.Generator,
         count: int,
     ) -> FloatArray:
-        """Return the next ``count`` ticks after ``now``, with exponential gaps.
-
-        The gaps are proportional to 1 / rate: clocks of different rates use the same numbers.
+        """Return the next ``count`` ticks (seconds) after ``now``, with exponential gaps of mean
+        1 / rate: the ticks of clocks with equal generators are in proportion.
         """
         return _accumulate(now, random.standard_exponential(count) / self.mean_rate(entity))
 

@@ -264,12 +264,13 @@ class RandomGraph(Graph):
         """
         import networkx
 
-        first, tries, drawn = seed if self.seed is None else self.seed, 0, 0
-        while tries < (MAX_TRIES if self.connected else 1) and drawn < MAX_DRAWN:
+        first_seed, tries, entries = seed if self.seed is None else self.seed, 0, 0
+        # Limited in the number of graphs and in the nodes and edges of all of them.
+        while tries < (MAX_TRIES if self.connected else 1) and entries < MAX_DRAWN:
             # networkx takes legacy generators only for its older functions.
-            state = np.random.RandomState((first + tries) % 2**32)
+            state = np.random.RandomState((first_seed + tries) % 2**32)
             graph = make(state)
-            tries, drawn = tries + 1, drawn + len(graph) + graph.number_of_edges()
+            tries, entries = tries + 1, entries + len(graph) + graph.number_of_edges()
             if not self.connected or networkx.is_connected(graph):
                 return graph
         raise ScenarioError(
@@ -288,7 +289,10 @@ class Regular(RandomGraph):
     degree: int = field(integer(low=0))
 
     def build(self, seed: int) -> Topology:
-        """Return networkx.random_regular_graph; raises ScenarioError if there is no such graph."""
+        """Return a topology from ``networkx.random_regular_graph``.
+
+        Raises ScenarioError if there is no graph with this degree.
+        """
         import networkx
 
         N, degree = self.nodes, self.degree
@@ -323,7 +327,7 @@ class ErdosRenyi(RandomGraph):
     p: float = field(probability)
 
     def build(self, seed: int) -> Topology:
-        """Return networkx.fast_gnp_random_graph."""
+        """Return a topology from ``networkx.fast_gnp_random_graph``."""
         import networkx
 
         _check_size(self.nodes, int(0.5 * self.p * self.nodes * (self.nodes - 1)))
@@ -340,7 +344,9 @@ class Geometric(RandomGraph):
     radius: float = field(positive)
 
     def build(self, seed: int) -> Topology:
-        """Return networkx.random_geometric_graph with its positions."""
+        """Return a topology from ``networkx.random_geometric_graph``, with the positions of
+        nodes.
+        """
         import networkx
 
         pairs = 0.5 * self.nodes * (self.nodes - 1)
@@ -417,7 +423,7 @@ class CsvGraph(Graph):
         """Return the links of the table; raises ScenarioError if it is wrong or none are left."""
         table = self._table()
         named = {node for link in table.probability for node in link}
-        delivery, has_probabilities = self._both_directions(table)
+        delivery, has_probabilities = self._add_reverse_links(table)
         links = self._links(delivery)
         one_way = [] if self.directed else sorted(p for p in delivery if p[::-1] not in delivery)
         if has_probabilities and links.intersection(one_way):
@@ -463,8 +469,12 @@ class CsvGraph(Graph):
             raise ScenarioError("path", rule, list(repeated), "remove the other rows")
         return _Table(dict(zip(pairs, values, strict=True)), has_probabilities)
 
-    def _both_directions(self, table: _Table) -> _Table:
-        """Return the table with each row counted both ways if every link is listed once."""
+    def _add_reverse_links(self, table: _Table) -> _Table:
+        """Return the table with the reverse of each row, unless links are directed or listed both
+        ways.
+
+        Raises ScenarioError if ``minimum`` needs probabilities that the table does not have.
+        """
         if self.minimum is not None and not table.has_probabilities:
             raise ScenarioError(
                 "minimum",

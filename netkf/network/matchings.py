@@ -85,7 +85,7 @@ class Matching(SlotActivation):
             )
 
     def draw(self, topology: Topology, random: np.random.Generator) -> list[Link]:
-        """Draw the pairs of one slot."""
+        """Draw the matching of one slot by the protocol: its pairs (i, j), i < j."""
         links = topology.links
         if not links:
             return []

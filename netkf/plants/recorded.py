@@ -77,7 +77,7 @@ class RecordedPlant(LinearPlant):
         """The states (n,) by slot."""
         times, states = _states(self.path, self.n)
         rows = list(zip(times.tolist(), states, strict=True))
-        return by_slot(self.path, rows, self.period, "")
+        return index_by_slot(self.path, rows, self.period, "")
 
     def require_slots(self, slots: Iterable[int]) -> None:
         """Raise ScenarioError if the table has no state for one of the slots."""
@@ -284,7 +284,7 @@ class RecordedSensor(Sensor):
 
         Raises ScenarioError for a time that is not the start of a slot and for two rows of a slot.
         """
-        return by_slot(self.path, self._rows[node], period, f" of node {node}")
+        return index_by_slot(self.path, self._rows[node], period, f" of node {node}")
 
     def require_slot_times(self, period: float) -> None:
         """Raise ScenarioError if the table does not fit slots of ``period`` seconds."""
@@ -377,7 +377,7 @@ def _column_number(name: str, letter: str = "y") -> int:
     return int(number) if name.startswith(letter) and number.isdecimal() else -1
 
 
-def by_slot(
+def index_by_slot(
     source: SourceFile, rows: Iterable[tuple[float, FloatArray]], period: float, whose: str
 ) -> Table:
     """Return the values of ``rows`` (t, values) by the slot of ``period`` seconds that begins at t.

@@ -267,11 +267,11 @@ def nearest_row(times: FloatArray, time: float) -> int | None:
     return k if k < len(times) and times[k] <= time + TOLERANCE else None
 
 
-def demand_rows(source: SourceFile, times: FloatArray, needed: FloatArray, what: str) -> None:
+def demand_rows(source: SourceFile, times: FloatArray, needed: FloatArray, use: str) -> None:
     """Raise ScenarioError for the first of the ``needed`` times that is not among the ``times`` of
-    the table; ``what`` names the use of the state in the message.
+    the table, in seconds; ``use`` says in the message what the state is for.
     """
     for time in needed.tolist():
         if nearest_row(times, time) is None:
-            rule = f"{source.name} has no state for {what}, t = {time:.9g}"
+            rule = f"{source.name} has no state for {use}, t = {time:.9g}"
             raise ScenarioError("path", rule, None, "add the row, or ask for no state then")
