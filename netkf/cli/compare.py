@@ -23,13 +23,13 @@ def _declare(parser: argparse.ArgumentParser) -> None:
 def _run(options: argparse.Namespace) -> int:
     """Print the comparison of run directories; return the exit status."""
     from netkf.studies.compare import compare
-    from netkf.studies.tables import comparison_text
+    from netkf.studies.tables import format_comparison
 
     comparison = compare(options.directories, options.confidence)
     if options.json:
         print_json(comparison.document())
     else:
-        print(comparison_text(comparison))
+        print(format_comparison(comparison))
     return 0
 
 

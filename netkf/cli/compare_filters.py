@@ -62,7 +62,7 @@ def _compare(options: argparse.Namespace) -> int:
     """
     from netkf.scenario.values import parse_values
     from netkf.studies.compare_filters import compare_filters, write_comparison
-    from netkf.studies.tables import filters_text
+    from netkf.studies.tables import format_filters
 
     filters = parse_values("--filters", "filters", options.filters)
     scenario = load_scenario(options)
@@ -87,7 +87,7 @@ def _compare(options: argparse.Namespace) -> int:
             print_json(comparison.document())
         else:
             print_title(scenario)
-            print(f"\n{filters_text(comparison)}")
+            print(f"\n{format_filters(comparison)}")
     if options.out is not None and not options.json:
         print(f"written to {options.out}")
     return 0

@@ -38,7 +38,7 @@ def _run(options: argparse.Namespace) -> int:
     of a node are inconsistent with its P.
     """
     from netkf.studies.consistency import consistency
-    from netkf.studies.tables import consistency_text
+    from netkf.studies.tables import format_consistency
 
     result = consistency(
         load_scenario(options),
@@ -51,7 +51,7 @@ def _run(options: argparse.Namespace) -> int:
     if options.json:
         print_json({**vars(result), "rows": [vars(row) for row in result.rows]})
     else:
-        print(f"{result.scenario}\n\n{consistency_text(result)}")
+        print(f"{result.scenario}\n\n{format_consistency(result)}")
     if not result:
         nodes = ", ".join(str(row.node) for row in result.rows if row.verdict.startswith("BROKEN"))
         print(f"netkf: errors are inconsistent with P at node {nodes}", file=sys.stderr)

@@ -60,7 +60,7 @@ def _run(options: argparse.Namespace) -> int:
     """
     from netkf.studies.parameter_grid import parse_interval
     from netkf.studies.size import size
-    from netkf.studies.tables import answer, sizing_text
+    from netkf.studies.tables import format_answer, format_sizing
 
     if len(options.vary) > 1:
         remedy = "size searches one key; sweep varies several"
@@ -84,11 +84,13 @@ def _run(options: argparse.Namespace) -> int:
     if options.json:
         probes = [probe._asdict() for probe in sorted(sizing.probes)]
         target = sizing.target._asdict()
-        print_json({**vars(sizing), "target": target, "probes": probes, "answer": answer(sizing)})
+        print_json(
+            {**vars(sizing), "target": target, "probes": probes, "answer": format_answer(sizing)}
+        )
     else:
-        print(sizing_text(sizing))
+        print(format_sizing(sizing))
     if not sizing:
-        print(f"netkf: {answer(sizing)}", file=sys.stderr)
+        print(f"netkf: {format_answer(sizing)}", file=sys.stderr)
     return 0 if sizing else FAILED
 
 

@@ -82,7 +82,7 @@ def _print_sweep(
     scenario: Scenario, completed: CompletedSweep, options: argparse.Namespace
 ) -> None:
     """Print the table of a finished sweep and its duration, or JSON with ``--json``."""
-    from netkf.studies.tables import sweep_text
+    from netkf.studies.tables import format_sweep
 
     if options.json:
         rows = completed.table.to_dict("records")
@@ -90,7 +90,7 @@ def _print_sweep(
         return
     runs = options.runs
     print_title(scenario)
-    print(f"\n{sweep_text(completed.table, completed.keys)}\n")
+    print(f"\n{format_sweep(completed.table, completed.keys)}\n")
     points = len(completed.table)
     line = f"{points:,} point{'s' if points > 1 else ''} of {runs:,} run{'s' if runs > 1 else ''}"
     line += f" in {completed.seconds:.2f} s, all with the same random draws"

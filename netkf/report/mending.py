@@ -21,7 +21,7 @@ from netkf.runs.simulate import simulate
 from netkf.runs.tables import format_number
 from netkf.studies.explanation import Explanation
 from netkf.studies.why import why
-from netkf.studies.why_text import relative_change, sentences
+from netkf.studies.why_text import relative_change, write_sentences
 
 SAME_NUMBERS = 1e-4
 """Relative difference below which numbers of four digits look the same."""
@@ -183,4 +183,4 @@ def mending_section(source: ReportSource, explanation: Explanation | str) -> str
     replays = table_box(caption, ("replayed with", "messages", "trace P", "change", "error"), rows)
     command = _why_command(source, source.worst.explained)
     note = f"All numbers are from replays of the run, none is estimated. For more: {command}"
-    return bullets(sentences(explanation)) + replays + paragraph(note, "note")
+    return bullets(write_sentences(explanation)) + replays + paragraph(note, "note")

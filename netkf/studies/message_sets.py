@@ -70,26 +70,27 @@ class SmallestSet:
         return self.complete >= size - 1
 
 
-def smallest_set(
+def find_smallest_set(
     replayer: Replayer,
     candidates: Sequence[Candidate],
     limit: float,
     most: int,
     replays: int,
 ) -> SmallestSet:
-    """Return the smallest set of at most ``most`` candidates whose arrival brings the trace of P to
-    ``limit`` or below, with at most ``replays`` replays.
+    """Return the smallest set of candidates whose arrival brings the trace of P to ``limit``.
+
+    Sets of at most ``most`` messages are tried, with at most ``replays`` replays of the run.
     """
     search = _Search(replayer, limit)
     first, base = replayer.count, search.trace(())
     if base <= limit:
         return SmallestSet((), base, limit, most, most, len(candidates), 0, math.nan, 0)
-    recent = search.recent(sorted(candidates, key=lambda c: (c.sent, c.key)))
+    recent = search.drop_oldest(sorted(candidates, key=lambda c: (c.sent, c.key)))
     complete, messages = 0, None
     for size in range(1, most + 1):
         # Half of the replays for single messages, a quarter for pairs, and so on.
         replay_budget = replays if size == most else replays - (replays >> size)
-        messages, all_tried = search.of_size(recent, size, first + replay_budget)
+        messages, all_tried = search.find_set(recent, size, first + replay_budget)
         if messages is not None:
             break
         complete = size if all_tried and complete == size - 1 else complete
@@ -125,16 +126,16 @@ class _Search:
         largest = max(self._gains, key=self._gains.__getitem__, default=())
         return largest if self._gains.get(largest, 0.0) > 0.0 else ()
 
-    def recent(self, candidates: Sequence[Candidate]) -> list[Candidate]:
-        """Return the candidates, in the order of sending, without the oldest ones.
+    def drop_oldest(self, candidates: Sequence[Candidate]) -> list[Candidate]:
+        """Return ``candidates``, which are in the order of sending, without the oldest ones.
 
-        Those left out, found by bisection, change the trace together by less than NEGLIGIBLE times
-        the decrease that the limit asks for.
+        All that are left out change the trace together by at most NEGLIGIBLE times the decrease
+        that the limit asks for. Their number is found by bisection.
         """
         base = self.trace(())
         tolerance = NEGLIGIBLE * (base - self._limit)
 
-        def negligible(count: int) -> bool:
+        def are_negligible(count: int) -> bool:
             """Return True if the first ``count`` candidates change the trace negligibly."""
             keys = [candidate.key for candidate in candidates[:count]]
             return abs(self.trace(keys) - base) <= tolerance
@@ -142,40 +143,43 @@ class _Search:
         low, high = 0, len(candidates)
         while low < high:
             middle = (low + high + 1) // 2
-            if negligible(middle):
+            if are_negligible(middle):
                 low = middle
             else:
                 high = middle - 1
         return list(candidates[low:])
 
-    def of_size(
-        self, candidates: Sequence[Candidate], size: int, most_replays: int
+    def find_set(
+        self, candidates: Sequence[Candidate], size: int, max_count: int
     ) -> tuple[tuple[MessageKey, ...] | None, bool]:
-        """Return a set of ``size`` messages with which the trace is at most the limit, and whether
-        all sets of this size were considered.
+        """Return a set of ``size`` messages with which the trace is at most the limit, else None;
+        and True if all sets of this size were considered.
 
         Of single messages it is the one with the smallest trace, of larger sets the first that is
-        tried; None if there is none. The search ends when the replayer's count of replays is
-        ``most_replays``.
+        tried. The search ends when the replayer's number of replays reaches ``max_count``.
         """
-        best_set: tuple[float, tuple[MessageKey, ...]] | None = None
-        sets, all_listed = self._in_order(candidates, size)
+        best_set: tuple[MessageKey, ...] | None = None
+        best_trace = math.inf
+        sets, all_listed = self._list_sets(candidates, size)
         for keys in sets:
-            if self._replayer.count >= most_replays:
-                return (None if best_set is None else best_set[1]), False
+            if self._replayer.count >= max_count:
+                return best_set, False
             trace = self.trace(keys)
             self._gains[keys] = self.trace(()) - trace
-            if trace <= self._limit and (best_set is None or trace < best_set[0]):
-                best_set = trace, keys
+            if trace <= self._limit and trace < best_trace:
+                best_set, best_trace = keys, trace
                 if size > 1:
                     break
-        return (None if best_set is None else best_set[1]), all_listed
+        return best_set, all_listed
 
-    def _in_order(
+    def _list_sets(
         self, candidates: Sequence[Candidate], size: int
     ) -> tuple[Iterator[tuple[MessageKey, ...]], bool]:
-        """Return the sets of a size in decreasing order of expected gain, then of latest messages;
-        and False if there are too many, so that the least promising messages are left out.
+        """Return the sets of ``size`` messages in decreasing order of expected gain, and True if
+        these are all sets.
+
+        If there are more than MAX_SETS, the least promising messages are left out. Of sets with
+        equal gain those of later messages come first.
         """
         single_gains = {c.key: self._gains.get((c.key,), 0.0) for c in candidates}
         ranked = sorted(candidates, key=lambda c: (-single_gains[c.key], -c.sent))
@@ -187,40 +191,41 @@ class _Search:
         needed = np.array([c.needed for c in ranked[:count]], dtype=np.intp)
         chosen = chosen[_are_joined(needed[chosen])]
         keys = sorted(c.key for c in ranked[:count])
-        place = {key: k for k, key in enumerate(keys)}
-        places = np.array([place[c.key] for c in ranked[:count]], dtype=np.intp)
-        members = np.sort(places[chosen], axis=1)
-        order = np.argsort(-self._expected(members, place, single_gains), kind="stable")
+        index_of_key = {key: k for k, key in enumerate(keys)}
+        indices = np.array([index_of_key[c.key] for c in ranked[:count]], dtype=np.intp)
+        members = np.sort(indices[chosen], axis=1)
+        gains = self._expected_gains(members, index_of_key, single_gains)
+        order = np.argsort(-gains, kind="stable")
         sets = (tuple(keys[k] for k in members[row].tolist()) for row in order.tolist())
         return sets, count == len(ranked)
 
-    def _expected(
+    def _expected_gains(
         self,
         members: np.ndarray,
-        place: Mapping[MessageKey, int],
+        index_of_key: Mapping[MessageKey, int],
         single_gains: Mapping[MessageKey, float],
     ) -> FloatArray:
-        """Return the expected gain (S,) of each set: the sum of the gains of its single messages,
-        and of the interactions of its pairs as far as they are known.
+        """Return the expected gain (S,) of each set.
 
-        ``members`` (S, size) are indices of messages, as in ``place``.
+        It is the sum of the gains of its single messages and, for each pair that was replayed, of
+        the gain of the pair beyond those of its two messages. ``members`` (S, size) are the indices
+        of the sets' messages in ``index_of_key``.
         """
-        size = members.shape[1]
-        single = np.array([single_gains[key] for key in place])
-        gain = np.zeros(len(members))
+        size, messages = members.shape[1], len(index_of_key)
+        single = np.array([single_gains[key] for key in index_of_key])
+        gains = np.zeros(len(members))
         for column in members.T:
-            gain += single[column]
+            gains += single[column]
         if size > 2:
-            pair_gains = np.zeros((len(place), len(place)))
-            for pair, gain_of_pair in self._gains.items():
-                if len(pair) == 2 and set(pair) <= place.keys():
+            interactions = np.zeros((messages, messages))
+            for pair, pair_gain in self._gains.items():
+                if len(pair) == 2 and set(pair) <= index_of_key.keys():
                     a, b = pair
-                    pair_gains[place[a], place[b]] = (
-                        gain_of_pair - single_gains[a] - single_gains[b]
-                    )
+                    interaction = pair_gain - single_gains[a] - single_gains[b]
+                    interactions[index_of_key[a], index_of_key[b]] = interaction
             for i, j in itertools.combinations(range(size), 2):
-                gain += pair_gains[members[:, i], members[:, j]]
-        return gain
+                gains += interactions[members[:, i], members[:, j]]
+        return gains
 
 
 def _are_joined(needed: np.ndarray) -> np.ndarray:

@@ -22,13 +22,13 @@ MAX_ROWS = 40  # rows that fit onto a screen
 MAX_LENGTH = 30  # characters of a cell
 
 
-def sweep_text(lines: pd.DataFrame, keys: Sequence[str]) -> str:
+def format_sweep(lines: pd.DataFrame, keys: Sequence[str]) -> str:
     """Return the table of a sweep, one row per point; of long tables the ends."""
     header = [*keys, *(name.replace("_", " ") for name in COLUMNS), "messages", "status"]
     rows = [
         [
             *(_format_short(row[key]) for key in keys),
-            *(_with_error(row[name], row.get(f"{name}_se")) for name in COLUMNS),
+            *(_format_with_error(row[name], row.get(f"{name}_se")) for name in COLUMNS),
             f"{row['sent']:,.6g}",
             row["status"],
         ]
@@ -43,12 +43,12 @@ def _format_short(value: Any) -> str:
     return text if len(text) <= MAX_LENGTH else f"{text[: MAX_LENGTH - 3]}..."
 
 
-def _with_error(value: float | None, error: float | None) -> str:
+def _format_with_error(value: float | None, error: float | None) -> str:
     """Return a value with its standard error as text."""
     return format_number(value) + format_standard_error(error)
 
 
-def sizing_text(sizing: Sizing) -> str:
+def format_sizing(sizing: Sizing) -> str:
     """Return the values that were tried, the answer, and how sure it is."""
     header = [sizing.key, sizing.target.quantity, "at least", "at most", "runs", "target", "by"]
     rows = [
@@ -68,7 +68,7 @@ def sizing_text(sizing: Sizing) -> str:
         rows = [[f"{p.value:g}", f"{p.quantity:.7g}", p.target] for p in sorted(sizing.probes)]
     lines = [format_table(header, rows), ""]
     lines += [
-        answer(sizing),
+        format_answer(sizing),
         f"{sizing.target.quantity}: {sizing.quantity}",
         f"sure: {sizing.sure}",
     ]
@@ -76,7 +76,7 @@ def sizing_text(sizing: Sizing) -> str:
     return "\n".join(lines)
 
 
-def answer(sizing: Sizing) -> str:
+def format_answer(sizing: Sizing) -> str:
     """Return the answer of a search as one sentence."""
     values = [probe.value for probe in sizing.probes]
     span = f"{min(values):g} .. {max(values):g}"
@@ -101,7 +101,7 @@ def answer(sizing: Sizing) -> str:
     )
 
 
-def consistency_text(consistency: Consistency) -> str:
+def format_consistency(consistency: Consistency) -> str:
     """Return one row per node, and a legend of the columns."""
     header = ["node", "NEES", "should be", "inside", "NIS", "should be", "verdict"]
     rows = [
@@ -132,7 +132,7 @@ def consistency_text(consistency: Consistency) -> str:
     )
 
 
-def filters_text(comparison: FilterComparison) -> str:
+def format_filters(comparison: FilterComparison) -> str:
     """Return one row per filter, reasons of those that cannot run, and a legend of the columns."""
     header = ["filter", "RMS error", "difference", "worst instant", "difference", "NEES / n"]
     header += ["difference", "consistency", "transmissions", "kB"]
@@ -140,7 +140,7 @@ def filters_text(comparison: FilterComparison) -> str:
     rows = [
         [
             shorten(row.filter),
-            *(cell for name in QUANTITIES for cell in _quantity_cells(row.quantities[name])),
+            *(cell for name in QUANTITIES for cell in _format_quantity(row.quantities[name])),
             row.consistency,
             f"{row.transmissions:,}",
             f"{row.bytes / 1000.0:,.6g}",
@@ -164,7 +164,7 @@ def filters_text(comparison: FilterComparison) -> str:
     return "\n".join(lines)
 
 
-def _quantity_cells(cells: Quantity) -> tuple[str, str]:
+def _format_quantity(cells: Quantity) -> tuple[str, str]:
     """Return the value with its standard error, and the difference with half its interval."""
     difference = "-"
     if math.isfinite(cells.difference):
@@ -172,10 +172,10 @@ def _quantity_cells(cells: Quantity) -> tuple[str, str]:
         difference = f"{cells.difference:+.4g}"
         difference += f" +- {width:.2g}" if math.isfinite(width) else ""
         difference += "*" if cells.real else ""
-    return _with_error(cells.value, cells.se), difference
+    return _format_with_error(cells.value, cells.se), difference
 
 
-def comparison_text(comparison: Comparison) -> str:
+def format_comparison(comparison: Comparison) -> str:
     """Return directories side by side; a star marks significant differences from the first."""
     numbered = [f"({k + 1})" for k in range(len(comparison.directories))]
     lines = [
@@ -219,4 +219,4 @@ def comparison_text(comparison: Comparison) -> str:
 
 def _format_marked(entry: Entry) -> str:
     """Return a value as text, with a star if its difference is certain."""
-    return _with_error(entry.value, entry.se) + (" *" if entry.real else "  ")
+    return _format_with_error(entry.value, entry.se) + (" *" if entry.real else "  ")

@@ -35,10 +35,10 @@ from netkf.studies.information import (
     rows_until,
     search_back,
 )
-from netkf.studies.message_sets import Candidate, SmallestSet, smallest_set
+from netkf.studies.message_sets import Candidate, SmallestSet, find_smallest_set
 from netkf.studies.opening import open as open_directory
 from netkf.studies.replay import Replayer
-from netkf.studies.why_text import source_table, why_document, why_text
+from netkf.studies.why_text import format_why, source_table, why_document
 from netkf.trace.run import Run
 
 if TYPE_CHECKING:
@@ -59,7 +59,7 @@ class Why(Explanation):
         return source_table(self)
 
     def __str__(self) -> str:
-        return why_text(self)
+        return format_why(self)
 
     def __repr__(self) -> str:
         return (
@@ -102,7 +102,7 @@ def why(
     most = integer(low=1, high=MAX_MISSING)("most", most)
     limit = None if below is None else number(above=0.0)("below", below)
     replayer = Replayer(run_scenario, run.seed, run.replica, node, at)
-    _same_events(rows_until(run_scenario, run.log, at), replayer.log)
+    _require_same_events(rows_until(run_scenario, run.log, at), replayer.log)
     outcome = replayer.outcome(error=True)
     if not np.isfinite(outcome.xhat).all() or np.isinf(outcome.P).any():
         raise ScenarioError(
@@ -115,7 +115,7 @@ def why(
         target = (1.0 + GOOD_ENOUGH) * replayer.outcome(None).trace if limit is None else limit
         wanted = _default_replays(len(replayer.log)) if replays is None else replays
         count = integer(low=1)("replays", wanted)
-        smallest = smallest_set(replayer, evidence.candidates(), target, most, count)
+        smallest = find_smallest_set(replayer, evidence.candidates(), target, most, count)
     return Why(
         scenario=run_scenario.name,
         node=node,
@@ -123,7 +123,7 @@ def why(
         seed=run.seed,
         replica=run.replica,
         sources=sources,
-        what_ifs=_what_ifs(replayer, sources, smallest),
+        what_ifs=_make_what_ifs(replayer, sources, smallest),
         smallest=smallest,
         missing=evidence.missing,
         notes=_replay_notes(evidence),
@@ -185,7 +185,7 @@ def _check_instant(run: Run, scenario: Scenario, node: int, at: float) -> float:
     return plant.slot_time(int(plant.slots_of(np.array([time]))[0]))
 
 
-def _same_events(logged: IntArray, replayed: IntArray) -> None:
+def _require_same_events(logged: IntArray, replayed: IntArray) -> None:
     """Raise ScenarioError if a replay does not have the events of the run."""
     same = len(logged) == len(replayed) and all(
         np.array_equal(logged[name], replayed[name], equal_nan=logged[name].dtype.kind == "f")
@@ -265,7 +265,7 @@ class _Evidence:
         ``without_losses`` that with all of them.
         """
         reading, *with_more = [math.nan if n is None else n.reading for n in newest_by_budget]
-        last, unheard = self._last_direct(node)
+        last, unheard = self._find_last_message(node)
         path_nodes: tuple[int, ...] = ()
         if newest_by_budget[0] is not None:
             path_nodes = route(self._reach, newest_by_budget[0].segment, 0)
@@ -283,7 +283,7 @@ class _Evidence:
             heard=math.nan if last is None else float(self.messages.sent[last]),
             arrived=math.nan if last is None else float(self.messages.arrived[last]),
             unheard=unheard,
-            known=self._replayer.at if node == self._node else _known_time(newest_by_budget[0]),
+            known=self._replayer.at if node == self._node else _time_known(newest_by_budget[0]),
             reading=reading,
             route=path_nodes,
             with_more=tuple(with_more),
@@ -291,7 +291,7 @@ class _Evidence:
             missing=missing,
         )
 
-    def _last_direct(self, sender: int) -> tuple[int | None, int]:
+    def _find_last_message(self, sender: int) -> tuple[int | None, int]:
         """Return the last used message from ``sender``, and the number of unused ones since."""
         messages = self.messages
         direct = (messages.sender == sender) & (messages.receiver == self._node)
@@ -303,7 +303,7 @@ class _Evidence:
         return last, int((messages.sent[unused] > messages.sent[last]).sum())
 
 
-def _known_time(newest: Newest | None) -> float:
+def _time_known(newest: Newest | None) -> float:
     """Return the time at which a reading became known, nan without one."""
     return math.nan if newest is None else newest.known
 
@@ -323,7 +323,7 @@ def _describe_missing(messages: Messages, m: int) -> Missing:
     )
 
 
-def _what_ifs(
+def _make_what_ifs(
     replayer: Replayer, sources: Sequence[InformationSource], smallest: SmallestSet | None
 ) -> tuple[WhatIf, ...]:
     """Return the run as it was, and the replays that the answer names."""

@@ -59,7 +59,7 @@ def why_document(explanation: Explanation) -> dict[str, Any]:
         "replica": explanation.replica,
         "trace": explanation.trace,
         "error": explanation.error,
-        "sentences": sentences(explanation),
+        "sentences": write_sentences(explanation),
         "sources": [
             {**vars(s), "missing": [_message_entry(explanation, m.key) for m in s.missing]}
             for s in explanation.sources
@@ -108,10 +108,10 @@ def _message_entry(explanation: Explanation, key: MessageKey) -> dict[str, Any]:
     }
 
 
-def why_text(explanation: Explanation) -> str:
+def format_why(explanation: Explanation) -> str:
     """Return the answer for a terminal: sentences, the table of sources, the table of replays."""
     lines = [
-        *sentences(explanation),
+        *write_sentences(explanation),
         "",
         _source_table(explanation),
         "",
@@ -121,7 +121,7 @@ def why_text(explanation: Explanation) -> str:
     return "\n".join(lines)
 
 
-def sentences(explanation: Explanation) -> list[str]:
+def write_sentences(explanation: Explanation) -> list[str]:
     """Return the answer in sentences, one line each."""
     return [
         *_state_sentences(explanation),

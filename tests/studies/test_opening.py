@@ -16,7 +16,7 @@ from netkf.runs.run import run_to_directory
 from netkf.scenario.writing import resolve_defaults, to_toml
 from netkf.studies.compare_filters import compare_filters, write_comparison
 from netkf.studies.sweep import plan_sweep, sweep_to_directory
-from netkf.studies.tables import filters_text
+from netkf.studies.tables import format_filters
 from tests.conftest import SCENARIOS
 
 SHORT = {"horizon": 3.0, "probe": 0.5}
@@ -132,7 +132,7 @@ def test_a_comparison_of_filters_comes_back_as_it_was(compared):
     pd.testing.assert_frame_equal(found.table, comparison.table)
     assert (found.runs, found.seed, found.confidence) == (4, comparison.seed, 0.95)
     assert repr(found) == repr(comparison)
-    assert filters_text(found) == filters_text(comparison)
+    assert format_filters(found) == format_filters(comparison)
     assert found.base.name == "push-sum-planar"
     assert "hcmci steps=2" in found._repr_html_()
 

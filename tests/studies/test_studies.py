@@ -30,7 +30,7 @@ from netkf.studies.metrics import (
 from netkf.studies.parameter_grid import parse_grid, parse_interval
 from netkf.studies.size import size
 from netkf.studies.sweep import plan_sweep, sweep, sweep_to_directory
-from netkf.studies.tables import answer
+from netkf.studies.tables import format_answer
 from netkf.studies.targets import Target, parse_target, quantity_by_simulation
 from tests.conftest import SCENARIOS
 
@@ -285,7 +285,7 @@ def test_a_bound_is_called_a_bound(short):
     assert {p.by for p in found.probes} == {"bound"}
     assert {p.target for p in found.probes} == {"reached", "not shown"}
     assert all(p.low == 0.0 for p in found.probes)
-    text = answer(found)
+    text = format_answer(found)
     assert "for which the bound shows mean_trace <= 3" in text
     assert "misses" not in text
     assert "proves nothing" in found.sure

@@ -21,7 +21,7 @@ from netkf.studies.information import (
     rows_until,
     search_back,
 )
-from netkf.studies.message_sets import Candidate, smallest_set
+from netkf.studies.message_sets import Candidate, find_smallest_set
 from netkf.studies.replay import MessageKey, Replayer
 from netkf.studies.why import why
 
@@ -331,14 +331,14 @@ def test_the_smallest_set_is_that_of_all_sets(tmp_path):
     assert best[0] > best[1] > best[2] > best[3]
     candidates = [Candidate(key, times[key], 1) for key in keys]
     for size, limit in [(1, best[1]), (2, 0.5 * (best[1] + best[2])), (3, best[3] + 1e-12)]:
-        found = smallest_set(replayer, candidates, limit, 3, 10**6)
+        found = find_smallest_set(replayer, candidates, limit, 3, 10**6)
         assert len(found.messages) == size
         assert found.trace == values[tuple(sorted(found.messages, key=keys.index))] <= limit
         assert found.proven
-    none = smallest_set(replayer, candidates, best[3] - 1e-9, 3, 10**6)
+    none = find_smallest_set(replayer, candidates, best[3] - 1e-9, 3, 10**6)
     assert none.messages is None
     assert none.proven
-    few = smallest_set(replayer, candidates, best[3] - 1e-9, 3, 0)
+    few = find_smallest_set(replayer, candidates, best[3] - 1e-9, 3, 0)
     assert few.messages is None
     assert not few.proven
 
