@@ -67,7 +67,7 @@ class ClockTrial(Trial):
     def by_reading(
         cls, watched: WatchedPart, system: System, shift: FloatArray | None, clock: str | None
     ) -> Iterator[ClockTrial]:
-        """Yield a trial with samples and one with increments, if the filter supports both."""
+        """Yield a trial with samples and one with increments, each if the filter supports it."""
         part = watched.part
         if not isinstance(part, FlowAdapter):
             yield cls(watched, system, shift, clock, increments=False)
@@ -113,13 +113,13 @@ class ClockTrial(Trial):
             demand(seconds > 0.0, where, "must be above 0 seconds", seconds)
 
     def _compare_predictions(
-        self, name: str, one: FloatArray, other: FloatArray, first: float, second: float
+        self, name: str, one_step: FloatArray, two_steps: FloatArray, first: float, second: float
     ) -> None:
-        """Check that arrays ``name`` of predictions over gaps ``first + second`` (seconds), in one
-        step and in two, are equal up to rounding.
+        """Check that the predictions of xhat or P, called ``name``, in one step of ``first +
+        second`` seconds and in two steps, are equal up to rounding.
         """
-        difference = float(np.abs(one - other).max())
-        size = max(float(np.abs(one).max()), float(np.abs(other).max()), 1e-300)
+        difference = float(np.abs(one_step - two_steps).max())
+        size = max(float(np.abs(one_step).max()), float(np.abs(two_steps).max()), 1e-300)
         method = self.watched.defined_name("predict")
         demand(
             difference <= COMPOSITION_TOLERANCE * size,

@@ -94,14 +94,14 @@ def _all_entities(part: Any) -> tuple[Entity, ...]:
     return entities or ((0, 1),)
 
 
-def _check_entity(watched: WatchedPart, link: Entity) -> None:
+def _check_entity(watched: WatchedPart, entity: Entity) -> None:
     """Check that the ticks of one entity increase, are the same from equal generators, and do not
     depend on how many are asked for at once.
     """
-    _check_origin(watched, link)
-    in_one_block = _read_ticks(watched, link, BLOCKS[0])
+    _check_origin(watched, entity)
+    in_one_block = _read_ticks(watched, entity, BLOCKS[0])
     _check_increasing(watched, in_one_block)
-    repeated = _read_ticks(watched, link, BLOCKS[0])
+    repeated = _read_ticks(watched, entity, BLOCKS[0])
     demand(
         np.array_equal(in_one_block, repeated),
         f"{watched.name}.ticks",
@@ -109,7 +109,7 @@ def _check_entity(watched: WatchedPart, link: Entity) -> None:
         "other times from an equal generator",
     )
     for blocks in BLOCKS[1:]:
-        in_blocks = _read_ticks(watched, link, blocks)
+        in_blocks = _read_ticks(watched, entity, blocks)
         if not np.array_equal(in_one_block, in_blocks):
             k = _first_difference(in_one_block, in_blocks)
             texts = [f"{t[k]:.17g}" if k < len(t) else "nothing" for t in (in_one_block, in_blocks)]
@@ -159,12 +159,12 @@ def _iterate_ticks(part: Any, entity: Entity, stream: int) -> Iterator[float]:
         position = position._replace(number=position.number + 1, now=tick)
 
 
-def _check_origin(watched: WatchedPart, link: Entity) -> None:
+def _check_origin(watched: WatchedPart, entity: Entity) -> None:
     """Check that the origin (the phase of the clock) is a finite number, and the same from equal
     generators.
     """
     first, second = (
-        watched.call("origin", link, lambda: RecordingGenerator(8), repeatable=False)
+        watched.call("origin", entity, lambda: RecordingGenerator(8), repeatable=False)
         for _ in range(2)
     )
     where = f"{watched.name}.origin"
@@ -173,19 +173,19 @@ def _check_origin(watched: WatchedPart, link: Entity) -> None:
     demand(first == second, where, "must use no generator but the one it is given", [first, second])
 
 
-def _read_ticks(watched: WatchedPart, link: Entity, blocks: tuple[int, ...]) -> FloatArray:
+def _read_ticks(watched: WatchedPart, entity: Entity, blocks: tuple[int, ...]) -> FloatArray:
     """Return the ticks (K,) of an entity in seconds, asked for in ``blocks`` of these sizes.
 
     Each block must be a float64 vector of at most its size, and empty after the clock stopped.
     """
     random = RecordingGenerator(9)
-    origin = watched.part.origin(link, lambda: RecordingGenerator(10))
+    origin = watched.part.origin(entity, lambda: RecordingGenerator(10))
     where, now, has_stopped = f"{watched.name}.ticks", 0.0, False
     times: list[FloatArray] = []
     for count in blocks:
         index = sum(len(block) for block in times)
         block = np.asarray(
-            watched.call("ticks", link, origin, index, now, random, count, repeatable=False)
+            watched.call("ticks", entity, origin, index, now, random, count, repeatable=False)
         )
         is_vector = block.ndim == 1 and block.dtype == np.float64
         demand(is_vector, where, "must be a vector of float64", f"{block.dtype} {block.shape}")
