@@ -263,8 +263,8 @@ def _nees_claim(rows: list[dict[str, Any]], key: str, scale: float) -> str:
 def _draw_ratios(
     axes: Any, data: FigureData, rows: list[dict[str, Any]], key: str, scale: float
 ) -> None:
-    """Draw ``scale`` times the column ``key`` of each row, as a line from 1, with a bar of 1.96
-    standard errors.
+    """Draw the ratio of each node, ``scale`` times the entry ``key`` of its row: a dot, a bar of
+    1.96 standard errors on each side, and a line to the reference value 1.
     """
     positions = np.arange(len(rows))
     values = scale * np.array([row[key] for row in rows])

@@ -137,8 +137,8 @@ def break_lines(text: str, width: float, size: float, weight: str = "normal") ->
 
 
 def _split_word(line: str, width: float, size: float, weight: str) -> list[str]:
-    """Return pieces of at most ``width`` points of a line: only a line of a single long word has
-    more than one.
+    """Return a line in pieces of at most ``width`` points: several if it is one long word, which
+    ``break_lines`` cannot break between words.
     """
     pieces = []
     while len(line) > 1 and text_width(line, size, weight) > width:

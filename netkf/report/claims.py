@@ -257,7 +257,8 @@ def _describe_last_messages(received: np.ndarray, worst: WorstSample, cutoff: fl
     ``received`` are the MESSAGE rows to the node of that sample, lost ones included; only arrivals
     until ``cutoff`` (seconds) count. Messages lost or late since the last arrival are counted.
     """
-    ages, missing = [], 0  # seconds since the last arrival was sent, inf without one; and sender
+    # For each sender the seconds since its last message that arrived was sent, inf without one.
+    ages, missing = [], 0
     for sender in np.unique(received["sender"]).tolist():
         link = received[(received["sender"] == sender) & (received["sent"] <= cutoff)]
         arrived = link[(link["outcome"] == DELIVERED) & (link["ended"] <= cutoff)]
