@@ -278,9 +278,9 @@ class DerivedScenario(ScenarioModel):
 
     @property
     def filters_know_the_truth(self) -> bool:
-        """True if the filters use the plant's own matrices and the sensors' own R.
+        """True if the believed matrices, of the plant and R of all sensors, are the true ones.
 
-        False if states or readings are recorded: their law is unknown.
+        False if states or readings are recorded: their true matrices are unknown.
         """
         plant = self.plant
         if not self.is_random:

@@ -162,6 +162,7 @@ def _check_clock(scenario: ScenarioModel, key: str, sensor: LinearSensor | Nonli
                 rule = f"{clock.path.name} names a node that the graph does not have"
                 remedy = "correct the row or the graph"
                 raise ScenarioError(f"{key}.sampling.path", rule, node, remedy)
+    # Sampling clocks are of the same classes as clocks of links; these fields are for links only.
     if getattr(clock, "rates", ()):
         raise ScenarioError(
             f"{key}.sampling.rates",

@@ -35,10 +35,10 @@ class Scenario(DerivedScenario):
 
     name     one line of text; it names the run directory
     horizon  simulated seconds; a run covers [0, horizon)
-    plant    how the state moves
-    sensors  who reads what; nodes named by no sensor only relay
+    plant    the dynamics of the state
+    sensors  the sensors and the nodes that have them; nodes without a sensor only relay
     network  the graph, the activation of its links, and the channel of its messages
-    filter   what every node computes
+    filter   the filter that every node runs
     probe    period of the state samples in seconds, or increasing times in [0, horizon]
     claim    what the scenario shows, one line
     seed     root seed of all random numbers

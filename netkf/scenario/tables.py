@@ -37,9 +37,13 @@ S = TypeVar("S", bound=DerivedScenario)
 
 
 def change_keys(scenario: S, changes: Mapping[str, Any]) -> S:
-    """Return the scenario with some keys changed; see Scenario.replace."""
+    """Return a scenario with the values at some key paths changed, see ``Scenario.replace``.
+
+    Files and modules are looked up in the folder of the scenario's file. A scenario that was built
+    in Python has none: then it is that of its first data file, or the current folder.
+    """
     folder = getattr(scenario, "_folder", None)
-    if folder is None:  # built in Python
+    if folder is None:
         folder = next((s.folder for s in source_files(scenario)), Path.cwd())
     try:
         origin = Origin(folder, getattr(scenario, "_trust", True))

@@ -160,7 +160,7 @@ def _heard_sentences(explanation: Explanation) -> Iterator[str]:
         others = f" and {len(heard) - MAX_LISTED} others before" if len(heard) > MAX_LISTED else ""
         yield f"It last heard {_join_with_and(parts)}{others} (times of sending)."
     if silent:
-        yield f"It had never heard node {_list_messages(silent)}."
+        yield f"It had never heard node {_list_items(silent)}."
     unheard = sum(s.unheard for s in neighbours)
     if unheard:
         counts = [f"{s.unheard} of node {s.node}" for s in neighbours if s.unheard]
@@ -168,7 +168,7 @@ def _heard_sentences(explanation: Explanation) -> Iterator[str]:
         verb = "was" if unheard == 1 else "were"
         yield (
             f"{unheard} {noun} sent to it since then {verb} lost, late or not used: "
-            f"{_list_messages(counts, 'other nodes')}."
+            f"{_list_items(counts, 'other nodes')}."
         )
 
 
@@ -190,7 +190,7 @@ def _reading_sentences(explanation: Explanation) -> Iterator[str]:
         prefix = "The oldest of its" if len(with_reading) > MAX_LISTED else "Its"
         yield f"{prefix} newest readings are {_join_with_and(parts)}."
     if never:
-        yield f"No reading of node {_list_messages(never)} can have reached it."
+        yield f"No reading of node {_list_items(never)} can have reached it."
     kept_away = [
         s for s in with_reading + [s for s in sensors if math.isnan(s.reading)] if s.missing
     ]
@@ -362,8 +362,11 @@ def _format_route(source: InformationSource) -> str:
     return " -> ".join(map(str, nodes))
 
 
-def _list_messages(items: Sequence[object], others: str = "others") -> str:
-    """Return the first items joined by commas and "and", with the number of ``others``."""
+def _list_items(items: Sequence[object], others: str = "others") -> str:
+    """Return the first MAX_LISTED items joined by commas and "and", and the number of the others.
+
+    ``others`` is what the text calls these.
+    """
     parts = [str(item) for item in items[:MAX_LISTED]]
     more = len(items) - len(parts)
     return _join_with_and([*parts, f"{more} {others}"] if more else parts)
