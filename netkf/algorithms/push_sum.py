@@ -162,6 +162,16 @@ class PushSumArrays(NamedTuple):
 
 
 @kernel
+def drop_mass_of_stopped(
+    arrays: PushSumArrays, plan: SlotPlan, links: SlotLinks, samples: SlotSamples, b: int, s: int
+) -> None:
+    """Drop the messages with mass of nodes that have stopped, which send none by the paper."""
+    if arrays.rule == PAPER and not arrays.asymptotic:
+        silence_stopped(plan, samples, b, s)
+        drop_silent(plan, links, b, s, MASS)
+
+
+@kernel
 def push_sum_slots(
     nodes: SlotNodes,
     readings: ReadingBlock,
@@ -174,11 +184,8 @@ def push_sum_slots(
     """Simulate push-sum filters over the slots of a plan, P Fig. 1."""
     for b in range(plan.up.shape[0]):
         for s in range(plan.up.shape[1]):
-            # Nodes that have stopped send no mass.
-            decides = arrays.rule == PAPER and not arrays.asymptotic
-            if decides and plan.exchanged[s] and plan.part != ARRIVING:
-                silence_stopped(plan, samples, b, s)
-                drop_silent(plan, links, b, s, MASS)
+            if plan.exchanged[s] and plan.part != ARRIVING:
+                drop_mass_of_stopped(arrays, plan, links, samples, b, s)
             if plan.part == SENDING:
                 continue
             # Step 3: with asymptotic gains the covariance is the limit, and only the mean is

@@ -79,6 +79,12 @@ class ValueBuilder(ir.IRBuilder):
         return super().extract_value(value, remaining_indices, name) if remaining_indices else value
 
 
+def _variables_in(source: Any) -> list[str]:
+    """Return the names of the variables that a statement, or the value that it assigns, uses."""
+    operands = source.list_vars() if isinstance(source, numba_ir.Inst) else [source]
+    return [variable.name for variable in operands if isinstance(variable, numba_ir.Var)]
+
+
 class ValueLower(Lower):
     """numba's lowering of one function, with the overridden methods that the module describes."""
 
@@ -136,10 +142,7 @@ class ValueLower(Lower):
         for offset, block in sorted(self.blocks.items()):
             for statement in block.body:
                 source = statement.value if isinstance(statement, numba_ir.Assign) else statement
-                operands = source.list_vars() if isinstance(source, numba_ir.Inst) else [source]
-                for name in [
-                    variable.name for variable in operands if isinstance(variable, numba_ir.Var)
-                ]:
+                for name in _variables_in(source):
                     if name not in block_of:
                         used_early.add(name)
                     elif block_of[name] != offset:
@@ -150,17 +153,26 @@ class ValueLower(Lower):
         names = {
             name for name, number in assignments.items() if number == 1 and name not in used_early
         }
-        crossing = [
-            name for name in names if block_of[name] != self.firstblk and name in using_blocks
-        ]
-        if crossing:  # used in other blocks than the one that assigns it
-            dominators = compute_cfg_from_blocks(self.blocks).dominators()
-            names -= {
-                name
-                for name in crossing
-                if any(block_of[name] not in dominators[user] for user in using_blocks[name])
-            }
-        return names
+        return names - self._missed_on_some_path(
+            names & using_blocks.keys(), block_of, using_blocks
+        )
+
+    def _missed_on_some_path(
+        self, names: set[str], block_of: dict[str, int], using_blocks: dict[str, set[int]]
+    ) -> set[str]:
+        """Return those of ``names`` that some block uses without being dominated by the block that
+        assigns them.
+        """
+        # The first block dominates all.
+        names = {name for name in names if block_of[name] != self.firstblk}
+        if not names:
+            return names
+        dominators = compute_cfg_from_blocks(self.blocks).dominators()
+        return {
+            name
+            for name in names
+            if any(block_of[name] not in dominators[user] for user in using_blocks[name])
+        }
 
     # Loops.
 
@@ -316,12 +328,7 @@ def remove_unread(function: Any) -> None:
     all_instructions = [
         instruction for block in function.blocks for instruction in block.instructions
     ]
-    readers = Counter(
-        [id(value) for instruction in all_instructions for value in instruction.operands]
-    )
-    for instruction in all_instructions:
-        if isinstance(instruction, instructions.PhiInstr):
-            readers.update(id(value) for value, _ in instruction.incomings)
+    readers = _count_readers(all_instructions)
     unread: set[int] = set()
     # Backwards, so that an instruction read only by removed ones is removed too.
     for instruction in reversed(all_instructions):
@@ -330,24 +337,36 @@ def remove_unread(function: Any) -> None:
             unread.add(id(instruction))
             for value in instruction.operands:
                 readers[id(value)] -= 1
+    unread |= _written_only(all_instructions, readers)
+    for block in function.blocks:
+        block.instructions[:] = [
+            instruction for instruction in block.instructions if id(instruction) not in unread
+        ]
+
+
+def _count_readers(all_instructions: list[Any]) -> Counter[int]:
+    """Return how many operands of instructions each value is, by its id."""
+    readers = Counter(
+        [id(value) for instruction in all_instructions for value in instruction.operands]
+    )
+    for instruction in all_instructions:
+        if isinstance(instruction, instructions.PhiInstr):
+            readers.update(id(value) for value, _ in instruction.incomings)
+    return readers
+
+
+def _written_only(all_instructions: list[Any], readers: Counter[int]) -> set[int]:
+    """Return the ids of stack variables that are only written, and of the stores to them."""
     stores = [
         instruction
         for instruction in all_instructions
         if type(instruction) is instructions.StoreInstr
     ]
-    writers = Counter([id(instruction.operands[1]) for instruction in stores])
-    variables = {
-        id(instruction)
-        for instruction in all_instructions
-        if type(instruction) is instructions.AllocaInstr
+    writers = Counter([id(store.operands[1]) for store in stores])
+    unread = {
+        id(variable)
+        for variable in all_instructions
+        if type(variable) is instructions.AllocaInstr
+        and readers.get(id(variable)) == writers.get(id(variable))
     }
-    unread |= {variable for variable in variables if readers.get(variable) == writers.get(variable)}
-    unread |= {
-        id(instruction)
-        for instruction in stores
-        if id(instruction.operands[1]) in unread & variables
-    }
-    for block in function.blocks:
-        block.instructions[:] = [
-            instruction for instruction in block.instructions if id(instruction) not in unread
-        ]
+    return unread | {id(store) for store in stores if id(store.operands[1]) in unread}

@@ -254,6 +254,20 @@ def first_difference(a: Run | pd.DataFrame, b: Run | pd.DataFrame) -> str | None
             raise TypeError(message)
     one, other = (t.events if isinstance(t, Run) else t for t in (a, b))
     names = [name for name in EVENT_COLUMNS if name not in ("run", "seq")]
+    row = _first_different_row(one, other, names)
+    if row == len(one) == len(other):
+        return None
+    descriptions = [
+        " ".join(f"{name}={t[name].iloc[row]}" for name in names) if row < len(t) else "no event"
+        for t in (one, other)
+    ]
+    return f"event {row}: {descriptions[0]} | {descriptions[1]}"
+
+
+def _first_different_row(one: pd.DataFrame, other: pd.DataFrame, names: list[str]) -> int:
+    """Return the number of the first row in which columns differ; the length of the shorter table
+    if none does.
+    """
     shorter = min(len(one), len(other))
     differs = np.zeros(shorter, dtype=bool)
     for name in names:
@@ -262,14 +276,4 @@ def first_difference(a: Run | pd.DataFrame, b: Run | pd.DataFrame) -> str | None
         if left.dtype.kind == "f":
             unequal &= ~(np.isnan(left) & np.isnan(right))
         differs |= unequal.astype(bool)
-    if differs.any():
-        row = int(np.argmax(differs))
-    elif len(one) != len(other):
-        row = shorter
-    else:
-        return None
-    descriptions = [
-        " ".join(f"{name}={t[name].iloc[row]}" for name in names) if row < len(t) else "no event"
-        for t in (one, other)
-    ]
-    return f"event {row}: {descriptions[0]} | {descriptions[1]}"
+    return int(np.argmax(differs)) if differs.any() else shorter

@@ -35,6 +35,7 @@ from netkf.engines.compiled.event_loop import (
     on_sense,
     record_event,
     record_event_with_age,
+    seek_piece,
 )
 from netkf.engines.compiled.message_queue import sort_indices
 from netkf.engines.compiled.schedule import delay_is_zero
@@ -255,8 +256,7 @@ def queue_events(state: Simulation, visits: Visits, until: float) -> int:
             return PAUSE
         if visits.count + max_visits > len(visits.records):
             return FULL
-        while state.path.stop[state.piece] < now:
-            state.piece += 1
+        seek_piece(state, now)
         if event == ON_TICK:
             queue_ticks(state, visits, first, min(until, end_of_ticks(state)))
         elif event == ON_SENSE:

@@ -89,6 +89,7 @@ def event_loop(
     """Simulate until the loop needs something from Python; return the request (WANT_...
     or DONE).
     """
+    absorbs_at_once = totals is None and history is None
     while True:
         # Check first that the event has everything it needs: if not, nothing has changed, and the
         # next call finds the same event again.
@@ -96,17 +97,14 @@ def event_loop(
         request = find_shortage(state, history, event, now)
         if request != GO_ON:
             return request
-        # The piece of the path that the event lies in; events come in the order of time.
-        while state.path.stop[state.piece] < now:
-            state.piece += 1
+        seek_piece(state, now)
         # Participants are predicted first.
-        lost = event == ON_TICK and totals is None and history is None and is_lost(state)
+        lost = event == ON_TICK and absorbs_at_once and is_lost(state)
         predict_participants(state, combination, event, lost, now)
         if event == ON_TICK:
             on_tick(state, totals, combination, now)
             # Absorptions come next, unless there are other events at this instant.
-            ends = totals is None and history is None and ends_instant(state, now)
-            if ends:
+            if absorbs_at_once and ends_instant(state, now):
                 absorb_messages(state, totals, history, combination, now)
         elif event == ON_ABSORB:
             on_absorb(state, totals, history, combination, now)
@@ -122,6 +120,13 @@ def event_loop(
         # The sample is stored, but there is no space for another one.
         elif not on_probe(state, totals):
             return WANT_SAMPLES
+
+
+@kernel
+def seek_piece(state: Simulation, now: float) -> None:
+    """Move on to the piece of the path in which the time of the next event lies."""
+    while state.path.stop[state.piece] < now:
+        state.piece += 1
 
 
 @kernel

@@ -354,9 +354,8 @@ def filters_at_start(scenario: Scenario) -> Filters:
     # Nodes that share a model share its table.
     distinct = list({id(model): model for model in models}.values())
     index = {id(model): k for k, model in enumerate(distinct)}
-    starts = [scenario.initial_estimate(node) for node in (ids[:1] if pooled else ids)]
-    covariances = {id(cov): cov for _, cov in starts}  # nodes share them
-    roots = {key: first_root(cov) for key, cov in covariances.items()}
+    filtering_nodes = ids[:1] if pooled else ids
+    starts = [scenario.initial_estimate(node) for node in filtering_nodes]
     counts = [len(scenario.increment_sensors.get(node, ())) for node in ids]
     # Increment sensors of all nodes in one list: each has those up to ``sensors``.
     after = np.array([sum(counts)] if pooled else np.cumsum(counts), dtype=np.int64)
@@ -366,11 +365,18 @@ def filters_at_start(scenario: Scenario) -> Filters:
     # ``sensor`` of the first node stays 0.
     nodes["sensors"], nodes["sensor"][1:] = after, after[:-1]
     nodes["inbox"] = nodes["reading"] = -1
-    nodes["own"] = [scenario.own_weights[node] for node in (ids[:1] if pooled else ids)]
+    nodes["own"] = [scenario.own_weights[node] for node in filtering_nodes]
     # One table for each distinct model.
     table, gains = _stack_model_tables(distinct)
     xhat = np.stack([mean for mean, _ in starts]).astype(np.float64)
-    return Filters(nodes, xhat, np.stack([roots[id(cov)] for _, cov in starts]), table, gains)
+    return Filters(nodes, xhat, _roots_of([cov for _, cov in starts]), table, gains)
+
+
+def _roots_of(covariances: list[FloatArray]) -> FloatArray:
+    """Return the stacked roots (N, n, n) of covariances, many of which are the same array."""
+    distinct = {id(cov): cov for cov in covariances}
+    roots = {key: first_root(cov) for key, cov in distinct.items()}
+    return np.stack([roots[id(cov)] for cov in covariances])
 
 
 def _stack_model_tables(models: list[FlowModel]) -> tuple[FlowTable, Gains]:

@@ -91,19 +91,10 @@ def clock_jumps(scenario: Scenario) -> ClockJumps | DelayedJumps | SlotJumps:
         raise TheoryError(
             "exact mean squares of bursts under Poisson clocks are known if messages take no time"
         )
-    N, n = len(scenario.nodes), scenario.plant.n
-    noise, sampled_nodes = flow.noise.copy(), []
-    for sensor in samples:
-        if sensor.clock is None or not sensor.clock.memoryless:
-            raise TheoryError(
-                f"node {scenario.nodes[sensor.node]} does not sample by a Poisson clock"
-            )
-        rate, rows = float(sensor.clock.mean_rate(sensor.entity)), _node_slice(sensor.node, n)
-        noise[rows, rows] += rate * sensor.noise
-        sampled_nodes.append((sensor.node, rate, sensor.correction))
-    drift = block_diagonal(list(flow.drift))
+    sampled_nodes, sampling_noise = _poisson_samples(scenario, samples)
+    noise, drift = flow.noise + sampling_noise, block_diagonal(list(flow.drift))
     ticks = poisson_ticks(scenario, list(weights)) if talks else ()
-    instant = ClockJumps(N, drift, noise, tuple(sampled_nodes), directions, ticks)
+    instant = ClockJumps(len(scenario.nodes), drift, noise, sampled_nodes, directions, ticks)
     if not delay or not ticks:
         return instant
     return DelayedJumps(
@@ -139,6 +130,25 @@ def _sampled_nodes(scenario: Scenario) -> list[SampledNode]:
             noise = L @ sensor.R @ L.T
             sampled_nodes.append(SampledNode(k, clock, entity, L @ sensor.H, noise))
     return sampled_nodes
+
+
+def _poisson_samples(
+    scenario: Scenario, samples: list[SampledNode]
+) -> tuple[tuple[tuple[int, float, FloatArray], ...], FloatArray]:
+    """Return (node, rate in 1/s, correction) of each sensor, and the noise per second (N n, N n)
+    that its samples bring. Raises TheoryError for clocks that are not Poisson processes.
+    """
+    N, n = len(scenario.nodes), scenario.plant.n
+    noise, sampled_nodes = np.zeros((N * n, N * n)), []
+    for sensor in samples:
+        if sensor.clock is None or not sensor.clock.memoryless:
+            raise TheoryError(
+                f"node {scenario.nodes[sensor.node]} does not sample by a Poisson clock"
+            )
+        rate, rows = float(sensor.clock.mean_rate(sensor.entity)), _node_slice(sensor.node, n)
+        noise[rows, rows] += rate * sensor.noise
+        sampled_nodes.append((sensor.node, rate, sensor.correction))
+    return tuple(sampled_nodes), noise
 
 
 def _from_tick_to_tick(

@@ -254,7 +254,8 @@ def _exact_probability(neighbours: list[dict[int, float]], order: list[int]) -> 
     appearance.
     """
     index = {node: k for k, node in enumerate(order)}
-    last = [max((index[k] for k in links), default=0) for links in neighbours]
+    # A node stays open until all of its neighbours have been opened.
+    last = [max(index[k] for k in (node, *links)) for node, links in enumerate(neighbours)]
     open_: list[int] = []
     states: dict[tuple[int, ...], float] = {(): 1.0}
     cuts = []
@@ -262,15 +263,13 @@ def _exact_probability(neighbours: list[dict[int, float]], order: list[int]) -> 
         open_.append(node)
         # A new node starts as a part of its own.
         states = {(*labels, len(labels)): p for labels, p in states.items()}
-        for neighbour in [x for x in open_ if x in neighbours[node]]:
-            states = _apply_link(states, open_.index(neighbour), neighbours[node][neighbour])
+        for x, neighbour in enumerate(open_):
+            if neighbour in neighbours[node]:
+                states = _apply_link(states, x, neighbours[node][neighbour])
             if len(states) > MAX_PARTITIONS:
                 return None
-        # A node stays open as long as some neighbour is still to come.
-        keep = [
-            x for x, neighbour in enumerate(open_) if max(last[neighbour], index[neighbour]) > k
-        ]
         if k + 1 < len(order):
+            keep = [x for x, member in enumerate(open_) if last[member] > k]
             states, lost = _close_nodes(states, keep)
             cuts.append(lost)
             open_ = [open_[x] for x in keep]
