@@ -30,9 +30,11 @@ MAX_STEPS = 400  # implicit steps of the search for gains
 MAX_FACTOR = 1e6  # up to which the search for a steady state looks
 NEWTON_TOLERANCE = 1e-7  # of a change of P, relative to the slope that it has to undo
 POWER_STEPS = 60  # of the power method
+IMPLICIT_STEPS = 3  # of Newton's method for an implicit step of H(12)
 NEWTON_STEPS = 12  # convergence is quadratic: more would not help
 MAX_FACTORED = 3000  # nodes of a network without small cuts up to which its coupling is factored
 MAX_LISTED = 12  # nodes that a message names
+MAX_GUESSES = 8  # of the threshold in a row, before the interval is halved
 FEW_UNKNOWNS = 400  # up to which the threshold is found to 1e-6
 
 
@@ -152,17 +154,31 @@ def _find_stabilising(packed: PackedRiccati, first: FloatArray | None = None) ->
             return P
         # One implicit step of dP/dt = H12(P): 0 = H12(P+) + (P - P+) / step.
         shift = equations.A - 0.5 / step * np.eye(n)
-        implicit = packed.shift(shift, equations.Q + P / step)
-        if not _is_stabilised(implicit, P):
+        following = _implicit_step(packed.shift(shift, equations.Q + P / step), P)
+        if following is None:
             step *= 0.5
             continue
-        # Three Newton steps solve the implicit step closely enough to follow H(12).
-        for _ in range(3):
-            P = _newton(implicit, P)
+        P = following
         if not np.abs(P).max() < MAX_GROWTH * size:
             return None
         step *= 3.0
     return None
+
+
+def _implicit_step(implicit: PackedRiccati, P: FloatArray) -> FloatArray | None:
+    """Return the solution (N, n, n) of an implicit step from P, closely enough to follow H(12); None
+    if the step is too long.
+
+    Q + P / step is positive definite. So the gains of P stabilise the equations of the step if and
+    only if their fixed point with these gains is positive definite too.
+    """
+    for _ in range(IMPLICIT_STEPS):
+        previous, P = P, _newton(implicit, P)
+        if not (np.isfinite(P).all() and np.linalg.eigvalsh(P)[:, 0].min() > 0.0):
+            return None
+        if np.abs(P - previous).max() <= 0.1 * np.abs(P).max():
+            break
+    return P
 
 
 def _no_steady_state(scenario: Scenario, equations: CoupledRiccati) -> str:
@@ -210,7 +226,9 @@ def threshold_factor(equations: CoupledRiccati) -> float | None:
     points, guesses = [(high, 1.0 / float(np.abs(P).max()))], 0
     while high / low > 1.0 + fine:
         factor = float(np.sqrt(low * high))
-        if len(points) > 1 and guesses < 2:
+        # Guesses approach from above, where the last P is a good start; a factor below the
+        # threshold takes about ten times as long.
+        if len(points) > 1 and guesses < MAX_GUESSES:
             factor, guesses = _guess(points, low, high, fine), guesses + 1
         else:
             guesses = 0
@@ -245,7 +263,7 @@ def _steady_at(
 def _guess(points: list[tuple[float, float]], low: float, high: float, fine: float) -> float:
     """Return a factor close to the threshold, extrapolated from (factor, 1 / max P) of two others.
 
-    The inverse of the covariances falls to 0 at the threshold, linearly in the end.
+    The inverse of the covariances falls to 0 at the threshold.
     """
     (f, inverse), (g, following) = points[-2:]
     root = g - following * (f - g) / (inverse - following) if inverse != following else high
