@@ -50,7 +50,7 @@ def _declare(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--replays",
         type=parse_count,
-        help="largest number of replays that search the set (default: 100 to 1000, by the events "
+        help="largest number of replays that search the set (default: 10 to 1000, by the events "
         "of the run)",
     )
     add_trust(parser, "DIR")

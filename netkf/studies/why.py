@@ -45,8 +45,10 @@ if TYPE_CHECKING:
     import pandas as pd
 
 MAX_MISSING = 3
-MIN_REPLAYS, MAX_REPLAYS, MAX_EVENTS = 100, 1000, 5_000_000
-"""Limits of the default number of replays, and the number of events that all of them may have."""
+MIN_REPLAYS, MAX_REPLAYS, MAX_EVENTS = 10, 1000, 5_000_000
+"""Limits of the default number of replays, and the number of events that all of them may have;
+those that look for the smallest set, and those with newer readings of single nodes.
+"""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -92,7 +94,7 @@ def why(
     (default 0) names one. ``scenario`` is only needed for a run that does not know its own.
     ``below`` is the trace of P that the smallest set of messages has to reach; by default that of
     the run without losses, but for 5 %. The set has at most ``most`` messages, and at most
-    ``replays`` replays look for it, by default 100 to 1000. ``trust`` imports classes of modules in
+    ``replays`` replays look for it, by default 10 to 1000. ``trust`` imports classes of modules in
     the directory.
 
     Raises ScenarioError for a node, time or run that is not there, and for a run without events.
@@ -116,6 +118,7 @@ def why(
         wanted = _default_replays(len(replayer.log)) if replays is None else replays
         count = integer(low=1)("replays", wanted)
         smallest = find_smallest_set(replayer, evidence.candidates(), target, most, count)
+    what_ifs, left_out = _make_what_ifs(replayer, sources, smallest)
     return Why(
         scenario=run_scenario.name,
         node=node,
@@ -123,10 +126,10 @@ def why(
         seed=run.seed,
         replica=run.replica,
         sources=sources,
-        what_ifs=_make_what_ifs(replayer, sources, smallest),
+        what_ifs=what_ifs,
         smallest=smallest,
         missing=evidence.missing,
-        notes=_replay_notes(evidence),
+        notes=_replay_notes(evidence, left_out),
     )
 
 
@@ -325,16 +328,22 @@ def _describe_missing(messages: Messages, m: int) -> Missing:
 
 def _make_what_ifs(
     replayer: Replayer, sources: Sequence[InformationSource], smallest: SmallestSet | None
-) -> tuple[WhatIf, ...]:
-    """Return the run as it was, and the replays that the answer names."""
+) -> tuple[tuple[WhatIf, ...], int]:
+    """Return the run as it was and the replays that the answer names, and how many replays with
+    newer readings were left out because the run is long.
+    """
     sets: list[tuple[str, tuple[MessageKey, ...] | None]] = [("as it was", ())]
-    newer: dict[tuple[MessageKey, ...], list[str]] = {}
+    newer: dict[tuple[MessageKey, ...], list[InformationSource]] = {}
     for source in sources:
         if source.missing:
-            keys = tuple(m.key for m in source.missing)
-            newer.setdefault(keys, []).append(str(source.node))
-    for keys, nodes in newer.items():
-        sets.append((f"newer readings of node {', '.join(nodes)}", keys))
+            newer.setdefault(tuple(m.key for m in source.missing), []).append(source)
+    # Of many the readings that would be newer by the longest time; ``sorted`` is stable.
+    count = _default_replays(len(replayer.log))
+    replayed = set(sorted(newer, key=lambda keys: -max(map(_time_gained, newer[keys])))[:count])
+    for keys, gaining in newer.items():
+        if keys in replayed:
+            nodes = ", ".join(str(source.node) for source in gaining)
+            sets.append((f"newer readings of node {nodes}", keys))
     if len(newer) > 1:
         sets.append(("all of these", tuple(sorted({key for keys in newer for key in keys}))))
     if smallest is not None and smallest.messages:
@@ -342,15 +351,30 @@ def _make_what_ifs(
     elif smallest is not None and smallest.best:
         sets.append(("the best set tried", smallest.best))
     sets.append(("no message missing", None))
-    return tuple(
+    what_ifs = tuple(
         WhatIf(label, keys, outcome.trace, outcome.distance)
         for label, keys, outcome in ((a, b, replayer.outcome(b, error=True)) for a, b in sets)
     )
+    return what_ifs, len(newer) - len(replayed)
 
 
-def _replay_notes(evidence: _Evidence) -> tuple[str, ...]:
-    """Return notes on the limits of the replays."""
+def _time_gained(source: InformationSource) -> float:
+    """Return by how many seconds the newest reading of a source would be newer with its missing
+    messages; inf if the node has none of it.
+    """
+    if math.isnan(source.reading):
+        return math.inf
+    return max(reading - source.reading for reading in source.with_more if not math.isnan(reading))
+
+
+def _replay_notes(evidence: _Evidence, left_out: int) -> tuple[str, ...]:
+    """Return notes on the limits of the replays, of which ``left_out`` were not made."""
     notes = []
+    if left_out:
+        notes.append(
+            f"the run is long: {left_out} more replays with newer readings of a node were left out,"
+            " those whose readings would be newer by the shortest times"
+        )
     if not evidence.same_sends:
         notes.append(
             "with this filter what is sent depends on what has arrived: the replays are exact, the "

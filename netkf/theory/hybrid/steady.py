@@ -166,8 +166,8 @@ def _find_stabilising(packed: PackedRiccati, first: FloatArray | None = None) ->
 
 
 def _implicit_step(implicit: PackedRiccati, P: FloatArray) -> FloatArray | None:
-    """Return the solution (N, n, n) of an implicit step from P, closely enough to follow H(12); None
-    if the step is too long.
+    """Return the solution (N, n, n) of an implicit step from P, closely enough to follow H(12), or
+    None if the step is too long.
 
     Q + P / step is positive definite. So the gains of P stabilise the equations of the step if and
     only if their fixed point with these gains is positive definite too.
