@@ -431,15 +431,9 @@ def _describe_filters(comparison: StoredComparison) -> list[str]:
         f"Of {len(rows)} filters over {comparison.runs:,} runs of each, {best.filter} had the "
         f"smallest RMS error ({listed})"
     ]
-    for row in rows:
-        error = _rms_error(row)
-        if error.real:
-            side = "less" if error.difference < 0.0 else "more"
-            sentences.append(
-                f"Certain: the RMS error of {row.filter} is {side} than that of "
-                f"{comparison.first}, by {format_number(abs(error.difference))}; the difference "
-                f"lies in {format_number(error.low)} .. {format_number(error.high)}"
-            )
+    sentences += [
+        _describe_difference(row, comparison.first) for row in rows if _rms_error(row).real
+    ]
     if len(sentences) == 1:
         sentences.append(f"No difference of RMS errors from {comparison.first} is certain")
     inconsistent = [
@@ -449,6 +443,19 @@ def _describe_filters(comparison: StoredComparison) -> list[str]:
         sentences.append(f"P does not describe the errors of {', '.join(inconsistent)}")
     incomplete = [row for row in comparison.rows if row.status != "complete"]
     return sentences + [f"{row.filter}: {row.status}" for row in incomplete]
+
+
+def _describe_difference(row: ComparedFilter, first: str) -> str:
+    """Return the sentence on a certain difference between the RMS errors of a filter and of the
+    ``first`` one.
+    """
+    error = _rms_error(row)
+    side = "less" if error.difference < 0.0 else "more"
+    return (
+        f"Certain: the RMS error of {row.filter} is {side} than that of {first}, by "
+        f"{format_number(abs(error.difference))}; the difference lies in "
+        f"{format_number(error.low)} .. {format_number(error.high)}"
+    )
 
 
 def _rms_error(row: ComparedFilter) -> Quantity:

@@ -8,7 +8,7 @@ covariance of the integral of the prediction error e: de = A e ds + dw with cov(
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -71,21 +71,27 @@ class ExpectedIncrements:
         return np.asarray(np.linalg.solve(np.linalg.cholesky(S), y - H @ J @ xhat))
 
 
+def _expected_increments_of_models() -> Callable[[Any], ExpectedIncrements]:
+    """Return a function that returns the predictions of a model, which are set up once."""
+    cache: dict[int, tuple[Any, ExpectedIncrements]] = {}
+
+    def expected_increments(model: Any) -> ExpectedIncrements:
+        """Return the predictions of a model."""
+        # The entry refers to the model, so that its id is not reused for another one.
+        if id(model) not in cache:
+            cache[id(model)] = model, ExpectedIncrements(model)
+        return cache[id(model)][1]
+
+    return expected_increments
+
+
 def record_increments(algorithm: Filter, intervals: list[WhitenedInnovation]) -> Filter:
     """Return a filter with the estimates of ``algorithm`` that appends the whitened innovation of
     each measured increment to ``intervals``.
 
     Its states are TimedState, which wrap those of ``algorithm``.
     """
-    cache: dict[int, tuple[Any, ExpectedIncrements]] = {}
-
-    def expected_increments(model: Any) -> ExpectedIncrements:
-        """Return the predictions of a model, which are set up once."""
-        # The entry refers to the model, so that its id is not reused for another one.
-        if id(model) not in cache:
-            cache[id(model)] = model, ExpectedIncrements(model)
-        return cache[id(model)][1]
-
+    expected_increments = _expected_increments_of_models()
     base: Any = type(algorithm)
 
     class RecordingFilter(base):  # type: ignore[misc]

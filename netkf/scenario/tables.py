@@ -178,15 +178,7 @@ def _build_object(
     error about an unknown key lists them too.
     """
     fields = {f.name: f for f in dataclasses.fields(cls) if f.init}
-    for key, value in values.items():
-        if key not in fields:
-            allowed_keys = [*other_keys, *fields]
-            remedy = f"{suggest_nearest(key, allowed_keys)}keys are {', '.join(allowed_keys)}"
-            raise ScenarioError(key, UNKNOWN, value, remedy)
-    for name, field in fields.items():
-        if field.default is dataclasses.MISSING and name not in values:
-            remedy = f"add [{name}]" if name in TABLES else f"add {name} = ..."
-            raise ScenarioError(name, "is missing", None, remedy)
+    _check_keys(fields, values, other_keys)
     rules = {name: fields[name].metadata.get("rule") for name in values}
     values = dict(values)
     for name, value in values.items():
@@ -200,6 +192,23 @@ def _build_object(
                 rule(name, value)
         return WAITING
     return _construct(cls, values)
+
+
+def _check_keys(
+    fields: dict[str, dataclasses.Field[Any]], values: dict[str, Any], other_keys: tuple[str, ...]
+) -> None:
+    """Raise ScenarioError for a key that is not a field, and for a missing field without default;
+    ``other_keys`` are listed among the allowed ones.
+    """
+    for key, value in values.items():
+        if key not in fields:
+            allowed_keys = [*other_keys, *fields]
+            remedy = f"{suggest_nearest(key, allowed_keys)}keys are {', '.join(allowed_keys)}"
+            raise ScenarioError(key, UNKNOWN, value, remedy)
+    for name, field in fields.items():
+        if field.default is dataclasses.MISSING and name not in values:
+            remedy = f"add [{name}]" if name in TABLES else f"add {name} = ..."
+            raise ScenarioError(name, "is missing", None, remedy)
 
 
 def _is_waiting(value: Any) -> bool:

@@ -270,16 +270,21 @@ def _distinct_labels(filters: Sequence[Choice], labels: list[str]) -> list[str]:
         # A kind or a table beside an object of that kind: nothing tells what differs.
         if not all(isinstance(item, Filter) for item in objects):
             continue
-        settings = [_filter_settings(item) for item in objects]
-        names = dict.fromkeys(name for item in settings for name in item)
-        differing = [name for name in names if len({item.get(name) for item in settings}) > 1]
-        for k, table in zip(indices, settings, strict=True):
-            # What is left out of a table is at its default.
-            values = {name: table.get(name, str(getattr(filters[k], name))) for name in differing}
-            distinct[k] = _make_label(
-                label, {name: shorten(value) for name, value in values.items()}
-            )
+        for k, settings in zip(indices, _differing_settings(objects), strict=True):
+            distinct[k] = _make_label(label, settings)
     return distinct
+
+
+def _differing_settings(filters: Sequence[Any]) -> list[dict[str, str]]:
+    """Return for each filter the settings, shortened, that are not the same in all of them."""
+    tables = [_filter_settings(algorithm) for algorithm in filters]
+    names = dict.fromkeys(name for table in tables for name in table)
+    differing = [name for name in names if len({table.get(name) for table in tables}) > 1]
+    # What is left out of a table is at its default.
+    return [
+        {name: shorten(table.get(name, str(getattr(algorithm, name)))) for name in differing}
+        for algorithm, table in zip(filters, tables, strict=True)
+    ]
 
 
 def _filter_settings(algorithm: Any) -> dict[str, str]:

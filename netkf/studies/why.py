@@ -333,10 +333,7 @@ def _make_what_ifs(
     newer readings were left out because the run is long.
     """
     sets: list[tuple[str, tuple[MessageKey, ...] | None]] = [("as it was", ())]
-    newer: dict[tuple[MessageKey, ...], list[InformationSource]] = {}
-    for source in sources:
-        if source.missing:
-            newer.setdefault(tuple(m.key for m in source.missing), []).append(source)
+    newer = _group_by_missing(sources)
     # Of many the readings that would be newer by the longest time; ``sorted`` is stable.
     count = _default_replays(len(replayer.log))
     replayed = set(sorted(newer, key=lambda keys: -max(map(_time_gained, newer[keys])))[:count])
@@ -356,6 +353,17 @@ def _make_what_ifs(
         for label, keys, outcome in ((a, b, replayer.outcome(b, error=True)) for a, b in sets)
     )
     return what_ifs, len(newer) - len(replayed)
+
+
+def _group_by_missing(
+    sources: Sequence[InformationSource],
+) -> dict[tuple[MessageKey, ...], list[InformationSource]]:
+    """Return the sources whose readings missing messages would have made newer, by these."""
+    groups: dict[tuple[MessageKey, ...], list[InformationSource]] = {}
+    for source in sources:
+        if source.missing:
+            groups.setdefault(tuple(m.key for m in source.missing), []).append(source)
+    return groups
 
 
 def _time_gained(source: InformationSource) -> float:

@@ -161,26 +161,29 @@ def _heard_sentences(explanation: Explanation) -> Iterator[str]:
         yield f"It last heard {_join_with_and(parts)}{others} (times of sending)."
     if silent:
         yield f"It had never heard node {_list_items(silent)}."
+    if any(s.unheard for s in neighbours):
+        yield _unheard_sentence(neighbours)
+
+
+def _unheard_sentence(neighbours: list[InformationSource]) -> str:
+    """Return the sentence on the messages of neighbours that were not used since the last ones."""
     unheard = sum(s.unheard for s in neighbours)
-    if unheard:
-        counts = [f"{s.unheard} of node {s.node}" for s in neighbours if s.unheard]
-        noun = "message" if unheard == 1 else "messages"
-        verb = "was" if unheard == 1 else "were"
-        yield (
-            f"{unheard} {noun} sent to it since then {verb} lost, late or not used: "
-            f"{_list_items(counts, 'other nodes')}."
-        )
+    counts = [f"{s.unheard} of node {s.node}" for s in neighbours if s.unheard]
+    noun = "message" if unheard == 1 else "messages"
+    verb = "was" if unheard == 1 else "were"
+    return (
+        f"{unheard} {noun} sent to it since then {verb} lost, late or not used: "
+        f"{_list_items(counts, 'other nodes')}."
+    )
 
 
 def _reading_sentences(explanation: Explanation) -> Iterator[str]:
-    """Yield sentences about the newest readings that reached the node, and about the messages that
-    would have brought newer ones.
-    """
+    """Yield sentences about the newest readings that reached the node, and those kept away."""
     sensors = [s for s in explanation.sources if s.sensor and s.node != explanation.node]
     with_reading = sorted(
         (s for s in sensors if not math.isnan(s.reading)), key=lambda s: s.reading
     )
-    never = [s.node for s in sensors if math.isnan(s.reading)]
+    without_reading = [s for s in sensors if math.isnan(s.reading)]
     if with_reading:
         oldest = with_reading[:MAX_LISTED]
         parts = [
@@ -189,11 +192,17 @@ def _reading_sentences(explanation: Explanation) -> Iterator[str]:
         ]
         prefix = "The oldest of its" if len(with_reading) > MAX_LISTED else "Its"
         yield f"{prefix} newest readings are {_join_with_and(parts)}."
-    if never:
-        yield f"No reading of node {_list_items(never)} can have reached it."
-    kept_away = [
-        s for s in with_reading + [s for s in sensors if math.isnan(s.reading)] if s.missing
-    ]
+    if without_reading:
+        nodes = _list_items([s.node for s in without_reading])
+        yield f"No reading of node {nodes} can have reached it."
+    yield from _kept_away_sentences(explanation, with_reading + without_reading)
+
+
+def _kept_away_sentences(
+    explanation: Explanation, sensors: list[InformationSource]
+) -> Iterator[str]:
+    """Yield sentences about the messages that would have brought newer readings of ``sensors``."""
+    kept_away = [s for s in sensors if s.missing]
     for source in kept_away[:MAX_LISTED]:
         newest = source.with_more[len(source.missing) - 1]
         messages = _join_with_and([str(m) for m in source.missing])
