@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from netkf.algorithms.baselines import Central
+from netkf.algorithms.kernels.root_flow import whiten_observation
 from netkf.algorithms.models import SlotModel
 from netkf.core.errors import TheoryError
 from netkf.engines.base import Engine
@@ -194,7 +195,9 @@ def _slot_traces(scenario: Scenario, model: SlotModel, start: FloatArray) -> Flo
     ``start``.
     """
     predicts = scenario.filter.algorithm.predicts  # type: ignore[union-attr]
-    F, Q, H, R = model.F, model.Q, model.H, model.R
+    # At most n rows with the same information: a central filter may read hundreds.
+    F, Q, H = model.F, model.Q, whiten_observation(model.H, model.R)
+    R = np.eye(len(H))
     P, traces = start, np.empty(max(scenario.sampled_slots) + 1)
     traces[0] = np.trace(start)
     for slot in range(1, len(traces)):
