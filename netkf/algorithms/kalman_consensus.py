@@ -83,7 +83,12 @@ def kcf_slots(
     scratch: SlotScratch,
     arrays: KcfArrays,
 ) -> None:
-    """Simulate Kalman-consensus filters over the slots of a plan."""
+    """Simulate Kalman-consensus filters over the slots of a plan: advance ``nodes`` in place, and
+    write ``samples``.
+
+    With prediction x and its covariance P, a slot's readings first update x, and then the consensus
+    term epsilon / (1 + |P|) P sum_j (x_j - x), computed from predictions alone, is added.
+    """
     for b in range(plan.up.shape[0]):
         for s in range(plan.up.shape[1]):
             if plan.sensed[s]:

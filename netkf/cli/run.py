@@ -181,7 +181,9 @@ def _print_ensemble(completed: Any, runs: int) -> None:
 
 
 def _describe_divergence(completed: CompletedRun) -> str:
-    """Return a sentence on which nodes diverged and when."""
+    """Return a text on which nodes diverged and when, and on the time up to which errors are
+    averaged, if rounding dominates them from then on.
+    """
     samples = completed.samples
     ids = samples.diverged
     listed = ", ".join(map(str, ids[:MAX_LISTED_NODES]))
@@ -190,12 +192,12 @@ def _describe_divergence(completed: CompletedRun) -> str:
     problem = f"estimate or covariance of {nodes} is no longer finite"
     if samples.is_finite_at_end:
         problem = f"covariance of {nodes} is no longer positive semidefinite"
-    rounding = ""
+    averaging = ""
     if samples.rounding_from is not None:
-        rounding = f"; errors are averaged before {samples.rounding_from:g} s"
+        averaging = f"; errors are averaged before {samples.rounding_from:g} s"
     return (
         f"{completed.status}, the {problem} at {samples.times[-1]:g} s and the run ended "
-        f"there{rounding}"
+        f"there{averaging}"
     )
 
 

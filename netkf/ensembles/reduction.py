@@ -308,8 +308,9 @@ def join_nodes(scratch: ReductionScratch, depth: int, count: int) -> int:
 def add_node(
     lanes: Lanes, scratch: ReductionScratch, active: int, count: int, node: int, complete: bool
 ) -> None:
-    """Merge the ``active`` rows of a group of runs into the tree's waiting ``node``; ``complete``
-    if no run lacks one of the ``count`` samples.
+    """Merge the ``active`` runs of a group of L, and store the result as waiting ``node`` of the
+    tree over runs: size, mean and M2 at ``count`` sample times. ``complete`` says that no run lacks
+    one of these samples.
     """
     if complete and active == len(lanes):
         merge_whole(lanes, scratch, count, node)

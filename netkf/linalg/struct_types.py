@@ -170,7 +170,9 @@ def lower_class_constant(context: Any, *_: Any) -> Any:
 
 @intrinsic
 def _struct_from_memory(_: Any, memory: Any, cls: ClassType) -> Any:
-    """Type and emit the struct at the first word of ``memory``."""
+    """Return the numba type of the call, which is a struct of class ``cls``, and the function that
+    emits its code: the struct is the address of the first word of the array ``memory``.
+    """
 
     def take_address(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         array = context.make_array(sig.args[0])(context, builder, args[0])

@@ -124,9 +124,11 @@ class _Links(NamedTuple):
 
 
 def _next_use(log: IntArray, rows: IntArray) -> IntArray:
-    """Return the row at which the node of each of ``rows`` next uses arrived messages; NEVER if it
-    does not.
+    """Return the row of ``log`` (an EVENT array) in which the node of each of ``rows`` (K,) next
+    uses arrived messages, by an absorb or a swap event; NEVER (-1) if it does not.
     """
+    # One sorted search for all nodes: keys order the uses by node, then by row of the log. The
+    # result may be a use by the following node, which the last line rejects.
     uses = np.flatnonzero((log["kind"] == CODES["absorb"]) | (log["kind"] == CODES["swap"]))
     ids, length = np.unique(log["node"]), len(log) + 1
     keys = np.searchsorted(ids, log["node"][uses]) * length + uses

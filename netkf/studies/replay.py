@@ -126,14 +126,16 @@ class HurryingDelay(Delay):
     def message_delay(self, link: Link, message: int, drawn: float) -> float:
         """Return the delay in seconds: 0 for hurried messages, else that of the model ``given``.
 
-        A message that is recorded as lost has no delay (nan): it takes no time if it is delivered.
+        ``message`` is the number of the message on its link, and ``drawn`` the delay that was drawn
+        for it. A message that is recorded as lost has no delay (nan): it takes no time if it is
+        among the chosen ones, which this replay delivers.
         """
         chosen, key = self.deliveries.chosen, (*link, message)
         if key in self.deliveries.hurried:
             return 0.0
         seconds = self.given.message_delay(link, message, drawn)
-        comes = chosen is None or key in chosen
-        return 0.0 if comes and math.isnan(seconds) else seconds
+        delivered = chosen is None or key in chosen
+        return 0.0 if delivered and math.isnan(seconds) else seconds
 
     def check(self, topology: Topology) -> None:
         """Raise ScenarioError if the model ``given`` does not fit the graph."""

@@ -329,30 +329,36 @@ def _describe_missing(messages: Messages, m: int) -> Missing:
 def _make_what_ifs(
     replayer: Replayer, sources: Sequence[InformationSource], smallest: SmallestSet | None
 ) -> tuple[tuple[WhatIf, ...], int]:
-    """Return the run as it was and the replays that the answer names, and how many replays with
-    newer readings were left out because the run is long.
+    """Return the trace of P and the error in the run as it was and in its replays, and how many
+    replays with newer readings were left out because the run is long.
+
+    Each replay delivers one set of messages that did not arrive in the run: those that would have
+    brought newer readings of a node, all of these, the ``smallest`` set that brings the trace below
+    its limit (or the best set tried), and every message.
     """
-    sets: list[tuple[str, tuple[MessageKey, ...] | None]] = [("as it was", ())]
+    # Label and messages of each replay; None stands for every message.
+    delivered_sets: list[tuple[str, tuple[MessageKey, ...] | None]] = [("as it was", ())]
     newer = _group_by_missing(sources)
-    # Of many the readings that would be newer by the longest time; ``sorted`` is stable.
+    # If there are too many, replay those that gain the most time; ``sorted`` is stable.
     count = _default_replays(len(replayer.log))
     replayed = set(sorted(newer, key=lambda keys: -max(map(_time_gained, newer[keys])))[:count])
     for keys, gaining in newer.items():
         if keys in replayed:
             nodes = ", ".join(str(source.node) for source in gaining)
-            sets.append((f"newer readings of node {nodes}", keys))
+            delivered_sets.append((f"newer readings of node {nodes}", keys))
     if len(newer) > 1:
-        sets.append(("all of these", tuple(sorted({key for keys in newer for key in keys}))))
+        together = tuple(sorted({key for keys in newer for key in keys}))
+        delivered_sets.append(("all of these", together))
     if smallest is not None and smallest.messages:
-        sets.append(("the smallest set", smallest.messages))
+        delivered_sets.append(("the smallest set", smallest.messages))
     elif smallest is not None and smallest.best:
-        sets.append(("the best set tried", smallest.best))
-    sets.append(("no message missing", None))
-    what_ifs = tuple(
-        WhatIf(label, keys, outcome.trace, outcome.distance)
-        for label, keys, outcome in ((a, b, replayer.outcome(b, error=True)) for a, b in sets)
-    )
-    return what_ifs, len(newer) - len(replayed)
+        delivered_sets.append(("the best set tried", smallest.best))
+    delivered_sets.append(("no message missing", None))
+    what_ifs = []
+    for label, delivered in delivered_sets:
+        outcome = replayer.outcome(delivered, error=True)
+        what_ifs.append(WhatIf(label, delivered, outcome.trace, outcome.distance))
+    return tuple(what_ifs), len(newer) - len(replayed)
 
 
 def _group_by_missing(

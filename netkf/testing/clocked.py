@@ -64,10 +64,14 @@ class ClockTrial(Trial):
         super().__init__(watched, system, shift)
 
     @classmethod
-    def by_reading(
+    def make_per_sensor_kind(
         cls, watched: WatchedPart, system: System, shift: FloatArray | None, clock: str | None
     ) -> Iterator[ClockTrial]:
-        """Yield a trial with samples and one with increments, each if the filter supports it."""
+        """Yield a trial with sensors that take samples and one with sensors of increments, each if
+        the filter supports it; the other arguments are those of ``ClockTrial``.
+
+        ``shift`` (n,) moves the truth on the way, None does not.
+        """
         part = watched.part
         if not isinstance(part, FlowAdapter):
             yield cls(watched, system, shift, clock, increments=False)

@@ -36,7 +36,7 @@ def make_trials(watched: WatchedPart, shift: FloatArray | None = None) -> Iterat
         for clock in clocks:
             # All clocks on one system only: a fault that depends on it shows under any clock.
             if clock == clocks[0] or system is systems[-1]:
-                yield from ClockTrial.by_reading(watched, system, system_shift, clock)
+                yield from ClockTrial.make_per_sensor_kind(watched, system, system_shift, clock)
 
 
 def check_shift(watched: WatchedPart, trials: Sequence[Trial]) -> None:

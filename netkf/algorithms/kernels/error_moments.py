@@ -85,9 +85,11 @@ def mix(
     P0: FloatArray,
     S0: FloatArray,
 ) -> None:
-    """Apply one reset, H (7) and (9), in place to P (N, n, n) and S (N, N, n, n): message k moves
-    node ``rows[k]`` by ``weights[k]`` towards node ``columns[k]``, all from the values before the
-    reset. P0 and S0 are scratch.
+    """Apply the messages of one instant, H (7) and (9), in place to the covariances P (N, n, n) of
+    the filters and those of their true errors, S_ij = cov(e_i, e_j) (N, N, n, n).
+
+    Message k moves node ``rows[k]`` by ``weights[k]`` towards node ``columns[k]``, all from the
+    values before the instant. P0 and S0 are scratch, shaped like P and S.
     """
     P0[:] = P
     S0[:] = S

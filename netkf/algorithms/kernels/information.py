@@ -111,7 +111,9 @@ def weigh_part(
 def store_part(
     lanes: Lanes, parts: FloatArray, index: tuple[int, int, int], total: FloatArray
 ) -> None:
-    """Copy ``total`` (n, n + 1, L) into ``parts[t, k, h]``; ``index`` is [t, k, h]."""
+    """Copy the root ``total`` (n, n + 1, L) of an information pair into ``parts[t, k, h]``, pair k
+    of node h in copy t; ``index`` is [t, k, h]. Zeros above the diagonal are not copied.
+    """
     t, k, h = index
     n = len(total)
     for i in range(n):

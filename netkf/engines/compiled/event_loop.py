@@ -282,8 +282,8 @@ def record_event_with_age(
 
 @kernel
 def predict(state: Simulation, combination: CombinationState | None, h: int, time: float) -> None:
-    """Predict node ``h`` to ``time`` (seconds), using its increments, unless it is
-    there already.
+    """Predict node ``h`` to ``time`` (seconds), using its increments, unless it is there
+    already.
     """
     node, now = state.nodes[h], state.now[h]
     # ``not <`` also returns for a time that is nan.

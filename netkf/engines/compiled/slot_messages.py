@@ -321,7 +321,11 @@ def mark_paired_senders(
     lanes: Lanes, channels: Channels, active: np.ndarray, pair_count: np.ndarray, sent: np.ndarray
 ) -> None:
     """Write 1 into ``sent`` (B, S, E, N, L) for both ends of all paired links: matchings ask each
-    of them for a message. ``active``, ``pair_count``: see SlotMessages.
+    of them for a message.
+
+    Dimensions are B blocks of L runs, S slots of E exchange steps, N nodes. ``pair_count`` (R, S,
+    E) is the number of pairs of each of the R = B L runs, and the first so many entries of
+    ``active`` (R, S, E, A) are the indices of their links.
     """
     for r in range(pair_count.shape[0]):
         for s in range(pair_count.shape[1]):
@@ -597,8 +601,12 @@ def _write_step_end(
     stopping: int,
     row: int,
 ) -> int:
-    """Write which nodes absorb or swap when a step ends, and which stop; return the index of the
-    next row.
+    """Write which nodes absorb or swap when the exchange step of ``stage`` ends, and which stop;
+    return the index of the next row.
+
+    Nodes that received something swap states with their peer if exchanges are ``pairwise``, else
+    they absorb it. In step number ``stopping`` (-1: none) nodes may permanently freeze their
+    network estimate. ``row`` is the index of the first row written into ``rows``.
     """
     for i in range(len(traced.nodes)):
         has_received = False

@@ -330,7 +330,11 @@ def integration_steps(scenario: Scenario) -> int:
 
 
 def _increment_flows(scenario: Scenario, estimators: int) -> IncrementFlows | None:
-    """Return the flows of a scenario, or None if no sensor senses increments."""
+    """Return how errors evolve between messages, or None if no sensor senses increments.
+
+    That is an ErrorFlow for each of the first ``estimators`` nodes, with the node's own sensors,
+    and one without sensors for messages under way.
+    """
     observations = increment_observations(scenario)
     if not any(len(observation.H) for observation in observations):
         return None
@@ -339,7 +343,7 @@ def _increment_flows(scenario: Scenario, estimators: int) -> IncrementFlows | No
     B = plant[1] if np.array_equal(plant[1] @ plant[1].T, Q) else square_root(Q)
     flows: dict[bytes, ErrorFlow] = {}
 
-    def flow(observation: Observation) -> ErrorFlow:
+    def find_flow(observation: Observation) -> ErrorFlow:
         """Return the flow of errors with these sensors."""
         # Estimators with equal sensors share a flow, and are then propagated together.
         key = b"|".join(part.tobytes() for part in observation)
@@ -348,7 +352,7 @@ def _increment_flows(scenario: Scenario, estimators: int) -> IncrementFlows | No
         return flows[key]
 
     empty = np.zeros((0, 0))
-    unobserved = flow(Observation(np.zeros((0, scenario.plant.n)), empty, empty))
+    unobserved = find_flow(Observation(np.zeros((0, scenario.plant.n)), empty, empty))
     return IncrementFlows(
-        [flow(observation) for observation in observations[:estimators]], unobserved, plant
+        [find_flow(observation) for observation in observations[:estimators]], unobserved, plant
     )

@@ -187,9 +187,12 @@ def critical_probability(F: ArrayLike, H: ArrayLike) -> tuple[float, float]:
 
 
 def critical_certificate(F: ArrayLike, H: ArrayLike) -> CriticalProbability:
-    """Return the bounds of ``critical_probability`` with proofs of the upper one from both sides.
+    """Return the bounds R (31) and (32) on the critical delivery probability of the system with F
+    (n, n) and H (p, n), with a proof of the upper one from both sides.
 
-    Raises TheoryError as that does.
+    The upper bound g is the least probability at which some gain makes errors contract in the mean
+    square: the result has a gain (n, p) that does so at g + 1e-6, and a matrix (n, n) that shows
+    that no gain does at g - 1e-6. Raises TheoryError if (F, H) is not detectable.
     """
     transition = as_square("F", F)
     n = len(transition)
@@ -322,7 +325,10 @@ class _GainSearch:
         return np.asarray(np.ldexp(matrix, -np.frexp(np.trace(matrix))[1]))
 
     def _improve(self, gains: list[FloatArray], X: FloatArray) -> list[FloatArray]:
-        """Return the gains ``K = -F X H' (H X H')^-1``, which minimise L(X)."""
+        """Return the gains ``K_s = -F X H_s' (H_s X H_s')^-1`` , which minimise ``L(X) =
+        sum_s p_s (F + K_s H_s) X (F + K_s H_s)'`` for a given X (n, n); like ``gains``, one for
+        each H_s and with the shape of H_s'.
+        """
         # In the kernel of H X H' any gain is optimal: the pseudo-inverse keeps the present one.
         improved = []
         for K, H in zip(gains, self._readings, strict=True):

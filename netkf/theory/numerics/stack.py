@@ -82,8 +82,11 @@ class GaussianStack:
         return self.table[self.indices(names), :, : self._frozen]
 
     def _reduce(self, names: Iterable[Hashable], count: int) -> None:
-        """Reduce the inputs that are not frozen to at most the number of rows, by a QR
-        factorisation of the forms in the order of ``names``; make space for ``count`` more.
+        """Replace the columns of T that are not frozen by at most as many as T has rows, and make
+        space for ``count`` more inputs.
+
+        T (rows, inputs) has the linear forms of all vectors, stacked in the order of ``names``.
+        Joint covariances T T' do not change. The new columns are lower triangular in that order.
         """
         rows = self.indices(names)
         stacked = self.table[rows, :, self._frozen : self.used].reshape(len(rows) * self._n, -1)

@@ -51,9 +51,10 @@ def large_gamma_limits(scenario: Scenario) -> LargeGamma:
 def push_sum_noise(scenario: Scenario, gammas: Sequence[int]) -> FloatArray:
     """Return the covariance (len(gammas), N n, N n) of the transformed noise of P (29), exactly.
 
-    ``(T' (x) I) E[(M (x) I) cov(h) (M (x) I)'] (T (x) I)`` with ``T = (v W)`` of P (75), v =
-    (1, .., 1) / sqrt(N) and W any orthonormal complement. P Lemma 4 says what it tends to. Raises
-    TheoryError as ``large_gamma_limits`` does.
+    ``(T' (x) I) E[(M (x) I) cov(h) (M (x) I)'] (T (x) I)``, where (x) is the Kronecker product, M
+    (N, N) the random product of gamma averaging steps, h (N n,) the stacked noises of the plant and
+    the sensors, and ``T = (v W)`` of P (75) with v = (1, .., 1) / sqrt(N) and W any orthonormal
+    complement. P Lemma 4 says what it tends to. Raises TheoryError as ``large_gamma_limits`` does.
     """
     steps = estimation_steps(scenario)
     _require_averaging(scenario, steps)
