@@ -100,8 +100,8 @@ def limit_blas_threads() -> Iterator[None]:
 
 @contextmanager
 def hide_main_module(hide: bool) -> Iterator[None]:
-    """With ``hide``, keep processes that are started within the block from importing the user's
-    script, which would run it again.
+    """Keep processes that are started within the block from importing the user's script, which
+    would run it again; do nothing unless ``hide``.
     """
     main = sys.modules["__main__"]
     # multiprocessing finds the script by these attributes.

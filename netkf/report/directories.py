@@ -104,7 +104,7 @@ class ReportSource:
 
     @property
     def knowledge(self) -> str:
-        """Which messages the estimates sampled at t include: ``until`` (arrived at t or earlier),
+        """The messages that estimates sampled at t include: ``until`` (arrived at t or earlier),
         ``before`` (earlier than t: slots whose samples are predictions) or ``slot`` (also those of
         the slot that begins at t: slots whose samples are filtered).
         """

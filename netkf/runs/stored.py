@@ -74,7 +74,7 @@ class WithPromises:
 
     @cached_property
     def promised(self) -> PromisedTraces:
-        """What theory promises at the sample times: bound, limit, centralised filter."""
+        """The traces that theory promises at the sample times: bound, limit, centralised filter."""
         return promise_traces(self.scenario, self.times)
 
     @property

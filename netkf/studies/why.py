@@ -378,7 +378,7 @@ def _time_gained(source: InformationSource) -> float:
     """
     if math.isnan(source.reading):
         return math.inf
-    return max(reading - source.reading for reading in source.with_more if not math.isnan(reading))
+    return source.with_more[len(source.missing) - 1] - source.reading
 
 
 def _replay_notes(evidence: _Evidence, left_out: int) -> tuple[str, ...]:

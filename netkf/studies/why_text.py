@@ -195,10 +195,10 @@ def _reading_sentences(explanation: Explanation) -> Iterator[str]:
     if without_reading:
         nodes = _list_items([s.node for s in without_reading])
         yield f"No reading of node {nodes} can have reached it."
-    yield from _kept_away_sentences(explanation, with_reading + without_reading)
+    yield from _missed_reading_sentences(explanation, with_reading + without_reading)
 
 
-def _kept_away_sentences(
+def _missed_reading_sentences(
     explanation: Explanation, sensors: list[InformationSource]
 ) -> Iterator[str]:
     """Yield sentences about the messages that would have brought newer readings of ``sensors``."""

@@ -32,7 +32,7 @@ from netkf.testing.watching import (
     demand_array,
     guard_user_code,
     make_part,
-    relative_difference,
+    scaled_difference,
 )
 
 STARTS, STEPS, LENGTH = 40_000, 100_000, 400
@@ -132,7 +132,7 @@ def _demand_same(where: str, one: FloatArray, other: FloatArray, when: str) -> N
     """Check that two paths from equal streams are equal; ``when`` says in messages how the second
     one was drawn.
     """
-    difference = relative_difference(one, other)
+    difference = scaled_difference(one, other)
     demand(
         difference <= ROUNDING,
         where,
@@ -218,7 +218,7 @@ def _draw_starts(
         # Drawing them one by one would take most of the time of a check.
         together = part.starts(_SharedNormals(_make_generator(seed, 0), count))
         same = together[: len(first)]
-        if np.shape(first) == same.shape and relative_difference(np.array(first), same) <= ROUNDING:
+        if np.shape(first) == same.shape and scaled_difference(np.array(first), same) <= ROUNDING:
             return [*first, *together[len(first) :]]
     return [*first, *(start(random) for _ in range(count - len(first)))]
 
@@ -306,7 +306,7 @@ def _compare_frames(part: LinearPlant, where: str, path: FloatArray, truth: Any)
             ("absolute", truth.absolute(slot)),
             ("local", truth.local(slot) + origin),
         ):
-            error = relative_difference(np.asarray(state), x)
+            error = scaled_difference(np.asarray(state), x)
             rule = f"{kind} states must be the same in frames, up to the origin"
             text = f"{error:.3g} of the state apart in slot {slot}"
             demand(error <= FRAME_TOLERANCE, where, rule, text)

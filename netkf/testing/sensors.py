@@ -37,7 +37,7 @@ from netkf.testing.watching import (
     fail,
     guard_user_code,
     make_part,
-    relative_difference,
+    scaled_difference,
 )
 
 READINGS, LENGTH, MAX_NODES = 100_000, 250, 8
@@ -159,7 +159,7 @@ def _demand_equal(
     taken.
     """
     for name, a, b in zip(("readings", "matrices H"), one, other, strict=True):
-        difference = relative_difference(a, b)
+        difference = scaled_difference(a, b)
         demand(
             difference <= ROUNDING,
             reader.where,
@@ -187,7 +187,7 @@ def _check_linear(reader: SensorReader, node: int, seed: int) -> None:
     x, other_x = (_make_states(seed, LENGTH, reader.n, run) for run in (0, 1))
     series = reader.read_several(reader.make_path(streams, node), numbers, x)
     other = reader.read_several(reader.make_path(streams, node), numbers, other_x)
-    difference = relative_difference(series.H, other.H)
+    difference = scaled_difference(series.H, other.H)
     rule = "H must not depend on the state"
     demand(difference <= ROUNDING, reader.where, rule, f"{difference:.3g} apart")
     expected = np.einsum("kpn,kn->kp", series.H, other_x - x)
@@ -200,7 +200,7 @@ def _check_linear(reader: SensorReader, node: int, seed: int) -> None:
         "return H @ x plus noise that does not depend on x",
     )
     if not reader.sensor.varying:
-        difference = max(relative_difference(H, reader.sensor.H) for H in series.H)
+        difference = max(scaled_difference(H, reader.sensor.H) for H in series.H)
         demand(
             difference <= ROUNDING,
             reader.where,
@@ -244,7 +244,7 @@ def _check_increments(reader: IncrementReader, node: int, seed: int) -> None:
     streams = Streams(seed)
     cut = reader.read_pieces(streams, node, x, SHORT_LENGTH, cut=True)
     uncut = reader.read_pieces(streams, node, x, SHORT_LENGTH, cut=False)
-    difference = relative_difference(reader.combine(cut), uncut.moments)
+    difference = scaled_difference(reader.combine(cut), uncut.moments)
     demand(
         difference <= ROUNDING,
         reader.where,
@@ -253,7 +253,7 @@ def _check_increments(reader: IncrementReader, node: int, seed: int) -> None:
         "draw the noise of the grid first, and cut it by its conditional law",
     )
     repeated = reader.read_pieces(streams, node, x, SHORT_LENGTH, cut=True)
-    difference = relative_difference(cut.moments, repeated.moments)
+    difference = scaled_difference(cut.moments, repeated.moments)
     demand(
         difference <= ROUNDING,
         reader.where,
@@ -265,7 +265,7 @@ def _check_increments(reader: IncrementReader, node: int, seed: int) -> None:
     gaps = (other.spans[:, 1] - other.spans[:, 0])[:, None]
     change = gaps * (reader.sensor.H @ (other_x - x))
     expected = cut.moments + np.stack([change, np.zeros_like(change)], axis=1)
-    difference = relative_difference(other.moments, expected)
+    difference = scaled_difference(other.moments, expected)
     demand(
         difference <= ROUNDING,
         reader.where,

@@ -409,7 +409,7 @@ def demand_array(where: str, name: str, value: Any, shape: tuple[int, ...]) -> F
     return array
 
 
-def relative_difference(one: FloatArray, other: FloatArray) -> float:
+def scaled_difference(one: FloatArray, other: FloatArray) -> float:
     """Return the largest absolute difference of two arrays of one shape, divided by 1 + the largest
     absolute entry of both.
     """
