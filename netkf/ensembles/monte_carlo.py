@@ -144,7 +144,11 @@ def monte_carlo(
 
 
 def ensemble_of(scenario: Scenario, statistics: RunStatistics, seed: int, engine: str) -> Ensemble:
-    """Return the ensemble that the statistics of all runs describe."""
+    """Return the ensemble that the ``statistics`` of all runs describe.
+
+    ``seed`` and ``engine`` (its name) are those of the runs. Errors and NEES are nan from the time
+    on at which rounding blurs them in some run.
+    """
     samples, shape = statistics.samples, (len(scenario.times), len(scenario.nodes), -1)
     means = np.where(samples.size[:, None] > 0.0, samples.mean, np.nan)
     n = scenario.plant.n
@@ -189,7 +193,12 @@ def _upper_indices(n: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _unpack_samples(values: FloatArray, n: int) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return (T, N, 2 u + 1) as two stacks of symmetric matrices (T, N, n, n) and (T, N)."""
+    """Return means of P and of e e' (T, N, n, n) and of NEES (T, N) from ``values``
+    (T, N, 2 u + 1).
+
+    The u = n (n + 1) / 2 entries of an upper triangle are stored row by row, first of P, then of e
+    e'.
+    """
     i, j = _upper_indices(n)
     matrices = np.empty((2, *values.shape[:2], n, n))
     for matrix, upper in zip(matrices, np.split(values[..., :-1], 2, axis=-1), strict=True):
@@ -199,14 +208,14 @@ def _unpack_samples(values: FloatArray, n: int) -> tuple[FloatArray, FloatArray,
 
 
 def ensemble_table(ensemble: Ensemble) -> dict[str, np.ndarray]:
-    """Return the columns of ensemble.parquet by name, with one row for each time and node; those of
-    errors only with ground truth.
+    """Return the columns (T N,) of ensemble.parquet by name, with one row for each of T times and,
+    within it, each of N nodes; those of errors only with ground truth.
     """
     n, rows = ensemble.mean_P.shape[-1], len(ensemble.times) * len(ensemble.nodes)
     i, j = np.triu_indices(n)
 
     def upper(values: FloatArray) -> list[FloatArray]:
-        """Return the columns of the upper triangle of matrices (T, N, n, n)."""
+        """Return the columns (T N,) of the upper triangle of matrices (T, N, n, n), row by row."""
         return list(values[:, :, i, j].reshape(rows, -1).T)
 
     columns = [

@@ -178,14 +178,18 @@ def run_values(batch: RunBatch, scenario: Scenario, first: int = 0) -> RunValues
 
 
 def _mean_of_nodes(averages: FloatArray) -> FloatArray:
-    """Return the means (R, 1, 3) over the nodes of (R, N, 3), added in the order of nodes."""
+    """Return the means (R, 1, 3) over the N nodes of the ``averages`` (R, N, 3) of R runs, added in
+    the order of nodes.
+    """
     # accumulate() adds in order; sum() may add in another one, and would give other bits.
     total = np.add.accumulate(averages, axis=1)[:, -1:]
     return np.asarray(total / averages.shape[1])
 
 
 def merge_runs(values: RunValues, piece: int) -> RunStatistics:
-    """Return the statistics of one piece of the runs, merged by the tree over them."""
+    """Return the statistics of the runs of piece number ``piece`` of ``values``, merged by the tree
+    over them; its fingerprint is empty.
+    """
     runs = values.pieces[piece]
     samples = values.samples[piece]
     averages = values.averages[runs]
@@ -222,7 +226,9 @@ def merge_runs(values: RunValues, piece: int) -> RunStatistics:
 
 
 def count_messages(counts: np.ndarray, slotted: bool) -> FloatArray:
-    """Return (R, 5) as MESSAGES, from the events by kind (R, len(KINDS))."""
+    """Return the counts (R, 5) of R runs, columns as MESSAGES, from the numbers of events by kind,
+    ``counts`` (R, len(KINDS)); transmissions are nan if runs are ``slotted``.
+    """
     of = dict(zip(KINDS, counts.T.astype(np.float64), strict=True))
     sent, delivered, lost = of["send"], of["deliver"], of["lost"] + of["late"]
     # Without broadcasts every message is a transmission of its own.

@@ -120,7 +120,9 @@ def _read_averages(rows: list[dict[str, Any]]) -> tuple[FloatArray, FloatArray]:
     """Return means and standard errors (N + 1, 3) of an ensemble from rows of its summary."""
 
     def column(name: str) -> FloatArray:
-        """Return one quantity of all nodes."""
+        """Return one quantity (N + 1,) of all nodes and, last, of all together; nan where a row
+        lacks it.
+        """
         return np.array([row.get(name) for row in rows], dtype=np.float64)
 
     rms, rms_se = column("rms_error"), column("rms_error_se")
@@ -168,7 +170,9 @@ def _read_samples(path: Path, scenario: Scenario) -> dict[str, Any]:
 
 
 def _select_columns(table: pd.DataFrame, names: list[str], shape: tuple[int, int]) -> FloatArray:
-    """Return columns as an array (T, N, columns); those that the table lacks are nan."""
+    """Return the columns ``names`` as an array (T, N, columns), ``shape`` being (T, N); those that
+    the table lacks are nan.
+    """
     return np.asarray(
         table.reindex(columns=names).to_numpy(dtype=np.float64).reshape(*shape, len(names))
     )

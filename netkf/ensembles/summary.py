@@ -84,8 +84,10 @@ def _mean_bounds(scenario: Scenario, promised: PromisedTraces) -> list[float | N
 
 
 def _make_row(mean: FloatArray, error: FloatArray, bound: float | None) -> dict[str, Any]:
-    """Return the summary of a node or of all nodes from means and standard errors of squared error,
-    trace and NEES.
+    """Return the summary of a node, or of all nodes together, by the names in summary.json.
+
+    ``mean`` (3,) and its standard errors ``error`` (3,) are those of squared error, trace of P and
+    NEES; ``bound`` is the mean bound on the trace, if there is one.
     """
     rms = float(np.sqrt(mean[0]))
     return {

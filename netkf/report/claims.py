@@ -48,8 +48,8 @@ def describe_source(
 ) -> list[str]:
     """Return sentences about a source, the most important first, without full stops.
 
-    ``messages`` are the MESSAGE rows of its run (none without a run), ``readings`` the innovations
-    of the run, or None or the reason why there are none.
+    ``messages`` are the M MESSAGE rows (M,) of its run (none without a run), ``readings`` the
+    innovations of the run, or None or the reason why there are none.
     """
     if source.kind == "sweep":
         return [*_describe_status(source), *_describe_sweep(source)]
@@ -156,7 +156,7 @@ def _describe_interruption(source: ReportSource) -> str:
 def _describe_worst_node(source: ReportSource, run: StoredRun, messages: np.ndarray) -> list[str]:
     """Return sentences on the worst node of a recorded run; empty if no sample is finite.
 
-    ``messages`` are the MESSAGE rows of the run.
+    ``messages`` are the M MESSAGE rows (M,) of the run.
     """
     if source.worst is None:
         return []
@@ -189,6 +189,8 @@ def _explain_worst(
 ) -> list[str]:
     """Return sentences on the worst sample after the start-up: the messages that the node had
     received by then, and whether P allows the error.
+
+    ``messages`` are the M MESSAGE rows (M,) of the run.
     """
     worst = samples.explained
     received = messages[messages["receiver"] == worst.node]
@@ -254,8 +256,9 @@ def _judge_error(source: ReportSource, run: StoredRun, worst: WorstSample) -> li
 def _describe_last_messages(received: np.ndarray, worst: WorstSample, cutoff: float) -> str:
     """Return a sentence on the last message from each neighbour before the worst sample.
 
-    ``received`` are the MESSAGE rows to the node of that sample, lost ones included; only arrivals
-    until ``cutoff`` (seconds) count. Messages lost or late since the last arrival are counted.
+    ``received`` are the MESSAGE rows (M,) to the node of that sample, lost ones included; only
+    arrivals until ``cutoff`` (seconds) count. Messages lost or late since the last arrival are
+    counted.
     """
     # For each sender the seconds since its last message that arrived was sent, inf without one.
     ages, missing = [], 0
@@ -282,8 +285,11 @@ def _describe_last_messages(received: np.ndarray, worst: WorstSample, cutoff: fl
 
 
 def _compare_delivery(messages: np.ndarray, received: np.ndarray) -> str:
-    """Return a sentence that compares the delivery ratio of the messages to a node (``received``,
-    lost ones included) with that of all messages of the run; empty if they differ by chance.
+    """Return a sentence that compares the delivery ratio of the messages to a node with that of all
+    messages of the run; empty if they differ by chance.
+
+    Both are MESSAGE rows, ``messages`` of the run and ``received`` those to the node, lost ones
+    included.
     """
     node_count, total = max(1, len(received)), max(1, len(messages))
     node_ratio = int((received["outcome"] == DELIVERED).sum()) / node_count
@@ -302,6 +308,8 @@ def _judge_age(
 ) -> str:
     """Return a sentence on whether the node's information was unusually old at its worst sample;
     empty if there are too few samples to compare with.
+
+    ``received`` are the MESSAGE rows (M,) to that node, lost ones included.
     """
     cutoffs = source.cutoffs(run.times)
     ages: FloatArray = information_age(received, (worst.node,), run.times, cutoffs)[:, 0]

@@ -61,8 +61,8 @@ def run_data(
 ) -> dict[str, Any]:
     """Return the data of a recorded run for the live views, as JSON values.
 
-    ``messages`` are the MESSAGE rows of the run, ``readings`` its innovations or the reason why
-    there are none. Columns of numbers are added to ``packer``, and the data refer to them.
+    ``messages`` are the M MESSAGE rows (M,) of the run, ``readings`` its innovations or the reason
+    why there are none. Columns of numbers are added to ``packer``, and the data refer to them.
     """
     worst = None if source.worst is None else source.worst.explained
     horizon = float(source.scenario.horizon)
@@ -140,7 +140,7 @@ def thinning_rules(data: dict[str, Any]) -> list[str]:
 
 
 def sample_indices(run: StoredRun, max_values: int, instant: float) -> np.ndarray:
-    """Return the sorted indices of the samples that a page holds.
+    """Return the sorted indices (K,) of the K samples that a page holds.
 
     They are all samples, or if these have more than ``max_values`` numbers every k-th, the last
     one, the one at ``instant`` (seconds), and that with the largest error of each node.
@@ -257,8 +257,11 @@ def _drawing_limits(source: ReportSource) -> dict[str, Any]:
 def _sample_columns(
     source: ReportSource, run: StoredRun, rows: np.ndarray, messages: np.ndarray, packer: Packer
 ) -> dict[str, Any]:
-    """Return the samples with the indices ``rows`` as packed columns, their number, the step
+    """Return the samples with the indices ``rows`` (K,) as packed columns, their number K, the step
     between them, and the interval of NEES.
+
+    ``messages`` are the MESSAGE rows of the run, for the ages of information. Columns are added to
+    ``packer``.
     """
     n = run.x.shape[1]
     i, j = np.triu_indices(n)

@@ -40,7 +40,8 @@ class ThinnedMessages(NamedTuple):
 
 
 def join_messages(log: np.ndarray) -> np.ndarray:
-    """Return MESSAGE rows, ordered by sender, receiver and number, from the EVENT rows of a run.
+    """Return M MESSAGE rows (M,), ordered by sender, receiver and number, from the EVENT rows
+    ``log`` (E,) of a run.
 
     Raises ValueError if an outcome belongs to no send event, or if ids or numbers are too large.
     """
@@ -65,11 +66,12 @@ def join_messages(log: np.ndarray) -> np.ndarray:
 def _message_keys(
     rows: np.ndarray, node_columns: tuple[str, str], number_column: str = "number"
 ) -> np.ndarray:
-    """Return one integer (M,) for each row, which identifies its message and orders by sender,
-    receiver and number.
+    """Return one integer for each of M ``rows``, (M,), which identifies its message and orders by
+    sender, receiver and number.
 
-    ``node_columns`` are the names of the columns of sender and receiver. Raises ValueError for ids
-    of 2^20 and more, or numbers of 2^24 and more, which runs that fit in memory do not reach.
+    ``node_columns`` are the names of the columns of sender and receiver, ``number_column`` that of
+    the number. Raises ValueError for ids of 2^20 and more, or numbers of 2^24 and more, which runs
+    that fit in memory do not reach.
     """
     sender, receiver = (rows[name].astype(np.uint64) for name in node_columns)
     number = rows[number_column].astype(np.uint64)
@@ -81,7 +83,8 @@ def _message_keys(
 def _set_outcomes(
     messages: np.ndarray, rows: np.ndarray, outcome: int, node_columns: tuple[str, str]
 ) -> None:
-    """Set the outcome, the end and the age of the messages that EVENT ``rows`` are about.
+    """Set the ``outcome``, ``ended`` and ``age`` of those ``messages`` (M,), in place, that EVENT
+    ``rows`` (K,) are about.
 
     ``node_columns`` are the names of their columns of sender and receiver. Raises ValueError if a
     row is about none of the messages.
@@ -99,7 +102,7 @@ def _set_outcomes(
 
 
 def thin_messages(messages: np.ndarray, max_messages: int, instant: float) -> ThinnedMessages:
-    """Return at most about ``max_messages`` messages.
+    """Return at most about ``max_messages`` of the MESSAGE rows ``messages`` (M,).
 
     If there are more, half of those returned are all messages of an interval around ``instant``
     (seconds), and the other half is spread over the run.
@@ -120,12 +123,12 @@ def thin_messages(messages: np.ndarray, max_messages: int, instant: float) -> Th
 def information_age(
     messages: np.ndarray, nodes: tuple[int, ...], times: FloatArray, cutoffs: FloatArray
 ) -> FloatArray:
-    """Return the age of information (T, N) in seconds of ``nodes`` at sample ``times`` (T,): the
+    """Return the age of information (T, N) in seconds of N ``nodes`` at sample ``times`` (T,): the
     time since the newest delivered message of a link was sent, averaged over the links into a node.
 
-    A sample includes the messages that arrived until its cutoff (T,). Before the first delivery the
-    age is the time since the start; it is nan for a node without incoming links. MESSAGE rows are
-    ordered as by ``join_messages``.
+    A sample includes the messages that arrived until its cutoff, ``cutoffs`` (T,) in seconds.
+    Before the first delivery the age is the time since the start; it is nan for a node without
+    incoming links. ``messages`` (M,) are MESSAGE rows ordered as by ``join_messages``.
     """
     total = np.zeros((len(times), len(nodes)))
     links = np.zeros(len(nodes))
@@ -145,8 +148,8 @@ def information_age(
 
 
 def count_traffic(messages: np.ndarray, horizon: float, bins: int) -> dict[str, list[int]]:
-    """Return the numbers of messages sent in each of ``bins`` equal intervals of a run of
-    ``horizon`` seconds, for each outcome.
+    """Return for each outcome the numbers (bins,) of messages sent in each of ``bins`` equal
+    intervals of a run of ``horizon`` seconds; ``messages`` are its MESSAGE rows (M,).
     """
     edges = np.linspace(0.0, max(horizon, 1e-300), bins + 1)
     names = {"delivered": DELIVERED, "lost": LOST, "late": LATE, "under way": UNDER_WAY}

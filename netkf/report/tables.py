@@ -289,7 +289,9 @@ def difference_curves(source_a: ReportSource, source_b: ReportSource) -> dict[st
 
 
 def _matrix_traces(matrices: FloatArray) -> FloatArray:
-    """Return the traces (T, N) of matrices (T, N, n, n)."""
+    """Return the traces (T, N) of ``matrices`` (T, N, n, n), such as covariances of N nodes at T
+    times.
+    """
     return np.asarray(np.trace(matrices, axis1=2, axis2=3))
 
 

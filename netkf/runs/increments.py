@@ -76,7 +76,7 @@ def _expected_increments_of_models() -> Callable[[Any], ExpectedIncrements]:
     cache: dict[int, tuple[Any, ExpectedIncrements]] = {}
 
     def expected_increments(model: Any) -> ExpectedIncrements:
-        """Return the predictions of a model."""
+        """Return the predictions of ``model``, the same object for the same model."""
         # The entry refers to the model, so that its id is not reused for another one.
         if id(model) not in cache:
             cache[id(model)] = model, ExpectedIncrements(model)
@@ -95,7 +95,11 @@ def record_increments(algorithm: Filter, intervals: list[WhitenedInnovation]) ->
     base: Any = type(algorithm)
 
     class RecordingFilter(base):  # type: ignore[misc]
-        """The filter on TimedState: methods unwrap the state, call the filter and wrap again."""
+        """The filter on TimedState: methods unwrap the state, call the filter and wrap again.
+
+        Arguments and results are those of :class:`netkf.Filter`, with TimedState for states: times
+        and gaps in seconds, ``mean`` and ``offset`` (n,), ``cov`` (n, n).
+        """
 
         def init(self, model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo) -> TimedState:
             inner = base.init(self, model, mean, cov, node)

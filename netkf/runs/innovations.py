@@ -97,18 +97,20 @@ def with_filter(scenario: Scenario, filtering: Any) -> Scenario:
 
 def _record_samples(algorithm: Filter, samples: list[RecordedSample]) -> Filter:
     """Return a filter with the estimates of ``algorithm`` that appends each sample that it is
-    updated with to ``samples``.
+    updated with to ``samples``, in place.
     """
     base: Any = type(algorithm)
 
     def update(self: Any, state: Any, reading: Any) -> Any:
-        """Record the sample with the estimate before it, then update."""
+        """Append the sample, with the estimate before it, to ``samples``, then update as the filter
+        does.
+        """
         if isinstance(reading, Reading):
             samples.append(RecordedSample(reading, *self.estimate(state)))
         return base.update(self, state, reading)
 
     def shift(self: Any, state: Any, offset: FloatArray) -> Any:
-        """Shift the state as the filter does."""
+        """Move the ``state`` by ``offset`` (n,) as the filter does."""
         return base.shift(self, state, offset)
 
     # Shifted coordinates are given up for a class that defines ``update`` but not ``shift``.
@@ -147,8 +149,11 @@ def _collect_innovations(
 def _match_nodes(
     run: Run, samples: list[RecordedSample]
 ) -> tuple[np.ndarray, list[RecordedSample]]:
-    """Return the node of each sample, -1 if a pooled filter reads for all, and the samples without
-    those after the last event of the run.
+    """Return the node id of each sample (M,), -1 if a pooled filter reads for all, and the M
+    samples without those after the last event of the run.
+
+    Readings do not name their node: it is that of the ``sense`` event in the same place of the
+    order.
     """
     senses = run.log[run.log["kind"] == CODES["sense"]][["t", "node"]]
     # A node with several sensors uses them together, and may have an event for each.
@@ -199,16 +204,19 @@ def innovation_series(recorded: Innovations) -> dict[int, FloatArray]:
 
 
 def autocorrelation(values: FloatArray, lags: int) -> FloatArray:
-    """Return the autocorrelation at lags 1 .. ``lags`` of a series (M,) with expectation 0."""
+    """Return the autocorrelations (lags,) at lags 1 .. ``lags`` of a series ``values`` (M,) with
+    expectation 0, relative to lag 0.
+    """
     total = float(values @ values)
     return np.array([values[k:] @ values[:-k] for k in range(1, lags + 1)]) / max(total, 1e-300)
 
 
 def autocorrelations(recorded: Innovations) -> tuple[dict[int, FloatArray], dict[int, int]]:
-    """Return, by node with at least MIN_READINGS readings, the autocorrelation of its innovations
-    at lags 1 .. MAX_LAG, and the number of its readings.
+    """Return, by node with at least MIN_READINGS readings, the autocorrelations (L,) of its
+    innovations at lags 1 .. L, and the number of its readings.
 
-    The lags are the same for all nodes: fewer than MAX_LAG if a node has few readings.
+    The L lags are the same for all nodes: MAX_LAG, or fewer if a node has few readings. One lag is
+    one reading of the node.
     """
     series = innovation_series(recorded)
     counts = {node: len(values) for node, values in series.items()}

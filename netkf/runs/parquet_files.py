@@ -158,7 +158,7 @@ class ParquetSink(Sink):
         self._rows = 0
 
     def events(self, rows: np.ndarray) -> None:
-        """Write a block of EVENT rows as a row group."""
+        """Write a block ``rows`` (E,) of EVENT rows as a row group of events.parquet."""
         if self._events is not None:
             self._events.write(event_columns(rows, self._replica, self._event_count))
             self._event_count += len(rows)
@@ -166,8 +166,9 @@ class ParquetSink(Sink):
     def states(
         self, t: FloatArray, x: FloatArray, xhat: FloatArray, P: FloatArray, error: FloatArray
     ) -> None:
-        """Collect samples, of the shapes in StateSamples, and write them when they fill a row
-        group.
+        """Collect T samples of N nodes, and write them when they fill a row group.
+
+        ``t`` (T,) seconds, ``x`` (T, n), ``xhat`` and ``error`` (T, N, n), ``P`` (T, N, n, n).
         """
         if self._states is not None:
             self._samples.append((t, x, xhat, P, error))
@@ -224,7 +225,9 @@ class TraceTables:
         self._rows = 0
 
     def add(self, replica: int, log: np.ndarray, samples: StateSamples) -> None:
-        """Append one run: the EVENT rows ``log`` and its samples."""
+        """Append run number ``replica``: the EVENT rows ``log`` (E,) and its samples; written once
+        they fill a row group.
+        """
         states = state_table(replica, self._nodes, samples, self._truth_known)
         self._pending_events.append(pd.DataFrame(event_columns(log, replica, 0)))
         self._pending_states.append(pd.DataFrame(states))

@@ -165,8 +165,10 @@ def _steady_bound(scenario: Scenario) -> dict[str, Any]:
 
 
 def _value_or_reason(function: Callable[[], FloatArray]) -> dict[str, Any]:
-    """Return the ``value`` of a function, one matrix (n, n) or a stack of them, with its ``trace``;
-    if it raises TheoryError both are None and ``reason`` is the message.
+    """Return a dictionary with the ``value`` of a function, one matrix (n, n) or a stack (N, n, n),
+    as lists, its ``trace``, and ``reason`` None.
+
+    If the function raises TheoryError value and trace are None and ``reason`` is the message.
     """
     try:
         value = function()

@@ -174,7 +174,7 @@ def read_run(
 
 
 def _status_of_log(log: np.ndarray) -> str:
-    """Return "diverged" if the EVENT rows of a run say so, else "complete"."""
+    """Return "diverged" if the EVENT rows ``log`` (E,) of a run say so, else "complete"."""
     return "diverged" if (log["kind"] == CODES["diverged"]).any() else "complete"
 
 
@@ -230,7 +230,8 @@ def _read_states(
 
 
 def _read_events(path: Path, scenario: Scenario, replica: int) -> np.ndarray:
-    """Return the events of a replica as EVENT rows; no rows without the file.
+    """Return the E events of a replica as EVENT rows (E,), in order of time; no rows without the
+    file.
 
     Raises DamagedError if the file does not fit the scenario.
     """

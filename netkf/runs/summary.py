@@ -60,7 +60,9 @@ class SummarySink(Sink):
         self.transmissions = Transmissions()
 
     def events(self, rows: np.ndarray) -> None:
-        """Count the messages in a block of EVENT rows, and note nodes that diverged."""
+        """Count the messages in a block ``rows`` (E,) of EVENT rows, and note nodes that diverged;
+        changes ``transmissions``, ``delivered`` and ``diverged``.
+        """
         self.transmissions.add(rows)
         self.diverged += rows["node"][rows["kind"] == CODES["diverged"]].tolist()
         deliveries = rows[rows["kind"] == CODES["deliver"]]
@@ -72,7 +74,12 @@ class SummarySink(Sink):
     def states(
         self, t: FloatArray, x: FloatArray, xhat: FloatArray, P: FloatArray, error: FloatArray
     ) -> None:
-        """Reduce a block of samples, with the shapes in trace.recorder.Sink; P is not stored."""
+        """Reduce a block of T samples of N nodes, appended to ``times``, ``sq_error``, ``trace``,
+        ``nees`` and ``first_component``; P is not stored.
+
+        ``t`` (T,) seconds, ``x`` (T, n), ``xhat`` and ``error`` (T, N, n), ``P`` (T, N, n, n). Sets
+        ``rounding_from`` at the first blurred sample.
+        """
         if not len(t):
             return
         sq_error, nees = errors(error, P)
@@ -316,7 +323,8 @@ def conserved_sums(sums: dict[str, tuple[float, float]]) -> dict[str, Any]:
 def _averages(
     mean_square: FloatArray, trace: FloatArray, nees: FloatArray, bound: FloatArray | None = None
 ) -> dict[str, list[Any]]:
-    """Return the averages of summary.json by name, a list of N numbers each, from arrays (N,).
+    """Return the averages of summary.json by name, a list of N numbers each, from arrays (N,) of
+    mean squared error, mean trace of P, mean NEES and mean ``bound`` of N nodes.
 
     Without a ``bound``, the lists of the bound and of the ratio to it hold None.
     """

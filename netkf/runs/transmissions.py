@@ -36,7 +36,9 @@ class Transmissions:
         self._senders: set[int] = set()
 
     def add(self, rows: np.ndarray) -> None:
-        """Count the next block of EVENT rows; blocks must come in the order of the run."""
+        """Count the next block ``rows`` (E,) of EVENT rows; blocks must come in the order of the
+        run.
+        """
         sends = rows[rows["kind"] == SEND]
         _add_counts(self.sent, sends["node"])
         _add_counts(self._broadcasts, rows["node"][rows["kind"] == TRANSMIT])
@@ -96,7 +98,7 @@ class SentPerLink(Sink):
         self.sent: Counter[Link] = Counter()
 
     def events(self, rows: np.ndarray) -> None:
-        """Count the messages in a block of EVENT rows."""
+        """Count the messages in a block ``rows`` (E,) of EVENT rows, in ``sent``."""
         sends = rows[rows["kind"] == SEND]
         ends = np.column_stack([sends["node"], sends["peer"]])
         pairs, counts = np.unique(ends, axis=0, return_counts=True)
@@ -106,11 +108,11 @@ class SentPerLink(Sink):
     def states(
         self, t: FloatArray, x: FloatArray, xhat: FloatArray, P: FloatArray, error: FloatArray
     ) -> None:
-        """Ignore samples."""
+        """Ignore samples; only events are counted."""
 
 
 def _add_counts(counter: Counter[int], nodes: np.ndarray) -> None:
-    """Add to ``counter`` how often each node occurs in ``nodes``."""
+    """Add to ``counter``, in place, how often each node id occurs in ``nodes`` (K,)."""
     distinct, counts = np.unique(nodes, return_counts=True)
     for node, count in zip(distinct.tolist(), counts.tolist(), strict=True):
         counter[node] += count
