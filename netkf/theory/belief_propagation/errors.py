@@ -51,7 +51,9 @@ class BeliefRule(ErrorRule):
             errors.copy(estimator, _prior_name(estimator), estimator)
 
     def _put_evidence(self, name: Hashable, U: FloatArray, s: FloatArray) -> None:
-        """Set the U (n, n) and the form of s (n, inputs) of an item of evidence."""
+        """Set U (n, n) and the form of s (n, inputs) of the item of evidence ``name``, in the stack
+        of errors.
+        """
         self._evidence.add(name)
         self.errors.stack.put(name, s)
         self.errors.stack.matrices[self.errors.stack.index(name)] = U
@@ -69,7 +71,9 @@ class BeliefRule(ErrorRule):
         return U, sum((stack.form(name) for name in present_names), np.zeros((n, stack.used)))
 
     def elapse(self, gap: float, columns: slice | None, noise: FloatArray | None) -> None:
-        """Predict all evidence over ``gap`` seconds."""
+        """Predict all evidence over ``gap`` seconds; changes U and s of every item. The plant's
+        noise, in ``columns``, is not needed.
+        """
         if gap > 0.0:
             self._predict_evidence(np.asarray(scipy.linalg.expm(-gap * self.scenario.belief[0])))
 
@@ -111,7 +115,9 @@ class BeliefRule(ErrorRule):
             self._update_belief(estimator)
 
     def _update_belief(self, estimator: int) -> None:
-        """Set the error and the root of P of a node from its prior and its evidence."""
+        """Set the error and the root of P of node ``estimator`` from its prior, its own evidence
+        and that received from its neighbours.
+        """
         errors, eye = self.errors, np.eye(self.errors.n)
         U, s = self._sum_evidence(
             [_own_name(estimator), *((estimator, j) for j in self._received[estimator])]
@@ -128,8 +134,9 @@ class BeliefRule(ErrorRule):
         errors.roots[estimator] = triangular_root(root)
 
     def _evidence_for(self, sender: int, receiver: int) -> tuple[FloatArray, FloatArray]:
-        """Return U and s of the message to ``receiver``: the evidence of the sender's readings and
-        that received from all its other neighbours.
+        """Return U (n, n) and the form of s (n, inputs) of the message of ``sender`` to
+        ``receiver``: the evidence of the sender's readings and that received from all its other
+        neighbours.
         """
         others = [(sender, j) for j in self._received[sender] if j != receiver]
         return self._sum_evidence([_own_name(sender), *others])

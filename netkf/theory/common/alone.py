@@ -11,9 +11,12 @@ from netkf.theory.intermittent.riccati import steady_covariance
 
 
 def steady_gain(F: FloatArray, Q: FloatArray, H: FloatArray, R: FloatArray) -> FloatArray:
-    """Return the Kalman gain (n, p) at the steady prediction covariance of sensors H (p, n), R.
+    """Return the steady Kalman gain (n, p) of one filter in slots, for predictions
+    ``x+ = F x + w``.
 
-    Raises TheoryError if that covariance does not exist.
+    ``F`` and ``Q`` (n, n): transition of a slot and covariance of w; ``H`` (p, n) and ``R`` (p, p):
+    all readings of a slot, stacked. The gain belongs to the covariance before the readings. Raises
+    TheoryError if that covariance has no limit.
     """
     if not len(H):
         return np.zeros((len(F), 0))
@@ -22,7 +25,11 @@ def steady_gain(F: FloatArray, Q: FloatArray, H: FloatArray, R: FloatArray) -> F
 
 
 def silent_jumps(scenario: Scenario) -> SlotJumps:
-    """Return the errors of each node by itself, or those of one filter that every node shows."""
+    """Return the errors of filters in slots that exchange nothing, with their steady gains.
+
+    One block of n errors for each node, or a single block if all nodes share one pooled filter.
+    Gains follow from the R that filters assume, the noise of the readings from the true one.
+    """
     F, Q = scenario.slot_belief
     if scenario.node_filter.pooled:
         model = scenario.pooled_slot_model

@@ -15,7 +15,11 @@ ArrivalsByStep = dict[tuple[int, int, int], FloatArray]
 
 
 def arrivals_by_step(scenario: Scenario, run: Run) -> ArrivalsByStep:
-    """Return the messages of a run that arrived in time, by slot, phase and step of the phase."""
+    """Return the messages of a run that arrived in time, by slot, phase and step of the phase.
+
+    The keys are 0-based: the slot, the exchange within the slot, the step within the exchange. Each
+    value is an (N, N) table, receiver by sender; keys without a message are missing.
+    """
     index, size, period = scenario.topology.index, len(scenario.nodes), scenario.slot_plant.period
     rows = run.log[run.log["kind"] == CODES["deliver"]]
     sent, length = rows["t"] - rows["age"], scenario.phase_length

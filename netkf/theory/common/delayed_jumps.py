@@ -69,24 +69,26 @@ class DelayedJumps:
 
     @property
     def nodes(self) -> int:
-        """N."""
+        """N, the number of nodes."""
         return self.instant.nodes
 
     @property
     def shape(self) -> tuple[int, int, int]:
-        """(1, M, M) of Phi, as of the second moments."""
+        """(1, M, M), the shape of Phi and of the second moments of the M = N n errors."""
         return self.instant.shape
 
     @cached_property
     def _message_directions(self) -> Directions:
-        """The links, with messages under way as senders: that of node i has the index N + i."""
+        """The K links, with messages under way as senders: that of node i has the index N + i."""
         directions = self.instant.directions
         assert directions is not None
         return directions._replace(sender=directions.sender + self.nodes)
 
     @cached_property
     def _mean(self) -> tuple[FloatArray, FloatArray]:
-        """B and G (M, M), the mean effects of the errors and of the messages that arrive."""
+        """B and G (M, M), the mean effects per second of the errors and of the messages that
+        arrive.
+        """
         N, M = self.nodes, len(self.instant.drift)
         mean_drift = np.zeros((M, 2 * M))
         mean_drift[:, :M] = self.instant.drift
@@ -114,7 +116,9 @@ class DelayedJumps:
 
     @cached_property
     def _integral(self) -> FloatArray:
-        """Integrals (k + 1, k + 1) from 0 to each point over values at the points."""
+        """Integrals (k + 1, k + 1) in seconds: row a weights the values at the k + 1 collocation
+        points of the delay so that their sum is the integral from 0 to point a.
+        """
         return self.delay * chebyshev_integrals(self.points)
 
     @cached_property
@@ -145,7 +149,11 @@ class DelayedJumps:
         return np.linalg.inv(np.eye(size) - coupled)
 
     def _apply_inverse(self, y: FloatArray) -> FloatArray:
-        """Return the ``_propagators`` applied to y (k + 1, M, columns), node by node."""
+        """Return the solution (k + 1, M, columns) of ``Y - integral B Y = y``, at the k + 1 points
+        of the delay, for y of the same shape: each column is a function of s with M = N n entries.
+
+        B is block diagonal, so that each node is solved by itself.
+        """
         N, (K, M, columns) = self.nodes, y.shape
         by_node = y.reshape(K, N, -1, columns).swapaxes(0, 1).reshape(N, -1, columns)
         solution = (self._propagators @ by_node).reshape(N, K, -1, columns)
@@ -169,22 +177,26 @@ class DelayedJumps:
         return E @ covariance[::-1], symmetric(noise[-1])
 
     def _heard_products(self, K: FloatArray) -> FloatArray:
-        """Return H K(d - s)' (k + 1, M, M) at the points, which lie symmetrically."""
+        """Return H K(d - s)' (k + 1, M, M) at the k + 1 points s of the delay, for K of that shape.
+
+        The points lie symmetrically in [0, d], so that K(d - s) is K in reverse order.
+        """
         k, M, _ = K.shape
         columns = np.ascontiguousarray(K[::-1].transpose(2, 0, 1)).reshape(M, k * M)
         return np.asarray((self._coupling @ columns).reshape(M, k, M).swapaxes(0, 1))
 
     def _driven_by(self, Phi: FloatArray) -> FloatArray:
-        """Return the right-hand side (k + 1, M, M) of the problem of ``_residual`` for white noise
-        of covariance Phi (M, M) per second.
+        """Return the right-hand side (k + 1, M, M) of the boundary value problem of ``_residual``
+        for white noise of covariance Phi (M, M) per second, which enters its second equation (entry
+        0).
         """
         right = np.zeros((self.points + 1, *Phi.shape))
         right[0] = Phi
         return right
 
     def _driven_by_noises(self) -> FloatArray:
-        """Return the right-hand side (k + 1, M, M) for the noises of plant and readings, with the
-        part of Phi that is due to the noise in messages.
+        """Return the right-hand side (k + 1, M, M), at the k + 1 points of the delay, for the
+        noises of plant and readings, with the part of Phi that is due to the noise in messages.
         """
         heard = self._mean[1] @ np.tile(self._message_noise[0], (1, self.nodes, 1))
         right = np.tensordot(self._integral, heard, 1)
@@ -193,7 +205,8 @@ class DelayedJumps:
         return np.asarray(right)
 
     def _residual(self, K: FloatArray, right: FloatArray, jumps: bool) -> FloatArray:
-        """Return the residuals (k + 1, M, M) of the boundary value problem for given K.
+        """Return the residuals (k + 1, M, M) of the boundary value problem for K and a
+        ``right``-hand side, of the same shape; the first axis are the k + 1 points of the delay.
 
         Entry 0 is the residual of its second equation, the others are those of the first equation
         integrated from 0 to each point. With ``jumps`` Phi is the inflow computed from K.
@@ -214,7 +227,9 @@ class DelayedJumps:
         return LyapunovInverse(self._mean[0][None])
 
     def _solve_without_messages(self, right: FloatArray) -> FloatArray:
-        """Return the solution K (k + 1, M, M) without the terms of messages, the preconditioner."""
+        """Return the solution K (k + 1, M, M) of the problem with this ``right``-hand side, of the
+        same shape, if no message is heard (H = 0); GMRES uses it as preconditioner.
+        """
         equation = symmetric(right[:1])
         first = 2.0 * (right[:1] - equation) + self._lyapunov(equation)
         return self._apply_inverse(np.concatenate([first, right[1:] + first]))
@@ -225,7 +240,11 @@ class DelayedJumps:
         return {}
 
     def _by_elimination(self, right: FloatArray, jumps: bool) -> FloatArray:
-        """Return the solution K (k + 1, M, M) of a small problem by dense LU factors."""
+        """Return the solution K (k + 1, M, M) of a small problem by dense LU factors.
+
+        ``right`` (k + 1, M, M) is the right-hand side; with ``jumps`` Phi depends on K. The factors
+        are cached in ``_factors``.
+        """
         if jumps not in self._factors:
             units = np.eye(right.size).reshape(right.size, *right.shape)
             columns = [-self._residual(unit, np.zeros_like(unit), jumps).ravel() for unit in units]
@@ -235,13 +254,18 @@ class DelayedJumps:
         )
 
     def _solve(self, right: FloatArray, jumps: bool, tolerance: float) -> FloatArray:
-        """Return the solution K (k + 1, M, M) of the problem to a relative ``tolerance``."""
+        """Return the solution K (k + 1, M, M) of the boundary value problem to a relative
+        ``tolerance``.
+
+        ``right`` (k + 1, M, M) is the right-hand side at the k + 1 points of the delay; with
+        ``jumps`` Phi depends on K. Small problems are solved by elimination, others by GMRES.
+        """
         if right.size <= MAX_DENSE:
             return self._by_elimination(right, jumps)
         zeros = np.zeros_like(right)
 
         def apply(x: FloatArray) -> FloatArray:
-            """Return the residual of the unknowns ``x``, preconditioned."""
+            """Return the residual of the unknowns ``x`` ((k + 1) M M,), preconditioned."""
             return -self._solve_without_messages(
                 self._residual(x.reshape(right.shape), zeros, jumps)
             ).ravel()
@@ -254,8 +278,10 @@ class DelayedJumps:
         return np.asarray(solution).reshape(right.shape)
 
     def _autocovariances(self, right: FloatArray, jumps: bool) -> FloatArray:
-        """Return K (k + 1, M, M) at the points for a right-hand side, with or without the inflow of
-        jumps, by iterative refinement. Raises TheoryError if that does not converge.
+        """Return K (k + 1, M, M) at the k + 1 points of the delay, by iterative refinement.
+
+        ``right`` (k + 1, M, M) is the right-hand side; with ``jumps`` Phi includes the inflow
+        computed from K. Raises TheoryError if the refinement does not converge.
         """
         K = self._solve(right, jumps, FIRST_TOLERANCE)
         for _ in range(MAX_ROUNDS):
@@ -279,16 +305,16 @@ class DelayedJumps:
         return np.block([[X, across], [across.T, symmetric(sent)]])
 
     def _inflow(self, moments: FloatArray) -> FloatArray:
-        """Return the white noise Phi (M, M) per second that jumps cause, from the moments
-        (2 M, 2 M) of errors and messages.
+        """Return Phi (M, M), the covariance per second that arriving messages and samples add, from
+        the ``moments`` (2 M, 2 M) of errors and messages.
         """
         M, Z = len(moments) // 2, moments[None]
         heard = self._message_directions.products(*self.instant.all_pairs, Z)[:, :M, :M]
         return np.asarray(symmetric(self.instant.sampled(Z[:, :M, :M]) + heard)[0])
 
     def apply_jumps(self, Phi: FloatArray) -> FloatArray:
-        """Return T(Phi) (1, M, M): the Phi that jumps cause in errors driven by white noise Phi; T
-        is a positive map.
+        """Return T(Phi) (1, M, M), the Phi that jumps cause in errors driven by white noise of
+        covariance Phi (1, M, M) per second; T is a positive map.
         """
         K = self._autocovariances(self._driven_by(Phi[0]), False)
         return self._inflow(self._moments(K, False))[None]
@@ -320,7 +346,9 @@ class DelayedJumps:
         K, M = self.points + 1, len(self.instant.drift)
 
         def next_means(y: FloatArray) -> FloatArray:
-            """Return the means (K M,) at the points of the next delay from those of the last."""
+            """Return the means (K M,) of the M errors at the K points of the next delay from those
+            ``y`` (K M,) of the last one.
+            """
             past = y.reshape(K, M)
             heard = self._integral @ (self._coupling @ past.T).T
             return self._apply_inverse((past[-1] + heard)[:, :, None]).ravel()
@@ -337,7 +365,9 @@ class DelayedJumps:
 
 
 def chebyshev_points(K: int) -> FloatArray:
-    """Return the K + 1 extreme points of the Chebyshev polynomial of degree K on [0, 1]."""
+    """Return the extreme points (K + 1,) of the Chebyshev polynomial of degree K, increasing from 0
+    to 1.
+    """
     return np.asarray(0.5 * (1.0 - np.cos(np.pi * np.arange(K + 1) / K)))
 
 

@@ -17,7 +17,11 @@ from netkf.theory.common.stacked_errors import StackedErrors, Term
 
 
 class SentMessage(NamedTuple):
-    """One message between nodes given by their indices; ``arrives`` is nan for a lost one."""
+    """One message between nodes given by their indices.
+
+    ``number`` counts the messages of its link; ``time`` and ``arrives`` are seconds
+    (the slot, in runs in slots), and ``arrives`` is nan for a lost message.
+    """
 
     sender: int
     receiver: int
@@ -46,7 +50,9 @@ class ErrorRule:
         self.scenario, self.errors, self.times = scenario, errors, times
 
     def sense(self, time: float, observations: EstimatorObservations) -> None:
-        """Update each estimator by its readings of this instant."""
+        """Update the errors and roots of P of each estimator by its readings at ``time``
+        (seconds, or the slot).
+        """
         columns = self.errors.reading_noises(observations)
         for estimator, observation in observations.items():
             self.errors.update(estimator, observation, columns[estimator])
@@ -55,7 +61,9 @@ class ErrorRule:
         """Record messages that leave at this instant and will arrive."""
 
     def arrive(self, time: float, messages: Sequence[SentMessage]) -> None:
-        """Use all messages that arrive at this instant; those without delay also left at it."""
+        """Use all messages that arrive at ``time`` (seconds, or the slot); those without delay also
+        left at it. Filters without messages ignore them.
+        """
 
     def exchange(self, slot: int, phase: int, messages: Sequence[SentMessage]) -> None:
         """Use the messages that arrived in time in exchange number ``phase`` of a slot."""
@@ -79,7 +87,9 @@ class EstimateExchangeRule(ErrorRule):
                 self.errors.copy(message.sender, message, None)
 
     def arrive(self, time: float, messages: Sequence[SentMessage]) -> None:
-        """Combine each receiver's estimate with the newest message of each sender."""
+        """Combine the estimate of each receiver with the newest message of each sender; changes
+        errors and roots of P of the receivers, and drops the copies that late messages carried.
+        """
         inboxes: dict[int, dict[int, SentMessage]] = {}
         # Messages of one sender can overtake each other: the last one sent counts.
         for message in sorted(messages, key=lambda m: (m.sender, m.time, m.number)):
@@ -95,7 +105,10 @@ class EstimateExchangeRule(ErrorRule):
     def _combine_inbox(
         self, receiver: int, inbox: list[SentMessage]
     ) -> tuple[FloatArray, list[tuple[Hashable, FloatArray]]]:
-        """Return the new root (n, n) of a receiver, and the factor of each error that enters."""
+        """Return the new root (n, n) of P of the node with index ``receiver``, and the terms of its
+        new error: for its own estimate and for each message of the ``inbox`` a name and a factor
+        (n, n).
+        """
         # An instantaneous message needs no copy: its content is the sender's present estimate.
         sources: list[Hashable] = [receiver]
         sources += [message if message.late else message.sender for message in inbox]

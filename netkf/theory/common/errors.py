@@ -32,7 +32,10 @@ def error_covariance(scenario: Scenario, run: Run, stacked: bool = False) -> Flo
 
 
 def diagonal_blocks(stacked: FloatArray, nodes: int) -> FloatArray:
-    """Return the diagonal blocks (T, N, n, n) of stacked covariances (T, N n, N n)."""
+    """Return the diagonal blocks (T, N, n, n) of T stacked covariances (T, N n, N n).
+
+    ``nodes`` is N; block (t, i) is the covariance of the error of node i at time t.
+    """
     n = stacked.shape[-1] // nodes
     # Entry (t, i, a, j, b) is the covariance of entry a of e_i and entry b of e_j.
     blocks = stacked.reshape(len(stacked), nodes, n, nodes, n)
@@ -40,12 +43,13 @@ def diagonal_blocks(stacked: FloatArray, nodes: int) -> FloatArray:
 
 
 def error_law(scenario: Scenario, run: Run) -> ErrorLaw:
-    """Return the joint Gaussian law of all errors at all ``run.times``, given the run's events, and
-    P_i by the filter's equations, independently of the engine.
+    """Return the joint Gaussian law of all errors at all T ``run.times``, given the run's events,
+    and P_i by the filter's equations, independently of the engine.
 
-    Unlike :func:`error_covariance` it relates different times, and includes the mean that errors
-    have where filters start elsewhere than the plant. Nodes that share one pooled filter count
-    once. Raises the errors of :func:`error_covariance`.
+    Of M filters of n states: mean (T M n,), covariance (T M n, T M n) and P (T, M, n, n). Unlike
+    :func:`error_covariance` it relates different times, and includes the mean that errors have
+    where filters start elsewhere than the plant. Nodes that share one pooled filter count once.
+    Raises the errors of :func:`error_covariance`.
     """
     _require_same_run(scenario, run)
     return replay_law(scenario, run)
@@ -62,7 +66,10 @@ def _require_same_run(scenario: Scenario, run: Run) -> None:
 
 
 def _replay_nodes(scenario: Scenario, run: Run) -> FloatArray:
-    """Return the joint error covariance (T, N n, N n) of all nodes."""
+    """Return the joint error covariance (T, N n, N n) of all N nodes at the T ``run.times``.
+
+    Raises TheoryError if the run is of another scenario.
+    """
     _require_same_run(scenario, run)
     joint, nodes = replay_covariances(scenario, run), len(scenario.nodes)
     # A pooled filter is replayed once; all nodes share its estimate, and so its error.

@@ -39,23 +39,25 @@ class SlotJumps:
 
     @property
     def nodes(self) -> int:
-        """N."""
+        """N, the number of nodes."""
         return len(self.closed)
 
     @property
     def shape(self) -> tuple[int, int, int]:
-        """(S, M, M) of second moments by mode."""
+        """(S, M, M), the shape of second moments by mode; S = 1 without bursty links."""
         M = self.nodes * len(self.F)
         return (self.directions.modes if self.directions else 1, M, M)
 
     @cached_property
     def _all(self) -> IntArray:
-        """Indices of all directions."""
+        """Indices (K,) of all K directions; empty if nothing is sent."""
         return np.arange(len(self.directions.sender) if self.directions else 0)
 
     @cached_property
     def _pairs(self) -> tuple[IntArray, IntArray]:
-        """Pairs of directions that share a draw, each with itself too; others are independent."""
+        """Pairs of directions that share a draw, as two arrays (P,) of indices; each direction is
+        also paired with itself. Deliveries of other pairs are independent.
+        """
         assert self.directions is not None
         same = self.directions.source[:, None] == self.directions.source
         first, second = np.nonzero(same)
@@ -63,12 +65,17 @@ class SlotJumps:
 
     @cached_property
     def _mean(self) -> FloatArray:
-        """E[D] (S, M, M) over all directions, by mode."""
+        """E[D] (S, M, M) by mode, the mean change of the stacked errors in one exchange."""
         assert self.directions is not None
         return self.directions.mean(self.nodes, self._all)
 
     def step(self, X: FloatArray, noise: bool = False) -> FloatArray:
-        """Return the second moments (S, M, M) one slot later, with or without the noises."""
+        """Return the second moments (S, M, M) one slot later, from those X (S, M, M) of the M = N n
+        stacked errors in each of S modes.
+
+        Each is weighted by the probability of its mode, so that their sum is the second moment.
+        ``noise`` adds the noises of plant and readings; without it the map is linear.
+        """
         N = self.nodes
         weight = self.directions.stationary if self.directions else np.ones(1)
         share = (weight if noise else 0.0 * weight)[:, None, None]
@@ -79,7 +86,9 @@ class SlotJumps:
         return updated if self.directions is None else self._exchange(predicted, updated)
 
     def _exchange(self, predicted: FloatArray, updated: FloatArray) -> FloatArray:
-        """Return the second moments (S, M, M) after the exchange."""
+        """Return the second moments (S, M, M) after the exchange, from those of the errors before
+        and after the readings of the slot, ``predicted`` and ``updated`` (S, M, M), by mode.
+        """
         directions, mean = self.directions, self._mean
         assert directions is not None
         source, cross = updated, updated
@@ -125,7 +134,9 @@ class ClockJumps:
 
     @cached_property
     def _chains(self) -> list[IntArray]:
-        """Channels (chains of the losses) that make a step at the ticks of each clock."""
+        """Channels (chains of the losses) that make a step at the ticks of each clock: for each
+        entry of ``ticks`` an array of their indices.
+        """
         assert self.directions is not None
         return [
             np.unique(self.directions.source[tick_directions]) for _, tick_directions in self.ticks
@@ -148,8 +159,8 @@ class ClockJumps:
 
     @cached_property
     def _pairs(self) -> list[tuple[IntArray, IntArray, FloatArray]]:
-        """All pairs of directions of each clock, and the rates (S, P) at which both messages
-        arrive.
+        """For each clock all P ordered pairs of its directions, as two arrays (P,) of indices, and
+        the rates (S, P) per second, by mode, at which both messages arrive.
         """
         assert self.directions is not None
         pairs = []
@@ -160,7 +171,9 @@ class ClockJumps:
 
     @cached_property
     def all_pairs(self) -> tuple[IntArray, IntArray, FloatArray]:
-        """Pairs of directions of each tick, and the rates (S, P) at which both messages arrive."""
+        """Pairs of directions of all clocks together, as two arrays (P,) of indices, and the rates
+        (S, P) per second, by mode, at which both messages arrive.
+        """
         first, second = (np.concatenate([pair[k] for pair in self._pairs]) for k in (0, 1))
         return first, second, np.concatenate([rates for *_, rates in self._pairs], axis=1)
 
@@ -173,7 +186,9 @@ class ClockJumps:
         ]
 
     def sampled(self, X: FloatArray) -> FloatArray:
-        """Return the part of ``inflow`` (S, M, M) that samples add."""
+        """Return the part (S, M, M) of ``inflow`` that samples of the nodes add, for second moments
+        X (S, M, M).
+        """
         inflow = np.zeros_like(X)
         for node, rate, lost in self.samples:
             block = _block_slice(X, self.nodes, node)
@@ -181,8 +196,10 @@ class ClockJumps:
         return inflow
 
     def inflow(self, X: FloatArray) -> FloatArray:
-        """Return the rate (S, M, M) at which jumps increase the second moments X beyond the mean
-        drift B of ``flows``: ``dX/dt = B X + X B' + inflow(X) + noise``. It is a positive map.
+        """Return the rate (S, M, M) per second at which jumps increase second moments X (S, M, M)
+        beyond the mean drift B of ``flows``: ``dX/dt = B X + X B' + inflow(X) + noise``.
+
+        It is a positive map; S counts modes of the channels, M = N n stacked errors.
         """
         total = self.sampled(X)
         if self.directions is None or not self.ticks:
@@ -200,13 +217,20 @@ class ClockJumps:
 
 
 def _block_slice(X: FloatArray, nodes: int, i: int) -> FloatArray:
-    """Return the block (S, n, n) of node i of X (S, N n, N n), which may be written to."""
+    """Return the block (S, n, n) of node i of X (S, N n, N n) as a view, which may be written to.
+
+    ``nodes`` is N; S counts modes.
+    """
     n = X.shape[1] // nodes
     return X[:, i * n : (i + 1) * n, i * n : (i + 1) * n]
 
 
 def _multiply_blocks(maps: FloatArray, X: FloatArray, nodes: int) -> FloatArray:
-    """Return ``C X C'`` (S, M, M) for the block diagonal C of N ``maps`` (N, n, n), or of one."""
+    """Return ``C X C'`` (S, M, M) for the second moments X (S, M, M) in S modes, M = N n.
+
+    C is block diagonal with the N blocks ``maps`` (N, n, n), or with one block (1, n, n) for all;
+    ``nodes`` is N.
+    """
     S, M, _ = X.shape
     n = M // nodes
     CX = (maps @ X.reshape(S, nodes, n, M)).reshape(S, M, M)
@@ -221,15 +245,15 @@ class LyapunovInverse:
         self._forms = [scipy.linalg.schur(matrix)[:2] for matrix in B]
 
     def __call__(self, Y: FloatArray) -> FloatArray:
-        """Return X (S, M, M) with ``B X + X B' + Y = 0``."""
+        """Return X (S, M, M) with ``B X + X B' + Y = 0`` for Y (S, M, M), matrix by matrix."""
         return np.stack(
             [self._solve(T, U, matrix) for (T, U), matrix in zip(self._forms, Y, strict=True)]
         )
 
     @staticmethod
     def _solve(T: FloatArray, U: FloatArray, Y: FloatArray) -> FloatArray:
-        """Return symmetric X with ``A X + X A' = -Y``, where A = U T U' is a real Schur form
-        (Bartels and Stewart 1972).
+        """Return symmetric X (M, M) with ``A X + X A' = -Y``, where ``A = U T U'`` is a real Schur
+        form (Bartels and Stewart 1972); T, U and Y are (M, M).
         """
         X, scale, _ = scipy.linalg.lapack.dtrsyl(T, T, -(U.T @ Y @ U), trana="N", tranb="T")
         return symmetric(np.asarray(U @ (X / scale) @ U.T))

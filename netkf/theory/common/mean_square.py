@@ -80,8 +80,10 @@ def steady_error_covariance(scenario: Scenario) -> FloatArray:
 
 @lru_cache(maxsize=8)
 def _solve(scenario: Scenario) -> tuple[float, FloatArray | None]:
-    """Return the radius, and the covariances (N, n, n) if it is below 1; with delays the radius is
-    0 if it is only proved to be below 1.
+    """Return the mean-square radius, and the steady error covariances (N, n, n) of the nodes if it
+    is below 1, else None.
+
+    With delays the radius is 0 if it is only proved to be below 1. The last 8 results are cached.
     """
     solve = _choose_solver(scenario)
     if solve is not None:
@@ -167,7 +169,10 @@ def is_quickly_solved(scenario: Scenario) -> bool:
 def _choose_solver(
     scenario: Scenario,
 ) -> Callable[[Scenario], tuple[float, FloatArray | None]] | None:
-    """Return the paper's own function for radius and covariances in slots, None without one."""
+    """Return the paper's own function from a scenario in slots to its radius and covariances
+    (N, n, n), the latter None if the radius is not below 1; None if the paper has no such function
+    or the scenario runs under clocks.
+    """
     solver: Callable[[Scenario], tuple[float, FloatArray | None]] | None = paper_function(
         scenario, "steady_errors", f"{scenario.node_filter.combination}_in_slots".replace(" ", "_")
     )
@@ -186,7 +191,9 @@ def _system_maker(scenario: Scenario) -> Callable[[Scenario], LinearErrors] | No
 
 
 def _require_size(shape: tuple[int, int, int]) -> None:
-    """Raise TheoryError for systems (S, M, M) that are too large."""
+    """Raise TheoryError for systems of a ``shape`` (S, M, M) that are too large: S joint states of
+    the links, M errors of all nodes.
+    """
     S, M, _ = shape
     if M > MAX_ERRORS:
         raise TheoryError(
@@ -201,14 +208,18 @@ def _require_size(shape: tuple[int, int, int]) -> None:
 
 
 def _slot_map(system: SlotJumps) -> tuple[PositiveMap, FloatArray]:
-    """Return the map of second moments over a slot and the noise (S, M, M) that it adds."""
+    """Return the linear map of second moments (S, M, M) over a slot, and the noise (S, M, M) that a
+    slot adds; S counts joint states of the links, M errors of all nodes.
+    """
     return system.step, system.step(np.zeros(system.shape), noise=True)
 
 
 def _clock_map(system: ClockJumps) -> tuple[PositiveMap, FloatArray | None]:
-    """Return the map ``X -> S^-1(inflow(X))`` with ``S X = -(B X + X B')``, and ``S^-1(noise)``.
+    """Return the map ``X -> L^-1(inflow(X))`` of second moments (S, M, M), where
+    ``L X = -(B X + X B')`` is what errors lose between jumps, and ``L^-1(noise)`` (S, M, M).
 
-    The latter is None if some B is not stable: errors then grow even between jumps.
+    Steady moments X are a fixed point of ``X = L^-1(inflow(X)) + L^-1(noise)``. The second result
+    is None if some B is not stable: errors then grow even between jumps.
     """
     if max(np.linalg.eigvals(B).real.max() for B in system.flows) >= 0.0:
         return system.inflow, None

@@ -63,7 +63,11 @@ def increment_observations(scenario: Scenario) -> list[Observation]:
 
 
 def slot_observations(scenario: Scenario, run: Run) -> Callable[[int], EstimatorObservations]:
-    """Return a function from a slot to its readings by estimator; call it with increasing slots."""
+    """Return a function from a slot (0-based) to the readings of that slot, by index of the
+    estimator; call it with increasing slots.
+
+    Estimators without sensors are missing; p is the number of readings of the slot.
+    """
     streams, n = Streams(run.seed, run.replica), scenario.plant.n
     noises = _noises(scenario)
     estimators = [

@@ -45,7 +45,7 @@ class Directions(NamedTuple):
 
     @property
     def modes(self) -> int:
-        """S."""
+        """S, the number of modes."""
         return len(self.delivery)
 
     @property
@@ -61,7 +61,9 @@ class Directions(NamedTuple):
         return probabilities
 
     def advance(self, X: FloatArray, chains: IntArray) -> FloatArray:
-        """Return second moments (S, M, M) by mode after the given ``chains`` made a step."""
+        """Return second moments (S, M, M) by mode after a step of the given ``chains`` (indices),
+        from those X (S, M, M) before it; each is weighted by the probability of its mode.
+        """
         if self.steps is None:
             return X
         to_bad, to_good = self.steps
@@ -73,7 +75,9 @@ class Directions(NamedTuple):
         return X
 
     def stay(self, chains: IntArray) -> FloatArray:
-        """Return the probability (S,) that a step of the given ``chains`` leaves the mode."""
+        """Return the probability (S,), by mode, that a step of the given ``chains`` (indices)
+        leaves the mode as it is.
+        """
         if self.steps is None:
             return np.ones(1)
         to_bad, to_good = self.steps
@@ -83,7 +87,9 @@ class Directions(NamedTuple):
         return probability
 
     def mean(self, nodes: int, directions: IntArray) -> FloatArray:
-        """Return E[D] (S, N n, N n) of the directions ``directions``, by mode."""
+        """Return E[D] (S, N n, N n) by mode, the mean change of stacked errors by one exchange over
+        the given ``directions`` (indices); ``nodes`` is N.
+        """
         n = self.weight.shape[-1]
         blocks = np.zeros((self.modes, nodes, nodes, n, n))
         terms = self.delivery[:, directions, None, None] * self.weight[directions]
@@ -95,8 +101,10 @@ class Directions(NamedTuple):
     def products(
         self, first: IntArray, second: IntArray, factor: FloatArray, Z: FloatArray
     ) -> FloatArray:
-        """Return ``sum c D_a Z D_b'`` (S, N n, N n) over pairs (a, b) of directions, factors c
-        (S, P) of P pairs, for second moments Z (S, N n, N n).
+        """Return ``sum_p c_p D_a Z D_b'`` (S, N n, N n) over P pairs (a, b) of directions.
+
+        ``first`` and ``second`` (P,) are the indices a and b, ``factor`` (S, P) holds c by mode,
+        and Z (S, N n, N n) the second moments of the stacked errors.
         """
         n = self.weight.shape[-1]
         S, N = len(Z), Z.shape[1] // n
@@ -111,8 +119,8 @@ class Directions(NamedTuple):
         return _join_blocks(blocks_out)
 
     def joint(self, first: IntArray, second: IntArray) -> FloatArray:
-        """Return the probability (S, P) that the messages of both directions arrive in one
-        activation, by mode, for P pairs of directions.
+        """Return the probability (S, P), by mode, that the messages of both directions arrive in
+        one activation, for P pairs of directions with the indices ``first`` and ``second`` (P,).
         """
         p, q = self.delivery[:, first], self.delivery[:, second]
         # Directions of one source share one uniform draw: both arrive if it is below min(p, q).
@@ -121,13 +129,17 @@ class Directions(NamedTuple):
 
 
 def _add_blocks(blocks: FloatArray, rows: IntArray, columns: IntArray, terms: FloatArray) -> None:
-    """Add terms (S, P, n, n) to ``blocks`` (S, N, N, n, n) at P indices, which may repeat."""
+    """Add P terms (S, P, n, n) to ``blocks`` (S, N, N, n, n) in place, at the nodes ``rows`` and
+    ``columns`` (P,), of which pairs may repeat; S counts modes.
+    """
     index: Any = (slice(None), rows, columns)
     np.add.at(blocks, index, terms)
 
 
 def _join_blocks(blocks: FloatArray) -> FloatArray:
-    """Return matrices (S, N n, N n) of blocks (S, N, N, n, n)."""
+    """Return the matrices (S, N n, N n) that consist of ``blocks`` (S, N, N, n, n): for each of S
+    modes an (n, n) block for each pair of N nodes.
+    """
     S, N, _, n, _ = blocks.shape
     return np.asarray(np.swapaxes(blocks, 2, 3).reshape(S, N * n, N * n))
 
@@ -138,7 +150,7 @@ def directions_of(
     """Return the directions of a scenario with ``weights`` (n, n) for each (sender, receiver).
 
     Messages that take more than ``wait`` seconds count as lost. Raises TheoryError if losses or
-    delays have no law that is known here.
+    delays have no law that is known here. The order is that of ``weights``.
     """
     _require_law(scenario)
     loss, delay = scenario.network.channel.loss, scenario.network.channel.delay.fixed
@@ -187,15 +199,19 @@ def _require_law(scenario: Scenario) -> None:
 def _deliveries(
     scenario: Scenario, links: list[tuple[int, int]], source: IntArray, chains: int
 ) -> FloatArray:
-    """Return the delivery probabilities (S, K) of each of ``links``, by mode (see Directions), for
-    the given number of ``chains``. Raises TheoryError for more than MAX_CHAINS.
+    """Return the delivery probabilities (S, K) of K ``links`` (sender, receiver), by mode.
+
+    ``source`` (K,) is the index of the chain of each link, ``chains`` their number; with bursts
+    there are S = 2^chains modes, else one. Raises TheoryError for more than MAX_CHAINS.
     """
     loss = scenario.network.channel.loss
     if isinstance(loss, GilbertElliott) and loss.independent:
         return np.array([[loss.mean_delivery(link, 1.0) for link in links]])
 
     def probabilities(bad: bool) -> FloatArray:
-        """Return the delivery probability of each link if all channels are in this state."""
+        """Return the delivery probability (K,) of each link if all channels are in their bad state
+        (``bad``), or all in their good one.
+        """
         tables = ((link, scenario.table_probability(link)) for link in links)
         return np.array([loss.delivery_probability(link, 0, bad, table) for link, table in tables])
 
@@ -231,8 +247,10 @@ def _fail_together(scenario: Scenario) -> bool:
 def poisson_ticks(
     scenario: Scenario, links: list[tuple[int, int]]
 ) -> tuple[tuple[float, IntArray], ...]:
-    """Return rate (1/s) and directions (indices in ``links``) of each clock at which nodes
-    transmit; raises TheoryError unless clocks are Poisson processes.
+    """Return for each clock at which nodes transmit its rate (1/s) and the indices (K,), in
+    ``links``, of the K directions that transmit when it ticks.
+
+    ``links`` are pairs (sender, receiver). Raises TheoryError unless clocks are Poisson processes.
     """
     clock = scenario.network.activation
     assert isinstance(clock, LinkClock)

@@ -67,13 +67,15 @@ def replay_law(scenario: Scenario, run: Run) -> ErrorLaw:
 
 
 def _stacked_errors(scenario: Scenario) -> StackedErrors:
-    """Return the errors at time 0."""
+    """Return the errors of all estimators of a scenario at time 0; raises TheoryError for a filter
+    whose equations are not known here.
+    """
     require_known_filter(scenario)
     return StackedErrors(scenario, len(nodes_by_estimator(scenario)))
 
 
 def _replay(scenario: Scenario, run: Run, errors: StackedErrors) -> Iterator[None]:
-    """Replay a run; yield at each of ``run.times``."""
+    """Replay a run's events on ``errors``, which it changes; yield at each of ``run.times``."""
     return (_replay_slots if scenario.slotted else _replay_instants)(scenario, run, errors)
 
 
@@ -115,7 +117,7 @@ def delivered_messages(scenario: Scenario, run: Run) -> list[SentMessage]:
 
 
 def _replay_instants(scenario: Scenario, run: Run, errors: StackedErrors) -> Iterator[None]:
-    """Replay a run in continuous time; yield at each of ``run.times``."""
+    """Replay a run in continuous time, which changes ``errors``; yield at each of ``run.times``."""
     messages = delivered_messages(scenario, run)
     rule = _make_rule(scenario, errors, run, messages)
     propagator = ErrorPropagator(scenario, errors)
@@ -151,7 +153,9 @@ def _exchanged_messages(scenario: Scenario, run: Run) -> dict[tuple[int, int], l
 
 
 def _group_by_time(messages: list[SentMessage], column: int) -> dict[float, list[SentMessage]]:
-    """Return the messages by the time in their field number ``column``."""
+    """Return the messages by the time in their field number ``column``: that at which they were
+    sent or that at which they arrive (seconds).
+    """
     groups: dict[float, list[SentMessage]] = {}
     for message in messages:
         groups.setdefault(message[column], []).append(message)
@@ -169,7 +173,7 @@ def _make_rule(
 
 
 def _replay_slots(scenario: Scenario, run: Run, errors: StackedErrors) -> Iterator[None]:
-    """Replay a run in slots; yield at each of ``run.times``.
+    """Replay a run in slots, which changes ``errors``; yield at each of ``run.times``.
 
     A sample shows the state before its slot for filters that predict, else the state after it.
     """
@@ -198,7 +202,11 @@ def _replay_slot(
     observations: EstimatorObservations,
     arrivals: dict[tuple[int, int], list[SentMessage]],
 ) -> None:
-    """Apply the phases of one slot in the filter's order."""
+    """Apply the ``phases`` of one ``slot`` in the filter's order; changes the errors of ``rule``.
+
+    ``observations`` are the readings of the slot, ``arrivals`` the messages that arrived in time,
+    by slot and number of the exchange (0-based) within it.
+    """
     exchange = 0
     for phase in phases:
         if phase == "predict":

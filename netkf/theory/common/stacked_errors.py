@@ -37,10 +37,12 @@ class Roots:
         return name in self._owner
 
     def __getitem__(self, name: Hashable) -> FloatArray:
+        """Return a copy (n, n) of the root of P of the estimate ``name``."""
         root: FloatArray = self._stack.matrices[self._stack.index(name)].copy()
         return root
 
     def __setitem__(self, name: Hashable, root: FloatArray) -> None:
+        """Overwrite the root of P of the estimate ``name`` by ``root`` (n, n)."""
         self._stack.matrices[self._stack.index(name)] = root
 
 
@@ -96,7 +98,9 @@ class StackedErrors:
             self.stack.add(name, column, offset[:, None])
 
     def keep(self) -> None:
-        """Store the present errors of all estimators for ``law``."""
+        """Store the present forms of the errors of all estimators for ``law``; appends to
+        ``_kept``.
+        """
         self._kept.append(self.stack.freeze(range(self.estimators)))
 
     def law(self) -> tuple[FloatArray, FloatArray]:
@@ -110,7 +114,9 @@ class StackedErrors:
         return self._mean_and_covariance(forms.reshape(-1, width))
 
     def _mean_and_covariance(self, forms: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the mean (K,) and the covariance (K, K) of errors with the forms (K, inputs)."""
+        """Return the mean (K,) and the covariance (K, K) of K scalar errors with the ``forms``
+        (K, inputs): their coefficients of the standard normal inputs.
+        """
         if OFFSET not in self.stack:
             return np.zeros(len(forms)), np.asarray(forms @ forms.T)
         constant_input = self.stack.form(OFFSET)[0]
@@ -162,7 +168,10 @@ class StackedErrors:
         }
 
     def update(self, name: Hashable, observation: Observation, columns: slice) -> None:
-        """Update an estimate; the noise is ``observation.root`` times the inputs in ``columns``."""
+        """Update the error and the root of P of estimate ``name`` by readings.
+
+        The noise of the p readings is ``observation.root`` times the p inputs in ``columns``.
+        """
         if not len(observation.H):
             return
         stack, (H, R, root) = self.stack, map(as_kernel_array, observation)
@@ -170,12 +179,18 @@ class StackedErrors:
         update_estimate(stack.arrays, index, H, R, root, first)
 
     def multiply(self, name: Hashable, matrix: FloatArray, root: FloatArray) -> None:
-        """Multiply an error by a matrix (n, n) and set the root of its P."""
+        """Multiply the error of estimate ``name`` by a ``matrix`` (n, n), and set the root of its P
+        to ``root`` (n, n).
+        """
         self.stack.put(name, matrix @ self.stack.form(name))
         self.roots[name] = root
 
     def combine(self, changes: Mapping[Hashable, tuple[FloatArray, Sequence[Term]]]) -> None:
-        """Set roots and errors ``sum W e`` of several estimates from their values before."""
+        """Replace the errors and the roots of P of several estimates at once.
+
+        ``changes`` gives for each name its new root (n, n) and the terms (estimate, W (n, n)) of
+        its new error ``sum W e``, in which all e are the errors before the call.
+        """
         forms = {
             name: self.stack.mix([source for source, _ in terms], np.array([W for _, W in terms]))
             for name, (_, terms) in changes.items()
@@ -185,7 +200,10 @@ class StackedErrors:
             self.roots[name] = root
 
     def predict(self, step: Prediction) -> slice:
-        """Predict all estimates, and the state; return the columns of the plant's inputs."""
+        """Predict all estimates, and the state if errors follow it, by one ``step``; changes the
+        stack and all roots of P. Return the columns of the k inputs of the plant's noise, which the
+        step adds.
+        """
         stack, noise = self.stack, step.error_noise
         columns = stack.inputs(noise.shape[1])
         indices = stack.indices(self.owner)
@@ -301,7 +319,13 @@ class ErrorPropagator:
         gap: float,
         columns: tuple[slice, int],
     ) -> None:
-        """Propagate estimates with one flow whose errors depend on the state's form x."""
+        """Propagate the estimates ``names``, which share a ``flow`` and whose errors depend on the
+        state, over ``gap`` seconds; changes their forms and roots of P.
+
+        ``x`` (n, inputs) is the form of the state before. ``columns``: the slice of the inputs that
+        all estimates share (the plant's noise), and the first of n further inputs of each estimate
+        in turn.
+        """
         errors, (shared, column) = self._errors, columns
         flow_step = flow.transition(np.stack([errors.roots[name] for name in names]), gap)
         forms = flow_step.transition @ errors.stack.forms(names) + flow_step.follow @ x

@@ -188,7 +188,7 @@ def _from_tick_to_tick(
 
 
 def all_equal(drift: FloatArray) -> bool:
-    """Return True if all nodes have the same drift (N, n, n) of the error."""
+    """Return True if all N nodes have the same ``drift`` (N, n, n) of the error."""
     return bool((drift == drift[0]).all())
 
 

@@ -19,8 +19,12 @@ class DiffusionRule(EstimateExchangeRule):
     def combine(
         self, node: int, weights: list[float], roots: list[FloatArray]
     ) -> tuple[FloatArray, FloatArray]:
-        """Intersect covariances; weights of lost messages are shared as the filter does, so that
-        the weights sum to 1.
+        """Return the new root (n, n) of P and the factors (J, n, n) of the J errors, by covariance
+        intersection.
+
+        ``roots`` are J roots (n, n) of P: that of the ``node`` first, then those of the messages,
+        whose ``weights`` are J - 1 numbers. Weights of lost messages are shared as the filter does,
+        so that the weights sum to 1.
         """
         algorithm: Any = self.scenario.filter.algorithm
         own_weight, heard_weights = algorithm.share(self.scenario.own_weights[node], weights)

@@ -120,14 +120,17 @@ def _make_sources(scenario: Scenario) -> list[_Source]:
 def _draw_pasts(
     scenario: Scenario, sources: list[_Source], runs: int, random: np.random.Generator
 ) -> list[FloatArray]:
-    """Return for each source (runs, m) states at random slots, the same slots for all sources."""
+    """Return for each source its states (runs, m) at random slots, the same slots for all sources.
+    """
     last = max(1, int(scenario.horizon / scenario.slot_plant.period))
     slots = random.integers(last, size=runs)
     return [_draw_states(source, slots, random) for source in sources]
 
 
 def _draw_states(source: _Source, slots: np.ndarray, random: np.random.Generator) -> FloatArray:
-    """Return the states (K, m) of a source at K slots, drawn from their Gaussian law."""
+    """Return the states (K, m) of a source at K ``slots`` (K,), each drawn from the Gaussian law
+    that the state has in that slot; 1 for a fixed regressor.
+    """
     normals = random.standard_normal((len(slots), len(source.start)))
     if not source.drive.size:
         return np.ones((len(slots), 1))
@@ -144,7 +147,10 @@ def _draw_states(source: _Source, slots: np.ndarray, random: np.random.Generator
 
 
 def _sensor_rows(sources: list[_Source], past: list[FloatArray], window: int) -> list[LevelRow]:
-    """Return a row for each sensor alone; fixed sensors of one kind share its numbers."""
+    """Return a row of the table for each sensor alone; fixed sensors of one kind share its numbers.
+
+    ``past`` holds the states (K, m) of each source in K pasts, ``window`` is h in slots.
+    """
     rows: list[LevelRow | None] = [None] * len(sources)
     for group in _group_by_kind(sources):
         for k in group:
@@ -155,7 +161,11 @@ def _sensor_rows(sources: list[_Source], past: list[FloatArray], window: int) ->
 
 
 def _make_row(node: int, sources: list[_Source], past: list[FloatArray], window: int) -> LevelRow:
-    """Return the row of the given sources, as a network or a single sensor."""
+    """Return the row of the table for the given ``sources``: the whole network (``node`` -1), or
+    one sensor.
+
+    ``past`` holds the states (K, m) of each source in K pasts, ``window`` is h in slots.
+    """
     values = _levels(sources, past, window)
     mean = float(values.mean())
     error = QUANTILE * float(values.std(ddof=1)) / np.sqrt(len(values))
@@ -167,7 +177,11 @@ def _make_row(node: int, sources: list[_Source], past: list[FloatArray], window:
 def _search_least(
     sources: list[_Source], past: list[FloatArray], values: FloatArray, window: int
 ) -> float:
-    """Return the least level found: by drawing, at states 0, and by a search from both."""
+    """Return the least level lambda_k found: by drawing, at states 0, and by a search from both.
+
+    ``past`` holds the states (K, m) of each source in K pasts, ``values`` (K,) the levels there;
+    ``window`` is h in slots.
+    """
     # The least level may be attained far from all pasts drawn.
     lowest = int(np.argmin(values))
     # A fixed regressor has no state that could differ.
@@ -181,10 +195,12 @@ def _search_least(
 def _search(
     sources: list[_Source], past: list[FloatArray], start: list[FloatArray], window: int
 ) -> list[float]:
-    """Return the level at a past, and that found from it by the simplex method of Nelder and Mead.
+    """Return the level at the past ``start``, and that found from it by the simplex method of
+    Nelder and Mead.
 
-    The search stays within the range of the pasts drawn, and is left out for a level of 0 and for
-    pasts of more than MAX_SEARCHED numbers.
+    ``start`` holds one state (m,) of each source. The search stays within the range of the pasts
+    drawn, ``past`` with (K, m) states of each source, and is left out for a level of 0 and for
+    pasts of more than MAX_SEARCHED numbers. ``window`` is h in slots.
     """
     moving = [k for k, source in enumerate(sources) if source.drive.size]
     low = [np.minimum(past[k].min(axis=0), 0.0) for k in moving]
@@ -193,7 +209,9 @@ def _search(
     ends = np.cumsum([0, *(len(sources[k].start) for k in moving)])
 
     def level(x: FloatArray) -> float:
-        """Return the level at the regressors ``x``."""
+        """Return the level at the past ``x``, the states of all sources that are not fixed, side by
+        side.
+        """
         states = [s[None] for s in start]
         for index, k in enumerate(moving):
             states[k] = x[None, ends[index] : ends[index + 1]]
@@ -213,7 +231,11 @@ def _search(
 
 
 def _levels(sources: list[_Source], past: list[FloatArray], window: int) -> FloatArray:
-    """Return lambda_k (K,) for each of K pasts, one array of states (K, m) per source."""
+    """Return the levels lambda_k (K,) of the ``sources`` together, for K pasts.
+
+    ``past`` holds the states (K, m) of each source, ``window`` is h in slots. A level is the least
+    eigenvalue of the mean excitation by the sources, 0 if it is below rounding.
+    """
     n = len(sources[0].C)
     total = np.zeros((len(past[0]), n, n))
     for group in _group_by_kind(sources):
@@ -231,7 +253,9 @@ def _levels(sources: list[_Source], past: list[FloatArray], window: int) -> Floa
 
 
 def _group_by_kind(sources: list[_Source]) -> list[list[int]]:
-    """Return the indices of the sources of each kind, which differ in their pasts only."""
+    """Return the indices of the sources of each kind: those with the same A, C and drive, which
+    differ in their pasts only.
+    """
     groups: dict[tuple[bytes, ...], list[int]] = {}
     for k, source in enumerate(sources):
         key = tuple(part.tobytes() for part in (source.A, source.C, source.drive))
@@ -240,7 +264,9 @@ def _group_by_kind(sources: list[_Source]) -> list[list[int]]:
 
 
 def _window_excitation(source: _Source, states: FloatArray, window: int) -> FloatArray:
-    """Return the sum (K, n, n) of the normalised outer products over a window, for K pasts."""
+    """Return the sum (K, n, n) of ``E[phi phi' / (1 + |phi|^2)]`` over the ``window`` slots after K
+    pasts, in which the source has the ``states`` (K, m).
+    """
     mean, cov, n = states, np.zeros_like(source.A), len(source.C)
     total = np.zeros((len(states), n, n))
     for _ in range(window):  # mean and covariance of s in each slot
@@ -251,10 +277,10 @@ def _window_excitation(source: _Source, states: FloatArray, window: int) -> Floa
 
 
 def normalised_outer(mean: FloatArray, cov: FloatArray) -> FloatArray:
-    """Return ``E[phi phi' / (1 + |phi|^2)]`` (k, n, n) for Gaussian phi.
+    """Return ``E[phi phi' / (1 + |phi|^2)]`` (K, n, n) for Gaussian phi.
 
-    phi has k means (k, n) and one covariance (n, n). 1 / (1 + r) is the integral of exp(-u (1 + r))
-    over u > 0, so that only Gaussian integrals remain.
+    phi has K means ``mean`` (K, n) and one covariance ``cov`` (n, n). 1 / (1 + r) is the integral
+    of exp(-u (1 + r)) over u > 0, so that only Gaussian integrals remain.
     """
     spread, axes = np.linalg.eigh(cov)
     spread = np.maximum(spread, 0.0)

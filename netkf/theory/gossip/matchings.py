@@ -78,7 +78,7 @@ def _recorded_mean(scenario: Scenario, activation: RecordedSlots) -> FloatArray:
 
 
 def primitive(matrix: FloatArray) -> tuple[bool, bool, int]:
-    """Return (is irreducible, is also aperiodic, period) of a nonnegative matrix (N, N).
+    """Return (is irreducible, is also aperiodic, period) of a nonnegative ``matrix`` (N, N).
 
     The period is the greatest common divisor of the lengths of the cycles in the graph of positive
     entries; 0 if the matrix is reducible.
@@ -130,7 +130,9 @@ def detecting_walk(scenario: Scenario) -> list[int] | None:
 
 
 def _extend_basis(basis: FloatArray, rows: FloatArray) -> FloatArray:
-    """Return an orthonormal basis, as rows, of the span of ``basis`` and of ``rows``."""
+    """Return an orthonormal basis (r, n), as rows, of the span of the rows of ``basis`` (k, n) and
+    of ``rows`` (p, n).
+    """
     size = np.abs(rows).max(initial=0.0)
     if size == 0.0:
         return basis

@@ -64,7 +64,9 @@ def covariance_bound(scenario: Scenario, times: Any) -> FloatArray:
 
 
 def _solve_coupled(packed: PackedRiccati, times: FloatArray) -> FloatArray:
-    """Return the packed solution (T, N, m) at ``times``."""
+    """Return the solution (T, N, m) at T ``times`` (seconds), for each node the m = n (n + 1) / 2
+    entries of the upper triangle of its covariance.
+    """
     equations = packed.equations
     # Without delay the right-hand side is quadratic, and Taylor series are fastest unless stiff.
     if equations.delay == 0.0 and not equations.samples and not equations.jumps:
@@ -84,7 +86,9 @@ def _covariance_scale(packed: PackedRiccati) -> float:
 
 
 def _solve_uncoupled(equations: CoupledRiccati, times: FloatArray) -> FloatArray:
-    """Return P (T, N, n, n) of nodes that receive nothing: the Riccati flow of each by itself."""
+    """Return P (T, N, n, n) at T ``times`` (seconds) of N nodes that receive nothing: the Riccati
+    flow of each by itself, from its ``equations.start``.
+    """
     P = np.empty((len(times), *equations.start.shape))
     tables: dict[bytes, RiccatiTable] = {}
     mean = np.zeros(len(equations.A))  # the kernel moves a mean along with P
@@ -134,7 +138,8 @@ class _PiecewiseSolution:
         return self._outputs[piece](t).reshape(start.shape)
 
     def extend(self, last: float) -> None:
-        """Integrate up to time ``last`` (seconds).
+        """Integrate up to time ``last`` (seconds); appends pieces to ``_outputs`` and
+        ``_piece_ends``.
 
         With a delay this goes piece by piece, and nothing arrives in the first one. A piece is one
         delay long, so that all that arrives in it is known; if the delay is much shorter than the
@@ -172,13 +177,17 @@ class _PiecewiseSolution:
         return min(last, begin + max(delay, 0.5 / max(inflow, 1e-300)))
 
     def _append(self, end: float, output: Callable[[float], FloatArray]) -> None:
-        """Add a piece that ends at ``end``, given by its dense ``output``."""
+        """Add a piece that ends at ``end`` (seconds), given by its dense ``output``, a function
+        from the time to the solution (N m,); the next piece begins at its end value.
+        """
         self._outputs.append(output)
         self._piece_ends.append(end)
         self._start_value = output(end).reshape(self._packed.start.shape)
 
     def _iterate(self, begin: float, end: float, slope: Slope) -> None:
-        """Append a piece longer than the delay by Picard iteration; raises TheoryError."""
+        """Append a piece from ``begin`` to ``end`` (seconds), longer than the delay, by Picard
+        iteration; raises TheoryError if that does not converge.
+        """
         start = self._start_value
         probes = np.linspace(begin, end, 9)[1:]
         self._append(end, lambda _: start.reshape(-1))  # first guess: constant
@@ -197,11 +206,14 @@ class _PiecewiseSolution:
         raise TheoryError(f"late arrivals did not converge between {begin:g} and {end:g} s")
 
     def _slope(self, begin: float) -> Slope:
-        """Return the right-hand side of H(12), flat, for a piece that begins at ``begin``."""
+        """Return the right-hand side of H(12) as a function of the time and the solution (N m,),
+        for a piece that begins at ``begin`` (seconds).
+        """
         packed, silent, delay = self._packed, self._without_arrivals, self._packed.equations.delay
 
         def slope(t: float, y: FloatArray) -> FloatArray:
-            """Return dY/dt of the packed covariances."""
+            """Return dy/dt (N m,) of the packed covariances ``y`` (N m,) at time ``t`` (seconds).
+            """
             Y = y.reshape(packed.start.shape)
             if not np.abs(y).max() < OVERFLOW:
                 raise TheoryError(f"H(12) grows beyond {OVERFLOW:g} before {t:g} s")
@@ -216,7 +228,8 @@ class _PiecewiseSolution:
     def _integrate(
         self, begin: float, end: float, slope: Slope, growth: float = math.inf
     ) -> tuple[Callable[[float], FloatArray], float]:
-        """Return the solution from time ``begin`` on as a function of time, and its last time.
+        """Return the solution (N m,) from time ``begin`` on as a function of time, and its last
+        time.
 
         That is ``end`` (seconds), or earlier if the solution has grown by a factor ``growth``.
         Raises TheoryError if the solver fails or the defect of the solution is too large.
@@ -241,7 +254,12 @@ class _PiecewiseSolution:
     def _integrate_piece(
         self, begin: float, end: float, slope: Slope, max_step: float, growth: float
     ) -> Any:
-        """Solve by an explicit method unless the equations are stiff, else by an implicit one."""
+        """Solve from ``begin`` to ``end`` (seconds) by an explicit method unless the equations are
+        stiff, else by an implicit one; return the result of scipy's ``solve_ivp``.
+
+        Steps last at most ``max_step`` seconds; the implicit solver stops where an entry has grown
+        by the factor ``growth``.
+        """
         equations = self._packed.equations
         with np.errstate(over="ignore", invalid="ignore"):
             # Without delays and samples the Taylor series have found the equations stiff before.
@@ -262,7 +280,9 @@ class _PiecewiseSolution:
             )
 
     def _solve(self, begin: float, end: float, slope: Slope, **method: Any) -> Any:
-        """Return the solution of a piece by scipy's ``solve_ivp``."""
+        """Return the solution of a piece from ``begin`` to ``end`` (seconds) by scipy's
+        ``solve_ivp`` with the options ``method``, from ``_start_value`` on.
+        """
         # It takes 0.4 s to import.
         import scipy.integrate
 
@@ -301,17 +321,22 @@ class _PiecewiseSolution:
         )
 
     def _jacobian(self, t: float, y: FloatArray) -> Any:
-        """Return the sparse Jacobian (N m, N m) of the right-hand side at ``y``."""
+        """Return the sparse Jacobian (N m, N m), per second, of the right-hand side at the packed
+        solution ``y`` (N m,).
+        """
         linear = self._packed.linear(self._packed.unpack(y.reshape(self._packed.start.shape)))
         # With a delay the arrivals are known from earlier pieces and do not depend on y.
         return linear.matrix(arriving=self._packed.equations.delay == 0.0)
 
 
 def _growth_event(limit: float) -> Callable[[float, FloatArray], float]:
-    """Return an event of the solver that ends it where an entry exceeds ``limit``."""
+    """Return an event for ``solve_ivp`` that ends it where the largest entry of the solution
+    exceeds ``limit``; never if that is infinite.
+    """
 
     def margin(_: float, y: FloatArray) -> float:
-        """Return the margin to the limit, which is negative beyond it."""
+        """Return ``limit`` less the largest entry of ``y`` (N m,): the solver stops where it is 0.
+        """
         return limit - float(np.abs(y).max()) if math.isfinite(limit) else 1.0
 
     margin.terminal = True  # type: ignore[attr-defined]
@@ -340,7 +365,10 @@ class _SampleJumps:
         return time in self._samples or time in self._arrivals
 
     def apply(self, time: float, Y: FloatArray) -> FloatArray:
-        """Return Y (N, m) after the samples of this time and then its arrivals."""
+        """Return Y (N, m) after the samples of this ``time`` (seconds) and then its arrivals.
+
+        Messages that nodes send at their samples are stored in ``_arrivals`` until they arrive.
+        """
         packed, equations = self._packed, self._packed.equations
         jump = self._samples.get(time)
         if jump is not None:
@@ -362,7 +390,9 @@ class _SampleJumps:
 
 
 def _joseph_update(P: FloatArray, observation: Observation) -> FloatArray:
-    """Return ``g(P) = (I - K H) P (I - K H)' + K R K'`` (n, n), the Joseph form of the update."""
+    """Return the Joseph form ``(I - K H) P (I - K H)' + K R K'`` (n, n) of the update of a
+    covariance P (n, n) by readings with H (p, n) and R (p, p).
+    """
     H, R = observation.H, observation.R
     K = np.linalg.solve(H @ P @ H.T + R, H @ P).T
     closed = np.eye(len(P)) - K @ H
@@ -374,7 +404,9 @@ def _limit_evaluations(slope: Slope) -> Slope:
     evaluations_left = MAX_EXPLICIT_EVALUATIONS
 
     def limited(t: float, y: FloatArray) -> FloatArray:
-        """Return the slope; raises StiffError after too many evaluations."""
+        """Return dy/dt (N m,) at time ``t`` (seconds); raises StiffError after too many
+        evaluations.
+        """
         nonlocal evaluations_left
         evaluations_left -= 1
         if evaluations_left < 0:
@@ -387,7 +419,8 @@ def _limit_evaluations(slope: Slope) -> Slope:
 def _check_defect(slope: Slope, output: Any) -> None:
     """Compare the change over steps of the solver with the integral of the slope.
 
-    Raises TheoryError if they differ by more than DEFECT_TOLERANCE, relative.
+    ``output`` is the dense solution (N m,) of ``solve_ivp``, of which up to MAX_CHECKED_STEPS steps
+    are checked. Raises TheoryError if they differ by more than DEFECT_TOLERANCE, relative.
     """
     times = output.ts
     steps = np.unique(np.linspace(0, len(times) - 2, MAX_CHECKED_STEPS).astype(int))

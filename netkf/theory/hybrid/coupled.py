@@ -72,7 +72,7 @@ class CoupledRiccati(NamedTuple):
         return bool(self.coupling.nnz or any(s.heard.nnz for s in self.samples) or sent)
 
     def restrict(self, node: int) -> CoupledRiccati:
-        """Return the equation of one node without the others."""
+        """Return the equation of the node with index ``node`` without the others, with N = 1."""
         return self._replace(
             G=self.G[node : node + 1],
             start=self.start[node : node + 1],
@@ -219,7 +219,7 @@ def has_balanced_rates(scenario: Scenario) -> bool | None:
 
 
 def _is_symmetric(c: scipy.sparse.csr_array) -> bool:
-    """Return True if the rates are symmetric up to rounding."""
+    """Return True if the rates c (N, N), per second, are symmetric up to rounding."""
     difference, size = abs(c - c.T), abs(c.T)
     return bool((difference - RELATIVE_TOLERANCE * size).max() <= ABSOLUTE_TOLERANCE)
 
@@ -227,8 +227,9 @@ def _is_symmetric(c: scipy.sparse.csr_array) -> bool:
 def left_weights(scenario: Scenario) -> FloatArray:
     """Return the weights (N,) of the nodes' information in the limit of ever faster links.
 
-    They are the left null vector of the coupling, scaled to sum 1: 1/N if both directions of each
-    link have one rate. Raises TheoryError if messages do not connect all nodes.
+    They are the left null vector of ``D - c``, c the coupling and D its row sums, scaled to sum 1:
+    1/N if both directions of each link have one rate. Raises TheoryError if messages do not connect
+    all nodes.
     """
     algorithm = scenario.filter.algorithm
     if len(scenario.nodes) == 1:
@@ -253,7 +254,8 @@ def left_weights(scenario: Scenario) -> FloatArray:
 
 
 def _heard_by_all(c: scipy.sparse.csr_array) -> np.ndarray | None:
-    """Return the indices of the nodes whose information reaches all others, None if no node's does.
+    """Return the indices (K,) of the nodes whose information reaches all others by way of the rates
+    c (N, N), receiver by sender; None if no node's does.
 
     They are the one strongly connected component that receives nothing from outside; with two such
     components the coupling has two left null vectors.
@@ -268,7 +270,8 @@ def _heard_by_all(c: scipy.sparse.csr_array) -> np.ndarray | None:
 
 
 def _stationary(c: scipy.sparse.csr_array) -> FloatArray:
-    """Return w (M,) with ``w (D - C) = 0`` and sum 1, D the row sums of C.
+    """Return w (M,) with ``w (D - C) = 0`` and sum 1, D the row sums of the rates C (M, M) of M
+    nodes.
 
     The nodes must be strongly connected. Raises TheoryError if the residual is too large.
     """

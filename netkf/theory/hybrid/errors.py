@@ -18,7 +18,13 @@ class ResetRule(EstimateExchangeRule):
     def combine(
         self, node: int, weights: list[float], roots: list[FloatArray]
     ) -> tuple[FloatArray, FloatArray]:
-        """Average or intersect; the node's own estimate has the weight 1 - sum of ``weights``."""
+        """Return the new root (n, n) of P and the factors (J, n, n) of the J errors, by averaging
+        or intersection of covariances.
+
+        ``roots`` are J roots (n, n) of P: that of the ``node`` first, then those of the messages,
+        whose ``weights`` are J - 1 numbers; the node's own estimate has the weight 1 - sum of
+        ``weights``.
+        """
         all_weights = [1.0 - sum(weights), *weights]
         if self.scenario.node_filter.combination == "intersection":
             return intersect_covariances(all_weights, roots)

@@ -70,7 +70,12 @@ def _require_limit(scenario: Scenario) -> None:
 def _shared_equation(
     scenario: Scenario, A: FloatArray, Q: FloatArray, G: FloatArray, w: FloatArray
 ) -> CoupledRiccati:
-    """Return H(12) of nodes that share one covariance: a sensor counts by its node's weight."""
+    """Return H(12) of N nodes that share one covariance, as equations of a single node.
+
+    A and Q (n, n) are the drift and noise that the filters assume, G (n, n) is the information per
+    second of the increments of all nodes, each with its weight w (N,); the rate of a sensor that
+    samples is multiplied by its node's weight.
+    """
     groups = []
     for group in poisson_samples(scenario):
         silent = scipy.sparse.csr_array((1, len(group.nodes)))

@@ -31,10 +31,12 @@ def solve_linearised(
     right: FloatArray,
     tolerance: float = RESIDUAL_TOLERANCE,
 ) -> FloatArray:
-    """Return the solution X (N, m) for the gains of P (N, n, n); nan if the map is singular.
+    """Return the solution X (N, m) of ``op_P(X) = -right``, for ``right`` (N, m) and the gains of P
+    (N, n, n); nan if the map is singular.
 
-    The norm of its residual is at most ``tolerance`` times that of ``right``, or as small as
-    rounding lets it be. Raises TheoryError if neither method can solve for so many unknowns.
+    Rows hold the m entries of the upper triangle of each node's matrix. The norm of the residual is
+    at most ``tolerance`` times that of ``right``, or as small as rounding lets it be. Raises
+    TheoryError if neither method can solve for so many unknowns.
     """
     linear = packed.linear(P)
     eliminates = right.size <= FEW_UNKNOWNS or packed.eliminates_cheaply
@@ -49,7 +51,9 @@ def solve_linearised(
 
 
 def _eliminate(linear: LinearisedRiccati, right: FloatArray) -> FloatArray:
-    """Return the solution of L(X) = -right by sparse elimination, nan where L is singular."""
+    """Return the solution X (N, m) of ``L(X) = -right`` by sparse elimination, for ``right`` (N, m)
+    and the linear map L; nan where L is singular.
+    """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", scipy.sparse.linalg.MatrixRankWarning)
         # A singular map yields nan, which the caller takes as unstable.
@@ -60,10 +64,11 @@ def _eliminate(linear: LinearisedRiccati, right: FloatArray) -> FloatArray:
 def _solve_by_gmres(
     linear: LinearisedRiccati, right: FloatArray, tolerance: float
 ) -> FloatArray | None:
-    """Return the solution by GMRES with rounds of iterative refinement, None if it diverges.
+    """Return the solution X (N, m) of ``L(X) = -right`` by GMRES with rounds of iterative
+    refinement, for ``right`` (N, m); None if it diverges.
 
     The preconditioner solves for a change that all nodes share, and then inverts each node's own
-    block.
+    block. ``tolerance`` is relative to the norm of ``right``.
     """
     blocks = linear.blocks
     try:
@@ -73,16 +78,18 @@ def _solve_by_gmres(
         return None
 
     def apply(x: FloatArray) -> FloatArray:
-        """Return L(x) as a vector."""
+        """Return L(x) (N m,) for a vector x (N m,)."""
         X = x.reshape(right.shape)
         return np.asarray(np.einsum("ik,ikl->il", X, blocks) + linear.arriving(X)).reshape(-1)
 
     def solve_alone(x: FloatArray) -> FloatArray:
-        """Return the solution for each node alone, without arrivals."""
+        """Return the solution (N m,) of ``L(X) = x`` for each node alone, without arrivals."""
         return np.asarray(np.einsum("ik,ikl->il", x.reshape(right.shape), inverse)).reshape(-1)
 
     def precondition(x: FloatArray) -> FloatArray:
-        """Return an approximate solution: the mean over nodes exactly, then each node alone."""
+        """Return an approximate solution (N m,) of ``L(X) = x``: the mean over nodes exactly, then
+        each node alone.
+        """
         shared = np.tile(x.reshape(right.shape).mean(axis=0) @ coarse, len(right))
         return shared + solve_alone(x - apply(shared))
 

@@ -64,7 +64,8 @@ def link_rate_for(scenario: Scenario, delta: float) -> LinkRate:
     equations, S = _require_talk(scenario), limit_covariance(scenario)
 
     def excess(log_factor: float) -> float:
-        """Return the logarithm of distance over ``delta`` with all rates times a factor."""
+        """Return the logarithm of distance over ``delta`` with all rates times exp(``log_factor``).
+        """
         distance = _distance(equations, S, math.exp(log_factor))
         if distance is None:
             return NO_STEADY_STATE
@@ -95,7 +96,11 @@ def _require_talk(scenario: Scenario) -> CoupledRiccati:
 
 
 def _distance(equations: CoupledRiccati, S: FloatArray | None, factor: float) -> float | None:
-    """Return ``max_i |calP_i - S|_F``, or 0 if S is None; None if there is no steady state."""
+    """Return ``max_i |calP_i - S|_F`` with all link rates times ``factor``, or 0 if S is None; None
+    if there is no steady state.
+
+    calP_i (n, n) is the steady bound of node i, S (n, n) the limit for fast links.
+    """
     P = steady_state(equations.scale_rates(factor))
     if P is None or S is None:
         return None if P is None else 0.0
@@ -103,7 +108,9 @@ def _distance(equations: CoupledRiccati, S: FloatArray | None, factor: float) ->
 
 
 def _with_rate(scenario: Scenario, factor: float) -> LinkRate:
-    """Return the factor, with the rate that it stands for if all clocks have the same."""
+    """Return ``factor`` with the rate (1/s) that it stands for if all clocks of the scenario have
+    the same rate, else with nan.
+    """
     clock = scenario.network.activation
     rate = getattr(clock, "rate", None)
     if rate is None or getattr(clock, "rates", None):

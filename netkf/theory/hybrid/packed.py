@@ -57,9 +57,11 @@ class PackedRiccati:
         self._across = np.ascontiguousarray(self._C.transpose(1, 2, 0))
 
     def shift(self, A: FloatArray, Q: FloatArray) -> PackedRiccati:
-        """Return the equations with another drift A (n, n) and noise Q (n, n) or (N, n, n).
+        """Return the equations with another drift A (n, n) and noise Q (n, n) or (N, n, n), per
+        second.
 
-        Arrays that depend on the network alone are shared.
+        Arrays that depend on the network alone are shared with the present object, which is
+        unchanged.
         """
         shifted = copy.copy(self)
         shifted.equations = self.equations._replace(A=A, Q=Q)
@@ -67,7 +69,9 @@ class PackedRiccati:
         return shifted
 
     def _set_drift(self, A: FloatArray, Q: FloatArray) -> None:
-        """Set the terms A P + P A' and Q of each node."""
+        """Set the map ``_drift_map`` (m, m) of rows by A P + P A', for A (n, n), and the rows
+        ``_Q`` of the noise Q (n, n), or (N, n, n) by node.
+        """
         drift = A @ self._basis
         self._drift_map = self.pack(drift + np.swapaxes(drift, 1, 2))
         self._Q = self.pack(Q)
@@ -90,20 +94,26 @@ class PackedRiccati:
         return scipy.sparse.csr_array(matrix)
 
     def pack(self, P: FloatArray) -> FloatArray:
-        """Return the upper triangles (..., m) of symmetric P (..., n, n)."""
+        """Return the upper triangles (..., m) of symmetric P (..., n, n), row by row; m = n (n + 1)
+        / 2.
+        """
         return np.ascontiguousarray(P[..., self._i, self._j])
 
     def unpack(self, Y: FloatArray) -> FloatArray:
-        """Return the symmetric matrices (..., n, n) of upper triangles Y (..., m)."""
+        """Return the symmetric matrices (..., n, n) of which Y (..., m) are the upper triangles."""
         n = len(self.equations.A)
         return np.asarray(Y[..., self._indices].reshape(*Y.shape[:-1], n, n))
 
     def predict(self, Y: FloatArray) -> FloatArray:
-        """Return rows (N, m) predicted over the delay, ``T P T' + q``."""
+        """Return the rows (N, m) of ``T P T' + q``: the covariances in rows Y (N, m) predicted over
+        the delay.
+        """
         return np.asarray(Y @ self._predicted + self._q)
 
     def slope(self, Y: FloatArray, sent: FloatArray | None = None) -> FloatArray:
-        """Return dY/dt (N, m); ``sent`` (N, m) is Y a delay ago, and Y itself if None."""
+        """Return dY/dt (N, m), per second, of the covariances in rows Y (N, m); ``sent`` (N, m) is
+        Y a delay ago, and Y itself if None.
+        """
         if sent is None:
             change = self._exchange @ Y + Y @ self._drift_map + self._Q
         else:
@@ -121,7 +131,12 @@ class PackedRiccati:
     def _add_samples(
         self, change: FloatArray, group: PoissonSamples, P: FloatArray, sent: FloatArray | None
     ) -> None:
-        """Add ``s (g(P) - P)`` and the arrivals of estimates that were sent at samples."""
+        """Add to ``change`` (N, m), in place, ``s (g(P) - P)`` of the sensors of a ``group`` with
+        Poisson rates s, and the arrivals of estimates that nodes sent at these samples.
+
+        P (N, n, n) are the present covariances, ``sent`` (N, n, n) those one delay ago (None: no
+        delay).
+        """
         decrease = self.pack(group.sample_decrease(P))
         np.subtract.at(change, group.nodes, group.rate[:, None] * decrease)
         if not group.heard.nnz:
@@ -134,7 +149,7 @@ class PackedRiccati:
         change += group.heard @ arriving
 
     def series(self, Y: FloatArray, span: float, order: int) -> FloatArray:
-        """Return the Taylor coefficients (order + 1, N, m) of the solution through ``Y``.
+        """Return the Taylor coefficients (order + 1, N, m) of the solution through ``Y`` (N, m).
 
         Without delay, in powers of seconds / ``span``. The right-hand side is quadratic, so that
         each coefficient follows from those before it.
@@ -206,7 +221,7 @@ class LinearisedRiccati(NamedTuple):
     packed: PackedRiccati
 
     def arriving(self, X: FloatArray) -> FloatArray:
-        """Return the arrivals (N, m) at each node for rows X (N, m)."""
+        """Return the arrivals (N, m) per second at each node for rows X (N, m) of all nodes."""
         total = np.zeros_like(X)
         for rates, nodes, maps in self.heard:
             sent = X[nodes]
@@ -246,7 +261,9 @@ class LinearisedRiccati(NamedTuple):
 
 
 def _low_rank_factors(G: FloatArray) -> FloatArray:
-    """Return C (S, n, r) with ``C C' = G`` (S, n, n), r the largest rank."""
+    """Return C (S, n, r) with ``C C' = G`` for S positive semidefinite matrices G (S, n, n), r the
+    largest of their ranks.
+    """
     # Scaled to a diagonal of ones, so that the units of the states do not matter to what is small.
     scale = np.sqrt(np.diagonal(G, axis1=1, axis2=2))
     divided = 1.0 / np.where(scale > 0.0, scale, 1.0)

@@ -41,19 +41,23 @@ class PoissonSamples(NamedTuple):
     heard: scipy.sparse.csr_array
 
     def update_gains(self, P: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return K (S, n, p) and ``I - K H`` (S, n, n) at covariances P (N, n, n)."""
+        """Return the Kalman gains K (S, n, p) and ``I - K H`` (S, n, n) of the S sensors, at the
+        covariances P (N, n, n) of the N nodes.
+        """
         # C = P H' and K = C (H C + R)^-1
         C = P[self.nodes] @ np.swapaxes(self.H, 1, 2)
         K = np.swapaxes(np.linalg.solve(self.H @ C + self.R, np.swapaxes(C, 1, 2)), 1, 2)
         return K, np.eye(P.shape[-1]) - K @ self.H
 
     def sample_decrease(self, P: FloatArray) -> FloatArray:
-        """Return the decrease ``P H' (H P H' + R)^-1 H P`` (S, n, n) of P (N, n, n) by a sample."""
+        """Return the decrease ``P H' (H P H' + R)^-1 H P`` (S, n, n) of the covariance of each
+        sensor's node by one sample, at the covariances P (N, n, n) of the N nodes.
+        """
         C = P[self.nodes] @ np.swapaxes(self.H, 1, 2)
         return np.asarray(C @ np.linalg.solve(self.H @ C + self.R, np.swapaxes(C, 1, 2)))
 
     def restrict(self, node: int) -> PoissonSamples:
-        """Return the sensors of one node as those of a network of one node."""
+        """Return the sensors of the node with index ``node`` as those of a network of one node."""
         at_node = self.nodes == node
         count = int(at_node.sum())
         silent = scipy.sparse.csr_array((1, count))
@@ -148,7 +152,11 @@ def poisson_samples(scenario: Scenario) -> tuple[PoissonSamples, ...]:
 def _arrival_rates(
     scenario: Scenario, senders: list[int], rates: FloatArray
 ) -> scipy.sparse.csr_array:
-    """Return ``heard`` (N, S) of sensors with the given nodes and sampling rates (S,)."""
+    """Return ``heard`` (N, S), sparse: the rate (1/s) at which messages that the node of sensor k
+    sends at its samples arrive at node i, times their weight.
+
+    ``senders`` are the S indices of the sensors' nodes, ``rates`` (S,) the samples per second.
+    """
     heard = np.zeros((len(scenario.nodes), len(senders)))
     for (i, j), weight in mean_link_weights(scenario).items():
         for k, sender in enumerate(senders):
@@ -193,7 +201,9 @@ def sample_jumps(scenario: Scenario) -> tuple[SampleJump, ...]:
 
 
 def _sent_weights(scenario: Scenario, senders: list[int]) -> FloatArray | None:
-    """Return the weights (N, N) of messages that these nodes send at a sample, None if none do."""
+    """Return the weights (N, N), receiver by sender, of the messages that the nodes with the
+    indices ``senders`` send at a sample; None if nodes do not transmit at samples.
+    """
     weights = mean_link_weights(scenario)
     if not weights:
         return None

@@ -59,7 +59,12 @@ def second_moment_rate(scenario: Scenario) -> float:
 
 
 class _SecondMomentEquation:
-    """The right-hand side for second moments (N n n, N n n), as a function of flat arrays."""
+    """The right-hand side, per second, for second moments Y (N n n, N n n), as a function of flat
+    arrays.
+
+    Axes of Y are those of the stacked vec(P_i), node by node; ``bound`` (N, n, n) is calP, whose
+    constant gains the recursion uses.
+    """
 
     def __init__(self, scenario: Scenario, bound: FloatArray) -> None:
         n, index = scenario.plant.n, scenario.topology.index
@@ -77,7 +82,10 @@ class _SecondMomentEquation:
             self._add_link(scenario, i, j, index[i], index[j])
 
     def _add_link(self, scenario: Scenario, i: int, j: int, a: int, b: int) -> None:
-        """Add the outcomes of an activation of link (i, j) between the nodes of index a and b."""
+        """Add the outcomes of an activation of link (i, j) between the nodes of index a and b: to
+        ``_mixing`` their mean effect, to ``_outcomes`` (a, b, rate in 1/s, weights of a and of b on
+        the other).
+        """
         clock, channel = scenario.network.activation, scenario.network.channel
         assert isinstance(clock, Poisson)
         rate, loss = clock.mean_rate((i, j)), channel.loss
@@ -97,6 +105,8 @@ class _SecondMomentEquation:
         ]
 
     def __call__(self, flat: FloatArray) -> FloatArray:
+        """Return dY/dt, flat, for second moments Y given as a ``flat`` array of (N n n)^2 entries.
+        """
         Y = np.asarray(flat, dtype=np.float64).reshape(self._shape)
         # L Y + Y L'
         change = np.einsum("aij,ajbk->aibk", self._drift_maps, Y)

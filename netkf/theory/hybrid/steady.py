@@ -50,7 +50,9 @@ def steady_covariance_bound(scenario: Scenario) -> FloatArray:
 
 @lru_cache(maxsize=8)
 def _steady_bound(scenario: Scenario) -> FloatArray:
-    """Return the steady bound, cached because several promises are about it."""
+    """Return the steady bound (N, n, n), cached because several promises are about it; raises the
+    errors of ``steady_covariance_bound``.
+    """
     equations = coupled_riccati(scenario)
     P = steady_state(equations)
     if P is None:
@@ -116,7 +118,8 @@ def steady_state(equations: CoupledRiccati) -> FloatArray | None:
 
 
 def _newton(packed: PackedRiccati, P: FloatArray) -> FloatArray:
-    """Return the fixed point (N, n, n) of H(12) with the gains of P held fixed (Kleinman).
+    """Return the fixed point (N, n, n) of H(12) with the gains of P (N, n, n) held fixed
+    (Kleinman).
 
     Solved for the change of P, so that a few digits of it are enough.
     """
@@ -126,7 +129,7 @@ def _newton(packed: PackedRiccati, P: FloatArray) -> FloatArray:
 
 
 def _is_stabilised(packed: PackedRiccati, P: FloatArray) -> bool:
-    """Return True if the gains of P stabilise the linearisation X -> op(X) of H(12).
+    """Return True if the gains of P (N, n, n) stabilise the linearisation X -> op(X) of H(12).
 
     op generates positive maps, so that it is stable if and only if a positive definite X has a
     negative definite op(X) at every node: op(X) = -I, with a residual that nowhere reaches I.
@@ -140,7 +143,8 @@ def _is_stabilised(packed: PackedRiccati, P: FloatArray) -> bool:
 def _find_stabilising(packed: PackedRiccati, first: FloatArray | None = None) -> FloatArray | None:
     """Return covariances (N, n, n) whose gains stabilise H(12), or None if none were found.
 
-    The search starts from ``first`` (N, n, n).
+    The search follows H(12) by implicit steps; it starts from ``first`` (N, n, n), or from the
+    first covariances of the nodes.
     """
     equations, n = packed.equations, len(packed.equations.A)
     size = max(float(np.abs(x).max()) for x in (equations.Q, equations.start, [[1e-12]]))
@@ -166,8 +170,8 @@ def _find_stabilising(packed: PackedRiccati, first: FloatArray | None = None) ->
 
 
 def _implicit_step(implicit: PackedRiccati, P: FloatArray) -> FloatArray | None:
-    """Return the solution (N, n, n) of an implicit step from P, closely enough to follow H(12), or
-    None if the step is too long.
+    """Return the solution (N, n, n) of an ``implicit`` step from P (N, n, n), closely enough to
+    follow H(12), or None if the step is too long.
 
     Q + P / step is positive definite. So the gains of P stabilise the equations of the step if and
     only if their fixed point with these gains is positive definite too.
@@ -247,7 +251,7 @@ def _steady_at(
 ) -> FloatArray | None:
     """Return the steady state (N, n, n), to a few digits, with link rates times ``factor``.
 
-    None if there is none. ``first`` starts the search.
+    None if there is none. The search starts from ``first`` (N, n, n), if given.
     """
     packed = PackedRiccati(equations.scale_rates(factor))
     P = _find_stabilising(packed, first)
@@ -261,9 +265,11 @@ def _steady_at(
 
 
 def _guess(points: list[tuple[float, float]], low: float, high: float, fine: float) -> float:
-    """Return a factor close to the threshold, extrapolated from (factor, 1 / max P) of two others.
+    """Return a factor close to the threshold, extrapolated from the last two ``points``, pairs
+    (factor, 1 / max P).
 
-    The inverse of the covariances falls to 0 at the threshold.
+    The inverse of the covariances falls to 0 at the threshold, which lies between ``low`` and
+    ``high``; it is sought to the relative accuracy ``fine``.
     """
     (f, inverse), (g, following) = points[-2:]
     root = g - following * (f - g) / (inverse - following) if inverse != following else high
@@ -299,7 +305,8 @@ def _necessary_factor(equations: CoupledRiccati) -> float | None:
 
 
 def _longest_lag(M: scipy.sparse.csc_array) -> float | None:
-    """Return a lower bound on the largest eigenvalue of ``M^-1`` (seconds).
+    """Return a lower bound on the largest eigenvalue of ``M^-1`` (seconds), for M (K, K) per
+    second.
 
     None if M, whose off-diagonal entries are at most 0, is not a nonsingular M-matrix, so that some
     eigenvalue of M is at most 0. The least factor by which a step of the power method multiplies an

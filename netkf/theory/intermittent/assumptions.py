@@ -126,7 +126,9 @@ def _bounded_mean_row(scenario: Scenario) -> AssumptionRow:
 
 
 def _deliveries(scenario: Scenario, heard: list[tuple[int, int]]) -> list[float]:
-    """Return the mean delivery probability of each link."""
+    """Return the mean delivery probability of each link of ``heard``, pairs (sender, receiver), in
+    their order.
+    """
     loss = scenario.network.channel.loss
     return [loss.mean_delivery(link, scenario.table_probability(link)) for link in heard]
 
@@ -134,7 +136,12 @@ def _deliveries(scenario: Scenario, heard: list[tuple[int, int]]) -> list[float]
 def _arrival_sets(
     scenario: Scenario, own_H: FloatArray, heard: list[tuple[int, int]]
 ) -> list[tuple[float, FloatArray]]:
-    """Return the probability and the stacked H of every set of readings that may arrive."""
+    """Return for every set of readings that may reach a node its probability and its stacked H
+    (p, n).
+
+    ``own_H`` (p_0, n) is the node's own, which it always has; ``heard`` are the k links
+    (sender, node) that can bring readings, so that there are 2^k sets.
+    """
     sets, probabilities = [], _deliveries(scenario, heard)
     # All 2^k outcomes of the k links, which fail independently.
     for arrived in itertools.product((False, True), repeat=len(heard)):

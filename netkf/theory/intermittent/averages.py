@@ -52,12 +52,13 @@ def path_average(
 ) -> PathAverage:
     """Return the average of ``function`` over ``slots`` slots of one path, R (140).
 
-    By R Proposition 25 it converges to the integral of the function over the invariant law, for
-    almost every start by that law; R recommends a point of its support, and P* is the default
-    (``start`` is an (n, n) covariance). ``function`` maps covariances (K, n, n) to K numbers. It
-    must be integrable: below the critical probability the average of P itself diverges, and the
-    standard error says nothing then. Raises TheoryError for wrong arguments or if P* does not
-    exist.
+    F and Q are (n, n), H (p, n), R (p, p); readings arrive with probability ``delivery``, drawn
+    with ``seed``. By R Proposition 25 the average converges to the integral of the function over
+    the invariant law, for almost every start by that law; R recommends a point of its support, and
+    P* is the default (``start`` is an (n, n) covariance). ``function`` maps covariances (K, n, n)
+    to K numbers. It must be integrable: below the critical probability the average of P itself
+    diverges, and the standard error says nothing then. Raises TheoryError for wrong arguments or if
+    P* does not exist.
     """
     system, g = check_system(F, Q, H, R), check_delivery(delivery)
     slots, seed = as_integer("slots", slots, BATCHES), as_integer("seed", seed, 0)
@@ -76,7 +77,11 @@ def _evaluate(
     root: FloatArray,
     arrived: np.ndarray,
 ) -> list[FloatArray]:
-    """Return the values of the function at P_0, P_1, ..., in pieces of limited size."""
+    """Return the values of the ``function`` at P_0, P_1, ..., one for each slot, as arrays (K,) of
+    pieces of limited size.
+
+    ``root`` (n, n) is that of P_0, and ``arrived`` (slots,) is true in slots with a reading.
+    """
     F, Q, H, R = system
     modes, root_Q = reading_modes([(H[:0], R[:0, :0]), (H, R)], len(F)), square_root(Q)
     piece, values_of_pieces = max(1, MAX_ENTRIES // len(F) ** 2), []
@@ -111,9 +116,10 @@ def mean_covariance_bounds(
     slots: int,
     start: ArrayLike,
 ) -> MeanBounds:
-    """Return bounds on E[P_t] from the covariance ``start`` (n, n) on.
+    """Return bounds on E[P_t], from the covariance ``start`` (n, n) on, for t = 0 .. ``slots``.
 
-    The lower one counts slots without a reading only, ``S+ = (1 - g) F S F' + Q``; the upper one
+    F and Q are (n, n), H (p, n), R (p, p); readings arrive with probability g = ``delivery``. The
+    lower one counts slots without a reading only, ``S+ = (1 - g) F S F' + Q``; the upper one
     applies Jensen's inequality to the concave f_1, ``X+ = (1 - g) f_0(X) + g f_1(X)``. The lower
     one grows without bound if (1 - g) alpha^2 >= 1 for the largest modulus alpha of the eigenvalues
     of F, which is R (29) up to the probability (31); the upper one stays bounded above R (32).

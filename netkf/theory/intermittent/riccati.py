@@ -41,7 +41,9 @@ class SlotSystem(NamedTuple):
 
 
 def check_system(F: ArrayLike, Q: ArrayLike, H: ArrayLike, R: ArrayLike) -> SlotSystem:
-    """Return the matrices as arrays; raises TheoryError if shapes or definiteness are wrong."""
+    """Return F (n, n), Q (n, n), H (p, n) and R (p, p) as arrays; raises TheoryError if shapes or
+    definiteness are wrong.
+    """
     F_ = as_square("F", F)
     n = len(F_)
     H_ = _check_observation(H, n)
@@ -53,7 +55,7 @@ def check_system(F: ArrayLike, Q: ArrayLike, H: ArrayLike, R: ArrayLike) -> Slot
 
 
 def _check_observation(H: ArrayLike, n: int) -> FloatArray:
-    """Return H as a finite matrix of n columns; raises TheoryError."""
+    """Return H as a finite array (p, n); raises TheoryError otherwise."""
     array = as_numbers("H", H)
     if array.ndim != 2 or array.shape[1] != n or not np.isfinite(array).all():
         raise TheoryError(f"H must be a finite matrix of {n} columns, its shape is {array.shape}")
@@ -68,7 +70,11 @@ def check_delivery(delivery: float) -> float:
 
 
 def lyapunov_step(P: ArrayLike, F: ArrayLike, Q: ArrayLike) -> FloatArray:
-    """Return ``f_0(P) = F P F' + Q`` (n, n), R (16): a slot without a reading."""
+    """Return ``f_0(P) = F P F' + Q`` (n, n), R (16), for P, F and Q (n, n): a slot without a
+    reading.
+
+    Raises TheoryError if shapes or definiteness are wrong.
+    """
     transition = as_square("F", F)
     n = len(transition)
     return symmetric(
@@ -81,8 +87,9 @@ def riccati_step(
 ) -> FloatArray:
     """Return ``f_1(P) = F P F' + Q - F P H' (H P H' + R)^-1 H P F'`` (n, n), R (17).
 
-    A slot with a reading. Computed from square roots by an orthogonal triangularisation, which
-    subtracts nothing. Raises TheoryError if shapes or definiteness are wrong.
+    A slot with a reading; P, F and Q are (n, n), H (p, n), R (p, p). Computed from square roots by
+    an orthogonal triangularisation, which subtracts nothing. Raises TheoryError if shapes or
+    definiteness are wrong.
     """
     system = check_system(F, Q, H, R)
     start = as_covariance("P", P, len(system.F))
@@ -95,7 +102,8 @@ def riccati_step(
 
 
 def covariance_root(P: FloatArray) -> FloatArray:
-    """Return a root (n, n) of a covariance, lower triangular if it is positive definite."""
+    """Return a root (n, n) of a covariance P (n, n), lower triangular if it is positive definite.
+    """
     try:
         return np.asarray(np.linalg.cholesky(P), dtype=np.float64)
     except np.linalg.LinAlgError:  # semidefinite: a root from eigenvalues
@@ -103,7 +111,7 @@ def covariance_root(P: FloatArray) -> FloatArray:
 
 
 def steady_covariance(F: ArrayLike, Q: ArrayLike, H: ArrayLike, R: ArrayLike) -> FloatArray:
-    """Return P* (n, n), the stabilising fixed point of f_1.
+    """Return P* (n, n), the stabilising fixed point of f_1, for F and Q (n, n), H (p, n), R (p, p).
 
     Raises TheoryError if (F, H) is not detectable, with the mode, and if the computed P* fails the
     check of its residual or does not stabilise the filter.
@@ -132,7 +140,10 @@ def steady_covariance(F: ArrayLike, Q: ArrayLike, H: ArrayLike, R: ArrayLike) ->
 
 
 def filtered_covariance(F: FloatArray, Q: FloatArray, H: FloatArray, R: FloatArray) -> FloatArray:
-    """Return the steady covariance (n, n) after a reading, P (12); P* is that before it."""
+    """Return the steady covariance (n, n) after a reading, P (12); P* is that before it.
+
+    F and Q are (n, n), H (p, n), R (p, p); raises the errors of ``steady_covariance``.
+    """
     P = steady_covariance(F, Q, H, R)
     information = H.T @ np.linalg.solve(R, H)
     # (P^-1 + G)^-1 = (I + P G)^-1 P, which needs no inverse of P.
@@ -140,12 +151,16 @@ def filtered_covariance(F: FloatArray, Q: FloatArray, H: FloatArray, R: FloatArr
 
 
 def _optimal_gain(P: FloatArray, F: FloatArray, H: FloatArray, R: FloatArray) -> FloatArray:
-    """Return the predictor's gain ``F P H' (H P H' + R)^-1`` (n, p)."""
+    """Return the predictor's gain ``F P H' (H P H' + R)^-1`` (n, p), for P and F (n, n), H (p, n)
+    and R (p, p).
+    """
     return np.asarray(np.linalg.solve(H @ P @ H.T + R, H @ P @ F.T).T)
 
 
 def undetectable_slot_mode(F: FloatArray, H: FloatArray) -> complex | None:
-    """Return an eigenvalue of F on or outside the unit circle that H does not observe, or None."""
+    """Return an eigenvalue of F (n, n) on or outside the unit circle that H (p, n) does not
+    observe, or None.
+    """
     size = max(float(np.linalg.norm(F, 2)), 1e-300)
     scaled = H / max(float(np.abs(H).max(initial=0.0)), 1e-300) * size
     for value in np.linalg.eigvals(F):
@@ -178,9 +193,9 @@ class CriticalProbability(NamedTuple):
 def critical_probability(F: ArrayLike, H: ArrayLike) -> tuple[float, float]:
     """Return the bounds (lower, upper) on the critical delivery probability, R (31) and (32).
 
-    The upper one is the smallest g for which some K makes the mean of the Kronecker squares
-    contract. Policy iteration over K inside a root search over g finds it to about 1e-12. Raises
-    TheoryError if (F, H) is not detectable: then no probability suffices.
+    F is (n, n), H (p, n). The upper bound is the smallest g for which some K makes the mean of the
+    Kronecker squares contract. Policy iteration over K inside a root search over g finds it to
+    about 1e-12. Raises TheoryError if (F, H) is not detectable: then no probability suffices.
     """
     bounds = critical_certificate(F, H)
     return bounds.lower, bounds.upper
@@ -211,13 +226,15 @@ def critical_certificate(F: ArrayLike, H: ArrayLike) -> CriticalProbability:
 
 
 def _critical_bounds(F: FloatArray, H: FloatArray, search: _GainSearch) -> tuple[float, float]:
-    """Return R (31) and R (32); raises TheoryError if the latter is not found."""
+    """Return R (31) and R (32) for F (n, n) and H (p, n), with the ``search`` over gains for them;
+    raises TheoryError if the latter is not found.
+    """
     moduli = np.abs(np.linalg.eigvals(F))
     alpha = float(moduli.max())
     lower = max(0.0, 1.0 - 1.0 / alpha**2) if alpha > 0.0 else 0.0
 
     def radius(g: float) -> float:
-        """Return the best spectral radius with weight ``g`` on the open loop."""
+        """Return the least spectral radius over gains if readings arrive with probability ``g``."""
         return search.best((1.0 - g, g))[0]
 
     # Without an unstable mode the mean is bounded for every probability.
@@ -241,9 +258,9 @@ def _critical_bounds(F: FloatArray, H: FloatArray, search: _GainSearch) -> tuple
 def contraction_radius(F: FloatArray, arrivals: Sequence[tuple[float, FloatArray]]) -> float:
     """Return the least spectral radius over gains of the mean-square dynamics.
 
-    ``X -> sum_s p_s (F + K_s H_s) X (F + K_s H_s)'`` over sets s of readings, with stacked ``H_s``
-    (p, n), that arrive with probability p_s. Below 1 the mean of the covariance stays bounded
-    (R (32), derived for several links).
+    ``X -> sum_s p_s (F + K_s H_s) X (F + K_s H_s)'`` with F (n, n), over sets s of readings, with
+    stacked ``H_s`` (p, n), that arrive with probability p_s: ``arrivals`` are the pairs (p_s, H_s).
+    Below 1 the mean of the covariance stays bounded (R (32), derived for several links).
     """
     return _GainSearch(F, [H for _, H in arrivals]).best([p for p, _ in arrivals])[0]
 
@@ -251,8 +268,10 @@ def contraction_radius(F: FloatArray, arrivals: Sequence[tuple[float, FloatArray
 class _GainSearch:
     """Minimises the spectral radius of ``L: X -> sum_s p_s (F + K_s H_s) X (F + K_s H_s)'``.
 
-    Policy iteration over the gains K_s: L is a positive map, so that its radius is an eigenvalue
-    with a semidefinite X, and gains that minimise L(X) for this X do not raise the radius.
+    F is (n, n), ``readings`` the H_s (p, n), one for each set s of readings that may arrive, of
+    which p can differ. Policy iteration over the gains K_s: L is a positive map, so that its radius
+    is an eigenvalue with a semidefinite X, and gains that minimise L(X) for this X do not raise the
+    radius.
     """
 
     def __init__(self, F: FloatArray, readings: Sequence[FloatArray]) -> None:
@@ -267,7 +286,9 @@ class _GainSearch:
         self._pick = rows * n + columns
 
     def best(self, probabilities: Sequence[float]) -> tuple[float, list[FloatArray], FloatArray]:
-        """Return the least spectral radius, the gains (n, p) that attain it, the Perron matrix."""
+        """Return the least spectral radius, the gains K_s (n, p) that attain it, and the Perron
+        matrix (n, n), for the ``probabilities`` p_s of the sets of readings.
+        """
         n = len(self._F)
         gains = self._improve([np.zeros((n, len(H))) for H in self._readings], np.eye(n))
         gains = self._first_gains(probabilities, gains)
@@ -283,7 +304,8 @@ class _GainSearch:
     def _first_gains(
         self, probabilities: Sequence[float], gains: list[FloatArray]
     ) -> list[FloatArray]:
-        """Return gains close to the best ones, starting from any ``gains``.
+        """Return gains (n, p), one for each set of readings, close to the best ones for its
+        ``probabilities``, starting from any ``gains``.
 
         Policy iteration with the resolvent ``X = (s - L)^-1 I``, s above the radius of L, instead
         of the Perron matrix, which may be singular and then leaves gains undetermined in some
@@ -310,6 +332,9 @@ class _GainSearch:
     ) -> FloatArray | None:
         """Return ``(s - L)^-1 I`` (n, n) times a power of two that brings its trace to about 1, or
         None if it is not positive definite.
+
+        L is the map with these ``probabilities`` and ``gains`` (n, p), one for each set of
+        readings.
         """
         n, operator = len(self._F), self._operator(probabilities, gains)
         identity = np.eye(n).reshape(-1)[self._pick]
@@ -338,7 +363,9 @@ class _GainSearch:
         return improved
 
     def _operator(self, probabilities: Sequence[float], gains: list[FloatArray]) -> FloatArray:
-        """Return L as a matrix on upper triangles."""
+        """Return L with these ``probabilities`` and ``gains`` (n, p) as a matrix (m, m) on the m =
+        n (n + 1) / 2 entries of upper triangles.
+        """
         kron = np.zeros((len(self._F) ** 2,) * 2)
         for p, K, H in zip(probabilities, gains, self._readings, strict=True):
             closed = self._F + K @ H
@@ -348,7 +375,9 @@ class _GainSearch:
     def _perron(
         self, probabilities: Sequence[float], gains: list[FloatArray]
     ) -> tuple[float, FloatArray]:
-        """Return the spectral radius of L and its Perron matrix X (n, n), of positive trace."""
+        """Return the spectral radius of L with these ``probabilities`` and ``gains`` (n, p), and
+        its Perron matrix X (n, n), of positive trace.
+        """
         values, vectors = np.linalg.eig(self._operator(probabilities, gains))
         k = int(np.argmax(values.real))
         vector = (self._expand @ vectors[:, k]).real
@@ -359,10 +388,10 @@ class _GainSearch:
 def support(F: ArrayLike, Q: ArrayLike, H: ArrayLike, R: ArrayLike, depth: int) -> FloatArray:
     """Return all compositions (2^depth, n, n) of ``depth`` maps f_0 or f_1, applied to P*.
 
-    The binary digits of the index k are the maps of entry k, the leading digit being applied last.
-    By R Theorem 10 the closure of these points over all depths is the support of the invariant law;
-    f_1(P*) = P*, so that each depth contains the ones before. Raises TheoryError for a depth
-    outside 0 .. 22 and if P* does not exist.
+    F and Q are (n, n), H (p, n), R (p, p). The binary digits of the index k are the maps of entry
+    k, the leading digit being applied last. By R Theorem 10 the closure of these points over all
+    depths is the support of the invariant law; f_1(P*) = P*, so that each depth contains the ones
+    before. Raises TheoryError for a depth outside 0 .. 22 and if P* does not exist.
     """
     depth = as_integer("depth", depth, 0, MAX_DEPTH)
     F, Q, H, R = check_system(F, Q, H, R)
@@ -390,12 +419,13 @@ def invariant_samples(
 ) -> FloatArray:
     """Return independent draws (samples, n, n) from the invariant law of the Riccati equation.
 
-    Coupling from the past (Propp and Wilson, 1996): each draw has its own arrivals, drawn backwards
-    from the present; the equation runs through the last T of them from P*, the least point of the
-    support, and from a covariance a million times larger. T is doubled until the two ends differ by
-    at most 1e-9: then every start in the infinite past leads there. (A forward chain that stops
-    when it has forgotten its start would favour draws with recent arrivals.) Raises TheoryError if
-    no invariant law exists or the ends do not meet.
+    F and Q are (n, n), H (p, n), R (p, p); readings arrive with probability ``delivery``. Coupling
+    from the past (Propp and Wilson, 1996): each draw has its own arrivals, drawn backwards from the
+    present; the equation runs through the last T of them from P*, the least point of the support,
+    and from a covariance a million times larger. T is doubled until the two ends differ by at most
+    1e-9: then every start in the infinite past leads there. (A forward chain that stops when it has
+    forgotten its start would favour draws with recent arrivals.) Raises TheoryError if no invariant
+    law exists or the ends do not meet.
     """
     F, Q, H, R = check_system(F, Q, H, R)
     delivery = check_delivery(delivery)

@@ -38,12 +38,14 @@ class ScalarLaw:
     """P*, the least point of the support."""
 
     def without(self, P: FloatArray) -> FloatArray:
-        """Return ``f_0(P)``, elementwise."""
+        """Return ``f_0(P) = F^2 P + Q`` elementwise, an array of the shape of P."""
         with np.errstate(over="ignore"):  # at a hole's lower edge all earlier slots are outages
             return np.asarray(self.F**2 * P + self.Q)
 
     def with_reading(self, P: FloatArray) -> FloatArray:
-        """Return ``f_1(P)``, elementwise, also at infinity."""
+        """Return ``f_1(P) = F^2 P R / (H^2 P + R) + Q`` elementwise, an array of the shape of P,
+        also at infinity.
+        """
         with np.errstate(invalid="ignore"):
             gain = np.where(np.isinf(P), self.R / self.H**2, P * self.R / (self.H**2 * P + self.R))
         return np.asarray(self.F**2 * gain + self.Q)
@@ -54,7 +56,7 @@ class ScalarLaw:
         return self.F**2 * self.R / self.H**2 + self.Q, float(self.without(np.array(self.least)))
 
     def cdf(self, x: ArrayLike) -> FloatArray:
-        """Return P(X <= x), exact to about 1e-15, elementwise."""
+        """Return P(X <= x), exact to about 1e-15, elementwise: an array of the shape of ``x``."""
         point = np.array(x, dtype=np.float64)
         total, weight = np.zeros_like(point), np.ones_like(point)
         top = self.hole[0]
@@ -72,7 +74,8 @@ class ScalarLaw:
         return total
 
     def cdf_after(self, x: ArrayLike, slots: int, start: float) -> FloatArray:
-        """Return P(P_t <= x) after ``slots`` slots from P_0 = ``start``, exact, elementwise.
+        """Return P(P_t <= x) after t = ``slots`` slots from P_0 = ``start``, exact, an array of the
+        shape of ``x``.
 
         P_t is f_0(P_{t-1}) with probability 1 - g and f_1(P_{t-1}) with probability g, so that the
         distribution function obeys ``P(P_t <= x) = (1 - g) P(P_{t-1} <= f_0^-1(x)) + g P(P_{t-1} <=
@@ -102,9 +105,9 @@ class ScalarLaw:
         return total.reshape(x.shape)
 
     def quantile(self, u: ArrayLike) -> FloatArray:
-        """Return the least x with P(X <= x) >= u, elementwise; raises TheoryError for other u.
+        """Return the least x with P(X <= x) >= u, an array of the shape of ``u``.
 
-        u must lie in [0, 1).
+        ``u`` must lie in [0, 1), otherwise it raises TheoryError.
         """
         level = np.array(u, dtype=np.float64)
         if ((level < 0.0) | (level >= 1.0)).any():
@@ -128,11 +131,11 @@ class ScalarLaw:
         return P
 
     def mean(self) -> float:
-        """Return E[X] to about 1e-9 relative, infinite if (1-g) F^2 >= 1; raises TheoryError.
+        """Return E[X] to about 1e-9 relative, infinite if (1-g) F^2 >= 1.
 
         E = g E[f_1(X)] + (1-g)(F^2 E + Q), and E[f_1(X)] lies between two sums over all
-        compositions of 18 maps, applied to P* and to infinity. TheoryError if these differ by more
-        than 1e-6.
+        compositions of 18 maps, applied to P* and to infinity. Raises TheoryError if these differ
+        by more than 1e-6.
         """
         growth = (1.0 - self.delivery) * self.F**2
         if growth >= 1.0:
@@ -154,7 +157,8 @@ class ScalarLaw:
 def scalar_law(
     F: ArrayLike, Q: ArrayLike, H: ArrayLike, R: ArrayLike, delivery: float
 ) -> ScalarLaw:
-    """Return the exact invariant law of a scalar system (1 x 1 matrices or numbers).
+    """Return the exact invariant law of a scalar system: F, Q, H and R are numbers or 1 x 1
+    matrices, and readings arrive with probability ``delivery``.
 
     Raises TheoryError if the system is not scalar, has no P*, or if the images of f_0 and f_1
     overlap, so that the recursion has two branches.

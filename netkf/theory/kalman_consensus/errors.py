@@ -34,7 +34,9 @@ class KcfRule(ErrorRule):
         self._columns: dict[int, slice] = {}
 
     def elapse(self, gap: float, columns: slice | None, noise: FloatArray | None) -> None:
-        """Forget the predictions and readings of an earlier instant."""
+        """Forget the predictions and readings of an earlier instant if ``gap`` (seconds) is
+        positive; a message of this instant must find those of this instant only.
+        """
         if gap > 0.0:
             self._forget()
 
@@ -98,7 +100,9 @@ class KcfRule(ErrorRule):
         self.errors.drop([message for message in messages if message.late])
 
     def _consensus_term(self, estimator: int, inbox: list[SentMessage]) -> FloatArray:
-        """Return the form of ``gamma P sum_j (ebar_j - ebar)``."""
+        """Return the form (n, inputs) of ``gamma P sum_j (ebar_j - ebar)``, which the consensus
+        adds to the error of ``estimator``; the sum is over the messages of its ``inbox``.
+        """
         prediction, stack = self._prediction_name(estimator), self.errors.stack
         root = self.errors.roots[prediction]
         # The gain uses the predicted P, as the consensus term does predictions.

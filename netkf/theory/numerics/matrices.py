@@ -13,7 +13,10 @@ RESIDUAL = 1e-9  # of an equation, relative to its terms: larger ones mean a fai
 
 
 def as_numbers(name: str, value: ArrayLike) -> FloatArray:
-    """Return ``value`` as a float array, a single number as 1 x 1; raises TheoryError otherwise."""
+    """Return ``value`` as a float array of its own shape, a single number as (1, 1).
+
+    ``name`` is how the message of the TheoryError calls the value if it is not real numbers.
+    """
     try:
         if np.iscomplexobj(value):
             raise TypeError
@@ -25,7 +28,9 @@ def as_numbers(name: str, value: ArrayLike) -> FloatArray:
 
 
 def as_integer(name: str, value: object, min_value: int, max_value: float = np.inf) -> int:
-    """Return ``value``, an int in ``min_value`` .. ``max_value``, otherwise raises TheoryError."""
+    """Return ``value``, an int in ``min_value`` .. ``max_value``; otherwise raises TheoryError,
+    whose message calls it ``name``.
+    """
     if isinstance(value, bool) or not isinstance(value, (int, np.integer)):
         raise TheoryError(f"{name} must be an integer, got {value!r}")
     if not min_value <= value <= max_value:
@@ -39,7 +44,10 @@ def as_integer(name: str, value: object, min_value: int, max_value: float = np.i
 
 
 def as_square(name: str, value: ArrayLike, n: int | None = None) -> FloatArray:
-    """Return a finite (n, n) array, a number as 1 x 1, any n if None; raises TheoryError."""
+    """Return ``value`` as a finite (n, n) array, a number as 1 x 1; any n if it is None.
+
+    Raises TheoryError otherwise, whose message calls the value ``name``.
+    """
     array = as_numbers(name, value)
     shape_text = "square" if n is None else f"{n} x {n}"
     if array.ndim != 2 or array.shape[0] != array.shape[1] or n not in (None, len(array)):
@@ -50,7 +58,10 @@ def as_square(name: str, value: ArrayLike, n: int | None = None) -> FloatArray:
 
 
 def as_covariance(name: str, value: ArrayLike, n: int) -> FloatArray:
-    """Return a symmetric positive semidefinite (n, n) array; raises TheoryError otherwise."""
+    """Return ``value`` as a symmetric positive semidefinite (n, n) array.
+
+    Raises TheoryError otherwise, whose message calls the value ``name``.
+    """
     array = as_square(name, value, n)
     if n == 0:
         return array
@@ -86,8 +97,9 @@ def riccati_flow(P: ArrayLike, A: ArrayLike, Q: ArrayLike, G: ArrayLike, gap: fl
 
 
 def algebraic_riccati(A: FloatArray, Q: FloatArray, G: FloatArray) -> FloatArray:
-    """Return the stabilising solution S (n, n) of 0 = A S + S A' + Q - S G S.
+    """Return the stabilising solution S (n, n) of ``0 = A S + S A' + Q - S G S``.
 
+    A, Q and G are (n, n), ``G = H' R^-1 H`` the information per second of continuous readings.
     Raises TheoryError with the reason if there is none, or if the computed S fails the check of its
     residual or does not stabilise A - S G.
     """
@@ -115,7 +127,9 @@ def algebraic_riccati(A: FloatArray, Q: FloatArray, G: FloatArray) -> FloatArray
 
 
 def lyapunov(A: FloatArray, Q: FloatArray) -> FloatArray:
-    """Return the solution X (n, n) of 0 = A X + X A' + Q; raises TheoryError for an unstable A."""
+    """Return the solution X (n, n) of ``0 = A X + X A' + Q`` for A and Q (n, n), the steady
+    covariance of ``dx = A x dt`` and noise Q per second; raises TheoryError for an unstable A.
+    """
     if not np.linalg.eigvals(A).real.max() < 0.0:
         raise TheoryError("the error dynamics are not stable, their covariance has no limit")
     X = _solve_lyapunov(A, Q)
@@ -126,23 +140,29 @@ def lyapunov(A: FloatArray, Q: FloatArray) -> FloatArray:
 
 
 def _solve_lyapunov(A: FloatArray, Q: FloatArray) -> FloatArray:
-    """Return symmetric X (n, n) with ``A X + X A' = -Q``."""
+    """Return symmetric X (n, n) with ``A X + X A' = -Q`` for A and Q (n, n)."""
     return symmetric(np.asarray(scipy.linalg.solve_continuous_lyapunov(A, -Q), dtype=np.float64))
 
 
 def undetectable_mode(A: FloatArray, G: FloatArray) -> complex | None:
-    """Return an eigenvalue of A with nonnegative real part that G does not observe, or None."""
+    """Return an eigenvalue of A (n, n) with nonnegative real part that G (n, n) does not observe,
+    or None; ``G = H' R^-1 H``, or any matrix with the null space of H.
+    """
     return _hidden_mode(A, G, only_unstable=True)
 
 
 def unobservable_mode(A: FloatArray, G: FloatArray) -> complex | None:
-    """Return an eigenvalue of A that G does not observe (Popov, Belevitch, Hautus), or None."""
+    """Return an eigenvalue of A (n, n) that G (n, n), such as ``H' R^-1 H``, does not observe
+    (Popov, Belevitch, Hautus), or None.
+    """
     return _hidden_mode(A, G, only_unstable=False)
 
 
 def _hidden_mode(A: FloatArray, G: FloatArray, only_unstable: bool) -> complex | None:
-    """Return an eigenvalue of A whose mode G does not observe, or None (Popov-Belevitch-Hautus
-    test).
+    """Return an eigenvalue of A (n, n) whose mode G (n, n) does not observe, or None (test of
+    Popov, Belevitch and Hautus).
+
+    With ``only_unstable`` eigenvalues with negative real part (1/s) are skipped.
     """
     n, size = len(A), max(float(np.linalg.norm(A, 2)), 1e-300)
     scaled = G / max(float(np.abs(G).max()), 1e-300) * size  # rank does not depend on units

@@ -49,11 +49,11 @@ def spectral_radius(T: PositiveMap, shape: Shape) -> float:
 
 
 def fixed_point(T: PositiveMap, Q: FloatArray, radius: float) -> FloatArray:
-    """Return the solution (S, M, M) of ``X = T(X) + Q`` by GMRES with refinement, for a positive
-    map of spectral ``radius`` below 1.
+    """Return the solution (S, M, M) of ``X = T(X) + Q`` by GMRES with refinement.
 
-    Its residual is below RESIDUAL (1 - radius), relative to the standard deviations of row and
-    column. Raises TheoryError if that is not reached.
+    T is a positive map on stacks of S symmetric matrices, of spectral ``radius`` below 1, and Q
+    (S, M, M) such a stack. The residual is below RESIDUAL (1 - radius), relative to the standard
+    deviations of row and column. Raises TheoryError if that is not reached.
     """
     # The error of the solution is up to 1 / (1 - radius) times the residual.
     tolerance = RESIDUAL * max(1.0 - radius, 1e-3)
@@ -69,13 +69,13 @@ def fixed_point(T: PositiveMap, Q: FloatArray, radius: float) -> FloatArray:
 
 
 def _count_numbers(shape: Shape) -> int:
-    """Return the number of entries in the upper triangles of a stack."""
+    """Return the number of entries in the upper triangles of a stack of the ``shape`` (S, M, M)."""
     return shape[0] * shape[-1] * (shape[-1] + 1) // 2
 
 
 def _confirm(T: PositiveMap, X: FloatArray, value: float) -> float:
-    """Return the radius ``value`` if a different search, for the largest modulus from another
-    start, agrees; raises TheoryError if not.
+    """Return the radius ``value`` with its eigenvector X (S, M, M) if a different search, for the
+    largest modulus from another start, finds the same; raises TheoryError if not.
     """
     start = X + np.diag(np.linspace(0.5, 1.5, X.shape[-1])) * np.trace(X.sum(axis=0))
     second_value, _ = _extreme_eigenvalue(T, start, "LM")
@@ -92,8 +92,9 @@ def _extreme_eigenvalue(
     """Return the modulus of an extreme eigenvalue of T, and its eigenvector X (S, M, M) of positive
     trace.
 
-    Arnoldi's method starts at ``start``, which has a component along X if it is positive definite.
-    (0, zeros) if it fails for a map small enough for dense eigenvalues.
+    ``which`` is "LR" for the rightmost eigenvalue, "LM" for that of largest modulus. Arnoldi's
+    method begins at ``start`` (S, M, M), which has a component along X if it is positive definite.
+    Returns (0, zeros) if it fails for a map small enough for dense eigenvalues.
     """
     shape = start.shape
     try:
@@ -115,7 +116,9 @@ def _extreme_eigenvalue(
 
 
 def _least_factor(T: PositiveMap, X: FloatArray) -> float:
-    """Return the least c with T(X) <= c X, which bounds the radius; inf if X is not definite."""
+    """Return the least c with ``T(X) <= c X`` for X (S, M, M), which bounds the radius of T from
+    above; inf if X is not positive definite.
+    """
     try:
         roots = np.linalg.cholesky(X)
     except np.linalg.LinAlgError:
@@ -124,14 +127,18 @@ def _least_factor(T: PositiveMap, X: FloatArray) -> float:
 
 
 def _largest_ratio(image: FloatArray, L: FloatArray) -> float:
-    """Return the largest eigenvalue of ``L^-1 moved L^-T``, for lower triangular L (M, M)."""
+    """Return the largest eigenvalue of ``L^-1 image L^-T`` for a symmetric ``image`` (M, M) and a
+    lower triangular L (M, M): the least c with ``image <= c L L'``.
+    """
     half = scipy.linalg.solve_triangular(L, image, lower=True)
     scaled = scipy.linalg.solve_triangular(L, half.T, lower=True)
     return float(np.linalg.eigvalsh(symmetric(scaled))[-1])
 
 
 def _is_small(residual: FloatArray, X: FloatArray, tolerance: float) -> bool:
-    """Return True if a residual is below ``tolerance`` for every entry of X."""
+    """Return True if every entry of the ``residual`` (S, M, M) is below ``tolerance`` times the
+    standard deviations of its row and column in the second moments X (S, M, M).
+    """
     variances = np.abs(np.diagonal(X, axis1=1, axis2=2)).sum(axis=0)
     deviations = np.sqrt(variances)
     # Small variances must be accurate too, beside large ones of other states.
@@ -140,14 +147,18 @@ def _is_small(residual: FloatArray, X: FloatArray, tolerance: float) -> bool:
 
 
 def _triangle_indices(shape: Shape) -> tuple[IntArray, IntArray, IntArray]:
-    """Return the indices of the upper triangles of a stack: of matrices, rows and columns."""
+    """Return the indices of the entries in the upper triangles of a stack of the ``shape``
+    (S, M, M): of matrices, rows and columns, three arrays of S M (M + 1) / 2 entries.
+    """
     rows, columns = np.triu_indices(shape[-1])
     matrices = np.repeat(np.arange(shape[0]), len(rows))
     return matrices, np.tile(rows, shape[0]), np.tile(columns, shape[0])
 
 
 def _dense_matrix(T: PositiveMap, shape: Shape) -> FloatArray:
-    """Return T as a matrix on upper triangles."""
+    """Return T as a matrix (m, m) on the m = S M (M + 1) / 2 entries of the upper triangles of a
+    stack of the ``shape`` (S, M, M).
+    """
     triangle, columns = _triangle_indices(shape), []
     for s, i, j in zip(*triangle, strict=True):
         unit = np.zeros(shape)
@@ -157,7 +168,9 @@ def _dense_matrix(T: PositiveMap, shape: Shape) -> FloatArray:
 
 
 def _solve_by_elimination(T: PositiveMap, right: FloatArray) -> FloatArray:
-    """Return the solution (S, M, M) of ``X - T(X) = right`` by elimination."""
+    """Return the solution (S, M, M) of ``X - T(X) = right`` by elimination, for ``right``
+    (S, M, M).
+    """
     s, i, j = triangle = _triangle_indices(right.shape)
     X = np.zeros_like(right)
     X[s, i, j] = X[s, j, i] = np.linalg.solve(
@@ -167,7 +180,9 @@ def _solve_by_elimination(T: PositiveMap, right: FloatArray) -> FloatArray:
 
 
 def _by_gmres(T: PositiveMap, right: FloatArray) -> FloatArray:
-    """Return an approximate solution (S, M, M) of ``X - T(X) = right``."""
+    """Return an approximate solution (S, M, M) of ``X - T(X) = right``, for ``right`` (S, M, M), to
+    a relative residual of about 1e-8.
+    """
     x, _ = scipy.sparse.linalg.gmres(
         _linear_operator(lambda X: X - T(X), right.shape),
         right.ravel(),
@@ -180,7 +195,9 @@ def _by_gmres(T: PositiveMap, right: FloatArray) -> FloatArray:
 
 
 def _linear_operator(apply: PositiveMap, shape: Shape) -> scipy.sparse.linalg.LinearOperator:
-    """Return a map on vectors (S M M,) that acts on their symmetric parts."""
+    """Return ``apply``, a map on stacks of the ``shape`` (S, M, M), as a linear operator on vectors
+    (S M M,), of which it uses the symmetric part.
+    """
     size = int(np.prod(shape))
     return scipy.sparse.linalg.LinearOperator(
         (size, size),

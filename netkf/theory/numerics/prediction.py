@@ -54,7 +54,11 @@ class Prediction(NamedTuple):
 
 
 class ShortExponential:
-    """``exp(M s)`` by its Taylor series for 0 <= s <= ``unit``, at which |M| s = MAX_NORM."""
+    """``exp(M s)`` (d, d) by its Taylor series for 0 <= s <= ``unit`` seconds, at which |M| s =
+    MAX_NORM, for M (d, d) per second.
+
+    terms : (TERMS, d, d) coefficients of the powers of s / unit
+    """
 
     def __init__(self, M: FloatArray) -> None:
         self.unit = MAX_NORM / max(float(np.abs(M).sum(axis=0).max(initial=0.0)), 1e-300)
@@ -64,13 +68,15 @@ class ShortExponential:
         self.terms = np.array(terms)
 
     def __call__(self, times: FloatArray) -> FloatArray:
-        """Return the exponentials (K, d, d) at K times, each at most ``unit``."""
+        """Return exp(M s) (K, d, d) at K ``times`` s in seconds, each at most ``unit``."""
         powers = (np.asarray(times)[:, None] / self.unit) ** np.arange(TERMS)
         return np.asarray(np.tensordot(powers, self.terms, 1))
 
 
 def triangular_root(factor: FloatArray) -> FloatArray:
-    """Return lower triangular S (..., n, n) with ``S S' = parts parts'``, parts (..., n, k)."""
+    """Return the lower triangular S (..., n, n) with ``S S' = factor factor'``, for a ``factor``
+    (..., n, k) with any number k of columns.
+    """
     n, k = factor.shape[-2:]
     if k == 0:
         return np.zeros((*factor.shape[:-1], n))
@@ -86,6 +92,8 @@ def triangular_root(factor: FloatArray) -> FloatArray:
 class Predictor:
     """Predictions without increments, for the plant dx = A x dt + B dw and filters that assume A_f
     and B_f instead.
+
+    A and A_f are (n, n), B and B_f (n, m), for m independent noises w of variance 1 per second.
     """
 
     def __init__(self, A: FloatArray, B: FloatArray, A_f: FloatArray, B_f: FloatArray) -> None:
@@ -99,7 +107,9 @@ class Predictor:
         self._known: dict[float, Prediction] = {}
 
     def __call__(self, gap: float) -> Prediction:
-        """Return the prediction over ``gap`` seconds."""
+        """Return the prediction of the state and of all errors over ``gap`` seconds; up to
+        MAX_CACHED are cached by their gap.
+        """
         prediction = self._known.get(gap)
         if prediction is None:
             prediction = self._discretise(gap)
@@ -109,7 +119,7 @@ class Predictor:
         return prediction
 
     def _discretise(self, gap: float) -> Prediction:
-        """Return the prediction over ``gap`` seconds."""
+        """Compute the prediction of the state and of all errors over ``gap`` seconds."""
         F_f, root = self._belief.discretise(gap)
         if self._truth is None:
             return Prediction(F_f, F_f, np.zeros_like(F_f), root, root, root)
@@ -119,7 +129,9 @@ class Predictor:
 
 
 class LinearSDE:
-    """The equation dz = A z dt + B dw, discretised over any gap by doubling."""
+    """The equation dz = A z dt + B dw for z (d,), discretised over any gap by doubling; A is
+    (d, d), B (d, m).
+    """
 
     def __init__(self, A: FloatArray, B: FloatArray) -> None:
         self._exp, self._B = ShortExponential(A), as_kernel_array(B)
@@ -153,8 +165,8 @@ class ErrorFlow:
     """Errors of filters with the same continuous readings H (p, n); p = 0 for filters without any.
 
     ``R`` (p, p) is the noise covariance that the filters assume, ``noise`` (p, p) a root of the
-    true one; ``A``, ``B`` as they assume them, ``plant`` the true pair. Transitions are over at
-    most ``unit`` seconds.
+    true one; ``A`` (n, n), ``B`` (n, m) as they assume them, ``plant`` the true pair. Transitions
+    are over at most ``unit`` seconds.
     """
 
     def __init__(
@@ -195,7 +207,9 @@ class ErrorFlow:
     def _exponential_blocks(
         self, times: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Return the transposes (K, n, n) of the four blocks of exp(M s), without the scale."""
+        """Return the transposes (K, n, n) of the four blocks of exp(M s) (2 n, 2 n), row by row, at
+        K ``times`` s in seconds, without the scale.
+        """
         n, c = self._n, self._scale
         E = np.swapaxes(self._exp(times), 1, 2)
         return E[:, :n, :n], E[:, n:, :n] / c, E[:, :n, n:] * c, E[:, n:, n:]
@@ -235,7 +249,8 @@ class ErrorFlow:
     ) -> None:
         """Move errors, which do not depend on the state, and the roots of P over ``gap`` seconds.
 
-        ``columns``: the first of the plant's 8 m inputs, and the first of n inputs of each error.
+        Changes ``stack.table`` and ``stack.matrices`` of the vectors ``names``. ``columns``: the
+        first of the plant's 8 m inputs, and the first of n inputs of each error.
         """
         flow_estimates(
             stack.arrays,
@@ -273,8 +288,12 @@ class ErrorFlow:
         T21: FloatArray,
         root_weights: FloatArray,
     ) -> FloatArray:
-        """Return the root of P at the end of the gap: P(g) = (F S Z_1)(F S Z_1)' plus the solution
-        from P(0) = 0.
+        """Return the roots (K, n, n) of P of K filters at the end of the gap.
+
+        P(g) = (F S Z_1)(F S Z_1)' plus the solution from P(0) = 0: ``start_factor`` (K, n, n) is F
+        S Z_1, F (n, n) is X(g)^-T for P(0) = 0, and T11 and T21 (8, n, n) are blocks of exp(M s) at
+        the nodes of the quadrature, whose square roots of the weights are ``root_weights``
+        (8, 1, 1).
         """
         noise_factors = [_side_by_side((root_weights * (F @ T11 @ self._B))[None])[0]]
         noise_factors.append(
@@ -287,8 +306,11 @@ class ErrorFlow:
         return triangular_root(factor)
 
     def _response_through_state(self, FJ: FloatArray, FC: FloatArray, gap: float) -> FloatArray:
-        """Return the response (K, 8, n, m) of errors, by way of the state, to the plant's noise at
-        each node.
+        """Return the response (K, 8, n, m) of the errors of K filters, by way of the state, to the
+        m noises of the plant at each of the 8 nodes of a ``gap`` in seconds.
+
+        FJ and FC (K, n, n) give the error's transition from s,
+        ``Phi(g, s) = FJ T11(s) + FC T12(s)``.
         """
         assert self._state is not None
         responses = []
@@ -304,9 +326,11 @@ class ErrorFlow:
 def propagate_state(
     plant: tuple[FloatArray, FloatArray], gap: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the state's transition (n, n) and its response (n, 8 m) to the plant's inputs.
+    """Return the state's transition (n, n) and its response (n, 8 m) to the plant's inputs, over a
+    ``gap`` in seconds.
 
-    The inputs are those of :class:`ErrorFlow`: m at each of the 8 nodes of the gap (seconds).
+    ``plant`` is the pair A (n, n), B (n, m). The inputs are those of :class:`ErrorFlow`: m at each
+    of the 8 nodes of the gap, the inputs of one node side by side.
     """
     A, B = plant
     E = ShortExponential(A)(np.append((1.0 - NODES) * gap, gap))
@@ -315,14 +339,14 @@ def propagate_state(
 
 
 def _side_by_side(matrices: FloatArray) -> FloatArray:
-    """Reshape (K, s, n, m) to (K, n, s m): s matrices side by side."""
+    """Return (K, n, s m): for each of K, the s ``matrices`` (K, s, n, m) side by side."""
     K, s, n, m = matrices.shape
     return np.ascontiguousarray(matrices.transpose(0, 2, 1, 3)).reshape(K, n, s * m)
 
 
 def _balancing_scale(A: FloatArray, Q: FloatArray, G: FloatArray) -> float:
     """Return the scale of covariances for which the off-diagonal blocks Q and G of the Hamiltonian
-    have about equal norms, so that steps are longest.
+    of A, Q and G, each (n, n), have about equal norms, so that steps are longest.
     """
     q, g = float(np.abs(Q).max(initial=0.0)), float(np.abs(G).max(initial=0.0))
     if g == 0.0:

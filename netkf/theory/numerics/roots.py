@@ -62,8 +62,8 @@ def triangular(factor: FloatArray) -> FloatArray:
 
 @kernel
 def cholesky_into(L: FloatArray, matrix: FloatArray, n: int) -> None:
-    """Write the Cholesky factor of a positive definite matrix (n, n) into the first n rows and
-    columns of L.
+    """Write the lower triangular Cholesky factor of a positive definite ``matrix`` (n, n) into the
+    first n rows and columns of L, zeros above the diagonal included.
     """
     for i in range(n):
         for j in range(i + 1):
@@ -77,7 +77,10 @@ def cholesky_into(L: FloatArray, matrix: FloatArray, n: int) -> None:
 
 @kernel
 def divide_by_transpose(rows: FloatArray, L: FloatArray, count: int, n: int) -> None:
-    """Replace ``rows`` (count, n) by ``rows L^-T`` for a lower triangular L (n, n)."""
+    """Replace ``rows`` (count, n) by ``rows L^-T`` in place, for a lower triangular L (n, n).
+
+    By forward substitution, row by row.
+    """
     for r in range(count):
         for j in range(n):
             total = rows[r, j]
@@ -88,8 +91,8 @@ def divide_by_transpose(rows: FloatArray, L: FloatArray, count: int, n: int) -> 
 
 @kernel
 def multiply_form(form: FloatArray, matrix: FloatArray, used: int, scratch: FloatArray) -> None:
-    """Replace the first ``used`` columns of a form (n, width) by ``matrix form``; ``scratch`` has
-    the shape (n, used).
+    """Replace the first ``used`` columns of a form (n, width) by ``matrix form``, for a ``matrix``
+    (n, n); ``scratch`` (n, used) is overwritten.
     """
     n = matrix.shape[0]
     for i in range(n):
@@ -108,7 +111,8 @@ def multiply_form(form: FloatArray, matrix: FloatArray, used: int, scratch: Floa
 
 @kernel
 def add_columns(form: FloatArray, first: int, matrix: FloatArray, sign: float) -> None:
-    """Add ``sign matrix`` (n, k) to the columns of a form from ``first`` on."""
+    """Add ``sign matrix`` (n, k) to k columns of a ``form`` (n, width) in place, from ``first`` on.
+    """
     for i in range(matrix.shape[0]):
         for k in range(matrix.shape[1]):
             form[i, first + k] += sign * matrix[i, k]
@@ -144,7 +148,7 @@ def predict_estimates(
 
 @kernel
 def _multiply_into(out: FloatArray, a: FloatArray, b: FloatArray) -> None:
-    """Write ``a b`` over the first columns of ``out``."""
+    """Write ``a b`` (r, c) over the first c columns of ``out``, for a (r, k) and b (k, c)."""
     for i in range(a.shape[0]):
         for j in range(b.shape[1]):
             total = 0.0
@@ -167,7 +171,10 @@ def update_root(
     root: FloatArray, H: FloatArray, R: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return ``I - K H`` (n, n), the Kalman gain K (n, p) and the root (n, n) of P after a reading
-    ``y = H x + v``, R the covariance of v that the filter assumes.
+    ``y = H x + v``.
+
+    ``root`` (n, n) is that of P before it, H (p, n), and R (p, p) the covariance of v that the
+    filter assumes.
     """
     p, n = H.shape
     array = np.zeros((p + n, p + n))
@@ -204,9 +211,10 @@ def update_estimate(
     noise: FloatArray,
     first: int,
 ) -> None:
-    """Update an error and its root by a reading: ``e+ = (I - K H) e - K noise w``.
+    """Update the error ``index`` of the table and the root of its P in place by a reading:
+    ``e+ = (I - K H) e - K noise w``, with the Kalman gain K of H (p, n) and the assumed R (p, p).
 
-    ``noise`` (p, p) is a root of the true covariance, and belongs to the inputs from column
+    ``noise`` (p, p) is a root of the true covariance, and belongs to the p inputs from column
     ``first`` on.
     """
     forms, matrices, used = errors
@@ -221,7 +229,9 @@ def update_estimate(
 
 @kernel(allocates=True)
 def average_roots(weights: FloatArray, roots: FloatArray) -> FloatArray:
-    """Return a root (n, n) of ``sum_j w_j P_j`` from roots (J, n, n)."""
+    """Return a root (n, n) of ``sum_j w_j P_j`` from ``roots`` (J, n, n) of the P_j and ``weights``
+    (J,); negative weights count as 0.
+    """
     count, n = roots.shape[0], roots.shape[1]
     factor = np.empty((n, count * n))
     for k in range(count):
@@ -238,7 +248,11 @@ def average_roots(weights: FloatArray, roots: FloatArray) -> FloatArray:
 
 @kernel(allocates=True)
 def mixed_form(forms: FloatArray, sources: IntArray, factors: FloatArray, used: int) -> FloatArray:
-    """Return ``sum_j W_j e_j`` (n, used) for factors W (J, n, n)."""
+    """Return ``sum_j W_j e_j`` (n, used), a linear form of the first ``used`` inputs.
+
+    ``factors`` are W (J, n, n); the e_j are the ``forms`` (vectors, n, width) at the indices
+    ``sources`` (J,).
+    """
     n = factors.shape[1]
     out = np.zeros((n, used))
     for k in range(len(sources)):
@@ -255,7 +269,9 @@ def mixed_form(forms: FloatArray, sources: IntArray, factors: FloatArray, used: 
 
 @kernel(allocates=True)
 def add_information(root: FloatArray, U: FloatArray) -> FloatArray:
-    """Return a root (n, n) of ``(P^-1 + U)^-1`` for a positive semidefinite U (n, n)."""
+    """Return a root (n, n) of ``(P^-1 + U)^-1`` for ``root`` (n, n) of P and positive semidefinite
+    U (n, n).
+    """
     n = root.shape[0]
     half, inner = np.zeros((n, n)), np.zeros((n, n))
     # (P^-1 + U)^-1 = S (I + S' U S)^-1 S' with P = S S'; P itself is never inverted.
@@ -284,7 +300,8 @@ def fade_totals(
     noise: FloatArray,
     first: int,
 ) -> None:
-    """Predict the totals of push-sum with running sums at ``indices``.
+    """Predict the totals of push-sum with running sums at ``indices``; changes their matrices and
+    forms.
 
     The matrices of ``totals`` are their information U, the forms are their errors u - U x.
     ``U+ = s F^-T U F^-1`` and ``(u - U x)+ = s F^-T (u - U x) - U+ w``, with ``inverse`` F^-1
@@ -315,7 +332,10 @@ def fade_totals(
 @kernel(allocates=True)
 def intersect_with_factors(weights: FloatArray, roots: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return the root (n, n) of P and the factors (J, n, n) ``w_j P P_j^-1`` of the errors, where
-    ``P^-1 = sum_j w_j P_j^-1``; nan if one of the roots (J, n, n) is singular.
+    ``P^-1 = sum_j w_j P_j^-1``.
+
+    ``weights`` (J,) and ``roots`` (J, n, n) of the P_j; negative weights count as 0. The results
+    are nan if one of the roots is singular.
     """
     count, n = roots.shape[0], roots.shape[1]
     factor, inverses = np.empty((n, count * n)), np.zeros((count, n, n))
@@ -347,7 +367,9 @@ def intersect_with_factors(weights: FloatArray, roots: FloatArray) -> tuple[Floa
 
 @kernel(allocates=True)
 def exponential(series: FloatArray, share: float) -> FloatArray:
-    """Return ``sum_k share^k series[k]`` (d, d) of a power series (T, d, d), by Horner's scheme."""
+    """Return ``sum_k share^k series[k]`` (d, d), T terms of a power ``series`` (T, d, d), by
+    Horner's scheme.
+    """
     d = series.shape[1]
     E = np.empty((d, d))
     for i in range(d):
@@ -367,10 +389,11 @@ def discretise(
     gap: float,
     quadrature: tuple[FloatArray, FloatArray],
 ) -> tuple[FloatArray, FloatArray]:
-    """Return ``exp(A gap)`` (d, d) and the root (d, d) of the covariance that B dw adds.
+    """Return ``exp(A gap)`` (d, d) and the root (d, d) of the covariance that B dw adds over
+    ``gap`` seconds.
 
-    ``series`` (T, d, d) are the terms of exp(A s) in s / unit, ``quadrature`` the nodes and weights
-    on [0, 1].
+    ``series`` (T, d, d) are the terms of exp(A s) in s / ``unit``, which hold for s up to ``unit``
+    seconds; B is (d, m); ``quadrature`` the nodes and weights (K,) on [0, 1].
     """
     # The series holds up to one unit: discretise a short step, then double it.
     short, doublings = gap, 0
@@ -409,7 +432,8 @@ def flow_blocks(
     ``nodes`` (K,) of a gap and at its end.
 
     ``series`` (T, 2 n, 2 n) are the terms of the power series of exp(M s) in s / unit for
-    covariances in units of ``scale``, which is removed from the result.
+    covariances in units of ``scale``, which is removed from the result. ``nodes`` are fractions of
+    the ``gap``, and ``gap`` and ``unit`` are seconds.
     """
     n, count = series.shape[1] // 2, len(nodes)
     out = np.empty((count + 1, 4, n, n))
@@ -430,8 +454,10 @@ def flow_gramian(
 ) -> tuple[FloatArray, FloatArray]:
     """Return F (n, n) and Gamma (K p, n) of a gap, see :mod:`netkf.theory.numerics.prediction`.
 
-    ``blocks`` (K + 1, 4, n, n) are those of ``flow_blocks``, ``whitened`` (p, n) is R^-1/2 H, and
-    ``root_weights`` (K,) are the square roots of the quadrature weights in seconds.
+    F is the transition ``X(g)^-T`` without readings' effect on P(0), Gamma' Gamma the information
+    that the readings of the gap give about the state at its start. ``blocks`` (K + 1, 4, n, n) are
+    those of ``flow_blocks``, ``whitened`` (p, n) is R^-1/2 H, and ``root_weights`` (K,) are the
+    square roots of the quadrature weights in seconds.
     """
     count = len(root_weights)
     p, n = whitened.shape
@@ -462,7 +488,8 @@ def flow_start(
 ) -> FloatArray:
     """Return the root (n, n) of P at the end of a gap from P = 0 at its start.
 
-    ``gain`` is ``H' R^-1/2`` (n, p); ``F``, ``blocks`` and ``root_weights`` as in flow_gramian().
+    ``B`` (n, m) is the filters' noise factor, ``gain`` (n, p) is ``H' R^-1/2``; ``F``, ``blocks``
+    and ``root_weights`` as in flow_gramian().
     """
     count, n, m, p = len(root_weights), B.shape[0], B.shape[1], gain.shape[1]
     factor, response = np.zeros((n, max(n, count * (m + p)))), np.empty((n, n))
@@ -480,7 +507,9 @@ def flow_start(
 
 @kernel
 def _add_product(out: FloatArray, first: int, a: FloatArray, b: FloatArray, scale: float) -> None:
-    """Add ``scale a b`` to the columns of ``out`` from ``first`` on."""
+    """Add ``scale a b`` (r, c) to c columns of ``out`` in place, from ``first`` on, for a (r, k)
+    and b (k, c).
+    """
     for i in range(a.shape[0]):
         for j in range(b.shape[1]):
             total = 0.0
@@ -493,10 +522,11 @@ def _add_product(out: FloatArray, first: int, a: FloatArray, b: FloatArray, scal
 def flow_over_gap(
     F: FloatArray, Gamma: FloatArray, start: FloatArray, root: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return ``F J``, ``F J P`` (n, n) and the root of P at the end of a gap.
+    """Return ``F J``, ``F J P`` and the root of P at the end of a gap, (n, n) each.
 
-    ``J = (I + P G)^-1`` with P = root root' at the start of the gap and ``G = Gamma' Gamma``;
-    ``start`` (n, n) is the root at the end of the solution from P = 0, see flow_start().
+    ``J = (I + P G)^-1`` with P = root root' at the start of the gap and ``G = Gamma' Gamma``; F
+    (n, n) and Gamma (K p, n) are those of flow_gramian(), and ``start`` (n, n) is the root at the
+    end of the solution from P = 0, see flow_start().
     """
     n, rows = F.shape[0], Gamma.shape[0]
     GS, SL = np.empty((rows, n)), root.copy()
@@ -544,11 +574,12 @@ def flow_estimates(
     quadrature: tuple[FloatArray, FloatArray],
 ) -> None:
     """Propagate errors of filters with the same continuous readings, and their roots of P, over a
-    gap of at most one unit.
+    ``gap`` of at most one unit, in seconds; changes both in ``errors`` at ``indices``.
 
     flow        : R^-1/2 H (p, n), the filters' gain factors H' R^-1/2 and H' R^-1 times a root of
-                  the true noise (n, p), the filters' B and the plant's B
-    exponential : terms of the series of exp(M s), its unit and the scale of covariances
+                  the true noise (n, p), the filters' B and the plant's B (n, m)
+    exponential : terms (T, 2 n, 2 n) of the series of exp(M s), its unit in seconds and the scale
+                  of covariances
     quadrature  : nodes and weights (K,) on [0, 1]
     columns     : the first of the K m inputs of the plant, and the first of the n inputs of each
                   error's own noise, which are there if p > 0

@@ -123,7 +123,9 @@ class GaussianStack:
         return index
 
     def put_all(self, forms: Mapping[Hashable, FloatArray]) -> None:
-        """Add or overwrite several vectors."""
+        """Add or overwrite several vectors by their forms (n, inputs), given by name; inputs newer
+        than a form get zero columns.
+        """
         for name, form in forms.items():
             self.put(name, form)
 
@@ -132,7 +134,9 @@ class GaussianStack:
         self.table[self._index[name], :, columns] += matrix
 
     def mix(self, sources: Sequence[Hashable], factors: FloatArray) -> FloatArray:
-        """Return the form (n, inputs) of the sum of vectors times ``factors`` (K, n, n)."""
+        """Return the form (n, inputs) of ``sum_k W_k e_k`` for the K vectors ``sources`` and
+        ``factors`` W (K, n, n).
+        """
         return mixed_form(self.table, self.indices(sources), factors, self.used)
 
     def copy(self, name: Hashable, new: Hashable) -> None:
@@ -162,7 +166,9 @@ class GaussianStack:
         return np.asarray(stacked @ stacked.T)
 
     def _grow(self) -> int:
-        """Double the storage and return a free index."""
+        """Double the storage, at least to 4 vectors, and return a free index (which is then in
+        use).
+        """
         count = len(self.table)
         added = max(4, 2 * count) - count
         self.table, self.matrices = (

@@ -33,7 +33,9 @@ class Observation(NamedTuple):
 
 
 def stack_observations(observations: list[Observation], n: int) -> Observation:
-    """Join observations of a state (n,) with independent noises into one."""
+    """Join ``observations`` of a state (n,) with independent noises into one: H (p, n) stacked, R
+    and root (p, p) block diagonal, for p readings together.
+    """
     if len(observations) == 1:
         return observations[0]
     H = np.concatenate([np.zeros((0, n)), *(observation.H for observation in observations)])
@@ -46,7 +48,8 @@ def update_covariance_root(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return ``I - K H`` (n, n), the Kalman gain K (n, p) and the root (n, n) of P after a reading.
 
-    One orthogonal triangularisation of [[R^1/2, H S], [0, S]], so that no subtraction loses digits.
+    ``root`` (n, n) is that of P before the reading. By one orthogonal triangularisation of [[R^1/2,
+    H S], [0, S]], so that no subtraction loses digits.
     """
     p, n = observation.H.shape
     if not p:
@@ -57,10 +60,11 @@ def update_covariance_root(
 def average_covariances(
     weights: list[float], roots: list[FloatArray]
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the root (n, n) of ``sum_j w_j P_j`` and the factors (J, n, n) of the errors, H
-    (7), (9).
+    """Return the root (n, n) of ``sum_j w_j P_j`` and the factors (J, n, n) of the errors, H (7),
+    (9).
 
-    The estimate is the convex combination, so that each error is multiplied by its weight.
+    ``weights`` are J numbers that add up to 1, ``roots`` J roots (n, n) of the P_j. The estimate is
+    the convex combination, so that each error is multiplied by its weight.
     """
     weight_array = np.array(weights, dtype=float)
     return average_roots(weight_array, np.stack(roots)), weight_array[:, None, None] * np.eye(
@@ -71,9 +75,9 @@ def average_covariances(
 def intersect_covariances(
     weights: list[float], roots: list[FloatArray]
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the root (n, n) of P and the factors (J, n, n) of covariance intersection, D (8),
-    (9).
+    """Return the root (n, n) of P and the factors (J, n, n) of covariance intersection, D (8), (9).
 
+    ``weights`` are J numbers that add up to 1, ``roots`` J roots (n, n) of the P_j.
     ``P^-1 = sum_j w_j P_j^-1``; error j is multiplied by ``w_j P P_j^-1``.
     """
     result: tuple[FloatArray, FloatArray] = intersect_with_factors(
@@ -83,6 +87,8 @@ def intersect_covariances(
 
 
 def add_information_to_root(root: FloatArray, U: FloatArray) -> FloatArray:
-    """Return a root (n, n) of ``(P^-1 + U)^-1`` for a positive semidefinite U (n, n)."""
+    """Return a root (n, n) of ``(P^-1 + U)^-1`` for ``root`` (n, n) of P and a positive
+    semidefinite information matrix U (n, n).
+    """
     result: FloatArray = add_information(root, U)
     return result
