@@ -15,9 +15,10 @@ from netkf.linalg.compiling import kernel
 
 
 class Moments(NamedTuple):
-    """Mean and sum of squared deviations of ``size`` values each.
+    """Mean and sum of squared deviations M2 of S times C quantities, in rows and columns.
 
-    ``mean`` and ``M2`` (S, C) have one ``size`` (S,) for each row.
+    size     : (S,) the number of observations of all quantities of a row
+    mean, M2 : (S, C)
     """
 
     size: FloatArray
@@ -35,8 +36,10 @@ class Moments(NamedTuple):
 
 
 def moments_of(values: FloatArray, size: FloatArray) -> Moments:
-    """Return the moments of R observations (R, S, C), merged in the binary tree over them; ``size``
-    (R, S) is 1 where an observation exists and 0 where it does not. Both arrays are overwritten.
+    """Return the moments of R observations ``values`` (R, S, C) of S rows of C quantities.
+
+    They are merged in the binary tree over R; ``size`` (R, S) is 1 where an observation exists and
+    0 where it does not. Both arrays are overwritten.
     """
     _, rows, columns = values.shape
     mean, M2 = np.empty((rows, columns)), np.empty((rows, columns))
@@ -45,14 +48,16 @@ def moments_of(values: FloatArray, size: FloatArray) -> Moments:
 
 
 def merge_moments(a: Moments, b: Moments) -> Moments:
-    """Return the moments of both samples together."""
+    """Return the moments of both samples together; both have the same rows and columns, (S, C)."""
     size, mean, M2 = (_stack_pair(*pair) for pair in zip(a, b, strict=True))
     merge_two(size, mean, M2)
     return Moments(size[0], mean[0], M2[0])
 
 
 def _stack_pair(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Return ``np.stack([a, b])``, several times faster than numpy for small arrays."""
+    """Return ``np.stack([a, b])`` (2, ...) of two arrays of one shape, several times faster than
+    numpy for small arrays.
+    """
     stacked = np.empty((2, *a.shape))
     stacked[0] = a
     stacked[1] = b
@@ -63,8 +68,11 @@ def _stack_pair(a: FloatArray, b: FloatArray) -> FloatArray:
 def merge_pair(
     size: FloatArray, mean: FloatArray, M2: FloatArray, a: int, b: int, s: int, t: int
 ) -> None:
-    """Merge the moments of observation ``b`` into those of ``a``, for row ``s`` of size (R, S) and
-    mean (R, S, C) and row ``t`` of M2 (R, S', C) (Chan, Golub and LeVeque 1983, (2.1)).
+    """Merge the moments of observation ``b`` into those of ``a`` in place (Chan, Golub and LeVeque
+    1983, (2.1)).
+
+    Of R observations with S rows of C quantities only row ``s`` is merged: of ``size`` (R, S), of
+    ``mean`` (R, S, C), and as row ``t`` of ``M2`` (R, S', C), which may hold fewer rows.
     """
     total = size[a, s] + size[b, s]
     share = size[b, s] / max(total, 1.0)
@@ -80,7 +88,9 @@ def merge_pair(
 
 @kernel
 def merge_two(size: FloatArray, mean: FloatArray, M2: FloatArray) -> None:
-    """Merge two moments into the first: size (2, S), mean and M2 (2, S, C)."""
+    """Merge two moments into the first in place: size (2, S), mean and M2 (2, S, C), for S rows of
+    C quantities.
+    """
     for s in range(mean.shape[1]):
         merge_pair(size, mean, M2, 0, 1, s, s)
 
@@ -89,8 +99,11 @@ def merge_two(size: FloatArray, mean: FloatArray, M2: FloatArray) -> None:
 def merge_leaves(
     size: FloatArray, values: FloatArray, work: FloatArray, mean: FloatArray, M2: FloatArray
 ) -> None:
-    """Write mean and M2 (S, C) of R observations (R, S, C), merged in the binary tree over R; size
-    (R, S) and values are overwritten, ``work`` (R, 1, C) is scratch.
+    """Write ``mean`` and ``M2`` (S, C) of R observations ``values`` (R, S, C), merged in the binary
+    tree over R.
+
+    S counts rows and C the quantities of a row; ``size`` (R, S) and ``values`` are overwritten,
+    ``work`` (R, 1, C) is scratch.
     """
     # Row by row, so that the values of a row are still in the cache when they are merged again.
     for s in range(values.shape[1]):
@@ -102,8 +115,11 @@ def merge_leaves(
 
 @kernel
 def merge_row(size: FloatArray, values: FloatArray, work: FloatArray, s: int) -> None:
-    """Merge row ``s`` of R observations into observation 0: its mean into ``values[0, s]``, its M2
-    into ``work[0, 0]``; arrays as in ``merge_leaves``.
+    """Merge row ``s`` of R observations into observation 0, in place: its mean into
+    ``values[0, s]``, its M2 into ``work[0, 0]``.
+
+    ``size`` (R, S) numbers of observations, ``values`` (R, S, C) and ``work`` (R, 1, C), which is
+    scratch.
     """
     runs = len(values)
     # A single observation has M2 = 0.

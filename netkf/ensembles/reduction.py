@@ -269,7 +269,11 @@ def _nees_of_irregular(batch: Batch, regular: np.ndarray) -> FloatArray:
 def reduce_runs(
     lanes: Lanes, b: Batch, bounds: np.ndarray, sums: Sums, scratch: ReductionScratch
 ) -> None:
-    """Fill ``sums`` for R runs; piece k has the runs ``bounds[k]`` to ``bounds[k + 1] - 1``."""
+    """Fill ``sums`` for the R runs of the batch ``b``; piece k has the runs ``bounds[k]`` to
+    ``bounds[k + 1] - 1``, for K pieces and ``bounds`` (K + 1,).
+
+    Runs go through in groups of L lanes; ``scratch`` is overwritten.
+    """
     for k in range(len(bounds) - 1):
         # A few sample times of all runs of a piece at a time.
         for t in range(0, len(b.times), scratch.times):
@@ -298,7 +302,11 @@ def reduce_runs(
 
 @kernel(compact=True)
 def join_nodes(scratch: ReductionScratch, depth: int, count: int) -> int:
-    """Merge the last two of ``depth`` waiting nodes, for ``count`` times; return depth - 1."""
+    """Merge the last two of ``depth`` waiting nodes of the tree over runs, at ``count`` sample
+    times; return depth - 1, the number that waits now.
+
+    Changes node depth - 2 of ``scratch.node_size``, ``mean`` and ``M2``.
+    """
     for s in range(count):
         merge_pair(scratch.node_size, scratch.mean, scratch.M2, depth - 2, depth - 1, s, s)
     return depth - 1
@@ -309,8 +317,10 @@ def add_node(
     lanes: Lanes, scratch: ReductionScratch, active: int, count: int, node: int, complete: bool
 ) -> None:
     """Merge the ``active`` runs of a group of L, and store the result as waiting ``node`` of the
-    tree over runs: size, mean and M2 at ``count`` sample times. ``complete`` says that no run lacks
-    one of these samples.
+    tree over runs.
+
+    Reads ``scratch.rows`` and ``size``, and sets ``node_size``, ``mean`` and ``M2`` of the node at
+    ``count`` sample times. ``complete`` says that no run lacks one of these samples.
     """
     if complete and active == len(lanes):
         merge_whole(lanes, scratch, count, node)
@@ -327,7 +337,11 @@ def add_node(
 
 @kernel
 def merge_whole(lanes: Lanes, scratch: ReductionScratch, count: int, node: int) -> None:
-    """Merge L rows that all have the sample, as ``merge_row`` does but L columns at a time."""
+    """Merge the ``rows`` of L runs that all have the samples, as ``merge_row`` does but L columns
+    at a time.
+
+    Sets ``node_size``, ``mean`` and ``M2`` of the waiting ``node`` at ``count`` sample times.
+    """
     rows, work, mean_of, M2_of = scratch.rows, scratch.work, scratch.mean, scratch.M2
     for s in range(count):
         scratch.node_size[node, s] = 1.0 * len(lanes)
@@ -359,8 +373,10 @@ def gather_samples(
     lines: FloatArray,
     out: FloatArray,
 ) -> None:
-    """Transpose columns ``start`` to ``start + count`` of ``samples`` (R, ...) for the ``active``
-    runs from ``first`` on into lanes, ``out`` (>= count, L). Idle lanes repeat the last run.
+    """Transpose columns ``start`` to ``start + count`` of ``samples`` (R, columns) for the
+    ``active`` runs from ``first`` on into the L lanes of ``out`` (>= count, L).
+
+    Idle lanes repeat the last run; ``lines`` (L, >= count) is scratch.
     """
     for q in range(len(lanes)):
         r = first + min(q, active - 1)
@@ -381,8 +397,10 @@ def reduce_group(
     t: int,
     count: int,
 ) -> bool:
-    """Fill ``scratch.rows`` for ``count`` samples from ``t`` on of the ``active`` runs from
-    ``first`` on, and add them to the averages; return True if no run lacks one of them.
+    """Fill ``scratch.rows`` for ``count`` samples from number ``t`` on of the ``active`` runs from
+    ``first`` on, one run in each lane; return True if no run lacks one of them.
+
+    Adds the samples to ``sums.averages`` of these runs, and sets ``sums.rounding_from``.
     """
     filters, n = b.error.shape[2:]
     entries, complete, sample_counts, totals, averages = (
@@ -439,7 +457,11 @@ def reduce_group(
 def mark_missing(
     b: Batch, scratch: ReductionScratch, first: int, active: int, t: int, count: int
 ) -> None:
-    """Set ``size`` to 1 for samples that a run has, else to 0, with zeros in ``rows``."""
+    """Set ``scratch.size`` to 1 for samples that a run has, else to 0, with zeros in
+    ``scratch.rows``.
+
+    For ``count`` samples from number ``t`` on of the ``active`` runs from ``first`` on.
+    """
     for q in range(active):
         for s in range(count):
             exists = t + s < b.sample_counts[first + q]
@@ -460,8 +482,10 @@ def reduce_sample(
     s: int,
     f: int,
 ) -> None:
-    """Fill the columns of sample ``t``, number ``s`` of a group, for filter ``f``, and add it to
-    the averages.
+    """Fill the columns of sample ``t`` for filter ``f``, and add it to the averages, in L lanes.
+
+    The group has the ``active`` runs from ``first`` on, one in each lane, and the sample is its
+    number ``s``. Changes ``scratch.columns`` and ``scratch.totals[f]``.
     """
     # Loaded from the struct once instead of in each step of the loops.
     errors_of, P, columns, factor, z = (
@@ -518,8 +542,11 @@ def add_total(lanes: Lanes, totals: FloatArray, f: int, a: int, number: Any) -> 
 def fill_single_nees(
     b: Batch, sums: Sums, scratch: ReductionScratch, r: int, t: int, f: int, q: int
 ) -> None:
-    """Write NEES of sample ``t`` of run ``r`` and filter ``f`` into lane ``q``, by Gaussian
-    elimination with pivoting; mark the run as not regular if P is singular.
+    """Write NEES of sample ``t`` of run ``r`` and filter ``f`` into ``scratch.nees[q]``, lane q, by
+    Gaussian elimination with pivoting.
+
+    Sets ``sums.regular[r]`` to False if P is singular. Takes NEES from ``b.known_nees`` where that
+    has it.
     """
     error, P = b.error[r, t, f : f + 1], b.P[r, t, f : f + 1]
     if not fill_nees(error, P, scratch.single_nees, scratch.single_factor, scratch.single_solved):
@@ -532,8 +559,10 @@ def mark_averaged(
     b: Batch, sums: Sums, scratch: ReductionScratch, first: int, active: int, t: int
 ) -> None:
     """Mark the runs in whose averages sample ``t`` counts, by the rule of
-    ``runs.summary.select_averaged_samples``: ``clear`` for those of errors, ``traced`` for that of
-    P.
+    ``runs.summary.select_averaged_samples``.
+
+    Sets of the ``active`` runs from ``first`` on, one in each lane, ``scratch.clear`` to 1 where
+    errors count and ``scratch.traced`` to 1 where P counts, else to 0.
     """
     # Loaded from the structs once instead of in each step of the loop.
     times, sample_counts, diverged, rounding_from = (
@@ -558,7 +587,8 @@ def mark_averaged(
 
 @kernel(compact=True)
 def divide_averages(b: Batch, sums: Sums, r: int) -> None:
-    """Divide the sums of run ``r`` over its samples by the numbers of samples in them.
+    """Divide ``sums.averages[r]`` (F, 3), sums of run ``r`` over its samples, by the numbers of
+    samples in them.
 
     Sums begin at sample ``b.start``, or at 0 if the run diverged before it. Those of squared errors
     and NEES end where rounding errors exceed the errors, the trace of P with them if the run
@@ -578,10 +608,11 @@ def divide_averages(b: Batch, sums: Sums, r: int) -> None:
 
 @kernel(inlined=True)
 def nees_of_lanes(lanes: Lanes, scratch: ReductionScratch) -> Any:
-    """Write NEES ``e' P^-1 e`` of L samples, one in each lane, and return the lanes whose P is not
-    positive definite or not finite; ``not_definite`` (L,) counts their bad pivots.
+    """Write NEES ``e' P^-1 e`` of L samples, one in each lane, into ``scratch.nees`` (L,), and
+    return the lanes whose P is not positive definite or not finite.
 
-    On entry ``factor`` is P and ``z`` the error e; both are overwritten.
+    ``scratch.not_definite`` (L,) counts their bad pivots. On entry ``scratch.factor`` (n, n, L) is
+    P and ``scratch.z`` (n, L) the error e; both are overwritten.
     """
     # P = G D G' with G unit lower triangular, and e' P^-1 e = z' D^-1 z with G z = e.
     schur = scratch.factor
@@ -616,8 +647,10 @@ def mark_blurred(
     t: int,
     s: int,
 ) -> None:
-    """Set ``rounding_from`` to the time of sample ``t``, number ``s`` of a group, in the runs in
-    which this is the first sample that rounding blurs.
+    """Set ``sums.rounding_from`` to the time of sample ``t``, number ``s`` of a group, in the runs
+    in which this is the first sample that rounding blurs.
+
+    The group has the ``active`` runs from ``first`` on, one in each lane.
     """
     # A fast sufficient test of all lanes by squares, without a root; is_blurred() decides about the
     # runs that it does not clear. Comparisons with nan are false, as in is_blurred().
@@ -646,7 +679,8 @@ def mark_blurred(
 @kernel(compact=True)
 def is_blurred(b: Batch, r: int, t: int) -> bool:
     """Return True if rounding blurs sample ``t`` of run ``r``, by the rule of
-    ``trace.run.rounding_from``.
+    ``trace.run.rounding_from``: rounding errors of the state exceed a fraction 1 / BLUR of the
+    smallest standard deviation.
     """
     filters, n = b.error.shape[2:]
     largest, min_variance, square = 0.0, np.inf, 0.0

@@ -23,7 +23,9 @@ class ConstantGainRule(EstimateExchangeRule):
     """Updates with the given gains, and the resets H (7), (9)."""
 
     def sense(self, time: float, observations: EstimatorObservations) -> None:
-        """Move each error to ``(I - L H) e - L v``."""
+        """Move the error of each estimator to ``(I - L H) e - L v``, with its gain L (n, p);
+        changes its root of P with it.
+        """
         algorithm: Any = self.scenario.filter.algorithm
         errors = self.errors
         columns = errors.reading_noises(observations)
@@ -40,7 +42,13 @@ class ConstantGainRule(EstimateExchangeRule):
     def combine(
         self, node: int, weights: list[float], roots: list[FloatArray]
     ) -> tuple[FloatArray, FloatArray]:
-        """Average covariances; the node's own estimate has the weight 1 - sum of ``weights``."""
+        """Return the new root (n, n) of P and the factors (J, n, n) of the J errors, by averaging
+        covariances.
+
+        ``roots`` are J roots (n, n) of P: that of the ``node`` first, then those of the messages,
+        whose ``weights`` are J - 1 numbers; the node's own estimate has the weight 1 - sum of
+        ``weights``.
+        """
         return average_covariances([1.0 - sum(weights), *weights], roots)
 
 

@@ -19,7 +19,12 @@ class SwapRule(EstimateExchangeRule):
     def combine(
         self, node: int, weights: list[float], roots: list[FloatArray]
     ) -> tuple[FloatArray, FloatArray]:
-        """Multiply the last error by the identity and all others by zero."""
+        """Return the root (n, n) of P of the last message, and the factors (J, n, n) of the J
+        errors: the identity for the last one, zero for all others.
+
+        ``roots`` are J roots (n, n) of P: that of the ``node`` first, then those of the messages,
+        whose ``weights`` have no meaning here.
+        """
         n, others = self.errors.n, len(roots) - 1
         return roots[-1], np.concatenate([np.zeros((others, n, n)), np.eye(n)[None]])
 

@@ -212,7 +212,8 @@ class _PiecewiseSolution:
         packed, silent, delay = self._packed, self._without_arrivals, self._packed.equations.delay
 
         def slope(t: float, y: FloatArray) -> FloatArray:
-            """Return dy/dt (N m,) of the packed covariances ``y`` (N m,) at time ``t`` (seconds).
+            """Return dy/dt (N m,) of the packed covariances ``y`` (N m,) at time ``t``
+            (seconds).
             """
             Y = y.reshape(packed.start.shape)
             if not np.abs(y).max() < OVERFLOW:
@@ -335,7 +336,8 @@ def _growth_event(limit: float) -> Callable[[float, FloatArray], float]:
     """
 
     def margin(_: float, y: FloatArray) -> float:
-        """Return ``limit`` less the largest entry of ``y`` (N m,): the solver stops where it is 0.
+        """Return ``limit`` less the largest entry of ``y`` (N m,): the solver stops where
+        it is 0.
         """
         return limit - float(np.abs(y).max()) if math.isfinite(limit) else 1.0
 

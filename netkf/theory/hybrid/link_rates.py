@@ -64,7 +64,8 @@ def link_rate_for(scenario: Scenario, delta: float) -> LinkRate:
     equations, S = _require_talk(scenario), limit_covariance(scenario)
 
     def excess(log_factor: float) -> float:
-        """Return the logarithm of distance over ``delta`` with all rates times exp(``log_factor``).
+        """Return the logarithm of distance over ``delta`` with all rates times
+        exp(``log_factor``).
         """
         distance = _distance(equations, S, math.exp(log_factor))
         if distance is None:

@@ -105,7 +105,8 @@ class _SecondMomentEquation:
         ]
 
     def __call__(self, flat: FloatArray) -> FloatArray:
-        """Return dY/dt, flat, for second moments Y given as a ``flat`` array of (N n n)^2 entries.
+        """Return dY/dt, flat, for second moments Y given as a ``flat`` array of (N n n)^2
+        entries.
         """
         Y = np.asarray(flat, dtype=np.float64).reshape(self._shape)
         # L Y + Y L'

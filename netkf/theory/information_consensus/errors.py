@@ -35,10 +35,11 @@ def step_weights(scenario: Scenario) -> FloatArray:
 def effective_weights(
     scenario: Scenario, weights: Sequence[FloatArray]
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the weights (N, N) of the predictions and of the readings (N, N) in the estimates.
+    """Return the weights (N, N) of the predictions and those of the readings (N, N) in the
+    estimates.
 
-    Entry (i, j) is the number of times that node i counts the information of node j.
-    ``weights`` (N, N) of each step are those of the messages that arrived in it, 0 for others.
+    Entry (i, j) is the number of times that node i counts the information of node j. ``weights``
+    (N, N) of each step are those of the messages that arrived in it, 0 for others.
     """
     algorithm: Any = scenario.node_filter
     N = len(scenario.nodes)

@@ -102,7 +102,8 @@ def riccati_step(
 
 
 def covariance_root(P: FloatArray) -> FloatArray:
-    """Return a root (n, n) of a covariance P (n, n), lower triangular if it is positive definite.
+    """Return a root (n, n) of a covariance P (n, n), lower triangular if it is positive
+    definite.
     """
     try:
         return np.asarray(np.linalg.cholesky(P), dtype=np.float64)

@@ -111,7 +111,8 @@ def multiply_form(form: FloatArray, matrix: FloatArray, used: int, scratch: Floa
 
 @kernel
 def add_columns(form: FloatArray, first: int, matrix: FloatArray, sign: float) -> None:
-    """Add ``sign matrix`` (n, k) to k columns of a ``form`` (n, width) in place, from ``first`` on.
+    """Add ``sign matrix`` (n, k) to k columns of a ``form`` (n, width) in place, from
+    ``first`` on.
     """
     for i in range(matrix.shape[0]):
         for k in range(matrix.shape[1]):

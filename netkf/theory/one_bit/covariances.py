@@ -17,8 +17,9 @@ def one_bit_update(P: ArrayLike, H: ArrayLike, R: ArrayLike) -> FloatArray:
     """Return P (n, n) after the signs of the innovations of a reading's p rows, one after the other
     once their noises are decorrelated, ``P - (2 / pi) P h' h P / (h P h' + 1)`` for each row h.
 
-    A bit is worth 2 / pi of its reading (Ribeiro, Giannakis and Roumeliotis 2006, equation 22).
-    Raises TheoryError if shapes or definiteness are wrong.
+    P (n, n) is the covariance before them, H is (p, n), R (p, p). A bit is worth 2 / pi of its
+    reading (Ribeiro, Giannakis and Roumeliotis 2006, equation 22). Raises TheoryError if shapes or
+    definiteness are wrong.
     """
     size = np.asarray(P, dtype=np.float64)
     _, result, H_, R_ = check_system(np.eye(len(np.atleast_2d(size))), P, H, R)
@@ -30,7 +31,7 @@ def one_bit_update(P: ArrayLike, H: ArrayLike, R: ArrayLike) -> FloatArray:
 
 
 def bit_covariances(scenario: Scenario, run: Run) -> FloatArray:
-    """Return P (T, N, n, n) at the times of a run in slots, from the messages that arrived."""
+    """Return P (T, N, n, n) at the T times of a run in slots, from the messages that arrived."""
     nodes, index, plant = scenario.nodes, scenario.topology.index, scenario.slot_plant
     F, Q = scenario.slot_belief
     sensors = [scenario.observation_matrices(node, believed=True) for node in nodes]
@@ -48,7 +49,9 @@ def bit_covariances(scenario: Scenario, run: Run) -> FloatArray:
 
 
 def _used_bits(scenario: Scenario, run: Run) -> dict[int, list[tuple[int, int]]]:
-    """Return by slot who used whose bits; a sender uses its own."""
+    """Return by slot who used whose bits, as sorted pairs of node ids (receiver, sender); a sender
+    uses its own.
+    """
     bits: dict[int, set[tuple[int, int]]] = {}
     rows = run.log[run.log["kind"] == CODES["deliver"]]
     slots = scenario.slot_plant.slots_of(rows["t"])

@@ -32,9 +32,9 @@ MAX_OUTCOMES_AT_ONCE = 8192  # bounds the memory of the products
 
 @dataclass(frozen=True, eq=False)
 class Averaging:
-    """The law of gamma averaging steps on ``nodes`` nodes with consensus gain ``delta``.
+    """The law of gamma averaging steps on N = ``nodes`` nodes with consensus gain ``delta``.
 
-    links  : (E, 2) indices of the two ends
+    links  : (E, 2) indices of the two ends of each of E links
     hears  : (E, 2) probabilities that the first end hears the second, and that the second the first
     both   : (E,) probability that both hear each other in one step
     held   : True if one draw of the links serves all steps of a slot, else each step has its own
@@ -87,7 +87,9 @@ class Averaging:
         return np.linalg.matrix_power(expected + spread @ difference, self.gamma)
 
     def second_moment(self, Y: FloatArray) -> FloatArray:
-        """Return E[(M^gamma (x) I) Y (M^gamma (x) I)'] (N n, N n) for Y (N n, N n)."""
+        """Return E[(M^gamma (x) I) Y (M^gamma (x) I)'] (N n, N n) for the second moments Y
+        (N n, N n) of the stacked errors of N nodes with n states.
+        """
         N, n = self.nodes, len(Y) // self.nodes
         if self.enumerated or N <= MAX_KRONECKER:
             pairs = Y.reshape(N, n, N, n).transpose(0, 2, 1, 3).reshape(N * N, n * n)
@@ -113,7 +115,7 @@ class Averaging:
         return Y
 
     def _multiply(self, Y: FloatArray) -> FloatArray:
-        """Return (E[M] (x) I) Y of one step."""
+        """Return (E[M] (x) I) Y (N n, columns) of one averaging step, for Y (N n, columns)."""
         product = self.mean_step @ np.ascontiguousarray(Y).reshape(self.nodes, -1)
         return np.asarray(product).reshape(Y.shape)
 
@@ -196,7 +198,11 @@ class Averaging:
 def _tabulate(
     outcomes: list[tuple[FloatArray, FloatArray]], size: int
 ) -> tuple[FloatArray, FloatArray]:
-    """Return probabilities (K,) and sums of terms (K, size) of all outcomes of several links."""
+    """Return the probabilities (K,) and the sums of terms (K, size) of all K outcomes of several
+    links together.
+
+    ``outcomes`` has for each link the probabilities (k,) and terms (k, size) of its own k outcomes.
+    """
     probabilities, sums = np.ones(1), np.zeros((1, size))
     for probability, terms in outcomes:
         probabilities = np.outer(probabilities, probability).reshape(-1)

@@ -85,7 +85,11 @@ def leader_agreement(scenario: Scenario, slots: int, leader: int | None = None) 
 
 
 def _spread(law: FloatArray, missed: FloatArray) -> FloatArray:
-    """Return the law (2^N,) of the set of informed nodes one slot later, from ``law`` (2^N,)."""
+    """Return the law (2^N,) of the set of informed nodes one slot later, from ``law`` (2^N,).
+
+    The index of a set is a bit mask of node indices; ``missed`` (N, N) is the probability that node
+    i (row) does not hear node j (column) in a slot.
+    """
     N, next_law = len(missed), np.zeros_like(law)
     for informed in np.flatnonzero(law).tolist():
         members = [k for k in range(N) if informed >> k & 1]

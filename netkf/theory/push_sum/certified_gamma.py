@@ -80,7 +80,9 @@ def _bound_constants(scenario: Scenario) -> GammaConstants:
 
 
 def _require_conditions(scenario: Scenario, law: Averaging, P: FloatArray) -> None:
-    """Raise TheoryError if a condition of P Theorems 5 and 6 fails."""
+    """Raise TheoryError if a condition of P Theorems 5 and 6 fails for the ``law`` of averaging and
+    the limit P_inf, ``P`` (n, n).
+    """
     laplacian_radius = consensus_gain_bound(scenario).radius
     if not law.delta > laplacian_radius:
         raise TheoryError(
@@ -103,7 +105,9 @@ def _disconnection_bound(scenario: Scenario, law: Averaging) -> float:
 
 
 def _weighted_norm(A: FloatArray, P: FloatArray) -> float:
-    """Return |A|_P = sup over z of sqrt(z' A' P A z / z' P z), P (35)."""
+    """Return |A|_P = sup over z of sqrt(z' A' P A z / z' P z), P (35), for A (n, n) and a positive
+    definite P (n, n).
+    """
     # The largest generalised eigenvalue of (A' P A, P).
     return float(np.sqrt(scipy.linalg.eigh(A.T @ P @ A, P, eigvals_only=True)[-1]))
 

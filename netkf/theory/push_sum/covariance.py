@@ -29,7 +29,9 @@ def covariance_of_steps(steps: EstimationSteps) -> FloatArray:
 
 
 def _covariance(steps: EstimationSteps, value: float) -> FloatArray:
-    """Return the steady covariance (N, n, n) of steps 4 and 5 with mean-square radius ``value``."""
+    """Return the steady covariance (N, n, n) of the nodes' errors under steps 4 and 5, whose
+    mean-square radius is ``value``; raises TheoryError unless it is below 1.
+    """
     if not value < 1.0:
         raise TheoryError(
             f"no steady error covariance: the mean-square radius is {value:.6g}, not below 1; "

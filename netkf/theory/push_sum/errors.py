@@ -77,7 +77,11 @@ class AveragingRule(ErrorRule):
         self._heard = np.zeros((self._N, *self._z.shape))
 
     def exchange(self, slot: int, phase: int, messages: Sequence[SentMessage]) -> None:
-        """Exchange the masses, P (3)-(5) (phase 0), or average the estimates, P step 5."""
+        """Exchange the masses, P (3)-(5) (``phase`` 0), or average the estimates of all nodes in
+        gamma steps, P step 5 (``phase`` 1).
+
+        Phase 0 changes ``_z`` (and the running sums), phase 1 the errors in the stack.
+        """
         if phase == 0:
             received = self._arrived_weights(slot, 0, 0)
             shares = self._z / self._nu[:, None]
@@ -103,11 +107,15 @@ class AveragingRule(ErrorRule):
         stack.table[indices, :, : stack.used] = (mixing @ forms).reshape(self._N, -1, stack.used)
 
     def _arrived_weights(self, slot: int, phase: int, step: int) -> FloatArray:
-        """Return the weights (N, N) of the messages that arrived in a step, zeros if none did."""
+        """Return a table (N, N), receiver by sender, that is 1 where a message arrived in this
+        ``step`` of an exchange, ``phase`` of a ``slot``, else 0.
+        """
         return self._arrivals.get((slot, phase, step), np.zeros((self._N, self._N)))
 
     def sense(self, time: float, observations: EstimatorObservations) -> None:
-        """Update the estimates, P step 4, with the G and N that the masses estimate, P (6)-(8)."""
+        """Update the estimates of all nodes, P step 4, with the G and N that the masses estimate, P
+        (6)-(8); changes errors and roots of P.
+        """
         n, errors = self.errors.n, self.errors
         heard = self._z[:, 0] > 0.0  # before any weight arrives a node knows its own sensor only
         weight = np.where(heard, self._z[:, 0], 1.0)
@@ -154,7 +162,9 @@ class RunningTotalsRule(ErrorRule):
             self._put_total(("sent", estimator), 0.0, np.zeros((n, n)), np.zeros((n, 0)))
 
     def _put_total(self, name: Hashable, weight: float, U: FloatArray, form: FloatArray) -> None:
-        """Set a total: its weight, its information U (n, n) and the form of its error."""
+        """Set the total ``name``: its weight, its information U (n, n) and the ``form`` (n, inputs)
+        of its error.
+        """
         stack, self._totals[name] = self.errors.stack, weight
         stack.put(name, form)
         stack.matrices[stack.index(name)] = U
@@ -166,7 +176,10 @@ class RunningTotalsRule(ErrorRule):
         return U
 
     def elapse(self, gap: float, columns: slice | None, noise: FloatArray | None) -> None:
-        """Predict all totals by ``gap`` seconds; the plant's noise is in the inputs ``columns``."""
+        """Predict the information and errors of all totals by ``gap`` seconds.
+
+        The plant's noise over the gap is ``noise`` (n, k) times the k inputs in ``columns``.
+        """
         if gap <= 0.0 or columns is None or noise is None:
             return
         # F^-1 with F = exp(A gap), and s = exp(-2 r gap), r the rate of the fastest decaying mode,
@@ -184,7 +197,7 @@ class RunningTotalsRule(ErrorRule):
 
     def sense(self, time: float, observations: EstimatorObservations) -> None:
         """Update by samples, each counted N / w times, and then add the shares of the nodes that
-        broadcast now to their totals.
+        broadcast now, at ``time`` (seconds), to their totals.
         """
         columns, number = self.errors.reading_noises(observations), self.errors.estimators
         for estimator, observation in observations.items():
@@ -194,7 +207,8 @@ class RunningTotalsRule(ErrorRule):
             self._add_share(estimator)
 
     def _add_share(self, estimator: int) -> None:
-        """Add the share 1 / (receivers + 1) of the node's mass to the total for each receiver.
+        """Add the share 1 / (receivers + 1) of the mass of node ``estimator`` to its total for each
+        receiver; changes that total and the node's weight.
 
         The mass is ``(w / N) (P^-1, P^-1 xhat)``, and its error ``-(w / N) P^-1 e``.
         """
@@ -227,7 +241,12 @@ class RunningTotalsRule(ErrorRule):
         self.errors.stack.drop(messages)
 
     def _receive_totals(self, estimator: int, messages: Sequence[SentMessage]) -> None:
-        """Add the growth of the received totals to a node's mass, and update its estimate."""
+        """Add the growth of the received totals to the mass of node ``estimator``, and update its
+        estimate.
+
+        Changes the node's weight, error and root of P, and the totals last heard over the links of
+        the ``messages``.
+        """
         errors, n = self.errors, self.errors.n
         weight, U, form = 0.0, np.zeros((n, n)), np.zeros((n, 1))
         for message in messages:

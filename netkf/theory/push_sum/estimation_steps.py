@@ -79,7 +79,8 @@ def estimation_steps(scenario: Scenario, averaging: Averaging | None = None) -> 
 
 
 def averaging_law(scenario: Scenario, delivery: float | None = None) -> Averaging:
-    """Return the law of step 5 for the scenario's channel, or one ``delivery`` for all links.
+    """Return the law of step 5 for the scenario's channel, or with one ``delivery`` probability for
+    all links.
 
     Raises TheoryError for recorded links, for losses that depend on the past, and for delays by
     which messages can be late.
@@ -108,7 +109,9 @@ def averaging_law(scenario: Scenario, delivery: float | None = None) -> Averagin
 
 
 def _probabilities(scenario: Scenario, delivery: float | None) -> FloatArray:
-    """Return (E, 2) probabilities that the first end of a link hears the second, and vice versa."""
+    """Return the probabilities (E, 2), for each of E links, that its first end hears the second,
+    and vice versa; ``delivery`` for all, if given.
+    """
     loss, links = scenario.network.channel.loss, scenario.topology.links
     if delivery is not None:
         if not 0.0 <= delivery <= 1.0:

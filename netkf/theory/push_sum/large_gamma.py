@@ -71,7 +71,7 @@ def push_sum_noise(scenario: Scenario, gammas: Sequence[int]) -> FloatArray:
 
 
 def push_sum_covariances(scenario: Scenario, gammas: Sequence[int]) -> FloatArray:
-    """Return the exact steady error covariances (len(gammas), N, n, n) for several gamma.
+    """Return the exact steady error covariances (G, N, n, n) of all nodes for each of G ``gammas``.
 
     As ``push_sum_error_covariance`` for the scenario with that gamma; nan where the mean-square
     radius is not below 1. P Theorem 4 says that they tend to P_inf. Raises TheoryError if
@@ -109,6 +109,8 @@ def _require_averaging(scenario: Scenario, steps: EstimationSteps) -> None:
 
 
 def _steady_mean(steps: EstimationSteps, noise: FloatArray) -> FloatArray:
-    """Return X (n, n) with ``X = A_C X A_C' + noise``, the error of the mean over nodes."""
+    """Return X (n, n) with ``X = A_C X A_C' + noise``, the covariance of the mean error over nodes;
+    ``noise`` (n, n) is what a slot adds to it.
+    """
     central = steps.closed.mean(axis=0)
     return symmetric(np.asarray(scipy.linalg.solve_discrete_lyapunov(central, noise)))

@@ -49,7 +49,9 @@ def _cached_radius(scenario: Scenario) -> float:
 def push_sum_stability(
     scenario: Scenario, gammas: Sequence[int], deliveries: Sequence[float]
 ) -> FloatArray:
-    """Return ``push_sum_radius`` (len(gammas), len(deliveries)), the stability map."""
+    """Return ``push_sum_radius`` (G, D) for each of G ``gammas`` and D ``deliveries``,
+    probabilities that all links have; the stability map.
+    """
     steps = estimation_steps(scenario, averaging_law(scenario, 1.0))
     radii = np.empty((len(gammas), len(deliveries)))
     for column, delivery in enumerate(deliveries):
@@ -75,7 +77,9 @@ def mean_radius(steps: EstimationSteps) -> float:
 
 
 def _mean_radius(law: Averaging, closed: FloatArray) -> float:
-    """Return the spectral radius of the mean errors of one group of states."""
+    """Return the spectral radius, per slot, of the mean errors of one group of n states, with the
+    closed loops ``closed`` (N, n, n) of the nodes.
+    """
     N, n, _ = closed.shape
     if N * n > DENSE_ROWS and not law.enumerated:
         return _mean_radius_by_arnoldi(law, closed)
@@ -85,11 +89,13 @@ def _mean_radius(law: Averaging, closed: FloatArray) -> float:
 
 
 def _mean_radius_by_arnoldi(law: Averaging, closed: FloatArray) -> float:
-    """Return the radius of the mean dynamics of a large network; raises TheoryError."""
+    """Return the radius of the mean dynamics of a large network, with the closed loops ``closed``
+    (N, n, n); raises TheoryError if it is not found.
+    """
     N, n, _ = closed.shape
 
     def step(e: FloatArray) -> FloatArray:
-        """Return the mean errors (N n,) one slot later."""
+        """Return the mean errors (N n,) of all nodes one slot after ``e`` (N n,)."""
         errors = (closed @ e.reshape(N, n, 1))[:, :, 0]
         for _ in range(law.gamma):
             errors = law.mean_step @ errors
@@ -113,7 +119,8 @@ def _mean_radius_by_arnoldi(law: Averaging, closed: FloatArray) -> float:
 
 
 def _groups(closed: FloatArray) -> list[FloatArray]:
-    """Return the A_i of each group of states that no A_i mixes with others, such as plane axes.
+    """Return the A_i (N, k, k) of each group of k states that no A_i mixes with others, such as
+    plane axes; ``closed`` (N, n, n) are the A_i of all states.
 
     The cross covariance of two groups grows no faster than the geometric mean of their own.
     """
@@ -126,7 +133,9 @@ def _groups(closed: FloatArray) -> list[FloatArray]:
 
 
 def _radius(law: Averaging, closed: FloatArray) -> float:
-    """Return the spectral radius of T for one group of states; raises TheoryError."""
+    """Return the spectral radius of T for one group of n states with the closed loops ``closed``
+    (N, n, n); raises TheoryError if it is too large or not found.
+    """
     if law.deterministic:  # M is fixed, so that T is the square of the mean dynamics
         return _mean_radius(law, closed) ** 2
     size = closed.shape[0] * closed.shape[1]
@@ -145,7 +154,7 @@ def second_moment_map(law: Averaging, closed: FloatArray) -> PositiveMap:
     N, n, _ = closed.shape
 
     def left(X: FloatArray) -> FloatArray:
-        """Return diag(A_j) X for X (N n, N n)."""
+        """Return diag(A_j) X (N n, N n) for X (N n, N n)."""
         return np.asarray(closed @ X.reshape(N, n, N * n)).reshape(X.shape)
 
     return lambda X: symmetric(law.second_moment(left(left(X[0]).T)))[None]

@@ -61,7 +61,9 @@ class ScheduleRule(ErrorRule):
         self._observations = observations
 
     def exchange(self, slot: int, phase: int, messages: Sequence[SentMessage]) -> None:
-        """Update the estimates of all nodes by every sensor, whether it sent or not."""
+        """Update the estimates of all nodes by every sensor of this ``slot``, whether it sent or
+        not; changes their errors and roots of P.
+        """
         columns = self.errors.reading_noises(self._observations)
         for estimator, observation in self._observations.items():
             # Silence counts as a reading that equals its prediction, with the noise R + Y^-1.
@@ -71,7 +73,11 @@ class ScheduleRule(ErrorRule):
 
 
 def silence(reading: Observation, Y: float | FloatArray) -> Observation:
-    """Return the observation to which silence is equivalent: the same H, with noise R + Y^-1."""
+    """Return the observation to which silence is equivalent: the same H (p, n), with noise R + Y^-1
+    (p, p).
+
+    ``Y`` (p, p), or a number times I, is the matrix of the trigger.
+    """
     R = silence_noise(reading.R, Y)
     # The true noise, whose root the reading has, may differ from the believed R.
     root = np.asarray(np.linalg.cholesky(reading.root @ reading.root.T + R - reading.R))

@@ -29,7 +29,12 @@ from netkf.trace.run import Run
 def fusion_weight(
     own_root: FloatArray, other_root: FloatArray, inverse: bool, trace: bool
 ) -> float:
-    """Return the weight of the first of two covariances given by roots (n, n), see PairFusion."""
+    """Return the weight, in 0 .. 1, of the first of two covariances with the roots ``own_root`` and
+    ``other_root`` (n, n).
+
+    ``inverse`` is for inverse covariance intersection, else covariance intersection; the weight
+    minimises the trace of the result, or its determinant without ``trace``.
+    """
     n = len(own_root)
     first, second = (np.ascontiguousarray(triangular_root(S)) for S in (own_root, other_root))
     U, W, b = np.empty((n, n)), np.empty((n, n)), np.empty(n)
@@ -43,7 +48,12 @@ class PairRule(EstimateExchangeRule):
     def combine(
         self, node: int, weights: list[float], roots: list[FloatArray]
     ) -> tuple[FloatArray, list[FloatArray]]:
-        """Fuse with the estimate of each message in turn, in the order of the senders."""
+        """Return the new root (n, n) of P and the factors (n, n) of the J errors, after fusion with
+        the estimate of each message in turn, in the order of the senders.
+
+        ``roots`` are J roots (n, n) of P: that of the ``node`` first, then those of the messages;
+        ``weights`` of links are not used.
+        """
         algorithm: Any = self.scenario.filter.algorithm
         root, factors = roots[0], [np.eye(len(roots[0]))]
         for heard_root in roots[1:]:
@@ -59,7 +69,7 @@ def fuse_inversely(
     weights: list[float], roots: list[FloatArray]
 ) -> tuple[FloatArray, list[FloatArray]]:
     """Return the root (n, n) of P and the factors (n, n) of both errors of inverse covariance
-    intersection.
+    intersection, for two ``weights`` with sum 1 and two ``roots`` (n, n).
     """
     P_a, P_b = (S @ S.T for S in roots)
     inverses = [np.linalg.inv(P_a), np.linalg.inv(P_b)]

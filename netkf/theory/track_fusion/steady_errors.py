@@ -43,7 +43,9 @@ def tracks_in_slots(scenario: Scenario) -> tuple[float, FloatArray]:
 
 
 def steady_tracks(scenario: Scenario) -> tuple[FloatArray, float]:
-    """Return the covariances (N, N, n, n) of the errors of all steady tracks, and the radius."""
+    """Return the covariances (N, N, n, n) of the errors of all steady tracks, block (i, j) being
+    that of nodes i and j, and the largest spectral radius of ``C F (x) C F`` of a track.
+    """
     (F, Q), n = scenario.slot_belief, scenario.plant.n
     closed, noises = [], []
     for node in scenario.nodes:
@@ -64,7 +66,12 @@ def steady_tracks(scenario: Scenario) -> tuple[FloatArray, float]:
 
 
 def _mean_reported_covariance(scenario: Scenario, joint: FloatArray, i: int) -> FloatArray:
-    """Return the mean covariance (n, n) of node i's reported estimate; ``joint`` (N, N, n, n)."""
+    """Return the mean covariance (n, n), over losses, of the estimate that node i (an index)
+    reports.
+
+    ``joint`` (N, N, n, n) are the covariances of all steady tracks. Raises TheoryError if more than
+    MAX_NEIGHBOURS links to the node have losses.
+    """
     probabilities = _hearing_probabilities(scenario, scenario.nodes[i])
     certain = [j for j, p in probabilities.items() if p == 1.0]
     unsure = [j for j, p in probabilities.items() if 0.0 < p < 1.0]
@@ -102,7 +109,9 @@ def _hearing_probabilities(scenario: Scenario, node: int) -> dict[int, float]:
 
 
 def _fuse_tracks(joint: FloatArray, order: list[int]) -> FloatArray:
-    """Return the covariance (n, n) of the best combination of tracks, the first one the own."""
+    """Return the covariance (n, n) of the best combination of the tracks with indices ``order``,
+    the node's own first, from the covariances ``joint`` (N, N, n, n) of all tracks.
+    """
     P: FloatArray = joint[order[0], order[0]]
     if len(order) == 1:
         return P
