@@ -111,7 +111,9 @@ def _errors_bounded(samples: RunSamples, level: float) -> Finding:
 
 
 def _draw_squares(Sigma: FloatArray, random: np.random.Generator) -> FloatArray:
-    """Return e e' (DRAWS R, n, n) of Gaussian errors with each of the covariances (R, n, n)."""
+    """Return e e' (DRAWS R, n, n) of Gaussian errors e, DRAWS of them with the variances of each of
+    R covariances ``Sigma`` (R, n, n); entries of an error are independent.
+    """
     deviations = np.sqrt(np.maximum(np.diagonal(Sigma, axis1=1, axis2=2), 0.0))
     e = random.standard_normal((DRAWS, *deviations.shape)) * deviations
     e = e.reshape(-1, deviations.shape[1])

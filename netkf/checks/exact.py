@@ -112,8 +112,10 @@ def max_replayed(scenario: Scenario) -> int:
 def _summary_without_replay(
     P: FloatArray, e: FloatArray, nees: FloatArray, size: int
 ) -> ReplicaSummary:
-    """Return a summary of P (K, N, n, n), errors and NEES without exact covariances; ``size`` is
-    the number of errors at all sample times.
+    """Return a summary of one run without exact covariances, whose fields are then nan.
+
+    At K checked times and N sampled nodes: ``P`` (K, N, n, n), errors ``e`` (K, N, n) and ``nees``
+    (K, N). ``size`` is the number of errors of all nodes at all sample times.
     """
     times, n = len(P), P.shape[-1]
     unknown, pair = np.full(P.shape, np.nan), np.full(2, np.nan)
@@ -136,8 +138,8 @@ def _replayed_summary(
 ) -> ReplicaSummary:
     """Return the summary of a run with the exact law of its errors.
 
-    ``e`` and ``nees`` are those at the checked times and sampled nodes; they become nan where the
-    rounding of large states exceeds the exact deviation of the errors.
+    ``e`` (K, N, n) and ``nees`` (K, N) are those at the K checked times and N sampled nodes; they
+    become nan where the rounding of large states exceeds the exact deviation of the errors.
     """
     time_indices, sampled = checked_samples(scenario, run.times), sampled_indices(scenario)
     nodes, times, estimators, n = (
@@ -232,8 +234,8 @@ def nees_shares(whitened: FloatArray) -> FloatArray:
 
 
 def _nearly_singular(P: FloatArray) -> np.ndarray:
-    """Return (K, N) bool: True for covariances (K, N, n, n) that are not finite, or whose smallest
-    eigenvalue is at most SINGULAR times the largest.
+    """Return a mask (K, N) of the covariances P (K, N, n, n), at K times and N nodes, that are not
+    finite or whose smallest eigenvalue is at most SINGULAR times the largest.
     """
     finite = np.asarray(np.isfinite(P).all(axis=(-1, -2)))
     values = np.linalg.eigvalsh(np.where(finite[..., None, None], P, 0.0))
@@ -493,11 +495,12 @@ def check_nees(samples: RunSamples, level: float) -> Finding:
 
 def pooled_nees(nees: FloatArray, mean: FloatArray, square: FloatArray, level: float) -> Interval:
     """Return an interval for the relative difference between the sum of all NEES (R, K) and that of
-    their exact means (R, K); ``square`` (R, K) is half of their variances.
+    their exact means.
 
-    Runs are independent. For the K points of a run, which are correlated in an unknown way, the
-    standard deviation of their sum is at most the sum of their standard deviations. The chi-square
-    law with the mean and this variance gives the limits.
+    ``nees``, ``mean`` and ``square`` are (R, K), for K points (time, node) of R runs; ``square`` is
+    half of the variances. Runs are independent. For the K points of a run, which are correlated in
+    an unknown way, the standard deviation of their sum is at most the sum of their standard
+    deviations. The chi-square law with the mean and this variance gives the limits.
     """
     spread = np.sqrt(2.0 * square).sum(axis=1)
     expected = float(mean.sum())

@@ -112,8 +112,8 @@ def _summarise(scenario: Scenario, run: Run) -> GossipSummary:
 
 
 def _pairs_to_count(scenario: Scenario) -> tuple[IntArray, IntArray]:
-    """Return the indices i and j of the pairs of nodes whose moves are counted: all pairs, or in a
-    large network the ends of links, in both directions.
+    """Return the indices i and j, (K,) each, of the K pairs of nodes whose moves are counted: all
+    pairs, or in a large network the ends of links, in both directions.
     """
     if len(sampled_indices(scenario)) == len(scenario.nodes):
         i, j = np.nonzero(~np.eye(len(scenario.nodes), dtype=bool))
@@ -298,7 +298,9 @@ def _sensors_together(samples: GossipSamples, level: float) -> Finding:
 
 
 def _share_from(values: FloatArray, points: FloatArray) -> FloatArray:
-    """Return the shares of a sample (S,) that are at least each of the points (K,)."""
+    """Return the shares (K,) of a sample ``values`` (S,) that are at least each of the ``points``
+    (K,).
+    """
     below = np.searchsorted(np.sort(round_digits(values)), points, "left")
     return np.asarray(1.0 - below / len(values))
 

@@ -484,7 +484,11 @@ def _outage_counts(samples: IntermittentSamples, level: float) -> Finding:
 def _law_at_end(
     samples: IntermittentSamples, k: int, law: ScalarLaw
 ) -> Callable[[FloatArray], FloatArray]:
-    """Return the exact distribution function of P at the k-th sampled node in the last slot."""
+    """Return the exact distribution function of P at the k-th sampled node in the last slot, a
+    function from points (K,) to probabilities (K,).
+
+    ``law`` is the law of the scalar system of that node.
+    """
     node = int(sampled_indices(samples.scenario)[k])
     start = float(samples.first_covariances[node, 0, 0])
     return partial(law.cdf_after, slots=check_slots(samples.scenario)[-1], start=start)

@@ -94,8 +94,8 @@ def pool(
 
 
 def _rounding_of(P: FloatArray, start: float) -> float:
-    """Return the size of rounding errors in entries of covariances P (S, n, n) that were computed
-    from covariances with traces up to ``start``.
+    """Return the size of rounding errors in entries of S covariances ``P`` (S, n, n) that were
+    computed from covariances with traces up to ``start``.
     """
     return OPERATIONS * EPS * max(start, float(np.median(np.trace(P, axis1=-2, axis2=-1))))
 
@@ -130,8 +130,8 @@ def compare_laws(pairs: Sequence[Pair], level: float, start: float = 0.0) -> Fin
 
 
 def diagonal_distances(first: FloatArray, second: FloatArray) -> FloatArray:
-    """Return the largest differences (n,) between the empirical distribution functions of the
-    diagonals of two samples (S, n, n) and (S', n, n).
+    """Return the largest differences (n,), one for each state, between the empirical distribution
+    functions of the diagonals of two samples ``first`` (S, n, n) and ``second`` (S', n, n).
     """
     return np.array(
         [law_distance(first[:, k, k], second[:, k, k], 0.5).value for k in range(first.shape[-1])]
@@ -139,8 +139,11 @@ def diagonal_distances(first: FloatArray, second: FloatArray) -> FloatArray:
 
 
 def growth_intervals(earlier: FloatArray, later: FloatArray, level: float) -> list[Interval]:
-    """Return an interval for each diagonal entry of two samples of covariances (S, n, n) and
-    (S', n, n): the largest P(later > GROWTH x) - P(earlier > x) over all x.
+    """Return an interval for each of the n diagonal entries of two samples of covariances,
+    ``earlier`` (S, n, n) and ``later`` (S', n, n): the largest P(later > GROWTH x) - P(earlier > x)
+    over all x.
+
+    Each interval misses the truth with at most the probability ``level``.
     """
     return [
         law_excess(GROWTH * earlier[:, k, k], later[:, k, k], level)
@@ -155,10 +158,11 @@ def compare_growth(
 ) -> Finding:
     """Test the null hypothesis that covariances stay stochastically bounded.
 
-    Under it the later sample of each pair is stochastically at most GROWTH times the earlier one.
-    In a short horizon laws may still grow, so that ``expected`` has samples of the laws that both
-    should have: only faster growth than theirs breaks the promise. Where it is None, growth leaves
-    the row undecided.
+    Under it the later sample of each pair, ``second``, is stochastically at most GROWTH times the
+    earlier one, ``first``. In a short horizon laws may still grow, so that ``expected`` has for
+    each pair two samples (S, n, n) of the laws that both should have: only faster growth than
+    theirs breaks the promise. Where it is None, growth leaves the row undecided. ``level`` is
+    shared by all comparisons.
     """
     single_level, early = 0.5 * level / sum(pair.first.shape[-1] for pair in pairs), False
     intervals = []
@@ -183,10 +187,13 @@ def compare_growth(
 def compare_chi_square(
     ratios: FloatArray, freedom: Sequence[float], labels: Sequence[str], level: float, name: str
 ) -> Finding:
-    """Test the null hypothesis that squares over their degrees of freedom (R, K) have mean 1.
+    """Test the null hypothesis that squares over their degrees of freedom, ``ratios`` (R, K), have
+    mean 1.
 
-    Under it the sum of the squares of column k over all runs is chi-square with ``freedom[k]``
-    degrees of freedom. Columns that are not finite are left out, and the others share the level.
+    Under it the sum of the squares of column k over all R runs is chi-square with ``freedom[k]``
+    degrees of freedom. Columns that are not finite are left out, and the others share the
+    ``level``. ``labels`` (K) say what the columns are, ``name`` what the squares are called in the
+    message.
     """
     finite = np.flatnonzero(np.isfinite(ratios).all(axis=0))
     if not len(finite):

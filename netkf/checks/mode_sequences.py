@@ -39,7 +39,9 @@ class ModeTable(NamedTuple):
     modes: ReadingModes
 
     def apply(self, roots: FloatArray, sequences: np.ndarray) -> FloatArray:
-        """Return the roots (K, n, n) after K mode sequences (K, T) of T slots."""
+        """Return the roots (K, n, n) of K covariances after the modes ``sequences`` (K, T), one
+        mode for each of T slots, from ``roots`` (K, n, n) on.
+        """
         return move_roots(roots, sequences, self.F, self.root_Q, self.modes)
 
     def covariances(
@@ -139,8 +141,10 @@ def pair_sources(scenario: Scenario, run: Run, slots: int) -> np.ndarray:
 
 
 def trace_tokens(sources: np.ndarray, slot: int) -> TokenHistory:
-    """Return the history of the pairs that the nodes hold at the start of a slot; ``sources`` as
-    :func:`pair_sources` returns it.
+    """Return the history of the pairs that the N nodes hold at the start of a ``slot``.
+
+    ``sources`` (slots, N) is the node whose pair each node used in each slot, from
+    :func:`pair_sources`.
     """
     path = np.empty((sources.shape[1], slot), dtype=int)
     holder = np.arange(sources.shape[1])
@@ -151,8 +155,10 @@ def trace_tokens(sources: np.ndarray, slot: int) -> TokenHistory:
 
 
 def token_positions(sources: np.ndarray, slot: int) -> np.ndarray | None:
-    """Return p_n(slot - 1) (N,), the node where token n took its last reading, G (13); None if
-    pairs were copied, so that tokens are no permutation.
+    """Return p_n(slot - 1) (N,), the index of the node where token n took its last reading, G (13);
+    None if pairs were copied, so that tokens are no permutation.
+
+    ``sources`` (slots, N) is the node whose pair each node used in each slot.
     """
     origin = trace_tokens(sources, slot).origin
     if len(set(origin.tolist())) < len(origin):

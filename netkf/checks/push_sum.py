@@ -97,8 +97,8 @@ class PushSumSamples(RunSamples):
 
     @cached_property
     def standardised(self) -> FloatArray:
-        """Errors (R', N, n) at the end, each whitened by its exact covariance: standard normal
-        unless there is a bias.
+        """Errors (R', N, n) of R' replicas and N nodes at the end, each whitened by its exact
+        covariance: standard normal unless there is a bias.
         """
         Sigma, e = self.runs.Sigma[self.followed, -1], self.runs.e[self.followed, -1]
         values, vectors = np.linalg.eigh(Sigma)
@@ -276,7 +276,9 @@ def _many_steps(samples: PushSumSamples, level: float) -> Finding:
 
 
 def _relative_distance(P: FloatArray, limit: FloatArray) -> float:
-    """Return the largest entry of |P - limit|, P (N, n, n), over the largest entry of |limit|."""
+    """Return the largest entry of |P - limit| over the largest entry of |limit|, for the
+    covariances ``P`` (N, n, n) of N nodes and one ``limit`` (n, n).
+    """
     return float(np.abs(P - limit).max() / np.abs(limit).max())
 
 

@@ -13,16 +13,22 @@ OPERATIONS = 1e3
 
 
 def allowed_deviation(size: FloatArray, terms: ArrayLike, base: float) -> FloatArray:
-    """Return the largest deviations that rounding explains, in the shape of ``size``; for the
-    arguments see :func:`compare_identities`.
+    """Return the largest deviations that rounding explains, in the shape of ``size``.
+
+    ``size`` are the sizes of the compared results, ``terms`` (a shape that broadcasts) those of the
+    largest quantities that they were computed from, and ``base`` is the share of ``size`` that is
+    allowed in any case.
     """
     largest = np.maximum(np.broadcast_to(terms, np.shape(size)), size)
     return np.asarray(np.maximum(base * np.asarray(size), OPERATIONS * EPS * largest))
 
 
 def first_wrong(gap: FloatArray, size: FloatArray, terms: ArrayLike, base: float) -> int | None:
-    """Return the first run whose deviations ``gap`` (R, ...) exceed what rounding explains, or
-    None; for the arguments see :func:`compare_identities`.
+    """Return the index of the first run whose deviations ``gap`` (R, ...) exceed what rounding
+    explains, or None.
+
+    ``size`` (R, ...) and ``terms`` are the sizes of the results and of the largest quantities that
+    they were computed from, ``base`` the share of ``size`` that is allowed in any case.
     """
     wrong = ~(np.asarray(gap) <= allowed_deviation(size, terms, base))
     runs = np.flatnonzero(wrong.reshape(len(wrong), -1).any(axis=1))
@@ -34,11 +40,12 @@ def compare_identities(
 ) -> Finding:
     """Return the finding on many identities: that of the largest deviation over its allowed one.
 
-    gap   : absolute deviations; nan or infinite ones exceed every finite one
+    gap   : absolute deviations (R, ...); nan or infinite ones exceed every finite one
     size  : sizes (at least 0) of the compared results, such as traces of covariances, in the shape
             of ``gap``
-    terms : sizes of the largest quantities that the results were computed from: a small difference
-            of large terms has the rounding errors, EPS relative, of the large terms
+    terms : sizes of the largest quantities that the results were computed from, in a shape that
+            broadcasts: a small difference of large terms has the rounding errors, EPS relative, of
+            the large terms
     base  : share of ``size`` that is allowed in any case
     """
     deviations = np.nan_to_num(np.abs(np.asarray(gap, dtype=np.float64)), nan=np.inf).reshape(-1)

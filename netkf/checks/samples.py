@@ -81,7 +81,7 @@ class RunSamples:
 
     @property
     def first_covariances(self) -> FloatArray:
-        """P(0) (N', n, n) of all N' nodes of the network."""
+        """P(0) (N', n, n) of all N' nodes of the network, in their order."""
         return np.array([self.scenario.initial_estimate(node)[1] for node in self.scenario.nodes])
 
     @property
@@ -90,8 +90,8 @@ class RunSamples:
         return float(np.trace(self.first_covariances, axis1=-2, axis2=-1).max())
 
     def largest_terms(self, P: FloatArray) -> FloatArray:
-        """Return the sizes (R, K, N) of the largest terms from which covariances P (R, K, N, n, n)
-        were computed: their roundings remain in P.
+        """Return the sizes (R, K, N) of the largest terms from which the covariances ``P``
+        (R, K, N, n, n) of R runs, K times and N nodes were computed: their roundings remain in P.
         """
         information = float(np.linalg.norm(self.scenario.node_infos[0].information, 2))
         return largest_terms(P, self.first_covariances, information)
@@ -166,8 +166,10 @@ def with_departure(
 
 
 def relative_difference(P: FloatArray, expected: FloatArray) -> FloatArray:
-    """Return |P - expected| over the largest entry of each expected matrix, in the shape of P; inf
-    where that is not finite.
+    """Return |P - expected| over the largest entry of each expected matrix, in the shape of ``P``
+    (..., n, n); inf where that is not finite.
+
+    ``expected`` has the same shape, or is one matrix (n, n) for all.
     """
     size = np.abs(expected).max(axis=(-1, -2), keepdims=True)
     with np.errstate(invalid="ignore", divide="ignore"):

@@ -158,7 +158,9 @@ def band_width(samples: int, level: float) -> float:
 
 
 def round_digits(values: FloatArray) -> FloatArray:
-    """Round to 9 significant digits, so that rounding errors make no difference between laws."""
+    """Return ``values``, of any shape, rounded to 9 significant digits, so that rounding errors
+    make no difference between laws.
+    """
     with np.errstate(divide="ignore", invalid="ignore"):
         scale = 10.0 ** (DIGITS - 1 - np.floor(np.log10(np.abs(values))))
         return np.asarray(np.where(np.isfinite(scale), np.round(values * scale) / scale, values))
@@ -167,8 +169,9 @@ def round_digits(values: FloatArray) -> FloatArray:
 def law_distance(
     first: FloatArray, second: FloatArray, level: float, rounding: float = 0.0
 ) -> Interval:
-    """Return an interval for sup |F - G| of the distribution functions F and G of two samples (S,)
-    and (S',): the two-sample Kolmogorov-Smirnov statistic, with a band around each sample.
+    """Return an interval for sup |F - G| of the distribution functions F and G of two samples
+    ``first`` (S,) and ``second`` (S',): the two-sample Kolmogorov-Smirnov statistic, with a band
+    around each sample.
 
     The samples may depend on each other, since each band holds on its own. Further runs add to the
     first sample only. Values that differ by less than ``rounding``, or in the last of DIGITS
@@ -181,16 +184,19 @@ def law_distance(
 def law_excess(
     first: FloatArray, second: FloatArray, level: float, rounding: float = 0.0
 ) -> Interval:
-    """Return an interval for the largest ``P(second > x) - P(first > x)`` over all x; see
-    :func:`law_distance` for ``rounding``. Further runs add to both samples.
+    """Return an interval for the largest ``P(second > x) - P(first > x)`` over all x, from two
+    samples ``first`` (S,) and ``second`` (S',).
+
+    Values that differ by less than ``rounding`` count as equal. Further runs add to both samples.
     """
     gaps = _ecdf_gaps(first, second, rounding)
     return _band_interval(gaps, len(first), len(second), level, grow=True)
 
 
 def _ecdf_gaps(first: FloatArray, second: FloatArray, rounding: float) -> FloatArray:
-    """Return the differences (V,) of two empirical distribution functions at the V distinct values
-    of both samples.
+    """Return the differences (V,) of the empirical distribution functions of two samples ``first``
+    (S,) and ``second`` (S',), at the V distinct values of both; values closer than ``rounding`` are
+    one.
     """
     a, b = np.sort(first), np.sort(second)
     points = np.sort(np.concatenate([a, b]))
@@ -308,8 +314,8 @@ def quadratic_interval(total: float, weights: FloatArray, level: float) -> Inter
 
 
 def _quadratic_quantile(weights: FloatArray, tail: float, upper: bool) -> float:
-    """Return the quantile that the sum of :func:`quadratic_interval` exceeds (``upper``), or stays
-    below, with probability ``tail``.
+    """Return the quantile that the sum of :func:`quadratic_interval`, with ``weights`` (K,),
+    exceeds (``upper``), or stays below, with probability ``tail``.
     """
     # The saddle point of a value x solves K'(s) = sum w / (1 - 2 s w) = x, with K the cumulant
     # generating function. K' increases up to its pole, so that bisection over s finds the quantile.
@@ -332,11 +338,12 @@ def _quadratic_quantile(weights: FloatArray, tail: float, upper: bool) -> float:
 
 
 def _log_tail(weights: FloatArray, s: float) -> float:
-    """Return log P(sum > K'(s)) for s > 0, log P(sum < K'(s)) for s < 0 (Lugannani and Rice 1980).
+    """Return log P(sum > K'(s)) for s > 0, log P(sum < K'(s)) for s < 0 (Lugannani and Rice 1980),
+    for the sum of squares of standard normal numbers with ``weights`` (K,).
 
-    With r = sqrt(2 (s K'(s) - K(s))) and u = |s| sqrt(K''(s)) the probability is
-    1 - N(r) + n(r) (1/u - 1/r), N and n the normal distribution and density; near s = 0, where
-    1/u - 1/r cancels, 1/2.
+    With r = sqrt(2 (s K'(s) - K(s))) and u = |s| sqrt(K''(s)) the probability is 1 - N(r) + n(r)
+    (1/u - 1/r), N and n the normal distribution and density; near s = 0, where 1/u - 1/r cancels,
+    1/2.
     """
     shrunk = 1.0 - 2.0 * s * weights
     value, curvature = float((weights / shrunk).sum()), float((2.0 * (weights / shrunk) ** 2).sum())
@@ -351,10 +358,11 @@ def _log_tail(weights: FloatArray, s: float) -> float:
 
 
 def eigenvalue_interval(samples: FloatArray, level: float) -> Interval:
-    """Return an interval for the largest eigenvalue of the mean of symmetric samples (R, n, n).
+    """Return an interval for the largest eigenvalue of the mean of R symmetric ``samples``
+    (R, n, n).
 
-    Scheffe's method covers all directions at once: Hotelling's T^2 bounds the mean of the
-    n (n + 1) / 2 distinct entries, estimated from R samples, which must have a variance.
+    Scheffe's method covers all directions at once: Hotelling's T^2 bounds the mean of the n (n + 1)
+    / 2 distinct entries, estimated from R samples, which must have a variance.
     """
     count, n = len(samples), samples.shape[-1]
     mean = samples.mean(axis=0)
@@ -379,8 +387,8 @@ def eigenvalue_interval(samples: FloatArray, level: float) -> Interval:
 def pearson_test(counts: np.ndarray, probabilities: FloatArray) -> tuple[float, int]:
     """Return the p-value of Pearson's chi-square test and its number of cells.
 
-    ``counts`` and ``probabilities`` are those of the cells in decreasing order of probability; the
-    last cells, with expected counts below MIN_EXPECTED, are pooled.
+    ``counts`` (C,) and ``probabilities`` (C,) are those of C cells in decreasing order of
+    probability; the last cells, with expected counts below MIN_EXPECTED, are pooled.
     """
     expected = probabilities * counts.sum()
     frequent = max(1, int((expected >= MIN_EXPECTED).sum()))

@@ -153,7 +153,10 @@ def _read_rows(document: dict[str, Any]) -> tuple[Evidence, ...]:
 
 
 def _result_columns(results: tuple[ReplicaResult, ...]) -> dict[str, np.ndarray]:
-    """Return all results as arrays with a first axis over the replicas."""
+    """Return all results as arrays with a first axis over the replicas, by name: "summary.NAME" and
+    "PART.NAME" are fields of the summaries of the runs that did not diverge, the first axis over
+    these.
+    """
     columns = {
         "difference": np.array([result.difference for result in results]),
         "expected": np.array([result.expected for result in results]),

@@ -174,8 +174,8 @@ def whiteness_figure(data: FigureData) -> Picture:
 def _draw_correlations(
     axes: Any, curves: dict[int, FloatArray], worst: int, band: float, lags: int
 ) -> None:
-    """Draw the autocorrelations (lags,) of each node over the lag, that of the ``worst`` node as a
-    line of its own, and the 95% band of white noise, 0 +- ``band``.
+    """Draw the autocorrelations (lags,) of each node, ``curves`` by node id, over the lag, that of
+    the ``worst`` node as a line of its own, and the 95% band of white noise, 0 +- ``band``.
     """
     positions = np.arange(1, lags + 1)
     axes.axhspan(-band, band, color=EXACT, alpha=0.2, lw=0, label="95% if white")

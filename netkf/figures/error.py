@@ -205,8 +205,8 @@ def _mark_worst(
 
 
 def _compare_with_median(values: FloatArray, median: float) -> str:
-    """Return text with the ratio of the largest value to the median, or with the median if it is
-    0.
+    """Return text with the ratio of the largest of ``values`` (any shape, nan ignored) to their
+    ``median``, or with the median if it is 0.
     """
     largest = float(np.nanmax(values))
     return f"{largest / median:.3g} times the median" if median > 0.0 else f"median {median:.3g}"

@@ -98,13 +98,13 @@ class FigureData:
 
     @cached_property
     def averaged(self) -> np.ndarray:
-        """Indices of the samples that averages of errors are taken over."""
+        """Indices (K,) of the K samples that averages of errors are taken over."""
         diverged = self.status == "diverged" and self.runs == 1
         return select_averaged_samples(self.times, self.rounding_from, diverged).errors
 
     @property
     def log(self) -> np.ndarray:
-        """The events of the run as EVENT rows; raises UnavailableError if there are none."""
+        """The E events of the run as EVENT rows (E,); raises UnavailableError if there are none."""
         if self.run is None:
             raise UnavailableError(
                 "Only single runs have events: draw one of them, netkf.open(DIR).replica(0)."

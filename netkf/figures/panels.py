@@ -30,7 +30,7 @@ ROOT_TRACE = "root of trace P, units of the state"
 
 
 def select_evenly(indices: np.ndarray, max_count: int = MAX_LINES) -> np.ndarray:
-    """Return at most ``max_count`` of the indices, evenly spaced."""
+    """Return at most ``max_count`` of the ``indices`` (K,), evenly spaced, in their order."""
     if len(indices) <= max_count:
         return indices
     return np.asarray(indices[np.linspace(0, len(indices) - 1, max_count).astype(int)])

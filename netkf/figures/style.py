@@ -223,8 +223,8 @@ def message_figure(claim: str, message: str, caption: Sequence[str]) -> Picture:
 
 
 def set_scale(axes: Any, values: FloatArray) -> None:
-    """Set the scale and the limits of the y axis for ``values``: logarithmic if the largest one is
-    more than LOG_MEDIANS times their median.
+    """Set the scale and the limits of the y axis for ``values`` (any shape): logarithmic if the
+    largest one is more than LOG_MEDIANS times their median.
     """
     positive = values[np.isfinite(values) & (values > 0.0)]
     if positive.size and positive.max() > LOG_MEDIANS * np.median(positive):

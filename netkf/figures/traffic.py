@@ -40,8 +40,10 @@ TIME_BINS = 30  # of time: each has enough messages for an interval
 
 
 def newest_arrivals(log: np.ndarray, node: int) -> tuple[FloatArray, FloatArray]:
-    """Return the times (K,) at which messages arrived at a node, and for each the time (K,) at
-    which the newest message so far was sent, in seconds, from EVENT rows.
+    """Return the times (K,) at which K messages arrived at a ``node`` (id), and for each the time
+    (K,) at which the newest message so far was sent, in seconds.
+
+    ``log`` (E,) are the EVENT rows of a run.
     """
     arrivals = log[(log["kind"] == CODES["deliver"]) & (log["node"] == node)]
     # A message that overtakes others makes them old before they arrive.
@@ -61,7 +63,9 @@ class AgeSawtooth(NamedTuple):
     low: FloatArray
 
     def mean(self, edges: FloatArray) -> FloatArray:
-        """Return the time averages (B,) between ``edges`` (B + 1,), which begin at time 0."""
+        """Return the time averages (B,) of the age, in seconds, in B bins between ``edges``
+        (B + 1,) in seconds, which begin at time 0.
+        """
         length = self.stop - self.start
         # The integral of the age up to each segment, then up to each edge within its segment.
         at_start = np.concatenate([[0.0], np.cumsum(length * (self.low + 0.5 * length))])
@@ -71,7 +75,9 @@ class AgeSawtooth(NamedTuple):
         return np.asarray(np.diff(integral) / np.diff(edges))
 
     def largest(self, edges: FloatArray) -> FloatArray:
-        """Return the largest age (B,) between ``edges`` (B + 1,)."""
+        """Return the largest age (B,), in seconds, in each of B bins between ``edges`` (B + 1,) in
+        seconds.
+        """
         # The age is largest at the end of the bin, or of a segment within it.
         last = np.searchsorted(self.start, edges[1:], side="left") - 1
         largest = self.low[last] + edges[1:] - self.start[last]
@@ -88,7 +94,9 @@ class AgeSawtooth(NamedTuple):
 
 
 def _sum_excess(values: FloatArray, levels: FloatArray) -> FloatArray:
-    """Return the sum of ``max(0, value - level)`` over the values (K,) for each level (L,)."""
+    """Return the sum of ``max(0, value - level)`` over K ``values`` (K,), for each of L ``levels``
+    (L,).
+    """
     descending = np.sort(values)[::-1]
     sums = np.concatenate([[0.0], np.cumsum(descending)])
     above = len(descending) - np.searchsorted(descending[::-1], levels, side="right")
@@ -96,7 +104,8 @@ def _sum_excess(values: FloatArray, levels: FloatArray) -> FloatArray:
 
 
 def age_of_information(log: np.ndarray, node: int, end: float) -> AgeSawtooth:
-    """Return the age of information of a node from time 0 to ``end`` seconds, from EVENT rows.
+    """Return the age of information of a ``node`` (id) from time 0 to ``end`` seconds; ``log`` (E,)
+    are the EVENT rows of a run.
 
     It is the time since the newest message that has arrived was sent; before the first arrival the
     time since 0.
@@ -137,7 +146,9 @@ def age_figure(data: FigureData) -> Picture:
 
 
 def _draw_ages(axes: Any, edges: FloatArray, ages: list[AgeSawtooth]) -> None:
-    """Draw the median of the nodes' mean ages and the largest age within bins between ``edges``."""
+    """Draw the median of the nodes' mean ages and the largest age in B bins between ``edges``
+    (B + 1,), in seconds.
+    """
     # Samples of a sawtooth at the times of a grid would alias with the clocks; means do not.
     centres = 0.5 * (edges[:-1] + edges[1:])
     means = np.array([age.mean(edges) for age in ages])
@@ -201,8 +212,8 @@ class DirectedMessages(NamedTuple):
 
 
 def messages_by_direction(log: np.ndarray) -> list[DirectedMessages]:
-    """Return the messages of each direction that have an outcome, from EVENT rows, ordered by
-    sender and receiver.
+    """Return the messages of each direction that have an outcome, ordered by sender and receiver,
+    from the EVENT rows ``log`` (E,) of a run.
     """
     arrivals = log[log["kind"] == CODES["deliver"]]
     losses = log[np.isin(log["kind"], (CODES["lost"], CODES["late"]))]
@@ -222,7 +233,9 @@ def messages_by_direction(log: np.ndarray) -> list[DirectedMessages]:
 def _times_by_direction(
     senders: np.ndarray, receivers: np.ndarray, times: FloatArray
 ) -> dict[tuple[int, int], FloatArray]:
-    """Return the sorted times of each pair (sender, receiver), from one row (K,) for each event."""
+    """Return the sorted times (M,), in seconds, of each pair (sender, receiver), from K events with
+    ``senders``, ``receivers`` (ids) and ``times``, (K,) each.
+    """
     if not len(times):
         return {}
     order = np.lexsort((times, receivers, senders))

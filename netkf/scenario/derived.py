@@ -66,7 +66,9 @@ class DerivedScenario(ScenarioModel):
         )
 
     def _slot_model(self, H_and_R: tuple[FloatArray, FloatArray]) -> SlotModel:
-        """Return the believed model in slots of a node with these H (p, n) and R (p, p)."""
+        """Return the believed model in slots of a node with the stacked H (p, n) and R (p, p) of
+        its readings, the pair ``H_and_R``.
+        """
         return SlotModel(*self.slot_belief, *H_and_R, self.slot_plant.period)
 
     @cached_property
@@ -245,7 +247,9 @@ class DerivedScenario(ScenarioModel):
 
     @cached_property
     def _stacks(self) -> dict[tuple[tuple[int, ...], bool], tuple[FloatArray, FloatArray]]:
-        """Cache of stacked H and R by entries and by whether R is the believed one."""
+        """Cache of stacked H (p, n) and R (p, p) by ``[[sensors]]`` entries and by whether R is the
+        believed one.
+        """
         return {}
 
     def sample_times(self, streams: Streams) -> dict[tuple[int, int], FloatArray]:
@@ -321,7 +325,8 @@ class DerivedScenario(ScenarioModel):
     def _model(
         self, H_and_R: tuple[FloatArray, FloatArray], models: dict[bytes, FlowModel]
     ) -> FlowModel:
-        """Return the believed model in continuous time of a node with these H (p, n) and R (p, p).
+        """Return the believed model in continuous time of a node with the stacked H (p, n) and R
+        (p, p) of its increments, the pair ``H_and_R``.
 
         ``models`` holds the models made so far, by the bytes of H and R, and is added to.
         """

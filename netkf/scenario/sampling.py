@@ -76,7 +76,9 @@ def sample_rate(scenario: ScenarioModel, node: int) -> float:
 
 
 def all_sample_times(times: dict[tuple[int, int], FloatArray]) -> FloatArray:
-    """Return the increasing instants (K,) at which any sensor samples."""
+    """Return the increasing instants (K,), in seconds, at which any sensor samples; ``times`` has
+    those of each sensor, by (node, ordinal).
+    """
     return np.unique(np.concatenate([np.empty(0), *times.values()]))
 
 

@@ -7,9 +7,8 @@ from netkf.linalg.arrays import FloatArray
 
 
 def require_shape(key: str, value: FloatArray, shape: tuple[int | None, ...], why: str) -> None:
-    """Raise ScenarioError at ``key`` unless an array has the shape, in which None is any length.
-
-    ``why`` is the reason in the message.
+    """Raise ScenarioError at ``key`` unless the array ``value`` has the ``shape``, in which None is
+    any length; ``why`` is the reason in the message.
     """
     fits = len(value.shape) == len(shape) and all(
         length is None or actual == length

@@ -92,7 +92,9 @@ def run_consistency(
 
 
 def _mean(values: FloatArray, blurred: np.ndarray) -> FloatArray:
-    """Return the means (N,) over the samples (T, N) that are not blurred; nan without any."""
+    """Return the means (N,) of the ``values`` (T, N) over the T samples that are not ``blurred``
+    (T, N); nan for a node without any.
+    """
     count = (~blurred).sum(axis=0)
     with np.errstate(invalid="ignore"):
         return np.asarray(
@@ -116,7 +118,9 @@ def _exact_covariance(scenario: Scenario, run: Run) -> FloatArray | None:
 
 
 def _expected_nees(P: FloatArray, sigma: FloatArray | None) -> FloatArray:
-    """Return tr(P^-1 Sigma) (T, N); nan if Sigma is unknown or P is singular."""
+    """Return tr(P^-1 Sigma) (T, N), from ``P`` and ``sigma`` (T, N, n, n) at T times and N nodes;
+    nan if Sigma is unknown or P is singular.
+    """
     expected = np.full(P.shape[:2], np.nan)
     if sigma is None:
         return expected
@@ -130,7 +134,10 @@ def _expected_nees(P: FloatArray, sigma: FloatArray | None) -> FloatArray:
 def _mean_nis(
     scenario: Scenario, run: Run, sigma: FloatArray | None, blurred: np.ndarray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the mean NIS (N,) of each node's own readings and its expected value; nan in
+    """Return the mean NIS (N,) of each node's own readings and its expected value (N,), over the
+    samples that are not ``blurred`` (T, N).
+
+    ``sigma`` (T, N, n, n) are the exact covariances of the errors, if known. Both are nan in
     continuous time, where predictions at readings are not sampled.
     """
     unknown = np.full(len(run.nodes), np.nan)
@@ -146,7 +153,9 @@ class _Innovations:
     """Innovations of a run in slots, from predictions that are samples (or one step after one).
 
     The innovation is computed as H e + v from the error e of the prediction, by letting the sensor
-    read e instead of the state, so that a large state costs no digits.
+    read e instead of the state, so that a large state costs no digits. ``sigma`` (T, N, n, n) are
+    the exact covariances of the errors, if known; samples in the mask ``blurred`` (T, N) are left
+    out.
     """
 
     def __init__(
@@ -194,7 +203,8 @@ class _Innovations:
     def _prediction(
         self, k: int, i: int, noise: FloatArray | None
     ) -> tuple[FloatArray, FloatArray, FloatArray | None]:
-        """Return the error (n,) of a prediction, its P and its exact covariance (None if unknown).
+        """Return the error (n,) of the prediction of the i-th node, its P (n, n), and its exact
+        covariance (n, n), None if unknown.
 
         They are those of sample k or, with the plant's ``noise`` (n,) of the step, one slot on.
         """

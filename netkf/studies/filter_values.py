@@ -157,12 +157,14 @@ def _influences(values: FilterValues, n: int) -> dict[str, tuple[float, FloatArr
 
 
 def _standard_error(values: FloatArray) -> float:
-    """Return the standard error of a mean, nan for one value."""
+    """Return the standard error of the mean of ``values`` (R,), nan for one value."""
     return float(values.std(ddof=1)) / math.sqrt(len(values)) if len(values) > 1 else math.nan
 
 
 def _width(values: FloatArray, level: float) -> float:
-    """Return half the width of Student's interval for the mean of values (R,)."""
+    """Return half the width of Student's interval, which misses with probability ``level``, for the
+    mean of ``values`` (R,); nan for one value.
+    """
     if len(values) < 2:
         return math.nan
     return float(scipy.special.stdtrit(len(values) - 1, 1.0 - level / 2.0)) * _standard_error(

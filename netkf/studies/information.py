@@ -72,10 +72,11 @@ class Messages:
 
 
 def match_messages(log: IntArray, swaps: bool, slotted: bool) -> Messages:
-    """Return the messages of an EVENT log, which must begin with the run.
+    """Return the M messages of an EVENT ``log`` (E,), which must begin with the run.
 
     With ``swaps`` a receiver uses one message of an instant only, that of the sender with the
-    largest id.
+    largest id. A message with a ``late`` event was too late if the run is ``slotted``, else
+    refused.
     """
     kind = log["kind"]
     rows = np.flatnonzero(kind == CODES["send"])
@@ -105,8 +106,8 @@ def match_messages(log: IntArray, swaps: bool, slotted: bool) -> Messages:
 
 
 class _Links(NamedTuple):
-    """Directed links in the order of ``sender`` and ``receiver``; ``start`` is the index of the
-    first message of each.
+    """L directed links in the order of ``sender`` and ``receiver`` (L,), node ids; ``start`` (L,)
+    is the index of the first message of each among all messages.
     """
 
     sender: IntArray
@@ -114,7 +115,9 @@ class _Links(NamedTuple):
     start: IntArray
 
     def indices(self, sender: IntArray, receiver: IntArray, number: IntArray) -> IntArray:
-        """Return the indices of messages, by link and number on it, among those of all links."""
+        """Return the indices (K,), among the messages of all links, of K messages given by
+        ``sender``, ``receiver`` and ``number`` on their link, (K,) each.
+        """
         if not len(self.start):
             return np.empty(0, dtype=np.int64)
         ids = np.unique(np.concatenate([self.sender, self.receiver]))
@@ -142,6 +145,9 @@ def _next_use(log: IntArray, rows: IntArray) -> IntArray:
 def _last_of_instant(used: IntArray, sender: IntArray, sent_row: IntArray) -> IntArray:
     """Return a mask (K,) of the messages that count if a receiver uses one message at an instant:
     that of the sender with the largest id, and of several from it the last sent.
+
+    ``used`` (K,) is the row of the log at which each of K messages is used, ``sender`` (K,) the id
+    of its sender, and ``sent_row`` (K,) the row at which it was sent.
     """
     order = np.lexsort((sent_row, sender, used))
     last = np.ones(len(used), dtype=bool)
@@ -152,7 +158,8 @@ def _last_of_instant(used: IntArray, sender: IntArray, sent_row: IntArray) -> In
 
 
 def at_once(messages: Messages, log: IntArray) -> Messages:
-    """Return the messages with unused ones taken to be used when they were sent.
+    """Return the ``messages`` with unused ones taken to be used when they were sent, in the EVENT
+    ``log`` (E,): only ``used_row`` differs.
 
     The time at which they would have arrived is unknown; so ages found with these are lower bounds.
     """
@@ -162,12 +169,16 @@ def at_once(messages: Messages, log: IntArray) -> Messages:
 
 
 def rows_until(scenario: DerivedScenario, log: IntArray, at: float) -> IntArray:
-    """Return the rows of an EVENT log that influence the sample at ``at`` seconds."""
+    """Return those of the E rows of an EVENT ``log`` (E,) that influence the sample at ``at``
+    seconds.
+    """
     return np.asarray(log[: _count_events(scenario, log["t"], at)])
 
 
 def _count_events(scenario: DerivedScenario, times: FloatArray, at: float) -> int:
-    """Return the number of events that influence the sample at ``at`` seconds."""
+    """Return the number of events, of those at the increasing ``times`` (E,) in seconds, that
+    influence the sample at ``at`` seconds.
+    """
     if not scenario.slotted:
         return int(np.searchsorted(times, at, side="right"))
     plant = scenario.slot_plant
@@ -251,7 +262,11 @@ def _carry_readings(combination: str, messages: Messages) -> IntArray:
 
 
 def _swap_flow(nodes: IntArray, rows: int, messages: Messages, used: IntArray) -> Flow:
-    """Return the flow of a filter that swaps: each swap begins a new segment of its receiver."""
+    """Return the flow of a filter that swaps: each swap begins a new segment of its receiver.
+
+    ``nodes`` (N,) are ids, ``rows`` is the number of rows of the log, and the mask ``used`` (M,)
+    has the messages that were used.
+    """
     swapped = np.flatnonzero(used)
     node = np.concatenate([nodes, messages.receiver[swapped]])
     start = np.concatenate([np.zeros(len(nodes), np.int64), messages.used_row[swapped]])
@@ -261,7 +276,9 @@ def _swap_flow(nodes: IntArray, rows: int, messages: Messages, used: IntArray) -
     keys = indices * length + start
 
     def segment(segment_nodes: IntArray, row: IntArray) -> IntArray:
-        """Return the segment of each node at an event row."""
+        """Return the index (K,) of the segment of each of ``segment_nodes`` (K,), ids, at an event
+        ``row`` (K,).
+        """
         sought_keys = np.searchsorted(nodes, segment_nodes) * length + row
         return np.asarray(np.searchsorted(keys, sought_keys, side="right") - 1)
 
@@ -331,7 +348,10 @@ def search_back(flow: Flow, node: int, budget: int = 0) -> Reach:
 
 
 class KeptReadings:
-    """The times at which the nodes of a log took readings, by row."""
+    """The times at which the nodes of a log took readings, by row.
+
+    ``log`` (E,) are the EVENT rows that influence a sample at ``at`` seconds.
+    """
 
     def __init__(self, scenario: DerivedScenario, log: IntArray, at: float) -> None:
         self._scenario, self._times, self._at = scenario, log["t"], at
@@ -342,7 +362,8 @@ class KeptReadings:
         }
 
     def _with_values(self, node: int, rows: IntArray) -> IntArray:
-        """Return the rows at which a node took a reading that had values.
+        """Return the rows (K,) of the log at which a node took a reading that had values, of the
+        ``rows`` (K',) at which it took any.
 
         In slots a node with sensors reads in every slot, but a record may lack rows.
         """
@@ -393,7 +414,11 @@ class Newest(NamedTuple):
 def newest_information(
     reach: Reach, log: IntArray, readings: KeptReadings, budget: int
 ) -> dict[int, Newest]:
-    """Return the newest information, by node, that reached the node of a search with a budget."""
+    """Return the newest information, by node, that reached the node of a search with at most
+    ``budget`` messages of cost 1.
+
+    ``log`` (E,) are the EVENT rows of the run, ``readings`` those that its nodes took.
+    """
     flow, newest = reach.flow, dict[int, Newest]()
     deadline = reach.deadline[budget]
     for segment in np.flatnonzero(deadline != NEVER).tolist():

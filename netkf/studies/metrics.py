@@ -120,19 +120,23 @@ class MeanEstimate(NamedTuple):
 
 
 def mean_over_runs(values: FloatArray) -> MeanEstimate:
-    """Return the mean of one value per run, (R,)."""
+    """Return the mean of ``values`` (R,), one for each run, with its standard error."""
     with np.errstate(over="ignore", invalid="ignore"):
         spread = float(values.std(ddof=1)) if len(values) > 1 else math.nan
     return MeanEstimate(float(values.mean()), spread / math.sqrt(len(values)))
 
 
 def worst_node(values: FloatArray) -> MeanEstimate:
-    """Return the estimate (R, N) of the node with the largest mean."""
+    """Return the estimate of the node with the largest mean, from ``values`` (R, N) of R runs and N
+    nodes.
+    """
     return mean_over_runs(values[:, int(np.argmax(values.mean(axis=0)))])
 
 
 def all_nodes(values: FloatArray) -> MeanEstimate:
-    """Return the estimate (R, N) of the mean over all nodes."""
+    """Return the estimate of the mean over all nodes, from ``values`` (R, N) of R runs and
+    N nodes.
+    """
     return mean_over_runs(values.mean(axis=1))
 
 

@@ -255,8 +255,9 @@ def _check_fractions(watched: WatchedPart, links: dict[Link, float], seed: int) 
 
 
 def _check_bursts(watched: WatchedPart, chain: GilbertElliott, delivered: FloatArray) -> None:
-    """Check how often two messages in a row are lost, from outcomes 0 or 1 of C runs, K messages
-    and L links (C, K, L), against the built-in ``chain`` with the same parameters.
+    """Check how often two messages in a row are lost, from the outcomes ``delivered`` (C, K, L), 0
+    or 1, of C runs, K messages and L links, against the built-in ``chain`` with the same
+    parameters.
     """
     lost, expected = 1.0 - delivered, loss_twice(chain)
     excess = (lost[:, 1:] * lost[:, :-1]).mean(axis=1) - expected

@@ -119,8 +119,8 @@ class ClockTrial(Trial):
     def _compare_predictions(
         self, name: str, one_step: FloatArray, two_steps: FloatArray, first: float, second: float
     ) -> None:
-        """Check that the predictions of xhat or P, called ``name``, in one step of ``first +
-        second`` seconds and in two steps, are equal up to rounding.
+        """Check that the predictions of xhat (n,) or P (n, n), called ``name``, in one step of
+        ``first + second`` seconds and in two steps, are equal up to rounding.
         """
         difference = float(np.abs(one_step - two_steps).max())
         size = max(float(np.abs(one_step).max()), float(np.abs(two_steps).max()), 1e-300)

@@ -203,7 +203,7 @@ def _read_ticks(watched: WatchedPart, entity: Entity, blocks: tuple[int, ...]) -
 
 
 def _check_increasing(watched: WatchedPart, times: FloatArray) -> None:
-    """Check that the ticks (K,), in seconds, are finite, positive and increasing."""
+    """Check that the ticks ``times`` (K,), in seconds, are finite, positive and increasing."""
     where = f"{watched.name}.ticks"
     demand(
         np.isfinite(times).all(),
@@ -224,7 +224,9 @@ def _check_increasing(watched: WatchedPart, times: FloatArray) -> None:
 
 
 def _first_difference(one: FloatArray, other: FloatArray) -> int:
-    """Return the first index at which two arrays of times differ, of which one may be longer."""
+    """Return the first index at which two arrays of times, ``one`` (K,) and ``other`` (K',),
+    differ; the length of the shorter one if it agrees with the longer.
+    """
     shorter = min(len(one), len(other))
     unequal = np.flatnonzero(one[:shorter] != other[:shorter])
     return int(unequal[0]) if unequal.size else shorter
@@ -281,7 +283,12 @@ def _check_stated_law(watched: WatchedPart, gaps: FloatArray, times: FloatArray)
 
 
 def _read_chain(part: Any, entity: Entity, seed: int, run: int, stream: int) -> FloatArray:
-    """Return the first LENGTH ticks of an entity in a run, in seconds, fewer if the clock stops."""
+    """Return the first LENGTH ticks (LENGTH,) of an entity in a ``run``, in seconds, fewer if the
+    clock stops.
+
+    ``stream`` numbers the generators of the entity; entities with different numbers are
+    independent.
+    """
     random = Streams(seed, run).generator("testing", stream)
     origin = part.origin(entity, lambda: Streams(seed, run).generator("phase", stream))
     return np.asarray(part.ticks(entity, origin, 0, 0.0, random, LENGTH))
@@ -290,8 +297,8 @@ def _read_chain(part: Any, entity: Entity, seed: int, run: int, stream: int) -> 
 def _check_generators_used(
     watched: WatchedPart, entities: tuple[Entity, ...], gaps: FloatArray
 ) -> None:
-    """Check that the random gaps (E, runs, length) of a memoryless clock differ between runs and
-    between entities, which have different generators.
+    """Check that the random ``gaps`` (E, runs, length) of a memoryless clock differ between runs
+    and between the E ``entities``, which have different generators.
     """
     varies = gaps.std(axis=2).min() > 1e-9 * gaps.mean()
     if not (varies and watched.part.memoryless):

@@ -44,7 +44,9 @@ def _check_array(where: str, name: str, array: Any, shape: tuple[int, ...]) -> N
 
 
 def _check_covariance(where: str, P: FloatArray) -> None:
-    """Raise AssertionError unless P is symmetric and positive semidefinite up to rounding."""
+    """Raise AssertionError unless ``P`` (n, n) is symmetric and positive semidefinite up to
+    rounding; ``where`` begins the message.
+    """
     size = max(float(np.abs(P).max()), np.finfo(float).tiny)
     asymmetry = float(np.abs(P - P.T).max())
     demand(

@@ -180,8 +180,10 @@ def _check_weights(watched: WatchedPart) -> None:
 
 
 def _check_pair_weights(watched: WatchedPart, weights: FloatArray) -> None:
-    """Check that a matrix of weights (N, N) is square, not negative, and that its columns sum to at
-    most 1.
+    """Check that a matrix of ``weights`` (N, N) is square, not negative, and that its columns sum
+    to at most 1.
+
+    Entry (l, i) is the weight that node i gives to what node l sends.
     """
     where = f"{watched.name}.pair_weights"
     is_square = weights.ndim == 2 and weights.shape[0] == weights.shape[1]

@@ -68,11 +68,12 @@ def largest_deviation(values: FloatArray, min_values: int = MIN_VALUES) -> Devia
 
 
 def _is_significant_if_skewed(values: FloatArray, mean: float, error: float, limit: float) -> bool:
-    """Return True if the ``mean`` of values (N,) exceeds ``limit`` standard errors after a
+    """Return True if the ``mean`` of ``values`` (N,) exceeds ``limit`` standard errors after a
     correction for skewness.
 
-    A studentised mean of skewed values has one long tail. It is corrected to second order by the
-    transformation of P. Hall, "On the removal of skewness by transformation", 1992.
+    ``error`` is its standard error. A studentised mean of skewed values has one long tail. It is
+    corrected to second order by the transformation of P. Hall, "On the removal of skewness by
+    transformation", 1992.
     """
     if error <= NEGLIGIBLE * abs(mean):
         return True
@@ -94,7 +95,7 @@ class Whitening(NamedTuple):
 
 
 def compute_whitening(S: FloatArray) -> Whitening:
-    """Return the whitening factors of a covariance S (n, n), which may be singular."""
+    """Return the whitening factors of a covariance ``S`` (n, n), which may be singular."""
     values, vectors = np.linalg.eigh(symmetric(S))
     positive = values > 1e-12 * max(float(values[-1]), np.finfo(float).tiny)
     factor = (vectors[:, positive] / np.sqrt(values[positive])).T
@@ -115,7 +116,8 @@ class NoiseLabels(NamedTuple):
 
 
 def check_white(e: FloatArray, labels: NoiseLabels) -> None:
-    """Check that e (R, K, q), noise of R runs at K times, is standard white noise.
+    """Check that ``e`` (R, K, q), noise with q components of R runs at K times, is standard white
+    noise.
 
     In every part of a run its mean must be 0 and its covariance 1; components at different times,
     and runs, must be uncorrelated. Raises AssertionError for the most significant deviation of the
@@ -135,7 +137,9 @@ def check_white(e: FloatArray, labels: NoiseLabels) -> None:
 
 
 def _check_moments(e: FloatArray, labels: NoiseLabels, when: str) -> None:
-    """Check that whitened noise e (..., q) has mean 0 and covariance 1; ``when`` ends messages."""
+    """Check that whitened noise ``e`` (..., q) has mean 0 and covariance 1, over all axes but the
+    last; ``when`` ends messages.
+    """
     q = e.shape[-1]
     flat = e.reshape(-1, q)
     deviation = largest_deviation(flat)
@@ -160,8 +164,8 @@ def _name_components(i: int, j: int) -> str:
 
 
 def check_uncorrelated(one: FloatArray, other: FloatArray, labels: NoiseLabels, apart: str) -> None:
-    """Check that unit noises (..., q) and (..., r), paired along all but the last axis, are
-    uncorrelated; ``apart`` says in messages how they are related.
+    """Check that unit noises ``one`` (..., q) and ``other`` (..., r), paired along all but the last
+    axis, are uncorrelated; ``apart`` says in messages how they are related.
     """
     first, second = one.reshape(-1, one.shape[-1]), other.reshape(-1, other.shape[-1])
     deviation = largest_deviation(first[:, :, None] * second[:, None])
@@ -213,8 +217,8 @@ def kolmogorov_distance(values: FloatArray) -> float:
 
 
 def divergence(frequencies: FloatArray, probabilities: FloatArray) -> FloatArray:
-    """Return the Kullback-Leibler divergence of each frequency from its probability; the shapes
-    broadcast.
+    """Return the Kullback-Leibler divergence of each of ``frequencies`` from its probability; both
+    broadcast to one shape, which is that of the result.
 
     A frequency in N trials deviates so much to one side with a probability of at most
     ``exp(-N divergence)`` (Chernoff's bound).

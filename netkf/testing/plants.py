@@ -129,8 +129,8 @@ def _make_generator(seed: int, run: int, purpose: str = "plant") -> np.random.Ge
 
 
 def _demand_same(where: str, one: FloatArray, other: FloatArray, when: str) -> None:
-    """Check that two paths from equal streams are equal; ``when`` says in messages how the second
-    one was drawn.
+    """Check that two paths (K, n) from equal streams are equal; ``when`` says in messages how the
+    ``other`` one was drawn.
     """
     difference = scaled_difference(one, other)
     demand(
@@ -169,7 +169,7 @@ def _check_starts(
     start: Callable[[np.random.Generator], FloatArray],
     is_inherited: bool,
 ) -> None:
-    """Check mean and covariance of x(0), which ``start`` draws from a generator.
+    """Check mean (n,) and covariance (n, n) of x(0) (n,), which ``start`` draws from a generator.
 
     ``is_inherited`` says that the class does not override the method behind ``start``.
     """
@@ -319,7 +319,7 @@ def _compare_frames(part: LinearPlant, where: str, path: FloatArray, truth: Any)
 
 def transition_law(A: FloatArray, B: FloatArray, gap: float) -> tuple[FloatArray, FloatArray]:
     """Return the transition matrix ``e^{A g}`` (n, n) of dx = A x dt + B dw over g = ``gap``
-    seconds, and the covariance (n, n) of its noise (Van Loan, 1978).
+    seconds, and the covariance (n, n) of its noise (Van Loan, 1978), for A (n, n) and B (n, m).
     """
     n = len(A)
     block = np.block([[-A, B @ B.T], [np.zeros((n, n)), A.T]]) * gap
@@ -332,7 +332,8 @@ def moment_law(A: FloatArray, B: FloatArray, gap: float) -> tuple[FloatArray, Fl
     """Return the law of the state after ``gap`` seconds together with the two moments of x over
     them: its response (3 n, n) to the state before, and the covariance (3 n, 3 n) of its noise.
 
-    The moments are the integrals of x and of x times the Legendre polynomial P_1 over the gap.
+    The plant is dx = A x dt + B dw with A (n, n) and B (n, m). The moments are the integrals of x
+    and of x times the Legendre polynomial P_1 over the gap.
     """
     n, zero, eye = len(A), np.zeros_like(A), np.eye(len(A))
     # x, I = int x ds and J = int I ds: int s x ds = g I - J.
@@ -470,7 +471,8 @@ def _check_one_path(
     part: Diffusion, where: str, cut: Any, times: tuple[FloatArray, FloatArray], seed: int
 ) -> None:
     """Check that ``path``, which draws one run, gives the states of ``cut``, the block that
-    ``paths`` drew for the same run; ``times`` are its probe and sample times in seconds.
+    ``paths`` drew for the same run; ``times`` are its probe and sample times (K,) and (K',) in
+    seconds.
     """
     plant_random, probe_random, sample_random = (
         _make_generator(seed, 1, purpose) for purpose in ("plant", "probe", "samples")

@@ -56,8 +56,8 @@ class SensorReader:
         return self.sensor.slot_path(node, PERIOD, generator)
 
     def read_several(self, path: Any, ks: Sequence[int], x: FloatArray) -> ReadingSeries:
-        """Return the readings with the increasing numbers ``ks`` (K,) at the states x (K, n), taken
-        in one call.
+        """Return the readings y (K, p) and their H (K, p, n) with the increasing numbers ``ks``
+        (K,) at the states ``x`` (K, n), taken in one call.
         """
         y, H = call_user_function(self.where, path.several, ks, x)
         y = demand_array(self.where, "y of several", y, (len(ks), self.p))
@@ -65,7 +65,9 @@ class SensorReader:
         return ReadingSeries(y, H)
 
     def read_one(self, path: Any, k: int, x: FloatArray) -> ReadingSeries:
-        """Return reading ``k`` at the state x (n,), as a series of one reading."""
+        """Return reading number ``k`` at the state ``x`` (n,), as a series of one reading: y
+        (1, p), H (1, p, n).
+        """
         with guard_user_code(self.where):
             y, H = self._read_one(path, k, x)
         y = demand_array(self.where, "a reading", y, (self.p,))
@@ -73,7 +75,7 @@ class SensorReader:
         return ReadingSeries(y[None], H[None])
 
     def _read_one(self, path: Any, k: int, x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return reading ``k`` (p,) at the state x (n,), and its H (p, n)."""
+        """Return reading number ``k`` (p,) at the state ``x`` (n,), and its H (p, n)."""
         # In the order in which engines call them.
         return path.reading(k, x), path.matrix(k)
 
@@ -88,7 +90,7 @@ class SampleReader(SensorReader):
         return self.sensor.samples(node, generator, HORIZON)
 
     def _read_one(self, path: Any, k: int, x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return sample ``k`` (p,) at the state x (n,), and its H (p, n)."""
+        """Return sample number ``k`` (p,) at the state ``x`` (n,), and its H (p, n)."""
         y, H = path.reading(k, x)
         return y, H
 
@@ -135,8 +137,8 @@ class IncrementReader:
     def read_pieces(
         self, streams: Streams, node: int, x: FloatArray, steps: int, cut: bool
     ) -> IncrementPieces:
-        """Return the increments over ``steps`` steps at the state x (n,), ``cut`` at CUTS or
-        not.
+        """Return the increments over ``steps`` steps at the constant state ``x`` (n,), each step
+        ``cut`` into pieces at CUTS or not.
         """
         with guard_user_code(self.where):
             return self._read_pieces(streams, node, x, steps, cut)
@@ -144,7 +146,9 @@ class IncrementReader:
     def _read_pieces(
         self, streams: Streams, node: int, x: FloatArray, steps: int, cut: bool
     ) -> IncrementPieces:
-        """Return the increments as :meth:`read_pieces`, without its guard of the user's code."""
+        """Return the increments over ``steps`` steps at the constant state ``x`` (n,), as
+        :meth:`read_pieces` but without its guard of the user's code.
+        """
         plant = Diffusion(
             mean=x, A=np.zeros((self.n, self.n)), B=np.zeros((self.n, 1)), sensing_period=STEP
         )

@@ -276,7 +276,9 @@ def _check_increments(reader: IncrementReader, node: int, seed: int) -> None:
 
 
 def _check_increment_noise(reader: IncrementReader, node: int, x: FloatArray, seed: int) -> None:
-    """Check that the noise of increments at the state x (n,) is white with the stated R."""
+    """Check that the noise of increments at the constant state ``x`` (n,) is white with the stated
+    R (p, p), in RUNS runs of STEPS steps.
+    """
     factor = compute_whitening(reader.sensor.R).factor
     whitened = []
     for run in range(RUNS):
@@ -333,8 +335,8 @@ def _check_regressors(
 
 
 def _check_regressor_steps(sensor: RegressorSensor, H: FloatArray, labels: NoiseLabels) -> None:
-    """Check the noise s[k+1] - A s[k] of H = C s (runs, slots, n), if s follows from H: C has full
-    column rank.
+    """Check the noise s[k+1] - A s[k] of H = C s, from ``H`` (runs, slots, n), if s (m,) follows
+    from H: C (n, m) has full column rank.
     """
     m = len(sensor.A)
     if len(sensor.C) < m or np.linalg.cond(sensor.C) > 1e6:
@@ -459,8 +461,8 @@ def _accepts_state_size(sensor: NonlinearSensor, n: int) -> bool:
 
 
 def _derivative_error(sensor: NonlinearSensor, node: int, x: FloatArray, J: FloatArray) -> float:
-    """Return the largest absolute difference of a Jacobian J (p, n) at the state x (n,) from
-    central differences of ``h``.
+    """Return the largest absolute difference of a Jacobian ``J`` (p, n) at the state ``x`` (n,)
+    from central differences of ``h``.
     """
     numerical = np.empty_like(J)
     for k, step in enumerate(np.eye(len(x)) * DERIVATIVE_STEP):

@@ -22,7 +22,8 @@ TOLERANCE = 1e-9  # relative to the estimates before the shift is subtracted
 def make_trials(watched: WatchedPart, shift: FloatArray | None = None) -> Iterator[Trial]:
     """Yield the trials of a filter on all systems, in every kind of time that it supports.
 
-    In each trial the truth is shifted by the first n components of ``shift``, unless that is None.
+    In each trial of a system of n states the truth is shifted by the first n components of
+    ``shift`` (k,), unless that is None.
     """
     part = watched.part
     systems = make_systems(part.inverts)
@@ -80,5 +81,7 @@ def estimate_differences(
 
 
 def _largest_difference(one: FloatArray, other: FloatArray) -> float:
-    """Return the largest absolute difference of two arrays of one shape."""
+    """Return the largest absolute difference of two arrays of one shape, such as xhat (n,) or P
+    (n, n).
+    """
     return float(np.abs(one - other).max())

@@ -151,7 +151,7 @@ def differing_path(one: Leaves, other: Leaves) -> str | None:
 
 
 def _are_equal(one: np.ndarray, other: np.ndarray) -> bool:
-    """Return True if two arrays have equal types, shapes and entries; nan equals nan."""
+    """Return True if two arrays have equal types, shapes (any) and entries; nan equals nan."""
     same_type = one.dtype == other.dtype and one.shape == other.shape
     # Comparing bytes is cheap, and nearly all are equal to the last bit.
     if same_type and one.dtype != object and one.tobytes() == other.tobytes():
@@ -399,8 +399,10 @@ def call_user_function(where: str, function: Callable[..., Any], *arguments: Any
 
 
 def demand_array(where: str, name: str, value: Any, shape: tuple[int, ...]) -> FloatArray:
-    """Return ``value`` as an array; raises AssertionError unless it is float64, finite and of that
-    ``shape``. ``name`` is what messages call it.
+    """Return ``value`` as an array of the given ``shape``.
+
+    Raises AssertionError unless it is float64, finite and of that shape; ``where`` and ``name`` are
+    what messages call its origin and the array.
     """
     array = np.asarray(value)
     demand(array.shape == shape, where, f"{name} must have the shape {shape}", str(array.shape))
@@ -410,8 +412,8 @@ def demand_array(where: str, name: str, value: Any, shape: tuple[int, ...]) -> F
 
 
 def scaled_difference(one: FloatArray, other: FloatArray) -> float:
-    """Return the largest absolute difference of two arrays of one shape, divided by 1 + the largest
-    absolute entry of both.
+    """Return the largest absolute difference of two arrays of one shape (any), divided by 1 + the
+    largest absolute entry of both.
     """
     size = 1.0 + max(np.abs(a).max(initial=0.0) for a in (one, other))
     return float(np.abs(one - other).max(initial=0.0) / size)

@@ -109,12 +109,16 @@ def _drawn_counts(
     first: int,
     count: int,
 ) -> np.ndarray:
-    """Return the numbers of ticks (count, E) of all clocks in the replicas from ``first`` on."""
+    """Return the numbers of ticks (``count``, E) of all E clocks in ``count`` replicas from number
+    ``first`` on; cached.
+
+    ``draw`` returns the ticks (E,) of one replica, given the scenario, the seed and its number.
+    """
     return np.array([draw(scenario, seed, first + k) for k in range(count)])
 
 
 def _counts_of_each(clocks: ClockSamples) -> np.ndarray:
-    """Return the ticks (R', E) of each clock in the R runs and in R' - R further replicas.
+    """Return the ticks (R', E) of each of E clocks in the R runs and in R' - R further replicas.
 
     Clocks are cheap to draw without the rest of a run. There are as many further replicas as a rate
     that is off by WANTED_RATE takes to be detected, within the limits of :func:`_number_drawn`.
@@ -223,8 +227,9 @@ def _limit_of_one_clock(
     """Return a note on the smallest detectable rate error of one clock, empty if that is at most
     WANTED_RATE.
 
-    The note tells a reader that more ticks are needed, not a better test: by the Cramer-Rao bound
-    an estimate of a rate from N ticks of a Poisson process has at least the relative standard
+    ``counts`` (R, E) are the ticks of E clocks in R runs, ``singles`` their E intervals. The note
+    tells a reader that more ticks are needed, not a better test: by the Cramer-Rao bound an
+    estimate of a rate from N ticks of a Poisson process has at least the relative standard
     deviation 1 / sqrt(N).
     """
     least_precise = max(range(len(singles)), key=lambda k: singles[k].detectable)

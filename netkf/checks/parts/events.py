@@ -82,7 +82,9 @@ def count_losses(scenario: Scenario, run: Run) -> LossCounts | None:
 def in_direction(
     senders: np.ndarray, receivers: np.ndarray, indices: dict[tuple[int, int], int]
 ) -> np.ndarray:
-    """Return the index (K,) of the direction of each message."""
+    """Return the index (K,) of the direction of each of K messages from ``senders`` to
+    ``receivers`` (K,), node ids; ``indices`` is by (sender, receiver).
+    """
     ids = zip(senders.tolist(), receivers.tolist(), strict=True)
     return np.array([indices[direction] for direction in ids], dtype=np.int64)
 

@@ -130,7 +130,9 @@ def moments(z: FloatArray, states: FloatArray | None = None) -> NoiseMoments:
 
 
 def count_cells(u: FloatArray, present: np.ndarray) -> FloatArray:
-    """Return the counts (CELLS, d) of the ``present`` numbers u (S, d) in [0, 1] in each cell."""
+    """Return the counts (CELLS, d) of numbers u (S, d) in [0, 1] in each of CELLS equal cells, of S
+    values of d entries; only those in the mask ``present`` (S, d) count.
+    """
     index = np.minimum((CELLS * u).astype(np.int64), CELLS - 1) * u.shape[1] + np.arange(u.shape[1])
     counts = np.bincount(index[present], minlength=CELLS * u.shape[1])
     return counts.reshape(CELLS, u.shape[1]).astype(float)
@@ -142,7 +144,7 @@ def total(stacked: NoiseMoments) -> NoiseMoments:
 
 
 def whitening_matrix(covariance: FloatArray) -> FloatArray:
-    """Return W (d, n) with W C W' = I for a covariance C (n, n) of numerical rank d."""
+    """Return W (d, n) with W C W' = I for a ``covariance`` C (n, n) of numerical rank d."""
     values, vectors = np.linalg.eigh(covariance)
     varying = values > MIN_VARIANCE_SHARE * max(values[-1], 0.0)
     return np.asarray((vectors[:, varying] / np.sqrt(values[varying])).T)
@@ -348,7 +350,8 @@ def _in_size(sums: NoiseMoments, labels: list[str]) -> Iterator[tuple[float, flo
 def _correlations(
     products: FloatArray, first_squares: FloatArray, second_squares: FloatArray
 ) -> FloatArray:
-    """Return correlations from sums of products and squares over the same pairs; 0 without pairs.
+    """Return correlations from sums of products and of squares over the same pairs, three arrays of
+    one shape, which is that of the result; 0 without pairs.
 
     With squares summed over other terms than the products, |correlation| could exceed 1.
     """

@@ -288,8 +288,8 @@ def _directions_apart(scenario: Scenario) -> bool:
 def _correlation_of_runs(
     excess: FloatArray, count: np.ndarray, scale: FloatArray, variance: FloatArray, level: float
 ) -> Interval | None:
-    """Return an interval for the correlation of the two events of a pair, from R independent runs;
-    None with fewer than MIN_RUNS runs.
+    """Return an interval for the correlation of the two events of a pair, from R independent runs
+    with D directions (or links); None with fewer than MIN_RUNS runs.
 
     excess   : (R, D) number of pairs in which both events happened, less its expected value if
                they are independent

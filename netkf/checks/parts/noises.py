@@ -71,7 +71,10 @@ def path_law(scenario: Scenario) -> PathLaw | None:
 
 
 def _sizes(plant: Any, Phi: FloatArray, W: FloatArray, steps: int) -> FloatArray:
-    """Return the root mean squares (steps, n) of the states before each step."""
+    """Return the root mean squares (steps, n) of the states before each of ``steps`` steps
+    ``x+ = Phi x + w``, with Phi (n, n) and the covariance W (n, n) of w, from the start of
+    ``plant`` on.
+    """
     mean, covariance, sizes = plant.start_mean, plant.start_cov, []
     for _ in range(steps):
         sizes.append(np.sqrt(np.diagonal(covariance) + mean**2))
@@ -80,8 +83,8 @@ def _sizes(plant: Any, Phi: FloatArray, W: FloatArray, steps: int) -> FloatArray
 
 
 def _discretise(A: FloatArray, B: FloatArray, gap: float) -> tuple[FloatArray, FloatArray]:
-    """Return ``exp(A gap)`` (n, n) and the covariance ``int_0^gap e^{A s} B B' e^{A' s} ds``
-    (n, n) of the noise over a gap in seconds (Van Loan 1978).
+    """Return ``exp(A gap)`` (n, n) and the covariance ``int_0^gap e^{A s} B B' e^{A' s} ds`` (n, n)
+    of the noise over a ``gap`` in seconds (Van Loan 1978), for A (n, n) and B (n, m).
     """
     n = len(A)
     blocks = np.block([[-A, B @ B.T], [np.zeros((n, n)), A.T]])
@@ -107,7 +110,9 @@ def plant_moments(scenario: Scenario, streams: Streams) -> NoiseMoments | None:
 
 
 def _standardise(x: FloatArray, sizes: FloatArray) -> FloatArray:
-    """Return states x (S, n) in units of their root mean squares; 0 where these are 0."""
+    """Return S states ``x`` (S, n) in units of their root mean squares ``sizes`` (S, n); 0 where
+    these are 0.
+    """
     return np.divide(x, sizes, out=np.zeros_like(x), where=sizes > 0.0)
 
 
@@ -261,7 +266,9 @@ def _typical_covariance(scenario: Scenario) -> FloatArray:
 
 
 def _state_sizes(scenario: Scenario, x: FloatArray) -> FloatArray:
-    """Return the root mean squares (S, n) of states x (S, n) from :func:`_typical_states`."""
+    """Return the root mean squares (S, n) of S states ``x`` (S, n) from :func:`_typical_states`;
+    all rows are equal.
+    """
     sizes = np.sqrt(np.diagonal(_typical_covariance(scenario)) + scenario.plant.start_mean**2)
     return np.asarray(np.broadcast_to(sizes, x.shape))
 
