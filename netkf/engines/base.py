@@ -105,8 +105,9 @@ def batch_sink(scenario: Scenario, replicas: range) -> BatchSink:
 def broken(
     scenario: Scenario, xhat: FloatArray, P: FloatArray, without: np.ndarray | None = None
 ) -> list[int]:
-    """Return the nodes whose estimate or covariance, (N, n) and (N, n, n), is not sound; those
-    ``without`` (N,) a covariance have none to be looked at. They end a run as diverged.
+    """Return the ids of the nodes whose estimate (row of ``xhat`` (N, n)) or covariance (``P``
+    (N, n, n)) is not finite, or whose covariance is not positive semidefinite: they end a run as
+    diverged. ``without``: mask (N,) of nodes that have no covariance, whose P is ignored.
     """
     # False broadcasts: every node then has a covariance to be looked at.
     intact = sound_mask(xhat, P, False if without is None else without)

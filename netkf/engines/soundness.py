@@ -15,7 +15,7 @@ BoolArray = NDArray[np.bool_]
 def stack_estimates(
     pairs: Sequence[tuple[FloatArray, FloatArray | None]],
 ) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """Stack the results (xhat, P) of ``estimate`` of N filters.
+    """Stack the results (xhat (n,), P (n, n) or None) of ``estimate`` of N filters.
 
     Returns xhat (N, n), P (N, n, n), nan for a filter without covariance, and a mask (N,) of these
     filters.

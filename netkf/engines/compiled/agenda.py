@@ -97,7 +97,9 @@ def is_immediate(scenario: Scenario) -> bool:
 
 
 def together(nodes: int, runs: int) -> int:
-    """Return how many of ``runs`` runs with ``nodes`` filters are simulated together."""
+    """Return how many of ``runs`` runs, each with ``nodes`` filters, are simulated together: as
+    many as have MAX_FILTERS filters in all, at least 1.
+    """
     return max(1, min(runs, MAX_FILTERS // nodes))
 
 
@@ -114,22 +116,27 @@ def pause_of(state: Simulation, ticks: int, count: int) -> float:
 
 
 def simulate_together(state: Simulation, visits: Visits, batch: BatchArrays, group: int) -> None:
-    """Simulate all runs of a batch, ``group`` of them at a time."""
+    """Simulate all R runs of a batch up to the horizon, ``group`` of them at a time; the results
+    are in ``batch`` and the samples in ``state.buffer``. ``visits`` is scratch space for ``group``
+    runs.
+    """
     ticks = int(batch.first[-1]) // len(batch.lengths)
     pause, progress = pause_of(state, ticks, group), np.zeros(group, dtype=PROGRESS)
     simulate_agenda(state, visits.memory, batch.memory, progress, pause)
 
 
 def advance_alone(state: Simulation, visits: Visits) -> int:
-    """Simulate one run until it needs something from Python; return the request
-    (WANT_... or DONE).
+    """Simulate one run until it needs something from Python; return the request (WANT_... or DONE).
+    Changes ``state``, the run; ``visits`` is an empty queue, and empty again after the call.
     """
     return int(simulate_agenda(state, visits.memory, no_batch().memory, _no_progress(), math.inf))
 
 
 @cache
 def _no_progress() -> np.ndarray:
-    """Return no positions, for a run that is simulated alone."""
+    """Return an empty array of PROGRESS records, which makes ``simulate_agenda`` simulate one
+    run.
+    """
     return np.zeros(0, dtype=PROGRESS)
 
 
@@ -141,9 +148,13 @@ def simulate_agenda(
     progress: np.ndarray,
     pause: float,
 ) -> int:
-    """Simulate a batch, ``len(progress)`` runs together, which process their visits every ``pause``
-    seconds of simulated time. If ``progress`` is empty simulate one run until it needs something
-    from Python, and return the request.
+    """Simulate the R runs of a batch, ``len(progress)`` of them together, which process their
+    visits every ``pause`` seconds of simulated time. If ``progress`` is empty simulate one run
+    until it needs something from Python. Return the request, DONE for a batch.
+
+    ``visits_memory`` and ``batch_memory`` are the blocks of memory (int64 words) of a Visits and a
+    BatchArrays, since numba dispatches on arrays faster than on structs; ``progress`` (G,) are
+    PROGRESS records, scratch space.
     """
     visits = struct_at(visits_memory, Visits)
     if len(progress) == 0:
@@ -172,7 +183,11 @@ def simulate_group(
     first: int,
     pause: float,
 ) -> None:
-    """Simulate together the runs from ``first`` on, one for each entry of ``progress``."""
+    """Simulate together the G runs ``first`` to ``first`` + G - 1 of a batch, one for each entry of
+    ``progress`` (G,), and store their results in ``batch``. Node h of the k-th of these runs is at
+    the place k N + h of ``state.xhat``, ``root`` and ``now``. Every ``pause`` simulated seconds the
+    queued visits are processed.
+    """
     state.first_run = first
     for k in range(len(progress)):
         reset_filters(state, batch, k * len(state.nodes))
@@ -196,7 +211,9 @@ def simulate_group(
 
 @kernel
 def suspend(state: Simulation, batch: BatchArrays, progress: np.ndarray, k: int) -> None:
-    """Store the position and counts of the present run in entry ``k`` of ``progress``."""
+    """Store the position of the present run ``state.run`` in entry ``k`` of ``progress`` (G,), and
+    its numbers of events in row ``state.run`` of ``batch.counts``.
+    """
     position = progress[k]
     position.tick_at, position.ticks_stop, position.first_delay = (
         state.tick_at,
@@ -211,7 +228,9 @@ def suspend(state: Simulation, batch: BatchArrays, progress: np.ndarray, k: int)
 
 @kernel
 def resume(state: Simulation, batch: BatchArrays, progress: np.ndarray, k: int) -> None:
-    """Restore the position and counts of the run in entry ``k`` of ``progress``."""
+    """Make run ``state.first_run`` + ``k`` the present one: restore its position in ``state`` from
+    entry ``k`` of ``progress`` (G,), and its numbers of events from ``batch.counts``.
+    """
     position = progress[k]
     state.tick_at, state.ticks_stop, state.first_delay = (
         position.tick_at,
@@ -227,8 +246,9 @@ def resume(state: Simulation, batch: BatchArrays, progress: np.ndarray, k: int) 
 
 @kernel
 def run_agenda(state: Simulation, visits: Visits, until: float) -> int:
-    """Go through the events of a run before ``until`` (seconds): queue visits, and process them
-    whenever the queue is full. Return why it stopped (WANT_..., DONE or PAUSE).
+    """Go through the events of the present run before ``until`` (seconds): queue visits, and
+    process them whenever the queue is full. Return why it stopped (WANT_..., DONE or PAUSE). The
+    last visits are still queued then.
     """
     request = FULL
     # A batch has space for all of its samples: WANT_SAMPLES comes after the last one and is
@@ -242,8 +262,9 @@ def run_agenda(state: Simulation, visits: Visits, until: float) -> int:
 
 @kernel
 def queue_events(state: Simulation, visits: Visits, until: float) -> int:
-    """Go through the events of a run before ``until`` and queue visits; return why it stopped
-    (WANT_..., DONE, PAUSE or FULL).
+    """Go through the events of the present run before ``until`` (seconds) and queue visits; return
+    why it stopped (WANT_..., DONE, PAUSE or FULL). Moves the positions ``tick_at``, ``grid_at``,
+    ... of ``state`` behind these events.
     """
     nodes = len(state.nodes)
     first, max_visits = (state.run - state.first_run) * nodes, nodes + 2 + state.most_messages
@@ -274,8 +295,8 @@ def queue_events(state: Simulation, visits: Visits, until: float) -> int:
 
 @kernel
 def end_of_ticks(state: Simulation) -> float:
-    """Return the time up to which only ticks happen: that of the next other event, or the end of
-    the present piece of the path or of the window of ticks, whichever comes first.
+    """Return the time in seconds up to which only ticks happen: that of the next other event, or
+    the end of the present piece of the path or of the window of ticks, whichever comes first.
     """
     path, ticks = state.path, state.ticks
     event = min(next_of(state.frames, state.frame_at), next_of(path.grid, state.grid_at))
@@ -285,8 +306,8 @@ def end_of_ticks(state: Simulation) -> float:
 
 @kernel
 def queue_ticks(state: Simulation, visits: Visits, first: int, until: float) -> None:
-    """Queue the visits of the next tick, and of all later ticks before ``until`` while the queue
-    has space.
+    """Queue the visits of the next tick, and of all later ticks before ``until`` (seconds) while
+    the queue has space. ``first`` is the place of the run's first node in ``state.xhat``.
     """
     ticks, space = state.ticks, len(visits.records) - 2 - state.most_messages
     queue_tick(state, visits, first, ticks.t[state.tick_at])
@@ -297,7 +318,10 @@ def queue_ticks(state: Simulation, visits: Visits, first: int, until: float) -> 
 
 @kernel
 def queue_tick(state: Simulation, visits: Visits, first: int, now: float) -> None:
-    """Queue the visits of the next tick; record or count its messages and their absorption."""
+    """Queue the visits of the next tick, at ``now`` (seconds); record or count its messages and
+    their absorption, and advance ``state.tick_at``. ``first`` is the place of the run's first node
+    in ``state.xhat``.
+    """
     ticks, nodes, k = state.ticks, state.nodes, state.tick_at
     entity, bits = state.entities[ticks.entity[k]], ticks.arrival_bits[k]
     state.tick_at += 1
@@ -318,8 +342,9 @@ def queue_tick(state: Simulation, visits: Visits, first: int, now: float) -> Non
 
 @kernel
 def count_tick(state: Simulation, sent: int, bits: int) -> None:
-    """Count the events that ``record_tick`` records: ``sent`` messages, of which as many arrive as
-    ``bits`` has ones.
+    """Add the events that ``record_tick`` would record to ``state.counts``: a tick, ``sent``
+    messages, of which as many arrive and are absorbed as the arrival bits ``bits`` have ones; the
+    others are lost.
     """
     # bits & (bits - 1) clears the lowest one.
     arrived = 0
@@ -338,9 +363,10 @@ def count_tick(state: Simulation, sent: int, bits: int) -> None:
 def record_tick(
     state: Simulation, i: int, j: int, begin: int, after: int, bits: int, now: float
 ) -> None:
-    """Record a tick of node i (and j), its messages on the directed links
-    ``outgoing[begin:after]``, of which message m arrives if bit m of ``bits`` is 1, and their
-    absorption.
+    """Append to ``state.rows`` a tick at ``now`` (seconds) of node i (and j, -1: none), its
+    messages on the directed links ``outgoing[begin:after]``, of which number m - ``begin`` arrives
+    if that bit of ``bits`` is 1, and their absorption. Counts these messages in ``directions`` and
+    the transmission in ``nodes[i].sent``; i and j are indices of nodes.
     """
     nodes, receivers = state.nodes, 0
     record_event(state, now, TICK, nodes[i].id, nodes[j].id if j >= 0 else -1, -1)
@@ -367,8 +393,10 @@ def record_tick(
 
 @kernel
 def queue_pairs(state: Simulation, visits: Visits, k: int, first: int, now: float) -> None:
-    """Queue the visits of tick ``k``, some messages of which arrive: one visit of both ends of a
-    link, or one of the sender with each receiver of a broadcast.
+    """Queue the visits of tick ``k`` (index in ``state.ticks``) at ``now`` (seconds), some messages
+    of which arrive: one visit of both ends of a link, or one of the sender with each receiver of a
+    broadcast. ``first`` is the place of the run's first node in ``state.xhat``; raises
+    ``visits.level`` of all these nodes.
     """
     bits, directions, outgoing = state.ticks.arrival_bits[k], state.directions, state.outgoing
     entity = state.entities[state.ticks.entity[k]]
@@ -405,8 +433,9 @@ def queue_pairs(state: Simulation, visits: Visits, k: int, first: int, now: floa
 
 @kernel
 def set_receiving_link(visits: Visits, v: int, first: bool, direction: int) -> None:
-    """Set the directed link over which the first node of visit ``v``, or the second
-    one, receives.
+    """Write the index ``direction`` of a directed link into visit ``v`` (index in
+    ``visits.records``): over it the first node of the visit receives if ``first``, otherwise the
+    second one.
     """
     if first:
         visits.records[v].to_first = direction
@@ -416,8 +445,9 @@ def set_receiving_link(visits: Visits, v: int, first: bool, direction: int) -> N
 
 @kernel
 def fill_arrival_bits(state: Simulation, first: int, after: int, delays: int) -> None:
-    """Write the arrival bits of the ticks ``first`` to ``after`` - 1: bit m is 1 if message m of a
-    tick arrives. The outcomes of their run begin at ``delays``.
+    """Write ``state.ticks.arrival_bits`` of the ticks ``first`` to ``after`` - 1: bit m is 1 if
+    message m of a tick arrives. The outcomes of these ticks' run begin at index ``delays`` of
+    ``state.ticks.delay``, which holds the delay of each message, negative or nan if it is lost.
     """
     ticks, entities = state.ticks, state.entities
     for k in range(first, after):

@@ -48,7 +48,10 @@ ALONE = -1
 
 
 def simulate_batch(state: Simulation, batch: BatchArrays) -> None:
-    """Simulate all runs of a batch up to the horizon, or until an estimate is no longer finite."""
+    """Simulate all R runs of a batch up to the horizon, or until an estimate is no longer finite.
+    Writes ``lengths``, ``counts`` and ``diverged`` of ``batch``, and the samples into
+    ``state.buffer``.
+    """
     run, resumed = 0, False
     while run < len(batch.lengths):
         run = int(simulate_runs(state, batch.memory, run, resumed))
@@ -59,7 +62,8 @@ def simulate_batch(state: Simulation, batch: BatchArrays) -> None:
 
 
 def run_alone(state: Simulation) -> int:
-    """Run ``event_loop`` for one run through the kernel of batches, which is then compiled only
+    """Simulate the run ``state`` until it needs something from Python, and return that request
+    (WANT_... or DONE). It takes the kernel of batches, so that ``event_loop`` is compiled only
     once.
     """
     return int(simulate_runs(state, no_batch().memory, ALONE, True))
@@ -67,7 +71,7 @@ def run_alone(state: Simulation) -> int:
 
 @cache
 def no_batch() -> BatchArrays:
-    """Return a batch without runs."""
+    """Return a batch of R = 0 runs, which the kernels take in place of one for a run on its own."""
     no_runs = np.zeros(0, dtype=np.int64)
     return BatchArrays(
         nodes=np.zeros(0, dtype=NODE),
@@ -85,9 +89,11 @@ def no_batch() -> BatchArrays:
 
 @kernel
 def simulate_runs(state: Simulation, batch_memory: IntArray, run: int, resumed: bool) -> int:
-    """Simulate the runs of a batch from ``run`` on, which goes on where it stopped if ``resumed``.
-    Return the run that needs a larger pool of messages, or the number of runs at the end. For ALONE
-    call ``event_loop`` and return its request.
+    """Simulate the runs of a batch from number ``run`` on, which goes on where it stopped if
+    ``resumed``. Return the number of the run that needs a larger pool of messages, or the number of
+    runs at the end. For ``run`` = ALONE simulate ``state`` until it needs something from Python,
+    and return the request (WANT_... or DONE). ``batch_memory`` is the block of memory (int64 words)
+    of a BatchArrays.
     """
     # The batch comes as an array, since numba dispatches on arrays much faster than on structs.
     if run == ALONE:
@@ -97,7 +103,10 @@ def simulate_runs(state: Simulation, batch_memory: IntArray, run: int, resumed: 
 
 @kernel
 def simulate_from(state: Simulation, batch: BatchArrays, run: int, resumed: bool) -> int:
-    """Simulate the runs of a batch, see ``simulate_runs``."""
+    """Simulate the runs of a batch from number ``run`` on, each from time 0, except that the first
+    of them goes on where it stopped if ``resumed``; store their results in ``batch``. Return the
+    number of the run that needs a larger pool of messages, or the number of runs at the end.
+    """
     while run < len(batch.lengths):
         if not resumed:
             state.first_run = run
@@ -116,7 +125,9 @@ def simulate_from(state: Simulation, batch: BatchArrays, run: int, resumed: bool
 
 @kernel
 def begin(state: Simulation, batch: BatchArrays, run: int) -> None:
-    """Set the positions of a Simulation in its draws to the beginning of a run."""
+    """Set ``state`` to the beginning of run number ``run`` of a batch: the indices of its next
+    tick, sample, piece of the path and so on, ``counts`` 0, and no polynomial of its path cached.
+    """
     state.run, place = run, run - state.first_run
     state.frame_at = state.piece = state.grid_at = state.wake_at = state.instant_at = 0
     state.tick_at, state.ticks_stop = batch.first[run], batch.first[run + 1]
@@ -130,7 +141,10 @@ def begin(state: Simulation, batch: BatchArrays, run: int) -> None:
 
 @kernel
 def reset_filters(state: Simulation, batch: BatchArrays, first: int) -> None:
-    """Reset estimates and covariances to time 0, from place ``first`` on."""
+    """Reset the nodes of a run to time 0: copy ``nodes``, ``xhat`` (N, n) and ``root`` (N, n, n) of
+    ``batch`` into ``state``, from the place ``first`` of ``state.xhat`` on, and set ``state.now``
+    to 0.
+    """
     n = batch.xhat.shape[1]
     for h in range(len(batch.nodes)):
         state.nodes[h] = batch.nodes[h]
@@ -144,7 +158,9 @@ def reset_filters(state: Simulation, batch: BatchArrays, first: int) -> None:
 
 @kernel
 def reset_messages(state: Simulation) -> None:
-    """Remove all messages: nothing is under way, and the whole pool is free."""
+    """Remove all messages of ``state``: nothing is under way or in an inbox, and the whole pool is
+    free; directed links number their messages from 0 again.
+    """
     for w in range(len(state.directions)):
         state.directions[w].messages = 0
     # Chain the whole pool into the list of free messages.
@@ -157,8 +173,9 @@ def reset_messages(state: Simulation) -> None:
 
 @kernel
 def finish(state: Simulation, batch: BatchArrays, run: int) -> None:
-    """Store the results of a run: its length and counts, up to the first sample that is not finite
-    if there is one.
+    """Store the results of run number ``run`` in ``batch``: its number of samples ``lengths``, its
+    events ``counts`` and whether it has ``diverged``; up to the first sample that is not finite if
+    there is one.
     """
     buffer = state.buffer
     for kind in range(batch.counts.shape[1]):
@@ -178,7 +195,9 @@ def finish(state: Simulation, batch: BatchArrays, run: int) -> None:
 
 @kernel
 def count_diverged_filters(state: Simulation, run: int, k: int) -> int:
-    """Return the number of filters that are not finite in sample ``k`` of a run."""
+    """Return how many of the N filters have an estimate or covariance that is not finite in sample
+    ``k`` of run number ``run``.
+    """
     xhat, P, n, diverged = state.buffer.xhat, state.buffer.P, len(state.size), 0
     for h in range(len(state.nodes)):
         # P = S S' cannot be indefinite, so only finiteness is tested: 0 times a number that is not

@@ -45,7 +45,9 @@ MAX_BATCH_BYTES = 1 << 25
 
 
 def flow_batches(scenario: Scenario, seed: int, replicas: range) -> Iterator[RunBatch]:
-    """Yield the runs of consecutive replicas, as many at a time as memory allows."""
+    """Yield the results of consecutive replicas (numbers of runs), as many runs at a time as memory
+    allows; ``seed`` is that of all their random numbers.
+    """
     keep_freed_memory()
     size = batch_size(scenario)
     workspace = _workspace(scenario) if size > 1 else Workspace(scenario)
@@ -67,7 +69,9 @@ def _workspace(scenario: Scenario) -> Workspace:
 
 
 def _simulate(scenario: Scenario, workspace: Workspace, seed: int, replicas: range) -> RunBatch:
-    """Simulate a batch of runs."""
+    """Draw the random numbers of the runs ``replicas`` from ``seed``, simulate them, and return
+    their samples, counts of events and states.
+    """
     with np.errstate(over="ignore", invalid="ignore"):  # growth to infinity is reported
         if not drawn_together(scenario):
             sources = (Source(scenario, Streams(seed, replica)) for replica in replicas)
@@ -84,7 +88,9 @@ def _simulate(scenario: Scenario, workspace: Workspace, seed: int, replicas: ran
 def _run_by_run(
     scenario: Scenario, workspace: Workspace, draws: Iterable[Draws], replicas: range
 ) -> RunBatch:
-    """Simulate runs one by one, for scenarios that need Python during a run."""
+    """Simulate runs one by one, for scenarios that need Python during a run, and return their
+    results; ``draws`` has the random numbers of each of the ``replicas``.
+    """
     sink = batch_sink(scenario, replicas)
     for run_draws in draws:
         recorder = Recorder([sink], counts_only=True)
@@ -94,8 +100,8 @@ def _run_by_run(
 
 
 def _all_at_once(scenario: Scenario, workspace: Workspace, draws: BatchDraws) -> RunBatch:
-    """Simulate all runs in one call of a kernel; more calls only if its pool of messages is too
-    small.
+    """Simulate the R runs of ``draws`` in one call of a kernel, and return their results; more
+    calls only if the kernel's pool of messages is too small.
     """
     start, runs = workspace.filters, len(draws.replicas)
     # np.empty: runs that diverge go on to the end, so that all samples are written.
@@ -124,7 +130,10 @@ def _all_at_once(scenario: Scenario, workspace: Workspace, draws: BatchDraws) ->
 
 
 def _batch_arrays(scenario: Scenario, start: Filters, draws: BatchDraws) -> BatchArrays:
-    """Return the arrays of a batch: filters at time 0, ticks of its runs, and space for results."""
+    """Return the arrays of a batch of R runs: the filters ``start`` at time 0, the ticks of its
+    runs in ``draws``, and space for results: ``lengths`` (R,), ``counts`` (R, kinds), ``diverged``
+    (R,).
+    """
     runs = len(draws.replicas)
     return BatchArrays(
         nodes=start.nodes,
@@ -183,8 +192,8 @@ def quick_runs(scenario: Scenario) -> int:
 
 
 def _expected_ticks(scenario: Scenario) -> float:
-    """Return the expected number of ticks of a run; a large number if a clock has no
-    finite rate.
+    """Return the expected number of ticks of all clocks in a run, 0 if nobody sends on a clock; a
+    large number if a clock has no finite rate.
     """
     clock = scenario.network.activation
     if not (scenario.node_filter.talks and isinstance(clock, LinkClock)):
@@ -215,29 +224,33 @@ class BatchDraws:
         self.states: States = PathStates(scenario, np.empty(0))
 
     def window(self) -> Window:
-        """Return the ticks of all runs, one run after the other."""
+        """Return the ticks of all R runs, one run after the other in each array."""
         ticks = self.ticks
         return Window(
             math.inf, *ticks[:4], arrival_bits=ticks.first_outcome if ticks.bits else None
         )
 
     def path(self, together: int = 1) -> PathBlock:
-        """Return all steps of all runs, ``together`` of which are simulated at a time."""
+        """Return all steps of the paths of all R runs, for an event loop that simulates
+        ``together`` runs at a time.
+        """
         return self.paths.block(self._block, together)
 
     def runs(self) -> Iterator[RunDraws]:
-        """Yield the draws of each run."""
+        """Yield the draws of each of the R runs, for runs that are simulated one by one."""
         return (RunDraws(self, self._scenario, run) for run in range(len(self.replicas)))
 
     def path_of(self, run: int) -> PathBlock:
-        """Return the steps of one run."""
+        """Return all steps of the path of run number ``run`` (0 to R - 1)."""
         block, one = self._block, slice(run, run + 1)
         names = ("x_start", "x_end", "moments", "cubic")
         own: dict[str, Any] = {name: getattr(block, name)[one] for name in names}
         return self.paths.block(block._replace(**own))
 
     def sampled_states(self, times: FloatArray) -> FloatArray:
-        """Return the states (R, T, n) at the sample ``times``, if no origin moves."""
+        """Return the states (R, T, n) of all runs at the sample ``times`` (T,) in seconds; only for
+        runs in which no origin moves, so that these are absolute states.
+        """
         block = self._block
         # Times of samples are ends of pieces or, at time 0, the start of the first.
         pieces = np.searchsorted(block.end, times)
@@ -263,5 +276,5 @@ class RunDraws:
         return window_of(self._batch.ticks, self._run)
 
     def path(self, together: int = 1) -> PathBlock:
-        """Return all steps of the run."""
+        """Return all steps of the path of this run; ``together`` is not used."""
         return self._batch.path_of(self._run)

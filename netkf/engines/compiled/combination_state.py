@@ -97,7 +97,9 @@ class CombinationState(Struct):
 
 
 def combination_state_of(scenario: Scenario, state: Simulation) -> CombinationState | None:
-    """Return the extra arrays that the filter's combination needs, None if it needs none."""
+    """Return the extra arrays that the filter's combination needs, at time 0, None if it needs
+    none. Its ``lanes`` and ``evidence`` are views of ``state.xhat`` and ``state.root``.
+    """
     if state.combination_kind not in (BEST, INVERSE, GAINS, PREDICTIONS, BELIEFS):
         return None
     algorithm: Any = scenario.node_filter
@@ -127,7 +129,9 @@ def combination_state_of(scenario: Scenario, state: Simulation) -> CombinationSt
 
 
 def _make_gains(scenario: Scenario, state: Simulation) -> dict[str, Any]:
-    """Return the fields of constant gains, empty for filters of other combinations."""
+    """Return the fields of a CombinationState for constant gains by name, from ``A`` (n, n) to
+    ``model`` (N,); zeros for filters of other combinations.
+    """
     N, n = state.xhat.shape
     algorithm: Any = scenario.node_filter
     node_gains = [
@@ -169,8 +173,9 @@ def _make_gains(scenario: Scenario, state: Simulation) -> dict[str, Any]:
 
 @kernel
 def keep_prediction(state: Simulation, combination: CombinationState, h: int) -> None:
-    """Store the prediction of node ``h`` as its prior, before any reading of this
-    instant is used.
+    """Copy the estimate and root of node ``h`` to ``prior`` and ``prior_root`` of ``combination``:
+    they are its prediction, before any reading of this instant is used. Sets ``nodes[h].reading``
+    to -1.
     """
     copy_state(state.size, combination.prior, combination.prior_root, h, state.xhat, state.root, h)
     # A reading of an earlier instant is not sent any more.
@@ -181,8 +186,9 @@ def keep_prediction(state: Simulation, combination: CombinationState, h: int) ->
 def predict_with_gain(
     state: Simulation, combination: CombinationState, h: int, now: float, time: float
 ) -> None:
-    """Predict node ``h`` from ``now`` to ``time`` and use its increments by its constant gain, in
-    intervals short against the rate of the gain.
+    """Predict node ``h`` (index) from ``now`` to ``time`` (seconds) and use its increments by its
+    constant gain L (n, p), in intervals short against the rate of the gain. Changes row ``h`` of
+    ``state.xhat`` and ``state.root``.
     """
     piece, m, longest = state.piece, combination.model[h], usable(combination.rate[h])
     least = MIN_GAP_SHARE * (time - now)
@@ -219,8 +225,9 @@ def predict_with_gain(
 def sample_with_gain(
     state: Simulation, combination: CombinationState, h: int, instant: int
 ) -> None:
-    """Update node ``h`` with its sample of an instant by its constant gain: ``xhat += L (y - H
-    xhat)`` and ``P <- (I - L H) P (I - L H)' + L R L'``.
+    """Update node ``h`` with its sample of an instant (index in ``state.instants``) by its constant
+    gain L (n, p): ``xhat += L (y - H xhat)`` and ``P <- (I - L H) P (I - L H)' + L R L'``. Changes
+    row ``h`` of ``state.xhat`` and ``state.root``, with P = root root'.
     """
     instants = state.instants
     s = instants.first[instant]
@@ -250,7 +257,8 @@ def sample_with_gain(
 @kernel
 def fuse_inbox(state: Simulation, combination: CombinationState, h: int) -> None:
     """Fuse the estimate of node ``h`` with each one in its inbox, one after the other, with the
-    optimal weight.
+    weight that minimises the trace or the determinant of the fused covariance. Changes row ``h`` of
+    ``state.xhat`` and ``state.root``.
     """
     m = state.nodes[h].inbox
     while m != -1:
@@ -263,8 +271,8 @@ def fuse_inbox(state: Simulation, combination: CombinationState, h: int) -> None
 
 @kernel
 def send_prediction(state: Simulation, combination: CombinationState, m: int, h: int) -> None:
-    """Write the prior of node ``h`` into message ``m``, and the instant of its reading if readings
-    are shared.
+    """Copy the prior of node ``h`` into message ``m`` (index in the pool), and set its ``tag`` to
+    the instant of the node's newest sample if readings are shared, otherwise to -1.
     """
     copy_state(
         state.size, state.pool_x, state.pool_root, m, combination.prior, combination.prior_root, h
@@ -274,7 +282,10 @@ def send_prediction(state: Simulation, combination: CombinationState, m: int, h:
 
 @kernel
 def use_readings_heard(state: Simulation, h: int, now: float) -> None:
-    """Update node ``h`` with the readings in its inbox that arrive without delay."""
+    """Update node ``h`` with the samples in its inbox that arrive without delay, at ``now``
+    (seconds), as if it had taken them itself. Changes row ``h`` of ``state.xhat`` and
+    ``state.root``.
+    """
     m = state.nodes[h].inbox
     while m != -1:
         message = state.pool[m]
@@ -286,8 +297,9 @@ def use_readings_heard(state: Simulation, h: int, now: float) -> None:
 
 @kernel
 def add_consensus(state: Simulation, combination: CombinationState, h: int) -> None:
-    """Add the consensus term on predictions, ``gamma P sum_j (xbar_j - xbar)``, to the estimate of
-    node ``h``.
+    """Add the consensus term on predictions, ``gamma P sum_j (xbar_j - xbar)``, to
+    ``state.xhat[h]``: xbar and P are the prior of node ``h``, the xbar_j the priors in its inbox,
+    and gamma is ``epsilon / (norm of P + 1)``.
     """
     n = state.xhat.shape[1]
     for i in range(n):

@@ -33,12 +33,14 @@ time, and all of them would not fit the processor's cache.
 
 
 def blocks_to_the_end(scenario: Scenario) -> int:
-    """Return the number of blocks of steps that reach the horizon."""
+    """Return the number of blocks, of BLOCK steps of the sensing grid each, that reach the
+    horizon.
+    """
     return -(-steps_to_the_end(scenario) // BLOCK)
 
 
 def steps_to_the_end(scenario: Scenario) -> int:
-    """Return the number of steps that reach the horizon."""
+    """Return the number of steps of the sensing grid that reach the horizon."""
     period = scenario.diffusion.sensing_period
     assert period is not None
     # A first guess from below; the loop counts the rest.
@@ -50,13 +52,15 @@ def steps_to_the_end(scenario: Scenario) -> int:
 
 
 def increments(scenario: Scenario) -> list[tuple[int, PlacedSensor]]:
-    """Return all increment sensors, each with its node, in the order of nodes."""
+    """Return all increment sensors as pairs (id of its node, sensor), in the order of nodes."""
     by_node = scenario.increment_sensors.items()
     return [(node, sensor) for node, placed in by_node for sensor in placed]
 
 
 def blocks_at_once(scenario: Scenario) -> int:
-    """Return the number of blocks of steps that a run draws at once."""
+    """Return the number of blocks, of BLOCK steps of the sensing grid each, that a run draws at
+    once.
+    """
     rows = [
         len(scenario.sensors[placed_sensor.entry].R) for _, placed_sensor in increments(scenario)
     ]
@@ -66,8 +70,8 @@ def blocks_at_once(scenario: Scenario) -> int:
 
 
 class Paths:
-    """The paths of some runs, drawn ``blocks`` blocks of BLOCK steps at a time. Steps are cut into
-    pieces at times at which a state is ``sampled``.
+    """The paths of R runs, drawn ``blocks`` blocks of BLOCK steps at a time. Steps are cut into
+    pieces at the times ``sampled`` (T,), in seconds, at which a state is sampled.
     """
 
     def __init__(
@@ -134,7 +138,9 @@ class Paths:
 
 
 def no_path(n: int) -> PathBlock:
-    """Return one piece without an end, for runs in which nothing senses increments."""
+    """Return a path of one piece without an end, (1, 1, n) states that are 0, for runs in which
+    nothing senses increments.
+    """
     rows = {name: np.zeros((1, 1, n)) for name in ("x_start", "x_stop")}
     return PathBlock(
         end=math.inf,
@@ -154,8 +160,9 @@ def no_path(n: int) -> PathBlock:
 
 @once_per_scenario
 def _sensor_fields(scenario: Scenario) -> tuple[dict[str, np.ndarray], list[tuple[int, int]]]:
-    """Return the fields of a Sensing that all runs share, and the keys of the streams of its
-    sensors.
+    """Return the fields of a Sensing that all runs share, for S increment sensors of at most p rows
+    (rows (S,), H (S, p, n), ...), and the keys of the streams of these sensors:
+    (node, number at the node).
     """
     placed = increments(scenario)
     # Many nodes may have the same sensor: its R is factored once.
@@ -187,7 +194,9 @@ def _sensor_fields(scenario: Scenario) -> tuple[dict[str, np.ndarray], list[tupl
 
 
 class Noise:
-    """The noise of all sensors in some runs, drawn in blocks of ``steps`` steps."""
+    """The noise of all S increment sensors in R runs, drawn in blocks of ``steps`` steps of the
+    sensing grid into ``sensing.noise``.
+    """
 
     def __init__(self, scenario: Scenario, streams: Streams | ReplicaStreams, steps: int) -> None:
         shared, keys = _sensor_fields(scenario)
@@ -208,7 +217,9 @@ class Noise:
         )
 
     def following(self) -> None:
-        """Draw the noise of the next block."""
+        """Draw the noise of the next block of steps of all R runs and S sensors into
+        ``sensing.noise`` (R S steps, 2, p).
+        """
         sensing = self.sensing
         # Streams of all runs and sensors, run by run.
         shape = len(sensing.cuts), sensing.steps, *sensing.noise.shape[1:]
@@ -226,8 +237,9 @@ def fill_noise(
     scales: FloatArray,
     out: FloatArray,
 ) -> None:
-    """Write normals with the standard deviations ``scales`` (2,) into ``out`` (K, C, 2, >= p): the
-    next numbers of stream k, which belongs to sensor k modulo S with ``rows`` (S,) p.
+    """Write normals with the standard deviations ``scales`` (2,) of the two moments into ``out``
+    (K, C, 2, >= p), for C steps: the next numbers of each stream k of the K = R S ``states`` (K, 4)
+    of R runs, which belongs to sensor k modulo S with ``rows`` (S,) p. Advances ``states``.
     """
     for k in range(len(out)):
         # Streams are numbered run by run, so the sensor is the remainder.

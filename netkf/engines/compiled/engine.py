@@ -86,7 +86,10 @@ class CompiledEngine(Engine):
     def run(
         self, scenario: Scenario, streams: Streams, recorder: Recorder, progress: Progress
     ) -> str:
-        """Simulate up to the horizon; returns complete or diverged."""
+        """Simulate a scenario up to the horizon with the random numbers of ``streams``, and pass
+        its events and samples to ``recorder``; ``progress`` is called with the simulated seconds
+        from time to time. Return "complete" or "diverged".
+        """
         with np.errstate(over="ignore", invalid="ignore"):  # growth to infinity is reported
             if scenario.slotted:
                 return run_slots(scenario, streams, recorder, progress)
@@ -104,7 +107,10 @@ class CompiledEngine(Engine):
     def run_many(
         self, scenario: Scenario, seed: int, replicas: range, fingerprint: bool = False
     ) -> Iterator[RunBatch]:
-        """Yield the runs of consecutive replicas in order."""
+        """Yield the runs of consecutive ``replicas`` in order, many in each RunBatch, with random
+        numbers from ``seed``. With ``fingerprint``, the first batch has that of the events of its
+        first run.
+        """
         alone = partial(super().run_many, scenario, seed)
         if not scenario.slotted:
             # Batches write no rows of events, which a fingerprint needs.

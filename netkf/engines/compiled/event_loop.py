@@ -86,8 +86,10 @@ def event_loop(
     history: History | None,
     combination: CombinationState | None,
 ) -> int:
-    """Simulate until the loop needs something from Python; return the request (WANT_...
-    or DONE).
+    """Simulate the run ``state`` until the loop needs something from Python; return the request
+    (WANT_... or DONE). ``totals``, ``history`` and ``combination`` hold the extra state that some
+    filters need (running sums, past events, see CombinationState), None for the others; all of
+    these are changed.
     """
     absorbs_at_once = totals is None and history is None
     while True:
@@ -124,15 +126,17 @@ def event_loop(
 
 @kernel
 def seek_piece(state: Simulation, now: float) -> None:
-    """Move on to the piece of the path in which the time of the next event lies."""
+    """Move ``state.piece`` on to the piece of the path in which ``now``, the time of the next event
+    in seconds, lies.
+    """
     while state.path.stop[state.piece] < now:
         state.piece += 1
 
 
 @kernel
 def find_shortage(state: Simulation, history: History | None, event: int, now: float) -> int:
-    """Return the request for what an event at ``now`` needs and lacks (WANT_..., DONE),
-    or GO_ON.
+    """Return the request for what an event (ON_...) at ``now`` (seconds) needs and lacks
+    (WANT_..., DONE), or GO_ON; nothing is changed.
     """
     # Space for the worst case of one event, so that no handler has to stop half-way.
     request = GO_ON
@@ -156,7 +160,9 @@ def find_shortage(state: Simulation, history: History | None, event: int, now: f
 
 @kernel
 def next_event(state: Simulation) -> tuple[int, float]:
-    """Return the next event (ON_...) and its time in seconds; ties go to the earlier kind."""
+    """Return the next event (ON_...) of the run ``state`` and its time in seconds, NEVER if none is
+    left; ties go to the earlier kind.
+    """
     # ``<`` keeps the earlier event of the list at equal times: the order of ranks.
     event, now = ON_REBASE, next_of(state.frames, state.frame_at)
     sense = next_of(state.path.grid, state.grid_at)
@@ -184,13 +190,13 @@ def next_event(state: Simulation) -> tuple[int, float]:
 
 @kernel
 def next_tick(state: Simulation) -> float:
-    """Return the time of the next tick of the run, or NEVER."""
+    """Return the time in seconds of the next tick of the run, or NEVER."""
     return float(state.ticks.t[state.tick_at]) if state.tick_at < state.ticks_stop else NEVER
 
 
 @kernel
 def next_of(times: FloatArray, k: int) -> float:
-    """Return ``times[k]``, or NEVER behind the last."""
+    """Return entry ``k`` of ``times`` (K,), in seconds, or NEVER if there are fewer."""
     return float(times[k]) if k < len(times) else NEVER
 
 
@@ -198,8 +204,9 @@ def next_of(times: FloatArray, k: int) -> float:
 def predict_participants(
     state: Simulation, combination: CombinationState | None, event: int, lost: bool, now: float
 ) -> None:
-    """Predict the nodes that take part in an event to ``now``; ``lost``: all messages of the tick
-    are lost.
+    """Predict all nodes that take part in an ``event`` (ON_...) to ``now`` (seconds), in
+    ``state.xhat``, ``root`` and ``now``. ``lost``: all messages of a tick are lost, so that its
+    nodes need no prediction unless they read increments.
     """
     for k in range(count_participants(state, event)):
         h = participant(state, event, k)
@@ -210,7 +217,9 @@ def predict_participants(
 
 @kernel
 def count_participants(state: Simulation, event: int) -> int:
-    """Return the number of nodes that are predicted to the time of an event before it happens."""
+    """Return the number of nodes that are predicted to the time of an ``event`` (ON_...) before it
+    happens: none, one, both ends of a link, or all.
+    """
     count = 1
     # Samples and moves of the origin concern the states of all nodes at one time.
     if event in (ON_REBASE, ON_PROBE):
@@ -226,7 +235,10 @@ def count_participants(state: Simulation, event: int) -> int:
 
 @kernel
 def participant(state: Simulation, event: int, k: int) -> int:
-    """Return the index of the k-th participant of an event."""
+    """Return the index in ``state.nodes`` of participant number ``k`` (from 0) of the next event,
+    which is of kind ``event`` (ON_...). For the first ON_ABSORB of an instant sorts
+    ``state.waiting``.
+    """
     if event == ON_TICK:
         entity = state.entities[state.ticks.entity[state.tick_at]]
         return int(entity.sender if k == 0 else entity.other)
@@ -245,7 +257,9 @@ def participant(state: Simulation, event: int, k: int) -> int:
 
 @kernel
 def max_readings(state: Simulation, event: int) -> int:
-    """Return the largest number of readings that an event uses."""
+    """Return the largest number of readings that the next event, of kind ``event`` (ON_...),
+    uses.
+    """
     if event == ON_SAMPLE:
         return 1
     count = 0
@@ -261,7 +275,11 @@ def max_readings(state: Simulation, event: int) -> int:
 def record_event(
     state: Simulation, t: float, kind: int, node: int, peer: int, message: int
 ) -> None:
-    """Record an event without an age, see ``record_event_with_age``."""
+    """Record an event of kind number ``kind`` (trace.schema.CODES) at ``t`` (seconds), whose age is
+    nan: append a row to ``state.rows``, or, if rows are not ``traced``, count it in
+    ``state.counts``. ``node`` and ``peer`` are ids of nodes, ``message`` a number on its link; -1:
+    none.
+    """
     record_event_with_age(state, t, kind, node, peer, message, np.nan)
 
 
@@ -269,7 +287,11 @@ def record_event(
 def record_event_with_age(
     state: Simulation, t: float, kind: int, node: int, peer: int, message: int, age: float
 ) -> None:
-    """Write one event as a row, or only count it if rows are not ``traced``."""
+    """Record an event of kind number ``kind`` (trace.schema.CODES) at ``t`` (seconds): append a row
+    to ``state.rows``, or, if rows are not ``traced``, count it in ``state.counts``. ``node`` and
+    ``peer`` are ids of nodes, ``message`` a number on its link (-1: none), ``age`` seconds since it
+    was sent.
+    """
     if not state.traced:
         state.counts[kind] += 1
         return
@@ -282,8 +304,9 @@ def record_event_with_age(
 
 @kernel
 def predict(state: Simulation, combination: CombinationState | None, h: int, time: float) -> None:
-    """Predict node ``h`` to ``time`` (seconds), using its increments, unless it is there
-    already.
+    """Predict node ``h`` (index in ``state.nodes``) from ``state.now[h]`` to ``time`` (seconds),
+    using its increments, unless it is there already. Changes ``state.xhat[h]``, ``root[h]`` and
+    ``now[h]``, and for some combinations the node's prior or evidence in ``combination``.
     """
     node, now = state.nodes[h], state.now[h]
     # ``not <`` also returns for a time that is nan.
@@ -307,7 +330,10 @@ def predict(state: Simulation, combination: CombinationState | None, h: int, tim
 
 @kernel
 def on_sense(state: Simulation, now: float) -> None:
-    """Record that a node has used its increments up to a point of the sensing grid."""
+    """Record that the next node with increment sensors has used its increments up to ``now``
+    (seconds), a point of the sensing grid; advances ``state.wake_at``, and after the last node
+    ``state.grid_at``.
+    """
     sensing = state.sensing
     record_event(state, now, SENSE, sensing.node[state.wake_at], -1, -1)
     state.wake_at += 1
@@ -325,7 +351,11 @@ def on_sample(
     combination: CombinationState | None,
     now: float,
 ) -> None:
-    """Update a node with all its samples of the next instant."""
+    """Update a node with all its samples of the next instant, ``now`` (seconds), and advance
+    ``state.instant_at``. Changes the row of ``state.xhat`` and ``state.root`` of that node, its
+    newest ``reading``, and what ``totals``, ``history`` or ``combination`` (None if unused) hold of
+    it.
+    """
     instants, instant = state.instants, state.instant_at
     h, last_node = instants.index[instant], -1
     for s in range(instants.first[instant], instants.first[instant + 1]):
@@ -353,8 +383,9 @@ def on_sample(
 def on_tick(
     state: Simulation, totals: Totals | None, combination: CombinationState | None, now: float
 ) -> None:
-    """Handle a tick of a clock, or a transmission after a sample: send on all its
-    directed links.
+    """Handle the next tick of a clock at ``now`` (seconds), or a transmission after a sample: send
+    one message on each directed link of its entity, and advance ``state.tick_at``. ``totals`` and
+    ``combination``, None if unused, have the contents of messages for some filters.
     """
     ticks, nodes, k = state.ticks, state.nodes, state.tick_at
     entity = state.entities[ticks.entity[k]]
@@ -385,7 +416,11 @@ def send(
     delay: float,
     now: float,
 ) -> None:
-    """Send one message on directed link ``w``; ``delay`` (seconds) is LOST or nan if it is lost."""
+    """Send one message on directed link ``w`` (index in ``state.directions``) at ``now`` (seconds):
+    record it, copy what it carries from its sender into a free message of ``state.pool``, and
+    deliver it at once or put it on the heap. ``delay`` (seconds) is LOST or nan if it is lost.
+    ``totals`` and ``combination``: None if unused.
+    """
     direction, pool = state.directions[w], state.pool
     number, h = direction.messages, direction.sender
     # A lost message has a number too: recorded losses refer to it.
@@ -428,7 +463,7 @@ def send(
 
 @kernel
 def is_lost(state: Simulation) -> bool:
-    """Return True if all messages of the next tick are lost."""
+    """Return True if all messages of the next tick (number ``state.tick_at``) are lost."""
     ticks = state.ticks
     entity = state.entities[ticks.entity[state.tick_at]]
     first = state.first_delay + ticks.first_outcome[state.tick_at]
@@ -440,7 +475,9 @@ def is_lost(state: Simulation) -> bool:
 
 @kernel
 def ends_instant(state: Simulation, now: float) -> bool:
-    """Return True if no tick or delivery at ``now`` is left, so that absorptions come next."""
+    """Return True if no tick or delivery at ``now`` (seconds) is left, so that absorptions come
+    next.
+    """
     arriving = state.in_flight > 0 and state.pool[state.heap[0]].arrival <= now
     return not arriving and next_tick(state) > now
 
@@ -453,7 +490,10 @@ def absorb_messages(
     combination: CombinationState | None,
     now: float,
 ) -> None:
-    """Let all receivers of this instant absorb their messages."""
+    """Let all nodes in ``state.waiting``, which have messages of this instant ``now`` (seconds),
+    absorb these: predict each node, update its estimate in ``state.xhat`` and ``root``, and empty
+    its inbox. ``totals``, ``history``, ``combination``: extra state of the filter, None if unused.
+    """
     sort_indices(state.waiting, state.receivers)
     while state.receivers > 0:
         predict(state, combination, state.waiting[state.absorbing], now)
@@ -462,7 +502,9 @@ def absorb_messages(
 
 @kernel
 def on_deliver(state: Simulation, now: float) -> None:
-    """Deliver the message that arrives next."""
+    """Take the message that arrives next, at ``now`` (seconds), from the heap and put it into the
+    inbox of its receiver, or drop it if it is too old.
+    """
     m = pop(state.pool, state.heap, state.in_flight)
     state.in_flight -= 1
     arrive(state, m, now)
@@ -470,7 +512,10 @@ def on_deliver(state: Simulation, now: float) -> None:
 
 @kernel
 def arrive(state: Simulation, m: int, now: float) -> None:
-    """Put message ``m`` into the inbox of its receiver, or drop it if it is too old."""
+    """Put message ``m`` (index in ``state.pool``), which arrives at ``now`` (seconds), into the
+    inbox of its receiver and list that in ``state.waiting``; or drop it if it is older than
+    ``state.age_limit``.
+    """
     message = state.pool[m]
     direction = state.directions[message.direction]
     sender_id, receiver_id = state.nodes[direction.sender].id, state.nodes[direction.receiver].id
@@ -497,7 +542,11 @@ def on_absorb(
     combination: CombinationState | None,
     now: float,
 ) -> None:
-    """Let the next node absorb all messages of this instant, in the order of senders."""
+    """Let the next node, ``state.waiting[state.absorbing]``, absorb all messages of this instant
+    ``now`` (seconds), in the order of senders. Changes its estimate in ``state.xhat`` and ``root``,
+    empties its inbox, and advances ``absorbing``. ``totals``, ``history``, ``combination``: extra
+    state of the filter, None if unused.
+    """
     pool, h = state.pool, state.waiting[state.absorbing]
     node, oldest = state.nodes[h], 0.0
     # The age of the oldest message goes into the trace.
@@ -528,7 +577,10 @@ def on_absorb(
 
 @kernel
 def use_messages(state: Simulation, history: History, h: int, now: float) -> None:
-    """Update node ``h`` with the readings in its inbox."""
+    """Update node ``h`` (index in ``state.nodes``) at ``now`` (seconds) with the readings in its
+    inbox, late ones at their own time. Changes ``state.xhat[h]``, ``root[h]`` and the node's
+    ``history``.
+    """
     m = state.nodes[h].inbox
     while m != -1:
         message = state.pool[m]
@@ -544,7 +596,9 @@ def use_messages(state: Simulation, history: History, h: int, now: float) -> Non
 def combine_with_state(
     state: Simulation, combination: CombinationState, h: int, now: float
 ) -> None:
-    """Combine node ``h`` with its inbox, for combinations that have a CombinationState."""
+    """Combine node ``h`` (index in ``state.nodes``) with its inbox at ``now`` (seconds), for the
+    combinations that need a CombinationState. Changes ``state.xhat[h]`` and ``root[h]``.
+    """
     if combination.kind == PREDICTIONS:
         use_readings_heard(state, h, now)
     received_weight = predict_payloads(state, h, now)
@@ -560,8 +614,9 @@ def combine_with_state(
 
 @kernel
 def predict_payloads(state: Simulation, h: int, now: float) -> float:
-    """Predict the estimates in the inbox of node ``h`` that were delayed to ``now``, without
-    readings; return the sum of the weights of all messages.
+    """Predict the estimates that messages in the inbox of node ``h`` carry from when they were sent
+    to ``now`` (seconds), without readings, in ``state.pool_x`` and ``pool_root``. Return the sum of
+    the weights of all these messages.
     """
     # The last model of the table has no sensors: prediction alone, as readings since then are
     # unknown here.
@@ -581,7 +636,10 @@ def predict_payloads(state: Simulation, h: int, now: float) -> float:
 
 @kernel
 def combine(state: Simulation, h: int, now: float) -> None:
-    """Combine node ``h`` with the estimates in its inbox, predicted to now."""
+    """Combine node ``h`` (index in ``state.nodes``) with the estimates in its inbox, predicted to
+    ``now`` (seconds), in the way of the filter's ``combination_kind``. Changes ``state.xhat[h]``
+    and ``root[h]``.
+    """
     received_weight = predict_payloads(state, h, now)
     if state.combination_kind == CONVEX:
         # The weights of messages that do not arrive go to the own one, so that weights sum to 1.
@@ -605,7 +663,8 @@ def combine(state: Simulation, h: int, now: float) -> None:
 @kernel
 def combine_convex(state: Simulation, h: int, own: float) -> None:
     """Combine node ``h`` with its inbox by H (7) and (9): x = w x + sum w_j x_j and P = w P + sum
-    w_j P_j, with the own weight w = ``own``.
+    w_j P_j, with the own weight w = ``own`` and the weight w_j of each directed link. Changes
+    ``state.xhat[h]`` and ``root[h]``, the root of P.
     """
     # w P first, then + w_j P_j for each message.
     xhat, root, pool, directions = state.xhat, state.root, state.pool, state.directions
@@ -619,8 +678,9 @@ def combine_convex(state: Simulation, h: int, own: float) -> None:
 
 @kernel
 def intersect(state: Simulation, h: int, own: float, total: float) -> None:
-    """Combine node ``h`` with its inbox by covariance intersection, D (8) and (9), with the own
-    weight ``own`` and the weights of messages divided by ``total``.
+    """Combine node ``h`` with its inbox by covariance intersection, D (8) and (9): P^-1 = w P^-1 +
+    sum w_j P_j^-1, with the own weight w = ``own`` and the weight w_j of each directed link divided
+    by ``total``. Changes ``state.xhat[h]`` and ``root[h]``, the root of P.
     """
     xhat, root, pool, directions = state.xhat, state.root, state.pool, state.directions
     scratch = state.update_scratch
@@ -637,7 +697,9 @@ def intersect(state: Simulation, h: int, own: float, total: float) -> None:
 
 @kernel
 def on_probe(state: Simulation, totals: Totals | None) -> bool:
-    """Store a sample of all nodes; return False if there is no space for another one."""
+    """Store a sample of all nodes in ``state.buffer``, and of the weights of running sums if
+    ``totals`` is not None; return False if there is no space for another one.
+    """
     store_sample(state, state.run, 0, state.samples)
     # Terms of the weight of the network: held by nodes, sent, and (to subtract) heard.
     if totals is not None:
@@ -652,8 +714,9 @@ def on_probe(state: Simulation, totals: Totals | None) -> bool:
 
 @kernel
 def store_sample(state: Simulation, run: int, first: int, k: int) -> None:
-    """Store estimates and covariances ``P = S S'`` of the nodes from place ``first`` on as sample
-    ``k`` of a run.
+    """Store the estimates and covariances ``P = S S'`` of the N nodes at the places ``first`` to
+    ``first`` + N - 1 of ``state.xhat`` and ``root`` as sample ``k`` of run number ``run``, in
+    ``buffer.xhat[run, k]`` (N, n) and ``buffer.P[run, k]`` (N, n, n).
     """
     xhat, P, root, n = state.buffer.xhat, state.buffer.P, state.root, len(state.size)
     for h in range(len(state.nodes)):
@@ -670,7 +733,10 @@ def store_sample(state: Simulation, run: int, first: int, k: int) -> None:
 
 @kernel
 def count_sample(state: Simulation) -> bool:
-    """Store counts and position of a sample; return False if there is no space for another one."""
+    """Count the sample just stored: write the numbers of events so far, the next row and the piece
+    of the path to ``state.buffer``, and advance ``probe_at`` and ``samples``. Return False if there
+    is no space for another one.
+    """
     # A run that diverges at this sample ends with these counts and rows.
     buffer, run, k = state.buffer, state.run, state.samples
     for kind in range(len(state.counts)):

@@ -66,7 +66,10 @@ class EvidenceArrays(Struct):
 
 
 def empty_evidence(state: Simulation, A: FloatArray, roots: FloatArray) -> EvidenceArrays:
-    """Return the evidence at time 0, priors only; ``roots`` (1, N, n, n, 1)."""
+    """Return the evidence of N nodes at time 0, priors only, from their roots of P, ``roots``
+    (1, N, n, n, 1), with space for the messages of ``state``. ``A`` (n, n) is the plant's matrix in
+    1/s.
+    """
     N, n = state.xhat.shape
     directions, p, shape = state.directions, len(state.scratch.y), (n, n + 1, 1)
     incoming = np.lexsort((directions["sender"], directions["receiver"]))
@@ -96,7 +99,9 @@ def empty_evidence(state: Simulation, A: FloatArray, roots: FloatArray) -> Evide
 
 
 def enlarge_evidence(evidence: EvidenceArrays, capacity: int) -> None:
-    """Enlarge the array of evidence in messages to ``capacity`` messages."""
+    """Replace ``evidence.carried`` by an array for ``capacity`` messages, (capacity, n, n + 1, 1),
+    which begins with the present ones.
+    """
     carried = np.zeros((capacity, *evidence.carried.shape[1:]))
     carried[: len(evidence.carried)] = evidence.carried
     evidence.carried = carried
@@ -104,7 +109,9 @@ def enlarge_evidence(evidence: EvidenceArrays, capacity: int) -> None:
 
 @kernel
 def predict_node_evidence(evidence: EvidenceArrays, h: int, gap: float) -> None:
-    """Predict all evidence of node ``h`` by ``gap`` seconds."""
+    """Predict all evidence of node ``h`` (index) by ``gap`` seconds without process noise, in
+    place: its ``prior``, ``own`` and ``received`` evidence.
+    """
     fill_inverse_transition(evidence.A, gap, evidence.maps)
     back, total, work = evidence.maps[0], evidence.total, evidence.work
     predict_part(ONE, evidence.prior[h], back, total, work)
@@ -115,8 +122,9 @@ def predict_node_evidence(evidence: EvidenceArrays, h: int, gap: float) -> None:
 
 @kernel
 def update_belief(state: Simulation, evidence: EvidenceArrays, h: int) -> None:
-    """Compute the belief of node ``h``, the sum of its prior and all evidence, and move the centre
-    of these to the new estimate.
+    """Compute the belief of node ``h`` (index), the sum of its prior and all evidence, and write
+    its estimate and root to ``state.xhat[h]`` and ``root[h]``. Moves the centre of the node's
+    ``prior``, ``own`` and ``received`` evidence to the new estimate.
     """
     total, work, centre = evidence.total, evidence.work, evidence.centre
     for i in range(state.xhat.shape[1]):
@@ -136,7 +144,9 @@ def update_belief(state: Simulation, evidence: EvidenceArrays, h: int) -> None:
 
 @kernel
 def add_samples(state: Simulation, evidence: EvidenceArrays, h: int, instant: int) -> None:
-    """Add the samples of an instant to the own evidence of node ``h``, and update its belief."""
+    """Add the samples of an ``instant`` (index in ``state.instants``) to ``evidence.own[h]`` of
+    node ``h``, and update its belief in ``state.xhat[h]`` and ``root[h]``.
+    """
     instants, n = state.instants, state.xhat.shape[1]
     for i in range(n):
         evidence.centre[h, i, 0] = state.xhat[h, i]
@@ -163,8 +173,9 @@ def add_samples(state: Simulation, evidence: EvidenceArrays, h: int, instant: in
 
 @kernel
 def send_evidence(state: Simulation, evidence: EvidenceArrays, m: int, h: int) -> None:
-    """Write the sum of the evidence of node ``h``, without that of the receiver, into message
-    ``m``.
+    """Write the sum of the evidence of node ``h``, without what the receiver sent, to
+    ``evidence.carried[m]`` of message ``m`` (index in the pool), and the node's estimate, to which
+    it is relative, to ``state.pool_x[m]``.
     """
     receiver = state.directions[state.pool[m].direction].receiver
     copy_state(state.size, state.pool_x, state.pool_root, m, state.xhat, state.root, h)
@@ -177,9 +188,10 @@ def send_evidence(state: Simulation, evidence: EvidenceArrays, m: int, h: int) -
 
 @kernel
 def absorb_evidence(state: Simulation, evidence: EvidenceArrays, h: int, now: float) -> None:
-    """Replace the evidence of each sender in the inbox of node ``h``, unless the present one was
-    sent later; then update the belief. The estimates in the messages, the centres of their
-    evidence, are predicted to ``now`` already.
+    """Replace ``evidence.received`` of each sender in the inbox of node ``h`` by what its message
+    carries, unless the present one was sent later; then update the belief in ``state.xhat[h]`` and
+    ``root[h]``. The estimates in the messages, the centres of their evidence, are predicted to
+    ``now`` (seconds) already.
     """
     m, maps = state.nodes[h].inbox, evidence.maps
     while m != -1:

@@ -112,7 +112,7 @@ class Draws(Protocol):
 
     def path(self, together: int = 1) -> PathBlock:
         """Return the next steps of the path for ``together`` runs; fill in the noise of these steps
-        in ``sensing``, and the samples taken during them in ``instants``.
+        in ``sensing``, and the values of the samples taken during them in ``instants``.
         """
 
 
@@ -143,11 +143,15 @@ class Source:
             samples.read(states.truth.states(sampled)[0], sampled, -math.inf, math.inf)
 
     def window(self) -> Window:
-        """Return the next window: some ticks of each entity."""
+        """Return the next window: some ticks of each entity with a clock."""
         return self._windows.following()
 
     def path(self, together: int = 1) -> PathBlock:
-        """Return the next block of steps."""
+        """Return the next block of steps of the path, or a single piece without an end if nothing
+        senses increments. Draws the noise of these steps into ``sensing``, and reads the samples
+        taken during them into ``instants``. ``together`` is the number of runs whose cache the
+        block has space for.
+        """
         if not self._grid:
             return no_path(self._n)
         # Noise and path advance together, a block of steps at a time.
@@ -203,7 +207,9 @@ class Workspace:
         return self._start
 
     def visits(self, together: int = 1) -> Visits:
-        """Return an empty queue of visits for ``together`` runs."""
+        """Return an empty queue of visits with space for all nodes of ``together`` runs, reused
+        from earlier runs if it is large enough.
+        """
         capacity = together * len(self._start.nodes)
         if self._visits is None or len(self._visits.level) < capacity:
             series, weights = series_of_lanes(self._scenario), self._records[1]["weight"]
@@ -264,7 +270,9 @@ class Workspace:
         return state
 
     def _scalar_fields(self, instants: Instants) -> dict[str, Any]:
-        """Return the scalar fields of a Simulation by name."""
+        """Return by name those scalar fields of a Simulation that are not 0 at the start, for a run
+        with the samples ``instants``.
+        """
         algorithm: Any = self._scenario.node_filter
         max_messages = int(np.diff(self._senders.first).max(initial=0))
         return {
@@ -284,7 +292,9 @@ class Workspace:
 
 
 def ticks_of(window: Window) -> TickArrays:
-    """Return the ticks of a window as arrays for kernels."""
+    """Return the K ticks of a window as a struct for kernels, with arrival bits 0 if it has
+    none.
+    """
     bits = window.arrival_bits
     if bits is None:
         bits = np.zeros(len(window.t), dtype=np.int64)
@@ -294,8 +304,9 @@ def ticks_of(window: Window) -> TickArrays:
 def empty_samples(
     shape: tuple[int, int, int, int], terms: int = 0, make: Callable[..., Any] = np.zeros
 ) -> SampleBuffer:
-    """Return arrays for samples of ``shape`` (R, B, N, n), with ``terms`` terms of conserved sums;
-    ``make`` (np.zeros or np.empty) creates those of estimates and covariances.
+    """Return space for B samples of N filters in R runs of n states, ``shape`` being (R, B, N, n),
+    and for ``terms`` terms of conserved sums; ``make`` (np.zeros or np.empty) creates the arrays of
+    estimates and covariances.
     """
     runs, count, _, n = shape
     return SampleBuffer(
@@ -328,7 +339,9 @@ class FlowRun:
         self._combination = combination_state_of(scenario, self._state)
 
     def to_the_end(self) -> str:
-        """Simulate up to the horizon; returns complete or diverged."""
+        """Simulate up to the horizon, or until an estimate is no longer finite, and record events
+        and samples; return "complete" or "diverged".
+        """
         try:
             # Any value but DONE.
             request = WANT_ROWS
@@ -349,7 +362,9 @@ class FlowRun:
         return "complete"
 
     def _advance(self) -> int:
-        """Run the kernel that fits the filter until it needs something; return its request."""
+        """Run the kernel that fits the filter until it needs something from Python; return its
+        request (WANT_... or DONE).
+        """
         if self._visits is not None:
             return advance_alone(self._state, self._visits)
         if self._scenario.node_filter.combination not in SPECIAL:
@@ -357,7 +372,9 @@ class FlowRun:
         return int(event_loop(self._state, self._totals, self._history, self._combination))
 
     def _fulfil(self, request: int) -> None:
-        """Fulfil a request of the event loop: ticks, steps of the path, or space."""
+        """Fulfil a ``request`` (WANT_...) of the event loop: put the next ticks, the next steps of
+        the path or larger arrays into the state of the run, or move the origin.
+        """
         state = self._state
         if request == WANT_TICKS:
             window = self._draws.window()
@@ -378,7 +395,9 @@ class FlowRun:
             self._rebase()
 
     def _rebase(self) -> None:
-        """Make the present state the new origin of all states, estimates and messages."""
+        """Make the present state of the plant the new origin of all states, estimates and messages,
+        and advance ``frame_at``.
+        """
         state, k = self._state, self._state.frame_at
         offset = -self._draws.states.offset(k, state.path, state.piece)
         # The history of each node gets one entry: the beginning of the frame.
@@ -407,8 +426,9 @@ class FlowRun:
             self._state.rows = np.empty(length, dtype=EVENT)
 
     def _record_rows(self, count: int, counts: np.ndarray) -> None:
-        """Record the first ``count`` rows of events, or, in a run without rows,
-        ``counts`` by kind.
+        """Pass the first ``count`` event rows on to the recorder, which keeps their array, and
+        empty the buffer; in a run without rows pass on ``counts`` (kinds,), the number of events by
+        kind.
         """
         state, recorder = self._state, self._recorder
         if not state.traced:
@@ -423,7 +443,9 @@ class FlowRun:
         state.rows = np.empty(len(rows), dtype=EVENT)
 
     def _record_samples(self) -> bool:
-        """Record the samples in the buffer; return False if one of them is not finite."""
+        """Pass the samples in the buffer on to the recorder and empty the buffer; return False if
+        one of them is not finite.
+        """
         state, buffer = self._state, self._state.buffer
         count, state.samples = state.samples, 0
         if not count:
@@ -453,8 +475,11 @@ class FlowRun:
 
 
 def _sums(terms: FloatArray, receivers: np.ndarray) -> dict[str, tuple[float, float]]:
-    """Return the total weight of running sums at the start and now: the weights that nodes hold,
-    plus the totals sent, minus the totals heard.
+    """Return the total weight of running sums at the start and now, as {"weight": (start, now)}:
+    the weights that nodes hold, plus the totals sent, minus the totals heard.
+
+    ``terms`` (2 N + W,) are these for N nodes, N nodes and W directed links; ``receivers`` (N,) is
+    the number of nodes that hear each node.
     """
     count = len(receivers)
     # A total counts once for each receiver of its node.

@@ -20,8 +20,11 @@ from netkf.rng.numbers import NormalZiggurat, normal_of
 def read_increments(
     state: Simulation, run: int, h: int, piece: int, now: float, end: float, out: FloatArray
 ) -> None:
-    """Write the moments (2 p,) of the increments that node ``h`` reads over [now, end], inside the
-    step of ``piece``, from the moments of x in ``scratch.state_moments``.
+    """Write the two moments (2 p,) of the increments that node ``h`` (index) of run number ``run``
+    reads over [now, end] (seconds) into ``out``, first moments of all p rows before the second
+    ones. The interval lies in the step of ``piece`` (index of a piece of the path);
+    ``scratch.state_moments`` has the moments of x over it. Noise that is used is taken away from
+    ``sensing.noise``.
     """
     sensing, early = state.sensing, state.scratch.early
     x, H, root, row = state.scratch.state_moments, sensing.H, sensing.root, 0
@@ -40,13 +43,17 @@ def read_increments(
 
 @kernel(inlined=True)
 def noise_index(sensing: Sensing, run: int, s: int, step: int) -> int:
-    """Return the index in ``sensing.noise`` of sensor ``s`` in a step of a run."""
+    """Return the index in ``sensing.noise`` of the noise of sensor ``s`` (0 to S - 1) in step
+    number ``step`` of the present block, in run number ``run``.
+    """
     return (run * len(sensing.rows) + s) * sensing.steps + step
 
 
 @kernel
 def draw_cut(sensing: Sensing, run: int, s: int, normals: FloatArray) -> None:
-    """Draw the standard normals (2, p) that divide the noise of sensor ``s`` within a step."""
+    """Draw standard ``normals`` (2, p) that divide the two noise moments of sensor ``s`` (0 to S -
+    1) of run number ``run`` within a step; advances that sensor's stream in ``sensing.cuts``.
+    """
     ziggurat = NormalZiggurat(sensing.height, sensing.width, sensing.inside)
     states, stream = sensing.cuts, run * len(sensing.rows) + s
     high, low = states[stream, 0], states[stream, 1]
@@ -58,8 +65,9 @@ def draw_cut(sensing: Sensing, run: int, s: int, normals: FloatArray) -> None:
 
 @kernel(inlined=True)
 def find_course(state: Simulation, run: int, piece: int) -> int:
-    """Return the index of the polynomial of x in a piece, among those of its run; computed once for
-    all nodes that read in the piece.
+    """Return the index c of the polynomial of x in a ``piece`` of the path (index), which is
+    ``path.course[run - state.first_run, c]`` (D, W). It is computed once for all nodes that read in
+    the piece, and cached in ``path.course`` and ``path.known``.
     """
     path, k = state.path, run - state.first_run
     place: int = piece & (path.known.shape[1] - 1)
@@ -74,7 +82,10 @@ def find_course(state: Simulation, run: int, piece: int) -> int:
 
 @kernel
 def fill_moments_of_piece(state: Simulation, run: int, piece: int, now: float, end: float) -> None:
-    """Write the moments of x over [now, end], inside one piece, into ``scratch.state_moments``."""
+    """Write the two moments (2, n) of x over [now, end] (seconds), inside one ``piece`` of the path
+    (index) of run number ``run``, into ``scratch.state_moments``: the integrals of x and of x times
+    the Legendre polynomial P_1 of the interval.
+    """
     path, scratch = state.path, state.scratch
     start, stop = path.start[piece], path.stop[piece]
     # A whole piece has its moments already, drawn from their exact law.
@@ -88,7 +99,9 @@ def fill_moments_of_piece(state: Simulation, run: int, piece: int, now: float, e
 
 @kernel(inlined=True)
 def piece_of(path: PathBlock, piece: int, end: float) -> int:
-    """Return the piece of the path that contains ``end``, searched backwards from ``piece``."""
+    """Return the index of the piece of the path that contains ``end`` (seconds), searched backwards
+    from the index ``piece``.
+    """
     # Back from the present piece: a node may be behind it.
     while piece > 0 and path.stop[piece - 1] >= end:
         piece -= 1
@@ -97,8 +110,10 @@ def piece_of(path: PathBlock, piece: int, end: float) -> int:
 
 @kernel
 def fill_moments(state: Simulation, run: int, piece: int, now: float, end: float) -> None:
-    """Write the moments of x over [now, end], inside one step that samples of other nodes may cut,
-    into ``scratch.state_moments``; ``end`` is not after ``piece``.
+    """Write the two moments (2, n) of x over [now, end] (seconds) in run number ``run`` into
+    ``scratch.state_moments``: the integrals of x and of x times the Legendre polynomial P_1. The
+    interval lies inside one step, which samples of other nodes may cut into pieces; ``end`` is not
+    after ``piece`` (index of a piece of the path).
     """
     path = state.path
     k = piece_of(path, piece, end)
@@ -129,8 +144,9 @@ def fill_moments(state: Simulation, run: int, piece: int, now: float, end: float
 def fill_readings(
     state: Simulation, run: int, h: int, piece: int, now: float, end: float, out: FloatArray
 ) -> None:
-    """Write the moments of the readings of node ``h`` over [now, end] into ``out`` (2 p,); ``end``
-    is not after ``piece``, and in its step.
+    """Write the two moments of the readings of node ``h`` (index) of run number ``run`` over [now,
+    end] (seconds) into ``out`` (2 p,), first moments of all p rows before the second ones; ``end``
+    is not after ``piece`` (index of a piece of the path), and in its step.
     """
     fill_moments(state, run, piece, now, end)
     read_increments(state, run, h, piece, now, end, out)
@@ -138,9 +154,9 @@ def fill_readings(
 
 @kernel(inlined=True)
 def next_interval(rate: float, now: float, time: float, least: float) -> tuple[float, float]:
-    """Return until when readings are used at once, at most ``time``, given the ``rate`` of
-    information trace(P G) in 1/s; and the least length of the following interval (``least`` of the
-    call before, first 0).
+    """Return until when (seconds) readings are used at once, from ``now`` to at most ``time``,
+    given the ``rate`` of information trace(P G) in 1/s; and the least length in seconds of the
+    following interval (``least`` of the call before, first 0).
     """
     end, interval = time, usable(rate)
     if interval < time - now:
@@ -157,8 +173,10 @@ def next_interval(rate: float, now: float, time: float, least: float) -> tuple[f
 def advance_over_interval(
     state: Simulation, run: int, h: int, k: int, piece: int, now: float, end: float
 ) -> None:
-    """Predict node ``h`` of a run, at index ``k`` of the states, from ``now`` to ``end``, and use
-    all increments between them in one update.
+    """Predict node ``h`` (index in ``state.nodes``) of run number ``run`` from ``now`` to ``end``
+    (seconds) and use all increments between them in one update. Changes row ``k`` of ``state.xhat``
+    and ``state.root``; ``piece`` is the index of a piece of the path in the step that ``end`` lies
+    in.
     """
     table, m, scratch, gap = state.table, state.nodes[h].model, state.scratch, end - now
     xhat, root, readings = state.xhat, state.root, scratch.moments[: state.gains.moments[m]]
@@ -174,7 +192,10 @@ def advance_over_interval(
 def predict_with_increments(
     state: Simulation, run: int, h: int, k: int, piece: int, now: float, time: float
 ) -> None:
-    """Predict node ``h`` up to ``time`` with its increments, in as many intervals as P asks for."""
+    """Predict node ``h`` (index in ``state.nodes``) of run number ``run`` from ``now`` to ``time``
+    (seconds) with its increments, in as many intervals as P asks for. Changes row ``k`` of
+    ``state.xhat`` and ``state.root``; ``time`` lies in the ``piece`` of the path (index).
+    """
     seen, least = state.table.whitened_H[state.nodes[h].model], 0.0
     while now < time:
         # How much of the gap may be used at once depends on the rate of information, trace(P G).

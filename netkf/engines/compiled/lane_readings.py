@@ -69,7 +69,9 @@ class LaneReadings(Struct):
 
 
 def empty_readings(filters: Filters) -> LaneReadings:
-    """Return arrays for the readings of such filters."""
+    """Return arrays for the readings of L nodes, with space for the largest number of moments of
+    any of these filters.
+    """
     n, q = filters.xhat.shape[1], int(filters.gains.moments.max())
     p, width = q // 2, 2 * course_width(n)
     names = ("rate", "trace", "gap", "remaining", "first", "share")
@@ -97,7 +99,9 @@ def empty_readings(filters: Filters) -> LaneReadings:
 
 @kernel
 def load_model(readings: LaneReadings, q: int, m: int, whitened_H: FloatArray) -> None:
-    """Copy R^-1/2 H of model ``m`` into lane q, unless the lane has it."""
+    """Copy R^-1/2 H of model number ``m`` from ``whitened_H`` (M, q, n) into lane ``q`` of
+    ``readings.whitened_H``, unless the lane has it.
+    """
     if readings.model[q] == m:
         return
     readings.model[q] = m
@@ -108,7 +112,9 @@ def load_model(readings: LaneReadings, q: int, m: int, whitened_H: FloatArray) -
 
 @kernel
 def load_sensor(readings: LaneReadings, q: int, sensing: Sensing, s: int) -> None:
-    """Copy H and the root of R of sensor ``s`` into lane q, unless the lane has them."""
+    """Copy H and the root of R of sensor ``s`` (0 to S - 1) into lane ``q`` of ``readings.H`` and
+    ``readings.root``, unless the lane has them.
+    """
     if readings.kind[q] == sensing.kind[s]:
         return
     readings.kind[q] = sensing.kind[s]
@@ -132,8 +138,9 @@ def read_alone(
     end: float,
     q: int,
 ) -> None:
-    """Write the moments of the readings of node ``h`` over [now, end] into lane q, by the scalar
-    kernels.
+    """Write the moments of the readings of node ``h`` (index) of run number ``run`` over [now, end]
+    (seconds) into lane ``q`` of ``readings.moments``, by the scalar kernels; ``piece`` is the index
+    of a piece of the path in the step that ``end`` lies in.
     """
     count = state.gains.moments[state.nodes[h].model]
     found, moments = state.scratch.moments[:count], readings.moments
@@ -156,8 +163,10 @@ def begin_reading(
     end: float,
     q: int,
 ) -> None:
-    """Prepare the reading of node ``h``, which has one sensor, over [now, end] in lane q: draw its
-    normals and integrate the path.
+    """Prepare the reading of node ``h`` (index) of run number ``run``, which has one sensor, over
+    [now, end] (seconds) in lane ``q``: draw its normals and integrate the path. ``piece`` is the
+    index of a piece of the path in the step that ``end`` lies in. ``end_readings`` computes the
+    readings of all lanes from what is written to ``readings``.
     """
     path, sensing, s = state.path, state.sensing, state.nodes[h].sensor
     load_sensor(readings, q, sensing, s)
@@ -183,8 +192,8 @@ def begin_reading(
 
 @kernel
 def set_moments(readings: LaneReadings, q: int, moments: FloatArray) -> None:
-    """Set the moments (2, n) of x in lane q, of a whole piece or of several: as integrals over a
-    piece that would have them.
+    """Set the two ``moments`` (2, n) of x over the reading of lane ``q``, a whole piece or several,
+    in ``readings.rows``, ``first`` and ``share``: as integrals over a piece that would have them.
     """
     rows, n = readings.rows, moments.shape[1]
     half = rows.shape[1] // 2
@@ -197,7 +206,9 @@ def set_moments(readings: LaneReadings, q: int, moments: FloatArray) -> None:
 
 @kernel
 def end_readings(state: Simulation, readings: LaneReadings) -> None:
-    """Write the moments of the readings of all lanes."""
+    """Write the moments of the readings of all L lanes, which ``begin_reading`` has prepared, into
+    ``readings.moments`` (q, L), and take the noise that they use away from ``state.sensing.noise``.
+    """
     r, size, p = readings, state.size, readings.noise.shape[1]
     for j in range(0, r.rows.shape[1], LANES):
         turn(MANY, r.rows, j, r.integrals)

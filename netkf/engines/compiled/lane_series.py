@@ -35,7 +35,7 @@ NEAR = 2
 
 
 class LaneSeries(Struct):
-    """Power series of E values for M models.
+    """Power series of E values for M models, in W columns of distinct values.
 
     series : (M, cells, terms, W) coefficients of W columns, around 0 in cell 0 and around the
              middles of the other cells
@@ -54,19 +54,21 @@ class LaneSeries(Struct):
 
 @once_per_scenario
 def series_of_lanes(scenario: Scenario) -> tuple[LaneSeries, LaneSeries]:
-    """Return the series for nodes without sensors and for nodes that read increments."""
+    """Return the series for nodes without increment sensors and that for nodes that read
+    increments.
+    """
     filters = filters_at_start(scenario)
     period = float(scenario.diffusion.sensing_period or 0.0)
     return unobserved_series(filters), sensing_series(filters, period)
 
 
 def max_moments(filters: Filters) -> int:
-    """Return the largest number of moments that a node reads."""
+    """Return the largest number of moments that a node reads over an interval, two for each row."""
     return int(filters.gains.moments.max())
 
 
 def unobserved_series(filters: Filters) -> LaneSeries:
-    """Return the series of Q_g and exp(A g), for nodes without sensors."""
+    """Return the series of Q_g and exp(A g) in the gap, of all models without sensors."""
     n, table = filters.xhat.shape[1], filters.table
     selected = table.sizes[:, 1] == 0
     width = n * (n + 1) // 2 + n * n
@@ -75,7 +77,7 @@ def unobserved_series(filters: Filters) -> LaneSeries:
 
 def sensing_series(filters: Filters, period: float) -> LaneSeries:
     """Return the series of Q_g, exp(A g), F and G_g with the gains U, W and C, for gaps up to
-    ``period`` seconds.
+    ``period`` seconds, of all models with increment sensors.
     """
     n, table = filters.xhat.shape[1], filters.table
     width, selected = n * (n + 1) + 2 * n * n, table.sizes[:, 1] > 0
@@ -96,7 +98,9 @@ def sensing_series(filters: Filters, period: float) -> LaneSeries:
 
 
 def expand_around(series: FloatArray, middle: float) -> FloatArray:
-    """Return the power series (terms, ...) around 0 expanded around ``middle``."""
+    """Return the coefficients (terms, ...) around ``middle`` of the power series with the
+    coefficients ``series`` (terms, ...) around 0.
+    """
     terms = len(series)
     powers = np.longdouble(middle) ** np.arange(terms)
     # Coefficient k of the shifted series: sum over j >= k of binomial(j, k) middle^(j - k) c_j.
@@ -160,7 +164,9 @@ def _united(series: FloatArray, unit: FloatArray, selected: np.ndarray) -> LaneS
 
 
 def divide_cells(series: FloatArray, unit: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the series (M, cells, terms, E) of shorter cells, and the length (M,) of these."""
+    """Return the series (M, cells, terms, E) of M models in shorter cells, and the length (M,) of
+    these in seconds; ``unit`` (M,) is the length of the present cells of ``series``.
+    """
     models, cells, terms, entries = series.shape
     parts = PARTS
     while parts > 1 and cells * parts * MANY_TERMS[-1] * entries * series.itemsize > CELL_BYTES:
@@ -179,8 +185,9 @@ def divide_cells(series: FloatArray, unit: FloatArray) -> tuple[FloatArray, Floa
 
 
 def terms_needed(series: FloatArray, unit: FloatArray) -> IntArray:
-    """Return the number of terms that each cell needs (cells,): what follows is below rounding at
-    the ends of the cell, for all entries of all models.
+    """Return the number of terms (cells,) that each cell needs of ``series`` (M, cells, terms, E),
+    whose cells are ``unit`` (M,) seconds long: what follows is below rounding at the ends of the
+    cell, for all E entries of all M models.
     """
     # From its middle a cell reaches half a unit, but the first one reaches a whole unit.
     spans = np.repeat(0.5 * unit[:, None], series.shape[1], axis=1)
@@ -193,8 +200,8 @@ def terms_needed(series: FloatArray, unit: FloatArray) -> IntArray:
 
 
 def number_of_terms(needed: IntArray, max_terms: int) -> int:
-    """Return the number of terms to evaluate in cells that need ``needed``, at most ``max_terms``:
-    the next number for which ``series.fill_row`` is unrolled, if there is one.
+    """Return the number of terms to evaluate in all cells, which need ``needed`` (cells,), at most
+    ``max_terms``: the next number for which ``series.fill_row`` is unrolled, if there is one.
     """
     min_terms = int(needed.max(initial=0))
     return next((terms for terms in MANY_TERMS if terms >= min_terms), max_terms)

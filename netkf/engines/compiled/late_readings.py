@@ -43,7 +43,9 @@ class History(Struct):
 
 
 def empty_history(state: Simulation, lag: float, capacity: int) -> History:
-    """Return a history of all nodes at time 0, with ``capacity`` free entries."""
+    """Return a history of all N nodes at time 0, with ``capacity`` free entries, that remembers
+    events for ``lag`` seconds.
+    """
     count, n = state.xhat.shape
     capacity = count + capacity
     # The first entries are the states of all nodes at time 0, and the others are free.
@@ -61,7 +63,9 @@ def empty_history(state: Simulation, lag: float, capacity: int) -> History:
 
 
 def add_past(history: History, at_least: int) -> None:
-    """Enlarge a history: double it, or add ``at_least`` entries if these are more."""
+    """Enlarge the pool of a history in place: double it, or add ``at_least`` entries if these are
+    more.
+    """
     capacity = len(history.past)
     added = max(capacity, at_least)
     # Chain the new entries, and the former free list behind them.
@@ -78,8 +82,9 @@ def add_past(history: History, at_least: int) -> None:
 def use_instant(
     state: Simulation, instant: int, root: FloatArray, x: FloatArray, k: int, scale: float
 ) -> None:
-    """Update entry ``k`` of ``root`` and ``x`` with all samples of an instant in one update,
-    stacked in the order of sensors, with noise ``scale``^2 R.
+    """Update entry ``k`` of the estimates ``x`` (K, n) and of the roots of P ``root`` (K, n, n)
+    with all samples of an ``instant`` (index in ``state.instants``) in one update, stacked in the
+    order of sensors, with noise ``scale``^2 R.
     """
     instants, scratch, n, row = state.instants, state.scratch, x.shape[1], 0
     # All sensors of the instant in one reading: R is block diagonal, and so is its root.
@@ -111,7 +116,9 @@ def copy_state(
     from_root: FloatArray,
     m: int,
 ) -> None:
-    """Copy entry ``m`` of (from_x, from_root) to entry ``k`` of (x, root)."""
+    """Copy entry ``m`` of ``from_x`` (M, n) and ``from_root`` (M, n, n), lower triangular, to entry
+    ``k`` of ``x`` (K, n) and ``root`` (K, n, n).
+    """
     for i in range(len(size)):
         x[k, i] = from_x[m, i]
         # Only the lower triangle of a root is ever read.
@@ -121,8 +128,9 @@ def copy_state(
 
 @kernel
 def allocate_past(history: History, time: float, instant: int, frame: int) -> int:
-    """Allocate an entry for an event at ``time``: a reading (``instant``) or a frame; return its
-    index.
+    """Take a free entry of ``history`` for an event at ``time`` (seconds): the reading of
+    ``instant`` (index in Instants), or the beginning of the frame number ``frame``; the other one
+    is -1. Return the index of the entry; its state is not set yet.
     """
     k = history.free[0]
     entry = history.past[k]
@@ -136,8 +144,9 @@ def allocate_past(history: History, time: float, instant: int, frame: int) -> in
 def remember(
     state: Simulation, history: History, h: int, time: float, instant: int, frame: int
 ) -> None:
-    """Store the state of node ``h`` after an event at ``time``: a reading (``instant``), or the
-    beginning of a ``frame``; -1 for the other one.
+    """Add the present state of node ``h`` to ``history``, as that after an event at ``time``
+    (seconds): the reading of ``instant`` (index in Instants), or the beginning of frame number
+    ``frame``; -1 for the other one.
     """
     k = allocate_past(history, time, instant, frame)
     # The events of a node are a linked list, the newest first.
@@ -148,8 +157,8 @@ def remember(
 
 @kernel
 def forget(history: History, h: int, since: float) -> None:
-    """Free the events of node ``h`` that no late reading can reach: those from ``since`` on stay,
-    and one before it.
+    """Free the events in ``history`` of node ``h`` that no late reading can reach: those from
+    ``since`` (seconds) on stay, and one before it.
     """
     past = history.past
     k = history.newest[h]
@@ -170,7 +179,9 @@ def forget(history: History, h: int, since: float) -> None:
 
 @kernel
 def use_reading(state: Simulation, history: History, h: int, instant: int) -> None:
-    """Update node ``h`` with a reading of the present instant, and remember it."""
+    """Update node ``h`` with the reading of ``instant`` (index in ``state.instants``), which is the
+    present one, and remember it in ``history``. Changes ``state.xhat[h]`` and ``root[h]``.
+    """
     use_instant(state, instant, state.root, state.xhat, h, 1.0)
     lag, time = history.lag, state.instants.t[instant]
     # Without delays nothing need be remembered.
@@ -184,8 +195,10 @@ def use_reading(state: Simulation, history: History, h: int, instant: int) -> No
 
 @kernel
 def use_late_reading(state: Simulation, history: History, h: int, instant: int, now: float) -> None:
-    """Update node ``h`` with a reading that arrives late, at ``now``: go back to the event before
-    its time, use it, and repeat all later events.
+    """Update node ``h`` with the reading of ``instant`` (index in ``state.instants``) that arrives
+    late, at ``now`` (seconds): go back to the event before its time in ``history``, use it, and
+    repeat all later events. Changes ``state.xhat[h]`` and ``root[h]``, and all later states in
+    ``history``.
     """
     past, x, root, model = history.past, history.x, history.root, state.nodes[h].model
     time = state.instants.t[instant]

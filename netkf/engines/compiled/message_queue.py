@@ -10,7 +10,9 @@ from netkf.linalg.compiling import kernel
 
 @kernel
 def arrives_first(pool: np.ndarray, a: int, b: int) -> bool:
-    """Return True if message ``a`` arrives before ``b``: by time, directed link, order sent."""
+    """Return True if message ``a`` arrives before message ``b`` (indices in ``pool`` (C,) of
+    MESSAGE records): by time, then by directed link, then by order sent.
+    """
     # Ties must not depend on the order of insertion: the order is that of the SimPy engine.
     first, second = pool[a], pool[b]
     if first.arrival != second.arrival:
@@ -22,7 +24,9 @@ def arrives_first(pool: np.ndarray, a: int, b: int) -> bool:
 
 @kernel
 def push(pool: np.ndarray, heap: np.ndarray, size: int, message: int) -> None:
-    """Insert a message into the heap, which holds ``size`` messages ordered by arrival."""
+    """Insert ``message`` (index in ``pool`` (C,)) in place into the binary ``heap`` (C,) of
+    indices, which holds ``size`` messages ordered by arrival; the caller counts them.
+    """
     # A binary heap of indices in the pool: sift up. heapq would need Python objects.
     k = size
     while k > 0 and arrives_first(pool, message, heap[(k - 1) // 2]):
@@ -33,8 +37,8 @@ def push(pool: np.ndarray, heap: np.ndarray, size: int, message: int) -> None:
 
 @kernel
 def pop(pool: np.ndarray, heap: np.ndarray, size: int) -> int:
-    """Remove and return the message that arrives next from the heap, which holds
-    ``size`` messages.
+    """Remove and return the message (index in ``pool`` (C,)) that arrives next from the binary
+    ``heap`` (C,) of indices, which holds ``size`` messages; the caller counts them.
     """
     # Sift the last entry down from the top.
     top, last, k = heap[0], heap[size - 1], 0
@@ -52,7 +56,9 @@ def pop(pool: np.ndarray, heap: np.ndarray, size: int) -> int:
 
 @kernel
 def take(state: Simulation) -> int:
-    """Remove a free message from the pool and return its index."""
+    """Remove a free message from ``state.pool`` and return its index; counts it in
+    ``free_count``.
+    """
     # The free messages are a linked list: a stack, so that recently used memory comes first.
     message = state.first_free
     state.first_free = state.pool[message].next
@@ -62,7 +68,7 @@ def take(state: Simulation) -> int:
 
 @kernel
 def release(state: Simulation, message: int) -> None:
-    """Return a message to the free ones of the pool."""
+    """Return ``message`` (index in ``state.pool``) to the free ones."""
     state.pool[message].next = state.first_free
     state.first_free = message
     state.free_count += 1
@@ -70,9 +76,10 @@ def release(state: Simulation, message: int) -> None:
 
 @kernel
 def put(state: Simulation, h: int, message: int) -> None:
-    """Insert a message into the inbox of node ``h``, which is sorted by sender. Of several messages
-    of one sender the newest replaces the others; readings (READINGS) all stay, in the order of
-    arrival.
+    """Insert ``message`` (index in ``state.pool``) into the inbox of node ``h`` (index in
+    ``state.nodes``), a linked list sorted by sender. Of several messages of one sender the newest
+    replaces the others; readings (READINGS) all stay, in the order of arrival. Changes the links
+    ``inbox``, ``last`` and ``next``; a message that is replaced becomes free.
     """
     nodes, directions, pool = state.nodes, state.directions, state.pool
     newest_only = state.combination_kind != READINGS
@@ -109,7 +116,9 @@ def put(state: Simulation, h: int, message: int) -> None:
 
 @kernel
 def sort_indices(indices: np.ndarray, count: int) -> None:
-    """Sort the first ``count`` indices (Shell's sort: a few lines to compile)."""
+    """Sort the first ``count`` entries of ``indices`` (K >= count,) in place, in ascending order
+    (Shell's sort: a few lines to compile).
+    """
     gap = count // 2
     while gap > 0:
         for k in range(gap, count):

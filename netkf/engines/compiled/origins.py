@@ -19,8 +19,10 @@ def move_origin(
     k: int,
     offset: FloatArray,
 ) -> None:
-    """Add ``offset`` (n,) to all estimates at the time of frame ``k``, and to the estimates in
-    messages under way the offset predicted back to the time of sending.
+    """Add ``offset`` (n,) to all estimates at the time of frame ``k``, at which the origin of the
+    states moves, and to the estimates in messages under way the offset predicted back to the time
+    of sending. Changes ``state.xhat`` and ``state.pool_x``; and what ``totals``, ``history`` and
+    ``combination``, None if the filter has none, hold of estimates.
     """
     now = float(state.frames[k])
     # Covariances stay: only means refer to an origin.
@@ -45,8 +47,9 @@ def move_origin(
 def _shift_totals(
     scenario: Scenario, state: Simulation, totals: Totals, now: float, offset: FloatArray
 ) -> None:
-    """Add ``U offset`` to the ``u`` of all totals, with the offset at the time that
-    each refers to.
+    """Add ``U offset`` to the ``u`` of all running sums (weight, U (n, n), u (n,)) that nodes have
+    sent or heard or that are under way; ``offset`` (n,) is first predicted from ``now`` (seconds)
+    back to the time that each sum refers to.
     """
     for times, values in ((totals.sent_at, totals.sent), (totals.heard_at, totals.heard)):
         for k, time in enumerate(times.tolist()):
@@ -56,7 +59,9 @@ def _shift_totals(
 
 
 def _shift_total(total: FloatArray, offset: FloatArray) -> None:
-    """Shift a total (w, U, u) in place by ``offset`` (n,) of the state."""
+    """Add ``U offset`` to u in place, for the total (1 + n n + n,) = (w, U by rows, u) and the
+    ``offset`` (n,) of the state x: since u = U x, it moves with x.
+    """
     n = len(offset)
     # u = U x: it moves by U times the move of x.
     total[1 + n * n :] += total[1 : 1 + n * n].reshape(n, n) @ offset

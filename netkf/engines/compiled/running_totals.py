@@ -57,7 +57,10 @@ class Totals(Struct):
 def empty_totals(
     state: Simulation, receivers: np.ndarray, A: FloatArray, forgetting: float
 ) -> Totals:
-    """Return the running sums at time 0: weight 1 at every node, and nothing sent yet."""
+    """Return the running sums of N nodes at time 0: weight 1 at every node, and nothing sent yet.
+    ``receivers`` (N,) is the number of nodes that can hear each node, ``A`` (n, n) the plant's
+    matrix in 1/s, ``forgetting`` the rate in 1/s at which old information fades.
+    """
     count, n = state.xhat.shape
     m, directions = 1 + n * n + n, len(state.directions)
     return Totals(
@@ -79,7 +82,9 @@ def empty_totals(
 
 @kernel
 def fill_inverse(totals: Totals, gap: float) -> None:
-    """Write ``e^{-A gap}`` into ``scratch[0]``, by scaling and squaring."""
+    """Write ``e^{-A gap}`` (n, n) into ``totals.scratch[0]``, for ``gap`` seconds, by scaling and
+    squaring.
+    """
     A, out, term, product = totals.A, totals.scratch[0], totals.scratch[1], totals.scratch[2]
     n, norm = len(A), 0.0
     for i in range(n):
@@ -109,8 +114,9 @@ def fill_inverse(totals: Totals, gap: float) -> None:
 
 @kernel
 def predict_total(totals: Totals, values: FloatArray, k: int, gap: float) -> None:
-    """Predict total ``values[k]`` by ``gap`` seconds: ``U <- s Phi^-T U Phi^-1`` and ``u <- s
-    Phi^-T u``, with Phi = e^{A gap} and the fading s.
+    """Predict the total ``values[k]`` by ``gap`` seconds in place: ``U <- s Phi^-T U Phi^-1`` and
+    ``u <- s Phi^-T u``, with Phi = e^{A gap} and the fading s. ``values`` (K, 1 + n n + n) holds K
+    totals: weight w, U by rows, u.
     """
     if not gap > 0.0:
         return
@@ -141,8 +147,9 @@ def predict_total(totals: Totals, values: FloatArray, k: int, gap: float) -> Non
 
 @kernel
 def offer_round(state: Simulation, totals: Totals, h: int, now: float) -> bool:
-    """Offer a share of node ``h``'s mass to each of its receivers: add it to the total ``sent[h]``,
-    and subtract it from the node's weight. Return False if the node has no receivers.
+    """Offer a share of the mass of node ``h`` (index) at ``now`` (seconds) to each of its
+    receivers: add it to the total ``totals.sent[h]``, and subtract its weight from
+    ``totals.weight[h]``. Return False if the node has no receivers.
     """
     receivers, n, weight = totals.receivers[h], state.xhat.shape[1], totals.weight[h]
     if receivers == 0:
@@ -181,7 +188,9 @@ def offer_round(state: Simulation, totals: Totals, h: int, now: float) -> bool:
 
 @kernel
 def fill_inverse_root(out: FloatArray, root: FloatArray, h: int) -> None:
-    """Write the inverse of ``root[h]``, lower triangular and regular, into ``out`` (n, n)."""
+    """Write the inverse of ``root[h]``, one of N lower triangular, regular matrices (N, n, n), into
+    ``out`` (n, n).
+    """
     n = root.shape[1]
     for i in range(n):
         for j in range(i + 1):
@@ -193,8 +202,10 @@ def fill_inverse_root(out: FloatArray, root: FloatArray, h: int) -> None:
 
 @kernel
 def hear(state: Simulation, totals: Totals, h: int, now: float) -> None:
-    """Add the growth of each total in the inbox, since its sender was last heard, to the mass of
-    node ``h``. A total older than the last one heard adds nothing.
+    """Add the growth of each total in the inbox of node ``h`` since its sender was last heard,
+    predicted to ``now`` (seconds), to the mass of the node: ``totals.weight[h]``, ``state.xhat[h]``
+    and ``root[h]``. A total older than the last one heard adds nothing. The totals are stored as
+    ``totals.heard``.
     """
     gain, pool, heard, offered = totals.gain, state.pool, totals.heard, totals.offered
     # Two passes over the inbox: first the sum of all growth, because the totals are not stored as
@@ -235,8 +246,9 @@ def hear(state: Simulation, totals: Totals, h: int, now: float) -> None:
 
 @kernel
 def gain_mass(state: Simulation, totals: Totals, h: int, factor: float, share: float) -> None:
-    """Add the mass ``totals.gain`` to node ``h``: ``P^-1 <- (w P^-1 + N U) / w+`` with the new
-    weight w+, and the estimate likewise. ``factor`` is (w+ / w)^1/2, ``share`` is N / w+.
+    """Add the mass ``totals.gain`` = (weight, U (n, n), u (n,)) to node ``h``: ``P^-1 <- (w P^-1 +
+    N U) / w+`` with the new weight w+, and the estimate likewise. Changes ``state.xhat[h]`` and
+    ``root[h]``, the root of P. ``factor`` is (w+ / w)^1/2, ``share`` is N / w+.
     """
     root, gain, n = state.root, totals.gain, state.xhat.shape[1]
     inner, half, vectors = totals.scratch[0], totals.scratch[1], totals.scratch[2]
@@ -265,8 +277,9 @@ def gain_mass(state: Simulation, totals: Totals, h: int, factor: float, share: f
 
 @kernel
 def update_root_by_gain(state: Simulation, h: int, values: FloatArray, vectors: FloatArray) -> None:
-    """Replace root S of node ``h`` by the lower triangular root of ``S V D^-1 V' S'``, with the
-    eigenvalues D on the diagonal of ``values``, raised to at least 1, and eigenvectors V.
+    """Replace the root S = ``state.root[h]`` (n, n) of node ``h`` by the lower triangular root of
+    ``S V D^-1 V' S'``, with the eigenvalues D on the diagonal of ``values`` (n, n), raised to at
+    least 1, and the eigenvectors V = ``vectors`` (n, n), in columns.
     """
     root, F, n = state.root, state.flow_scratch.values, state.xhat.shape[1]
     wide, noise = state.flow_scratch.wide, state.flow_scratch.T
@@ -289,8 +302,9 @@ def update_root_by_gain(state: Simulation, h: int, values: FloatArray, vectors: 
 def move_by_gain(
     state: Simulation, h: int, gain: FloatArray, share: float, innovation: FloatArray
 ) -> None:
-    """Correct the estimate of node ``h`` by the mass gained, ``xhat += P share (u - U xhat)``;
-    ``innovation`` (n,) is scratch.
+    """Correct ``state.xhat[h]`` of node ``h`` by the mass ``gain`` (1 + n n + n,) =
+    (weight, U by rows, u): ``xhat += P share (u - U xhat)`` with the new P; ``innovation`` (n,) is
+    scratch.
     """
     root, xhat, n = state.root, state.xhat, state.xhat.shape[1]
     # innovation = N / w+ (u - U xhat).
@@ -313,8 +327,9 @@ def move_by_gain(
 
 @kernel
 def add_reading(state: Simulation, totals: Totals, h: int, instant: int) -> None:
-    """Add the samples of an ``instant`` to the mass of node ``h``: ``U += H' R^-1 H`` and ``u += H'
-    R^-1 y``, which counts N / w times in P^-1.
+    """Add the samples of an ``instant`` (index in ``state.instants``) to the mass of node ``h``:
+    ``U += H' R^-1 H`` and ``u += H' R^-1 y``, which counts N / w times in P^-1. Changes
+    ``state.xhat[h]`` and ``root[h]``.
     """
     # Equivalent to noise R w / N.
     scale = math.sqrt(totals.weight[h] / len(state.nodes))

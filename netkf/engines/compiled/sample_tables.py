@@ -64,8 +64,9 @@ class SampleTables:
         self._matrices: list[FloatArray] = []
 
     def read(self, states: FloatArray, times: FloatArray, after: float, until: float) -> None:
-        """Fill in the values of the samples taken in (``after``, ``until``], from the states (T, n)
-        at ``times`` (T,), which contain their times.
+        """Fill in the values ``instants.y`` (and H, where it varies) of the samples taken in
+        (``after``, ``until``] seconds, from the states (T, n) at ``times`` (T,), which contain
+        their times.
         """
         instants = self.instants
         for sensor in self._sensors:
@@ -79,6 +80,7 @@ class SampleTables:
             y, H = sensor.samples.several(range(first, last), x)
             indices, p = sensor.indices[first:last], y.shape[1]
             instants.y[indices, :p] = y
+            # Numbers of matrices beyond those of the sensors belong to single samples.
             if instants.matrix[indices[0]] >= len(
                 instants.rows
             ):  # a sensor with an H for each sample
@@ -88,8 +90,9 @@ class SampleTables:
 def _make_instants(
     scenario: Scenario, placed: list[tuple[int, PlacedSensor]], t: FloatArray, sensor: np.ndarray
 ) -> Instants:
-    """Return the instants at which nodes have samples, from the sorted times ``t`` (K,) and the
-    index of the ``sensor`` (K,) of each sample.
+    """Return the instants at which nodes have samples, from the sorted times ``t`` (K,) in seconds
+    of all samples and the ``sensor`` (K,) of each, an index in ``placed``, which pairs each sensor
+    with its node's id. Values ``y`` are 0 until they are read.
     """
     index = scenario.topology.index if placed else {}
     pooled, n = scenario.node_filter.pooled, scenario.plant.n

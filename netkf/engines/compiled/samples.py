@@ -23,12 +23,13 @@ def record_samples(
     samples: StateSamples,
     pass_rows_on: Callable[[int], None],
 ) -> bool:
-    """Record samples up to the first one that is not sound (engines.soundness); return True if all
-    are sound.
+    """Record K samples (times (K,), x (K, n), xhat (K, F, n), ... of F filters) up to the first one
+    that is not sound (engines.soundness); return True if all are sound.
 
     ``pass_rows_on`` is called with the index of the first sample that is not sound, to record the
     events before it; later ones are dropped. If filters are pooled, ``samples`` have one estimator
-    for all nodes.
+    for all nodes (F = 1), and are recorded for each of them. ``progress`` is called with the
+    simulated seconds reached.
     """
     times, x, xhat, P, error = samples
     # The loop may stop for other reasons than samples.

@@ -19,7 +19,8 @@ class Senders(NamedTuple):
     at : kind of clock: "links", "directions", "nodes" or "readings"
     entities : the E entities with a clock; nodes for "readings"
     directions : the W directed links, in the order in which simultaneous messages arrive
-    first, outgoing : entity e sends on the directions ``outgoing[first[e]:first[e + 1]]``
+    first, outgoing : (E + 1,) and (W,), entity e sends on the directed links with the indices
+                      ``outgoing[first[e]:first[e + 1]]``
     sources, source : keys of the random streams of losses and delays, and the index (W,) of the
                       stream of each direction; directions that share a stream share a draw at each
                       tick
@@ -66,7 +67,9 @@ def senders_of(scenario: Scenario) -> Senders:
 
 
 def _link_senders(links: tuple[Link, ...], directed: bool, symmetric: bool) -> Senders:
-    """Return the senders if links have clocks: an entity is a link of one or two directions."""
+    """Return the senders if links have clocks: an entity is a link of one direction if
+    ``directed``, else of two, which share one stream of losses and delays if ``symmetric``.
+    """
     if directed:
         indices = np.arange(len(links))
         return Senders("links", links, links, np.arange(len(links) + 1), indices, links, indices)

@@ -28,7 +28,9 @@ from netkf.scenario.scenario import Scenario
 
 
 def _record_type(integers: str, floats: str = "") -> np.dtype:
-    """Return a record type of int64 and float64 fields; blanks separate their names."""
+    """Return a record type of int64 and float64 fields; blanks separate their names in ``integers``
+    and ``floats``.
+    """
     # int64 fields first, then float64 ones: every field is aligned without padding.
     fields = [(name, np.int64) for name in integers.split()]
     return np.dtype([*fields, *((name, np.float64) for name in floats.split())])
@@ -82,8 +84,12 @@ CLOCKS = ("links", "directions", "nodes", "readings")
 
 
 class Gains(Struct):
-    """The gain tables of M models, padded to one size: ``series`` (M, terms, width), its ``reach``
-    (M, terms, 1) and the rows 2 p of ``moments`` (M,).
+    """The gain tables of M models, padded to one size; p rows of readings.
+
+    series : (M, terms, width), coefficients of the power series in the interval of the gains U
+             (n, 2 p), W (n, 2 p) and C (2 p, n), see kernels.gains
+    reach : (M, terms, 1), up to which interval in seconds the terms so far are enough
+    moments : (M,), 2 p, the numbers of moments that are read
     """
 
     series: FloatArray
@@ -196,8 +202,14 @@ class PathBlock(Struct):
 
 
 class TickArrays(Struct):
-    """The ticks of a ``schedule.Window``, or those of several runs one after the other. If no
-    message takes time, ``arrival_bits`` (K,) has a bit for each message of a tick that arrives.
+    """The K ticks of a ``schedule.Window``, or those of several runs one after the other.
+
+    end : seconds; from here on ticks are not drawn yet
+    t, entity : (K,), time in seconds, and index of the entity whose clock ticks
+    first_outcome : (K,), the outcomes of tick k begin at ``delay[first_outcome[k]]``, one for each
+                    directed link of its entity
+    delay : seconds that each message takes, negative or nan if it is lost
+    arrival_bits : (K,), if no message takes time: bit m is 1 if message m of a tick arrives
     """
 
     end: float
@@ -336,7 +348,9 @@ class Simulation(Struct):
 
 
 class Filters(NamedTuple):
-    """The filters at time 0: see Simulation."""
+    """The filters at time 0: NODE records ``nodes`` (N,), estimates ``xhat`` (N, n), roots of their
+    covariances ``root`` (N, n, n), and the tables of all models for prediction and for gains.
+    """
 
     nodes: np.ndarray
     xhat: FloatArray
@@ -347,7 +361,9 @@ class Filters(NamedTuple):
 
 @once_per_scenario
 def filters_at_start(scenario: Scenario) -> Filters:
-    """Return the filters at time 0, or the one that reads all sensors if they are pooled."""
+    """Return all N filters at time 0, or, if they are pooled, the one that reads all sensors (N =
+    1).
+    """
     # A pooled filter is one node with the id -1 and the sensors of all.
     ids, pooled = scenario.nodes, scenario.node_filter.pooled
     models = (scenario.pooled_model,) if pooled else scenario.models
@@ -373,14 +389,18 @@ def filters_at_start(scenario: Scenario) -> Filters:
 
 
 def _roots_of(covariances: list[FloatArray]) -> FloatArray:
-    """Return the stacked roots (N, n, n) of covariances, many of which are the same array."""
+    """Return the stacked roots (N, n, n) of N covariances (n, n), many of which are the same
+    array.
+    """
     distinct = {id(cov): cov for cov in covariances}
     roots = {key: first_root(cov) for key, cov in distinct.items()}
     return np.stack([roots[id(cov)] for cov in covariances])
 
 
 def _stack_model_tables(models: list[FlowModel]) -> tuple[FlowTable, Gains]:
-    """Return the stacked flow tables and gains of some models with equal n."""
+    """Return the tables of M models with n states each: for prediction, with one more model without
+    sensors at the end (M + 1), and of gains (M).
+    """
     n = len(models[0].A)
     # A model without sensors has no gains; its entry keeps the numbering.
     no_gains = GainTable(n, 0, np.zeros((0, 1)))
@@ -400,7 +420,7 @@ def _stack_model_tables(models: list[FlowModel]) -> tuple[FlowTable, Gains]:
 
 @once_per_scenario
 def entity_records(scenario: Scenario) -> tuple[np.ndarray, np.ndarray]:
-    """Return the ENTITY and DIRECTED_LINK records of a run that has not begun."""
+    """Return the ENTITY records (E,) and DIRECTED_LINK records (W,) of a run that has not begun."""
     senders, index = senders_of(scenario), scenario.topology.index
     entities = np.zeros(len(senders.entities), dtype=ENTITY)
     # (i, j) of a link or direction, (i, -1) of a node.
@@ -421,7 +441,9 @@ def entity_records(scenario: Scenario) -> tuple[np.ndarray, np.ndarray]:
 def scratch_arrays(
     table: FlowTable, gains: Gains, instants: Instants, unrolled: bool
 ) -> tuple[Scratch, FlowScratch, UpdateScratch]:
-    """Return scratch arrays for all computations; ``unrolled`` ones have types that know n."""
+    """Return scratch arrays for all computations of a run with these ``instants``, in models with
+    these tables; ``unrolled`` ones have types that know n, so that kernels are compiled for it.
+    """
     n, max_moments, width = table.levels.shape[3], int(gains.moments.max()), gains.series.shape[2]
     # Rows of the reading of each sample, then the largest sum over one instant.
     rows = np.concatenate([instants.rows, [0]])[instants.sensor]
@@ -444,14 +466,18 @@ def scratch_arrays(
 
 
 def empty_pool(capacity: int, n: int) -> tuple[np.ndarray, FloatArray, FloatArray, np.ndarray]:
-    """Return pool, xhat, root and heap for ``capacity`` messages, all free."""
+    """Return the pool of C = ``capacity`` MESSAGE records (C,), all free, the estimates (C, n) and
+    roots (C, n, n) that they carry, and the heap (C,) of messages under way.
+    """
     pool = np.zeros(capacity, dtype=MESSAGE)
     pool["next"] = np.arange(1, capacity + 1)
     return pool, np.zeros((capacity, n)), np.zeros((capacity, n, n)), np.zeros(capacity, np.int64)
 
 
 def add_messages(state: Simulation, at_least: int) -> None:
-    """Enlarge the pool of messages: double it, or add ``at_least`` messages if these are more."""
+    """Enlarge ``pool``, ``pool_x``, ``pool_root`` and ``heap`` of ``state``: to twice as many
+    messages, or by ``at_least`` messages if these are more.
+    """
     # Doubling keeps the cost of copies proportional to the messages.
     capacity, n = len(state.pool), state.xhat.shape[1]
     added = max(capacity, at_least)

@@ -27,7 +27,9 @@ class States(Protocol):
     def states_at(
         self, times: FloatArray, path: PathBlock, pieces: np.ndarray
     ) -> tuple[FloatArray, FloatArray]:
-        """Return local and absolute states (T, n) at times within these pieces of the path."""
+        """Return local and absolute states (T, n) each at ``times`` (T,) in seconds, of which time
+        k lies in the piece ``pieces[k]`` of the ``path``.
+        """
 
 
 class CompleteStates:
@@ -38,20 +40,26 @@ class CompleteStates:
         self.frame_times = np.array(self.truth.frame_times, dtype=np.float64)
 
     def offset(self, k: int, path: PathBlock, piece: int) -> FloatArray:
-        """Return the local state (n,) just before ``frame_times[k]``."""
+        """Return the local state (n,) just before frame ``k`` begins at ``frame_times[k]``; the
+        path is not used.
+        """
         # The truth has frames of its own.
         return np.asarray(self.truth.rebase(k))
 
     def states_at(
         self, times: FloatArray, path: PathBlock, pieces: np.ndarray
     ) -> tuple[FloatArray, FloatArray]:
-        """Return local and absolute states (T, n)."""
+        """Return local and absolute states (T, n) each at ``times`` (T,) in seconds; the path is
+        not used.
+        """
         local, absolute = self.truth.states(times)
         return local, absolute
 
 
 class PathStates:
-    """States of a path that is drawn block by block."""
+    """The states of a path that is drawn block by block; its origin moves to the state at each of
+    ``frame_times`` (F,), in seconds.
+    """
 
     def __init__(self, scenario: Scenario, frame_times: FloatArray) -> None:
         self.frame_times = frame_times
@@ -62,7 +70,10 @@ class PathStates:
         self._frame, self._frame_start, self._origin = 0, 0.0, np.zeros(scenario.plant.n)
 
     def local(self, times: FloatArray, path: PathBlock, pieces: np.ndarray) -> FloatArray:
-        """Return the local states (T, n) at ``times``, 0 at times at which a frame begins."""
+        """Return the states (T, n) relative to the origin at ``times`` (T,) in seconds, of which
+        time k is an end of the piece ``pieces[k]`` of the ``path``; 0 at times at which a frame
+        begins.
+        """
         # A time is the end of its piece, or the start of the first one.
         ends = (times == path.stop[pieces])[:, None]
         x = np.where(ends, path.x_stop[0, pieces], path.x_start[0, pieces])
@@ -72,7 +83,9 @@ class PathStates:
         return np.asarray(x)
 
     def offset(self, k: int, path: PathBlock, piece: int) -> FloatArray:
-        """Return the local state (n,) just before ``frame_times[k]``; there a frame begins."""
+        """Return the local state (n,) just before frame ``k`` begins at ``frame_times[k]``, where
+        the ``piece`` (index) of the ``path`` ends, and make it the new origin.
+        """
         x, time = path.x_stop[0, piece], float(self.frame_times[k])
         with np.errstate(over="ignore", invalid="ignore"):
             # The new origin: the old one moved to now, plus the local state.
@@ -84,7 +97,9 @@ class PathStates:
     def states_at(
         self, times: FloatArray, path: PathBlock, pieces: np.ndarray
     ) -> tuple[FloatArray, FloatArray]:
-        """Return local and absolute states (T, n) at times in the present frame."""
+        """Return local and absolute states (T, n) each at ``times`` (T,) in seconds in the present
+        frame, of which time k lies in the piece ``pieces[k]`` of the ``path``.
+        """
         local = self.local(times, path, pieces)
         # No frame has begun: local states are absolute.
         if not self._frame:
@@ -93,8 +108,8 @@ class PathStates:
             return local, local + self._origin_at(times)
 
     def _origin_at(self, times: FloatArray) -> FloatArray:
-        """Return the absolute origin (T, n) of the present frame at some times: the origin at the
-        beginning of the frame, moved by the plant without noise.
+        """Return the absolute origin (T, n) of the present frame at ``times`` (T,) in seconds: the
+        origin at the beginning of the frame, moved by the plant without noise.
         """
         # An origin of 0 stays 0, and its transition may overflow.
         if self._moves is None or not self._origin.any():

@@ -90,7 +90,8 @@ LANE = np.dtype(
 
 class Visits(Struct):
     """Queued visits and the arrays that processing them needs. F places, C records, M models, W
-    directed links, L lanes, K distinct weights, E values of a series.
+    directed links, L lanes, K distinct weights, W' columns and E values of a series, n states,
+    readings of q moments.
 
     The queue:
 
@@ -159,8 +160,9 @@ class Visits(Struct):
 def empty_visits(
     filters: Filters, weights: FloatArray, places: int, series: tuple[LaneSeries, LaneSeries]
 ) -> Visits:
-    """Return an empty queue for filters at ``places`` places; ``weights`` (W,) are those of
-    directed links, ``series`` those of nodes without increment sensors and with them.
+    """Return an empty queue for such filters at F = ``places`` places, N for each of the runs
+    simulated together; ``weights`` (W,) are those of directed links, ``series`` those of nodes
+    without increment sensors and with them.
     """
     n, capacity = filters.xhat.shape[1], max(MAX_VISITS, 4 * places)
     # Networks have few distinct weights: lanes look them up in a table, roots included.
@@ -212,7 +214,10 @@ def empty_visits(
 def append_visit(
     state: Simulation, visits: Visits, level: int, time: float, first: int, second: int
 ) -> int:
-    """Add a visit of the nodes at places ``first`` and ``second`` to a level; return its index."""
+    """Add a visit at ``time`` (seconds) of the nodes at the places ``first`` and ``second``
+    (NO_NODE or ALL_NODES: see VISIT) to ``visits.records`` and to the list of ``level``; return its
+    index. Its run and piece of the path are the present ones of ``state``.
+    """
     v = visits.count
     visits.count = v + 1
     visit = visits.records[v]
@@ -228,7 +233,9 @@ def append_visit(
 
 @kernel
 def queue_visit(state: Simulation, visits: Visits, time: float, place: int) -> None:
-    """Queue the prediction of the node at ``place`` to ``time``, one level above its last visit."""
+    """Queue the prediction of the node at ``place`` (index in ``state.xhat``) to ``time``
+    (seconds), one level above its last visit; raises ``visits.level[place]``.
+    """
     level = visits.level[place] + 1
     visits.level[place] = level
     append_visit(state, visits, level, time, place, NO_NODE)
@@ -236,8 +243,8 @@ def queue_visit(state: Simulation, visits: Visits, time: float, place: int) -> N
 
 @kernel
 def queue_sample(state: Simulation, visits: Visits, first: int) -> None:
-    """Queue a sample of all nodes of a run, from place ``first`` on, one level above all their
-    visits.
+    """Queue sample number ``state.samples`` of all N nodes of the present run, at the places
+    ``first`` to ``first`` + N - 1 of ``state.xhat``, one level above all their visits.
     """
     level = 0
     for h in range(len(state.nodes)):
@@ -254,7 +261,9 @@ def queue_sample(state: Simulation, visits: Visits, first: int) -> None:
 
 @kernel
 def process_visits(state: Simulation, visits: Visits) -> None:
-    """Process all queued visits, level by level, and empty the queue."""
+    """Process all queued visits, level by level, and empty the queue. Changes ``state.xhat``,
+    ``root`` and ``now`` of the nodes visited, and stores samples in ``state.buffer``.
+    """
     for level in range(1, visits.top + 1):
         process_level(state, visits, visits.first[level])
         visits.first[level] = -1
@@ -265,7 +274,9 @@ def process_visits(state: Simulation, visits: Visits) -> None:
 
 @kernel
 def process_level(state: Simulation, visits: Visits, first: int) -> None:
-    """Process the visits of a level, a linked list that begins with ``first``."""
+    """Process the visits of a level, a linked list in ``visits.records`` that begins with index
+    ``first``: predict all their nodes, then combine pairs of nodes, or store samples.
+    """
     v, pairs = first, 0
     while v != -1:
         visit = visits.records[v]
@@ -287,8 +298,9 @@ def process_level(state: Simulation, visits: Visits, first: int) -> None:
 
 @kernel
 def queue_prediction(state: Simulation, visits: Visits, v: int, place: int) -> None:
-    """Queue the node at ``place`` for its prediction to visit ``v`` in a lane, or predict it at
-    once if the gap is too long for one step.
+    """Queue the node at ``place`` (index in ``state.xhat``) for its prediction to the time of visit
+    ``v`` (index in ``visits.records``) in a lane, or predict it at once if the gap is too long for
+    one step. Sets ``state.now[place]``; predicts all lanes if none is free any more.
     """
     visit, now = visits.records[v], state.now[place]
     # A node may have several visits at one time: it is predicted with the first of them.
@@ -312,14 +324,16 @@ def queue_prediction(state: Simulation, visits: Visits, v: int, place: int) -> N
 
 @kernel
 def node_at(state: Simulation, run: int, place: int) -> int:
-    """Return the index within its run of the node at ``place``."""
+    """Return the index (0 to N - 1) in ``state.nodes`` of the node at ``place`` (index in
+    ``state.xhat``), which belongs to run number ``run``.
+    """
     return place - (run - state.first_run) * len(state.nodes)
 
 
 @kernel(inlined=True)
 def ring_index(visits: Visits, number: int) -> int:
-    """Return the index in the ring buffer, whose length is a power of two, of interval
-    ``number``.
+    """Return the index in the ring buffer ``visits.intervals``, whose length is a power of two, of
+    interval ``number``, counted from the first one ever queued.
     """
     return number & (len(visits.intervals) - 1)
 
@@ -328,8 +342,9 @@ def ring_index(visits: Visits, number: int) -> int:
 def queue_interval(
     state: Simulation, visits: Visits, place: int, v: int, now: float, least: float
 ) -> None:
-    """Queue the next measurement interval of the sensing node at ``place``, which has been
-    predicted up to ``now`` on its way to visit ``v``; ``least``: see INTERVAL.
+    """Queue the next measurement interval of the sensing node at ``place`` (index in
+    ``state.xhat``), which has been predicted up to ``now`` (seconds) on its way to visit ``v``
+    (index in ``visits.records``); ``least`` is the lower bound of its length in seconds.
     """
     # A node has one visit in a level at most, so the ring buffer has space for all.
     interval = visits.intervals[ring_index(visits, visits.after_intervals)]
@@ -340,8 +355,8 @@ def queue_interval(
 
 @kernel
 def prefetch_path_and_noise(state: Simulation, visits: Visits, v: int, place: int) -> None:
-    """Prefetch the path and the noise in the piece of visit ``v``, from which the node at a place
-    will read.
+    """Prefetch into the processor's cache the path and the noise in the piece of visit ``v`` (index
+    in ``visits.records``), from which the node at ``place`` (index in ``state.xhat``) will read.
     """
     # Each run has its own path and noise, far from each other: waiting for them took 4 % of a run.
     path, visit = state.path, visits.records[v]
@@ -354,7 +369,10 @@ def prefetch_path_and_noise(state: Simulation, visits: Visits, v: int, place: in
 
 @kernel
 def process_intervals(state: Simulation, visits: Visits) -> None:
-    """Predict all sensing nodes of a level up to their visits, and use their increments."""
+    """Predict all sensing nodes in the queue ``visits.intervals`` up to the times of their visits,
+    using their increments, L nodes at a time; empties the queue. Changes ``state.xhat`` and
+    ``root``.
+    """
     while visits.first_interval < visits.after_intervals:
         # The next interval of a node is added while this one is processed.
         count = min(LANES, visits.after_intervals - visits.first_interval)
@@ -371,7 +389,8 @@ def process_intervals(state: Simulation, visits: Visits) -> None:
 @kernel
 def fill_rates(state: Simulation, visits: Visits, count: int) -> None:
     """Write the rate of information trace(P G) in 1/s and trace(P) of the nodes in the first
-    ``count`` lanes into ``visits.readings``.
+    ``count`` lanes, those of the next intervals in the ring buffer, into ``rate`` and ``trace``
+    (1, L) of ``visits.readings``.
     """
     size, readings = state.size, visits.readings
     for q in range(count):
@@ -386,8 +405,8 @@ def fill_rates(state: Simulation, visits: Visits, count: int) -> None:
 
 @kernel
 def begin_interval(state: Simulation, visits: Visits, q: int) -> None:
-    """Take the next interval from the ring buffer, whose node is in lane q: assign it the lane, or
-    predict its node at once if P is too wide for one step.
+    """Take the next interval from the ring buffer, whose node is in lane ``q``: assign it the lane,
+    or predict its node at once if P is too wide for one step. Queues the rest of the gap, if any.
     """
     interval, readings = (
         visits.intervals[ring_index(visits, visits.first_interval)],
@@ -413,8 +432,9 @@ def begin_interval(state: Simulation, visits: Visits, q: int) -> None:
 def assign_lane(
     visits: Visits, kind: int, q: int, place: int, v: int, m: int, now: float, end: float
 ) -> None:
-    """Assign lane q of ``kind`` to the node at ``place`` with model ``m``, for its prediction from
-    ``now`` to ``end`` on the way to visit ``v``.
+    """Assign lane ``q`` of ``kind`` (UNOBSERVED or SENSING) to the node at ``place`` (index in
+    ``state.xhat``) with model number ``m``, for its prediction from ``now`` to ``end`` (seconds) on
+    the way to visit ``v`` (index in ``visits.records``).
     """
     lane = visits.lanes[kind, q]
     lane.visit, lane.model, lane.now, lane.end = v, m, now, end
@@ -423,7 +443,10 @@ def assign_lane(
 
 @kernel
 def read_increments_in_lanes(state: Simulation, visits: Visits, count: int) -> None:
-    """Write the moments of the increments that the nodes in lanes read."""
+    """Write the moments of the increments that the nodes in the first ``count`` SENSING lanes read,
+    each over the interval of its lane, into ``visits.readings.moments`` (q, L); lanes whose place
+    is NO_NODE read nothing.
+    """
     places, readings = visits.places[SENSING], visits.readings
     for q in range(LANES):
         readings.noise_row[q] = NO_NODE
@@ -445,8 +468,9 @@ def read_increments_in_lanes(state: Simulation, visits: Visits, count: int) -> N
 def gather_states(
     state: Simulation, places: IntArray, count: int, x: FloatArray, S: FloatArray
 ) -> None:
-    """Copy the states at the first ``count`` ``places`` into lanes; the other places become
-    NO_NODE.
+    """Copy the estimates and roots of the nodes at the first ``count`` of the ``places`` (L,),
+    indices in ``state.xhat``, into the lanes of ``x`` (n, L) and ``S`` (n, n, L); the other places
+    become NO_NODE.
     """
     n = len(state.size)
     for q in range(count, LANES):
@@ -459,7 +483,9 @@ def gather_states(
 
 @kernel
 def scatter_states(state: Simulation, places: IntArray, x: FloatArray, S: FloatArray) -> None:
-    """Copy the states in lanes back to their ``places``, except lanes with NO_NODE."""
+    """Copy the estimates ``x`` (n, L) and roots ``S`` (n, n, L) in lanes back to rows ``places``
+    (L,) of ``state.xhat`` and ``state.root``, except lanes with NO_NODE.
+    """
     n = len(state.size)
     for first in range(0, n, LANES):
         scatter(MANY, x, first, state.xhat, places, n - first)
@@ -469,7 +495,9 @@ def scatter_states(state: Simulation, places: IntArray, x: FloatArray, S: FloatA
 
 @kernel
 def predict_unobserved(state: Simulation, visits: Visits) -> None:
-    """Predict the queued nodes without sensors, at most L of them."""
+    """Predict the ``visits.waiting`` queued nodes without increment sensors, at most L, over the
+    gaps of their UNOBSERVED lanes, and empty these. Changes ``state.xhat`` and ``root``.
+    """
     n, count, places = len(state.size), visits.waiting, visits.places[UNOBSERVED]
     if count == 0:
         return
@@ -486,7 +514,10 @@ def predict_unobserved(state: Simulation, visits: Visits) -> None:
 
 @kernel
 def predict_sensing(state: Simulation, visits: Visits, count: int) -> None:
-    """Predict the nodes with sensors, whose states are in the lanes, and use their readings."""
+    """Predict the nodes in the first ``count`` SENSING lanes, whose states are in ``visits.x`` and
+    ``S``, over the gaps of their lanes, correct them by their readings, and write them to
+    ``state.xhat`` and ``root``.
+    """
     places = visits.places[SENSING]
     for q in range(count):
         if places[q] != NO_NODE:
@@ -507,7 +538,9 @@ def predict_sensing(state: Simulation, visits: Visits, count: int) -> None:
 def evaluate_series(
     visits: Visits, kind: int, q: int, series: LaneSeries, rows: FloatArray
 ) -> None:
-    """Evaluate the ``series`` of the model in lane ``q`` at the lane's gap into ``rows[q]``."""
+    """Evaluate the ``series`` of the model in lane ``q`` of ``kind`` (UNOBSERVED or SENSING) at the
+    lane's gap; write the W' values into ``rows[q]`` of ``rows`` (L, W').
+    """
     lane = visits.lanes[kind, q]
     row = series.row[lane.model]
     cell, since = cell_of(series.unit[row], lane.end - lane.now)
@@ -517,7 +550,7 @@ def evaluate_series(
 
 @kernel
 def transpose_rows(rows: FloatArray, out: FloatArray) -> None:
-    """Write rows (L, W) as (W, L)."""
+    """Write the transpose of ``rows`` (L, W'), one row for each lane, into ``out`` (W', L)."""
     for j in range(0, rows.shape[1], LANES):
         turn(MANY, rows, j, out)
 
@@ -526,15 +559,18 @@ def transpose_rows(rows: FloatArray, out: FloatArray) -> None:
 def copy_columns(
     columns: FloatArray, index: IntArray, first: int, count: int, out: FloatArray
 ) -> None:
-    """Copy ``count`` values to ``out``: entry e is column ``index[first + e]`` of ``columns``."""
+    """Copy ``count`` rows of ``columns`` (W', L) to ``out`` (count, L): row e comes from row
+    ``index[first + e]``, since equal entries of a series are stored once.
+    """
     for e in range(count):
         store(MANY, out, e, load(MANY, columns, index[first + e]))
 
 
 @kernel(fused=True)
 def predict_lanes(state: Simulation, visits: Visits, reads: bool) -> None:
-    """Predict the states ``visits.x`` and ``visits.S`` by the matrices in ``visits.values``: x =
-    exp(A g) x and P = Q_g + F P (I + G_g P)^-1 F', with G_g = 0 and F = exp(A g) unless ``reads``.
+    """Predict the states ``visits.x`` (n, L) and roots ``visits.S`` (n, n, L) of L nodes, in place,
+    by the matrices in ``visits.values`` (E, L): x = exp(A g) x and P = Q_g + F P (I + G_g P)^-1 F',
+    with G_g = 0 and F = exp(A g) unless ``reads``.
     """
     size, n, values = state.size, len(state.size), visits.values
     S, V, T = (
@@ -561,8 +597,9 @@ def predict_lanes(state: Simulation, visits: Visits, reads: bool) -> None:
 
 @kernel
 def combine_pairs(state: Simulation, visits: Visits, k: int, count: int) -> None:
-    """Combine the two nodes of each of the visits ``pairs[k:k + count]``, one visit in
-    each lane.
+    """Combine the two nodes of each of the visits ``visits.pairs[k:k + count]``, one visit in each
+    of at most L lanes; the nodes that receive the other's estimate change in ``state.xhat`` and
+    ``root``.
     """
     records, places = visits.records, visits.places
     first_receives, second_receives = False, False
@@ -590,8 +627,9 @@ def combine_pairs(state: Simulation, visits: Visits, k: int, count: int) -> None
 
 @kernel
 def assign_receiver(visits: Visits, side: int, lane: int, direction: int, place: int) -> bool:
-    """Assign a lane the receiver at ``place`` (``side`` 0: first node of the visit, 1: second) and
-    the weights of its incoming link ``direction``. Return False if it receives nothing (NOT_HEARD).
+    """Write the receiver at ``place`` (index in ``state.xhat``) and the weights of its incoming
+    directed link ``direction`` (index) into ``receiver_places`` and ``in_lanes`` of a ``lane``;
+    ``side`` 0: first node of the visit, 1: second. Return False if it receives nothing (NOT_HEARD).
     """
     if direction == NOT_HEARD:
         visits.receiver_places[side, lane] = NO_NODE
@@ -616,8 +654,10 @@ def combine_lanes(
     other_x: FloatArray,
     other_S: FloatArray,
 ) -> None:
-    """Write the convex combination H (7) and (9), w x + w_j x_j and the root of w P + w_j P_j, into
-    ``moved`` and ``V``, with the weights of ``side``.
+    """Write the convex combination H (7) and (9), w x + w_j x_j (n, L) and the root (n, n, L) of w
+    P + w_j P_j, into ``visits.moved`` and ``visits.V``: of x (n, L) and S (n, n, L), the root of P,
+    with ``other_x`` and ``other_S`` (x_j and the root of P_j), with the weights of ``side`` (0: the
+    first nodes of the visits receive, 1: the second ones).
     """
     size, n, values = state.size, len(state.size), visits.in_lanes
     total, wide = local_lanes_matrix(size, MANY, visits.V), local_lanes_matrix(size, MANY, visits.T)
