@@ -154,7 +154,9 @@ class ReplicaResult(NamedTuple):
 def run_replica(
     scenario: Scenario, seed: int, replica: int, engine: str | Engine = "auto"
 ) -> ReplicaResult:
-    """Simulate and summarise one replica of a scenario from :func:`with_check_times`."""
+    """Simulate and summarise one ``replica`` of the runs of ``seed`` of a scenario from
+    :func:`with_check_times`.
+    """
     run, promised = simulate(scenario, seed, replica, engine), with_promised_filter(scenario)
     diverged, difference = run.status == "diverged", math.nan
     expected = promised is scenario
@@ -189,7 +191,10 @@ def _error_difference(run: Run, twin: Run) -> float:
 
 
 def _same_as_base(results: list[ReplicaResult], level: float) -> Finding:
-    """Compare the first replicas with those of the filter that the class derives from."""
+    """Compare the first replicas with those of the filter that the class derives from.
+
+    No interval is estimated, so that ``level`` is not used.
+    """
     differences = [result.difference for result in results[:TWIN_RUNS]]
     if np.isnan(differences).all():
         return find_nothing(0.0)
@@ -200,7 +205,10 @@ def _same_as_base(results: list[ReplicaResult], level: float) -> Finding:
 
 
 def _none_diverged(results: list[ReplicaResult], level: float) -> Finding:
-    """Count the runs that ended early."""
+    """Count the runs that ended early.
+
+    No interval is estimated, so that ``level`` is not used.
+    """
     diverged = sum(result.diverged for result in results)
     message = f"{diverged} of {len(results)} runs ended early, so no other promise is looked at"
     return Finding((-diverged / len(results),) * 3, 0.0, message)

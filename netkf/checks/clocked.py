@@ -41,7 +41,10 @@ class ClockedSummary(ReplicaSummary):
 
 
 def _mass_conserved(samples: RunSamples, level: float) -> Finding:
-    """Compare the sums at the end with those at the start, messages in flight included."""
+    """Compare the sums at the end with those at the start, messages in flight included.
+
+    No interval is estimated, so that ``level`` is not used.
+    """
     drift, scenario = np.abs(samples.runs.drift), samples.scenario
     message = f"drift of the total weight in {samples.count} runs"
     # Running totals grow with every broadcast, and their rounding remains in their differences.

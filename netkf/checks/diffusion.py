@@ -75,7 +75,8 @@ def _sensors_excite(samples: RunSamples, level: float) -> Finding:
 def _cooperation_helps(samples: RunSamples, level: float) -> Finding:
     """Compare exact mean-square errors at the end with those of the same runs without cooperation.
 
-    The node with the largest error counts in both cases.
+    The node with the largest error counts in both cases. No interval is estimated, so that
+    ``level`` is not used.
     """
     Sigma, Sigma_alone = samples.runs.Sigma[:ALONE, -1], samples.runs.alone[:ALONE]
     cooperative = np.trace(Sigma, axis1=-2, axis2=-1).mean(axis=0)
@@ -91,6 +92,8 @@ def _cooperation_helps(samples: RunSamples, level: float) -> Finding:
 def _errors_bounded(samples: RunSamples, level: float) -> Finding:
     """Compare the growth of the law of squared errors in the second half of the horizon with that
     of Gaussian errors that have the exact covariances.
+
+    The interval of the finding misses the truth with at most the probability ``level``.
     """
     e, Sigma = samples.runs.e[:, -2:], samples.runs.Sigma[: max_replayed(samples.scenario), -2:]
     if np.isnan(e).all():

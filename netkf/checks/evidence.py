@@ -152,7 +152,10 @@ def judge(
 
 
 def _run_test(promise: Promise, samples: Any, level: float) -> Finding:
-    """Return the finding of a test; undecided if theory cannot compute the expected value."""
+    """Return the finding of a test; undecided if theory cannot compute the expected value.
+
+    The interval of the finding misses the truth with at most the probability ``level``.
+    """
     try:
         return promise.test(samples, level)
     except TheoryError as error:
@@ -263,7 +266,9 @@ def find_identity(deviation: float, allowed: float, message: str) -> Finding:
 
 
 def find_nothing(tolerance: float) -> Finding:
-    """Return the finding of a test whose errors are all blurred by rounding."""
+    """Return the finding, with this ``tolerance``, of a test whose errors are all blurred by
+    rounding: undecided.
+    """
     nan = math.nan
     message = (
         "the state is so large that rounding blurs the errors wherever they are looked at; shorten "

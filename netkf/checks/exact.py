@@ -318,7 +318,10 @@ def promised_filter(algorithm: Any) -> Any:
 
 
 def check_upper_bound(samples: RunSamples, level: float) -> Finding:
-    """Check P >= Sigma, the exact error covariance, by the least eigenvalue of P - Sigma."""
+    """Check P >= Sigma, the exact error covariance, by the least eigenvalue of P - Sigma.
+
+    No interval is estimated, so that ``level`` is not used.
+    """
     max_runs = max_replayed(samples.scenario)
     P, Sigma = samples.runs.P[:max_runs], samples.runs.Sigma[:max_runs]
     size = np.trace(Sigma, axis1=-2, axis2=-1)
@@ -368,6 +371,8 @@ def check_error_covariance(samples: RunSamples, level: float) -> Finding:
 def _compare_pooled(joint: FloatArray, level: float) -> Interval:
     """Return an interval for the relative difference between the pooled squared errors and their
     degrees of freedom, both summed over the rows of ``joint`` (R, 2).
+
+    The interval misses the truth with at most the probability ``level``.
     """
     total, freedom = joint[np.isfinite(joint).all(axis=1)].sum(axis=0).tolist()
     if not freedom > 0.0:
@@ -381,6 +386,8 @@ def check_bias(samples: RunSamples, level: float) -> Finding:
 
     The bias is estimated by generalised least squares. Its length is in standard deviations of an
     error: it is whitened by the mean covariance of all nodes and times.
+
+    The interval of the finding misses the truth with at most the probability ``level``.
     """
     max_runs = max_replayed(samples.scenario)
     bias, Sigma = samples.runs.bias[:max_runs], samples.runs.Sigma[:max_runs]
@@ -405,6 +412,8 @@ def check_bias(samples: RunSamples, level: float) -> Finding:
 def _length_interval(spread: FloatArray, z: FloatArray, level: float) -> Interval:
     """Return an interval for |spread m|, where ``z`` (k,) is normal with mean m and covariance I
     and ``spread`` is (d, k). It excludes 0 if and only if |z|^2 exceeds its chi-square quantile.
+
+    The interval misses the truth with at most the probability ``level``.
     """
     reach = math.sqrt(2.0 * float(scipy.special.gammainccinv(len(z) / 2.0, level)))
     sizes = np.linalg.svd(spread, compute_uv=False)
@@ -424,7 +433,8 @@ def check_expected_nees(samples: RunSamples, level: float) -> Finding:
     Given the events NEES is a quadratic form of Gaussian errors (less their exact mean): a sum of
     squares of standard normal numbers weighted by the eigenvalues of P^-1 Sigma. So is its sum over
     runs, and no variance has to be estimated. Each NEES is scaled to the expected value n, since
-    expected values may differ widely between runs.
+    expected values may differ widely between runs. The interval of the finding misses the truth
+    with at most the probability ``level``.
     """
     runs, n = samples.runs, samples.scenario.plant.n
     max_runs = max_replayed(samples.scenario)
@@ -463,6 +473,8 @@ def check_expected_nees(samples: RunSamples, level: float) -> Finding:
 def _expected_together(quadratic: FloatArray, level: float) -> Interval:
     """Return an interval for the relative difference between the NEES pooled over times, nodes and
     runs and its expected value; ``quadratic`` (R, 1 + S) stacks the fields of ReplicaSummary.
+
+    The interval misses the truth with at most the probability ``level``.
     """
     finite = quadratic[np.isfinite(quadratic).all(axis=1)]
     ratio = quadratic_interval(float(finite[:, 0].sum()), finite[:, 1:].ravel(), level)
@@ -474,7 +486,7 @@ def check_nees(samples: RunSamples, level: float) -> Finding:
     """Test the null hypothesis that errors are Gaussian with covariance P, given the exchanges.
 
     Under it NEES is chi-square with n degrees of freedom at every point, and so is its sum over
-    runs.
+    runs. The interval of the finding misses the truth with at most the probability ``level``.
     """
     n, nees = samples.scenario.plant.n, samples.runs.nees.reshape(samples.count, -1)
     if np.isnan(samples.runs.e).all():
@@ -500,7 +512,8 @@ def pooled_nees(nees: FloatArray, mean: FloatArray, square: FloatArray, level: f
     ``nees``, ``mean`` and ``square`` are (R, K), for K points (time, node) of R runs; ``square`` is
     half of the variances. Runs are independent. For the K points of a run, which are correlated in
     an unknown way, the standard deviation of their sum is at most the sum of their standard
-    deviations. The chi-square law with the mean and this variance gives the limits.
+    deviations. The chi-square law with the mean and this variance gives the limits. The interval
+    misses the truth with at most the probability ``level``.
     """
     spread = np.sqrt(2.0 * square).sum(axis=1)
     expected = float(mean.sum())

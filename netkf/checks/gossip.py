@@ -206,7 +206,10 @@ def _draw_chains(
 
 
 def _walks_bound(samples: GossipSamples, level: float) -> Finding:
-    """Check P <= bound, the covariance from the last WINDOW readings of the pair, G Lemma 14."""
+    """Check P <= bound, the covariance from the last WINDOW readings of the pair, G Lemma 14.
+
+    No interval is estimated, so that ``level`` is not used.
+    """
     P, bound = samples.runs.P, samples.runs.bounds
     size = np.trace(bound, axis1=-2, axis2=-1)
     with np.errstate(invalid="ignore"):
@@ -230,6 +233,8 @@ def _walks_bound(samples: GossipSamples, level: float) -> Finding:
 def _tokens_move(samples: GossipSamples, level: float) -> Finding:
     """Test the null hypothesis that j hands its pair to i with probability Abar_ij, independently
     in each slot: then the numbers of moves are binomial.
+
+    The interval of the finding misses the truth with at most the probability ``level``.
     """
     i, j = _pairs_to_count(samples.scenario)
     trials, totals = int(np.sum(samples.runs.slots)), samples.runs.moves.sum(axis=0)
@@ -247,6 +252,7 @@ def _random_sensor(samples: GossipSamples, level: float) -> Finding:
     """Compare the law of P at a random sensor with that of the switched chain, G (67).
 
     The sensor is drawn anew for each run and slot, so that each run gives one independent value.
+    The interval of the finding misses the truth with at most the probability ``level``.
     """
     random = Streams(samples.seed).generator("random sensor")
     runs, nodes = np.arange(samples.count), len(samples.scenario.nodes)
@@ -259,7 +265,10 @@ def _random_sensor(samples: GossipSamples, level: float) -> Finding:
 
 
 def _each_sensor(samples: GossipSamples, level: float) -> Finding:
-    """Compare law(Phat_n(t)) with law(Ptilde(t) given ptilde(t - 1) = n), from G (19)."""
+    """Compare law(Phat_n(t)) with law(Ptilde(t) given ptilde(t - 1) = n), from G (19).
+
+    The interval of the finding misses the truth with at most the probability ``level``.
+    """
     P, _, positions = samples.reference
     pairs = [
         Pair(
@@ -276,7 +285,8 @@ def _sensors_together(samples: GossipSamples, level: float) -> Finding:
 
     Its mean over the sensors equals that of the chain, G (67), which gives (28) and (29) in the
     limit; hence it exceeds N times that of the chain at no sensor, (27). Both comparisons use bands
-    around empirical distribution functions (:func:`band_width`).
+    around empirical distribution functions (:func:`band_width`). The interval of the finding misses
+    the truth with at most the probability ``level``.
     """
     traces = np.trace(samples.runs.P, axis1=-2, axis2=-1)
     expected = np.trace(samples.reference.P, axis1=-2, axis2=-1)
@@ -309,7 +319,8 @@ def _check_tokens(samples: GossipSamples, level: float) -> Finding:
     """Compare the law of each token at the end with that of the stationary switched chain.
 
     Chains that start where the token does have the exact law at this time; their distance from the
-    stationary one tells whether the horizon is long enough.
+    stationary one tells whether the horizon is long enough. The interval of the finding misses the
+    truth with at most the probability ``level``.
     """
     last, pairs = len(check_slots(samples.scenario)) - 1, []
     chain, origin = samples.reference.P[last], samples.reference.positions[:, 0]
@@ -325,6 +336,8 @@ def _check_tokens(samples: GossipSamples, level: float) -> Finding:
 def _check_initial_condition(samples: GossipSamples, level: float) -> Finding:
     """Compare the law at each sensor at the end with that of chains at this sensor that started
     with a covariance about 1000 times larger.
+
+    The interval of the finding misses the truth with at most the probability ``level``.
     """
     P, restarted, positions = samples.reference
     pairs = []
@@ -338,7 +351,10 @@ def _check_initial_condition(samples: GossipSamples, level: float) -> Finding:
 
 
 def _check_bounded(samples: GossipSamples, level: float) -> Finding:
-    """Compare the growth of the law of P at each sensor with that of the chains at this sensor."""
+    """Compare the growth of the law of P at each sensor with that of the chains at this sensor.
+
+    The interval of the finding misses the truth with at most the probability ``level``.
+    """
     runs, (chain, _, positions) = samples.runs.P, samples.reference
     half = check_slots(samples.scenario)[-2]
     pairs, expected = [], []

@@ -116,6 +116,8 @@ def _mean_below_bound(samples: HybridSamples, level: float) -> Finding:
 def _relative_excess(P: FloatArray, bound: FloatArray, level: float) -> Interval | None:
     """Return an interval for the largest eigenvalue of E[P] relative to ``bound`` (n, n), less 1,
     from samples ``P`` (R, n, n); None if the bound is singular.
+
+    The interval misses the truth with at most the probability ``level``.
     """
     values, vectors = np.linalg.eigh(bound)
     if not values[0] > 1e-12 * values[-1]:
@@ -129,7 +131,10 @@ def _relative_excess(P: FloatArray, bound: FloatArray, level: float) -> Interval
 
 
 def _bound_settles(samples: HybridSamples, level: float) -> Finding:
-    """Compute the bound of H (12) at 10, 100, ... horizons and compare it with its steady state."""
+    """Compute the bound of H (12) at 10, 100, ... horizons and compare it with its steady state.
+
+    No interval is estimated, so that ``level`` is not used.
+    """
     promised = with_promised_filter(samples.scenario)
     steady_bound, distance, factor = steady_covariance_bound(promised), np.inf, 1.0
     while distance > STEADY_TOLERANCE and factor < MAX_TIME:
@@ -145,7 +150,10 @@ def _bound_settles(samples: HybridSamples, level: float) -> Finding:
 
 
 def _bound_approaches_limit(samples: HybridSamples, level: float) -> Finding:
-    """Compute the exponent of the distance between the steady bound and S: -1 for fast links."""
+    """Compute the exponent of the distance between the steady bound and S: -1 for fast links.
+
+    No interval is estimated, so that ``level`` is not used.
+    """
     promised = with_promised_filter(samples.scenario)
     S, first = limit_covariance(promised), _mixing_factor(promised)
     distances = []
@@ -172,7 +180,10 @@ def _bound_approaches_limit(samples: HybridSamples, level: float) -> Finding:
 
 
 def _constant_gains_are_worse(samples: HybridSamples, level: float) -> Finding:
-    """Check that H (12) is at most the bound for the constant gains of its steady state."""
+    """Check that H (12) is at most the bound for the constant gains of its steady state.
+
+    No interval is estimated, so that ``level`` is not used.
+    """
     promised, times = (
         with_promised_filter(samples.scenario),
         np.array(check_times(samples.scenario)),

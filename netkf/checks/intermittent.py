@@ -103,8 +103,8 @@ def _heard_directions(scenario: Scenario) -> list[Direction]:
 
 @lru_cache(maxsize=8)
 def _least_roots(scenario: Scenario) -> FloatArray:
-    """Return the roots (W, n, n) of P* of each sampled node, with all readings that can reach it;
-    nan if it does not exist.
+    """Return the roots (W, n, n) of P* of each of W sampled nodes, with all readings that can reach
+    it; nan if it does not exist.
     """
     arrivals, n = all_arrivals(scenario, 1), scenario.plant.n
     F, Q = scenario.slot_belief
@@ -219,7 +219,11 @@ class IntermittentSamples(RunSamples):
     def _draw_node(
         self, purpose: str, k: int, slots: list[int], samples: int, paths: int
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return the fields of ArrivalSamples for the k-th node: (K, S, n, n), (S, n, n), (S',)."""
+        """Return the fields of ArrivalSamples for the k-th node: (K, S, n, n), (S, n, n), (S',).
+
+        S = ``samples`` filters at K numbers of ``slots``, and averages of the first S' = ``paths``;
+        ``purpose`` names their random stream.
+        """
         scenario = self.scenario
         node = scenario.nodes[k]
         senders = sensing_neighbours(scenario)[node]
@@ -262,7 +266,10 @@ def _delivery_probability(scenario: Scenario, direction: Direction) -> float:
 
 
 def _above_least(samples: IntermittentSamples, level: float) -> Finding:
-    """Check that no P is below that of the path without losses, which converges to P*."""
+    """Check that no P is below that of the path without losses, which converges to P*.
+
+    No interval is estimated, so that ``level`` is not used.
+    """
     slots = list(check_slots(samples.scenario))
     table, sequences, _ = all_arrivals(samples.scenario, slots[-1])
     starts = initial_roots(samples.scenario)[sampled_indices(samples.scenario)]
@@ -285,6 +292,7 @@ def _in_support(samples: IntermittentSamples, level: float) -> Finding:
     Both lie between the paths from a very large start and from 0, and may differ by the spread of
     these two, which vanishes once P has become independent of its start. If no spread has vanished
     yet, the horizon that would do is extrapolated from the rate at which the median spread decays.
+    No interval is estimated, so that ``level`` is not used.
     """
     P, point, spread = samples.runs.P[:, -1], samples.runs.in_support, samples.runs.spread
     finite = np.isfinite(point).all(axis=(0, -1, -2))
@@ -315,8 +323,10 @@ def _in_support(samples: IntermittentSamples, level: float) -> Finding:
 
 
 def _check_arrival_counts(samples: IntermittentSamples, level: float) -> Finding:
-    """Test the null hypothesis that readings arrive independently with the stated probability,
-    R (12): then their numbers are binomial.
+    """Test the null hypothesis that readings arrive independently with the stated probability, R
+    (12): then their numbers are binomial.
+
+    The interval of the finding misses the truth with at most the probability ``level``.
     """
     pairs = _heard_directions(samples.scenario)
     sent, arrived = samples.runs.sent.sum(axis=0), samples.runs.arrived.sum(axis=0)
@@ -330,7 +340,10 @@ def _check_arrival_counts(samples: IntermittentSamples, level: float) -> Finding
 
 
 def _law_of_arrivals(samples: IntermittentSamples, level: float) -> Finding:
-    """Compare the law of P at each node and time with that of filters with independent arrivals."""
+    """Compare the law of P at each node and time with that of filters with independent arrivals.
+
+    The interval of the finding misses the truth with at most the probability ``level``.
+    """
     pairs = [
         Pair(f"slot {slot}, node {node}", samples.runs.P[:, k, i], samples.reference.P[i, k])
         for k, slot in enumerate(check_slots(samples.scenario))
@@ -340,7 +353,10 @@ def _law_of_arrivals(samples: IntermittentSamples, level: float) -> Finding:
 
 
 def _check_bounded(samples: IntermittentSamples, level: float) -> Finding:
-    """Compare the growth of the law of P with that of filters with independent arrivals."""
+    """Compare the growth of the law of P with that of filters with independent arrivals.
+
+    The interval of the finding misses the truth with at most the probability ``level``.
+    """
     runs, reference_P = samples.runs.P, samples.reference.P
     pairs = [
         Pair(f"node {node}", runs[:, -2, i], runs[:, -1, i]) for i, node in enumerate(samples.nodes)
@@ -351,7 +367,10 @@ def _check_bounded(samples: IntermittentSamples, level: float) -> Finding:
 
 
 def _check_initial_condition(samples: IntermittentSamples, level: float) -> Finding:
-    """Compare the law of P at the end with that from a start a thousand times larger."""
+    """Compare the law of P at the end with that from a start a thousand times larger.
+
+    The interval of the finding misses the truth with at most the probability ``level``.
+    """
     P, restarted, _ = samples.reference
     pairs = [
         Pair(f"node {node}", samples.runs.P[:, -1, i], restarted[i], P[i, -1])
@@ -373,7 +392,10 @@ def _memory_of(reference: ArrivalSamples) -> float:
 
 
 def _averages_of_paths(samples: IntermittentSamples, level: float) -> Finding:
-    """Compare averages over the slots of one path with those of paths with independent arrivals."""
+    """Compare averages over the slots of one path with those of paths with independent arrivals.
+
+    The interval of the finding misses the truth with at most the probability ``level``.
+    """
     averages, expected = samples.runs.averages, samples.reference.averages
     intervals = [
         (
@@ -414,6 +436,8 @@ def _outage_factors(scenario: Scenario) -> dict[int, float]:
 def _mean_diverges(samples: IntermittentSamples, level: float) -> Finding:
     """Compute the lower bound on E[P] of the node with the largest outage factor, at the horizon
     and at twice the horizon, and check that it grows.
+
+    No interval is estimated, so that ``level`` is not used.
     """
     scenario, factors = samples.scenario, _outage_factors(samples.scenario)
     node = max(factors, key=lambda k: factors[k])
@@ -463,6 +487,7 @@ def _outage_counts(samples: IntermittentSamples, level: float) -> Finding:
     After an outage of k slots, of probability g (1 - g)^k, P lies between the k-th and the next
     hole, R Proposition 24. The exact law at the last slot gives the probabilities also when the
     start still matters. Counts of a cell are binomial; Pearson's p-value is added to the message.
+    The interval of the finding misses the truth with at most the probability ``level``.
     """
     laws, intervals, tests = _scalar_laws(samples.scenario), [], []
     single_level = level / (len(laws) * (CELLS + 1))
@@ -505,7 +530,10 @@ def _outage_edges(law: ScalarLaw) -> FloatArray:
 
 
 def _scalar_law_exact(samples: IntermittentSamples, level: float) -> Finding:
-    """Compare P at the end with its exact distribution function at that time."""
+    """Compare P at the end with its exact distribution function at that time.
+
+    The interval of the finding misses the truth with at most the probability ``level``.
+    """
     laws = _scalar_laws(samples.scenario)
     intervals = []
     for k, law in laws.items():

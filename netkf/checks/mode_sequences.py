@@ -48,7 +48,7 @@ class ModeTable(NamedTuple):
         self, roots: FloatArray, sequences: np.ndarray, lengths: list[int]
     ) -> FloatArray:
         """Return the covariances (L, K, n, n) after the first ``lengths`` (L increasing numbers) of
-        the modes of each sequence (K, T), from start ``roots`` (K, n, n).
+        the modes of each of K ``sequences`` (K, T), from start ``roots`` (K, n, n).
         """
         results, applied = [], 0
         for length in lengths:
@@ -231,7 +231,7 @@ def find_arrivals(scenario: Scenario, run: Run, slots: int) -> Arrivals:
 
 
 def all_arrivals(scenario: Scenario, slots: int) -> Arrivals:
-    """Return the readings that would be used in each slot if none were lost."""
+    """Return the readings that would be used in each of ``slots`` slots if none were lost."""
     neighbours = sensing_neighbours(scenario)
     modes: dict[tuple[int, ...], int] = {}
     sampled = sampled_nodes(scenario)

@@ -127,7 +127,10 @@ class PushSumSamples(RunSamples):
 
 
 def _mass_conserved(samples: PushSumSamples, level: float) -> Finding:
-    """Compare the totals of weight and number at the end with 1 and N."""
+    """Compare the totals of weight and number at the end with 1 and N.
+
+    No interval is estimated, so that ``level`` is not used.
+    """
     drift = np.abs(samples.runs.drift)
     message = f"drift of the totals of weight and number in {len(samples.runs.P)} runs"
     limits = np.ones_like(drift), _count_exchanges(samples), 1e-9
@@ -145,6 +148,8 @@ def _at_steady_state(samples: PushSumSamples, level: float) -> Finding:
 
     The row is undecided where the replay along the links of these runs is as far from P_inf: then
     the horizon is too short.
+
+    No interval is estimated, so that ``level`` is not used.
     """
     limit = push_sum_limits(with_promised_filter(samples.scenario)).P
     was_replayed = ~np.isnan(samples.runs.replayed[:, -1, 0, 0, 0])
@@ -179,7 +184,8 @@ def _horizon_factor(samples: PushSumSamples, limit: FloatArray) -> float:
 def _check_unbiased(samples: PushSumSamples, level: float) -> Finding:
     """Test the null hypothesis that errors at the end have mean 0, in all directions at once.
 
-    Under it the mean of R' whitened errors is normal with covariance I / R' at every node.
+    Under it the mean of R' whitened errors is normal with covariance I / R' at every node. The
+    interval of the finding misses the truth with at most the probability ``level``.
     """
     if not len(samples.followed):
         return find_unknown("no run has errors that were followed exactly", BIAS_TOLERANCE)
@@ -210,7 +216,8 @@ def _mean_square(samples: PushSumSamples, level: float) -> Finding:
     Given the links of a run, |W e|^2 is a quadratic form of normal numbers; summed over the runs it
     gives an interval for the factor on its expected value. The promise is broken only if mean
     squares differ from those expected for the links of these runs; the upper limit is for their
-    distance from the steady ones.
+    distance from the steady ones. The interval of the finding misses the truth with at most the
+    probability ``level``.
     """
     if not len(samples.followed):
         return find_unknown("no run has errors that were followed exactly", SQUARE_TOLERANCE)
@@ -237,7 +244,10 @@ def _mean_square(samples: PushSumSamples, level: float) -> Finding:
 
 
 def _gamma_certified(samples: PushSumSamples, level: float) -> Finding:
-    """Check that the gamma that Theorem 6 certifies is at least the exact minimum."""
+    """Check that the gamma that Theorem 6 certifies is at least the exact minimum.
+
+    No interval is estimated, so that ``level`` is not used.
+    """
     scenario = with_promised_filter(samples.scenario)
     gamma, needed = minimum_gamma(scenario, "mean-square"), exact_minimum_gamma(scenario)
     margin = float(gamma - needed)
@@ -248,6 +258,8 @@ def _gamma_certified(samples: PushSumSamples, level: float) -> Finding:
 def _many_steps(samples: PushSumSamples, level: float) -> Finding:
     """Compute error covariances and averaging noise for gamma = 1, 2, 4, ... and compare them with
     their limits, until they agree to STEADY_TOLERANCE or gamma exceeds MAX_STEPS.
+
+    No interval is estimated, so that ``level`` is not used.
     """
     scenario = with_promised_filter(samples.scenario)
     limits, gamma, distance = large_gamma_limits(scenario), 1, np.inf

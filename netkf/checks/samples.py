@@ -119,7 +119,8 @@ class RunSamples:
 def check_replay(samples: RunSamples, level: float) -> Finding:
     """Compare every covariance with the one that the equations give for the events of its run.
 
-    The finding is undecided if no run could be replayed.
+    The finding is undecided if no run could be replayed. No interval is estimated, so that
+    ``level`` is not used.
     """
     replayed = ~np.isnan(samples.runs.replayed).all(axis=(1, 2, 3, 4))
     P, expected = samples.runs.P[replayed], samples.runs.replayed[replayed]
@@ -181,6 +182,8 @@ def relative_difference(P: FloatArray, expected: FloatArray) -> FloatArray:
 def check_growth(samples: RunSamples, level: float) -> Finding:
     """Compare the growth of the law of P in the second half of the horizon with that of P replayed
     by the equations; see :func:`compare_growth`.
+
+    The interval of the finding misses the truth with at most the probability ``level``.
     """
     P, replayed = samples.runs.P, samples.runs.replayed
     # Only some runs are replayed, the entries of the others are nan.

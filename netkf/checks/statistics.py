@@ -69,6 +69,8 @@ def detectable_shift(deviation: float, level: float) -> float:
 def student_interval(value: float, deviation: float, count: int, level: float) -> Interval:
     """Return Student's t interval for an estimate ``value``, whose standard ``deviation`` was
     estimated from ``count`` independent values.
+
+    The interval misses the truth with at most the probability ``level``.
     """
 
     def limits(value: float, factor: float) -> tuple[float, float]:
@@ -87,8 +89,8 @@ def _normal_quantile(probability: float) -> float:
 
 
 def probability_interval(successes: int, trials: int, level: float) -> Interval:
-    """Return the exact interval of Clopper and Pearson (1934) for the probability of a success in
-    independent trials.
+    """Return the exact interval of Clopper and Pearson (1934) for the probability of a success,
+    from ``successes`` in independent ``trials``; it misses with probability ``level``.
     """
     low = high = detectable = math.nan
 
@@ -151,8 +153,9 @@ def deviation_interval(expected: float, interval: Interval) -> Interval:
 
 
 def band_width(samples: int, level: float) -> float:
-    """Return the half width of a band around an empirical distribution function that contains the
-    true one with probability 1 - level (Dvoretzky, Kiefer and Wolfowitz; Massart's constant).
+    """Return the half width of a band around the empirical distribution function of ``samples``
+    values that contains the true one with probability 1 - ``level`` (Dvoretzky, Kiefer and
+    Wolfowitz; Massart's constant).
     """
     return math.sqrt(math.log(2.0 / level) / (2.0 * samples))
 
@@ -175,7 +178,7 @@ def law_distance(
 
     The samples may depend on each other, since each band holds on its own. Further runs add to the
     first sample only. Values that differ by less than ``rounding``, or in the last of DIGITS
-    digits, count as equal.
+    digits, count as equal. The interval misses the truth with at most the probability ``level``.
     """
     gaps = np.abs(_ecdf_gaps(first, second, rounding))
     return _band_interval(gaps, len(first), len(second), level, grow=False)
@@ -188,6 +191,7 @@ def law_excess(
     samples ``first`` (S,) and ``second`` (S',).
 
     Values that differ by less than ``rounding`` count as equal. Further runs add to both samples.
+    The interval misses the truth with at most the probability ``level``.
     """
     gaps = _ecdf_gaps(first, second, rounding)
     return _band_interval(gaps, len(first), len(second), level, grow=True)
@@ -211,6 +215,8 @@ def _ecdf_gaps(first: FloatArray, second: FloatArray, rounding: float) -> FloatA
 def _band_interval(gaps: FloatArray, a: int, b: int, level: float, grow: bool) -> Interval:
     """Return the interval of the largest of the ``gaps`` (V,) between two empirical distribution
     functions of ``a`` and ``b`` samples; ``grow``: further runs add to the second sample too.
+
+    The interval misses the truth with at most the probability ``level``.
     """
     value = max(0.0, float(gaps.max()))
     widths = band_width(a, level / 2.0), band_width(b, level / 2.0)
@@ -233,7 +239,8 @@ def distance_to_law(
     cdf: Callable[[FloatArray], FloatArray], values: FloatArray, level: float
 ) -> Interval:
     """Return an interval for the largest difference between the exact distribution function ``cdf``
-    and that of a sample (S,): the one-sample Kolmogorov-Smirnov statistic with its DKW band.
+    and that of the sample ``values`` (S,): the one-sample Kolmogorov-Smirnov statistic with its DKW
+    band, which misses with probability ``level``.
     """
     points = np.unique(round_digits(values))
     slack = 10.0 ** (1 - DIGITS) * np.maximum(np.abs(points), 1e-300)
@@ -264,6 +271,8 @@ def band_around(value: float, width: float, detectable: float = math.nan) -> Int
 def scale_interval(total: float, freedom: float, level: float) -> Interval:
     """Return the interval for c if ``total`` is c times a chi-square variable with ``freedom``
     degrees of freedom; its estimate is total / freedom.
+
+    The interval misses the truth with at most the probability ``level``.
     """
 
     def quantiles(freedom: float) -> tuple[float, float]:
@@ -292,7 +301,8 @@ def quadratic_interval(total: float, weights: FloatArray, level: float) -> Inter
 
     Its ends are quantiles of that sum by the saddle-point formula of Lugannani and Rice (1980),
     whose relative error in the tails is a few per cent for any weights. For equal weights the sum
-    is a multiple of a chi-square variable, whose exact quantiles are used.
+    is a multiple of a chi-square variable, whose exact quantiles are used. The interval misses the
+    truth with at most the probability ``level``.
     """
     weights = weights[weights > 1e-12 * weights.max(initial=0.0)]
     if not len(weights):
@@ -362,7 +372,8 @@ def eigenvalue_interval(samples: FloatArray, level: float) -> Interval:
     (R, n, n).
 
     Scheffe's method covers all directions at once: Hotelling's T^2 bounds the mean of the n (n + 1)
-    / 2 distinct entries, estimated from R samples, which must have a variance.
+    / 2 distinct entries, estimated from R samples, which must have a variance. The interval misses
+    the truth with at most the probability ``level``.
     """
     count, n = len(samples), samples.shape[-1]
     mean = samples.mean(axis=0)

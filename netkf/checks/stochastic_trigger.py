@@ -36,7 +36,8 @@ def check_rate(samples: RunSamples, level: float) -> Finding:
     """Test the null hypothesis that nodes send with their stated probability given the past.
 
     Under it the number of messages of a run less the sum of the probabilities is a martingale with
-    mean 0; Student's interval is over the independent runs.
+    mean 0; Student's interval is over the independent runs. The interval of the finding misses the
+    truth with at most the probability ``level``.
     """
     sent, expected = samples.runs.sends.T
     total = float(expected.mean())

@@ -26,7 +26,10 @@ below which P counts as steady.
 
 
 def check_exact_covariance(samples: RunSamples, level: float) -> Finding:
-    """Compare P with the exact covariance Sigma of the error, up to rounding."""
+    """Compare P with the exact covariance Sigma of the error, up to rounding.
+
+    No interval is estimated, so that ``level`` is not used.
+    """
     max_runs = max_replayed(samples.scenario)
     P, Sigma = samples.runs.P[:max_runs], samples.runs.Sigma[:max_runs]
     size = np.trace(Sigma, axis1=-2, axis2=-1)
@@ -48,7 +51,8 @@ EXACT = Promise(
 def check_steady(samples: RunSamples, level: float) -> Finding:
     """Compare P at the end of the runs with that of steady tracks.
 
-    While the initial P may still matter, the row is undecided and has the horizon that suffices.
+    While the initial P may still matter, the row is undecided and has the horizon that suffices. No
+    interval is estimated, so that ``level`` is not used.
     """
     radius, steady = tracks_in_slots(samples.scenario)
     expected = steady[sampled_indices(samples.scenario)]

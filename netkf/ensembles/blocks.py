@@ -76,7 +76,9 @@ def work(job: Job) -> Any:
 
 
 def each_replica(task: Task, merge: Merge, scenario: Scenario, seed: int, replicas: range) -> Any:
-    """Return the results of ``task`` for each replica, merged by the tree over replicas."""
+    """Return the results of ``task(scenario, seed, replica)`` for each of ``replicas``, merged by
+    the tree over replicas with ``merge``.
+    """
     tree = MergeTree(merge)
     for k, replica in enumerate(replicas):
         tree.add(k, task(scenario, seed, replica))

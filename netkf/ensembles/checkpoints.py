@@ -112,7 +112,7 @@ class BlockCheckpoints:
         return statistics
 
     def save(self, number: int, statistics: RunStatistics, identity: RunIdentity) -> None:
-        """Write a block with the traces that its runs left; raises WriteError."""
+        """Write block ``number`` with the traces that its runs left; raises WriteError."""
         with writing_file(self._folder):
             self._folder.mkdir(exist_ok=True)
         # In memory first: on a full disk some versions of numpy leave their file open.
@@ -179,7 +179,9 @@ class BlockCheckpoints:
         )
 
     def _restore_trace(self, arrays: Any, k: int) -> Trace:
-        """Return a trace; raises DamagedError if it does not fit the scenario."""
+        """Return the k-th trace of a block from its stored ``arrays``; raises DamagedError if it
+        does not fit the scenario.
+        """
         trace: Any = Trace(*(arrays[f"trace_{k}_{name}"] for name in Trace._fields))
         T, N, n = len(trace.times), len(self._scenario.nodes), self._scenario.plant.n
         shapes = [(), (len(trace.log),), (T,), (T, n), (T, N, n), (T, N, n, n), (T, N, n)]
@@ -190,8 +192,8 @@ class BlockCheckpoints:
 
     @contextlib.contextmanager
     def _expect_block(self, number: int) -> Iterator[None]:
-        """Turn a DamagedError about a block that was readable before into an EngineError, and
-        remove the block.
+        """Turn a DamagedError about block ``number``, which was readable before, into an
+        EngineError, and remove the block.
         """
         try:
             yield

@@ -137,7 +137,8 @@ def _open_directory(
     engine: str,
     width: int,
 ) -> _DirectoryWriter | None:
-    """Return the writer of a new directory, or of the one to resume; None if that is complete.
+    """Return the writer of a new directory for ``runs`` runs, or of the one to resume; None if that
+    is complete.
 
     ``engine`` is the name of the engine, ``width`` the number of blocks that run at a time.
     """
@@ -230,8 +231,8 @@ class _DirectoryWriter:
         return min(self.plan.block, self.plan.runs - number * self.plan.block)
 
     def save_block(self, number: int, statistics: RunStatistics) -> RunStatistics:
-        """Store a completed block, and return its statistics without the traces, which would fill
-        the memory.
+        """Store completed block ``number``, and return its statistics without the traces, which
+        would fill the memory.
         """
         self.blocks.save(number, statistics, self.plan)
         self._done += self._runs_in_block(number)

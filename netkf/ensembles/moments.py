@@ -48,7 +48,9 @@ def moments_of(values: FloatArray, size: FloatArray) -> Moments:
 
 
 def merge_moments(a: Moments, b: Moments) -> Moments:
-    """Return the moments of both samples together; both have the same rows and columns, (S, C)."""
+    """Return the moments of the observations of ``a`` and ``b`` together; both have S rows and C
+    columns.
+    """
     size, mean, M2 = (_stack_pair(*pair) for pair in zip(a, b, strict=True))
     merge_two(size, mean, M2)
     return Moments(size[0], mean[0], M2[0])

@@ -190,7 +190,11 @@ class _ScratchCache(threading.local):
         self._scratch = reduction_scratch(1, 1, 1)
 
     def of(self, filters: int, n: int, largest: int) -> ReductionScratch:
-        """Return scratch for at least these sizes (see ``reduction_scratch``), not cleared."""
+        """Return scratch for ``filters`` filters of n states and chunks of at most ``largest``
+        runs, not cleared.
+
+        The arrays are kept for the next call, which gets larger ones if it needs them.
+        """
         if filters * n * n > MAX_SCRATCH_ENTRIES:
             return reduction_scratch(filters, n, largest)
         if self._sizes[:2] != (filters, n) or self._sizes[2] < largest:

@@ -115,7 +115,8 @@ def clear_unfinished_runs(
     replica: int = 0,
     note: Callable[[str], None] | None = None,
 ) -> bool:
-    """Remove the files of a single run that was stopped; return False if it is finished.
+    """Remove the files of a single run, number ``replica``, that was stopped; return False if it is
+    finished.
 
     The files of a finished run that were changed since are removed too, and ``note`` is called with
     a line about them. Raises ScenarioError if the directory holds another run.

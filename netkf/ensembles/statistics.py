@@ -87,8 +87,8 @@ def merge(a: RunStatistics, b: RunStatistics) -> RunStatistics:
 def block_statistics(
     scenario: Scenario, seed: int, replicas: range, engine: Engine, traces: int = 0
 ) -> RunStatistics:
-    """Return the merged statistics of a block of replicas, which it simulates; the traces of the
-    first ``traces`` replicas of the ensemble are kept.
+    """Return the merged statistics of a block of ``replicas``, which it simulates with ``seed``;
+    the traces of the first ``traces`` replicas of the ensemble are kept.
     """
     tree, count = MergeTree(merge), 0
     for batch, batch_traces in _batches(scenario, seed, replicas, engine, traces):
@@ -105,8 +105,10 @@ def block_statistics(
 def _batches(
     scenario: Scenario, seed: int, replicas: range, engine: Engine, traces: int
 ) -> Iterator[tuple[RunBatch, tuple[Trace, ...]]]:
-    """Yield batches of runs with their traces. A run with a trace is a batch of its own; the batch
-    of replica 0 has a fingerprint.
+    """Yield batches of the runs of ``replicas``, simulated with ``seed``, with their traces.
+
+    A run with a trace (one of the first ``traces`` of the ensemble) is a batch of its own; the
+    batch of replica 0 has a fingerprint.
     """
     for replica in range(replicas.start, min(traces, replicas.stop)):
         yield _traced_run(scenario, seed, replica, engine)
@@ -119,7 +121,9 @@ def _batches(
 def _traced_run(
     scenario: Scenario, seed: int, replica: int, engine: Engine
 ) -> tuple[RunBatch, tuple[Trace, ...]]:
-    """Simulate one replica and keep its trace."""
+    """Simulate one ``replica`` of the runs of ``seed``; return it as a batch of one run, and its
+    trace.
+    """
     sink, memory = batch_sink(scenario, range(replica, replica + 1)), MemorySink()
     recorder = Recorder([sink, memory])
     status = engine.run(scenario, Streams(seed, replica), recorder, silent)

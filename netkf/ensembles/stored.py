@@ -43,7 +43,9 @@ class StoredEnsemble(WithPromises, Ensemble):
     status: str
 
     def replica(self, number: int = 0) -> StoredRun:
-        """Return one run of the ensemble; raises ScenarioError if its trace was not kept."""
+        """Return run ``number`` of the ensemble, from 0 on; raises ScenarioError if its trace was
+        not kept.
+        """
         assert self.scenario is not None
         where = shorten(self.directory)
         number = integer(low=0)("replica", number)

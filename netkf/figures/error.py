@@ -254,7 +254,9 @@ def ratios_figure(data: FigureData) -> Picture:
 
 
 def _nees_claim(rows: list[dict[str, Any]], key: str, scale: float) -> str:
-    """Return a sentence on the range of the ratios of squared errors to P, without a bound."""
+    """Return a sentence on the range of the ratios of squared errors to P, ``row[key] * scale`` of
+    each node's row, without a bound.
+    """
     ratios = [row[key] * scale for row in rows]
     span = f"{min(ratios):.3g} to {max(ratios):.3g}" if len(ratios) > 1 else f"{ratios[0]:.3g}"
     return f"Squared errors are {span} times what P says; no bound applies"

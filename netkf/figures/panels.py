@@ -71,8 +71,8 @@ def draw_nodes(axes: Any, data: FigureData, values: FloatArray, se: FloatArray |
 
 
 def root_interval(root: FloatArray, se: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the limits (T,) of the 95% intervals of roots (T,) whose squares have the standard
-    errors ``se`` (T,).
+    """Return the limits (T,) of the 95% intervals of values ``root`` (T,) whose squares have the
+    standard errors ``se`` (T,).
     """
     low, high = (np.maximum(root**2 + s * NORMAL_QUANTILE * se, 0.0) for s in (-1.0, 1.0))
     return np.sqrt(low), np.sqrt(high)
@@ -141,7 +141,9 @@ def draw_promises(axes: Any, times: FloatArray, promised: PromisedTraces) -> Non
 
 
 def _draw_bound(axes: Any, times: FloatArray, roots: FloatArray) -> None:
-    """Draw the bounds ``roots`` (T, N), only the largest and smallest if nodes differ."""
+    """Draw the bounds ``roots`` (T, N) of N nodes over ``times`` (T,) in seconds, only the largest
+    and smallest if nodes differ.
+    """
     same = np.allclose(roots.max(axis=1), roots.min(axis=1))
     label = "bound H(12)" if same else "bound H(12): largest"
     axes.plot(times, roots.max(axis=1), color=INK, lw=1.3, ls="--", label=label, zorder=3)

@@ -305,8 +305,8 @@ def _readable_end(directions: list[DirectedMessages], end: float) -> float:
 
 
 def wilson_interval(delivered: int, total: int) -> tuple[float, float]:
-    """Return Wilson's interval of a delivery probability, at the level CONFIDENCE, from the number
-    of delivered messages and of all.
+    """Return Wilson's interval of a delivery probability, at the level CONFIDENCE, from the numbers
+    of ``delivered`` messages and of all, ``total``.
     """
     interval = binomtest(delivered, total).proportion_ci(CONFIDENCE, "wilson")
     return float(interval.low), float(interval.high)

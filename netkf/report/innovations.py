@@ -55,7 +55,9 @@ def read_innovations(source: ReportSource) -> Innovations | str | None:
 
 
 def node_means(readings: Innovations) -> NodeMeans:
-    """Return the mean NIS of each node with readings, with limits that hold if P is exact."""
+    """Return the mean NIS (M,) of each of M nodes with readings, with limits (M,) that hold if P is
+    exact.
+    """
     finite = np.isfinite(readings.nis)
     nodes, columns = np.unique(readings.nodes[finite], return_inverse=True)
     freedom, sums = (
@@ -98,7 +100,9 @@ def describe_innovations(readings: Innovations) -> str:
 
 
 def _judge_mean(mean: float, low: float, high: float) -> str:
-    """Return as text whether P is consistent with a node's mean NIS, whose limits are given."""
+    """Return as text whether P is consistent with a node's ``mean`` NIS over its degrees of
+    freedom, which lies in ``low`` .. ``high`` if P is exact.
+    """
     interval = f"{format_number(low)} .. {format_number(high)}"
     if mean > high:
         return f"P is too sure: {CONFIDENCE:.0%} of such means would lie in {interval}"

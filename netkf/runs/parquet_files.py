@@ -150,6 +150,7 @@ class ParquetSink(Sink):
     thread_safe: ClassVar[bool] = True
 
     def __init__(self, directory: Path, scenario: Scenario, replica: int, events: bool) -> None:
+        """Prepare the files of run number ``replica`` in ``directory``; none without ``events``."""
         self._nodes, self._replica, self._event_count = scenario.nodes, replica, 0
         self._truth_known = scenario.plant.truth_known
         self._events = _Table(directory / "events.parquet", EVENT_ENCODING) if events else None

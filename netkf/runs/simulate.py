@@ -87,7 +87,8 @@ def collect_run(
 ) -> Run:
     """Return the Run of a finished simulation whose ``recorder`` wrote to ``memory``.
 
-    ``engine`` is the name of the engine, ``status`` "complete" or "diverged".
+    It is number ``replica`` of the runs of ``seed``; ``engine`` is the name of the engine,
+    ``status`` "complete" or "diverged".
     """
     count, n = len(scenario.nodes), scenario.plant.n
     shapes = (), (n,), (count, n), (count, n, n), (count, n)

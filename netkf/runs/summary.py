@@ -298,7 +298,11 @@ def _mean_or_nan(values: list[FloatArray], indices: np.ndarray, scenario: Scenar
 def summary_notes(
     scenario: Scenario, rounding_from: float | None, has_covariance: bool
 ) -> list[str]:
-    """Return notes for users on the averages of a run or of an ensemble, one sentence each."""
+    """Return notes for users on the averages of a run or of an ensemble, one sentence each.
+
+    ``rounding_from`` is the time in seconds from which rounding blurs errors, if any;
+    ``has_covariance`` says whether the filter gives P.
+    """
     notes = [] if has_covariance else [NO_COVARIANCE]
     if rounding_from is not None and scenario.plant.truth_known:
         notes.append(

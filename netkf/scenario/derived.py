@@ -229,14 +229,18 @@ class DerivedScenario(ScenarioModel):
     def _stack_sensors(
         self, placed_sensors: tuple[PlacedSensor, ...], believed: bool
     ) -> tuple[FloatArray, FloatArray]:
-        """Return the stacked H (p, n) and block diagonal R (p, p) of sensors of any nodes."""
+        """Return the stacked H (p, n) and block diagonal R (p, p) of sensors of any nodes; R is the
+        one that filters assume if ``believed``, else the true one.
+        """
         entries = tuple(placed_sensor.entry for placed_sensor in placed_sensors)
         return self._stack_entries(entries, believed)
 
     def _stack_entries(
         self, entries: tuple[int, ...], believed: bool
     ) -> tuple[FloatArray, FloatArray]:
-        """Return the stacked H (p, n) and block diagonal R (p, p) of ``[[sensors]]`` entries."""
+        """Return the stacked H (p, n) and block diagonal R (p, p) of ``[[sensors]]`` entries, given
+        by their indices; R is the one that filters assume if ``believed``, else the true one.
+        """
         # Cached, because thousands of nodes may have the sensors of one [[sensors]] entry.
         if (entries, believed) not in self._stacks:
             H = [self.sensors[entry].matrix_of(self.plant.n) for entry in entries]

@@ -246,7 +246,9 @@ class ScenarioModel(Component):
         return self.plant.is_random and all(sensor.is_random for sensor in self.sensors)
 
     def noise_covariance(self, entry: int, *, believed: bool) -> FloatArray:
-        """Return R (p, p) of a ``[[sensors]]`` entry: the true one, or the one filters believe."""
+        """Return R (p, p) of the ``[[sensors]]`` entry with this index: the one that filters assume
+        if ``believed``, else the true one.
+        """
         believed_R = self.filter.model.R
         if not believed or believed_R is None:
             true_R: FloatArray = self.sensors[entry].R

@@ -58,7 +58,9 @@ def _iterate_sampled_sensors(scenario: ScenarioModel) -> Iterator[tuple[int, Pla
 def _make_generator(
     streams: Streams, node: int, placed_sensor: PlacedSensor
 ) -> Callable[[str], np.random.Generator]:
-    """Return a function that returns a sensor's own random generator for a purpose."""
+    """Return a function that returns the random generator for a purpose that belongs to one sensor
+    of ``node`` (its id) alone.
+    """
     return lambda purpose: streams.generator(purpose, node, placed_sensor.ordinal)
 
 

@@ -101,7 +101,9 @@ class RunDirectory:
         return int(self.manifest["runs"]["done"] or 1)
 
     def value(self, quantity: str, node: int) -> tuple[float | None, float | None]:
-        """Return the value and the standard error of a quantity, None if it has none."""
+        """Return the value and the standard error of a ``quantity`` at ``node`` (an id, -1 for all
+        nodes together), None if it has none.
+        """
         if quantity in MESSAGES:
             table, errors = self.summary["messages"], self.summary.get("messages_se", {})
             return table.get(quantity), errors.get(quantity)
@@ -144,9 +146,11 @@ class RunDirectory:
         return math.inf if stored is None else float(stored)
 
     def by_run(self, quantity: str, node: int, end: float) -> pd.Series[float] | None:
-        """Return averages over time, run by run; None if the states were not kept.
+        """Return the average of ``quantity`` over time for each run, at ``node`` (an id, -1 for all
+        nodes together); None if the states were not kept.
 
-        For ``rms_error`` it is the squared error, and only samples before ``end`` count.
+        For ``rms_error`` it is the squared error. Of errors and NEES only samples before ``end``
+        (seconds) count.
         """
         columns = {"rms_error": "sq_error", "mean_trace": "mean_trace", "mean_nees": "nees"}
         if self.samples is None or quantity not in columns:
@@ -289,7 +293,9 @@ def _read_all(directories: Sequence[str | Path]) -> list[RunDirectory]:
 def _compare_quantity(
     first: RunDirectory, other: RunDirectory, quantity: str, node: int, level: float
 ) -> Entry:
-    """Return a quantity of one directory and its difference from the first one."""
+    """Return a ``quantity`` of one directory at ``node`` (an id, -1 for all nodes together) and its
+    difference from the ``first`` one, with an interval that misses with probability ``level``.
+    """
     value, se = other.value(quantity, node)
     entry = Entry(value, se)
     if other is first or value is None:
@@ -302,7 +308,11 @@ def _compare_quantity(
 def _pair_runs(
     first: RunDirectory, other: RunDirectory, quantity: str, node: int, level: float, entry: Entry
 ) -> Entry | None:
-    """Return the entry with a paired difference, None if the runs do not have the same truth."""
+    """Return the ``entry`` with a paired difference, run by run, and its interval at ``level``;
+    None if the runs do not have the same truth.
+
+    ``node`` is an id, -1 for all nodes together.
+    """
     end = min(first.rounding_from, other.rounding_from)
     base_values, values = (finished.by_run(quantity, node, end) for finished in (first, other))
     if base_values is None or values is None or not _same_truth(first, other):
@@ -342,7 +352,8 @@ def _same_truth(first: RunDirectory, other: RunDirectory) -> bool:
 def _welch_difference(
     base: tuple[float | None, float | None], entry: Entry, runs: tuple[int, int], level: float
 ) -> Entry:
-    """Return the entry with the difference of independent runs, by Welch's t interval.
+    """Return the entry with the difference of independent runs, by Welch's t interval, which misses
+    with probability ``level``.
 
     ``base`` and ``entry`` have means and standard errors over ``runs`` runs each; the degrees of
     freedom are those of Welch and Satterthwaite.
@@ -366,7 +377,9 @@ def _welch_difference(
 def _student_interval(
     mean: float, error: float, freedom: float, level: float
 ) -> tuple[float, float]:
-    """Return the limits of Student's t interval, ``mean`` +- a quantile times ``error``."""
+    """Return the limits of Student's t interval, ``mean`` +- a quantile times its standard
+    ``error``, at ``freedom`` degrees of freedom; it misses with probability ``level``.
+    """
     width = float(scipy.special.stdtrit(freedom, 1.0 - level / 2.0)) * error
     return mean - width, mean + width
 

@@ -188,7 +188,9 @@ def compare_filters(
 
 
 def _simulate(scenario: Scenario, runs: int, seed: int, engine: str, pool: Pool) -> FilterValues:
-    """Return the values of all runs of a filter."""
+    """Return the values of all ``runs`` replicas of ``seed`` of one filter, simulated by the
+    ``engine`` of that name.
+    """
     with explain_failures(scenario):
         task = partial(block_values, engine=choose_engine(engine, scenario))
         values: FilterValues = replicate_blocks(task, join_values, scenario, runs, seed, pool=pool)
@@ -203,7 +205,9 @@ def _make_row(
     n: int,
     level: float,
 ) -> ComparedFilter:
-    """Return the row of a filter, with differences from the ``first`` one."""
+    """Return the row of a filter, with differences from the ``first`` one in intervals that miss
+    with probability ``level``; n is the number of states.
+    """
     diverged = int(values.diverged.sum())
     return ComparedFilter(
         label,

@@ -71,7 +71,7 @@ class RunConsistency(NamedTuple):
 def run_consistency(
     scenario: Scenario, seed: int, replica: int, engine: str | Engine = "auto"
 ) -> RunConsistency:
-    """Simulate one replica and return its NEES and NIS."""
+    """Simulate one ``replica`` of the runs of ``seed``, and return its NEES and NIS."""
     run = simulate(scenario, seed, replica, engine)
     _, nees = errors(run.error, run.P)
     after_start = np.flatnonzero(run.times > 0.0)
@@ -161,6 +161,9 @@ class _Innovations:
     def __init__(
         self, scenario: Scenario, run: Run, sigma: FloatArray | None, blurred: np.ndarray
     ) -> None:
+        """Take a run with its T samples: the exact covariances ``sigma`` (T, N, n, n) of the
+        errors, if known, and the mask ``blurred`` (T, N) of errors to leave out.
+        """
         self._scenario, self._run, self._sigma, self._blurred = scenario, run, sigma, blurred
         self._streams = Streams(run.seed, run.replica)
         # Samples of a predicting filter are predictions; others are predicted by one slot.
@@ -337,7 +340,9 @@ def _without_horizon(scenario: Scenario) -> Scenario:
 def judge_consistency(
     scenario: Scenario, runs: Sequence[RunConsistency], confidence: float
 ) -> Consistency:
-    """Return the consistency of a scenario from several of its runs."""
+    """Return the consistency of a scenario from several of its ``runs``; all intervals of the nodes
+    hold together with probability ``confidence``.
+    """
     n, count, level = scenario.plant.n, len(runs), 1.0 - confidence
     low, high = (
         2.0 * float(scipy.special.gammaincinv(0.5 * count * n, q)) / count
@@ -375,7 +380,9 @@ def _blurred_from(runs: Sequence[RunConsistency]) -> float:
 
 
 def _share_inside(runs: Sequence[RunConsistency], low: float, high: float) -> FloatArray:
-    """Return for each node (N,) the share of samples whose mean NEES lies in the bounds."""
+    """Return for each node (N,) the share of samples whose mean NEES over the runs lies between
+    ``low`` and ``high``.
+    """
     shortest = min(len(run.samples) for run in runs)  # runs that diverged ended early
     means = np.mean([run.samples[:shortest] for run in runs], axis=0)
     usable = np.isfinite(means).sum(axis=0)
@@ -386,7 +393,11 @@ def _share_inside(runs: Sequence[RunConsistency], low: float, high: float) -> Fl
 def _judge_node(
     scenario: Scenario, runs: Sequence[RunConsistency], i: int, share_inside: float, quantile: float
 ) -> NodeConsistency:
-    """Return the verdict on node ``i`` by the interval of its mean NEES over the runs."""
+    """Return the verdict on the i-th node by the interval of its mean NEES over the runs,
+    ``quantile`` standard errors wide to each side.
+
+    ``share_inside`` is the share of its samples whose mean NEES lies in the chi-square bounds.
+    """
     nees = np.array([run.nees[i] for run in runs])
     expected = np.array([run.expected[i] for run in runs])
     is_known = bool(np.isfinite(expected).all())

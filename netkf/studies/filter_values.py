@@ -56,7 +56,9 @@ def _batch_values(scenario: Scenario, batch: RunBatch) -> FilterValues:
 
 
 def _largest_error(batch: RunBatch, r: int, blurred_from: float) -> float:
-    """Return the largest |e| of a run after time 0, where rounding does not blur it."""
+    """Return the largest |e| of any node in run ``r`` of a batch after time 0, before
+    ``blurred_from`` (seconds), from where on rounding blurs it; nan without a sample.
+    """
     length = int(batch.lengths[r])
     times = batch.times[:length]
     # The last sample of a run that diverges is not finite.
@@ -80,7 +82,9 @@ class Traffic(NamedTuple):
 
 
 def count_traffic(scenario: Scenario, seed: int, engine: Engine) -> Traffic:
-    """Return the traffic of replica 0, with 8 bytes for each number of a message."""
+    """Return the traffic of replica 0 of the runs of ``seed``, with 8 bytes for each number of a
+    message.
+    """
     log, slotted = simulate(scenario, seed, 0, engine).log, scenario.slotted
     sent = log[log["kind"] == CODES["send"]]
     if slotted:
@@ -140,7 +144,8 @@ def estimate_quantities(
 
 
 def _influences(values: FilterValues, n: int) -> dict[str, tuple[float, FloatArray]]:
-    """Return each quantity with its influence values (R,), one for each run.
+    """Return each quantity with its influence values (R,), one for each of R runs of a scenario
+    with n states.
 
     The standard error of the quantity is that of the mean of its influence values, and paired
     differences of two filters follow from differences of these (delta method).
@@ -173,8 +178,8 @@ def _width(values: FloatArray, level: float) -> float:
 
 
 def credibility(values: FilterValues, n: int, level: float) -> str:
-    """Return "too sure", "too careful" or "consistent" by the interval of NEES / n, "-" where NEES
-    is unknown or one run shows nothing.
+    """Return "too sure", "too careful" or "consistent" by the interval of NEES / n, which misses
+    with probability ``level``, "-" where NEES is unknown or one run shows nothing.
     """
     ratios = values.nees / n
     mean, width = float(ratios.mean()), _width(ratios, level)

@@ -304,7 +304,9 @@ class Reach:
     via: IntArray
 
     def messages_from(self, segment: int, budget: int) -> list[int]:
-        """Return the messages on the path from a segment to the node, in the order of sending."""
+        """Return the indices of the messages on the path from ``segment`` (its index) to the node,
+        in the order of sending, if at most ``budget`` messages of cost 1 are used.
+        """
         path: list[int] = []
         while self.via[budget, segment] != NEVER:
             message = int(self.via[budget, segment])
@@ -314,8 +316,9 @@ class Reach:
         return path
 
     def needed(self, message: int) -> int | None:
-        """Return the number of messages of cost 1 that must be used, this one included, for its
-        information to reach the node; None if it exceeds the budget of the search.
+        """Return the number of messages of cost 1 that must be used, ``message`` (its index)
+        included, for its information to reach the node; None if it exceeds the budget of the
+        search.
         """
         used, cost = self.flow.messages.used_row[message], int(self.flow.cost[message])
         for budget in range(len(self.deadline) - cost):
@@ -354,6 +357,9 @@ class KeptReadings:
     """
 
     def __init__(self, scenario: DerivedScenario, log: IntArray, at: float) -> None:
+        """Find the readings in the EVENT rows ``log`` (E,) that influence the sample at ``at``
+        seconds.
+        """
         self._scenario, self._times, self._at = scenario, log["t"], at
         sensed = np.flatnonzero(log["kind"] == CODES["sense"])
         self._rows = {
@@ -434,7 +440,9 @@ def newest_information(
 
 
 def _age_key(reading: float, known: float) -> tuple[float, float]:
-    """Return a key that sorts missing times first."""
+    """Return a key of the times of a ``reading`` and up to which information is ``known``, both in
+    seconds, that sorts missing times (nan) first.
+    """
     return (
         -np.inf if np.isnan(reading) else reading,
         -np.inf if np.isnan(known) else known,

@@ -71,7 +71,8 @@ def join_metrics(*parts: RunMetrics) -> RunMetrics:
 
 
 def expected_metrics(scenario: Scenario, seed: int, replica: int, engine: Engine) -> RunMetrics:
-    """Return the metrics of one replica with the expected squared error given its events.
+    """Return the metrics of one ``replica`` of the runs of ``seed``, with the expected squared
+    error given its events.
 
     The conditional expectation removes the variance that the noises cause (Rao-Blackwell), so that
     far fewer runs are enough.

@@ -213,7 +213,11 @@ class Search:
         self.probes: list[Probe] = []
 
     def run(self, low: float, high: float, confidence: float, quantity: str) -> Sizing:
-        """Search between two values and return the result; ``quantity`` describes the quantity."""
+        """Search between the values ``low`` and ``high`` of the key and return the result.
+
+        All decisions together hold with probability ``confidence``; ``quantity`` describes the
+        quantity.
+        """
         first, last = self._probe(low), self._probe(high)
         grows = self._detect_growth(first, last)
         good, bad = (first, last) if grows else (last, first)
@@ -249,8 +253,8 @@ class Search:
         return last.quantity > first.quantity
 
     def _bisect(self, value: float, misses: float) -> tuple[float, float]:
-        """Return two neighbouring values, of which the first reaches the target and the second
-        does not, from two such values further apart.
+        """Return two neighbouring values, of which the first reaches the target and the second does
+        not, from two such values, ``value`` and ``misses``, further apart.
         """
         while len(self.probes) < MAX_PROBES[self._problem.by]:
             middle = self._value_between(*sorted((value, misses)))
@@ -273,7 +277,9 @@ class Search:
         return self.probes[-1]
 
     def _value_between(self, low: float, high: float) -> float | None:
-        """Return a value between two, an integer or rounded to DIGITS; None if there is none."""
+        """Return a value between ``low`` and ``high``, an integer or rounded to DIGITS; None if
+        there is none.
+        """
         if self._problem.integer:
             middle = (low + high) // 2
             return int(middle) if low < middle < high else None
@@ -291,7 +297,11 @@ def advise(
     misses: float | None,
     grows: bool,
 ) -> str:
-    """Return advice on range and runs of the next search, empty if this one was conclusive."""
+    """Return advice on range and runs of the next search, empty if this one was conclusive.
+
+    ``value`` is the last value of the key that reaches the target and ``misses`` the first that
+    does not, None if there is none; ``grows`` says that the quantity grows with the key.
+    """
     by_value = sorted(probes)
     if value is not None and misses is None:
         end = by_value[-1] if grows else by_value[0]

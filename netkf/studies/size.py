@@ -136,7 +136,9 @@ def _count_looks(runs: int, first: int) -> int:
 
 
 def _check_range(scenario: Scenario, key: str, low: float, high: float) -> bool:
-    """Return True if the key is an integer; raises ScenarioError for a wrong range or key."""
+    """Return True if the ``key`` is an integer; raises ScenarioError for a range ``low`` ..
+    ``high`` that does not fit it, or a wrong key.
+    """
     is_integer = is_integer_key(scenario, key)
     for end in (low, high):
         if is_integer and not isinstance(end, int):

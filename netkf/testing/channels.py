@@ -298,8 +298,8 @@ def _fraction_deviation(
 def _check_independent(
     watched: WatchedPart, delivered: FloatArray, links: tuple[Link, ...]
 ) -> None:
-    """Check that outcomes (C, K, L) of C runs, K messages and L links are independent of those of
-    other links, and of those up to MAX_LAG messages later.
+    """Check that the outcomes ``delivered`` (C, K, L), 0 or 1, of C runs, K messages and L links
+    are independent of those of other links, and of those up to MAX_LAG messages later.
     """
     p = delivered.mean(axis=(0, 1))
     expected = np.outer(p, p)

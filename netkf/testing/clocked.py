@@ -79,7 +79,9 @@ class ClockTrial(Trial):
             yield cls(watched, system, shift, clock, increments=True)
 
     def model(self, has_sensor: bool) -> FlowModel:
-        """Return the model of a node; H and R are those of sensors with increments only."""
+        """Return the model of a node; H (p, n) and R (p, p) are those of its sensor if it has one
+        (``has_sensor``) that gives increments, else p = 0.
+        """
         H, R = self.matrices(has_sensor and self._increments)
         interval = min(0.1, longest_interval(self._A, self.system.Q, H, R))
         return FlowModel(self._A, self.system.Q, H, R, HORIZON, interval)
@@ -96,8 +98,8 @@ class ClockTrial(Trial):
             self.record_end()
 
     def _check_composition(self, node: int) -> None:
-        """Check that a prediction over two gaps in turn equals that over their sum, and
-        that ``max_measurement_interval`` is positive.
+        """Check for ``node`` that a prediction over two gaps in turn equals that over their sum,
+        and that ``max_measurement_interval`` is positive.
         """
         watched, state = self.watched, self.states[node]
         for first, second in GAPS:

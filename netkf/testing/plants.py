@@ -207,10 +207,10 @@ def _draw_starts(
     is_inherited: bool,
     count: int,
 ) -> Sequence[FloatArray]:
-    """Return ``count`` draws of x(0) (n,).
+    """Return ``count`` draws of x(0) (n,), with generators of ``seed``.
 
-    They are drawn all at once if the class overrides neither ``start`` nor ``starts`` and both give
-    the same first values.
+    They are drawn all at once if the class overrides neither ``start`` (``is_inherited``) nor
+    ``starts`` and both give the same first values.
     """
     random = _make_generator(seed, 0)
     first = [start(random) for _ in range(min(count, FEW_STARTS))]
@@ -256,7 +256,7 @@ def _check_slots(part: LinearPlant, copy: LinearPlant, name: str, seed: int) -> 
     where = f"{name}.truth"
 
     def draw_path(plant: Any, slots: Sequence[int], run: int = 0) -> FloatArray:
-        """Return the states (K, n) of a run in K slots."""
+        """Return the states (K, n) of number ``run`` of the plant's runs in K ``slots``."""
         with guard_user_code(where):
             truth = plant.truth(_make_generator(seed, run))
             states = [truth.state(slot) for slot in slots]
@@ -378,7 +378,9 @@ def _check_sampled(
     def draw_path(
         plant: Any, at: FloatArray, run: int = 0, probes: FloatArray = probe_times
     ) -> FloatArray:
-        """Return the states (1 + K, n) of a run at time 0 and K times ``at``."""
+        """Return the states (1 + K, n) of a ``run`` at time 0 and at K times ``at`` (K,) in
+        seconds, if the state is probed at the times ``probes``.
+        """
         randoms = [_make_generator(seed, run, purpose) for purpose in ("plant", "probe")]
         truth = call_user_function(
             where, plant.sampled_truth, *randoms, sample_times, probes, horizon

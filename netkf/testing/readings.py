@@ -137,8 +137,8 @@ class IncrementReader:
     def read_pieces(
         self, streams: Streams, node: int, x: FloatArray, steps: int, cut: bool
     ) -> IncrementPieces:
-        """Return the increments over ``steps`` steps at the constant state ``x`` (n,), each step
-        ``cut`` into pieces at CUTS or not.
+        """Return the increments that ``node`` (an id) reads over ``steps`` steps at the constant
+        state ``x`` (n,), each step ``cut`` into pieces at CUTS or not.
         """
         with guard_user_code(self.where):
             return self._read_pieces(streams, node, x, steps, cut)
@@ -146,8 +146,8 @@ class IncrementReader:
     def _read_pieces(
         self, streams: Streams, node: int, x: FloatArray, steps: int, cut: bool
     ) -> IncrementPieces:
-        """Return the increments over ``steps`` steps at the constant state ``x`` (n,), as
-        :meth:`read_pieces` but without its guard of the user's code.
+        """Return the increments that ``node`` reads over ``steps`` steps at the constant state
+        ``x`` (n,), ``cut`` or not, as :meth:`read_pieces` but without its guard of the user's code.
         """
         plant = Diffusion(
             mean=x, A=np.zeros((self.n, self.n)), B=np.zeros((self.n, 1)), sensing_period=STEP

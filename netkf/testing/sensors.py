@@ -397,8 +397,8 @@ def _check_sampling_rate(sensor: Any, where: str, nodes: tuple[int, ...], seed: 
 
 
 def _read_times(sensor: Any, where: str, node: int, seed: int, horizon: float) -> FloatArray:
-    """Return the sample times (K,) of a sensor in a run of ``horizon`` seconds, which must be a
-    float64 vector.
+    """Return the sample times (K,), in seconds, of the sensor at ``node`` in a run of ``horizon``
+    seconds with ``seed``, which must be a float64 vector.
     """
     streams = Streams(seed)
 

@@ -56,10 +56,11 @@ class SlotTrial(Trial):
                 self._advance(kind, slot)
 
     def _advance(self, kind: str, slot: int) -> None:
-        """Run the phase ``kind``, "predict" or "sense", and move the shift of the truth with it.
+        """Run the phase ``kind``, "predict" or "sense", of a ``slot``, and move the shift of the
+        truth with it.
 
-        Without a phase "predict", ``update`` also predicts: before the reading is used, or after
-        it if the filter ``predicts``.
+        Without a phase "predict", ``update`` also predicts: before the reading is used, or after it
+        if the filter ``predicts``.
         """
         part = self.part
         update_predicts = kind == "sense" and "predict" not in part.schedule

@@ -208,7 +208,8 @@ def _rates_by_window(windows: np.ndarray, mean: float, level: float) -> list[tup
     """Return labelled intervals for the relative error of the total rate in each window.
 
     ``windows`` (R, W, E) are ticks and ``mean`` is the stated mean total of a run; no intervals if
-    there is only one window, since that is the whole run.
+    there is only one window, since that is the whole run. The probability that any of them misses
+    the truth is at most ``level``.
     """
     window_ticks = windows.sum(axis=2)
     count = window_ticks.shape[1]
@@ -247,11 +248,12 @@ def _limit_of_one_clock(
 def _count_interval(
     values: np.ndarray, mean: float, level: float, poisson: bool, first_ticks: float
 ) -> Interval:
-    """Return an interval for |E(count) / mean - 1|, from the counts ``values`` (R,) of R runs.
+    """Return an interval for |E(count) / mean - 1|, from the counts ``values`` (R,) of R runs, that
+    misses with probability ``level``.
 
-    Sums of Poisson counts are Poisson and have exact limits. For other clocks Student's interval
-    uses the spread of the counts, and ``first_ticks``, the slack for the transient at the start of
-    a run, is subtracted from the distance.
+    Sums of ``poisson`` counts are Poisson and have exact limits. For other clocks Student's
+    interval uses the spread of the counts, and ``first_ticks``, the slack for the transient at the
+    start of a run, is subtracted from the distance.
     """
     total, runs = float(values.sum()), len(values)
     expected_total = runs * mean
@@ -277,6 +279,8 @@ def _count_interval(
 def _poisson_interval(total: float, mean: float, level: float) -> Interval:
     """Return the exact (Garwood 1936) interval for the mean of a Poisson variable, in units of
     ``mean``, from one observation ``total``.
+
+    The interval misses the truth with at most the probability ``level``.
     """
 
     def limits(ratio: float, factor: float) -> tuple[float, float]:
@@ -313,7 +317,10 @@ def _check_gaps(group: Group, samples: PartSamples, level: float) -> Finding:
 
 
 def _check_lattice(group: Group, samples: PartSamples, level: float) -> Finding:
-    """Compare the times of ticks of deterministic clocks with the stated times."""
+    """Compare the times of ticks of deterministic clocks with the stated times.
+
+    No interval is estimated, so that ``level`` is not used.
+    """
     counts, horizon = group(samples).counts, samples.scenario.horizon
     largest_error, ticks = float(counts.off.max()), counts.ticks.sum()
     message = f"{ticks:,.0f} ticks, times in units of the length of a run"
@@ -352,7 +359,8 @@ def largest_correlation(
 
     ``values`` (K, L) have mean 0 and independent rows; the products of two standardised columns are
     averaged by Student's interval, with Bonferroni's correction for all pairs. None with fewer than
-    two varying columns or 100 rows.
+    two varying columns or 100 rows. The interval misses the truth with at most the probability
+    ``level``.
     """
     compared = values[:, :MAX_CLOCKS]
     varying = np.flatnonzero(compared.var(axis=0) > 0.0)

@@ -108,7 +108,10 @@ def count_delays(scenario: Scenario, run: Run) -> DelayCounts | None:
 
 
 def _check_fixed(samples: Any, level: float) -> Finding:
-    """Compare all delays with the stated constant."""
+    """Compare all delays with the stated constant.
+
+    No interval is estimated, so that ``level`` is not used.
+    """
     largest_error, horizon = float(samples.delays.off.max()), samples.scenario.horizon
     return find_identity(
         largest_error / horizon, FIXED_TOLERANCE, "delays in units of the length of a run"
@@ -151,6 +154,8 @@ def _check_law(samples: Any, level: float) -> Finding:
 def _mean_interval(mean: float, count: float, level: float) -> Interval:
     """Return an interval for |E u - 1/2| of ``count`` uniform numbers u in [0, 1] (normal limits);
     ``mean`` is that of u - 1/2.
+
+    The interval misses the truth with at most the probability ``level``.
     """
     reach = -float(scipy.special.ndtri(level / 2.0)) / np.sqrt(12.0 * count)
     return deviation_interval(0.5, Interval(0.5 + mean, 0.5 + mean - reach, 0.5 + mean + reach))

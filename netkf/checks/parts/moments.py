@@ -222,7 +222,8 @@ def _with_states(sums: NoiseMoments, labels: list[str], level: float) -> list[tu
 
     States within a run are correlated, so that the independent values are the sums of the products
     over each run; their mean under the null hypothesis is 0, which makes the sum of their squares
-    an estimate of the variance.
+    an estimate of the variance. The probability that any of them misses the truth is at most
+    ``level``.
     """
     counts, products, squares, runs = sums.states
     comparable = np.argwhere((runs >= MIN_RUNS) & (squares > 0.0)).tolist()
@@ -280,7 +281,10 @@ def compare_cells(cells: FloatArray, labels: list[str], level: float, noun: str)
 
 
 def _cell_interval(count: float, total: float, level: float) -> Interval:
-    """Return the interval of the distance between a cell's share of ranks and 1 / CELLS."""
+    """Return the interval of the distance between a cell's share of ranks and 1 / CELLS.
+
+    The interval misses the truth with at most the probability ``level``.
+    """
     return deviation_interval(1.0 / CELLS, probability_interval(int(count), int(total), level))
 
 
@@ -292,6 +296,8 @@ def _cell_label(k: int) -> str:
 def correlation_interval(value: float, count: float, level: float) -> Interval:
     """Return an interval for the correlation of two normal variables by Fisher's transformation:
     atanh of the estimate ``value`` from ``count`` pairs has the variance 1 / (count - 3).
+
+    The interval misses the truth with at most the probability ``level``.
     """
     spread = 1.0 / math.sqrt(max(count - 3.0, 1.0))
     reach = -spread * float(scipy.special.ndtri(level / 2.0))

@@ -103,6 +103,8 @@ def _loss_interval(
     expected number have mean 0, and Student's interval applies. Where losses (or deliveries) occur
     in fewer than MIN_EVENTS runs, their sample variance is unreliable: limits are then those of
     independent messages if independence is stated, else those of :func:`_share_of_bounded_runs`.
+
+    The interval misses the truth with at most the probability ``level``.
     """
     total, runs = float(sent[:, directions].sum()), len(sent)
     excess = (lost[:, directions] - sent[:, directions] * q[directions]).sum(axis=1)
@@ -138,9 +140,10 @@ def _share_of_bounded_runs(
     """Return an interval for the lost share of messages that holds for every law of a run.
 
     ``excess`` (R,) is the number of messages lost in each run less the expected number, ``sent``
-    (R,) the number of messages, ``expected`` the stated share. By Hoeffding's bound (1963, Theorem
-    1) the average of R independent numbers in [0, 1] with mean m is f, or further from m, with a
-    probability of at most exp(-R KL(f, m)), KL the Kullback-Leibler divergence of Bernoulli laws.
+    (R,) the number of messages, ``expected`` the stated share. By Hoeffding's bound
+    (1963, Theorem 1) the average of R independent numbers in [0, 1] with mean m is f, or further
+    from m, with a probability of at most exp(-R KL(f, m)), KL the Kullback-Leibler divergence of
+    Bernoulli laws. The interval misses the truth with at most the probability ``level``.
     """
     runs, max_sent = len(sent), float(sent.max())
     # The numbers are lost messages over ``max_sent``; their mean is the share over ``scale``.
@@ -231,7 +234,8 @@ def _check_bursts(samples: PartSamples, level: float) -> Finding:
     """Test the null hypothesis that losses follow the stated two-state (Gilbert-Elliott) chain.
 
     Compared is the probability that the message after a lost one is lost too, by Student's interval
-    over the runs.
+    over the runs. The interval of the finding misses the truth with at most the probability
+    ``level``.
     """
     scenario, counts = samples.scenario, samples.fates
     loss, q = _stated_loss(scenario), loss_probabilities(scenario)
@@ -297,6 +301,8 @@ def _correlation_of_runs(
     scale    : (D,) product of the standard deviations of both events
     variance : (D,) variance of ``excess`` for each pair if all events are independent, covariances
                with overlapping pairs included
+
+    The interval misses the truth with at most the probability ``level``.
     """
     weight = float((count * scale).sum())
     if not weight > 0.0 or len(excess) < MIN_RUNS:
@@ -313,6 +319,8 @@ def _correlation_of_runs(
 def _links_apart(samples: PartSamples, level: float) -> list[tuple[Interval, str]]:
     """Return labelled intervals for the largest and for the mean correlation of losses of two
     links, from their counts in the windows of all runs.
+
+    The probability that any of them misses the truth is at most ``level``.
     """
     scenario, counts = samples.scenario, samples.fates
     # One direction of a link stands for both, which may share their draws.
@@ -352,7 +360,8 @@ def _mean_correlation(excess: FloatArray, variance: FloatArray, level: float) ->
     ``excess`` (K, L) are the losses of L links in K windows of runs less their expected numbers,
     and ``variance`` (K, L) their variances under independence. The estimate is the sum over windows
     and pairs of links of the products of two excesses, each of mean 0 under independence, over the
-    sum of the products of their standard deviations.
+    sum of the products of their standard deviations. The interval misses the truth with at most the
+    probability ``level``.
     """
     deviation = np.sqrt(variance)
     # The sum of x_i x_j over all pairs i < j is ((sum x)^2 - sum x^2) / 2.
@@ -390,7 +399,8 @@ def _check_matchings(samples: PartSamples, level: float) -> Finding:
 
     Compared with the mean matching are the number of pairs in a slot (Student's interval over the
     runs) and the probability that each link is paired (Clopper and Pearson); and a link that is
-    paired in one slot must not be correlated with itself in the next.
+    paired in one slot must not be correlated with itself in the next. The interval of the finding
+    misses the truth with at most the probability ``level``.
     """
     scenario, pairs = samples.scenario, samples.pairs
     p = pair_probabilities(scenario)

@@ -135,7 +135,7 @@ def _choose_times(scenario: Scenario) -> Scenario:
 
 
 def start_states(scenario: Scenario, seed: int, count: int) -> FloatArray:
-    """Return x(0) (count, n) of replicas 0 to count - 1."""
+    """Return x(0) (count, n) of replicas 0 to ``count`` - 1 of the runs of ``seed``."""
     # Built-in classes draw all replicas in one call, with the same numbers as one by one.
     if type(scenario.plant) in (LinearPlant, Diffusion):
         seed_words = ReplicaStreams(seed, 0, count).seed_words("plant", [()])

@@ -41,7 +41,10 @@ def _start_moments(scenario: Scenario, seed: int) -> NoiseMoments:
 
 
 def _start_variance(samples: PartSamples, level: float) -> Finding:
-    """Compare the variances of the initial states with the stated covariance."""
+    """Compare the variances of the initial states with the stated covariance.
+
+    The interval of the finding misses the truth with at most the probability ``level``.
+    """
     sums = _start_moments(samples.scenario, samples.seed)
     labels = _number_labels("direction", len(sums.first))
     gaussian = not is_own_class(samples.scenario.plant, "plant")
@@ -49,7 +52,10 @@ def _start_variance(samples: PartSamples, level: float) -> Finding:
 
 
 def _start_mean(samples: PartSamples, level: float) -> Finding:
-    """Compare the means of the initial states with the stated ones."""
+    """Compare the means of the initial states with the stated ones.
+
+    The interval of the finding misses the truth with at most the probability ``level``.
+    """
     sums = _start_moments(samples.scenario, samples.seed)
     return compare_means(sums, _number_labels("direction", len(sums.first)), level)
 
@@ -61,36 +67,54 @@ def _step_moments(samples: PartSamples) -> tuple[NoiseMoments, list[str]]:
 
 
 def _step_variance(samples: PartSamples, level: float) -> Finding:
-    """Compare the variances of the plant's noise with the stated ones."""
+    """Compare the variances of the plant's noise with the stated ones.
+
+    The interval of the finding misses the truth with at most the probability ``level``.
+    """
     sums, labels = _step_moments(samples)
     gaussian = not is_own_class(samples.scenario.plant, "plant")
     return compare_variances(sums, labels, level, "directions of the noise", gaussian)
 
 
 def _step_mean(samples: PartSamples, level: float) -> Finding:
-    """Compare the means of the plant's noise with zero."""
+    """Compare the means of the plant's noise with zero.
+
+    The interval of the finding misses the truth with at most the probability ``level``.
+    """
     return compare_means(*_step_moments(samples), level)
 
 
 def _step_correlation(samples: PartSamples, level: float) -> Finding:
-    """Compare the correlations of the plant's noise with zero."""
+    """Compare the correlations of the plant's noise with zero.
+
+    The interval of the finding misses the truth with at most the probability ``level``.
+    """
     return compare_correlations(*_step_moments(samples), level)
 
 
 def _reading_variance(samples: PartSamples, level: float) -> Finding:
-    """Compare the variances of the readings' noise with R."""
+    """Compare the variances of the readings' noise with R.
+
+    The interval of the finding misses the truth with at most the probability ``level``.
+    """
     labels = reading_labels(samples.scenario)
     gaussian = not _own_sensors(samples.scenario)
     return compare_variances(total(samples.readings), labels, level, "readings", gaussian)
 
 
 def _reading_mean(samples: PartSamples, level: float) -> Finding:
-    """Compare the means of the readings' noise with zero."""
+    """Compare the means of the readings' noise with zero.
+
+    The interval of the finding misses the truth with at most the probability ``level``.
+    """
     return compare_means(total(samples.readings), reading_labels(samples.scenario), level)
 
 
 def _reading_correlation(samples: PartSamples, level: float) -> Finding:
-    """Compare the correlations of the readings' noise with zero."""
+    """Compare the correlations of the readings' noise with zero.
+
+    The interval of the finding misses the truth with at most the probability ``level``.
+    """
     return compare_correlations(total(samples.readings), reading_labels(samples.scenario), level)
 
 

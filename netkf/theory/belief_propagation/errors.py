@@ -101,7 +101,9 @@ class BeliefRule(ErrorRule):
             self.errors.copy(estimator, _prior_name(estimator), estimator)
 
     def sense(self, time: float, observations: EstimatorObservations) -> None:
-        """Add the readings to the nodes' own evidence."""
+        """Add the readings of ``time`` (seconds, or the slot) to the nodes' own evidence, and
+        update the beliefs of the nodes that read.
+        """
         if self.scenario.slotted:
             self._begin_slot()
         columns = self.errors.reading_noises(observations)
@@ -142,7 +144,9 @@ class BeliefRule(ErrorRule):
         return self._sum_evidence([_own_name(sender), *others])
 
     def exchange(self, slot: int, phase: int, messages: Sequence[SentMessage]) -> None:
-        """Pass the messages of all steps of a slot that arrived."""
+        """Pass the messages of all steps of exchange number ``phase`` of a ``slot`` that arrived;
+        changes the evidence and the beliefs of all nodes.
+        """
         estimators = self.errors.estimators
         no_arrivals = np.zeros((estimators, estimators))
         for step in range(self._steps):
@@ -163,7 +167,9 @@ class BeliefRule(ErrorRule):
                 self._put_evidence(message, *self._evidence_for(message.sender, message.receiver))
 
     def arrive(self, time: float, messages: Sequence[SentMessage]) -> None:
-        """Replace the earlier evidence of each sender, unless that was sent later."""
+        """Replace the earlier evidence of each sender, unless that was sent later, and update the
+        beliefs of the receivers at ``time`` (seconds).
+        """
         late = [message for message in messages if message.late]
         # Contents first: a message has the sender's evidence before this instant's messages.
         contents = {

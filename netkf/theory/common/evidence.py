@@ -35,7 +35,8 @@ def true_model_row(scenario: Scenario, source: str, matrices: str) -> Assumption
 
 
 def judge_plant(scenario: Scenario, holds: bool, evidence: str) -> tuple[bool | None, str]:
-    """Return verdict and evidence about the plant's own matrices.
+    """Return the verdict ``holds`` and the ``evidence`` for a statement about the plant's own
+    matrices.
 
     Where the state is recorded these matrices are an assumption, and the verdict is None.
     """

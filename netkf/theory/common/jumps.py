@@ -242,6 +242,9 @@ class LyapunovInverse:
     """The inverse of ``X -> -(B X + X B')`` for stable matrices B (S, M, M), by Schur forms."""
 
     def __init__(self, B: FloatArray) -> None:
+        """Compute the Schur forms of S stable matrices ``B`` (S, M, M), which each solution
+        uses.
+        """
         self._forms = [scipy.linalg.schur(matrix)[:2] for matrix in B]
 
     def __call__(self, Y: FloatArray) -> FloatArray:

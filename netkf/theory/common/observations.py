@@ -80,7 +80,9 @@ def slot_observations(scenario: Scenario, run: Run) -> Callable[[int], Estimator
     ]
 
     def observe(slot: int) -> EstimatorObservations:
-        """Return the readings of a slot by estimator."""
+        """Return the readings of ``slot`` (0-based), H (p, n) and R (p, p), by index of the
+        estimator.
+        """
         observations = {}
         for estimator, paths in enumerate(estimators):
             if not paths:

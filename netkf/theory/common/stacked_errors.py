@@ -56,6 +56,9 @@ class StackedErrors:
     """
 
     def __init__(self, scenario: Scenario, estimators: int) -> None:
+        """Take the errors at time 0 of the first M = ``estimators`` nodes of a scenario, or of its
+        pooled filter (M = 1).
+        """
         self.n, self.estimators = scenario.plant.n, estimators
         self.stack = GaussianStack(self.n)
         self.owner: dict[Hashable, int | None] = {}

@@ -40,7 +40,9 @@ class PseudoStateRule(ErrorRule):
             errors.stack.put(_difference_name(estimator), np.zeros((errors.n, 0)))
 
     def sense(self, time: float, observations: EstimatorObservations) -> None:
-        """Predict the differences, and keep the readings of the slot."""
+        """Predict the differences yhat - G xhat of all nodes over a slot, and keep the readings of
+        the slot for ``exchange``; ``time`` is not used.
+        """
         self._observations, self._slot, stack = observations, self._slot + 1, self.errors.stack
         # yhat - G xhat does not depend on the plant's noise, since yhat and G xhat share it.
         for estimator in range(self.errors.estimators):
@@ -53,7 +55,11 @@ class PseudoStateRule(ErrorRule):
             self.errors.roots[estimator] = node_gains.predicted
 
     def exchange(self, slot: int, phase: int, messages: Sequence[SentMessage]) -> None:
-        """Correct all estimates by messages and readings."""
+        """Correct the estimates of all nodes by the messages and readings of the present slot;
+        changes their errors, differences and roots of P.
+
+        ``slot`` and ``phase`` are not used.
+        """
         errors, G, estimators = self.errors, self._pseudo.G, range(self.errors.estimators)
         columns = errors.reading_noises(self._observations)
         states = [errors.stack.form(estimator) for estimator in estimators]

@@ -27,13 +27,17 @@ class DiffusionKalmanRule(ErrorRule):
         self._columns: dict[int, slice] = {}
 
     def sense(self, time: float, observations: EstimatorObservations) -> None:
-        """Update by the nodes' own readings, and keep them for their neighbours."""
+        """Update by the nodes' own readings of the slot ``time``, and keep them for their
+        neighbours.
+        """
         self._observations, self._columns = observations, self.errors.reading_noises(observations)
         for estimator, observation in observations.items():
             self.errors.update(estimator, observation, self._columns[estimator])
 
     def exchange(self, slot: int, phase: int, messages: Sequence[SentMessage]) -> None:
-        """Use the readings that arrived, or combine the estimates."""
+        """Use the readings that arrived (``phase`` READINGS), or combine the estimates (the other
+        phase); changes errors and, with readings, roots of P of the receivers.
+        """
         if phase == READINGS:
             for message in messages:
                 observation, columns = (

@@ -165,8 +165,8 @@ class _PiecewiseSolution:
                 )
 
     def _piece_end(self, begin: float, last: float) -> float:
-        """Return how far the piece from ``begin`` may reach, seconds: inside it the delayed terms
-        are known.
+        """Return how far the piece from ``begin`` may reach, at most to ``last``, all in seconds:
+        inside it the delayed terms are known.
         """
         delay = self._packed.equations.delay
         if delay == 0.0:
@@ -298,7 +298,8 @@ class _PiecewiseSolution:
         )
 
     def _absolute_tolerance(self, begin: float) -> FloatArray:
-        """Return the absolute tolerance (N m,) of a piece, relative to the covariance of each node.
+        """Return the absolute tolerance (N m,) of the piece from ``begin`` (seconds) on, relative
+        to the covariance of each node.
 
         A node with precise sensors next to one that nobody can follow has a covariance of the order
         of the root of the other's, whose inflow is rounded: a solver that is asked for more makes

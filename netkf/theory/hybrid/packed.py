@@ -238,7 +238,9 @@ class LinearisedRiccati(NamedTuple):
         return np.asarray(total)
 
     def matrix(self, arriving: bool = True) -> scipy.sparse.csc_array:
-        """Return the linear map as a sparse matrix (N m, N m), with or without the arrivals."""
+        """Return the linear map as a sparse matrix (N m, N m), with the arrivals from other nodes
+        or, without ``arriving``, block diagonal.
+        """
         size, m, _ = self.blocks.shape
         shape = (size * m, size * m)
         transposed = np.ascontiguousarray(np.swapaxes(self.blocks, 1, 2))

@@ -67,6 +67,7 @@ class _SecondMomentEquation:
     """
 
     def __init__(self, scenario: Scenario, bound: FloatArray) -> None:
+        """Take the gains of the steady ``bound`` (N, n, n) of the scenario's N nodes."""
         n, index = scenario.plant.n, scenario.topology.index
         self._shape = (len(index), n * n, len(index), n * n)
         eye = np.eye(n)

@@ -68,7 +68,9 @@ class ConsensusRule(ErrorRule):
         self._observations = observations
 
     def exchange(self, slot: int, phase: int, messages: Sequence[SentMessage]) -> None:
-        """Update all estimates by the predictions and readings with their weights of this slot."""
+        """Update all estimates by the predictions and readings with their weights in exchange
+        ``phase`` of this ``slot``; changes errors and roots of P.
+        """
         nothing = np.zeros_like(self._weights)
         heard = [
             self._weights * self._arrivals.get((slot, phase, step), nothing)

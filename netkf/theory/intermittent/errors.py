@@ -41,7 +41,9 @@ class ReadingExchangeRule(ErrorRule):
         self._columns: Mapping[int, slice] = {}
 
     def sense(self, time: float, observations: EstimatorObservations) -> None:
-        """Update each version of each estimate by the readings that arrive before its end."""
+        """Update each version of each estimate by the readings of ``time`` (seconds, or the slot)
+        that arrive before its end.
+        """
         self._observations, self._columns = observations, self.errors.reading_noises(observations)
         for estimator in range(self.errors.estimators):
             self._branch(estimator, time)
@@ -52,7 +54,9 @@ class ReadingExchangeRule(ErrorRule):
                 self._update(("version", estimator, until), [estimator, *senders])
 
     def _branch(self, estimator: int, time: float) -> None:
-        """Start the versions of an estimate that end when late readings of ``time`` arrive."""
+        """Start the versions of the estimate of node ``estimator`` that end when late readings of
+        ``time`` (seconds) arrive; each is a copy of the version that ends just before it.
+        """
         arrivals = self._versions[estimator]
         for until in self._branches.get((estimator, time), ()):
             # A version has all readings that arrive before its end: so far, those of the version
@@ -64,13 +68,17 @@ class ReadingExchangeRule(ErrorRule):
             arrivals.sort()
 
     def _update(self, name: Hashable, nodes: Sequence[int]) -> None:
-        """Update an error by the readings of some nodes."""
+        """Update the error ``name`` and the root of its P by the readings of the ``nodes``
+        (indices) that have some.
+        """
         for node in nodes:
             if node in self._observations:
                 self.errors.update(name, self._observations[node], self._columns[node])
 
     def arrive(self, time: float, messages: Sequence[SentMessage]) -> None:
-        """Use readings that come in time, or replace an estimate by its finished version."""
+        """Use readings that come in time, or replace an estimate by its version that ends at
+        ``time`` (seconds, or the slot).
+        """
         for estimator in {m.receiver for m in messages}:
             if time in self._versions[estimator]:
                 self._versions[estimator].remove(time)

@@ -276,6 +276,9 @@ class _GainSearch:
     """
 
     def __init__(self, F: FloatArray, readings: Sequence[FloatArray]) -> None:
+        """Take F (n, n) and the ``readings`` H_s (p, n) of each set s of readings that may
+        arrive.
+        """
         self._F, self._readings = F, readings
         n = len(F)
         rows, columns = np.triu_indices(n)

@@ -60,7 +60,9 @@ class KcfRule(ErrorRule):
         return _prior_name(estimator) if self._has_error(_prior_name(estimator)) else estimator
 
     def sense(self, time: float, observations: EstimatorObservations) -> None:
-        """Update by the nodes' own readings, and keep their predictions."""
+        """Update by the nodes' own readings of ``time`` (seconds, or the slot), and keep their
+        predictions from before them.
+        """
         self._forget()
         for estimator in observations:
             self.errors.copy(estimator, _prior_name(estimator), estimator)
@@ -75,7 +77,10 @@ class KcfRule(ErrorRule):
                 self.errors.copy(self._prediction_name(message.sender), message, None)
 
     def arrive(self, time: float, messages: Sequence[SentMessage]) -> None:
-        """Add the consensus terms, and use the readings of messages without delay."""
+        """Add the consensus terms of messages that arrive at ``time`` (seconds, or the slot), and
+        use the readings of those without delay; changes errors, and roots of P where readings are
+        used.
+        """
         inboxes: dict[int, dict[int, SentMessage]] = {}
         # Messages of one sender can overtake each other: the last one sent counts.
         for message in sorted(messages, key=lambda m: (m.sender, m.time, m.number)):

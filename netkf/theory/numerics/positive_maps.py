@@ -35,7 +35,7 @@ RESIDUAL, MAX_ROUNDS = 1e-10, 20
 
 
 def spectral_radius(T: PositiveMap, shape: Shape) -> float:
-    """Return the spectral radius of a positive map on stacks of a ``shape`` (S, M, M).
+    """Return the spectral radius of a positive map ``T`` on stacks of a ``shape`` (S, M, M).
 
     Raises TheoryError if it is neither proved nor found by two different searches.
     """
@@ -74,8 +74,9 @@ def _count_numbers(shape: Shape) -> int:
 
 
 def _confirm(T: PositiveMap, X: FloatArray, value: float) -> float:
-    """Return the radius ``value`` with its eigenvector X (S, M, M) if a different search, for the
-    largest modulus from another start, finds the same; raises TheoryError if not.
+    """Return the radius ``value`` of the positive map ``T``, with eigenvector X (S, M, M), if a
+    different search, for the largest modulus from another start, finds the same; raises TheoryError
+    if not.
     """
     start = X + np.diag(np.linspace(0.5, 1.5, X.shape[-1])) * np.trace(X.sum(axis=0))
     second_value, _ = _extreme_eigenvalue(T, start, "LM")

@@ -61,6 +61,7 @@ class ShortExponential:
     """
 
     def __init__(self, M: FloatArray) -> None:
+        """Compute the terms (TERMS, d, d) of the series of exp(M s) for M (d, d), per second."""
         self.unit = MAX_NORM / max(float(np.abs(M).sum(axis=0).max(initial=0.0)), 1e-300)
         terms = [np.eye(len(M))]
         for k in range(1, TERMS):
@@ -97,6 +98,9 @@ class Predictor:
     """
 
     def __init__(self, A: FloatArray, B: FloatArray, A_f: FloatArray, B_f: FloatArray) -> None:
+        """Take the plant's A (n, n) and B (n, m), and those that the filters assume, A_f and B_f of
+        the same shapes.
+        """
         self._n = n = len(A)
         self._belief = LinearSDE(A_f, B_f)
         # State and error together, driven by the same noise: de = (A_f e + (A - A_f) x) dt + B dw.
@@ -134,6 +138,7 @@ class LinearSDE:
     """
 
     def __init__(self, A: FloatArray, B: FloatArray) -> None:
+        """Take A (d, d), per second, and B (d, m) of m noises of variance 1 per second."""
         self._exp, self._B = ShortExponential(A), as_kernel_array(B)
 
     def discretise(self, gap: float) -> tuple[FloatArray, FloatArray]:
@@ -178,6 +183,9 @@ class ErrorFlow:
         noise: FloatArray,
         plant: tuple[FloatArray, FloatArray],
     ) -> None:
+        """Take A (n, n), B (n, m), H (p, n) and R (p, p) as the filters assume them, a root
+        ``noise`` (p, p) of the true R, and the true pair A, B of the ``plant``.
+        """
         n = len(A)
         self._n, self._B, self._plant = n, B, plant
         self._root_R = np.linalg.cholesky(R)

@@ -28,6 +28,7 @@ class GaussianStack:
     """
 
     def __init__(self, n: int) -> None:
+        """Make an empty stack of vectors of n entries."""
         self._n = n
         self._index: dict[Hashable, int] = {}
         self._free: list[int] = []

@@ -149,7 +149,9 @@ def corollary_2(scenario: Scenario, sharp: bool = False) -> CorollaryTwo:
 
     With ``a = sqrt(lambda)`` and ``t = theta^gamma``, rho(A_R) < 1 means
     ``t < (1 - a) / (c_B (1 - a + c_B))``; P (44), ``t < ((1 - a) / c_B)^2``, is weaker where
-    ``(1 - a)^2 > a c_B``. ``sharp`` as for ``minimum_gamma``. Raises TheoryError as that does.
+    ``(1 - a)^2 > a c_B``. lambda, theta and c_B are ``contraction``, ``mean`` and the larger of
+    ``printed`` and ``sharp`` of ``gamma_constants``; with ``sharp`` c_B is the latter. Raises
+    TheoryError if a condition of the theorem fails or no gamma is certified.
     """
     constants = gamma_constants(scenario)
     bound = constants.sharp if sharp else max(constants.printed, constants.sharp)

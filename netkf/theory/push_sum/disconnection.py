@@ -50,7 +50,9 @@ class Probability(float):
     exact: bool
 
     def __new__(cls, value: float, low: float, high: float, exact: bool) -> Probability:
-        """Return the value with its interval."""
+        """Return ``value`` with its interval ``low`` .. ``high``; ``exact`` says that it was
+        computed, not estimated.
+        """
         probability = super().__new__(cls, value)
         probability.low, probability.high, probability.exact = low, high, exact
         return probability
@@ -96,9 +98,10 @@ def _scenario_probability(scenario: Scenario, seed: int, samples: int | None) ->
 def _probability(
     nodes: int, probabilities: dict[tuple[int, int], float], seed: int, samples: int | None
 ) -> Probability:
-    """Return the exact probability if few enough partitions occur, else an estimate.
+    """Return the exact probability p_d that the links which are up do not connect all nodes if few
+    enough partitions occur, else an estimate from ``samples`` draws with ``seed``.
 
-    ``probabilities`` are those that a link (pair of node indices) is up.
+    ``nodes`` is their number; ``probabilities`` are those that a link (pair of node indices) is up.
     """
     neighbours: list[dict[int, float]] = [{} for _ in range(nodes)]
     for (i, j), p in probabilities.items():
@@ -218,8 +221,10 @@ def _elimination_order(neighbours: list[dict[int, float]]) -> list[int] | None:
 
 
 def _greedy_order(neighbours: list[dict[int, float]], root: int) -> tuple[float, list[int]] | None:
-    """Return an estimate of the effort (number of partitions) and a greedy order of the nodes.
+    """Return an estimate of the effort (number of partitions) and a greedy order of the nodes,
+    which begins at node ``root``.
 
+    ``neighbours`` has the probabilities of the links of each node, by the index of the other end.
     The next node is the one that closes the most open nodes and then adds the fewest candidates.
     None as soon as more than MAX_OPEN nodes are open.
     """
@@ -280,7 +285,12 @@ def _exact_probability(neighbours: list[dict[int, float]], order: list[int]) -> 
 def _apply_link(
     states: dict[tuple[int, ...], float], index: int, up: float
 ) -> dict[tuple[int, ...], float]:
-    """Return the partitions after the link between open node ``index`` and the last open node."""
+    """Return the probability of each partition after the link between open node ``index`` and the
+    last open node, which is up with probability ``up``.
+
+    ``states`` has the probabilities before it; a partition is the tuple of the labels of the open
+    nodes' parts.
+    """
     partitions: defaultdict[tuple[int, ...], float] = defaultdict(float)
     for labels, p in states.items():
         first, second = labels[index], labels[-1]
@@ -321,7 +331,11 @@ def _renumber(labels: list[int]) -> tuple[int, ...]:
 def _estimate(
     nodes: int, probabilities: dict[tuple[int, int], float], seed: int, samples: int
 ) -> Probability:
-    """Return the fraction of disconnected draws, with its Clopper-Pearson interval."""
+    """Return the fraction of ``samples`` draws of the links, with ``seed``, that do not connect all
+    ``nodes`` (their number), with its Clopper-Pearson interval.
+
+    ``probabilities`` are those that a link (pair of node indices) is up.
+    """
     edges, edge_probabilities = (
         np.array(list(probabilities)),
         np.array(list(probabilities.values())),

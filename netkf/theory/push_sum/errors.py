@@ -232,7 +232,9 @@ class RunningTotalsRule(ErrorRule):
             self._totals[message] = self._totals[name]
 
     def arrive(self, time: float, messages: Sequence[SentMessage]) -> None:
-        """Add to each receiver's mass the difference between the totals received now and last."""
+        """Add to each receiver's mass the difference between the totals received now, at ``time``
+        (seconds), and last; changes weights, errors and roots of P.
+        """
         for estimator in sorted({message.receiver for message in messages}):
             received = [m for m in messages if m.receiver == estimator]
             self._receive_totals(estimator, sorted(received, key=lambda m: (m.sender, m.number)))

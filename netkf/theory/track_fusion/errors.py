@@ -95,7 +95,9 @@ class TrackRule(ErrorRule):
             errors.copy(estimator, _track_name(estimator), estimator)
 
     def sense(self, time: float, observations: EstimatorObservations) -> None:
-        """Update the tracks; a node that hears nothing shows its own."""
+        """Update the tracks by the readings of the slot ``time``; a node that hears nothing shows
+        its own.
+        """
         self._joint = updated_joint(predicted_joint(self._joint, self._models[0]), self._sensors)
         columns = self.errors.reading_noises(observations)
         for estimator, observation in observations.items():
@@ -103,7 +105,9 @@ class TrackRule(ErrorRule):
         self._combine_tracks({estimator: [] for estimator in range(self.errors.estimators)})
 
     def exchange(self, slot: int, phase: int, messages: Sequence[SentMessage]) -> None:
-        """Combine each node's track with those that it heard."""
+        """Combine each node's track with those that it heard in this ``slot``; changes the errors
+        that nodes show, not the tracks.
+        """
         heard: dict[int, list[int]] = {}
         for message in messages:
             heard.setdefault(message.receiver, []).append(message.sender)
