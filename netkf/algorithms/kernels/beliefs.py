@@ -21,12 +21,14 @@ from netkf.linalg.lanes import ONE, Lanes, any_lane, load, load_flags, select, s
 
 
 class BeliefScratch(NamedTuple):
-    """Evidence (n, n + 1, L) that nodes send, and scratch.
+    """Evidence (n, n + 1, L) that H nodes send over W directions in L runs, and scratch.
 
-    all : (H, ...), sum of all evidence of each node
-    others : (W, ...), for each direction the evidence of its receiver without that of its sender
-    suffix : (D + 1, ...), entry k is the sum of the evidence of directions k to D - 1
-    total, work : scratch
+    all : (H, n, n + 1, L), sum of all evidence of each node
+    others : (W, n, n + 1, L), for each direction the evidence of its receiver without that of its
+             sender
+    suffix : (D + 1, n, n + 1, L), entry k is the sum of the evidence of directions k to D - 1 of
+             the D directions to one node
+    total, work : (n, n + 1, L), scratch
     """
 
     all: FloatArray
@@ -48,7 +50,9 @@ def clear_part(lanes: Lanes, part: FloatArray) -> None:
 
 @kernel
 def copy_part(lanes: Lanes, source: FloatArray, target: FloatArray) -> None:
-    """Copy evidence (n, n + 1, L)."""
+    """Copy evidence ``source`` (n, n + 1, L) into ``target``; entries above the diagonal are left
+    alone.
+    """
     n = len(source)
     for i in range(n):
         for j in range(i + 1):
@@ -58,7 +62,9 @@ def copy_part(lanes: Lanes, source: FloatArray, target: FloatArray) -> None:
 
 @kernel
 def add_part(lanes: Lanes, total: FloatArray, part: FloatArray, work: FloatArray) -> None:
-    """Add the independent evidence ``part`` to ``total``; ``work`` is scratch."""
+    """Add the independent evidence ``part`` (n, n + 1, L) to ``total`` of the same shape, in place;
+    ``work`` is scratch of that shape.
+    """
     copy_part(lanes, part, work)
     merge_lanes(lanes, total, work)
 
@@ -67,8 +73,8 @@ def add_part(lanes: Lanes, total: FloatArray, part: FloatArray, work: FloatArray
 def recentre_part(
     lanes: Lanes, part: FloatArray, before: FloatArray, after: FloatArray, out: FloatArray
 ) -> None:
-    """Move the centre of evidence from ``before`` (n, L) to ``after``: write it into ``out``, which
-    may be ``part`` itself.
+    """Move the centre that the evidence ``part`` (n, n + 1, L) is relative to from ``before``
+    (n, L) to ``after`` (n, L): write the result into ``out``, which may be ``part`` itself.
     """
     n = len(part)
     for i in range(n):
@@ -85,9 +91,9 @@ def recentre_part(
 def predict_part(
     lanes: Lanes, part: FloatArray, back: FloatArray, total: FloatArray, work: FloatArray
 ) -> None:
-    """Predict evidence to a later state of a plant without noise, in place: ``Z <- Z back``, where
-    ``back`` (n, n) is the inverse transition, made triangular again. The caller predicts the
-    centre. ``total`` and ``work`` are scratch.
+    """Predict the evidence ``part`` (n, n + 1, L), in place, to a later state of a plant without
+    noise: ``Z <- Z back``, where ``back`` (n, n) is the inverse transition, made triangular again.
+    The caller predicts the centre. ``total`` and ``work`` are scratch of the shape of ``part``.
     """
     n = len(part)
     clear_part(lanes, total)
@@ -106,8 +112,9 @@ def predict_part(
 
 @kernel
 def write_prior(lanes: Lanes, root: FloatArray, b: int, h: int, part: FloatArray) -> None:
-    """Write the prior with the regular root S = ``root[b, h]`` as evidence: Z = S^-1, and z = 0
-    relative to its own mean.
+    """Write the prior of filter ``h`` of block ``b`` as evidence into ``part`` (n, n + 1, L): Z =
+    S^-1 of the regular lower triangular root S = ``root[b, h]`` (n, n, L), and z = 0 relative to
+    its own mean.
     """
     n = len(part)
     for i in range(n):
@@ -124,7 +131,9 @@ def write_prior(lanes: Lanes, root: FloatArray, b: int, h: int, part: FloatArray
 
 @kernel
 def write_prior_single(roots: FloatArray, h: int, part: FloatArray) -> None:
-    """Apply ``write_prior`` to filter ``h`` of ``roots`` (1, H, n, n, 1) with one lane."""
+    """Write the prior of filter ``h`` as evidence [S^-1, 0] into ``part`` (n, n + 1, 1), for one
+    run: S is its lower triangular root in ``roots`` (1, H, n, n, 1).
+    """
     write_prior(ONE, roots, 0, h, part)
 
 
@@ -139,7 +148,10 @@ def gather_evidence(
     scratch: BeliefScratch,
 ) -> None:
     """Sum the evidence of node ``h``, its own and that received on directions ``first`` to ``last``
-    - 1: all of it into ``all[h]``, and all but that of direction m into ``others[m]``.
+    - 1: write all of it into ``scratch.all[h]``, and all but that of direction m into
+    ``scratch.others[m]``, (n, n + 1, L) each.
+
+    ``own`` (H, n, n + 1, L) is evidence by node, ``received`` (W, n, n + 1, L) by direction.
     """
     D = last - first
     # The sum without direction k is a prefix sum plus a suffix sum: nothing is subtracted.
@@ -165,8 +177,12 @@ def receive_evidence(
     centre: FloatArray,
     scratch: BeliefScratch,
 ) -> None:
-    """Replace the evidence of each sender to node ``h`` whose message arrives: ``up`` at ``index``
-    [b, s, e].
+    """Replace the evidence ``received[m]`` of ``received`` (W, n, n + 1, L) for each direction m to
+    node ``h`` whose message arrives: ``up`` (B, S, E, W, L) at ``index`` [b, s, e], block, slot and
+    step of the exchanges.
+
+    The message is ``scratch.all`` of the sender or, if it hears node h itself, ``scratch.others``;
+    it is moved to the centre of node h. ``centre`` (H, n, L) are the centres of all nodes.
     """
     b, s, e = index
     n = received.shape[1]

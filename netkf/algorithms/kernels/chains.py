@@ -32,7 +32,9 @@ class ReadingModes(NamedTuple):
 
 
 def reading_modes(readings: Sequence[tuple[FloatArray, FloatArray]], n: int) -> ReadingModes:
-    """Return the modes of readings ``(H, R)``, (p, n) and (p, p), each with its own p >= 0."""
+    """Return the modes of M readings ``(H, R)``, (p, n) and (p, p), each with its own p >= 0, for
+    ``n`` states; R is factored and rows are padded to the largest p.
+    """
     max_rows = max((len(H) for H, _ in readings), default=0)
     rows = np.array([len(H) for H, _ in readings], dtype=np.int64)
     padded_H, root_R = (
@@ -51,7 +53,8 @@ def reading_modes(readings: Sequence[tuple[FloatArray, FloatArray]], n: int) -> 
 def move_roots(
     roots: FloatArray, sequences: np.ndarray, F: FloatArray, root_Q: FloatArray, modes: ReadingModes
 ) -> FloatArray:
-    """Return the roots (K, n, n) of K chains after T slots with the modes ``sequences`` (K, T).
+    """Return the lower triangular roots (K, n, n) of K chains after T slots with the modes
+    ``sequences`` (K, T), from their ``roots`` (K, n, n) before; F and ``root_Q`` are (n, n).
 
     Uses all cores if there is enough to do.
     """
@@ -82,14 +85,19 @@ def move_roots(
 def trace_path(
     root: FloatArray, sequence: np.ndarray, F: FloatArray, root_Q: FloatArray, modes: ReadingModes
 ) -> FloatArray:
-    """Return the roots (T, n, n) of one chain after each mode of its sequence (T,)."""
+    """Return the lower triangular roots (T, n, n) of one chain after each mode of its ``sequence``
+    (T,), from ``root`` (n, n) on; F and ``root_Q`` are (n, n).
+    """
     return next(trace_paths(root[None], sequence[None], F, root_Q, modes))
 
 
 def trace_paths(
     roots: FloatArray, sequences: np.ndarray, F: FloatArray, root_Q: FloatArray, modes: ReadingModes
 ) -> Iterator[FloatArray]:
-    """Yield the roots (T, n, n) of each of K chains after each mode of its sequence (K, T)."""
+    """Yield for each of K chains the lower triangular roots (T, n, n) after each mode of its
+    sequence, a row of ``sequences`` (K, T), from ``roots`` (K, n, n) on; F and ``root_Q`` are
+    (n, n).
+    """
     lows = np.ascontiguousarray(lower_triangular(roots))
     F = as_kernel_array(F)
     low_Q = np.ascontiguousarray(lower_triangular(root_Q))
@@ -113,8 +121,11 @@ def run_path(
     work: FloatArray,
     path: FloatArray,
 ) -> None:
-    """Move one root (1, n, n) in place along its mode ``sequence`` (T,); store each step in
-    ``path`` (T, n, n).
+    """Move one lower triangular root ``roots`` (1, n, n) in place along its mode ``sequence`` (T,);
+    store the root after each step in ``path`` (T, n, n).
+
+    F and ``root_Q`` are (n, n); H (M, p, n), ``root_R`` (M, p, p) and ``rows`` (M,) are those of
+    ``ReadingModes``; ``work`` (p + n, 2 n + p) is scratch.
     """
     for step in range(len(sequence)):
         step_root(roots, 0, sequence[step], F, root_Q, H, root_R, rows, work)
@@ -133,8 +144,11 @@ def run_sequences(
     root_R: FloatArray,
     rows: np.ndarray,
 ) -> None:
-    """Move the roots (K, n, n) of K chains in place along their mode ``sequences`` (K, T); roots
-    and root_Q are lower triangular.
+    """Move the lower triangular roots (K, n, n) of K chains in place along their mode ``sequences``
+    (K, T).
+
+    F and ``root_Q``, lower triangular too, are (n, n); H (M, p, n), ``root_R`` (M, p, p) and
+    ``rows`` (M,) are those of ``ReadingModes``.
     """
     # The pre-array [[H S, root_R, 0], [F S, 0, root_Q]] of the largest reading, reused by all
     # steps.

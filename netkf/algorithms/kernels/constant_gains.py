@@ -18,8 +18,9 @@ TERMS = 18  # of the exponential, for a norm of at most 1/2
 def fill_legendre_integrals(
     M: FloatArray, sign: float, gap: float, J_1: FloatArray, second: FloatArray, work: FloatArray
 ) -> None:
-    """Write ``int_0^g e^{sign M u} P_j(1 - 2 u / g) du`` (n, n) for the Legendre polynomials P_0
-    and P_1 into ``J_1`` and ``second``; ``work`` (4, n, n) is scratch.
+    """Write ``int_0^g e^{sign M u} P_j(1 - 2 u / g) du`` (n, n) over a ``gap`` g in seconds for the
+    Legendre polynomials P_0 and P_1 into ``J_1`` and ``second``, with M (n, n); ``work`` (4, n, n)
+    is scratch.
     """
     n, norm, J_2 = len(M), 0.0, work[3]
     for i in range(n):
@@ -45,8 +46,9 @@ def fill_legendre_integrals(
 def fill_exponential_integrals(
     M: FloatArray, sign: float, step: float, J_1: FloatArray, work: FloatArray
 ) -> None:
-    """Write ``J_1 = int_0^s e^{M u} du``, and e^{M s} and ``J_2 = int_0^s (s - u) e^{M u} du`` into
-    the first and the last of ``work`` (4, n, n), by power series; M is multiplied by ``sign``.
+    """Write ``J_1 = int_0^s e^{M u} du`` (n, n) for a ``step`` of s seconds, and e^{M s} and ``J_2
+    = int_0^s (s - u) e^{M u} du`` into the first and the last of ``work`` (4, n, n), by power
+    series; M (n, n) is multiplied by ``sign``.
     """
     n, E, term, product, J_2 = len(M), work[0], work[1], work[2], work[3]
     for i in range(n):
@@ -67,8 +69,9 @@ def fill_exponential_integrals(
 
 @kernel
 def double_gap(step: float, J_1: FloatArray, work: FloatArray) -> None:
-    """Double the step of the integrals that ``fill_exponential_integrals`` wrote for ``step``:
-    J_2 <- J_2 + s J_1 + E J_2, J_1 <- J_1 + E J_1 and E <- E E.
+    """Double the step s, in seconds, of the integrals ``J_1`` (n, n) and E = ``work[0]``, J_2 =
+    ``work[3]`` of ``work`` (4, n, n), in place: J_2 <- J_2 + s J_1 + E J_2, J_1 <- J_1 + E J_1 and
+    E <- E E. See ``fill_exponential_integrals``, which writes them for a first step.
     """
     n, E, product, J_2 = len(J_1), work[0], work[2], work[3]
     multiply_square(product, E, J_2)
@@ -87,7 +90,9 @@ def double_gap(step: float, J_1: FloatArray, work: FloatArray) -> None:
 
 @kernel
 def fill_inverse_transition(A: FloatArray, gap: float, maps: FloatArray) -> None:
-    """Write ``e^{-A g}`` (n, n) into the first of ``maps`` (6, n, n); the others are scratch."""
+    """Write ``e^{-A g}`` (n, n) for a ``gap`` of g seconds into the first of ``maps`` (6, n, n);
+    the others are scratch. A is (n, n).
+    """
     fill_legendre_integrals(A, -1.0, gap, maps[4], maps[5], maps[:4])
 
 
@@ -103,9 +108,12 @@ def correct_by_moments(
     gap: float,
     work: FloatArray,
 ) -> None:
-    """Correct the open-loop prediction ``x[k]`` (n,) at the end of a gap by the ``moments`` (2 p,)
-    of the increments of the gap, with gain L (>= n, >= p) and H (>= p, n). ``closed`` is A - L H;
-    the moments are overwritten with the innovations; ``work`` (6, n, n) is scratch.
+    """Correct the open-loop prediction ``x[k]`` (n,) at the end of a ``gap`` in seconds, entry
+    ``k`` of x (K, n), in place by the ``moments`` (2 p,) of the increments of the gap, with gain L
+    (>= n, >= p) and H (>= p, n).
+
+    A is (n, n) and ``closed`` (n, n) is A - L H; the moments are overwritten with the innovations;
+    ``work`` (6, n, n) is scratch.
     """
     n, p = len(A), len(moments) // 2
     first, second, integrals_work = work[4], work[5], work[:4]
@@ -131,7 +139,9 @@ def correct_by_moments(
 def correct_by_innovation(
     x: FloatArray, k: int, H: FloatArray, L: FloatArray, y: FloatArray, updated: FloatArray
 ) -> None:
-    """Add ``L (y - H x)`` to ``x[k]`` (n,) for a sample y (p,); ``updated`` (n,) is scratch."""
+    """Add ``L (y - H x)`` to ``x[k]`` (n,), entry ``k`` of x (K, n), for a sample y (p,) with H
+    (p, n) and gain L (n, p); ``updated`` (n,) is scratch.
+    """
     n = x.shape[1]
     for i in range(n):
         updated[i] = x[k, i]

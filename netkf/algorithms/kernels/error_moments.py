@@ -24,7 +24,10 @@ from netkf.linalg.compiling import kernel
 def covariance_slope(
     P: FloatArray, A: FloatArray, Q: FloatArray, G: FloatArray, K: FloatArray, dP: FloatArray
 ) -> None:
-    """Write K_i = A - P_i G_i and dP_i/dt = K_i P_i + P_i A' + Q for all nodes, (N, n, n) each."""
+    """Write ``K`` and ``dP`` (N, n, n): K_i = A - P_i G_i and dP_i/dt = K_i P_i + P_i A' + Q for
+    all N nodes, from their covariances P (N, n, n) and information rates G (N, n, n), 1/s; A and Q
+    are (n, n).
+    """
     N, n = len(P), len(A)
     for i in range(N):
         for a in range(n):
@@ -44,8 +47,9 @@ def covariance_slope(
 
 @kernel
 def error_slope(S: FloatArray, K: FloatArray, true_Q: FloatArray, dS: FloatArray) -> None:
-    """Write dS_ij/dt = K_i S_ij + S_ij K_j' + Qt (N, N, n, n) of S_ij = cov(e_i, e_j), without the
-    noise of the sensors.
+    """Write dS_ij/dt = K_i S_ij + S_ij K_j' + Qt into ``dS`` (N, N, n, n) for the covariances S_ij
+    = cov(e_i, e_j) (N, N, n, n) of the errors of N nodes, without the noise of the sensors. K
+    (N, n, n) are the closed loops A - P_i G_i; Qt = ``true_Q`` (n, n) is the noise of the plant.
     """
     # All errors share the noise of the plant. S_ji = S_ij' is filled from the same entry.
     N, n = len(S), len(true_Q)
@@ -62,7 +66,9 @@ def error_slope(S: FloatArray, K: FloatArray, true_Q: FloatArray, dS: FloatArray
 
 @kernel
 def add_sensor_noise(P: FloatArray, true_G: FloatArray, dS: FloatArray) -> None:
-    """Add P_i Gt_i P_i, the noise of the sensors, to the derivatives dS_ii/dt, in place."""
+    """Add P_i Gt_i P_i, the noise of the sensors, to the derivatives dS_ii/dt in ``dS``
+    (N, N, n, n), in place, with Gt = ``true_G`` (N, n, n) and the filters' covariances P (N, n, n).
+    """
     # Only in dS_ii: the noises of different nodes are independent.
     for i in range(len(P)):
         n = P.shape[1]
@@ -85,11 +91,11 @@ def mix(
     P0: FloatArray,
     S0: FloatArray,
 ) -> None:
-    """Apply the messages of one instant, H (7) and (9), in place to the covariances P (N, n, n) of
-    the filters and those of their true errors, S_ij = cov(e_i, e_j) (N, N, n, n).
+    """Apply the M messages of one instant, H (7) and (9), in place to the covariances P (N, n, n)
+    of the filters and those of their true errors, S_ij = cov(e_i, e_j) (N, N, n, n).
 
-    Message k moves node ``rows[k]`` by ``weights[k]`` towards node ``columns[k]``, all from the
-    values before the instant. P0 and S0 are scratch, shaped like P and S.
+    Message k moves node ``rows[k]`` by ``weights[k]`` towards node ``columns[k]``, (M,) each, all
+    from the values before the instant. P0 and S0 are scratch, shaped like P and S.
     """
     P0[:] = P
     S0[:] = S
@@ -118,12 +124,13 @@ def run_moments(
     step: float,
     traces: FloatArray,
 ) -> None:
-    """Integrate P (N, n, n) and S (N, N, n, n) in place and write the traces (T, N) of cov(e_i) at
-    ``times`` (T,), after the messages of the same instant, with steps of at most ``step`` seconds.
+    """Integrate P (N, n, n) and S (N, N, n, n) of N nodes in place and write the traces (T, N) of
+    cov(e_i) at ``times`` (T,), after the messages of the same instant, with steps of at most
+    ``step`` seconds.
 
-    ``model`` is (A, Q, Qt, G, Gt). The messages at ``instants[m]`` are those with numbers
-    ``ends[m]`` to ``ends[m + 1]`` - 1; message k goes from node ``columns[k]`` to ``rows[k]`` with
-    ``weights[k]``.
+    ``model`` is (A, Q, Qt, G, Gt), (n, n) or, for G and Gt, (N, n, n). The messages at
+    ``instants[m]``, in seconds, are those with numbers ``ends[m]`` to ``ends[m + 1]`` - 1; message
+    k goes from node ``columns[k]`` to ``rows[k]`` with ``weights[k]``.
     """
     A, Q, true_Q, G, true_G = model
     K, P0, S0 = np.empty_like(P), np.empty_like(P), np.empty_like(S)

@@ -27,8 +27,12 @@ MAX_INTERVAL = 8.0  # |M| g beyond which two moments do not describe a reading w
 
 
 class GainTable(NamedTuple):
-    """Power series in the interval g of U (n, 2p), W (n, 2p) and the predictor C (2p, n), with
-    their reach, see linalg/series.
+    """Power series in the interval g (seconds) of U (n, 2p), W (n, 2p) and the predictor C (2p, n),
+    for readings of p rows.
+
+    n, moments : number of states, and 2p
+    series : (terms, 6 n p + 1), the coefficients of U, W and C by rows, and their reach in the
+             last column: the longest interval for which the terms so far suffice, see linalg/series
     """
 
     n: int
@@ -39,8 +43,10 @@ class GainTable(NamedTuple):
 def gain_table(
     A: FloatArray, Q: FloatArray, H: FloatArray, R: FloatArray, longest: float
 ) -> GainTable:
-    """Tabulate the gains for intervals up to ``longest`` seconds; raises ValueError above
-    :func:`longest_interval`.
+    """Tabulate the gains of a plant with A and Q (n, n) and a sensor with H (p, n) and R (p, p) for
+    intervals up to ``longest`` seconds.
+
+    Raises ValueError if that is above :func:`longest_interval`.
     """
     n, p = len(A), len(H)
     # H' R^-1 (n, p).
@@ -74,12 +80,16 @@ def gain_table(
 
 
 def longest_interval(A: FloatArray, Q: FloatArray, H: FloatArray, R: FloatArray) -> float:
-    """Return the longest interval (seconds) whose reading the gains can use."""
+    """Return the longest interval (seconds) whose reading the gains can use, for a plant with A and
+    Q (n, n) and a sensor with H (p, n) and R (p, p).
+    """
     return longest_interval_for(A, Q, H.T @ np.linalg.solve(R, H))
 
 
 def longest_interval_for(A: FloatArray, Q: FloatArray, G: FloatArray) -> float:
-    """Return the longest interval (s) whose reading with ``G = H' R^-1 H`` the gains can use."""
+    """Return the longest interval (seconds) whose reading the gains can use, for a plant with A and
+    Q (n, n) and a sensor with the information rate ``G = H' R^-1 H`` (n, n).
+    """
     M, _ = hamiltonian(A, Q, G)
     norm = float(np.abs(M).sum(axis=0).max())
     # No dynamics and no information: every interval is short enough.
@@ -100,8 +110,8 @@ def _count_terms(size: float) -> int:
 def gain_update(
     table: GainTable, P: FloatArray, x: FloatArray, moments: FloatArray, gap: float
 ) -> FloatArray:
-    """Return ``xhat(b)`` (n,) from the open-loop prediction ``x``, ``P = P(b)`` and the moments
-    (2p,).
+    """Return ``xhat(b)`` (n,) at the end b of an interval of ``gap`` seconds, from the open-loop
+    prediction ``x`` (n,) there, ``P = P(b)`` (n, n) and the ``moments`` (2p,) of the reading.
     """
     n, q = table.n, table.moments
     # One evaluation of the concatenated series [U, W, C].

@@ -34,8 +34,9 @@ from netkf.linalg.lanes import (
 def write_information(
     lanes: Lanes, out: FloatArray, share: float, inverse: FloatArray, h: int
 ) -> None:
-    """Write the root of ``share`` times the information ``P^-1`` of node ``h`` into ``out`` (n, n +
-    1, L), relative to the node's estimate; ``inverse[h]`` is S^-1 for P = S S'.
+    """Write the root of ``share`` times the information ``P^-1`` of node ``h`` into ``out``
+    (n, n + 1, L), relative to the node's estimate; ``inverse[h]`` of ``inverse`` (H, n, n, L) is
+    S^-1 for P = S S'.
     """
     # P^-1 = S^-T S^-1, whose root is the inverse of S, lower triangular like S.
     n, factor = len(out), share**0.5
@@ -59,9 +60,10 @@ def add_reading_pair(
     work: FloatArray,
 ) -> None:
     """Add ``share`` times the information pair ``(H' H, H' y)`` of a whitened reading to ``total``
-    (n, n + 1, L), relative to ``centre[h]``.
+    (n, n + 1, L), in place, relative to ``centre[h]`` of ``centre`` (H, n, L).
 
-    The reading has ``rows`` rows at ``index`` [b, s, h] of y and H; ``work`` is scratch.
+    The reading has ``rows`` rows at ``index`` [b, s, h], block, slot and node, of y (B, S, H, p, L)
+    and H (B, S, H, p, n, L); ``work`` (n, n + 1, L) is scratch.
     """
     b, s, h = index
     n, factor = len(total), share**0.5
@@ -92,8 +94,9 @@ def weigh_part(
     centre: FloatArray,
     h: int,
 ) -> None:
-    """Write the root of ``weight`` times the pair ``parts[t, k, sender]`` into ``out`` (n, n + 1,
-    L), relative to the centre of node ``h``; ``index`` is [t, k, sender].
+    """Write the root of ``weight`` (L,) times the information pair ``parts[t, k, sender]`` of
+    ``parts`` (2, K, H, n, n + 1, L) into ``out`` (n, n + 1, L), relative to ``centre[h]`` instead
+    of ``centre[sender]``, (n, L); ``index`` is [t, k, sender]: copy t, pair k of that node.
     """
     t, k, sender = index
     n, factor = len(out), root_of(weight)
@@ -137,8 +140,13 @@ def begin_part(
     total: FloatArray,
     work: FloatArray,
 ) -> None:
-    """Write the initial pair ``k`` of node h: ``shares[k, 0]`` times the information of its
-    prediction plus ``shares[k, 1]`` times that of its reading; ``index`` is [b, s, h].
+    """Write the initial pair ``k`` of node h, before any consensus step, into ``parts[0, k, h]`` of
+    ``parts`` (2, K, H, n, n + 1, L): ``shares[k, 0]`` times the information of its prediction plus
+    ``shares[k, 1]`` times that of its reading, ``shares`` (K, 2).
+
+    ``index`` is [b, s, h], block, slot and node; ``inverse`` (H, n, n, L) holds the inverse roots
+    of the predictions and ``centre`` (H, n, L) their means. The reading has ``rows`` whitened rows
+    of y (B, S, H, p, L) and H (B, S, H, p, n, L). ``total`` and ``work`` (n, n + 1, L) are scratch.
     """
     write_information(lanes, total, shares[k, 0], inverse, index[2])
     if shares[k, 1] > 0.0:
@@ -159,9 +167,14 @@ def mix_parts(
     total: FloatArray,
     work: FloatArray,
 ) -> None:
-    """Do consensus step number ``step`` of node ``h``: replace each of its pairs by the convex
-    combination of it and those that arrive (``up`` at ``index`` [b, s, e]). The weights of messages
-    that do not arrive go to the own pair.
+    """Do consensus step number ``step`` of node ``h``: replace each of its K pairs in ``parts``
+    (2, K, H, n, n + 1, L) by the convex combination of it and those that arrive. The weights of
+    messages that do not arrive go to the own pair.
+
+    Reads copy ``step`` modulo 2 of ``parts`` and writes the other one at node h. ``up``
+    (B, S, E, W, L) at ``index`` [b, s, e] (block, slot, step of the exchanges) flags the messages
+    that arrive; ``centre`` (H, n, L) are the means that pairs are relative to; ``total`` and
+    ``work`` (n, n + 1, L) are scratch.
     """
     b, s, e = index
     # Two copies alternate: all nodes read from copy t and write to copy 1 - t.
@@ -200,9 +213,12 @@ def write_estimate(
     total: FloatArray,
     work: FloatArray,
 ) -> None:
-    """Write the estimate and root of filter ``h`` of block ``b`` from the sum of information:
-    ``counts[K]`` times that of its prediction plus ``counts[k]`` times each of its K pairs after
-    the consensus steps, ``parts[t]``.
+    """Write ``xhat[b, h]`` (n, L) and ``root[b, h]`` (n, n, L) of filter ``h`` of block ``b`` from
+    a sum of information: ``counts[K]`` times that of its prediction plus ``counts[k]`` times each
+    of its K pairs after the consensus steps, copy ``t`` of ``parts`` (2, K, H, n, n + 1, L).
+
+    ``inverse`` (H, n, n, L) holds the inverse roots of the predictions and ``centre`` (H, n, L)
+    their means; ``total`` and ``work`` (n, n + 1, L) are scratch.
     """
     K = parts.shape[1]
     write_information(lanes, total, float(counts[K]), inverse, h)

@@ -17,7 +17,9 @@ from netkf.linalg.lanes import Lanes, load, magnitude, root_of, select, spread, 
 
 @kernel(inlined=True)
 def invert_lanes(lanes: Lanes, out: FloatArray, root: FloatArray, b: int, h: int) -> None:
-    """Write the inverse of the root of filter ``h`` of block ``b`` into ``out[h]`` (n, n, L).
+    """Write the inverse of ``root[b, h]`` (n, n, L), the lower triangular root of filter ``h`` of
+    block ``b``, into ``out[h]`` of ``out`` (H, n, n, L).
+
     Pivots are raised to SINGULAR times the length of their row, see ``root_update.invert_root``.
     """
     # The floor grows with the whole root, so that a zero row is not inverted on its own scale.
@@ -53,8 +55,11 @@ def whiten(
     sender: int,
     h: int,
 ) -> None:
-    """Write ``sqrt(weight) [Z, Z (x - xhat[h])]`` of the estimate of ``sender`` into ``out`` (n,
-    n + 1, L): a root of its information, with Z = S^-1 = ``inverse[sender]`` (H, n, n, L).
+    """Write ``sqrt(weight) [Z, Z (x - xhat[h])]`` of the estimate x = ``xhat[sender]`` into ``out``
+    (n, n + 1, L): a root of ``weight`` (L,) times its information, with Z = S^-1 =
+    ``inverse[sender]``.
+
+    ``inverse`` (H, n, n, L) and ``xhat`` (H, n, L) are those of all H filters of a block.
     """
     n, factor = inverse.shape[1], root_of(weight)
     for i in range(n):
@@ -69,8 +74,9 @@ def whiten(
 
 @kernel(inlined=True)
 def merge_lanes(lanes: Lanes, total: FloatArray, whitened: FloatArray) -> None:
-    """Replace ``total`` (n, n + 1, L), a root [Z, z] of information, by a root of the sum of it and
-    ``whitened`` (n, n + 1, L), which is overwritten; as ``root_update.merge_information``.
+    """Replace ``total`` (n, n + 1, L), a root [Z, z] of information (Z lower triangular,
+    information Z' Z, z = Z times the mean), by a root of the sum of it and ``whitened``
+    (n, n + 1, L), which is overwritten; as ``root_update.merge_information`` does for one run.
     """
     # Reflections from the left zero the columns of ``whitened`` from the last one on, so that both
     # stay lower triangular.
@@ -113,8 +119,11 @@ def finish_lanes(
     unchanged: Any,
 ) -> None:
     """Write the estimate of the information ``total`` (n, n + 1, L), [Z, z] relative to
-    ``centre[h]``, into filter ``h`` of block ``b``: root Z^-1 and ``xhat = centre + Z^-1 z``. Lanes
-    with the flag ``unchanged`` keep their estimate; ``whitened`` is scratch.
+    ``centre[h]`` of ``centre`` (H, n, L), into filter ``h`` of block ``b``: Z^-1 into ``root[b,
+    h]`` (n, n, L) and ``centre + Z^-1 z`` into ``xhat[b, h]`` (n, L).
+
+    Lanes with the flag ``unchanged`` (L,) keep their estimate; ``whitened`` (n, n + 1, L) is
+    scratch.
     """
     # S = Z^-1: the total is lower triangular, so P = Z^-1 Z^-T has the lower root Z^-1.
     n = len(total)

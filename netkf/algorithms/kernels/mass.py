@@ -23,8 +23,8 @@ from netkf.linalg.lanes import Lanes, any_lane, load, load_flags, root_of, selec
 def split_mass(
     lanes: Lanes, mass: FloatArray, b: int, h: int, degree: int, share: FloatArray
 ) -> None:
-    """Write into ``share[h]`` (m, L) the message of node ``h`` to each of its ``degree``
-    neighbours: its mass over degree + 1.
+    """Write into ``share[h]`` (m, L) the message of node ``h`` of block ``b`` to each of its
+    ``degree`` neighbours: its mass, m = 2 + n n entries of ``mass`` (B, H, m, L), over degree + 1.
     """
     # P (3)-(5) with equal weights 1 / (degree + 1). The quotient is computed once: all neighbours
     # receive the same bits.
@@ -36,8 +36,9 @@ def split_mass(
 def keep_share(
     lanes: Lanes, mass: FloatArray, b: int, h: int, share: FloatArray, times: Any, unchanged: Any
 ) -> None:
-    """Add ``times`` times its own ``share`` to the mass that node ``h`` received, P (3)-(5), except
-    in lanes with the flag ``unchanged``.
+    """Add ``times`` (L,) times its own ``share[h]`` (m, L) to the mass that node ``h`` of block
+    ``b`` received, ``mass[b, h]`` of ``mass`` (B, H, m, L), in place, P (3)-(5), except in lanes
+    with the flag ``unchanged`` (L,).
 
     ``times`` is 1 for the node itself plus 1 for each of its links that failed.
     """
@@ -60,8 +61,9 @@ def learn_network(
     number: FloatArray,
 ) -> None:
     """Write the information of all sensors G = C~ / w and the number of nodes N = n~ / w as node
-    ``h`` estimates them, P (6), into ``information`` (n, n, L) and ``number`` (1, L). While its
-    weight w is exactly 0, these are its own information ``alone[h]`` and 1.
+    ``h`` of block ``b`` estimates them, P (6), into ``information`` (n, n, L) and ``number``
+    (1, L), from its mass in ``mass`` (B, H, 2 + n n, L). While its weight w is exactly 0, these are
+    its own information ``alone[h]`` of ``alone`` (H, n, n) and 1.
     """
     n, weight = information.shape[0], load(lanes, mass, b, h, 0)
     is_empty = weight == 0.0
@@ -86,8 +88,9 @@ def correct_root(
     remainder: FloatArray,
     scratch: SlotScratch,
 ) -> None:
-    """Replace the root of filter ``h`` by that of ``(P^-1 + G)^-1 = P (I + G P)^-1``, P (7), with
-    the information G = ``information[b, h]`` (B, H, n, n, L); ``remainder`` (n, n, L) is scratch.
+    """Replace ``root[b, h]`` (n, n, L) of filter ``h`` of block ``b`` by the root of ``(P^-1 +
+    G)^-1 = P (I + G P)^-1``, P (7), with the information G = ``information[b, h]`` of
+    ``information`` (B, H, n, n, L); ``remainder`` (n, n, L) is scratch.
     """
     # G = sum v v' by Cholesky with the largest pivot first. Each v' is used as an observation with
     # noise of variance 1: nothing is inverted, and P may be singular.
@@ -127,7 +130,7 @@ def correct_root(
 @kernel(inlined=True)
 def largest_row(lanes: Lanes, remainder: FloatArray, v: FloatArray) -> Any:
     """Write the row of ``remainder`` (n, n, L) with the largest diagonal entry into ``v`` (n, L),
-    lane by lane; return that entry.
+    lane by lane; return that entry (L,).
     """
     # Diagonal pivoting reveals the rank of G.
     n, pivot = len(remainder), load(lanes, remainder, 0, 0)
@@ -160,9 +163,12 @@ def add_gain(
     projected: FloatArray,
     root_projected: FloatArray,
 ) -> None:
-    """Correct the estimate of filter ``h`` of block ``b``, P (8): ``x += number S S' H' (y - H x)``
-    for the whitened reading ``y[b, s, h]`` with ``rows`` rows; ``projected`` and ``root_projected``
-    (n, L) are scratch.
+    """Correct the estimate ``x[b, h]`` (n, L) of filter ``h`` of block ``b`` in place, P (8): ``x
+    += number S S' H' (y - H x)`` with the root S = ``root[b, h]`` (n, n, L) and the ``number`` (L,)
+    of nodes that it knows of.
+
+    The reading of slot ``s`` has ``rows`` whitened rows ``y[b, s, h]`` of y (B, S, H, p, L) and H
+    (B, S, H, p, n, L); ``projected`` and ``root_projected`` (n, L) are scratch.
     """
     n = x.shape[2]
     # A fixed H has one block and one slot.
@@ -202,9 +208,11 @@ def average(
     averaged: FloatArray,
     factor: float,
 ) -> None:
-    """Do one averaging step of all nodes of block ``b``, P (9): ``z_i += factor sum_j (z_j - z_i)``
-    over the estimates z_j that arrive (``up`` in step ``step`` of slot ``s``), with ``factor`` =
-    1 / delta; z is (B, H, n, L), ``averaged`` (H, n, L) is scratch.
+    """Do one averaging step of all nodes of block ``b`` in place, P (9): ``z_i += factor sum_j (z_j
+    - z_i)`` over the estimates z_j that arrive, with ``factor`` = 1 / delta; ``z`` is (B, H, n, L).
+
+    ``up`` (B, S, E, W, L) flags the messages that arrive in step ``step`` of the exchanges of slot
+    ``s``; ``averaged`` (H, n, L) is scratch.
     """
     H, n = len(links.first) - 1, z.shape[2]
     # All differences before any estimate moves: the step is simultaneous.

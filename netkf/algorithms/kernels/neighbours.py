@@ -48,8 +48,11 @@ def sum_differences(
     differences: FloatArray,
 ) -> None:
     """Write into ``differences[h]`` (n, L) the sum of x_j - x_h over the estimates x_j that filter
-    ``h`` hears (``up`` in step ``e`` of slot ``s``), each times the weight of its link if
-    ``weighted``.
+    ``h`` of block ``b`` hears in step ``e`` of the exchanges of slot ``s``, each times the weight
+    of its link if ``weighted``.
+
+    ``x`` (B, H, n, L) holds the estimates of H filters in B blocks of L runs; ``up``
+    (B, S, E, W, L) flags the messages that arrive on each of W directions.
     """
     for i in range(x.shape[2]):
         own, total = load(lanes, x, b, h, i), spread(lanes, 0.0)
@@ -71,9 +74,9 @@ def scale_by_covariance(
     differences: FloatArray,
     work: FloatArray,
 ) -> None:
-    """Multiply ``differences[h]`` (n, L) by the consensus gain of the Kalman consensus filter (KCF,
-    Olfati-Saber 2009), ``epsilon / (1 + |P|) P`` with the Frobenius norm; ``work`` (n, L) is
-    scratch.
+    """Multiply ``differences[h]`` (n, L) in place by the consensus gain of the Kalman consensus
+    filter (KCF, Olfati-Saber 2009), ``epsilon / (1 + |P|) P`` with the Frobenius norm, where P has
+    the root ``root[b, h]`` (n, n, L) of filter ``h`` of block ``b``; ``work`` (n, L) is scratch.
     """
     n, square = root.shape[2], spread(lanes, 0.0)
     # |P|^2 is the sum of the squares of the entries of S S'.
@@ -100,7 +103,9 @@ def scale_by_covariance(
 
 @kernel(inlined=True)
 def add_to_estimate(lanes: Lanes, x: FloatArray, b: int, h: int, term: FloatArray) -> None:
-    """Add ``term[h]`` (n, L) to the estimate of filter ``h`` of block ``b``."""
+    """Add ``term[h]`` (n, L) to ``x[b, h]`` of ``x`` (B, H, n, L), the estimate of filter ``h`` of
+    block ``b``, in place.
+    """
     for i in range(x.shape[2]):
         store(lanes, x, b, h, i, load(lanes, x, b, h, i) + load(lanes, term, h, i))
 
@@ -118,7 +123,10 @@ def fuse_readings(
     h: int,
 ) -> None:
     """Update filter ``h`` of block ``b`` with its own reading of slot ``s`` and, if nodes ``share``
-    readings, with those that arrive in the first step of the slot.
+    readings, with those that arrive in the first step of the slot's exchanges (``plan.up[b, s,
+    0]``).
+
+    Changes ``nodes.xhat[b, h]`` (n, L) and ``nodes.root[b, h]`` (n, n, L), in L runs.
     """
     update_by_reading(nodes, readings, scratch, b, s, h, h, True)
     if not share:
@@ -132,8 +140,8 @@ def fuse_readings(
 
 @kernel
 def copy_pairs(nodes: SlotNodes, scratch: SlotScratch, b: int) -> None:
-    """Copy (xhat, root) of all filters of block ``b`` to ``scratch``: the messages that
-    they send.
+    """Copy (xhat, root) of all H filters of block ``b`` to ``scratch.xhat`` (H, n, L) and
+    ``scratch.root`` (H, n, n, L): the messages that they send.
     """
     for h in range(len(nodes.rows)):
         for i in range(nodes.xhat.shape[2]):
@@ -153,9 +161,11 @@ def combine_convex_roots(
     s: int,
     h: int,
 ) -> None:
-    """Replace (xhat, P) of filter ``h`` of block ``b`` by the convex combination of it and those
-    that arrive, H (7) and (9), from the copies of all in ``scratch``. The weights of messages that
-    do not arrive go to the own one.
+    """Replace ``nodes.xhat[b, h]`` (n, L) and ``nodes.root[b, h]`` (n, n, L) of filter ``h`` of
+    block ``b`` by the convex combination of it and those that arrive in slot ``s``, H (7) and (9),
+    from the copies of all filters in ``scratch`` (see ``copy_pairs``).
+
+    The weights of messages that do not arrive go to the own estimate.
     """
     lanes, n = scratch.lanes, nodes.xhat.shape[2]
     received_weight = spread(lanes, 0.0)

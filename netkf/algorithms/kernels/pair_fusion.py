@@ -36,7 +36,8 @@ def common_basis(
     own: FloatArray, other: FloatArray, U: FloatArray, W: FloatArray, b: FloatArray
 ) -> None:
     """Write an orthogonal U, ``W = own U`` (n, n each) and b (n,) with ``own own' = W W'`` and
-    ``other other' = W diag(b) W'``, for lower triangular, regular roots (n, n).
+    ``other other' = W diag(b) W'``: a basis in which both covariances are diagonal, with variances
+    1 and b. ``own`` and ``other`` (n, n) are lower triangular, regular roots.
     """
     n = len(b)
     # T = own^-1 other, by forward substitution.
@@ -64,7 +65,9 @@ def common_basis(
 
 @kernel
 def orthogonalise(T: FloatArray) -> float:
-    """Rotate each pair of columns of T (n, n) once; return the largest cosine found between two."""
+    """Rotate each pair of columns of T (n, n) once, in place, so that the two become orthogonal;
+    return the largest cosine that was found between two columns.
+    """
     n, largest = len(T), 0.0
     for p in range(n - 1):
         for q in range(p + 1, n):
@@ -94,8 +97,9 @@ def orthogonalise(T: FloatArray) -> float:
 
 @kernel(inlined=True)
 def fused_variance(w: float, b: float, inverse: bool) -> float:
-    """Return the fused variance of two estimates with variances 1 (weight ``w``) and ``b``
-    (weight 1 - w).
+    """Return the variance of the fusion of two scalar estimates with variances 1 (weight ``w``) and
+    ``b`` (weight 1 - w), by inverse covariance intersection if ``inverse``, else by covariance
+    intersection.
     """
     if inverse:
         mixed = w + (1.0 - w) * b
@@ -105,8 +109,12 @@ def fused_variance(w: float, b: float, inverse: bool) -> float:
 
 @kernel
 def slope(w: float, W: FloatArray, b: FloatArray, inverse: bool, trace: bool) -> float:
-    """Return the derivative by ``w`` of the criterion: the trace of P, or the logarithm of its
-    determinant.
+    """Return the derivative by ``w`` of the criterion: the trace of the fused P, or the logarithm
+    of its determinant unless ``trace``.
+
+    ``W`` (n, n) and ``b`` (n,) are those of ``common_basis``: both covariances are diagonal in the
+    basis W, with variances 1 (weight w) and b (weight 1 - w). ``inverse`` chooses the fusion, see
+    ``fused_variance``.
     """
     total = 0.0
     for k in range(len(b)):
@@ -131,7 +139,12 @@ def slope(w: float, W: FloatArray, b: FloatArray, inverse: bool, trace: bool) ->
 
 @kernel
 def best_weight(W: FloatArray, b: FloatArray, inverse: bool, trace: bool) -> float:
-    """Return the weight w of the first estimate that minimises the criterion, see ``slope``."""
+    """Return the weight w in [0, 1] of the first of two estimates that minimises the trace of the
+    fused P, or its determinant unless ``trace``.
+
+    In the basis ``W`` (n, n) both covariances are diagonal, with variances 1 and ``b`` (n,).
+    ``inverse``: inverse covariance intersection, else covariance intersection.
+    """
     difference = 0.0
     for k in range(len(b)):
         difference = max(difference, abs(b[k] - 1.0))
@@ -162,7 +175,8 @@ def fuse_pair(
     trace: bool,
     work: FloatArray,
 ) -> None:
-    """Fuse an estimate x (n,) with lower triangular ``root`` (n, n), in place, with another one.
+    """Fuse an estimate x (n,) with lower triangular ``root`` (n, n), in place, with another one,
+    ``other_x`` (n,) with the lower triangular root ``other`` (n, n).
 
     ``inverse``: inverse covariance intersection, else covariance intersection; ``trace``: the
     weight minimises the trace of P, else its determinant. ``work`` (2 n + 2, n) is scratch.
@@ -198,8 +212,9 @@ def fuse_pair(
 
 @kernel(inlined=True)
 def other_gain(p: float, w: float, b: float, inverse: bool) -> float:
-    """Return the gain of the other estimate in a direction in which the variances are 1 (own),
-    ``b`` (other) and ``p`` (fused).
+    """Return the gain (0 to 1) of the other estimate in a direction in which the variances are 1
+    (own, weight ``w``), ``b`` (other, weight 1 - w) and ``p`` (fused); ``inverse`` as in
+    ``fused_variance``.
     """
     if inverse:
         return p * (1.0 / b - (1.0 - w) / (w + (1.0 - w) * b))
@@ -212,8 +227,12 @@ def fuse_tracks(
     inverse: bool,
     trace: bool,
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the fused estimate (n,) and lower triangular root (n, n) of two estimates, each given
-    with its root; see ``fuse_pair``.
+    """Return the fused estimate (n,) and lower triangular root (n, n) of two estimates of unknown
+    correlation, ``first`` and ``second``, each a pair of the estimate (n,) and its lower triangular
+    root (n, n).
+
+    ``inverse``: inverse covariance intersection, else covariance intersection; ``trace``: the
+    weight minimises the trace of P, else its determinant.
     """
     x, root = (np.array(values, dtype=np.float64) for values in first)
     n = len(x)

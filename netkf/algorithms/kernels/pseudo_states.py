@@ -27,8 +27,12 @@ def predict_pseudo(
     coupling: FloatArray,
     predicted: FloatArray,
 ) -> None:
-    """Predict the estimate of the pseudo-state of filter ``h`` to the next slot, ``A yhat +
-    coupling xhat``, with xhat of the present slot; ``predicted`` (n, L) is scratch.
+    """Predict the estimate of the pseudo-state of filter ``h`` of block ``b`` to the next slot:
+    replace yhat = ``y[b, h]`` (n, L) by ``A yhat + coupling xhat``, with xhat = ``x[b, h]`` of the
+    present slot.
+
+    ``x`` and ``y`` are (B, H, n, L), ``A`` and ``coupling`` (n, n); ``predicted`` (n, L) is
+    scratch.
     """
     n = len(A)
     for i in range(n):
@@ -54,9 +58,11 @@ def fill_pseudo_innovation(
     state: FloatArray,
     z: FloatArray,
 ) -> None:
-    """Write the pseudo-innovation ``H' R^-1 (reading - H G^+ yhat)`` of filter ``h`` into ``z`` (n,
-    L), for the reading of slot ``s`` with ``rows`` whitened rows; ``inverse`` (n, n) is G^+ and
-    ``state`` (n, L) scratch for ``G^+ yhat``.
+    """Write the pseudo-innovation ``H' R^-1 (reading - H G^+ yhat)`` of filter ``h`` of block ``b``
+    into ``z`` (n, L), for the reading of slot ``s`` with ``rows`` whitened rows.
+
+    ``y`` (B, H, n, L) are the estimates yhat; ``inverse`` (n, n) is G^+ and ``state`` (n, L)
+    scratch for ``G^+ yhat``.
     """
     n = len(inverse)
     # A fixed H has one block and one slot.
@@ -93,10 +99,12 @@ def correct_pseudo(
     corrected: FloatArray,
 ) -> None:
     """Write ``yhat_h + sum_l B_hl (yhat_l - yhat_h) + M_h z`` into ``corrected[h]`` (n, L), summed
-    over the estimates yhat_l that arrive in the first step of slot ``s``.
+    over the estimates yhat_l that arrive at filter ``h`` of block ``b`` in the first step of slot
+    ``s``.
 
-    ``y`` (blocks, H, n, L) are the estimates yhat; ``up`` flags the messages that arrive; ``B``
-    (W, n, n) are in the order of ``links``, ``M`` (H, n, n); ``z`` (n, L) is the pseudo-innovation.
+    ``y`` (blocks, H, n, L) are the estimates yhat; ``up`` (blocks, S, E, W, L) flags the messages
+    that arrive; ``B`` (W, n, n) are in the order of ``links``, ``M`` (H, n, n); ``z`` (n, L) is the
+    pseudo-innovation.
     """
     n = M.shape[1]
     # Into a separate array: the other filters still need yhat_h from before the step.
@@ -128,8 +136,11 @@ def correct_state(
     corrected: FloatArray,
     difference: FloatArray,
 ) -> None:
-    """Set yhat of filter ``h`` to ``corrected[h]`` and correct the state by it, ``xhat += K_h (yhat
-    - G xhat)``; ``K`` (H, n, n), ``difference`` (n, L) is scratch.
+    """Set yhat = ``y[b, h]`` of filter ``h`` of block ``b`` to ``corrected[h]`` and correct the
+    state by it in place, ``x[b, h] += K_h (yhat - G xhat)``.
+
+    ``x`` and ``y`` are (B, H, n, L), ``corrected`` (H, n, L), ``K`` (H, n, n), G (n, n);
+    ``difference`` (n, L) is scratch.
     """
     n = len(G)
     # difference = yhat - G xhat, complete before xhat changes.
@@ -150,8 +161,8 @@ def correct_state(
 def shift_pseudo(
     lanes: Lanes, y: FloatArray, readings: ReadingBlock, G: FloatArray, b: int, s: int
 ) -> None:
-    """Move the origin of the pseudo-states of block ``b`` to G x of slot ``s``, if a frame begins
-    there.
+    """Move the origin of the pseudo-states ``y[b]`` (H, n, L) of block ``b`` to G x of slot ``s``,
+    if a frame begins there: subtract G (n, n) times the true state ``readings.local[b, s]`` (n, L).
     """
     if readings.rebased[s]:
         n = len(G)

@@ -27,12 +27,13 @@ TAYLOR_TERMS = 19  # 1 / 19! is below double rounding when |M| unit <= 1
 
 
 class RiccatiTable(NamedTuple):
-    """Everything that depends on ``A, Q, G`` and not on ``P`` or the gap.
+    """Everything that depends on ``A, Q, G`` (n, n) and not on ``P`` or the gap.
 
+    n      : number of states
+    unit   : gap that the series covers, seconds
     series : (terms, 5 n n + 1) Taylor coefficients of the blocks of ``exp(M g)`` and of
              ``exp(A g)``, with their reach, see linalg/series
     unobserved : (terms, 2 n n + 1) those of ``exp(A g)`` and of W where G = 0, else no row
-    unit   : gap that the series covers, seconds
     transition, F, G, Q : (levels, n, n) ``exp(A g)`` and the triple for ``g = unit * 2^level``
     """
 
@@ -47,7 +48,9 @@ class RiccatiTable(NamedTuple):
 
 
 def exponential_series(M: FloatArray, terms: int) -> FloatArray:
-    """Return the series (terms, n, n) with ``exp(M g) = sum_k g^k series[k]``."""
+    """Return the series (terms, n, n) with ``exp(M g) = sum_k g^k series[k]`` for M (n, n), in its
+    precision.
+    """
     series = np.empty((terms, *M.shape), dtype=M.dtype)
     series[0] = np.eye(len(M))
     for k in range(1, terms):
@@ -57,8 +60,8 @@ def exponential_series(M: FloatArray, terms: int) -> FloatArray:
 
 
 def lyapunov_series(A: FloatArray, Q: FloatArray, terms: int) -> FloatArray:
-    """Return the power series (terms, n, n) of W(g) with ``dW/dg = A W + W A' + Q`` and
-    W(0) = 0.
+    """Return the power series (terms, n, n) in g of the noise covariance W(g) with ``dW/dg = A W +
+    W A' + Q`` and W(0) = 0; A and Q are (n, n).
     """
     series = np.zeros((terms, *A.shape))
     series[1] = Q
@@ -70,7 +73,9 @@ def lyapunov_series(A: FloatArray, Q: FloatArray, terms: int) -> FloatArray:
 
 
 def hamiltonian(A: FloatArray, Q: FloatArray, G: FloatArray) -> tuple[FloatArray, float]:
-    """Return the Hamiltonian of ``P / s`` and the scale ``s`` that balances ``Q`` against ``G``."""
+    """Return the Hamiltonian (2 n, 2 n) ``[[-A', G s], [Q / s, A]]`` of the Riccati equation of ``P
+    / s`` and the scale ``s`` that balances ``Q`` against ``G``; A, Q and G are (n, n).
+    """
     size_A, size_Q, size_G = (float(np.abs(matrix).max()) for matrix in (A, Q, G))
     # A floor, so that a plant without dynamics does not divide by zero below.
     size_A = max(size_A, 1e-6)
@@ -86,7 +91,9 @@ def hamiltonian(A: FloatArray, Q: FloatArray, G: FloatArray) -> tuple[FloatArray
 
 
 def riccati_table(A: FloatArray, Q: FloatArray, G: FloatArray, longest: float) -> RiccatiTable:
-    """Tabulate the flow for gaps up to ``longest`` seconds; ``A, Q, G`` are (n, n)."""
+    """Tabulate the Riccati flow ``dP = A P + P A' + Q - P G P`` for gaps up to ``longest`` seconds;
+    ``A, Q, G`` are (n, n).
+    """
     n = len(A)
     M, scale = hamiltonian(A, Q, G)
     norm, abs_A, unobserved = float(np.abs(M).sum(axis=0).max()), np.abs(A), not G.any()
@@ -113,8 +120,9 @@ def riccati_table(A: FloatArray, Q: FloatArray, G: FloatArray, longest: float) -
 
 
 def _side_by_side(unit: float, *parts: FloatArray) -> FloatArray:
-    """Return the coefficients (terms, ...) of matrices as rows (terms, size + 1), with
-    their reach.
+    """Return the coefficients of some power series of matrices, ``parts`` (terms, n, n) each, as
+    rows (terms, size + 1), with their reach in the last column: the gap, up to ``unit`` seconds,
+    for which the terms so far suffice.
     """
     rows = np.concatenate([part.reshape(len(part), -1) for part in parts], axis=1)
     return with_reach(rows, unit)
@@ -123,8 +131,9 @@ def _side_by_side(unit: float, *parts: FloatArray) -> FloatArray:
 def _doubling_tables(
     M: FloatArray, scale: float, A: FloatArray, unit: float, levels: int
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Return exp(A t), F, G and Q, each (levels, n, n), over t = 1, 2, 4, ... units: ``P(t) = Q +
-    F P (I + G P)^-1 F'``, by doubling.
+    """Return exp(A t), F, G and Q, each (levels, n, n), over t = 1, 2, 4, ... units of ``unit``
+    seconds: ``P(t) = Q + F P (I + G P)^-1 F'``, by doubling. ``M`` (2 n, 2 n) and ``scale`` are
+    those of ``hamiltonian``, A is (n, n).
     """
     # Doubling also doubles the relative error, so it works in extended precision (where the
     # machine has it): after 2^14 units a table in double would have lost 1e-12.
@@ -157,8 +166,8 @@ def _doubling_tables(
 
 
 def _invert_extended(matrix: FloatArray) -> FloatArray:
-    """Return the inverse in the precision of ``matrix``, by Newton's iteration from double; nan if
-    it is singular or not finite, as for very long gaps of an unstable plant.
+    """Return the inverse (n, n) of ``matrix`` (n, n) in its precision, by Newton's iteration from
+    double; nan if it is singular or not finite, as for very long gaps of an unstable plant.
     """
     if not np.isfinite(matrix).all():
         return np.full_like(matrix, np.nan)
@@ -176,7 +185,9 @@ def _invert_extended(matrix: FloatArray) -> FloatArray:
 def substep(
     table: RiccatiTable, P: FloatArray, x: FloatArray, gap: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Return P and x after ``gap`` seconds, at most one unit, as ``propagate_riccati`` does."""
+    """Return the covariance P (n, n) after the Riccati flow over ``gap`` seconds, at most one unit
+    of the table, and ``exp(A gap) x`` (n,).
+    """
     n = table.n
     # G = 0, a Lyapunov equation: P <- e P e' + W, and no inverse is needed.
     if len(table.unobserved):
@@ -198,7 +209,9 @@ def substep(
 def propagate_riccati(
     table: RiccatiTable, P: FloatArray, x: FloatArray, gap: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Return P (n, n) after the Riccati flow over ``gap`` seconds, and ``exp(A gap) x`` (n,)."""
+    """Return P (n, n) after the Riccati flow over ``gap`` >= 0 seconds, and ``exp(A gap) x`` (n,):
+    the covariance counts the readings of the gap, the estimate does not.
+    """
     P, x = P.copy(), x.copy()  # C-contiguous, so that one version of this code is compiled
     # One step for each binary digit 1 of the number of whole units, with its tabulated triple.
     units, level = int(gap / table.unit), 0

@@ -198,7 +198,9 @@ def flow_table(
 def pack_series(
     E: FloatArray, F: FloatArray, Q_g: FloatArray, G: FloatArray, observed: bool
 ) -> FloatArray:
-    """Return the series (C, terms, width) of a FlowTable from those of exp(A g), F, Q_g and G_g."""
+    """Return the series (C, terms, width) of a FlowTable for C cells from those of exp(A g), F, Q_g
+    and G_g, (C, terms, n, n) each: one row for each term, without F and G_g unless ``observed``.
+    """
     rows, columns = np.tril_indices(E.shape[2])
     parts = [Q_g[:, :, rows, columns], E.reshape(*E.shape[:2], -1)]
     if observed:
@@ -210,7 +212,7 @@ def pack_series(
 
 
 def whiten_observation(H: FloatArray, R: FloatArray) -> FloatArray:
-    """Return ``R^-1/2 H`` as at most n rows (q, n)."""
+    """Return ``R^-1/2 H`` as at most n rows (q, n), for H (p, n) and R (p, p)."""
     p, n = H.shape
     if p == 0:
         return np.zeros((0, n))
@@ -222,8 +224,9 @@ def whiten_observation(H: FloatArray, R: FloatArray) -> FloatArray:
 def transition_series(
     A: FloatArray, Q: FloatArray, whitened_H: FloatArray, middles: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Return Taylor coefficients of exp(A g), F, Q_g and G_g around gaps ``middles`` (C,), in
-    extended precision: (C, TERMS, n, n) each.
+    """Return Taylor coefficients of exp(A g), F, Q_g and G_g around C gaps ``middles`` (C,) in
+    seconds, in extended precision: (C, TERMS, n, n) each, for A and Q (n, n) and ``whitened_H``
+    (q, n).
 
     ``dF = (A - Q_g G) F``, ``dQ_g = A Q_g + Q_g A' + Q - Q_g G Q_g`` and ``dG_g = F' G F``.
     """
@@ -249,15 +252,18 @@ def transition_series(
 
 
 def _convolved(a: FloatArray, b: FloatArray, k: int) -> FloatArray:
-    """Return coefficient ``k`` of the product of two power series."""
+    """Return coefficient ``k`` (C, r, c) of the product of two power series of matrices, ``a``
+    (C, terms, r, m) and ``b`` (C, terms, m, c).
+    """
     return np.asarray((a[:, : k + 1] @ b[:, k::-1]).sum(axis=1))
 
 
 def transitions_at(
     A: FloatArray, Q: FloatArray, whitened_H: FloatArray, middles: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Return exp(A g), F, Q_g and G_g (C, n, n) at the ``middles`` g = 0 and 3/2, 5/2, ... units of
-    C cells, from the exponential exp(M g) of the Hamiltonian M.
+    """Return exp(A g), F, Q_g and G_g (C, n, n) at the ``middles`` (C,) g = 0 and 3/2, 5/2, ...
+    units of C cells, in seconds, from the exponential exp(M g) of the Hamiltonian M of A and Q
+    (n, n) and ``whitened_H`` (q, n).
     """
     n, count = len(A), len(middles)
     E, F, Q_g, G = wide_zeros(4, count, n, n)
@@ -293,7 +299,9 @@ def wide_zeros(*shape: int) -> Any:
 
 
 def wide_inverse(matrix: FloatArray) -> FloatArray:
-    """Return the inverse in extended precision, by Newton's iteration from double."""
+    """Return the inverse (n, n) of ``matrix`` (n, n) in extended precision, by Newton's iteration
+    from double.
+    """
     inverse = np.linalg.inv(matrix.astype(np.float64)).astype(WIDE)
     # X <- X (2 I - M X) doubles the correct digits: twice takes double precision to extended.
     for _ in range(2):
@@ -305,8 +313,8 @@ def information_blocks(
     whitened_H: FloatArray, F: FloatArray, unit: float
 ) -> tuple[list[FloatArray], FloatArray]:
     """Return the power series (TERMS, q n) of ``c_j / (g^j sqrt(2 j + 1))``, one block for each j,
-    and bounds of their squared norms for gaps up to ``unit``. ``F`` (TERMS, n, n) is the series
-    around 0.
+    and bounds (blocks,) of their squared norms for gaps up to ``unit`` seconds. ``F`` (TERMS, n, n)
+    is the series around 0, and ``whitened_H`` (q, n) is R^-1/2 H.
     """
     q, n = whitened_H.shape
     blocks: list[FloatArray] = []
@@ -341,11 +349,12 @@ def double_levels(
     levels: int,
 ) -> FloatArray:
     """Return exp(A g), F, Gamma and T (levels, 4, n, n) for ``g = unit 2^level`` seconds, from the
-    series around 0 of exp(A g), F, Q_g and Gamma (``blocks``).
+    series around 0 of exp(A g), F and Q_g, (TERMS, n, n) each, and of Gamma, ``blocks``
+    (TERMS, q n). There are fewer ``levels`` if F grows too much.
 
     Each level follows from the one below by the doubling formulas (Anderson 1978). Doubling also
     doubles relative errors, so it works in extended precision, and on roots, so that directions
-    that are not observed keep exactly no information.
+    that are not observed keep exactly no information. ``scale`` is that of ``hamiltonian``.
     """
     n = E.shape[1]
     powers = WIDE(unit) ** np.arange(TERMS)
@@ -384,7 +393,9 @@ def double_levels(
 
 
 def upper_root(rows: FloatArray) -> FloatArray:
-    """Return U (n, n), upper triangular with ``U' U = rows' rows``, in extended precision."""
+    """Return U (n, n), upper triangular with ``U' U = rows' rows``, in extended precision, for any
+    ``rows`` (k, n).
+    """
     n = rows.shape[1]
     work = np.concatenate([rows, np.zeros((n, n))]).astype(WIDE)
     for i in range(n):
@@ -407,7 +418,9 @@ def upper_root(rows: FloatArray) -> FloatArray:
 
 
 def cholesky_root(Q: FloatArray) -> FloatArray:
-    """Return the lower triangular root of Q (n, n); pivots at the level of rounding count as 0."""
+    """Return the lower triangular root (n, n) of Q (n, n) in its precision; pivots at the level of
+    rounding count as 0.
+    """
     n = len(Q)
     L = np.zeros_like(Q)
     for j in range(n):
@@ -418,7 +431,9 @@ def cholesky_root(Q: FloatArray) -> FloatArray:
 
 
 def substitute(lower: FloatArray, right: FloatArray) -> FloatArray:
-    """Return ``lower^-1 right`` by forward substitution, in the precision of both."""
+    """Return ``lower^-1 right`` (n, c) by forward substitution, in the precision of both, for a
+    lower triangular ``lower`` (n, n) and ``right`` (n, c).
+    """
     out = np.zeros_like(right)
     for i in range(len(lower)):
         out[i] = (right[i] - lower[i, :i] @ out[:i]) / lower[i, i]
@@ -429,7 +444,9 @@ def stack_tables(tables: Sequence[FlowTable]) -> FlowTable:
     """Return one table of all models of ``tables``, in their order."""
 
     def padded(parts: list[FloatArray], fill: float) -> FloatArray:
-        """Return arrays of several models stacked, padded to the largest shape with ``fill``."""
+        """Return the arrays ``parts`` (M_i, ...) of several tables stacked along their first axis,
+        that of models, each padded to the largest shape with ``fill``.
+        """
         # The padding is never read: ``sizes`` and the infinite last reach end every loop before it.
         shape = np.max([part.shape for part in parts], axis=0)
         out: FloatArray = aligned((sum(len(part) for part in parts), *shape[1:]), parts[0].dtype)
@@ -458,8 +475,9 @@ def propagate_root(
     gap: float,
     scratch: FlowScratch,
 ) -> None:
-    """Propagate the root and the mean in entry ``k`` of ``root`` (K, n, n) and ``x`` (K, n) over
-    ``gap`` seconds by model ``m`` of the table.
+    """Propagate ``root[k]`` (n, n) and the mean ``x[k]`` (n,), entry ``k`` of root (K, n, n) and x
+    (K, n), in place over ``gap`` seconds by model ``m`` of the table. The root counts the readings
+    of the gap, the mean does not: it moves by exp(A gap).
     """
     # A gap beyond all cells: first take whole steps of the first level that is longer than these.
     octaves = table.sizes[m, 4]
@@ -478,15 +496,17 @@ def propagate_root(
 
 @kernel
 def trace_of(size: Size, table: FlowTable, m: int, root: FloatArray, k: int) -> float:
-    """Return ``trace(P)`` of entry ``k`` for ``is_narrow``, or 0 if the model observes nothing."""
+    """Return ``trace(P)`` of the root of P in entry ``k`` of ``root`` (K, n, n), or 0 if model
+    ``m`` of the table observes nothing.
+    """
     # Without observation G = 0, and any P is narrow: the trace need not be computed.
     return 0.0 if table.sizes[m, 1] == 0 else float(trace_of_root(ONE, size, root[k]))
 
 
 @kernel(inlined=True)
 def is_narrow(table: FlowTable, m: int, gap: float, trace: float) -> bool:
-    """Return True if P of this ``trace`` takes one step inside a cell: the rounding of G_g times P
-    is harmless.
+    """Return True if a P of this ``trace`` is small enough to be moved over ``gap`` seconds in one
+    step by model ``m`` of the table: the rounding of G_g times P is harmless.
     """
     # ``not >=``: a nan counts as narrow, so that it takes the short way.
     return not table.size[m] * gap * trace >= NARROW
@@ -494,14 +514,18 @@ def is_narrow(table: FlowTable, m: int, gap: float, trace: float) -> bool:
 
 @kernel(inlined=True)
 def takes_one_step(table: FlowTable, m: int, gap: float, trace: float) -> bool:
-    """Return True if ``propagate_root`` moves a P of this ``trace`` in one step inside a cell."""
+    """Return True if ``propagate_root`` moves a P of this ``trace`` over ``gap`` seconds in one
+    step, by the series of a cell, with model ``m`` of the table.
+    """
     longest = table.unit[m] * (1 << table.sizes[m, 4])
     return bool(gap < longest and is_narrow(table, m, gap, trace))
 
 
 @kernel(inlined=True)
 def trace_of_root(lanes: Lanes, size: Size, S: FloatArray) -> Any:
-    """Return ``trace(P)`` (L,) of roots S (n, n, L)."""
+    """Return ``trace(P)`` (L,) of P = S S' for lower triangular roots S (n, n, L), one for each of
+    L runs.
+    """
     total = spread(lanes, 0.0)
     # |S|_F^2 = trace(S S').
     for i in range(len(size)):
@@ -521,8 +545,9 @@ def propagate_by_levels(
     gap: float,
     scratch: FlowScratch,
 ) -> float:
-    """Propagate over the whole multiples of ``unit 2^level`` seconds in a gap; return the rest of
-    the gap, seconds.
+    """Propagate ``root[k]`` (n, n) and ``x[k]`` (n,) in place over the whole multiples of ``unit
+    2^level`` seconds in a ``gap``, by model ``m`` of the table; return the rest of the gap,
+    seconds.
     """
     length, levels = table.unit[m] * (1 << level), table.sizes[m, 3]
     steps = int(gap / length)
@@ -549,8 +574,9 @@ def propagate_level(
     k: int,
     scratch: FlowScratch,
 ) -> None:
-    """Apply ``propagate_root`` over ``unit 2^level`` seconds, with the tabulated exp(A g), F, Gamma
-    and T: ``P <- F P (I + Gamma' Gamma P)^-1 F' + T T'`` and ``x <- exp(A g) x``.
+    """Propagate ``root[k]`` (n, n) and ``x[k]`` (n,) in place over ``unit 2^level`` seconds by
+    model ``m`` of the table, with the tabulated exp(A g), F, Gamma and T: ``P <- F P (I + Gamma'
+    Gamma P)^-1 F' + T T'`` and ``x <- exp(A g) x``.
     """
     n, levels, T, observed = len(scratch.size), table.levels, scratch.T, scratch.observed
     if table.sizes[m, 1] > 0:
@@ -591,7 +617,8 @@ def propagate_wide(
     gap: float,
     scratch: FlowScratch,
 ) -> None:
-    """Apply ``propagate_root`` over a gap below ``table.unit[m]`` for any P, however large.
+    """Propagate ``root[k]`` (n, n) and ``x[k]`` (n,) in place over a ``gap`` below
+    ``table.unit[m]`` seconds by model ``m`` of the table, for any P, however large.
 
     ``P_g = F P (I + G P)^-1 F' + Q_g``: first the readings of the whole gap, then the transition.
     """
@@ -613,14 +640,19 @@ def propagate_narrow(
     gap: float,
     scratch: FlowScratch,
 ) -> None:
-    """Apply ``propagate_root`` over a gap inside a cell, if P is narrow or nothing is observed."""
+    """Propagate ``root[k]`` (n, n) and ``x[k]`` (n,) in place over a ``gap`` in seconds inside a
+    cell by model ``m`` of the table, if P is narrow (``is_narrow``) or nothing is observed.
+    """
     fill_values(scratch.values, table, m, gap)
     propagate_by_series(table, m, root, x, k, True, scratch)
 
 
 @kernel
 def fill_values(out: FloatArray, table: FlowTable, m: int, gap: float) -> None:
-    """Write Q_g, exp(A g) and, if something is observed, F and G_g for a gap inside a cell."""
+    """Write Q_g, exp(A g) and, if something is observed, F and G_g for a ``gap`` in seconds inside
+    a cell into ``out`` (>= width,), by model ``m`` of the table; symmetric matrices as lower
+    triangles by rows.
+    """
     cell, since = cell_of(table.unit[m], gap)
     width = width_of(table.levels.shape[4], table.sizes[m, 1] > 0)
     fill_series(out, width, table.series[m, cell], table.reach[m, cell], 0, since)
@@ -628,8 +660,8 @@ def fill_values(out: FloatArray, table: FlowTable, m: int, gap: float) -> None:
 
 @kernel(inlined=True)
 def cell_of(unit: float, gap: float) -> tuple[int, float]:
-    """Return the index of the cell that a gap lies in, and the gap minus the point that its series
-    is expanded at, seconds.
+    """Return the index of the cell, ``unit`` seconds long, that a ``gap`` in seconds lies in, and
+    the gap minus the point that the series of this cell is expanded at, seconds.
     """
     # Cell 0 is expanded at 0 and the others at their middles.
     cell = int(gap / unit)
@@ -638,7 +670,9 @@ def cell_of(unit: float, gap: float) -> tuple[int, float]:
 
 @kernel(inlined=True)
 def width_of(n: int, observed: bool) -> int:
-    """Return the number of entries of Q_g and exp(A g) and, if ``observed``, F and G_g."""
+    """Return the number of entries of Q_g and exp(A g) and, if ``observed``, F and G_g for n
+    states; of the symmetric Q_g and G_g only one triangle counts.
+    """
     width = n * (n + 1) // 2 + n * n
     return 2 * width if observed else width
 
@@ -653,8 +687,9 @@ def propagate_by_series(
     reads: bool,
     scratch: FlowScratch,
 ) -> None:
-    """Apply ``propagate_root`` with Q_g, exp(A g), F and G_g in ``scratch.values``. ``reads``: use
-    the information G_g first; otherwise the caller has done so.
+    """Propagate ``root[k]`` (n, n) and ``x[k]`` (n,) in place by model ``m`` of the table over the
+    gap for which ``scratch.values`` holds Q_g, exp(A g), F and G_g (see ``fill_values``).
+    ``reads``: use the information G_g first; otherwise the caller has done so.
     """
     size, n, observed = scratch.size, len(scratch.size), table.sizes[m, 1] > 0
     S, mean = local_matrix(size, scratch.S), local_vector(size, scratch.mean)
@@ -680,7 +715,7 @@ def propagate_by_series(
 
 @kernel(inlined=True)
 def offset_of_F(n: int, observed: bool) -> int:
-    """Return the index at which F begins in ``values``."""
+    """Return the index at which F begins in the values of a gap (``fill_values``), for n states."""
     # Without sensors F = exp(A g), and the series holds it once.
     return n * (n + 1) // 2 + (n * n if observed else 0)
 
@@ -689,7 +724,9 @@ def offset_of_F(n: int, observed: bool) -> int:
 def propagate_mean(
     lanes: Lanes, size: Size, x: FloatArray, values: FloatArray, moved: FloatArray
 ) -> None:
-    """Compute ``x = exp(A g) x`` (n, L) in place; ``moved`` is scratch of the same shape."""
+    """Compute ``x = exp(A g) x`` (n, L) in place in L lanes; ``values`` (>= width, L) holds exp(A
+    g) by rows behind Q_g, and ``moved`` (n, L) is scratch.
+    """
     n, begin = len(size), len(size) * (len(size) + 1) // 2
     for i in range(n):
         total = spread(lanes, 0.0)
@@ -704,9 +741,9 @@ def propagate_mean(
 def condition_root(
     lanes: Lanes, size: Size, S: FloatArray, values: FloatArray, V: FloatArray
 ) -> None:
-    """Replace S (n, n, L), a root of P, by a root of ``P (I + G P)^-1``: the update with
-    information G. ``values`` holds the lower triangle of G by rows, behind Q_g, exp(A g) and F; V
-    (n, n, L) is scratch.
+    """Replace S (n, n, L), a lower triangular root of P in each of L lanes, by one of ``P (I + G
+    P)^-1``: the update with information G. ``values`` (>= width, L) holds the lower triangle of G
+    by rows, behind Q_g, exp(A g) and F; V (n, n, L) is scratch.
     """
     n = len(size)
     begin = n * (n + 1) // 2 + 2 * n * n
@@ -748,7 +785,9 @@ def condition_root(
 def use_information(
     table: FlowTable, m: int, root: FloatArray, k: int, gap: float, scratch: FlowScratch
 ) -> None:
-    """Update the root of entry ``k`` with the information Gamma' Gamma of a gap below a unit."""
+    """Update ``root[k]`` (n, n) of ``root`` (K, n, n) in place with the information Gamma' Gamma of
+    a ``gap`` below one unit, in seconds, by model ``m`` of the table.
+    """
     n, q, rows, observed = len(scratch.size), table.sizes[m, 0], scratch.rows, scratch.observed
     gamma, width = table.gamma, q * n
     trace = trace_of_root(ONE, scratch.size, root[k])
@@ -782,8 +821,9 @@ def use_information(
 
 @kernel(inlined=True, fused=True)
 def cholesky_in_lanes(lanes: Lanes, size: Size, T: FloatArray, packed: FloatArray) -> None:
-    """Write the Cholesky factor T (n, n, L) of the symmetric matrices whose lower triangles are
-    ``packed`` by rows; pivots at the level of rounding count as 0.
+    """Write the lower triangular Cholesky factor T (n, n, L) of the symmetric matrices whose lower
+    triangles are ``packed`` (>= n (n + 1) / 2, L) by rows; pivots at the level of rounding count as
+    0.
     """
     n = len(size)
     for j in range(n):
@@ -810,9 +850,9 @@ def transform_root(
     wide: FloatArray,
     T: FloatArray,
 ) -> None:
-    """Replace S (n, n, L) by the lower triangular root of ``F S S' F' + T T'``. F is given by rows
-    from index ``begin`` on; T (n, n, L), lower triangular, is overwritten; ``wide`` (n, n, L) is
-    scratch.
+    """Replace S (n, n, L) by the lower triangular root of ``F S S' F' + T T'`` in each of L lanes.
+    ``F`` (>= begin + n n, L) holds F by rows from index ``begin`` on; T (n, n, L), lower
+    triangular, is overwritten; ``wide`` (n, n, L) is scratch.
     """
     n = len(size)
     # wide = F S; S is lower triangular, so the sum begins at r = j.
@@ -865,8 +905,9 @@ def gain_root(
     gap: float,
     values: FloatArray,
 ) -> None:
-    """Correct the prediction ``x[k]`` at the end of a gap by the ``moments`` (2 p,) of its
-    readings, which are overwritten with the innovations: ``x += (U + S S' W) innovations``.
+    """Correct the prediction ``x[k]`` (n,) at the end of a ``gap`` in seconds, entry ``k`` of x
+    (K, n), in place by the ``moments`` (2 p,) of its readings, which are overwritten with the
+    innovations: ``x += (U + S S' W) innovations``, with the root S = ``root[k]`` (n, n).
 
     U, W and C are power series in the gap, the rows of ``series`` of a GainTable; their reach is
     ``reach[:, column]``. ``values`` (>= row length) is scratch.
@@ -884,8 +925,11 @@ def use_moments(
     values: FloatArray,
     moments: FloatArray,
 ) -> None:
-    """Apply ``gain_root`` to S (n, n, L), x (n, L) and moments (q, L): ``x += (U + S S' W)
-    (moments - C x)``. ``values`` holds U and W (n, q) and C (q, n) at the gap; C is overwritten.
+    """Correct the predictions x (n, L) of L lanes in place by the ``moments`` (q, L) of their
+    readings, which are overwritten with the innovations ``moments - C x``: ``x += (U + S S' W)
+    innovations``, with lower triangular roots S (n, n, L).
+
+    ``values`` (3 q n, L) holds U and W (n, q) and C (q, n) at the gap; C is overwritten.
     """
     n, q = len(size), len(moments)
     # Innovations: the moments minus C x.
@@ -924,7 +968,9 @@ def use_moments(
 def propagate_one(
     table: IntArray, scratch: IntArray, root: FloatArray, x: FloatArray, gap: float
 ) -> None:
-    """Apply ``propagate_root`` to one node by a table of one model, from the memory of structs."""
+    """Propagate ``root`` (1, n, n) and ``x`` (1, n) of one node in place over ``gap`` seconds by a
+    table of one model. ``table`` and ``scratch`` are the memory of a FlowTable and a FlowScratch.
+    """
     propagate_root(struct_at(table, FlowTable), 0, root, x, 0, gap, struct_at(scratch, FlowScratch))
 
 
@@ -950,7 +996,7 @@ def flow_root(
     table: FlowTable, root: FloatArray, x: FloatArray, gap: float
 ) -> tuple[FloatArray, FloatArray]:
     """Return the root (n, n) and x (n,) of one node ``gap`` >= 0 seconds later, by a table of one
-    model.
+    model: the root counts the readings of the gap, ``x`` does not. The arguments are not changed.
     """
     n = len(x)
     roots, means = root.reshape(1, n, n).copy(), x.reshape(1, n).copy()
@@ -962,8 +1008,9 @@ def flow_root(
 def gain_update_root(
     table: GainTable, root: FloatArray, x: FloatArray, moments: FloatArray, gap: float
 ) -> FloatArray:
-    """Return ``xhat(b)`` (n,) from the open-loop prediction ``x``, the root at b and the moments
-    (2p,).
+    """Return ``xhat(b)`` (n,) at the end b of an interval of ``gap`` seconds, from the open-loop
+    prediction ``x`` (n,), the ``root`` (n, n) at b and the ``moments`` (2 p,) of the readings of
+    the interval.
     """
     if table.moments == 0:
         return x

@@ -81,7 +81,9 @@ class _Scratches(threading.local):
         self.scratches: dict[tuple[int, int], UpdateScratch] = {}
 
     def of(self, n: int, p: int) -> UpdateScratch:
-        """Return scratch arrays for n states and samples of p rows."""
+        """Return scratch arrays for n states and samples of p rows, made once and reused by later
+        calls of the same thread.
+        """
         if (n, p) not in self.scratches:
             self.scratches[n, p] = update_scratch(n, p)
         return self.scratches[n, p]
@@ -91,8 +93,8 @@ _scratches = _Scratches()
 
 
 def lower_root(root: FloatArray) -> FloatArray:
-    """Return the lower triangular S (n, n) with nonnegative diagonal and ``S S' = root root'``
-    (n, c).
+    """Return the lower triangular S (n, n) with a nonnegative diagonal and ``S S' = root root'``,
+    for any ``root`` (n, c).
     """
     n, columns = root.shape
     # QR of the transpose needs at least as many columns as rows.
@@ -109,10 +111,11 @@ def lower_root(root: FloatArray) -> FloatArray:
 def rotate_out(
     size: Size, root: FloatArray, k: int, row: FloatArray, m: int, gains: FloatArray, pivot: float
 ) -> float:
-    """Update the root S = ``root[k]`` with the scalar observation ``h x + v``, where ``h S`` is
-    ``row[m]`` and v has the variance ``pivot``^2.
+    """Update the root S = ``root[k]`` (n, n) of stack ``root`` (K, n, n), in place, with the scalar
+    observation ``h x + v``, where ``h S`` is ``row[m]`` (n,) and v has the variance ``pivot``^2.
 
-    Return the standard deviation of the innovation; the gain is ``gains[m]`` (n,) over it.
+    Return the standard deviation of the innovation; the Kalman gain is ``gains[m]`` (n,), which is
+    written, divided by it.
     """
     # Multiply [pivot, h S; 0, S] from the right by Givens rotations that zero h S from its last
     # entry on, so that S stays lower triangular.
@@ -148,8 +151,9 @@ def sample_root(
     root_R: FloatArray,
     scratch: UpdateScratch,
 ) -> None:
-    """Update ``x[k]`` and ``root[k]`` with the sample ``y = H x + v``: y (p,), H (p, n), ``root_R``
-    (p, p) lower triangular and regular.
+    """Update ``x[k]`` (n,) and ``root[k]`` (n, n), entry ``k`` of stacks of K estimates, in place
+    with the sample ``y = H x + v``: y (p,), H (p, n), ``root_R`` (p, p) lower triangular and
+    regular.
 
     ``y`` is overwritten with the normalised innovation ``C^-1 (y - H x)``, C C' = H P H' + R. Its
     squares sum to the NIS; its entries are independent standard normals if the filter is
@@ -193,8 +197,12 @@ def sample_root(
 def rotate_rows(
     root: FloatArray, k: int, C: FloatArray, HS: FloatArray, gains: FloatArray, r: int, p: int
 ) -> None:
-    """Apply ``rotate_out`` to row ``r`` of an observation with p rows, and the same rotations to
-    the rows of C and HS below it.
+    """Update ``root[k]`` (n, n) with row ``r`` of an observation with ``p`` rows, by the rotations
+    of ``rotate_out``, and apply these to the later rows too.
+
+    Changes in place ``root[k]``, the rows from r on of ``C`` (p, p), a root of the noise in the
+    innovation, and the rows below r of ``HS`` (p, n), which is H times the root; writes
+    ``gains[r]`` (n,), the unscaled gain of row r.
     """
     n = root.shape[1]
     for i in range(n):
@@ -220,8 +228,11 @@ def rotate_rows(
 def update_with_sample(
     root: FloatArray, x: FloatArray, y: FloatArray, H: FloatArray, root_R: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the root (n, n) and x (n,) after an update with the sample y (p,), and the normalised
-    innovation (p,), see ``sample_root``.
+    """Return the root (n, n), x (n,) and the normalised innovation ``C^-1 (y - H x)`` (p,), with C
+    C' = H P H' + R, after an update of ``root`` and ``x`` with the sample y (p,).
+
+    H is (p, n) and ``root_R`` (p, p), a lower triangular root of the noise covariance. The
+    arguments are not changed.
     """
     n = len(x)
     roots, means, innovation = root.reshape(1, n, n).copy(), x.reshape(1, n).copy(), y.copy()
@@ -234,7 +245,9 @@ def update_with_sample(
 
 @kernel(inlined=True)
 def scale_root(size: Size, root: FloatArray, x: FloatArray, k: int, weight: float) -> None:
-    """Multiply P and x of entry ``k`` by ``weight`` >= 0."""
+    """Multiply the estimate ``x[k]`` (n,) and its covariance P = S S' by ``weight`` >= 0, in place:
+    S = ``root[k]`` (n, n) by the root of ``weight``.
+    """
     # sqrt(w) S is a root of w P.
     n, factor = len(size), math.sqrt(weight)
     for i in range(n):
@@ -254,8 +267,9 @@ def add_root(
     m: int,
     scratch: UpdateScratch,
 ) -> None:
-    """Add to P and x of entry ``k`` ``weight`` >= 0 times those of entry ``m`` of ``other`` (M, n,
-    n) and ``other_x`` (M, n): one term of H (7) and (9).
+    """Add to the estimate ``x[k]`` (n,) and the covariance P of ``root[k]`` (n, n), in place,
+    ``weight`` >= 0 times those of entry ``m`` of ``other_x`` (M, n) and ``other`` (M, n, n): one
+    term of the convex combinations H (7) and (9). All roots are lower triangular.
     """
     size, n, factor = scratch.size, len(scratch.size), math.sqrt(weight)
     # P + w P_m = A A' with A = [S, sqrt(w) S_m], made triangular from the right.
@@ -272,8 +286,8 @@ def add_root(
 
 @kernel(inlined=True, fused=True)
 def absorb_columns(lanes: Lanes, size: Size, S: FloatArray, wide: FloatArray) -> None:
-    """Replace S (n, n, L) by the root of ``S S' + wide wide'``; both are lower triangular, and
-    ``wide`` is overwritten.
+    """Replace S (n, n, L) by the lower triangular root of ``S S' + wide wide'`` in each of L lanes
+    (runs side by side); both are lower triangular, and ``wide`` (n, n, L) is overwritten.
     """
     for i in range(len(size)):
         pivot, below = load(lanes, S, i, i), spread(lanes, 0.0)
@@ -288,8 +302,8 @@ def absorb_columns(lanes: Lanes, size: Size, S: FloatArray, wide: FloatArray) ->
 def combine_roots(
     weights: FloatArray, means: FloatArray, roots: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return ``sum w_j x_j`` (n,) and the root of ``sum w_j P_j`` (n, n), for weights (k,), means
-    (k, n) and roots (k, n, n).
+    """Return ``sum w_j x_j`` (n,) and the lower triangular root (n, n) of ``sum w_j P_j``, for
+    weights (k,), means (k, n) and lower triangular roots (k, n, n) of k estimates.
     """
     x, root = means[:1].copy(), roots[:1].copy()
     scratch = _scratches.of(means.shape[1], 1)
@@ -304,7 +318,9 @@ def combine_roots(
 
 @kernel(inlined=True)
 def begin_intersection(scratch: UpdateScratch) -> None:
-    """Set the information in ``scratch.total`` to zero."""
+    """Set the information in ``scratch.total`` (n, n + 1) to zero, before the terms of an
+    intersection are added.
+    """
     total = scratch.total
     for i in range(total.shape[0]):
         for j in range(total.shape[1]):
@@ -321,8 +337,11 @@ def add_to_intersection(
     m: int,
     scratch: UpdateScratch,
 ) -> None:
-    """Add ``weight`` times the information of entry ``k`` to ``scratch.total``, one term of D (8).
-    Means are relative to ``centre[m]``, the same for all terms of one intersection.
+    """Add ``weight`` times the information of the estimate ``x[k]`` (n,) with the root ``root[k]``
+    (n, n) to ``scratch.total`` (n, n + 1), one term of D (8).
+
+    Means are relative to ``centre[m]`` (n,), the same for all terms of one intersection. Changes
+    ``scratch.total`` and ``scratch.whitened`` only; a weight of 0 adds nothing.
     """
     whitened, total, n = scratch.whitened, scratch.total, x.shape[1]
     if weight <= 0.0:
@@ -341,7 +360,8 @@ def add_to_intersection(
 @kernel(inlined=True)
 def merge_information(total: FloatArray, whitened: FloatArray) -> None:
     """Replace ``total`` (n, n + 1), a root [Z, z] of information, by a root of the sum of it and
-    ``whitened`` (n, n + 1), which is overwritten. z is Z times the mean.
+    ``whitened`` (n, n + 1), which is overwritten. Z (n, n) is lower triangular with information Z'
+    Z, and z (n,) is Z times the mean.
     """
     # Reflections from the left zero the columns of ``whitened`` from the last one on, so that both
     # stay lower triangular.
@@ -372,8 +392,8 @@ def merge_information(total: FloatArray, whitened: FloatArray) -> None:
 
 @kernel(inlined=True)
 def invert_root(out: FloatArray, root: FloatArray, k: int, factor: float) -> None:
-    """Write ``factor`` times the inverse of the root in entry ``k`` into ``out`` (n, >= n), lower
-    triangular.
+    """Write ``factor`` times the inverse of the lower triangular ``root[k]`` (n, n) into ``out``
+    (n, >= n), lower triangular.
 
     Soon after a start from P = 0 some combinations of states have almost no noise yet, and pivots
     are rounding. They are raised to SINGULAR times the length of their row, which makes P no
@@ -403,8 +423,9 @@ def invert_root(out: FloatArray, root: FloatArray, k: int, factor: float) -> Non
 def end_intersection(
     root: FloatArray, x: FloatArray, k: int, centre: FloatArray, m: int, scratch: UpdateScratch
 ) -> None:
-    """Write the intersection, ``P = (Z' Z)^-1`` and its mean, into entry ``k``; nan if nothing was
-    added.
+    """Write the intersection that ``scratch.total`` [Z, z] holds: its mean, relative to
+    ``centre[m]`` (n,), into ``x[k]`` (n,) and the lower triangular root Z^-1 of ``P = (Z' Z)^-1``
+    into ``root[k]`` (n, n); nan if nothing was added.
     """
     total, whitened, n = scratch.total, scratch.whitened, x.shape[1]
     # S = Z^-1: the total is lower triangular, so P = Z^-1 Z^-T has the lower root Z^-1.
@@ -429,8 +450,9 @@ def end_intersection(
 def intersect_roots(
     weights: FloatArray, means: FloatArray, roots: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the estimate (n,) and root (n, n) of D (8) and (9), for weights (k,), means (k, n) and
-    roots (k, n, n).
+    """Return the estimate (n,) and lower triangular root (n, n) of the covariance intersection D
+    (8) and (9), for weights (k,), means (k, n) and lower triangular roots (k, n, n) of k estimates:
+    ``P^-1 = sum w_j P_j^-1`` and ``P^-1 x = sum w_j P_j^-1 x_j``.
     """
     x, root = means[:1].copy(), np.zeros_like(roots[:1])
     scratch = _scratches.of(means.shape[1], 1)

@@ -44,10 +44,11 @@ TINY = 1e-200  # far below any length that counts, yet above underflow
 
 
 class SlotNodes(NamedTuple):
-    """The filters of B blocks of runs, and the model that all of them believe.
+    """The filters of B blocks of L runs each, and the model that all of them believe.
 
-    xhat, root : (B, H, n, L) and lower triangular (B, H, n, n, L)
-    F, root_Q : (n, n), the root lower triangular
+    xhat, root : estimates (B, H, n, L) of H filters, and lower triangular roots (B, H, n, n, L) of
+                 their covariances
+    F, root_Q : (n, n), transition of a slot, and the lower triangular root of its noise covariance
     rows : number of rows (H,) of each filter's reading
     """
 
@@ -59,12 +60,12 @@ class SlotNodes(NamedTuple):
 
 
 class ReadingBlock(NamedTuple):
-    """Readings of S slots, whitened.
+    """Whitened readings of S slots in B blocks of L runs; H filters have at most p rows each.
 
     y : (B, S, H, p, L)
     H : (B, S, H, p, n, L), or (1, 1, H, p, n, L) if it is fixed
     local : the true state (B, S, n, L) in the coordinates of the estimates
-    rebased : slots (S,) in which the origin of these moves
+    rebased : flags (S,) of the slots in which the origin of these coordinates moves
     """
 
     y: FloatArray
@@ -78,7 +79,8 @@ WHOLE, SENDING, ARRIVING = range(3)
 
 
 class SlotPlan(NamedTuple):
-    """What happens in S slots.
+    """What happens in S slots of B blocks of L runs, with E steps of the exchanges in each slot, W
+    directed links and H filters.
 
     first : number of the first slot
     sensed, exchanged : (S,), whether nodes read and predict, and whether they exchange
@@ -108,11 +110,11 @@ class SlotPlan(NamedTuple):
 
 
 class SlotLinks(NamedTuple):
-    """Directed links by receiver: those to filter h are ``first[h]`` to ``first[h + 1]`` - 1.
+    """W directed links by receiver: those to filter h are ``first[h]`` to ``first[h + 1]`` - 1.
 
     first : (H + 1,)
-    sender : index (W,) of the sender
-    direction : index (W,) in ``up``
+    sender : index (W,) of the sending filter
+    direction : index (W,) in the axis W of ``SlotPlan.up``
     weight : (W,) that the receiver gives to the sender
     """
 
@@ -123,7 +125,7 @@ class SlotLinks(NamedTuple):
 
 
 class SlotSamples(NamedTuple):
-    """Samples that a kernel writes, and the true states that they need.
+    """T samples of R runs that a kernel writes, and the true states of S slots that they need.
 
     x, xhat, P : (R, T, n), (R, T, H n) and (R, T, H n n) in the coordinates of the plant, with all
                  filters side by side
@@ -190,7 +192,10 @@ def slot_scratch(H: int, n: int, unrolled: bool, lanes: Lanes = MANY) -> SlotScr
 
 
 def whiten_reading(y: FloatArray, H: FloatArray, R: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return a reading y (p,) and its H (p, n) times ``L^-1``, with ``L L' = R``."""
+    """Return the whitened reading ``L^-1 y`` (p,) and ``L^-1 H`` (p, n) of a reading y (p,) with H
+    (p, n) and noise covariance ``R = L L'`` (p, p), so that the noise of its rows is white with
+    variance 1.
+    """
     # One solve for y and H together.
     whitened = np.linalg.solve(np.linalg.cholesky(R), np.column_stack([y, H]))
     return np.ascontiguousarray(whitened[:, 0]), np.ascontiguousarray(whitened[:, 1:])
@@ -210,8 +215,9 @@ def block_of_reading(y: FloatArray, H: FloatArray) -> ReadingBlock:
 
 
 def star_of(weights: Sequence[float]) -> tuple[SlotLinks, np.ndarray]:
-    """Return the links from senders 1, 2, ... to the one receiver 0, with these ``weights``, and
-    the array ``up`` (1, 1, 1, W, 1) of messages that all arrive.
+    """Return links and flags of a star: from senders 1, 2, ... to the one receiver 0, with the
+    ``weights`` (one of each of W senders), and the array ``up`` (1, 1, 1, W, 1) that lets all their
+    messages arrive.
     """
     count = len(weights)
     indices = np.arange(count)
@@ -225,7 +231,12 @@ def star_of(weights: Sequence[float]) -> tuple[SlotLinks, np.ndarray]:
 def store_sample_of_slot(
     nodes: SlotNodes, plan: SlotPlan, samples: SlotSamples, scratch: SlotScratch, b: int, s: int
 ) -> None:
-    """Write the sample of slot ``s``, if it has one, for all runs of block ``b``."""
+    """Write the sample of slot ``s``, if it has one, of the L runs of block ``b``.
+
+    Fills ``x``, ``xhat``, ``error`` and ``P`` of ``samples`` at index ``plan.sample[s]`` of their
+    axis T, for all H filters of these runs, and adds the entries of xhat and of the lower triangles
+    of P to ``samples.total[b]`` (L,), by which the caller finds runs that diverged.
+    """
     k, lanes = plan.sample[s], scratch.lanes
     if k < 0:
         return
@@ -267,8 +278,9 @@ def store_sample_of_slot(
 def scatter_sample(
     lanes: Lanes, values: FloatArray, samples: FloatArray, indices: np.ndarray
 ) -> None:
-    """Write the first C rows of ``values`` (>= C, L) into the ``samples`` (R, C) of the runs with
-    these ``indices`` (L,); -1: no run.
+    """Write one sample of L lanes (runs side by side) into the arrays of all R runs: the first C
+    rows of ``values`` (>= C, L) into ``samples`` (R, C), lane q into row ``indices[q]`` (L,); -1:
+    no run.
     """
     count = samples.shape[1]
     for c in range(0, count, len(lanes)):
@@ -277,7 +289,10 @@ def scatter_sample(
 
 @kernel
 def drop_silent(plan: SlotPlan, links: SlotLinks, b: int, s: int, e: int) -> None:
-    """Set ``up`` to 0 for the messages of nodes that send nothing in step ``e`` of slot ``s``."""
+    """Set ``plan.up`` (B, S, E, W, L) to 0 for the messages of nodes that send nothing in step
+    ``e`` of the exchanges of slot ``s``, in each of the L runs of block ``b``: those with 0 in
+    ``plan.sent`` (B, S, E, H, L).
+    """
     for m in range(len(links.sender)):
         for q in range(plan.up.shape[4]):
             if plan.sent[b, s, e, links.sender[m], q] == 0:
@@ -286,7 +301,12 @@ def drop_silent(plan: SlotPlan, links: SlotLinks, b: int, s: int, e: int) -> Non
 
 @kernel
 def rebase(nodes: SlotNodes, readings: ReadingBlock, scratch: SlotScratch, b: int, s: int) -> None:
-    """Move the origin of all estimates to the state of slot ``s``, if a frame begins there."""
+    """Move the origin that all estimates of block ``b`` refer to, if ``readings.rebased[s]``:
+    subtract the true state of slot ``s``, ``readings.local[b, s]`` (n, L), from ``nodes.xhat[b]``
+    (H, n, L).
+
+    An origin near the state keeps estimates small, so that large absolute states cost no digits.
+    """
     # Only the mean moves: a covariance does not depend on the origin.
     if readings.rebased[s]:
         for h in range(len(nodes.rows)):
@@ -300,7 +320,10 @@ def rebase(nodes: SlotNodes, readings: ReadingBlock, scratch: SlotScratch, b: in
 def read_all(
     nodes: SlotNodes, readings: ReadingBlock, scratch: SlotScratch, b: int, s: int
 ) -> None:
-    """Update all filters of block ``b`` with their own readings of slot ``s``."""
+    """Update all filters of block ``b`` with their own readings of slot ``s``: changes
+    ``nodes.xhat[b]`` (H, n, L) and ``nodes.root[b]`` (H, n, n, L) for H filters in L runs side by
+    side.
+    """
     for h in range(len(nodes.rows)):
         update_by_reading(nodes, readings, scratch, b, s, h, h, True)
 
@@ -316,8 +339,11 @@ def update_by_reading(
     sender: int,
     arrived: Any,
 ) -> None:
-    """Update filter ``h`` of block ``b`` with the reading of filter ``sender`` in slot ``s``, in
-    the lanes where it has ``arrived``: row by row ``x += P h' (h P h' + 1)^-1 (y - h x)``.
+    """Update filter ``h`` of block ``b`` with the whitened reading of filter ``sender`` in slot
+    ``s``, in the lanes (runs) whose flag in ``arrived`` (L,) is set; True: all.
+
+    Changes ``nodes.xhat[b, h]`` (n, L) and ``nodes.root[b, h]`` (n, n, L), row by row of the
+    reading ``readings.y[b, s, sender]`` (p, L): ``x += P h' (h P h' + 1)^-1 (y - h x)``.
     """
     lanes, size, n = scratch.lanes, scratch.size, len(scratch.size)
     row = local_lanes_vector(size, lanes, scratch.row)
@@ -352,10 +378,12 @@ def rotate_lanes(
     row: FloatArray,
     gains: FloatArray,
 ) -> Any:
-    """Update root [b, h] with the scalar observation ``h S = row`` (n, L) of unit noise. Return 1
-    over the standard deviation of the innovation; the gain is ``gains`` (n, L) times it.
+    """Update ``root[b, h]`` (n, n, L), the lower triangular root S of filter ``h`` of block ``b``
+    in L runs, in place with the scalar observation ``h S = row`` (n, L) of unit noise.
 
-    These are the rotations of ``root_update.rotate_out``; an entry of 0 rotates nothing.
+    Return 1 over the standard deviation of the innovation, (L,); the Kalman gain is this number
+    times ``gains`` (n, L), which are written. The rotations are those of
+    ``root_update.rotate_out``; an entry of 0 rotates nothing.
     """
     n = len(size)
     for i in range(n):
@@ -381,7 +409,9 @@ def rotate_lanes(
 
 @kernel
 def predict_all(nodes: SlotNodes, scratch: SlotScratch, b: int) -> None:
-    """Predict all filters of block ``b`` to the next slot: ``F xhat`` and ``F P F' + Q``."""
+    """Predict all H filters of block ``b`` to the next slot, in place: ``nodes.xhat[b]`` (H, n, L)
+    to ``F xhat``, and ``nodes.root[b]`` (H, n, n, L) to the root of ``F P F' + Q``.
+    """
     for h in range(len(nodes.rows)):
         predict_mean(nodes, scratch, b, h)
         move_root(scratch, nodes.root, b, h, nodes.F, nodes.root_Q)
@@ -389,13 +419,17 @@ def predict_all(nodes: SlotNodes, scratch: SlotScratch, b: int) -> None:
 
 @kernel(inlined=True)
 def predict_mean(nodes: SlotNodes, scratch: SlotScratch, b: int, h: int) -> None:
-    """Predict the estimate of filter ``h`` to the next slot, ``F xhat``."""
+    """Replace ``nodes.xhat[b, h]`` (n, L), the estimate of filter ``h`` of block ``b``, by ``F
+    xhat`` for the next slot.
+    """
     transform_mean(scratch, nodes.xhat, b, h, nodes.F)
 
 
 @kernel(inlined=True)
 def transform_mean(scratch: SlotScratch, x: FloatArray, b: int, h: int, F: FloatArray) -> None:
-    """Multiply estimate [b, h] of ``x`` (B, H, n, L) by F."""
+    """Multiply estimate ``x[b, h]`` of ``x`` (B, H, n, L), filter ``h`` of block ``b``, by F (n, n)
+    in place, in all L runs of the block.
+    """
     lanes, n = scratch.lanes, len(scratch.size)
     moved_mean = local_lanes_vector(scratch.size, lanes, scratch.moved_mean)
     for i in range(n):
@@ -412,7 +446,10 @@ def transform_mean(scratch: SlotScratch, x: FloatArray, b: int, h: int, F: Float
 def move_root(
     scratch: SlotScratch, root: FloatArray, b: int, h: int, F: FloatArray, root_Q: FloatArray
 ) -> None:
-    """Apply ``predict_root`` with the arrays of ``scratch``."""
+    """Replace ``root[b, h]`` of ``root`` (B, H, n, n, L), the lower triangular root S of filter
+    ``h`` of block ``b``, by that of ``F S S' F' + Q``, with F and ``root_Q`` (n, n); uses
+    ``scratch``.
+    """
     predict_root(scratch.lanes, scratch.size, root, b, h, F, root_Q, scratch.moved, scratch.noise)
 
 
@@ -428,9 +465,11 @@ def predict_root(
     moved_scratch: FloatArray,
     noise_scratch: FloatArray,
 ) -> None:
-    """Replace the lower triangular root S of filter ``h`` of block ``b`` by that of
-    ``F S S' F' + Q``; ``root_Q`` (n, n) is lower triangular. ``moved_scratch`` and
-    ``noise_scratch`` (n, n, L) are used if n is too large for registers.
+    """Replace ``root[b, h]`` of ``root`` (B, H, n, n, L), the lower triangular root S of filter
+    ``h`` of block ``b`` in L runs, by that of ``F S S' F' + Q``.
+
+    ``F`` and the lower triangular ``root_Q`` are (n, n). ``moved_scratch`` and ``noise_scratch``
+    (n, n, L) are used if n is too large for registers.
     """
     n = len(size)
     moved = local_lanes_matrix(size, lanes, moved_scratch)
@@ -461,8 +500,9 @@ def write_root_column(
     moved: FloatArray,
     noise: FloatArray,
 ) -> None:
-    """Write column ``i`` of the triangular root of ``[moved, noise]`` into ``root[b, h]``: apply
-    the Householder reflection that zeroes row ``i`` right of its diagonal to the rows below.
+    """Write column ``i`` of the triangular root of ``[moved, noise]``, both (n, n, L), into
+    ``root[b, h]`` of ``root`` (B, H, n, n, L): apply the Householder reflection that zeroes row
+    ``i`` right of its diagonal to the rows below, which changes ``moved`` and ``noise`` in place.
     """
     # The squared length of row i; the columns of ``noise`` right of i are still zero here.
     n, pivot, square = len(size), load(lanes, moved, i, i), spread(lanes, 0.0)
@@ -503,13 +543,16 @@ def write_root_column(
 def predict_root_single(
     root: FloatArray, F: FloatArray, root_Q: FloatArray, moved: FloatArray, noise: FloatArray
 ) -> None:
-    """Apply ``predict_root`` to one filter with one lane, root (1, 1, n, n, 1)."""
+    """Replace the lower triangular root S of one filter of one run, ``root`` (1, 1, n, n, 1), by
+    that of ``F S S' F' + Q``; F and the lower triangular ``root_Q`` are (n, n), and ``moved`` and
+    ``noise`` (n, n, 1) are scratch.
+    """
     predict_root(ONE, F[0], root, 0, 0, F, root_Q, moved, noise)
 
 
 def predict_root_alone(root: FloatArray, F: FloatArray, root_Q: FloatArray) -> FloatArray:
-    """Return the lower triangular root (n, n) of ``F S S' F' + Q``, for lower triangular ``root`` S
-    and ``root_Q``.
+    """Return the lower triangular root (n, n) of ``F S S' F' + Q`` for the lower triangular
+    ``root`` S and ``root_Q`` (n, n each), for one filter.
     """
     n = len(F)
     moved = np.array(root).reshape(1, 1, n, n, 1)

@@ -20,15 +20,18 @@ from netkf.linalg.structs import Size
 
 
 def lower_triangular(array: FloatArray) -> FloatArray:
-    """Return L (..., r, r), lower triangular with ``L L' = array array'`` (..., r, c), c >= r."""
+    """Return L (..., r, r), lower triangular with ``L L' = array array'``, for each matrix of
+    ``array`` (..., r, c), c >= r.
+    """
     return np.asarray(np.swapaxes(np.linalg.qr(np.swapaxes(array, -1, -2), mode="r"), -1, -2))
 
 
 @kernel
 def reflect(work: FloatArray, i: int, rows: int, columns: int) -> None:
-    """Apply, from the right and in place, the Householder reflection of the columns below
-    ``columns`` that zeroes row ``i`` right of its diagonal, to the rows ``i`` to ``rows`` - 1. In
-    row ``i`` itself the entries right of the diagonal are not cleared: read them as zeros.
+    """Apply, from the right and in place, the Householder reflection of the columns ``i`` to
+    ``columns`` - 1 of ``work`` (>= rows, >= columns) that zeroes row ``i`` right of its diagonal,
+    to the rows ``i`` to ``rows`` - 1. In row ``i`` itself the entries right of the diagonal are not
+    cleared: read them as zeros.
     """
     square = 0.0
     for j in range(i, columns):
@@ -63,10 +66,11 @@ def reflect_row(
     active: Any,
 ) -> None:
     """Apply the Householder reflection from the right that zeroes row ``i`` of [wide, T] except its
-    diagonal entry, which becomes nonnegative, to the rows from ``i`` on, in the ``active`` lanes.
+    diagonal entry, which becomes nonnegative, to the rows from ``i`` on, in place, in the
+    ``active`` lanes (flags (L,) of runs side by side).
 
-    wide and T are (n, n, L), T lower triangular. Row ``i`` has the squared length ``square``; in
-    ``wide`` its entries are in columns ``i`` to ``end`` - 1.
+    wide and T are (n, n, L), T lower triangular. Row ``i`` has the squared length ``square`` (L,);
+    in ``wide`` its entries are in columns ``i`` to ``end`` - 1.
     """
     n, pivot = len(size), load(lanes, wide, i, i)
     length = root_of(select(active, square, 1.0))
@@ -105,8 +109,11 @@ def step_root(
     rows: np.ndarray,
     work: FloatArray,
 ) -> None:
-    """Replace root ``chain`` of ``roots`` (K, n, n) by that of f_m(P), R (17): update with reading
-    ``m`` and predict. ``work`` (>= p + n, >= 2 n + p) is scratch.
+    """Replace root ``chain`` of ``roots`` (K, n, n), lower triangular, by that of f_m(P), R (17):
+    update with reading ``m`` of M and predict.
+
+    F and ``root_Q`` are (n, n); H (M, p, n), ``root_R`` (M, p, p) and ``rows`` (M,) give the
+    readings, of which the first ``rows[m]`` rows count. ``work`` (>= p + n, >= 2 n + p) is scratch.
     """
     n, p = len(F), rows[m]
     # The pre-array [[H S, root_R, 0], [F S, 0, root_Q]].

@@ -16,9 +16,10 @@ NEVER, SAFE, PAPER = range(3)
 
 
 class MassStep(NamedTuple):
-    """How the mass and the network estimate of one node changed in a step.
+    """How the mass and the network estimate of one node changed in a step, for n states.
 
-    before, mass : (2 + n n,), its mass before the step and after it
+    before, mass : (2 + n n,), its mass before the step and after it: weight, number of nodes and
+                   information (n, n) by rows
     former, information : (n, n), G^(i) of P (6), before and after
     former_number, number : (1,), N^(i), before and after
     work : (n, n), scratch
@@ -35,8 +36,9 @@ class MassStep(NamedTuple):
 
 @kernel
 def has_stopped(rule: int, tolerance: float, step: MassStep, all_up: bool) -> bool:
-    """Return True if a node stops by ``rule`` (its index in RULES) with this ``tolerance``;
-    ``all_up``: all links of the node were up in this step.
+    """Return True if a node stops after this ``step`` by ``rule``, an index in RULES: PAPER, if the
+    change of its information has a spectral norm below ``tolerance``; SAFE, if its network estimate
+    changed by less than ``tolerance`` (relative) while all its links were up (``all_up``).
     """
     if rule == PAPER:
         # P step 2.3 waits until information has reached the node, since a mass of zero does not
@@ -55,8 +57,9 @@ def has_stopped(rule: int, tolerance: float, step: MassStep, all_up: bool) -> bo
 
 @kernel
 def moved_within(before: FloatArray, mass: FloatArray, bound: float, work: FloatArray) -> bool:
-    """Return True if the change D of the information, from ``before`` to ``mass``, has a spectral
-    norm below ``bound``: both ``bound I - D`` and ``bound I + D`` are positive definite.
+    """Return True if the change D (n, n) of the information, entries 2 and on of the masses
+    ``before`` and ``mass`` (2 + n n,), has a spectral norm below ``bound``: both ``bound I - D``
+    and ``bound I + D`` are positive definite. ``work`` (n, n) is scratch.
     """
     n = len(work)
     # |D_ii| < bound is necessary and cheap to test first. ``not <`` rejects nan.
@@ -101,8 +104,9 @@ def has_converged(
     number: float,
     tolerance: float,
 ) -> bool:
-    """Return True if N^(i) and G^(i) (n, n; Frobenius norm) changed by less than ``tolerance``,
-    relative to their present values ``number`` and ``information``.
+    """Return True if a node's network estimate changed by less than ``tolerance`` (relative) in a
+    step: the number of nodes N^(i) from ``former_number`` to ``number``, and the information G^(i)
+    (n, n) from ``former`` to ``information``, in the Frobenius norm.
     """
     if not abs(number - former_number) < tolerance * number:
         return False

@@ -61,7 +61,9 @@ def track_scratch(k: int, n: int) -> TrackScratch:
 
 @kernel
 def predict_joint(joint: FloatArray, F: FloatArray, Q: FloatArray, work: FloatArray) -> None:
-    """Predict all pairs of tracks, ``P_ij <- F P_ij F' + Q``; ``work`` (n, n) is scratch."""
+    """Predict the covariances ``joint`` (K, n, n) of all K pairs of tracks in place, ``P_ij <- F
+    P_ij F' + Q`` with F and Q (n, n); ``work`` (n, n) is scratch.
+    """
     for k in range(len(joint)):
         multiply_both(F, joint[k], F, work)
         for a in range(len(Q)):
@@ -71,7 +73,9 @@ def predict_joint(joint: FloatArray, F: FloatArray, Q: FloatArray, work: FloatAr
 
 @kernel(inlined=True)
 def multiply_both(left: FloatArray, P: FloatArray, right: FloatArray, work: FloatArray) -> None:
-    """Replace P (n, n) by ``left P right'``; ``work`` (n, n) is scratch."""
+    """Replace P (n, n) by ``left P right'``, with ``left`` and ``right`` (n, n); ``work`` (n, n) is
+    scratch.
+    """
     n = len(P)
     for a in range(n):
         for c in range(n):
@@ -96,11 +100,12 @@ def update_joint(
     closed: FloatArray,
     work: FloatArray,
 ) -> None:
-    """Update the covariances of m tracks, each by a reading of its own sensors:
-    ``P_ij <- C_i P_ij C_j'`` for i != j, with ``C_i = I - K_i H_i`` written into ``closed`` (m, n,
-    n).
+    """Update the covariances ``joint`` (K, n, n) of K pairs of m tracks in place, each track by a
+    reading of its own sensors: ``P_ij <- C_i P_ij C_j'`` for i != j, with ``C_i = I - K_i H_i``
+    written into ``closed`` (m, n, n).
 
-    ``H`` (m, p, n) is whitened, and ``rows`` (m,) of its rows count; ``work`` (n, n) is scratch.
+    ``pairs`` (K, 2) are the indices (i, j) of both tracks. ``H`` (m, p, n) is whitened, and
+    ``rows`` (m,) of its rows count; ``work`` (n, n) is scratch.
     """
     for k in range(len(joint)):
         i, j = pairs[k, 0], pairs[k, 1]
@@ -117,8 +122,8 @@ def update_joint(
 def close_track(
     P: FloatArray, H: FloatArray, rows: int, closed: FloatArray, work: FloatArray
 ) -> None:
-    """Update P (n, n) by a reading with ``rows`` whitened rows H (p, n); write ``I - K H`` into
-    ``closed`` (n, n).
+    """Update P (n, n) in place by a reading with ``rows`` whitened rows H (p, n); write ``I - K
+    H``, with the gain K of all rows, into ``closed`` (n, n). ``work`` (n, n) is scratch.
     """
     n = len(P)
     for i in range(n):
@@ -196,8 +201,12 @@ def combine_tracks(
 
 @kernel
 def fill_difference_covariances(joint: FloatArray, count: int, scratch: TrackScratch) -> None:
-    """Write E[d d'] of the differences ``d_a = e_own - e_a`` into ``difference_cov``, E[e_own d']
-    into ``cross_cov``, and the sum of both variances of each entry into ``variance_scale``.
+    """Write into ``scratch`` the covariances of the differences ``d_a = e_own - e_a`` between the
+    errors of a node's own track and of ``count`` = k others: E[d d'] into ``difference_cov`` (k n,
+    k n), E[e_own d'] into ``cross_cov`` (n, k n), and the sum of both variances of each entry into
+    ``variance_scale`` (k n,).
+
+    ``joint`` (>= k + 1, >= k + 1, n, n) holds the covariances of the tracks, the own one first.
     """
     n = joint.shape[2]
     for a in range(count):
@@ -213,11 +222,12 @@ def fill_difference_covariances(joint: FloatArray, count: int, scratch: TrackScr
 
 @kernel
 def factor_differences(n: int, K: int, scratch: TrackScratch) -> int:
-    """Factor ``difference_cov`` (K, K) = factor factor' by Cholesky with pivoting; return its
-    numerical rank t.
+    """Factor ``scratch.difference_cov`` (K, K) = factor factor' by Cholesky with pivoting, for the
+    K entries of the differences of all tracks; return its numerical rank t.
 
-    The differences are ``d = factor u`` with white u (t,); ``white_cov`` (n, t) becomes E[e_own u']
-    and ``order`` (t,) the pivots. ``difference_cov`` and ``cross_cov`` are overwritten.
+    The differences are ``d = factor u`` with white u (t,). Fills in ``scratch`` the ``factor``
+    (K, t), ``white_cov`` (n, t) = E[e_own u'] for ``n`` states, and ``order`` (t,), the index of
+    each pivot. ``difference_cov`` and ``cross_cov`` are overwritten.
     """
     difference_cov, factor = scratch.difference_cov, scratch.factor
     for t in range(K):
@@ -253,8 +263,12 @@ def factor_differences(n: int, K: int, scratch: TrackScratch) -> int:
 def write_combined_root(
     joint: FloatArray, count: int, gain: FloatArray, scratch: TrackScratch, root: FloatArray
 ) -> None:
-    """Write the lower triangular ``root`` of cov(e_own - gain d) = W joint W', with the weights W
-    of all errors. In this form it is positive semidefinite for any gain, rounding included.
+    """Write the lower triangular ``root`` (n, n) of cov(e_own - gain d) = W joint W', for the
+    ``gain`` (n, >= k n) of the differences d to ``count`` = k other tracks, with the weights W of
+    all errors. In this form it is positive semidefinite for any gain, rounding included.
+
+    ``joint`` (>= k + 1, >= k + 1, n, n) holds the covariances of the tracks, the own one first;
+    ``scratch.weights`` and ``scratch.work`` are overwritten.
     """
     n, weights, P = len(root), scratch.weights, scratch.work
     for i in range(n):

@@ -21,8 +21,8 @@ NO_READING = -1.0  # not the news of any reading, since z' Y z is never negative
 
 @kernel
 def silence_probability(news: float) -> float:
-    """Return ``exp(-z' Y z / 2)`` for the ``news`` z' Y z of a reading, Han et al. (2015); 0 for
-    NO_READING.
+    """Return the probability ``exp(-z' Y z / 2)`` that a node stays silent, for the ``news`` z' Y z
+    of its reading, Han et al. (2015); 0 for NO_READING.
     """
     return math.exp(-0.5 * news) if news >= 0.0 else 0.0
 
@@ -37,10 +37,12 @@ def weigh_news(
     Y: FloatArray,
     z: FloatArray,
 ) -> Any:
-    """Return the news ``z' Y z`` (L,) of a whitened reading with ``rows`` rows at ``index`` [b, s,
-    h], with its innovation z = y - H x; NO_READING in lanes without a reading.
+    """Return the news ``z' Y z`` (L,) of the whitened reading with ``rows`` rows at ``index`` [b,
+    s, h], block, slot and filter, with its innovation z = y - H x; NO_READING in lanes without a
+    reading.
 
-    x (B, H, n, L) are the estimates, Y (H, p, p) is for whitened rows, ``z`` (p, L) is scratch.
+    x (B, H, n, L) are the estimates, Y = ``Y[h]`` of (H, p, p) is for whitened rows, ``z`` (p, L)
+    is scratch.
     """
     b, s, h = index
     # A fixed H has one block and one slot.
@@ -73,11 +75,13 @@ def is_near(
     ratio: FloatArray,
     work: FloatArray,
 ) -> Any:
-    """Return flags (L,): the copy is near the estimate, ``|S^-1 (x - xbar)|^2 < alpha`` and
-    ``P < (1 + delta) Pbar`` and ``Pbar < (1 + delta) P``, for ``bounds`` (alpha, 1 + delta).
+    """Return flags (L,) of the runs in which a copy is near the estimate, ``|S^-1 (x - xbar)|^2 <
+    alpha`` and ``P < (1 + delta) Pbar`` and ``Pbar < (1 + delta) P``, for ``bounds``
+    (alpha, 1 + delta).
 
-    ``index`` is [b, h, k]: x and the root S of P are those of filter h of block b, xbar and the
-    root of Pbar are copy k of the block. ``ratio`` (n, n + 1, L) and ``work`` (n, n, L) are
+    ``index`` is [b, h, k]: x and the root S of P are ``x[b, h]`` (n, L) and ``root[b, h]``
+    (n, n, L), of filter h of block b; xbar and the root of Pbar are ``copies_x[b, k]`` and
+    ``copies_root[b, k]``, copy k of the block. ``ratio`` (n, n + 1, L) and ``work`` (n, n, L) are
     scratch.
     """
     (b, h, k), n = index, x.shape[2]
@@ -116,7 +120,8 @@ def is_near(
 @kernel(inlined=True)
 def is_positive(lanes: Lanes, work: FloatArray) -> Any:
     """Return flags (L,) of the symmetric matrices ``work`` (n, n, L), given by their lower
-    triangles, that are positive definite: L D L' elimination in place has positive pivots only.
+    triangles, that are positive definite: L D L' elimination, which overwrites them, has positive
+    pivots only.
     """
     n, smallest_pivot = len(work), spread(lanes, math.inf)
     for k in range(n):
