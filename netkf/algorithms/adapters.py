@@ -50,7 +50,9 @@ class _Adapter(Filter):
         return xhat, P
 
     def weight(self, degree: int, peer_degree: int) -> float:
-        """Return the wrapped filter's weight for a message."""
+        """Return the weight that the wrapped filter gives to a message, at a node with ``degree``
+        links from one with ``peer_degree``.
+        """
         return float(self.inner.weight(degree, peer_degree))
 
     def largest_degree(self) -> float:
@@ -65,29 +67,37 @@ class FlowAdapter(_Adapter):
     clocks = CLOCKS[:-1]  # all but after samples
 
     def init(self, model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo) -> Any:
-        """Return the state at time 0."""
+        """Return the wrapped filter's state at time 0 from ``mean`` (n,) and ``cov`` (n, n)."""
         return self.inner.init(model, mean, cov)
 
     def predict(self, state: Any, gap: float) -> Any:
-        """Call ``flow``."""
+        """Return the wrapped filter's state ``gap`` seconds later, by its method ``flow``."""
         return self.inner.flow(state, gap)
 
     def update(self, state: Any, reading: Any) -> Any:
-        """Call ``measure`` with the increments of the last gap; a sample is a TypeError."""
+        """Return the state after the increments of the last gap, by the method ``measure``; a
+        sample is a TypeError.
+        """
         if not isinstance(reading, Increments):
             raise TypeError("a FlowFilter takes increments only; derive from netkf.parts.Filter")
         return self.inner.measure(state, reading)
 
     def emit(self, state: Any, exchange: Exchange) -> tuple[Any, Any]:
-        """Call ``emit``, which does not change the state."""
+        """Return the state, unchanged, and the payload that the wrapped filter's ``emit`` makes of
+        it.
+        """
         return state, self.inner.emit(state)
 
     def absorb(self, state: Any, messages: Sequence[Message], exchange: Exchange) -> Any:
-        """Call ``absorb`` with (weight, payload, age) of each message."""
+        """Return the state after all messages of an instant: calls the wrapped filter's ``absorb``
+        with (weight, payload, age) of each.
+        """
         return self.inner.absorb(state, [tuple(message[1:]) for message in messages])
 
     def max_measurement_interval(self, state: Any) -> float:
-        """Call ``stretch``."""
+        """Return the seconds of increments that may be used at once, by the wrapped filter's
+        ``stretch``.
+        """
         return float(self.inner.stretch(state))
 
 
@@ -103,20 +113,28 @@ class SlotAdapter(_Adapter):
             object.__setattr__(self, name, getattr(inner, name))
 
     def init(self, model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo) -> Any:
-        """Call ``init`` and then ``place``."""
+        """Return the state at slot 0 from ``mean`` (n,) and ``cov`` (n, n), by the wrapped filter's
+        ``init`` and then its ``place``, which is told what the node knows of the network.
+        """
         role = Role(node.node, node.degree, node.nodes, node.information, node.own_weight)
         return self.inner.place(self.inner.init(model, mean, cov), role)
 
     def update(self, state: Any, reading: Reading) -> Any:
-        """Call ``sense``."""
+        """Return the state after the reading of the slot and the prediction to the next one, by the
+        wrapped filter's ``sense``.
+        """
         return self.inner.sense(state, reading)
 
     def emit(self, state: Any, exchange: Exchange) -> tuple[Any, Any]:
-        """Call ``emit``, which does not change the state."""
+        """Return the state, unchanged, and the payload of the wrapped filter's ``emit`` for this
+        exchange.
+        """
         return state, self.inner.emit(state, exchange.phase)
 
     def absorb(self, state: Any, messages: Sequence[Message], exchange: Exchange) -> Any:
-        """Call ``absorb`` with (weight, payload, age) of each message."""
+        """Return the state after all messages of a step: calls the wrapped filter's ``absorb`` with
+        (weight, payload, age) of each.
+        """
         return self.inner.absorb(state, exchange.phase, [tuple(m[1:]) for m in messages])
 
     def steps(self, phase: int) -> int:
@@ -124,7 +142,9 @@ class SlotAdapter(_Adapter):
         return int(self.inner.steps(phase))
 
     def redraws_links(self, phase: int, step: int) -> bool:
-        """Call ``redraws``."""
+        """Return True if links draw new outcomes in repetition ``step`` of exchange number
+        ``phase``, by the wrapped filter's ``redraws``.
+        """
         return bool(self.inner.redraws(phase, step))
 
     def stopped(self, state: Any) -> bool:

@@ -32,7 +32,12 @@ def local_slots(
     samples: SlotSamples,
     scratch: SlotScratch,
 ) -> None:
-    """Simulate filters that never talk over the slots of a plan: predict, then update."""
+    """Simulate H filters that never talk over the S slots of a plan, in B blocks of L runs: in each
+    slot they predict, then update with their own readings.
+
+    Changes ``nodes.xhat`` (B, H, n, L) and ``nodes.root`` (B, H, n, n, L) in place and writes
+    ``samples`` in the slots that have one.
+    """
     for b in range(plan.up.shape[0]):
         for s in range(plan.up.shape[1]):
             if plan.sensed[s]:

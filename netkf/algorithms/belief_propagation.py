@@ -105,13 +105,15 @@ class Beliefs(NamedTuple):
 
 
 class BeliefArrays(NamedTuple):
-    """Arrays of belief propagation for B blocks of runs, in one block if nothing is kept.
+    """Arrays of belief propagation for B blocks of L runs, in one block if nothing is kept; H
+    filters and W directions of links.
 
     steps : steps of a slot
     keeps : whether messages are kept from slot to slot
     back : the inverse of F (n, n) if they are
     prior, own : evidence of priors and own readings (B, H, n, n + 1, L)
     received : evidence received on each direction (B, W, n, n + 1, L)
+    scratch : evidence that is sent, and scratch
     """
 
     steps: int
@@ -133,7 +135,13 @@ def belief_slots(
     scratch: SlotScratch,
     arrays: BeliefArrays,
 ) -> None:
-    """Simulate filters by belief propagation over the slots of a plan."""
+    """Simulate H filters by belief propagation over the S slots of a plan, in B blocks of L runs:
+    in each slot they predict, read, exchange evidence ``arrays.steps`` times and compute their
+    beliefs.
+
+    Changes ``nodes.xhat`` (B, H, n, L), ``nodes.root`` (B, H, n, n, L) and the evidence in
+    ``arrays`` in place, and writes ``samples`` in the slots that have one.
+    """
     for b in range(plan.up.shape[0]):
         k, lanes = min(b, arrays.own.shape[0] - 1), scratch.lanes
         own, received = arrays.own[k], arrays.received[k]
@@ -169,9 +177,12 @@ def belief_slots(
 
 @kernel
 def predict_beliefs(nodes: SlotNodes, scratch: SlotScratch, arrays: BeliefArrays, b: int) -> None:
-    """Predict all filters of block ``b`` to the next slot. If messages are kept, all evidence is
-    predicted; else the predicted belief is the prior, and all other evidence is cleared. Evidence
-    is relative to the predictions, which are copied to ``scratch.xhat``.
+    """Predict all H filters of block ``b`` to the next slot, ``nodes.xhat[b]`` (H, n, L), and copy
+    the predictions to ``scratch.xhat`` (H, n, L): all evidence is relative to them.
+
+    If messages are kept, all evidence in ``arrays`` is predicted, and ``nodes.root`` waits for
+    ``update_beliefs``; else ``nodes.root[b]`` (H, n, n, L) is predicted too, the predicted belief
+    becomes ``arrays.prior``, and all other evidence is cleared.
     """
     lanes, beliefs, k = scratch.lanes, arrays.scratch, min(b, arrays.own.shape[0] - 1)
     if not arrays.keeps:
@@ -202,8 +213,9 @@ def update_beliefs(
     b: int,
     h: int,
 ) -> None:
-    """Compute the belief of filter ``h`` of block ``b``, the sum of its prior and all evidence. If
-    messages are kept, move the centre of the evidence to the new belief.
+    """Compute the belief of filter ``h`` of block ``b``, the sum of its prior and all evidence:
+    writes ``nodes.xhat[b, h]`` (n, L) and ``nodes.root[b, h]`` (n, n, L). If messages are kept, the
+    centre of the filter's evidence in ``arrays`` moves to the new belief.
     """
     lanes, beliefs, k = scratch.lanes, arrays.scratch, min(b, arrays.own.shape[0] - 1)
     copy_part(lanes, arrays.prior[k, h], beliefs.total)
@@ -223,7 +235,9 @@ def update_beliefs(
 
 @kernel
 def add_part_single(parts: FloatArray, total: FloatArray, work: FloatArray) -> None:
-    """Add all ``parts`` (K, n, n + 1, 1) to ``total`` (n, n + 1, 1) with one lane."""
+    """Add all ``parts`` (K, n, n + 1, 1), K pieces of independent evidence of one run, to ``total``
+    (n, n + 1, 1) in place; ``work`` of the same shape is scratch.
+    """
     for k in range(len(parts)):
         add_part(ONE, total, parts[k], work)
 
@@ -232,7 +246,10 @@ def add_part_single(parts: FloatArray, total: FloatArray, work: FloatArray) -> N
 def add_reading_single(
     y: FloatArray, H: FloatArray, centre: FloatArray, total: FloatArray, work: FloatArray
 ) -> None:
-    """Add a whitened reading, y (1, 1, 1, p, 1), to ``total`` (n, n + 1, 1) with one lane."""
+    """Add a whitened reading of one node in one run, y (1, 1, 1, p, 1) and H (1, 1, 1, p, n, 1), to
+    the evidence ``total`` (n, n + 1, 1) in place, relative to ``centre`` (1, n, 1); ``work``
+    (n, n + 1, 1) is scratch.
+    """
     add_reading_pair(ONE, total, 1.0, y, H, (0, 0, 0), y.shape[3], centre, work)
 
 
@@ -240,13 +257,18 @@ def add_reading_single(
 def predict_part_single(
     part: FloatArray, back: FloatArray, total: FloatArray, work: FloatArray
 ) -> None:
-    """Apply ``predict_part`` to one piece of evidence (n, n + 1, 1) with one lane."""
+    """Predict the evidence ``part`` (n, n + 1, 1) of one run in place to a later state of a plant
+    without noise: ``Z <- Z back``, where ``back`` (n, n) is the inverse transition. ``total`` and
+    ``work`` (n, n + 1, 1) are scratch.
+    """
     predict_part(ONE, part, back, total, work)
 
 
 @kernel
 def recentre_part_single(part: FloatArray, before: FloatArray, after: FloatArray) -> None:
-    """Apply ``recentre_part`` to one piece of evidence (n, n + 1, 1) with one lane."""
+    """Move the centre that the evidence ``part`` (n, n + 1, 1) of one run is relative to from
+    ``before`` (n, 1) to ``after`` (n, 1), in place.
+    """
     recentre_part(ONE, part, before, after, part)
 
 
@@ -254,7 +276,10 @@ def recentre_part_single(part: FloatArray, before: FloatArray, after: FloatArray
 def finish_single(
     root: FloatArray, x: FloatArray, centre: FloatArray, total: FloatArray, work: FloatArray
 ) -> None:
-    """Apply ``finish_lanes`` to one node with one lane, root (1, 1, n, n, 1), x (1, 1, n, 1)."""
+    """Write the estimate of the evidence ``total`` (n, n + 1, 1) of one run, [Z, z] relative to
+    ``centre`` (1, n, 1): its root Z^-1 into ``root`` (1, 1, n, n, 1) and ``centre + Z^-1 z`` into
+    ``x`` (1, 1, n, 1); ``work`` (n, n + 1, 1) is scratch.
+    """
     finish_lanes(ONE, root, x, 0, 0, centre, total, work, False)
 
 
@@ -288,7 +313,9 @@ class BeliefPropagation(Filter):
     def slot_arrays(
         self, states: Sequence[Any], infos: Sequence[NodeInfo], runs: int
     ) -> tuple[BeliefArrays]:
-        """Return the initial evidence of all nodes, and scratch."""
+        """Return the arrays of ``slot_kernel`` for ``runs`` runs of H nodes that start in these
+        ``states``: the initial evidence of all nodes, and scratch.
+        """
         keeps, H, n = self.memory == ALL, len(states), len(states[0].xhat)
         W, D = sum(info.degree for info in infos), max(info.degree for info in infos)
         blocks = blocks_of(runs) if keeps else 1
@@ -332,17 +359,22 @@ class BeliefPropagation(Filter):
         )
 
     def exchange_steps(self, phase: int) -> int:
-        """Return ``steps``."""
+        """Return ``steps``, the number of steps of the only exchange of a slot."""
         return self.steps
 
     def init(self, model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo) -> BeliefState:
-        """Return the first state, in which nothing was read or heard."""
+        """Return the first state of a node, with estimate ``mean`` (n,) and covariance ``cov``
+        (n, n), in which nothing was read or heard.
+        """
         root = first_root(cov)
         prior, no_evidence = evidence_of(root), np.zeros((len(mean), len(mean) + 1))
         return BeliefState(mean, root, model, prior, no_evidence, (), (), node.node)
 
     def predict(self, state: BeliefState, gap: float) -> BeliefState:
-        """Predict the belief, and the evidence if messages are kept."""
+        """Return the state ``gap`` seconds later: with the belief predicted, and the evidence if
+        messages are kept; otherwise the predicted belief is the prior, and all other evidence is
+        dropped.
+        """
         xhat, root = state.model.predict(state.xhat, state.root, gap)
         state = state._replace(xhat=xhat, root=root)
         if isinstance(state.model, SlotModel) and self.memory == SLOT:
@@ -352,20 +384,26 @@ class BeliefPropagation(Filter):
         return map_evidence(state, lambda evidence: predict_evidence(evidence, back))
 
     def update(self, state: BeliefState, reading: Reading) -> BeliefState:
-        """Add a reading to the own ones."""
+        """Return the state after a sample: its evidence is added to that of the node's own
+        readings, and the belief follows from all evidence.
+        """
         if not len(reading.y):
             return state
         return compute_belief(state._replace(own=add_to_own_evidence(state, reading)))
 
     def emit(self, state: BeliefState, exchange: Exchange) -> tuple[BeliefState, Beliefs]:
-        """Send the evidence of the node's own readings and of its neighbours."""
+        """Return the state, unchanged, and the payload: the evidence of the node's own readings and
+        of each neighbour, of which a receiver leaves out its own.
+        """
         heard = tuple(one.evidence for one in state.received)
         return state, Beliefs(state.xhat, state.own, state.senders, heard)
 
     def absorb(
         self, state: BeliefState, messages: Sequence[Message], exchange: Exchange
     ) -> BeliefState:
-        """Replace the earlier evidence of each sender, unless that was sent later."""
+        """Return the state in which the evidence of each sender is replaced by that of its message,
+        unless the one it has was sent later, with the belief that follows from all evidence.
+        """
         if not messages:
             return state
         received = dict(zip(state.senders, state.received, strict=True))
@@ -396,7 +434,9 @@ def is_forest(scenario: Any) -> bool:
 
 
 def merge_evidence(parts: Sequence[FloatArray]) -> FloatArray:
-    """Return the sum (n, n + 1) of independent evidence."""
+    """Return the sum (n, n + 1) of several pieces of independent evidence, ``parts`` (n, n + 1)
+    each, all relative to one centre.
+    """
     stack = np.stack(parts)[..., None]
     add_part_single(stack[1:], stack[0], np.empty(stack.shape[1:]))
     return np.ascontiguousarray(stack[0, ..., 0])
@@ -416,13 +456,17 @@ def add_to_own_evidence(state: BeliefState, reading: Reading) -> FloatArray:
 
 
 def evidence_for(node: int, payload: Beliefs) -> FloatArray:
-    """Return the evidence of a payload for the receiver ``node``: all but the receiver's own."""
+    """Return the evidence (n, n + 1) of a payload for the receiver ``node``, an id: all but what
+    the sender has from the receiver itself, relative to ``payload.xhat``.
+    """
     others = zip(payload.senders, payload.heard, strict=True)
     return merge_evidence([payload.own, *(one for sender, one in others if sender != node)])
 
 
 def evidence_of(root: FloatArray) -> FloatArray:
-    """Return an estimate with the root (n, n) of its covariance as evidence relative to itself."""
+    """Return an estimate with the lower triangular root (n, n) of its covariance as evidence
+    (n, n + 1) relative to itself: [S^-1, 0].
+    """
     n = len(root)
     part = np.zeros((n, n + 1, 1))
     write_prior_single(np.array(root).reshape(1, 1, n, n, 1), 0, part)
@@ -430,7 +474,9 @@ def evidence_of(root: FloatArray) -> FloatArray:
 
 
 def compute_belief(state: BeliefState) -> BeliefState:
-    """Return the state with the belief that follows from its prior and all evidence."""
+    """Return the state with the belief, ``xhat`` (n,) and ``root`` (n, n), that follows from its
+    prior and all evidence; the centre of the evidence moves to the new ``xhat``.
+    """
     # From all evidence, and not as an update of the old belief: on an unstable plant that may be so
     # far off that digits are lost.
     total = merge_evidence([state.prior, state.own, *(one.evidence for one in state.received)])
@@ -442,13 +488,17 @@ def compute_belief(state: BeliefState) -> BeliefState:
 
 
 def map_evidence(state: BeliefState, change: Callable[[FloatArray], FloatArray]) -> BeliefState:
-    """Return the state with ``change`` applied to all its evidence."""
+    """Return the state with ``change``, a function from evidence (n, n + 1) to evidence, applied to
+    its prior, its own and all received evidence.
+    """
     received = tuple(one._replace(evidence=change(one.evidence)) for one in state.received)
     return state._replace(prior=change(state.prior), own=change(state.own), received=received)
 
 
 def backward(model: Any, gap: float) -> FloatArray:
-    """Return the inverse (n, n) of the plant's transition over a gap, seconds."""
+    """Return the inverse (n, n) of the plant's transition over a ``gap`` in seconds, by the
+    ``model`` of a node (SlotModel or FlowModel).
+    """
     if isinstance(model, SlotModel):
         power = np.linalg.matrix_power(model.F, round(gap / model.period))
         return np.asarray(np.linalg.inv(power), dtype=np.float64)
@@ -458,7 +508,9 @@ def backward(model: Any, gap: float) -> FloatArray:
 
 
 def predict_evidence(evidence: FloatArray, back: FloatArray) -> FloatArray:
-    """Return evidence predicted to a later state; ``back`` (n, n) is the inverse transition."""
+    """Return ``evidence`` (n, n + 1) predicted to a later state; ``back`` (n, n) is the inverse
+    transition.
+    """
     predicted = np.array(evidence)[..., None]
     back = np.ascontiguousarray(back)
     predict_part_single(predicted, back, np.empty(predicted.shape), np.empty(predicted.shape))
@@ -466,7 +518,9 @@ def predict_evidence(evidence: FloatArray, back: FloatArray) -> FloatArray:
 
 
 def recentre_evidence(evidence: FloatArray, before: FloatArray, after: FloatArray) -> FloatArray:
-    """Return evidence with its centre moved from ``before`` (n,) to ``after``."""
+    """Return ``evidence`` (n, n + 1) with the centre that it is relative to moved from ``before``
+    (n,) to ``after`` (n,).
+    """
     result, old_centre, new_centre = (
         np.array(values)[..., None] for values in (evidence, before, after)
     )

@@ -10,8 +10,8 @@ from netkf.linalg.arrays import FloatArray
 
 
 def closed_loop(model: FlowModel, gain: FloatArray) -> FlowModel:
-    """Return a model without readings whose P is that of a constant gain L (n, p) over increments:
-    drift ``A - L H``, noise ``Q + L R L'``.
+    """Return a model without readings whose P (n, n) is that of a constant ``gain`` L (n, p) over
+    increments: drift ``A - L H``, noise ``Q + L R L'``.
     """
     noise, nothing = model.Q + gain @ model.R @ gain.T, model.H[:0]
     closed = np.ascontiguousarray(model.A - gain @ model.H)
@@ -19,11 +19,15 @@ def closed_loop(model: FlowModel, gain: FloatArray) -> FlowModel:
 
 
 def sample_maps(L: FloatArray, H: FloatArray, R: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return ``I - L H`` (n, n) and the lower triangular root (n, n) of ``L R L'``."""
+    """Return ``I - L H`` (n, n) and the lower triangular root (n, n) of ``L R L'``, for a gain L
+    (n, p) and a sample with H (p, n) and R (p, p).
+    """
     closed = np.eye(len(L)) - L @ H
     return closed, lower_root(np.asarray(L @ np.linalg.cholesky(R)))
 
 
 def gain_rate(L: FloatArray, H: FloatArray) -> float:
-    """Return the rate (1/s) at which increments move an estimate through the gain L (n, p)."""
+    """Return the rate (1/s) at which increments move an estimate through the gain L (n, p): the
+    Frobenius norm of L H, with H (p, n).
+    """
     return float(np.linalg.norm(L @ H))

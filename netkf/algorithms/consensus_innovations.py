@@ -85,7 +85,8 @@ class NodeGains(NamedTuple):
 
     B : (d, n, n) for the d nodes that it hears, in the order of their indices
     M, K : (n, n) of the pseudo-observation, and of the pseudo-state
-    predicted, root : (n, n) roots of the covariance of x - xhat before and after
+    predicted, root : lower triangular roots (n, n) of the covariance of x - xhat, after the
+                      prediction to the slot and at its end
     """
 
     B: FloatArray
@@ -124,7 +125,9 @@ class PseudoStates(NamedTuple):
 
 
 def pseudo_states(F: FloatArray, information: FloatArray) -> PseudoStates:
-    """Return the matrices of pseudo-states, ``information`` (n, n) being that of all sensors."""
+    """Return the matrices (n, n) of pseudo-states for the transition F (n, n), ``information``
+    (n, n) being that of all sensors.
+    """
     inverse = np.asarray(np.linalg.pinv(information, hermitian=True))
     projector = inverse @ information
     return PseudoStates(
@@ -161,7 +164,7 @@ class GainSequence:
         self._converged = False
 
     def at(self, slot: int) -> tuple[NodeGains, ...]:
-        """Return the gains of all nodes in a slot, counted from 1."""
+        """Return the gains of each of N nodes in a ``slot``, counted from 1."""
         # Gains do not depend on readings: each slot is computed once.
         while len(self._gains) < slot and not self._converged:
             self._gains.append(self._advance_slot())
@@ -169,11 +172,11 @@ class GainSequence:
         return self._gains[min(slot, len(self._gains)) - 1]
 
     def table(self, first: int, count: int) -> tuple[np.ndarray, SlotGains]:
-        """Return the table rows (count,) of slots ``first`` to ``first + count - 1``, and the
-        table.
+        """Return the table rows (count,) of ``count`` slots from number ``first`` on, and the table
+        of gains.
 
-        Slots after convergence share one row. Slot 0 gets that of slot 1, since nothing happens
-        in it.
+        Slots after convergence share one row. Slot 0 gets that of slot 1, since nothing happens in
+        it.
         """
         slots = np.maximum(np.arange(first, first + count), 1)
         self.at(int(slots[-1]))
@@ -192,13 +195,17 @@ class GainSequence:
 
     @staticmethod
     def _has_converged(before: tuple[NodeGains, ...], now: tuple[NodeGains, ...]) -> bool:
-        """Return True if no covariance has changed by more than rounding."""
+        """Return True if no covariance of any node has changed by more than rounding between the
+        gains of two slots, ``before`` and ``now``.
+        """
         roots = (np.stack([one.root for one in gains]) for gains in (before, now))
         former, present = (S @ np.swapaxes(S, 1, 2) for S in roots)
         return bool(np.abs(present - former).max() <= CONVERGED * np.abs(present).max())
 
     def _advance_slot(self) -> tuple[NodeGains, ...]:
-        """Advance the errors by one slot, and return its gains."""
+        """Advance ``_errors`` (2 N n, inputs) by one slot, and return the gains of each of N nodes
+        in it.
+        """
         nodes = range(len(self._neighbours))
         self._errors = np.hstack([self._predict(), self._driven])
         predicted = [self._covariance_root(i) for i in nodes]
@@ -219,19 +226,23 @@ class GainSequence:
         return predicted.reshape(self._errors.shape)
 
     def _state_error(self, i: int) -> FloatArray:
-        """Return the error (n, inputs) of a node's xhat, which may be written to."""
+        """Return the error (n, inputs) of the xhat of node ``i``, an index from 0: a view that may
+        be written to.
+        """
         return self._errors[i * self._n : (i + 1) * self._n]
 
     def _pseudo_error(self, i: int) -> FloatArray:
-        """Return the error (n, inputs) of a node's yhat."""
+        """Return the error (n, inputs) of the yhat of node ``i``, an index from 0."""
         return self._state_error(len(self._neighbours) + i)
 
     def _covariance_root(self, i: int) -> FloatArray:
-        """Return the lower triangular root (n, n) of P of node ``i``."""
+        """Return the lower triangular root (n, n) of P of node ``i``, an index from 0."""
         return lower_root(np.ascontiguousarray(self._state_error(i)))
 
     def _correct_pseudo_states(self) -> list[tuple[FloatArray, FloatArray]]:
-        """Correct all yhat at once; return B (d, n, n) and M (n, n) of each node."""
+        """Correct the errors of all yhat in ``_errors`` at once; return for each node B (d, n, n)
+        for the d nodes that it hears, and M (n, n).
+        """
         n, N, first = self._n, len(self._neighbours), self._errors.shape[1]
         inputs = sum(noise.shape[1] for noise in self._noises)
         self._errors = np.hstack([self._errors, np.zeros((len(self._errors), inputs))])
@@ -257,7 +268,9 @@ class GainSequence:
         return gains
 
     def _correct_state(self, i: int) -> FloatArray:
-        """Correct xhat_i by ``yhat_i - G xhat_i``, which is ``G e - e_y``; return K (n, n)."""
+        """Correct the error of xhat of node ``i`` (an index from 0) in ``_errors`` by ``yhat_i - G
+        xhat_i``, which is ``G e - e_y``; return the gain K (n, n).
+        """
         G, e, e_y = self._pseudo.G, self._state_error(i), self._pseudo_error(i)
         theta = G @ e - e_y
         K = optimal_gain(e, theta, np.square(G) @ variances(e) + variances(e_y))
@@ -266,18 +279,21 @@ class GainSequence:
 
 
 def without_zeros(matrix: FloatArray) -> FloatArray:
-    """Return the columns of a matrix that are not zero."""
+    """Return the columns (n, k) of ``matrix`` (n, n) that are not zero."""
     return np.asarray(matrix[:, matrix.any(axis=0)])
 
 
 def variances(errors: FloatArray) -> FloatArray:
-    """Return the variances (k,) of errors (k, inputs)."""
+    """Return the variances (k,) of k ``errors`` (k, inputs), given by their coefficients of
+    independent inputs with variance 1.
+    """
     return np.asarray(np.square(errors).sum(axis=1))
 
 
 def optimal_gain(e: FloatArray, theta: FloatArray, terms: FloatArray) -> FloatArray:
     """Return the gain ``E[e theta'] E[theta theta']^+`` (n, k) that corrects errors e (n, inputs)
-    by differences theta (k, inputs); ``terms`` (k,) are the sums of the variances of their terms.
+    by differences theta (k, inputs), both given by their coefficients of independent inputs with
+    variance 1; ``terms`` (k,) are the sums of the variances of the terms of each difference.
     """
     # Relative to its terms the difference of equal estimates is rounding, and counts as 0 below.
     scale = np.divide(1.0, np.sqrt(terms), out=np.zeros_like(terms), where=terms > 0.0)
@@ -336,7 +352,7 @@ class PseudoEstimate(NamedTuple):
 
 
 class PseudoArrays(NamedTuple):
-    """Arrays of all nodes for B blocks of runs.
+    """Arrays of all H nodes for B blocks of L runs.
 
     pseudo, gains : matrices of pseudo-states, gains of some slots
     table_row : row (S,) of each slot in ``gains``
@@ -364,7 +380,12 @@ def pseudo_slots(
     scratch: SlotScratch,
     arrays: PseudoArrays,
 ) -> None:
-    """Simulate filters by consensus plus innovations over the slots of a plan."""
+    """Simulate H filters by consensus plus innovations over the S slots of a plan, in B blocks of L
+    runs: in each slot they predict, then correct by readings and messages.
+
+    Changes ``nodes.xhat`` (B, H, n, L), ``nodes.root`` (B, H, n, n, L) and ``arrays.yhat``
+    (B, H, n, L) in place and writes ``samples`` in the slots that have one.
+    """
     for b in range(plan.up.shape[0]):
         for s in range(plan.up.shape[1]):
             if plan.sensed[s]:
@@ -391,7 +412,10 @@ def correct_all(
     b: int,
     s: int,
 ) -> None:
-    """Correct all filters of block ``b`` by their readings and messages of slot ``s``."""
+    """Correct all H filters of block ``b`` by their readings and messages of slot ``s``: changes
+    ``nodes.xhat[b]`` and ``arrays.yhat[b]`` (H, n, L), and sets ``nodes.root[b]`` (H, n, n, L) to
+    the roots that belong to the gains.
+    """
     lanes, k = scratch.lanes, arrays.table_row[s]
     for h in range(len(nodes.rows)):
         fill_pseudo_innovation(
@@ -417,7 +441,10 @@ def correct_all(
 def predict_pseudo_single(
     x: FloatArray, y: FloatArray, A: FloatArray, coupling: FloatArray, work: FloatArray
 ) -> None:
-    """Apply ``predict_pseudo`` to one node with one lane, x and y (1, 1, n, 1)."""
+    """Replace the estimate of the pseudo-state of one node in one run, y (1, 1, n, 1), by ``A y +
+    coupling x`` with its estimate x (1, 1, n, 1) of the state; A and ``coupling`` are (n, n),
+    ``work`` (n, 1) is scratch.
+    """
     predict_pseudo(ONE, x, y, 0, 0, A, coupling, work)
 
 
@@ -429,7 +456,11 @@ def correct_single(
     up: Any,
     arrays: PseudoArrays,
 ) -> None:
-    """Correct one node, the first of ``arrays.yhat`` (1, H, n, 1), with one lane."""
+    """Correct one node in one run by its reading and messages: its estimate x (1, 1, n, 1) and that
+    of the pseudo-state, ``arrays.yhat[0, 0]``, are changed in place. The entries 1 to H - 1 of
+    ``arrays.yhat`` (1, H, n, 1) are those of its senders, and ``up`` (1, 1, 1, W, 1) flags their
+    messages.
+    """
     gains, pseudo = arrays.gains, arrays.pseudo
     y, state, z = arrays.yhat, arrays.state, arrays.z
     fill_pseudo_innovation(ONE, y, 0, 0, readings.y.shape[3], pseudo.inverse, readings, 0, state, z)
@@ -460,7 +491,9 @@ class ConsensusInnovations(Filter):
     def slot_arrays(
         self, states: Sequence[Any], infos: Sequence[NodeInfo], runs: int
     ) -> tuple[PseudoArrays]:
-        """Return the first pseudo-states and scratch."""
+        """Return the arrays of ``slot_kernel`` for ``runs`` runs of H nodes that start in these
+        ``states``: the first pseudo-states, the gains of slot 0, and scratch.
+        """
         H, n = len(states), len(states[0].xhat)
         yhat = in_lanes(np.stack([state.yhat for state in states]), blocks_of(runs))
         scratch = [aligned(shape) for shape in ((H, n, LANES), (n, LANES), (n, LANES))]
@@ -470,7 +503,7 @@ class ConsensusInnovations(Filter):
     def slot_gains(
         self, states: Sequence[Any], arrays: tuple[Any, ...], first: int, count: int
     ) -> tuple[PseudoArrays]:
-        """Return the arrays with the gains of slots ``first`` to ``first + count - 1``."""
+        """Return ``arrays`` with the gains of ``count`` slots from number ``first`` on."""
         rows, gains = gain_sequence(states[0].design).table(first, count)
         return (arrays[0]._replace(table_row=rows, gains=gains),)
 
@@ -479,11 +512,15 @@ class ConsensusInnovations(Filter):
         require_common_start(scenario, "from which gains are computed", "hcmci")
 
     def payload_numbers(self, n: int, rows: int, phase: int) -> int:
-        """Return the numbers of a message, an estimate of the pseudo-state."""
+        """Return n, the size of a message in numbers of 64 bits: an estimate of the
+        pseudo-state.
+        """
         return n
 
     def init(self, model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo) -> PseudoState:
-        """Return the first state of a node, which knows the whole network."""
+        """Return the first state of a node, with estimate ``mean`` (n,) and covariance ``cov``
+        (n, n); the node knows the whole network, ``node.network``.
+        """
         network = node.network
         assert network is not None
         F, Q, start, information = (
@@ -497,7 +534,9 @@ class ConsensusInnovations(Filter):
         return PseudoState(mean, root, model, pseudo.G @ mean, pseudo, None, 0, design, node.place)
 
     def predict(self, state: PseudoState, gap: float) -> PseudoState:
-        """Predict both estimates."""
+        """Return the state ``gap`` seconds later: both estimates are predicted, the root follows
+        from the gains of the new slot, and no reading is kept.
+        """
         slot, n = state.slot, len(state.xhat)
         xhat, yhat = state.xhat, state.yhat.reshape(1, 1, n, 1).copy()
         for _ in range(round(gap / state.model.period)):
@@ -508,20 +547,22 @@ class ConsensusInnovations(Filter):
         return state._replace(root=state.gains.predicted)
 
     def update(self, state: PseudoState, reading: Reading) -> PseudoState:
-        """Keep the reading for the exchange of the slot."""
+        """Return the state with the reading, whitened, kept for the exchange of the slot."""
         if not len(reading.y):
             return state
         return state._replace(reading=whiten_reading(reading.y, reading.H, reading.R))
 
     def emit(self, state: PseudoState, exchange: Exchange) -> tuple[PseudoState, PseudoEstimate]:
-        """Send the prediction of the pseudo-state."""
+        """Return the state, unchanged, and the payload: the prediction ``yhat`` (n,) of the
+        pseudo-state.
+        """
         return state, PseudoEstimate(state.yhat, state.node_index, state.pseudo.G)
 
     def absorb(
         self, state: PseudoState, messages: Sequence[Message], exchange: Exchange
     ) -> PseudoState:
-        """Correct the pseudo-state by messages and the node's reading, and the state by the
-        pseudo-state.
+        """Return the state at the end of the slot: the pseudo-state corrected by messages and the
+        node's reading, the state by the pseudo-state, and the root that belongs to the gains.
         """
         gains, order = state.gains, state.design.heard[state.node_index]
         senders = [order.index(message.payload.node_index) for message in messages]
@@ -531,7 +572,9 @@ class ConsensusInnovations(Filter):
         return state._replace(xhat=xhat, yhat=yhat, root=gains.root)
 
     def shift(self, state: PseudoState, offset: FloatArray) -> PseudoState:
-        """Return the state shifted by ``offset``: gains multiply differences."""
+        """Return the state with ``offset`` (n,) added to the estimate, and what follows from it to
+        the pseudo-state and the reading; gains multiply differences, and do not change.
+        """
         reading = state.reading
         if reading is not None:
             reading = reading[0] + reading[1] @ offset, reading[1]
@@ -540,15 +583,17 @@ class ConsensusInnovations(Filter):
         )
 
     def shift_payload(self, payload: PseudoEstimate, offset: FloatArray) -> PseudoEstimate:
-        """Move the pseudo-state."""
+        """Return the payload with G ``offset`` added to the pseudo-state, for an ``offset`` (n,) of
+        the state.
+        """
         return payload._replace(yhat=payload.yhat + payload.G @ offset)
 
 
 def correct_estimates(
     state: PseudoState, gains: NodeGains, received: Sequence[FloatArray]
 ) -> tuple[FloatArray, FloatArray]:
-    """Return xhat and yhat (n,) of a node after an exchange in which it ``received`` the estimates
-    of pseudo-states to which the gains B belong.
+    """Return xhat (n,) and yhat (n,) of a node after an exchange in which it ``received`` the
+    estimates (n,) of pseudo-states to which the gains B belong, one by one.
     """
     n, y = len(state.xhat), np.stack([state.yhat, *received])[None, :, :, None]
     links, up = star_of([1.0] * len(received))

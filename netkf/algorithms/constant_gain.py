@@ -86,7 +86,12 @@ def constant_gain_slots(
     scratch: SlotScratch,
     arrays: ConstantGainArrays,
 ) -> None:
-    """Simulate filters with constant gains over the slots of a plan."""
+    """Simulate H filters with constant gains over the S slots of a plan, in B blocks of L runs: in
+    each slot they predict, correct by their readings and form convex combinations.
+
+    Changes ``nodes.xhat`` (B, H, n, L) and ``nodes.root`` (B, H, n, n, L) in place and writes
+    ``samples`` in the slots that have one.
+    """
     for b in range(plan.up.shape[0]):
         for s in range(plan.up.shape[1]):
             if plan.sensed[s]:
@@ -111,8 +116,9 @@ def correct_by_gain(
     s: int,
     h: int,
 ) -> None:
-    """Update filter ``h`` of block ``b`` by its reading of slot ``s``: ``xhat += L (y - H xhat)``
-    and ``P = (I - L H) P (I - L H)' + L R L'``.
+    """Update filter ``h`` of block ``b`` by its reading of slot ``s``: ``nodes.xhat[b, h]`` (n, L)
+    by ``xhat += L (y - H xhat)`` with the gain L, and ``nodes.root[b, h]`` (n, n, L) to the root of
+    ``P = (I - L H) P (I - L H)' + L R L'``.
     """
     lanes, n = scratch.lanes, nodes.xhat.shape[2]
     # All innovations refer to the estimate before the reading, since L is the gain of all its rows.
@@ -162,7 +168,9 @@ class ConstantGain(Filter):
     def slot_arrays(
         self, states: Sequence[Any], infos: Sequence[NodeInfo], runs: int
     ) -> tuple[ConstantGainArrays]:
-        """Return the constant matrices of all filters, for whitened readings."""
+        """Return the constant matrices of all H filters, for whitened readings; all ``runs`` share
+        them.
+        """
         n = len(states[0].xhat)
         max_rows = max(1, *(state.gain.shape[1] for state in states))
         closed, noise = np.zeros((len(states), n, n)), np.zeros((len(states), n, n))
@@ -178,18 +186,22 @@ class ConstantGain(Filter):
     def init(
         self, model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo
     ) -> ConstantGainState:
-        """Return the first state of a node, which has its gain."""
+        """Return the first state of a node, with estimate ``mean`` (n,), covariance ``cov`` (n, n)
+        and the node's gain.
+        """
         gain = self.gain_of(node.place)
         increments = not isinstance(model, SlotModel) and len(model.H)
         loop = closed_loop(model, gain) if increments else None
         return ConstantGainState(mean, first_root(cov), model, gain, loop)
 
     def gain_of(self, index: int) -> FloatArray:
-        """Return the gain (n, p) of a node given by its index in the order of ids."""
+        """Return the gain (n, p) of the node with this ``index`` in the order of ids, from 0."""
         return self.gain[index] if isinstance(self.gain, tuple) else self.gain
 
     def predict(self, state: ConstantGainState, gap: float) -> ConstantGainState:
-        """Predict; with increments P counts the readings of the gap already."""
+        """Return the state ``gap`` seconds later; with increments P counts the readings of the gap
+        already, the estimate does not.
+        """
         if state.loop is None:
             xhat, root = state.model.predict(state.xhat, state.root, gap)
             return state._replace(xhat=xhat, root=root)
@@ -198,7 +210,9 @@ class ConstantGain(Filter):
         return state._replace(xhat=xhat, root=root)
 
     def update(self, state: ConstantGainState, reading: Any) -> ConstantGainState:
-        """Use a sample or the increments of the gap that just passed."""
+        """Return the state after a sample, or after the increments of the gap that just passed, by
+        the node's constant gain.
+        """
         if isinstance(reading, Increments):
             assert state.loop is not None
             model, n = state.model, len(state.xhat)
@@ -218,7 +232,9 @@ class ConstantGain(Filter):
     def absorb(
         self, state: ConstantGainState, messages: Sequence[Message], exchange: Exchange
     ) -> ConstantGainState:
-        """Reset by H (7) and (9)."""
+        """Return the state after a reset by H (7) and (9): the convex combination of the node's
+        estimate and covariance with those of all messages.
+        """
         if not messages:
             return state
         weights, means, roots = weighted_pairs(state, messages)
@@ -228,7 +244,9 @@ class ConstantGain(Filter):
     shift = Filter.shift  # affine: the weights sum to one
 
     def max_measurement_interval(self, state: ConstantGainState) -> float:
-        """Return the seconds in which the gain lets the estimate follow the readings."""
+        """Return the seconds in which the gain lets the estimate follow the readings; infinity
+        without increments.
+        """
         return usable(gain_rate(state.gain, state.model.H) if state.loop is not None else 0.0)
 
     def check_scenario(self, scenario: Any) -> None:

@@ -26,7 +26,9 @@ class CovarianceIntersection(Hybrid):
     inverts: ClassVar[bool] = True
 
     def absorb(self, state: State, messages: Sequence[Message], exchange: Exchange) -> State:
-        """Combine by D (8) and (9), with values from before the reset."""
+        """Return the state after covariance intersection, D (8) and (9), of the node's estimate
+        with those of all messages, with values from before the reset.
+        """
         weights, means, roots = self._pairs(state, messages)
         xhat, root = intersect_roots(weights, means, roots)
         return state._replace(xhat=xhat, root=root)

@@ -23,7 +23,7 @@ FORWARDED = (
 
 
 def forwarded(name: str) -> property:
-    """Return a property that is an attribute of the wrapped filter."""
+    """Return a property with the value of the attribute ``name`` of the wrapped filter."""
     return property(lambda self: getattr(self.wrapped, name))
 
 
@@ -37,7 +37,7 @@ class Delegate(Filter):
         """The filter that runs."""
 
     def init(self, model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo) -> Any:
-        """Return the state at time 0."""
+        """Return the wrapped filter's state at time 0 from ``mean`` (n,) and ``cov`` (n, n)."""
         return self.wrapped.init(model, mean, cov, node)
 
     def predict(self, state: Any, gap: float) -> Any:

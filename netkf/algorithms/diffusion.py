@@ -59,7 +59,7 @@ class DiffusionState(NamedTuple):
 
 
 class DiffusionWeights(NamedTuple):
-    """The weights ``own`` (H,) that filters give to themselves when all messages arrive;
+    """The weights ``own`` (H,) that H filters give to themselves when all messages arrive;
     ``keep_own``: whether the weights of lost messages are added to them.
     """
 
@@ -69,10 +69,11 @@ class DiffusionWeights(NamedTuple):
 
 @kernel(inlined=True)
 def applied_weights(lanes: Lanes, own: float, received: Any, keep_own: bool) -> tuple[Any, Any]:
-    """Return the own weight that is applied and the divisor of the other weights, so that all of
-    them sum to 1, see ``DiffusionFilter.on_loss``.
+    """Return the own weight (L,) that is applied and the divisor (L,) of the other weights, so that
+    all of them sum to 1, see ``DiffusionFilter.on_loss``.
 
-    ``own`` is the nominal own weight, ``received`` the sum of those of the messages that arrived.
+    ``own`` is the nominal own weight of a filter, ``received`` (L,) the sum of those of the
+    messages that arrived in each of L runs; ``keep_own``: lost weights go to the own one.
     """
     total, remainder = own + received, 1.0 - received
     remainder = select(remainder > 0.0, remainder, 0.0)
@@ -86,7 +87,11 @@ def applied_weights(lanes: Lanes, own: float, received: Any, keep_own: bool) -> 
 
 @kernel
 def applied_weights_single(own: float, received: float, keep_own: bool) -> tuple[float, float]:
-    """Return ``applied_weights`` of one filter with one lane."""
+    """Return the own weight that is applied and the divisor of the other weights, so that all of
+    them sum to 1, for one filter in one run with the nominal weight ``own`` and the sum
+    ``received`` of those of the messages that arrived; ``keep_own``: lost weights go to the own
+    one.
+    """
     weights: tuple[float, float] = applied_weights(ONE, own, received, keep_own)
     return weights
 
@@ -101,7 +106,12 @@ def diffusion_slots(
     scratch: SlotScratch,
     weights: DiffusionWeights,
 ) -> None:
-    """Simulate diffusion filters over the slots of a plan, D (6)-(9)."""
+    """Simulate H diffusion filters over the S slots of a plan, D (6)-(9), in B blocks of L runs: in
+    each slot they read, predict and combine.
+
+    Changes ``nodes.xhat`` (B, H, n, L) and ``nodes.root`` (B, H, n, n, L) in place and writes
+    ``samples``, of the predictions with which slots begin.
+    """
     for b in range(plan.up.shape[0]):
         for s in range(plan.up.shape[1]):
             # Samples show predictions: before the reading of the slot.
@@ -139,7 +149,9 @@ def combine_senders(
     h: int,
 ) -> None:
     """Combine filter ``h`` of block ``b`` with the messages that arrive in slot ``s``, D (8) and
-    (9).
+    (9): changes ``nodes.xhat[b, h]`` (n, L) and ``nodes.root[b, h]`` (n, n, L). The messages are in
+    ``scratch``: the estimates ``xhat`` (H, n, L) and the inverses of the roots, ``root``
+    (H, n, n, L).
     """
     lanes, received = scratch.lanes, spread(scratch.lanes, 0.0)
     for m in range(links.first[h], links.first[h + 1]):
@@ -208,7 +220,7 @@ class DiffusionFilter(Filter):
     def slot_arrays(
         self, states: Sequence[Any], infos: Sequence[NodeInfo], runs: int
     ) -> tuple[DiffusionWeights]:
-        """Return the weights of the nodes."""
+        """Return the own weights of all H nodes, and the rule for lost messages."""
         own = np.array([info.own_weight for info in infos], dtype=np.float64)
         return (DiffusionWeights(own, self.on_loss == "keep-own"),)
 
@@ -219,17 +231,21 @@ class DiffusionFilter(Filter):
 
     @property
     def pair_weights(self) -> FloatArray | None:
-        """``weights`` where they are a matrix."""
+        """``weights`` (N, N) where they are a matrix, else None."""
         return None if isinstance(self.weights, str) else self.weights
 
     def init(self, model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo) -> DiffusionState:
-        """Return the first state of a node, which knows its own weight."""
+        """Return the first state of a node, with estimate ``mean`` (n,) and covariance ``cov``
+        (n, n); the node knows its own weight.
+        """
         return DiffusionState(mean, first_root(cov), model, node.own_weight)
 
     def absorb(
         self, state: DiffusionState, messages: Sequence[Message], exchange: Exchange
     ) -> DiffusionState:
-        """Combine, D (8) and (9)."""
+        """Return the state after covariance intersection of the node's estimate with those of all
+        messages, D (8) and (9).
+        """
         own, shares = self.share(state.own, [message.weight for message in messages])
         # Nothing to combine, or all weight is the node's own.
         if own == 1.0 or not messages:
@@ -242,7 +258,7 @@ class DiffusionFilter(Filter):
 
     def share(self, own: float, arrived: list[float]) -> tuple[float, list[float]]:
         """Return the own weight and those of the messages that arrived, which sum to 1, from the
-        nominal ones.
+        nominal ones ``own`` and ``arrived``, one for each message.
         """
         # fsum: the sum must not depend on the order of messages.
         own_weight, divisor = applied_weights_single(

@@ -65,7 +65,12 @@ def diffusion_kalman_slots(
     samples: SlotSamples,
     scratch: SlotScratch,
 ) -> None:
-    """Simulate diffusion Kalman filters over the slots of a plan."""
+    """Simulate H diffusion Kalman filters over the S slots of a plan, in B blocks of L runs: in
+    each slot they predict, use the readings of their neighbourhood, and combine estimates.
+
+    Changes ``nodes.xhat`` (B, H, n, L) and ``nodes.root`` (B, H, n, n, L) in place and writes
+    ``samples`` in the slots that have one.
+    """
     for b in range(plan.up.shape[0]):
         for s in range(plan.up.shape[1]):
             if plan.sensed[s]:
@@ -87,7 +92,10 @@ def diffusion_kalman_slots(
 def sum_differences_single(
     x: FloatArray, links: SlotLinks, up: Any, differences: FloatArray
 ) -> None:
-    """Apply ``sum_differences`` to one node, the first of x (1, H, n, 1), with one lane."""
+    """Write into ``differences`` (1, n, 1) the weighted sum of x_j - x_0 over the estimates x_j
+    that arrive at one node in one run; x (1, H, n, 1) holds its own estimate x_0 and those of its
+    senders, ``up`` (1, 1, 1, W, 1) flags their messages.
+    """
     sum_differences(ONE, x, 0, 0, links, up, 0, 0, True, differences)
 
 
@@ -124,25 +132,29 @@ class DiffusionKalman(Filter):
 
     @property
     def pair_weights(self) -> FloatArray | None:
-        """``weights`` where they are a matrix."""
+        """``weights`` (N, N) where they are a matrix, else None."""
         return None if isinstance(self.weights, str) else self.weights
 
     def sends_in_slots(self, phase: int, has_sensor: bool) -> bool:
-        """Return False for the readings of nodes without a sensor."""
+        """Return False if a node without a sensor has nothing to send: in the exchange of readings,
+        ``phase`` 0, but not in that of estimates.
+        """
         return has_sensor or phase == ESTIMATES
 
     def payload_numbers(self, n: int, rows: int, phase: int) -> int:
-        """Return the numbers of a message: y, H and R, or psi."""
+        """Return the size of a message in numbers of 64 bits: y, H and R of a reading with ``rows``
+        rows, or psi with n states.
+        """
         return n if phase == ESTIMATES else rows * (1 + n) + rows * (rows + 1) // 2
 
     def init(
         self, model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo
     ) -> DiffusionKalmanState:
-        """Return the state at time 0."""
+        """Return the state at time 0 from ``mean`` (n,) and ``cov`` (n, n)."""
         return DiffusionKalmanState(mean, first_root(cov), model)
 
     def update(self, state: DiffusionKalmanState, reading: Reading) -> DiffusionKalmanState:
-        """Use the node's own reading, and keep it to be sent."""
+        """Return the state after the node's own reading, which is kept to be sent."""
         if not len(reading.y):
             return state._replace(reading=None)
         xhat, root = sample_update(state.xhat, state.root, reading.y, reading.H, reading.R)
@@ -151,13 +163,17 @@ class DiffusionKalman(Filter):
     def emit(
         self, state: DiffusionKalmanState, exchange: Exchange
     ) -> tuple[DiffusionKalmanState, Any]:
-        """Return the reading, None from nodes that have none, and then psi."""
+        """Return the state, unchanged, and the payload: in the first exchange of a slot the reading
+        (None from nodes that have none), in the second psi (n,).
+        """
         return state, state.xhat if exchange.phase == ESTIMATES else state.reading
 
     def absorb(
         self, state: DiffusionKalmanState, messages: Sequence[Message], exchange: Exchange
     ) -> DiffusionKalmanState:
-        """Do step 1 of Algorithm 1, the incremental update, or step 2, the diffusion update."""
+        """Return the state after step 1 of Algorithm 1, the update with all readings received, or
+        after step 2, the weighted combination of estimates.
+        """
         if not messages:
             return state
         if exchange.phase == ESTIMATES:
@@ -171,14 +187,16 @@ class DiffusionKalman(Filter):
     shift = Filter.shift  # affine: the weights sum to one
 
     def shift_payload(self, payload: Any, offset: FloatArray) -> Any:
-        """Return the payload shifted: estimates move, readings keep the coordinates of
-        their time.
+        """Return the payload shifted by ``offset`` (n,): estimates move, readings keep the
+        coordinates of their time.
         """
         return payload if isinstance(payload, Reading) else payload + offset
 
 
 def combine_estimates(psi: FloatArray, messages: Sequence[Message]) -> FloatArray:
-    """Return ``sum_l c_l psi_l`` (n,) with the weights of the messages and the rest for psi."""
+    """Return ``sum_l c_l psi_l`` (n,) with the weights c_l of the messages, whose payloads are the
+    estimates psi_l (n,), and the rest of the weight for the node's own ``psi`` (n,).
+    """
     n, x = len(psi), np.stack([psi, *(m.payload for m in messages)])[None, :, :, None]
     links, up = star_of([message.weight for message in messages])
     differences = np.empty((1, n, 1))

@@ -118,7 +118,13 @@ def triggered_ci_slots(
     scratch: SlotScratch,
     arrays: TriggeredCiArrays,
 ) -> None:
-    """Simulate filters by event-triggered consensus over the slots of a plan."""
+    """Simulate H filters by event-triggered consensus over the S slots of a plan, in B blocks of L
+    runs: in each slot they predict, read, decide whether to send, and combine.
+
+    Changes ``nodes.xhat`` (B, H, n, L), ``nodes.root`` (B, H, n, n, L) and the copies in ``arrays``
+    in place, writes 0 into ``plan.sent`` and ``plan.up`` for messages that are not sent, and writes
+    ``samples``. ``plan.part`` says which part of a slot is simulated.
+    """
     for b in range(plan.up.shape[0]):
         for s in range(plan.up.shape[1]):
             # A part of the plan: up to the decisions to send, or from the arrivals on.
@@ -144,7 +150,9 @@ def triggered_ci_slots(
 def predict_copies(
     nodes: SlotNodes, scratch: SlotScratch, arrays: TriggeredCiArrays, b: int
 ) -> None:
-    """Predict all copies of estimates in block ``b``, as their senders do."""
+    """Predict all C copies of estimates in block ``b`` to the next slot as their senders do:
+    changes ``arrays.x[b]`` (C, n, L) and ``arrays.root[b]`` (C, n, n, L).
+    """
     lanes = scratch.lanes
     for k in range(arrays.x.shape[1]):
         if any_lane(load_flags(lanes, arrays.has_copy, b, k)):
@@ -156,7 +164,9 @@ def predict_copies(
 def rebase_copies(
     readings: ReadingBlock, lanes: Lanes, arrays: TriggeredCiArrays, b: int, s: int
 ) -> None:
-    """Move the origin of all copies to the state of slot ``s``, where a frame begins."""
+    """Move the origin of all C copies in block ``b`` to the true state of slot ``s``, where a frame
+    begins: subtract ``readings.local[b, s]`` (n, L) from each of ``arrays.x[b]`` (C, n, L).
+    """
     for k in range(arrays.x.shape[1]):
         for i in range(arrays.x.shape[2]):
             origin = load(lanes, readings.local, b, s, i)
@@ -174,8 +184,9 @@ def copy_estimate(
     b: int,
     flags: Any,
 ) -> None:
-    """Copy estimate ``sender`` of ``x`` and ``root`` in block ``b`` to entry ``index`` of
-    ``target`` (estimates, roots), in the lanes with ``flags``.
+    """Copy the estimate and root with index ``sender`` in block ``b`` of ``x`` (B, K, n, L) and
+    ``root`` (B, K, n, n, L) to entry ``index`` of block ``b`` of ``target``, a pair of such arrays
+    (estimates, roots), in the lanes with ``flags`` (L,).
     """
     for i in range(x.shape[2]):
         former, present = load(lanes, target[0], b, index, i), load(lanes, x, b, sender, i)
@@ -199,8 +210,11 @@ def decide_estimate(
     s: int,
     h: int,
 ) -> None:
-    """Decide whether node ``h`` sends its estimate in slot ``s``; update the copy of what it sent
-    last.
+    """Decide whether node ``h`` of block ``b`` sends its estimate in slot ``s``, in each of L runs:
+    writes 0 into ``plan.sent[b, s, 0, h]`` (L,) where it does not.
+
+    Updates in ``arrays`` the copy of what the node sent last, where it sends, and the copy of what
+    it sends now.
     """
     lanes, copies = scratch.lanes, (arrays.x, arrays.root)
     # Copies in order: last received on each link, sent now by each node, sent last by each node.
@@ -237,6 +251,9 @@ def combine_copies(
 ) -> None:
     """Combine the estimate of filter ``h`` of block ``b`` with those that arrive in slot ``s`` and
     with the copies of silent neighbours' estimates, whose covariances are enlarged: D (8) and (9).
+
+    Changes ``nodes.xhat[b, h]`` (n, L) and ``nodes.root[b, h]`` (n, n, L); the estimates that
+    arrive replace the copies of their links in ``arrays``.
     """
     lanes = scratch.lanes
     n = nodes.xhat.shape[2]
@@ -294,7 +311,10 @@ def is_near_single(
     ratio: FloatArray,
     work: FloatArray,
 ) -> bool:
-    """Return ``is_near`` of the first and the second of two estimates (1, 2, n, 1), one lane."""
+    """Return True if the second of two estimates, a copy, is near the first, in one run: x
+    (1, 2, n, 1) with lower triangular roots (1, 2, n, n, 1), and ``bounds`` (alpha, 1 + delta) as
+    in ``EventTriggeredCi.thresholds``. ``ratio`` (n, n + 1, 1) and ``work`` (n, n, 1) are scratch.
+    """
     near: bool = is_near(ONE, x, root, x, root, (0, 0, 1), bounds, ratio, work)
     return near
 
@@ -353,13 +373,17 @@ class EventTriggeredCi(Filter):
     unrolled: ClassVar[bool] = True
 
     def decides_in_slots(self) -> bool:
-        """Return True."""
+        """Return True: a node sends nothing while its neighbours' copy of its estimate is near
+        enough.
+        """
         return True
 
     def slot_arrays(
         self, states: Sequence[Any], infos: Sequence[NodeInfo], runs: int
     ) -> tuple[TriggeredCiArrays]:
-        """Return the arrays of thresholds and of copies, without any copy yet."""
+        """Return the arrays of ``slot_kernel`` for ``runs`` runs of H nodes: thresholds, and space
+        for the copies, without any copy yet.
+        """
         (H, n), blocks = (len(states), len(states[0].xhat)), blocks_of(runs)
         W, alpha = sum(info.degree for info in infos), self.thresholds[0]
         entries = W + 2 * H
@@ -378,7 +402,7 @@ class EventTriggeredCi(Filter):
 
     @property
     def widening(self) -> float:
-        """The factor of the root of a silent neighbour's pair."""
+        """The factor (1 + alpha^1/2) (1 + delta)^1/2 of the root of a silent neighbour's pair."""
         alpha, delta = self.thresholds
         return (1.0 + math.sqrt(alpha)) * math.sqrt(1.0 + delta)
 
@@ -397,11 +421,15 @@ class EventTriggeredCi(Filter):
         )
 
     def init(self, model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo) -> TriggeredState:
-        """Return the first state, in which nothing was sent or heard."""
+        """Return the first state, with estimate ``mean`` (n,) and covariance ``cov`` (n, n), in
+        which nothing was sent or heard.
+        """
         return TriggeredState(mean, first_root(cov), model)
 
     def predict(self, state: TriggeredState, gap: float) -> TriggeredState:
-        """Predict the estimate, and all copies of estimates as their senders do."""
+        """Return the state ``gap`` seconds later: the estimate is predicted, and all copies of
+        estimates as their senders do.
+        """
         xhat, root = state.model.predict(state.xhat, state.root, gap)
         sent, copies = state.sent, []
         if sent is not None:
@@ -414,7 +442,9 @@ class EventTriggeredCi(Filter):
     def emit(
         self, state: TriggeredState, exchange: Exchange
     ) -> tuple[TriggeredState, Estimate | None]:
-        """Send the estimate if the neighbours' copy of it is no longer good enough."""
+        """Return the state and the payload: the estimate, which is kept as ``sent``, or None while
+        the neighbours' copy of it is good enough.
+        """
         if state.sent is not None and self.is_near(state, state.sent):
             return state, None
         own = Estimate(state.xhat, state.root)
@@ -431,7 +461,10 @@ class EventTriggeredCi(Filter):
     def absorb(
         self, state: TriggeredState, messages: Sequence[Message], exchange: Exchange
     ) -> TriggeredState:
-        """Combine with the estimates received, and with the copies of silent neighbours."""
+        """Return the state after covariance intersection of the node's estimate with those
+        received, which become the copies of their senders, and with the widened copies of silent
+        neighbours.
+        """
         copies = dict(zip(state.senders, state.copies, strict=True))
         received = {
             m.sender: NeighbourCopy(m.payload.xhat, m.payload.root, m.weight) for m in messages
@@ -455,7 +488,9 @@ class EventTriggeredCi(Filter):
         )
 
     def shift(self, state: TriggeredState, offset: FloatArray) -> TriggeredState:
-        """Return the state shifted by ``offset``: the triggers look at differences."""
+        """Return the state with ``offset`` (n,) added to the estimate and to all copies: the
+        triggers look at differences.
+        """
         sent = state.sent
         if sent is not None:
             sent = sent._replace(xhat=sent.xhat + offset)

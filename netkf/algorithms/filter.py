@@ -36,22 +36,29 @@ class Model(Protocol):
     def predict(
         self, xhat: FloatArray, root: FloatArray, gap: float
     ) -> tuple[FloatArray, FloatArray]:
-        """Return estimate (n,) and root (n, n) of its covariance ``gap`` seconds later. With
-        increment sensors the root counts the readings of the gap already.
+        """Return estimate (n,) and root (n, n) of its covariance ``gap`` seconds later, from those
+        now. With increment sensors the root counts the readings of the gap already.
         """
 
     def extrapolate(
         self, xhat: FloatArray, root: FloatArray, age: float
     ) -> tuple[FloatArray, FloatArray]:
-        """Return the same ``age`` seconds later for a received estimate, without readings."""
+        """Return estimate (n,) and root (n, n) of a received estimate ``age`` seconds later,
+        without readings.
+        """
 
     def gain_update(
         self, xhat: FloatArray, root: FloatArray, moments: FloatArray, gap: float
     ) -> FloatArray:
-        """Return the estimate (n,) after the increments of the gap that just passed."""
+        """Return the estimate (n,) after the increments of the last ``gap`` seconds with these
+        ``moments`` (2 p,), from the prediction ``xhat`` (n,) and the ``root`` (n, n) at the end of
+        the gap.
+        """
 
     def max_interval(self, root: FloatArray) -> float:
-        """Return the seconds of increments that may be used at once from this root on."""
+        """Return the seconds of increments that may be used at once if the covariance has this root
+        (n, n).
+        """
 
 
 class NetworkInfo(NamedTuple):
@@ -280,7 +287,8 @@ class Filter(Component):
 
     def emit(self, state: Any, exchange: Exchange) -> tuple[Any, Any]:
         """Return the state after sending and the payload for all ``exchange.receivers`` (in slots:
-        of this step); a payload of None sends nothing.
+        of this step); a payload of None sends nothing. By default the payload is ``xhat`` (n,) and
+        ``root`` (n, n).
         """
         return state, Estimate(state.xhat, state.root)
 
@@ -305,8 +313,8 @@ class Filter(Component):
         return state._replace(xhat=state.xhat + offset)
 
     def shift_payload(self, payload: Any, offset: FloatArray) -> Any:
-        """Return a payload under way with ``offset`` added; ``offset`` refers to the time of
-        sending.
+        """Return a payload under way with ``offset`` (n,) added to the estimate in it; ``offset``
+        refers to the time of sending.
         """
         return payload._replace(xhat=payload.xhat + offset)
 
@@ -323,16 +331,20 @@ class Filter(Component):
         return float(state.model.max_interval(state.root))
 
     def steps(self, phase: int) -> int:
-        """Return how often exchange number ``phase`` of a slot is repeated, in equal times."""
+        """Return how often exchange number ``phase`` of a slot, from 0, is repeated, in equal
+        times.
+        """
         return 1
 
     def exchange_steps(self, phase: int) -> int:
-        """Return ``steps(phase)``; a filter that has a setting called ``steps`` defines this."""
+        """Return how often exchange number ``phase`` of a slot is repeated: ``steps(phase)``,
+        except for a filter that has a setting called ``steps``, which defines this method instead.
+        """
         return self.steps(phase)
 
     def redraws_links(self, phase: int, step: int) -> bool:
-        """Return True if links draw new outcomes in this step; else each keeps its last one. The
-        first step always draws.
+        """Return True if links draw new outcomes in repetition ``step``, from 0, of exchange number
+        ``phase`` of a slot; else each keeps its last one. The first step always draws.
         """
         return True
 
@@ -371,8 +383,8 @@ class Filter(Component):
     def slot_arrays(
         self, states: Sequence[Any], infos: Sequence[NodeInfo], runs: int
     ) -> tuple[Any, ...]:
-        """Return the arrays that ``slot_kernel`` is given besides, for ``runs`` runs that start in
-        these states.
+        """Return the arrays that ``slot_kernel`` is given besides, for ``runs`` runs of H nodes:
+        ``states`` are those in which each node starts, and ``infos`` what each knows at time 0.
         """
         return ()
 
@@ -404,7 +416,9 @@ class Filter(Component):
         return {}
 
     def weight(self, degree: int, peer_degree: int) -> float:
-        """Return the weight that a node of ``degree`` links gives to one of ``peer_degree``."""
+        """Return the weight that a node that hears ``degree`` others gives to a message of one that
+        hears ``peer_degree`` others; by default the Metropolis weight.
+        """
         return 1.0 / (1.0 + max(degree, peer_degree))
 
     @property
@@ -427,7 +441,7 @@ class Filter(Component):
 
     @property
     def wrapped(self) -> Filter | None:
-        """The filter that this one runs on its nodes, if it runs another."""
+        """The filter that this one runs on its nodes, if it runs another, else None."""
         return None
 
 

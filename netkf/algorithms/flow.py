@@ -57,7 +57,7 @@ class FlowFilter(Component):
     pooled: ClassVar[bool] = False
 
     def init(self, model: FlowModel, mean: FloatArray, cov: FloatArray) -> Any:
-        """Return the state at time 0."""
+        """Return the state at time 0 from ``mean`` (n,) and ``cov`` (n, n)."""
         return FlowState(mean, cov, model)
 
     def flow(self, state: Any, gap: float) -> Any:
@@ -107,7 +107,8 @@ class FlowFilter(Component):
 
 @kernel
 def interval_end(now: float, time: float, stretch: float) -> float:
-    """Return the end of a measurement interval that begins at ``now``, at most ``time``.
+    """Return the end, in seconds, of a measurement interval that begins at ``now`` and lasts
+    ``stretch`` seconds, but ends at ``time`` at the latest.
 
     An interval too short to change the clock would repeat for ever; it ends at ``time`` instead.
     """

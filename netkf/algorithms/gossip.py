@@ -33,7 +33,12 @@ def gossip_slots(
     samples: SlotSamples,
     scratch: SlotScratch,
 ) -> None:
-    """Simulate gossip filters over the slots of a plan, G (10)."""
+    """Simulate H gossip filters over the S slots of a plan in B blocks of L runs, G (10): in each
+    slot they swap estimates in pairs, then read and predict.
+
+    Changes ``nodes.xhat`` (B, H, n, L) and ``nodes.root`` (B, H, n, n, L) in place and writes
+    ``samples``, of the predictions with which slots begin.
+    """
     for b in range(plan.up.shape[0]):
         for s in range(plan.up.shape[1]):
             # Samples show predictions: before the reading of the slot.
@@ -50,8 +55,9 @@ def gossip_slots(
 def swap_pairs(
     nodes: SlotNodes, plan: SlotPlan, links: SlotLinks, scratch: SlotScratch, b: int, s: int
 ) -> None:
-    """Replace the pair (xhat, P) of each node by the one that arrives in slot ``s``; if several
-    arrive, by that of the last sender.
+    """Replace the estimate ``nodes.xhat[b, h]`` (n, L) and root ``nodes.root[b, h]`` (n, n, L) of
+    each filter h of block ``b`` by those that arrive in slot ``s``; if several arrive, by those of
+    the last sender. The estimates that are sent are copied to ``scratch`` first.
     """
     lanes, n = scratch.lanes, len(scratch.size)
     # All payloads are from before the exchange.
@@ -72,7 +78,10 @@ def swap_pairs(
 def copy_pair(
     nodes: SlotNodes, scratch: SlotScratch, b: int, h: int, sender: int, arrived: Any
 ) -> None:
-    """Copy the pair that ``sender`` sent to filter ``h``, in the lanes in which it ``arrived``."""
+    """Copy the estimate and root of filter ``sender`` from ``scratch`` to ``nodes.xhat[b, h]``
+    (n, L) and ``nodes.root[b, h]`` (n, n, L) of filter ``h`` of block ``b``, in the lanes (runs) in
+    which the message has ``arrived`` (L,).
+    """
     lanes = scratch.lanes
     for i in range(len(scratch.size)):
         own, sent = load(lanes, nodes.xhat, b, h, i), load(lanes, scratch.xhat, sender, i)

@@ -31,7 +31,9 @@ class Hybrid(Filter):
     schedule: ClassVar[tuple[str, ...] | None] = None
 
     def absorb(self, state: State, messages: Sequence[Message], exchange: Exchange) -> State:
-        """Reset by H (7) and (9); all right-hand sides are values from before the reset."""
+        """Return the state after a reset by H (7) and (9): the convex combination of the node's
+        estimate and covariance with those of all messages, all values from before the reset.
+        """
         weights, means, roots = self._pairs(state, messages)
         xhat, root = combine_roots(weights, means, roots)
         return state._replace(xhat=xhat, root=root)

@@ -58,8 +58,8 @@ INFORMATION, MEASUREMENTS, HYBRID = "information", "measurements", "hybrid"
 class Recipe(NamedTuple):
     """How the K pairs of a node begin, and how its estimate follows from them after the last step.
 
-    shares (K, 2): multiples of the information of the prediction and of the reading; counts
-    (K + 1,): multiples of each pair after the last step, and of the node's own prediction.
+    shares : (K, 2), multiples of the information of the prediction and of the reading
+    counts : (K + 1,), multiples of each pair after the last step, and of the node's own prediction
     """
 
     shares: FloatArray
@@ -67,7 +67,7 @@ class Recipe(NamedTuple):
 
 
 def recipe(shares: Sequence[Sequence[float]], counts: Sequence[float]) -> Recipe:
-    """Return a recipe from plain numbers."""
+    """Return a recipe from plain numbers: ``shares``, K rows of 2, and K + 1 ``counts``."""
     return Recipe(np.array(shares, dtype=np.float64), np.array(counts, dtype=np.float64))
 
 
@@ -102,8 +102,8 @@ class Pairs(NamedTuple):
 
 
 class ConsensusArrays(NamedTuple):
-    """Steps and recipe, and the pairs of all nodes of a block, ``parts``
-    (2, K, H, n, n + 1, L).
+    """The ``steps`` of a slot, the recipe, ``shares`` (K, 2) and ``counts`` (K + 1,), and the K
+    pairs of all H nodes of a block, ``parts`` (2, K, H, n, n + 1, L), before and after a step.
     """
 
     steps: int
@@ -122,7 +122,13 @@ def consensus_slots(
     scratch: SlotScratch,
     arrays: ConsensusArrays,
 ) -> None:
-    """Simulate filters by consensus on information over the slots of a plan."""
+    """Simulate H filters by consensus on information over the S slots of a plan, in B blocks of L
+    runs: in each slot they predict, make their pairs, mix them in ``arrays.steps`` steps, and
+    compute estimates.
+
+    Changes ``nodes.xhat`` (B, H, n, L) and ``nodes.root`` (B, H, n, n, L) in place and writes
+    ``samples`` in the slots that have one; ``arrays.parts`` is overwritten.
+    """
     for b in range(plan.up.shape[0]):
         for s in range(plan.up.shape[1]):
             # Slot 0 has no reading and no exchange: it shows the start.
@@ -153,7 +159,12 @@ def begin_all(
     b: int,
     s: int,
 ) -> None:
-    """Write the initial pairs of all filters of block ``b``, from predictions and readings."""
+    """Write the initial pairs of all H filters of block ``b``, from their predictions and their
+    readings of slot ``s``, into copy 0 of ``arrays.parts`` (2, K, H, n, n + 1, L).
+
+    The predictions are copied to ``scratch.xhat`` (H, n, L) and the inverses of their roots to
+    ``scratch.root`` (H, n, n, L), where the steps of the slot read them.
+    """
     for h in range(len(nodes.rows)):
         for i in range(nodes.xhat.shape[2]):
             store(scratch.lanes, scratch.xhat, h, i, load(scratch.lanes, nodes.xhat, b, h, i))
@@ -169,7 +180,9 @@ def begin_all(
 def begin_part_single(
     nodes: SlotNodes, readings: ReadingBlock, scratch: SlotScratch, arrays: ConsensusArrays
 ) -> None:
-    """Apply ``begin_all`` to one filter with one lane."""
+    """Write the initial pairs of one filter in one run, from its prediction in ``nodes`` and its
+    reading, into ``arrays.parts[0]`` of ``arrays.parts`` (2, K, 1, n, n + 1, 1).
+    """
     begin_all(nodes, readings, scratch, arrays, 0, 0)
 
 
@@ -177,8 +190,11 @@ def begin_part_single(
 def mix_parts_single(
     parts: FloatArray, links: SlotLinks, up: Any, centre: FloatArray, work: Any
 ) -> None:
-    """Do a consensus step of one node, the first of ``parts`` (2, K, H, n, n + 1, 1), with one
-    lane.
+    """Do a consensus step of one node in one run, the first of ``parts`` (2, K, H, n, n + 1, 1):
+    read copy 0 of its pairs and those of its senders, write copy 1 of its own.
+
+    ``centre`` (H, n, 1) are the means that pairs are relative to, ``up`` (1, 1, 1, W, 1) flags the
+    messages, and ``work`` (2, n, n + 1, 1) is scratch.
     """
     mix_parts(ONE, parts, 0, 0, links, up, (0, 0, 0), centre, work[0], work[1])
 
@@ -193,7 +209,13 @@ def write_estimate_single(
     centre: FloatArray,
     work: FloatArray,
 ) -> None:
-    """Apply ``write_estimate`` to one node with one lane, root (1, 1, n, n, 1), x (1, 1, n, 1)."""
+    """Write the estimate x (1, 1, n, 1) and its root (1, 1, n, n, 1) of one node in one run from
+    its pairs ``parts[0]`` of ``parts`` (2, K, 1, n, n + 1, 1) and its prediction, which count as
+    often as ``counts`` (K + 1,) says.
+
+    ``root`` and ``centre`` (1, n, 1) hold the prediction; ``inverse`` (1, n, n, 1) and ``work``
+    (2, n, n + 1, 1) are scratch.
+    """
     invert_lanes(ONE, inverse, root, 0, 0)
     write_estimate(ONE, root, x, 0, 0, parts, 0, counts, inverse, centre, work[0], work[1])
 
@@ -221,25 +243,32 @@ class InformationConsensus(Filter):
         """Return the recipe of combinations for a network of N ``nodes``."""
 
     def exchange_steps(self, phase: int) -> int:
-        """Return ``steps``."""
+        """Return ``steps``, the number of steps of the only exchange of a slot."""
         return self.steps
 
     def slot_arrays(
         self, states: Sequence[Any], infos: Sequence[NodeInfo], runs: int
     ) -> tuple[ConsensusArrays]:
-        """Return steps, recipe and scratch for the pairs of all nodes."""
+        """Return the arrays of ``slot_kernel`` for H nodes: steps, recipe, and scratch for the
+        pairs of all nodes; ``runs`` does not matter, since blocks of runs use them one after the
+        other.
+        """
         recipe = self.recipe(infos[0].nodes)
         n, K = len(states[0].xhat), len(recipe.shares)
         parts: FloatArray = aligned((2, K, len(states), n, n + 1, LANES))
         return (ConsensusArrays(self.steps, *recipe, parts),)
 
     def payload_numbers(self, n: int, rows: int, phase: int) -> int:
-        """Return the size of K pairs (Omega, q) in slots, and of one pair under clocks."""
+        """Return the size of a message in numbers of 64 bits: K pairs (Omega, q) of n states in
+        slots, one pair under clocks (``phase`` -1).
+        """
         pairs = 1 if phase < 0 else len(self.recipe(2).shares)
         return pairs * (n + n * (n + 1) // 2)
 
     def init(self, model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo) -> ConsensusState:
-        """Return the first state of a node, which knows how many nodes there are."""
+        """Return the first state of a node, with estimate ``mean`` (n,) and covariance ``cov``
+        (n, n); the node knows how many nodes there are.
+        """
         return ConsensusState(mean, first_root(cov), model, self.recipe(node.nodes))
 
     def update(self, state: ConsensusState, reading: Any) -> ConsensusState:
@@ -250,7 +279,9 @@ class InformationConsensus(Filter):
         return state._replace(parts=first_parts(state, reading))
 
     def emit(self, state: ConsensusState, exchange: Exchange) -> tuple[ConsensusState, Any]:
-        """Return the pairs of the node, in slots those of this step."""
+        """Return the state, unchanged, and the payload: in slots the node's pairs of this step,
+        under clocks its estimate.
+        """
         if exchange.slot < 0 or state.parts is None:
             return state, Estimate(state.xhat, state.root)
         return state, Pairs(state.xhat, state.parts)
@@ -258,7 +289,9 @@ class InformationConsensus(Filter):
     def absorb(
         self, state: ConsensusState, messages: Sequence[Message], exchange: Exchange
     ) -> ConsensusState:
-        """Do a consensus step; after the last one of a slot compute the estimate."""
+        """Return the state after a consensus step; after the last one of a slot with the new
+        estimate.
+        """
         if exchange.slot < 0:
             return self._intersect(state, messages)
         assert state.parts is not None
@@ -269,7 +302,9 @@ class InformationConsensus(Filter):
         return state._replace(xhat=xhat, root=root, parts=None)
 
     def _intersect(self, state: ConsensusState, messages: Sequence[Message]) -> ConsensusState:
-        """Do, under clocks, one step of consensus on the pairs of those heard, predicted to now."""
+        """Return the state after one step of consensus under clocks, on the pairs of those heard,
+        predicted to now.
+        """
         weights, means, roots = weighted_pairs(state, messages)
         xhat, root = intersect_roots(weights, means, roots)
         return state._replace(xhat=xhat, root=root)
@@ -300,7 +335,9 @@ class Hcmci(InformationConsensus):
     one_way: ClassVar[bool] = True
 
     def recipe(self, nodes: int) -> Recipe:
-        """Return the pairs of the paper's Algorithm, for the variant that was chosen."""
+        """Return the recipe of the paper's Algorithm for a network of N ``nodes``, for the variant
+        that was chosen.
+        """
         omega = float(nodes) if self.novelty_weight is None else self.novelty_weight
         # Rows: shares of prediction and reading in a pair; then how often each pair counts, and the
         # prediction itself.
@@ -344,12 +381,16 @@ class Icf(InformationConsensus):
     """
 
     def recipe(self, nodes: int) -> Recipe:
-        """Return ``V = P^-1 / N + H' R^-1 H``, of which N times the average is the new P^-1."""
+        """Return the recipe for a network of N ``nodes``: pairs ``V = P^-1 / N + H' R^-1 H``, of
+        which N times the average is the new P^-1.
+        """
         return recipe([[1.0 / nodes, 1.0]], [float(nodes), 0.0])
 
 
 def first_parts(state: ConsensusState, reading: Reading) -> FloatArray:
-    """Return the roots (K, n, n + 1) of the pairs that a node begins a slot with."""
+    """Return the roots (K, n, n + 1) of the K pairs that a node begins a slot with, from its
+    prediction and its ``reading``.
+    """
     n, (y, H, R) = len(state.xhat), reading[:3]
     if len(y):
         # The kernel takes readings whose noise has variance 1.
@@ -371,7 +412,9 @@ def first_parts(state: ConsensusState, reading: Reading) -> FloatArray:
 
 
 def mix_node_parts(xhat: FloatArray, parts: FloatArray, messages: Sequence[Message]) -> FloatArray:
-    """Return the roots (K, n, n + 1) of a node's pairs after a consensus step."""
+    """Return the roots (K, n, n + 1) of a node's K pairs after a consensus step, from its own
+    ``parts`` (K, n, n + 1), relative to ``xhat`` (n,), and those in the payloads of ``messages``.
+    """
     # The kernel of slots on a network of one node and its senders.
     K, n, _ = parts.shape
     stack = np.zeros((2, K, 1 + len(messages), n, n + 1, 1))
@@ -385,7 +428,9 @@ def mix_node_parts(xhat: FloatArray, parts: FloatArray, messages: Sequence[Messa
 
 
 def estimate_of(state: ConsensusState, parts: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return estimate (n,) and root (n, n) from the pairs after the last step."""
+    """Return estimate (n,) and root (n, n) of a node from its pairs after the last step, ``parts``
+    (K, n, n + 1), and its prediction.
+    """
     K, n, _ = parts.shape
     stack = np.zeros((2, K, 1, n, n + 1, 1))
     stack[0, :, 0, :, :, 0] = parts

@@ -87,7 +87,12 @@ def intermittent_slots(
     samples: SlotSamples,
     scratch: SlotScratch,
 ) -> None:
-    """Simulate intermittent filters over the slots of a plan, R (15)-(18)."""
+    """Simulate H intermittent filters over the S slots of a plan, R (15)-(18), in B blocks of L
+    runs: in each slot they use their own readings and those that arrive, then predict.
+
+    Changes ``nodes.xhat`` (B, H, n, L) and ``nodes.root`` (B, H, n, n, L) in place and writes
+    ``samples``, of the predictions with which slots begin.
+    """
     for b in range(plan.up.shape[0]):
         for s in range(plan.up.shape[1]):
             # Samples show predictions: before the reading of the slot.
@@ -127,17 +132,21 @@ class Intermittent(Filter):
     unrolled: ClassVar[bool] = True
 
     def sends_in_slots(self, phase: int, has_sensor: bool) -> bool:
-        """Return True: nodes send their readings."""
+        """Return True for nodes with a sensor: they send their readings."""
         return has_sensor
 
     def payload_numbers(self, n: int, rows: int, phase: int) -> int:
-        """Return the numbers of a message: y, H and R."""
+        """Return the size of a message in numbers of 64 bits: y, H and R of ``rows`` rows and n
+        states.
+        """
         return rows * (1 + n) + rows * (rows + 1) // 2
 
     def init(
         self, model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo
     ) -> IntermittentState:
-        """Return the state at time 0, before any reading."""
+        """Return the state at time 0, before any reading, with estimate ``mean`` (n,) and
+        covariance ``cov`` (n, n).
+        """
         root = first_root(cov)
         # The start is the first entry of the past: every late reading has a state before it.
         start = Past(0.0, None, None, mean, root, None)
@@ -152,29 +161,37 @@ class Intermittent(Filter):
         return math.inf if self.window is None else self.window
 
     def history_span(self, max_delay: float) -> float:
-        """Return the seconds of its past that a node must keep for late readings."""
+        """Return the seconds of its past that a node must keep for late readings, if no message
+        takes longer than ``max_delay`` seconds.
+        """
         # No message is older than the longest delay.
         return SLACK * min(self.max_age, max_delay)
 
     def predict(self, state: IntermittentState, gap: float) -> IntermittentState:
-        """Predict, and drop the unsent reading: one of an earlier instant is never sent."""
+        """Return the state ``gap`` seconds later, without the unsent reading: one of an earlier
+        instant is never sent.
+        """
         xhat, root = state.model.predict(state.xhat, state.root, gap)
         return state._replace(xhat=xhat, root=root, time=state.time + gap, unsent=None)
 
     def update(self, state: IntermittentState, reading: Reading) -> IntermittentState:
-        """Use the reading, R (15)-(18), and store it to be sent."""
+        """Return the state after the reading, R (15)-(18), which is kept to be sent."""
         return _use_reading(state, reading)._replace(unsent=reading if len(reading.y) else None)
 
     def emit(
         self, state: IntermittentState, exchange: Exchange
     ) -> tuple[IntermittentState, Reading | None]:
-        """Return the reading of this instant, None from nodes that have none."""
+        """Return the state, unchanged, and the payload: the reading of this instant, None from
+        nodes that have none.
+        """
         return state, state.unsent
 
     def absorb(
         self, state: IntermittentState, messages: Sequence[Message], exchange: Exchange
     ) -> IntermittentState:
-        """Use the readings of this instant, and late ones as if they had come in time."""
+        """Return the state after the readings of this instant, and after late ones as if they had
+        come in time.
+        """
         for message in messages:
             reading: Reading = message.payload
             # In slots a message of the exchange is always of now.
@@ -185,11 +202,15 @@ class Intermittent(Filter):
         return state
 
     def accepts(self, payload: Reading, age: float) -> bool:
-        """Return False if it took longer than the window, or if late readings are dropped."""
+        """Return False if the message took longer than the window, ``age`` seconds, or if late
+        readings are dropped.
+        """
         return age <= self.max_age
 
     def shift(self, state: IntermittentState, offset: FloatArray) -> IntermittentState:
-        """Return the state shifted by ``offset``; the past keeps the coordinates of its time."""
+        """Return the state with ``offset`` (n,) added to the estimate; the past keeps the
+        coordinates of its time, and the shift becomes an event of it.
+        """
         xhat = state.xhat + offset
         # A late reading that goes back over this time must shift again on its way forward.
         if state.lag > 0.0:
@@ -198,7 +219,9 @@ class Intermittent(Filter):
         return state._replace(xhat=xhat)
 
     def shift_payload(self, payload: Reading, offset: FloatArray) -> Reading:
-        """Return the payload unchanged: a reading keeps the coordinates of its time."""
+        """Return the payload unchanged by ``offset`` (n,): a reading keeps the coordinates of its
+        time.
+        """
         return payload
 
 
@@ -219,8 +242,8 @@ def _use_reading(state: IntermittentState, reading: Reading) -> IntermittentStat
 
 
 def _use_late(state: IntermittentState, reading: Reading, now: float) -> IntermittentState:
-    """Return the state as if a late reading had come in time: go back to the event before it, use
-    it, and repeat all later events.
+    """Return the state at ``now`` (seconds) as if a late reading had come in time: go back to the
+    event before it, use it, and repeat all later events.
     """
     later_events: list[Past] = []
     past = state.past
@@ -252,7 +275,7 @@ def _use_late(state: IntermittentState, reading: Reading, now: float) -> Intermi
 
 def _drop_old(past: Past, since: float) -> Past:
     """Return the past without the events that no late reading can reach: those after ``since``
-    stay, and one before it.
+    (seconds) stay, and one before it.
     """
     recent: list[Past] = []
     event: Past | None = past

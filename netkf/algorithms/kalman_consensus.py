@@ -67,7 +67,9 @@ class Shared(NamedTuple):
 
 
 class KcfArrays(NamedTuple):
-    """The settings of all filters."""
+    """The settings of all filters: ``epsilon``, the strength of the consensus term, and whether
+    nodes ``share`` their readings.
+    """
 
     epsilon: float
     share: bool
@@ -83,8 +85,9 @@ def kcf_slots(
     scratch: SlotScratch,
     arrays: KcfArrays,
 ) -> None:
-    """Simulate Kalman-consensus filters over the slots of a plan: advance ``nodes`` in place, and
-    write ``samples``.
+    """Simulate H Kalman-consensus filters over the S slots of a plan, in B blocks of L runs:
+    changes ``nodes.xhat`` (B, H, n, L) and ``nodes.root`` (B, H, n, n, L) in place, and writes
+    ``samples`` in the slots that have one.
 
     With prediction x and its covariance P, a slot's readings first update x, and then the consensus
     term epsilon / (1 + |P|) P sum_j (x_j - x), computed from predictions alone, is added.
@@ -118,7 +121,12 @@ def consensus_term_single(
     term: FloatArray,
     work: FloatArray,
 ) -> None:
-    """Write the consensus term of one node, the first of x (1, H, n, 1), with one lane."""
+    """Write the consensus term ``epsilon / (1 + |P|) P sum_j (x_j - x_0)`` of one node in one run
+    into ``term`` (1, n, 1).
+
+    x (1, H, n, 1) holds its own prediction x_0 and those of its senders, ``up`` (1, 1, 1, W, 1)
+    flags their messages, and P has the root ``root`` (1, 1, n, n, 1); ``work`` (n, 1) is scratch.
+    """
     sum_differences(ONE, x, 0, 0, links, up, 0, 0, False, term)
     scale_by_covariance(ONE, root, 0, 0, epsilon, term, work)
 
@@ -154,36 +162,44 @@ class Kcf(Filter):
     def slot_arrays(
         self, states: Sequence[Any], infos: Sequence[NodeInfo], runs: int
     ) -> tuple[KcfArrays]:
-        """Return the settings."""
+        """Return the settings that ``slot_kernel`` needs, the same for all nodes and runs."""
         return (KcfArrays(self.epsilon, self.share_readings),)
 
     def payload_numbers(self, n: int, rows: int, phase: int) -> int:
-        """Return the numbers of a message: (u, U, xbar), or xbar alone."""
+        """Return the size of a message in numbers of 64 bits: (u, U, xbar), or xbar alone from a
+        node without ``rows`` or if readings are not shared.
+        """
         return 2 * n + n * (n + 1) // 2 if rows and self.share_readings else n
 
     def init(self, model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo) -> KcfState:
-        """Return the state at time 0, a prediction."""
+        """Return the state at time 0, a prediction with ``mean`` (n,) and ``cov`` (n, n)."""
         root = first_root(cov)
         return KcfState(mean, root, model, mean, root)
 
     def predict(self, state: KcfState, gap: float) -> KcfState:
-        """Predict; a reading of an earlier instant is not sent any more."""
+        """Return the state ``gap`` seconds later; a reading of an earlier instant is not sent any
+        more.
+        """
         xhat, root = state.model.predict(state.xhat, state.root, gap)
         return KcfState(xhat, root, state.model, xhat, root)
 
     def update(self, state: KcfState, reading: Reading) -> KcfState:
-        """Use the node's own reading, and keep it to be sent."""
+        """Return the state after the node's own reading, which is kept to be sent."""
         if not len(reading.y):
             return state
         xhat, root = sample_update(state.xhat, state.root, reading.y, reading.H, reading.R)
         return state._replace(xhat=xhat, root=root, reading=reading)
 
     def emit(self, state: KcfState, exchange: Exchange) -> tuple[KcfState, Shared]:
-        """Return the message (u, U, xbar) of Algorithm 1, the reading in place of u and U."""
+        """Return the state, unchanged, and the payload: the message (u, U, xbar) of Algorithm 1,
+        with the reading in place of u and U.
+        """
         return state, Shared(state.prior, state.reading if self.share_readings else None)
 
     def absorb(self, state: KcfState, messages: Sequence[Message], exchange: Exchange) -> KcfState:
-        """Use the readings heard, then add the consensus term."""
+        """Return the state after an update with all readings heard, with the consensus term on
+        predictions added.
+        """
         if not messages:
             return state
         xhat, root = state.xhat, state.root
@@ -201,15 +217,18 @@ class Kcf(Filter):
         return state._replace(xhat=xhat + term, root=root)
 
     def shift(self, state: KcfState, offset: FloatArray) -> KcfState:
-        """Return the state shifted by ``offset``: the consensus term is made of differences."""
+        """Return the state with ``offset`` (n,) added to estimate and prediction: the consensus
+        term is made of differences.
+        """
         return state._replace(xhat=state.xhat + offset, prior=state.prior + offset)
 
 
 def consensus_term(
     prior: FloatArray, root: FloatArray, predictions: Sequence[FloatArray], epsilon: float
 ) -> FloatArray:
-    """Return ``gamma P sum_j (xbar_j - xbar)`` (n,) for the ``predictions`` (n,) that a node
-    received.
+    """Return ``gamma P sum_j (xbar_j - xbar)`` (n,) with ``gamma = epsilon / (1 + |P|)``, for the
+    ``predictions`` xbar_j (n,) that a node received; its own is ``prior`` (n,) with the lower
+    triangular ``root`` (n, n) of P.
     """
     n, x = len(prior), np.stack([prior, *predictions])[None, :, :, None]
     links, up = star_of([1.0] * len(predictions))

@@ -36,8 +36,8 @@ class Backward(NamedTuple):
 def _shared_flow_table(
     A: FloatArray, Q: FloatArray, H: FloatArray, R: FloatArray, longest: float
 ) -> FlowTable:
-    """Return the flow table of a model; equal models share it, since it takes some 30 ms to
-    compute.
+    """Return the flow table of a model with A and Q (n, n), H (p, n) and R (p, p) for gaps up to
+    ``longest`` seconds; equal models share it, since it takes some 30 ms to compute.
     """
     parts = (np.asarray(part, dtype=np.float64).tobytes() for part in (A, Q, H, R))
     return _cached_flow_table(len(A), tuple(parts), longest)
@@ -104,7 +104,9 @@ class FlowModel:
         return max(0.0, -float(np.linalg.eigvals(self.A).real.min()))
 
     def backward(self, gap: float) -> Backward:
-        """Return the transition of information about the state to ``gap`` seconds later."""
+        """Return the transition of information about the state to ``gap`` seconds later: ``e^{-A
+        gap}`` (n, n) and the factor by which old information fades, so that it stays bounded.
+        """
         if not self.A.any():
             return Backward(np.eye(len(self.A)), 1.0)
         inverse = np.asarray(scipy.linalg.expm(-gap * self.A))
@@ -113,14 +115,16 @@ class FlowModel:
     def predict(
         self, xhat: FloatArray, root: FloatArray, gap: float
     ) -> tuple[FloatArray, FloatArray]:
-        """Return estimate and root ``gap`` seconds later; the root counts the gap's readings."""
+        """Return estimate (n,) and root (n, n) ``gap`` seconds later; the root counts the gap's
+        readings, the estimate does not.
+        """
         root, xhat = flow_root(self.flow, root, xhat, gap)
         return xhat, root
 
     def extrapolate(
         self, xhat: FloatArray, root: FloatArray, age: float
     ) -> tuple[FloatArray, FloatArray]:
-        """Return estimate and root ``age`` seconds later, without readings."""
+        """Return estimate (n,) and root (n, n) ``age`` seconds later, without readings."""
         if age <= 0.0:
             return xhat, root
         root, xhat = flow_root(self.unobserved_flow, root, xhat, age)
@@ -129,11 +133,16 @@ class FlowModel:
     def gain_update(
         self, xhat: FloatArray, root: FloatArray, moments: FloatArray, gap: float
     ) -> FloatArray:
-        """Return the estimate after the increments of the gap, see algorithms/kernels/gains."""
+        """Return the estimate (n,) after the increments of the last ``gap`` seconds with these
+        ``moments`` (2 p,), from the prediction ``xhat`` (n,) and ``root`` (n, n) at the end of the
+        gap; see algorithms/kernels/gains.
+        """
         return gain_update_root(self.gains, root, xhat, moments, gap)
 
     def max_interval(self, root: FloatArray) -> float:
-        """Return the longest measurement interval, see ``Filter.max_measurement_interval``."""
+        """Return the longest measurement interval, in seconds, for a covariance with this root
+        (n, n), see ``Filter.max_measurement_interval``.
+        """
         HS = self.flow.whitened_H[0] @ root
         return usable(float((HS * HS).sum()))
 
@@ -154,7 +163,7 @@ class SlotModel:
 
     @cached_property
     def root_Q(self) -> FloatArray:
-        """Lower triangular, ``root_Q root_Q' = Q``."""
+        """Lower triangular root (n, n) of the process noise, ``root_Q root_Q' = Q``."""
         return lower_root(square_root(self.Q))
 
     @property
@@ -165,7 +174,9 @@ class SlotModel:
     def predict(
         self, xhat: FloatArray, root: FloatArray, gap: float
     ) -> tuple[FloatArray, FloatArray]:
-        """Return estimate and root after one slot for each period of the gap."""
+        """Return estimate (n,) and root (n, n) after one slot for each period of the ``gap`` in
+        seconds.
+        """
         for _ in range(round(gap / self.period)):
             xhat, root = self.F @ xhat, predict_root_alone(root, self.F, self.root_Q)
         return xhat, root
@@ -173,7 +184,9 @@ class SlotModel:
     def extrapolate(
         self, xhat: FloatArray, root: FloatArray, age: float
     ) -> tuple[FloatArray, FloatArray]:
-        """Return them unchanged: a message is used in the slot in which it was sent."""
+        """Return estimate (n,) and root (n, n) unchanged: a message is used in the slot in which it
+        was sent.
+        """
         return xhat, root
 
     def gain_update(
@@ -196,14 +209,18 @@ def usable(rate: float) -> float:
 
 
 def first_root(cov: FloatArray) -> FloatArray:
-    """Return the lower triangular root (n, n) of an initial covariance."""
+    """Return the lower triangular root (n, n) of an initial covariance (n, n), which may be
+    singular.
+    """
     return lower_root(square_root(cov))
 
 
 def sample_update(
     xhat: FloatArray, root: FloatArray, y: FloatArray, H: FloatArray, R: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return estimate (n,) and root (n, n) after a sample ``y = H x + v`` of p > 0 rows."""
+    """Return estimate (n,) and root (n, n) after a sample ``y = H x + v`` (p,) of p > 0 rows,
+    cov(v) = R (p, p), from those before.
+    """
     noise = np.asarray(np.linalg.cholesky(R), dtype=np.float64)
     root, xhat, _ = update_with_sample(root, xhat, y, H, noise)
     return xhat, root

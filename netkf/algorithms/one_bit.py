@@ -83,7 +83,7 @@ class OneBitState(NamedTuple):
 
 
 class BitArrays(NamedTuple):
-    """Scratch: the ``signs`` (p, L) that are sent in a slot."""
+    """Scratch for L runs: the ``signs`` (p, L) of the rows of a reading that are sent in a slot."""
 
     signs: FloatArray
 
@@ -98,7 +98,14 @@ def one_bit_slots(
     scratch: SlotScratch,
     arrays: BitArrays,
 ) -> None:
-    """Simulate sign-of-innovations filters over the slots of a plan."""
+    """Simulate H sign-of-innovations filters over the S slots of a plan, in B blocks of L runs: in
+    each slot they predict, and the node whose turn it is corrects itself and those who hear it by
+    its bits.
+
+    Changes ``nodes.xhat`` (B, H, n, L) and ``nodes.root`` (B, H, n, n, L) in place, writes 0 into
+    ``plan.sent`` and ``plan.up`` for messages that are not sent, and writes ``samples``.
+    ``plan.part`` says which part of a slot is simulated.
+    """
     for b in range(plan.up.shape[0]):
         for s in range(plan.up.shape[1]):
             # One node a slot: its bits refer to an estimate that all nodes share.
@@ -119,8 +126,9 @@ def one_bit_slots(
 def silence_others(
     plan: SlotPlan, readings: ReadingBlock, rows: np.ndarray, turn: int, b: int, s: int
 ) -> None:
-    """Write 0 into ``sent`` for all nodes but the one whose ``turn`` it is, and for that one too if
-    it has no reading in slot ``s``.
+    """Write 0 into ``plan.sent[b, s, 0]`` (H, L) for all nodes but the one with index ``turn``, and
+    for that one too if it has no reading in slot ``s`` of block ``b``; ``rows`` (H,) are the rows
+    of each node's reading.
     """
     for h in range(plan.sent.shape[3]):
         if h != turn or not has_read(readings, rows[h], b, s, h):
@@ -130,8 +138,8 @@ def silence_others(
 
 @kernel
 def has_read(readings: ReadingBlock, rows: int, b: int, s: int, h: int) -> bool:
-    """Return True if filter ``h`` has a reading in slot ``s``, the same in all runs: y and H are
-    zero if a recorded sensor has no row.
+    """Return True if filter ``h`` of block ``b``, with ``rows`` rows, has a reading in slot ``s``,
+    the same in all runs: y and H are zero if a recorded sensor has no row.
     """
     # A fixed H has one block and one slot.
     c, t = min(b, readings.H.shape[0] - 1), min(s, readings.H.shape[1] - 1)
@@ -165,8 +173,11 @@ def share_bits(
     b: int,
     s: int,
 ) -> None:
-    """Compute the bits of node ``turn`` in slot ``s``, and correct it and the nodes that hear it by
-    them, in block ``b`` of runs.
+    """Compute the bits of the node with index ``turn`` in slot ``s`` of block ``b``, and correct it
+    and the nodes that hear it by them.
+
+    Changes ``nodes.xhat[b]`` (H, n, L) and ``nodes.root[b]`` (H, n, n, L) of these nodes;
+    ``arrays.signs`` are the bits.
     """
     lanes, rows = scratch.lanes, nodes.rows[turn]
     # ``sent`` does not matter: a node uses its own bits even if a trigger keeps it silent.
@@ -203,8 +214,10 @@ def send_bits(
     row: FloatArray,
     gains: FloatArray,
 ) -> None:
-    """Write the ``signs`` (p, L) of the innovations of filter ``h`` in slot ``s`` of block ``b`` of
-    runs, and correct the filter by them; ``row`` and ``gains`` (n, L) are scratch.
+    """Write the ``signs`` (p, L), +1 or -1, of the innovations of filter ``h`` in slot ``s`` of
+    block ``b``, and correct the filter by them: changes ``x[b, h]`` of x (B, H, n, L) and ``root[b,
+    h]`` of root (B, H, n, n, L). ``rows`` rows of its reading count; ``row`` and ``gains`` (n, L)
+    are scratch.
     """
     # A fixed H has one block and one slot.
     c, t = min(b, readings.H.shape[0] - 1), min(s, readings.H.shape[1] - 1)
@@ -233,12 +246,13 @@ def use_bit(
     row: FloatArray,
     gains: FloatArray,
 ) -> None:
-    """Correct filter ``h`` of block ``b`` of runs by the ``sign`` (+1 or -1 in each lane) of the
-    innovation of the whitened row at ``index`` [s, sender, k] of H, in the lanes where it has
-    ``arrived``; ``row`` and ``gains`` (n, L) are scratch.
+    """Correct filter ``h`` of block ``b`` by the ``sign`` (+1 or -1 in each of L lanes) of the
+    innovation of one whitened row of a reading, in the lanes where it has ``arrived`` (flags (L,)
+    or True): changes ``x[b, h]`` of x (B, H, n, L) and ``root[b, h]`` of root (B, H, n, n, L).
 
-    With ``p = h P h'``, ``P - (2 / pi) P h' h P / (p + 1)`` is the Kalman update with noise
-    ``r = (pi / 2 - 1) p + pi / 2``, and ``P h' sqrt(2 / pi / (p + 1))`` is its gain times
+    ``index`` [s, sender, k] is slot, filter and row in ``readings.H``; ``row`` and ``gains`` (n, L)
+    are scratch. With ``p = h P h'``, ``P - (2 / pi) P h' h P / (p + 1)`` is the Kalman update with
+    noise ``r = (pi / 2 - 1) p + pi / 2``, and ``P h' sqrt(2 / pi / (p + 1))`` is its gain times
     ``sqrt(pi / 2 (p + 1))``.
     """
     s, sender, k = index
@@ -270,7 +284,10 @@ def use_bit(
 def send_bits_single(
     x: FloatArray, root: FloatArray, readings: ReadingBlock, signs: FloatArray, work: FloatArray
 ) -> None:
-    """Apply ``send_bits`` to one node with one lane, x (1, 1, n, 1)."""
+    """Write the ``signs`` (p, 1), +1 or -1, of the innovations of one node in one run, and correct
+    its estimate x (1, 1, n, 1) and root (1, 1, n, n, 1) by them in place; ``work`` (2, n, 1) is
+    scratch.
+    """
     send_bits(ONE, x, root, 0, 0, len(signs), readings, 0, signs, work[0], work[1])
 
 
@@ -278,7 +295,10 @@ def send_bits_single(
 def use_bits_single(
     x: FloatArray, root: FloatArray, readings: ReadingBlock, signs: FloatArray, work: FloatArray
 ) -> None:
-    """Apply ``use_bit`` to one node with one lane for each of its rows."""
+    """Correct the estimate x (1, 1, n, 1) and root (1, 1, n, n, 1) of one node in one run, in
+    place, by the ``signs`` (p, 1) of the innovations of a sender's reading, whose rows H are in
+    ``readings``; ``work`` (2, n, 1) is scratch.
+    """
     for k in range(len(signs)):
         use_bit(
             ONE, x, root, 0, 0, load(ONE, signs, k), readings, (0, 0, k), True, work[0], work[1]
@@ -311,7 +331,9 @@ class OneBit(Filter):
     def slot_arrays(
         self, states: Sequence[Any], infos: Sequence[NodeInfo], runs: int
     ) -> tuple[BitArrays]:
-        """Return space for the bits of one reading."""
+        """Return space for the bits of one reading in L runs, one for each row of the largest
+        sensor.
+        """
         return (BitArrays(aligned((max(1, *(len(s.model.H) for s in states)), LANES))),)
 
     def payload_numbers(self, n: int, rows: int, phase: int) -> float:
@@ -319,15 +341,19 @@ class OneBit(Filter):
         return rows / 64.0
 
     def init(self, model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo) -> OneBitState:
-        """Return the first state of a node, which knows its turn."""
+        """Return the first state of a node, with estimate ``mean`` (n,) and covariance ``cov``
+        (n, n); the node knows its turn.
+        """
         return OneBitState(mean, first_root(cov), model, None, node.place, node.nodes)
 
     def update(self, state: OneBitState, reading: Reading) -> OneBitState:
-        """Keep the reading for the exchange of the slot."""
+        """Return the state with the reading kept for the exchange of the slot."""
         return state._replace(reading=reading if len(reading.y) else None)
 
     def emit(self, state: OneBitState, exchange: Exchange) -> tuple[OneBitState, Bits | None]:
-        """Send the reading as bits in the node's turn, and use them."""
+        """Return in the node's turn the state corrected by the bits of its reading, and these bits
+        as the payload; else the state and None.
+        """
         if state.reading is None or exchange.slot % state.nodes != state.turn:
             return state, None
         y, H = whiten_reading(*state.reading[:3])
@@ -337,7 +363,7 @@ class OneBit(Filter):
     def absorb(
         self, state: OneBitState, messages: Sequence[Message], exchange: Exchange
     ) -> OneBitState:
-        """Correct by the bits of the sender whose turn it is."""
+        """Return the state corrected by the bits of the sender whose turn it is."""
         for message in messages:
             signs, H = message.payload
             state = apply_bits(state, use_bits_single, np.zeros(len(signs)), H, signs)
@@ -346,15 +372,15 @@ class OneBit(Filter):
     shift = Filter.shift  # signs of innovations do not depend on the origin
 
     def shift_payload(self, payload: Bits, offset: FloatArray) -> Bits:
-        """Return the payload unchanged: bits have no coordinates."""
+        """Return the payload unchanged by ``offset`` (n,): bits have no coordinates."""
         return payload
 
 
 def apply_bits(
     state: OneBitState, use: Any, y: FloatArray, H: FloatArray, signs: FloatArray
 ) -> OneBitState:
-    """Return the state after ``use`` of the bits of a whitened reading y (p,), H (p, n):
-    ``send_bits_single`` writes the ``signs`` (p,), ``use_bits_single`` reads them.
+    """Return the state after ``use`` of the bits of a whitened reading y (p,), H (p, n), a kernel:
+    ``send_bits_single`` writes the ``signs`` (p,) in place, ``use_bits_single`` reads them.
     """
     n = len(state.xhat)
     x = np.array(state.xhat).reshape(1, 1, n, 1)

@@ -12,7 +12,8 @@ from netkf.linalg.arrays import FloatArray
 
 
 def pairs_now(state: Any, messages: Sequence[Message]) -> tuple[FloatArray, FloatArray]:
-    """Return estimates (k, n) and roots (k, n, n), the node's own first.
+    """Return estimates (k, n) and roots (k, n, n) of a node and its k - 1 messages, the node's own
+    first.
 
     Under clocks a message may be old: its pair is predicted to now without readings.
     """
@@ -25,6 +26,8 @@ def pairs_now(state: Any, messages: Sequence[Message]) -> tuple[FloatArray, Floa
 def weighted_pairs(
     state: Any, messages: Sequence[Message]
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return weights (k,) and ``pairs_now``; the node keeps the weight that no message has."""
+    """Return weights (k,), estimates (k, n) and roots (k, n, n) of a node and its k - 1 messages,
+    the node's own first; the node keeps the weight that no message has.
+    """
     own = max(0.0, 1.0 - sum(message.weight for message in messages))
     return np.array([own, *(message.weight for message in messages)]), *pairs_now(state, messages)

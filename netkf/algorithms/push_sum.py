@@ -123,7 +123,7 @@ class PushSumState(NamedTuple):
 
 
 class PushSumArrays(NamedTuple):
-    """Arrays and settings of H nodes for B blocks of runs; a mass has m = 2 + n n numbers.
+    """Arrays and settings of H nodes for B blocks of L runs; a mass has m = 2 + n n numbers.
 
     mass, degree : (B, H, m, L) masses, and nominal degrees (H,)
     information, number : estimates of the network, G^(i) (B, H, n, n, L) and N^(i) (B, H, L)
@@ -132,7 +132,7 @@ class PushSumArrays(NamedTuple):
     limit : (n, n), root of P_inf, with asymptotic gains
     running : whether masses are exchanged by running sums
     offered, heard : then the totals that nodes have offered (B, H, m, L), and those last heard on
-                     each direction (B, W, m, L)
+                     each of W directions (B, W, m, L)
     share, before : scratch, shares (H, m, L) that nodes send, and a mass (m, L) before a step
     new_information, new_number : scratch, P (6) of this slot (n, n, L) and (1, L)
     silent : scratch (L,), 1 where a node has stopped in an earlier slot
@@ -165,7 +165,10 @@ class PushSumArrays(NamedTuple):
 def drop_mass_of_stopped(
     arrays: PushSumArrays, plan: SlotPlan, links: SlotLinks, samples: SlotSamples, b: int, s: int
 ) -> None:
-    """Drop the messages with mass of nodes that have stopped, which send none by the paper."""
+    """Drop the messages with mass of nodes of block ``b`` that stopped before slot ``s``, which
+    send none by the paper's rule: writes 0 into ``plan.sent[b, s, MASS]`` (H, L) and ``plan.up[b,
+    s, MASS]`` (W, L).
+    """
     if arrays.rule == PAPER and not arrays.asymptotic:
         silence_stopped(plan, samples, b, s)
         drop_silent(plan, links, b, s, MASS)
@@ -181,7 +184,13 @@ def push_sum_slots(
     scratch: SlotScratch,
     arrays: PushSumArrays,
 ) -> None:
-    """Simulate push-sum filters over the slots of a plan, P Fig. 1."""
+    """Simulate H push-sum filters over the S slots of a plan, P Fig. 1, in B blocks of L runs: in
+    each slot they predict, exchange mass, correct by their readings and average estimates.
+
+    Changes ``nodes.xhat`` (B, H, n, L), ``nodes.root`` (B, H, n, n, L) and the masses and network
+    estimates in ``arrays`` in place, and writes ``samples``. ``plan.part`` says which part of a
+    slot is simulated.
+    """
     for b in range(plan.up.shape[0]):
         for s in range(plan.up.shape[1]):
             if plan.exchanged[s] and plan.part != ARRIVING:
@@ -215,8 +224,9 @@ def push_sum_slots(
 def write_conserved_sums(
     arrays: PushSumArrays, links: SlotLinks, samples: SlotSamples, scratch: SlotScratch, b: int
 ) -> None:
-    """Write each node's part of the conserved sums, of the weight w (total 1) and of n~ (total N),
-    into ``samples.conserved``; with running sums including what is under way to it.
+    """Write each node's part of the conserved sums of block ``b``, of the weight w (total 1) and of
+    n~ (total N), into ``samples.conserved[b]`` (H, 2, L); with running sums including what is under
+    way to it.
     """
     for h in range(len(arrays.degree)):
         for k in range(2):
@@ -240,8 +250,11 @@ def exchange_mass(
     b: int,
     s: int,
 ) -> None:
-    """Exchange mass once in slot ``s`` of block ``b``, P steps 2.1 to 2.3: all nodes send shares of
-    their mass, mix what arrives, and update their estimates of the network.
+    """Exchange mass once in slot ``s`` of block ``b``, P steps 2.1 to 2.3: all H nodes send shares
+    of their mass, mix what arrives, and update their estimates of the network.
+
+    Changes in block ``b`` of ``arrays`` ``mass``, ``information``, ``number`` and the running sums,
+    and writes the slot into ``samples.stopped[b]`` (H, L) where a node stops.
     """
     H, slot = len(arrays.degree), plan.first + s
     # All shares are computed before any mass changes.
@@ -265,8 +278,8 @@ def exchange_mass(
 
 @kernel
 def silence_stopped(plan: SlotPlan, samples: SlotSamples, b: int, s: int) -> None:
-    """Write 0 into ``sent`` for nodes that stopped in an earlier slot: they send no mass, P step
-    2.3.
+    """Write 0 into ``plan.sent[b, s, MASS]`` (H, L) for nodes of block ``b`` that stopped before
+    slot ``s``: they send no mass, P step 2.3.
     """
     for h in range(plan.sent.shape[3]):
         for q in range(plan.sent.shape[4]):
@@ -276,7 +289,9 @@ def silence_stopped(plan: SlotPlan, samples: SlotSamples, b: int, s: int) -> Non
 
 @kernel
 def add_to_totals(arrays: PushSumArrays, scratch: SlotScratch, b: int) -> None:
-    """Add the share of each node to the total that it has offered to each of its neighbours."""
+    """Add the share of each of H nodes of block ``b``, ``arrays.share`` (H, m, L), to the total
+    that it has offered to each of its neighbours, ``arrays.offered[b]`` (H, m, L).
+    """
     for h in range(len(arrays.degree)):
         for i in range(arrays.mass.shape[2]):
             before = load(scratch.lanes, arrays.offered, b, h, i)
@@ -294,7 +309,10 @@ def receive_totals(
     s: int,
     h: int,
 ) -> None:
-    """Set the mass of node ``h`` to the growth of the totals that arrive, plus its own share."""
+    """Set the mass of node ``h`` of block ``b``, ``arrays.mass[b, h]`` (m, L), to the growth of the
+    totals that arrive in slot ``s``, plus its own share. Totals that arrive replace the last ones
+    in ``arrays.heard[b]`` (W, m, L).
+    """
     lanes, mass = scratch.lanes, arrays.mass
     for i in range(mass.shape[2]):
         store(lanes, mass, b, h, i, 0.0)
@@ -322,8 +340,9 @@ def mix_mass(
     s: int,
     h: int,
 ) -> Any:
-    """Set the mass of node ``h`` to the shares that it keeps and receives, P (3)-(5); return the
-    number (L,) of shares that arrived.
+    """Set the mass of node ``h`` of block ``b``, ``arrays.mass[b, h]`` (m, L), to the shares that
+    it keeps and receives in slot ``s``, P (3)-(5); return the number (L,) of shares that arrived.
+    The mass from before is left in ``arrays.before`` (m, L).
     """
     lanes, mass, received = scratch.lanes, arrays.mass, spread(scratch.lanes, 0.0)
     # The mass before is kept for the stop rule.
@@ -362,8 +381,12 @@ def update_network_estimate(
     received: Any,
     slot: int,
 ) -> None:
-    """Update the network estimate of node ``h`` from its mass, P (6), and apply the stop rule;
-    ``received`` (L,) is the number of shares that arrived in this slot.
+    """Update the network estimate of node ``h`` of block ``b`` from its mass, P (6), and apply the
+    stop rule; ``received`` (L,) is the number of shares that arrived in slot number ``slot``.
+
+    Changes ``arrays.information[b, h]`` (n, n, L) and ``arrays.number[b, h]`` (L,), except where
+    the node stopped before, and writes the slot into ``samples.stopped[b, h]`` (L,) where it stops
+    now.
     """
     lanes, information = scratch.lanes, arrays.new_information
     learn_network(lanes, arrays.mass, b, h, arrays.alone, information, arrays.new_number)
@@ -390,8 +413,8 @@ def update_network_estimate(
 
 @kernel
 def stops(arrays: PushSumArrays, b: int, h: int, q: int, all_up: bool) -> bool:
-    """Return True if node ``h`` stops in this slot, in lane ``q`` of block ``b``; ``all_up``: all
-    its links were up.
+    """Return True if node ``h`` of block ``b`` stops in this slot in lane ``q``, one of L runs;
+    ``all_up``: all its links were up. Overwrites the scratch ``arrays.stop``.
     """
     stop, n = arrays.stop, arrays.new_information.shape[0]
     for i in range(arrays.mass.shape[2]):
@@ -415,7 +438,8 @@ def correct(
     h: int,
 ) -> None:
     """Correct filter ``h`` of block ``b`` by its reading of slot ``s``, step 4, P (7) and (8); with
-    asymptotic gains also predict it, step 3.
+    asymptotic gains also predict it, step 3. Changes ``nodes.xhat[b, h]`` (n, L) and
+    ``nodes.root[b, h]`` (n, n, L).
     """
     n, lanes = nodes.xhat.shape[2], scratch.lanes
     if arrays.asymptotic:
@@ -445,19 +469,26 @@ def add_gain_single(
     H: FloatArray,
     scratch: FloatArray,
 ) -> None:
-    """Apply ``add_gain`` to one filter with one lane: x (1, 1, n, 1), y (1, 1, 1, p, 1)."""
+    """Correct the estimate x (1, 1, n, 1) of one filter in one run in place, P (8): ``x += number S
+    S' H' (y - H x)`` with its root S (1, 1, n, n, 1) and a whitened reading y (1, 1, 1, p, 1), H
+    (1, 1, 1, p, n, 1); ``scratch`` is (2, n, 1).
+    """
     add_gain(ONE, x, root, 0, 0, number, y, 0, H, y.shape[3], scratch[0], scratch[1])
 
 
 @kernel
 def split_mass_single(mass: FloatArray, degree: int, share: FloatArray) -> None:
-    """Apply ``split_mass`` to one node with one lane, mass (1, 1, m, 1)."""
+    """Write into ``share`` (1, m, 1) the mass (1, 1, m, 1) of one node in one run over ``degree`` +
+    1, its message to each of ``degree`` neighbours.
+    """
     split_mass(ONE, mass, 0, 0, degree, share)
 
 
 @kernel
 def keep_share_single(mass: FloatArray, share: FloatArray, times: int) -> None:
-    """Apply ``keep_share`` to one node with one lane, mass (1, 1, m, 1)."""
+    """Add ``times`` times its own ``share`` (1, m, 1) to the ``mass`` (1, 1, m, 1) that one node
+    received in one run, in place, P (3)-(5).
+    """
     keep_share(ONE, mass, 0, 0, share, times, False)
 
 
@@ -465,7 +496,11 @@ def keep_share_single(mass: FloatArray, share: FloatArray, times: int) -> None:
 def learn_network_single(
     mass: FloatArray, alone: FloatArray, information: FloatArray, number: FloatArray
 ) -> None:
-    """Apply ``learn_network`` to one node with one lane, mass (1, 1, m, 1)."""
+    """Write the information of all sensors, C~ / w, into ``information`` (n, n, 1) and the number
+    of nodes, n~ / w, into ``number`` (1, 1), as one node estimates them in one run from its
+    ``mass`` (1, 1, m, 1), P (6). While its weight w is 0 these are its own information ``alone``
+    (1, n, n) and 1.
+    """
     learn_network(ONE, mass, 0, 0, alone, information, number)
 
 
@@ -473,7 +508,10 @@ def learn_network_single(
 def correct_root_single(
     root: FloatArray, information: FloatArray, remainder: FloatArray, scratch: SlotScratch
 ) -> None:
-    """Apply ``correct_root`` to one filter with one lane, root (1, 1, n, n, 1)."""
+    """Replace the root (1, 1, n, n, 1) of one filter in one run by that of ``(P^-1 + G)^-1``, P
+    (7), with the information G = ``information`` (1, 1, n, n, 1); ``remainder`` (n, n, 1) is
+    scratch.
+    """
     correct_root(root, 0, 0, information, remainder, scratch)
 
 
@@ -518,13 +556,15 @@ class PushSum(Filter):
     slot_kernel = staticmethod(push_sum_slots)
 
     def sends_in_slots(self, phase: int, has_sensor: bool) -> bool:
-        """Return True unless the exchange is of mass and the gains are asymptotic."""
+        """Return True unless the exchange with number ``phase`` is of mass and the gains are
+        asymptotic.
+        """
         # Exchange MASS carries nothing if the gains are known beforehand.
         return phase == AVERAGE or not self.asymptotic
 
     def payload_numbers(self, n: int, rows: int, phase: int) -> int:
-        """Return the numbers of a message: w, n~ and C~, or z; under clocks a weight, information
-        and its vector.
+        """Return the size of a message about n states in numbers of 64 bits: w, n~ and C~, or z;
+        under clocks (``phase`` -1) a weight, information and its vector.
         """
         if phase == AVERAGE:
             return n
@@ -546,7 +586,9 @@ class PushSum(Filter):
     def slot_arrays(
         self, states: Sequence[Any], infos: Sequence[NodeInfo], runs: int
     ) -> tuple[PushSumArrays]:
-        """Return the arrays of all nodes of all runs at the start."""
+        """Return the arrays of ``slot_kernel`` for ``runs`` runs of H nodes that start in these
+        ``states``.
+        """
         network_estimates = [state.network for state in states]
         alone = np.stack([state.model.information for state in states])
         (H, n), blocks = alone.shape[:2], blocks_of(runs)
@@ -587,8 +629,8 @@ class PushSum(Filter):
         )
 
     def init(self, model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo) -> Any:
-        """Return the state of step 1: the leader has the weight; with asymptotic gains every node
-        knows the limits.
+        """Return the state of step 1, with estimate ``mean`` (n,) and covariance ``cov`` (n, n):
+        the leader has the weight; with asymptotic gains every node knows the limits.
         """
         if not isinstance(model, SlotModel):
             # A model without slots: clocks, where running sums are kept.
@@ -613,13 +655,17 @@ class PushSum(Filter):
         return self.running_sums and not self.asymptotic
 
     def predict(self, state: Any, gap: float) -> Any:
-        """Estimate, covariance and, in running sums, all information."""
+        """Return the state ``gap`` seconds later: estimate, covariance and, in running sums, all
+        information.
+        """
         if isinstance(state, RunningSums):
             return running_sums.predict_sums(state, gap)
         return super().predict(state, gap)
 
     def steps(self, phase: int) -> int:
-        """Return the steps of an exchange: 1 for the mass, ``gamma`` for the estimates."""
+        """Return the steps of exchange number ``phase`` of a slot: 1 for the mass, ``gamma`` for
+        the estimates.
+        """
         return self.gamma or 1 if phase == AVERAGE else 1
 
     def redraws_links(self, phase: int, step: int) -> bool:
@@ -627,7 +673,9 @@ class PushSum(Filter):
         return self.links == "fresh" or step == 0
 
     def emit(self, state: Any, exchange: Exchange) -> tuple[Any, Any]:
-        """Send the node's share of its mass, step 2.1, or z, step 5.1."""
+        """Return the state after sending and the payload: the node's share of its mass (2 + n n,),
+        step 2.1, or z (n,), step 5.1; under clocks the next offer of running sums.
+        """
         if isinstance(state, RunningSums):
             return running_sums.offer(state)
         if exchange.phase == AVERAGE:
@@ -641,7 +689,9 @@ class PushSum(Filter):
         return state, None if silent else share(state.mass, state.degree)
 
     def absorb(self, state: Any, messages: Sequence[Message], exchange: Exchange) -> Any:
-        """Use messages by steps 2.2 and 2.3, or step 5.2."""
+        """Return the state after all messages of a step: with its mass mixed and its network
+        estimate updated, steps 2.2 and 2.3, or with z averaged, step 5.2.
+        """
         if isinstance(state, RunningSums):
             return running_sums.absorb_totals(state, messages)
         received = [message.payload for message in messages]
@@ -662,7 +712,10 @@ class PushSum(Filter):
         return self._learn_network(state._replace(mass=mass), state.mass, all_up)
 
     def _learn_network(self, state: PushSumState, before: FloatArray, all_up: bool) -> PushSumState:
-        """Apply P (6) and the stop rule; ``all_up``: all links of the node were up."""
+        """Return the state with the network estimate that follows from its mass, P (6), and with
+        ``stopped`` by the stop rule. ``before`` (2 + n n,) is the mass before the step; ``all_up``:
+        all links of the node were up.
+        """
         # Frozen by the safe rule: the mass was mixed, but the estimate is not updated any more.
         if state.stopped:
             return state
@@ -680,7 +733,9 @@ class PushSum(Filter):
         return state._replace(network=estimate, stopped=stopped)
 
     def update(self, state: Any, reading: Reading) -> Any:
-        """Use a reading by steps 3 and 4 after the prediction, P (7) and (8)."""
+        """Return the state after a reading by steps 3 and 4, P (7) and (8), from the prediction of
+        the slot.
+        """
         if isinstance(state, RunningSums):
             return running_sums.update_sums(state, reading)
         root = state.network.root
@@ -711,13 +766,15 @@ class PushSum(Filter):
         }
 
     def shift(self, state: Any, offset: FloatArray) -> Any:
-        """Return the state shifted by ``offset``: averaging weights sum to one."""
+        """Return the state with ``offset`` (n,) added to the estimate: averaging weights sum to
+        one.
+        """
         if isinstance(state, RunningSums):
             return running_sums.shift(state, offset)
         return state._replace(xhat=state.xhat + offset)
 
     def shift_payload(self, payload: Any, offset: FloatArray) -> Any:
-        """Return the payload shifted by ``offset``: estimates move, mass does not."""
+        """Return the payload shifted by ``offset`` (n,): estimates move, mass does not."""
         if isinstance(payload, Offer):
             return running_sums.shift_offer(payload, offset)
         # A mass is longer than an estimate: 2 + n^2 > n entries.
@@ -796,7 +853,9 @@ class PushSum(Filter):
 
 
 def _heard_totals(state: PushSumState, sums: NodeSums, messages: Sequence[Message]) -> PushSumState:
-    """Return the state whose mass is its own share plus the growth of the totals it hears."""
+    """Return the state whose mass (2 + n n,) is its own share plus the growth of the totals it
+    hears, which become the last ones heard in its ``sums``.
+    """
     heard, nothing = dict(sums.heard), np.zeros(state.mass.shape)
     gained = [message.payload - heard.get(message.sender, nothing) for message in messages]
     heard |= {message.sender: message.payload for message in messages}
@@ -812,8 +871,9 @@ def correct_estimate(
     H: FloatArray,
     R: FloatArray,
 ) -> FloatArray:
-    """Return P (8): the prediction (n,) and ``number`` times the gain of the reading, which may
-    have no rows.
+    """Return the estimate (n,) of P (8): the prediction ``predicted`` (n,) plus ``number`` times
+    the gain of the reading y (p,), H (p, n), R (p, p), which may have no rows; ``root`` (n, n) is
+    that of P (7).
     """
     n, x = len(predicted), np.array(predicted, dtype=np.float64)
     if len(y):
@@ -831,15 +891,18 @@ def correct_estimate(
 
 
 def share(mass: FloatArray, degree: int) -> FloatArray:
-    """Return the mass that a node of ``degree`` neighbours sends to each: mass / (degree + 1)."""
+    """Return the mass (2 + n n,) that a node of ``degree`` neighbours sends to each of them:
+    ``mass`` over degree + 1.
+    """
     part = np.empty(mass.shape)
     split_mass_single(mass.reshape(1, 1, -1, 1), degree, part.reshape(1, -1, 1))
     return part
 
 
 def conserve_mass(mass: FloatArray, received: Sequence[FloatArray], degree: int) -> FloatArray:
-    """Return the mass by P (3)-(5): the shares ``received`` and the node's own, which it keeps
-    once for itself and once for each link of its ``degree`` that failed.
+    """Return the mass (2 + n n,) by P (3)-(5): the shares ``received`` and the node's own share of
+    its former ``mass``, which it keeps once for itself and once for each link of its ``degree``
+    that failed.
     """
     total = np.array(sum(received, np.zeros(mass.shape)))
     # The same kernels as in slots, on arrays of one node: both engines round alike.
@@ -849,7 +912,9 @@ def conserve_mass(mass: FloatArray, received: Sequence[FloatArray], degree: int)
 
 
 def network(mass: FloatArray, model: SlotModel) -> NetworkInformation:
-    """Return C~ / w and n~ / w, P (6), or the node's own values while its weight is exactly 0."""
+    """Return the information of all sensors C~ / w (n, n) and the number of nodes n~ / w, P (6),
+    from the ``mass`` (2 + n n,) of a node, or the node's own values while its weight is exactly 0.
+    """
     alone = model.information
     information, number = np.empty((*alone.shape, 1)), np.empty((1, 1))
     learn_network_single(mass.reshape(1, 1, -1, 1), alone[None], information, number)
@@ -857,8 +922,8 @@ def network(mass: FloatArray, model: SlotModel) -> NetworkInformation:
 
 
 def correct_root_alone(root: FloatArray, information: FloatArray) -> FloatArray:
-    """Return the root of ``(P^-1 + G)^-1 = P (I + G P)^-1``, P (7), for the lower triangular root
-    of P, possibly singular, and the information G (n, n).
+    """Return the root (n, n) of ``(P^-1 + G)^-1 = P (I + G P)^-1``, P (7), for the lower triangular
+    ``root`` (n, n) of P, possibly singular, and the information G = ``information`` (n, n).
     """
     n = len(root)
     result, information_lanes = (np.array(a).reshape(1, 1, n, n, 1) for a in (root, information))
@@ -869,7 +934,9 @@ def correct_root_alone(root: FloatArray, information: FloatArray) -> FloatArray:
 
 
 def average_estimates(z: FloatArray, received: Sequence[FloatArray], delta: float) -> FloatArray:
-    """Return z plus 1 / delta of the differences to the estimates that arrived, P (9)."""
+    """Return ``z`` (n,) plus 1 / delta of the differences to the estimates (n,) that were
+    ``received``, P (9).
+    """
     x = np.stack([z, *received])[None, :, :, None]
     links, up = star_of([0.0] * len(received))
     average(ONE, x, 0, links, up, 0, 0, np.empty((1, len(z), 1)), 1.0 / delta)
@@ -877,8 +944,9 @@ def average_estimates(z: FloatArray, received: Sequence[FloatArray], delta: floa
 
 
 def asymptotic_root(F: FloatArray, Q: FloatArray, information: FloatArray) -> FloatArray | None:
-    """Return the root of P_inf (n, n), P (12): the steady covariance of a filter that has all the
-    information (n, n) in each slot, after its reading; None if there is none.
+    """Return the root of P_inf (n, n), P (12): the steady covariance of a filter with F and Q
+    (n, n) that has all the ``information`` (n, n) in each slot, after its reading; None if there is
+    none.
 
     By structure-preserving doubling: k steps give the covariance of 2^k slots (Chu, Fan, Lin and
     Wang, Int. J. Control 77, 2004).

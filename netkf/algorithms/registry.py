@@ -54,7 +54,9 @@ def choice_name(kind: str, choice: Mapping[str, str]) -> str:
 
 
 def split_choice(name: str) -> tuple[str, dict[str, str]]:
-    """Return kind and choice of a name."""
+    """Return the kind of a filter and its choice of keys and values, from a name as ``choice_name``
+    makes it.
+    """
     kind, *choice = name.split(" ")
     return kind, dict(one.split("=", 1) for one in choice)
 

@@ -39,7 +39,9 @@ offers nothing.
 
 
 class Offer(NamedTuple):
-    """The payload of a broadcast: its number at its sender, and the running ``total``."""
+    """The payload of a broadcast: its ``number`` at its sender, from 0, and the running ``total``
+    (1 + n n + n,) of weight w, information U by rows and ``u = U xhat``.
+    """
 
     number: int
     total: FloatArray
@@ -74,7 +76,9 @@ class RunningSums(NamedTuple):
 
 
 def start(model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo) -> RunningSums:
-    """Return the state at time 0: weight 1, nothing sent."""
+    """Return the state at time 0, with estimate ``mean`` (n,), covariance ``cov`` (n, n) and weight
+    1, and nothing sent.
+    """
     n = len(mean)
     return RunningSums(
         xhat=mean,
@@ -90,7 +94,9 @@ def start(model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo) -> Runn
 
 
 def predict_sums(state: RunningSums, gap: float) -> RunningSums:
-    """Return the state ``gap`` seconds later."""
+    """Return the state ``gap`` seconds later: estimate and root are predicted, and all totals, sent
+    and heard, refer to the later state.
+    """
     xhat, root = state.model.predict(state.xhat, state.root, gap)
     back = state.model.backward(gap)
     heard = {sender: predict_offer(offer, back) for sender, offer in state.heard.items()}
@@ -98,13 +104,15 @@ def predict_sums(state: RunningSums, gap: float) -> RunningSums:
 
 
 def predict_offer(offer: Offer, back: Backward) -> Offer:
-    """Return an offer that refers to a later state."""
+    """Return an offer whose total refers to a later state; ``back`` is the transition of
+    information over the time between.
+    """
     return offer._replace(total=_move_total(offer.total, back))
 
 
 def _move_total(total: FloatArray, back: Backward) -> FloatArray:
-    """Return a total (w, U, u) about a state one gap later: ``U <- s F^-T U F^-1``, ``u <- s F^-T
-    u``, where ``back`` is (F^-1, s).
+    """Return a ``total`` (1 + n n + n,) of (w, U, u) about a state one gap later: ``U <- s F^-T U
+    F^-1``, ``u <- s F^-T u``, where ``back`` is (F^-1, s).
     """
     inverse, fading = back
     n, out = len(inverse), total.copy()
@@ -115,7 +123,9 @@ def _move_total(total: FloatArray, back: Backward) -> FloatArray:
 
 
 def offer(state: RunningSums) -> tuple[RunningSums, Offer | None]:
-    """Offer one round. Estimate and covariance stay: all masses shrink by one factor."""
+    """Return the state after one round, and its offer; None if nobody can hear. Estimate and
+    covariance stay: all masses shrink by one factor.
+    """
     if state.receivers == 0:
         return state, None
     n = len(state.xhat)
@@ -136,8 +146,8 @@ def offer(state: RunningSums) -> tuple[RunningSums, Offer | None]:
 
 
 def absorb_totals(state: RunningSums, messages: Sequence[Message]) -> RunningSums:
-    """Add to the mass the growth of each total since it was last heard; an older total adds
-    nothing.
+    """Return the state whose mass has grown by the growth of each total since it was last heard; an
+    older total adds nothing. Changes ``xhat``, ``root``, ``weight`` and ``heard``.
     """
     gained, heard = np.zeros_like(state.sent), dict(state.heard)
     for message in messages:
@@ -165,8 +175,8 @@ def absorb_totals(state: RunningSums, messages: Sequence[Message]) -> RunningSum
 
 
 def update_sums(state: RunningSums, reading: Reading) -> RunningSums:
-    """Use a reading: ``U += H' R^-1 H`` and ``u += H' R^-1 y``, that is N / w times as much in
-    P^-1, or a reading with noise R w / N.
+    """Return the state after a reading: ``U += H' R^-1 H`` and ``u += H' R^-1 y``, that is N / w
+    times as much in P^-1, or a reading with noise R w / N.
     """
     if not len(reading.y):
         return state
@@ -176,8 +186,8 @@ def update_sums(state: RunningSums, reading: Reading) -> RunningSums:
 
 
 def weights(state: RunningSums) -> dict[str, list[float]]:
-    """Return the terms of the node's weight, plus the totals it sent, less those it heard: summed
-    over all nodes they are N.
+    """Return the terms of the node's weight, plus the totals it sent, less those it heard, by the
+    name "weight": summed over all nodes they are N.
     """
     heard = [-float(offer.total[0]) for offer in state.heard.values()]
     sent = [float(state.sent[0])] * state.receivers
@@ -185,19 +195,25 @@ def weights(state: RunningSums) -> dict[str, list[float]]:
 
 
 def shift(state: RunningSums, offset: FloatArray) -> RunningSums:
-    """Shift the estimate by ``offset``, and every ``u`` by ``U offset``."""
+    """Return the state with ``offset`` (n,) added to the estimate and ``U offset`` to
+    every ``u``.
+    """
     heard = {sender: shift_offer(offer, offset) for sender, offer in state.heard.items()}
     sent = _shift_total(state.sent, offset)
     return state._replace(xhat=state.xhat + offset, sent=sent, heard=heard)
 
 
 def shift_offer(offer: Offer, offset: FloatArray) -> Offer:
-    """Shift the vector ``u`` of an offer by ``U offset``."""
+    """Return the offer with ``U offset`` added to its vector ``u``, for an ``offset`` (n,) of the
+    state.
+    """
     return offer._replace(total=_shift_total(offer.total, offset))
 
 
 def _shift_total(total: FloatArray, offset: FloatArray) -> FloatArray:
-    """Return a total (w, U, u) after a shift of the state by ``offset`` (n,): ``u + U offset``."""
+    """Return a ``total`` (1 + n n + n,) of (w, U, u) after a shift of the state by ``offset`` (n,):
+    ``u + U offset``.
+    """
     n, out = len(offset), total.copy()
     out[1 + n * n :] += total[1 : 1 + n * n].reshape(n, n) @ offset
     return out

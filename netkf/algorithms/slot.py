@@ -94,7 +94,7 @@ class SlotFilter(Component):
     pooled: ClassVar[bool] = False
 
     def init(self, model: SlotModel, mean: FloatArray, cov: FloatArray) -> Any:
-        """Return the state at slot 0."""
+        """Return the state at slot 0 from ``mean`` (n,) and ``cov`` (n, n)."""
         return SlotState(mean, square_root(cov), model)
 
     def place(self, state: Any, role: Role) -> Any:
@@ -165,8 +165,9 @@ class SlotFilter(Component):
 def update_and_predict(
     xhat: FloatArray, root: FloatArray, model: SlotModel, reading: Reading
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the next prediction (n,) and the root (n, n) of its covariance, from a prediction, any
-    root of its covariance, and a reading, which may have no rows.
+    """Return the next prediction (n,) and the root (n, n) of its covariance, from a prediction
+    ``xhat`` (n,), any ``root`` (n, n) of its covariance, and the reading of the slot, which may
+    have no rows.
     """
     root = lower_root(root)
     if len(reading.y):

@@ -10,8 +10,9 @@ from netkf.core.errors import ScenarioError
 
 
 def require_common_start(scenario: Any, why: str, other: str) -> None:
-    """Raise ScenarioError unless all nodes start with one mean and one covariance; ``why`` they
-    must, and which ``other`` filter need not.
+    """Raise ScenarioError unless all nodes of a ``netkf.Scenario`` start with one mean and one
+    covariance. The message ends with the reason ``why`` they must, and names the ``other`` filter
+    that does not need it.
     """
     starts = [scenario.initial_estimate(node) for node in scenario.nodes]
     mean, cov = starts[0]

@@ -76,23 +76,31 @@ def trigger_matrix(Y: float | FloatArray, rows: int) -> FloatArray:
 
 
 def entries_at(scenario: Any, node: int) -> list[int]:
-    """Return the indices, in the scenario, of the sensors of a node."""
+    """Return the indices, in ``scenario.sensors``, of the sensors of a node with the id
+    ``node``.
+    """
     return [placed_sensor.entry for placed_sensor in scenario.placed_sensors.get(node, ())]
 
 
 def whitened_trigger(Y: float | FloatArray, R: FloatArray) -> FloatArray:
-    """Return ``L' Y L`` (p, p) with ``L L' = R``, the trigger for whitened readings."""
+    """Return ``L' Y L`` (p, p) with ``L L' = R`` (p, p), the trigger for whitened readings; Y is
+    (p, p) or a multiple of the identity.
+    """
     root = np.linalg.cholesky(R)
     return np.asarray(root.T @ trigger_matrix(Y, len(R)) @ root)
 
 
 def silence_noise(R: FloatArray, Y: float | FloatArray) -> FloatArray:
-    """Return ``R + Y^-1`` (p, p), the noise of the reading that silence is equivalent to."""
+    """Return ``R + Y^-1`` (p, p), the noise of the reading that silence is equivalent to, for R
+    (p, p) and Y (p, p) or a multiple of the identity.
+    """
     return np.asarray(R + np.linalg.inv(trigger_matrix(Y, len(R))))
 
 
 def news_of(reading: Reading, xhat: FloatArray, Y: float | FloatArray) -> float:
-    """Return ``z' Y z`` with the innovation ``z = y - H xhat`` of a reading with p > 0 rows."""
+    """Return ``z' Y z`` with the innovation ``z = y - H xhat`` (p,) of a reading with p > 0 rows;
+    ``xhat`` is (n,), Y (p, p) or a multiple of the identity.
+    """
     y, H = whiten_reading(*reading[:3])
     p, n = H.shape
     readings = block_of_reading(y, H)
@@ -104,13 +112,17 @@ def news_of(reading: Reading, xhat: FloatArray, Y: float | FloatArray) -> float:
 
 @kernel
 def weigh_news_single(x: FloatArray, readings: ReadingBlock, Y: FloatArray, z: FloatArray) -> float:
-    """Return ``weigh_news`` of one reading with one lane."""
+    """Return the news ``z' Y z`` of one whitened reading in one run, with its innovation z = y - H
+    x and the estimate x (1, 1, n, 1); Y (1, p, p) is for whitened rows, ``z`` (p, 1) is scratch.
+    """
     news: float = weigh_news(ONE, x, readings, (0, 0, 0), len(z), Y, z)
     return news
 
 
 def whitened_triggers(models: Sequence[Any], Y: float | FloatArray) -> FloatArray:
-    """Return ``L' Y L`` (H, p, p) of the readings of all nodes, zeros beyond their rows."""
+    """Return ``L' Y L`` (H, p, p) with ``L L' = R`` for the readings of H nodes with these
+    ``models``, zeros beyond their rows; p is the largest number of rows.
+    """
     p = max(1, *(len(model.R) for model in models))
     weights = np.zeros((len(models), p, p))
     for k, model in enumerate(models):
@@ -132,7 +144,7 @@ def silence_whitening(weight: FloatArray) -> FloatArray:
 
 
 class ScheduledArrays(NamedTuple):
-    """Sensors and predictions for B blocks of runs of H nodes: W + H sensors, those of the sender
+    """Sensors and predictions for B blocks of L runs of H nodes: W + H sensors, those of the sender
     of each of W directions as its receiver knows them, then the own one of each node.
 
     trigger : (H, p, p), for whitened rows
@@ -162,7 +174,14 @@ def scheduled_slots(
     scratch: SlotScratch,
     arrays: ScheduledArrays,
 ) -> None:
-    """Simulate filters that broadcast readings over the slots of a plan, Han et al. (2015)."""
+    """Simulate H filters that broadcast readings over the S slots of a plan, Han et al. (2015), in
+    B blocks of L runs: in each slot they predict, decide whether to send, and use readings and
+    silence.
+
+    Changes ``nodes.xhat`` (B, H, n, L), ``nodes.root`` (B, H, n, n, L) and the known sensors in
+    ``arrays`` in place, writes 0 into ``plan.sent`` and ``plan.up`` for messages that are not sent,
+    and writes ``samples``. ``plan.part`` says which part of a slot is simulated.
+    """
     for b in range(plan.up.shape[0]):
         for s in range(plan.up.shape[1]):
             # A part of the plan: up to the decisions to send, or from the arrivals on.
@@ -197,8 +216,9 @@ def schedule_reading(
     s: int,
     h: int,
 ) -> None:
-    """Decide whether node ``h`` sends its reading of slot ``s``: with probability 1 - exp(-z' Y z /
-    2).
+    """Decide whether node ``h`` of block ``b`` sends its reading of slot ``s``, in each of L runs:
+    with probability 1 - exp(-z' Y z / 2) for its innovation z. Writes 0 into ``plan.sent[b, s, 0,
+    h]`` (L,) where it is silent.
     """
     lanes = scratch.lanes
     news = weigh_news(
@@ -228,7 +248,8 @@ def update_by_sensors(
     h: int,
 ) -> None:
     """Update filter ``h`` of block ``b`` with the readings that arrive in slot ``s``, its own
-    first, and with the silence of the other sensors that it knows.
+    first, and with the silence of the other sensors that it knows: changes ``nodes.xhat[b, h]``
+    (n, L) and ``nodes.root[b, h]`` (n, n, L), and marks the sensors of these readings as known.
     """
     sent = load_flags(scratch.lanes, plan.sent, b, s, 0, h)
     own = len(links.sender) + h
@@ -251,8 +272,12 @@ def update_by_sensor(
     index: int,
     arrived: Any,
 ) -> None:
-    """Update filter ``h`` of block ``b`` by the sensor of ``sender``, entry ``index`` of the known
-    sensors: with its reading in the lanes where that has ``arrived``, else with its silence.
+    """Update filter ``h`` of block ``b`` by the sensor of filter ``sender``, entry ``index`` of the
+    W + H known sensors: with its reading of slot ``s`` in the lanes where that has ``arrived``
+    (flags (L,)), else with its silence.
+
+    Changes ``nodes.xhat[b, h]`` (n, L) and ``nodes.root[b, h]`` (n, n, L), and where a reading
+    arrived ``arrays.H`` and ``arrays.known`` of this sensor.
     """
     lanes, rows = scratch.lanes, nodes.rows[sender]
     known = load_flags(lanes, arrays.known, b, index)
@@ -284,7 +309,9 @@ def use_silence(
     silent: Any,
 ) -> None:
     """Update filter ``h`` of block ``b`` with a reading ``H xbar`` of noise ``R + Y^-1``, in the
-    lanes where ``sender`` is ``silent``; entry ``index`` of the known sensors holds its whitened H.
+    lanes where filter ``sender`` is ``silent`` (flags (L,)): changes ``nodes.xhat[b, h]`` (n, L)
+    and ``nodes.root[b, h]`` (n, n, L). Entry ``index`` of the W + H known sensors holds the
+    sender's whitened H.
     """
     lanes, n = scratch.lanes, nodes.xhat.shape[2]
     for k in range(nodes.rows[sender]):
@@ -356,13 +383,15 @@ class ScheduledReadings(Filter):
     slot_kernel = staticmethod(scheduled_slots)
 
     def decides_in_slots(self) -> bool:
-        """Return True."""
+        """Return True: a node may keep its reading to itself."""
         return True
 
     def slot_arrays(
         self, states: Sequence[Any], infos: Sequence[NodeInfo], runs: int
     ) -> tuple[ScheduledArrays]:
-        """Return empty tables of the sensors that nodes know of each other."""
+        """Return the arrays of ``slot_kernel`` for ``runs`` runs of H nodes: triggers, and empty
+        tables of the sensors that nodes know of each other.
+        """
         models, blocks = [state.model for state in states], blocks_of(runs)
         (H, n), W = (len(models), len(states[0].xhat)), sum(info.degree for info in infos)
         weights = whitened_triggers(models, self.Y)
@@ -380,26 +409,34 @@ class ScheduledReadings(Filter):
         )
 
     def payload_numbers(self, n: int, rows: int, phase: int) -> int:
-        """Return the numbers of a message, a reading; sensors do not change and are not counted."""
+        """Return the size of a message in numbers of 64 bits: the ``rows`` of a reading; sensors do
+        not change and are not counted.
+        """
         return rows
 
     def init(self, model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo) -> ScheduledState:
-        """Return the first state of a node, to which no sensor is known yet."""
+        """Return the first state of a node, with estimate ``mean`` (n,) and covariance ``cov``
+        (n, n), to which no sensor is known yet.
+        """
         return ScheduledState(mean, first_root(cov), model, mean)
 
     def predict(self, state: ScheduledState, gap: float) -> ScheduledState:
-        """Predict, and keep the prediction, to which all decisions of the slot refer."""
+        """Return the state ``gap`` seconds later; the prediction is kept as ``prior``, to which all
+        decisions of the slot refer.
+        """
         xhat, root = state.model.predict(state.xhat, state.root, gap)
         return state._replace(xhat=xhat, root=root, prior=xhat, reading=None, sent=False)
 
     def update(self, state: ScheduledState, reading: Reading) -> ScheduledState:
-        """Store the reading for the exchange of the slot."""
+        """Return the state with the reading stored for the exchange of the slot."""
         return state._replace(reading=reading if len(reading.y) else None)
 
     def emit(
         self, state: ScheduledState, exchange: Exchange
     ) -> tuple[ScheduledState, Reading | None]:
-        """Send the reading, or say by silence that it was near its prediction."""
+        """Return the state and the payload: the reading, or None, which says that it was near its
+        prediction.
+        """
         reading = state.reading
         if reading is None:
             return state, None
@@ -413,7 +450,9 @@ class ScheduledReadings(Filter):
     def absorb(
         self, state: ScheduledState, messages: Sequence[Message], exchange: Exchange
     ) -> ScheduledState:
-        """Use the readings that were sent, and the silence of all other known sensors."""
+        """Return the state after the readings that were sent, and after the silence of all other
+        known sensors.
+        """
         arrived = {message.sender: message.payload for message in messages}
         if state.sent and state.reading is not None:
             arrived[-1] = state.reading
@@ -433,19 +472,21 @@ class ScheduledReadings(Filter):
         )
 
     def shift(self, state: ScheduledState, offset: FloatArray) -> ScheduledState:
-        """Return the state shifted by ``offset``: the trigger looks at innovations."""
+        """Return the state with ``offset`` (n,) added to estimate and prediction, and ``H offset``
+        to the reading: the trigger looks at innovations.
+        """
         reading = state.reading
         if reading is not None:
             reading = reading._replace(y=reading.y + reading.H @ offset)
         return state._replace(xhat=state.xhat + offset, prior=state.prior + offset, reading=reading)
 
     def shift_payload(self, payload: Reading, offset: FloatArray) -> Reading:
-        """Move a reading."""
+        """Return the reading with ``H offset`` added, for an ``offset`` (n,) of the state."""
         return payload._replace(y=payload.y + payload.H @ offset)
 
 
 class TriggerArrays(NamedTuple):
-    """Decisions of the nodes for B blocks of runs.
+    """Decisions of H nodes for B blocks of L runs.
 
     trigger : (H, p, p), for whitened rows
     news : (B, H, L), z' Y z of the last reading
@@ -465,7 +506,9 @@ class TriggerArrays(NamedTuple):
 
 
 def trigger_arrays(models: Sequence[Any], Y: float | FloatArray, runs: int) -> TriggerArrays:
-    """Return the arrays of nodes that have read nothing."""
+    """Return the arrays of H nodes with these ``models`` in ``runs`` runs, before they have read
+    anything.
+    """
     trigger, shape = whitened_triggers(models, Y), (blocks_of(runs), len(models))
     return TriggerArrays(
         trigger,
@@ -521,8 +564,11 @@ def decide_senders(
     order: TriggerPlan,
     s: int,
 ) -> None:
-    """Decide which nodes send in slot ``s``: in steps before the reading by the reading of the slot
-    before, then by this one.
+    """Decide which nodes send in slot ``s``, in all blocks: in steps before the reading by the
+    reading of the slot before, then by this one.
+
+    Writes 0 into ``plan.sent[:, s]`` (B, E, H, L) and ``plan.up[:, s]`` (B, E, W, L) for messages
+    that are not sent, and stores news and decisions in ``arrays``.
     """
     for b in range(plan.sent.shape[0]):
         for e in range(order.first):
@@ -537,8 +583,9 @@ def decide_senders(
 
 @kernel
 def decide_step(plan: SlotPlan, arrays: TriggerArrays, b: int, s: int, e: int) -> None:
-    """Decide which of the nodes that are asked in step ``e`` send, in block ``b``: a decision holds
-    until the next reading.
+    """Decide which of the nodes of block ``b`` that are asked in step ``e`` of slot ``s`` send: a
+    decision holds until the next reading. Writes 0 into ``plan.sent[b, s, e]`` (H, L) for silent
+    ones, and new decisions into ``arrays``.
     """
     for h in range(plan.sent.shape[3]):
         for q in range(plan.sent.shape[4]):
@@ -566,9 +613,10 @@ def store_news(
     predicted: bool,
     framed: bool,
 ) -> None:
-    """Store the news ``z' Y z`` of the readings of all nodes of block ``b`` in slot ``s``, with
-    respect to the estimates after the steps that precede the reading: a move of the origin
-    (``framed``) and a prediction (``predicted``).
+    """Store the news ``z' Y z`` of the readings of all H nodes of block ``b`` in slot ``s`` in
+    ``arrays.news[b]`` (H, L), and mark their decisions as open, with respect to the estimates after
+    the steps that precede the reading: a move of the origin (``framed``) and a prediction
+    (``predicted``).
     """
     lanes = scratch.lanes
     for h in range(len(nodes.rows)):
@@ -591,7 +639,10 @@ def store_news(
 def store_news_of_slot(
     nodes: SlotNodes, readings: ReadingBlock, arrays: TriggerArrays, scratch: SlotScratch
 ) -> None:
-    """Apply ``store_news`` to all blocks of one slot whose steps before the reading are done."""
+    """Store the news ``z' Y z`` of the readings of all nodes and blocks of one slot in
+    ``arrays.news`` (B, H, L), where all steps before the reading are done: ``nodes.xhat`` holds the
+    predictions.
+    """
     for b in range(nodes.xhat.shape[0]):
         store_news(nodes, readings, arrays, scratch, b, 0, False, False)
 
@@ -620,7 +671,10 @@ class TriggeredSlots:
         states: Sequence[Any],
         *more: Any,
     ) -> None:
-        """Simulate the filters over the slots of a plan."""
+        """Simulate the filters over the S slots of a plan in place: changes ``nodes``, the
+        decisions in ``arrays``, ``plan.sent`` and ``plan.up``, and writes ``samples``. ``states``
+        are those in which nodes start, ``more`` the arrays of the inner filter's kernel.
+        """
         carried_nodes = nodes._replace(xhat=self._inner.carried_estimates(nodes.xhat, more))
         for s in range(plan.up.shape[1]):
             asked = plan.sent[:, s : s + 1].copy()
@@ -656,13 +710,13 @@ class TriggeredSlots:
 def single_slot(
     readings: ReadingBlock, plan: SlotPlan, samples: SlotSamples, s: int
 ) -> tuple[ReadingBlock, SlotPlan, SlotSamples]:
-    """Return readings, plan and samples of slot ``s`` alone, for a kernel whose filters do not
-    decide who sends.
+    """Return readings, plan and samples of slot ``s`` alone, as blocks of one slot, for a kernel
+    whose filters do not decide who sends.
     """
     at = slice(s, s + 1)
 
     def at_slot(values: Any) -> Any:
-        """Return the part of the values of a block at this slot."""
+        """Return the values (B, 1, ...) of slot ``s`` from those of all slots (B, S, ...)."""
         return np.ascontiguousarray(values[:, at])
 
     local, fixed = at_slot(readings.local), readings.H.shape[1] == 1
@@ -736,13 +790,15 @@ class TriggeredMessages(Filter):
         return TriggeredSlots(inner, plan) if is_compiled and plan is not None else None
 
     def decides_in_slots(self) -> bool:
-        """Return True."""
+        """Return True: a node may send nothing after a reading."""
         return True
 
     def slot_arrays(
         self, states: Sequence[Any], infos: Sequence[NodeInfo], runs: int
     ) -> tuple[Any, ...]:
-        """Return the arrays of the trigger, the filter's states and its arrays."""
+        """Return the arguments of ``slot_kernel`` for ``runs`` runs of H nodes: the arrays of the
+        trigger, the wrapped filter's states, and the arrays of its kernel.
+        """
         inner = [state.inner for state in states]
         arrays = trigger_arrays([state.model for state in inner], self.Y, runs)
         return (arrays, inner, *self.inner.slot_arrays(inner, infos, runs))
@@ -750,26 +806,34 @@ class TriggeredMessages(Filter):
     def slot_gains(
         self, states: Sequence[Any], arrays: tuple[Any, ...], first: int, count: int
     ) -> tuple[Any, ...]:
-        """Return the arrays: the filter's gains are asked for slot by slot."""
+        """Return the ``arrays`` unchanged: the wrapped filter's gains are asked for
+        slot by slot.
+        """
         return arrays
 
     def init(self, model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo) -> WrappedState:
-        """Return the state of the wrapped filter, without a decision yet."""
+        """Return the state of the wrapped filter at time 0 from ``mean`` (n,) and ``cov`` (n, n),
+        without a decision yet.
+        """
         return WrappedState(self.inner.init(model, mean, cov, node))
 
     def predict(self, state: WrappedState, gap: float) -> WrappedState:
-        """Predict."""
+        """Return the state ``gap`` seconds later, in which the wrapped filter has predicted."""
         return state._replace(inner=self.inner.predict(state.inner, gap))
 
     def update(self, state: WrappedState, reading: Reading) -> WrappedState:
-        """Keep the news for the decision, and use the reading."""
+        """Return the state after a reading, which the wrapped filter uses; its news is kept for the
+        decision.
+        """
         news = NO_READING
         if len(reading.y):
             news = news_of(reading, self.inner.estimate(state.inner)[0], self.Y)
         return WrappedState(self.inner.update(state.inner, reading), news, state.has_sent)
 
     def emit(self, state: WrappedState, exchange: Exchange) -> tuple[WrappedState, Any]:
-        """Send the payload of the wrapped filter, or nothing until the next reading."""
+        """Return the state after sending, with the decision, and the payload of the wrapped filter,
+        or None until the next reading if the node is silent.
+        """
         silent = state.silent
         if silent is None:
             # After its first reading a node always sends.
@@ -783,15 +847,17 @@ class TriggeredMessages(Filter):
     def absorb(
         self, state: WrappedState, messages: Sequence[Message], exchange: Exchange
     ) -> WrappedState:
-        """Absorb the messages as the wrapped filter does."""
+        """Return the state after the messages, which the wrapped filter absorbs."""
         return state._replace(inner=self.inner.absorb(state.inner, messages, exchange))
 
     def estimate(self, state: WrappedState) -> tuple[FloatArray, FloatArray | None]:
-        """Return the estimate of the filter."""
+        """Return estimate (n,) and covariance (n, n) of the wrapped filter."""
         return self.inner.estimate(state.inner)
 
     def shift(self, state: WrappedState, offset: FloatArray) -> WrappedState:
-        """Shift the wrapped filter; the trigger looks at innovations, which do not move."""
+        """Return the state with the wrapped filter shifted by ``offset`` (n,); the trigger looks at
+        innovations, which do not move.
+        """
         return state._replace(inner=self.inner.shift(state.inner, offset))
 
     def stopped(self, state: WrappedState) -> bool:
@@ -831,7 +897,9 @@ class StochasticTrigger(Delegate):
 
     @cached_property
     def wrapped(self) -> Filter:
-        """The filter that runs."""
+        """The filter that runs: one that uses silence if ``inner`` is "intermittent", else
+        ``inner`` with a trigger.
+        """
         if type(self.inner) is Intermittent:
             return ScheduledReadings(self.Y)
         return TriggeredMessages(self.Y, self.inner)

@@ -56,8 +56,12 @@ COMBINATIONS, MAX_DIRECTION_BITS = 64, 62
 
 
 class FusionArrays(NamedTuple):
-    """The rule of fusion, ``inverse`` and ``trace`` as in ``fuse_pair``, and scratch: its ``pair``
-    (2 n + 2, n); an estimate ``x`` (n,) with ``root`` (n, n), and ``other_x``, ``other``.
+    """The rule of fusion and scratch, for one estimate of n states at a time.
+
+    inverse, trace : rule and criterion, as in ``fuse_pair``
+    pair : (2 n + 2, n), scratch of ``fuse_pair``
+    x, root : (n,) and (n, n), estimate that is fused, and its root
+    other_x, other : (n,) and (n, n), those of a sender
     """
 
     inverse: bool
@@ -79,7 +83,12 @@ def fusion_slots(
     scratch: SlotScratch,
     arrays: FusionArrays,
 ) -> None:
-    """Simulate filters that fuse pairs of estimates over the slots of a plan."""
+    """Simulate H filters that fuse pairs of estimates over the S slots of a plan, in B blocks of L
+    runs: in each slot they predict, read and fuse what they hear.
+
+    Changes ``nodes.xhat`` (B, H, n, L) and ``nodes.root`` (B, H, n, n, L) in place and writes
+    ``samples`` in the slots that have one.
+    """
     for b in range(plan.up.shape[0]):
         for s in range(plan.up.shape[1]):
             if plan.sensed[s]:
@@ -105,8 +114,10 @@ def fuse_received(
     arrays: FusionArrays,
     index: tuple[int, int, int, int],
 ) -> None:
-    """Fuse filter h of block b in lane q with all estimates that arrive in slot s, one after the
-    other; ``index`` is [b, s, h, q].
+    """Fuse filter h of block b in lane q (one run) with all estimates that arrive in slot s, one
+    after the other; ``index`` is [b, s, h, q]. Changes ``nodes.xhat[b, h, :, q]`` (n,) and
+    ``nodes.root[b, h, :, :, q]`` (n, n); the messages are the copies of all estimates in
+    ``scratch``.
     """
     b, s, h, q = index
     n, has_received = nodes.xhat.shape[2], False
@@ -134,7 +145,9 @@ def fuse_received(
 def copy_track(
     x: FloatArray, root: FloatArray, means: FloatArray, roots: FloatArray, h: int, q: int
 ) -> None:
-    """Copy the estimate of filter h in lane q to x (n,) and ``root`` (n, n)."""
+    """Copy the estimate of filter ``h`` in lane ``q``, from ``means`` (H, n, L) and lower
+    triangular ``roots`` (H, n, n, L), to x (n,) and ``root`` (n, n).
+    """
     for i in range(len(x)):
         x[i] = means[h, i, q]
         for j in range(i + 1):
@@ -162,14 +175,14 @@ class PairFusion(Filter):
     def slot_arrays(
         self, states: Sequence[Any], infos: Sequence[NodeInfo], runs: int
     ) -> tuple[FusionArrays]:
-        """Return the settings and scratch."""
+        """Return the settings and scratch of ``slot_kernel``, the same for all nodes and runs."""
         n = len(states[0].xhat)
         shapes = [(2 * n + 2, n), (n,), (n, n), (n,), (n, n)]
         scratch = [np.zeros(shape) for shape in shapes]
         return (FusionArrays(self.inverse, self.minimise == TRACE, *scratch),)
 
     def absorb(self, state: State, messages: Sequence[Message], exchange: Exchange) -> State:
-        """Fuse with each estimate heard, predicted to now."""
+        """Return the state after fusion with each estimate heard, predicted to now."""
         pair = state.xhat, state.root
         for message in messages:
             payload = message.payload
@@ -256,7 +269,7 @@ class CombinationCache(NamedTuple):
 
 
 class TrackArrays(NamedTuple):
-    """Tracks of all nodes for B blocks of runs.
+    """Tracks of all H nodes for B blocks of L runs.
 
     xhat, root : own tracks (B, H, n, L) and (B, H, n, n, L)
     Q, H : (n, n) and whitened sensors (H, p, n)
@@ -264,7 +277,8 @@ class TrackArrays(NamedTuple):
     first : (H + 1,), pairs of track i begin at ``first[i]``
     closed : (H, n, n), scratch
     tracks, block : scratch, indices (D + 1,) of the tracks to combine, the own one first, and their
-                    joint covariance (D + 1, D + 1, n, n)
+                    joint covariance (D + 1, D + 1, n, n), for at most D senders
+    scratch, cache : of combinations
     """
 
     xhat: FloatArray
@@ -291,7 +305,12 @@ def track_slots(
     scratch: SlotScratch,
     arrays: TrackArrays,
 ) -> None:
-    """Simulate filters that combine tracks over the slots of a plan."""
+    """Simulate H filters that combine tracks over the S slots of a plan, in B blocks of L runs: in
+    each slot the own tracks predict and read, and each node combines its own with those it hears.
+
+    Changes the tracks and their covariances ``joint`` in ``arrays``, writes the reported estimates
+    into ``nodes.xhat`` (B, H, n, L) and ``nodes.root`` (B, H, n, n, L), and ``samples``.
+    """
     tracks = SlotNodes(arrays.xhat, arrays.root, nodes.F, nodes.root_Q, nodes.rows)
     work = arrays.scratch.work
     # Slot by slot: the covariances of tracks are the same in all runs.
@@ -320,8 +339,8 @@ def track_slots(
 
 @kernel
 def copy_tracks(nodes: SlotNodes, tracks: SlotNodes, scratch: SlotScratch, b: int) -> None:
-    """Copy the own tracks of all nodes of block ``b`` to ``nodes``, the estimates that
-    they report.
+    """Copy the own tracks of all H nodes of block ``b`` to ``nodes.xhat[b]`` (H, n, L) and
+    ``nodes.root[b]`` (H, n, n, L), the estimates that they report.
     """
     for h in range(len(nodes.rows)):
         for i in range(nodes.xhat.shape[2]):
@@ -339,8 +358,9 @@ def combine_received(
     arrays: TrackArrays,
     index: tuple[int, int, int, int],
 ) -> None:
-    """Replace the reported estimate of filter h of block b in lane q by the combination of its
-    track with those that arrive in slot s; ``index`` is [b, s, h, q].
+    """Replace the reported estimate of filter h of block b in lane q (one run) by the combination
+    of its track with those that arrive in slot s; ``index`` is [b, s, h, q]. Changes
+    ``nodes.xhat[b, h, :, q]`` (n,) and ``nodes.root[b, h, :, :, q]`` (n, n).
     """
     b, s, h, q = index
     n, count, key = nodes.xhat.shape[2], 0, 0
@@ -371,9 +391,9 @@ def combine_received(
 
 @kernel
 def combination_of(arrays: TrackArrays, key: int, count: int, degree: int) -> int:
-    """Return the index in the cache of the combination of the own track with ``count`` others,
-    ``arrays.tracks``; compute it if the cache lacks it. ``key`` has a bit for each of ``degree``
-    directions.
+    """Return the index in ``arrays.cache`` of the combination of the own track with ``count``
+    others, whose indices are in ``arrays.tracks``; compute it if the cache lacks it. ``key`` has a
+    bit for each of the ``degree`` directions to the node on which a track arrived.
     """
     cache = arrays.cache
     k = (key ^ (key >> 6) ^ (key >> 12)) % len(cache.key)
@@ -392,7 +412,9 @@ def combination_of(arrays: TrackArrays, key: int, count: int, degree: int) -> in
 
 @kernel
 def pair_of(arrays: TrackArrays, i: int, j: int) -> int:
-    """Return the index in ``arrays.pairs`` of the pair (i, j) of tracks, which is among them."""
+    """Return the index in ``arrays.pairs`` (K, 2) of the pair (i, j) of tracks, which is among
+    them.
+    """
     # Bisection: pairs of track i are sorted by the second track.
     low, high = arrays.first[i], arrays.first[i + 1] - 1
     while low < high:
@@ -428,7 +450,9 @@ class BarShalomCampo(Filter):
     def slot_arrays(
         self, states: Sequence[Any], infos: Sequence[NodeInfo], runs: int
     ) -> tuple[TrackArrays]:
-        """Return the tracks with their covariances, and scratch."""
+        """Return the arrays of ``slot_kernel`` for ``runs`` runs of H nodes that start in these
+        ``states``: the tracks with their covariances, and scratch.
+        """
         H, n, start = len(states), len(states[0].xhat), states[0].start
         max_degree = max(info.degree for info in infos)
         xhat, root = (
@@ -462,7 +486,9 @@ class BarShalomCampo(Filter):
         )
 
     def carried_estimates(self, reported: FloatArray, arrays: tuple[Any, ...]) -> FloatArray:
-        """Return the own tracks."""
+        """Return the own tracks (B, H, n, L), with which nodes go on, instead of the combinations
+        that are ``reported`` (B, H, n, L).
+        """
         tracks: TrackArrays = arrays[0]
         return tracks.xhat
 
@@ -480,17 +506,23 @@ class BarShalomCampo(Filter):
                 )
 
     def payload_numbers(self, n: int, rows: int, phase: int) -> int:
-        """Return the numbers of a message, a track; sensors do not change and are not counted."""
+        """Return the size of a message in numbers of 64 bits: n, a track; sensors do not change and
+        are not counted.
+        """
         return n
 
     def init(self, model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo) -> TrackState:
-        """Return the first state of a node, which shows its own track."""
+        """Return the first state of a node, with estimate ``mean`` (n,) and covariance ``cov``
+        (n, n), which shows its own track.
+        """
         root, joint = first_root(cov), np.array(cov)[None, None]
         sensors = (whitened_sensors(model),)
         return TrackState(mean, root, model, mean, root, 0, (-1,), sensors, joint, joint[0, 0])
 
     def predict(self, state: TrackState, gap: float) -> TrackState:
-        """Predict the tracks."""
+        """Return the state ``gap`` seconds, a slot, later: own track and joint covariance are
+        predicted, and the own track is shown.
+        """
         xhat, root = state.model.predict(state.xhat, state.root, gap)
         joint = predicted_joint(state.joint, state.model)
         return state._replace(
@@ -498,19 +530,21 @@ class BarShalomCampo(Filter):
         )
 
     def update(self, state: TrackState, reading: Reading) -> TrackState:
-        """Update the own track by the reading, and the covariances of all."""
+        """Return the state with the own track updated by the reading, and the covariances of all
+        tracks by their sensors.
+        """
         tracked: TrackState = super().update(state, reading)
         joint = updated_joint(state.joint, state.sensors)
         return tracked._replace(joint=joint, fused=tracked.xhat, fused_root=tracked.root)
 
     def emit(self, state: TrackState, exchange: Exchange) -> tuple[TrackState, Track]:
-        """Send the own track."""
+        """Return the state, unchanged, and the payload: the own track with its sensors."""
         return state, Track(state.xhat, state.sensors[0])
 
     def absorb(
         self, state: TrackState, messages: Sequence[Message], exchange: Exchange
     ) -> TrackState:
-        """Combine the own track with those heard."""
+        """Return the state that shows the best combination of the own track and those heard."""
         if not messages:
             return state
         state = add_senders(state, messages)
@@ -520,23 +554,27 @@ class BarShalomCampo(Filter):
         return state._replace(fused=state.xhat + gain @ differences, fused_root=root)
 
     def estimate(self, state: TrackState) -> tuple[FloatArray, FloatArray]:
-        """Return the combination."""
+        """Return the combination that is shown, (n,), and its covariance (n, n)."""
         return state.fused, state.P
 
     def shift(self, state: TrackState, offset: FloatArray) -> TrackState:
-        """Return the state shifted by ``offset``: tracks enter by their differences."""
+        """Return the state with ``offset`` (n,) added to the track and to the combination: tracks
+        enter by their differences.
+        """
         return state._replace(xhat=state.xhat + offset, fused=state.fused + offset)
 
 
 def whitened_sensors(model: SlotModel) -> FloatArray:
-    """Return H (p, n) of a node's sensors over the deviations of their noise."""
+    """Return the whitened H (p, n) of a node's sensors: H times the inverse of the Cholesky factor
+    of R.
+    """
     H: FloatArray = np.asarray(model.H, dtype=np.float64)
     return whiten_reading(np.zeros(len(H)), H, model.R)[1] if len(H) else H
 
 
 def stacked_sensors(sensors: Sequence[FloatArray]) -> tuple[FloatArray, np.ndarray]:
-    """Return whitened sensors of several nodes as (m, p, n), with zeros below, and the rows (m,) of
-    each.
+    """Return the whitened ``sensors`` of m nodes, (p_i, n) each, as one array (m, p, n) with zeros
+    below, and the rows (m,) of each.
     """
     rows = np.array([len(H) for H in sensors])
     stack = np.zeros((len(sensors), max(int(rows.max()), 1), sensors[0].shape[1]))
@@ -546,7 +584,9 @@ def stacked_sensors(sensors: Sequence[FloatArray]) -> tuple[FloatArray, np.ndarr
 
 
 def combined_pairs(infos: Sequence[NodeInfo]) -> np.ndarray:
-    """Return the pairs (K, 2) of tracks that some node may combine, in lexical order."""
+    """Return the pairs (K, 2) of indices of tracks that some of the N nodes may combine, in lexical
+    order.
+    """
     network, N = infos[0].network, len(infos)
     assert network is not None
     tracks = [np.array([h, *heard]) for h, heard in enumerate(network.heard)]
@@ -555,8 +595,8 @@ def combined_pairs(infos: Sequence[NodeInfo]) -> np.ndarray:
 
 
 def predicted_joint(joint: FloatArray, model: SlotModel) -> FloatArray:
-    """Return the covariances (m, m, n, n) of the errors of m tracks one slot later: all of them
-    have the same process noise.
+    """Return the covariances (m, m, n, n) of the errors of m tracks one slot later, from ``joint``
+    of the same shape: all of them have the same process noise.
     """
     predicted, F, Q = (np.array(part, order="C") for part in (joint, model.F, model.Q))
     predict_joint(predicted.reshape(-1, *F.shape), F, Q, np.empty(F.shape))
@@ -564,8 +604,9 @@ def predicted_joint(joint: FloatArray, model: SlotModel) -> FloatArray:
 
 
 def updated_joint(joint: FloatArray, sensors: Sequence[FloatArray]) -> FloatArray:
-    """Return the covariances (m, m, n, n) of the errors of m tracks after each has used a reading
-    of its own whitened ``sensors``, ``P_ij+ = (I - K_i H_i) P_ij (I - K_j H_j)'``.
+    """Return the covariances (m, m, n, n) of the errors of m tracks, from ``joint`` of the same
+    shape, after each has used a reading of its own whitened ``sensors`` (p_i, n), ``P_ij+ = (I -
+    K_i H_i) P_ij (I - K_j H_j)'``.
     """
     updated, (H, rows) = np.array(joint, order="C"), stacked_sensors(sensors)
     m, n = len(H), H.shape[2]

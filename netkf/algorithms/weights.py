@@ -11,8 +11,8 @@ METROPOLIS = "metropolis"
 
 
 def check_columns(weights: FloatArray) -> None:
-    """Raise ScenarioError unless the weights (N, N) are not negative and each column, what one node
-    gives to all senders and to itself, sums to 1.
+    """Raise ScenarioError unless the ``weights`` (N, N) of N nodes are not negative and each
+    column, what one node gives to all senders and to itself, sums to 1.
     """
     if (weights < 0.0).any():
         # Weights come from files: the message names the entry.
