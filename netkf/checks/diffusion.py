@@ -58,7 +58,9 @@ def _without_cooperation(scenario: Scenario) -> Scenario:
 
 
 def _sensors_excite(samples: RunSamples, level: float) -> Finding:
-    """Compute the excitation level of D (19) for the network, which must be positive."""
+    """Compute the excitation lambda of D (19) for the network, which must be positive; the level of
+    the test is not used.
+    """
     levels = information_level(samples.scenario, PASTS, samples.seed)
     network = levels[levels["node"] == -1].iloc[0]
     best_sensor = float(levels.loc[levels["node"] != -1, "level"].max())

@@ -277,7 +277,9 @@ def whiten_errors(
 
 
 def with_promised_filter(scenario: Scenario) -> Scenario:
-    """Return the scenario with the filter of :func:`promised_filter`."""
+    """Return the scenario with the filter whose promises are checked: its own if that is built in
+    or overrides only weights of links, else the built-in one that its class derives from.
+    """
     is_promised = promised_filter(scenario.filter.algorithm) is scenario.filter.algorithm
     return scenario if is_promised else with_base_filter(scenario)
 

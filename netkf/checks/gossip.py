@@ -125,8 +125,9 @@ def _pairs_to_count(scenario: Scenario) -> tuple[IntArray, IntArray]:
 
 
 def _count_moves(scenario: Scenario, sources: np.ndarray) -> np.ndarray:
-    """Return the number of slots in which j handed its pair to i, for each (i, j) of
-    :func:`_pairs_to_count`; ``sources`` (slots, N) as :func:`pair_sources` returns it.
+    """Return the number (K,) of slots in which j handed its pair to i, for each of the K pairs
+    (i, j) that are counted; ``sources`` (slots, N) is the node whose pair each node used in each
+    slot.
     """
     size = len(scenario.nodes)
     codes, counts = np.unique(np.arange(size) * size + sources, return_counts=True)

@@ -381,7 +381,9 @@ def _check_initial_condition(samples: IntermittentSamples, level: float) -> Find
 
 
 def _growth_of(reference: ArrivalSamples) -> float:
-    """Return the largest growth (:func:`growth_intervals`) between the last two slot counts."""
+    """Return the largest excess of P(later P > GROWTH x) over P(earlier P > x), over all x and
+    nodes, between the last two numbers of slots in ``reference``.
+    """
     return max(g.value for P in reference.P for g in growth_intervals(P[-2], P[-1], 0.5))
 
 

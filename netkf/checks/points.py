@@ -70,7 +70,9 @@ def probe_times(scenario: Scenario) -> list[float]:
 
 
 def checked_samples(scenario: Scenario, times: FloatArray) -> IntArray:
-    """Return the indices (K,) of :func:`check_times` in the sample ``times`` of a run."""
+    """Return the indices (K,), in the sample ``times`` (T,) of a run in seconds, of the K times at
+    which promises are checked.
+    """
     targets = np.array(check_times(scenario))
     return np.asarray(np.argmin(np.abs(times[None] - targets[:, None]), axis=1), dtype=np.int64)
 

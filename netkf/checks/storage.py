@@ -177,7 +177,7 @@ def _result_columns(results: tuple[ReplicaResult, ...]) -> dict[str, np.ndarray]
 
 
 def _read_results(path: Path, scenario: Scenario) -> list[ReplicaResult]:
-    """Return the results that :func:`save_verdict` wrote, in order."""
+    """Return the results of the replicas in the file ``path``, in order."""
     with np.load(path, allow_pickle=False) as file:
         columns = {name: file[name] for name in file.files}
     chosen = with_check_times(scenario)

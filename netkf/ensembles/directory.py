@@ -186,6 +186,7 @@ class _DirectoryWriter:
     """
 
     def __init__(self, scenario: Scenario, directory: Path, plan: RunIdentity) -> None:
+        """Prepare to write the blocks of the runs in ``plan`` to an existing ``directory``."""
         self.scenario, self.directory, self.plan = scenario, directory, plan
         self.blocks = BlockCheckpoints(directory, scenario)
         name, seed = scenario.name, scenario.seed

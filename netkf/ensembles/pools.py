@@ -112,6 +112,7 @@ class AdaptivePool(LocalPool):
     """
 
     def __init__(self, workers: int, open_ended: bool = False) -> None:
+        """Make a pool of this process, which may grow to so many ``workers`` processes."""
         super().__init__()
         self.width, self._open_ended = workers, open_ended
         self._processes: ProcessPool | None = None
@@ -209,6 +210,7 @@ class DaskPool(RemotePool):
     """
 
     def __init__(self, address: str) -> None:
+        """Connect to the scheduler at ``address``, such as "tcp://HOST:PORT"."""
         super().__init__()
         _check_address(address)
         try:

@@ -562,11 +562,11 @@ def fill_single_nees(
 def mark_averaged(
     b: Batch, sums: Sums, scratch: ReductionScratch, first: int, active: int, t: int
 ) -> None:
-    """Mark the runs in whose averages sample ``t`` counts, by the rule of
-    ``runs.summary.select_averaged_samples``.
+    """Mark the runs in whose averages sample ``t`` counts, as summaries of single runs count it.
 
-    Sets of the ``active`` runs from ``first`` on, one in each lane, ``scratch.clear`` to 1 where
-    errors count and ``scratch.traced`` to 1 where P counts, else to 0.
+    Sets, for the ``active`` runs from ``first`` on, one in each lane, ``scratch.clear`` to 1 where
+    errors count, which is after time 0 and before rounding blurs them, and ``scratch.traced`` to 1
+    where P counts, else to 0.
     """
     # Loaded from the structs once instead of in each step of the loop.
     times, sample_counts, diverged, rounding_from = (

@@ -49,6 +49,7 @@ class _Worker:
     """A worker process with its two pipes, and the task it works on (None if idle)."""
 
     def __init__(self, hide_main: bool) -> None:
+        """Start the process; with ``hide_main`` it does not import the user's script."""
         receiver, self._jobs = multiprocessing.Pipe(duplex=False)
         self.results, sender = multiprocessing.Pipe(duplex=False)
         self.task: _Task | None = None

@@ -129,7 +129,12 @@ def make_page(
     trust: bool = False,
     out: Path | None = None,
 ) -> str:
-    """Return the page of one or two directories as HTML; see ``write_report``."""
+    """Return the page of one or two directories as HTML.
+
+    ``replica`` chooses the run of an ensemble to show, ``trust`` allows scenarios to import users'
+    modules, and ``out`` is the file to be written, which the command on the page names. Raises
+    ScenarioError if netkf did not write a directory.
+    """
     if not 1 <= len(directories) <= 2:
         raise ScenarioError("report", "takes one or two directories", len(directories))
     entries = [_read_entry(Path(directory), replica, trust) for directory in directories]

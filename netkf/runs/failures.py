@@ -44,7 +44,9 @@ def explain_failure(
 
 @contextmanager
 def explain_failures(scenario: Scenario) -> Iterator[None]:
-    """Replace exceptions of the body as :func:`explain_failure` does."""
+    """Replace an exception of a user's class in the body by an EngineError that names the class;
+    others pass unchanged.
+    """
     try:
         yield
     except Exception as error:

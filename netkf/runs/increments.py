@@ -51,6 +51,7 @@ class ExpectedIncrements:
     """
 
     def __init__(self, model: Any) -> None:
+        """Take A and Q (n, n), H (p, n) and R (p, p) of ``model``."""
         n = len(model.A)
         self._n, self._H, self._R = n, model.H, model.R
         # The joint equation of (x, z): dx = A x ds + dw and dz = x ds.

@@ -218,6 +218,7 @@ class TraceTables:
     """
 
     def __init__(self, directory: Path, scenario: Scenario) -> None:
+        """Prepare both files in ``directory``, for runs of the scenario."""
         self._nodes, self._truth_known = scenario.nodes, scenario.plant.truth_known
         self._events = _Table(directory / "events.parquet", EVENT_ENCODING)
         self._states = _Table(directory / "states.parquet", STATE_ENCODING)
@@ -277,6 +278,9 @@ class _Table:
     """
 
     def __init__(self, path: Path, encoding: dict[str, Any] | None = None) -> None:
+        """Prepare the file ``path``, with options ``encoding`` of pyarrow's ParquetWriter; it is
+        created by the first rows.
+        """
         self._path, self._temporary = path, path.with_name(path.name + ".part")
         self._encoding = encoding or {}
         self._file: Any = None

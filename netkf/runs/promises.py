@@ -110,8 +110,9 @@ def _sufficient_link_rate(scenario: Scenario) -> dict[str, Any]:
 
 
 def _steady_error(scenario: Scenario) -> dict[str, Any]:
-    """Return the exact steady error covariance of each node, as :func:`_value_or_reason` does, with
-    its mean-square ``radius``; None with a ``reason`` if there is none.
+    """Return the exact steady error covariances (N, n, n) of N nodes as a dictionary with
+    ``value``, ``trace``, ``reason`` and the mean-square ``radius``; without a value the ``reason``
+    says why.
     """
 
     def covariance() -> FloatArray:
@@ -138,7 +139,8 @@ def _slot_central_covariance(scenario: Scenario) -> FloatArray:
 
 
 def _steady_bound(scenario: Scenario) -> dict[str, Any]:
-    """Return the steady bounds (N, n, n) on P, as :func:`_value_or_reason` does.
+    """Return the steady bounds (N, n, n) on P of N nodes as a dictionary: ``value`` and ``trace``
+    as lists, or None for both and the ``reason``.
 
     Nodes that do not exchange messages may have one or not: then the value has nan for those
     without, next to the reason.

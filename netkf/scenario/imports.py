@@ -312,6 +312,7 @@ class _Source:
     """
 
     def __init__(self, module_name: str, spec: ModuleSpec) -> None:
+        """Read the source text of the module, if it has one."""
         self._module_name = module_name
         is_package = spec.submodule_search_locations is not None
         self._package = module_name if is_package else module_name.rpartition(".")[0]

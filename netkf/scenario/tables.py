@@ -172,7 +172,8 @@ def _call_under(key: str, builder: Callable[[Any], Any], value: Any) -> Any:
 def _build_object(
     cls: type[Any], values: dict[str, Any], origin: Origin, other_keys: tuple[str, ...] = ()
 ) -> Any:
-    """Return an object of class ``cls`` with fields ``values``, or WAITING if one of them waits.
+    """Return an object of class ``cls`` with fields ``values``, or WAITING if a value of them is
+    WAITING: it stands for an object whose class must not be imported yet.
 
     ``other_keys`` are keys of the same table in the file that were taken out of ``values``; an
     error about an unknown key lists them too.
@@ -299,7 +300,10 @@ def _build_sensor(origin: Origin, value: Any) -> Any:
 
 
 def _build_network(origin: Origin, time: str, value: Any) -> Any:
-    """Return the network of a table, or WAITING; ``time`` is as in ``_build_activation``."""
+    """Return the network of a table, or WAITING if a class in it must not be imported yet.
+
+    ``time`` is the plant's model of time: "slot ", "" for continuous time, or "unknown".
+    """
     table = _as_dict(value)
     builders: dict[str, Callable[[Any], Any]] = {
         "graph": partial(_build_component, "graph", origin),

@@ -38,7 +38,9 @@ class FilterValues(NamedTuple):
 
 
 def block_values(scenario: Scenario, seed: int, replicas: range, engine: Engine) -> FilterValues:
-    """Simulate consecutive replicas and return their values; a task of ``replicate_blocks``."""
+    """Simulate the consecutive ``replicas`` of the runs of ``seed``, R of them, and return their
+    values; a task of ``replicate_blocks``.
+    """
     batches = engine.run_many(scenario, seed, replicas)
     return join_values(*(_batch_values(scenario, batch) for batch in batches))
 

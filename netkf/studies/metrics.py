@@ -49,7 +49,9 @@ class RunMetrics(NamedTuple):
 
 
 def block_metrics(scenario: Scenario, seed: int, replicas: range, engine: Engine) -> RunMetrics:
-    """Simulate consecutive replicas and return their metrics; a task of ``replicate_blocks``."""
+    """Simulate the consecutive ``replicas`` of the runs of ``seed``, R of them, and return their
+    metrics; a task of ``replicate_blocks``.
+    """
     batches = engine.run_many(scenario, seed, replicas)
     return join_metrics(*(_batch_metrics(run_values(batch, scenario)) for batch in batches))
 

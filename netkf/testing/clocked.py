@@ -57,6 +57,9 @@ class ClockTrial(Trial):
         clock: str | None,
         increments: bool,
     ) -> None:
+        """Start a trial of the ``system``: sensors give ``increments`` or samples, nodes transmit
+        by the kind of ``clock``, and ``shift`` (n,), if any, moves the truth on the way.
+        """
         self._clock, self._increments = clock, increments
         self._A = system.M - np.eye(len(system.M))
         self._time, self._count = 0.0, 0
@@ -68,9 +71,10 @@ class ClockTrial(Trial):
         cls, watched: WatchedPart, system: System, shift: FloatArray | None, clock: str | None
     ) -> Iterator[ClockTrial]:
         """Yield a trial with sensors that take samples and one with sensors of increments, each if
-        the filter supports it; the other arguments are those of ``ClockTrial``.
+        the filter supports it.
 
-        ``shift`` (n,) moves the truth on the way, None does not.
+        ``clock`` is the kind of clock by which nodes transmit, None without messages; ``shift``
+        (n,) moves the truth on the way, None does not.
         """
         part = watched.part
         if not isinstance(part, FlowAdapter):

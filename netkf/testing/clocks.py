@@ -63,9 +63,11 @@ def check_clock(clock: Any, /, link: Link | None = None, **settings: Any) -> Non
 
 
 def check_clock_object(part: Any, link: Link | None, seed: int) -> None:
-    """Check a LinkClock as ``check_clock`` does, with random streams of ``seed``.
+    """Check a LinkClock ``part``: increasing ticks, repeatable from equal generators, at the stated
+    rates and laws, with random streams of ``seed``.
 
-    ``link`` is the only entity to check; None: all entities of a complete graph of 4 nodes.
+    ``link`` is the only entity to check; None: all entities of a complete graph of 4 nodes. Raises
+    AssertionError for the first rule that is broken; ``check_clock`` lists them.
     """
     watched = WatchedPart(part)
     watched.pickle_copy()

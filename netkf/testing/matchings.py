@@ -53,9 +53,11 @@ def check_matching(matching: Any, /, topology: Topology | None = None, **setting
 
 
 def check_matching_object(part: Any, topology: Topology | None, seed: int) -> None:
-    """Check a slot activation as ``check_matching`` does, with random streams of ``seed``.
+    """Check a slot activation ``part``: the form of its matchings, their repeatability from equal
+    generators, and their frequencies and independence over slots, with random streams of ``seed``.
 
-    Without a ``topology`` it is checked on several small networks.
+    Without a ``topology`` it is checked on several small networks. Raises AssertionError for the
+    first rule that is broken; ``check_matching`` lists them.
     """
     watched = WatchedPart(part)
     copy = watched.pickle_copy()

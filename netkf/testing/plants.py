@@ -79,7 +79,11 @@ def check_plant(plant: Any, /, **settings: Any) -> None:
 
 
 def check_plant_object(part: Any, seed: int) -> None:
-    """Check a Plant as ``check_plant`` does, with random streams of ``seed``."""
+    """Check a Plant ``part``: repeatable paths, and the stated laws of x(0) and of the noise, with
+    random streams of ``seed``.
+
+    Raises AssertionError for the first rule that is broken; ``check_plant`` lists them.
+    """
     watched = WatchedPart(part)
     copy = watched.pickle_copy()
     name = watched.name

@@ -85,7 +85,11 @@ def check_sensor(sensor: Any, /, **settings: Any) -> None:
 
 
 def check_sensor_object(part: Any, seed: int) -> None:
-    """Check a Sensor as ``check_sensor`` does, with random streams of ``seed``."""
+    """Check a Sensor ``part``: readings are repeatable, follow from the state as the class states,
+    and have noise of the stated R, with random streams of ``seed``.
+
+    Raises AssertionError for the first rule that is broken; ``check_sensor`` lists them.
+    """
     watched = WatchedPart(part)
     copy = watched.pickle_copy()
     if isinstance(part, NonlinearSensor):
@@ -180,8 +184,9 @@ def _select(series: ReadingSeries, ks: list[int]) -> ReadingSeries:
 
 
 def _check_linear(reader: SensorReader, node: int, seed: int) -> None:
-    """Check that another state changes a reading by H times the difference, and does not change H,
-    which is that of the sensor unless it is ``varying``.
+    """Check that another state changes a reading of ``node`` by H times the difference, and does
+    not change H, which is that of the sensor unless it is ``varying``; states are drawn with
+    ``seed``.
     """
     streams, numbers = Streams(seed), list(range(LENGTH))
     x, other_x = (_make_states(seed, LENGTH, reader.n, run) for run in (0, 1))

@@ -45,6 +45,9 @@ class Trial(ABC):
     def __init__(
         self, watched: WatchedPart, system: System, shift: FloatArray | None = None
     ) -> None:
+        """Start the filters of all nodes of the ``system`` (n states); ``shift`` (n,), if any,
+        moves the truth during the run.
+        """
         self.watched, self.part, self.system = watched, watched.part, system
         self.random = Streams(0).generator("testing")
         self.estimates: list[CheckedEstimate] = []

@@ -42,7 +42,11 @@ def fail(where: str, rule: str, got: object = None, remedy: str = "") -> NoRetur
 
 
 def demand(holds: object, where: str, rule: str, got: object = None, remedy: str = "") -> None:
-    """Raise AssertionError as :func:`fail` does unless ``holds``."""
+    """Raise AssertionError with the line ``where: rule; got ...; remedy`` unless ``holds``.
+
+    ``where`` names a method or attribute of the user's class, ``rule`` what it must do, ``got`` the
+    wrong value (None omits it).
+    """
     if not holds:
         fail(where, rule, got, remedy)
 
@@ -393,7 +397,9 @@ def guard_user_code(where: str) -> Iterator[None]:
 
 
 def call_user_function(where: str, function: Callable[..., Any], *arguments: Any) -> Any:
-    """Call a function of a user's class and return the result, with :func:`guard_user_code`."""
+    """Call a ``function`` of a user's class with the ``arguments`` and return the result; an
+    exception becomes an AssertionError that names ``where``.
+    """
     with guard_user_code(where):
         return function(*arguments)
 

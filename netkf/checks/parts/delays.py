@@ -50,7 +50,9 @@ class DelayCounts(NamedTuple):
 
 @lru_cache(maxsize=8)
 def stated_delay(scenario: Scenario) -> Any:
-    """Return the delay that states the law of the scenario's delay; see :func:`stated_part`."""
+    """Return the delay that states the law of the scenario's delay: its own, or for a user's class
+    that states none an object of the built-in class that it derives from.
+    """
     return stated_part(scenario.network.channel.delay, "delay")
 
 

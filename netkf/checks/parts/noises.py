@@ -253,7 +253,9 @@ def _whitened_noises(
 
 
 def _typical_states(scenario: Scenario, random: np.random.Generator, count: int) -> FloatArray:
-    """Return Gaussian states (count, n) with the covariance of :func:`_typical_covariance`."""
+    """Return ``count`` Gaussian states (count, n) with the mean of x(0), and the covariance of x(0)
+    plus the noise of ten steps.
+    """
     root = square_root(_typical_covariance(scenario))
     plant: Any = scenario.plant
     return np.asarray(plant.start_mean + random.standard_normal((count, len(root))) @ root.T)
@@ -266,8 +268,8 @@ def _typical_covariance(scenario: Scenario) -> FloatArray:
 
 
 def _state_sizes(scenario: Scenario, x: FloatArray) -> FloatArray:
-    """Return the root mean squares (S, n) of S states ``x`` (S, n) from :func:`_typical_states`;
-    all rows are equal.
+    """Return the root mean squares (S, n) of S states ``x`` (S, n) as :func:`_typical_states` draws
+    them; all rows are equal.
     """
     sizes = np.sqrt(np.diagonal(_typical_covariance(scenario)) + scenario.plant.start_mean**2)
     return np.asarray(np.broadcast_to(sizes, x.shape))

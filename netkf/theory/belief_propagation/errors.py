@@ -36,6 +36,9 @@ class BeliefRule(ErrorRule):
     takes_messages = False
 
     def __init__(self, scenario: Scenario, errors: StackedErrors, run: Run) -> None:
+        """Take the errors at time 0 and, in slots, the messages of the run that arrived; each
+        estimate is copied as the prior of its node.
+        """
         super().__init__(scenario, errors)
         algorithm: Any = scenario.filter.algorithm
         self._keeps = not scenario.slotted or algorithm.memory == ALL

@@ -56,7 +56,7 @@ def error_law(scenario: Scenario, run: Run) -> ErrorLaw:
 
 
 def _require_same_run(scenario: Scenario, run: Run) -> None:
-    """Raise TheoryError unless the run is one of the scenario."""
+    """Raise TheoryError unless ``run`` has the nodes and the number of states of the scenario."""
     if not isinstance(run, Run):
         raise TheoryError(
             f"run must be a netkf.Run, as netkf.simulate returns it, got a {type(run).__name__}"

@@ -140,7 +140,9 @@ def _replay_instants(scenario: Scenario, run: Run, errors: StackedErrors) -> Ite
 
 
 def _exchanged_messages(scenario: Scenario, run: Run) -> dict[tuple[int, int], list[SentMessage]]:
-    """Return the messages that arrived in time, by slot and number of the exchange."""
+    """Return the messages that arrived in time, by slot and number of the exchange in it, both
+    0-based; their times are slots.
+    """
     rows, index = run.log[run.log["kind"] == CODES["deliver"]], scenario.topology.index
     slots = scenario.slot_plant.slots_of(rows["t"])
     messages: dict[tuple[int, int], list[SentMessage]] = {}

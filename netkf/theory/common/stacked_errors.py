@@ -251,6 +251,9 @@ class ErrorPropagator:
     """Propagates stacked errors through continuous time, from 0 on."""
 
     def __init__(self, scenario: Scenario, errors: StackedErrors) -> None:
+        """Prepare to propagate ``errors``, which are those at time 0, with the plant and the
+        filters' model of the scenario.
+        """
         self._errors, self._now = errors, 0.0
         self._flows = _increment_flows(scenario, errors.estimators)
         A, B = scenario.diffusion.A, scenario.diffusion.B
@@ -260,10 +263,12 @@ class ErrorPropagator:
         self._predictor = Predictor(A, B, A_f, B_f)
 
     def advance(self, time: float) -> tuple[float, slice | None, FloatArray | None]:
-        """Advance to ``time`` (seconds); return the arguments of ``ErrorRule.elapse``.
+        """Advance to ``time`` (seconds); return the gap since the last call and the plant's noise
+        over it.
 
-        They are the gap and, if no sensor senses increments, the columns of the plant's inputs over
-        it and the matrix (n, k) by which these enter the state.
+        The noise is a matrix (n, k), by which it enters the state, and the columns of its k inputs:
+        the arguments of ``ErrorRule.elapse``. Both are None if a sensor senses increments, or for
+        no gap.
         """
         gap = time - self._now
         if gap <= 0.0:

@@ -26,6 +26,7 @@ class PseudoStateRule(ErrorRule):
     """Corrections by the gains of a network without losses; what is lost is left out."""
 
     def __init__(self, scenario: Scenario, errors: StackedErrors) -> None:
+        """Take the errors at time 0, and add a difference yhat - G xhat = 0 for each node."""
         super().__init__(scenario, errors)
         algorithm: Any = scenario.filter.algorithm
         self._observations: EstimatorObservations = {}

@@ -114,6 +114,7 @@ class _PiecewiseSolution:
     """
 
     def __init__(self, packed: PackedRiccati) -> None:
+        """Begin at time 0 with the start of the equations ``packed``; nothing is integrated yet."""
         self._packed = packed
         equations = packed.equations
         # Until the first message has taken the delay, nodes lose nothing and receive nothing.
@@ -350,6 +351,9 @@ class _SampleJumps:
     """Jumps of the solution: samples at known times, and the arrivals of messages sent at them."""
 
     def __init__(self, packed: PackedRiccati) -> None:
+        """Take the samples at known times from the equations ``packed``, and the times at which
+        messages sent at them arrive.
+        """
         self._packed = packed
         equations = packed.equations
         self._samples = {jump.time: jump for jump in equations.jumps}

@@ -31,6 +31,9 @@ class PackedRiccati:
     """
 
     def __init__(self, equations: CoupledRiccati) -> None:
+        """Pack the coefficients of the equations of N nodes with n states: symmetric matrices
+        (n, n) become rows of m = n (n + 1) / 2 numbers.
+        """
         self.equations = equations
         n = len(equations.A)
         self._i, self._j = np.triu_indices(n)

@@ -23,6 +23,9 @@ class ReadingExchangeRule(ErrorRule):
     def __init__(
         self, scenario: Scenario, errors: StackedErrors, messages: Sequence[SentMessage]
     ) -> None:
+        """Take the errors at time 0 and all ``messages`` of the run that arrived, from which it is
+        known which versions an estimate needs.
+        """
         super().__init__(scenario, errors)
         self._sent: dict[tuple[int, float], list[SentMessage]] = {}  # by receiver, time of sending
         first: dict[tuple[int, float], float] = {}  # earliest reading among those that arrive at T

@@ -27,6 +27,7 @@ class KcfRule(ErrorRule):
     """
 
     def __init__(self, scenario: Scenario, errors: StackedErrors) -> None:
+        """Take the errors at time 0 and the filter's settings."""
         super().__init__(scenario, errors)
         algorithm: Any = scenario.filter.algorithm
         self._epsilon, self._share = algorithm.epsilon, algorithm.share_readings

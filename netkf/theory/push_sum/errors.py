@@ -57,6 +57,9 @@ class AveragingRule(ErrorRule):
     takes_messages = False
 
     def __init__(self, scenario: Scenario, errors: StackedErrors, run: Run) -> None:
+        """Take the errors at time 0 and the messages of the run that arrived; masses ``_z``
+        (N, 2 + n^2) begin as in P (3).
+        """
         super().__init__(scenario, errors)
         algorithm: Any = scenario.filter.algorithm
         self._gamma, self._delta = int(algorithm.gamma or 1), float(algorithm.delta or math.nan)
@@ -145,6 +148,9 @@ class RunningTotalsRule(ErrorRule):
     def __init__(
         self, scenario: Scenario, errors: StackedErrors, rounds: Mapping[float, Sequence[int]]
     ) -> None:
+        """Take the errors at time 0, and ``rounds``: the indices of the nodes that broadcast, by
+        time (seconds).
+        """
         super().__init__(scenario, errors, rounds)
         if errors.follows:
             raise TheoryError("the exact errors are known for filters that have the plant's A")

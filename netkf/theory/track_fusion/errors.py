@@ -84,6 +84,7 @@ class TrackRule(ErrorRule):
     """Tracks of the nodes, which nothing but readings changes, and combinations of them."""
 
     def __init__(self, scenario: Scenario, errors: StackedErrors) -> None:
+        """Take the errors at time 0; each track begins as a copy of its node's estimate."""
         super().__init__(scenario, errors)
         self._models = scenario.slot_models
         self._sensors = [whitened_sensors(model) for model in self._models]
