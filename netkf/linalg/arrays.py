@@ -24,7 +24,7 @@ __all__ = [
 
 
 def readonly_array(value: ArrayLike) -> FloatArray:
-    """Return a read-only float64 copy."""
+    """Return a read-only float64 copy of an array or nested lists of any shape."""
     # A copy: the caller may go on writing into its own array.
     array = np.array(value, dtype=np.float64)
     array.flags.writeable = False
@@ -32,19 +32,25 @@ def readonly_array(value: ArrayLike) -> FloatArray:
 
 
 def symmetric(matrices: FloatArray) -> FloatArray:
-    """Return the symmetric part of one matrix (n, n) or of a stack of them (..., n, n)."""
+    """Return the symmetric part, (n, n) or (..., n, n), of one matrix (n, n) or of a stack of
+    them.
+    """
     return np.asarray(0.5 * (matrices + np.swapaxes(matrices, -1, -2)))
 
 
 def is_semidefinite(matrix: FloatArray, tolerance: float = 1e-10) -> bool:
-    """Return True if no eigenvalue of a symmetric matrix is below -tolerance times its largest."""
+    """Return True if no eigenvalue of a symmetric ``matrix`` (n, n) is below -tolerance times its
+    largest.
+    """
     values = np.linalg.eigvalsh(matrix)
     # Relative to the largest eigenvalue; the smallest normal number admits the zero matrix.
     return bool(values[0] >= -tolerance * max(abs(values[-1]), np.finfo(float).tiny))
 
 
 def square_root(matrix: FloatArray) -> FloatArray:
-    """Return a factor ``S`` (n, n) with ``S S' = matrix``; the matrix may be singular."""
+    """Return a factor ``S`` (n, n) with ``S S' = matrix``, positive semidefinite (n, n); it may be
+    singular.
+    """
     # Eigenvalues instead of Cholesky, which fails for singular matrices.
     values, vectors = np.linalg.eigh(matrix)
     # Negative eigenvalues are rounding of zero.
@@ -52,7 +58,9 @@ def square_root(matrix: FloatArray) -> FloatArray:
 
 
 def block_diagonal(blocks: Sequence[FloatArray]) -> FloatArray:
-    """Return a matrix with ``blocks``, possibly rectangular or empty, along its diagonal."""
+    """Return a matrix (r, c) with ``blocks`` (r_k, c_k), possibly rectangular or empty, along its
+    diagonal, r and c being the sums of their rows and columns.
+    """
     rows = sum(b.shape[0] for b in blocks)
     columns = sum(b.shape[1] for b in blocks)
     # Empty slices assign blocks without rows or columns correctly.
@@ -66,8 +74,8 @@ def block_diagonal(blocks: Sequence[FloatArray]) -> FloatArray:
 
 
 def as_kernel_array(matrix: FloatArray) -> FloatArray:
-    """Return the matrix, or a copy, as a writable C-contiguous array, the only layout for which
-    kernels are compiled.
+    """Return the matrix (r, c), or a copy, as a writable C-contiguous array, the only layout for
+    which kernels are compiled.
     """
     if matrix.flags.c_contiguous and matrix.flags.writeable:
         return matrix

@@ -13,8 +13,9 @@ ROUNDING = 2.0**-54
 
 @kernel(compact=True)
 def diagonalise(a: FloatArray, vectors: FloatArray) -> None:
-    """Leave the eigenvalues of a symmetric ``a`` (n, n) on its diagonal and write its eigenvectors
-    into the columns of ``vectors`` (n, n). Cyclic sweeps (Golub and Van Loan, section 8.5).
+    """Leave the eigenvalues of a symmetric ``a`` (n, n) on its diagonal, zeros elsewhere, and write
+    its eigenvectors into the columns of ``vectors`` (n, n). Cyclic sweeps (Golub and Van Loan,
+    section 8.5).
     """
     n = len(a)
     for i in range(n):
@@ -38,7 +39,9 @@ def diagonalise(a: FloatArray, vectors: FloatArray) -> None:
 
 @kernel
 def rotate(a: FloatArray, vectors: FloatArray, p: int, q: int) -> None:
-    """Apply the Jacobi rotation a <- J' a J, V <- V J in the plane (p, q) that makes a[p, q] 0."""
+    """Apply the Jacobi rotation a <- J' a J, V <- V J in the plane (p, q) that makes a[p, q] 0, to
+    the symmetric ``a`` (n, n) and V = ``vectors`` (n, n) in place.
+    """
     # t = tan(angle), the smaller of both solutions: |t| <= 1. An infinite tilt is an angle of 0.
     n, tilt = len(a), (a[q, q] - a[p, p]) / (2.0 * a[p, q])
     t = math.copysign(1.0, tilt) / (abs(tilt) + math.sqrt(1.0 + tilt * tilt))

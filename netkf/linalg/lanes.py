@@ -32,7 +32,9 @@ ONE: Lanes = (0,)
 
 
 def aligned(shape: tuple[int, ...], dtype: Any = np.float64) -> Any:
-    """Zeros in memory that begins at a line of the cache, C-contiguous."""
+    """Return an array of zeros of this ``shape`` in memory that begins at a line of the cache,
+    C-contiguous.
+    """
     size = math.prod(shape) * np.dtype(dtype).itemsize
     memory = np.zeros(size + ALIGNMENT, dtype=np.uint8)
     start = -memory.__array_interface__["data"][0] % ALIGNMENT
@@ -40,55 +42,66 @@ def aligned(shape: tuple[int, ...], dtype: Any = np.float64) -> Any:
 
 
 def unset(shape: tuple[int, ...]) -> Any:
-    """Memory as ``aligned``, with anything in it: for large arrays that are filled at once."""
+    """Return a float64 array of this ``shape`` in memory that begins at a line of the cache, with
+    anything in it: for large arrays that are filled at once.
+    """
     memory = np.empty(math.prod(shape) + ALIGNMENT // 8)
     start = -memory.__array_interface__["data"][0] % ALIGNMENT // 8
     return memory[start : start + math.prod(shape)].reshape(shape)
 
 
 def with_spare(shape: tuple[int, ...], make: Callable[[tuple[int, ...]], Any] = aligned) -> Any:
-    """An array that ``make`` (``aligned`` or ``unset``) makes, with memory for a block of L by L
-    behind it.
+    """Return an array of this ``shape`` that ``make`` (``aligned`` or ``unset``) makes, with memory
+    for a block of L by L numbers behind it, so that reading whole blocks never leaves it.
     """
     entries = math.prod(shape)
     return make((entries + LANES * LANES,))[:entries].reshape(shape)
 
 
 def blocks_of(runs: int, lanes: int = LANES) -> int:
-    """Number of blocks of so many ``lanes`` that hold the runs; the last may have idle lanes."""
+    """Return the number of blocks of so many ``lanes`` that hold the ``runs``; the last may have
+    idle lanes.
+    """
     return -(-runs // lanes)
 
 
 def in_lanes(values: FloatArray, blocks: int, lanes: int = LANES) -> FloatArray:
-    """The same ``values`` (...) for each lane: (blocks, ..., lanes)."""
+    """Return an array (blocks, ..., lanes) with the same ``values`` (...) in each lane."""
     made: FloatArray = aligned((blocks, *values.shape, lanes))
     made[:] = values[..., None]
     return made
 
 
 def by_run(values: Any, runs: int) -> Any:
-    """(runs, ...) from lanes (B, ..., L)."""
+    """Return ``values`` (B, ..., L) of B blocks of L lanes as an array (runs, ...), one run after
+    the other; the idle lanes of the last block are left out.
+    """
     blocks, *shape, lanes = values.shape
     every = np.moveaxis(values, -1, 1).reshape(blocks * lanes, *shape)
     return np.ascontiguousarray(every[:runs])
 
 
 def load(lanes: Lanes, array: FloatArray, *place: int) -> Any:
-    """Return ``array[place]`` (L,) as one value."""
+    """Return, in kernels, ``array[place]`` (L,) as one value of L lanes."""
     raise _only_in_kernels()
 
 
 def turn(lanes: Lanes, rows: FloatArray, column: int, out: FloatArray) -> None:
-    """Write ``rows[q, column + k]`` into ``out[column + k, q]``, for all lanes q and k < L."""
+    """Transpose a block in kernels: write ``rows[q, column + k]`` into ``out[column + k, q]``, for
+    all lanes q and k < L; ``rows`` is (L, W), ``out`` (W, L).
+    """
     raise _only_in_kernels()
 
 
 def gather(
     lanes: Lanes, array: FloatArray, places: np.ndarray, first: int, out: FloatArray
 ) -> None:
-    """Write the L entries from ``first`` on of ``array[places[q]]`` into the L rows of ``out`` from
-    there on, lane q of each. Both arrays are taken as matrices, and have memory behind their last
-    entries (``with_spare``). Where a place is negative, lane q gets something.
+    """Transpose rows of different places into lanes, in kernels: write the L entries from ``first``
+    on of ``array[places[q]]`` into lane q of the L rows of ``out`` from ``first`` on.
+
+    ``array`` (K, W) and ``out`` (W, L) are taken as matrices, whatever their axes, and have memory
+    behind their last entries (``with_spare``). Where a place (L,) is negative, lane q gets
+    something.
     """
     raise _only_in_kernels()
 
@@ -96,14 +109,18 @@ def gather(
 def scatter(
     lanes: Lanes, rows: FloatArray, first: int, array: FloatArray, places: np.ndarray, count: int
 ) -> None:
-    """Write them back, the ``count`` first of them, where the place is not negative. The array may
-    be a part ``whole[:, k]`` of another.
+    """Transpose lanes back into rows of different places, in kernels: write lane q of the
+    ``count``, at most L, rows of ``rows`` (W, L) from ``first`` on into ``array[places[q]]``
+    (K, W), where the place (L,) is not negative. The array may be a part ``whole[:, k]`` of
+    another.
     """
     raise _only_in_kernels()
 
 
 def store(lanes: Lanes, array: FloatArray, *place_and_value: Any) -> None:
-    """Write a value, the last argument, into ``array[place]`` (L,); a float into all lanes."""
+    """Write, in kernels, a value of L lanes, the last argument, into ``array[place]`` (L,); a float
+    into all lanes.
+    """
     raise _only_in_kernels()
 
 
@@ -115,42 +132,46 @@ def prefetch(array: np.ndarray, *place: int) -> None:
 
 
 def spread(lanes: Lanes, number: float) -> Any:
-    """Return a number in all lanes as one value."""
+    """Return, in kernels, one value with a number in all L lanes."""
     raise _only_in_kernels()
 
 
 def load_flags(lanes: Lanes, array: np.ndarray, *place: int) -> Any:
-    """Return flags, set where ``array[place]`` (L,) of uint8 is not 0."""
+    """Return, in kernels, flags of L lanes, set where ``array[place]`` (L,) of uint8 is not 0."""
     raise _only_in_kernels()
 
 
 def store_flags(lanes: Lanes, array: np.ndarray, *place_and_flags: Any) -> None:
-    """Write flags, the last argument, into ``array[place]`` (L,) of uint8 as 1 and 0."""
+    """Write, in kernels, flags of L lanes, the last argument, into ``array[place]`` (L,) of uint8
+    as 1 and 0.
+    """
     raise _only_in_kernels()
 
 
 def select(flags: Any, chosen: Any, other: Any) -> Any:
-    """Return ``chosen`` in the lanes that are flagged, ``other`` in the rest."""
+    """Return, in kernels, the value that is ``chosen`` in the lanes that are flagged, ``other`` in
+    the rest.
+    """
     raise _only_in_kernels()
 
 
 def any_lane(flags: Any) -> bool:
-    """Return True if a lane is flagged."""
+    """Return True, in kernels, if at least one lane is flagged."""
     raise _only_in_kernels()
 
 
 def root_of(value: Any) -> Any:
-    """Return the square root."""
+    """Return, in kernels, the square root of a value, lane by lane."""
     raise _only_in_kernels()
 
 
 def magnitude(value: Any) -> Any:
-    """Return the absolute value."""
+    """Return, in kernels, the absolute value, lane by lane."""
     raise _only_in_kernels()
 
 
 def with_sign(size: Any, sign: Any) -> Any:
-    """Return ``size`` with the sign of ``sign``."""
+    """Return, in kernels, ``size`` with the sign of ``sign``, lane by lane."""
     raise _only_in_kernels()
 
 

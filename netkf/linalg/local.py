@@ -15,22 +15,30 @@ from netkf.linalg.structs import Size
 def local_matrix(size: Size, scratch: FloatArray) -> FloatArray:  # noqa: ARG001
     """Return, in kernels, an uninitialised array (n, n), valid until the calling kernel returns.
 
-    It is on the stack if ``size`` is a tuple, and ``scratch`` if ``size`` is an array. Called from
-    Python it raises TypeError.
+    It is on the stack if ``size`` is a tuple, and ``scratch`` (n, n) if ``size`` is an array.
+    Called from Python it raises TypeError.
     """
     raise TypeError("local_matrix is for kernels")
 
 
 def local_vector(size: Size, scratch: FloatArray) -> FloatArray:  # noqa: ARG001
-    """Return, in kernels, an uninitialised (n,), as ``local_matrix``."""
+    """Return, in kernels, an uninitialised array (n,), valid until the calling kernel returns: on
+    the stack if ``size`` is a tuple, else ``scratch`` (n,). Called from Python it raises TypeError.
+    """
     raise TypeError("local_vector is for kernels")
 
 
 def local_lanes_matrix(size: Size, lanes: Lanes, scratch: FloatArray) -> FloatArray:  # noqa: ARG001
-    """Return, in kernels, an uninitialised (n, n, L), as ``local_matrix``."""
+    """Return, in kernels, an uninitialised array (n, n, L), valid until the calling kernel returns:
+    on the stack if ``size`` is a tuple, else ``scratch`` (n, n, L). Called from Python it raises
+    TypeError.
+    """
     raise TypeError("local_lanes_matrix is for kernels")
 
 
 def local_lanes_vector(size: Size, lanes: Lanes, scratch: FloatArray) -> FloatArray:  # noqa: ARG001
-    """Return, in kernels, an uninitialised (n, L), as ``local_matrix``."""
+    """Return, in kernels, an uninitialised array (n, L), valid until the calling kernel returns: on
+    the stack if ``size`` is a tuple, else ``scratch`` (n, L). Called from Python it raises
+    TypeError.
+    """
     raise TypeError("local_lanes_vector is for kernels")

@@ -22,7 +22,9 @@ SAME = 0.9
 
 
 def product(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Return ``a b`` (..., r, c) of (..., r, m) and (..., m, c)."""
+    """Return the product ``a b`` (..., r, c) of matrices ``a`` (..., r, m) and ``b``
+    (..., m, c).
+    """
     if a.shape[-1] == 0:
         shape = np.broadcast_shapes(a.shape[:-2], b.shape[:-2])
         return np.zeros((*shape, a.shape[-2], b.shape[-1]))
@@ -34,7 +36,9 @@ def product(a: FloatArray, b: FloatArray) -> FloatArray:
 
 
 def apply(a: FloatArray, x: FloatArray) -> FloatArray:
-    """Return ``a x`` (..., r) of (..., r, m) and (..., m)."""
+    """Return the product ``a x`` (..., r) of matrices ``a`` (..., r, m) and vectors ``x``
+    (..., m).
+    """
     if a.shape[-1] == 0:
         return np.zeros(np.broadcast_shapes(a.shape[:-1], (*x.shape[:-1], 1)))
     total: FloatArray = a[..., 0] * x[..., 0, None] + 0.0
@@ -44,12 +48,14 @@ def apply(a: FloatArray, x: FloatArray) -> FloatArray:
 
 
 def norm(x: FloatArray) -> FloatArray:
-    """Return the Euclidean norms (...) of vectors (..., m)."""
+    """Return the Euclidean norms (...) of vectors ``x`` (..., m)."""
     return np.asarray(np.sqrt(product(x[..., None, :], x[..., None])[..., 0, 0]))
 
 
 def cholesky(matrix: FloatArray) -> FloatArray:
-    """Return the lower triangular ``L`` with ``L L' = matrix`` (n, n), positive definite."""
+    """Return the lower triangular ``L`` (n, n) with ``L L' = matrix``, which is (n, n) and positive
+    definite.
+    """
     L = np.array(matrix, dtype=np.float64)
     for k in range(len(L)):
         L[k, k] = np.sqrt(L[k, k])
@@ -59,7 +65,9 @@ def cholesky(matrix: FloatArray) -> FloatArray:
 
 
 def solve_lower(L: FloatArray, right: FloatArray) -> FloatArray:
-    """Return ``L^-1 right`` (..., n, c) of a lower triangular ``L`` (n, n)."""
+    """Return ``L^-1 right`` (..., n, c) of a lower triangular ``L`` (n, n) and ``right``
+    (..., n, c).
+    """
     out = np.array(right, dtype=np.float64)
     for k in range(len(L)):
         out[..., k, :] /= L[k, k]
@@ -68,7 +76,9 @@ def solve_lower(L: FloatArray, right: FloatArray) -> FloatArray:
 
 
 def eigenvectors(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return eigenvalues (n,), increasing, and eigenvectors (n, n) of a symmetric matrix."""
+    """Return the eigenvalues (n,) of a symmetric ``matrix`` (n, n), increasing, and its
+    eigenvectors, the columns of (n, n).
+    """
     A, V = np.ascontiguousarray(symmetric(matrix)), np.eye(len(matrix))
     # Diagonal matrices, which are frequent, need no compiled kernel.
     if np.count_nonzero(A - np.diag(A.diagonal())):
@@ -78,13 +88,15 @@ def eigenvectors(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _spectral(matrix: FloatArray, function: Callable[[FloatArray], FloatArray]) -> FloatArray:
-    """Return ``V f(w) V'`` of a symmetric matrix ``V diag(w) V'``."""
+    """Return ``V f(w) V'`` (n, n) of a symmetric ``matrix`` (n, n) = ``V diag(w) V'``; ``function``
+    f maps the eigenvalues w (n,).
+    """
     values, vectors = eigenvectors(matrix)
     return symmetric(product(vectors * function(values), vectors.T))
 
 
 def symmetric_root(matrix: FloatArray) -> FloatArray:
-    """Return the symmetric square root (n, n) of a positive semidefinite matrix.
+    """Return the symmetric square root (n, n) of a positive semidefinite ``matrix`` (n, n).
 
     It is a continuous function of the matrix, unlike :func:`noise_root`, whose eigenvectors may
     change abruptly.
@@ -93,12 +105,12 @@ def symmetric_root(matrix: FloatArray) -> FloatArray:
 
 
 def pseudo_inverse(matrix: FloatArray, rcond: float) -> FloatArray:
-    """Return the pseudo-inverse of a symmetric matrix, in which eigenvalues of size up to ``rcond``
-    times the largest count as 0.
+    """Return the pseudo-inverse (n, n) of a symmetric ``matrix`` (n, n), in which eigenvalues of
+    size up to ``rcond`` times the largest count as 0.
     """
 
     def invert(values: FloatArray) -> FloatArray:
-        """Return the reciprocals of eigenvalues, 0 for those that count as 0."""
+        """Return the reciprocals (n,) of eigenvalues (n,), 0 for those that count as 0."""
         small = np.abs(values) <= rcond * np.abs(values).max(initial=0.0)
         return np.where(small, 0.0, 1.0 / np.where(small, 1.0, values))
 
@@ -106,8 +118,8 @@ def pseudo_inverse(matrix: FloatArray, rcond: float) -> FloatArray:
 
 
 def noise_root(matrix: FloatArray) -> FloatArray:
-    """Return a factor ``S`` (n, n) with ``S S' = matrix``, equal to ``square_root`` up to rounding
-    but with the same bits on every CPU.
+    """Return a factor ``S`` (n, n) with ``S S' = matrix`` (n, n), equal to ``square_root`` up to
+    rounding but with the same bits on every CPU.
 
     The order and signs of its columns are those of LAPACK. Where the eigenvectors cannot be matched
     with LAPACK's (multiple eigenvalues have arbitrary ones), and for more than MAX_REFINED_STATES

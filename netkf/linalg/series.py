@@ -51,7 +51,10 @@ def with_reach(series: FloatArray, longest: float) -> FloatArray:
 
 @kernel
 def fill_polynomial(out: FloatArray, series: FloatArray, gap: float) -> None:
-    """Write the first len(out) entries of the sum at ``gap`` seconds into ``out``."""
+    """Write the first len(out) entries of ``sum_k gap^k series[k]`` at ``gap`` (seconds) into
+    ``out`` (m,), from a table ``series`` (terms, size + 1) whose last column is the reach of each
+    term.
+    """
     fill_series(out, len(out), series, series, series.shape[1] - 1, gap)
 
 
@@ -59,7 +62,8 @@ def fill_polynomial(out: FloatArray, series: FloatArray, gap: float) -> None:
 def fill_series(
     out: FloatArray, width: int, series: FloatArray, reach: FloatArray, column: int, gap: float
 ) -> None:
-    """Write the first ``width`` entries of ``sum_k gap^k series[k]`` into ``out``.
+    """Write the first ``width`` entries of ``sum_k gap^k series[k]`` at ``gap`` (seconds) into
+    ``out`` (>= width,); ``series`` is (terms, >= width).
 
     ``reach`` (terms, ...) has in ``column`` the longest abs(gap) for which the terms up to each k
     suffice.
@@ -80,7 +84,10 @@ def fill_series(
 def horner(
     order: tuple[int, ...], out: FloatArray, width: int, series: FloatArray, gap: float
 ) -> None:
-    """Write ``sum_{k <= K} gap^k series[k]`` into ``out`` (width,), K = len(order): Horner."""
+    """Write ``sum_{k <= K} gap^k series[k]`` at ``gap`` (seconds) into ``out`` (width,), by
+    Horner's scheme; ``order`` is a tuple of length K, which is then known when the kernel is
+    compiled, and ``series`` is (> K, >= width).
+    """
     # Entries are the outer loop, which LLVM vectorises.
     for j in range(width):
         total = series[len(order), j]
@@ -93,8 +100,9 @@ def horner(
 def add_terms(
     out: FloatArray, width: int, series: FloatArray, reach: FloatArray, column: int, gap: float
 ) -> None:
-    """Write ``sum_k gap^k series[k]`` into ``out`` (width,), with as many terms as ``reach`` in
-    this ``column`` requires for the gap.
+    """Write ``sum_k gap^k series[k]`` at ``gap`` (seconds) into ``out`` (width,), with as many
+    terms of ``series`` (terms, >= width) as ``reach`` (terms, ...) in this ``column`` requires for
+    the gap.
     """
     for j in range(width):
         out[j] = series[0, j]
@@ -111,10 +119,11 @@ def add_terms(
 def fill_row(
     out: FloatArray, row: int, series: FloatArray, terms: int, m: int, cell: int, gap: float
 ) -> None:
-    """Write the sum of ``gap^k series[m, cell, k]`` over k < ``terms`` into a ``row`` of ``out``.
+    """Write the sum of ``gap^k series[m, cell, k]`` (W,) over k < ``terms`` into row ``row`` of
+    ``out`` (L, W), for model ``m`` and a cell of gaps, at ``gap`` seconds from its centre.
 
-    The width W of ``series`` (., cells, K, W) is a multiple of L lanes. The numbers of terms
-    in MANY_TERMS have unrolled loops.
+    The width W of ``series`` (M, cells, K, W) is a multiple of L lanes. The numbers of terms in
+    MANY_TERMS have unrolled loops.
     """
     if terms == len(ORDER_7) + 1:
         fill_blocks(ORDER_7, out, row, series, m, cell, gap)
@@ -138,8 +147,9 @@ def fill_blocks(
     cell: int,
     gap: float,
 ) -> None:
-    """Write ``sum_k gap^k series[m, cell, k]`` over k <= len(order) into a ``row`` of ``out``, by
-    Horner's scheme for blocks of L entries at a time.
+    """Write ``sum_k gap^k series[m, cell, k]`` (W,) over k <= len(order) into row ``row`` of
+    ``out`` (L, W), by Horner's scheme for blocks of L entries at a time; ``series`` is
+    (M, cells, K, W), for M models and cells of gaps.
     """
     for j in range(0, series.shape[3], LANES):
         total = load(MANY, series, m, cell, len(order), j)
@@ -150,7 +160,9 @@ def fill_blocks(
 
 @kernel(allocates=True, compact=True)
 def polynomial(series: FloatArray, gap: float) -> FloatArray:
-    """Return ``sum_k gap^k series[k]`` (size,) of a table (terms, size + 1) from with_reach()."""
+    """Return ``sum_k gap^k series[k]`` (size,) at ``gap`` (seconds), of a table ``series``
+    (terms, size + 1) from with_reach(), as a new array.
+    """
     out = np.empty(series.shape[1] - 1)
     fill_polynomial(out, series, gap)
     return out

@@ -14,13 +14,13 @@ from netkf.linalg.compiling import kernel
 
 @kernel(allocates=True)
 def matmul(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Return ``a b`` (r, c) of (r, m) and (m, c)."""
+    """Return the product ``a b`` (r, c) of ``a`` (r, m) and ``b`` (m, c), as a new array."""
     return add_matmul(np.zeros((a.shape[0], b.shape[1])), a, b)
 
 
 @kernel(allocates=True)
 def add_matmul(c: FloatArray, a: FloatArray, b: FloatArray) -> FloatArray:
-    """Return ``c + a b`` (r, s) of (r, s), (r, m) and (m, s)."""
+    """Return ``c + a b`` (r, s) of ``c`` (r, s), ``a`` (r, m) and ``b`` (m, s), as a new array."""
     out = np.empty(c.shape)
     for i in range(c.shape[0]):
         for j in range(c.shape[1]):
@@ -33,7 +33,7 @@ def add_matmul(c: FloatArray, a: FloatArray, b: FloatArray) -> FloatArray:
 
 @kernel(allocates=True)
 def matvec(a: FloatArray, x: FloatArray) -> FloatArray:
-    """Return ``a x`` (r,) of (r, m) and (m,)."""
+    """Return the product ``a x`` (r,) of ``a`` (r, m) and ``x`` (m,), as a new array."""
     out = np.empty(a.shape[0])
     for i in range(a.shape[0]):
         total = 0.0
@@ -45,7 +45,7 @@ def matvec(a: FloatArray, x: FloatArray) -> FloatArray:
 
 @kernel(allocates=True)
 def symmetrize(P: FloatArray) -> FloatArray:
-    """Return the symmetric part of one matrix (n, n)."""
+    """Return the symmetric part (n, n) of one matrix ``P`` (n, n), as a new array."""
     out = np.empty(P.shape)
     for i in range(P.shape[0]):
         for j in range(i + 1):
@@ -87,7 +87,9 @@ def solve_inplace(L: FloatArray, out: FloatArray, n: int) -> None:
 
 @kernel
 def largest_pivot(L: FloatArray, k: int, n: int) -> int:
-    """Return the row, from k to n - 1, with the largest entry in column k."""
+    """Return the row, from ``k`` to ``n`` - 1, with the largest absolute entry in column ``k`` of
+    ``L`` (>= n, >= n).
+    """
     pivot = k
     for i in range(k + 1, n):
         if abs(L[i, k]) > abs(L[pivot, k]):
@@ -97,7 +99,9 @@ def largest_pivot(L: FloatArray, k: int, n: int) -> int:
 
 @kernel
 def swap_rows(a: FloatArray, i: int, k: int, first: int, last: int) -> None:
-    """Swap rows i and k from column ``first`` to before ``last``."""
+    """Swap rows ``i`` and ``k`` of a matrix ``a`` (r, c) in place, from column ``first`` to
+    ``last`` - 1.
+    """
     for j in range(first, last):
         a[i, j], a[k, j] = a[k, j], a[i, j]
 
@@ -112,7 +116,7 @@ def solve(left: FloatArray, right: FloatArray) -> FloatArray:
 
 @kernel
 def copy_matrix(target: FloatArray, source: FloatArray) -> None:
-    """Copy ``source`` into ``target`` of the same shape."""
+    """Copy ``source`` (r, c) into ``target`` (>= r, >= c)."""
     # ``target[:] = source`` would compile broadcasting and its errors: seconds of compile time.
     for i in range(source.shape[0]):
         for j in range(source.shape[1]):

@@ -180,5 +180,7 @@ def sized(n: int) -> Size:
 
 
 def struct_at(memory: np.ndarray, cls: type[Derived]) -> Derived:  # noqa: ARG001
-    """Return, in kernels, the struct of class ``cls`` with this memory; Python raises TypeError."""
+    """Return, in kernels, the struct of class ``cls`` whose block of int64 words is ``memory``
+    (words,); Python raises TypeError.
+    """
     raise TypeError("struct_at is for kernels; Python has the struct itself")

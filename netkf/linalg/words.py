@@ -6,5 +6,7 @@ from typing import Any
 
 
 def high_word(a: Any, b: Any) -> Any:  # noqa: ARG001
-    """Return, in kernels, the upper 64 bits of a product. Python raises TypeError."""
+    """Return, in kernels, the upper 64 bits of the product of two unsigned 64-bit words. Python
+    raises TypeError.
+    """
     raise TypeError("high_word is for kernels")

@@ -70,11 +70,11 @@ class Diffusion(Plant):
         frames: bool = False,
     ) -> DiffusionPath:
         """Return the path of one run, with states on the sensing grid and at the times ``sampled``
-        and ``probe_times`` (increasing, seconds).
+        (K,) and ``probe_times`` (P,), increasing, in seconds.
 
         ``random`` draws x(0) and the steps, ``sampling`` only the states at times ``sampled`` off
         the grid, ``probing`` only those at probe times off both. With ``frames`` states are local
-        to frames that begin before the ``horizon``, see ``truth``.
+        to frames that begin before the ``horizon`` (seconds), see ``truth``.
         """
         steps, probes = GeneratorNormals([random]), GeneratorNormals([probing])
         samples = GeneratorNormals([] if sampling is None else [sampling])
@@ -90,8 +90,12 @@ class Diffusion(Plant):
         sampled: FloatArray = NO_TIMES,
         frames: bool = False,
     ) -> DiffusionPaths:
-        """Return the paths of several runs, one for each stream of ``normals``; all are sampled and
-        probed at the same times. Parameters are as in ``path``.
+        """Return the paths of R runs, one for each of the R streams of ``normals``, which draw x(0)
+        and the steps; all have states on the sensing grid and at the times ``sampled`` and
+        ``probe_times`` (increasing, seconds), (K,) each.
+
+        ``sampling`` draws only the states at times ``sampled`` off the grid, ``probing`` those at
+        probe times off both. With ``frames`` states are local to frames, see ``truth``.
         """
         start = self.starts(normals)
         cuts = [] if sampling is None or not len(sampled) else [Cuts(sampled, sampling)]
@@ -99,7 +103,7 @@ class Diffusion(Plant):
         return DiffusionPaths(self.laws, start, normals, [*cuts, Cuts(probe_times, probing)], steps)
 
     def start(self, random: np.random.Generator) -> FloatArray:
-        """Draw x(0) (n,)."""
+        """Draw and return x(0) (n,)."""
         return np.asarray(self.starts(GeneratorNormals([random]))[0])
 
     @property
@@ -118,8 +122,10 @@ class Diffusion(Plant):
         horizon: float,
         frames: bool = False,
     ) -> SampledTruth:
-        """Return a path without a sensing grid: it has states only at ``samples``, ``probes`` and
-        frame times (seconds), up to the ``horizon``.
+        """Return a path without a sensing grid: it has states only at ``samples`` (K,), ``probes``
+        (P,) and frame times (seconds), up to the ``horizon``. ``random`` draws x(0) and the states
+        at samples, ``probing`` those at probes. With ``frames`` states are local to frames, see
+        ``truth``.
         """
         marks = multiples(frame_period(self.A), horizon)
         start = self.start(random)

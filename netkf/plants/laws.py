@@ -39,12 +39,12 @@ def grid_time(period: float, k: int) -> float:
 
 
 class GridLaws:
-    """The laws of all paths of ``dx = A x dt + B dw`` on the sensing grid of one ``period`` (s).
+    """The laws of all paths of ``dx = A x dt + B dw`` on the sensing grid of one ``period`` (s);
+    ``A`` (n, n), ``B`` (n, m).
 
-    to_end, to_moments  power series of the response to the state at the start of a step
-    response            (3, n, n) that response over one period
-    noise_factor        (3 n, 3 n) lower triangular root of the covariance of end and moments
-    course_table        the table that ``paths.fill_course`` uses
+    to_end, to_moments  power series of the response to the state at the start of a step response
+    (3, n, n) that response over one period noise_factor        (3 n, 3 n) lower triangular root of
+    the covariance of end and moments course_table        the table that ``paths.fill_course`` uses
 
     Laws of states inside a step are computed on demand and cached.
     """
@@ -60,7 +60,9 @@ class GridLaws:
         self._grids: dict[tuple[int, int], FloatArray] = {}
 
     def grid(self, first: int, count: int) -> FloatArray:
-        """Return the points ``first`` .. ``first + count - 1`` of the sensing grid in seconds."""
+        """Return the points ``first`` .. ``first + count - 1`` of the sensing grid in seconds,
+        (count,).
+        """
         times = self._grids.get((first, count))
         if times is None:
             times = np.array([grid_time(self.period, first + k) for k in range(count)])
@@ -86,8 +88,9 @@ class GridLaws:
     def _fill_impulses(
         self, out: FloatArray, row: int, end: float, instants: FloatArray, weights: FloatArray
     ) -> None:
-        """Write the responses to noise at ``instants`` into 3 n rows of ``out`` from ``row`` on;
-        see ``fill_impulses``.
+        """Write the responses of x(end) and of the two moments over [0, end] to noise at K
+        ``instants`` (K,), with quadrature ``weights`` (K,), all in seconds, into 3 n rows of
+        ``out`` (., K m) from ``row`` on.
         """
         tables = self.to_end, self.to_moments, self.B
         fill_impulses(out, row, *tables, end, instants, weights)
@@ -108,7 +111,10 @@ class GridLaws:
         return law
 
     def _conditional(self, length: float, before: float) -> tuple[FloatArray, FloatArray]:
-        """Compute ``conditional_law``."""
+        """Compute the law of state and moments ``before`` seconds after the start of a piece, given
+        the end and moments of the whole piece of ``length`` seconds: the gain of the conditional
+        mean and a square root of the conditional covariance, both (3 n, 3 n).
+        """
         size, after = 3 * self.n, length - before
         instants = np.concatenate([_NODES * before, before + _NODES * after])
         weights = np.concatenate([_WEIGHTS * before, _WEIGHTS * after])
@@ -135,7 +141,8 @@ def fill_impulses(
     weights: FloatArray,
 ) -> None:
     """Write the response of x(end) and of the moments over [0, end] to an impulse of the noise at
-    each of K ``instants``, times sqrt(weight), into 3 n rows of ``out`` (., K m) from ``row`` on.
+    each of K ``instants`` (K,), in seconds, times the root of its ``weights`` (K,), into 3 n rows
+    of ``out`` (., K m) from ``row`` on.
 
     By Gauss quadrature ``out out'`` is the covariance of end and moments. Noise after ``end`` has
     no effect. ``B`` is (n, m); the series ``to_end`` and ``to_moments`` are those of GridLaws.
@@ -163,9 +170,9 @@ def fill_impulses(
 
 
 def _response_series(A: FloatArray, longest: float) -> tuple[FloatArray, FloatArray]:
-    """Return power series in the gap g <= ``longest`` (seconds) of ``exp(A g)`` (terms, n n + 1)
-    and of its two moments over the gap (terms, 2 n n + 1). The last column is the reach of each
-    term, see linalg/series.
+    """Return power series in the gap g <= ``longest`` (seconds) of ``exp(A g)``, (terms, n n + 1),
+    and of its two moments over the gap, (terms, 2 n n + 1), for ``A`` (n, n) in 1/s. The last
+    column is the reach of each term, see linalg/series.
     """
     n, norm_times_gap = len(A), float(np.abs(A).sum(axis=0).max()) * longest
     # The term |A g|^k / k! bounds the rest of the series from some k on.

@@ -46,8 +46,8 @@ class LinearPlant(Plant):
         return float(round(k * self.period, 12))
 
     def slots_of(self, times: FloatArray) -> np.ndarray:
-        """Return the slot that contains each time (seconds); a time that is below the start of a
-        slot by rounding belongs to that slot.
+        """Return the slot (K,) that contains each of the ``times`` (K,), in seconds; a time that is
+        below the start of a slot by rounding belongs to that slot.
         """
         return np.asarray(np.floor(times / self.period + 1e-9).astype(int))
 
@@ -56,8 +56,8 @@ class LinearPlant(Plant):
         return self.slot_time(slot) >= horizon - 1e-9 * self.period
 
     def truth(self, random: np.random.Generator, frames: bool = False) -> Truth:
-        """Return the truth of one run; with ``frames`` the states of an unstable plant are local to
-        frames, see ``truth``.
+        """Return the truth of one run, drawn from ``random``; with ``frames`` the states of an
+        unstable plant are local to frames, see ``truth``.
         """
         start = self.start_mean + apply(self.start_root, random.standard_normal(self.n))
         slots = frame_slots(self.F) if frames else None
@@ -85,13 +85,15 @@ class Truth(Protocol):
         """Slots from one frame to the next, the first begins at slot 0; None without frames."""
 
     def local(self, slot: int) -> FloatArray:
-        """Return x (n,) in the present frame."""
+        """Return x (n,) in slot number ``slot``, relative to the origin of the present frame."""
 
     def absolute(self, slot: int) -> FloatArray:
-        """Return x (n,)."""
+        """Return x (n,) in slot number ``slot``, in the plant's coordinates."""
 
     def state(self, slot: int) -> FloatArray:
-        """Return x (n,), as ``absolute`` does."""
+        """Return x (n,) in slot number ``slot``, in the plant's coordinates, as ``absolute``
+        does.
+        """
 
     def rebase(self, slot: int) -> FloatArray:
         """Return the shift (n,) to subtract from estimates at a slot that begins a frame: its local
@@ -103,13 +105,15 @@ class Readings(Protocol):
     """The readings of one sensor on one node in slots."""
 
     def matrix(self, slot: int) -> FloatArray:
-        """Return H (p, n) of a slot not before the last one asked for."""
+        """Return H (p, n) in slot number ``slot``, not before the last one asked for."""
 
     def reading(self, slot: int, x: FloatArray) -> FloatArray:
-        """Return the reading (p,) of a slot whose state is x."""
+        """Return the reading (p,) in slot number ``slot``, whose state is x (n,)."""
 
     def several(self, slots: Sequence[int], x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return readings (S, p) and matrices (S, p, n) of increasing slots; x is (S, n)."""
+        """Return readings (S, p) and matrices (S, p, n) of S increasing ``slots``, whose states are
+        x (S, n).
+        """
 
 
 class LinearPath:
@@ -200,7 +204,9 @@ class LinearPath:
 
 
 class SlotReadings:
-    """The readings of one sensor on one node, ``y = H x + v``, one a slot."""
+    """The readings of one sensor on one node, ``y = H x + v``, one a slot: H (p, n), and v with
+    covariance R (p, p) drawn from ``random``.
+    """
 
     def __init__(self, H: FloatArray, R: FloatArray, random: np.random.Generator) -> None:
         self._H, self._root = H, cholesky(R)
@@ -208,29 +214,29 @@ class SlotReadings:
         self._slot, self._v = -1, np.zeros(len(R))
 
     def matrix(self, slot: int) -> FloatArray:
-        """Return H (p, n) of a slot not before the last one asked for."""
+        """Return H (p, n) of slot number ``slot``: the same in all slots."""
         return self._H
 
     def reading(self, slot: int, x: FloatArray) -> FloatArray:
-        """Return ``H x + v`` (p,) of a slot not before the last one asked for, where the state is x
-        (n,).
+        """Return ``H x + v`` (p,) in slot number ``slot``, not before the last one asked for, where
+        the state is x (n,).
         """
         return apply(self.matrix(slot), x) + self.noise(slot)
 
     def noise(self, slot: int) -> FloatArray:
-        """Return the noise v (p,) of a slot not before the last one asked for."""
+        """Return the noise v (p,) of slot number ``slot``, not before the last one asked for."""
         while self._slot < slot:
             self._v = apply(self._root, self._noise.draw())
             self._slot += 1
         return self._v
 
     def matrices(self, slots: Sequence[int]) -> FloatArray:
-        """Return ``matrix`` (S, p, n) of increasing slots."""
+        """Return H (S, p, n) of S increasing ``slots``."""
         return np.broadcast_to(self._H, (len(slots), *self._H.shape))
 
     def several(self, slots: Sequence[int], x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return ``reading`` (S, p) and ``matrix`` (S, p, n) of increasing slots whose states are x
-        (S, n).
+        """Return readings ``H x + v`` (S, p) and H (S, p, n) of S increasing ``slots`` whose states
+        are x (S, n).
         """
         H = self.matrices(slots)
         offsets = np.array(slots) - self._slot - 1
@@ -243,7 +249,7 @@ class SlotReadings:
 
 
 class Blocks:
-    """Standard normal vectors, drawn many at a time."""
+    """Standard normal vectors (size,) from ``random``, drawn many at a time."""
 
     def __init__(self, random: np.random.Generator, size: int) -> None:
         self._random, self._size, self._used = random, size, 0

@@ -42,7 +42,9 @@ class Linearised:
         self._sensor, self._node = sensor, node
 
     def __call__(self, y: FloatArray, xhat: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return ``y - h(xhat) + J xhat`` (p,) and the Jacobian J (p, n) at xhat (n,)."""
+        """Return the reading ``y`` (p,) of a sensor linearised at the estimate ``xhat`` (n,): ``y -
+        h(xhat) + J xhat`` (p,) and the Jacobian J (p, n).
+        """
         J = np.asarray(self._sensor.jacobian(xhat, self._node), dtype=np.float64)
         expected = np.asarray(self._sensor.h(xhat, self._node), dtype=np.float64)
         return self._sensor.difference(y, expected) + J @ xhat, J
@@ -63,11 +65,15 @@ class NonlinearSensor(Sensor):
 
     @abstractmethod
     def h(self, x: FloatArray, node: int) -> FloatArray:
-        """Return the noiseless reading (p,) of a node when the state is x (n,)."""
+        """Return the reading (p,) without noise of the sensor on ``node`` (id) when the state is x
+        (n,).
+        """
 
     @abstractmethod
     def jacobian(self, x: FloatArray, node: int) -> FloatArray:
-        """Return the Jacobian (p, n) of ``h`` at x (n,)."""
+        """Return the Jacobian (p, n) of ``h`` at the state x (n,), for the sensor on ``node``
+        (id).
+        """
 
     def difference(self, y: FloatArray, expected: FloatArray) -> FloatArray:
         """Return the innovation (p,): a reading y (p,) minus the ``expected`` one (p,)."""
@@ -77,7 +83,9 @@ class NonlinearSensor(Sensor):
         """Raise ScenarioError if the sensor cannot read a state of n components."""
 
     def located(self, positions: dict[int, tuple[float, float]] | None) -> NonlinearSensor:
-        """Return the sensor with the nodes at the ``positions`` of the graph, if it uses them."""
+        """Return the sensor with its nodes at the ``positions`` of the graph, coordinates by node
+        id (None: it has none), if the sensor uses them.
+        """
         return self
 
     @property
@@ -92,7 +100,9 @@ class NonlinearSensor(Sensor):
     def slot_path(
         self, node: int, period: float, generator: Callable[[str], np.random.Generator]
     ) -> Any:
-        """Return readings with noise from the stream "noise"."""
+        """Return the readings of the sensor on ``node`` in one run in slots, with noise from the
+        stream "noise" that ``generator`` returns.
+        """
         return NonlinearReadings(self, node, generator("noise"))
 
     def sample_times(
@@ -102,14 +112,19 @@ class NonlinearSensor(Sensor):
         generator: Callable[[str], np.random.Generator],
         horizon: float,
     ) -> FloatArray:
-        """Return the sample times (K,), drawn from the streams "sampling" and "sampling phase"."""
+        """Return the sample times (K,) in seconds, below the ``horizon``, of the sensor on ``node``
+        with the number ``ordinal`` there, drawn from its streams "sampling" and "sampling phase"
+        that ``generator`` returns.
+        """
         assert self.sampling is not None
         return sampling_ticks(self.sampling, (node, ordinal), generator, horizon)
 
     def samples(
         self, node: int, generator: Callable[[str], np.random.Generator], horizon: float
     ) -> Samples:
-        """Return samples with noise from the stream "noise"."""
+        """Return the samples of the sensor on ``node`` in one run, with noise from the stream
+        "noise" that ``generator`` returns.
+        """
         return NonlinearSamples(self, node, generator("noise"))
 
 
@@ -124,11 +139,15 @@ class NonlinearReadings(SlotReadings):
         self._sensor, self._node = sensor, node
 
     def matrix(self, slot: int) -> Any:
-        """Return the function that linearises a reading at an estimate."""
+        """Return the function that linearises a reading of this sensor at an estimate; it is the
+        same in all slots.
+        """
         return Linearised(self._sensor, self._node)
 
     def reading(self, slot: int, x: FloatArray) -> FloatArray:
-        """Return the reading (p,) of a slot not before the last one asked for."""
+        """Return the reading ``h(x) + v`` (p,) of slot number ``slot``, not before the last one
+        asked for, where the state is x (n,).
+        """
         noise = self.noise(slot)
         y: FloatArray = np.asarray(self._sensor.h(x, self._node), dtype=np.float64) + noise
         return y
@@ -141,11 +160,13 @@ class NonlinearSamples:
         self._readings = NonlinearReadings(sensor, node, random)
 
     def reading(self, k: int, x: FloatArray) -> tuple[FloatArray, Any]:
-        """Return ``y`` (p,) of sample k, and the function that linearises it."""
+        """Return ``y`` (p,) of sample number ``k``, at which the state is x (n,), and the function
+        that linearises it at an estimate.
+        """
         return self._readings.reading(k, x), self._readings.matrix(k)
 
     def several(self, ks: Sequence[int], x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Raise TypeError: there is no H before an estimate."""
+        """Raise TypeError: without an estimate there is no H (S, p, n) of samples ``ks``."""
         raise TypeError("readings of nonlinear sensors have no H before an estimate")
 
 
@@ -167,8 +188,8 @@ class PositionedSensor(NonlinearSensor):
     """Whether the last row of a reading is an angle."""
 
     def located(self, positions: dict[int, tuple[float, float]] | None) -> NonlinearSensor:
-        """Return the sensor with its nodes at the positions of the graph; raises ScenarioError if
-        the graph has none.
+        """Return the sensor with its nodes at the ``positions`` of the graph, coordinates by node
+        id; raises ScenarioError if the graph has none (None).
         """
         if not isinstance(self.positions, str):
             return self
@@ -186,7 +207,7 @@ class PositionedSensor(NonlinearSensor):
         )
 
     def check_state(self, n: int) -> None:
-        """Raise ScenarioError if positions, states or R do not fit."""
+        """Raise ScenarioError if positions, states or R do not fit a state of ``n`` components."""
         if max(self.states) >= n or len(set(self.states)) < len(self.states):
             rule = f"must be different components of a state of {n}, counted from 0"
             raise ScenarioError("states", rule, list(self.states), "name those of the position")
@@ -203,18 +224,24 @@ class PositionedSensor(NonlinearSensor):
             raise ScenarioError("R", rule, "{} x {}".format(*self.R.shape), "add or remove")
 
     def offset(self, x: FloatArray, node: int) -> FloatArray:
-        """Return the position (d,) of the target relative to a node, d = len(states)."""
+        """Return the position (d,) of the target in the state x (n,) relative to ``node`` (id), d =
+        len(states).
+        """
         positions = np.asarray(self.positions, dtype=np.float64)
         return np.asarray(x[list(self.states)] - positions[self.nodes.index(node)])
 
     def placed_columns(self, derivatives: FloatArray, n: int) -> FloatArray:
-        """Return the Jacobian (p, n) by the state from ``derivatives`` (p, d) by the position."""
+        """Return the Jacobian (p, n) by the state from ``derivatives`` (p, d) by the target's
+        position: zeros in the columns of other states.
+        """
         jacobian = np.zeros((len(derivatives), n))
         jacobian[:, list(self.states)] = derivatives
         return jacobian
 
     def difference(self, y: FloatArray, expected: FloatArray) -> FloatArray:
-        """Return ``y - expected`` (p,), with angles wrapped to [-pi, pi)."""
+        """Return ``y - expected`` (p,) of a reading y (p,) and the ``expected`` one (p,), with
+        angles wrapped to [-pi, pi).
+        """
         innovation = y - expected
         if self.turns:
             innovation[-1] = (innovation[-1] + math.pi) % (2.0 * math.pi) - math.pi
@@ -231,11 +258,13 @@ class RangeSensor(PositionedSensor):
     rows: ClassVar[int] = 1
 
     def h(self, x: FloatArray, node: int) -> FloatArray:
-        """Return the distance (1,)."""
+        """Return the distance (1,) of the target in the state x (n,) from ``node`` (id)."""
         return np.array([math.hypot(*self.offset(x, node))])
 
     def jacobian(self, x: FloatArray, node: int) -> FloatArray:
-        """Return the Jacobian (1, n): the unit vector from the node to the target."""
+        """Return the Jacobian (1, n) at the state x (n,): the unit vector from ``node`` (id) to the
+        target.
+        """
         return self.placed_columns(toward(self.offset(x, node))[None], len(x))
 
 
@@ -249,12 +278,16 @@ class BearingSensor(PositionedSensor):
     turns: ClassVar[bool] = True
 
     def h(self, x: FloatArray, node: int) -> FloatArray:
-        """Return the angle (1,) in (-pi, pi]."""
+        """Return the angle (1,) in (-pi, pi], radians, of the direction from ``node`` (id) to the
+        target in the state x (n,).
+        """
         first, second = self.offset(x, node).tolist()
         return np.array([math.atan2(second, first)])
 
     def jacobian(self, x: FloatArray, node: int) -> FloatArray:
-        """Return the Jacobian (1, n): ``[-d_2, d_1] / |d|^2`` for the offset d."""
+        """Return the Jacobian (1, n) at the state x (n,): ``[-d_2, d_1] / |d|^2`` for the offset d
+        of the target from ``node`` (id).
+        """
         return self.placed_columns(across(self.offset(x, node))[None], len(x))
 
 
@@ -266,23 +299,29 @@ class RangeBearingSensor(PositionedSensor):
     turns: ClassVar[bool] = True
 
     def h(self, x: FloatArray, node: int) -> FloatArray:
-        """Return distance and angle (2,)."""
+        """Return distance and angle (radians) (2,) of the target in the state x (n,) from ``node``
+        (id).
+        """
         first, second = self.offset(x, node).tolist()
         return np.array([math.hypot(first, second), math.atan2(second, first)])
 
     def jacobian(self, x: FloatArray, node: int) -> FloatArray:
-        """Return the Jacobian (2, n): the row of the distance, then that of the angle."""
+        """Return the Jacobian (2, n) at the state x (n,): the row of the distance from ``node``
+        (id), then that of the angle.
+        """
         d = self.offset(x, node)
         return self.placed_columns(np.stack([toward(d), across(d)]), len(x))
 
 
 def toward(d: FloatArray) -> FloatArray:
-    """Return the unit vector along d, zeros where d is 0."""
+    """Return the unit vector (d,) along an offset ``d`` (d,), zeros where that is 0."""
     length = math.hypot(*d)
     return d / length if length > 0.0 else np.zeros_like(d)
 
 
 def across(d: FloatArray) -> FloatArray:
-    """Return the derivatives (2,) of the angle of d (2,), zeros where d is 0."""
+    """Return the derivatives (2,) of the angle of an offset ``d`` (2,) by its components, in
+    radians per unit of length; zeros where it is 0.
+    """
     square = float(d @ d)
     return np.array([-d[1], d[0]]) / square if square > 0.0 else np.zeros(2)

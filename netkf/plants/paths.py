@@ -76,7 +76,9 @@ class Block(NamedTuple):
 
 
 class Cuts(NamedTuple):
-    """Increasing ``times`` at which steps are cut, and the normals of each run."""
+    """Increasing ``times`` (T,), in seconds, at which steps are cut, and the normals of each
+    run.
+    """
 
     times: FloatArray
     normals: Normals
@@ -107,7 +109,7 @@ class DiffusionPaths:
         self._x, self._drawn = start, 0
 
     def following(self, blocks: int = 1, most: int | None = None) -> Block:
-        """Draw and return the next steps of the sensing grid: ``blocks`` times BLOCK of them, at
+        """Draw and return the next S steps of the sensing grid: ``blocks`` times BLOCK of them, at
         most ``most``.
         """
         laws, (paths, n) = self.laws, self._x.shape
@@ -199,7 +201,8 @@ class DiffusionPaths:
         times: FloatArray,
         normals: FloatArray,
     ) -> None:
-        """Cut the pieces in ``rows`` (C,) at ``times`` (C,), given their ends and moments.
+        """Cut the pieces in ``rows`` (C,) at ``times`` (C,), given their ends and moments, in the
+        arrays of ``pieces``.
 
         All have the same length and are cut at the same position. The row becomes the part before
         the cut, the rows after it up to ``stops`` (C,) the part after it. ``normals`` (B, C, 3 n).
@@ -234,7 +237,7 @@ def split_pieces(
     work: FloatArray,
     pieces: tuple[FloatArray, FloatArray, FloatArray, FloatArray],
 ) -> None:
-    """Cut the pieces in ``rows`` (K,) of B paths, given their ends and moments.
+    """Cut the pieces in ``rows`` (K,) of B paths in place, given their ends and moments.
 
     All have the same length and are cut at the same position. A row becomes the part before the
     cut, and the rows after it up to its ``stops`` (K,) the part after it.
@@ -244,7 +247,8 @@ def split_pieces(
     responses (3, 3, n, n) GridLaws.responses over the whole piece and the parts before and after
     lengths   (2,) seconds of the whole piece and of the part before the cut
     work      (4, 3 n) scratch
-    pieces    states at the starts and ends, moments and cubics, as in ``fill_steps``
+    pieces    of K' >= K rows: states at the starts and ends (B, K', n), moments (B, K', 2, n) and
+              cubics (B, K', 3, n)
 
     Vectors of 3 n numbers hold a state x and the two moments, one after the other.
     """
@@ -301,7 +305,8 @@ def add_response(
     row: int,
 ) -> None:
     """Write ``out`` = ``values`` + ``sign`` R x[run, row], both (3 n,), where R (3 n, n) is
-    ``responses[which]``: the response of end state and moments to the state at the start.
+    ``responses[which]`` (3, n, n): the response of end state and moments to the state at the start.
+    ``responses`` is (W, 3, n, n), ``x`` (B, K, n) has the states of B paths at K pieces.
     """
     n = x.shape[2]
     for m in range(3):
@@ -321,7 +326,9 @@ def set_part(
     values: FloatArray,
     noise: FloatArray,
 ) -> None:
-    """Set moments and cubic of the piece ``row`` of ``length`` seconds in path ``run``.
+    """Set moments and cubic of the piece ``row`` of ``length`` seconds in path ``run``, in
+    ``pieces``: states at the starts and ends (B, K, n), moments (B, K, 2, n) and cubics
+    (B, K, 3, n) of B paths.
 
     ``values`` (3 n,) are its end state and moments, ``noise`` (3 n,) the contribution of the noise
     to them, which the cubic interpolates.
@@ -344,7 +351,8 @@ def fill_cubic(
     plain: float,
     tilted: float,
 ) -> None:
-    """Set ``cubic[run, row, :, i]``: the coefficients, times ``length``, of u, u^2 and u^3 of the
+    """Set ``cubic[run, row, :, i]`` of ``cubic`` (B, K, 3, n), for component i of the state in
+    piece ``row`` of path ``run``: the coefficients, times ``length``, of u, u^2 and u^3 of the
     cubic on 0 <= u <= 1 that is 0 at u = 0 and ``end`` at u = 1.
 
     Over ``length`` seconds its integral is ``plain`` and that of its product with P_1 ``tilted``.
@@ -372,13 +380,12 @@ def fill_steps(
     """Write S sensing steps of B paths into ``out``: states at their starts and ends (B, S, n),
     moments (B, S, 2, n) and cubics (B, S, 3, n).
 
-    normals     (B, S, 3 n) standard normal numbers
-    factor      (3 n, 3 n) GridLaws.noise_factor: covariance root of end and moments of one step
-    response    (3, n, n) GridLaws.response: their response to the state at the start
-    frame_steps steps from one frame to the next; 0: no frames
-    drawn       number of steps of these paths before this call
-    x           (B, n) state before the steps, replaced by the one after them
-    noise       (3 n,) scratch
+    normals     (B, S, 3 n) standard normal numbers factor      (3 n, 3 n) GridLaws.noise_factor:
+    covariance root of end and moments of one step response    (3, n, n) GridLaws.response: their
+    response to the state at the start period      length of a step in seconds frame_steps steps
+    from one frame to the next; 0: no frames drawn       number of steps of these paths before this
+    call x           (B, n) state before the steps, replaced by the one after them noise
+    (3 n,) scratch
     """
     x_start, x_end, moments, cubic = out
     runs, steps, n = x_start.shape
@@ -411,7 +418,7 @@ class DiffusionPath:
     """The path of one run: states and moments at times that do not decrease.
 
     Blocks of steps are drawn when a time beyond the last one is asked for. With frames, those that
-    begin before the ``horizon`` (seconds) have ``frame_times``.
+    begin before the ``horizon`` (seconds) have ``frame_times`` (F,).
     """
 
     def __init__(self, paths: DiffusionPaths, horizon: float = 0.0) -> None:
@@ -451,8 +458,8 @@ class DiffusionPath:
         return self._step_end
 
     def moments(self, start: float, end: float) -> FloatArray:
-        """Return moments (2, n) of x over ``[start, end]``, inside one sensing step: the one last
-        asked for or a later one.
+        """Return the two moments (2, n) of x over [start, end] seconds, its integrals with P_0 and
+        P_1, inside one sensing step: the one last asked for or a later one.
         """
         step = self._at(end)
         if start >= step.start:
@@ -460,8 +467,8 @@ class DiffusionPath:
         return self._over_pieces(start, end)
 
     def _over_pieces(self, start: float, end: float) -> FloatArray:
-        """Return ``moments`` over several pieces of one step, as sample times of other nodes may
-        cut it inside the interval.
+        """Return the moments (2, n) of x over [start, end] seconds, inside one step that sample
+        times of other nodes may have cut into several pieces.
         """
         block, k, gap = self._block, self._piece, end - start
         assert block is not None
@@ -537,7 +544,9 @@ class DiffusionPath:
 
 
 def state_moments(laws: GridLaws, step: PathStep, start: float, end: float) -> FloatArray:
-    """Return moments (2, n) of x over ``[start, end]`` seconds inside a piece of the path."""
+    """Return the two moments (2, n) of x over [start, end] seconds inside a piece ``step`` of the
+    path, its integrals with P_0 and P_1.
+    """
     n = len(step.x_start)
     # The moments of a whole piece were drawn from their exact law; those of a part are approximated
     # by the cubic.
@@ -594,8 +603,9 @@ def fill_state_moments(
     length: float,
     scratch: FloatArray,
 ) -> None:
-    """Write the moments ``out`` (2, n) of x over ``gap`` seconds, which begin ``since`` seconds
-    after the start of a piece of ``length`` seconds.
+    """Write the two moments of x, its integrals with P_0 and P_1, over ``gap`` seconds into ``out``
+    (2, n); these begin ``since`` seconds after the start of a piece of ``length`` seconds. ``size``
+    has length n.
 
     ``course`` (D, W) are the coefficients that ``fill_course`` wrote for the piece, ``scratch``
     (2 W,).
@@ -633,7 +643,8 @@ def fill_moments_between(
     first: Any,
     share: Any,
 ) -> None:
-    """Write the moments ``out`` (2, n, L) of x over u in [first, first + share] of a piece.
+    """Write the moments ``out`` (2, n, L) of x over u in [first, first + share] of a piece, (L,)
+    each, where u is the share of the piece that has passed; ``size`` has length n.
 
     ``integrals`` (2 W, L), W = ``width``, are those that ``fill_integrals`` wrote for both ends.
     """

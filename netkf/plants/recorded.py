@@ -54,7 +54,7 @@ class UnknownPlant(LinearPlant):
     truth_known: ClassVar[bool] = False
 
     def truth(self, random: np.random.Generator, frames: bool = False) -> RecordedPath:
-        """Return a path of nan."""
+        """Return a path of nan (n,) in all slots; nothing is drawn."""
         return RecordedPath({}, np.full(self.n, math.nan))
 
 
@@ -74,7 +74,7 @@ class RecordedPlant(LinearPlant):
 
     @cached_property
     def table(self) -> Table:
-        """The states (n,) by slot."""
+        """The states (n,) by slot number."""
         times, states = _states(self.path, self.n)
         rows = list(zip(times.tolist(), states, strict=True))
         return index_by_slot(self.path, rows, self.period, "")
@@ -84,7 +84,7 @@ class RecordedPlant(LinearPlant):
         _demand_rows(self.path, self.table, slots, self.period, "state")
 
     def truth(self, random: np.random.Generator, frames: bool = False) -> RecordedPath:
-        """Return the states of the table."""
+        """Return the states of the table, nan in slots without a row; nothing is drawn."""
         return RecordedPath(self.table, np.full(self.n, math.nan))
 
 
@@ -103,7 +103,7 @@ class UnknownDiffusion(Diffusion):
         return RecordedTruth(NO_TIMES, np.empty((0, self.n)), self.n)
 
     def require_times(self, times: FloatArray, what: str) -> None:
-        """Accept any times: no state is known."""
+        """Accept any ``times`` (K,): no state is known, so that none can be missing."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,7 +138,7 @@ class RecordedDiffusion(Diffusion):
         return RecordedTruth(*self.table, self.n)
 
     def require_times(self, times: FloatArray, what: str) -> None:
-        """Raise ScenarioError if the table has no state at one of the times (seconds).
+        """Raise ScenarioError if the table has no state at one of the ``times`` (K,), in seconds.
 
         ``what`` names the use of the states in the message.
         """
@@ -153,7 +153,9 @@ def _states(source: SourceFile, n: int) -> tuple[FloatArray, FloatArray]:
 
 
 class RecordedPath:
-    """The truth of a run from a table: states (n,) by slot, ``otherwise`` (n,) if missing."""
+    """The truth of a run from a table: states (n,) by slot number, ``otherwise`` (n,) in slots that
+    it lacks.
+    """
 
     frame_slots: int | None = None
 
@@ -161,13 +163,13 @@ class RecordedPath:
         self._states, self._otherwise = states, otherwise
 
     def state(self, slot: int) -> FloatArray:
-        """Return the state (n,) of any slot."""
+        """Return the state (n,) in slot number ``slot``."""
         return self._states.get(slot, self._otherwise)
 
     local = absolute = state
 
     def rebase(self, slot: int) -> FloatArray:
-        """Raise IndexError: there are no frames."""
+        """Raise IndexError: a recorded path has no frames."""
         raise IndexError(slot)
 
 
@@ -298,12 +300,16 @@ class RecordedSensor(Sensor):
         generator: Callable[[str], np.random.Generator],
         horizon: float,
     ) -> FloatArray:
-        """Return the times (K,) of the table."""
+        """Return the times (K,) in seconds of the table's rows of ``node`` (id), below the
+        ``horizon``; nothing is drawn.
+        """
         times = self.rows(node)[0]
         return times[: int(np.searchsorted(times, horizon))]
 
     def recorded_times(self, node: int) -> FloatArray:
-        """Return the times (K,) of all rows of a node, in the order of the table."""
+        """Return the times (K,) in seconds of all rows of ``node`` (id), in the order of the
+        table.
+        """
         return np.array([t for t, _ in self._rows[node]])
 
     def rows(self, node: int) -> tuple[FloatArray, FloatArray]:
@@ -329,25 +335,29 @@ class RecordedSensor(Sensor):
     def samples(
         self, node: int, generator: Callable[[str], np.random.Generator], horizon: float
     ) -> RecordedSamples:
-        """Return the samples of the table; nothing is drawn."""
+        """Return the samples of the table's rows of ``node`` (id); nothing is drawn."""
         return RecordedSamples(self.H, self.rows(node)[1])
 
     def slot_path(
         self, node: int, period: float, generator: Callable[[str], np.random.Generator]
     ) -> RecordedReadings:
-        """Return the readings of the table; nothing is drawn."""
+        """Return the readings of the table's rows of ``node`` (id) in slots of ``period`` seconds;
+        nothing is drawn.
+        """
         return RecordedReadings(self.H, self.table(node, period))
 
 
 class RecordedReadings:
-    """The readings of one node; a row of the table is y (p,), then phi (n,) where H varies."""
+    """The readings of one node by slot number, rows of a ``table``: y (p,), then phi (n,) where H
+    varies; ``H`` (p, n) for rows without phi.
+    """
 
     def __init__(self, H: FloatArray, table: Table) -> None:
         self._H, self._table = H, table
 
     def matrix(self, slot: int) -> FloatArray:
-        """Return H (p, n): the recorded phi' if there are regressors, else the given H; zeros for a
-        slot without a row.
+        """Return H (p, n) in slot number ``slot``: the recorded phi' if there are regressors, else
+        the given H; zeros for a slot without a row.
         """
         row = self._table.get(slot)
         if row is None:
@@ -356,13 +366,15 @@ class RecordedReadings:
         return phi[None] if phi.size else self._H
 
     def reading(self, slot: int, x: FloatArray) -> FloatArray:
-        """Return the reading (p,) of a slot; nan without a row."""
+        """Return the reading (p,) in slot number ``slot``, nan without a row; the state x (n,) is
+        not used.
+        """
         row = self._table.get(slot)
         return np.full(len(self._H), math.nan) if row is None else row[: len(self._H)]
 
     def several(self, slots: Sequence[int], x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return readings (S, p) and matrices (S, p, n) of the slots; zeros, which carry no
-        information, for a slot without a row.
+        """Return readings (S, p) and matrices (S, p, n) of S ``slots``; zeros, which carry no
+        information, for a slot without a row. The states x (S, n) are not used.
         """
         y, H = np.zeros((len(slots), len(self._H))), np.zeros((len(slots), *self._H.shape))
         for k, slot in enumerate(slots):
@@ -401,7 +413,9 @@ def index_by_slot(
 def _demand_rows(
     source: SourceFile, table: Table, slots: Iterable[int], period: float, what: str
 ) -> None:
-    """Raise ScenarioError if one of the ``slots`` has no row; ``what`` names its content."""
+    """Raise ScenarioError if one of the ``slots`` has no row in ``table``; ``what`` names its
+    content and ``period`` (seconds) turns a slot into a time in the message.
+    """
     missing = next((slot for slot in slots if slot not in table), None)
     if missing is not None:
         rule = f"{source.name} has no {what} for slot {missing}, t = {missing * period:g}"

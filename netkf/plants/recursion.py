@@ -37,7 +37,10 @@ class Recursion:
 
 
 def _states_by_steps(start: FloatArray, noise: FloatArray, powers: FloatArray) -> FloatArray:
-    """Return ``Recursion.states`` step by step, with F = ``powers[0]``."""
+    """Return the states (B, K L + 1, n) of B paths of ``x[k+1] = F x[k] + w[k]``, step by step:
+    from ``start`` (B, n) on with the w in ``noise`` (B, K, L, n), K blocks of L steps; F is
+    ``powers[0]`` of ``powers`` (>= 1, n, n).
+    """
     count, _, _, n = noise.shape
     x = [start[:, None]]
     for w in np.moveaxis(noise.reshape(count, -1, 1, n), 1, 0):
@@ -46,7 +49,9 @@ def _states_by_steps(start: FloatArray, noise: FloatArray, powers: FloatArray) -
 
 
 def _states_by_sums(start: FloatArray, noise: FloatArray, powers: FloatArray) -> FloatArray:
-    """Return ``Recursion.states`` by prefix sums within blocks, with ``powers`` F^1 .. F^L.
+    """Return the states (B, K L + 1, n) of B paths of ``x[k+1] = F x[k] + w[k]`` by prefix sums
+    within blocks: from ``start`` (B, n) on with the w in ``noise`` (B, K, L, n), K blocks of L
+    steps; ``powers`` (L, n, n) are F^1 .. F^L.
 
     A few products of large matrices replace one small product a step.
     """

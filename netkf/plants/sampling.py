@@ -21,45 +21,57 @@ class Samples(Protocol):
     """The samples of one sensor on one node in one run, numbered k = 0, 1, ... in order of time."""
 
     def reading(self, k: int, x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return ``y`` (p,) and ``H`` (p, n) of sample k, at which the state is x (n,); k must not
-        decrease from call to call.
+        """Return ``y`` (p,) and ``H`` (p, n) of sample number ``k``, at which the state is x (n,);
+        k must not decrease from call to call.
         """
 
     def several(self, ks: Sequence[int], x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return ``y`` (S, p) and ``H`` (S, p, n) of increasing samples with states x (S, n)."""
+        """Return ``y`` (S, p) and ``H`` (S, p, n) of the S samples with the increasing numbers
+        ``ks``, at which the states are x (S, n).
+        """
 
 
 class DrawnSamples:
-    """Samples ``y = H x + v``, cov(v) = R; v is the Cholesky factor of R times the next p standard
-    normals of ``random``.
+    """Samples ``y = H x + v``, cov(v) = R, with H (p, n) and R (p, p); v is the Cholesky factor of
+    R times the next p standard normals of ``random``.
     """
 
     def __init__(self, H: FloatArray, R: FloatArray, random: np.random.Generator) -> None:
         self._readings = SlotReadings(H, R, random)
 
     def reading(self, k: int, x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return ``y`` (p,) and ``H`` (p, n) of sample k."""
+        """Return ``y`` (p,) and ``H`` (p, n) of sample number ``k``, at which the state is x
+        (n,).
+        """
         return self._readings.reading(k, x), self._readings.matrix(k)
 
     def several(self, ks: Sequence[int], x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return ``y`` (S, p) and ``H`` (S, p, n) of increasing samples with states x (S, n)."""
+        """Return ``y`` (S, p) and ``H`` (S, p, n) of the S samples with the increasing numbers
+        ``ks``, at which the states are x (S, n).
+        """
         return self._readings.several(ks, x)
 
 
 class RecordedSamples:
-    """Samples from the ``rows`` of a table: y (K, p), or y and its row of H, (K, 1 + n)."""
+    """Samples from the ``rows`` of a table: y (K, p), or y and its row of H, (K, 1 + n); ``H``
+    (p, n) is that of rows without their own.
+    """
 
     def __init__(self, H: FloatArray, rows: FloatArray) -> None:
         self._H, self._rows = H, rows
 
     def reading(self, k: int, x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return ``y`` (p,) and ``H`` (p, n) of sample k, whatever x."""
+        """Return ``y`` (p,) and ``H`` (p, n) of sample number ``k``; the state x (n,) is not
+        used.
+        """
         p = len(self._H)
         phi = self._rows[k, p:]
         return self._rows[k, :p], phi[None] if phi.size else self._H
 
     def several(self, ks: Sequence[int], x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return ``y`` (S, p) and ``H`` (S, p, n) of the samples, whatever x."""
+        """Return ``y`` (S, p) and ``H`` (S, p, n) of the S samples with the numbers ``ks``; the
+        states x (S, n) are not used.
+        """
         p, rows = len(self._H), self._rows[list(ks)]
         if rows.shape[1] > p:
             return rows[:, :p], rows[:, None, p:]
@@ -80,7 +92,7 @@ class RecordedSampling(Clock):
 
     @cached_property
     def _times(self) -> dict[int, FloatArray]:
-        """Increasing sampling times in seconds, by node."""
+        """Increasing sampling times (K,) in seconds, by node id."""
         table = read_columns(self.path, ("t", "node"))
         nodes = np.array(parse_integers(self.path, "node", table["node"]), dtype=np.int64)
         early = np.flatnonzero(table["t"] <= 0.0)
@@ -108,7 +120,9 @@ class RecordedSampling(Clock):
         random: np.random.Generator,
         count: int,
     ) -> FloatArray:
-        """Return up to ``count`` recorded times of the node ``entity[0]`` from ``index`` on."""
+        """Return up to ``count`` recorded times (<= count,) in seconds of the node ``entity[0]``,
+        from number ``index`` on; nothing is drawn.
+        """
         return self._times.get(entity[0], np.empty(0))[index : index + count]
 
 

@@ -87,7 +87,9 @@ class Sensor(Component):
     def samples(
         self, node: int, generator: Callable[[str], np.random.Generator], horizon: float
     ) -> Samples:
-        """Return the samples of the sensor on ``node`` at its ``sample_times`` in one run."""
+        """Return the samples of the sensor on ``node`` (id) at its ``sample_times`` in one run;
+        ``generator`` returns the random stream of that sensor for a purpose.
+        """
         raise NotImplementedError
 
 
@@ -126,7 +128,10 @@ class LinearSensor(Sensor):
         generator: Callable[[str], np.random.Generator],
         horizon: float,
     ) -> FloatArray:
-        """Return the sample times (K,), drawn from the streams "sampling" and "sampling phase"."""
+        """Return the sample times (K,) in seconds, below the ``horizon``, of the sensor on ``node``
+        with the number ``ordinal`` there, drawn from its streams "sampling" and "sampling phase"
+        that ``generator`` returns.
+        """
         # Only sensors with a clock are asked.
         assert self.sampling is not None
         return sampling_ticks(self.sampling, (node, ordinal), generator, horizon)
@@ -134,7 +139,9 @@ class LinearSensor(Sensor):
     def samples(
         self, node: int, generator: Callable[[str], np.random.Generator], horizon: float
     ) -> DrawnSamples:
-        """Return samples with noise from the stream "noise"."""
+        """Return the samples of the sensor on ``node`` in one run, with noise from the stream
+        "noise" that ``generator`` returns.
+        """
         return DrawnSamples(self.H, self.R, generator("noise"))
 
     def path(self, random: np.random.Generator, cutting: np.random.Generator) -> SensorPath:
@@ -147,12 +154,17 @@ class LinearSensor(Sensor):
     def slot_path(
         self, node: int, period: float, generator: Callable[[str], np.random.Generator]
     ) -> SlotReadings:
-        """Return readings with noise from the stream "noise"."""
+        """Return the readings of the sensor on ``node`` in one run in slots, with noise from the
+        stream "noise" that ``generator`` returns.
+        """
         return SlotReadings(self.H, self.R, generator("noise"))
 
 
 class SensorPath:
-    """Increments dy of one sensor on one node; intervals must be asked for in order of time."""
+    """Increments dy of one sensor with H (p, n) and R (p, p) on one node; intervals must be asked
+    for in order of time. ``random`` draws the noise on the sensing grid, ``cutting`` that of parts
+    of steps.
+    """
 
     def __init__(
         self,
@@ -174,7 +186,8 @@ class SensorPath:
     def moments(
         self, truth: DiffusionPath, x_moments: FloatArray, start: float, end: float
     ) -> FloatArray:
-        """Return moments (2, p) of dy over ``[start, end]``, inside the truth's present step.
+        """Return the two moments (2, p) of dy, its integrals with P_0 and P_1, over [start, end]
+        seconds, inside the truth's present step.
 
         ``x_moments`` (2, n) are those of x over the same interval; ``start`` is the end of the
         interval of the previous call.
@@ -205,7 +218,7 @@ class SensorPath:
 
 
 def step_noise(normals: FloatArray, period: float) -> FloatArray:
-    """Return moments (..., 2, p) of unit white noise over ``period`` seconds from standard
+    """Return the two moments (..., 2, p) of unit white noise over ``period`` seconds from standard
     ``normals`` (..., 2, p): independent, with variances g and g / 3 for g = ``period``.
     """
     return np.asarray(normals * np.sqrt(np.array([[period], [period / 3.0]])))
@@ -214,8 +227,9 @@ def step_noise(normals: FloatArray, period: float) -> FloatArray:
 def reading(
     x_moments: FloatArray, H: FloatArray, noise: FloatArray, root: FloatArray
 ) -> FloatArray:
-    """Return moments (2, p) of dy = H x dt + root dw from those of x (2, n) and of unit white noise
-    w (2, p).
+    """Return the two moments (2, p) of dy = H x dt + root dw over an interval, from those of x,
+    ``x_moments`` (2, n), and of unit white noise w, ``noise`` (2, p); H (p, n), ``root`` (p, p)
+    lower triangular.
     """
     out = np.empty(2 * len(H))
     fill_reading(ONE, H[0], out, 0, len(H), x_moments, H[None], noise, root[None], 0)
@@ -235,7 +249,8 @@ def fill_reading(
     root: FloatArray,
     s: int,
 ) -> None:
-    """Write the moments of dy of sensor ``s``, which has ``rows`` rows, into ``out`` (2 q, L).
+    """Write the two moments of dy of sensor ``s``, which has ``rows`` rows, in L lanes into ``out``
+    (2 q, L); ``size`` has length n.
 
     Its first moments begin at ``out[row]``, its second moments at ``out[q + row]``. ``x_moments``
     (2, n, L) are those of x, ``noise`` (2, p, L) those of unit white noise; H is (S, p, n, L), root

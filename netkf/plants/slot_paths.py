@@ -44,8 +44,8 @@ def draw_normals(
 ) -> None:
     """Fill ``normals`` (>= count, L) with the next ``count`` standard normals of L streams.
 
-    Lane q takes them from row ``first + q * stride`` of ``states`` if q < ``runs``, the number of
-    runs left; idle lanes keep their values.
+    Lane q takes them from row ``first + q * stride`` of ``states`` (K, >= 4) if q < ``runs``, the
+    number of runs left; idle lanes keep their values. Steps these states.
     """
     # Lanes in the inner loop: numbers of different streams do not wait for each other.
     for j in range(count):
@@ -63,8 +63,8 @@ def draw_starts(
     scratch: FloatArray,
     x: FloatArray,
 ) -> None:
-    """Write the states x(0) = mean + root z (B, n, L) of R runs, where z (q,) are the next standard
-    normals of the stream of each run, ``states`` (R, >= 4).
+    """Write the states x(0) = mean + root z of R runs into ``x`` (B, n, L), B blocks of L runs,
+    where z (q,) are the next standard normals of the stream of each run, ``states`` (R, >= 4).
 
     ``mean`` (n,), ``root`` (n, q); ``scratch`` (q, L).
     """
@@ -90,11 +90,12 @@ def move_path(
     absolute: FloatArray,
     moved: FloatArray,
 ) -> None:
-    """Write the state of block ``b`` in ``slot`` and move ``path`` to the next slot.
+    """Write the states of the L runs of block ``b`` in slot number ``slot`` and move ``path`` to
+    the next slot; ``s`` is the index of the slot in the arrays.
 
     ``local[b, s]`` (n, L) gets the state in the frame before a rebase in this slot; with frames
-    ``absolute[b, s]`` (n, L) gets the state in the plant's coordinates. ``normals`` (q, L) drive
-    the step; ``moved`` (n, L) is scratch.
+    ``absolute[b, s]`` (n, L) gets the state in the plant's coordinates; both are (B, S, n, L).
+    ``normals`` (q, L) drive the step; ``moved`` (n, L) is scratch.
     """
     n = len(path.F)
     # Before a rebase: the errors of this slot are still in coordinates of the old frame.
@@ -141,8 +142,9 @@ def draw_paths(
     local: FloatArray,
     absolute: FloatArray,
 ) -> None:
-    """Write the states of S slots from ``slot`` on into ``local`` and, with frames, ``absolute``
-    (B, S, n, L), see ``move_path``.
+    """Write the states of R runs in S slots from number ``slot`` on into ``local``, relative to the
+    present frame, and, with frames, ``absolute``, both (B, S, n, L); move ``path`` behind these
+    slots.
 
     Each run draws from its own stream, ``states`` (R, >= 4); ``scratch`` (2, max(n, q), L).
     """
@@ -195,8 +197,8 @@ def draw_readings(
     y: FloatArray,
     H: FloatArray,
 ) -> None:
-    """Write the readings y (B, S, estimators, p, L) of all sensors in S slots, and H
-    (B, S, estimators, p, n, L) where it is random.
+    """Write the readings ``y`` (B, S, H', p, L) of all M sensors in S slots of R runs (B blocks of
+    L), for H' filters, and ``H`` (B, S, H', p, n, L) where it is random.
 
     x (B, S, n, L) are the states, ``regressors`` (D, B, S, k, L) those of the regressors. Run r
     draws the noise of sensor m from row r M + m of ``states`` (R M, >= 4); ``scratch`` (p, L).
@@ -229,8 +231,12 @@ def read_row(
     y: FloatArray,
     H: FloatArray,
 ) -> None:
-    """Write row ``i`` of the reading of sensor ``m`` in slot ``s`` of block ``b``, and that row of
-    H if it is random; see ``draw_readings``.
+    """Write row ``i`` of the reading of sensor ``m`` in slot ``s`` (index) of the L runs of block
+    ``b`` into ``y`` (B, S, H', p, L), for H' filters, and that row into ``H`` (B, S, H', p, n, L)
+    if it is random.
+
+    x (B, S, n, L) are the states, ``regressors`` (D, B, S, k, L) those of the regressors,
+    ``normals`` (p, L) the standard normals of the reading.
     """
     estimator, row, d = sensors.estimator[m], sensors.row[m] + i, sensors.driven[m]
     # total = (noise factor) z, row i

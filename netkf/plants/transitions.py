@@ -43,7 +43,9 @@ class Transitions:
         self._laws: dict[bytes, tuple[FloatArray, FloatArray]] = {}
 
     def laws(self, gaps: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return ``Phi`` and ``L``, both (K, n, n), of K gaps in seconds, none below 0."""
+        """Return ``Phi`` and ``L``, both (K, n, n), of the K ``gaps`` (K,) in seconds, none below
+        0.
+        """
         distinct, index = np.unique(gaps, return_inverse=True)
         key = distinct.tobytes()
         if key not in self._laws:
@@ -70,7 +72,7 @@ class Transitions:
         return Phi, L
 
     def transitions(self, gaps: FloatArray) -> FloatArray:
-        """Return only ``Phi = e^{A g}`` (K, n, n) of K gaps in seconds."""
+        """Return only ``Phi = e^{A g}`` (K, n, n) of the K ``gaps`` g (K,) in seconds."""
         distinct, index = np.unique(gaps, return_inverse=True)
         doublings = self._doublings(distinct)
         Phi = self._unit_transition(np.ldexp(distinct, -doublings))
@@ -93,19 +95,23 @@ class Transitions:
         return np.asarray(directions[index.reshape(-1)])
 
     def _doublings(self, gaps: FloatArray) -> np.ndarray:
-        """Return the number of halvings (K,) after which the power series applies to each gap."""
+        """Return the number of halvings (K,) after which the power series applies to each of the
+        ``gaps`` (K,), in seconds.
+        """
         sizes = np.maximum(gaps * (self._norm / UNIT_SIZE), 1.0)
         return np.ceil(np.log2(sizes)).astype(np.int64)
 
     def _unit_transition(self, gaps: FloatArray) -> FloatArray:
-        """Return exp(A g) (K, n, n) by its power series, for gaps g (K,) within one unit."""
+        """Return exp(A g) (K, n, n) by its power series, for ``gaps`` g (K,) in seconds within one
+        unit.
+        """
         n, terms = self.n, len(self._series)
         powers = _powers(gaps, terms)
         return product(powers, self._series.reshape(terms, n * n)).reshape(-1, n, n)
 
     def _unit_noise(self, gaps: FloatArray) -> FloatArray:
-        """Return a factor (K, n, 10 m) of the noise covariance of gaps (K,) within one unit:
-        columns ``e^{A s} B sqrt(weight)`` at the 10 quadrature nodes s.
+        """Return a factor (K, n, 10 m) of the noise covariance of ``gaps`` (K,) in seconds within
+        one unit: columns ``e^{A s} B sqrt(weight)`` at the 10 quadrature nodes s.
         """
         terms, n, m = self._response.shape
         powers = _powers(gaps[:, None] * _NODES, terms)
@@ -142,7 +148,9 @@ def noise_factors(noise: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _powers(gaps: FloatArray, terms: int) -> FloatArray:
-    """Return the powers g^0 .. g^(terms - 1), (K, c, terms), of g (K, c), or (K,) for c = 1."""
+    """Return the powers g^0 .. g^(terms - 1), (K, c, terms), of ``gaps`` g (K, c), or (K,) for c =
+    1.
+    """
     # By multiplication: the last bit of numpy's power depends on the CPU.
     gaps = gaps if gaps.ndim > 1 else gaps[:, None]
     factors = np.ones((*gaps.shape, terms))
@@ -155,7 +163,7 @@ GROWTH = 10.0 * math.log(2.0)
 
 
 def frame_period(A: FloatArray) -> float | None:
-    """Return the seconds g from one frame to the next for ``dx = A x dt``, A (n, n).
+    """Return the seconds g from one frame to the next for ``dx = A x dt``, ``A`` (n, n) in 1/s.
 
     The growth e^{a g} is 2^10 for the spectral abscissa a of A; None if a <= 0.
     """

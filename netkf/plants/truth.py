@@ -35,10 +35,10 @@ class ContinuousTruth(Protocol):
         """(F,) increasing, inside the run; empty unless frames are used."""
 
     def local(self, time: float) -> FloatArray:
-        """Return x (n,) in the present frame."""
+        """Return x (n,) at ``time`` (seconds), relative to the origin of the present frame."""
 
     def absolute(self, time: float) -> FloatArray:
-        """Return x (n,)."""
+        """Return x (n,) at ``time`` (seconds), in the plant's coordinates."""
 
     def rebase(self, k: int) -> FloatArray:
         """Return the shift (n,) to subtract from estimates at ``frame_times[k]``: the local state
@@ -90,7 +90,9 @@ def absolute_states(
 
 
 class TruthTimes(NamedTuple):
-    """Times in seconds of samples, of probes and of the marks at which frames may begin."""
+    """Times in seconds of samples (K,), of probes (P,) and of the marks (F,) at which frames may
+    begin.
+    """
 
     samples: FloatArray
     probes: FloatArray
@@ -135,18 +137,18 @@ class SampledTruth:
             )
 
     def _index_of(self, time: float) -> int:
-        """Return the index of a time among those of the path."""
+        """Return the index of ``time`` (seconds) among those of the path."""
         k = int(np.searchsorted(self._times, time))
         assert k < len(self._times), f"{time} is no sample, probe or frame time"
         assert self._times[k] == time, f"{time} is no sample, probe or frame time"
         return k
 
     def local(self, time: float) -> FloatArray:
-        """Return x (n,) in the present frame."""
+        """Return x (n,) at ``time`` (seconds), relative to the origin of the present frame."""
         return np.asarray(self._local[self._index_of(time)])
 
     def absolute(self, time: float) -> FloatArray:
-        """Return x (n,)."""
+        """Return x (n,) at ``time`` (seconds), in the plant's coordinates."""
         return np.asarray(self._absolute[self._index_of(time)])
 
     def rebase(self, k: int) -> FloatArray:
@@ -154,7 +156,9 @@ class SampledTruth:
         return np.asarray(self.offsets[k])
 
     def states(self, times: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return local and absolute states (K, n) at times in any order."""
+        """Return local and absolute states (K, n) each at ``times`` (K,) of the path in seconds, in
+        any order.
+        """
         indices = np.searchsorted(self._times, times)
         return self._local[indices], self._absolute[indices]
 
@@ -166,8 +170,8 @@ def _draw_states(
     times: FloatArray,
     rebased: np.ndarray,
 ) -> tuple[FloatArray, FloatArray]:
-    """Return states (K, n) at ``times`` (K,), each before a rebase, and the standard normals
-    (K - 1, n) of the gaps.
+    """Return states (K, n) at ``times`` (K,) in seconds, each before a rebase, and the standard
+    normals (K - 1, n) of the gaps.
 
     ``x <- Phi x + L z`` from ``start`` (n,) on; at times marked in ``rebased`` (K,) it restarts
     from 0.
@@ -196,7 +200,8 @@ def _bridge_gap(
     probing: np.random.Generator,
     probes: FloatArray,
 ) -> FloatArray:
-    """Return states (P, n) at increasing ``probes`` (P,) given the ``states`` (K, n) at ``times``.
+    """Return states (P, n) at increasing ``probes`` (P,) given the ``states`` (K, n) at ``times``
+    (K,), both in seconds.
 
     ``normals`` (K - 1, n) are those of the gaps between the times. A state is in the frame of the
     last time before it. After the last of ``times`` the path is drawn without a condition.
@@ -245,31 +250,35 @@ class RecordedTruth:
         self._missing = np.full(n, math.nan)
 
     def local(self, time: float) -> FloatArray:
-        """Return x (n,); nan at a time without a row."""
+        """Return x (n,) at ``time`` (seconds); nan at a time without a row."""
         k = nearest_row(self._times, time)
         return self._missing if k is None else np.asarray(self._states[k])
 
     absolute = local
 
     def rebase(self, k: int) -> FloatArray:
-        """Raise IndexError: there are no frames."""
+        """Raise IndexError: a recorded truth has no frames."""
         raise IndexError(k)
 
     def states(self, times: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return local and absolute states (K, n), which are equal, at times in any order."""
+        """Return local and absolute states (K, n) each, which are equal, at ``times`` (K,) in
+        seconds, in any order.
+        """
         x = np.array([self.local(time) for time in times.tolist()]).reshape(-1, len(self._missing))
         return x, x
 
 
 def nearest_row(times: FloatArray, time: float) -> int | None:
-    """Return the index in increasing ``times`` of the one within 1e-9 s of ``time``, else None."""
+    """Return the index in increasing ``times`` (K,) of the one within 1e-9 s of ``time``, else
+    None; both in seconds.
+    """
     k = int(np.searchsorted(times, time - TOLERANCE))
     return k if k < len(times) and times[k] <= time + TOLERANCE else None
 
 
 def demand_rows(source: SourceFile, times: FloatArray, needed: FloatArray, use: str) -> None:
-    """Raise ScenarioError for the first of the ``needed`` times that is not among the ``times`` of
-    the table, in seconds; ``use`` says in the message what the state is for.
+    """Raise ScenarioError for the first of the ``needed`` times (M,) that is not among the
+    ``times`` (K,) of the table, in seconds; ``use`` says in the message what the state is for.
     """
     for time in needed.tolist():
         if nearest_row(times, time) is None:

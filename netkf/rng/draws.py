@@ -60,7 +60,7 @@ def ziggurat() -> Ziggurat:
 
 @kernel
 def high_word_by_halves(a: Any, b: Any) -> Any:
-    """Return the upper 64 bits of the product a b, from 32-bit halves.
+    """Return the upper 64 bits of the product of two 64-bit words a and b, from 32-bit halves.
 
     It equals ``linalg.words.high_word``, but compilers can vectorise it.
     """
@@ -72,7 +72,9 @@ def high_word_by_halves(a: Any, b: Any) -> Any:
 
 @kernel
 def scramble(high: Any, low: Any) -> Any:
-    """Return the output word of a state (high, low): the DXSM permutation of PCG."""
+    """Return the 64-bit output word of a state (high, low), two 64-bit words: the DXSM permutation
+    of PCG.
+    """
     word = high ^ (high >> S32)
     word *= CHEAP
     word ^= word >> S48
@@ -83,9 +85,11 @@ def scramble(high: Any, low: Any) -> Any:
 def following(
     high: Any, low: Any, upper: Any, increment_high: Any, increment_low: Any
 ) -> tuple[Any, Any]:
-    """Return the state after (high, low): ``state <- state * CHEAP + increment`` modulo 2^128.
+    """Return the state after (high, low): ``state <- state * CHEAP + increment`` modulo 2^128, all
+    as 64-bit words.
 
-    ``more_high, more_low`` are the increment; ``upper`` is the upper word of ``low * CHEAP``.
+    ``increment_high, increment_low`` are the increment; ``upper`` is the upper word of ``low *
+    CHEAP``.
     """
     step = low * CHEAP + increment_low
     carry = ONE if step < increment_low else ZERO
@@ -94,7 +98,7 @@ def following(
 
 @kernel
 def next_word(states: np.ndarray, k: int) -> Any:
-    """Return the next 64-bit word of stream ``k`` of states (K, >= 4), and step its state."""
+    """Return the next 64-bit word of stream ``k`` of ``states`` (K, >= 4), and step its state."""
     high, low = states[k, 0], states[k, 1]
     upper = high_word(low, CHEAP)
     states[k, 0], states[k, 1] = following(high, low, upper, states[k, 2], states[k, 3])
@@ -103,14 +107,16 @@ def next_word(states: np.ndarray, k: int) -> Any:
 
 @kernel
 def next_unit(states: np.ndarray, k: int) -> float:
-    """Return the next number of stream ``k``, uniform on [0, 1)."""
+    """Return the next number of stream ``k`` of ``states`` (K, >= 4), uniform on [0, 1), and step
+    its state.
+    """
     return float(next_word(states, k) >> S11) * TO_UNIT
 
 
 @kernel
 def next_units(lanes: Lanes, states: np.ndarray, b: int, k: int, units: FloatArray) -> None:
-    """Write the next uniform number of stream ``k`` for the L runs of block ``b`` into
-    ``units[b, k]`` (L,), from states (B, K, 4, L).
+    """Write the next uniform number of stream ``k`` for the L runs of block ``b`` into ``units[b,
+    k]`` (L,) of ``units`` (B, K, L), from ``states`` (B, K, 4, L), which it steps.
     """
     # No branch depends on a word, so that the compiler computes several lanes with one instruction.
     for q in range(len(lanes)):
@@ -124,7 +130,9 @@ def next_units(lanes: Lanes, states: np.ndarray, b: int, k: int, units: FloatArr
 
 @kernel
 def next_unit_of_lane(states: np.ndarray, b: int, k: int, q: int) -> float:
-    """Return the next uniform number of stream ``k`` for the run in lane ``q`` of block ``b``."""
+    """Return the next uniform number of stream ``k`` for the run in lane ``q`` of block ``b``, from
+    ``states`` (B, K, 4, L), which it steps.
+    """
     high, low = states[b, k, 0, q], states[b, k, 1, q]
     states[b, k, 0, q], states[b, k, 1, q] = following(
         high, low, high_word(low, CHEAP), states[b, k, 2, q], states[b, k, 3, q]
@@ -136,7 +144,9 @@ def next_unit_of_lane(states: np.ndarray, b: int, k: int, q: int) -> float:
 def next_stream_state(
     high: Any, low: Any, increment_high: Any, increment_low: Any
 ) -> tuple[Any, Any]:
-    """Return the state of a stream after (high, low), given its increment; see ``following``."""
+    """Return the state of a stream after (high, low), given its increment, all as 64-bit words:
+    ``state <- state * CHEAP + increment`` modulo 2^128.
+    """
     return following(high, low, high_word(low, CHEAP), increment_high, increment_low)
 
 
@@ -144,8 +154,8 @@ def next_stream_state(
 def exponential_of(
     states: np.ndarray, k: int, high: Any, low: Any, ziggurat: Ziggurat
 ) -> tuple[float, Any, Any]:
-    """Return ``next_exponential`` of stream ``k`` and the state after it, for a loop that keeps the
-    state (high, low) in registers.
+    """Return the next exponential number of mean 1 of stream ``k`` of ``states`` (K, >= 4), and the
+    state after it, for a loop that keeps the state (high, low) in registers.
 
     Each number of a stream waits for the state after the one before; a state in memory would take
     longer. ``states[k]`` is only read and written for the rare numbers outside the fast path.
@@ -164,7 +174,9 @@ def exponential_of(
 
 @kernel
 def next_exponential(states: np.ndarray, k: int, ziggurat: Ziggurat) -> float:
-    """Return the next number of stream ``k`` from the exponential law of mean 1 (ziggurat)."""
+    """Return the next number of stream ``k`` of ``states`` (K, >= 4) from the exponential law of
+    mean 1 (ziggurat), and step its state.
+    """
     while True:
         # 8 bits choose a layer, 53 bits a point across it.
         word = next_word(states, k) >> S3
@@ -184,7 +196,8 @@ def next_exponential(states: np.ndarray, k: int, ziggurat: Ziggurat) -> float:
 
 @kernel
 def seed_states(words: np.ndarray, states: np.ndarray) -> None:
-    """Write the states (K, 4) of K streams that are seeded with four words (K, 4) each.
+    """Write the ``states`` (K, 4) of K streams that are seeded with four 64-bit ``words`` (K, 4)
+    each.
 
     As numpy: words 0 and 1 are the initial state s, words 2 and 3 the stream number i. The
     increment is 2 i + 1, and the first state (s + increment) * FULL + increment modulo 2^128.
@@ -208,8 +221,8 @@ def seed_states(words: np.ndarray, states: np.ndarray) -> None:
 
 @kernel
 def fill_units(states: np.ndarray, which: np.ndarray, counts: np.ndarray, out: FloatArray) -> None:
-    """Write the next ``counts[m]`` uniform numbers of stream ``which[m]`` into ``out``, for each m
-    in turn; both (M,), ``out`` (sum of counts,).
+    """Write the next ``counts[m]`` uniform numbers of stream ``which[m]`` of ``states`` (K, >= 4)
+    into ``out``, for each m in turn; ``counts`` and ``which`` are (M,), ``out`` (sum of counts,).
     """
     index = 0
     for m in range(len(which)):
@@ -222,8 +235,9 @@ def fill_units(states: np.ndarray, which: np.ndarray, counts: np.ndarray, out: F
 def fill_exponentials(
     states: np.ndarray, which: np.ndarray, counts: np.ndarray, ziggurat: Ziggurat, out: FloatArray
 ) -> None:
-    """Write the next ``counts[m]`` exponential numbers of mean 1 of stream ``which[m]`` into
-    ``out``, as ``fill_units``.
+    """Write the next ``counts[m]`` exponential numbers of mean 1 of stream ``which[m]`` of
+    ``states`` (K, >= 4) into ``out``, for each m in turn; ``counts`` and ``which`` are (M,),
+    ``out`` (sum of counts,).
     """
     index = 0
     for m in range(len(which)):
@@ -257,7 +271,8 @@ class StreamBatch:
         return lanes
 
     def units(self, which: np.ndarray, counts: np.ndarray) -> FloatArray:
-        """Return the next ``counts[m]`` uniforms of stream ``which[m]``, concatenated over m.
+        """Return the next ``counts[m]`` uniforms of stream ``which[m]``, concatenated over m
+        (sum of counts,); both arguments are (M,).
 
         They equal ``Generator.random(counts[m])`` of that stream.
         """
@@ -266,7 +281,11 @@ class StreamBatch:
         return out
 
     def exponentials(self, which: np.ndarray, counts: np.ndarray) -> FloatArray:
-        """Return ``Generator.standard_exponential(counts[m])`` of each stream, as ``units``."""
+        """Return the next ``counts[m]`` exponential numbers of mean 1 of stream ``which[m]``,
+        concatenated over m (sum of counts,); both arguments are (M,).
+
+        They equal ``Generator.standard_exponential(counts[m])`` of that stream.
+        """
         out = np.empty(int(counts.sum()))
         fill_exponentials(self.states, which, counts, ziggurat(), out)
         return out

@@ -21,7 +21,7 @@ class Normals(Protocol):
 
 
 class GeneratorNormals:
-    """The streams of K numpy generators."""
+    """The streams of K numpy generators, ``randoms``."""
 
     def __init__(self, randoms: Sequence[np.random.Generator]) -> None:
         self._randoms = randoms
@@ -50,8 +50,8 @@ class StreamNormals:
 
 @kernel
 def fill_normals_of_all(states: np.ndarray, ziggurat: NormalZiggurat, out: FloatArray) -> None:
-    """Write the next M numbers of stream ``states[k]`` into ``out[k]``; states (K, >= 4), out
-    (K, M).
+    """Write the next M standard normal numbers of stream k of ``states`` (K, >= 4) into ``out[k]``,
+    for all k; ``out`` is (K, M). Steps the states.
     """
     for k in range(out.shape[0]):
         high, low = states[k, 0], states[k, 1]

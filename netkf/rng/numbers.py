@@ -54,7 +54,7 @@ class NormalZiggurat(NamedTuple):
 
 @cache
 def normal_ziggurat() -> NormalZiggurat:
-    """Return the layers that numpy uses."""
+    """Return the 256 layers of numpy's ziggurat for normal numbers."""
     with np.load(Path(__file__).with_name("ziggurat_normal.npz")) as tables:
         return NormalZiggurat(tables["fi"], tables["wi"], tables["ki"])
 
@@ -63,8 +63,9 @@ def normal_ziggurat() -> NormalZiggurat:
 def normal_of(
     states: np.ndarray, k: int, high: Any, low: Any, ziggurat: NormalZiggurat
 ) -> tuple[float, Any, Any]:
-    """Return ``next_normal`` of stream ``k`` and the state after it, for a loop that keeps the
-    state (high, low) in registers; see ``draws.exponential_of``.
+    """Return the next standard normal number of stream ``k`` of ``states`` (K, >= 4), and the state
+    after it, for a loop that keeps the state (high, low) in registers; ``states[k]`` is read and
+    written only for the rare numbers outside the fast path.
     """
     word = scramble(high, low)
     layer = int(word & LAYER)
@@ -81,7 +82,9 @@ def normal_of(
 
 @kernel
 def next_normal(states: np.ndarray, k: int, ziggurat: NormalZiggurat) -> float:
-    """Return the next standard normal number of stream ``k`` of states (K, >= 4) (ziggurat)."""
+    """Return the next standard normal number of stream ``k`` of ``states`` (K, >= 4) (ziggurat),
+    and step its state.
+    """
     while True:
         # 8 bits choose a layer, one the sign, 52 a point across the layer.
         word = next_word(states, k)
@@ -104,7 +107,9 @@ def next_normal(states: np.ndarray, k: int, ziggurat: NormalZiggurat) -> float:
 
 @kernel
 def _tail(states: np.ndarray, k: int, negative: bool) -> float:
-    """Return a normal number with |x| > TAIL_START, by rejection (Marsaglia 1964)."""
+    """Return a normal number x with |x| > TAIL_START, ``negative`` or positive, by rejection
+    (Marsaglia 1964), from stream ``k`` of ``states`` (K, >= 4).
+    """
     while True:
         x = -INVERSE_TAIL_START * math.log1p(-next_unit(states, k))
         y = -math.log1p(-next_unit(states, k))

@@ -23,7 +23,7 @@ S32 = _L(32)
 
 @kernel
 def _scramble(value: Any, constant: Any, factor: Any) -> Any:
-    """Return ``hashmix`` of numpy's SeedSequence for one 32-bit word.
+    """Return the hash of one 32-bit word ``value``, as ``hashmix`` of numpy's SeedSequence.
 
     The caller replaces ``constant`` by ``constant * factor`` after each call, as numpy's does.
     """
@@ -33,7 +33,7 @@ def _scramble(value: Any, constant: Any, factor: Any) -> Any:
 
 @kernel
 def _mix(x: Any, y: Any) -> Any:
-    """Return ``mix`` of numpy's SeedSequence for two 32-bit words."""
+    """Return one 32-bit word mixed from two, x and y, as ``mix`` of numpy's SeedSequence."""
     mixed = _U(_U(MIX_LEFT * x) - _U(MIX_RIGHT * y))
     return _U(mixed ^ (mixed >> S16))
 

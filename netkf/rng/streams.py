@@ -132,26 +132,28 @@ class ReplicaStreams:
     def generators(
         self, purpose: str, entities: Sequence[tuple[int, ...]]
     ) -> list[np.random.Generator]:
-        """Return the generators of K entities for ``purpose``, (count K), run by run."""
+        """Return the ``count`` K generators of K entities for ``purpose``, run by run."""
         seeds: list[Any] = [_Words(words) for words in self.seed_words(purpose, entities)]
         return [np.random.Generator(np.random.PCG64DXSM(seed)) for seed in seeds]
 
 
 class _Words(ISeedSequence):
-    """A seed sequence of numpy with four words that were computed ahead."""
+    """A seed sequence of numpy with four 64-bit ``words`` (4,) that were computed ahead."""
 
     def __init__(self, words: np.ndarray) -> None:
         self._words = words
 
     def generate_state(self, n_words: int, dtype: Any = np.uint32) -> np.ndarray:
-        """Return the four words; PCG64DXSM asks for no others."""
+        """Return the four words (4,) of uint64; PCG64DXSM asks for no others."""
         assert (n_words, np.dtype(dtype)) == (4, np.uint64)
         return self._words
 
 
 @lru_cache(maxsize=32)
 def _small_ids(entities: tuple[tuple[int, ...], ...]) -> np.ndarray | None:
-    """Return the ids of K entities as 32-bit words (K, m); None if an id needs more bits."""
+    """Return the ids of K entities, m ids each, as 32-bit words (K, m); None if an id needs more
+    bits.
+    """
     if max(max(entity, default=0) for entity in entities) >= WORD:
         return None
     return np.array(entities, dtype=np.uint32)
@@ -162,7 +164,9 @@ WORD, MASK = 1 << 32, (1 << 32) - 1
 
 @cache
 def _entropy_words(seed: int) -> np.ndarray:
-    """Return the 32-bit words of a seed, lowest first, padded with zeros to POOL words."""
+    """Return the 32-bit words (>= POOL,) of a seed, lowest first, padded with zeros to POOL
+    words.
+    """
     words = [seed & MASK]
     while seed := seed >> 32:
         words.append(seed & MASK)

@@ -84,12 +84,14 @@ class BatchSink(Sink):
         self._fingerprint = ""
 
     def events(self, rows: np.ndarray) -> None:
-        """Ignore the events: the recorder counts them."""
+        """Ignore the EVENT ``rows`` (K,): the recorder counts them."""
 
     def states(
         self, t: FloatArray, x: FloatArray, xhat: FloatArray, P: FloatArray, error: FloatArray
     ) -> None:
-        """Append to the samples of the present run."""
+        """Append K samples to those of the present run: t (K,) in seconds, x (K, n), xhat and error
+        (K, N, n), P (K, N, n, n), of which the first F of the N filters are kept.
+        """
         run = len(self._status)
         first, last = self._lengths[run], self._lengths[run] + len(t)
         self._x[run, first:last] = x
@@ -100,7 +102,9 @@ class BatchSink(Sink):
         self._lengths[run] = last
 
     def finish(self, recorder: Recorder, status: str) -> None:
-        """End the present run; later samples belong to the next replica."""
+        """End the present run, with the counts and sums of its recorder and its ``status``
+        ("complete" or "diverged"); later samples belong to the next replica.
+        """
         if not self._status:
             self._fingerprint = recorder.fingerprint
         self._counts[len(self._status)] = recorder.counts

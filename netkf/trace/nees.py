@@ -10,8 +10,8 @@ from netkf.linalg.small import solve_inplace
 
 
 def errors(e: FloatArray, P: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the squared error and NEES ``e' P^-1 e`` (...) of errors (..., n) and covariances
-    (..., n, n); NEES is nan where P is singular or nan.
+    """Return the squared error ``e' e`` (...) and NEES ``e' P^-1 e`` (...) of errors e (..., n) and
+    covariances P (..., n, n); NEES is nan where P is singular or nan.
     """
     n, shape = e.shape[-1], e.shape[:-1]
     flat, nees = np.ascontiguousarray(e).reshape(-1, n), np.empty(shape)
@@ -27,8 +27,8 @@ def errors(e: FloatArray, P: FloatArray) -> tuple[FloatArray, FloatArray]:
 def fill_nees(
     e: FloatArray, P: FloatArray, out: FloatArray, factor: FloatArray, solved: FloatArray
 ) -> bool:
-    """Write NEES ``e' P^-1 e`` (K,) of errors (K, n) and covariances (K, n, n), nan where P is
-    exactly singular; return False if a finite P is.
+    """Write NEES ``e' P^-1 e`` into ``out`` (K,), of errors e (K, n) and covariances P (K, n, n),
+    nan where P is exactly singular; return False if a finite P is.
 
     ``factor`` (n, n) and ``solved`` (n, 1) are scratch.
     """
@@ -51,7 +51,7 @@ def fill_nees(
 
 
 def _is_regular(P: FloatArray) -> np.ndarray:
-    """Return a mask (K,) of the matrices (K, n, n) that are finite and of full rank up to
+    """Return a mask (K,) of the matrices P (K, n, n) that are finite and of full rank up to
     rounding.
     """
     regular = np.asarray(np.isfinite(P).all(axis=(1, 2)))

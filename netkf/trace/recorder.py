@@ -39,13 +39,14 @@ class Sink(ABC):
 
     @abstractmethod
     def events(self, rows: np.ndarray) -> None:
-        """Take the next block of EVENT rows."""
+        """Take the next block of EVENT ``rows`` (K,), in the order of time."""
 
     @abstractmethod
     def states(
         self, t: FloatArray, x: FloatArray, xhat: FloatArray, P: FloatArray, error: FloatArray
     ) -> None:
-        """Take samples at times (T,): x (T, n), xhat (T, N, n), P (T, N, n, n), error (T, N, n).
+        """Take T samples at times t (T,) in seconds: x (T, n), xhat (T, N, n), P (T, N, n, n),
+        error (T, N, n) of N nodes.
 
         P is nan if the filter gives none; error is x - xhat without the rounding of large x.
         """
@@ -61,13 +62,15 @@ class MemorySink(Sink):
         self.samples: list[tuple[FloatArray, ...]] = []
 
     def events(self, rows: np.ndarray) -> None:
-        """Append a block of rows."""
+        """Append the EVENT ``rows`` (K,) to ``blocks``."""
         self.blocks.append(rows)
 
     def states(
         self, t: FloatArray, x: FloatArray, xhat: FloatArray, P: FloatArray, error: FloatArray
     ) -> None:
-        """Append a block of rows."""
+        """Append T samples to ``samples``, as a tuple of t (T,) in seconds, x (T, n), xhat
+        (T, N, n), P (T, N, n, n) and error (T, N, n).
+        """
         self.samples.append((t, x, xhat, P, error))
 
 
@@ -149,7 +152,7 @@ class Recorder:
         self._run_or_submit(self._pass_on, rows)
 
     def extend(self, rows: np.ndarray) -> None:
-        """Record a block of EVENT rows; the caller must not write to it afterwards."""
+        """Record a block of EVENT ``rows`` (K,); the caller must not write to it afterwards."""
         with defer_signals():  # a signal must not separate the count from the rows
             self._flush_gathered()
             if not len(rows):
@@ -164,7 +167,7 @@ class Recorder:
             self._run_or_submit(self._pass_on, rows)
 
     def add_counts(self, counts: np.ndarray) -> None:
-        """Count events by kind (len(KINDS),), where they are only counted."""
+        """Add ``counts`` (len(KINDS),) of events by kind, where events are only counted."""
         assert self.counts_only, "events are recorded"
         self._flush_gathered()
         self._counts += counts
@@ -187,7 +190,7 @@ class Recorder:
         self._counts += np.bincount(kinds, minlength=len(KINDS))
 
     def _pass_on(self, rows: np.ndarray) -> None:
-        """Count and fingerprint a block of EVENT rows, and pass it to all sinks."""
+        """Count and fingerprint a block of EVENT ``rows`` (K,), and pass it to all sinks."""
         self._count(rows["kind"])
         self._hash.update(rows.data)
         for sink in self._sinks:
@@ -196,15 +199,17 @@ class Recorder:
     def sample(
         self, t: float, x: FloatArray, xhat: FloatArray, P: FloatArray, error: FloatArray
     ) -> None:
-        """Record one sample of the truth (n,) and of all nodes: xhat and error (N, n), P (N, n, n),
-        nan where the filter gives no covariance.
+        """Record one sample at ``t`` (seconds) of the truth x (n,) and of all nodes: xhat and error
+        (N, n), P (N, n, n), nan where the filter gives no covariance.
         """
         self.samples(np.array([t]), x[None], xhat[None], P[None], error[None])
 
     def samples(
         self, t: FloatArray, x: FloatArray, xhat: FloatArray, P: FloatArray, error: FloatArray
     ) -> None:
-        """Record several samples; the caller must not write to the arrays afterwards."""
+        """Record T samples at times t (T,) in seconds: x (T, n), xhat and error (T, N, n), P
+        (T, N, n, n); the caller must not write to the arrays afterwards.
+        """
         with defer_signals():  # a signal must not leave the sinks with different samples
             self._run_or_submit(self._pass_sample_on, t, x, xhat, P, error)
 

@@ -149,7 +149,9 @@ def plot_by_name(result: Any, figure: str) -> Any:
 
 
 def event_columns(rows: np.ndarray, replica: int, first: int) -> dict[str, Any]:
-    """Return EVENT rows as named columns; ``first`` is the sequence number of the first row."""
+    """Return K EVENT ``rows`` as named columns (K,), those of EVENT_COLUMNS; ``replica`` is the
+    number of the run and ``first`` the sequence number of the first row.
+    """
     import pandas as pd
 
     kinds = pd.Categorical.from_codes(rows["kind"].astype(np.int8), categories=pd.Index(KINDS))
@@ -159,11 +161,11 @@ def event_columns(rows: np.ndarray, replica: int, first: int) -> dict[str, Any]:
 
 
 def rounding_from(times: FloatArray, x: FloatArray, P: FloatArray, e: FloatArray) -> float:
-    """Return the first of the times (T,) at which the rounding error of x - xhat exceeds 1 / BLUR
-    of the standard deviation of the errors; inf if none does.
+    """Return the first of the ``times`` (T,), in seconds, at which the rounding error of x - xhat
+    exceeds 1 / BLUR of the standard deviation of the errors; inf if none does.
 
-    The rounding error is that of states x (T, n), the standard deviation the smallest one of
-    P (T, N, n, n) or, where P is nan, the root mean square of the errors e (T, N, n).
+    The rounding error is that of states x (T, n), the standard deviation the smallest one of P
+    (T, N, n, n) or, where P is nan, the root mean square of the errors e (T, N, n).
     """
     if not len(times):
         return np.inf
@@ -206,7 +208,9 @@ def blurred_samples(run: Run, matrices: FloatArray) -> np.ndarray:
 
 
 class StateSamples(NamedTuple):
-    """Samples at times (T,): x (T, n), xhat and error (T, N, n), P (T, N, n, n)."""
+    """T samples of N filters at ``times`` (T,) in seconds: x (T, n), xhat and error = x - xhat
+    (T, N, n), P (T, N, n, n).
+    """
 
     times: FloatArray
     x: FloatArray
@@ -218,7 +222,9 @@ class StateSamples(NamedTuple):
 def state_table(
     replica: int, nodes: tuple[int, ...], samples: StateSamples, truth_known: bool = True
 ) -> dict[str, Any]:
-    """Return samples as named columns, with a row for each time and node.
+    """Return T samples of N ``nodes`` (ids) as named columns (T N,), those of
+    trace.schema.state_columns, with a row for each time and node; ``replica`` is the number of the
+    run.
 
     Without known truth there are no columns of errors.
     """
@@ -265,8 +271,8 @@ def first_difference(a: Run | pd.DataFrame, b: Run | pd.DataFrame) -> str | None
 
 
 def _first_different_row(one: pd.DataFrame, other: pd.DataFrame, names: list[str]) -> int:
-    """Return the number of the first row in which columns differ; the length of the shorter table
-    if none does.
+    """Return the number of the first row in which the columns ``names`` of two tables of events
+    differ; the length of the shorter table if none does. nan equals nan.
     """
     shorter = min(len(one), len(other))
     differs = np.zeros(shorter, dtype=bool)

@@ -62,9 +62,12 @@ class PoissonClocks(NamedTuple):
 
 
 class TickBuffer(NamedTuple):
-    """Space for K ticks: times ``t`` and ``entity`` (K,). Their outcomes begin at
-    ``first_outcome[k]`` of ``delay``; with ``bits`` this number itself has a bit for each message
-    that arrives, and ``delay`` is empty.
+    """Space for K ticks.
+
+    t, entity : (K,), time in seconds, and index of the entity whose clock ticks
+    first_outcome : (K,), the outcomes of tick k begin at ``delay[first_outcome[k]]``; with ``bits``
+                    this number itself has a bit for each message that arrives
+    delay : (D,), outcomes of all messages, tick after tick: seconds, or LOST; empty with ``bits``
     """
 
     t: FloatArray
@@ -83,8 +86,10 @@ def draw_ticks(
     buffer: TickBuffer,
     counts: np.ndarray,
 ) -> bool:
-    """Append the ticks of a run before ``end`` (seconds) to ``buffer``; ``counts`` (2,) are the
-    numbers of ticks and outcomes in it. Return False if the buffer is full before.
+    """Append the ticks before ``end`` (seconds) of all entities of run number ``run`` to
+    ``buffer``, with their outcomes; messages that arrive take ``delay`` seconds. ``counts`` (2,)
+    are the numbers of ticks and outcomes in the buffer; advances these, ``clocks.next_tick`` and
+    the streams. Return False if the buffer is full before.
     """
     # Entity by entity, each from its own stream; put_in_time_order() sorts them afterwards.
     for e in range(len(clocks.first) - 1):
@@ -104,7 +109,11 @@ def draw_ticks_of(
     buffer: TickBuffer,
     counts: np.ndarray,
 ) -> bool:
-    """Append the ticks of entity ``e`` of a run, see ``draw_ticks``."""
+    """Append the ticks before ``end`` (seconds) of entity ``e`` (index within a run) of run number
+    ``run`` to ``buffer``, with their outcomes; messages that arrive take ``delay`` seconds.
+    Advances ``counts`` (2,), the numbers of ticks and outcomes in the buffer, the entity's
+    ``clocks.next_tick`` and its stream. Return False if the buffer is full before.
+    """
     states, first, after = clocks.tick_streams, clocks.first[e], clocks.first[e + 1]
     k = run * (len(clocks.first) - 1) + e
     now, rate, high, low = clocks.next_tick[k], clocks.rate[k], states[k, 0], states[k, 1]
@@ -135,8 +144,11 @@ def draw_outcomes(
     buffer: TickBuffer,
     counts: np.ndarray,
 ) -> int:
-    """Draw which messages of a tick arrive, on the directions ``outgoing[first:after]``; return the
-    ``first_outcome`` of the tick, see TickBuffer.
+    """Draw which messages of a tick arrive in run number ``run``, on the directed links
+    ``outgoing[first:after]``, and append their delays (``delay`` seconds or LOST) to
+    ``buffer.delay`` at ``counts[1]``, which advances. Return the ``first_outcome`` of the tick:
+    where its outcomes begin, or, with ``clocks.bits``, a bit for each message that arrives instead
+    of outcomes.
     """
     outcome, uniform, last_source = 0 if clocks.bits else counts[1], 0.0, -1
     # One uniform number for each loss stream: directions that share a stream are neighbours.
@@ -165,7 +177,7 @@ class Sorting(NamedTuple):
 
 
 def _sorting(ticks: int) -> Sorting:
-    """Return scratch to sort ``ticks`` ticks."""
+    """Return scratch to sort K = ``ticks`` ticks."""
     return Sorting(np.empty(ticks + 1, dtype=np.int32), np.empty(ticks, dtype=np.int32))
 
 
@@ -174,7 +186,7 @@ def put_in_time_order(
     begin: float, end: float, count: int, buffer: TickBuffer, ordered: TickBuffer, sorting: Sorting
 ) -> None:
     """Write the first ``count`` ticks of ``buffer``, which lie in [begin, end) seconds, into
-    ``ordered``, sorted by (time, entity).
+    ``ordered``, sorted by (time, entity); outcomes stay where they are. ``sorting`` is scratch.
     """
     # Ticks are evenly spread, hence about one in each of ``count`` equal bins.
     place, source, scale = sorting.place, sorting.source, count / (end - begin)
@@ -204,16 +216,19 @@ def put_in_time_order(
 
 @kernel(inlined=True)
 def bin_of(time: float, begin: float, scale: float, count: int) -> int:
-    """Return the index of the bin that a time lies in, of ``count`` bins, ``scale`` per second."""
+    """Return the index (0 to ``count`` - 1) of the bin that ``time`` lies in, of ``count`` bins
+    from ``begin`` (seconds) on, ``scale`` of them per second.
+    """
     return min(int((time - begin) * scale), count - 1)
 
 
 class AllTicks(NamedTuple):
-    """The ticks of R runs, one run after the other, as in a TickBuffer.
+    """The K ticks of R runs, one run after the other, as in a TickBuffer.
 
     t, entity, first_outcome : (K,); ticks ``first[r]`` to ``first[r + 1]`` - 1 are those of run r,
                                whose ``first_outcome`` counts from ``first_delay[r]``
-    delay : outcomes of all runs
+    delay : (D,), outcomes of all runs: seconds, or LOST
+    first, first_delay : (R + 1,)
     bits : whether ``first_outcome`` holds arrival bits instead
     """
 
@@ -237,9 +252,10 @@ def draw_all_ticks(
     sorting: Sorting,
     ticks: AllTicks,
 ) -> bool:
-    """Draw the ticks of all runs up to the horizon into ``ticks``, sorted by (time, entity) in each
-    run; ``buffer``, ``counts`` (2,) and ``sorting`` are scratch. Return False if an array is too
-    small.
+    """Draw the ticks of all R runs up to the ``horizon`` (seconds) into ``ticks``, sorted by
+    (time, entity) in each run; messages that arrive take ``delay`` seconds. ``buffer``, ``counts``
+    (2,) and ``sorting`` are scratch. Advances the streams of ``clocks``. Return False if an array
+    is too small.
     """
     for run in range(len(ticks.first) - 1):
         counts[0] = counts[1] = 0
@@ -275,8 +291,8 @@ def is_poisson(scenario: Scenario) -> bool:
 
 @once_per_scenario
 def _rates_and_probabilities(scenario: Scenario) -> tuple[FloatArray, FloatArray]:
-    """Return ticks per second of each entity (E,), and delivery probabilities of
-    directions (W,).
+    """Return ticks per second of each entity of a run, (E,), and the delivery probability of each
+    directed link, (W,).
     """
     clock, senders = scenario.network.activation, senders_of(scenario)
     assert isinstance(clock, LinkClock)
@@ -331,7 +347,7 @@ class PoissonSchedules:
         self._end, self._buffer = 0.0, _empty_buffer(0, 0)
 
     def following(self) -> Window:
-        """Return the next window of one run; the last one ends at infinity."""
+        """Return the next window of the ticks of one run; the last one ends at infinity."""
         begin, end = self._end, self._end + self._length
         # The last window has no end, so that the loop asks for no other.
         if not begin < end < self._horizon:
@@ -340,7 +356,7 @@ class PoissonSchedules:
         return self._window(0, begin, end)
 
     def all(self) -> AllTicks:
-        """Return all ticks of all runs."""
+        """Return all ticks of all R runs up to the horizon, one run after the other."""
         states = self._clocks.next_tick, self._clocks.tick_streams, self._clocks.loss_streams
         # Copies of the streams: an attempt that runs out of space starts again from them.
         copies = [state.copy() for state in states]
@@ -362,18 +378,24 @@ class PoissonSchedules:
                 state[:] = copy
 
     def _space(self, ticks: int) -> TickBuffer:
-        """Return space for ``ticks`` ticks and their messages."""
+        """Return space for ``ticks`` ticks and the outcomes of about as many messages as they
+        send.
+        """
         sends = 0.0 if self._clocks.bits else self._sends
         return _empty_buffer(ticks, int(sends * ticks) + self._max_sends)
 
     def _space_for_all(self, ticks: int) -> AllTicks:
-        """Return space for ``ticks`` ticks of all runs together, and their messages."""
+        """Return space for ``ticks`` ticks of all R runs together, and the outcomes of their
+        messages.
+        """
         t, entity, first_outcome, delay = self._space(ticks)
         first, first_delay = (np.zeros(self._runs + 1, dtype=np.int64) for _ in range(2))
         return AllTicks(t, entity, first_outcome, delay, first, first_delay, self._clocks.bits)
 
     def _window(self, run: int, begin: float, end: float) -> Window:
-        """Draw and return the ticks of a run in [begin, end) seconds."""
+        """Draw and return the ticks of run number ``run`` in [begin, end) seconds, in the order of
+        time.
+        """
         last, counts = min(end, self._horizon), np.zeros(2, dtype=np.int64)
         expected = self._rate * (last - begin)
         ticks = int(expected + 8.0 * math.sqrt(expected)) + 8
@@ -390,7 +412,9 @@ class PoissonSchedules:
         return Window(end, *ordered)
 
     def _enlarge_buffer(self, ticks: int, sends: int) -> None:
-        """Make the buffer large enough for ``ticks`` and their ``sends``; it never shrinks."""
+        """Make the buffer large enough for ``ticks`` ticks and ``sends`` outcomes, keeping its
+        contents; it never shrinks.
+        """
         if len(self._buffer.t) >= ticks and len(self._buffer.delay) >= sends:
             return
         larger = _empty_buffer(ticks, sends)
@@ -407,8 +431,8 @@ def _empty_buffer(ticks: int, sends: int) -> TickBuffer:
 
 
 def all_ticks(scenario: Scenario, streams: ReplicaStreams, bits: bool = False) -> AllTicks:
-    """Return all ticks of several runs. ``bits``: with arrival bits instead of outcomes, which is
-    possible if clocks are Poisson and no message takes time.
+    """Return all ticks of R runs up to the horizon. ``bits``: with arrival bits instead of
+    outcomes, which is possible if clocks are Poisson and no message takes time.
     """
     if is_poisson(scenario):
         return PoissonSchedules(scenario, streams, bits=bits).all()
@@ -426,7 +450,7 @@ def all_ticks(scenario: Scenario, streams: ReplicaStreams, bits: bool = False) -
 
 
 def window_of(ticks: AllTicks, run: int) -> Window:
-    """Return all ticks of one run as a window without an end."""
+    """Return all ticks of run number ``run`` (0 to R - 1) as a window without an end."""
     own, outcomes = (slice(*first[run : run + 2]) for first in (ticks.first, ticks.first_delay))
     return Window(
         math.inf, ticks.t[own], ticks.entity[own], ticks.first_outcome[own], ticks.delay[outcomes]
@@ -436,6 +460,8 @@ def window_of(ticks: AllTicks, run: int) -> Window:
 def schedule(
     scenario: Scenario, streams: Streams, senders: Senders | None = None
 ) -> PoissonSchedules | Schedule:
-    """Return the source of the windows of one run, drawn in compiled code if possible."""
+    """Return the source of the windows of ticks of one run, drawn in compiled code if possible;
+    ``senders`` defaults to those of the scenario.
+    """
     cls = PoissonSchedules if is_poisson(scenario) else Schedule
     return cls(scenario, streams, senders)

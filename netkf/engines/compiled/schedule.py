@@ -59,8 +59,8 @@ class Window(NamedTuple):
 
 
 class Ticks(NamedTuple):
-    """K ticks: times ``t`` and ``entity`` (K,), and the outcomes ``delay`` of all their messages,
-    tick after tick.
+    """K ticks: times ``t`` (K,) in seconds, index of the ``entity`` (K,) whose clock ticks, and the
+    outcomes ``delay`` (D,) of all their messages, tick after tick: seconds, or LOST.
     """
 
     t: FloatArray
@@ -68,7 +68,9 @@ class Ticks(NamedTuple):
     delay: FloatArray
 
     def select(self, indices: np.ndarray, sizes: np.ndarray) -> Ticks:
-        """Return the ticks with these ``indices``; a tick of entity e has ``sizes[e]`` outcomes."""
+        """Return the ticks with these ``indices`` (M,) in this order; a tick of entity e has
+        ``sizes[e]`` outcomes (E,).
+        """
         # Indices of the outcomes of these ticks, tick after tick in their new order.
         sent = sizes[self.entity]
         first, count = (np.cumsum(sent) - sent)[indices], sent[indices]
@@ -77,7 +79,9 @@ class Ticks(NamedTuple):
         return Ticks(self.t[indices], self.entity[indices], self.delay[outcomes])
 
     def window(self, end: float, sizes: np.ndarray) -> Window:
-        """Return these ticks, which must be in the order of time, as a window up to ``end``."""
+        """Return these ticks, which must be in the order of time, as a window up to ``end``
+        (seconds); a tick of entity e has ``sizes[e]`` outcomes (E,).
+        """
         sent = sizes[self.entity]
         return Window(end, self.t, self.entity, np.cumsum(sent) - sent, self.delay)
 
@@ -85,8 +89,8 @@ class Ticks(NamedTuple):
 class TickSource:
     """Draws the ticks of E entities, those of all runs one run after the other, block by block.
 
-    ``last`` (E,) are the times of the last ticks so far, infinite once the horizon is passed, and
-    ``drawn`` (E,) the numbers of ticks so far.
+    ``last`` (E,) are the times in seconds of the last ticks so far, infinite once the horizon is
+    passed, and ``drawn`` (E,) the numbers of ticks so far.
     """
 
     def __init__(
@@ -119,8 +123,9 @@ class TickSource:
             )
 
     def more(self, indices: np.ndarray, counts: np.ndarray) -> tuple[FloatArray, np.ndarray]:
-        """Draw the next ``counts`` ticks of the entities ``indices``; return the times of those
-        before the horizon, entity by entity, and how many each entity has.
+        """Draw the next ``counts`` (M,) ticks of the entities ``indices`` (M,); return the times
+        (K,) in seconds of those before the horizon, entity by entity, and how many each entity has,
+        (M,). Advances ``last`` and ``drawn``.
         """
         if self._all_poisson:
             times, sizes = self._exponential(indices, counts), counts
@@ -141,8 +146,9 @@ class TickSource:
         return times[before_horizon], numbers
 
     def _exponential(self, indices: np.ndarray, counts: np.ndarray) -> FloatArray:
-        """Return the times (E, count) of the next ticks of Poisson clocks, infinite beyond the
-        counts; see ``Poisson.ticks``.
+        """Return the times (M, max(counts)) in seconds of the next ``counts`` (M,) ticks of the
+        Poisson clocks of the entities ``indices`` (M,), infinite beyond the counts; see
+        ``Poisson.ticks``.
         """
         times = np.full((len(indices), counts.max() + 1), np.inf)
         times[:, 0] = self.last[indices]
@@ -153,7 +159,9 @@ class TickSource:
         return np.asarray(np.add.accumulate(times, axis=1)[:, 1:])
 
     def _ticks(self, k: int, count: int) -> FloatArray:
-        """Return the next ``count`` ticks of entity ``k``, fewer if its clock ends."""
+        """Return the times (count,) in seconds of the next ``count`` ticks of entity ``k``, fewer
+        if its clock ends.
+        """
         assert isinstance(self._clock, LinkClock)
         origin, index, now = float(self._origins[k]), int(self.drawn[k]), float(self.last[k])
         entity, random = self._entities[k], self._random[k]
@@ -175,7 +183,7 @@ def delay_is_zero(channel: Channel) -> bool:
 
 
 def delivery_probabilities_of(scenario: Scenario, directions: tuple[Link, ...]) -> FloatArray:
-    """Return the delivery probability (W,) of the messages of each directed link."""
+    """Return the delivery probabilities (W,) of the messages of W directed links."""
     loss = scenario.network.channel.loss
     return np.array(
         [
@@ -186,7 +194,9 @@ def delivery_probabilities_of(scenario: Scenario, directions: tuple[Link, ...]) 
 
 
 class Outcomes:
-    """Draws the outcomes of all messages of some runs: delays in seconds, or LOST."""
+    """Draws the outcomes of all messages of R runs: delays in seconds, or LOST. ``sizes`` (R E,) is
+    the number of messages that each entity sends at a tick.
+    """
 
     def __init__(
         self, scenario: Scenario, streams: Streams | ReplicaStreams, senders: Senders
@@ -222,8 +232,9 @@ class Outcomes:
         self.sizes = np.tile(np.diff(senders.first), runs)
 
     def of(self, indices: np.ndarray, counts: np.ndarray, first: np.ndarray) -> FloatArray:
-        """Return the outcomes of the next ``counts`` ticks of the entities ``indices`` (over all
-        runs), entity by entity and tick after tick; ``first`` are the numbers of their first ticks.
+        """Return the outcomes (K,) of the next ``counts`` (M,) ticks of the entities ``indices``
+        (M,), over all runs, entity by entity and tick after tick: delays in seconds, or LOST.
+        ``first`` (M,) are the numbers of their first ticks, from 0.
         """
         runs, entity = np.divmod(indices, max(self._count, 1))
         sizes = self.sizes[indices]
@@ -249,8 +260,9 @@ class Outcomes:
         return out
 
     def _draw(self, sources: np.ndarray, counts: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Draw for the next ``counts`` messages of each stream of ``sources``, K in all: return
-        uniform numbers, bad states of the channel (bool) and delays, (K,) each.
+        """Draw for the next ``counts`` (M,) messages of each of the streams ``sources`` (M,), K in
+        all: return uniform numbers, bad states of the channel (bool) and delays in seconds, (K,)
+        each.
         """
         total = int(counts.sum())
         if not self._has_table_law:
@@ -275,7 +287,10 @@ class Outcomes:
         bad: np.ndarray,
         delay: np.ndarray,
     ) -> FloatArray:
-        """Return the outcomes (K,) of messages from their draws: delays in seconds, or LOST."""
+        """Return the outcomes (K,) of messages, delays in seconds or LOST: of ``counts`` (M,)
+        messages on each of the ``directions`` (M,), numbered from ``first`` (M,) on. Their draws
+        (K,) are a ``uniform`` number, whether the channel is ``bad``, and a ``delay`` in seconds.
+        """
         if self._identical:
             probability = np.repeat(self._probabilities[directions], counts)
         else:
@@ -288,8 +303,9 @@ class Outcomes:
     def _delivery_probability(
         self, directions: np.ndarray, counts: np.ndarray, first: np.ndarray, bad: np.ndarray
     ) -> FloatArray:
-        """Return the delivery probabilities (K,) of messages, ``counts`` on each of ``directions``
-        with numbers from ``first`` on; ``bad`` (K,) is the state of the channel.
+        """Return the delivery probabilities (K,) of messages, ``counts`` (M,) on each of
+        ``directions`` (M,) with numbers from ``first`` (M,) on; ``bad`` (K,) is the state of the
+        channel.
         """
         loss, out, done = self._channel.loss, np.empty(len(bad)), 0
         # Probabilities that may depend on the state of the link and on the number of the message.
@@ -313,8 +329,9 @@ class Outcomes:
         lost: np.ndarray,
         delay: np.ndarray,
     ) -> FloatArray:
-        """Return the delays (K,) in seconds if their law depends on the message, except those of
-        ``lost`` messages, which keep ``delay``.
+        """Return the delays (K,) in seconds if their law depends on the message, for ``counts``
+        (M,) messages on each of ``directions`` (M,) with numbers from ``first`` (M,) on. Messages
+        that are ``lost`` (K,) keep ``delay`` (K,).
         """
         model, out, k = self._channel.delay, np.array(delay), 0
         for w, count, number in zip(directions, counts.tolist(), first.tolist(), strict=True):
@@ -356,7 +373,9 @@ class EntityDraws:
         return float((self._clocks.drawn / self.last).sum())
 
     def more(self, indices: np.ndarray) -> Ticks:
-        """Draw and return the next block of ticks of these entities, whose indices increase."""
+        """Draw and return the next block of ticks of the entities ``indices`` (M,), in ascending
+        order, with the outcomes of their messages: entity by entity.
+        """
         first = self._clocks.drawn[indices]
         t, counts = self._clocks.more(indices, self._block[indices])
         # Blocks double: an entity with few ticks draws few.
@@ -365,7 +384,7 @@ class EntityDraws:
 
 
 def _concatenate(parts: list[Ticks]) -> Ticks:
-    """Return the concatenation of several Ticks."""
+    """Return the ticks of all ``parts``, one part after the other."""
     return Ticks(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
 
@@ -384,7 +403,7 @@ class Schedule:
         self._length = window_ticks / draws.rate if draws.rate > 0.0 else math.inf
 
     def following(self) -> Window:
-        """Return the next window; the last one ends at infinity."""
+        """Return the next window of the ticks of the run; the last one ends at infinity."""
         end, draws = self._end + self._length, self._draws
         # The last window has no end, so that the loop asks for no other.
         if not self._end < end < self._horizon:
@@ -407,8 +426,8 @@ class Schedule:
 
 
 class ReadingsSchedule:
-    """The windows of one run in which nodes transmit after their samples: at times ``t`` (K,), in
-    order, node ``index`` (K,).
+    """The windows of one run in which nodes transmit after their samples: at times ``t`` (K,) in
+    seconds, in order, the node with the index ``index`` (K,).
     """
 
     def __init__(
@@ -424,7 +443,9 @@ class ReadingsSchedule:
         self._sent = np.zeros(len(senders.entities), dtype=np.int64)
 
     def following(self) -> Window:
-        """Return the next window; the last one ends at infinity."""
+        """Return the next window of transmissions, each a tick of the sending node; the last one
+        ends at infinity.
+        """
         begin, sizes = self._begin, self._outcomes.sizes
         # As many instants as send about MAX_WINDOW_TICKS messages; a node without receivers counts
         # as one message.
@@ -448,7 +469,7 @@ class ReadingsSchedule:
 
 
 def all_windows(scenario: Scenario, streams: ReplicaStreams) -> list[Window]:
-    """Return all ticks of several runs, one window for each run."""
+    """Return all ticks of R runs up to the horizon, in one window for each run."""
     senders, runs = senders_of(scenario), streams.runs
     draws = EntityDraws(scenario, streams, senders)
     if not draws.count:

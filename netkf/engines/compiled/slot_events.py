@@ -56,7 +56,9 @@ class DirectionDraws:
         )
 
     def draws(self) -> Iterator[Draw]:
-        """Yield (uniform number, bad state, delay) for its activations, one after the other."""
+        """Yield the draws (uniform number, bad state, delay in seconds) of the channel for the
+        activations of this link, one after the other.
+        """
         while True:
             # Drawn in blocks for speed; the numbers do not depend on the length of a block.
             columns = self._sampler.draws(DRAWN_TOGETHER)
@@ -117,8 +119,8 @@ class SlotEvents:
         self._chosen_pairs: list[tuple[list[Link], set[Link] | None]] = []
 
     def asked(self) -> np.ndarray:
-        """Return (E, N): 1 if a node is asked for a message in a step of the next slot. Draws the
-        pairs of the slot.
+        """Return ``asked`` (E, N): 1 if node h is asked for a message in step e of the next slot.
+        Draws the pairs of the slot.
         """
         setup, index = self._setup, self._scenario.topology.index
         asked = np.zeros((len(setup.fresh), len(setup.nodes)), dtype=np.uint8)
@@ -130,7 +132,8 @@ class SlotEvents:
 
     def following(self, max_events: int, sent: np.ndarray | None) -> tuple[int, np.ndarray]:
         """Make the messages and events of the next slots, up to about ``max_events`` events; return
-        the number of slots S and ``up`` (1, S, E, W).
+        the number of slots S and ``up`` (1, S, E, W), which is 1 where a message on directed link w
+        is used in step e.
 
         If nodes may be silent it is one slot, and ``sent`` (E, N) says which of the nodes that are
         ``asked`` send.
@@ -149,8 +152,8 @@ class SlotEvents:
         return len(arrivals), np.stack(arrivals)[None]
 
     def _one_slot(self) -> np.ndarray:
-        """Make all events of the present slot; return ``up`` (E, W), the messages that are used in
-        each step.
+        """Make all events of the present slot; return ``up`` (E, W), which is 1 where a message on
+        directed link w is used in step e.
         """
         setup, algorithm, slot = self._setup, self._algorithm, self._slot
         up = np.zeros((len(setup.fresh), len(self._directions)), dtype=np.uint8)
@@ -173,7 +176,9 @@ class SlotEvents:
         return up
 
     def _make_stage_events(self, slot: int, up: np.ndarray) -> None:
-        """Make the events of the readings and exchanges of a slot, in order."""
+        """Make the events of the readings and exchanges of slot number ``slot``, in order; sets
+        ``up`` (E, W) to 1 where a message on directed link w is used in step e.
+        """
         steps, now = self._iterate_steps(slot), self._scenario.slot_plant.slot_time(slot)
         for step in self._setup.stages.step.tolist():
             if step < 0:
@@ -193,7 +198,9 @@ class SlotEvents:
                 self._end_step(exchange_step, up[step])
 
     def _iterate_steps(self, slot: int) -> Iterator[Step]:
-        """Yield the steps of the exchanges of a slot, if any."""
+        """Yield the E steps of the exchanges of slot number ``slot`` in order, none if nothing is
+        exchanged.
+        """
         setup, algorithm, repeats = self._setup, self._algorithm, [0, 0]
         # At the horizon filters that predict are only sampled.
         acts = slot < setup.last or not algorithm.predicts
@@ -207,7 +214,10 @@ class SlotEvents:
                 yield exchange_step
 
     def rows(self, stopped: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the events as EVENT rows, and the number of rows before each sample."""
+        """Return the events of the slots just made as EVENT rows (K,), and the number of rows
+        before each of their T samples, (T,). ``stopped`` (N,) is the number of the slot in which
+        each node stops.
+        """
         rows: list[Row] = []
         before = []
         for row in self._rows:
@@ -241,7 +251,9 @@ class SlotEvents:
             self._rows.append(row)
 
     def _send_all(self, step: Step) -> None:
-        """Send all messages of a step, with a draw of the channel for each."""
+        """Send all messages of a step, with a draw of the channel for each: they go into inboxes,
+        under way, or are lost, and their events are recorded.
+        """
         broadcast, now, phase = not self._algorithm.pairwise, step.begin, step.phase
         pairs, up = self._chosen_pairs.pop(0) if self._chosen_pairs else self._choose_pairs(step)
         if broadcast:
@@ -265,8 +277,8 @@ class SlotEvents:
                     self._send(step, direction, draw if is_up else None)
 
     def _choose_pairs(self, step: Step) -> tuple[list[Link], set[Link] | None]:
-        """Return the links that are used in a step, and the set of those that are up
-        (None: all).
+        """Return the links (pairs of node ids) that are used in a step, and the set of those that
+        are up (None: all).
         """
         activation, topology = self._scenario.network.activation, self._scenario.topology
         links = list(topology.links)
@@ -282,14 +294,16 @@ class SlotEvents:
         return links, up if topology.directed else up | {(j, i) for i, j in listed}
 
     def _is_silent(self, direction: DirectionDraws, step: Step) -> bool:
-        """Return True if the sender sends nothing in this step."""
+        """Return True if the sender of a directed link sends nothing in this step."""
         node = self._scenario.topology.index[direction.ends[0]]
         if self._sent is not None and not self._sent[step.step, node]:
             return True
         return bool(self._setup.may_miss and self._unread[step.step, node])
 
     def _send(self, step: Step, direction: DirectionDraws, draw: Draw | None) -> None:
-        """Send one message: it is lost, arrives at once, or is under way."""
+        """Send one message on a directed link: record it, and put it into the receiver's inbox or
+        among those under way. It is lost if ``draw`` says so or is None (the link is down).
+        """
         (sender, receiver), number, now = direction.ends, direction.messages, step.begin
         direction.messages = number + 1
         self._append_row((now, SEND, sender, receiver, number, step.phase, NAN))
@@ -338,8 +352,8 @@ class SlotEvents:
                 self._inbox.setdefault(receiver, {})[sender] = (number, now - sent)
 
     def _end_step(self, step: Step, up: np.ndarray) -> None:
-        """End a step: mark the messages in the inboxes as used in ``up`` (W,), and record
-        absorptions.
+        """End a step: set ``up`` (W,) to 1 for the directed links of all messages in inboxes, which
+        are used now, record the absorptions, and empty the inboxes.
         """
         count = len(self._rows)
         # By receiver and sender, the order of the kernels and of SimPy.

@@ -37,14 +37,15 @@ NAN = np.nan
 
 
 class Matchings(NamedTuple):
-    """The matching protocol of a network, and the random streams that it draws from.
+    """The matching protocol of a network, and the random streams that R runs draw from.
 
     protocol : index in PROTOCOLS, -1: all links exchange
     probability : parameter ``lazy`` or ``p`` of the protocol
     states : states (R, 6) of the random streams
-    first, members : list k of links is ``members[first[k]:first[k + 1]]``; for node-wakeup the
-                     links of node k in the order of its peers, for uniform-maximal matching k
-    order, busy : scratch, an entry for each link and for each node
+    first, members : (K + 1,) and (M,), list k of links is ``members[first[k]:first[k + 1]]``; for
+                     node-wakeup the links of node k in the order of its peers, for uniform-maximal
+                     matching k
+    order, busy : scratch, an entry for each link and for each node (N,)
     """
 
     protocol: int
@@ -88,9 +89,11 @@ class Channels(NamedTuple):
 
 @kernel
 def draw_matching(matchings: Matchings, ends: np.ndarray, r: int, active: np.ndarray) -> int:
-    """Write the links of one matching of run ``r`` into ``active`` in their order; return how many.
+    """Write the indices of the links of one matching of run ``r`` into ``active`` (A,) in their
+    order; return how many. ``ends`` (links, 2) are the indices of the nodes at both ends of each
+    link.
 
-    The numbers are those that ``Matching.draw`` takes from the same stream.
+    The numbers are those that ``Matching.draw`` takes from the same stream, which advances.
     """
     count, states = len(ends), matchings.states
     first, members = matchings.first, matchings.members
@@ -120,7 +123,8 @@ def draw_matching(matchings: Matchings, ends: np.ndarray, r: int, active: np.nda
 
 @kernel
 def _free_links(matchings: Matchings, ends: np.ndarray, r: int, active: np.ndarray) -> int:
-    """Write the links of a matching of run ``r`` to the front of ``active``; return their number.
+    """Write the indices of the links of a matching of run ``r`` to the front of ``active`` (A,);
+    return their number. ``ends`` (links, 2) are the indices of the nodes at both ends of each link.
 
     MAXIMAL visits the links in random order and takes each one whose ends are both free.
     INDEPENDENT wakes each link with a probability and takes those that share no node with another
@@ -163,8 +167,10 @@ def _free_links(matchings: Matchings, ends: np.ndarray, r: int, active: np.ndarr
 def draw_link(
     lanes: Lanes, channels: Channels, b: int, link: int, fresh: bool, up: np.ndarray, s: int, e: int
 ) -> None:
-    """Draw which messages of one activation of a link arrive, in step ``e`` of slot ``s``, in all
-    runs of block ``b``; write them into ``up``. Links that are not ``fresh`` keep their last draws.
+    """Draw which messages of one activation of ``link`` (index) arrive, in step ``e`` of slot ``s``
+    (index in the block of slots), in all L runs of block ``b``; write 1 or 0 into ``up``
+    (B, S, E, W, L) for its one or two directed links. Links that are not ``fresh`` keep their last
+    draws, which ``channels`` stores.
     """
     uniforms = channels.loss_uniform
     for d in range(channels.directions_per_link):
@@ -206,7 +212,11 @@ def draw_link(
 def draw_link_of_lane(
     channels: Channels, b: int, link: int, fresh: bool, up: np.ndarray, s: int, e: int, q: int
 ) -> None:
-    """Draw one link for the run of lane ``q`` alone, as ``draw_link`` does for all lanes."""
+    """Draw which messages of one activation of ``link`` (index) arrive, in step ``e`` of slot
+    ``s``, in the run of lane ``q`` of block ``b`` alone; write 1 or 0 into ``up`` (B, S, E, W, L)
+    for its one or two directed links. A link that is not ``fresh`` keeps its last draws, which
+    ``channels`` stores.
+    """
     for d in range(channels.directions_per_link):
         k = link * channels.streams_per_link + min(d, channels.streams_per_link - 1)
         if (
@@ -245,9 +255,9 @@ def next_state(bad: int, u: float, to_bad: float, to_good: float) -> int:
 def draw_broadcasts(
     lanes: Lanes, channels: Channels, exchanged: np.ndarray, fresh: np.ndarray, up: np.ndarray
 ) -> None:
-    """Draw the messages of broadcasts, which use every link in every step, into ``up`` (B, S, E, W,
-    L), which holds zeros before. Slots that are not ``exchanged`` (S,) stay 0; links draw anew in
-    the steps that are ``fresh`` (E,).
+    """Draw which messages of broadcasts, which use every link in every step, arrive: write 1 into
+    ``up`` (B, S, E, W, L), which holds zeros before. Slots that are not ``exchanged`` (S,) stay 0;
+    links draw anew in the steps that are ``fresh`` (E,).
     """
     for b in range(up.shape[0]):
         for s in range(up.shape[1]):
@@ -267,9 +277,10 @@ def draw_matched(
     active: np.ndarray,
     pair_count: np.ndarray,
 ) -> None:
-    """Draw matchings and the messages on their links into ``up``, as ``draw_broadcasts`` does for
-    all links. ``active`` (R, S, E, A) gets the paired links in order, ``pair_count`` (R, S, E)
-    their number.
+    """Draw the matchings of all runs, and which messages on their links arrive: write 1 into ``up``
+    (B, S, E, W, L), which holds zeros before. ``active`` (R, S, E, A) gets the indices of the
+    paired links in order, ``pair_count`` (R, S, E) their number. Slots that are not ``exchanged``
+    (S,) stay 0; links draw anew in the steps that are ``fresh`` (E,).
     """
     for b in range(up.shape[0]):
         for s in range(up.shape[1]):
@@ -290,7 +301,11 @@ def draw_pairs(
     s: int,
     e: int,
 ) -> None:
-    """Draw the matchings of a step in all runs of a block, and their messages."""
+    """Draw the matchings of step ``e`` of slot ``s`` in all L runs of block ``b``, and which
+    messages on their links arrive: write these into ``up`` (B, S, E, W, L), the paired links into
+    ``active`` (R, S, E, A), and their number into ``pair_count`` (R, S, E). ``fresh``: links draw
+    anew.
+    """
     first = b * len(lanes)
     for q in range(min(len(lanes), len(pair_count) - first)):
         r = first + q
@@ -305,7 +320,7 @@ def mark_all_senders(
     lanes: Lanes, channels: Channels, exchanged: np.ndarray, sent: np.ndarray
 ) -> None:
     """Write 1 into ``sent`` (B, S, E, N, L) for all nodes with links, in the slots that are
-    ``exchanged`` (S,): broadcasts ask each of them for a message.
+    ``exchanged`` (S,): broadcasts ask each of them for a message in each of the E steps.
     """
     for b in range(sent.shape[0]):
         for s in range(sent.shape[1]):
@@ -368,7 +383,7 @@ class Stages(NamedTuple):
 class SlotTimes(NamedTuple):
     """When S slots begin and what happens in them.
 
-    first, start : number of the first slot, and the times (S,) at which slots begin
+    first, start : number of the first slot, and the times (S,) in seconds at which slots begin
     recorded, sensed, exchanged : (S,), whether events are recorded, sensors are read and nodes
                                   exchange
     sample : (S,), index of the slot's sample among those of the block or run, -1: none
@@ -388,7 +403,9 @@ class TracedNodes(NamedTuple):
     """Nodes and incoming links, for the kernels that write or count events.
 
     nodes, sensing : ids of all nodes (N,) and of those with sensors
-    first, sender, direction : directed links by receiver, see ``SlotLinks``
+    first, sender, direction : (N + 1,), (W,) and (W,), directed links by receiver: node h receives
+                               from the nodes ``sender[k]`` (index) on the directed links
+                               ``direction[k]``, with k from ``first[h]`` to ``first[h + 1]`` - 1
     sent : number of messages so far (W,)
     stopped : slot in which each node stopped (B, N, L)
     """
@@ -403,8 +420,8 @@ class TracedNodes(NamedTuple):
 
 
 class Rows(NamedTuple):
-    """Columns of the event table of one run (trace.schema), and the number of rows before each
-    sample, ``before_sample`` (T,).
+    """Columns (K,) of the event table of one run (trace.schema), and the number of rows before each
+    of T samples, ``before_sample`` (T,).
     """
 
     t: FloatArray
@@ -418,10 +435,11 @@ class Rows(NamedTuple):
 
 
 class SlotMessages(NamedTuple):
-    """Messages of S slots with E steps each.
+    """Messages of S slots with E steps each, in R runs side by side in B blocks of L lanes.
 
-    up : (B, S, E, W, L), 1 where a message arrives
-    active, pair_count : paired links (R, S, E, A) and their number (R, S, E); empty for broadcasts
+    up : (B, S, E, W, L), 1 where a message arrives on directed link w
+    active, pair_count : indices of the paired links (R, S, E, A) and their number (R, S, E); empty
+                         for broadcasts
     sent : (B, S, E, N, L), 1 where a node sends; empty where every node sends that is asked
     """
 
@@ -457,7 +475,10 @@ def write_row(
     age: float,
     row: int,
 ) -> int:
-    """Write one event into ``row`` of ``rows``; return the index of the next row."""
+    """Write one event of kind number ``kind`` (trace.schema.CODES) at the time of ``stage`` into
+    index ``row`` of the columns of ``rows``; return the next index. ``node`` and ``peer`` are ids
+    of nodes, ``message`` a number on its link (-1: none), ``age`` its seconds under way.
+    """
     rows.t[row], rows.kind[row], rows.node[row], rows.peer[row] = stage.t, kind, node, peer
     rows.message[row], rows.phase[row], rows.age[row] = message, stage.phase, age
     return row + 1
@@ -475,8 +496,9 @@ def make_rows(
     stop: int,
     rows: Rows,
 ) -> int:
-    """Write the events of the first run in the slots with indices ``first`` to ``stop`` - 1, in the
-    order of time; return their number.
+    """Write the events of the first run in the slots with indices ``first`` to ``stop`` - 1 into
+    ``rows``, in the order of time; return their number. Numbers messages in ``traced.sent``.
+    ``pairwise``: nodes swap with a peer, instead of absorbing broadcasts.
     """
     row = 0
     for s in range(first, stop):
@@ -493,7 +515,9 @@ def make_rows(
 
 @kernel
 def mark_sample(times: SlotTimes, s: int, rows: Rows, row: int) -> None:
-    """Store the number of rows before the sample of slot ``s``, if it has one."""
+    """Store ``row``, the number of rows before the sample of slot ``s`` (index), in
+    ``rows.before_sample``, if the slot has a sample.
+    """
     k = times.sample[s]
     if k >= 0:
         rows.before_sample[k] = row
@@ -511,7 +535,10 @@ def _slot_rows(
     s: int,
     row: int,
 ) -> int:
-    """Write the events of slot ``s`` from ``row`` on; return the index of the next row."""
+    """Write the events of the first run in slot ``s`` (index) into ``rows`` from index ``row`` on;
+    return the next index. Numbers messages in ``traced.sent``. ``pairwise``: nodes swap with a
+    peer.
+    """
     now = times.start[s]
     for k in range(len(stages.step)):
         stage = SlotStage(times.first + s, s, stages.step[k], stages.phase[k], now)
@@ -538,8 +565,9 @@ def _write_sends(
     pairwise: bool,
     row: int,
 ) -> int:
-    """Write the messages sent in a step: after the tick of each pair, or after one "round" for
-    broadcasts; return the index of the next row.
+    """Write the messages that the first run sends in the step of ``stage`` into ``rows`` from index
+    ``row`` on: after the tick of each pair if exchanges are ``pairwise``, or after one "round" for
+    broadcasts; return the next index. Numbers messages in ``traced.sent``.
     """
     if not pairwise:
         row = write_row(rows, stage, ROUND, -1, -1, -1, NAN, row)
@@ -563,8 +591,9 @@ def _link_rows(
     link: int,
     row: int,
 ) -> int:
-    """Write the messages sent on a link, each followed by its arrival or loss; return the index of
-    the next row.
+    """Write the messages that the first run sends on ``link`` (index) in the step of ``stage`` into
+    ``rows`` from index ``row`` on, each followed by its arrival or loss; return the next index.
+    Numbers messages in ``traced.sent``.
     """
     for end in range(channels.directions_per_link):
         w, i = link * channels.directions_per_link + end, channels.ends[link, end]
@@ -587,7 +616,9 @@ def _link_rows(
 
 @kernel
 def is_silent(messages: SlotMessages, b: int, stage: SlotStage, node: int, q: int) -> bool:
-    """Return True if ``node`` (an index) sends nothing in a step, in lane ``q`` of block ``b``."""
+    """Return True if ``node`` (an index) sends nothing in the step of ``stage``, in lane ``q`` of
+    block ``b``.
+    """
     return len(messages.sent) > 0 and messages.sent[b, stage.s, stage.step, node, q] == 0
 
 
@@ -601,12 +632,12 @@ def _write_step_end(
     stopping: int,
     row: int,
 ) -> int:
-    """Write which nodes absorb or swap when the exchange step of ``stage`` ends, and which stop;
-    return the index of the next row.
+    """Write which nodes absorb or swap when the exchange step of ``stage`` ends, and which stop,
+    into ``rows`` from index ``row`` on, in the first run; return the next index.
 
     Nodes that received something swap states with their peer if exchanges are ``pairwise``, else
     they absorb it. In step number ``stopping`` (-1: none) nodes may permanently freeze their
-    network estimate. ``row`` is the index of the first row written into ``rows``.
+    network estimate.
     """
     for i in range(len(traced.nodes)):
         has_received = False
@@ -640,8 +671,9 @@ def count_events(
     scratch: FloatArray,
     counts: np.ndarray,
 ) -> None:
-    """Add to ``counts`` (R, KINDS) the number of events of each kind that ``make_rows`` would
-    write; ``scratch`` (KINDS, L).
+    """Add to ``counts`` (R, KINDS) the number of events of each kind in S slots of each of R runs,
+    as many as ``make_rows`` would write; ``scratch`` (KINDS, L). ``pairwise``: nodes swap with a
+    peer, instead of absorbing broadcasts.
     """
     for b in range(messages.up.shape[0]):
         for kind in range(len(scratch)):
@@ -673,7 +705,9 @@ def count_events(
 
 @kernel(inlined=True)
 def add_count(lanes: Lanes, scratch: FloatArray, kind: int, number: Any) -> None:
-    """Add ``number`` events of a kind in each lane."""
+    """Add ``number``, (L,) lanes or one number for all, to the count ``scratch[kind]`` of
+    ``scratch`` (KINDS, L).
+    """
     store(lanes, scratch, kind, load(lanes, scratch, kind) + number)
 
 
@@ -690,8 +724,9 @@ def count_step(
     counts: np.ndarray,
     b: int,
 ) -> None:
-    """Count the events of one step of an exchange in the runs of block ``b``: in ``scratch``, but
-    stops in ``counts``.
+    """Add the events of the exchange step of ``stage`` in the L runs of block ``b`` to ``scratch``
+    (KINDS, L), but those of nodes that stop, in step number ``stopping``, to ``counts`` (R, KINDS).
+    ``pairwise``: nodes swap with a peer, instead of absorbing broadcasts.
     """
     stops = stage.step == stopping
     if pairwise:
@@ -731,8 +766,9 @@ def count_matched_pairs(
     counts: np.ndarray,
     b: int,
 ) -> None:
-    """Count the ticks of pairs in a step, and their messages, all as lost for now, in the runs of
-    block ``b``.
+    """Add the ticks of pairs in the step of ``stage``, and their messages, all as lost for now, in
+    the L runs of block ``b`` to ``scratch`` (KINDS, L); of ``counts`` (R, KINDS) only the number R
+    of runs is used.
     """
     first = b * len(lanes)
     for r in range(first, min(first + len(lanes), len(counts))):
@@ -758,7 +794,9 @@ def count_silent(
     scratch: FloatArray,
     b: int,
 ) -> None:
-    """Subtract the messages of silent nodes from SEND and LOST."""
+    """Subtract the messages that silent nodes do not send in the step of ``stage``, in the L runs
+    of block ``b``, from the counts SEND and LOST of ``scratch`` (KINDS, L).
+    """
     silent = spread(lanes, 0.0)
     for w in range(len(channels.ends) * channels.directions_per_link):
         if channels.talks[stage.step, w] == 1:
@@ -779,7 +817,9 @@ def count_silent(
 def count_stops(
     lanes: Lanes, traced: TracedNodes, stage: SlotStage, counts: np.ndarray, b: int
 ) -> None:
-    """Count the nodes that stop in a slot."""
+    """Add the nodes that stop in the slot of ``stage``, in the L runs of block ``b``, to the count
+    STOP of ``counts`` (R, KINDS).
+    """
     first = b * len(lanes)
     for r in range(first, min(first + len(lanes), len(counts))):
         for i in range(len(traced.nodes)):

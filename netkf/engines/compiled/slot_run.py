@@ -79,7 +79,7 @@ class SampledStates(NamedTuple):
 
 class SlotBlock(NamedTuple):
     """Results of S slots of R runs: indices ``sampled`` (T,) of the slots with a sample, the
-    ``samples`` of these slots or of all slots so far, times and messages.
+    ``samples`` of these slots or of all slots so far, the times of the slots, and their messages.
     """
 
     sampled: np.ndarray
@@ -271,7 +271,7 @@ class SlotRuns:
         return self._next_times(count, True), _pack_messages(up, np.zeros((0,) * 4, dtype=np.uint8))
 
     def _empty_samples(self, count: int) -> SampledStates:
-        """Return empty arrays for ``count`` samples."""
+        """Return space for T = ``count`` samples of all R runs, not initialised."""
         runs, estimators, n = self.runs, self.setup.estimators, self.setup.n
         filter_shape = runs, count, estimators, n
         shapes = (runs, count, n), filter_shape, (*filter_shape, n), filter_shape
@@ -290,7 +290,9 @@ class SlotRuns:
         return np.asarray(~np.isfinite(by_run(self._total, self.runs)))
 
     def _next_times(self, count: int, timed: bool) -> SlotTimes:
-        """Return flags, samples and, if ``timed``, start times of the next ``count`` slots."""
+        """Return flags, samples and, if ``timed``, start times of the next S = ``count`` slots;
+        without ``timed`` the times are 0.
+        """
         setup, algorithm, plant = self.setup, self.setup.algorithm, self._scenario.slot_plant
         slots = np.arange(self._slot, self._slot + count)
         recorded = slots < setup.last
@@ -311,7 +313,7 @@ class SlotRuns:
         return SlotTimes(self._slot, start, recorded, sensed, exchanged, sample, algorithm.predicts)
 
     def _draw_messages(self, times: SlotTimes) -> SlotMessages:
-        """Draw and return the matchings and messages of a block of slots for all runs."""
+        """Draw and return the matchings and messages of the S slots of ``times`` for all R runs."""
         setup = self.setup
         shape, pairs = (len(times.start), len(setup.fresh)), setup.max_pairs
         decided = setup.decides or setup.may_miss
@@ -341,8 +343,8 @@ class SlotRuns:
         return messages
 
     def _missed_readings(self, messages: SlotMessages, count: int) -> np.ndarray:
-        """Return (S, E, N) bool: nodes that send nothing in the next ``count`` slots because they
-        have no reading; their messages are removed from ``up``.
+        """Return (S, E, N) bool: nodes that send nothing in a step of the next S = ``count`` slots
+        because they have no reading; their messages are removed from ``messages.up``.
         """
         setup = self.setup
         if not setup.may_miss:
@@ -353,8 +355,9 @@ class SlotRuns:
         return unread
 
     def _draw_uniforms(self, sent: np.ndarray) -> FloatArray:
-        """Return a uniform number (B, S, E, N, L) for each node that is asked for a message; empty
-        if the filter needs none.
+        """Return a uniform number (B, S, E, N, L) for each node that is asked for a message in a
+        step, where ``sent`` (B, S, E, N, L) is 1, and 0 for the others; empty if the filter needs
+        none.
         """
         if not self.setup.algorithm.randomised or not self.setup.decides:
             return np.zeros((0,) * 5)
@@ -363,8 +366,8 @@ class SlotRuns:
         return uniform
 
     def _next_states(self, count: int) -> tuple[FloatArray, FloatArray, np.ndarray]:
-        """Return the states of the next slots relative to the moving origin and absolute, (B, S, n,
-        L) each, and the slots (S,) bool in which the origin moves.
+        """Return the states of the next S = ``count`` slots relative to the moving origin and
+        absolute, (B, S, n, L) each, and the slots (S,) bool in which the origin moves.
         """
         setup = self.setup
         slots = range(self._slot, self._slot + count)
@@ -387,8 +390,8 @@ class SlotRuns:
     def _draw_path(
         self, path: Path, states: np.ndarray, local: FloatArray, absolute: FloatArray
     ) -> None:
-        """Draw the next slots of a path into ``local`` and ``absolute`` (B, S, n, L), from the
-        random streams ``states``.
+        """Draw the next S slots of a path into ``local`` and ``absolute`` (B, S, n, L), the states
+        relative to the moving origin and absolute, from the random streams ``states`` (R, 4).
         """
         scratch = aligned((2, max(path.root.shape), LANES))
         draw_paths(MANY, path, states, normal_ziggurat(), self._slot, scratch, local, absolute)
@@ -396,8 +399,8 @@ class SlotRuns:
     def _draw_readings(
         self, times: SlotTimes, local: FloatArray, rebased: np.ndarray
     ) -> ReadingBlock:
-        """Draw and return the whitened readings of a block of slots at the states ``local`` (B, S,
-        n, L).
+        """Draw and return the whitened readings of S slots at the states ``local`` (B, S, n, L); in
+        the slots ``rebased`` (S,) the origin moves to the state.
         """
         setup, count = self.setup, local.shape[1]
         shape = self._blocks, count, setup.estimators, setup.p
@@ -432,8 +435,8 @@ class SlotRuns:
         return ReadingBlock(y, H, local, rebased)
 
     def events(self, block: SlotBlock) -> tuple[np.ndarray, np.ndarray]:
-        """Return the EVENT rows of a block of one run, and the number of rows before each sample
-        (T,).
+        """Return the EVENT rows (K,) of a block of slots of one run, and the number of rows before
+        each of its T samples, (T,).
         """
         if self._events is not None:
             return self._events.rows(self._stopped[0, :, 0])
@@ -441,7 +444,9 @@ class SlotRuns:
         return self._rows(block, 0, len(block.times.start), before_sample), before_sample
 
     def first_events(self, block: SlotBlock) -> Iterator[np.ndarray]:
-        """Yield the EVENT rows of the first run of a batch, for some slots at a time."""
+        """Yield the EVENT rows (K,) of the first run of a batch in a block of slots, for some slots
+        at a time.
+        """
         size = max(1, LONG // max(1, self.setup.rows_of(1)))
         # Samples of a batch are counted from the first of the run.
         before_sample = np.zeros(len(self.setup.samples), dtype=np.int64)
@@ -452,8 +457,9 @@ class SlotRuns:
     def _rows(
         self, block: SlotBlock, first: int, stop: int, before_sample: np.ndarray
     ) -> np.ndarray:
-        """Return the EVENT rows of the first run in the slots ``first`` to ``stop`` of a block;
-        write the number of rows before each sample into ``before_sample`` (T,).
+        """Return the EVENT rows (K,) of the first run in the slots with indices ``first`` to
+        ``stop`` - 1 of a block; write the number of rows before each sample into ``before_sample``
+        (T,).
         """
         setup = self.setup
         # Space for the largest number of rows.
@@ -467,7 +473,7 @@ class SlotRuns:
         return table[:count]
 
     def count_events(self, block: SlotBlock) -> None:
-        """Add the events of a block to ``counts``."""
+        """Add the events of a block of slots to ``self.counts`` (R, KINDS), by run and kind."""
         setup = self.setup
         count_events(
             MANY, setup.stages, block.times, self._channels, self._traced_nodes(), block.messages,
@@ -513,7 +519,9 @@ ROW_COLUMNS = ("t", "kind", "node", "peer", "message", "phase", "age")
 
 
 def run_slots(scenario: Scenario, streams: Streams, recorder: Recorder, progress: Progress) -> str:
-    """Simulate one run in slots up to the horizon; return complete or diverged."""
+    """Simulate one run in slots up to the horizon, and pass its events and samples to ``recorder``;
+    ``progress`` is called with the simulated seconds. Return "complete" or "diverged".
+    """
     runs = SlotRuns(scenario, streams)
     recorder.exact_errors = scenario.exact_errors
     try:
@@ -556,8 +564,9 @@ MAX_EVENT_ROWS = 1 << 15
 def slot_batches(
     scenario: Scenario, seed: int, replicas: range, fingerprint: bool = False
 ) -> Iterator[RunBatch]:
-    """Yield batches of consecutive replicas in order; ``fingerprint``: with the hash of the events
-    of the first run.
+    """Yield the results of consecutive ``replicas`` in order, as many runs at a time as fit the
+    memory, with random numbers from ``seed``; ``fingerprint``: with the hash of the events of the
+    first run.
     """
     keep_freed_memory()
     setup = slot_setup(scenario)
@@ -572,8 +581,9 @@ def slot_batches(
 def slot_batch(
     scenario: Scenario, seed: int, replicas: range, fingerprint: bool = False
 ) -> RunBatch:
-    """Simulate consecutive replicas side by side; a run that diverges goes on to the end with
-    invalid numbers, which ``with_ends`` replaces.
+    """Simulate R consecutive ``replicas`` side by side and return their results; a run that
+    diverges goes on to the end with invalid numbers, which ``with_ends`` replaces. ``fingerprint``:
+    with the hash of the events of the first run.
     """
     runs = SlotRuns(scenario, ReplicaStreams(seed, replicas.start, len(replicas)), store_all=True)
     assert runs.samples is not None
@@ -603,8 +613,8 @@ def slot_batch(
 
 
 def with_ends(batch: RunBatch, alone: Callable[[range, bool], Iterator[RunBatch]]) -> RunBatch:
-    """Return the batch with every run that diverges replaced by the same run simulated ``alone``, a
-    function of replicas and of whether their fingerprint is computed.
+    """Return the batch with every run that diverges replaced, in its arrays, by the same run
+    simulated ``alone``, a function of replicas and of whether their fingerprint is computed.
 
     In a batch a run that diverges goes on with invalid numbers; alone it ends where it diverges.
     """

@@ -32,7 +32,9 @@ from netkf.scenario.scenario import Scenario
 
 
 def slot_setup(scenario: Scenario) -> SlotSetup:
-    """Return the arrays of a scenario, computed at the first call and stored with the scenario."""
+    """Return the arrays that all runs of a scenario in slots share, computed at the first call and
+    stored with the scenario.
+    """
     # The scenario is frozen: its dictionary is where its cached properties are kept, too.
     if "_slot_setup" not in vars(scenario):
         vars(scenario)["_slot_setup"] = SlotSetup(scenario)
@@ -81,7 +83,10 @@ class SlotSetup:
         self.is_drawn = self._draws_everything(scenario)
 
     def _set_slots(self, scenario: Scenario) -> None:
-        """Set the slots of a run; the last one, at the horizon, exists only if it is sampled."""
+        """Set ``slots``, the number of slots of a run (the last one, at the horizon, exists only if
+        it is sampled), ``last``, the slot at the horizon, ``samples`` (T,), the slots with a
+        sample, and ``sample_times`` (T,) in seconds.
+        """
         plant, last = scenario.slot_plant, 0
         # A guess below the last slot: the plant itself decides, free of this division's rounding.
         last = max(0, int(scenario.horizon / plant.period) - 2)
@@ -94,8 +99,9 @@ class SlotSetup:
         self.sample_times = np.array([plant.slot_time(slot) for slot in self.samples.tolist()])
 
     def _set_stages(self, scenario: Scenario) -> None:
-        """Set the stages of a slot (readings and exchange steps), each with its phase and its end
-        in seconds after the slot begins.
+        """Set ``stages``, the readings and exchange steps of a slot in order, each with its phase
+        and its end in seconds after the slot begins, and ``fresh`` (E,): whether links draw anew in
+        each of the E exchange steps.
         """
         algorithm, phase, step = self.algorithm, 0, 0
         length = scenario.phase_length if algorithm.talks else 0.0
@@ -125,8 +131,9 @@ class SlotSetup:
         self.phases = [phase for step, phase, _ in stages if step >= 0]
 
     def _set_sensors(self, scenario: Scenario) -> None:
-        """Assign each sensor to a filter and to its rows there. A pooled filter reads the sensors
-        of all nodes.
+        """Assign each sensor to a filter and to its rows there (``assigned``), and set ``rows``
+        (H,), the number of rows of each of the H filters, and p, the most. A pooled filter reads
+        the sensors of all nodes.
         """
         pooled = self.algorithm.pooled
         self.estimators = 1 if pooled else len(scenario.nodes)
@@ -161,8 +168,9 @@ class SlotSetup:
         self._set_kernel_sensors(scenario)
 
     def _set_kernel_sensors(self, scenario: Scenario) -> None:
-        """Set the whitened H = L_b^-1 H and noise factors L_b^-1 L of all sensors that kernels
-        read, and the processes of random regressors.
+        """Set ``self.sensors``: the whitened H = L_b^-1 H (K, p, n) and noise factors L_b^-1 L
+        (K, p, p) of all K sensors that kernels read, and ``regressors``, the processes
+        (A, drive, start) of those with random H.
         """
         count, p, n = len(self.kernel_sensors), self.p, self.n
         H, noise = np.zeros((count, p, n)), np.zeros((count, p, p))
@@ -207,7 +215,9 @@ class SlotSetup:
         )
 
     def _set_states(self, scenario: Scenario) -> None:
-        """Set the filters at slot 0; equal nodes share one state."""
+        """Set the filters at slot 0: their ``states``, estimates ``xhat`` (H, n) and roots of their
+        covariances ``root`` (H, n, n); and the F and root of Q (n, n) that all of them believe.
+        """
         infos: Sequence[NodeInfo] = scenario.node_infos
         models: Sequence[Any] = scenario.slot_models
         if self.algorithm.pooled:
@@ -223,7 +233,7 @@ class SlotSetup:
         self.root = np.stack([state.root for state in self.states])
 
     def _make_links(self, scenario: Scenario) -> SlotLinks:
-        """Return the directed links sorted by receiver, with their weights."""
+        """Return the W directed links sorted by receiver, with their weights (W,)."""
         index = scenario.topology.index
         # By receiver and sender: the order in which a filter adds the messages it receives.
         incoming = sorted(
@@ -243,8 +253,9 @@ class SlotSetup:
         )
 
     def _set_channel(self, scenario: Scenario) -> None:
-        """Set the delivery probabilities of directed links, the streams that losses are drawn from,
-        and which directions send in which step.
+        """Set ``delivery`` (2, W), the delivery probabilities of directed links in the good and the
+        bad state of the channel, ``entities``, the streams that losses are drawn from, and
+        ``talks`` (E, W): which directions send in which step.
         """
         channel, each = scenario.network.channel, self.directions_per_link
         self.loss, bad = channel.loss, (False, True)
@@ -299,7 +310,7 @@ class SlotSetup:
 
     def unread(self, first: int, count: int) -> np.ndarray:
         """Return (S, E, N) bool: nodes that send nothing in a step, because it sends readings and
-        they have none. S = ``count`` slots from ``first`` on.
+        they have none. S = ``count`` slots from number ``first`` on.
         """
         missed = np.zeros((count, len(self.nodes)), dtype=bool)
         for index, slots in self._recorded_slots.items():
@@ -357,8 +368,8 @@ class SlotSetup:
         return int(min(max(power, LANES), max(1, MAX_BATCH_BYTES // sample_bytes)))
 
     def quick_runs(self) -> int:
-        """Return the number of runs that take some ten milliseconds: a power of two, and at least
-        a block of lanes.
+        """Return the number of runs that take some ten milliseconds together: a power of two, and
+        at least a block of lanes.
         """
         flops = self.estimators * (50 + 4 * self.n**3) + 10 * len(self.fresh) * len(self.directions)
         runs = min(QUICK_FLOPS // (max(1, self.slots) * flops), MAX_BATCH_RUNS)
@@ -377,7 +388,8 @@ QUICK_FLOPS = 1 << 25
 
 def matching_lists(scenario: Scenario) -> tuple[int, float, np.ndarray, np.ndarray]:
     """Return the first two fields of ``slot_messages.Matchings`` (protocol, probability) and its
-    lists ``first``, ``members``.
+    lists ``first`` (K + 1,), ``members`` (M,): list k of links is ``members[first[k]:first[k +
+    1]]``.
     """
     activation, topology = scenario.network.activation, scenario.topology
     if not isinstance(activation, Matching):

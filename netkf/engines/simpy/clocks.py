@@ -35,7 +35,8 @@ def clock_processes(
     transmitter: Transmitter,
     nodes: dict[int, ClockedNode],
 ) -> list[Process]:
-    """Return one process for each link, direction or node that has a clock.
+    """Return one process for each link, direction or node that has a clock. ``nodes`` are the nodes
+    by id.
 
     There are none with activation by readings: nodes then transmit after their samples.
     """
@@ -68,7 +69,10 @@ def _tick_process(
     tick_order: int,
     activate: Activation,
 ) -> Process:
-    """Wait for each tick up to the horizon, and activate the entity."""
+    """Wait for each tick of the clock of ``entity`` (node ids of a link, or of a node) up to the
+    horizon, and call ``activate`` with its time in seconds. ``tick_order`` is the index of the
+    entity, which orders simultaneous ticks.
+    """
     clock = scenario.network.activation
     assert isinstance(clock, LinkClock)
     # A stream of its own: the ticks of one entity never depend on those of another.
@@ -104,7 +108,9 @@ def _link_activations(
     transmitter: Transmitter,
     nodes: dict[int, ClockedNode],
 ) -> Activations:
-    """Return for each link an activation in which both ends exchange."""
+    """Return for each link (pair of node ids) an activation in which both ends exchange; ``nodes``
+    are the nodes by id.
+    """
 
     # A factory for each link, so that the closure binds these ends and not those of the last link.
     def activation(link: tuple[int, int], entity: int) -> Activation:
@@ -129,7 +135,9 @@ def _direction_activations(
     transmitter: Transmitter,
     nodes: dict[int, ClockedNode],
 ) -> Activations:
-    """Return for each direction an activation in which one end pushes to the other."""
+    """Return for each direction (sender, receiver) of a link an activation in which its sender
+    pushes a message to its receiver; ``nodes`` are the nodes by id.
+    """
 
     def activation(link: tuple[int, int], entity: int) -> Activation:
         """Return the activation of a directed link: its sender sends one message."""
@@ -154,7 +162,8 @@ def broadcasts(
     transmitter: Transmitter,
     nodes: dict[int, ClockedNode],
 ) -> dict[int, Activation]:
-    """Return for each node an activation that broadcasts one payload to all its receivers.
+    """Return for each node, by id, an activation that broadcasts one payload to all its receivers;
+    ``nodes`` are the nodes by id.
 
     Each receiver has an outcome of its own.
     """
@@ -194,7 +203,9 @@ def _node_activations(
     transmitter: Transmitter,
     nodes: dict[int, ClockedNode],
 ) -> Activations:
-    """Return for each node an activation in which it broadcasts."""
+    """Return for each node, as (id,), an activation in which it broadcasts; ``nodes`` are the nodes
+    by id.
+    """
     transmit = broadcasts(scenario, recorder, transmitter, nodes)
 
     def activation(node: int) -> Activation:

@@ -112,7 +112,9 @@ class _Simulation:
         ]
 
     def _sampling(self, truth: Any, nodes: dict[int, ClockedNode], sums: _Sums) -> Process:
-        """Record the states at the probe times."""
+        """Record the states of the plant and of all nodes at the probe times; ``nodes`` are by
+        id.
+        """
         for time in self._scenario.times.tolist():
             yield self.timeline.at(time, Rank.PROBE, 0)
             # Events predict only the nodes that take part; a sample needs all nodes at one time.
@@ -200,8 +202,8 @@ class _Simulation:
             slot += 1
 
     def _record(self, time: float, x: Any, local: Any, nodes: dict[int, Any], sums: _Sums) -> None:
-        """Record one sample of the state ``x``; ``local`` is x relative to the origin of the
-        estimates.
+        """Record one sample at ``time`` (seconds) of the state ``x`` (n,) and of all ``nodes``, by
+        id; ``local`` (n,) is x relative to the origin of the estimates.
 
         Raises DivergedError if an estimate is not sound.
         """
@@ -229,7 +231,9 @@ class _Simulation:
 
 
 def _nodes(scenario: Scenario, make: Callable[[int, int, tuple[int, ...]], Any]) -> dict[int, Any]:
-    """Return the node process of every node; the nodes of a pooled filter share one."""
+    """Return the node process of every node by id; the nodes of a pooled filter share one. ``make``
+    takes the node's id (-1: pooled), its index, and the ids of the nodes whose sensors it reads.
+    """
     nodes = scenario.nodes
     if scenario.node_filter.pooled:
         return dict.fromkeys(nodes, make(-1, 0, scenario.sensing_nodes))
@@ -237,7 +241,9 @@ def _nodes(scenario: Scenario, make: Callable[[int, int, tuple[int, ...]], Any])
 
 
 def _identify(scenario: Scenario, node: int, entity: int) -> tuple[Any, ...]:
-    """Return the arguments of Node: filter, id, index, model, start and NodeInfo."""
+    """Return the arguments of Node (filter, id, index, model, start and NodeInfo) for the node with
+    the id ``node`` (-1: the pooled filter) and the index ``entity``.
+    """
     model, first = scenario.believed_models[entity], scenario.nodes[entity]
     # -1: the pooled filter, which is not a node of the graph.
     if node < 0:

@@ -59,8 +59,8 @@ class Node:
         self.inbox: dict[int, list[Envelope]] = {}
 
     def put(self, envelope: Envelope) -> None:
-        """Put a message into the inbox; with ``newest_only`` the newest of each sender replaces
-        others.
+        """Put a message into the inbox; if the filter has ``newest_only``, the newest of each
+        sender replaces the others.
         """
         envelopes = self.inbox.setdefault(envelope.sender, [])
         if self.algorithm.newest_only and envelopes:
@@ -79,7 +79,9 @@ class Node:
         return envelopes, messages
 
     def shift(self, offset: FloatArray) -> None:
-        """Add ``offset`` to the estimate: the origin of the coordinates has moved."""
+        """Add ``offset`` (n,) to the estimate in ``self.state``: the origin of the coordinates has
+        moved.
+        """
         self.state = self.algorithm.shift(self.state, offset)
 
 
@@ -144,14 +146,18 @@ class ClockedNode(Node):
         return np.asarray(stacked.reshape(-1))
 
     def sample(self, node: int, y: FloatArray, H: Any, R: FloatArray) -> None:
-        """Store a sample of one sensor of ``node``; one update uses all samples of this instant."""
+        """Store a sample y (p,) of one sensor of ``node`` (id), with noise covariance R (p, p) and
+        H (p, n), or a function that linearises it; one update uses all samples of this instant.
+        """
         # The first sample of an instant schedules the update, which then uses all of them.
         if not self._samples:
             self._timeline.call_at(self._timeline.now, Rank.UPDATE, self.entity, self._use_samples)
         self._samples.append((node, y, H, R))
 
     def _use_samples(self, _: simpy.Event) -> None:
-        """Update by all samples of this instant together."""
+        """Update ``self.state`` by all samples of this instant together, and record which nodes
+        sensed.
+        """
         time, samples = self._timeline.now, self._samples
         self._samples = []
         self.predict_to(time)
@@ -168,7 +174,9 @@ class ClockedNode(Node):
             self.after_sample(time)
 
     def emit(self, time: float, receivers: tuple[int, ...]) -> Any:
-        """Return the payload that the node sends at ``time``, before it absorbs anything."""
+        """Return the payload that the node sends to the ``receivers`` (ids) at ``time`` (seconds),
+        before it absorbs anything; None if it sends nothing.
+        """
         # The payload is of the present state, not of that at the last event.
         self.predict_to(time)
         exchange = Exchange(time=time, receivers=receivers)
@@ -200,7 +208,7 @@ def linearise(
     algorithm: Filter, state: Any, y: FloatArray, H: Any
 ) -> tuple[FloatArray, FloatArray]:
     """Return a reading y (p,) and its H (p, n). A nonlinear sensor has a function in place of H,
-    which linearises its reading at the node's estimate.
+    which linearises its reading at the estimate (n,) of the filter's ``state``.
     """
     if isinstance(H, np.ndarray):
         return y, H

@@ -32,7 +32,9 @@ def sensor_processes(
     truth: Any,
     nodes: dict[int, ClockedNode],
 ) -> list[Process]:
-    """Return one process for each node with increment sensors and for each sampled sensor."""
+    """Return one process for each node with increment sensors and one for each sampled sensor; they
+    read the ``truth``, the state of the run, and pass readings to ``nodes``, by id.
+    """
     index = scenario.topology.index
     processes = [
         # One process for all increment sensors of a node: they are read at the same times.
@@ -61,7 +63,10 @@ def _increment_process(
     node: int,
     entity: int,
 ) -> Process:
-    """Make ``node`` use its increments at each point of the sensing grid."""
+    """Make ``node`` (id) use its increments at each point of the sensing grid: predict ``carrier``,
+    the filter that uses them, up to that point. ``entity`` is the index of the node, which orders
+    simultaneous events.
+    """
     # From grid point 1 on, since increments need an interval.
     k = 1
     # Half open: the horizon is excluded.
@@ -75,7 +80,9 @@ def _increment_process(
 
 @dataclass(frozen=True)
 class SamplingProcess:
-    """One sampled sensor of ``node`` in one run: its times, its readings and the believed R."""
+    """One sampled sensor of ``node`` (id) in one run: its times (K,) in seconds, its readings and
+    the R (p, p) that the filters believe. ``entity`` orders samples of one instant.
+    """
 
     node: int
     entity: int

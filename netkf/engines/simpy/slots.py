@@ -92,7 +92,7 @@ class SlotSchedule:
         return self._cache[slot]
 
     def end(self, slot: int) -> tuple[float, int]:
-        """Return a time and rank after all stages of a slot."""
+        """Return a time in seconds and a rank after all stages of a slot."""
         stages = self.stages(slot)
         return (stages[-1].time, stages[-1].rank + 1) if stages else (self.start(slot), FIRST_RANK)
 
@@ -161,7 +161,9 @@ class SlotNode(Node):
             slot += 1
 
     def _perform(self, stage: Stage, slot: int) -> None:
-        """Do one stage of a slot: predict, update or absorb."""
+        """Do one stage of slot number ``slot``: predict, update or absorb, which changes
+        ``self.state``.
+        """
         if stage.kind == "predict":
             self.state = self.algorithm.predict(self.state, self._period)
         elif stage.kind == "update":
@@ -170,11 +172,15 @@ class SlotNode(Node):
             self._close(stage, slot)
 
     def read(self, y: FloatArray, H: Any) -> None:
-        """Store the reading of one sensor."""
+        """Store the reading y (p,) of one sensor with its H (p, n), or the function that linearises
+        it, until the update of this slot.
+        """
         self._samples.append((y, H))
 
     def _update(self, time: float) -> None:
-        """Use the readings of this slot; without sensors they have no rows."""
+        """Update ``self.state`` by all readings of this slot, at ``time`` (seconds); without
+        sensors they have no rows.
+        """
         model = self.model
         samples = [linearise(self.algorithm, self.state, y, H) for y, H in self._samples]
         # Empty arrays first, so that nodes without sensors concatenate too.
@@ -198,7 +204,7 @@ class SlotNode(Node):
         return payload
 
     def open(self, number: int) -> None:
-        """Open the inbox for an exchange."""
+        """Open the inbox for the exchange with this ``number`` within the run."""
         self._open = number
 
     def in_time(self, envelope: Envelope) -> bool:
@@ -211,7 +217,9 @@ class SlotNode(Node):
         self.put(envelope)
 
     def _close(self, stage: Stage, slot: int) -> None:
-        """Close the inbox and absorb its messages."""
+        """Close the inbox at the end of an exchange, absorb its messages into ``self.state``, and
+        record that; ``slot`` is the number of the slot.
+        """
         append, now, phase = self._recorder.append, stage.time, stage.phase
         envelopes, messages = self.take_messages()
         # From now on a message of this exchange is late.
@@ -233,7 +241,9 @@ class SlotNode(Node):
 
 
 def _finite_rows(y: FloatArray, H: FloatArray) -> np.ndarray:
-    """Return flags (p,) of the rows of a reading that have a value."""
+    """Return flags (p,) of the rows of a reading ``y`` (p,) with ``H`` (p, n) that have a value;
+    ``y`` may be empty if the whole reading is missing.
+    """
     # A recorded sensor without a row has an empty y.
     return np.isfinite(y) if len(y) == len(H) else np.zeros(len(H), dtype=bool)
 
@@ -248,7 +258,9 @@ class Reader:
         self._node, self._entity, self._carrier = node, entity, carrier
 
     def run_process(self, timeline: Timeline, truth: Any, sensors: list[Readings]) -> Process:
-        """Read at the "read" stage of every slot."""
+        """Read all ``sensors`` of the node at the "read" stage of every slot, in the state of the
+        ``truth``, and pass the readings to its filter.
+        """
         slot = 0
         while self._schedule.runs(slot):
             for stage in self._schedule.stages(slot):
@@ -298,7 +310,9 @@ class SlotClock:
             slot += 1
 
     def _exchange(self, stage: Stage, slot: int) -> None:
-        """Let all nodes of this exchange send, over the links or pairs that are active."""
+        """Let all nodes send in one step of an exchange of slot number ``slot``, over the links or
+        pairs that are active, and record ticks or the round.
+        """
         now, phase, broadcast = stage.time, stage.phase, not self._algorithm.pairwise
         # All inboxes open before any node sends: a message without delay arrives at once.
         for node in self._distinct:
@@ -323,7 +337,10 @@ class SlotClock:
             self._links[i, j].exchange(both, phase, stage.number, is_up, fresh)
 
     def _pairs(self, stage: Stage, slot: int, broadcast: bool) -> tuple[list[Any], set[Any] | None]:
-        """Return the links that are used, and the subset of them that is up (None for all)."""
+        """Return the links (pairs of node ids) that are used in a stage of slot number ``slot``,
+        and the subset of them that is up (None for all). ``broadcast``: nodes send on all links,
+        not in pairs.
+        """
         activation, topology = self._scenario.network.activation, self._scenario.topology
         links = list(topology.links)
         if isinstance(activation, Matching):

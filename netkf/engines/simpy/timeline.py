@@ -27,7 +27,8 @@ class Timeline(simpy.Environment):
         self.process(process)
 
     def at(self, time: float, rank: Rank | int, entity: int) -> simpy.Event:
-        """Return an event that happens at ``time``, before those of higher (rank, entity).
+        """Return an event that happens at ``time`` (seconds), before those of higher
+        (rank, entity).
 
         ``Environment.timeout`` would add a delay to the present time, and ``now + (time - now)``
         may differ from ``time`` in the last bit: recorded times would not be reproduced, and events
@@ -46,7 +47,9 @@ class Timeline(simpy.Environment):
     def call_at(
         self, time: float, rank: Rank | int, entity: int, callback: Callable[[simpy.Event], None]
     ) -> None:
-        """Make an event at ``time`` that calls ``callback``."""
+        """Make an event at ``time`` (seconds) that calls ``callback``, before those of higher
+        (rank, entity).
+        """
         event = self.at(time, rank, entity)
         # An event that is not processed yet has a list of callbacks.
         assert event.callbacks is not None

@@ -38,7 +38,9 @@ class Receiver(Protocol):
 
 
 class DirectedLink:
-    """One direction of a link: its receiver, its sampler and its count of messages."""
+    """One direction of a link, (sender, receiver): its receiver, its sampler and its count of
+    messages. ``entity`` orders simultaneous arrivals.
+    """
 
     def __init__(
         self,
@@ -76,7 +78,9 @@ class Transmitter:
     def directed_link(
         self, link: Link, entity: int, receiver: Receiver, sampler: ChannelSampler
     ) -> DirectedLink:
-        """Return one direction of a link."""
+        """Return one direction ``link`` = (sender, receiver) of a link; ``entity`` is its index,
+        which orders simultaneous arrivals.
+        """
         return DirectedLink(self._scenario, link, entity, receiver, sampler)
 
     def send(
@@ -87,7 +91,10 @@ class Transmitter:
         phase: int = -1,
         exchange: int = -1,
     ) -> None:
-        """Send one message with its outcome; a payload of None is not sent."""
+        """Send one message with its outcome, the draw of the channel: record it, and deliver it
+        now, later or never. A payload of None is not sent. ``phase`` and ``exchange`` are the
+        number of the exchange in the slot and in the run, -1 under clocks.
+        """
         if payload is None:
             return
         now, (sender, receiver), number = self._timeline.now, direction.link, direction.messages
@@ -116,7 +123,10 @@ class Transmitter:
     def _arrive(
         self, direction: DirectedLink, phase: int, envelope: Envelope, arrival: simpy.Event | None
     ) -> None:
-        """Deliver a message to its receiver, or record that it arrives too late."""
+        """Deliver a message to its receiver, or record that it arrives too late. ``phase`` is the
+        number of its exchange in the slot, -1 under clocks; ``arrival`` is None for a message
+        without delay.
+        """
         now, (sender, receiver) = self._timeline.now, direction.link
         # A message without delay arrives inside the tick, and keeps its age of 0.
         if arrival is not None:
@@ -132,7 +142,9 @@ class Transmitter:
             direction.receiver.receive(envelope)
 
     def shift(self, algorithm: Filter, offset: FloatArray) -> None:
-        """Shift all messages under way: the origin of coordinates has moved by ``-offset``."""
+        """Shift all messages under way by ``offset`` (n,), predicted back to the time of sending:
+        the origin of coordinates has moved by ``-offset``.
+        """
         now = self._timeline.now
         for key, envelope in self._under_way.items():
             # A payload refers to the time of sending: predict the offset back to it.
@@ -180,8 +192,9 @@ class LinkExchange:
         """Send the payloads of both ends, one message in each direction of the link.
 
         All are lost if the link is not ``up``. Outcomes are drawn anew if ``fresh``, otherwise
-        those of the last exchange are used again. A payload of None is not sent, but its outcome
-        is drawn all the same.
+        those of the last exchange are used again. A payload of None is not sent, but its outcome is
+        drawn all the same. ``phase`` and ``exchange`` are the number of the exchange in the slot
+        and in the run, -1 under clocks.
         """
         if fresh or not self._outcomes:
             first, *others = self._directions
