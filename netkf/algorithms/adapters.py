@@ -38,6 +38,7 @@ class _Adapter(Filter):
     """Forwards what both contracts share; class variables are copied from the wrapped filter."""
 
     def __init__(self, inner: Any) -> None:
+        # Filters are frozen dataclasses: attributes can only be set around their guard.
         for name in ("talks", "pooled", "inverts"):
             object.__setattr__(self, name, getattr(inner, name))
         object.__setattr__(self, "inner", inner)
@@ -67,7 +68,9 @@ class FlowAdapter(_Adapter):
     clocks = CLOCKS[:-1]  # all but after samples
 
     def init(self, model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo) -> Any:
-        """Return the wrapped filter's state at time 0 from ``mean`` (n,) and ``cov`` (n, n)."""
+        """Return the wrapped filter's state at time 0 from ``mean`` (n,) and ``cov`` (n, n); flow
+        filters are not told about the ``node``.
+        """
         return self.inner.init(model, mean, cov)
 
     def predict(self, state: Any, gap: float) -> Any:

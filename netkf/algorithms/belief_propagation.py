@@ -143,6 +143,7 @@ def belief_slots(
     ``arrays`` in place, and writes ``samples`` in the slots that have one.
     """
     for b in range(plan.up.shape[0]):
+        # Without messages that are kept all blocks share the arrays of evidence.
         k, lanes = min(b, arrays.own.shape[0] - 1), scratch.lanes
         own, received = arrays.own[k], arrays.received[k]
         for s in range(plan.up.shape[1]):
@@ -154,6 +155,7 @@ def belief_slots(
                         scratch.xhat, arrays.scratch.work,
                     )  # fmt: skip
                 for e in range(arrays.steps):
+                    # All messages of a step are made before any arrives.
                     for h in range(len(nodes.rows)):
                         first, last = links.first[h], links.first[h + 1]
                         gather_evidence(lanes, own, received, first, last, h, arrays.scratch)
@@ -314,7 +316,8 @@ class BeliefPropagation(Filter):
         self, states: Sequence[Any], infos: Sequence[NodeInfo], runs: int
     ) -> tuple[BeliefArrays]:
         """Return the arrays of ``slot_kernel`` for ``runs`` runs of H nodes that start in these
-        ``states``: the initial evidence of all nodes, and scratch.
+        ``states`` and have the degrees in ``infos``: the initial evidence of all nodes, and
+        scratch.
         """
         keeps, H, n = self.memory == ALL, len(states), len(states[0].xhat)
         W, D = sum(info.degree for info in infos), max(info.degree for info in infos)
@@ -339,6 +342,7 @@ class BeliefPropagation(Filter):
         if scenario.slotted and self.memory == SLOT:
             return
         key, Q = ("Q", scenario.slot_belief[1]) if scenario.slotted else ("B", scenario.belief[1])
+        # Process noise that two messages share would count as independent evidence.
         if Q.any():
             slots = 'memory = "slot"'
             raise ScenarioError(
@@ -408,10 +412,12 @@ class BeliefPropagation(Filter):
             return state
         received = dict(zip(state.senders, state.received, strict=True))
         for message in messages:
+            # Messages may overtake each other: an older one knows nothing that the newer does not.
             sent = exchange.time - message.age
             if message.sender in received and received[message.sender].sent > sent:
                 continue
             evidence = evidence_for(state.node, message.payload)
+            # In slots a message is used in the slot in which it was sent.
             if message.age > 0.0 and not isinstance(state.model, SlotModel):
                 evidence = predict_evidence(evidence, backward(state.model, message.age))
             centre, _ = state.model.extrapolate(message.payload.xhat, state.root, message.age)
@@ -429,6 +435,7 @@ class BeliefPropagation(Filter):
 def is_forest(scenario: Any) -> bool:
     """Return True if no loop leads through the links of a scenario, whatever their directions."""
     topology = scenario.topology
+    # A graph is a forest if and only if it has as many links as nodes less components.
     pairs = {frozenset(link) for link in topology.directions}
     return len(pairs) == len(topology.nodes) - len(topology.components)
 
@@ -437,13 +444,16 @@ def merge_evidence(parts: Sequence[FloatArray]) -> FloatArray:
     """Return the sum (n, n + 1) of several pieces of independent evidence, ``parts`` (n, n + 1)
     each, all relative to one centre.
     """
+    # The kernel adds the other pieces to the first one; the stack is a copy.
     stack = np.stack(parts)[..., None]
     add_part_single(stack[1:], stack[0], np.empty(stack.shape[1:]))
     return np.ascontiguousarray(stack[0, ..., 0])
 
 
 def add_to_own_evidence(state: BeliefState, reading: Reading) -> FloatArray:
-    """Return the evidence (n, n + 1) of a node's own readings plus that of a new one."""
+    """Return the evidence (n, n + 1) of a node's own readings plus that of a new ``reading``,
+    relative to ``state.xhat``.
+    """
     y, H = whiten_reading(reading.y, reading.H, reading.R)
     n = len(state.xhat)
     # The kernel takes blocks, slots, nodes and lanes: one of each here.

@@ -13,6 +13,7 @@ def closed_loop(model: FlowModel, gain: FloatArray) -> FlowModel:
     """Return a model without readings whose P (n, n) is that of a constant ``gain`` L (n, p) over
     increments: drift ``A - L H``, noise ``Q + L R L'``.
     """
+    # H and R without rows: the readings are in the drift and the noise already.
     noise, nothing = model.Q + gain @ model.R @ gain.T, model.H[:0]
     closed = np.ascontiguousarray(model.A - gain @ model.H)
     return FlowModel(closed, noise, nothing, model.R[:0, :0], model.horizon, model.interval)

@@ -128,6 +128,7 @@ def pseudo_states(F: FloatArray, information: FloatArray) -> PseudoStates:
     """Return the matrices (n, n) of pseudo-states for the transition F (n, n), ``information``
     (n, n) being that of all sensors.
     """
+    # Sensors may leave directions unobserved: G is singular then, and G^+ G projects on the others.
     inverse = np.asarray(np.linalg.pinv(information, hermitian=True))
     projector = inverse @ information
     return PseudoStates(
@@ -306,7 +307,9 @@ def optimal_gain(e: FloatArray, theta: FloatArray, terms: FloatArray) -> FloatAr
 
 @lru_cache(maxsize=8)
 def gain_sequence(design: Design) -> GainSequence:
-    """Return the gains of a network, which all of its nodes and runs share."""
+    """Return the gains of the network of a ``design``, which all of its nodes and runs share; they
+    are kept for 8 designs.
+    """
     return GainSequence(design)
 
 
@@ -492,7 +495,8 @@ class ConsensusInnovations(Filter):
         self, states: Sequence[Any], infos: Sequence[NodeInfo], runs: int
     ) -> tuple[PseudoArrays]:
         """Return the arrays of ``slot_kernel`` for ``runs`` runs of H nodes that start in these
-        ``states``: the first pseudo-states, the gains of slot 0, and scratch.
+        ``states``: the first pseudo-states (B, H, n, L) in B blocks of L runs, the gains of slot 0,
+        and scratch.
         """
         H, n = len(states), len(states[0].xhat)
         yhat = in_lanes(np.stack([state.yhat for state in states]), blocks_of(runs))
@@ -503,7 +507,9 @@ class ConsensusInnovations(Filter):
     def slot_gains(
         self, states: Sequence[Any], arrays: tuple[Any, ...], first: int, count: int
     ) -> tuple[PseudoArrays]:
-        """Return ``arrays`` with the gains of ``count`` slots from number ``first`` on."""
+        """Return ``arrays`` with the gains of ``count`` slots from number ``first`` on, which
+        follow from the network and the start that are in ``states``.
+        """
         rows, gains = gain_sequence(states[0].design).table(first, count)
         return (arrays[0]._replace(table_row=rows, gains=gains),)
 
@@ -523,6 +529,7 @@ class ConsensusInnovations(Filter):
         """
         network = node.network
         assert network is not None
+        # Bytes, so that the design can be the key of a cache that all nodes share.
         F, Q, start, information = (
             np.asarray(part, dtype=np.float64).tobytes()
             for part in (model.F, model.Q, cov, network.information)
@@ -564,6 +571,7 @@ class ConsensusInnovations(Filter):
         """Return the state at the end of the slot: the pseudo-state corrected by messages and the
         node's reading, the state by the pseudo-state, and the root that belongs to the gains.
         """
+        # A lost message takes its gain with it: only the B of senders that were heard are used.
         gains, order = state.gains, state.design.heard[state.node_index]
         senders = [order.index(message.payload.node_index) for message in messages]
         received_gains = gains._replace(B=gains.B[senders])

@@ -86,8 +86,9 @@ def constant_gain_slots(
     scratch: SlotScratch,
     arrays: ConstantGainArrays,
 ) -> None:
-    """Simulate H filters with constant gains over the S slots of a plan, in B blocks of L runs: in
-    each slot they predict, correct by their readings and form convex combinations.
+    """Simulate H filters with constant gains, which ``arrays`` holds, over the S slots of a plan,
+    in B blocks of L runs: in each slot they predict, correct by their readings and form convex
+    combinations.
 
     Changes ``nodes.xhat`` (B, H, n, L) and ``nodes.root`` (B, H, n, n, L) in place and writes
     ``samples`` in the slots that have one.
@@ -116,9 +117,10 @@ def correct_by_gain(
     s: int,
     h: int,
 ) -> None:
-    """Update filter ``h`` of block ``b`` by its reading of slot ``s``: ``nodes.xhat[b, h]`` (n, L)
-    by ``xhat += L (y - H xhat)`` with the gain L, and ``nodes.root[b, h]`` (n, n, L) to the root of
-    ``P = (I - L H) P (I - L H)' + L R L'``.
+    """Update filter ``h`` of block ``b`` by its reading of slot ``s`` and its gain L,
+    ``arrays.gain[h]`` (n, p): changes ``nodes.xhat[b, h]`` (n, L) by ``xhat += L (y - H xhat)``,
+    and ``nodes.root[b, h]`` (n, n, L) to the root of ``P = (I - L H) P (I - L H)' + L R L'``. The
+    last axis of both is that of the runs side by side.
     """
     lanes, n = scratch.lanes, nodes.xhat.shape[2]
     # All innovations refer to the estimate before the reading, since L is the gain of all its rows.
@@ -168,8 +170,8 @@ class ConstantGain(Filter):
     def slot_arrays(
         self, states: Sequence[Any], infos: Sequence[NodeInfo], runs: int
     ) -> tuple[ConstantGainArrays]:
-        """Return the constant matrices of all H filters, for whitened readings; all ``runs`` share
-        them.
+        """Return ``I - L H`` (H, n, n), roots of ``L R L'`` (H, n, n) and gains L (H, n, p) of the
+        H nodes with these ``states``, for whitened readings; all ``runs`` share them.
         """
         n = len(states[0].xhat)
         max_rows = max(1, *(state.gain.shape[1] for state in states))
@@ -205,6 +207,7 @@ class ConstantGain(Filter):
         if state.loop is None:
             xhat, root = state.model.predict(state.xhat, state.root, gap)
             return state._replace(xhat=xhat, root=root)
+        # The estimate moves without readings, which update() adds; P is that of the closed loop.
         xhat, _ = state.model.extrapolate(state.xhat, state.root, gap)
         _, root = state.loop.predict(state.xhat, state.root, gap)
         return state._replace(xhat=xhat, root=root)
@@ -224,6 +227,7 @@ class ConstantGain(Filter):
             return state._replace(xhat=x[0])
         if not len(reading.y):
             return state
+        # P+ = (I - L H) P (I - L H)' + L R L' has the form of a prediction.
         closed, noise = sample_maps(state.gain, reading.H, reading.R)
         x, H = state.xhat.reshape(1, -1).copy(), np.ascontiguousarray(reading.H)
         correct_by_innovation(x, 0, H, state.gain, reading.y, np.empty(len(state.xhat)))

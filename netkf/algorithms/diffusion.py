@@ -107,7 +107,7 @@ def diffusion_slots(
     weights: DiffusionWeights,
 ) -> None:
     """Simulate H diffusion filters over the S slots of a plan, D (6)-(9), in B blocks of L runs: in
-    each slot they read, predict and combine.
+    each slot they read, predict and combine, with the own ``weights`` (H,) and those of the links.
 
     Changes ``nodes.xhat`` (B, H, n, L) and ``nodes.root`` (B, H, n, n, L) in place and writes
     ``samples``, of the predictions with which slots begin.
@@ -148,8 +148,11 @@ def combine_senders(
     s: int,
     h: int,
 ) -> None:
-    """Combine filter ``h`` of block ``b`` with the messages that arrive in slot ``s``, D (8) and
-    (9): changes ``nodes.xhat[b, h]`` (n, L) and ``nodes.root[b, h]`` (n, n, L). The messages are in
+    """Combine filter ``h`` of block ``b`` with the messages that arrive in slot ``s``, by
+    covariance intersection, D (8) and (9): changes ``nodes.xhat[b, h]`` (n, L) and ``nodes.root[b,
+    h]`` (n, n, L).
+
+    ``weights`` holds the own weights (H,), ``links`` those of messages. The messages are in
     ``scratch``: the estimates ``xhat`` (H, n, L) and the inverses of the roots, ``root``
     (H, n, n, L).
     """
@@ -220,7 +223,9 @@ class DiffusionFilter(Filter):
     def slot_arrays(
         self, states: Sequence[Any], infos: Sequence[NodeInfo], runs: int
     ) -> tuple[DiffusionWeights]:
-        """Return the own weights of all H nodes, and the rule for lost messages."""
+        """Return the own weights (H,) of the H nodes that ``infos`` describes, and the rule for
+        lost messages.
+        """
         own = np.array([info.own_weight for info in infos], dtype=np.float64)
         return (DiffusionWeights(own, self.on_loss == "keep-own"),)
 

@@ -136,14 +136,14 @@ class DiffusionKalman(Filter):
         return None if isinstance(self.weights, str) else self.weights
 
     def sends_in_slots(self, phase: int, has_sensor: bool) -> bool:
-        """Return False if a node without a sensor has nothing to send: in the exchange of readings,
-        ``phase`` 0, but not in that of estimates.
+        """Return False if a node has nothing to send in exchange number ``phase`` of a slot: a
+        reading in the first one, unless it ``has_sensor``. All send estimates in the second.
         """
         return has_sensor or phase == ESTIMATES
 
     def payload_numbers(self, n: int, rows: int, phase: int) -> int:
-        """Return the size of a message in numbers of 64 bits: y, H and R of a reading with ``rows``
-        rows, or psi with n states.
+        """Return the size of a message in numbers of 64 bits: in the exchange (``phase``) of
+        readings y, H and R of ``rows`` rows, in that of estimates psi with n states.
         """
         return n if phase == ESTIMATES else rows * (1 + n) + rows * (rows + 1) // 2
 
@@ -178,6 +178,7 @@ class DiffusionKalman(Filter):
             return state
         if exchange.phase == ESTIMATES:
             return state._replace(xhat=combine_estimates(state.xhat, messages))
+        # One after the other: with independent noise that equals one update with all of them.
         xhat, root = state.xhat, state.root
         for message in messages:
             reading = message.payload
@@ -197,6 +198,7 @@ def combine_estimates(psi: FloatArray, messages: Sequence[Message]) -> FloatArra
     """Return ``sum_l c_l psi_l`` (n,) with the weights c_l of the messages, whose payloads are the
     estimates psi_l (n,), and the rest of the weight for the node's own ``psi`` (n,).
     """
+    # As differences to psi, so that equal estimates give psi to the last bit.
     n, x = len(psi), np.stack([psi, *(m.payload for m in messages)])[None, :, :, None]
     links, up = star_of([message.weight for message in messages])
     differences = np.empty((1, n, 1))

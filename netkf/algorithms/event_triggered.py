@@ -137,6 +137,7 @@ def triggered_ci_slots(
                     decide_estimate(nodes, plan, links, scratch, arrays, b, s, h)
                 drop_silent(plan, links, b, s, 0)
             if plan.part != SENDING:
+                # Messages are copies from before the exchange: the order of nodes does not matter.
                 if plan.exchanged[s]:
                     for h in range(len(nodes.rows)):
                         combine_copies(nodes, plan, links, scratch, arrays, b, s, h)
@@ -311,17 +312,18 @@ def is_near_single(
     ratio: FloatArray,
     work: FloatArray,
 ) -> bool:
-    """Return True if the second of two estimates, a copy, is near the first, in one run: x
-    (1, 2, n, 1) with lower triangular roots (1, 2, n, n, 1), and ``bounds`` (alpha, 1 + delta) as
-    in ``EventTriggeredCi.thresholds``. ``ratio`` (n, n + 1, 1) and ``work`` (n, n, 1) are scratch.
+    """Return True if the second of two estimates, a copy, is near the first, in one run: estimates
+    ``x`` (1, 2, n, 1) with lower triangular roots ``root`` (1, 2, n, n, 1), and ``bounds``
+    (alpha, 1 + delta) as in ``EventTriggeredCi.thresholds``. ``ratio`` (n, n + 1, 1) and ``work``
+    (n, n, 1) are scratch.
     """
     near: bool = is_near(ONE, x, root, x, root, (0, 0, 1), bounds, ratio, work)
     return near
 
 
 def _is_information_consensus(value: Any) -> Filter:
-    """Return the filter if it is HCMCI with one step of consensus on information; raises TypeError
-    or ValueError, which the rule of the field turns into a ScenarioError.
+    """Return ``value`` if it is an HCMCI filter with one step of consensus on information; raises
+    TypeError or ValueError, which the rule of the field turns into a ScenarioError.
     """
     if not isinstance(value, Hcmci) or type(value) is not Hcmci:
         raise TypeError
@@ -381,8 +383,9 @@ class EventTriggeredCi(Filter):
     def slot_arrays(
         self, states: Sequence[Any], infos: Sequence[NodeInfo], runs: int
     ) -> tuple[TriggeredCiArrays]:
-        """Return the arrays of ``slot_kernel`` for ``runs`` runs of H nodes: thresholds, and space
-        for the copies, without any copy yet.
+        """Return the arrays of ``slot_kernel`` for ``runs`` runs of H nodes with W directed links,
+        counted from ``infos``: thresholds, and space for W + 2 H copies of estimates, none of which
+        exists yet.
         """
         (H, n), blocks = (len(states), len(states[0].xhat)), blocks_of(runs)
         W, alpha = sum(info.degree for info in infos), self.thresholds[0]
@@ -431,6 +434,7 @@ class EventTriggeredCi(Filter):
         estimates as their senders do.
         """
         xhat, root = state.model.predict(state.xhat, state.root, gap)
+        # Sender and receivers predict the copy alike, so that it stays the same at both ends.
         sent, copies = state.sent, []
         if sent is not None:
             sent = Estimate(*state.model.predict(sent.xhat, sent.root, gap))
@@ -479,6 +483,7 @@ class EventTriggeredCi(Filter):
             (copies[j].xhat, copies[j].root if j in received else widening * copies[j].root)
             for j in senders
         ]
+        # Weights of neighbours that were never heard stay with the node itself.
         link_weights = [copies[j].weight for j in senders]
         weights = np.array([max(0.0, 1.0 - math.fsum(link_weights)), *link_weights])
         means, roots = (np.stack(part) for part in zip(*pairs, strict=True))

@@ -36,15 +36,16 @@ class Model(Protocol):
     def predict(
         self, xhat: FloatArray, root: FloatArray, gap: float
     ) -> tuple[FloatArray, FloatArray]:
-        """Return estimate (n,) and root (n, n) of its covariance ``gap`` seconds later, from those
-        now. With increment sensors the root counts the readings of the gap already.
+        """Return estimate (n,) and root (n, n) of its covariance ``gap`` seconds later, from
+        ``xhat`` (n,) and ``root`` (n, n) now. With increment sensors the root counts the readings
+        of the gap already.
         """
 
     def extrapolate(
         self, xhat: FloatArray, root: FloatArray, age: float
     ) -> tuple[FloatArray, FloatArray]:
-        """Return estimate (n,) and root (n, n) of a received estimate ``age`` seconds later,
-        without readings.
+        """Return estimate (n,) and root (n, n) ``age`` seconds after a received estimate ``xhat``
+        (n,) with its ``root`` (n, n), without readings.
         """
 
     def gain_update(
@@ -248,6 +249,7 @@ class Filter(Component):
 
     def __init_subclass__(cls) -> None:
         super().__init_subclass__()
+        # A method by a former name would never be called: fail when the class is defined.
         for name, present in FORMER.items():
             if name in cls.__dict__:
                 raise TypeError(f"{cls.__name__}.{name} is now {present}, see netkf.parts.Filter")
@@ -257,7 +259,9 @@ class Filter(Component):
                 raise TypeError(f"{cls.__name__}.{name} must take ({', '.join(expected[1:])})")
 
     def init(self, model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo) -> Any:
-        """Return the state at time 0 from ``mean`` (n,) and ``cov`` (n, n)."""
+        """Return the state at time 0 from ``mean`` (n,) and ``cov`` (n, n), with the ``model`` of
+        plant and sensors; ``node`` is what the node knows about itself and the network.
+        """
         from netkf.algorithms.models import first_root
 
         return State(mean, first_root(cov), model)
@@ -280,6 +284,7 @@ class Filter(Component):
             return state._replace(
                 xhat=state.model.gain_update(state.xhat, state.root, reading.moments, reading.gap)
             )
+        # In slots a node without a sensor gets readings without rows.
         if not len(reading.y):
             return state
         xhat, root = sample_update(state.xhat, state.root, reading.y, reading.H, reading.R)
@@ -319,7 +324,9 @@ class Filter(Component):
         return payload._replace(xhat=payload.xhat + offset)
 
     def accepts(self, payload: Any, age: float) -> bool:
-        """Return False if a message of this ``age`` (seconds, under clocks) is too late to use."""
+        """Return False if a message with this ``payload``, ``age`` seconds old under clocks, is too
+        late to use.
+        """
         return True
 
     def max_measurement_interval(self, state: Any) -> float:
@@ -454,7 +461,8 @@ def _accepts(method: Any, count: int) -> bool:
 
 
 def commutes(algorithm: Filter) -> bool:
-    """Return True if the class declares that the filter commutes with a shift of the truth.
+    """Return True if the class of the filter ``algorithm`` declares that it commutes with a shift
+    of the truth: it gives shifted estimates for shifted readings.
 
     It declares so if ``shift`` is defined by the class that defines the last of its STEPS, or by
     one derived from that; a filter that it runs has to declare so, too.
@@ -467,4 +475,5 @@ def commutes(algorithm: Filter) -> bool:
         """Return the position in the method resolution order of the class that defines ``name``."""
         return next((k for k, cls in enumerate(order) if name in cls.__dict__), len(order))
 
+    # A class that redefines a step without ``shift`` may no longer commute.
     return owner("shift") <= min(owner(name) for name in STEPS)

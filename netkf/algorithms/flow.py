@@ -70,7 +70,9 @@ class FlowFilter(Component):
         return state._replace(xhat=xhat, P=P)
 
     def measure(self, state: Any, reading: Reading) -> Any:
-        """Return the state after the readings of the gap that just passed."""
+        """Return the state after the increments of the gap that just passed: ``reading.moments`` (2
+        p,).
+        """
         xhat = gain_update(state.model.gains, state.P, state.xhat, reading.moments, reading.gap)
         return state._replace(xhat=xhat)
 

@@ -249,9 +249,9 @@ class InformationConsensus(Filter):
     def slot_arrays(
         self, states: Sequence[Any], infos: Sequence[NodeInfo], runs: int
     ) -> tuple[ConsensusArrays]:
-        """Return the arrays of ``slot_kernel`` for H nodes: steps, recipe, and scratch for the
-        pairs of all nodes; ``runs`` does not matter, since blocks of runs use them one after the
-        other.
+        """Return the arrays of ``slot_kernel`` for H nodes: steps, recipe, and scratch
+        (2, K, H, n, n + 1, L) for the K pairs of all nodes; ``runs`` does not matter, since blocks
+        of L runs use it one after the other.
         """
         recipe = self.recipe(infos[0].nodes)
         n, K = len(states[0].xhat), len(recipe.shares)
@@ -272,7 +272,9 @@ class InformationConsensus(Filter):
         return ConsensusState(mean, first_root(cov), model, self.recipe(node.nodes))
 
     def update(self, state: ConsensusState, reading: Any) -> ConsensusState:
-        """Return the state with its first pairs, under clocks after the Kalman update."""
+        """Return the state with its first pairs, made of the prediction and the ``reading``; under
+        clocks the state after a Kalman update.
+        """
         if not isinstance(state.model, SlotModel):
             updated: ConsensusState = super().update(state, reading)
             return updated
@@ -296,6 +298,7 @@ class InformationConsensus(Filter):
             return self._intersect(state, messages)
         assert state.parts is not None
         parts = mix_node_parts(state.xhat, state.parts, messages)
+        # The estimate stays the prediction, to which all pairs are relative, until the last step.
         if exchange.step < self.steps - 1:
             return state._replace(parts=parts)
         xhat, root = estimate_of(state, parts)

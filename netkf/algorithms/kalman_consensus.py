@@ -87,7 +87,7 @@ def kcf_slots(
 ) -> None:
     """Simulate H Kalman-consensus filters over the S slots of a plan, in B blocks of L runs:
     changes ``nodes.xhat`` (B, H, n, L) and ``nodes.root`` (B, H, n, n, L) in place, and writes
-    ``samples`` in the slots that have one.
+    ``samples`` in the slots that have one; ``arrays`` holds the settings.
 
     With prediction x and its covariance P, a slot's readings first update x, and then the consensus
     term epsilon / (1 + |P|) P sum_j (x_j - x), computed from predictions alone, is added.
@@ -104,6 +104,7 @@ def kcf_slots(
                     scale_by_covariance(
                         scratch.lanes, nodes.root, b, h, arrays.epsilon, scratch.xhat, scratch.row
                     )
+                # The terms are in scratch.xhat, so that estimates may change one after the other.
                 for h in range(len(nodes.rows)):
                     fuse_readings(nodes, readings, plan, links, scratch, arrays.share, b, s, h)
                     add_to_estimate(scratch.lanes, nodes.xhat, b, h, scratch.xhat)
@@ -166,8 +167,8 @@ class Kcf(Filter):
         return (KcfArrays(self.epsilon, self.share_readings),)
 
     def payload_numbers(self, n: int, rows: int, phase: int) -> int:
-        """Return the size of a message in numbers of 64 bits: (u, U, xbar), or xbar alone from a
-        node without ``rows`` or if readings are not shared.
+        """Return the size of a message about n states in numbers of 64 bits: (u, U, xbar), or xbar
+        alone from a node without ``rows`` or if readings are not shared.
         """
         return 2 * n + n * (n + 1) // 2 if rows and self.share_readings else n
 
@@ -230,6 +231,7 @@ def consensus_term(
     ``predictions`` xbar_j (n,) that a node received; its own is ``prior`` (n,) with the lower
     triangular ``root`` (n, n) of P.
     """
+    # The kernel of slots on a star: the node itself, and one link from each sender.
     n, x = len(prior), np.stack([prior, *predictions])[None, :, :, None]
     links, up = star_of([1.0] * len(predictions))
     term, S = np.empty((1, n, 1)), np.ascontiguousarray(root).reshape(1, 1, n, n, 1)

@@ -45,7 +45,10 @@ def _shared_flow_table(
 
 @lru_cache(maxsize=TABLES)
 def _cached_flow_table(n: int, parts: tuple[bytes, ...], longest: float) -> FlowTable:
-    """Return the flow table of a model whose A, Q, H and R come as bytes, the keys of the cache."""
+    """Return the flow table of a model with ``n`` states for gaps up to ``longest`` seconds; its A,
+    Q, H and R are the bytes in ``parts``, since the keys of a cache must be hashable.
+    """
+    # Bytes have lost their shapes: p follows from the length of H.
     A, Q, H, R = (np.frombuffer(part) for part in parts)
     p = len(H) // n
     return flow_table(A.reshape(n, n), Q.reshape(n, n), H.reshape(p, n), R.reshape(p, p), longest)
@@ -107,6 +110,7 @@ class FlowModel:
         """Return the transition of information about the state to ``gap`` seconds later: ``e^{-A
         gap}`` (n, n) and the factor by which old information fades, so that it stays bounded.
         """
+        # A constant state: the exponential would be I up to rounding, and nothing fades.
         if not self.A.any():
             return Backward(np.eye(len(self.A)), 1.0)
         inverse = np.asarray(scipy.linalg.expm(-gap * self.A))
@@ -115,8 +119,8 @@ class FlowModel:
     def predict(
         self, xhat: FloatArray, root: FloatArray, gap: float
     ) -> tuple[FloatArray, FloatArray]:
-        """Return estimate (n,) and root (n, n) ``gap`` seconds later; the root counts the gap's
-        readings, the estimate does not.
+        """Return estimate (n,) and root (n, n) ``gap`` seconds after ``xhat`` (n,) and ``root``
+        (n, n); the root counts the gap's readings, the estimate does not.
         """
         root, xhat = flow_root(self.flow, root, xhat, gap)
         return xhat, root
@@ -124,7 +128,9 @@ class FlowModel:
     def extrapolate(
         self, xhat: FloatArray, root: FloatArray, age: float
     ) -> tuple[FloatArray, FloatArray]:
-        """Return estimate (n,) and root (n, n) ``age`` seconds later, without readings."""
+        """Return estimate (n,) and root (n, n) ``age`` seconds after ``xhat`` (n,) and ``root``
+        (n, n), without readings.
+        """
         if age <= 0.0:
             return xhat, root
         root, xhat = flow_root(self.unobserved_flow, root, xhat, age)
@@ -143,6 +149,7 @@ class FlowModel:
         """Return the longest measurement interval, in seconds, for a covariance with this root
         (n, n), see ``Filter.max_measurement_interval``.
         """
+        # trace(P G) = |R^-1/2 H S|^2, without forming P.
         HS = self.flow.whitened_H[0] @ root
         return usable(float((HS * HS).sum()))
 
@@ -175,8 +182,9 @@ class SlotModel:
         self, xhat: FloatArray, root: FloatArray, gap: float
     ) -> tuple[FloatArray, FloatArray]:
         """Return estimate (n,) and root (n, n) after one slot for each period of the ``gap`` in
-        seconds.
+        seconds, from ``xhat`` (n,) and ``root`` (n, n).
         """
+        # round: a gap of whole periods may be off by rounding of clock times.
         for _ in range(round(gap / self.period)):
             xhat, root = self.F @ xhat, predict_root_alone(root, self.F, self.root_Q)
         return xhat, root
@@ -184,8 +192,8 @@ class SlotModel:
     def extrapolate(
         self, xhat: FloatArray, root: FloatArray, age: float
     ) -> tuple[FloatArray, FloatArray]:
-        """Return estimate (n,) and root (n, n) unchanged: a message is used in the slot in which it
-        was sent.
+        """Return ``xhat`` (n,) and ``root`` (n, n) unchanged, whatever the ``age``: a message is
+        used in the slot in which it was sent.
         """
         return xhat, root
 
@@ -209,7 +217,7 @@ def usable(rate: float) -> float:
 
 
 def first_root(cov: FloatArray) -> FloatArray:
-    """Return the lower triangular root (n, n) of an initial covariance (n, n), which may be
+    """Return the lower triangular root (n, n) of an initial covariance ``cov`` (n, n), which may be
     singular.
     """
     return lower_root(square_root(cov))
@@ -219,7 +227,7 @@ def sample_update(
     xhat: FloatArray, root: FloatArray, y: FloatArray, H: FloatArray, R: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Return estimate (n,) and root (n, n) after a sample ``y = H x + v`` (p,) of p > 0 rows,
-    cov(v) = R (p, p), from those before.
+    cov(v) = R (p, p), from ``xhat`` (n,) and ``root`` (n, n) before.
     """
     noise = np.asarray(np.linalg.cholesky(R), dtype=np.float64)
     root, xhat, _ = update_with_sample(root, xhat, y, H, noise)

@@ -331,13 +331,15 @@ class OneBit(Filter):
     def slot_arrays(
         self, states: Sequence[Any], infos: Sequence[NodeInfo], runs: int
     ) -> tuple[BitArrays]:
-        """Return space for the bits of one reading in L runs, one for each row of the largest
-        sensor.
+        """Return space (p, L) for the bits of one reading in L runs, where p is the number of rows
+        of the largest sensor of the nodes in ``states``.
         """
         return (BitArrays(aligned((max(1, *(len(s.model.H) for s in states)), LANES))),)
 
     def payload_numbers(self, n: int, rows: int, phase: int) -> float:
-        """Return the size of a message in numbers of 64 bits: one bit for each row."""
+        """Return the size of a message in numbers of 64 bits: one bit for each of the ``rows`` of a
+        reading.
+        """
         return rows / 64.0
 
     def init(self, model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo) -> OneBitState:

@@ -167,7 +167,7 @@ def drop_mass_of_stopped(
 ) -> None:
     """Drop the messages with mass of nodes of block ``b`` that stopped before slot ``s``, which
     send none by the paper's rule: writes 0 into ``plan.sent[b, s, MASS]`` (H, L) and ``plan.up[b,
-    s, MASS]`` (W, L).
+    s, MASS]`` (W, L). Nothing happens under another rule in ``arrays``.
     """
     if arrays.rule == PAPER and not arrays.asymptotic:
         silence_stopped(plan, samples, b, s)
@@ -225,8 +225,8 @@ def write_conserved_sums(
     arrays: PushSumArrays, links: SlotLinks, samples: SlotSamples, scratch: SlotScratch, b: int
 ) -> None:
     """Write each node's part of the conserved sums of block ``b``, of the weight w (total 1) and of
-    n~ (total N), into ``samples.conserved[b]`` (H, 2, L); with running sums including what is under
-    way to it.
+    n~ (total N), from the masses in ``arrays`` into ``samples.conserved[b]`` (H, 2, L); with
+    running sums including what is under way to it.
     """
     for h in range(len(arrays.degree)):
         for k in range(2):
@@ -437,9 +437,9 @@ def correct(
     s: int,
     h: int,
 ) -> None:
-    """Correct filter ``h`` of block ``b`` by its reading of slot ``s``, step 4, P (7) and (8); with
-    asymptotic gains also predict it, step 3. Changes ``nodes.xhat[b, h]`` (n, L) and
-    ``nodes.root[b, h]`` (n, n, L).
+    """Correct filter ``h`` of block ``b`` by its reading of slot ``s``, step 4, P (7) and (8), with
+    what it knows of the network in ``arrays``; with asymptotic gains also predict it, step 3.
+    Changes ``nodes.xhat[b, h]`` (n, L) and ``nodes.root[b, h]`` (n, n, L).
     """
     n, lanes = nodes.xhat.shape[2], scratch.lanes
     if arrays.asymptotic:
@@ -576,7 +576,9 @@ class PushSum(Filter):
         return MASS if not self.asymptotic and self.stop != "never" else -1
 
     def moves_estimates(self, phase: int) -> bool:
-        """Return False for the exchange of mass."""
+        """Return True for the exchange of estimates, False for that of mass; ``phase`` is the
+        number of the exchange in a slot.
+        """
         return phase == AVERAGE
 
     def decides_in_slots(self) -> bool:
@@ -587,7 +589,8 @@ class PushSum(Filter):
         self, states: Sequence[Any], infos: Sequence[NodeInfo], runs: int
     ) -> tuple[PushSumArrays]:
         """Return the arrays of ``slot_kernel`` for ``runs`` runs of H nodes that start in these
-        ``states``.
+        ``states`` and have the degrees in ``infos``: masses and network estimates of all runs,
+        settings, and scratch.
         """
         network_estimates = [state.network for state in states]
         alone = np.stack([state.model.information for state in states])

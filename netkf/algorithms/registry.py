@@ -49,7 +49,9 @@ def built_in(kind: str, **choice: str) -> Callable[[F], F]:
 
 
 def choice_name(kind: str, choice: Mapping[str, str]) -> str:
-    """Return the name of a class: its kind, and ``kind key=value`` where several share that."""
+    """Return the name of a filter class: its ``kind``, and ``kind key=value`` for a ``choice`` of
+    key and value where several classes share the kind.
+    """
     return " ".join([kind, *(f"{key}={value}" for key, value in choice.items())])
 
 
@@ -64,6 +66,7 @@ def split_choice(name: str) -> tuple[str, dict[str, str]]:
 @cache
 def built_in_filters() -> dict[str, type[Filter]]:
     """Return all built-in filters by name (``choice_name``)."""
+    # Importing a module registers its filters: no list of them has to be kept.
     for module in pkgutil.iter_modules(netkf.algorithms.__path__, "netkf.algorithms."):
         if not module.ispkg:
             importlib.import_module(module.name)
@@ -71,13 +74,16 @@ def built_in_filters() -> dict[str, type[Filter]]:
 
 
 def built_in_class(algorithm: object) -> type[Filter] | None:
-    """Return the built-in class of a filter, or the one that a user's class is derived from."""
+    """Return the built-in class of the filter ``algorithm``, or the one that its class is derived
+    from; None if there is none.
+    """
     classes = set(built_in_filters().values())
     return next((cls for cls in type(algorithm).__mro__ if cls in classes), None)
 
 
 def base_filter(algorithm: Filter) -> Filter:
-    """Return the built-in filter that a user's filter derives from, with the same parameters.
+    """Return the built-in filter that a user's filter ``algorithm`` derives from, with the same
+    parameters.
 
     Raises TypeError if it derives from none.
     """

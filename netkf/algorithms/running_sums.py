@@ -77,7 +77,7 @@ class RunningSums(NamedTuple):
 
 def start(model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo) -> RunningSums:
     """Return the state at time 0, with estimate ``mean`` (n,), covariance ``cov`` (n, n) and weight
-    1, and nothing sent.
+    1, and nothing sent, of a ``node`` that knows how many can hear it.
     """
     n = len(mean)
     return RunningSums(
@@ -98,6 +98,7 @@ def predict_sums(state: RunningSums, gap: float) -> RunningSums:
     and heard, refer to the later state.
     """
     xhat, root = state.model.predict(state.xhat, state.root, gap)
+    # Totals that were heard move too: the next ones, which are compared with them, will have moved.
     back = state.model.backward(gap)
     heard = {sender: predict_offer(offer, back) for sender, offer in state.heard.items()}
     return state._replace(xhat=xhat, root=root, sent=_move_total(state.sent, back), heard=heard)

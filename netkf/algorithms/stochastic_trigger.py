@@ -86,6 +86,7 @@ def whitened_trigger(Y: float | FloatArray, R: FloatArray) -> FloatArray:
     """Return ``L' Y L`` (p, p) with ``L L' = R`` (p, p), the trigger for whitened readings; Y is
     (p, p) or a multiple of the identity.
     """
+    # z' Y z for z = L u, where u is the whitened innovation.
     root = np.linalg.cholesky(R)
     return np.asarray(root.T @ trigger_matrix(Y, len(R)) @ root)
 
@@ -217,8 +218,8 @@ def schedule_reading(
     h: int,
 ) -> None:
     """Decide whether node ``h`` of block ``b`` sends its reading of slot ``s``, in each of L runs:
-    with probability 1 - exp(-z' Y z / 2) for its innovation z. Writes 0 into ``plan.sent[b, s, 0,
-    h]`` (L,) where it is silent.
+    with probability 1 - exp(-z' Y z / 2), where z is its innovation with respect to the prediction
+    in ``arrays.prior``. Writes 0 into ``plan.sent[b, s, 0, h]`` (L,) where it is silent.
     """
     lanes = scratch.lanes
     news = weigh_news(
@@ -249,7 +250,8 @@ def update_by_sensors(
 ) -> None:
     """Update filter ``h`` of block ``b`` with the readings that arrive in slot ``s``, its own
     first, and with the silence of the other sensors that it knows: changes ``nodes.xhat[b, h]``
-    (n, L) and ``nodes.root[b, h]`` (n, n, L), and marks the sensors of these readings as known.
+    (n, L) and ``nodes.root[b, h]`` (n, n, L), and marks the sensors of these readings as known in
+    ``arrays``.
     """
     sent = load_flags(scratch.lanes, plan.sent, b, s, 0, h)
     own = len(links.sender) + h
@@ -310,8 +312,8 @@ def use_silence(
 ) -> None:
     """Update filter ``h`` of block ``b`` with a reading ``H xbar`` of noise ``R + Y^-1``, in the
     lanes where filter ``sender`` is ``silent`` (flags (L,)): changes ``nodes.xhat[b, h]`` (n, L)
-    and ``nodes.root[b, h]`` (n, n, L). Entry ``index`` of the W + H known sensors holds the
-    sender's whitened H.
+    and ``nodes.root[b, h]`` (n, n, L). Entry ``index`` of the W + H known sensors in ``arrays``
+    holds the sender's whitened H, and ``arrays.prior`` the prediction xbar.
     """
     lanes, n = scratch.lanes, nodes.xhat.shape[2]
     for k in range(nodes.rows[sender]):
@@ -389,8 +391,9 @@ class ScheduledReadings(Filter):
     def slot_arrays(
         self, states: Sequence[Any], infos: Sequence[NodeInfo], runs: int
     ) -> tuple[ScheduledArrays]:
-        """Return the arrays of ``slot_kernel`` for ``runs`` runs of H nodes: triggers, and empty
-        tables of the sensors that nodes know of each other.
+        """Return the arrays of ``slot_kernel`` for ``runs`` runs of H nodes with W directed links,
+        counted from ``infos``: triggers, and empty tables of the W + H sensors that nodes know of
+        each other and of themselves.
         """
         models, blocks = [state.model for state in states], blocks_of(runs)
         (H, n), W = (len(models), len(states[0].xhat)), sum(info.degree for info in infos)
@@ -507,7 +510,7 @@ class TriggerArrays(NamedTuple):
 
 def trigger_arrays(models: Sequence[Any], Y: float | FloatArray, runs: int) -> TriggerArrays:
     """Return the arrays of H nodes with these ``models`` in ``runs`` runs, before they have read
-    anything.
+    anything; the trigger Y is (p, p) or a multiple of the identity.
     """
     trigger, shape = whitened_triggers(models, Y), (blocks_of(runs), len(models))
     return TriggerArrays(
@@ -538,8 +541,8 @@ class TriggerPlan(NamedTuple):
 
 
 def trigger_plan(inner: Filter) -> TriggerPlan | None:
-    """Return the order of steps in the slots of a filter; None if its innovations cannot be
-    computed from outside.
+    """Return the order of steps in the slots of the filter ``inner``; None if its innovations
+    cannot be computed from outside.
     """
     schedule = inner.schedule or ()
     before = schedule[: schedule.index("sense")]
@@ -564,13 +567,14 @@ def decide_senders(
     order: TriggerPlan,
     s: int,
 ) -> None:
-    """Decide which nodes send in slot ``s``, in all blocks: in steps before the reading by the
-    reading of the slot before, then by this one.
+    """Decide which nodes send in slot ``s``, in all B blocks: in steps before the reading by the
+    reading of the slot before, then by this one; ``order`` says which steps come before.
 
     Writes 0 into ``plan.sent[:, s]`` (B, E, H, L) and ``plan.up[:, s]`` (B, E, W, L) for messages
     that are not sent, and stores news and decisions in ``arrays``.
     """
     for b in range(plan.sent.shape[0]):
+        # Exchanges before the reading: the decisions after the reading of the slot before hold.
         for e in range(order.first):
             decide_step(plan, arrays, b, s, e)
         if plan.sensed[s] and not order.split:
@@ -806,8 +810,8 @@ class TriggeredMessages(Filter):
     def slot_gains(
         self, states: Sequence[Any], arrays: tuple[Any, ...], first: int, count: int
     ) -> tuple[Any, ...]:
-        """Return the ``arrays`` unchanged: the wrapped filter's gains are asked for
-        slot by slot.
+        """Return the ``arrays`` unchanged, whatever the slots: the wrapped filter's gains are asked
+        for slot by slot.
         """
         return arrays
 
@@ -827,6 +831,7 @@ class TriggeredMessages(Filter):
         """
         news = NO_READING
         if len(reading.y):
+            # Before the filter uses the reading: news is relative to the prediction.
             news = news_of(reading, self.inner.estimate(state.inner)[0], self.Y)
         return WrappedState(self.inner.update(state.inner, reading), news, state.has_sent)
 

@@ -83,8 +83,8 @@ def fusion_slots(
     scratch: SlotScratch,
     arrays: FusionArrays,
 ) -> None:
-    """Simulate H filters that fuse pairs of estimates over the S slots of a plan, in B blocks of L
-    runs: in each slot they predict, read and fuse what they hear.
+    """Simulate H filters that fuse pairs of estimates by the rule in ``arrays`` over the S slots of
+    a plan, in B blocks of L runs: in each slot they predict, read and fuse what they hear.
 
     Changes ``nodes.xhat`` (B, H, n, L) and ``nodes.root`` (B, H, n, n, L) in place and writes
     ``samples`` in the slots that have one.
@@ -115,9 +115,9 @@ def fuse_received(
     index: tuple[int, int, int, int],
 ) -> None:
     """Fuse filter h of block b in lane q (one run) with all estimates that arrive in slot s, one
-    after the other; ``index`` is [b, s, h, q]. Changes ``nodes.xhat[b, h, :, q]`` (n,) and
-    ``nodes.root[b, h, :, :, q]`` (n, n); the messages are the copies of all estimates in
-    ``scratch``.
+    after the other, by the rule in ``arrays``; ``index`` is [b, s, h, q]. Changes ``nodes.xhat[b,
+    h, :, q]`` (n,) and ``nodes.root[b, h, :, :, q]`` (n, n); the messages are the copies of all
+    estimates in ``scratch``.
     """
     b, s, h, q = index
     n, has_received = nodes.xhat.shape[2], False
@@ -359,8 +359,8 @@ def combine_received(
     index: tuple[int, int, int, int],
 ) -> None:
     """Replace the reported estimate of filter h of block b in lane q (one run) by the combination
-    of its track with those that arrive in slot s; ``index`` is [b, s, h, q]. Changes
-    ``nodes.xhat[b, h, :, q]`` (n,) and ``nodes.root[b, h, :, :, q]`` (n, n).
+    of its track with those that arrive in slot s, all of them in ``arrays``; ``index`` is [b, s, h,
+    q]. Changes ``nodes.xhat[b, h, :, q]`` (n,) and ``nodes.root[b, h, :, :, q]`` (n, n).
     """
     b, s, h, q = index
     n, count, key = nodes.xhat.shape[2], 0, 0
@@ -451,7 +451,7 @@ class BarShalomCampo(Filter):
         self, states: Sequence[Any], infos: Sequence[NodeInfo], runs: int
     ) -> tuple[TrackArrays]:
         """Return the arrays of ``slot_kernel`` for ``runs`` runs of H nodes that start in these
-        ``states``: the tracks with their covariances, and scratch.
+        ``states`` and hear the nodes in ``infos``: the tracks with their covariances, and scratch.
         """
         H, n, start = len(states), len(states[0].xhat), states[0].start
         max_degree = max(info.degree for info in infos)
@@ -486,8 +486,8 @@ class BarShalomCampo(Filter):
         )
 
     def carried_estimates(self, reported: FloatArray, arrays: tuple[Any, ...]) -> FloatArray:
-        """Return the own tracks (B, H, n, L), with which nodes go on, instead of the combinations
-        that are ``reported`` (B, H, n, L).
+        """Return the own tracks (B, H, n, L) in ``arrays``, with which nodes go on, instead of the
+        combinations that are ``reported`` (B, H, n, L).
         """
         tracks: TrackArrays = arrays[0]
         return tracks.xhat
@@ -584,12 +584,13 @@ def stacked_sensors(sensors: Sequence[FloatArray]) -> tuple[FloatArray, np.ndarr
 
 
 def combined_pairs(infos: Sequence[NodeInfo]) -> np.ndarray:
-    """Return the pairs (K, 2) of indices of tracks that some of the N nodes may combine, in lexical
-    order.
+    """Return the pairs (K, 2) of indices of tracks that some of the N nodes in ``infos`` may
+    combine, in lexical order.
     """
     network, N = infos[0].network, len(infos)
     assert network is not None
     tracks = [np.array([h, *heard]) for h, heard in enumerate(network.heard)]
+    # The pair (i, j) as one number, i N + j, which sorts and removes duplicates quickly.
     codes = np.unique(np.concatenate([np.add.outer(N * one, one).reshape(-1) for one in tracks]))
     return np.ascontiguousarray(np.stack(np.divmod(codes, N), axis=1))
 
@@ -635,12 +636,14 @@ def add_senders(state: TrackState, messages: Sequence[Message]) -> TrackState:
 def best_combination(
     joint: FloatArray, tracks: Sequence[int], own_root: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the optimal gain (n, k n) of the differences of k tracks to the own one, and the root
-    (n, n) of the covariance of the combination, ``own_root`` if all tracks are the same.
+    """Return the optimal gain (n, k n) of the differences of k tracks to the own one, and the lower
+    triangular root (n, n) of the covariance of the combination: ``own_root`` (n, n) if all tracks
+    are the same.
 
     ``joint`` (m, m, n, n) is the joint covariance of the errors of all tracks; ``tracks`` are the
     indices of the own one and of the k others.
     """
+    # The kernel wants the covariances of these tracks alone, the own one first.
     n, k = joint.shape[2], len(tracks) - 1
     gain, root = np.zeros((n, k * n)), np.zeros((n, n))
     block = np.ascontiguousarray(joint[np.ix_(tracks, tracks)])

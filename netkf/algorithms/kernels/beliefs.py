@@ -40,7 +40,9 @@ class BeliefScratch(NamedTuple):
 
 @kernel
 def clear_part(lanes: Lanes, part: FloatArray) -> None:
-    """Set evidence (n, n + 1, L) to no information: zeros."""
+    """Set the evidence ``part`` (n, n + 1, L) to no information: zeros on and below the diagonal
+    and in the last column, the only entries that are ever read.
+    """
     n = len(part)
     for i in range(n):
         for j in range(i + 1):
@@ -50,8 +52,8 @@ def clear_part(lanes: Lanes, part: FloatArray) -> None:
 
 @kernel
 def copy_part(lanes: Lanes, source: FloatArray, target: FloatArray) -> None:
-    """Copy evidence ``source`` (n, n + 1, L) into ``target``; entries above the diagonal are left
-    alone.
+    """Copy evidence ``source`` (n, n + 1, L) into ``target`` of the same shape; entries above the
+    diagonal, which are never read, are left alone.
     """
     n = len(source)
     for i in range(n):

@@ -22,8 +22,8 @@ FEW = 4096  # chain steps below which threads cost more than they save
 
 
 class ReadingModes(NamedTuple):
-    """Readings of M modes: ``H`` (M, p, n) and ``root_R`` (M, p, p), of which the first ``rows[m]``
-    rows count.
+    """Readings of M modes: ``H`` (M, p, n) and lower triangular ``root_R`` (M, p, p), of which the
+    first ``rows[m]`` rows count, ``rows`` (M,).
     """
 
     H: FloatArray
@@ -54,7 +54,8 @@ def move_roots(
     roots: FloatArray, sequences: np.ndarray, F: FloatArray, root_Q: FloatArray, modes: ReadingModes
 ) -> FloatArray:
     """Return the lower triangular roots (K, n, n) of K chains after T slots with the modes
-    ``sequences`` (K, T), from their ``roots`` (K, n, n) before; F and ``root_Q`` are (n, n).
+    ``sequences`` (K, T), indices in ``modes``, from their ``roots`` (K, n, n) before; F and
+    ``root_Q`` are (n, n).
 
     Uses all cores if there is enough to do.
     """
@@ -86,7 +87,7 @@ def trace_path(
     root: FloatArray, sequence: np.ndarray, F: FloatArray, root_Q: FloatArray, modes: ReadingModes
 ) -> FloatArray:
     """Return the lower triangular roots (T, n, n) of one chain after each mode of its ``sequence``
-    (T,), from ``root`` (n, n) on; F and ``root_Q`` are (n, n).
+    (T,), indices in ``modes``, from ``root`` (n, n) on; F and ``root_Q`` are (n, n).
     """
     return next(trace_paths(root[None], sequence[None], F, root_Q, modes))
 
@@ -95,8 +96,8 @@ def trace_paths(
     roots: FloatArray, sequences: np.ndarray, F: FloatArray, root_Q: FloatArray, modes: ReadingModes
 ) -> Iterator[FloatArray]:
     """Yield for each of K chains the lower triangular roots (T, n, n) after each mode of its
-    sequence, a row of ``sequences`` (K, T), from ``roots`` (K, n, n) on; F and ``root_Q`` are
-    (n, n).
+    sequence, a row of ``sequences`` (K, T) of indices in ``modes``, from ``roots`` (K, n, n) on; F
+    and ``root_Q`` are (n, n).
     """
     lows = np.ascontiguousarray(lower_triangular(roots))
     F = as_kernel_array(F)

@@ -47,8 +47,8 @@ def covariance_slope(
 
 @kernel
 def error_slope(S: FloatArray, K: FloatArray, true_Q: FloatArray, dS: FloatArray) -> None:
-    """Write dS_ij/dt = K_i S_ij + S_ij K_j' + Qt into ``dS`` (N, N, n, n) for the covariances S_ij
-    = cov(e_i, e_j) (N, N, n, n) of the errors of N nodes, without the noise of the sensors. K
+    """Write dS_ij/dt = K_i S_ij + S_ij K_j' + Qt into ``dS`` (N, N, n, n) for the covariances S
+    (N, N, n, n) of the errors of N nodes, S_ij = cov(e_i, e_j), without the noise of the sensors. K
     (N, n, n) are the closed loops A - P_i G_i; Qt = ``true_Q`` (n, n) is the noise of the plant.
     """
     # All errors share the noise of the plant. S_ji = S_ij' is filled from the same entry.
@@ -124,13 +124,14 @@ def run_moments(
     step: float,
     traces: FloatArray,
 ) -> None:
-    """Integrate P (N, n, n) and S (N, N, n, n) of N nodes in place and write the traces (T, N) of
-    cov(e_i) at ``times`` (T,), after the messages of the same instant, with steps of at most
+    """Integrate P (N, n, n) and S (N, N, n, n) of N nodes in place and write the ``traces`` (T, N)
+    of cov(e_i) at ``times`` (T,), after the messages of the same instant, with steps of at most
     ``step`` seconds.
 
     ``model`` is (A, Q, Qt, G, Gt), (n, n) or, for G and Gt, (N, n, n). The messages at
-    ``instants[m]``, in seconds, are those with numbers ``ends[m]`` to ``ends[m + 1]`` - 1; message
-    k goes from node ``columns[k]`` to ``rows[k]`` with ``weights[k]``.
+    ``instants[m]``, seconds (M,), are those with numbers ``ends[m]`` to ``ends[m + 1]`` - 1 (M +
+    1,); message k goes from node ``columns[k]`` to ``rows[k]`` with ``weights[k]``, one entry for
+    each message.
     """
     A, Q, true_Q, G, true_G = model
     K, P0, S0 = np.empty_like(P), np.empty_like(P), np.empty_like(S)

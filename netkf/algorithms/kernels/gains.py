@@ -111,7 +111,8 @@ def gain_update(
     table: GainTable, P: FloatArray, x: FloatArray, moments: FloatArray, gap: float
 ) -> FloatArray:
     """Return ``xhat(b)`` (n,) at the end b of an interval of ``gap`` seconds, from the open-loop
-    prediction ``x`` (n,) there, ``P = P(b)`` (n, n) and the ``moments`` (2p,) of the reading.
+    prediction ``x`` (n,) there, ``P = P(b)`` (n, n), the ``moments`` (2p,) of the reading and the
+    ``table`` of the node's gains.
     """
     n, q = table.n, table.moments
     # One evaluation of the concatenated series [U, W, C].

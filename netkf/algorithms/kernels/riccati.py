@@ -185,8 +185,8 @@ def _invert_extended(matrix: FloatArray) -> FloatArray:
 def substep(
     table: RiccatiTable, P: FloatArray, x: FloatArray, gap: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the covariance P (n, n) after the Riccati flow over ``gap`` seconds, at most one unit
-    of the table, and ``exp(A gap) x`` (n,).
+    """Return the covariance (n, n) after the Riccati flow of a ``table`` over ``gap`` seconds, at
+    most one of its units, from P (n, n), and ``exp(A gap) x`` (n,).
     """
     n = table.n
     # G = 0, a Lyapunov equation: P <- e P e' + W, and no inverse is needed.
@@ -209,8 +209,9 @@ def substep(
 def propagate_riccati(
     table: RiccatiTable, P: FloatArray, x: FloatArray, gap: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Return P (n, n) after the Riccati flow over ``gap`` >= 0 seconds, and ``exp(A gap) x`` (n,):
-    the covariance counts the readings of the gap, the estimate does not.
+    """Return the covariance (n, n) after the Riccati flow of a ``table`` over ``gap`` >= 0 seconds
+    from P (n, n), and ``exp(A gap) x`` (n,): the covariance counts the readings of the gap, the
+    estimate does not.
     """
     P, x = P.copy(), x.copy()  # C-contiguous, so that one version of this code is compiled
     # One step for each binary digit 1 of the number of whole units, with its tabulated triple.

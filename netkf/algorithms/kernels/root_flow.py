@@ -198,8 +198,9 @@ def flow_table(
 def pack_series(
     E: FloatArray, F: FloatArray, Q_g: FloatArray, G: FloatArray, observed: bool
 ) -> FloatArray:
-    """Return the series (C, terms, width) of a FlowTable for C cells from those of exp(A g), F, Q_g
-    and G_g, (C, terms, n, n) each: one row for each term, without F and G_g unless ``observed``.
+    """Return the series (C, terms, width) of a FlowTable for C cells from those of exp(A g) =
+    ``E``, ``F``, ``Q_g`` and G_g = ``G``, (C, terms, n, n) each: one row for each term, without F
+    and G_g unless something is ``observed``.
     """
     rows, columns = np.tril_indices(E.shape[2])
     parts = [Q_g[:, :, rows, columns], E.reshape(*E.shape[:2], -1)]
@@ -349,8 +350,8 @@ def double_levels(
     levels: int,
 ) -> FloatArray:
     """Return exp(A g), F, Gamma and T (levels, 4, n, n) for ``g = unit 2^level`` seconds, from the
-    series around 0 of exp(A g), F and Q_g, (TERMS, n, n) each, and of Gamma, ``blocks``
-    (TERMS, q n). There are fewer ``levels`` if F grows too much.
+    series around 0 of exp(A g) = ``E``, ``F`` and ``Q_g``, (TERMS, n, n) each, and of Gamma,
+    ``blocks`` (TERMS, q n). There are fewer ``levels`` if F grows too much.
 
     Each level follows from the one below by the doubling formulas (Anderson 1978). Doubling also
     doubles relative errors, so it works in extended precision, and on roots, so that directions
@@ -715,7 +716,9 @@ def propagate_by_series(
 
 @kernel(inlined=True)
 def offset_of_F(n: int, observed: bool) -> int:
-    """Return the index at which F begins in the values of a gap (``fill_values``), for n states."""
+    """Return the index at which F begins in the values of a gap (``fill_values``), for n states:
+    behind exp(A g) if something is ``observed``, else at exp(A g), which F then equals.
+    """
     # Without sensors F = exp(A g), and the series holds it once.
     return n * (n + 1) // 2 + (n * n if observed else 0)
 
@@ -1009,8 +1012,8 @@ def gain_update_root(
     table: GainTable, root: FloatArray, x: FloatArray, moments: FloatArray, gap: float
 ) -> FloatArray:
     """Return ``xhat(b)`` (n,) at the end b of an interval of ``gap`` seconds, from the open-loop
-    prediction ``x`` (n,), the ``root`` (n, n) at b and the ``moments`` (2 p,) of the readings of
-    the interval.
+    prediction ``x`` (n,), the ``root`` (n, n) at b, the ``moments`` (2 p,) of the readings of the
+    interval and the ``table`` of the node's gains.
     """
     if table.moments == 0:
         return x
