@@ -43,9 +43,10 @@ class Clock(Component):
         random: np.random.Generator,
         count: int,
     ) -> FloatArray:
-        """Return the times of the next ticks, at most ``count``, from number ``index`` on.
+        """Return the times (<= count,) in seconds of the next ticks of ``entity``, at most
+        ``count``, from number ``index`` on, drawn from ``random``.
 
-        Tick ``index - 1`` was at ``now`` (0.0 before the first); ``origin`` is the value of
+        Tick ``index - 1`` was at ``now`` seconds (0.0 before the first); ``origin`` is the value of
         :meth:`origin`. The result is empty if the clock has stopped for good. The times must not
         depend on ``count``: two short blocks are the same ticks as a long one.
         """
@@ -88,7 +89,8 @@ def next_ticks(
     count: int,
     key: str = "network.activation",
 ) -> FloatArray:
-    """Return the times (K,) of the next ticks of a clock in seconds, K <= ``count``, checked.
+    """Return the times (K,) of the next ticks of the clock of ``entity`` in seconds, K <=
+    ``count``, drawn from ``random`` and checked; ``position`` says how far the clock has got.
 
     Raises ScenarioError at ``key`` if time does not advance: the run would never end.
     """

@@ -89,7 +89,8 @@ def _open_table(
 def parse_finite_numbers(
     source: SourceFile, line: int, header: list[str], entries: list[str], indices: list[int]
 ) -> list[float]:
-    """Return the entries of a row in the columns ``indices`` as numbers.
+    """Return the ``entries`` (texts) of a row in the columns with these ``indices`` as numbers, one
+    for each index; ``header`` has the names of all columns.
 
     Raises ScenarioError if one is not a finite number of at most MAX_MAGNITUDE, or if the row is
     not as long as the header. ``line`` is the row's line number in the file.
@@ -122,7 +123,7 @@ def parse_finite_numbers(
 
 
 def parse_integers(source: SourceFile, name: str, column: FloatArray) -> list[int]:
-    """Return the column ``name`` of a table, ids or counts, as integers.
+    """Return the values of the column ``name`` (K,) of a table, ids or counts, as K integers.
 
     Raises ScenarioError if a value is not an integer from 0 to MAX_ID.
     """

@@ -80,7 +80,9 @@ def suggest_nearest(word: object, candidates: Iterable[str]) -> str:
 
 
 def quote(value: object, max_length: int = 80) -> str:
-    """Return ``repr(value)`` on one line, arrays as lists, shortened in the middle if long."""
+    """Return ``repr(value)`` on one line, arrays as lists, shortened in the middle to
+    ``max_length`` characters if it is longer.
+    """
     tolist = getattr(value, "tolist", None)
     try:
         text = " ".join(repr(tolist() if callable(tolist) else value).split())

@@ -315,7 +315,9 @@ def either(first: Rule, second: Rule, is_second: Callable[[Any], bool]) -> Rule:
 
 
 def has_depth(depth: int) -> Callable[[Any], bool]:
-    """Return a predicate: whether a value is lists or an array nested at least ``depth`` deep."""
+    """Return a predicate of a value: True if it is lists or an array nested at least ``depth``
+    deep.
+    """
 
     def measure_depth(value: Any) -> int:
         """Return how deep lists, tuples and arrays are nested, 0 for a number."""
@@ -329,7 +331,8 @@ def has_depth(depth: int) -> Callable[[Any], bool]:
 
 
 def array(dimensions: int, name: str) -> Rule:
-    """Return the rule for an array of finite real numbers with 1 or 2 dimensions.
+    """Return the rule for an array of finite real numbers with 1 or 2 ``dimensions``: its result is
+    read-only float64, (k,) or (r, c), and not empty.
 
     ``name`` is what messages call it, such as "vector".
     """

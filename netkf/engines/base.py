@@ -51,7 +51,9 @@ Progress = Callable[[float], None]
 
 
 def silent(time: float) -> None:
-    """Ignore the progress of a run."""
+    """Ignore the progress of a run, the simulated ``time`` in seconds: a Progress that does
+    nothing.
+    """
 
 
 class Engine(ABC):
@@ -70,7 +72,10 @@ class Engine(ABC):
     def run(
         self, scenario: Scenario, streams: Streams, recorder: Recorder, progress: Progress
     ) -> str:
-        """Simulate up to the horizon and return the status, "complete" or "diverged"."""
+        """Simulate up to the horizon with the random numbers of ``streams``, pass events and
+        samples to ``recorder``, and return the status, "complete" or "diverged". ``progress`` is
+        called with the simulated time in seconds from time to time.
+        """
 
     def together(self, scenario: Scenario) -> int:
         """Return the number of runs, a power of two, that are best handed out together at least."""
@@ -79,9 +84,9 @@ class Engine(ABC):
     def run_many(
         self, scenario: Scenario, seed: int, replicas: range, fingerprint: bool = False
     ) -> Iterator[RunBatch]:
-        """Yield the runs of consecutive ``replicas`` in order, as many at a time as suits the
-        engine; each run is to the last bit what ``run`` gives for its replica. With
-        ``fingerprint``, the first batch has that of the events of its first run.
+        """Yield the runs of consecutive ``replicas`` in order, with random numbers from ``seed``,
+        as many at a time as suits the engine; each run is to the last bit what ``run`` gives for
+        its replica. With ``fingerprint``, the first batch has that of the events of its first run.
         """
         # Engines that have no batches run replicas one by one; only counts and samples are kept.
         for replica in replicas:
@@ -96,7 +101,9 @@ class Engine(ABC):
 
 
 def batch_sink(scenario: Scenario, replicas: range) -> BatchSink:
-    """Return a sink for the samples of some recorded runs of a scenario."""
+    """Return a sink that collects the samples of the runs numbered ``replicas`` of a scenario in
+    one RunBatch.
+    """
     # A pooled filter is sampled once, not once for each node.
     filters = 1 if scenario.node_filter.pooled else len(scenario.nodes)
     return BatchSink(replicas, scenario.times, (filters, scenario.plant.n))

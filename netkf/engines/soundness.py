@@ -15,7 +15,7 @@ BoolArray = NDArray[np.bool_]
 def stack_estimates(
     pairs: Sequence[tuple[FloatArray, FloatArray | None]],
 ) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """Stack the results (xhat (n,), P (n, n) or None) of ``estimate`` of N filters.
+    """Stack ``pairs``, the results (xhat (n,), P (n, n) or None) of ``estimate`` of N filters.
 
     Returns xhat (N, n), P (N, n, n), nan for a filter without covariance, and a mask (N,) of these
     filters.
@@ -32,11 +32,12 @@ INDEFINITE = 1e-9
 
 
 def sound_mask(xhat: FloatArray, P: FloatArray, without: BoolArray | bool = False) -> BoolArray:
-    """Return a mask (...) of sound pairs of estimates (..., n) and covariances (..., n, n).
+    """Return a mask (...) of sound pairs of estimates ``xhat`` (..., n) and covariances ``P``
+    (..., n, n).
 
     Both must be finite, and the covariance positive semidefinite; a filter ``without`` covariance
-    needs only a finite estimate. Estimates are in the coordinates that the filters compute in. A
-    run continues while all pairs are sound.
+    (mask (...), or False for none) needs only a finite estimate. Estimates are in the coordinates
+    that the filters compute in. A run continues while all pairs are sound.
     """
     finite = np.isfinite(xhat).all(axis=-1)
     whole = np.asarray(np.isfinite(P).all(axis=(-1, -2)))
@@ -45,7 +46,9 @@ def sound_mask(xhat: FloatArray, P: FloatArray, without: BoolArray | bool = Fals
 
 
 def _semidefinite(P: FloatArray) -> BoolArray:
-    """Return a mask (...) of the symmetric matrices (..., n, n) that are positive semidefinite."""
+    """Return a mask (...) of the symmetric matrices ``P`` (..., n, n) that are positive
+    semidefinite up to the share INDEFINITE of the largest eigenvalue.
+    """
     # A Cholesky factor of P plus a little is much cheaper than its eigenvalues, and nearly always
     # exists.
     size = np.abs(np.diagonal(P, axis1=-2, axis2=-1)).max(axis=-1, initial=0.0)

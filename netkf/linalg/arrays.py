@@ -32,8 +32,8 @@ def readonly_array(value: ArrayLike) -> FloatArray:
 
 
 def symmetric(matrices: FloatArray) -> FloatArray:
-    """Return the symmetric part, (n, n) or (..., n, n), of one matrix (n, n) or of a stack of
-    them.
+    """Return the symmetric parts (..., n, n) of ``matrices``, one matrix (n, n) or a stack
+    (..., n, n).
     """
     return np.asarray(0.5 * (matrices + np.swapaxes(matrices, -1, -2)))
 

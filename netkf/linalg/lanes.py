@@ -125,8 +125,8 @@ def store(lanes: Lanes, array: FloatArray, *place_and_value: Any) -> None:
 
 
 def prefetch(array: np.ndarray, *place: int) -> None:
-    """Ask the processor for the line of memory where ``array[place]`` begins, before it is needed.
-    Nothing happens if there is none.
+    """Ask the processor, in kernels, for the line of memory where ``array[place]`` begins, before
+    it is needed; ``place`` are indices of the first axes. Nothing happens if there is none.
     """
     raise _only_in_kernels()
 

@@ -51,7 +51,8 @@ def entry_pointer(builder: Any, kind: Any, array: Any, indices: Any) -> Any:
 
 def array_without_owner(builder: Any, kind: Any, data: Any, shape: Any, itemsize: int) -> Any:
     """Emit a C-contiguous array structure of LLVM type ``kind`` without owner, and hence without
-    reference counting.
+    reference counting: from the address ``data``, the lengths ``shape`` and ``itemsize`` bytes per
+    entry.
     """
     strides = [ir.Constant(I64, itemsize)]
     # Row-major strides, from the last axis to the first.

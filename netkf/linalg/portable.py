@@ -110,7 +110,9 @@ def pseudo_inverse(matrix: FloatArray, rcond: float) -> FloatArray:
     """
 
     def invert(values: FloatArray) -> FloatArray:
-        """Return the reciprocals (n,) of eigenvalues (n,), 0 for those that count as 0."""
+        """Return the reciprocals (n,) of the eigenvalues ``values`` (n,), 0 for those that count as
+        0.
+        """
         small = np.abs(values) <= rcond * np.abs(values).max(initial=0.0)
         return np.where(small, 0.0, 1.0 / np.where(small, 1.0, values))
 

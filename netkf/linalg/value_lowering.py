@@ -161,7 +161,8 @@ class ValueLower(Lower):
         self, names: set[str], block_of: dict[str, int], using_blocks: dict[str, set[int]]
     ) -> set[str]:
         """Return those of ``names`` that some block uses without being dominated by the block that
-        assigns them.
+        assigns them; ``block_of`` is the block that assigns each name, ``using_blocks`` the others
+        that use it.
         """
         # The first block dominates all.
         names = {name for name in names if block_of[name] != self.firstblk}
@@ -356,7 +357,9 @@ def _count_readers(all_instructions: list[Any]) -> Counter[int]:
 
 
 def _written_only(all_instructions: list[Any], readers: Counter[int]) -> set[int]:
-    """Return the ids of stack variables that are only written, and of the stores to them."""
+    """Return the ids of stack variables that are only written, and of the stores to them;
+    ``readers`` is how many operands each value is, by its id.
+    """
     stores = [
         instruction
         for instruction in all_instructions

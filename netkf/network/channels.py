@@ -72,7 +72,10 @@ class Loss(Component):
     chance, weather, certain, changing = delivery_probability, next_state, deterministic, stateful
 
     def mean_delivery(self, link: Link, table_probability: float) -> float:
-        """Return the delivered fraction in the long run; nan if it is unknown before a run."""
+        """Return the fraction of messages from link[0] to link[1] that arrive in the long run; nan
+        if it is unknown before a run. ``table_probability`` is the entry of the graph's table for
+        that direction.
+        """
         return self.delivery_probability(link, 0, False, table_probability)
 
     @property
@@ -96,7 +99,7 @@ class NoLoss(Loss):
     def delivery_probability(
         self, link: Link, message: int, bad: bool, table_probability: float
     ) -> float:
-        """Return 1."""
+        """Return 1, for any message in any state of the link."""
         return 1.0
 
 
@@ -109,7 +112,7 @@ class Bernoulli(Loss):
     def delivery_probability(
         self, link: Link, message: int, bad: bool, table_probability: float
     ) -> float:
-        """Return ``delivery``."""
+        """Return ``delivery``, for any message in any state of the link."""
         return self.delivery
 
 
@@ -120,7 +123,7 @@ class PerLink(Loss):
     def delivery_probability(
         self, link: Link, message: int, bad: bool, table_probability: float
     ) -> float:
-        """Return ``table_probability``."""
+        """Return ``table_probability``, for any message in any state of the link."""
         return table_probability
 
     def check(self, topology: Topology) -> None:
@@ -194,7 +197,9 @@ class GilbertElliott(Loss):
         return True
 
     def next_state(self, bad: bool | None, random: np.random.Generator) -> bool:
-        """Return the state after a step; the first is drawn from the stationary law."""
+        """Return True if the chain is in its bad state after a step from ``bad``, drawn with one
+        number of ``random``; the first state, after None, is drawn from the stationary law.
+        """
         to_bad, to_good = self.transitions
         u = random.random()
         if bad is None:
@@ -204,13 +209,17 @@ class GilbertElliott(Loss):
     def delivery_probability(
         self, link: Link, message: int, bad: bool, table_probability: float
     ) -> float:
-        """Return the delivery probability of the state."""
+        """Return the delivery probability of any message in the state ``bad`` (True) or good of the
+        link.
+        """
         if bad:
             return 0.0 if self.deliver_bad is None else self.deliver_bad
         return 1.0 if self.deliver_good is None else self.deliver_good
 
     def mean_delivery(self, link: Link, table_probability: float) -> float:
-        """Return the mean delivery probability under the stationary law."""
+        """Return the mean delivery probability of any link under the stationary law;
+        ``table_probability`` is not used.
+        """
         to_bad, to_good = self.transitions
         bad = to_bad / (to_bad + to_good)
         return bad * self.delivery_probability(link, 0, True, 1.0) + (
@@ -384,7 +393,9 @@ class ChannelSampler:
         self._delay_random = streams.get("delay")
 
     def draw(self) -> ChannelDraw:
-        """Return the draw of the next activation; a delay that is not random is fixed or 0."""
+        """Return the random numbers of the next activation; a delay that is not random is fixed or
+        0.
+        """
         uniform, bad, delay = 0.0, False, self._fixed_delay
         if self._loss_random is not None:
             uniform = float(self._loss_random.random())
@@ -441,10 +452,11 @@ def identical_per_link(loss: Loss) -> bool:
 def delivery_probabilities(
     loss: Loss, link: Link, first: int, bad: np.ndarray, table_probability: float
 ) -> FloatArray:
-    """Return (count,) delivery probabilities of messages ``first``, ``first + 1``, ... of a link.
+    """Return the delivery probabilities (K,) of the messages numbered ``first``, ``first + 1``, ...
+    of a directed ``link`` (sender, receiver).
 
-    ``bad`` (count,) holds the state of the link at each. Raises ScenarioError for a value outside
-    [0, 1].
+    ``bad`` (K,) holds the state of the link at each; ``table_probability`` is the entry of the
+    graph's table for that direction. Raises ScenarioError for a value outside [0, 1].
     """
     if identical_per_link(loss):
         return np.full(len(bad), loss.delivery_probability(link, first, False, table_probability))
@@ -459,7 +471,10 @@ def delivery_probabilities(
 def checked_delivery_probability(
     loss: Loss, link: Link, message: int, bad: bool, table_probability: float
 ) -> float:
-    """Return ``loss.delivery_probability``; raises ScenarioError if it is outside [0, 1]."""
+    """Return the probability that message number ``message`` on ``link`` (sender, receiver) arrives
+    if the link is in the state ``bad``; raises ScenarioError if the loss model gives one outside
+    [0, 1]. ``table_probability`` is the entry of the graph's table.
+    """
     value = loss.delivery_probability(link, message, bad, table_probability)
     if not 0.0 <= value <= 1.0:
         rule = (
@@ -472,12 +487,17 @@ def checked_delivery_probability(
 
 
 def delay_depends_on_message(delay: Delay) -> bool:
-    """Return True if the class overrides ``message_delay``."""
+    """Return True if the class overrides ``message_delay``, so that delays may depend on the
+    message.
+    """
     return type(delay).message_delay is not Delay.message_delay
 
 
 def checked_delay(delay: Delay, link: Link, message: int, drawn: float) -> float:
-    """Return ``delay.message_delay`` in seconds; raises ScenarioError if it is negative."""
+    """Return the seconds that message number ``message`` on ``link`` (sender, receiver) takes, nan
+    if it is lost, from the delay ``drawn`` for it; raises ScenarioError if the delay model gives a
+    negative one.
+    """
     seconds = delay.message_delay(link, message, drawn)
     if seconds < 0.0:
         rule = (
@@ -492,7 +512,9 @@ def checked_delay(delay: Delay, link: Link, message: int, drawn: float) -> float
 def transit_time(
     channel: Channel, link: Link, message: int, draw: ChannelDraw, table_probability: float
 ) -> float:
-    """Return the seconds after which message number ``message`` of a directed link arrives.
+    """Return the seconds that message number ``message`` on ``link`` (sender, receiver) takes to
+    arrive, decided by the random numbers ``draw``; ``table_probability`` is the entry of the
+    graph's table.
 
     The result is nan if the message is lost. Raises ScenarioError for a delivery probability
     outside [0, 1] and for a negative delay.

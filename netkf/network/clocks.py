@@ -46,7 +46,9 @@ class LinkClock(Clock):
     at: str = field(one_of(*AT), default="links")
 
     def entities(self, topology: Topology) -> tuple[Entity, ...]:
-        """Return the ids of all entities that have a clock, in order."""
+        """Return the entities that have a clock, in order: node ids (i, j) of links,
+        (sender, receiver) of directions, or (node,).
+        """
         if self.at == "nodes":
             return tuple((node,) for node in topology.nodes)
         return topology.directions if self.at == "directions" else topology.links
@@ -62,7 +64,7 @@ class OnReadings(LinkClock):
     at: str = dataclasses.field(init=False, default="readings")
 
     def entities(self, topology: Topology) -> tuple[Entity, ...]:
-        """Return no entities."""
+        """Return no entities: no clock ticks."""
         return ()
 
     def ticks(
@@ -74,7 +76,9 @@ class OnReadings(LinkClock):
         random: np.random.Generator,
         count: int,
     ) -> FloatArray:
-        """Return no ticks."""
+        """Return no ticks (0,), whatever ``entity``, ``origin``, ``index``, ``now`` and
+        ``count``.
+        """
         return np.empty(0)
 
 
@@ -140,7 +144,7 @@ class Poisson(LinkClock):
         return tuple(sorted(ids)) if self.at == "links" else ids
 
     def mean_rate(self, entity: Entity) -> float:
-        """Return the rate of the process, in ticks per second."""
+        """Return the rate of the process of ``entity``, in ticks per second; nan if it has none."""
         rate = self._entity_rates.get(entity, self.rate)
         return math.nan if rate is None else rate
 
@@ -158,8 +162,9 @@ class Poisson(LinkClock):
         random: np.random.Generator,
         count: int,
     ) -> FloatArray:
-        """Return the next ``count`` ticks (seconds) after ``now``, with exponential gaps of mean
-        1 / rate: the ticks of clocks with equal generators are in proportion.
+        """Return the next ``count`` ticks (count,) of ``entity`` in seconds, after ``now``, with
+        exponential gaps of mean 1 / rate drawn from ``random``: the ticks of clocks with equal
+        generators are in proportion. ``origin`` and ``index`` are not used.
         """
         return _accumulate(now, random.standard_exponential(count) / self.mean_rate(entity))
 
@@ -264,7 +269,10 @@ class Renewal(LinkClock):
         random: np.random.Generator,
         count: int,
     ) -> FloatArray:
-        """Return the next ``count`` ticks after ``now``, with gaps drawn from the distribution."""
+        """Return the next ``count`` ticks (count,) in seconds, after ``now``, with gaps drawn from
+        the distribution by ``random``; with constant gaps, the ticks from number ``index`` on,
+        which nothing is drawn for. ``entity`` and ``origin`` are not used.
+        """
         shape = self.shape or 1.0
         if self.distribution == "gamma":
             gaps = random.standard_gamma(shape, count)
@@ -282,7 +290,9 @@ class Renewal(LinkClock):
 
 
 def _lattice(phase: float, period: float, first: int, count: int) -> FloatArray:
-    """Return ticks ``first`` to ``first + count - 1`` of a periodic clock, in seconds."""
+    """Return the ticks (count,) ``first`` to ``first + count - 1`` of a periodic clock, tick k at
+    ``phase + k period``, all in seconds.
+    """
     # Rounded so that lattices whose periods are multiples of each other meet exactly.
     return np.round(phase + period * np.arange(first, first + count), 12)
 
@@ -308,7 +318,9 @@ class Periodic(LinkClock):
                 raise ScenarioError(name, "must be below the period", value, "give less")
 
     def origin(self, entity: Entity, random: Callable[[], np.random.Generator]) -> float:
-        """Return the phase in seconds, drawn if it is random."""
+        """Return the phase in seconds; a random one is drawn from the generator that ``random``
+        returns.
+        """
         if isinstance(self.phase, str):
             return self.period * float(random().random())
         return self.phase
@@ -326,7 +338,9 @@ class Periodic(LinkClock):
         random: np.random.Generator,
         count: int,
     ) -> FloatArray:
-        """Return ticks ``index`` to ``index + count - 1``: lattice points, each plus its jitter."""
+        """Return the ticks (count,) in seconds from number ``index`` on: lattice points ``origin +
+        k period``, each plus a jitter drawn from ``random``. ``entity`` and ``now`` are not used.
+        """
         # With phase 0 the lattice point at time 0 is no tick.
         times = _lattice(origin, self.period, index + (origin == 0.0), count)
         return times + self.jitter * random.random(count) if self.jitter > 0.0 else times
@@ -347,7 +361,7 @@ class RecordedClock(LinkClock):
 
     @cached_property
     def _times(self) -> dict[Entity, FloatArray]:
-        """Times of the table in seconds by entity, in the order of rows."""
+        """Times (K,) of the table in seconds by entity, in the order of rows."""
         columns = ("node",) if self.at == "nodes" else ("node", "peer")
         if self.at == "nodes" and "peer" in read_header(self.path):
             raise ScenarioError(
@@ -374,7 +388,7 @@ class RecordedClock(LinkClock):
 
     @cached_property
     def _instants(self) -> dict[Entity, FloatArray]:
-        """Increasing distinct times of each entity, in seconds."""
+        """Increasing distinct times (K,) of each entity, in seconds."""
         return {entity: np.unique(values) for entity, values in self._times.items()}
 
     @property
@@ -391,7 +405,9 @@ class RecordedClock(LinkClock):
         random: np.random.Generator,
         count: int,
     ) -> FloatArray:
-        """Return up to ``count`` recorded times of the entity from ``index`` on."""
+        """Return up to ``count`` recorded times (<= count,) of ``entity`` in seconds, from number
+        ``index`` on; nothing is drawn, and ``origin`` and ``now`` are not used.
+        """
         return self._instants.get(entity, np.empty(0))[index : index + count]
 
     def check(self, topology: Topology) -> None:

@@ -131,7 +131,9 @@ class Topology:
 
 
 def demand_links(source: SourceFile, pairs: Iterable[Link], topology: Topology) -> None:
-    """Raise ScenarioError if a file names a pair that is not a link of the graph."""
+    """Raise ScenarioError if a file names one of ``pairs`` (sender, receiver) that is not a link of
+    the graph.
+    """
     links = set(topology.links)
     if not topology.directed:
         links |= {(j, i) for i, j in links}
@@ -142,7 +144,7 @@ def demand_links(source: SourceFile, pairs: Iterable[Link], topology: Topology) 
 
 
 def demand_nodes(source: SourceFile, nodes: Iterable[int], topology: Topology) -> None:
-    """Raise ScenarioError if a file names a node that the graph does not have."""
+    """Raise ScenarioError if a file names one of ``nodes`` (ids) that the graph does not have."""
     unknown = sorted(set(nodes) - topology.index.keys())
     if unknown:
         rule = f"{source.name} names a node that the graph does not have"
@@ -155,11 +157,15 @@ class Graph(Component):
 
     @abstractmethod
     def build(self, seed: int) -> Topology:
-        """Return the nodes and links; raises ScenarioError if there are none to build."""
+        """Return the nodes and links; ``seed`` is the root seed, for random graphs without one of
+        their own. Raises ScenarioError if there are none to build.
+        """
 
 
 def _make_topology(nodes: Iterable[int], links: Iterable[Link], **more: Any) -> Topology:
-    """Return the topology of undirected links, each given in any order of its ends."""
+    """Return the topology of ``nodes`` (ids) with undirected ``links`` between them, each given in
+    any order of its ends; ``more`` are other fields of Topology.
+    """
     pairs = {(min(link), max(link)) for link in links}
     return Topology(tuple(sorted(nodes)), tuple(sorted(pairs)), **more)
 
@@ -175,7 +181,7 @@ _node_pair = tuple_of(_node, _node, description="a pair of node ids")
 
 
 def _check_size(nodes: int, links: int) -> None:
-    """Raise ScenarioError for graphs beyond the limits."""
+    """Raise ScenarioError for a number of ``nodes`` or ``links`` beyond the limits."""
     if nodes > MAX_NODES or links > MAX_LINKS:
         rule = f"must have at most {MAX_NODES:,} nodes and {MAX_LINKS:,} links"
         raise ScenarioError("", rule, f"{nodes:,} nodes, {links:,} links", "make it smaller")
@@ -259,8 +265,9 @@ class RandomGraph(Graph):
     def _draw(
         self, seed: int, make: Callable[[np.random.RandomState], networkx.Graph[Any]]
     ) -> networkx.Graph[Any]:
-        """Return the graph that ``make`` draws with the seed; if ``connected``, the first connected
-        one of successive seeds. Raises ScenarioError if none of the tries is.
+        """Return the graph that ``make`` draws with the graph's own seed, or else with the root
+        seed ``seed``; if ``connected``, the first connected one of successive seeds. Raises
+        ScenarioError if none of the tries is.
         """
         import networkx
 
@@ -489,7 +496,10 @@ class CsvGraph(Graph):
         return table._replace(probability=probability | reverse)
 
     def _links(self, delivery: dict[Link, float]) -> set[Link]:
-        """Return the directions whose probability reaches the minimum (both, if undirected)."""
+        """Return the directions (sender, receiver) whose probability in ``delivery`` reaches the
+        minimum, in both directions if the graph is undirected. Raises ScenarioError if there are
+        none.
+        """
         minimum = 0.0 if self.minimum is None else self.minimum
         links = {
             (i, j)
@@ -506,12 +516,14 @@ class CsvGraph(Graph):
         return links
 
     def _delivery(self, delivery: dict[Link, float], links: set[Link]) -> dict[Link, float]:
-        """Return the delivery probability of each direction, 0 where it is not listed."""
+        """Return the delivery probability of each direction (sender, receiver) of the ``links``, 0
+        where the table ``delivery`` does not list it.
+        """
         pairs = links if self.directed else links | {(j, i) for i, j in links}
         return {pair: delivery.get(pair, 0.0) for pair in sorted(pairs)}
 
     def _positions(self, nodes: set[int]) -> dict[int, tuple[float, float]] | None:
-        """Return the coordinates (x, y) of the nodes, None without a file."""
+        """Return the coordinates (x, y) of ``nodes`` (ids) by node, None without a file."""
         if self.positions is None:
             return None
         source = self.positions
@@ -535,7 +547,9 @@ class CsvGraph(Graph):
 
 
 def _isolated_note(nodes: set[int], minimum: float) -> tuple[str, ...]:
-    """Return a note on nodes that are left out because they have no link, if any."""
+    """Return a note on ``nodes`` (ids) that are left out because they have no link whose
+    probability reaches ``minimum``, none if there are no such nodes.
+    """
     if not nodes:
         return ()
     listed = ", ".join(map(str, sorted(nodes)))

@@ -99,7 +99,7 @@ class Matching(SlotActivation):
         return draws[self.protocol](topology, random)
 
     def _one_edge(self, topology: Topology, random: np.random.Generator) -> list[Link]:
-        """Return one uniform link, or no link with probability ``lazy``."""
+        """Return one link, drawn uniformly, or no link with probability ``lazy``."""
         lazy = random.random() < (self.lazy or 0.0)
         edge = topology.links[int(random.integers(len(topology.links)))]
         return [] if lazy else [edge]
@@ -125,7 +125,7 @@ class Matching(SlotActivation):
         return mean
 
     def _pairing_probabilities(self, topology: Topology) -> dict[Link, float]:
-        """Return the probability of each link to be paired in a slot."""
+        """Return the probability of each link to be paired in a slot, by link (i, j), i < j."""
         links, degrees = topology.links, topology.degrees
         if self.protocol == "one-edge":
             return dict.fromkeys(links, (1.0 - (self.lazy or 0.0)) / max(len(links), 1))
@@ -212,7 +212,8 @@ def maximal_matchings(links: tuple[Link, ...]) -> tuple[tuple[Link, ...], ...]:
 
 
 def _greedy_probabilities(links: tuple[Link, ...]) -> tuple[float, ...]:
-    """Return the probability that each link is in the greedy matching in random order.
+    """Return the probability (one for each of ``links``) that each link is in the greedy matching
+    in random order.
 
     The first link a of a random order is uniform, and the links that do not meet it follow in a
     random order again: ``p(free) = mean over a in free of (1 at a) + p(free without those that meet
@@ -267,7 +268,7 @@ class RecordedSlots(SlotActivation):
 
     @cached_property
     def _pairs(self) -> dict[tuple[int, int, int], list[Link]]:
-        """Pairs of the table by (slot, phase, step)."""
+        """Pairs of node ids of the table by (slot, phase, step)."""
         names: tuple[str, ...] = ("slot", "node", "peer")
         matching = self.matching
         if not matching:
@@ -294,7 +295,9 @@ class RecordedSlots(SlotActivation):
         return tuple(self._pairs)
 
     def pairs(self, slot: int, phase: int, step: int = 0) -> list[Link]:
-        """Return the sorted pairs of one exchange step; for broadcasts the listed directions."""
+        """Return the sorted pairs of node ids of one step of the exchange number ``phase`` of a
+        slot; for broadcasts the listed directions (sender, receiver).
+        """
         return self._pairs.get((slot, phase, step), [])
 
     def check(self, topology: Topology) -> None:

@@ -34,7 +34,9 @@ class MessageUse(NamedTuple):
 
 @dataclass(frozen=True)
 class MessageTable:
-    """A value for each listed message of each directed link."""
+    """A value for each listed message of each directed link: ``values[link][number]``, with
+    messages of a link (sender, receiver) numbered from 0.
+    """
 
     source: SourceFile
     values: Mapping[Link, Mapping[int, float]]
@@ -45,7 +47,8 @@ class MessageTable:
         return {link: 1 + max(listed) for link, listed in self.values.items()}
 
     def value(self, link: Link, message: int, after: str) -> float | None:
-        """Return the value of a message; None if the table does not list it.
+        """Return the value of message number ``message`` on ``link`` (sender, receiver); None if
+        the table does not list it.
 
         With ``after`` "repeat" the table of the link starts again after its largest number. With
         "refuse" raises ScenarioError at "path" for a message that is not listed.
@@ -122,7 +125,9 @@ class RecordedLoss(Loss):
     def delivery_probability(
         self, link: Link, message: int, bad: bool, table_probability: float
     ) -> float:
-        """Return 0 or 1."""
+        """Return 1 if the table says that message number ``message`` on ``link`` arrives, else 0;
+        ``after`` decides if the message is not listed. The other arguments are not used.
+        """
         value = _value_at("network.channel.loss", self.table, link, message, self.after)
         if value is None:
             return 0.0 if self.after == "lose" else 1.0
@@ -179,7 +184,9 @@ class RecordedDelay(Delay):
         return max(listed, default=0.0)
 
     def message_delay(self, link: Link, message: int, drawn: float) -> float:
-        """Return the recorded seconds."""
+        """Return the recorded seconds of message number ``message`` on ``link``; if it is not
+        listed, 0, or nan (lost) with ``after`` "lose". ``drawn`` is not used.
+        """
         value = _value_at("network.channel.delay", self.table, link, message, self.after)
         if value is None:
             return math.nan if self.after == "lose" else 0.0
@@ -191,7 +198,9 @@ class RecordedDelay(Delay):
 
 
 def _value_at(key: str, table: MessageTable, link: Link, message: int, after: str) -> float | None:
-    """Return the value of a message in the table; errors name ``key``."""
+    """Return the value of message number ``message`` on ``link`` in the table, None if it is not
+    listed; ``after`` is the treatment of such messages, and errors name the scenario's ``key``.
+    """
     # Asked for during a run, so the error must carry the whole path of its key.
     try:
         return table.value(link, message, after)

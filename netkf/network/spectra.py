@@ -26,7 +26,11 @@ def largest_laplacian_eigenvalue(degrees: FloatArray, ends: np.ndarray) -> float
 
 
 def _largest_sparse(degrees: FloatArray, ends: np.ndarray) -> float:
-    """Return the largest eigenvalue of the Laplacian of a graph, by Lanczos' method."""
+    """Return the largest eigenvalue of the Laplacian of an undirected graph, by Lanczos' method.
+
+    ``degrees`` (N,) are the numbers of links at each node, ``ends`` (L, 2) the indices of the two
+    nodes of each link.
+    """
     import scipy.sparse
     import scipy.sparse.linalg
 

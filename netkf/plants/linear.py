@@ -141,12 +141,16 @@ class LinearPath:
         self._origins = {0: np.zeros(len(start))}
 
     def local(self, slot: int) -> FloatArray:
-        """Return x (n,) in the present frame, at a slot not before the last one asked for."""
+        """Return x (n,) of slot number ``slot``, not before the last one asked for, relative to the
+        origin of the present frame.
+        """
         x = self._state_at(slot)
         return np.zeros(len(x)) if slot == self._rebased > 0 else x
 
     def _state_at(self, slot: int) -> FloatArray:
-        """Return the local state (n,) before a rebase; slots must not decrease."""
+        """Return the local state (n,) of slot number ``slot``, before a rebase; slots must not
+        decrease.
+        """
         while slot >= self._first + len(self._x):
             normals = self._random.standard_normal((BLOCK, self._root.shape[1]))
             noise = product(normals, self._root.T)
@@ -191,12 +195,16 @@ class LinearPath:
         return np.asarray(x)
 
     def rebase(self, slot: int) -> FloatArray:
-        """Return the local state (n,) of a slot that begins a frame, which is zero from now on."""
+        """Return the local state (n,) of slot number ``slot``, which begins a frame; it is zero
+        from now on.
+        """
         self._rebased = slot
         return self._state_at(slot)
 
     def absolute(self, slot: int) -> FloatArray:
-        """Return x (n,) in the plant's coordinates, at a slot not before the last one asked for."""
+        """Return x (n,) of slot number ``slot``, not before the last one asked for, in the plant's
+        coordinates.
+        """
         x = self._state_at(slot)
         return x if self.frame_slots is None else self._move_origin(slot) + x
 

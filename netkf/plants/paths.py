@@ -437,8 +437,8 @@ class DiffusionPath:
         return grid_time(self.period, k)
 
     def _at(self, time: float) -> PathStep:
-        """Return the piece that contains ``time`` (start < time <= end), in the sensing step last
-        asked for or a later one.
+        """Return the piece that contains ``time`` in seconds (start < time <= end), in the sensing
+        step last asked for or a later one.
         """
         while self._block is None or time > self._block.ends[-1]:
             self._block, self._first, self._piece = self._paths.following().of(0), 0, -1
@@ -495,8 +495,8 @@ class DiffusionPath:
         return np.asarray(times[times < horizon])
 
     def local(self, time: float) -> FloatArray:
-        """Return x (n,) in the present frame at a grid, sample or probe time, not before the last
-        one asked for; 0 at a frame time.
+        """Return x (n,) in the present frame at a grid, sample or probe ``time`` (seconds), not
+        before the last one asked for; 0 at a frame time.
         """
         step = self._at(time)
         assert time in (step.start, step.end), f"{time} is neither on the grid nor probed"
@@ -506,7 +506,7 @@ class DiffusionPath:
         return step.x_end if time == step.end else step.x_start
 
     def _begins_frame(self, time: float) -> bool:
-        """Return True if a frame begins at this time."""
+        """Return True if a frame begins at ``time`` (seconds)."""
         k = int(np.searchsorted(self.frame_times, time))
         return k < len(self.frame_times) and bool(self.frame_times[k] == time)
 
@@ -531,8 +531,8 @@ class DiffusionPath:
         return apply(self._moves.transitions(np.array([gap]))[0], self._origin)
 
     def absolute(self, time: float) -> FloatArray:
-        """Return x (n,) in the plant's coordinates at the times that ``local`` takes; ``rebase``
-        must have been called for all frame times so far.
+        """Return x (n,) in the plant's coordinates at a ``time`` (seconds) that ``local`` takes;
+        ``rebase`` must have been called for all frame times so far.
         """
         x = self.local(time)
         if not self._frame:

@@ -59,7 +59,9 @@ class RegressorSensor(Sensor):
     def slot_path(
         self, node: int, period: float, generator: Callable[[str], np.random.Generator]
     ) -> RegressorReadings:
-        """Return readings drawn from the streams "noise" and "regressor"."""
+        """Return the readings of the sensor on ``node`` (id) in one run in slots, drawn from the
+        streams "noise" and "regressor" that ``generator`` returns; ``period`` is not used.
+        """
         return RegressorReadings(self, generator("noise"), generator("regressor"))
 
 
@@ -76,10 +78,12 @@ class RegressorReadings(SlotReadings):
         self._C, self._s = sensor.C, LinearPath(sensor.steps, sensor.drive, sensor.start, driving)
 
     def matrix(self, slot: int) -> FloatArray:
-        """Return ``phi_k'`` (1, n) of a slot not before the last one asked for."""
+        """Return H = ``phi_k'`` (1, n) of slot number ``slot``, not before the last one asked
+        for.
+        """
         return apply(self._C, self._s.state(slot))[None]
 
     def matrices(self, slots: Sequence[int]) -> FloatArray:
-        """Return the rows ``phi_k'`` (S, 1, n) of increasing slots."""
+        """Return the rows H = ``phi_k'`` (S, 1, n) of S increasing ``slots``."""
         states = np.stack([self._s.state(slot) for slot in slots])
         return product(states[:, None], self._C.T)

@@ -121,7 +121,7 @@ class RecordedSampling(Clock):
         count: int,
     ) -> FloatArray:
         """Return up to ``count`` recorded times (<= count,) in seconds of the node ``entity[0]``,
-        from number ``index`` on; nothing is drawn.
+        from number ``index`` on; nothing is drawn, and ``origin`` and ``now`` are not used.
         """
         return self._times.get(entity[0], np.empty(0))[index : index + count]
 

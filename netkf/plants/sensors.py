@@ -87,8 +87,9 @@ class Sensor(Component):
     def samples(
         self, node: int, generator: Callable[[str], np.random.Generator], horizon: float
     ) -> Samples:
-        """Return the samples of the sensor on ``node`` (id) at its ``sample_times`` in one run;
-        ``generator`` returns the random stream of that sensor for a purpose.
+        """Return the samples of the sensor on ``node`` (id) at its ``sample_times`` below the
+        ``horizon`` (seconds) in one run; ``generator`` returns the random stream of that sensor for
+        a purpose.
         """
         raise NotImplementedError
 

@@ -172,7 +172,7 @@ def frame_period(A: FloatArray) -> float | None:
 
 
 def _round_seconds(seconds: float) -> float:
-    """Return a time rounded to 9 significant digits."""
+    """Return the time ``seconds`` rounded to 9 significant digits."""
     # Frames must not depend on the last bits of an eigenvalue, which differ between machines.
     return float(f"{seconds:.9g}")
 

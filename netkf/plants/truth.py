@@ -42,7 +42,7 @@ class ContinuousTruth(Protocol):
 
     def rebase(self, k: int) -> FloatArray:
         """Return the shift (n,) to subtract from estimates at ``frame_times[k]``: the local state
-        just before.
+        just before frame ``k`` begins there.
         """
 
 

@@ -119,8 +119,8 @@ def _tail(states: np.ndarray, k: int, negative: bool) -> float:
 
 @kernel
 def next_half(states: np.ndarray, k: int) -> Any:
-    """Return the next 32 bits of stream ``k`` of states (K, 6): the lower half of a new word, then
-    at the next call its upper half.
+    """Return the next 32 bits of stream ``k`` of ``states`` (K, 6): the lower half of a new word,
+    then at the next call its upper half, which the state keeps meanwhile.
     """
     if states[k, HAS_HALF] == ONE:
         states[k, HAS_HALF] = _U(0)
@@ -152,9 +152,10 @@ def next_integer(states: np.ndarray, k: int, count: int) -> Any:
 
 @kernel
 def shuffle(states: np.ndarray, k: int, order: np.ndarray, count: int) -> None:
-    """Write a random permutation of 0 .. count - 1 into ``order`` (>= count,) by Fisher-Yates.
+    """Write a random permutation of 0 .. count - 1 into ``order`` (>= count,) by Fisher-Yates, from
+    stream ``k`` of ``states`` (K, 6), which it steps.
 
-    It equals ``Generator.permutation(count)``; ``states`` is (K, 6).
+    It equals ``Generator.permutation(count)``.
     """
     for i in range(count):
         order[i] = i

@@ -51,13 +51,17 @@ class Streams:
         return (self,)
 
     def seed_words(self, purpose: str, entities: Sequence[tuple[int, ...]]) -> np.ndarray:
-        """Return the 64-bit words (K, 4) that seed the generators of K entities for ``purpose``."""
+        """Return the 64-bit words (K, 4) that seed the generators of K ``entities`` (ids of each)
+        for ``purpose``.
+        """
         return ReplicaStreams(self.seed, self.replica, 1).seed_words(purpose, entities)
 
     def generators(
         self, purpose: str, entities: Sequence[tuple[int, ...]]
     ) -> list[np.random.Generator]:
-        """Return ``generator(purpose, *entity)`` of each entity, in order."""
+        """Return the generators of K ``entities`` (ids of each) for ``purpose``, in order: those of
+        ``generator(purpose, *entity)``.
+        """
         return ReplicaStreams(self.seed, self.replica, 1).generators(purpose, entities)
 
     def with_seeds(self, purposes: Sequence[str], entities: Sequence[tuple[int, ...]]) -> Streams:

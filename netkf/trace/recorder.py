@@ -75,7 +75,7 @@ class MemorySink(Sink):
 
 
 def _ignore(row: tuple[float, int, int, int, int, int, float]) -> None:
-    """Discard an event."""
+    """Discard an event, the tuple ``row`` that ``Recorder.append`` takes."""
 
 
 class Recorder:
@@ -224,7 +224,7 @@ class Recorder:
 
     @property
     def counts(self) -> np.ndarray:
-        """The number of flushed events of each kind, (len(KINDS),)."""
+        """The numbers (len(KINDS),) of flushed events of each kind."""
         return self._counts.copy()
 
     @property

@@ -241,8 +241,9 @@ def draw_link_of_lane(
 
 @kernel
 def next_state(bad: int, u: float, to_bad: float, to_good: float) -> int:
-    """Return the next state (1: bad) of the Gilbert-Elliott chain, decided by the uniform number
-    ``u``. The first state, after ``bad`` = -1, has the stationary law.
+    """Return the next state (1: bad) of the Gilbert-Elliott chain of one link, decided by the
+    uniform number ``u``: a good state turns bad with probability ``to_bad``, a bad one good with
+    ``to_good``. The first state, after ``bad`` = -1, has the stationary law.
     """
     if bad < 0:
         return 1 if u < to_bad / (to_bad + to_good) else 0

@@ -581,9 +581,9 @@ def slot_batches(
 def slot_batch(
     scenario: Scenario, seed: int, replicas: range, fingerprint: bool = False
 ) -> RunBatch:
-    """Simulate R consecutive ``replicas`` side by side and return their results; a run that
-    diverges goes on to the end with invalid numbers, which ``with_ends`` replaces. ``fingerprint``:
-    with the hash of the events of the first run.
+    """Simulate R consecutive ``replicas`` side by side, with random numbers from ``seed``, and
+    return their results; a run that diverges goes on to the end with invalid numbers, which
+    ``with_ends`` replaces. ``fingerprint``: with the hash of the events of the first run.
     """
     runs = SlotRuns(scenario, ReplicaStreams(seed, replicas.start, len(replicas)), store_all=True)
     assert runs.samples is not None

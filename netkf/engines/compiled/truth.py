@@ -20,8 +20,8 @@ class States(Protocol):
     frame_times: FloatArray
 
     def offset(self, k: int, path: PathBlock, piece: int) -> FloatArray:
-        """Return the local state (n,) just before ``frame_times[k]``, where a piece of the path
-        ends.
+        """Return the local state (n,) just before frame ``k`` begins at ``frame_times[k]``, where
+        the ``piece`` (index) of the ``path`` ends.
         """
 
     def states_at(
@@ -40,8 +40,8 @@ class CompleteStates:
         self.frame_times = np.array(self.truth.frame_times, dtype=np.float64)
 
     def offset(self, k: int, path: PathBlock, piece: int) -> FloatArray:
-        """Return the local state (n,) just before frame ``k`` begins at ``frame_times[k]``; the
-        path is not used.
+        """Return the local state (n,) just before frame ``k`` begins at ``frame_times[k]``;
+        ``path`` and ``piece`` are not used.
         """
         # The truth has frames of its own.
         return np.asarray(self.truth.rebase(k))
@@ -49,8 +49,8 @@ class CompleteStates:
     def states_at(
         self, times: FloatArray, path: PathBlock, pieces: np.ndarray
     ) -> tuple[FloatArray, FloatArray]:
-        """Return local and absolute states (T, n) each at ``times`` (T,) in seconds; the path is
-        not used.
+        """Return local and absolute states (T, n) each at ``times`` (T,) in seconds; ``path`` and
+        ``pieces`` are not used.
         """
         local, absolute = self.truth.states(times)
         return local, absolute

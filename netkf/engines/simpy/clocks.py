@@ -229,7 +229,9 @@ def _transmit_after_samples(
     transmitter: Transmitter,
     nodes: dict[int, ClockedNode],
 ) -> None:
-    """Make every node broadcast, at the rank of ticks, after it has used a sample."""
+    """Make every node broadcast, at the rank of ticks, after it has used a sample: sets
+    ``after_sample`` of those ``nodes`` (by id) that have sampled sensors.
+    """
     transmit = broadcasts(scenario, recorder, transmitter, nodes)
     # Only nodes with sampled sensors have samples to transmit after.
     for node in scenario.sampled_sensors:

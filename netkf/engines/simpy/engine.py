@@ -93,7 +93,9 @@ class _Simulation:
         truth = scenario.continuous_truth(streams)
 
         def make_node(node: int, entity: int, sensing: tuple[int, ...]) -> ClockedNode:
-            """Return one node in continuous time with its increment sensors."""
+            """Return one node in continuous time (id ``node``, -1: pooled; index ``entity``) with
+            the increment sensors of the nodes ``sensing`` (ids).
+            """
             # A pooled filter has the increment sensors of all nodes.
             placed = [(k, p) for k in sensing for p in scenario.increment_sensors.get(k, ())]
             sensors = increment_sensors(scenario, streams, placed)
@@ -123,7 +125,8 @@ class _Simulation:
             self._record(time, truth.absolute(time), truth.local(time), nodes, sums)
 
     def _moving_origin(self, truth: Any, nodes: dict[int, ClockedNode]) -> Process:
-        """Move the origin of the coordinates to the state at every frame time.
+        """Move the origin of the coordinates of all ``nodes`` (by id) to the state at every frame
+        time.
 
         Otherwise the state of an unstable plant becomes so large that errors lose their digits.
         """
@@ -145,7 +148,7 @@ class _Simulation:
         schedule, period = SlotSchedule(scenario), scenario.slot_plant.period
 
         def make(node: int, entity: int, _: tuple[int, ...]) -> SlotNode:
-            """Return one node in slots."""
+            """Return one node in slots (id ``node``, -1: pooled; index ``entity``)."""
             own = _identify(scenario, node, entity)
             return SlotNode(recorder, schedule, period, streams, *own)
 
@@ -166,7 +169,9 @@ class _Simulation:
     def _sampling_slots(
         self, truth: Any, schedule: SlotSchedule, nodes: dict[int, SlotNode], sums: _Sums
     ) -> Process:
-        """Record the states of slots: predictions at their start, filtered states at their end."""
+        """Record the states of the plant and of all ``nodes`` (by id) in slots: predictions at
+        their start, filtered states at their end.
+        """
         predicts, recorder, slot = self._scenario.node_filter.predicts, self._recorder, 0
 
         def sample() -> None:

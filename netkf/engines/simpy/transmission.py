@@ -71,7 +71,9 @@ class Transmitter:
         self._under_way: dict[tuple[Link, int], Envelope] = {}
 
     def sampler(self, link: Link) -> ChannelSampler:
-        """Return the sampler of a link (symmetric channel) or of one direction of it."""
+        """Return the sampler of losses and delays of ``link`` = (i, j): of the whole link with a
+        symmetric channel, else of the direction from i to j.
+        """
         # The sampler makes its streams when it needs them, by purpose.
         return ChannelSampler(self._channel, partial(stream, self._streams, link))
 
@@ -217,5 +219,7 @@ class LinkExchange:
 
 
 def stream(streams: Streams, ends: tuple[int, ...], purpose: str) -> np.random.Generator:
-    """Return the random stream of a link or of one direction of it."""
+    """Return the random stream for a ``purpose`` of a link or of one direction of it, with the node
+    ids ``ends``.
+    """
     return streams.generator(purpose, *ends)
