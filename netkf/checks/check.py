@@ -233,7 +233,8 @@ NONE_DIVERGED = Promise(
 def judge_replicas(
     scenario: Scenario, results: Iterable[ReplicaResult], seed: int, confidence: float
 ) -> Verdict:
-    """Return the verdict on a scenario from the results of its replicas, in their order.
+    """Return the verdict on a scenario from the ``results`` of its replicas of ``seed``, in their
+    order; all intervals hold together with probability ``confidence``.
 
     Raises TheoryError if there are no covariances with which promises could be compared.
     """
@@ -357,7 +358,8 @@ def _look_again(
     confidence: float,
     may_continue: bool,
 ) -> Verdict:
-    """Return the verdict on all results so far, with the decisions of ``earlier`` looks kept.
+    """Return the verdict on all ``results`` so far, of the replicas of ``seed``, with the decisions
+    of ``earlier`` looks kept.
 
     ``may_continue``: further looks are planned, so that this one may spend only its share of the
     error probability 1 - ``confidence`` (alpha spending).
@@ -375,7 +377,9 @@ def _look_again(
 
 
 def _require_earlier(scenario: Scenario, earlier: Verdict | None, seed: int, runs: int) -> None:
-    """Raise ScenarioError unless runs can be added to an earlier verdict."""
+    """Raise ScenarioError unless runs of ``seed``, up to ``runs`` in all, can be added to an
+    ``earlier`` verdict.
+    """
     if earlier is None:
         return
     if (earlier.scenario, earlier.seed) != (scenario.name, seed):

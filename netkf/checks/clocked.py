@@ -41,7 +41,8 @@ class ClockedSummary(ReplicaSummary):
 
 
 def _mass_conserved(samples: RunSamples, level: float) -> Finding:
-    """Compare the sums at the end with those at the start, messages in flight included.
+    """Compare the total weight of all nodes at the end, messages in flight included, with that at
+    the start.
 
     No interval is estimated, so that ``level`` is not used.
     """

@@ -169,7 +169,8 @@ def _is_needed(promise: Promise, row: Assumption) -> bool:
 
 
 def _judge(promise: Promise, finding: Finding, runs: int) -> Evidence:
-    """Return the row with the verdict that follows from the interval of a finding.
+    """Return the row with the verdict that follows from the interval of a finding about ``runs``
+    runs.
 
     A promise is broken if the whole interval of the margin is below 0, and holds if the interval is
     above - tolerance. If neither, more runs may decide, and their number is forecast.

@@ -174,8 +174,8 @@ class GossipSamples(RunSamples):
         return self._draw_paths("switched chain", slots, reference_count(self.scenario, 1))
 
     def _draw_paths(self, purpose: str, slots: list[int], count: int) -> ChainSamples:
-        """Return ``count`` chains after the given numbers of ``slots``; ``purpose`` names their
-        stream.
+        """Return ``count`` chains, with their covariances after the given numbers of ``slots``;
+        ``purpose`` names the random stream that they are drawn from.
         """
         starts, random = initial_roots(self.scenario), Streams(self.seed).generator(purpose)
         positions = _draw_chains(self.matching, slots[-1], count, random)

@@ -43,7 +43,8 @@ class Pair(NamedTuple):
 def find_largest(
     distances: Sequence[tuple[Interval, str]], tolerance: float, message: str
 ) -> Finding:
-    """Return the finding on labelled distances that should all be 0.
+    """Return the finding on labelled distances that should all be 0, up to ``tolerance``;
+    ``message`` begins its text.
 
     The reported one has the largest lower limit. The intervals must hold jointly: each at its share
     of the level.

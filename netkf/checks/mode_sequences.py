@@ -58,8 +58,8 @@ class ModeTable(NamedTuple):
 
 
 def reference_count(scenario: Scenario, laws: int) -> int:
-    """Return the number of chains that represent each law: fewer for more laws, larger plants and
-    networks.
+    """Return the number of chains that represent each of ``laws`` laws: fewer for more laws, larger
+    plants and networks.
     """
     step = (3 * scenario.plant.n) ** 3
     budget = MAX_OPERATIONS if len(scenario.nodes) <= MAX_NODES else 0.1 * MAX_OPERATIONS

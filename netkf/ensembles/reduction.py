@@ -207,8 +207,10 @@ _scratch_cache = _ScratchCache()
 
 
 def reduce_batch(batch: RunBatch, pieces: Sequence[slice]) -> Reduced:
-    """Return the values of all runs of a batch, with moments of samples for each of ``pieces``:
-    adjacent slices that cover all runs. The last sample of a run that diverged is left out.
+    """Return the values of all R runs of a batch, with moments of samples for each of ``pieces``:
+    adjacent slices that cover all runs.
+
+    The last sample of a run that diverged is left out.
     """
     runs, count, filters, n = batch.error.shape
     bounds = np.array([0, *(piece.stop for piece in pieces)])
@@ -238,7 +240,7 @@ def reduce_batch(batch: RunBatch, pieces: Sequence[slice]) -> Reduced:
 
 
 def _batch_arrays(batch: RunBatch) -> Batch:
-    """Return the arrays of a batch."""
+    """Return the arrays of a batch of R runs with F filters, as contiguous arrays for kernels."""
     runs = len(batch)
     x, P, error = (np.ascontiguousarray(part) for part in (batch.x, batch.P, batch.error))
     return Batch(

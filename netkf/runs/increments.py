@@ -73,7 +73,9 @@ class ExpectedIncrements:
 
 
 def _expected_increments_of_models() -> Callable[[Any], ExpectedIncrements]:
-    """Return a function that returns the predictions of a model, which are set up once."""
+    """Return a function from a model to its predictions of increments, which are set up once for
+    each model.
+    """
     cache: dict[int, tuple[Any, ExpectedIncrements]] = {}
 
     def expected_increments(model: Any) -> ExpectedIncrements:
@@ -112,6 +114,9 @@ def record_increments(algorithm: Filter, intervals: list[WhitenedInnovation]) ->
             return TimedState(inner, state.node, state.time + gap, start)
 
         def update(self, state: TimedState, reading: Increments | Reading) -> TimedState:
+            """Update by ``reading``; of increments, append the whitened innovation to ``intervals``
+            first.
+            """
             xhat, P = state.start
             if isinstance(reading, Increments) and P is not None and np.isfinite(P).all():
                 # The first half of the moments is the integral of dy.

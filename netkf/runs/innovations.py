@@ -191,8 +191,8 @@ def chi_square_interval(freedom: FloatArray, probability: float) -> tuple[FloatA
 
 
 def innovation_series(recorded: Innovations) -> dict[int, FloatArray]:
-    """Return, by node with at least MIN_READINGS readings, the first components (M,) of their
-    whitened innovations.
+    """Return, by node with at least MIN_READINGS readings, the first components (M,) of the
+    whitened innovations of its M readings.
     """
     first_components = np.array([values[0] for values in recorded.whitened])
     series = {}

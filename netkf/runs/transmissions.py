@@ -48,7 +48,8 @@ class Transmissions:
         self._add_slot_messages(sends[in_slots])
 
     def _add_slot_messages(self, sends: np.ndarray) -> None:
-        """Count the distinct senders of each step (time, phase) in ``send`` rows of slots.
+        """Count the distinct senders of each step (time, phase) in ``sends`` (K,), ``send`` rows of
+        slots.
 
         The first step of a block may continue the last one of the block before: its senders are
         counted once.

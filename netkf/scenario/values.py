@@ -43,9 +43,10 @@ def parse_value(option: str, key: str, text: str) -> Any:
 
 
 def parse_values(option: str, key: str, text: str) -> list[Any]:
-    """Return the values of ``v1,v2,...``, each as :func:`parse_value` reads it.
+    """Return the values of ``v1,v2,...``, TOML expressions or words without quotes.
 
-    Commas inside brackets and quotes do not separate values.
+    Commas inside brackets and quotes do not separate values. Errors name the ``option`` and the
+    ``key``.
     """
     _require_short(option, text)
     try:

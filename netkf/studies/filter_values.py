@@ -124,8 +124,9 @@ class Quantity(NamedTuple):
 def estimate_quantities(
     values: FilterValues, first: FilterValues | None, n: int, level: float
 ) -> dict[str, Quantity]:
-    """Return ``rms_error``, ``worst_instant`` and ``nees_ratio`` (NEES / n) of a filter, with the
-    paired differences from the ``first`` one; each interval misses with probability ``level``.
+    """Return ``rms_error``, ``worst_instant`` and ``nees_ratio`` (NEES / n) of a filter with n
+    states, with the paired differences from the ``first`` one; each interval misses with
+    probability ``level``.
     """
     quantities = {}
     base = _influences(first, n) if first is not None else {}

@@ -217,7 +217,7 @@ class Flow:
 def find_flow(
     scenario: DerivedScenario, log: IntArray, messages: Messages, used: IntArray | None = None
 ) -> Flow:
-    """Return the flow of information in a log with these messages.
+    """Return the flow of information in an EVENT ``log`` (E,) with these M messages.
 
     ``used`` (M,) bool marks the messages that cost nothing: those that were used in the original
     run, of which the log may be a replay; by default those used in this log.
@@ -328,8 +328,8 @@ class Reach:
 
 
 def search_back(flow: Flow, node: int, budget: int = 0) -> Reach:
-    """Return the backward search from ``node`` at the end of the log, along messages of cost 0 and
-    at most ``budget`` others.
+    """Return the backward search from ``node`` (its id) at the end of the log, along messages of
+    cost 0 and at most ``budget`` others.
     """
     segments = len(flow.node)
     deadline = [[NEVER] * segments for _ in range(budget + 1)]
@@ -383,8 +383,8 @@ class KeptReadings:
         return rows[np.isin(slots_of(self._times[rows]), slots_of(np.array(times)))]
 
     def newest(self, node: int, start: int, end: int) -> float:
-        """Return the time in seconds of the newest reading of a node in the rows from ``start`` to
-        before ``end``, nan without one.
+        """Return the time in seconds of the newest reading of ``node`` (its id) in the rows of the
+        log from ``start`` to before ``end``, nan without one.
         """
         if node not in self._rows:
             return np.nan

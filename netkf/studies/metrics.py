@@ -198,8 +198,8 @@ def _require_fixed_H(scenario: Scenario) -> None:
 
 
 def _slot_traces(scenario: Scenario, model: SlotModel, start: FloatArray) -> FloatArray:
-    """Return the traces (T,) of P at the samples of a Kalman filter with ``model``, from P(0) =
-    ``start``.
+    """Return the traces (T,) of P at the T samples of a Kalman filter with ``model``, from P(0) =
+    ``start`` (n, n).
     """
     predicts = scenario.filter.algorithm.predicts  # type: ignore[union-attr]
     # At most n rows with the same information: a central filter may read hundreds.

@@ -319,8 +319,10 @@ def advise(
 
 
 def _advise_beyond(problem: SizingProblem, end: Probe, inner: Probe, grows: bool) -> str:
-    """Return advice on a range beyond ``end``, extrapolated from the last two probes; an empty
-    string if their quantities are not positive and finite.
+    """Return advice on a range beyond the probe ``end``, extrapolated from it and the next one,
+    ``inner``; an empty string if their quantities are not positive and finite.
+
+    ``grows`` says that the quantity grows with the key.
     """
     # The quantity is taken to be a power of the key.
     numbers = (end.value, inner.value, end.quantity, inner.quantity)
@@ -363,7 +365,12 @@ def _advise_runs(probe: Probe, target: Target) -> str:
 def _describe_certainty(
     probes: tuple[Probe, ...], confidence: float, grows: bool, none_reached: bool
 ) -> str:
-    """Return a sentence on the certainty of the answer and its assumptions."""
+    """Return a sentence on the certainty of the answer, which holds with probability
+    ``confidence``, and its assumptions.
+
+    ``grows`` says that the quantity grows with the key, ``none_reached`` that no probe reaches the
+    target.
+    """
     if all(probe.runs == 0 for probe in probes):
         certainty = "computed, no simulation"
         if any(probe.target == NOT_SHOWN for probe in probes):

@@ -429,8 +429,8 @@ def _check_grid(part: Diffusion, name: str, seed: int, steps: int) -> None:
     sample_times = period * np.array([2.5, 5.6])
 
     def draw_paths(runs: Sequence[int], cut: bool = False) -> Any:
-        """Return the steps of runs on the grid as a block (see plants.paths), with ``cut`` cut at
-        the probe and sample times.
+        """Return the steps of ``runs`` (their numbers) on the grid as a block (see plants.paths),
+        with ``cut`` cut at the probe and sample times.
         """
         plant_normals, probe_normals, sample_normals = (
             GeneratorNormals([_make_generator(seed, run, purpose) for run in runs])

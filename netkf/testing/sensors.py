@@ -215,8 +215,10 @@ def _check_linear(reader: SensorReader, node: int, seed: int) -> None:
 
 
 def _check_laws(reader: SensorReader, nodes: tuple[int, ...], seed: int) -> None:
-    """Check that the noise of readings is white with the stated R, for all nodes together and for
-    each; that it is uncorrelated between nodes; and that it does not depend on a varying H.
+    """Check that the noise of readings is white with the stated R, for all ``nodes`` together and
+    for each; that it is uncorrelated between nodes; and that it does not depend on a varying H.
+
+    Runs are simulated with ``seed``.
     """
     labels = NoiseLabels(reader.where, "the noise y - H x", "R")
     runs = max(2, READINGS // (LENGTH * len(nodes)))

@@ -223,6 +223,9 @@ class WatchedPart:
     def __init__(
         self, part: Any, owner: Any = None, former_names: Mapping[str, str] | None = None
     ) -> None:
+        """Take the component ``part``, the user's object ``owner`` that it adapts (by default
+        itself), and the former names of its methods by their present ones.
+        """
         self.part, self._owner = part, part if owner is None else owner
         self.name = type(self._owner).__name__
         self._former_names = former_names or {}

@@ -135,7 +135,9 @@ def _counts_of_each(clocks: ClockSamples) -> np.ndarray:
 
 
 def _number_drawn(clocks: ClockSamples, runs: float) -> int:
-    """Return the number of further replicas in which only the clocks are drawn."""
+    """Return the number of further replicas, beside ``runs`` runs, in which only the clocks are
+    drawn.
+    """
     ticks_per_run = clocks.rates * clocks.scenario.horizon
     further_replicas = min(
         math.ceil(ENOUGH_TICKS / ticks_per_run.min() - runs),

@@ -204,7 +204,12 @@ def _own_name(estimator: int) -> Hashable:
 def error_rule(
     scenario: Scenario, errors: StackedErrors, run: Run, messages: Sequence[SentMessage]
 ) -> ErrorRule:
-    """Return the rule of this filter for the errors of a run."""
+    """Return the rule by which the filter by belief propagation uses the readings and messages of a
+    run; it changes ``errors``, the stacked errors of all nodes, event by event.
+
+    ``messages`` are those of the run that arrived (none in slots, where the rule gets them slot by
+    slot).
+    """
     if scenario.slotted:
         require_traced_exchanges(scenario, run)
     return BeliefRule(scenario, errors, run)

@@ -101,7 +101,7 @@ class DelayedJumps:
 
     @cached_property
     def points(self) -> int:
-        """The number k of intervals between collocation points."""
+        """The number k of intervals between the k + 1 collocation points of the delay."""
         B, G = (float(np.linalg.norm(matrix, 2)) for matrix in self._mean)
         growth = float(np.linalg.norm(self.A, 2))
         changes = self.delay * (B + growth + G * np.exp(growth * self.delay))
@@ -292,8 +292,10 @@ class DelayedJumps:
         raise TheoryError(f"delayed mean squares were solved to {size:.1e} only")
 
     def _moments(self, K: FloatArray, noise: bool) -> FloatArray:
-        """Return E[(E, m) (E, m)'] (2 M, 2 M) from K (k + 1, M, M); ``noise`` adds the part of the
-        plant's noise in messages.
+        """Return E[(E, m) (E, m)'] (2 M, 2 M), of the M errors E and of the M errors m of arriving
+        messages, from their autocovariances K (k + 1, M, M) at the points of the delay.
+
+        ``noise`` adds the part of the plant's noise in messages.
         """
         late, X = self._delay_transition, symmetric(K[0])
         across = K[-1] @ late.T
@@ -321,8 +323,8 @@ class DelayedJumps:
 
     @cached_property
     def is_bounded(self) -> bool:
-        """True if it is proved that the radius of ``apply_jumps`` is below 1: it maps some positive
-        definite Phi to Phi - 1.
+        """True if it is proved that the spectral radius of ``apply_jumps``, T, is below 1: some
+        positive definite Phi (M, M) solves ``Phi = T(Phi) + I``.
         """
         unit = self._driven_by(np.eye(len(self.instant.drift)))
         try:

@@ -144,7 +144,9 @@ class ClockJumps:
 
     @cached_property
     def flows(self) -> FloatArray:
-        """B (S, M, M) of ``inflow``: the mean drift of errors while the mode stays."""
+        """B (S, M, M) of ``inflow``, per second: the mean drift of the M = N n errors in each of S
+        modes, while the mode stays.
+        """
         drifts, eye = np.tile(self.drift, (self.shape[0], 1, 1)), np.eye(len(self.drift))
         for node, rate, lost in self.samples:
             _block_slice(drifts, self.nodes, node)[...] -= rate * lost

@@ -101,7 +101,8 @@ class Directions(NamedTuple):
     def products(
         self, first: IntArray, second: IntArray, factor: FloatArray, Z: FloatArray
     ) -> FloatArray:
-        """Return ``sum_p c_p D_a Z D_b'`` (S, N n, N n) over P pairs (a, b) of directions.
+        """Return ``sum_p c_p D_a Z D_b'`` (S, N n, N n) over P pairs (a, b) of directions, where
+        D_a (N n, N n) is the change of the stacked errors by a message on direction a.
 
         ``first`` and ``second`` (P,) are the indices a and b, ``factor`` (S, P) holds c by mode,
         and Z (S, N n, N n) the second moments of the stacked errors.

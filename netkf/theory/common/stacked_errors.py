@@ -156,7 +156,8 @@ class StackedErrors:
         del self.owner[name]
 
     def reading_noises(self, observations: Mapping[int, Observation]) -> dict[int, slice]:
-        """Return new inputs for the noises of readings, by estimator.
+        """Add inputs for the noises of readings, p for an estimator with p readings; return their
+        columns by estimator.
 
         Use the columns before any other operation that adds inputs.
         """

@@ -55,7 +55,13 @@ class ConstantGainRule(EstimateExchangeRule):
 def error_rule(
     scenario: Scenario, errors: StackedErrors, run: Run, messages: Sequence[SentMessage]
 ) -> ErrorRule:
-    """Return the rule of this filter; raises TheoryError for sensors that give increments."""
+    """Return the rule by which the filter with constant gains uses the readings and messages of a
+    run; it changes ``errors``, the stacked errors of all nodes, event by event. Raises TheoryError
+    for sensors that give increments.
+
+    ``messages`` are those of the run that arrived (none in slots, where the rule gets them slot by
+    slot).
+    """
     if scenario.slotted:
         require_traced_exchanges(scenario, run)
     elif any(scenario.increment_sensors.values()):

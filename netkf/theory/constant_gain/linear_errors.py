@@ -27,7 +27,12 @@ def link_weights(scenario: Scenario) -> dict[tuple[int, int], FloatArray]:
 
 
 def slot_jumps(scenario: Scenario) -> SlotJumps:
-    """Return the system in slots: predict, ``e - L (H e + v)``, reset."""
+    """Return the errors of all nodes in slots as a linear system with jumps: they are predicted,
+    corrected to ``e - L (H e + v)`` by the gain L (n, p) of each node, and averaged in the
+    exchange.
+
+    Raises TheoryError for recorded exchanges.
+    """
     gains, n = _node_gains(scenario), scenario.plant.n
     sensors = [scenario.observation_matrices(node) for node in scenario.nodes]
     closed = [np.eye(n) - L @ H for L, (H, _) in zip(gains, sensors, strict=True)]

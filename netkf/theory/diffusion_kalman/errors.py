@@ -63,6 +63,11 @@ class DiffusionKalmanRule(ErrorRule):
 def error_rule(
     scenario: Scenario, errors: StackedErrors, run: Run, messages: Sequence[SentMessage]
 ) -> ErrorRule:
-    """Return the rule of this filter for the errors of a run."""
+    """Return the rule by which the diffusion Kalman filter uses the readings and messages of a run;
+    it changes ``errors``, the stacked errors of all nodes, event by event.
+
+    ``messages`` are those of the run that arrived (none in slots, where the rule gets them slot by
+    slot).
+    """
     require_traced_exchanges(scenario, run)
     return DiffusionKalmanRule(scenario, errors)

@@ -34,5 +34,10 @@ class ResetRule(EstimateExchangeRule):
 def error_rule(
     scenario: Scenario, errors: StackedErrors, run: Run, messages: Sequence[SentMessage]
 ) -> ErrorRule:
-    """Return the rule of this filter for the errors of a run."""
+    """Return the rule by which the hybrid filter, or covariance intersection, uses the readings and
+    messages of a run; it changes ``errors``, the stacked errors of all nodes, event by event.
+
+    ``messages`` are those of the run that arrived (none in slots, where the rule gets them slot by
+    slot).
+    """
     return ResetRule(scenario, errors)

@@ -102,7 +102,12 @@ class ConsensusRule(ErrorRule):
 def error_rule(
     scenario: Scenario, errors: StackedErrors, run: Run, messages: Sequence[SentMessage]
 ) -> ErrorRule:
-    """Return the rule of this filter for the errors of a run."""
+    """Return the rule by which the filter by consensus on information uses the readings and
+    messages of a run; it changes ``errors``, the stacked errors of all nodes, event by event.
+
+    ``messages`` are those of the run that arrived (none in slots, where the rule gets them slot by
+    slot).
+    """
     if not scenario.slotted:
         return ResetRule(scenario, errors)
     require_traced_exchanges(scenario, run)

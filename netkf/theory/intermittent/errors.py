@@ -93,5 +93,10 @@ class ReadingExchangeRule(ErrorRule):
 def error_rule(
     scenario: Scenario, errors: StackedErrors, run: Run, messages: Sequence[SentMessage]
 ) -> ErrorRule:
-    """Return the rule of this filter for the errors of a run."""
+    """Return the rule by which the filter with intermittent observations uses the readings and
+    messages of a run; it changes ``errors``, the stacked errors of all nodes, event by event.
+
+    ``messages`` are those of the run that arrived (none in slots, where the rule gets them slot by
+    slot).
+    """
     return ReadingExchangeRule(scenario, errors, messages)

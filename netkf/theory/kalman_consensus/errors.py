@@ -129,7 +129,12 @@ def _prior_name(estimator: int) -> Hashable:
 def error_rule(
     scenario: Scenario, errors: StackedErrors, run: Run, messages: Sequence[SentMessage]
 ) -> ErrorRule:
-    """Return the rule of this filter for the errors of a run."""
+    """Return the rule by which the Kalman-consensus filter uses the readings and messages of a run;
+    it changes ``errors``, the stacked errors of all nodes, event by event.
+
+    ``messages`` are those of the run that arrived (none in slots, where the rule gets them slot by
+    slot).
+    """
     if scenario.slotted:
         require_traced_exchanges(scenario, run)
     return KcfRule(scenario, errors)

@@ -21,7 +21,11 @@ from netkf.theory.intermittent.riccati import steady_covariance
 
 
 def slot_jumps(scenario: Scenario) -> SlotJumps:
-    """Return the system in slots."""
+    """Return the errors of all nodes in slots, at steady gains, as a linear system with jumps, in
+    which the exchange adds consensus terms of predictions.
+
+    Raises TheoryError for recorded exchanges, and if nodes share readings and messages can be lost.
+    """
     algorithm: Any = scenario.filter.algorithm
     nodes = scenario.nodes
     if not isinstance(scenario.network.activation, Broadcast):

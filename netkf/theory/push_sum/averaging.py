@@ -50,7 +50,7 @@ class Averaging:
 
     @cached_property
     def mean_step(self) -> scipy.sparse.csr_array:
-        """E[M] (N, N) of one step, sparse."""
+        """E[M] (N, N), sparse, of one averaging step of the N nodes."""
         # Each link has E[b_ij] (z_j - z_i) in row i and E[b_ji] (z_i - z_j) in row j, over delta.
         i, j = self.links.T
         first, second = self.hears.T / self.delta
@@ -68,7 +68,7 @@ class Averaging:
 
     @cached_property
     def kron(self) -> FloatArray:
-        """E[M^gamma (x) M^gamma] (N^2, N^2)."""
+        """E[M^gamma (x) M^gamma] (N^2, N^2), with M (N, N) one averaging step of the N nodes."""
         if self.enumerated:
             return self._moments[1]
         N, (i, j) = self.nodes, self.links.T

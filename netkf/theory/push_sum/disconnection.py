@@ -199,7 +199,9 @@ def _channel_probabilities(scenario: Scenario) -> dict[Edge, float]:
 
 
 def _is_connected(neighbours: list[dict[int, float]]) -> bool:
-    """Return True if the links connect all nodes."""
+    """Return True if the links connect all nodes; ``neighbours`` has the probabilities of the links
+    of each node, by the index of the other end.
+    """
     reached, waiting = {0}, [0]
     while waiting:
         for node in neighbours[waiting.pop()].keys() - reached:
@@ -209,8 +211,10 @@ def _is_connected(neighbours: list[dict[int, float]]) -> bool:
 
 
 def _elimination_order(neighbours: list[dict[int, float]]) -> list[int] | None:
-    """Return an order of the nodes for ``_exact_probability``, in which few are open at a time.
+    """Return an order of the nodes (indices) for ``_exact_probability``, in which few are open at a
+    time.
 
+    ``neighbours`` has the probabilities of the links of each node, by the index of the other end.
     It is the greedy order of least effort from several first nodes; None if in each of them more
     than MAX_OPEN nodes are open.
     """
@@ -255,8 +259,9 @@ def _greedy_order(neighbours: list[dict[int, float]], root: int) -> tuple[float,
 def _exact_probability(neighbours: list[dict[int, float]], order: list[int]) -> float | None:
     """Return the probability that the network is disconnected, None for too many partitions.
 
-    A partition is represented by the labels of the open nodes' parts, numbered in order of
-    appearance.
+    ``neighbours`` has the probabilities of the links of each node, by the index of the other end,
+    and ``order`` lists all nodes. A partition is represented by the labels of the open nodes'
+    parts, numbered in order of appearance.
     """
     index = {node: k for k, node in enumerate(order)}
     # A node stays open until all of its neighbours have been opened.
@@ -307,8 +312,11 @@ def _apply_link(
 def _close_nodes(
     states: dict[tuple[int, ...], float], keep: list[int]
 ) -> tuple[dict[tuple[int, ...], float], float]:
-    """Return the partitions of the nodes that stay open (indices ``keep``), and the probability of
-    a cut: that of the partitions with a part of which no node stays open.
+    """Return the probabilities of the partitions of the nodes that stay open (indices ``keep``
+    among the open ones), and the probability of a cut: that of the partitions with a part of which
+    no node stays open.
+
+    ``states`` has the probabilities before, by the labels of the open nodes' parts.
     """
     partitions: defaultdict[tuple[int, ...], float] = defaultdict(float)
     lost = []

@@ -297,7 +297,12 @@ def _read_rounds(scenario: Scenario, run: Run) -> dict[float, list[int]]:
 def error_rule(
     scenario: Scenario, errors: StackedErrors, run: Run, messages: Sequence[SentMessage]
 ) -> ErrorRule:
-    """Return the rule of this filter; raises TheoryError if the errors in slots are not known."""
+    """Return the rule by which the push-sum filter uses the readings and messages of a run; it
+    changes ``errors``, the stacked errors of all nodes, event by event.
+
+    ``messages`` are those of the run that arrived. Raises TheoryError if the errors in slots are
+    not known.
+    """
     if not scenario.slotted:
         return RunningTotalsRule(scenario, errors, _read_rounds(scenario, run))
     require_known_errors(scenario, run)

@@ -47,7 +47,9 @@ class EstimationSteps:
 
     @cached_property
     def noise(self) -> FloatArray:
-        """Covariance (N n, N n) of h."""
+        """Covariance (N n, N n) of h, the noise that a slot adds to the stacked errors before
+        averaging.
+        """
         N, n, _ = self.closed.shape
         # The plant's noise is common to all nodes, the sensors' noises are independent.
         covariance = np.einsum(

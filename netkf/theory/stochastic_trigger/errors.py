@@ -87,8 +87,11 @@ def silence(reading: Observation, Y: float | FloatArray) -> Observation:
 def error_rule(
     scenario: Scenario, errors: StackedErrors, run: Run, messages: Sequence[SentMessage]
 ) -> ErrorRule:
-    """Return the rule of this filter for the errors of a run; raises TheoryError where silence may
-    be a loss, or the filters do not know the law of innovations.
+    """Return the rule by which filters under the stochastic trigger use the readings, sent or not,
+    of a run; it changes ``errors``, the stacked errors of all nodes, slot by slot.
+
+    Raises TheoryError where silence may be a loss, or the filters do not know the law of
+    innovations.
     """
     require_traced_exchanges(scenario, run)
     if not all_hear_all(scenario):

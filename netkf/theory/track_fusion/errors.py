@@ -115,8 +115,8 @@ class TrackRule(ErrorRule):
         self._combine_tracks(heard)
 
     def _combine_tracks(self, heard: dict[int, list[int]]) -> None:
-        """Set the errors of receivers to those of their combinations with the tracks that they
-        heard.
+        """Set the errors and roots of P of receivers to those of their combinations with the tracks
+        that they heard; ``heard`` lists the senders by receiver, all by index.
         """
         errors, n = self.errors, self.errors.n
         changes: dict[Hashable, tuple[FloatArray, Sequence[Term]]] = {}
@@ -143,7 +143,9 @@ def _track_name(estimator: int) -> Hashable:
 def error_rule(
     scenario: Scenario, errors: StackedErrors, run: Run, messages: Sequence[SentMessage]
 ) -> ErrorRule:
-    """Return the rule of this filter for the errors of a run."""
+    """Return the rule by which track fusion, by cross-covariances or by pairs, uses the readings
+    and messages of a run; it changes ``errors``, the stacked errors of all nodes, event by event.
+    """
     if scenario.slotted:
         require_traced_exchanges(scenario, run)
     if scenario.node_filter.combination == "tracks":
