@@ -46,7 +46,7 @@ class _Adapter(Filter):
     inner: Any
 
     def estimate(self, state: Any) -> tuple[FloatArray, FloatArray | None]:
-        """Return ``xhat`` (n,) and ``P`` (n, n) of the wrapped filter."""
+        """Return ``xhat`` (n,) and ``P`` (n, n) of the wrapped filter; P is None if it has none."""
         xhat, P = self.inner.estimate(state)
         return xhat, P
 

@@ -58,7 +58,9 @@ SLOT, ALL = "slot", "all"
 
 
 class HeardEvidence(NamedTuple):
-    """The ``evidence`` (n, n + 1) that a neighbour sent last, at the time ``sent``, seconds."""
+    """The ``evidence`` (n, n + 1) that a neighbour sent last, a root [Z, z] of information, at the
+    time ``sent``, seconds.
+    """
 
     evidence: FloatArray
     sent: float
@@ -184,7 +186,7 @@ def predict_beliefs(nodes: SlotNodes, scratch: SlotScratch, arrays: BeliefArrays
 
     If messages are kept, all evidence in ``arrays`` is predicted, and ``nodes.root`` waits for
     ``update_beliefs``; else ``nodes.root[b]`` (H, n, n, L) is predicted too, the predicted belief
-    becomes ``arrays.prior``, and all other evidence is cleared.
+    becomes ``arrays.prior``, and all other evidence is cleared. Axes: L runs side by side.
     """
     lanes, beliefs, k = scratch.lanes, arrays.scratch, min(b, arrays.own.shape[0] - 1)
     if not arrays.keeps:
@@ -218,6 +220,8 @@ def update_beliefs(
     """Compute the belief of filter ``h`` of block ``b``, the sum of its prior and all evidence:
     writes ``nodes.xhat[b, h]`` (n, L) and ``nodes.root[b, h]`` (n, n, L). If messages are kept, the
     centre of the filter's evidence in ``arrays`` moves to the new belief.
+
+    Axes: L runs side by side.
     """
     lanes, beliefs, k = scratch.lanes, arrays.scratch, min(b, arrays.own.shape[0] - 1)
     copy_part(lanes, arrays.prior[k, h], beliefs.total)
@@ -259,9 +263,9 @@ def add_reading_single(
 def predict_part_single(
     part: FloatArray, back: FloatArray, total: FloatArray, work: FloatArray
 ) -> None:
-    """Predict the evidence ``part`` (n, n + 1, 1) of one run in place to a later state of a plant
-    without noise: ``Z <- Z back``, where ``back`` (n, n) is the inverse transition. ``total`` and
-    ``work`` (n, n + 1, 1) are scratch.
+    """Predict the evidence ``part`` (n, n + 1, 1) of one run, a root [Z, z] of information, in
+    place to a later state of a plant without noise: ``Z <- Z back``, where ``back`` (n, n) is the
+    inverse transition. ``total`` and ``work`` (n, n + 1, 1) are scratch.
     """
     predict_part(ONE, part, back, total, work)
 

@@ -418,6 +418,8 @@ def correct_all(
     """Correct all H filters of block ``b`` by their readings and messages of slot ``s``: changes
     ``nodes.xhat[b]`` and ``arrays.yhat[b]`` (H, n, L), and sets ``nodes.root[b]`` (H, n, n, L) to
     the roots that belong to the gains.
+
+    Axes: L runs side by side.
     """
     lanes, k = scratch.lanes, arrays.table_row[s]
     for h in range(len(nodes.rows)):
@@ -463,6 +465,8 @@ def correct_single(
     of the pseudo-state, ``arrays.yhat[0, 0]``, are changed in place. The entries 1 to H - 1 of
     ``arrays.yhat`` (1, H, n, 1) are those of its senders, and ``up`` (1, 1, 1, W, 1) flags their
     messages.
+
+    Axes: W directed links.
     """
     gains, pseudo = arrays.gains, arrays.pseudo
     y, state, z = arrays.yhat, arrays.state, arrays.z

@@ -154,7 +154,7 @@ def combine_senders(
 
     ``weights`` holds the own weights (H,), ``links`` those of messages. The messages are in
     ``scratch``: the estimates ``xhat`` (H, n, L) and the inverses of the roots, ``root``
-    (H, n, n, L).
+    (H, n, n, L). Axes: H filters, L runs side by side.
     """
     lanes, received = scratch.lanes, spread(scratch.lanes, 0.0)
     for m in range(links.first[h], links.first[h + 1]):
@@ -236,7 +236,7 @@ class DiffusionFilter(Filter):
 
     @property
     def pair_weights(self) -> FloatArray | None:
-        """``weights`` (N, N) where they are a matrix, else None."""
+        """The weights of N nodes (N, N), ``weights``, where they are a matrix, else None."""
         return None if isinstance(self.weights, str) else self.weights
 
     def init(self, model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo) -> DiffusionState:

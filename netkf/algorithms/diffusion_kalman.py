@@ -95,6 +95,8 @@ def sum_differences_single(
     """Write into ``differences`` (1, n, 1) the weighted sum of x_j - x_0 over the estimates x_j
     that arrive at one node in one run; x (1, H, n, 1) holds its own estimate x_0 and those of its
     senders, ``up`` (1, 1, 1, W, 1) flags their messages.
+
+    Axes: W directed links, H nodes.
     """
     sum_differences(ONE, x, 0, 0, links, up, 0, 0, True, differences)
 
@@ -132,7 +134,7 @@ class DiffusionKalman(Filter):
 
     @property
     def pair_weights(self) -> FloatArray | None:
-        """``weights`` (N, N) where they are a matrix, else None."""
+        """The weights of N nodes (N, N), ``weights``, where they are a matrix, else None."""
         return None if isinstance(self.weights, str) else self.weights
 
     def sends_in_slots(self, phase: int, has_sensor: bool) -> bool:

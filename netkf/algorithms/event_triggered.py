@@ -153,6 +153,8 @@ def predict_copies(
 ) -> None:
     """Predict all C copies of estimates in block ``b`` to the next slot as their senders do:
     changes ``arrays.x[b]`` (C, n, L) and ``arrays.root[b]`` (C, n, n, L).
+
+    Axes: L runs side by side.
     """
     lanes = scratch.lanes
     for k in range(arrays.x.shape[1]):
@@ -167,6 +169,8 @@ def rebase_copies(
 ) -> None:
     """Move the origin of all C copies in block ``b`` to the true state of slot ``s``, where a frame
     begins: subtract ``readings.local[b, s]`` (n, L) from each of ``arrays.x[b]`` (C, n, L).
+
+    Axes: L runs side by side.
     """
     for k in range(arrays.x.shape[1]):
         for i in range(arrays.x.shape[2]):
@@ -188,6 +192,8 @@ def copy_estimate(
     """Copy the estimate and root with index ``sender`` in block ``b`` of ``x`` (B, K, n, L) and
     ``root`` (B, K, n, n, L) to entry ``index`` of block ``b`` of ``target``, a pair of such arrays
     (estimates, roots), in the lanes with ``flags`` (L,).
+
+    Axes: B blocks of runs, K estimates.
     """
     for i in range(x.shape[2]):
         former, present = load(lanes, target[0], b, index, i), load(lanes, x, b, sender, i)
@@ -254,7 +260,7 @@ def combine_copies(
     with the copies of silent neighbours' estimates, whose covariances are enlarged: D (8) and (9).
 
     Changes ``nodes.xhat[b, h]`` (n, L) and ``nodes.root[b, h]`` (n, n, L); the estimates that
-    arrive replace the copies of their links in ``arrays``.
+    arrive replace the copies of their links in ``arrays``. Axes: L runs side by side.
     """
     lanes = scratch.lanes
     n = nodes.xhat.shape[2]

@@ -405,7 +405,8 @@ class Filter(Component):
         return arrays
 
     def carried_estimates(self, reported: FloatArray, arrays: tuple[Any, ...]) -> FloatArray:
-        """Return the estimates (B, H, n, L) with which nodes go on to the next slot.
+        """Return the estimates (B, H, n, L) with which nodes go on to the next slot: B blocks of L
+        runs, H nodes.
 
         By default they are the ``reported`` ones (B, H, n, L), which samples hold; ``arrays`` are
         those of ``slot_arrays``.
@@ -430,8 +431,8 @@ class Filter(Component):
 
     @property
     def pair_weights(self) -> FloatArray | None:
-        """Matrix (N, N) in the order of node ids: entry [l, i] is the weight that node i gives to a
-        message of node l. None if ``weight`` gives the weights.
+        """Matrix (N, N) of weights of N nodes in the order of their ids: entry [l, i] is the weight
+        that node i gives to a message of node l. None if ``weight`` gives the weights.
         """
         return None
 

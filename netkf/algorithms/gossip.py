@@ -58,6 +58,8 @@ def swap_pairs(
     """Replace the estimate ``nodes.xhat[b, h]`` (n, L) and root ``nodes.root[b, h]`` (n, n, L) of
     each filter h of block ``b`` by those that arrive in slot ``s``; if several arrive, by those of
     the last sender. The estimates that are sent are copied to ``scratch`` first.
+
+    Axes: L runs side by side.
     """
     lanes, n = scratch.lanes, len(scratch.size)
     # All payloads are from before the exchange.

@@ -163,7 +163,8 @@ def begin_all(
     readings of slot ``s``, into copy 0 of ``arrays.parts`` (2, K, H, n, n + 1, L).
 
     The predictions are copied to ``scratch.xhat`` (H, n, L) and the inverses of their roots to
-    ``scratch.root`` (H, n, n, L), where the steps of the slot read them.
+    ``scratch.root`` (H, n, n, L), where the steps of the slot read them. Axes: K information pairs,
+    L runs side by side.
     """
     for h in range(len(nodes.rows)):
         for i in range(nodes.xhat.shape[2]):
@@ -182,6 +183,8 @@ def begin_part_single(
 ) -> None:
     """Write the initial pairs of one filter in one run, from its prediction in ``nodes`` and its
     reading, into ``arrays.parts[0]`` of ``arrays.parts`` (2, K, 1, n, n + 1, 1).
+
+    Axes: K information pairs.
     """
     begin_all(nodes, readings, scratch, arrays, 0, 0)
 
@@ -194,7 +197,8 @@ def mix_parts_single(
     read copy 0 of its pairs and those of its senders, write copy 1 of its own.
 
     ``centre`` (H, n, 1) are the means that pairs are relative to, ``up`` (1, 1, 1, W, 1) flags the
-    messages, and ``work`` (2, n, n + 1, 1) is scratch.
+    messages, and ``work`` (2, n, n + 1, 1) is scratch. Axes: W directed links, H nodes, K
+    information pairs.
     """
     mix_parts(ONE, parts, 0, 0, links, up, (0, 0, 0), centre, work[0], work[1])
 
@@ -214,7 +218,7 @@ def write_estimate_single(
     often as ``counts`` (K + 1,) says.
 
     ``root`` and ``centre`` (1, n, 1) hold the prediction; ``inverse`` (1, n, n, 1) and ``work``
-    (2, n, n + 1, 1) are scratch.
+    (2, n, n + 1, 1) are scratch. Axes: K information pairs.
     """
     invert_lanes(ONE, inverse, root, 0, 0)
     write_estimate(ONE, root, x, 0, 0, parts, 0, counts, inverse, centre, work[0], work[1])
@@ -291,8 +295,8 @@ class InformationConsensus(Filter):
     def absorb(
         self, state: ConsensusState, messages: Sequence[Message], exchange: Exchange
     ) -> ConsensusState:
-        """Return the state after a consensus step; after the last one of a slot with the new
-        estimate.
+        """Return the state after a consensus step on the node's information pairs and those in
+        ``messages``; after the last step of a slot with the new estimate.
         """
         if exchange.slot < 0:
             return self._intersect(state, messages)
@@ -391,8 +395,8 @@ class Icf(InformationConsensus):
 
 
 def first_parts(state: ConsensusState, reading: Reading) -> FloatArray:
-    """Return the roots (K, n, n + 1) of the K pairs that a node begins a slot with, from its
-    prediction and its ``reading``.
+    """Return the roots (K, n, n + 1) of the K information pairs that a node begins a slot with,
+    from its prediction and its ``reading``.
     """
     n, (y, H, R) = len(state.xhat), reading[:3]
     if len(y):
@@ -415,8 +419,9 @@ def first_parts(state: ConsensusState, reading: Reading) -> FloatArray:
 
 
 def mix_node_parts(xhat: FloatArray, parts: FloatArray, messages: Sequence[Message]) -> FloatArray:
-    """Return the roots (K, n, n + 1) of a node's K pairs after a consensus step, from its own
-    ``parts`` (K, n, n + 1), relative to ``xhat`` (n,), and those in the payloads of ``messages``.
+    """Return the roots (K, n, n + 1) of a node's K information pairs after a consensus step, from
+    its own ``parts`` (K, n, n + 1), relative to ``xhat`` (n,), and those in the payloads of
+    ``messages``.
     """
     # The kernel of slots on a network of one node and its senders.
     K, n, _ = parts.shape
@@ -431,8 +436,8 @@ def mix_node_parts(xhat: FloatArray, parts: FloatArray, messages: Sequence[Messa
 
 
 def estimate_of(state: ConsensusState, parts: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return estimate (n,) and root (n, n) of a node from its pairs after the last step, ``parts``
-    (K, n, n + 1), and its prediction.
+    """Return estimate (n,) and root (n, n) of a node from its K information pairs after the last
+    step, the roots ``parts`` (K, n, n + 1), and its prediction.
     """
     K, n, _ = parts.shape
     stack = np.zeros((2, K, 1, n, n + 1, 1))

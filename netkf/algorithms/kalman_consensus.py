@@ -127,6 +127,7 @@ def consensus_term_single(
 
     x (1, H, n, 1) holds its own prediction x_0 and those of its senders, ``up`` (1, 1, 1, W, 1)
     flags their messages, and P has the root ``root`` (1, 1, n, n, 1); ``work`` (n, 1) is scratch.
+    Axes: W directed links, H nodes.
     """
     sum_differences(ONE, x, 0, 0, links, up, 0, 0, False, term)
     scale_by_covariance(ONE, root, 0, 0, epsilon, term, work)

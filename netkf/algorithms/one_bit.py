@@ -129,6 +129,8 @@ def silence_others(
     """Write 0 into ``plan.sent[b, s, 0]`` (H, L) for all nodes but the one with index ``turn``, and
     for that one too if it has no reading in slot ``s`` of block ``b``; ``rows`` (H,) are the rows
     of each node's reading.
+
+    Axes: H filters, L runs side by side.
     """
     for h in range(plan.sent.shape[3]):
         if h != turn or not has_read(readings, rows[h], b, s, h):
@@ -177,7 +179,7 @@ def share_bits(
     and the nodes that hear it by them.
 
     Changes ``nodes.xhat[b]`` (H, n, L) and ``nodes.root[b]`` (H, n, n, L) of these nodes;
-    ``arrays.signs`` are the bits.
+    ``arrays.signs`` are the bits. Axes: H filters, L runs side by side.
     """
     lanes, rows = scratch.lanes, nodes.rows[turn]
     # ``sent`` does not matter: a node uses its own bits even if a trigger keeps it silent.
@@ -218,6 +220,8 @@ def send_bits(
     block ``b``, and correct the filter by them: changes ``x[b, h]`` of x (B, H, n, L) and ``root[b,
     h]`` of root (B, H, n, n, L). ``rows`` rows of its reading count; ``row`` and ``gains`` (n, L)
     are scratch.
+
+    Axes: B blocks of L runs, H filters.
     """
     # A fixed H has one block and one slot.
     c, t = min(b, readings.H.shape[0] - 1), min(s, readings.H.shape[1] - 1)
@@ -253,7 +257,7 @@ def use_bit(
     ``index`` [s, sender, k] is slot, filter and row in ``readings.H``; ``row`` and ``gains`` (n, L)
     are scratch. With ``p = h P h'``, ``P - (2 / pi) P h' h P / (p + 1)`` is the Kalman update with
     noise ``r = (pi / 2 - 1) p + pi / 2``, and ``P h' sqrt(2 / pi / (p + 1))`` is its gain times
-    ``sqrt(pi / 2 (p + 1))``.
+    ``sqrt(pi / 2 (p + 1))``. Axes: B blocks of runs, H filters.
     """
     s, sender, k = index
     n = x.shape[2]

@@ -168,6 +168,8 @@ def drop_mass_of_stopped(
     """Drop the messages with mass of nodes of block ``b`` that stopped before slot ``s``, which
     send none by the paper's rule: writes 0 into ``plan.sent[b, s, MASS]`` (H, L) and ``plan.up[b,
     s, MASS]`` (W, L). Nothing happens under another rule in ``arrays``.
+
+    Axes: W directed links, H nodes, L runs side by side.
     """
     if arrays.rule == PAPER and not arrays.asymptotic:
         silence_stopped(plan, samples, b, s)
@@ -227,6 +229,8 @@ def write_conserved_sums(
     """Write each node's part of the conserved sums of block ``b``, of the weight w (total 1) and of
     n~ (total N), from the masses in ``arrays`` into ``samples.conserved[b]`` (H, 2, L); with
     running sums including what is under way to it.
+
+    Axes: H nodes, L runs side by side.
     """
     for h in range(len(arrays.degree)):
         for k in range(2):
@@ -254,7 +258,8 @@ def exchange_mass(
     of their mass, mix what arrives, and update their estimates of the network.
 
     Changes in block ``b`` of ``arrays`` ``mass``, ``information``, ``number`` and the running sums,
-    and writes the slot into ``samples.stopped[b]`` (H, L) where a node stops.
+    and writes the slot into ``samples.stopped[b]`` (H, L) where a node stops. Axes: L runs side by
+    side.
     """
     H, slot = len(arrays.degree), plan.first + s
     # All shares are computed before any mass changes.
@@ -280,6 +285,8 @@ def exchange_mass(
 def silence_stopped(plan: SlotPlan, samples: SlotSamples, b: int, s: int) -> None:
     """Write 0 into ``plan.sent[b, s, MASS]`` (H, L) for nodes of block ``b`` that stopped before
     slot ``s``: they send no mass, P step 2.3.
+
+    Axes: H nodes, L runs side by side.
     """
     for h in range(plan.sent.shape[3]):
         for q in range(plan.sent.shape[4]):
@@ -291,6 +298,8 @@ def silence_stopped(plan: SlotPlan, samples: SlotSamples, b: int, s: int) -> Non
 def add_to_totals(arrays: PushSumArrays, scratch: SlotScratch, b: int) -> None:
     """Add the share of each of H nodes of block ``b``, ``arrays.share`` (H, m, L), to the total
     that it has offered to each of its neighbours, ``arrays.offered[b]`` (H, m, L).
+
+    Axes: L runs side by side.
     """
     for h in range(len(arrays.degree)):
         for i in range(arrays.mass.shape[2]):
@@ -312,6 +321,8 @@ def receive_totals(
     """Set the mass of node ``h`` of block ``b``, ``arrays.mass[b, h]`` (m, L), to the growth of the
     totals that arrive in slot ``s``, plus its own share. Totals that arrive replace the last ones
     in ``arrays.heard[b]`` (W, m, L).
+
+    Axes: W directed links, L runs side by side.
     """
     lanes, mass = scratch.lanes, arrays.mass
     for i in range(mass.shape[2]):
@@ -343,6 +354,8 @@ def mix_mass(
     """Set the mass of node ``h`` of block ``b``, ``arrays.mass[b, h]`` (m, L), to the shares that
     it keeps and receives in slot ``s``, P (3)-(5); return the number (L,) of shares that arrived.
     The mass from before is left in ``arrays.before`` (m, L).
+
+    Axes: L runs side by side.
     """
     lanes, mass, received = scratch.lanes, arrays.mass, spread(scratch.lanes, 0.0)
     # The mass before is kept for the stop rule.
@@ -386,7 +399,7 @@ def update_network_estimate(
 
     Changes ``arrays.information[b, h]`` (n, n, L) and ``arrays.number[b, h]`` (L,), except where
     the node stopped before, and writes the slot into ``samples.stopped[b, h]`` (L,) where it stops
-    now.
+    now. Axes: L runs side by side.
     """
     lanes, information = scratch.lanes, arrays.new_information
     learn_network(lanes, arrays.mass, b, h, arrays.alone, information, arrays.new_number)
@@ -440,6 +453,8 @@ def correct(
     """Correct filter ``h`` of block ``b`` by its reading of slot ``s``, step 4, P (7) and (8), with
     what it knows of the network in ``arrays``; with asymptotic gains also predict it, step 3.
     Changes ``nodes.xhat[b, h]`` (n, L) and ``nodes.root[b, h]`` (n, n, L).
+
+    Axes: L runs side by side.
     """
     n, lanes = nodes.xhat.shape[2], scratch.lanes
     if arrays.asymptotic:

@@ -252,6 +252,8 @@ def update_by_sensors(
     first, and with the silence of the other sensors that it knows: changes ``nodes.xhat[b, h]``
     (n, L) and ``nodes.root[b, h]`` (n, n, L), and marks the sensors of these readings as known in
     ``arrays``.
+
+    Axes: L runs side by side.
     """
     sent = load_flags(scratch.lanes, plan.sent, b, s, 0, h)
     own = len(links.sender) + h
@@ -274,12 +276,13 @@ def update_by_sensor(
     index: int,
     arrived: Any,
 ) -> None:
-    """Update filter ``h`` of block ``b`` by the sensor of filter ``sender``, entry ``index`` of the
-    W + H known sensors: with its reading of slot ``s`` in the lanes where that has ``arrived``
-    (flags (L,)), else with its silence.
+    """Update filter ``h`` of block ``b`` by the sensor of filter ``sender``: with its reading of
+    slot ``s`` in the lanes where that has ``arrived`` (flags (L,)), else with its silence.
 
-    Changes ``nodes.xhat[b, h]`` (n, L) and ``nodes.root[b, h]`` (n, n, L), and where a reading
-    arrived ``arrays.H`` and ``arrays.known`` of this sensor.
+    ``index`` is the entry of the sensor among the W + H known ones: those of the senders of W
+    directions, then the own ones of H filters. Changes ``nodes.xhat[b, h]`` (n, L) and
+    ``nodes.root[b, h]`` (n, n, L), and where a reading arrived ``arrays.H`` and ``arrays.known`` of
+    this sensor.
     """
     lanes, rows = scratch.lanes, nodes.rows[sender]
     known = load_flags(lanes, arrays.known, b, index)
@@ -310,10 +313,12 @@ def use_silence(
     index: int,
     silent: Any,
 ) -> None:
-    """Update filter ``h`` of block ``b`` with a reading ``H xbar`` of noise ``R + Y^-1``, in the
-    lanes where filter ``sender`` is ``silent`` (flags (L,)): changes ``nodes.xhat[b, h]`` (n, L)
-    and ``nodes.root[b, h]`` (n, n, L). Entry ``index`` of the W + H known sensors in ``arrays``
-    holds the sender's whitened H, and ``arrays.prior`` the prediction xbar.
+    """Update filter ``h`` of block ``b`` with a reading ``H xbar`` of noise ``R + Y^-1``, which the
+    silence of filter ``sender`` is equivalent to, in the lanes where it is ``silent`` (flags (L,)):
+    changes ``nodes.xhat[b, h]`` (n, L) and ``nodes.root[b, h]`` (n, n, L).
+
+    ``arrays.H[b, index]`` (p, n, L) is the sender's whitened H, and ``arrays.prior[b, h]`` (n, L)
+    the prediction xbar.
     """
     lanes, n = scratch.lanes, nodes.xhat.shape[2]
     for k in range(nodes.rows[sender]):
@@ -571,7 +576,8 @@ def decide_senders(
     reading of the slot before, then by this one; ``order`` says which steps come before.
 
     Writes 0 into ``plan.sent[:, s]`` (B, E, H, L) and ``plan.up[:, s]`` (B, E, W, L) for messages
-    that are not sent, and stores news and decisions in ``arrays``.
+    that are not sent, and stores news and decisions in ``arrays``. Axes: E exchange steps, W
+    directed links, H filters, L runs side by side.
     """
     for b in range(plan.sent.shape[0]):
         # Exchanges before the reading: the decisions after the reading of the slot before hold.
@@ -590,6 +596,8 @@ def decide_step(plan: SlotPlan, arrays: TriggerArrays, b: int, s: int, e: int) -
     """Decide which of the nodes of block ``b`` that are asked in step ``e`` of slot ``s`` send: a
     decision holds until the next reading. Writes 0 into ``plan.sent[b, s, e]`` (H, L) for silent
     ones, and new decisions into ``arrays``.
+
+    Axes: H filters, L runs side by side.
     """
     for h in range(plan.sent.shape[3]):
         for q in range(plan.sent.shape[4]):
@@ -621,6 +629,8 @@ def store_news(
     ``arrays.news[b]`` (H, L), and mark their decisions as open, with respect to the estimates after
     the steps that precede the reading: a move of the origin (``framed``) and a prediction
     (``predicted``).
+
+    Axes: L runs side by side.
     """
     lanes = scratch.lanes
     for h in range(len(nodes.rows)):
@@ -646,6 +656,8 @@ def store_news_of_slot(
     """Store the news ``z' Y z`` of the readings of all nodes and blocks of one slot in
     ``arrays.news`` (B, H, L), where all steps before the reading are done: ``nodes.xhat`` holds the
     predictions.
+
+    Axes: B blocks of L runs, H filters.
     """
     for b in range(nodes.xhat.shape[0]):
         store_news(nodes, readings, arrays, scratch, b, 0, False, False)
@@ -800,8 +812,9 @@ class TriggeredMessages(Filter):
     def slot_arrays(
         self, states: Sequence[Any], infos: Sequence[NodeInfo], runs: int
     ) -> tuple[Any, ...]:
-        """Return the arguments of ``slot_kernel`` for ``runs`` runs of H nodes: the arrays of the
-        trigger, the wrapped filter's states, and the arrays of its kernel.
+        """Return the arguments of ``slot_kernel`` for ``runs`` runs of H nodes that start in these
+        ``states``: the arrays of the trigger, the wrapped filter's states, and the arrays of its
+        kernel.
         """
         inner = [state.inner for state in states]
         arrays = trigger_arrays([state.model for state in inner], self.Y, runs)

@@ -147,6 +147,8 @@ def copy_track(
 ) -> None:
     """Copy the estimate of filter ``h`` in lane ``q``, from ``means`` (H, n, L) and lower
     triangular ``roots`` (H, n, n, L), to x (n,) and ``root`` (n, n).
+
+    Axes: H filters.
     """
     for i in range(len(x)):
         x[i] = means[h, i, q]
@@ -341,6 +343,8 @@ def track_slots(
 def copy_tracks(nodes: SlotNodes, tracks: SlotNodes, scratch: SlotScratch, b: int) -> None:
     """Copy the own tracks of all H nodes of block ``b`` to ``nodes.xhat[b]`` (H, n, L) and
     ``nodes.root[b]`` (H, n, n, L), the estimates that they report.
+
+    Axes: L runs side by side.
     """
     for h in range(len(nodes.rows)):
         for i in range(nodes.xhat.shape[2]):
@@ -414,6 +418,8 @@ def combination_of(arrays: TrackArrays, key: int, count: int, degree: int) -> in
 def pair_of(arrays: TrackArrays, i: int, j: int) -> int:
     """Return the index in ``arrays.pairs`` (K, 2) of the pair (i, j) of tracks, which is among
     them.
+
+    Axes: K pairs of tracks.
     """
     # Bisection: pairs of track i are sorted by the second track.
     low, high = arrays.first[i], arrays.first[i + 1] - 1
@@ -487,7 +493,7 @@ class BarShalomCampo(Filter):
 
     def carried_estimates(self, reported: FloatArray, arrays: tuple[Any, ...]) -> FloatArray:
         """Return the own tracks (B, H, n, L) in ``arrays``, with which nodes go on, instead of the
-        combinations that are ``reported`` (B, H, n, L).
+        combinations that are ``reported`` (B, H, n, L): B blocks of L runs, H nodes.
         """
         tracks: TrackArrays = arrays[0]
         return tracks.xhat
@@ -586,6 +592,8 @@ def stacked_sensors(sensors: Sequence[FloatArray]) -> tuple[FloatArray, np.ndarr
 def combined_pairs(infos: Sequence[NodeInfo]) -> np.ndarray:
     """Return the pairs (K, 2) of indices of tracks that some of the N nodes in ``infos`` may
     combine, in lexical order.
+
+    Axes: K pairs of tracks.
     """
     network, N = infos[0].network, len(infos)
     assert network is not None

@@ -40,8 +40,10 @@ class BeliefScratch(NamedTuple):
 
 @kernel
 def clear_part(lanes: Lanes, part: FloatArray) -> None:
-    """Set the evidence ``part`` (n, n + 1, L) to no information: zeros on and below the diagonal
-    and in the last column, the only entries that are ever read.
+    """Set the evidence ``part`` (n, n + 1, L), a root [Z, z] of information, to no information:
+    zeros on and below the diagonal and in the last column, the only entries that are ever read.
+
+    Axes: L runs side by side.
     """
     n = len(part)
     for i in range(n):
@@ -52,8 +54,11 @@ def clear_part(lanes: Lanes, part: FloatArray) -> None:
 
 @kernel
 def copy_part(lanes: Lanes, source: FloatArray, target: FloatArray) -> None:
-    """Copy evidence ``source`` (n, n + 1, L) into ``target`` of the same shape; entries above the
-    diagonal, which are never read, are left alone.
+    """Copy the evidence ``source`` (n, n + 1, L), a root [Z, z] of information with Z lower
+    triangular, into ``target`` of the same shape; entries above the diagonal, which are never read,
+    are left alone.
+
+    Axes: L runs side by side.
     """
     n = len(source)
     for i in range(n):
@@ -64,8 +69,10 @@ def copy_part(lanes: Lanes, source: FloatArray, target: FloatArray) -> None:
 
 @kernel
 def add_part(lanes: Lanes, total: FloatArray, part: FloatArray, work: FloatArray) -> None:
-    """Add the independent evidence ``part`` (n, n + 1, L) to ``total`` of the same shape, in place;
-    ``work`` is scratch of that shape.
+    """Add the independent evidence ``part`` (n, n + 1, L) to ``total`` of the same shape, in place:
+    both are roots [Z, z], and the information Z' Z adds up. ``work`` is scratch of that shape.
+
+    Axes: L runs side by side.
     """
     copy_part(lanes, part, work)
     merge_lanes(lanes, total, work)
@@ -75,8 +82,11 @@ def add_part(lanes: Lanes, total: FloatArray, part: FloatArray, work: FloatArray
 def recentre_part(
     lanes: Lanes, part: FloatArray, before: FloatArray, after: FloatArray, out: FloatArray
 ) -> None:
-    """Move the centre that the evidence ``part`` (n, n + 1, L) is relative to from ``before``
-    (n, L) to ``after`` (n, L): write the result into ``out``, which may be ``part`` itself.
+    """Move the centre c that the evidence ``part`` (n, n + 1, L), [Z, z] with ``Z (x - c) = z +
+    noise``, is relative to from ``before`` (n, L) to ``after`` (n, L): write the result into
+    ``out``, which may be ``part`` itself.
+
+    Axes: L runs side by side.
     """
     n = len(part)
     for i in range(n):
@@ -93,9 +103,12 @@ def recentre_part(
 def predict_part(
     lanes: Lanes, part: FloatArray, back: FloatArray, total: FloatArray, work: FloatArray
 ) -> None:
-    """Predict the evidence ``part`` (n, n + 1, L), in place, to a later state of a plant without
-    noise: ``Z <- Z back``, where ``back`` (n, n) is the inverse transition, made triangular again.
-    The caller predicts the centre. ``total`` and ``work`` are scratch of the shape of ``part``.
+    """Predict the evidence ``part`` (n, n + 1, L), a root [Z, z] of information, in place to a
+    later state of a plant without noise: ``Z <- Z back``, where ``back`` (n, n) is the inverse
+    transition, made triangular again. The caller predicts the centre. ``total`` and ``work`` are
+    scratch of the shape of ``part``.
+
+    Axes: L runs side by side.
     """
     n = len(part)
     clear_part(lanes, total)
@@ -117,6 +130,8 @@ def write_prior(lanes: Lanes, root: FloatArray, b: int, h: int, part: FloatArray
     """Write the prior of filter ``h`` of block ``b`` as evidence into ``part`` (n, n + 1, L): Z =
     S^-1 of the regular lower triangular root S = ``root[b, h]`` (n, n, L), and z = 0 relative to
     its own mean.
+
+    Axes: L runs side by side.
     """
     n = len(part)
     for i in range(n):
@@ -135,6 +150,8 @@ def write_prior(lanes: Lanes, root: FloatArray, b: int, h: int, part: FloatArray
 def write_prior_single(roots: FloatArray, h: int, part: FloatArray) -> None:
     """Write the prior of filter ``h`` as evidence [S^-1, 0] into ``part`` (n, n + 1, 1), for one
     run: S is its lower triangular root in ``roots`` (1, H, n, n, 1).
+
+    Axes: H nodes.
     """
     write_prior(ONE, roots, 0, h, part)
 
@@ -150,10 +167,11 @@ def gather_evidence(
     scratch: BeliefScratch,
 ) -> None:
     """Sum the evidence of node ``h``, its own and that received on directions ``first`` to ``last``
-    - 1: write all of it into ``scratch.all[h]``, and all but that of direction m into
-    ``scratch.others[m]``, (n, n + 1, L) each.
+    - 1, pieces of independent information as roots [Z, z] (n, n + 1, L): write all of it into
+    ``scratch.all[h]``, and all but that of direction m into ``scratch.others[m]``.
 
-    ``own`` (H, n, n + 1, L) is evidence by node, ``received`` (W, n, n + 1, L) by direction.
+    ``own`` (H, n, n + 1, L) is evidence by node, ``received`` (W, n, n + 1, L) by direction. Axes:
+    W directed links, H nodes, L runs side by side.
     """
     D = last - first
     # The sum without direction k is a prefix sum plus a suffix sum: nothing is subtracted.
@@ -184,7 +202,8 @@ def receive_evidence(
     step of the exchanges.
 
     The message is ``scratch.all`` of the sender or, if it hears node h itself, ``scratch.others``;
-    it is moved to the centre of node h. ``centre`` (H, n, L) are the centres of all nodes.
+    it is moved to the centre of node h. ``centre`` (H, n, L) are the centres of all nodes. Axes: B
+    blocks of L runs, S slots, E exchange steps, W directed links, H nodes.
     """
     b, s, e = index
     n = received.shape[1]

@@ -88,6 +88,8 @@ def trace_path(
 ) -> FloatArray:
     """Return the lower triangular roots (T, n, n) of one chain after each mode of its ``sequence``
     (T,), indices in ``modes``, from ``root`` (n, n) on; F and ``root_Q`` are (n, n).
+
+    Axes: T slots.
     """
     return next(trace_paths(root[None], sequence[None], F, root_Q, modes))
 
@@ -98,6 +100,8 @@ def trace_paths(
     """Yield for each of K chains the lower triangular roots (T, n, n) after each mode of its
     sequence, a row of ``sequences`` (K, T) of indices in ``modes``, from ``roots`` (K, n, n) on; F
     and ``root_Q`` are (n, n).
+
+    Axes: T slots.
     """
     lows = np.ascontiguousarray(lower_triangular(roots))
     F = as_kernel_array(F)
@@ -126,7 +130,7 @@ def run_path(
     store the root after each step in ``path`` (T, n, n).
 
     F and ``root_Q`` are (n, n); H (M, p, n), ``root_R`` (M, p, p) and ``rows`` (M,) are those of
-    ``ReadingModes``; ``work`` (p + n, 2 n + p) is scratch.
+    ``ReadingModes``; ``work`` (p + n, 2 n + p) is scratch. Axes: M modes, T slots.
     """
     for step in range(len(sequence)):
         step_root(roots, 0, sequence[step], F, root_Q, H, root_R, rows, work)
@@ -149,7 +153,7 @@ def run_sequences(
     (K, T).
 
     F and ``root_Q``, lower triangular too, are (n, n); H (M, p, n), ``root_R`` (M, p, p) and
-    ``rows`` (M,) are those of ``ReadingModes``.
+    ``rows`` (M,) are those of ``ReadingModes``. Axes: M modes, T slots.
     """
     # The pre-array [[H S, root_R, 0], [F S, 0, root_Q]] of the largest reading, reused by all
     # steps.

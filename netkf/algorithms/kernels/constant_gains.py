@@ -113,7 +113,7 @@ def correct_by_moments(
     (>= n, >= p) and H (>= p, n).
 
     A is (n, n) and ``closed`` (n, n) is A - L H; the moments are overwritten with the innovations;
-    ``work`` (6, n, n) is scratch.
+    ``work`` (6, n, n) is scratch. Axes: K estimates.
     """
     n, p = len(A), len(moments) // 2
     first, second, integrals_work = work[4], work[5], work[:4]
@@ -141,6 +141,8 @@ def correct_by_innovation(
 ) -> None:
     """Add ``L (y - H x)`` to ``x[k]`` (n,), entry ``k`` of x (K, n), for a sample y (p,) with H
     (p, n) and gain L (n, p); ``updated`` (n,) is scratch.
+
+    Axes: K estimates.
     """
     n = x.shape[1]
     for i in range(n):

@@ -68,6 +68,8 @@ def error_slope(S: FloatArray, K: FloatArray, true_Q: FloatArray, dS: FloatArray
 def add_sensor_noise(P: FloatArray, true_G: FloatArray, dS: FloatArray) -> None:
     """Add P_i Gt_i P_i, the noise of the sensors, to the derivatives dS_ii/dt in ``dS``
     (N, N, n, n), in place, with Gt = ``true_G`` (N, n, n) and the filters' covariances P (N, n, n).
+
+    Axes: N nodes.
     """
     # Only in dS_ii: the noises of different nodes are independent.
     for i in range(len(P)):
@@ -95,7 +97,7 @@ def mix(
     of the filters and those of their true errors, S_ij = cov(e_i, e_j) (N, N, n, n).
 
     Message k moves node ``rows[k]`` by ``weights[k]`` towards node ``columns[k]``, (M,) each, all
-    from the values before the instant. P0 and S0 are scratch, shaped like P and S.
+    from the values before the instant. P0 and S0 are scratch, shaped like P and S. Axes: N nodes.
     """
     P0[:] = P
     S0[:] = S
@@ -128,10 +130,10 @@ def run_moments(
     of cov(e_i) at ``times`` (T,), after the messages of the same instant, with steps of at most
     ``step`` seconds.
 
+    P_i is the covariance that filter i believes, S_ij = cov(e_i, e_j) that of the true errors.
     ``model`` is (A, Q, Qt, G, Gt), (n, n) or, for G and Gt, (N, n, n). The messages at
-    ``instants[m]``, seconds (M,), are those with numbers ``ends[m]`` to ``ends[m + 1]`` - 1 (M +
-    1,); message k goes from node ``columns[k]`` to ``rows[k]`` with ``weights[k]``, one entry for
-    each message.
+    ``instants[m]``, seconds (M,), are those with numbers ``ends[m]`` to ``ends[m + 1]`` - 1;
+    message k goes from node ``columns[k]`` to ``rows[k]`` with ``weights[k]``.
     """
     A, Q, true_Q, G, true_G = model
     K, P0, S0 = np.empty_like(P), np.empty_like(P), np.empty_like(S)

@@ -34,9 +34,11 @@ from netkf.linalg.lanes import (
 def write_information(
     lanes: Lanes, out: FloatArray, share: float, inverse: FloatArray, h: int
 ) -> None:
-    """Write the root of ``share`` times the information ``P^-1`` of node ``h`` into ``out``
-    (n, n + 1, L), relative to the node's estimate; ``inverse[h]`` of ``inverse`` (H, n, n, L) is
-    S^-1 for P = S S'.
+    """Write the root [Z, z] of ``share`` times the information ``P^-1 = Z' Z`` of node ``h`` into
+    ``out`` (n, n + 1, L), relative to the node's estimate, so that z = 0; ``inverse[h]`` of
+    ``inverse`` (H, n, n, L) is S^-1 for P = S S'.
+
+    Axes: H nodes, L runs side by side.
     """
     # P^-1 = S^-T S^-1, whose root is the inverse of S, lower triangular like S.
     n, factor = len(out), share**0.5
@@ -59,11 +61,13 @@ def add_reading_pair(
     centre: FloatArray,
     work: FloatArray,
 ) -> None:
-    """Add ``share`` times the information pair ``(H' H, H' y)`` of a whitened reading to ``total``
-    (n, n + 1, L), in place, relative to ``centre[h]`` of ``centre`` (H, n, L).
+    """Add ``share`` times the information pair ``(H' H, H' y)`` of a whitened reading to the root
+    [Z, z] of information in ``total`` (n, n + 1, L), in place, relative to ``centre[h]`` of
+    ``centre`` (H, n, L).
 
     The reading has ``rows`` rows at ``index`` [b, s, h], block, slot and node, of y (B, S, H, p, L)
-    and H (B, S, H, p, n, L); ``work`` (n, n + 1, L) is scratch.
+    and H (B, S, H, p, n, L); ``work`` (n, n + 1, L) is scratch. Axes: B blocks of L runs, S slots,
+    H nodes.
     """
     b, s, h = index
     n, factor = len(total), share**0.5
@@ -94,9 +98,11 @@ def weigh_part(
     centre: FloatArray,
     h: int,
 ) -> None:
-    """Write the root of ``weight`` (L,) times the information pair ``parts[t, k, sender]`` of
-    ``parts`` (2, K, H, n, n + 1, L) into ``out`` (n, n + 1, L), relative to ``centre[h]`` instead
-    of ``centre[sender]``, (n, L); ``index`` is [t, k, sender]: copy t, pair k of that node.
+    """Write the root [Z, z] of ``weight`` (L,) times the information pair ``parts[t, k, sender]``
+    of ``parts`` (2, K, H, n, n + 1, L) into ``out`` (n, n + 1, L), relative to ``centre[h]``
+    instead of ``centre[sender]``, (n, L); ``index`` is [t, k, sender]: copy t, pair k of that node.
+
+    Axes: H nodes, K information pairs, L runs side by side.
     """
     t, k, sender = index
     n, factor = len(out), root_of(weight)
@@ -116,6 +122,8 @@ def store_part(
 ) -> None:
     """Copy the root ``total`` (n, n + 1, L) of an information pair into ``parts[t, k, h]``, pair k
     of node h in copy t; ``index`` is [t, k, h]. Zeros above the diagonal are not copied.
+
+    Axes: L runs side by side.
     """
     t, k, h = index
     n = len(total)
@@ -140,13 +148,15 @@ def begin_part(
     total: FloatArray,
     work: FloatArray,
 ) -> None:
-    """Write the initial pair ``k`` of node h, before any consensus step, into ``parts[0, k, h]`` of
-    ``parts`` (2, K, H, n, n + 1, L): ``shares[k, 0]`` times the information of its prediction plus
-    ``shares[k, 1]`` times that of its reading, ``shares`` (K, 2).
+    """Write the initial information pair ``k`` of node h, before any consensus step, as a root [Z,
+    z] into ``parts[0, k, h]`` of ``parts`` (2, K, H, n, n + 1, L): ``shares[k, 0]`` times the
+    information of its prediction plus ``shares[k, 1]`` times that of its reading, ``shares``
+    (K, 2).
 
     ``index`` is [b, s, h], block, slot and node; ``inverse`` (H, n, n, L) holds the inverse roots
     of the predictions and ``centre`` (H, n, L) their means. The reading has ``rows`` whitened rows
     of y (B, S, H, p, L) and H (B, S, H, p, n, L). ``total`` and ``work`` (n, n + 1, L) are scratch.
+    Axes: B blocks of L runs, S slots, H nodes, K information pairs.
     """
     write_information(lanes, total, shares[k, 0], inverse, index[2])
     if shares[k, 1] > 0.0:
@@ -167,14 +177,15 @@ def mix_parts(
     total: FloatArray,
     work: FloatArray,
 ) -> None:
-    """Do consensus step number ``step`` of node ``h``: replace each of its K pairs in ``parts``
-    (2, K, H, n, n + 1, L) by the convex combination of it and those that arrive. The weights of
-    messages that do not arrive go to the own pair.
+    """Do consensus step number ``step`` of node ``h``: replace each of its K information pairs by
+    the convex combination of it and those that arrive. The weights of messages that do not arrive
+    go to the own pair.
 
-    Reads copy ``step`` modulo 2 of ``parts`` and writes the other one at node h. ``up``
-    (B, S, E, W, L) at ``index`` [b, s, e] (block, slot, step of the exchanges) flags the messages
-    that arrive; ``centre`` (H, n, L) are the means that pairs are relative to; ``total`` and
-    ``work`` (n, n + 1, L) are scratch.
+    ``parts`` (2, K, H, n, n + 1, L) holds two copies of all pairs, as roots [Z, z] relative to the
+    means ``centre`` (H, n, L) of H nodes: copy ``step`` modulo 2 is read, the other one is written
+    at node h. ``up`` (B, S, E, W, L) at ``index`` [b, s, e] (block, slot, step of the exchanges)
+    flags the messages that arrive; ``total`` and ``work`` (n, n + 1, L) are scratch. Axes: B blocks
+    of L runs, S slots, E exchange steps, W directed links.
     """
     b, s, e = index
     # Two copies alternate: all nodes read from copy t and write to copy 1 - t.
@@ -218,7 +229,8 @@ def write_estimate(
     of its K pairs after the consensus steps, copy ``t`` of ``parts`` (2, K, H, n, n + 1, L).
 
     ``inverse`` (H, n, n, L) holds the inverse roots of the predictions and ``centre`` (H, n, L)
-    their means; ``total`` and ``work`` (n, n + 1, L) are scratch.
+    their means; ``total`` and ``work`` (n, n + 1, L) are scratch. Axes: H nodes, L runs side by
+    side.
     """
     K = parts.shape[1]
     write_information(lanes, total, float(counts[K]), inverse, h)

@@ -21,6 +21,7 @@ def invert_lanes(lanes: Lanes, out: FloatArray, root: FloatArray, b: int, h: int
     block ``b``, into ``out[h]`` of ``out`` (H, n, n, L).
 
     Pivots are raised to SINGULAR times the length of their row, see ``root_update.invert_root``.
+    Axes: H filters, L runs side by side.
     """
     # The floor grows with the whole root, so that a zero row is not inverted on its own scale.
     n, smallest = root.shape[2], spread(lanes, TINY)
@@ -59,7 +60,8 @@ def whiten(
     (n, n + 1, L): a root of ``weight`` (L,) times its information, with Z = S^-1 =
     ``inverse[sender]``.
 
-    ``inverse`` (H, n, n, L) and ``xhat`` (H, n, L) are those of all H filters of a block.
+    ``inverse`` (H, n, n, L) and ``xhat`` (H, n, L) are those of all H filters of a block. Axes: L
+    runs side by side.
     """
     n, factor = inverse.shape[1], root_of(weight)
     for i in range(n):
@@ -123,7 +125,7 @@ def finish_lanes(
     h]`` (n, n, L) and ``centre + Z^-1 z`` into ``xhat[b, h]`` (n, L).
 
     Lanes with the flag ``unchanged`` (L,) keep their estimate; ``whitened`` (n, n + 1, L) is
-    scratch.
+    scratch. Axes: H filters, L runs side by side.
     """
     # S = Z^-1: the total is lower triangular, so P = Z^-1 Z^-T has the lower root Z^-1.
     n = len(total)

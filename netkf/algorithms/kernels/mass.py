@@ -25,6 +25,8 @@ def split_mass(
 ) -> None:
     """Write into ``share[h]`` (m, L) the message of node ``h`` of block ``b`` to each of its
     ``degree`` neighbours: its mass, m = 2 + n n entries of ``mass`` (B, H, m, L), over degree + 1.
+
+    Axes: B blocks of L runs, H nodes.
     """
     # P (3)-(5) with equal weights 1 / (degree + 1). The quotient is computed once: all neighbours
     # receive the same bits.
@@ -40,7 +42,8 @@ def keep_share(
     ``b`` received, ``mass[b, h]`` of ``mass`` (B, H, m, L), in place, P (3)-(5), except in lanes
     with the flag ``unchanged`` (L,).
 
-    ``times`` is 1 for the node itself plus 1 for each of its links that failed.
+    ``times`` is 1 for the node itself plus 1 for each of its links that failed. Axes: B blocks of
+    runs, H nodes.
     """
     # A share that could not be sent stays here, so that the sums of w, n~ and C~ over the network
     # are conserved.
@@ -64,6 +67,8 @@ def learn_network(
     ``h`` of block ``b`` estimates them, P (6), into ``information`` (n, n, L) and ``number``
     (1, L), from its mass in ``mass`` (B, H, 2 + n n, L). While its weight w is exactly 0, these are
     its own information ``alone[h]`` of ``alone`` (H, n, n) and 1.
+
+    Axes: B blocks of L runs, H nodes.
     """
     n, weight = information.shape[0], load(lanes, mass, b, h, 0)
     is_empty = weight == 0.0
@@ -91,6 +96,8 @@ def correct_root(
     """Replace ``root[b, h]`` (n, n, L) of filter ``h`` of block ``b`` by the root of ``(P^-1 +
     G)^-1 = P (I + G P)^-1``, P (7), with the information G = ``information[b, h]`` of
     ``information`` (B, H, n, n, L); ``remainder`` (n, n, L) is scratch.
+
+    Axes: B blocks of L runs, H nodes.
     """
     # G = sum v v' by Cholesky with the largest pivot first. Each v' is used as an observation with
     # noise of variance 1: nothing is inverted, and P may be singular.
@@ -168,7 +175,8 @@ def add_gain(
     of nodes that it knows of.
 
     The reading of slot ``s`` has ``rows`` whitened rows ``y[b, s, h]`` of y (B, S, H, p, L) and H
-    (B, S, H, p, n, L); ``projected`` and ``root_projected`` (n, L) are scratch.
+    (B, S, H, p, n, L); ``projected`` and ``root_projected`` (n, L) are scratch. Axes: B blocks of L
+    runs, S slots, H nodes.
     """
     n = x.shape[2]
     # A fixed H has one block and one slot.
@@ -212,7 +220,8 @@ def average(
     - z_i)`` over the estimates z_j that arrive, with ``factor`` = 1 / delta; ``z`` is (B, H, n, L).
 
     ``up`` (B, S, E, W, L) flags the messages that arrive in step ``step`` of the exchanges of slot
-    ``s``; ``averaged`` (H, n, L) is scratch.
+    ``s``; ``averaged`` (H, n, L) is scratch. Axes: B blocks of L runs, S slots, E exchange steps, W
+    directed links, H nodes.
     """
     H, n = len(links.first) - 1, z.shape[2]
     # All differences before any estimate moves: the step is simultaneous.

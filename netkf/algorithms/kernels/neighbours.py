@@ -52,7 +52,8 @@ def sum_differences(
     of its link if ``weighted``.
 
     ``x`` (B, H, n, L) holds the estimates of H filters in B blocks of L runs; ``up``
-    (B, S, E, W, L) flags the messages that arrive on each of W directions.
+    (B, S, E, W, L) flags the messages that arrive on each of W directions. Axes: S slots, E
+    exchange steps.
     """
     for i in range(x.shape[2]):
         own, total = load(lanes, x, b, h, i), spread(lanes, 0.0)
@@ -77,6 +78,8 @@ def scale_by_covariance(
     """Multiply ``differences[h]`` (n, L) in place by the consensus gain of the Kalman consensus
     filter (KCF, Olfati-Saber 2009), ``epsilon / (1 + |P|) P`` with the Frobenius norm, where P has
     the root ``root[b, h]`` (n, n, L) of filter ``h`` of block ``b``; ``work`` (n, L) is scratch.
+
+    Axes: L runs side by side.
     """
     n, square = root.shape[2], spread(lanes, 0.0)
     # |P|^2 is the sum of the squares of the entries of S S'.
@@ -105,6 +108,8 @@ def scale_by_covariance(
 def add_to_estimate(lanes: Lanes, x: FloatArray, b: int, h: int, term: FloatArray) -> None:
     """Add ``term[h]`` (n, L) to ``x[b, h]`` of ``x`` (B, H, n, L), the estimate of filter ``h`` of
     block ``b``, in place.
+
+    Axes: B blocks of L runs, H filters.
     """
     for i in range(x.shape[2]):
         store(lanes, x, b, h, i, load(lanes, x, b, h, i) + load(lanes, term, h, i))
@@ -142,6 +147,8 @@ def fuse_readings(
 def copy_pairs(nodes: SlotNodes, scratch: SlotScratch, b: int) -> None:
     """Copy (xhat, root) of all H filters of block ``b`` to ``scratch.xhat`` (H, n, L) and
     ``scratch.root`` (H, n, n, L): the messages that they send.
+
+    Axes: L runs side by side.
     """
     for h in range(len(nodes.rows)):
         for i in range(nodes.xhat.shape[2]):
@@ -165,7 +172,7 @@ def combine_convex_roots(
     block ``b`` by the convex combination of it and those that arrive in slot ``s``, H (7) and (9),
     from the copies of all filters in ``scratch`` (see ``copy_pairs``).
 
-    The weights of messages that do not arrive go to the own estimate.
+    The weights of messages that do not arrive go to the own estimate. Axes: L runs side by side.
     """
     lanes, n = scratch.lanes, nodes.xhat.shape[2]
     received_weight = spread(lanes, 0.0)

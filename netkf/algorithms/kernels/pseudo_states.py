@@ -32,7 +32,7 @@ def predict_pseudo(
     present slot.
 
     ``x`` and ``y`` are (B, H, n, L), ``A`` and ``coupling`` (n, n); ``predicted`` (n, L) is
-    scratch.
+    scratch. Axes: B blocks of L runs, H filters.
     """
     n = len(A)
     for i in range(n):
@@ -62,7 +62,7 @@ def fill_pseudo_innovation(
     into ``z`` (n, L), for the reading of slot ``s`` with ``rows`` whitened rows.
 
     ``y`` (B, H, n, L) are the estimates yhat; ``inverse`` (n, n) is G^+ and ``state`` (n, L)
-    scratch for ``G^+ yhat``.
+    scratch for ``G^+ yhat``. Axes: B blocks of L runs, H filters.
     """
     n = len(inverse)
     # A fixed H has one block and one slot.
@@ -104,7 +104,8 @@ def correct_pseudo(
 
     ``y`` (blocks, H, n, L) are the estimates yhat; ``up`` (blocks, S, E, W, L) flags the messages
     that arrive; ``B`` (W, n, n) are in the order of ``links``, ``M`` (H, n, n); ``z`` (n, L) is the
-    pseudo-innovation.
+    pseudo-innovation. Axes: S slots, E exchange steps, W directed links, H filters, L runs side by
+    side.
     """
     n = M.shape[1]
     # Into a separate array: the other filters still need yhat_h from before the step.
@@ -140,7 +141,7 @@ def correct_state(
     state by it in place, ``x[b, h] += K_h (yhat - G xhat)``.
 
     ``x`` and ``y`` are (B, H, n, L), ``corrected`` (H, n, L), ``K`` (H, n, n), G (n, n);
-    ``difference`` (n, L) is scratch.
+    ``difference`` (n, L) is scratch. Axes: B blocks of L runs, H filters.
     """
     n = len(G)
     # difference = yhat - G xhat, complete before xhat changes.
@@ -163,6 +164,8 @@ def shift_pseudo(
 ) -> None:
     """Move the origin of the pseudo-states ``y[b]`` (H, n, L) of block ``b`` to G x of slot ``s``,
     if a frame begins there: subtract G (n, n) times the true state ``readings.local[b, s]`` (n, L).
+
+    Axes: H filters, L runs side by side.
     """
     if readings.rebased[s]:
         n = len(G)

@@ -140,7 +140,8 @@ def flow_scratch(table: FlowTable, unrolled: bool = False) -> FlowScratch:
 def flow_table(
     A: FloatArray, Q: FloatArray, H: FloatArray, R: FloatArray, longest: float
 ) -> FlowTable:
-    """Tabulate one model: ``A, Q`` (n, n), ``H`` (p, n), ``R`` (p, p); p may be 0.
+    """Tabulate one model, the flow of the covariance of a Kalman-Bucy filter: ``A, Q`` (n, n),
+    ``H`` (p, n), ``R`` (p, p); p may be 0.
 
     The table is fast for gaps up to ``longest`` seconds; longer ones take several steps.
     """
@@ -225,11 +226,12 @@ def whiten_observation(H: FloatArray, R: FloatArray) -> FloatArray:
 def transition_series(
     A: FloatArray, Q: FloatArray, whitened_H: FloatArray, middles: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Return Taylor coefficients of exp(A g), F, Q_g and G_g around C gaps ``middles`` (C,) in
-    seconds, in extended precision: (C, TERMS, n, n) each, for A and Q (n, n) and ``whitened_H``
-    (q, n).
+    """Return Taylor coefficients (C, TERMS, n, n) of exp(A g), the transition F, the noise Q_g and
+    the information G_g of the readings over gaps around ``middles`` (C,), seconds, in extended
+    precision, for C cells, A and Q (n, n) and ``whitened_H`` (q, n).
 
-    ``dF = (A - Q_g G) F``, ``dQ_g = A Q_g + Q_g A' + Q - Q_g G Q_g`` and ``dG_g = F' G F``.
+    ``dF = (A - Q_g G) F``, ``dQ_g = A Q_g + Q_g A' + Q - Q_g G Q_g`` and ``dG_g = F' G F``, with
+    the information rate ``G = whitened_H' whitened_H``.
     """
     n, count = len(A), len(middles)
     A, Q, whitened_H = A.astype(WIDE), Q.astype(WIDE), whitened_H.astype(WIDE)
@@ -262,9 +264,9 @@ def _convolved(a: FloatArray, b: FloatArray, k: int) -> FloatArray:
 def transitions_at(
     A: FloatArray, Q: FloatArray, whitened_H: FloatArray, middles: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Return exp(A g), F, Q_g and G_g (C, n, n) at the ``middles`` (C,) g = 0 and 3/2, 5/2, ...
-    units of C cells, in seconds, from the exponential exp(M g) of the Hamiltonian M of A and Q
-    (n, n) and ``whitened_H`` (q, n).
+    """Return exp(A g), the transition F, the noise Q_g and the information G_g of the readings
+    (C, n, n) at the ``middles`` (C,) g = 0 and 3/2, 5/2, ... units of C cells, in seconds, from the
+    exponential exp(M g) of the Hamiltonian M of A and Q (n, n) and ``whitened_H`` (q, n).
     """
     n, count = len(A), len(middles)
     E, F, Q_g, G = wide_zeros(4, count, n, n)
@@ -479,6 +481,8 @@ def propagate_root(
     """Propagate ``root[k]`` (n, n) and the mean ``x[k]`` (n,), entry ``k`` of root (K, n, n) and x
     (K, n), in place over ``gap`` seconds by model ``m`` of the table. The root counts the readings
     of the gap, the mean does not: it moves by exp(A gap).
+
+    Axes: K estimates.
     """
     # A gap beyond all cells: first take whole steps of the first level that is longer than these.
     octaves = table.sizes[m, 4]
@@ -499,6 +503,8 @@ def propagate_root(
 def trace_of(size: Size, table: FlowTable, m: int, root: FloatArray, k: int) -> float:
     """Return ``trace(P)`` of the root of P in entry ``k`` of ``root`` (K, n, n), or 0 if model
     ``m`` of the table observes nothing.
+
+    Axes: K estimates.
     """
     # Without observation G = 0, and any P is narrow: the trace need not be computed.
     return 0.0 if table.sizes[m, 1] == 0 else float(trace_of_root(ONE, size, root[k]))
@@ -577,7 +583,8 @@ def propagate_level(
 ) -> None:
     """Propagate ``root[k]`` (n, n) and ``x[k]`` (n,) in place over ``unit 2^level`` seconds by
     model ``m`` of the table, with the tabulated exp(A g), F, Gamma and T: ``P <- F P (I + Gamma'
-    Gamma P)^-1 F' + T T'`` and ``x <- exp(A g) x``.
+    Gamma P)^-1 F' + T T'`` and ``x <- exp(A g) x``. Gamma' Gamma is the information of the readings
+    of these g seconds, and T T' the noise.
     """
     n, levels, T, observed = len(scratch.size), table.levels, scratch.T, scratch.observed
     if table.sizes[m, 1] > 0:
@@ -621,7 +628,8 @@ def propagate_wide(
     """Propagate ``root[k]`` (n, n) and ``x[k]`` (n,) in place over a ``gap`` below
     ``table.unit[m]`` seconds by model ``m`` of the table, for any P, however large.
 
-    ``P_g = F P (I + G P)^-1 F' + Q_g``: first the readings of the whole gap, then the transition.
+    ``P_g = F P (I + G P)^-1 F' + Q_g``: first the information G of all readings of the gap, then
+    the transition F and the noise Q_g. The mean moves by exp(A gap), without the readings.
     """
     use_information(table, m, root, k, gap, scratch)
     n = len(scratch.size)
@@ -642,7 +650,8 @@ def propagate_narrow(
     scratch: FlowScratch,
 ) -> None:
     """Propagate ``root[k]`` (n, n) and ``x[k]`` (n,) in place over a ``gap`` in seconds inside a
-    cell by model ``m`` of the table, if P is narrow (``is_narrow``) or nothing is observed.
+    cell of the table by its model ``m``, in one step, if P is small enough (``is_narrow``) or
+    nothing is observed.
     """
     fill_values(scratch.values, table, m, gap)
     propagate_by_series(table, m, root, x, k, True, scratch)
@@ -650,9 +659,9 @@ def propagate_narrow(
 
 @kernel
 def fill_values(out: FloatArray, table: FlowTable, m: int, gap: float) -> None:
-    """Write Q_g, exp(A g) and, if something is observed, F and G_g for a ``gap`` in seconds inside
-    a cell into ``out`` (>= width,), by model ``m`` of the table; symmetric matrices as lower
-    triangles by rows.
+    """Write Q_g (noise of the gap), exp(A g) and, if something is observed, F (transition) and G_g
+    (information of the readings) for a ``gap`` in seconds inside a cell into ``out`` (>= width,),
+    by model ``m`` of the table; symmetric matrices as lower triangles by rows.
     """
     cell, since = cell_of(table.unit[m], gap)
     width = width_of(table.levels.shape[4], table.sizes[m, 1] > 0)
@@ -788,8 +797,11 @@ def condition_root(
 def use_information(
     table: FlowTable, m: int, root: FloatArray, k: int, gap: float, scratch: FlowScratch
 ) -> None:
-    """Update ``root[k]`` (n, n) of ``root`` (K, n, n) in place with the information Gamma' Gamma of
-    a ``gap`` below one unit, in seconds, by model ``m`` of the table.
+    """Update ``root[k]`` (n, n) of ``root`` (K, n, n) in place with the information Gamma' Gamma
+    that the readings of a ``gap`` give, in seconds and below one unit, by model ``m`` of the table:
+    row by row of Gamma, as observations of unit noise.
+
+    Axes: K estimates.
     """
     n, q, rows, observed = len(scratch.size), table.sizes[m, 0], scratch.rows, scratch.observed
     gamma, width = table.gamma, q * n
@@ -827,6 +839,8 @@ def cholesky_in_lanes(lanes: Lanes, size: Size, T: FloatArray, packed: FloatArra
     """Write the lower triangular Cholesky factor T (n, n, L) of the symmetric matrices whose lower
     triangles are ``packed`` (>= n (n + 1) / 2, L) by rows; pivots at the level of rounding count as
     0.
+
+    Axes: L runs side by side.
     """
     n = len(size)
     for j in range(n):
@@ -883,6 +897,8 @@ def transform_root(
 def information_rate(lanes: Lanes, size: Size, whitened_H: FloatArray, S: FloatArray) -> Any:
     """Return the rate of information ``trace(P G)`` (L,) in 1/s, of roots S (n, n, L) and of
     ``whitened_H`` (q, n, L) = R^-1/2 H.
+
+    Axes: L runs side by side.
     """
     # |R^-1/2 H S|_F^2 = trace(S' G S).
     n, rate = len(size), spread(lanes, 0.0)
@@ -913,7 +929,7 @@ def gain_root(
     innovations: ``x += (U + S S' W) innovations``, with the root S = ``root[k]`` (n, n).
 
     U, W and C are power series in the gap, the rows of ``series`` of a GainTable; their reach is
-    ``reach[:, column]``. ``values`` (>= row length) is scratch.
+    ``reach[:, column]``. ``values`` (>= row length) is scratch. Axes: K estimates.
     """
     fill_series(values, 3 * len(size) * len(moments), series, reach, column, gap)
     use_moments(ONE, size, root[k], x[k], values, moments)

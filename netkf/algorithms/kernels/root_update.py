@@ -115,7 +115,7 @@ def rotate_out(
     observation ``h x + v``, where ``h S`` is ``row[m]`` (n,) and v has the variance ``pivot``^2.
 
     Return the standard deviation of the innovation; the Kalman gain is ``gains[m]`` (n,), which is
-    written, divided by it.
+    written, divided by it. Axes: K estimates.
     """
     # Multiply [pivot, h S; 0, S] from the right by Givens rotations that zero h S from its last
     # entry on, so that S stays lower triangular.
@@ -270,6 +270,8 @@ def add_root(
     """Add to the estimate ``x[k]`` (n,) and the covariance P of ``root[k]`` (n, n), in place,
     ``weight`` >= 0 times those of entry ``m`` of ``other_x`` (M, n) and ``other`` (M, n, n): one
     term of the convex combinations H (7) and (9). All roots are lower triangular.
+
+    Axes: M other estimates.
     """
     size, n, factor = scratch.size, len(scratch.size), math.sqrt(weight)
     # P + w P_m = A A' with A = [S, sqrt(w) S_m], made triangular from the right.

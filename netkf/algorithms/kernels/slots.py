@@ -218,6 +218,8 @@ def star_of(weights: Sequence[float]) -> tuple[SlotLinks, np.ndarray]:
     """Return links and flags of a star: from senders 1, 2, ... to the one receiver 0, with the
     ``weights`` (one of each of W senders), and the array ``up`` (1, 1, 1, W, 1) that lets all their
     messages arrive.
+
+    Axes: W directed links.
     """
     count = len(weights)
     indices = np.arange(count)
@@ -292,6 +294,8 @@ def drop_silent(plan: SlotPlan, links: SlotLinks, b: int, s: int, e: int) -> Non
     """Set ``plan.up`` (B, S, E, W, L) to 0 for the messages of nodes that send nothing in step
     ``e`` of the exchanges of slot ``s``, in each of the L runs of block ``b``: those with 0 in
     ``plan.sent`` (B, S, E, H, L).
+
+    Axes: B blocks of runs, S slots, E exchange steps, W directed links, H filters.
     """
     for m in range(len(links.sender)):
         for q in range(plan.up.shape[4]):
@@ -306,6 +310,7 @@ def rebase(nodes: SlotNodes, readings: ReadingBlock, scratch: SlotScratch, b: in
     (H, n, L).
 
     An origin near the state keeps estimates small, so that large absolute states cost no digits.
+    Axes: H filters, L runs side by side.
     """
     # Only the mean moves: a covariance does not depend on the origin.
     if readings.rebased[s]:
@@ -411,6 +416,8 @@ def rotate_lanes(
 def predict_all(nodes: SlotNodes, scratch: SlotScratch, b: int) -> None:
     """Predict all H filters of block ``b`` to the next slot, in place: ``nodes.xhat[b]`` (H, n, L)
     to ``F xhat``, and ``nodes.root[b]`` (H, n, n, L) to the root of ``F P F' + Q``.
+
+    Axes: L runs side by side.
     """
     for h in range(len(nodes.rows)):
         predict_mean(nodes, scratch, b, h)
@@ -421,6 +428,8 @@ def predict_all(nodes: SlotNodes, scratch: SlotScratch, b: int) -> None:
 def predict_mean(nodes: SlotNodes, scratch: SlotScratch, b: int, h: int) -> None:
     """Replace ``nodes.xhat[b, h]`` (n, L), the estimate of filter ``h`` of block ``b``, by ``F
     xhat`` for the next slot.
+
+    Axes: L runs side by side.
     """
     transform_mean(scratch, nodes.xhat, b, h, nodes.F)
 
@@ -429,6 +438,8 @@ def predict_mean(nodes: SlotNodes, scratch: SlotScratch, b: int, h: int) -> None
 def transform_mean(scratch: SlotScratch, x: FloatArray, b: int, h: int, F: FloatArray) -> None:
     """Multiply estimate ``x[b, h]`` of ``x`` (B, H, n, L), filter ``h`` of block ``b``, by F (n, n)
     in place, in all L runs of the block.
+
+    Axes: B blocks of runs, H filters.
     """
     lanes, n = scratch.lanes, len(scratch.size)
     moved_mean = local_lanes_vector(scratch.size, lanes, scratch.moved_mean)
@@ -449,6 +460,8 @@ def move_root(
     """Replace ``root[b, h]`` of ``root`` (B, H, n, n, L), the lower triangular root S of filter
     ``h`` of block ``b``, by that of ``F S S' F' + Q``, with F and ``root_Q`` (n, n); uses
     ``scratch``.
+
+    Axes: B blocks of L runs, H filters.
     """
     predict_root(scratch.lanes, scratch.size, root, b, h, F, root_Q, scratch.moved, scratch.noise)
 
@@ -469,7 +482,7 @@ def predict_root(
     ``h`` of block ``b`` in L runs, by that of ``F S S' F' + Q``.
 
     ``F`` and the lower triangular ``root_Q`` are (n, n). ``moved_scratch`` and ``noise_scratch``
-    (n, n, L) are used if n is too large for registers.
+    (n, n, L) are used if n is too large for registers. Axes: B blocks of runs, H filters.
     """
     n = len(size)
     moved = local_lanes_matrix(size, lanes, moved_scratch)
@@ -503,6 +516,8 @@ def write_root_column(
     """Write column ``i`` of the triangular root of ``[moved, noise]``, both (n, n, L), into
     ``root[b, h]`` of ``root`` (B, H, n, n, L): apply the Householder reflection that zeroes row
     ``i`` right of its diagonal to the rows below, which changes ``moved`` and ``noise`` in place.
+
+    Axes: B blocks of L runs, H filters.
     """
     # The squared length of row i; the columns of ``noise`` right of i are still zero here.
     n, pivot, square = len(size), load(lanes, moved, i, i), spread(lanes, 0.0)

@@ -114,6 +114,7 @@ def step_root(
 
     F and ``root_Q`` are (n, n); H (M, p, n), ``root_R`` (M, p, p) and ``rows`` (M,) give the
     readings, of which the first ``rows[m]`` rows count. ``work`` (>= p + n, >= 2 n + p) is scratch.
+    Axes: K chains.
     """
     n, p = len(F), rows[m]
     # The pre-array [[H S, root_R, 0], [F S, 0, root_Q]].

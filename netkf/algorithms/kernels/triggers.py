@@ -42,7 +42,7 @@ def weigh_news(
     reading.
 
     x (B, H, n, L) are the estimates, Y = ``Y[h]`` of (H, p, p) is for whitened rows, ``z`` (p, L)
-    is scratch.
+    is scratch. Axes: B blocks of runs, H filters.
     """
     b, s, h = index
     # A fixed H has one block and one slot.
@@ -122,6 +122,8 @@ def is_positive(lanes: Lanes, work: FloatArray) -> Any:
     """Return flags (L,) of the symmetric matrices ``work`` (n, n, L), given by their lower
     triangles, that are positive definite: L D L' elimination, which overwrites them, has positive
     pivots only.
+
+    Axes: L runs side by side.
     """
     n, smallest_pivot = len(work), spread(lanes, math.inf)
     for k in range(n):
