@@ -195,7 +195,10 @@ class DiffusionChecks(PaperChecks):
     summary_type = DiffusionSummary
 
     def summarise(self, scenario: Scenario, run: Run) -> DiffusionSummary:
-        """Return the summary of a run whose samples are at ``check_times``."""
+        """Return the summary of a run at its K checked times and N sampled nodes, with the exact
+        covariances ``alone`` (N, n, n) of the errors at the end of the same run without
+        cooperation.
+        """
         sampled = sampled_indices(scenario)
         alone = np.full(run.P[0, sampled].shape, np.nan)
         if run.replica < ALONE and few_errors(scenario).holds:

@@ -73,8 +73,9 @@ SINGULAR = 1e-12
 
 
 def summarise_exactly(scenario: Scenario, run: Run) -> ReplicaSummary:
-    """Return the summary of a run at the sampled nodes, with exact covariances if the errors of all
-    nodes are few enough.
+    """Return the summary of a run at its K checked times and N sampled nodes: P (K, N, n, n),
+    errors (K, N, n), NEES (K, N), and the exact law of the errors if those of all nodes are few
+    enough.
     """
     time_indices, sampled = checked_samples(scenario, run.times), sampled_indices(scenario)
     _, nees = errors(run.error, run.P)
@@ -474,9 +475,11 @@ def check_expected_nees(samples: RunSamples, level: float) -> Finding:
 
 def _expected_together(quadratic: FloatArray, level: float) -> Interval:
     """Return an interval for the relative difference between the NEES pooled over times, nodes and
-    runs and its expected value; ``quadratic`` (R, 1 + S) stacks the fields of ReplicaSummary.
+    runs and its expected value.
 
-    The interval misses the truth with at most the probability ``level``.
+    ``quadratic`` (R, 1 + S) has for each of R runs the sum of its S scaled squares of standard
+    normal numbers, and their weights. The interval misses the truth with at most the probability
+    ``level``.
     """
     finite = quadratic[np.isfinite(quadratic).all(axis=1)]
     ratio = quadratic_interval(float(finite[:, 0].sum()), finite[:, 1:].ravel(), level)

@@ -87,7 +87,9 @@ class GossipSummary(ReplicaSummary):
 
 
 def _summarise(scenario: Scenario, run: Run) -> GossipSummary:
-    """Return the summary of a run: exact errors, and P replayed along the paths of tokens."""
+    """Return the summary of a run at K slots and N sampled nodes: exact errors, and P (K, N, n, n)
+    replayed along the paths of tokens.
+    """
     slots = list(check_slots(scenario))
     sources, table = pair_sources(scenario, run, slots[-1]), gossip_modes(scenario)
     starts, n, sampled = initial_roots(scenario), scenario.plant.n, sampled_indices(scenario)
@@ -174,8 +176,8 @@ class GossipSamples(RunSamples):
         return self._draw_paths("switched chain", slots, reference_count(self.scenario, 1))
 
     def _draw_paths(self, purpose: str, slots: list[int], count: int) -> ChainSamples:
-        """Return ``count`` chains, with their covariances after the given numbers of ``slots``;
-        ``purpose`` names the random stream that they are drawn from.
+        """Return S = ``count`` chains, with their covariances (K, S, n, n) after K numbers of
+        ``slots``; ``purpose`` names the random stream that they are drawn from.
         """
         starts, random = initial_roots(self.scenario), Streams(self.seed).generator(purpose)
         positions = _draw_chains(self.matching, slots[-1], count, random)

@@ -121,7 +121,8 @@ def _least_roots(scenario: Scenario) -> FloatArray:
 
 
 def _summarise(scenario: Scenario, run: Run) -> IntermittentSummary:
-    """Return the summary of a run: exact errors, and P replayed along its arrivals.
+    """Return the summary of a run at K slots and N sampled nodes: exact errors, and P (K, N, n, n)
+    replayed along its arrivals.
 
     P is replayed from P(0) to all checked slots. To the last slot only it is also replayed from 0
     and from a very large start, which should converge, and from P*, which stays in the support of
@@ -209,8 +210,11 @@ class IntermittentSamples(RunSamples):
     def _draw_arrivals(
         self, purpose: str, slots: list[int], samples: int, paths: int
     ) -> ArrivalSamples:
-        """Return ``samples`` filters of each node after the given numbers of ``slots``, with
-        averages over the slots of the first ``paths``; ``purpose`` names their stream.
+        """Return S = ``samples`` filters of each of N sampled nodes, with their covariances
+        (N, K, S, n, n) after K numbers of ``slots``, and averages (N, S') over the slots of the
+        first S' = ``paths``.
+
+        ``purpose`` names the random stream that arrivals are drawn from.
         """
         sampled = sampled_indices(self.scenario).tolist()
         per_node = [self._draw_node(purpose, k, slots, samples, paths) for k in sampled]
@@ -394,7 +398,8 @@ def _memory_of(reference: ArrivalSamples) -> float:
 
 
 def _averages_of_paths(samples: IntermittentSamples, level: float) -> Finding:
-    """Compare averages over the slots of one path with those of paths with independent arrivals.
+    """Compare the averages of 1 / (1 + tr P) over the slots of one path with those of paths with
+    independent arrivals, by their laws over runs.
 
     The interval of the finding misses the truth with at most the probability ``level``.
     """

@@ -141,7 +141,8 @@ def pair_sources(scenario: Scenario, run: Run, slots: int) -> np.ndarray:
 
 
 def trace_tokens(sources: np.ndarray, slot: int) -> TokenHistory:
-    """Return the history of the pairs that the N nodes hold at the start of a ``slot``.
+    """Return the history of the pairs that the N nodes hold at the start of a ``slot``: where each
+    started (N,), and its node in each slot (N, slot).
 
     ``sources`` (slots, N) is the node whose pair each node used in each slot, from
     :func:`pair_sources`.
@@ -197,7 +198,9 @@ def sensing_neighbours(scenario: Scenario) -> dict[int, tuple[int, ...]]:
 
 
 def intermittent_modes(scenario: Scenario, sets: list[tuple[int, ...]]) -> ModeTable:
-    """Return the modes of an intermittent filter: mode m is all readings of ``sets[m]``, R (17)."""
+    """Return the modes of an intermittent filter: mode m is all readings of the nodes (ids)
+    ``sets[m]``, with their stacked H (p, n) and R (p, p), R (17).
+    """
     F, Q = scenario.slot_belief
     index = scenario.topology.index
     readings = []
@@ -209,8 +212,8 @@ def intermittent_modes(scenario: Scenario, sets: list[tuple[int, ...]]) -> ModeT
 
 
 def find_arrivals(scenario: Scenario, run: Run, slots: int) -> Arrivals:
-    """Return the readings that were used in the first ``slots`` slots of a run: a node's own, and
-    those delivered by the trace.
+    """Return the readings that W sampled nodes used in the first ``slots`` slots of a run, a node's
+    own and those delivered by the trace, as sequences (W, slots) of modes.
     """
     delivered = run.log[run.log["kind"] == CODES["deliver"]]
     # A reading belongs to the slot in which it was sent, not to that of its arrival.
@@ -231,7 +234,9 @@ def find_arrivals(scenario: Scenario, run: Run, slots: int) -> Arrivals:
 
 
 def all_arrivals(scenario: Scenario, slots: int) -> Arrivals:
-    """Return the readings that would be used in each of ``slots`` slots if none were lost."""
+    """Return the readings that W sampled nodes would use in each of ``slots`` slots if none were
+    lost, as sequences (W, slots) of modes.
+    """
     neighbours = sensing_neighbours(scenario)
     modes: dict[tuple[int, ...], int] = {}
     sampled = sampled_nodes(scenario)

@@ -32,7 +32,9 @@ class BitChecks(PaperChecks):
     slots_only: ClassVar[bool] = True
 
     def summarise(self, scenario: Scenario, run: Run) -> ReplicaSummary:
-        """Return the summary of a run whose samples are at ``check_times``."""
+        """Return the summary of a run at its K checked times and N sampled nodes, with P
+        (K, N, n, n) replayed from the bits that arrived.
+        """
         summary = summarise_exactly(scenario, run)
         if run.replica >= max_replayed(scenario):
             return summary

@@ -144,7 +144,8 @@ def monte_carlo(
 
 
 def ensemble_of(scenario: Scenario, statistics: RunStatistics, seed: int, engine: str) -> Ensemble:
-    """Return the ensemble that the ``statistics`` of all runs describe.
+    """Return the ensemble that the ``statistics`` of all runs describe, with means of P and e e'
+    (T, N, n, n) and of NEES (T, N).
 
     ``seed`` and ``engine`` (its name) are those of the runs. Errors and NEES are nan from the time
     on at which rounding blurs them in some run.

@@ -157,7 +157,8 @@ class RunValues(NamedTuple):
 
 
 def run_values(batch: RunBatch, scenario: Scenario, first: int = 0) -> RunValues:
-    """Return the values of the runs of a batch, with averages for every node.
+    """Return the values of the R runs of a batch, such as averages (R, N + 1, 3) and counts of
+    messages (R, 5), with averages for every node.
 
     ``first`` is the index of the batch's first run in the tree over all runs.
     """

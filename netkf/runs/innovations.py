@@ -124,7 +124,8 @@ def _record_samples(algorithm: Filter, samples: list[RecordedSample]) -> Filter:
 def _collect_innovations(
     run: Run, samples: list[RecordedSample], intervals: list[WhitenedInnovation]
 ) -> Innovations:
-    """Return the innovations of the recorded samples and intervals of a run, in order of time.
+    """Return the innovations of the M recorded samples and intervals of a run, in order of time:
+    times, nodes and NIS, (M,) each, and the whitened innovations (p,).
 
     Raises NetkfError if there are none, or no covariance to judge them by.
     """

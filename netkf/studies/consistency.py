@@ -71,7 +71,9 @@ class RunConsistency(NamedTuple):
 def run_consistency(
     scenario: Scenario, seed: int, replica: int, engine: str | Engine = "auto"
 ) -> RunConsistency:
-    """Simulate one ``replica`` of the runs of ``seed``, and return its NEES and NIS."""
+    """Simulate one ``replica`` of the runs of ``seed``; return its NEES (T, N) after time 0, and
+    the means over time (N,) of NEES and NIS of the N nodes, with their expected values.
+    """
     run = simulate(scenario, seed, replica, engine)
     _, nees = errors(run.error, run.P)
     after_start = np.flatnonzero(run.times > 0.0)

@@ -46,7 +46,9 @@ def block_values(scenario: Scenario, seed: int, replicas: range, engine: Engine)
 
 
 def _batch_values(scenario: Scenario, batch: RunBatch) -> FilterValues:
-    """Return the values of a batch of runs."""
+    """Return squared error, largest error, NEES and whether it diverged, (R,) each, of the R runs
+    of a batch.
+    """
     values = run_values(batch, scenario)
     all_nodes_mean = values.averages[:, -1]
     largest = [

@@ -329,7 +329,7 @@ class Reach:
 
 def search_back(flow: Flow, node: int, budget: int = 0) -> Reach:
     """Return the backward search from ``node`` (its id) at the end of the log, along messages of
-    cost 0 and at most ``budget`` others.
+    cost 0 and at most ``budget`` others: tables (budget + 1, G) over the G segments of the flow.
     """
     segments = len(flow.node)
     deadline = [[NEVER] * segments for _ in range(budget + 1)]

@@ -57,7 +57,9 @@ def block_metrics(scenario: Scenario, seed: int, replicas: range, engine: Engine
 
 
 def _batch_metrics(values: RunValues) -> RunMetrics:
-    """Return the metrics of runs from their averages."""
+    """Return squared errors and traces of P (R, N) and counts of messages (R, 5) of R runs from
+    their averages.
+    """
     return RunMetrics(
         values.averages[:, :-1, 0],
         values.averages[:, :-1, 1],

@@ -72,8 +72,8 @@ def delay_law(delay: Any, seconds: FloatArray) -> FloatArray | None:
 
 
 def count_delays(scenario: Scenario, run: Run) -> DelayCounts | None:
-    """Return the delays of the messages of a run, counted by direction and as uniform numbers; None
-    without links or a stated law of the delays.
+    """Return the delays of the messages of a run, as uniform numbers: counts in cells (CELLS, 1),
+    and sums (2, D) for each of D directions; None without links or a stated law of the delays.
 
     Only messages that arrive before the run ends are in the log. So the law of a delay is
     conditioned on its being at most the time from sending to the end of the run.

@@ -51,7 +51,9 @@ def direction_indices(scenario: Scenario) -> dict[tuple[int, int], int]:
 
 
 def count_losses(scenario: Scenario, run: Run) -> LossCounts | None:
-    """Return the counts of sent and lost messages of a run by direction; None without links."""
+    """Return the counts (W, D) of sent and lost messages of a run, in W windows of it and by
+    direction; None without links.
+    """
     indices, log = direction_indices(scenario), run.log
     sends, losses = (log[log["kind"] == CODES[kind]] for kind in ("send", "lost"))
     if not indices:
@@ -111,8 +113,8 @@ def reversed_directions(scenario: Scenario) -> np.ndarray:
 
 
 def count_pairs(scenario: Scenario, run: Run) -> PairCounts | None:
-    """Return for each link the number of slots of a run in which it was in the matching; None
-    without drawn matchings.
+    """Return for each of L links the number (L,) of slots of a run in which it was in the matching;
+    None without drawn matchings.
     """
     if not isinstance(scenario.network.activation, Matching):
         return None

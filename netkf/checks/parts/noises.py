@@ -53,7 +53,9 @@ class PathLaw(NamedTuple):
 
 @lru_cache(maxsize=8)
 def path_law(scenario: Scenario) -> PathLaw | None:
-    """Return the law of the path by the matrices of the scenario; None for recorded states."""
+    """Return the law of the path by the matrices of the scenario: the transition (n, n) of a step,
+    and the whitening (d, n) of its noise; None for recorded states.
+    """
     if not scenario.plant.is_random:
         return None
     stated: Any = stated_part(scenario.plant, "plant")
@@ -95,7 +97,9 @@ def _discretise(A: FloatArray, B: FloatArray, gap: float) -> tuple[FloatArray, F
 
 
 def plant_moments(scenario: Scenario, streams: Streams) -> NoiseMoments | None:
-    """Return the moments of the noise in the steps of one path; None without noise or path law."""
+    """Return the sums of products (d, d), and further ones, of the whitened noise (d,) in the steps
+    of one path; None without noise or path law.
+    """
     law = path_law(scenario)
     if law is None or not len(law.white):
         return None
@@ -202,7 +206,8 @@ def reading_labels(scenario: Scenario) -> list[str]:
 
 
 def reading_moments(scenario: Scenario, streams: Streams) -> NoiseMoments | None:
-    """Return the moments of the noises of all readings; None without drawn sensors.
+    """Return the sums of products (d, d), and further ones, of the whitened noises (d,) of all
+    readings; None without drawn sensors.
 
     Sensors read states drawn here, of typical size, since their noise must not depend on the state.
     The k-th noises of all sensors form one vector; entries of sensors with fewer readings are nan.

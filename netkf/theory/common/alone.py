@@ -25,7 +25,8 @@ def steady_gain(F: FloatArray, Q: FloatArray, H: FloatArray, R: FloatArray) -> F
 
 
 def silent_jumps(scenario: Scenario) -> SlotJumps:
-    """Return the errors of filters in slots that exchange nothing, with their steady gains.
+    """Return the errors of filters in slots that exchange nothing, at their steady gains K (n, p),
+    as a linear system: a matrix I - K H (n, n) for each filter, and the noise of all.
 
     One block of n errors for each node, or a single block if all nodes share one pooled filter.
     Gains follow from the R that filters assume, the noise of the readings from the true one.

@@ -137,7 +137,9 @@ def linear_errors(scenario: Scenario) -> LinearErrors:
 
 
 def _require_known_law(scenario: Scenario) -> None:
-    """Raise TheoryError where errors have no law that is known here."""
+    """Raise TheoryError if filters have equations that are not known here, states or readings are
+    recorded, or the filters' F (or A) is not the plant's: then the errors have no law of their own.
+    """
     require_known_filter(scenario)
     if not scenario.is_random:
         raise TheoryError("the state or readings are recorded: their law is not known")

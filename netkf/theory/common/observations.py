@@ -44,7 +44,8 @@ def _noises(scenario: Scenario) -> list[tuple[FloatArray, FloatArray]]:
 
 
 def increment_observations(scenario: Scenario) -> list[Observation]:
-    """Return the continuous readings of each estimator; p is 0 for estimators without any.
+    """Return the continuous readings of each estimator, H (p, n), the assumed R (p, p) and a root
+    of the true one; p is 0 for estimators without any.
 
     Estimators with sensors of the same ``[[sensors]]`` entries share one object.
     """

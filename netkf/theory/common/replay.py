@@ -55,7 +55,9 @@ class ErrorLaw(NamedTuple):
 
 
 def replay_law(scenario: Scenario, run: Run) -> ErrorLaw:
-    """Return the joint law of the errors at all ``run.times``, of which there must be some.
+    """Return the joint Gaussian law of the errors of M estimators at all T ``run.times``, of which
+    there must be some: mean (T M n,), covariance (T M n, T M n), and P (T, M, n, n) by the filter's
+    equations.
 
     Raises TheoryError for a filter whose equations are not known here.
     """

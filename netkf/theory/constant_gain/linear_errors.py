@@ -113,7 +113,10 @@ def _node_slice(k: int, n: int) -> slice:
 
 
 def _error_flow(scenario: Scenario) -> JointErrorFlow:
-    """Return the dynamics of the errors between events, with the correction by increments."""
+    """Return the dynamics of the errors of N nodes between events, with the correction by
+    increments: the drift A - L H (N, n, n) per second, and the covariance (N n, N n) of the noise
+    per second.
+    """
     gains, truth = _node_gains(scenario), scenario.diffusion
     N, n = len(gains), len(truth.A)
     drift, noise = np.tile(truth.A, (N, 1, 1)), np.tile(truth.B @ truth.B.T, (N, N))

@@ -96,7 +96,9 @@ def few_regressors(scenario: Scenario) -> bool:
 
 
 def _make_sources(scenario: Scenario) -> list[_Source]:
-    """Return the scalar readings of all nodes; raises TheoryError for recorded sensors."""
+    """Return the scalar readings of all nodes, each as phi = C s (n,) with the law of its state s
+    (m,); raises TheoryError for recorded sensors.
+    """
     sources = []
     for node in scenario.sensing_nodes:
         for placed_sensor in scenario.placed_sensors[node]:

@@ -33,7 +33,8 @@ class SwitchedSamples(NamedTuple):
 
 
 def switched_samples(scenario: Scenario, samples: int, seed: int) -> SwitchedSamples:
-    """Return ``samples`` independent draws from mu^Abar of a gossip scenario, G Theorem 8.
+    """Return ``samples`` independent draws, covariances (samples, n, n) and nodes (samples,), from
+    mu^Abar of a gossip scenario, G Theorem 8.
 
     Coupling from the past: the chain of nodes is drawn backwards from the uniform law, and the
     Riccati recursion runs through ever longer pasts until a start at 0 and one at a huge covariance

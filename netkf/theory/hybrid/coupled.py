@@ -177,7 +177,11 @@ def coupling(scenario: Scenario) -> scipy.sparse.csr_array:
 
 
 def coupled_riccati(scenario: Scenario) -> CoupledRiccati:
-    """Return the equations of a scenario; raises TheoryError if H(12) does not apply."""
+    """Return the equations H(12) of a scenario with N nodes: coefficients (n, n), information
+    (N, n, n), rates of arrivals (N, N) and P(0) (N, n, n).
+
+    Raises TheoryError if H(12) does not apply.
+    """
     require_bound(scenario)
     A, Q = scenario.belief
     n = scenario.plant.n

@@ -125,7 +125,9 @@ def mean_link_weights(scenario: Scenario) -> dict[tuple[int, int], float]:
 
 
 def poisson_samples(scenario: Scenario) -> tuple[PoissonSamples, ...]:
-    """Return all sensors with Poisson clocks, in groups of equal numbers of rows."""
+    """Return all sensors with Poisson clocks, in groups of equal numbers p of rows: each has the H
+    (S, p, n), R (S, p, p) and rates (S,) of its S sensors.
+    """
     index, size = scenario.topology.index, len(scenario.nodes)
     pooled = scenario.filter.algorithm.pooled
     entries_by_rows: dict[int, list[tuple[int, FloatArray, FloatArray, float, int]]] = {}
@@ -166,7 +168,9 @@ def _arrival_rates(
 
 
 def sample_jumps(scenario: Scenario) -> tuple[SampleJump, ...]:
-    """Return the samples at known times below the horizon, in the order of time."""
+    """Return the samples at known times below the horizon, in the order of time: the readings of
+    each node, and the mean weights (N, N) of the messages that are sent then.
+    """
     placed_sensors = {
         (node, placed_sensor.ordinal): placed_sensor
         for node, sensors_of_node in scenario.sampled_sensors.items()

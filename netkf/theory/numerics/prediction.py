@@ -111,8 +111,10 @@ class Predictor:
         self._known: dict[float, Prediction] = {}
 
     def __call__(self, gap: float) -> Prediction:
-        """Return the prediction of the state and of all errors over ``gap`` seconds; up to
-        MAX_CACHED are cached by their gap.
+        """Return the prediction over ``gap`` seconds: the transitions (n, n) of the state and of
+        all errors, and the factors (n, k) of the plant's noise in them.
+
+        Up to MAX_CACHED predictions are cached by their gap.
         """
         prediction = self._known.get(gap)
         if prediction is None:

@@ -61,7 +61,9 @@ class EstimationSteps:
 
 
 def estimation_steps(scenario: Scenario, averaging: Averaging | None = None) -> EstimationSteps:
-    """Return steps 4 and 5 of a scenario, with its own links or the given ``averaging``.
+    """Return steps 4 and 5 of a scenario, with its own links or the given ``averaging``, as a
+    linear system: the closed loops and noise factors (N, n, n) of the nodes, and the law of
+    averaging.
 
     The filters' Q and R may differ from the truth, their F may not. Raises TheoryError if
     asymptotic gains do not exist or the links are not drawn independently.

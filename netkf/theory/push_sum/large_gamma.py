@@ -32,7 +32,9 @@ class LargeGamma(NamedTuple):
 
 
 def large_gamma_limits(scenario: Scenario) -> LargeGamma:
-    """Return the limits of P Lemma 4 and P Theorem 4 for gamma to infinity.
+    """Return the limits of P Lemma 4 and P Theorem 4 for gamma to infinity: the covariance
+    (N n, N n) of the transformed noise, and that of the steady errors (n, n), which is the same at
+    all nodes.
 
     The scenario's own gamma is ignored. Raises TheoryError where they do not hold: a graph that is
     not connected, links that are held over the steps or fail in one direction, a delta at or below

@@ -37,7 +37,8 @@ class PushSumLimits(NamedTuple):
 
 
 def push_sum_limits(scenario: Scenario) -> PushSumLimits:
-    """Return the limits of P Theorem 1, and of Theorem 2 (in probability) for failing links.
+    """Return the limits, by node, of the mass (N, n, n) and of the gains (n, p) of P Theorem 1, and
+    of Theorem 2 (in probability) for failing links.
 
     Theorem 2 needs links that fail in both directions together. F, Q, H and R are those that the
     filters assume. Raises TheoryError if the graph is not connected or P_inf does not exist, for
