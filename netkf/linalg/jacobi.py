@@ -45,6 +45,7 @@ def rotate(a: FloatArray, vectors: FloatArray, p: int, q: int) -> None:
     # t = tan(angle), the smaller of both solutions: |t| <= 1. An infinite tilt is an angle of 0.
     n, tilt = len(a), (a[q, q] - a[p, p]) / (2.0 * a[p, q])
     t = math.copysign(1.0, tilt) / (abs(tilt) + math.sqrt(1.0 + tilt * tilt))
+    # Cosine and sine from the tangent: square roots have the same bits on every CPU.
     c = 1.0 / math.sqrt(1.0 + t * t)
     s = t * c
     for k in range(n):

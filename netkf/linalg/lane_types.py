@@ -78,7 +78,9 @@ def _is_number(kind: Any) -> bool:
 
 
 def _broadcast(context: Any, builder: Any, value: Any, kind: Any, count: int) -> Any:
-    """Emit a value of ``count`` lanes from such a value (unchanged) or from a plain number."""
+    """Emit LLVM instructions for a value of ``count`` lanes from ``value``, of numba type ``kind``:
+    it may have these lanes already, or be a plain number.
+    """
     if isinstance(kind, LaneValue):
         return value
     number = context.cast(builder, value, kind, types.float64)
@@ -86,7 +88,7 @@ def _broadcast(context: Any, builder: Any, value: Any, kind: Any, count: int) ->
 
 
 def _splat(builder: Any, number: Any, count: int) -> Any:
-    """Emit a vector of ``count`` copies of a number."""
+    """Emit LLVM instructions for a vector of ``count`` copies of a number."""
     vector = ir.VectorType(number.type, count)
     first = builder.insert_element(ir.Constant(vector, ir.Undefined), number, I32(0))
     zeros = ir.Constant(ir.VectorType(I32, count), [0] * count)
@@ -142,7 +144,9 @@ def _load(lanes: Any, _array: Any, *_place: Any) -> Any:
 
 @lower_builtin(names.load, types.VarArg(types.Any))
 def lower_load(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-    """Emit one vector load of all lanes."""
+    """Emit one vector load of all lanes. numba calls it for ``load(lanes, array, *place)``: ``sig``
+    has the types of the call, ``args`` its LLVM values.
+    """
     pointer = _pointer(context, builder, sig.args[1:], args[1:])
     return builder.load(_as_vector(builder, pointer, DOUBLE, len(sig.args[0])), align=8)
 
@@ -154,7 +158,10 @@ def _store(_lanes: Any, _array: Any, *_place: Any) -> Any:
 
 @lower_builtin(names.store, types.VarArg(types.Any))
 def lower_store(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-    """Emit one vector store of all lanes."""
+    """Emit one vector store of all lanes. numba calls it for
+    ``store(lanes, array, *place, value)``: ``sig`` has the types of the call, ``args`` its LLVM
+    values.
+    """
     count = len(sig.args[0])
     pointer = _pointer(context, builder, sig.args[1:-1], args[1:-1])
     value = _broadcast(context, builder, args[-1], sig.args[-1], count)
@@ -179,7 +186,10 @@ def _scatter(*_: Any) -> Any:
 
 @lower_builtin(names.turn, types.BaseTuple, types.Array, types.Integer, types.Array)
 def lower_turn(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-    """Emit the transposition of L x L entries of ``rows``, from a column on, into ``out``."""
+    """Emit the transposition of L x L entries of ``rows``, from a column on, into ``out``. numba
+    calls it for ``turn(lanes, rows, column, out)``: ``sig`` has the types of the call, ``args`` its
+    LLVM values.
+    """
     count = len(sig.args[0])
     rows, out = (_Matrix(builder, sig.args[k], args[k]) for k in (1, 3))
     begin = context.cast(builder, args[2], sig.args[2], types.intp)
@@ -194,7 +204,9 @@ def lower_turn(context: Any, builder: Any, sig: Any, args: Any) -> Any:
 @lower_builtin(names.gather, types.BaseTuple, types.Array, types.Array, types.Integer, types.Array)
 def lower_gather(context: Any, builder: Any, sig: Any, args: Any) -> Any:
     """Emit one vector load per lane, from the row of ``array`` with the lane's index, and the
-    transposition of these; a negative index (no row) reads row 0.
+    transposition of these; a negative index (no row) reads row 0. numba calls it for
+    ``gather(lanes, array, places, first, out)``: ``sig`` has the types of the call, ``args`` its
+    LLVM values.
     """
     count = len(sig.args[0])
     array, out = (_Matrix(builder, sig.args[k], args[k]) for k in (1, 4))
@@ -216,7 +228,8 @@ def lower_gather(context: Any, builder: Any, sig: Any, args: Any) -> Any:
 )
 def lower_scatter(context: Any, builder: Any, sig: Any, args: Any) -> Any:
     """Emit a transposition and one masked store per lane, into the row of ``array`` with the lane's
-    index; lanes with a negative index store nothing.
+    index; lanes with a negative index store nothing. numba calls it for ``scatter(lanes, rows,
+    first, array, places, count)``: ``sig`` has the types of the call, ``args`` its LLVM values.
     """
     count = len(sig.args[0])
     rows, array = (_Matrix(builder, sig.args[k], args[k]) for k in (1, 3))
@@ -241,7 +254,9 @@ def lower_scatter(context: Any, builder: Any, sig: Any, args: Any) -> Any:
 
 
 def _entry_of(builder: Any, sig: Any, args: Any, argument: int, k: int) -> Any:
-    """Emit the load of entry k of an argument, an array of int64."""
+    """Emit the load of entry ``k`` of argument number ``argument`` of a call, an array of int64;
+    ``sig`` has the types of the call, ``args`` its LLVM values.
+    """
     return builder.load(
         entry_pointer(builder, sig.args[argument], args[argument], [ir.Constant(I64, k)])
     )
@@ -263,12 +278,16 @@ class _Matrix:
             self._columns = builder.mul(self._columns, size)
 
     def place(self, row: Any, column: Any, count: int) -> Any:
-        """Emit the address of ``count`` neighbouring entries in a row."""
+        """Emit the address, as that of a vector, of ``count`` neighbouring entries in ``row`` from
+        ``column`` on; both are LLVM integers.
+        """
         offset = self._builder.add(self._builder.mul(row, self._columns), column)
         return _as_vector(self._builder, self._builder.gep(self._data, [offset]), DOUBLE, count)
 
     def line(self, row: Any, count: int) -> Any:
-        """Emit the address of a row of an array whose rows have ``count`` entries."""
+        """Emit the address, as that of a vector, of ``row`` (an LLVM integer) of an array whose
+        rows have ``count`` entries.
+        """
         offset = self._builder.mul(row, ir.Constant(I64, count))
         return _as_vector(self._builder, self._builder.gep(self._data, [offset]), DOUBLE, count)
 
@@ -288,7 +307,9 @@ def _transposed(builder: Any, rows: list[Any]) -> list[Any]:
 
 
 def _exchange_blocks(builder: Any, a: Any, b: Any, half: int) -> tuple[Any, Any]:
-    """Emit rows ``a`` and ``b``, ``half`` apart, with their off-diagonal blocks exchanged."""
+    """Emit the rows ``a`` and ``b`` of a matrix, vectors whose indices are ``half`` apart, with
+    their off-diagonal blocks exchanged.
+    """
     count = a.type.count
     upper = [q if not q & half else count + q - half for q in range(count)]
     lower = [q + half if not q & half else count + q for q in range(count)]
@@ -304,7 +325,9 @@ def _prefetch(_array: Any, *_place: Any) -> Any:
 
 @lower_builtin(names.prefetch, types.VarArg(types.Any))
 def lower_prefetch(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-    """Emit a prefetch of the cache line at the given indices of an array."""
+    """Emit a prefetch of the cache line at the given indices of an array. numba calls it for
+    ``prefetch(array, *place)``: ``sig`` has the types of the call, ``args`` its LLVM values.
+    """
     pointer = builder.bitcast(_pointer(context, builder, sig.args, args), cgutils.voidptr_t)
     kinds = ir.FunctionType(ir.VoidType(), [cgutils.voidptr_t, I32, I32, I32])
     prefetch = cgutils.get_or_insert_function(builder.module, kinds, "llvm.prefetch.p0")
@@ -320,7 +343,9 @@ def _spread_type(lanes: Any, _number: Any) -> Any:
 
 @lower_builtin(names.spread, types.BaseTuple, types.Any)
 def lower_spread(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-    """Emit a number in all lanes."""
+    """Emit a number in all lanes. numba calls it for ``spread(lanes, number)``: ``sig`` has the
+    types of the call, ``args`` its LLVM values.
+    """
     return _broadcast(context, builder, args[1], sig.args[1], _count(sig.return_type))
 
 
@@ -331,7 +356,10 @@ def _load_flags(lanes: Any, _array: Any, *_place: Any) -> Any:
 
 @lower_builtin(names.load_flags, types.VarArg(types.Any))
 def lower_load_flags(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-    """Emit one vector load of bytes, compared with 0."""
+    """Emit one vector load of bytes, compared with 0. numba calls it for
+    ``load_flags(lanes, array, *place)``: ``sig`` has the types of the call, ``args`` its LLVM
+    values.
+    """
     pointer = _pointer(context, builder, sig.args[1:], args[1:])
     flags = builder.load(_as_vector(builder, pointer, BYTE, len(sig.args[0])), align=1)
     return builder.icmp_unsigned("!=", flags, ir.Constant(flags.type, None))
@@ -344,7 +372,10 @@ def _store_flags(_lanes: Any, _array: Any, *_place: Any) -> Any:
 
 @lower_builtin(names.store_flags, types.VarArg(types.Any))
 def lower_store_flags(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-    """Emit one vector store of all flags as bytes."""
+    """Emit one vector store of all flags as bytes. numba calls it for
+    ``store_flags(lanes, array, *place, flags)``: ``sig`` has the types of the call, ``args`` its
+    LLVM values.
+    """
     count = len(sig.args[0])
     pointer = _pointer(context, builder, sig.args[1:-1], args[1:-1])
     kind = BYTE if count == 1 else ir.VectorType(BYTE, count)
@@ -365,7 +396,9 @@ def _select(flags: Any, chosen: Any, other: Any) -> Any:
 
 @lower_builtin(names.select, types.Any, types.Any, types.Any)
 def lower_select(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-    """Emit a selection per lane, without a branch."""
+    """Emit a selection per lane, without a branch. numba calls it for
+    ``select(flags, chosen, other)``: ``sig`` has the types of the call, ``args`` its LLVM values.
+    """
     count = _count(sig.return_type)
     pair = [_broadcast(context, builder, args[k], sig.args[k], count) for k in (1, 2)]
     return builder.select(args[0], *pair)
@@ -378,7 +411,9 @@ def _any_lane(_flags: Any) -> Any:
 
 @lower_builtin(names.any_lane, types.Any)
 def lower_any_lane(_context: Any, builder: Any, sig: Any, args: Any) -> Any:
-    """Emit the flags as one integer, compared with 0."""
+    """Emit the flags as one integer, compared with 0. numba calls it for ``any_lane(flags)``:
+    ``sig`` has the types of the call, ``args`` its LLVM values.
+    """
     bits = builder.bitcast(args[0], ir.IntType(_count(sig.args[0])))
     return builder.icmp_unsigned("!=", bits, ir.Constant(bits.type, 0))
 
@@ -417,16 +452,22 @@ def _pair_count(a: Any, b: Any) -> int:
 
 
 def _arithmetic(operation: Any, name: str) -> None:
-    """Register an operator of two values; ``name`` is the builder's method, such as fadd."""
+    """Register with numba how an operator ``operation`` of two values of L lanes is typed and
+    compiled; ``name`` is the method of the LLVM builder, such as fadd.
+    """
 
     @_register_type(operation)
     def result(*args: Any) -> Any:
-        """Return the type of the result: a value of as many lanes as the operands."""
+        """Return the numba type of the result from the types of the operands: a value of as many
+        lanes as the operands.
+        """
         count = _pair_count(*args) if len(args) == 2 else 0
         return value_type(count) if count else None
 
     def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        """Emit the operation, with plain numbers copied to all lanes first."""
+        """Emit the operation, with plain numbers copied to all lanes first. numba gives the types
+        of the call in ``sig`` and its LLVM values in ``args``.
+        """
         count = _count(sig.return_type)
         pair = [
             _broadcast(context, builder, v, k, count) for v, k in zip(args, sig.args, strict=True)
@@ -438,16 +479,22 @@ def _arithmetic(operation: Any, name: str) -> None:
 
 
 def _comparison(operation: Any, sign: str) -> None:
-    """Register a comparison of two values; ``sign`` is LLVM's, such as ``<``."""
+    """Register with numba how a comparison ``operation`` of two values of L lanes is typed and
+    compiled; ``sign`` is LLVM's, such as ``<``.
+    """
 
     @_register_type(operation)
     def result(*args: Any) -> Any:
-        """Return the type of the result: flags of as many lanes as the operands."""
+        """Return the numba type of the result from the types of the operands: flags of as many
+        lanes as the operands.
+        """
         count = _pair_count(*args) if len(args) == 2 else 0
         return flags_type(count) if count else None
 
     def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        """Emit the comparison, with plain numbers copied to all lanes first."""
+        """Emit the comparison, with plain numbers copied to all lanes first. numba gives the types
+        of the call in ``sig`` and its LLVM values in ``args``.
+        """
         count = _count(sig.return_type)
         pair = [
             _broadcast(context, builder, v, k, count) for v, k in zip(args, sig.args, strict=True)
@@ -494,17 +541,23 @@ def lower_negative(_context: Any, builder: Any, _sig: Any, args: Any) -> Any:
 
 
 def _instruction(function: Any, name: str, arguments: int) -> None:
-    """Register a function as the LLVM intrinsic ``llvm.name`` of that many ``arguments``."""
+    """Register with numba that ``function`` is compiled to the LLVM intrinsic ``llvm.name`` of that
+    many ``arguments``.
+    """
 
     @_register_type(function)
     def result(*args: Any) -> Any:
-        """Return the type of the result: a value of as many lanes as the widest argument."""
+        """Return the numba type of the result from the types of the arguments: a value of as many
+        lanes as the widest argument.
+        """
         are_values = all(isinstance(kind, LaneValue) or _is_number(kind) for kind in args)
         return value_type(max(map(_count, args))) if are_values else None
 
     @lower_builtin(function, *[types.Any] * arguments)
     def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        """Emit a call of the intrinsic, with plain numbers copied to all lanes first."""
+        """Emit a call of the intrinsic, with plain numbers copied to all lanes first. numba gives
+        the types of the call in ``sig`` and its LLVM values in ``args``.
+        """
         count = _count(sig.return_type)
         values = [
             _broadcast(context, builder, v, k, count) for v, k in zip(args, sig.args, strict=True)

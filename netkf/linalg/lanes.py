@@ -36,6 +36,7 @@ def aligned(shape: tuple[int, ...], dtype: Any = np.float64) -> Any:
     C-contiguous.
     """
     size = math.prod(shape) * np.dtype(dtype).itemsize
+    # numpy aligns to 16 bytes only: take more, and begin at the next line of the cache.
     memory = np.zeros(size + ALIGNMENT, dtype=np.uint8)
     start = -memory.__array_interface__["data"][0] % ALIGNMENT
     return memory[start : start + size].view(dtype).reshape(shape)
@@ -77,6 +78,7 @@ def by_run(values: Any, runs: int) -> Any:
     the other; the idle lanes of the last block are left out.
     """
     blocks, *shape, lanes = values.shape
+    # Lanes right behind blocks: then runs are in their order.
     every = np.moveaxis(values, -1, 1).reshape(blocks * lanes, *shape)
     return np.ascontiguousarray(every[:runs])
 
@@ -88,7 +90,7 @@ def load(lanes: Lanes, array: FloatArray, *place: int) -> Any:
 
 def turn(lanes: Lanes, rows: FloatArray, column: int, out: FloatArray) -> None:
     """Transpose a block in kernels: write ``rows[q, column + k]`` into ``out[column + k, q]``, for
-    all lanes q and k < L; ``rows`` is (L, W), ``out`` (W, L).
+    all lanes q and k < L; ``rows`` is (L, W), ``out`` (W, L). There are L lanes and W columns.
     """
     raise _only_in_kernels()
 
@@ -99,9 +101,9 @@ def gather(
     """Transpose rows of different places into lanes, in kernels: write the L entries from ``first``
     on of ``array[places[q]]`` into lane q of the L rows of ``out`` from ``first`` on.
 
-    ``array`` (K, W) and ``out`` (W, L) are taken as matrices, whatever their axes, and have memory
-    behind their last entries (``with_spare``). Where a place (L,) is negative, lane q gets
-    something.
+    ``array`` (K, W), with K places, and ``out`` (W, L) are taken as matrices, whatever their axes,
+    and have memory behind their last entries (``with_spare``). Where a place (L,) is negative, lane
+    q gets something.
     """
     raise _only_in_kernels()
 
@@ -110,9 +112,9 @@ def scatter(
     lanes: Lanes, rows: FloatArray, first: int, array: FloatArray, places: np.ndarray, count: int
 ) -> None:
     """Transpose lanes back into rows of different places, in kernels: write lane q of the
-    ``count``, at most L, rows of ``rows`` (W, L) from ``first`` on into ``array[places[q]]``
-    (K, W), where the place (L,) is not negative. The array may be a part ``whole[:, k]`` of
-    another.
+    ``count``, at most L, rows of ``rows`` (W, L) from ``first`` on into ``array[places[q]]`` of
+    ``array`` (K, W), with K places, where the place (L,) is not negative. The array may be a part
+    ``whole[:, k]`` of another.
     """
     raise _only_in_kernels()
 

@@ -89,14 +89,18 @@ class KernelLower(ValueLower):
     """ValueLower with short code for entries and rows of C-contiguous arrays."""
 
     def _store_count(self, count: Any, difference: Any, step: Any) -> None:
-        """Store the number of steps of a range; none if it is 0 or negative."""
+        """Store the number of steps of a range at the address ``count``, from ``difference`` = stop
+        - start and a constant ``step``, LLVM values; it may be negative, which means none.
+        """
         if step.constant == 1:
             self.builder.store(difference, count)
         else:
             super()._store_count(count, difference, step)
 
     def lower_getitem(self, resty: Any, expr: Any, value: Any, index: Any, signature: Any) -> Any:
-        """Return ``value[index]``: an entry, or a row (the first index only) as a view."""
+        """Return the LLVM value of ``value[index]``, of numba type ``resty``: an entry, or a row
+        (the first index only) as a view.
+        """
         kind, indices = self.typeof(value.name), self._indices(value, index)
         if indices is None or not isinstance(kind.dtype, ENTRIES):
             return super().lower_getitem(resty, expr, value, index, signature)
@@ -108,7 +112,9 @@ class KernelLower(ValueLower):
         return self.context.cast(self.builder, entry, kind.dtype, resty)
 
     def lower_setitem(self, target_var: Any, index_var: Any, value_var: Any, signature: Any) -> Any:
-        """Emit ``target[index] = value`` for a number."""
+        """Emit LLVM IR for ``target[index] = value``: a short form for a number, numba's own for
+        all else. The arguments are variables of numba's IR.
+        """
         kind, value_type = self.typeof(target_var.name), self.typeof(value_var.name)
         indices = self._indices(target_var, index_var)
         has_indices = indices is not None and isinstance(kind.dtype, NUMBERS)
@@ -120,8 +126,8 @@ class KernelLower(ValueLower):
         return store_item(self.context, self.builder, kind, number, pointer)
 
     def _indices(self, array: Any, index: Any) -> Any:
-        """Return the nonnegative integer indices of an entry (one for each axis) or of a row (one);
-        None for slices, other layouts and all else that numba's own code handles.
+        """Return the nonnegative integer indices, LLVM values, of an entry (one for each axis) or
+        of a row (one); None for slices, other layouts and all else that numba's own code handles.
         """
         kind: Any = self.typeof(array.name)
         index_type: Any = self.typeof(index.name)
@@ -143,7 +149,8 @@ class KernelLower(ValueLower):
         return indices
 
     def _wrapped(self, index: Any, array: Any, axis: int) -> Any:
-        """Return ``index``, plus the length of its axis if it is negative, as Python does.
+        """Return ``index`` (an LLVM integer), plus the length of its ``axis`` of ``array`` if it is
+        negative, as Python does.
 
         An index that is known to be nonnegative is returned without the test that numba emits.
         """
@@ -155,7 +162,9 @@ class KernelLower(ValueLower):
         return builder.select(is_negative, builder.add(index, length), index)
 
     def _row(self, resty: Any, kind: Any, array: Any, index: Any) -> Any:
-        """Return the view ``array[index]`` of an array with more axes, without an owner."""
+        """Return the view ``array[index]``, of numba type ``resty``, of an array of numba type
+        ``kind`` with more axes, without an owner: only its address and shape are computed.
+        """
         builder, axes = self.builder, range(1, kind.ndim)
         shape = [builder.extract_value(array, [SHAPE, axis]) for axis in axes]
         items = shape[0]

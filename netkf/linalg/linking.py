@@ -51,7 +51,9 @@ def linked_once() -> Iterator[None]:
 
 @contextmanager
 def _patched_numba() -> Iterator[None]:
-    """Replace numba's methods within this context: all of them, or none if one is missing."""
+    """Replace the methods of numba that ``_patches`` and ``shortcuts`` list within this context:
+    all of them, or none if this version of numba lacks one. They are restored at the end.
+    """
     try:
         patches = [*_patches(), *shortcuts()]
         # All originals are looked up before the first is replaced.
@@ -102,7 +104,9 @@ def _patches() -> list[tuple[Any, str, Callable[..., Any]]]:
 
 
 def _count_depth(stage: str, original: Callable[..., Any]) -> Callable[..., Any]:
-    """Return ``original`` with a count of its nested calls in the attribute ``stage`` of _DEPTH."""
+    """Return ``original`` with a count of its nested calls in the attribute ``stage`` of _DEPTH.
+    ``stage`` is "compile", "load" or "finalize".
+    """
 
     def count_and_call(*args: Any, **kwargs: Any) -> Any:
         """Call ``original`` with the count one higher, also if it raises."""
@@ -118,7 +122,9 @@ def _count_depth(stage: str, original: Callable[..., Any]) -> Callable[..., Any]
 def _only_outermost(
     stage: str, original: Callable[..., Any], inner: Callable[..., Any]
 ) -> Callable[..., Any]:
-    """Return a function that calls ``original`` for the outermost function, else ``inner``."""
+    """Return a function that calls ``original`` while numba compiles the outermost function, else
+    ``inner``, with the same arguments; ``stage`` ("compile" or "finalize") is what is nested.
+    """
 
     def choose(*args: Any, **kwargs: Any) -> Any:
         return (inner if _is_linked(stage) else original)(*args, **kwargs)
@@ -127,7 +133,9 @@ def _only_outermost(
 
 
 def _is_linked(stage: str) -> bool:
-    """Return True if the function that is now in ``stage`` is an inner one."""
+    """Return True if the function that is now in ``stage`` ("compile" or "finalize") is an inner
+    one, which another compiled function calls.
+    """
     # The outermost library is finalized inside get_executable; a finalize outside of it, or nested
     # in another one, is that of a callee. Code loaded from disk is not finalized again.
     depth: int = getattr(_DEPTH, stage)
@@ -149,7 +157,7 @@ def _skip(*_: Any, **__: Any) -> None:
 
 
 def _internalise(optimize: Callable[..., Any]) -> Callable[..., Any]:
-    """Wrap ``optimize`` so that linked inner functions have internal linkage.
+    """Wrap numba's method ``optimize`` so that linked inner functions have internal linkage.
 
     LLVM may then drop a function after inlining it, and change its signature.
     """
@@ -182,8 +190,8 @@ class _OwnCode:
 
 
 def _link_once(finalize: Callable[..., Any]) -> Callable[..., Any]:
-    """Wrap ``finalize`` so that all direct and indirect callees are linked into the outermost
-    library at once, and none into inner libraries.
+    """Wrap numba's method ``finalize`` so that all direct and indirect callees are linked into the
+    outermost library at once, and none into inner libraries.
 
     numba links callees at each level, so that inner functions are copied many times.
     """

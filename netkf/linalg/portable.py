@@ -58,6 +58,7 @@ def cholesky(matrix: FloatArray) -> FloatArray:
     """
     L = np.array(matrix, dtype=np.float64)
     for k in range(len(L)):
+        # One outer product a step: every entry is reduced in the order of k, whatever the CPU.
         L[k, k] = np.sqrt(L[k, k])
         L[k + 1 :, k] /= L[k, k]
         L[k + 1 :, k + 1 :] -= L[k + 1 :, k, None] * L[None, k + 1 :, k]
@@ -70,6 +71,7 @@ def solve_lower(L: FloatArray, right: FloatArray) -> FloatArray:
     """
     out = np.array(right, dtype=np.float64)
     for k in range(len(L)):
+        # Forward substitution by columns, so that numpy works on whole rows at once.
         out[..., k, :] /= L[k, k]
         out[..., k + 1 :, :] -= L[k + 1 :, k, None] * out[..., None, k, :]
     return out
@@ -127,6 +129,7 @@ def noise_root(matrix: FloatArray) -> FloatArray:
     with LAPACK's (multiple eigenvalues have arbitrary ones), and for more than MAX_REFINED_STATES
     states, the result is ``square_root``, with the bits of LAPACK.
     """
+    # LAPACK decides the order and the signs of columns, which do not depend on its last bits.
     lapack_root = square_root(matrix)
     if len(matrix) > MAX_REFINED_STATES:
         return lapack_root
@@ -155,6 +158,7 @@ def gauss_legendre(count: int) -> tuple[FloatArray, FloatArray]:
     with localcontext() as context:
         context.prec = 40
         for k in range(count):
+            # An asymptotic formula for root k, from which Newton's method converges quadratically.
             x = Decimal(float(np.cos(np.pi * (count - k - 0.25) / (count + 0.5))))
             for _ in range(8):
                 value, slope = _legendre(count, x)

@@ -122,8 +122,8 @@ def fill_row(
     """Write the sum of ``gap^k series[m, cell, k]`` (W,) over k < ``terms`` into row ``row`` of
     ``out`` (L, W), for model ``m`` and a cell of gaps, at ``gap`` seconds from its centre.
 
-    The width W of ``series`` (M, cells, K, W) is a multiple of L lanes. The numbers of terms in
-    MANY_TERMS have unrolled loops.
+    ``series`` (M, cells, K, W) has K >= ``terms`` coefficients for each of M models; its width W is
+    a multiple of L lanes. The numbers of terms in MANY_TERMS have unrolled loops.
     """
     if terms == len(ORDER_7) + 1:
         fill_blocks(ORDER_7, out, row, series, m, cell, gap)
@@ -149,7 +149,8 @@ def fill_blocks(
 ) -> None:
     """Write ``sum_k gap^k series[m, cell, k]`` (W,) over k <= len(order) into row ``row`` of
     ``out`` (L, W), by Horner's scheme for blocks of L entries at a time; ``series`` is
-    (M, cells, K, W), for M models and cells of gaps.
+    (M, cells, K, W), with K coefficients of W entries for each of M models and of the cells of
+    gaps.
     """
     for j in range(0, series.shape[3], LANES):
         total = load(MANY, series, m, cell, len(order), j)
@@ -163,6 +164,7 @@ def polynomial(series: FloatArray, gap: float) -> FloatArray:
     """Return ``sum_k gap^k series[k]`` (size,) at ``gap`` (seconds), of a table ``series``
     (terms, size + 1) from with_reach(), as a new array.
     """
+    # The last column of the table is the reach, not a coefficient.
     out = np.empty(series.shape[1] - 1)
     fill_polynomial(out, series, gap)
     return out

@@ -141,7 +141,9 @@ def _cache_call_types(find: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _run_pass(manager: Any, _: int, step: Any, state: Any) -> None:
-    """Run a compiler pass, without numba's event notifications and measurements of time."""
+    """Run the compiler pass ``step`` on the ``state`` of one function, without numba's event
+    notifications and measurements of time.
+    """
     step.analysis = manager._analysis
     for part in (step.run_initialization, step.run_pass, step.run_finalizer):
         part(state)

@@ -109,6 +109,7 @@ def swap_rows(a: FloatArray, i: int, k: int, first: int, last: int) -> None:
 @kernel(allocates=True)
 def solve(left: FloatArray, right: FloatArray) -> FloatArray:
     """Return ``left^-1 right`` (n, c) of (n, n) and (n, c); nan if it is singular or overflows."""
+    # Copies, since the elimination overwrites both.
     out = right.copy()
     solve_inplace(left.copy(), out, len(left))
     return out

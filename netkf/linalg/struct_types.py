@@ -89,7 +89,9 @@ def _field_type(kind: Any) -> Any:
 
 @unbox(StructType)
 def unbox_struct(_: StructType, value: Any, c: Any) -> Any:
-    """Convert a struct of Python to its address, read from the attribute at each call."""
+    """Emit the conversion of a struct of Python, ``value``, to its address for compiled code, read
+    from the attribute at each call.
+    """
     number = c.pyapi.object_getattr_string(value, "address")
     address = c.pyapi.long_as_voidptr(number)
     c.pyapi.decref(number)
@@ -116,7 +118,9 @@ def _field_pointer(builder: Any, address: Any, offset: int, llvm_type: Any) -> A
 
 @lower_getattr_generic(StructType)
 def load_field(context: Any, builder: Any, struct: StructType, address: Any, name: str) -> Any:
-    """Emit ``struct.name``: load a number or an address, or build an array without an owner."""
+    """Emit LLVM IR for ``struct.name``, a struct of numba type ``struct`` at ``address``: load a
+    number or an address, or build an array without an owner.
+    """
     offset, kind = struct.field(name)
     # The values of a sized tuple are never read, only its length.
     if isinstance(kind, types.BaseTuple):
@@ -137,7 +141,9 @@ def load_field(context: Any, builder: Any, struct: StructType, address: Any, nam
 
 @lower_setattr_generic(StructType)
 def store_field(context: Any, builder: Any, sig: Any, args: Any, name: str) -> None:
-    """Emit ``struct.name = number``; arrays can be assigned in Python only."""
+    """Emit LLVM IR for ``struct.name = number``, with the numba types ``sig`` and LLVM values
+    ``args`` of the struct and the number; arrays can be assigned in Python only.
+    """
     struct, (address, value) = sig.args[0], args
     offset, kind = struct.field(name)
     # numba may have typed the value as another number: convert it to the field's type.

@@ -51,8 +51,9 @@ _NEVER_FAIL: set[str] = set()
 
 
 def inserted_value(aggregate: Any, indices: list[int]) -> tuple[Any, list[int]]:
-    """Return (value, indices in it) for the entry at ``indices`` of an aggregate, as far as the
-    chain of ``insertvalue`` instructions tells: empty indices if the entry is the value itself.
+    """Return (value, indices in it) for the entry at ``indices`` of an LLVM ``aggregate`` (a
+    structure), as far as the chain of ``insertvalue`` instructions tells: empty indices if the
+    entry is the value itself.
     """
     while indices and isinstance(aggregate, instructions.InsertValue):
         inserted_at = list(aggregate.indices)
@@ -102,7 +103,7 @@ class ValueLower(Lower):
             _NEVER_FAIL.add(self.function.name)
 
     def lower_inst(self, inst: Any) -> None:
-        """Lower a statement."""
+        """Emit LLVM IR for one statement ``inst`` of numba's IR."""
         # Assignments directly: numba first formats each statement as a comment for debugging.
         if isinstance(inst, numba_ir.Assign) and not self.context.enable_nrt:
             target = inst.target.name
@@ -113,7 +114,9 @@ class ValueLower(Lower):
     # Variables.
 
     def storevar(self, value: Any, name: str, argidx: int | None = None) -> None:
-        """Assign ``value`` to the variable ``name``."""
+        """Assign an LLVM ``value`` to the variable ``name``; ``argidx`` is its index if it is an
+        argument.
+        """
         # numba loads the old value first to decrease its reference count, which kernels without
         # reference counting (enable_nrt) do not need.
         if self.context.enable_nrt or name in self._singly_assigned_vars:
@@ -178,7 +181,9 @@ class ValueLower(Lower):
     # Loops.
 
     def lower_expr(self, resty: Any, expr: Any) -> Any:
-        """Return the value of an expression; loops over ``range`` and shapes in less IR."""
+        """Return the LLVM value of an expression ``expr`` of numba's IR, whose result has the numba
+        type ``resty``: loops over ``range`` and shapes in less LLVM IR, all else as numba does.
+        """
         result = None
         if expr.op == "getiter":
             result = self._iterator(resty, expr)
@@ -193,7 +198,10 @@ class ValueLower(Lower):
         return super().lower_expr(resty, expr) if result is None else result
 
     def lower_call(self, resty: Any, expr: Any) -> Any:
-        """Return the value of a call; ``len`` of an array and ``range`` of int64 in less IR."""
+        """Return the LLVM value of a call ``expr`` in numba's IR, whose result has the numba type
+        ``resty``: ``len`` of an array and ``range`` of int64 in less LLVM IR, all else as numba
+        does.
+        """
         signature = self.fndesc.calltypes[expr]
         callee = getattr(self.typeof(expr.func.name), "typing_key", None)
         if callee is len and isinstance(signature.args[0], types.Array):
@@ -206,20 +214,23 @@ class ValueLower(Lower):
         return self._struct(resty, *ranges[len(arguments) - 1])
 
     def _shape(self, expr: Any) -> Any:
-        """Return the shape of an array; None for other types."""
+        """Return the shape, an LLVM array of integers, that an expression ``expr`` =
+        ``value.shape`` of numba's IR asks for; None unless the value is an array.
+        """
         if not isinstance(self.typeof(expr.value.name), types.Array):
             return None
         return self.builder.extract_value(self.loadvar(expr.value.name), SHAPE)
 
     def _struct(self, kind: Any, *fields: Any) -> Any:
-        """Return a structure of numba type ``kind`` with these fields."""
+        """Return an LLVM structure of numba type ``kind`` with these fields, LLVM values."""
         struct = ir.Constant(self.context.get_value_type(kind), ir.Undefined)
         for k, value in enumerate(fields):
             struct = self.builder.insert_value(struct, value, k)
         return struct
 
     def _iterator(self, resty: Any, expr: Any) -> Any:
-        """Return the iterator of a range of int64 with a constant step; None for others.
+        """Return the LLVM structure of an iterator, of numba type ``resty``, over the range of
+        int64 with a constant step that ``expr`` iterates over; None for other iterators.
 
         Its state is on the stack, as in numba: the next value and the number of steps to go.
         """
@@ -236,7 +247,9 @@ class ValueLower(Lower):
         return self._struct(resty, next_value, stop, step, count)
 
     def _store_count(self, count: Any, difference: Any, step: Any) -> None:
-        """Store the number of steps of a range, at least 0, from ``difference`` = stop - start."""
+        """Store the number of steps of a range, at least 0, at the address ``count``, from
+        ``difference`` = stop - start and a constant ``step``, all LLVM values.
+        """
         builder = self.builder
         positive = builder.icmp_signed(">", difference, ZERO)
         is_empty = builder.not_(positive) if step.constant > 0 else positive
@@ -250,8 +263,8 @@ class ValueLower(Lower):
                 builder.store(builder.add(builder.sdiv(difference, step), extra_step), count)
 
     def _next(self, resty: Any, expr: Any) -> Any:
-        """Return the pair (current value, True while there are more) of a range iterator, and
-        advance it; None for other iterators.
+        """Return the pair (current value, True while there are more), of numba type ``resty``, of
+        the range iterator in ``expr``, and advance it; None for other iterators.
         """
         if self.typeof(expr.value.name) != types.range_iter64_type:
             return None

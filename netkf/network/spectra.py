@@ -14,7 +14,7 @@ def largest_laplacian_eigenvalue(degrees: FloatArray, ends: np.ndarray) -> float
     """Return the largest eigenvalue of the Laplacian of an undirected graph.
 
     ``degrees`` (N,) are the numbers of links at each node, ``ends`` (L, 2) the indices of the two
-    nodes of each link.
+    nodes of each of L links.
     """
     if not len(ends):
         return 0.0
@@ -29,7 +29,7 @@ def _largest_sparse(degrees: FloatArray, ends: np.ndarray) -> float:
     """Return the largest eigenvalue of the Laplacian of an undirected graph, by Lanczos' method.
 
     ``degrees`` (N,) are the numbers of links at each node, ``ends`` (L, 2) the indices of the two
-    nodes of each link.
+    nodes of each of L links.
     """
     import scipy.sparse
     import scipy.sparse.linalg

@@ -92,7 +92,7 @@ class Diffusion(Plant):
     ) -> DiffusionPaths:
         """Return the paths of R runs, one for each of the R streams of ``normals``, which draw x(0)
         and the steps; all have states on the sensing grid and at the times ``sampled`` and
-        ``probe_times`` (increasing, seconds), (K,) each.
+        ``probe_times`` (increasing, seconds), one-dimensional arrays.
 
         ``sampling`` draws only the states at times ``sampled`` off the grid, ``probing`` those at
         probe times off both. With ``frames`` states are local to frames, see ``truth``.

@@ -46,7 +46,7 @@ class LinearPlant(Plant):
         return float(round(k * self.period, 12))
 
     def slots_of(self, times: FloatArray) -> np.ndarray:
-        """Return the slot (K,) that contains each of the ``times`` (K,), in seconds; a time that is
+        """Return the slots (K,) that contain each of K ``times`` (K,), in seconds; a time that is
         below the start of a slot by rounding belongs to that slot.
         """
         return np.asarray(np.floor(times / self.period + 1e-9).astype(int))

@@ -152,8 +152,8 @@ class DiffusionPaths:
         return block
 
     def _cut(self, block: Block, times: FloatArray, source: Normals) -> Block:
-        """Return the block cut further at the ``times`` (C,), none of which is an end of a piece;
-        states and moments there are drawn from ``source``.
+        """Return the block cut further at C ``times`` (C,) in seconds, none of which is an end of a
+        piece; states and moments there are drawn from ``source``.
         """
         # Index of the piece that contains each time.
         owners = np.searchsorted(block.end, times)
@@ -201,8 +201,8 @@ class DiffusionPaths:
         times: FloatArray,
         normals: FloatArray,
     ) -> None:
-        """Cut the pieces in ``rows`` (C,) at ``times`` (C,), given their ends and moments, in the
-        arrays of ``pieces``.
+        """Cut the C pieces in ``rows`` (C,) of B paths at ``times`` (C,) in seconds, given their
+        ends and moments, in the arrays of ``pieces``.
 
         All have the same length and are cut at the same position. The row becomes the part before
         the cut, the rows after it up to ``stops`` (C,) the part after it. ``normals`` (B, C, 3 n).
@@ -306,7 +306,8 @@ def add_response(
 ) -> None:
     """Write ``out`` = ``values`` + ``sign`` R x[run, row], both (3 n,), where R (3 n, n) is
     ``responses[which]`` (3, n, n): the response of end state and moments to the state at the start.
-    ``responses`` is (W, 3, n, n), ``x`` (B, K, n) has the states of B paths at K pieces.
+    ``responses`` is (W, 3, n, n), for W intervals; ``x`` (B, K, n) has the states of B paths at K
+    pieces.
     """
     n = x.shape[2]
     for m in range(3):
@@ -328,7 +329,7 @@ def set_part(
 ) -> None:
     """Set moments and cubic of the piece ``row`` of ``length`` seconds in path ``run``, in
     ``pieces``: states at the starts and ends (B, K, n), moments (B, K, 2, n) and cubics
-    (B, K, 3, n) of B paths.
+    (B, K, 3, n) of B paths of K pieces.
 
     ``values`` (3 n,) are its end state and moments, ``noise`` (3 n,) the contribution of the noise
     to them, which the cubic interpolates.
@@ -352,8 +353,8 @@ def fill_cubic(
     tilted: float,
 ) -> None:
     """Set ``cubic[run, row, :, i]`` of ``cubic`` (B, K, 3, n), for component i of the state in
-    piece ``row`` of path ``run``: the coefficients, times ``length``, of u, u^2 and u^3 of the
-    cubic on 0 <= u <= 1 that is 0 at u = 0 and ``end`` at u = 1.
+    piece ``row`` (0 to K - 1) of path ``run`` (0 to B - 1): the coefficients, times ``length``, of
+    u, u^2 and u^3 of the cubic on 0 <= u <= 1 that is 0 at u = 0 and ``end`` at u = 1.
 
     Over ``length`` seconds its integral is ``plain`` and that of its product with P_1 ``tilted``.
     """
@@ -570,12 +571,13 @@ def fill_course(
     cubic: FloatArray,
     k: int,
 ) -> None:
-    """Write the running integrals of x over piece ``k`` of ``length`` seconds as polynomials in
-    u = (t - start) / length, 0 <= u <= 1.
+    """Write the running integrals of x over piece ``k`` of ``length`` seconds as polynomials in u =
+    (t - start) / length, 0 <= u <= 1.
 
     The coefficients ``out`` (D, W >= 2 n) are such that the integral of x from the start to u is
-    ``u sum_d u^d out[d, :n]``, and that of x u is ``u^2 sum_d u^d out[d, n : 2 n]``. ``table`` is
-    GridLaws.course_table, ``x_start`` (K, n), ``cubic`` (K, 3, n).
+    ``u sum_d u^d out[d, :n]``, and that of x u is ``u^2 sum_d u^d out[d, n : 2 n]``. ``table``
+    (D, 2 n, W) is GridLaws.course_table; ``x_start`` (K, n) and ``cubic`` (K, 3, n) are the states
+    at the starts and the cubics of K pieces. ``size`` has length n.
     """
     n, power = len(size), length  # power = length^(d + 1)
     for d in range(len(out)):
@@ -607,8 +609,8 @@ def fill_state_moments(
     (2, n); these begin ``since`` seconds after the start of a piece of ``length`` seconds. ``size``
     has length n.
 
-    ``course`` (D, W) are the coefficients that ``fill_course`` wrote for the piece, ``scratch``
-    (2 W,).
+    ``course`` (D, W), D of W polynomials, are the coefficients that ``fill_course`` wrote for the
+    piece, ``scratch`` (2 W,).
     """
     first, share = since / length, gap / length
     fill_integrals(scratch, course, first, first + share)
@@ -617,8 +619,8 @@ def fill_state_moments(
 
 @kernel(inlined=True, fused=True)
 def fill_integrals(out: FloatArray, course: FloatArray, first: float, last: float) -> None:
-    """Evaluate the polynomials ``u sum_d u^d course[d]`` (W,) of a ``course`` (D, W) at u =
-    ``first`` into ``out[:W]`` and at u = ``last`` into ``out[W : 2 W]``.
+    """Evaluate the polynomials ``u sum_d u^d course[d]`` (W,) of a ``course`` (D, W), D
+    coefficients each, at u = ``first`` into ``out[:W]`` and at u = ``last`` into ``out[W : 2 W]``.
     """
     width, top = course.shape[1], len(course) - 1
     # Horner's rule at both points in one loop: each product waits for the one before it, so two
@@ -643,8 +645,8 @@ def fill_moments_between(
     first: Any,
     share: Any,
 ) -> None:
-    """Write the moments ``out`` (2, n, L) of x over u in [first, first + share] of a piece, (L,)
-    each, where u is the share of the piece that has passed; ``size`` has length n.
+    """Write the moments ``out`` (2, n, L) of x over u in [first, first + share] of a piece, in L
+    lanes, (L,) each, where u is the share of the piece that has passed; ``size`` has length n.
 
     ``integrals`` (2 W, L), W = ``width``, are those that ``fill_integrals`` wrote for both ends.
     """

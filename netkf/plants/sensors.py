@@ -254,9 +254,10 @@ def fill_reading(
     (2 q, L); ``size`` has length n.
 
     Its first moments begin at ``out[row]``, its second moments at ``out[q + row]``. ``x_moments``
-    (2, n, L) are those of x, ``noise`` (2, p, L) those of unit white noise; H is (S, p, n, L), root
-    (S, p, p, L) and lower triangular.
+    (2, n, L) are those of x, ``noise`` (2, p, L) those of unit white noise; H of S sensors is
+    (S, p, n, L), root (S, p, p, L) and lower triangular.
     """
+    # First moments of all rows come before the second ones, as filters stack sensors.
     half = len(out) // 2
     # moment_m(dy) = H moment_m(x) + root moment_m(noise)
     for m in range(2):
@@ -286,7 +287,8 @@ def cut(
 def divide(
     lanes: Lanes, first: FloatArray, rest: FloatArray, normals: FloatArray, u: Any, length: Any
 ) -> None:
-    """Divide the noise moments ``rest`` (2, p, L) of an interval of ``length`` seconds in two.
+    """Divide the two noise moments ``rest`` (2, p, L) of p rows in L lanes of an interval of
+    ``length`` seconds in two.
 
     Those of its first part, a share ``u`` of the length, are written to ``first`` (2, p, L), those
     of the remaining part replace ``rest``. ``normals`` (2, p, L) are standard normal.

@@ -44,8 +44,8 @@ def draw_normals(
 ) -> None:
     """Fill ``normals`` (>= count, L) with the next ``count`` standard normals of L streams.
 
-    Lane q takes them from row ``first + q * stride`` of ``states`` (K, >= 4) if q < ``runs``, the
-    number of runs left; idle lanes keep their values. Steps these states.
+    Lane q takes them from row ``first + q * stride`` of the ``states`` (K, >= 4) of K streams if q
+    < ``runs``, the number of runs left; idle lanes keep their values. Steps these states.
     """
     # Lanes in the inner loop: numbers of different streams do not wait for each other.
     for j in range(count):
@@ -94,8 +94,8 @@ def move_path(
     the next slot; ``s`` is the index of the slot in the arrays.
 
     ``local[b, s]`` (n, L) gets the state in the frame before a rebase in this slot; with frames
-    ``absolute[b, s]`` (n, L) gets the state in the plant's coordinates; both are (B, S, n, L).
-    ``normals`` (q, L) drive the step; ``moved`` (n, L) is scratch.
+    ``absolute[b, s]`` (n, L) gets the state in the plant's coordinates; both are (B, S, n, L), for
+    B blocks and S slots. ``normals`` (q, L) drive the step; ``moved`` (n, L) is scratch.
     """
     n = len(path.F)
     # Before a rebase: the errors of this slot are still in coordinates of the old frame.
@@ -143,8 +143,8 @@ def draw_paths(
     absolute: FloatArray,
 ) -> None:
     """Write the states of R runs in S slots from number ``slot`` on into ``local``, relative to the
-    present frame, and, with frames, ``absolute``, both (B, S, n, L); move ``path`` behind these
-    slots.
+    present frame, and, with frames, ``absolute``, both (B, S, n, L) for B blocks of L runs; move
+    ``path`` behind these slots.
 
     Each run draws from its own stream, ``states`` (R, >= 4); ``scratch`` (2, max(n, q), L).
     """
@@ -200,11 +200,13 @@ def draw_readings(
     """Write the readings ``y`` (B, S, H', p, L) of all M sensors in S slots of R runs (B blocks of
     L), for H' filters, and ``H`` (B, S, H', p, n, L) where it is random.
 
-    x (B, S, n, L) are the states, ``regressors`` (D, B, S, k, L) those of the regressors. Run r
-    draws the noise of sensor m from row r M + m of ``states`` (R M, >= 4); ``scratch`` (p, L).
+    x (B, S, n, L) are the states, ``regressors`` (D, B, S, k, L) those of D regressors of k
+    components. Run r draws the noise of sensor m from row r M + m of ``states`` (R M, >= 4);
+    ``scratch`` (p, L).
     """
     count = len(sensors.estimator)
     for b in range(x.shape[0] if count > 0 else 0):
+        # Runs left: the last block may have more lanes than runs.
         runs, first = len(states) // count - b * len(lanes), b * len(lanes) * count
         for s in range(x.shape[1]):
             for m in range(count):
@@ -235,8 +237,8 @@ def read_row(
     ``b`` into ``y`` (B, S, H', p, L), for H' filters, and that row into ``H`` (B, S, H', p, n, L)
     if it is random.
 
-    x (B, S, n, L) are the states, ``regressors`` (D, B, S, k, L) those of the regressors,
-    ``normals`` (p, L) the standard normals of the reading.
+    x (B, S, n, L) are the states, ``regressors`` (D, B, S, k, L) those of D regressors of k
+    components, for B blocks and S slots, ``normals`` (p, L) the standard normals of the reading.
     """
     estimator, row, d = sensors.estimator[m], sensors.row[m] + i, sensors.driven[m]
     # total = (noise factor) z, row i

@@ -83,11 +83,11 @@ class Transitions:
         return np.asarray(Phi[index])
 
     def bridges(self, before: FloatArray, after: FloatArray) -> FloatArray:
-        """Return D (K, n, 2 n) with ``z = D [z1; z2]`` for gaps that consist of two parts of
+        """Return D (K, n, 2 n) with ``z = D [z1; z2]`` for K gaps that consist of two parts of
         ``before`` and ``after`` seconds (K,).
 
-        z are the standard normals of a whole gap, z1 and z2 those of its parts:
-        L z = Phi2 L1 z1 + L2 z2. The rows of D are orthonormal or zero.
+        z are the standard normals of a whole gap, z1 and z2 those of its parts: L z = Phi2 L1 z1 +
+        L2 z2. The rows of D are orthonormal or zero.
         """
         pairs, index = np.unique(np.stack([before, after]), axis=1, return_inverse=True)
         L1, (Phi2, L2) = self.laws(pairs[0])[1], self.laws(pairs[1])
@@ -95,22 +95,22 @@ class Transitions:
         return np.asarray(directions[index.reshape(-1)])
 
     def _doublings(self, gaps: FloatArray) -> np.ndarray:
-        """Return the number of halvings (K,) after which the power series applies to each of the
+        """Return the number of halvings (K,) after which the power series applies to each of K
         ``gaps`` (K,), in seconds.
         """
         sizes = np.maximum(gaps * (self._norm / UNIT_SIZE), 1.0)
         return np.ceil(np.log2(sizes)).astype(np.int64)
 
     def _unit_transition(self, gaps: FloatArray) -> FloatArray:
-        """Return exp(A g) (K, n, n) by its power series, for ``gaps`` g (K,) in seconds within one
-        unit.
+        """Return exp(A g) (K, n, n) by its power series, for K ``gaps`` g (K,) in seconds within
+        one unit.
         """
         n, terms = self.n, len(self._series)
         powers = _powers(gaps, terms)
         return product(powers, self._series.reshape(terms, n * n)).reshape(-1, n, n)
 
     def _unit_noise(self, gaps: FloatArray) -> FloatArray:
-        """Return a factor (K, n, 10 m) of the noise covariance of ``gaps`` (K,) in seconds within
+        """Return a factor (K, n, 10 m) of the noise covariance of K ``gaps`` (K,) in seconds within
         one unit: columns ``e^{A s} B sqrt(weight)`` at the 10 quadrature nodes s.
         """
         terms, n, m = self._response.shape

@@ -58,7 +58,8 @@ def origins(Phi: FloatArray, offsets: FloatArray) -> FloatArray:
     """Return the absolute position (F + 1, n) of each frame's origin at the start of the frame.
 
     The first is 0, then ``c[k+1] = Phi[k] c[k] + offsets[k]``: ``Phi`` (F, n, n) are the
-    transitions over the frames that end by a rebase, ``offsets`` (F, n) the local states before it.
+    transitions over the F frames that end by a rebase, ``offsets`` (F, n) the local states before
+    it.
     """
     positions = np.zeros((len(offsets) + 1, offsets.shape[1]))
     with np.errstate(over="ignore", invalid="ignore"):
@@ -74,7 +75,8 @@ def origins(Phi: FloatArray, offsets: FloatArray) -> FloatArray:
 def absolute_states(
     moves: Transitions, frame_times: FloatArray, offsets: FloatArray, t: FloatArray, x: FloatArray
 ) -> FloatArray:
-    """Return absolute states (K, n) at times ``t`` (K,) from local states ``x`` (K, n).
+    """Return absolute states (K, n) at K times ``t`` (K,) in seconds from local states ``x``
+    (K, n).
 
     A frame begins at 0 and at each of ``frame_times`` (F,), in seconds; ``offsets`` (F, n) are the
     local states just before these rebases. At a frame time ``x`` is local to the new frame.
@@ -200,7 +202,7 @@ def _bridge_gap(
     probing: np.random.Generator,
     probes: FloatArray,
 ) -> FloatArray:
-    """Return states (P, n) at increasing ``probes`` (P,) given the ``states`` (K, n) at ``times``
+    """Return states (P, n) at P increasing ``probes`` (P,) given the ``states`` (K, n) at ``times``
     (K,), both in seconds.
 
     ``normals`` (K - 1, n) are those of the gaps between the times. A state is in the frame of the

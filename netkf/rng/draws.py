@@ -98,7 +98,9 @@ def following(
 
 @kernel
 def next_word(states: np.ndarray, k: int) -> Any:
-    """Return the next 64-bit word of stream ``k`` of ``states`` (K, >= 4), and step its state."""
+    """Return the next 64-bit word of stream ``k`` of the ``states`` (K, >= 4) of K streams, and
+    step its state.
+    """
     high, low = states[k, 0], states[k, 1]
     upper = high_word(low, CHEAP)
     states[k, 0], states[k, 1] = following(high, low, upper, states[k, 2], states[k, 3])
@@ -107,16 +109,18 @@ def next_word(states: np.ndarray, k: int) -> Any:
 
 @kernel
 def next_unit(states: np.ndarray, k: int) -> float:
-    """Return the next number of stream ``k`` of ``states`` (K, >= 4), uniform on [0, 1), and step
-    its state.
+    """Return the next number of stream ``k`` of the ``states`` (K, >= 4) of K streams, uniform on
+    [0, 1), and step its state.
     """
+    # The upper 53 bits: as many as a float64 holds exactly.
     return float(next_word(states, k) >> S11) * TO_UNIT
 
 
 @kernel
 def next_units(lanes: Lanes, states: np.ndarray, b: int, k: int, units: FloatArray) -> None:
     """Write the next uniform number of stream ``k`` for the L runs of block ``b`` into ``units[b,
-    k]`` (L,) of ``units`` (B, K, L), from ``states`` (B, K, 4, L), which it steps.
+    k]`` (L,) of ``units`` (B, K, L), from ``states`` (B, K, 4, L), which it steps. There are K
+    streams in each run, and B blocks.
     """
     # No branch depends on a word, so that the compiler computes several lanes with one instruction.
     for q in range(len(lanes)):
@@ -131,7 +135,8 @@ def next_units(lanes: Lanes, states: np.ndarray, b: int, k: int, units: FloatArr
 @kernel
 def next_unit_of_lane(states: np.ndarray, b: int, k: int, q: int) -> float:
     """Return the next uniform number of stream ``k`` for the run in lane ``q`` of block ``b``, from
-    ``states`` (B, K, 4, L), which it steps.
+    ``states`` (B, K, 4, L), which it steps. There are K streams in each run, and B blocks of L
+    runs.
     """
     high, low = states[b, k, 0, q], states[b, k, 1, q]
     states[b, k, 0, q], states[b, k, 1, q] = following(
@@ -154,8 +159,8 @@ def next_stream_state(
 def exponential_of(
     states: np.ndarray, k: int, high: Any, low: Any, ziggurat: Ziggurat
 ) -> tuple[float, Any, Any]:
-    """Return the next exponential number of mean 1 of stream ``k`` of ``states`` (K, >= 4), and the
-    state after it, for a loop that keeps the state (high, low) in registers.
+    """Return the next exponential number of mean 1 of stream ``k`` of the ``states`` (K, >= 4) of K
+    streams, and the state after it, for a loop that keeps the state (high, low) in registers.
 
     Each number of a stream waits for the state after the one before; a state in memory would take
     longer. ``states[k]`` is only read and written for the rare numbers outside the fast path.
@@ -174,8 +179,8 @@ def exponential_of(
 
 @kernel
 def next_exponential(states: np.ndarray, k: int, ziggurat: Ziggurat) -> float:
-    """Return the next number of stream ``k`` of ``states`` (K, >= 4) from the exponential law of
-    mean 1 (ziggurat), and step its state.
+    """Return the next number of stream ``k`` of the ``states`` (K, >= 4) of K streams from the
+    exponential law of mean 1 (ziggurat), and step its state.
     """
     while True:
         # 8 bits choose a layer, 53 bits a point across it.
@@ -221,8 +226,9 @@ def seed_states(words: np.ndarray, states: np.ndarray) -> None:
 
 @kernel
 def fill_units(states: np.ndarray, which: np.ndarray, counts: np.ndarray, out: FloatArray) -> None:
-    """Write the next ``counts[m]`` uniform numbers of stream ``which[m]`` of ``states`` (K, >= 4)
-    into ``out``, for each m in turn; ``counts`` and ``which`` are (M,), ``out`` (sum of counts,).
+    """Write the next ``counts[m]`` uniform numbers of stream ``which[m]`` of the ``states``
+    (K, >= 4) of K streams into ``out``, for each of M entries m in turn; ``counts`` and ``which``
+    are (M,), ``out`` (sum of counts,).
     """
     index = 0
     for m in range(len(which)):
@@ -235,9 +241,9 @@ def fill_units(states: np.ndarray, which: np.ndarray, counts: np.ndarray, out: F
 def fill_exponentials(
     states: np.ndarray, which: np.ndarray, counts: np.ndarray, ziggurat: Ziggurat, out: FloatArray
 ) -> None:
-    """Write the next ``counts[m]`` exponential numbers of mean 1 of stream ``which[m]`` of
-    ``states`` (K, >= 4) into ``out``, for each m in turn; ``counts`` and ``which`` are (M,),
-    ``out`` (sum of counts,).
+    """Write the next ``counts[m]`` exponential numbers of mean 1 of stream ``which[m]`` of the
+    ``states`` (K, >= 4) of K streams into ``out``, for each of M entries m in turn; ``counts`` and
+    ``which`` are (M,), ``out`` (sum of counts,).
     """
     index = 0
     for m in range(len(which)):
@@ -272,7 +278,7 @@ class StreamBatch:
 
     def units(self, which: np.ndarray, counts: np.ndarray) -> FloatArray:
         """Return the next ``counts[m]`` uniforms of stream ``which[m]``, concatenated over m
-        (sum of counts,); both arguments are (M,).
+        (sum of counts,); both arguments are (M,), for M entries m.
 
         They equal ``Generator.random(counts[m])`` of that stream.
         """
@@ -282,7 +288,7 @@ class StreamBatch:
 
     def exponentials(self, which: np.ndarray, counts: np.ndarray) -> FloatArray:
         """Return the next ``counts[m]`` exponential numbers of mean 1 of stream ``which[m]``,
-        concatenated over m (sum of counts,); both arguments are (M,).
+        concatenated over m (sum of counts,); both arguments are (M,), for M entries m.
 
         They equal ``Generator.standard_exponential(counts[m])`` of that stream.
         """

@@ -17,7 +17,7 @@ class Normals(Protocol):
     """The contract of K independent streams of standard normal numbers."""
 
     def draw(self, shape: tuple[int, ...]) -> FloatArray:
-        """Return the next numbers (K, *shape) of each stream."""
+        """Return the next numbers (K, *shape) of each of the K streams."""
 
 
 class GeneratorNormals:
@@ -27,7 +27,7 @@ class GeneratorNormals:
         self._randoms = randoms
 
     def draw(self, shape: tuple[int, ...]) -> FloatArray:
-        """Return the next numbers (K, *shape) of each generator."""
+        """Return the next numbers (K, *shape) of each of the K generators."""
         return np.stack([random.standard_normal(shape) for random in self._randoms])
 
 
@@ -42,7 +42,7 @@ class StreamNormals:
         seed_states(words, self.states)
 
     def draw(self, shape: tuple[int, ...]) -> FloatArray:
-        """Return the next numbers (K, *shape) of each stream."""
+        """Return the next numbers (K, *shape) of each of the K streams."""
         out = np.empty((len(self.states), *shape))
         fill_normals_of_all(self.states, normal_ziggurat(), out.reshape(len(out), -1))
         return out
@@ -50,10 +50,11 @@ class StreamNormals:
 
 @kernel
 def fill_normals_of_all(states: np.ndarray, ziggurat: NormalZiggurat, out: FloatArray) -> None:
-    """Write the next M standard normal numbers of stream k of ``states`` (K, >= 4) into ``out[k]``,
-    for all k; ``out`` is (K, M). Steps the states.
+    """Write the next M standard normal numbers of stream k of the ``states`` (K, >= 4) of K streams
+    into ``out[k]``, for all k; ``out`` is (K, M). Steps the states.
     """
     for k in range(out.shape[0]):
+        # The state stays in registers during the loop and is stored once.
         high, low = states[k, 0], states[k, 1]
         for m in range(out.shape[1]):
             out[k, m], high, low = normal_of(states, k, high, low, ziggurat)

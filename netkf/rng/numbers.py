@@ -63,9 +63,9 @@ def normal_ziggurat() -> NormalZiggurat:
 def normal_of(
     states: np.ndarray, k: int, high: Any, low: Any, ziggurat: NormalZiggurat
 ) -> tuple[float, Any, Any]:
-    """Return the next standard normal number of stream ``k`` of ``states`` (K, >= 4), and the state
-    after it, for a loop that keeps the state (high, low) in registers; ``states[k]`` is read and
-    written only for the rare numbers outside the fast path.
+    """Return the next standard normal number of stream ``k`` of the ``states`` (K, >= 4) of K
+    streams, and the state after it, for a loop that keeps the state (high, low) in registers;
+    ``states[k]`` is read and written only for the rare numbers outside the fast path.
     """
     word = scramble(high, low)
     layer = int(word & LAYER)
@@ -82,8 +82,8 @@ def normal_of(
 
 @kernel
 def next_normal(states: np.ndarray, k: int, ziggurat: NormalZiggurat) -> float:
-    """Return the next standard normal number of stream ``k`` of ``states`` (K, >= 4) (ziggurat),
-    and step its state.
+    """Return the next standard normal number of stream ``k`` of the ``states`` (K, >= 4) of K
+    streams (ziggurat), and step its state.
     """
     while True:
         # 8 bits choose a layer, one the sign, 52 a point across the layer.
@@ -108,7 +108,7 @@ def next_normal(states: np.ndarray, k: int, ziggurat: NormalZiggurat) -> float:
 @kernel
 def _tail(states: np.ndarray, k: int, negative: bool) -> float:
     """Return a normal number x with |x| > TAIL_START, ``negative`` or positive, by rejection
-    (Marsaglia 1964), from stream ``k`` of ``states`` (K, >= 4).
+    (Marsaglia 1964), from stream ``k`` of the ``states`` (K, >= 4) of K streams.
     """
     while True:
         x = -INVERSE_TAIL_START * math.log1p(-next_unit(states, k))
@@ -119,8 +119,8 @@ def _tail(states: np.ndarray, k: int, negative: bool) -> float:
 
 @kernel
 def next_half(states: np.ndarray, k: int) -> Any:
-    """Return the next 32 bits of stream ``k`` of ``states`` (K, 6): the lower half of a new word,
-    then at the next call its upper half, which the state keeps meanwhile.
+    """Return the next 32 bits of stream ``k`` of the ``states`` (K, 6) of K streams: the lower half
+    of a new word, then at the next call its upper half, which the state keeps meanwhile.
     """
     if states[k, HAS_HALF] == ONE:
         states[k, HAS_HALF] = _U(0)
@@ -132,7 +132,8 @@ def next_half(states: np.ndarray, k: int) -> Any:
 
 @kernel
 def next_integer(states: np.ndarray, k: int, count: int) -> Any:
-    """Return the next integer of stream ``k`` of states (K, 6), uniform on 0 .. ``count`` - 1.
+    """Return the next integer of stream ``k`` of the ``states`` (K, 6) of K streams, uniform on 0
+    .. ``count`` - 1.
 
     ``count`` is at most 2^32 - 1. Lemire's method: of count times 32 random bits the upper half is
     the result; products whose lower half is below 2^32 mod count are rejected, so that all results
@@ -153,7 +154,7 @@ def next_integer(states: np.ndarray, k: int, count: int) -> Any:
 @kernel
 def shuffle(states: np.ndarray, k: int, order: np.ndarray, count: int) -> None:
     """Write a random permutation of 0 .. count - 1 into ``order`` (>= count,) by Fisher-Yates, from
-    stream ``k`` of ``states`` (K, 6), which it steps.
+    stream ``k`` of the ``states`` (K, 6) of K streams, which it steps.
 
     It equals ``Generator.permutation(count)``.
     """

@@ -41,7 +41,7 @@ def _mix(x: Any, y: Any) -> Any:
 @kernel
 def seed_words(entropy: np.ndarray, keys: np.ndarray, pool: np.ndarray, words: np.ndarray) -> None:
     """Write ``SeedSequence(seed, spawn_key=key).generate_state(4, uint64)`` into ``words`` (K, 4)
-    for each of the ``keys`` (K, m).
+    for each of K ``keys`` (K, m) of m words.
 
     ``entropy`` (at least 4,) holds the words of the seed, lowest first, padded with zeros; ``pool``
     (4,) is scratch; all but ``words`` are uint32.

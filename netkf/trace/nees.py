@@ -27,7 +27,7 @@ def errors(e: FloatArray, P: FloatArray) -> tuple[FloatArray, FloatArray]:
 def fill_nees(
     e: FloatArray, P: FloatArray, out: FloatArray, factor: FloatArray, solved: FloatArray
 ) -> bool:
-    """Write NEES ``e' P^-1 e`` into ``out`` (K,), of errors e (K, n) and covariances P (K, n, n),
+    """Write NEES ``e' P^-1 e`` into ``out`` (K,), of K errors e (K, n) and covariances P (K, n, n),
     nan where P is exactly singular; return False if a finite P is.
 
     ``factor`` (n, n) and ``solved`` (n, 1) are scratch.
@@ -51,7 +51,7 @@ def fill_nees(
 
 
 def _is_regular(P: FloatArray) -> np.ndarray:
-    """Return a mask (K,) of the matrices P (K, n, n) that are finite and of full rank up to
+    """Return a mask (K,) of the K matrices P (K, n, n) that are finite and of full rank up to
     rounding.
     """
     regular = np.asarray(np.isfinite(P).all(axis=(1, 2)))

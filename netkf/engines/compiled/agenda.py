@@ -148,7 +148,7 @@ def simulate_agenda(
     progress: np.ndarray,
     pause: float,
 ) -> int:
-    """Simulate the R runs of a batch, ``len(progress)`` of them together, which process their
+    """Simulate the R runs of a batch, G = ``len(progress)`` of them together, which process their
     visits every ``pause`` seconds of simulated time. If ``progress`` is empty simulate one run
     until it needs something from Python. Return the request, DONE for a batch.
 
@@ -211,8 +211,8 @@ def simulate_group(
 
 @kernel
 def suspend(state: Simulation, batch: BatchArrays, progress: np.ndarray, k: int) -> None:
-    """Store the position of the present run ``state.run`` in entry ``k`` of ``progress`` (G,), and
-    its numbers of events in row ``state.run`` of ``batch.counts``.
+    """Store the position of the present run ``state.run`` in entry ``k`` of ``progress`` (G,), for
+    G runs simulated together, and its numbers of events in row ``state.run`` of ``batch.counts``.
     """
     position = progress[k]
     position.tick_at, position.ticks_stop, position.first_delay = (
@@ -229,7 +229,8 @@ def suspend(state: Simulation, batch: BatchArrays, progress: np.ndarray, k: int)
 @kernel
 def resume(state: Simulation, batch: BatchArrays, progress: np.ndarray, k: int) -> None:
     """Make run ``state.first_run`` + ``k`` the present one: restore its position in ``state`` from
-    entry ``k`` of ``progress`` (G,), and its numbers of events from ``batch.counts``.
+    entry ``k`` of ``progress`` (G,), for G runs simulated together, and its numbers of events from
+    ``batch.counts``.
     """
     position = progress[k]
     state.tick_at, state.ticks_stop, state.first_delay = (

@@ -248,8 +248,8 @@ class BatchDraws:
         return self.paths.block(block._replace(**own))
 
     def sampled_states(self, times: FloatArray) -> FloatArray:
-        """Return the states (R, T, n) of all runs at the sample ``times`` (T,) in seconds; only for
-        runs in which no origin moves, so that these are absolute states.
+        """Return the states (R, T, n) of all R runs at the T sample ``times`` (T,) in seconds; only
+        for runs in which no origin moves, so that these are absolute states.
         """
         block = self._block
         # Times of samples are ends of pieces or, at time 0, the start of the first.

@@ -66,8 +66,8 @@ def draw_cut(sensing: Sensing, run: int, s: int, normals: FloatArray) -> None:
 @kernel(inlined=True)
 def find_course(state: Simulation, run: int, piece: int) -> int:
     """Return the index c of the polynomial of x in a ``piece`` of the path (index), which is
-    ``path.course[run - state.first_run, c]`` (D, W). It is computed once for all nodes that read in
-    the piece, and cached in ``path.course`` and ``path.known``.
+    ``path.course[run - state.first_run, c]`` (D, W): D coefficients of W integrals. It is computed
+    once for all nodes that read in the piece, and cached in ``path.course`` and ``path.known``.
     """
     path, k = state.path, run - state.first_run
     place: int = piece & (path.known.shape[1] - 1)

@@ -99,8 +99,8 @@ def empty_readings(filters: Filters) -> LaneReadings:
 
 @kernel
 def load_model(readings: LaneReadings, q: int, m: int, whitened_H: FloatArray) -> None:
-    """Copy R^-1/2 H of model number ``m`` from ``whitened_H`` (M, q, n) into lane ``q`` of
-    ``readings.whitened_H``, unless the lane has it.
+    """Copy R^-1/2 H of model number ``m`` from ``whitened_H`` (M, q, n) of M models into lane ``q``
+    of ``readings.whitened_H``, unless the lane has it.
     """
     if readings.model[q] == m:
         return

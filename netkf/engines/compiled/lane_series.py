@@ -113,8 +113,8 @@ def expand_around(series: FloatArray, middle: float) -> FloatArray:
 
 
 def padded_gains(filters: Filters) -> FloatArray:
-    """Return the series (M, terms, 3 n q) of the gains U, W and C of all models, padded with zeros
-    to the largest number q of moments.
+    """Return the series (M, terms, 3 n q) of the gains U, W and C of all M models, padded with
+    zeros to the largest number q of moments.
     """
     n, max_rows, gains = filters.xhat.shape[1], max_moments(filters), filters.gains
     terms = gains.series.shape[1]
@@ -138,8 +138,9 @@ def padded_gains(filters: Filters) -> FloatArray:
 
 
 def _united(series: FloatArray, unit: FloatArray, selected: np.ndarray) -> LaneSeries:
-    """Return the table of series (M, cells, terms, E), with equal columns stored once and as many
-    terms as cells of ``unit`` (M,) seconds need; ``selected`` flags their models in a FlowTable.
+    """Return the table of ``series`` (M, cells, terms, E) of E values in M models, with equal
+    columns stored once and as many terms as cells of ``unit`` (M,) seconds need; ``selected`` flags
+    their models in a FlowTable.
     """
     indices: dict[bytes, int] = {}
     # 0.0 and not -0.0: they are the same number.
@@ -164,8 +165,8 @@ def _united(series: FloatArray, unit: FloatArray, selected: np.ndarray) -> LaneS
 
 
 def divide_cells(series: FloatArray, unit: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the series (M, cells, terms, E) of M models in shorter cells, and the length (M,) of
-    these in seconds; ``unit`` (M,) is the length of the present cells of ``series``.
+    """Return the series (M, cells, terms, E) of E values in M models in shorter cells, and the
+    length (M,) of these in seconds; ``unit`` (M,) is the length of the present cells of ``series``.
     """
     models, cells, terms, entries = series.shape
     parts = PARTS

@@ -82,9 +82,9 @@ def add_past(history: History, at_least: int) -> None:
 def use_instant(
     state: Simulation, instant: int, root: FloatArray, x: FloatArray, k: int, scale: float
 ) -> None:
-    """Update entry ``k`` of the estimates ``x`` (K, n) and of the roots of P ``root`` (K, n, n)
-    with all samples of an ``instant`` (index in ``state.instants``) in one update, stacked in the
-    order of sensors, with noise ``scale``^2 R.
+    """Update entry ``k`` of K estimates ``x`` (K, n) and of the roots of P ``root`` (K, n, n) with
+    all samples of an ``instant`` (index in ``state.instants``) in one update, stacked in the order
+    of sensors, with noise ``scale``^2 R.
     """
     instants, scratch, n, row = state.instants, state.scratch, x.shape[1], 0
     # All sensors of the instant in one reading: R is block diagonal, and so is its root.

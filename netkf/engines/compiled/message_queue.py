@@ -10,7 +10,7 @@ from netkf.linalg.compiling import kernel
 
 @kernel
 def arrives_first(pool: np.ndarray, a: int, b: int) -> bool:
-    """Return True if message ``a`` arrives before message ``b`` (indices in ``pool`` (C,) of
+    """Return True if message ``a`` arrives before message ``b`` (indices in ``pool`` (C,), C
     MESSAGE records): by time, then by directed link, then by order sent.
     """
     # Ties must not depend on the order of insertion: the order is that of the SimPy engine.
@@ -24,8 +24,9 @@ def arrives_first(pool: np.ndarray, a: int, b: int) -> bool:
 
 @kernel
 def push(pool: np.ndarray, heap: np.ndarray, size: int, message: int) -> None:
-    """Insert ``message`` (index in ``pool`` (C,)) in place into the binary ``heap`` (C,) of
-    indices, which holds ``size`` messages ordered by arrival; the caller counts them.
+    """Insert ``message`` (index in ``pool`` (C,), C MESSAGE records) in place into the binary
+    ``heap`` (C,) of indices, which holds ``size`` messages ordered by arrival; the caller counts
+    them.
     """
     # A binary heap of indices in the pool: sift up. heapq would need Python objects.
     k = size
@@ -37,8 +38,8 @@ def push(pool: np.ndarray, heap: np.ndarray, size: int, message: int) -> None:
 
 @kernel
 def pop(pool: np.ndarray, heap: np.ndarray, size: int) -> int:
-    """Remove and return the message (index in ``pool`` (C,)) that arrives next from the binary
-    ``heap`` (C,) of indices, which holds ``size`` messages; the caller counts them.
+    """Remove and return the message (index in ``pool`` (C,), C MESSAGE records) that arrives next
+    from the binary ``heap`` (C,) of indices, which holds ``size`` messages; the caller counts them.
     """
     # Sift the last entry down from the top.
     top, last, k = heap[0], heap[size - 1], 0

@@ -291,8 +291,8 @@ def is_poisson(scenario: Scenario) -> bool:
 
 @once_per_scenario
 def _rates_and_probabilities(scenario: Scenario) -> tuple[FloatArray, FloatArray]:
-    """Return ticks per second of each entity of a run, (E,), and the delivery probability of each
-    directed link, (W,).
+    """Return ticks per second (E,) of each of E entities of a run, and the delivery probability
+    (W,) of each of W directed links.
     """
     clock, senders = scenario.network.activation, senders_of(scenario)
     assert isinstance(clock, LinkClock)

@@ -65,7 +65,7 @@ class SampleTables:
 
     def read(self, states: FloatArray, times: FloatArray, after: float, until: float) -> None:
         """Fill in the values ``instants.y`` (and H, where it varies) of the samples taken in
-        (``after``, ``until``] seconds, from the states (T, n) at ``times`` (T,), which contain
+        (``after``, ``until``] seconds, from the states (T, n) at T ``times`` (T,), which contain
         their times.
         """
         instants = self.instants
@@ -91,8 +91,8 @@ def _make_instants(
     scenario: Scenario, placed: list[tuple[int, PlacedSensor]], t: FloatArray, sensor: np.ndarray
 ) -> Instants:
     """Return the instants at which nodes have samples, from the sorted times ``t`` (K,) in seconds
-    of all samples and the ``sensor`` (K,) of each, an index in ``placed``, which pairs each sensor
-    with its node's id. Values ``y`` are 0 until they are read.
+    of all K samples and the ``sensor`` (K,) of each, an index in ``placed``, which pairs each
+    sensor with its node's id. Values ``y`` are 0 until they are read.
     """
     index = scenario.topology.index if placed else {}
     pooled, n = scenario.node_filter.pooled, scenario.plant.n

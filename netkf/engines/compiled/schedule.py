@@ -68,7 +68,7 @@ class Ticks(NamedTuple):
     delay: FloatArray
 
     def select(self, indices: np.ndarray, sizes: np.ndarray) -> Ticks:
-        """Return the ticks with these ``indices`` (M,) in this order; a tick of entity e has
+        """Return the M ticks with these ``indices`` (M,) in this order; a tick of entity e of E has
         ``sizes[e]`` outcomes (E,).
         """
         # Indices of the outcomes of these ticks, tick after tick in their new order.
@@ -80,7 +80,7 @@ class Ticks(NamedTuple):
 
     def window(self, end: float, sizes: np.ndarray) -> Window:
         """Return these ticks, which must be in the order of time, as a window up to ``end``
-        (seconds); a tick of entity e has ``sizes[e]`` outcomes (E,).
+        (seconds); a tick of entity e of E has ``sizes[e]`` outcomes (E,).
         """
         sent = sizes[self.entity]
         return Window(end, self.t, self.entity, np.cumsum(sent) - sent, self.delay)
@@ -123,9 +123,9 @@ class TickSource:
             )
 
     def more(self, indices: np.ndarray, counts: np.ndarray) -> tuple[FloatArray, np.ndarray]:
-        """Draw the next ``counts`` (M,) ticks of the entities ``indices`` (M,); return the times
-        (K,) in seconds of those before the horizon, entity by entity, and how many each entity has,
-        (M,). Advances ``last`` and ``drawn``.
+        """Draw the next ``counts`` (M,) ticks of M entities with the ``indices`` (M,); return the
+        times (K,) in seconds of those before the horizon, entity by entity, and how many each
+        entity has, (M,). Advances ``last`` and ``drawn``.
         """
         if self._all_poisson:
             times, sizes = self._exponential(indices, counts), counts
@@ -232,9 +232,9 @@ class Outcomes:
         self.sizes = np.tile(np.diff(senders.first), runs)
 
     def of(self, indices: np.ndarray, counts: np.ndarray, first: np.ndarray) -> FloatArray:
-        """Return the outcomes (K,) of the next ``counts`` (M,) ticks of the entities ``indices``
-        (M,), over all runs, entity by entity and tick after tick: delays in seconds, or LOST.
-        ``first`` (M,) are the numbers of their first ticks, from 0.
+        """Return the outcomes (K,) of the next ``counts`` (M,) ticks of M entities with the
+        ``indices`` (M,), over all runs, K messages in all, entity by entity and tick after tick:
+        delays in seconds, or LOST. ``first`` (M,) are the numbers of their first ticks, from 0.
         """
         runs, entity = np.divmod(indices, max(self._count, 1))
         sizes = self.sizes[indices]
@@ -260,7 +260,7 @@ class Outcomes:
         return out
 
     def _draw(self, sources: np.ndarray, counts: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Draw for the next ``counts`` (M,) messages of each of the streams ``sources`` (M,), K in
+        """Draw for the next ``counts`` (M,) messages of each of M streams ``sources`` (M,), K in
         all: return uniform numbers, bad states of the channel (bool) and delays in seconds, (K,)
         each.
         """
@@ -287,9 +287,9 @@ class Outcomes:
         bad: np.ndarray,
         delay: np.ndarray,
     ) -> FloatArray:
-        """Return the outcomes (K,) of messages, delays in seconds or LOST: of ``counts`` (M,)
-        messages on each of the ``directions`` (M,), numbered from ``first`` (M,) on. Their draws
-        (K,) are a ``uniform`` number, whether the channel is ``bad``, and a ``delay`` in seconds.
+        """Return the outcomes (K,) of K messages, delays in seconds or LOST: of ``counts`` (M,)
+        messages on each of M ``directions`` (M,), numbered from ``first`` (M,) on. Their draws (K,)
+        are a ``uniform`` number, whether the channel is ``bad``, and a ``delay`` in seconds.
         """
         if self._identical:
             probability = np.repeat(self._probabilities[directions], counts)
@@ -303,7 +303,7 @@ class Outcomes:
     def _delivery_probability(
         self, directions: np.ndarray, counts: np.ndarray, first: np.ndarray, bad: np.ndarray
     ) -> FloatArray:
-        """Return the delivery probabilities (K,) of messages, ``counts`` (M,) on each of
+        """Return the delivery probabilities (K,) of K messages, ``counts`` (M,) on each of M
         ``directions`` (M,) with numbers from ``first`` (M,) on; ``bad`` (K,) is the state of the
         channel.
         """
@@ -329,9 +329,9 @@ class Outcomes:
         lost: np.ndarray,
         delay: np.ndarray,
     ) -> FloatArray:
-        """Return the delays (K,) in seconds if their law depends on the message, for ``counts``
-        (M,) messages on each of ``directions`` (M,) with numbers from ``first`` (M,) on. Messages
-        that are ``lost`` (K,) keep ``delay`` (K,).
+        """Return the delays (K,) of K messages in seconds if their law depends on the message, for
+        ``counts`` (M,) messages on each of M ``directions`` (M,) with numbers from ``first`` (M,)
+        on. Messages that are ``lost`` (K,) keep ``delay`` (K,).
         """
         model, out, k = self._channel.delay, np.array(delay), 0
         for w, count, number in zip(directions, counts.tolist(), first.tolist(), strict=True):
@@ -373,8 +373,8 @@ class EntityDraws:
         return float((self._clocks.drawn / self.last).sum())
 
     def more(self, indices: np.ndarray) -> Ticks:
-        """Draw and return the next block of ticks of the entities ``indices`` (M,), in ascending
-        order, with the outcomes of their messages: entity by entity.
+        """Draw and return the next block of ticks of M entities with the ``indices`` (M,), in
+        ascending order, with the outcomes of their messages: entity by entity.
         """
         first = self._clocks.drawn[indices]
         t, counts = self._clocks.more(indices, self._block[indices])

@@ -120,7 +120,7 @@ class SlotEvents:
 
     def asked(self) -> np.ndarray:
         """Return ``asked`` (E, N): 1 if node h is asked for a message in step e of the next slot.
-        Draws the pairs of the slot.
+        Draws the pairs of the slot. There are E exchange steps in a slot.
         """
         setup, index = self._setup, self._scenario.topology.index
         asked = np.zeros((len(setup.fresh), len(setup.nodes)), dtype=np.uint8)
@@ -136,7 +136,7 @@ class SlotEvents:
         is used in step e.
 
         If nodes may be silent it is one slot, and ``sent`` (E, N) says which of the nodes that are
-        ``asked`` send.
+        ``asked`` send. Dimensions: E exchange steps in a slot, W directed links.
         """
         setup, arrivals = self._setup, []
         self._rows, self._sent = [], sent
@@ -153,7 +153,7 @@ class SlotEvents:
 
     def _one_slot(self) -> np.ndarray:
         """Make all events of the present slot; return ``up`` (E, W), which is 1 where a message on
-        directed link w is used in step e.
+        directed link w is used in step e. There are E exchange steps and W directed links.
         """
         setup, algorithm, slot = self._setup, self._algorithm, self._slot
         up = np.zeros((len(setup.fresh), len(self._directions)), dtype=np.uint8)
@@ -177,7 +177,8 @@ class SlotEvents:
 
     def _make_stage_events(self, slot: int, up: np.ndarray) -> None:
         """Make the events of the readings and exchanges of slot number ``slot``, in order; sets
-        ``up`` (E, W) to 1 where a message on directed link w is used in step e.
+        ``up`` (E, W) to 1 where a message on directed link w is used in step e. There are E
+        exchange steps and W directed links.
         """
         steps, now = self._iterate_steps(slot), self._scenario.slot_plant.slot_time(slot)
         for step in self._setup.stages.step.tolist():

@@ -89,9 +89,9 @@ class Channels(NamedTuple):
 
 @kernel
 def draw_matching(matchings: Matchings, ends: np.ndarray, r: int, active: np.ndarray) -> int:
-    """Write the indices of the links of one matching of run ``r`` into ``active`` (A,) in their
-    order; return how many. ``ends`` (links, 2) are the indices of the nodes at both ends of each
-    link.
+    """Write the indices of the links of one matching of run ``r`` into ``active`` (A,), which has
+    space for the largest one, in their order; return how many. ``ends`` (links, 2) are the indices
+    of the nodes at both ends of each link.
 
     The numbers are those that ``Matching.draw`` takes from the same stream, which advances.
     """
@@ -123,8 +123,9 @@ def draw_matching(matchings: Matchings, ends: np.ndarray, r: int, active: np.nda
 
 @kernel
 def _free_links(matchings: Matchings, ends: np.ndarray, r: int, active: np.ndarray) -> int:
-    """Write the indices of the links of a matching of run ``r`` to the front of ``active`` (A,);
-    return their number. ``ends`` (links, 2) are the indices of the nodes at both ends of each link.
+    """Write the indices of the links of a matching of run ``r`` to the front of ``active`` (A,),
+    which has space for the largest one; return their number. ``ends`` (links, 2) are the indices of
+    the nodes at both ends of each link.
 
     MAXIMAL visits the links in random order and takes each one whose ends are both free.
     INDEPENDENT wakes each link with a probability and takes those that share no node with another
@@ -170,7 +171,8 @@ def draw_link(
     """Draw which messages of one activation of ``link`` (index) arrive, in step ``e`` of slot ``s``
     (index in the block of slots), in all L runs of block ``b``; write 1 or 0 into ``up``
     (B, S, E, W, L) for its one or two directed links. Links that are not ``fresh`` keep their last
-    draws, which ``channels`` stores.
+    draws, which ``channels`` stores. Dimensions: B blocks of L runs, S slots of E exchange steps, W
+    directed links.
     """
     uniforms = channels.loss_uniform
     for d in range(channels.directions_per_link):
@@ -215,7 +217,8 @@ def draw_link_of_lane(
     """Draw which messages of one activation of ``link`` (index) arrive, in step ``e`` of slot
     ``s``, in the run of lane ``q`` of block ``b`` alone; write 1 or 0 into ``up`` (B, S, E, W, L)
     for its one or two directed links. A link that is not ``fresh`` keeps its last draws, which
-    ``channels`` stores.
+    ``channels`` stores. Dimensions: B blocks of L runs, S slots of E exchange steps, W directed
+    links.
     """
     for d in range(channels.directions_per_link):
         k = link * channels.streams_per_link + min(d, channels.streams_per_link - 1)
@@ -258,7 +261,8 @@ def draw_broadcasts(
 ) -> None:
     """Draw which messages of broadcasts, which use every link in every step, arrive: write 1 into
     ``up`` (B, S, E, W, L), which holds zeros before. Slots that are not ``exchanged`` (S,) stay 0;
-    links draw anew in the steps that are ``fresh`` (E,).
+    links draw anew in the steps that are ``fresh`` (E,). Dimensions: B blocks of L runs, S slots of
+    E exchange steps, W directed links.
     """
     for b in range(up.shape[0]):
         for s in range(up.shape[1]):
@@ -281,7 +285,8 @@ def draw_matched(
     """Draw the matchings of all runs, and which messages on their links arrive: write 1 into ``up``
     (B, S, E, W, L), which holds zeros before. ``active`` (R, S, E, A) gets the indices of the
     paired links in order, ``pair_count`` (R, S, E) their number. Slots that are not ``exchanged``
-    (S,) stay 0; links draw anew in the steps that are ``fresh`` (E,).
+    (S,) stay 0; links draw anew in the steps that are ``fresh`` (E,). Dimensions: B blocks of L
+    runs, R runs in all, S slots of E exchange steps, W directed links, at most A pairs.
     """
     for b in range(up.shape[0]):
         for s in range(up.shape[1]):
@@ -305,7 +310,8 @@ def draw_pairs(
     """Draw the matchings of step ``e`` of slot ``s`` in all L runs of block ``b``, and which
     messages on their links arrive: write these into ``up`` (B, S, E, W, L), the paired links into
     ``active`` (R, S, E, A), and their number into ``pair_count`` (R, S, E). ``fresh``: links draw
-    anew.
+    anew. Dimensions: B blocks of L runs, R runs in all, S slots of E exchange steps, W directed
+    links, at most A pairs.
     """
     first = b * len(lanes)
     for q in range(min(len(lanes), len(pair_count) - first)):
@@ -320,8 +326,9 @@ def draw_pairs(
 def mark_all_senders(
     lanes: Lanes, channels: Channels, exchanged: np.ndarray, sent: np.ndarray
 ) -> None:
-    """Write 1 into ``sent`` (B, S, E, N, L) for all nodes with links, in the slots that are
-    ``exchanged`` (S,): broadcasts ask each of them for a message in each of the E steps.
+    """Write 1 into ``sent`` (B, S, E, N, L), for B blocks of L runs and S slots, for all nodes with
+    links, in the slots that are ``exchanged`` (S,): broadcasts ask each of them for a message in
+    each of the E steps.
     """
     for b in range(sent.shape[0]):
         for s in range(sent.shape[1]):
@@ -339,9 +346,9 @@ def mark_paired_senders(
     """Write 1 into ``sent`` (B, S, E, N, L) for both ends of all paired links: matchings ask each
     of them for a message.
 
-    Dimensions are B blocks of L runs, S slots of E exchange steps, N nodes. ``pair_count`` (R, S,
-    E) is the number of pairs of each of the R = B L runs, and the first so many entries of
-    ``active`` (R, S, E, A) are the indices of their links.
+    Dimensions are B blocks of L runs, S slots of E exchange steps, N nodes, at most A pairs.
+    ``pair_count`` (R, S, E) is the number of pairs of each of the R = B L runs, and the first so
+    many entries of ``active`` (R, S, E, A) are the indices of their links.
     """
     for r in range(pair_count.shape[0]):
         for s in range(pair_count.shape[1]):
@@ -355,7 +362,8 @@ def mark_paired_senders(
 @kernel
 def draw_uniforms(states: np.ndarray, sent: np.ndarray, uniform: FloatArray) -> None:
     """Draw a uniform number for each node that is asked for a message (``sent``) into ``uniform``
-    (B, S, E, N, L), in the order of steps, from the streams ``states`` (B, N, 4, L).
+    (B, S, E, N, L), in the order of steps, from the streams ``states`` (B, N, 4, L). Dimensions: B
+    blocks of L runs, S slots of E exchange steps, N nodes.
     """
     for b in range(sent.shape[0]):
         for s in range(sent.shape[1]):
@@ -673,8 +681,8 @@ def count_events(
     counts: np.ndarray,
 ) -> None:
     """Add to ``counts`` (R, KINDS) the number of events of each kind in S slots of each of R runs,
-    as many as ``make_rows`` would write; ``scratch`` (KINDS, L). ``pairwise``: nodes swap with a
-    peer, instead of absorbing broadcasts.
+    as many as ``make_rows`` would write; ``scratch`` (KINDS, L) for the L runs of a block.
+    ``pairwise``: nodes swap with a peer, instead of absorbing broadcasts.
     """
     for b in range(messages.up.shape[0]):
         for kind in range(len(scratch)):
@@ -726,8 +734,8 @@ def count_step(
     b: int,
 ) -> None:
     """Add the events of the exchange step of ``stage`` in the L runs of block ``b`` to ``scratch``
-    (KINDS, L), but those of nodes that stop, in step number ``stopping``, to ``counts`` (R, KINDS).
-    ``pairwise``: nodes swap with a peer, instead of absorbing broadcasts.
+    (KINDS, L), but those of nodes that stop, in step number ``stopping``, to ``counts`` (R, KINDS)
+    of all R runs. ``pairwise``: nodes swap with a peer, instead of absorbing broadcasts.
     """
     stops = stage.step == stopping
     if pairwise:
@@ -819,7 +827,7 @@ def count_stops(
     lanes: Lanes, traced: TracedNodes, stage: SlotStage, counts: np.ndarray, b: int
 ) -> None:
     """Add the nodes that stop in the slot of ``stage``, in the L runs of block ``b``, to the count
-    STOP of ``counts`` (R, KINDS).
+    STOP of ``counts`` (R, KINDS) of all R runs.
     """
     first = b * len(lanes)
     for r in range(first, min(first + len(lanes), len(counts))):

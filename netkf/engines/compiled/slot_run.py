@@ -203,7 +203,9 @@ class SlotRuns:
         self._matchings = Matchings(protocol, probability, states, first, members, order, busy)
 
     def _in_lanes(self, purpose: str, entities: list[Link]) -> np.ndarray:
-        """Return the states (B, K, 4, L) of the random streams of K entities in each run."""
+        """Return the states (B, K, 4, L) of the random streams of K entities in each run. The runs
+        are side by side in B blocks of L lanes.
+        """
         return StreamBatch(self._streams, purpose, entities).in_lanes(self.runs)
 
     @property
@@ -344,7 +346,8 @@ class SlotRuns:
 
     def _missed_readings(self, messages: SlotMessages, count: int) -> np.ndarray:
         """Return (S, E, N) bool: nodes that send nothing in a step of the next S = ``count`` slots
-        because they have no reading; their messages are removed from ``messages.up``.
+        because they have no reading; their messages are removed from ``messages.up``. There are E
+        exchange steps in a slot.
         """
         setup = self.setup
         if not setup.may_miss:
@@ -357,7 +360,7 @@ class SlotRuns:
     def _draw_uniforms(self, sent: np.ndarray) -> FloatArray:
         """Return a uniform number (B, S, E, N, L) for each node that is asked for a message in a
         step, where ``sent`` (B, S, E, N, L) is 1, and 0 for the others; empty if the filter needs
-        none.
+        none. Dimensions: B blocks of L runs, S slots of E exchange steps, N nodes.
         """
         if not self.setup.algorithm.randomised or not self.setup.decides:
             return np.zeros((0,) * 5)
@@ -367,7 +370,8 @@ class SlotRuns:
 
     def _next_states(self, count: int) -> tuple[FloatArray, FloatArray, np.ndarray]:
         """Return the states of the next S = ``count`` slots relative to the moving origin and
-        absolute, (B, S, n, L) each, and the slots (S,) bool in which the origin moves.
+        absolute, (B, S, n, L) each, and the slots (S,) bool in which the origin moves. The runs are
+        side by side in B blocks of L lanes.
         """
         setup = self.setup
         slots = range(self._slot, self._slot + count)
@@ -391,7 +395,8 @@ class SlotRuns:
         self, path: Path, states: np.ndarray, local: FloatArray, absolute: FloatArray
     ) -> None:
         """Draw the next S slots of a path into ``local`` and ``absolute`` (B, S, n, L), the states
-        relative to the moving origin and absolute, from the random streams ``states`` (R, 4).
+        relative to the moving origin and absolute, from the random streams ``states`` (R, 4). The R
+        runs are side by side in B blocks of L lanes.
         """
         scratch = aligned((2, max(path.root.shape), LANES))
         draw_paths(MANY, path, states, normal_ziggurat(), self._slot, scratch, local, absolute)
@@ -400,7 +405,8 @@ class SlotRuns:
         self, times: SlotTimes, local: FloatArray, rebased: np.ndarray
     ) -> ReadingBlock:
         """Draw and return the whitened readings of S slots at the states ``local`` (B, S, n, L); in
-        the slots ``rebased`` (S,) the origin moves to the state.
+        the slots ``rebased`` (S,) the origin moves to the state. The runs are side by side in B
+        blocks of L lanes.
         """
         setup, count = self.setup, local.shape[1]
         shape = self._blocks, count, setup.estimators, setup.p
@@ -473,7 +479,9 @@ class SlotRuns:
         return table[:count]
 
     def count_events(self, block: SlotBlock) -> None:
-        """Add the events of a block of slots to ``self.counts`` (R, KINDS), by run and kind."""
+        """Add the events of a block of slots to ``self.counts`` (R, KINDS), by run and kind, of all
+        R runs.
+        """
         setup = self.setup
         count_events(
             MANY, setup.stages, block.times, self._channels, self._traced_nodes(), block.messages,
@@ -506,7 +514,8 @@ class SlotRuns:
 
 def _pack_messages(up: np.ndarray, sent: np.ndarray) -> SlotMessages:
     """Return the messages ``up`` (1, S, E, W) and senders ``sent`` (1, S, E, N) of one run, which
-    Python made, in lane 0 of the arrays that kernels expect.
+    Python made, in lane 0 of the arrays that kernels expect. Dimensions: S slots of E exchange
+    steps, W directed links, N nodes.
     """
     lane_arrays = [np.zeros((*values.shape, LANES), dtype=np.uint8) for values in (up, sent)]
     for lanes, values in zip(lane_arrays, (up, sent), strict=True):

@@ -215,8 +215,9 @@ class SlotSetup:
         )
 
     def _set_states(self, scenario: Scenario) -> None:
-        """Set the filters at slot 0: their ``states``, estimates ``xhat`` (H, n) and roots of their
-        covariances ``root`` (H, n, n); and the F and root of Q (n, n) that all of them believe.
+        """Set the H filters at slot 0: their ``states``, estimates ``xhat`` (H, n) and roots of
+        their covariances ``root`` (H, n, n); and the F and root of Q (n, n) that all of them
+        believe.
         """
         infos: Sequence[NodeInfo] = scenario.node_infos
         models: Sequence[Any] = scenario.slot_models
@@ -253,9 +254,9 @@ class SlotSetup:
         )
 
     def _set_channel(self, scenario: Scenario) -> None:
-        """Set ``delivery`` (2, W), the delivery probabilities of directed links in the good and the
-        bad state of the channel, ``entities``, the streams that losses are drawn from, and
-        ``talks`` (E, W): which directions send in which step.
+        """Set ``delivery`` (2, W), the delivery probabilities of the W directed links in the good
+        and the bad state of the channel, ``entities``, the streams that losses are drawn from, and
+        ``talks`` (E, W): which directions send in which of the E exchange steps.
         """
         channel, each = scenario.network.channel, self.directions_per_link
         self.loss, bad = channel.loss, (False, True)
@@ -310,7 +311,8 @@ class SlotSetup:
 
     def unread(self, first: int, count: int) -> np.ndarray:
         """Return (S, E, N) bool: nodes that send nothing in a step, because it sends readings and
-        they have none. S = ``count`` slots from number ``first`` on.
+        they have none. S = ``count`` slots from number ``first`` on. There are E exchange steps in
+        a slot.
         """
         missed = np.zeros((count, len(self.nodes)), dtype=bool)
         for index, slots in self._recorded_slots.items():
@@ -388,8 +390,8 @@ QUICK_FLOPS = 1 << 25
 
 def matching_lists(scenario: Scenario) -> tuple[int, float, np.ndarray, np.ndarray]:
     """Return the first two fields of ``slot_messages.Matchings`` (protocol, probability) and its
-    lists ``first`` (K + 1,), ``members`` (M,): list k of links is ``members[first[k]:first[k +
-    1]]``.
+    lists ``first`` (K + 1,), ``members`` (M,): list k of K lists of links is
+    ``members[first[k]:first[k + 1]]``.
     """
     activation, topology = scenario.network.activation, scenario.topology
     if not isinstance(activation, Matching):

@@ -420,7 +420,9 @@ def _stack_model_tables(models: list[FlowModel]) -> tuple[FlowTable, Gains]:
 
 @once_per_scenario
 def entity_records(scenario: Scenario) -> tuple[np.ndarray, np.ndarray]:
-    """Return the ENTITY records (E,) and DIRECTED_LINK records (W,) of a run that has not begun."""
+    """Return the records of E entities with a clock, ENTITY (E,), and of W directed links,
+    DIRECTED_LINK (W,), of a run that has not begun.
+    """
     senders, index = senders_of(scenario), scenario.topology.index
     entities = np.zeros(len(senders.entities), dtype=ENTITY)
     # (i, j) of a link or direction, (i, -1) of a node.

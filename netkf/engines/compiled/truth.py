@@ -27,8 +27,8 @@ class States(Protocol):
     def states_at(
         self, times: FloatArray, path: PathBlock, pieces: np.ndarray
     ) -> tuple[FloatArray, FloatArray]:
-        """Return local and absolute states (T, n) each at ``times`` (T,) in seconds, of which time
-        k lies in the piece ``pieces[k]`` of the ``path``.
+        """Return local and absolute states (T, n) each at T ``times`` (T,) in seconds, of which
+        time k lies in the piece ``pieces[k]`` of the ``path``.
         """
 
 
@@ -70,7 +70,7 @@ class PathStates:
         self._frame, self._frame_start, self._origin = 0, 0.0, np.zeros(scenario.plant.n)
 
     def local(self, times: FloatArray, path: PathBlock, pieces: np.ndarray) -> FloatArray:
-        """Return the states (T, n) relative to the origin at ``times`` (T,) in seconds, of which
+        """Return the states (T, n) relative to the origin at T ``times`` (T,) in seconds, of which
         time k is an end of the piece ``pieces[k]`` of the ``path``; 0 at times at which a frame
         begins.
         """
@@ -97,8 +97,8 @@ class PathStates:
     def states_at(
         self, times: FloatArray, path: PathBlock, pieces: np.ndarray
     ) -> tuple[FloatArray, FloatArray]:
-        """Return local and absolute states (T, n) each at ``times`` (T,) in seconds in the present
-        frame, of which time k lies in the piece ``pieces[k]`` of the ``path``.
+        """Return local and absolute states (T, n) each at T ``times`` (T,) in seconds in the
+        present frame, of which time k lies in the piece ``pieces[k]`` of the ``path``.
         """
         local = self.local(times, path, pieces)
         # No frame has begun: local states are absolute.
@@ -108,8 +108,8 @@ class PathStates:
             return local, local + self._origin_at(times)
 
     def _origin_at(self, times: FloatArray) -> FloatArray:
-        """Return the absolute origin (T, n) of the present frame at ``times`` (T,) in seconds: the
-        origin at the beginning of the frame, moved by the plant without noise.
+        """Return the absolute origin (T, n) of the present frame at T ``times`` (T,) in seconds:
+        the origin at the beginning of the frame, moved by the plant without noise.
         """
         # An origin of 0 stays 0, and its transition may overflow.
         if self._moves is None or not self._origin.any():

@@ -161,7 +161,7 @@ def empty_visits(
     filters: Filters, weights: FloatArray, places: int, series: tuple[LaneSeries, LaneSeries]
 ) -> Visits:
     """Return an empty queue for such filters at F = ``places`` places, N for each of the runs
-    simulated together; ``weights`` (W,) are those of directed links, ``series`` those of nodes
+    simulated together; ``weights`` (W,) are those of W directed links, ``series`` those of nodes
     without increment sensors and with them.
     """
     n, capacity = filters.xhat.shape[1], max(MAX_VISITS, 4 * places)
@@ -390,7 +390,7 @@ def process_intervals(state: Simulation, visits: Visits) -> None:
 def fill_rates(state: Simulation, visits: Visits, count: int) -> None:
     """Write the rate of information trace(P G) in 1/s and trace(P) of the nodes in the first
     ``count`` lanes, those of the next intervals in the ring buffer, into ``rate`` and ``trace``
-    (1, L) of ``visits.readings``.
+    (1, L), L lanes, of ``visits.readings``.
     """
     size, readings = state.size, visits.readings
     for q in range(count):
@@ -444,8 +444,8 @@ def assign_lane(
 @kernel
 def read_increments_in_lanes(state: Simulation, visits: Visits, count: int) -> None:
     """Write the moments of the increments that the nodes in the first ``count`` SENSING lanes read,
-    each over the interval of its lane, into ``visits.readings.moments`` (q, L); lanes whose place
-    is NO_NODE read nothing.
+    each over the interval of its lane, into ``visits.readings.moments`` (q, L), q moments in L
+    lanes; lanes whose place is NO_NODE read nothing.
     """
     places, readings = visits.places[SENSING], visits.readings
     for q in range(LANES):
@@ -469,8 +469,8 @@ def gather_states(
     state: Simulation, places: IntArray, count: int, x: FloatArray, S: FloatArray
 ) -> None:
     """Copy the estimates and roots of the nodes at the first ``count`` of the ``places`` (L,),
-    indices in ``state.xhat``, into the lanes of ``x`` (n, L) and ``S`` (n, n, L); the other places
-    become NO_NODE.
+    indices in ``state.xhat``, into the L lanes of ``x`` (n, L) and ``S`` (n, n, L); the other
+    places become NO_NODE.
     """
     n = len(state.size)
     for q in range(count, LANES):
@@ -483,7 +483,7 @@ def gather_states(
 
 @kernel
 def scatter_states(state: Simulation, places: IntArray, x: FloatArray, S: FloatArray) -> None:
-    """Copy the estimates ``x`` (n, L) and roots ``S`` (n, n, L) in lanes back to rows ``places``
+    """Copy the estimates ``x`` (n, L) and roots ``S`` (n, n, L) in L lanes back to rows ``places``
     (L,) of ``state.xhat`` and ``state.root``, except lanes with NO_NODE.
     """
     n = len(state.size)
@@ -539,7 +539,8 @@ def evaluate_series(
     visits: Visits, kind: int, q: int, series: LaneSeries, rows: FloatArray
 ) -> None:
     """Evaluate the ``series`` of the model in lane ``q`` of ``kind`` (UNOBSERVED or SENSING) at the
-    lane's gap; write the W' values into ``rows[q]`` of ``rows`` (L, W').
+    lane's gap; write the W' values into ``rows[q]`` of ``rows`` (L, W'), one row for each of L
+    lanes.
     """
     lane = visits.lanes[kind, q]
     row = series.row[lane.model]
@@ -550,7 +551,9 @@ def evaluate_series(
 
 @kernel
 def transpose_rows(rows: FloatArray, out: FloatArray) -> None:
-    """Write the transpose of ``rows`` (L, W'), one row for each lane, into ``out`` (W', L)."""
+    """Write the transpose of ``rows`` (L, W'), one row of W' values for each of L lanes, into
+    ``out`` (W', L).
+    """
     for j in range(0, rows.shape[1], LANES):
         turn(MANY, rows, j, out)
 
@@ -559,8 +562,8 @@ def transpose_rows(rows: FloatArray, out: FloatArray) -> None:
 def copy_columns(
     columns: FloatArray, index: IntArray, first: int, count: int, out: FloatArray
 ) -> None:
-    """Copy ``count`` rows of ``columns`` (W', L) to ``out`` (count, L): row e comes from row
-    ``index[first + e]``, since equal entries of a series are stored once.
+    """Copy ``count`` rows of ``columns`` (W', L), W' values in L lanes, to ``out`` (count, L): row
+    e comes from row ``index[first + e]``, since equal entries of a series are stored once.
     """
     for e in range(count):
         store(MANY, out, e, load(MANY, columns, index[first + e]))
@@ -569,8 +572,8 @@ def copy_columns(
 @kernel(fused=True)
 def predict_lanes(state: Simulation, visits: Visits, reads: bool) -> None:
     """Predict the states ``visits.x`` (n, L) and roots ``visits.S`` (n, n, L) of L nodes, in place,
-    by the matrices in ``visits.values`` (E, L): x = exp(A g) x and P = Q_g + F P (I + G_g P)^-1 F',
-    with G_g = 0 and F = exp(A g) unless ``reads``.
+    by the matrices in the E rows of ``visits.values`` (E, L): x = exp(A g) x and P = Q_g + F P (I +
+    G_g P)^-1 F', with G_g = 0 and F = exp(A g) unless ``reads``.
     """
     size, n, values = state.size, len(state.size), visits.values
     S, V, T = (
@@ -654,10 +657,10 @@ def combine_lanes(
     other_x: FloatArray,
     other_S: FloatArray,
 ) -> None:
-    """Write the convex combination H (7) and (9), w x + w_j x_j (n, L) and the root (n, n, L) of w
-    P + w_j P_j, into ``visits.moved`` and ``visits.V``: of x (n, L) and S (n, n, L), the root of P,
-    with ``other_x`` and ``other_S`` (x_j and the root of P_j), with the weights of ``side`` (0: the
-    first nodes of the visits receive, 1: the second ones).
+    """Write the convex combination H (7) and (9) of the estimates in L lanes, w x + w_j x_j (n, L)
+    and the root (n, n, L) of w P + w_j P_j, into ``visits.moved`` and ``visits.V``: of x (n, L) and
+    S (n, n, L), the root of P, with ``other_x`` and ``other_S`` (x_j and the root of P_j), with the
+    weights of ``side`` (0: the first nodes of the visits receive, 1: the second ones).
     """
     size, n, values = state.size, len(state.size), visits.in_lanes
     total, wide = local_lanes_matrix(size, MANY, visits.V), local_lanes_matrix(size, MANY, visits.T)
