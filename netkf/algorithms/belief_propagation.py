@@ -88,7 +88,7 @@ class BeliefState(NamedTuple):
 
     @property
     def P(self) -> FloatArray:
-        """``root root'`` (n, n)."""
+        """The covariance ``root root'`` (n, n) of the estimate."""
         return self.root @ self.root.T
 
 

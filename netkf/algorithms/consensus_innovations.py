@@ -269,8 +269,8 @@ class GainSequence:
         return gains
 
     def _correct_state(self, i: int) -> FloatArray:
-        """Correct the error of xhat of node ``i`` (an index from 0) in ``_errors`` by ``yhat_i - G
-        xhat_i``, which is ``G e - e_y``; return the gain K (n, n).
+        """Correct the error of xhat of node ``i`` (an index from 0) in ``_errors`` by
+        ``yhat_i - G xhat_i``, which is ``G e - e_y``; return the gain K (n, n).
         """
         G, e, e_y = self._pseudo.G, self._state_error(i), self._pseudo_error(i)
         theta = G @ e - e_y
@@ -337,7 +337,7 @@ class PseudoState(NamedTuple):
 
     @property
     def P(self) -> FloatArray:
-        """``root root'`` (n, n)."""
+        """The covariance ``root root'`` (n, n) of the estimate."""
         return self.root @ self.root.T
 
     @property
@@ -446,9 +446,9 @@ def correct_all(
 def predict_pseudo_single(
     x: FloatArray, y: FloatArray, A: FloatArray, coupling: FloatArray, work: FloatArray
 ) -> None:
-    """Replace the estimate of the pseudo-state of one node in one run, y (1, 1, n, 1), by ``A y +
-    coupling x`` with its estimate x (1, 1, n, 1) of the state; A and ``coupling`` are (n, n),
-    ``work`` (n, 1) is scratch.
+    """Replace the estimate of the pseudo-state of one node in one run, y (1, 1, n, 1), by
+    ``A y + coupling x`` with its estimate x (1, 1, n, 1) of the state; A and ``coupling`` are
+    (n, n), ``work`` (n, 1) is scratch.
     """
     predict_pseudo(ONE, x, y, 0, 0, A, coupling, work)
 

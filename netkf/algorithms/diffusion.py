@@ -54,7 +54,7 @@ class DiffusionState(NamedTuple):
 
     @property
     def P(self) -> FloatArray:
-        """``root root'`` (n, n)."""
+        """The covariance ``root root'`` (n, n) of the estimate."""
         return self.root @ self.root.T
 
 
@@ -149,8 +149,8 @@ def combine_senders(
     h: int,
 ) -> None:
     """Combine filter ``h`` of block ``b`` with the messages that arrive in slot ``s``, by
-    covariance intersection, D (8) and (9): changes ``nodes.xhat[b, h]`` (n, L) and ``nodes.root[b,
-    h]`` (n, n, L).
+    covariance intersection, D (8) and (9): changes ``nodes.xhat[b, h]`` (n, L) and
+    ``nodes.root[b, h]`` (n, n, L).
 
     ``weights`` holds the own weights (H,), ``links`` those of messages. The messages are in
     ``scratch``: the estimates ``xhat`` (H, n, L) and the inverses of the roots, ``root``

@@ -31,7 +31,9 @@ class Model(Protocol):
 
     @property
     def information(self) -> FloatArray:
-        """``H' R^-1 H`` (n, n) of the node's sensors."""
+        """The information ``H' R^-1 H`` (n, n) that the node's sensors give, per second or per
+        slot.
+        """
 
     def predict(
         self, xhat: FloatArray, root: FloatArray, gap: float
@@ -160,19 +162,21 @@ class State(NamedTuple):
 
     @property
     def P(self) -> FloatArray:
-        """``root root'`` (n, n)."""
+        """The covariance ``root root'`` (n, n) of the estimate."""
         return self.root @ self.root.T
 
 
 class Estimate(NamedTuple):
-    """The usual payload: the sender's estimate and the root of its covariance."""
+    """The usual payload: the sender's estimate ``xhat`` (n,) and the ``root`` (n, n) of its
+    covariance.
+    """
 
     xhat: FloatArray
     root: FloatArray
 
     @property
     def P(self) -> FloatArray:
-        """``root root'`` (n, n)."""
+        """The covariance ``root root'`` (n, n) of the estimate."""
         return self.root @ self.root.T
 
 
@@ -382,16 +386,17 @@ class Filter(Component):
         return True
 
     def decides_in_slots(self) -> bool:
-        """Return True if a node may decide to send nothing: ``slot_kernel`` then writes which nodes
-        send (``sent`` of kernels.slots.SlotPlan); for compiled filters.
+        """Return True if a node may decide to send nothing: the compiled ``slot_kernel`` then
+        writes which nodes send into ``SlotPlan.sent``.
         """
         return False
 
     def slot_arrays(
         self, states: Sequence[Any], infos: Sequence[NodeInfo], runs: int
     ) -> tuple[Any, ...]:
-        """Return the arrays that ``slot_kernel`` is given besides, for ``runs`` runs of H nodes:
-        ``states`` are those in which each node starts, and ``infos`` what each knows at time 0.
+        """Return the arrays that ``slot_kernel``, the compiled simulation of slots, is given
+        besides, for ``runs`` runs of H nodes: ``states`` are those in which each node starts, and
+        ``infos`` what each knows at time 0.
         """
         return ()
 

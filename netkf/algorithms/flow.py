@@ -37,7 +37,9 @@ class FlowState(NamedTuple):
 
 
 class Payload(NamedTuple):
-    """The content of a message: estimate and covariance of the sender at the time of sending."""
+    """The content of a message: estimate ``xhat`` (n,) and covariance ``P`` (n, n) of the sender at
+    the time of sending.
+    """
 
     xhat: FloatArray
     P: FloatArray

@@ -90,7 +90,7 @@ class ConsensusState(NamedTuple):
 
     @property
     def P(self) -> FloatArray:
-        """``root root'`` (n, n)."""
+        """The covariance ``root root'`` (n, n) of the estimate."""
         return self.root @ self.root.T
 
 

@@ -40,7 +40,7 @@ class Past(NamedTuple):
 
     time : in seconds
     reading : the reading that was used, or None
-    offset : shift of the frame of coordinates, or None
+    offset : shift (n,) of the frame of coordinates, or None
     xhat, root : estimate (n,) and root (n, n) right after the event
     before : the event before it
     """
@@ -74,7 +74,7 @@ class IntermittentState(NamedTuple):
 
     @property
     def P(self) -> FloatArray:
-        """``root root'`` (n, n)."""
+        """The covariance ``root root'`` (n, n) of the estimate."""
         return self.root @ self.root.T
 
 
@@ -202,7 +202,7 @@ class Intermittent(Filter):
         return state
 
     def accepts(self, payload: Reading, age: float) -> bool:
-        """Return False if the message took longer than the window, ``age`` seconds, or if late
+        """Return False if the message, ``age`` seconds old, took longer than the window, or if late
         readings are dropped.
         """
         return age <= self.max_age

@@ -55,7 +55,7 @@ class KcfState(NamedTuple):
 
     @property
     def P(self) -> FloatArray:
-        """``root root'`` (n, n)."""
+        """The covariance ``root root'`` (n, n) of the estimate."""
         return self.root @ self.root.T
 
 

@@ -72,7 +72,7 @@ class FlowModel:
 
     @cached_property
     def information(self) -> FloatArray:
-        """``G = H' R^-1 H`` (n, n)."""
+        """The information rate ``G = H' R^-1 H`` (n, n) of the node's sensors, per second."""
         return np.asarray(self.H.T @ np.linalg.solve(self.R, self.H))
 
     @cached_property
@@ -107,8 +107,9 @@ class FlowModel:
         return max(0.0, -float(np.linalg.eigvals(self.A).real.min()))
 
     def backward(self, gap: float) -> Backward:
-        """Return the transition of information about the state to ``gap`` seconds later: ``e^{-A
-        gap}`` (n, n) and the factor by which old information fades, so that it stays bounded.
+        """Return the transition of information about the state to ``gap`` seconds later:
+        ``e^{-A gap}`` (n, n) and the factor by which old information fades, so that it stays
+        bounded.
         """
         # A constant state: the exponential would be I up to rounding, and nothing fades.
         if not self.A.any():
@@ -119,8 +120,9 @@ class FlowModel:
     def predict(
         self, xhat: FloatArray, root: FloatArray, gap: float
     ) -> tuple[FloatArray, FloatArray]:
-        """Return estimate (n,) and root (n, n) ``gap`` seconds after ``xhat`` (n,) and ``root``
-        (n, n); the root counts the gap's readings, the estimate does not.
+        """Return the estimate (n,) and the root (n, n) of its covariance ``gap`` seconds after
+        ``xhat`` (n,) and ``root`` (n, n); the root counts the gap's readings, the estimate does
+        not.
         """
         root, xhat = flow_root(self.flow, root, xhat, gap)
         return xhat, root
@@ -128,8 +130,8 @@ class FlowModel:
     def extrapolate(
         self, xhat: FloatArray, root: FloatArray, age: float
     ) -> tuple[FloatArray, FloatArray]:
-        """Return estimate (n,) and root (n, n) ``age`` seconds after ``xhat`` (n,) and ``root``
-        (n, n), without readings.
+        """Return the estimate (n,) and the root (n, n) of its covariance ``age`` seconds after
+        ``xhat`` (n,) and ``root`` (n, n), without readings.
         """
         if age <= 0.0:
             return xhat, root
@@ -175,14 +177,14 @@ class SlotModel:
 
     @property
     def information(self) -> FloatArray:
-        """``H' R^-1 H`` (n, n)."""
+        """The information ``H' R^-1 H`` (n, n) of a reading of the node's sensors."""
         return symmetric(self.H.T @ np.linalg.solve(self.R, self.H))
 
     def predict(
         self, xhat: FloatArray, root: FloatArray, gap: float
     ) -> tuple[FloatArray, FloatArray]:
-        """Return estimate (n,) and root (n, n) after one slot for each period of the ``gap`` in
-        seconds, from ``xhat`` (n,) and ``root`` (n, n).
+        """Return the estimate (n,) and the root (n, n) of its covariance after one slot for each
+        period of the ``gap`` in seconds, from ``xhat`` (n,) and ``root`` (n, n).
         """
         # round: a gap of whole periods may be off by rounding of clock times.
         for _ in range(round(gap / self.period)):
@@ -226,8 +228,8 @@ def first_root(cov: FloatArray) -> FloatArray:
 def sample_update(
     xhat: FloatArray, root: FloatArray, y: FloatArray, H: FloatArray, R: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return estimate (n,) and root (n, n) after a sample ``y = H x + v`` (p,) of p > 0 rows,
-    cov(v) = R (p, p), from ``xhat`` (n,) and ``root`` (n, n) before.
+    """Return the estimate (n,) and the root (n, n) of its covariance after a sample ``y = H x + v``
+    (p,) of p > 0 rows, H (p, n), cov(v) = R (p, p), from ``xhat`` (n,) and ``root`` (n, n) before.
     """
     noise = np.asarray(np.linalg.cholesky(R), dtype=np.float64)
     root, xhat, _ = update_with_sample(root, xhat, y, H, noise)

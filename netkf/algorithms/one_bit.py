@@ -78,7 +78,7 @@ class OneBitState(NamedTuple):
 
     @property
     def P(self) -> FloatArray:
-        """``root root'`` (n, n)."""
+        """The covariance ``root root'`` (n, n) of the estimate."""
         return self.root @ self.root.T
 
 
@@ -217,9 +217,9 @@ def send_bits(
     gains: FloatArray,
 ) -> None:
     """Write the ``signs`` (p, L), +1 or -1, of the innovations of filter ``h`` in slot ``s`` of
-    block ``b``, and correct the filter by them: changes ``x[b, h]`` of x (B, H, n, L) and ``root[b,
-    h]`` of root (B, H, n, n, L). ``rows`` rows of its reading count; ``row`` and ``gains`` (n, L)
-    are scratch.
+    block ``b``, and correct the filter by them: changes ``x[b, h]`` of x (B, H, n, L) and
+    ``root[b, h]`` of root (B, H, n, n, L). ``rows`` rows of its reading count; ``row`` and
+    ``gains`` (n, L) are scratch.
 
     Axes: B blocks of L runs, H filters.
     """

@@ -78,7 +78,7 @@ MAX_SPREAD = 1e14
 
 class NetworkInformation(NamedTuple):
     """A node's estimate of the network: the ``information`` (n, n) of all sensors, G^(i) of P (6),
-    and the ``number`` of nodes, N^(i); with asymptotic gains the ``root`` of P_inf.
+    and the ``number`` of nodes, N^(i); with asymptotic gains the ``root`` (n, n) of P_inf.
     """
 
     information: FloatArray
@@ -118,7 +118,7 @@ class PushSumState(NamedTuple):
 
     @property
     def P(self) -> FloatArray:
-        """``root root'`` (n, n)."""
+        """The covariance ``root root'`` (n, n) of the estimate."""
         return self.root @ self.root.T
 
 
@@ -166,8 +166,8 @@ def drop_mass_of_stopped(
     arrays: PushSumArrays, plan: SlotPlan, links: SlotLinks, samples: SlotSamples, b: int, s: int
 ) -> None:
     """Drop the messages with mass of nodes of block ``b`` that stopped before slot ``s``, which
-    send none by the paper's rule: writes 0 into ``plan.sent[b, s, MASS]`` (H, L) and ``plan.up[b,
-    s, MASS]`` (W, L). Nothing happens under another rule in ``arrays``.
+    send none by the paper's rule: writes 0 into ``plan.sent[b, s, MASS]`` (H, L) and
+    ``plan.up[b, s, MASS]`` (W, L). Nothing happens under another rule in ``arrays``.
 
     Axes: W directed links, H nodes, L runs side by side.
     """
@@ -687,7 +687,9 @@ class PushSum(Filter):
         return self.gamma or 1 if phase == AVERAGE else 1
 
     def redraws_links(self, phase: int, step: int) -> bool:
-        """Return True unless links that are held keep the outcome of the first averaging step."""
+        """Return True if links draw new outcomes in repetition ``step`` of exchange number
+        ``phase`` of a slot: always, unless links that are "held" keep the outcome of the first one.
+        """
         return self.links == "fresh" or step == 0
 
     def emit(self, state: Any, exchange: Exchange) -> tuple[Any, Any]:
@@ -769,7 +771,9 @@ class PushSum(Filter):
         return not isinstance(state, RunningSums) and bool(state.stopped)
 
     def conserved(self, state: Any) -> Mapping[str, float | Sequence[float]]:
-        """Return weight and number of a node; their sums over all nodes are 1 and N."""
+        """Return the weight w and the number n~ of a node by name, or the terms of both with
+        running sums; their sums over all nodes are 1 and N.
+        """
         if isinstance(state, RunningSums):
             return running_sums.weights(state)
         if state.sums is None:
@@ -838,7 +842,9 @@ class PushSum(Filter):
             raise ScenarioError("filter.leader", rule, self.leader, remedy)
 
     def _check_gain(self, radius: float) -> None:
-        """Raise ScenarioError unless averaging with ``delta`` contracts; ``radius`` is rho(L)."""
+        """Raise ScenarioError unless averaging with ``delta`` contracts; ``radius`` is rho(L), the
+        largest eigenvalue of the graph's Laplacian.
+        """
         # Averaging contracts if and only if all eigenvalues of I - L / delta but one lie inside
         # (-1, 1).
         if self.delta <= 0.5 * radius * (1.0 + 1e-12):

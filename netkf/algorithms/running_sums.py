@@ -71,7 +71,7 @@ class RunningSums(NamedTuple):
 
     @property
     def P(self) -> FloatArray:
-        """``root root'`` (n, n)."""
+        """The covariance ``root root'`` (n, n) of the estimate."""
         return self.root @ self.root.T
 
 
@@ -112,8 +112,8 @@ def predict_offer(offer: Offer, back: Backward) -> Offer:
 
 
 def _move_total(total: FloatArray, back: Backward) -> FloatArray:
-    """Return a ``total`` (1 + n n + n,) of (w, U, u) about a state one gap later: ``U <- s F^-T U
-    F^-1``, ``u <- s F^-T u``, where ``back`` is (F^-1, s).
+    """Return a ``total`` (1 + n n + n,) of (w, U, u) about a state one gap later:
+    ``U <- s F^-T U F^-1``, ``u <- s F^-T u``, where ``back`` is (F^-1, s).
     """
     inverse, fading = back
     n, out = len(inverse), total.copy()

@@ -108,8 +108,8 @@ class SlotFilter(Component):
         return 1
 
     def redraws(self, phase: int, step: int) -> bool:
-        """Return True if links draw new outcomes in a step, else each keeps its last one; True in
-        the first.
+        """Return True if links draw new outcomes in repetition ``step`` of exchange number
+        ``phase``, else each keeps its last one; True in the first.
         """
         return True
 
@@ -148,8 +148,8 @@ class SlotFilter(Component):
 
     @property
     def pair_weights(self) -> FloatArray | None:
-        """(N, N) in the order of node ids: entry [l, i] is the weight node i gives to a message of
-        node l. None where ``weight`` says it.
+        """Weights of N nodes (N, N) in the order of their ids: entry [l, i] is the weight node i
+        gives to a message of node l. None where ``weight`` says it.
         """
         return None
 

@@ -115,9 +115,9 @@ def fuse_received(
     index: tuple[int, int, int, int],
 ) -> None:
     """Fuse filter h of block b in lane q (one run) with all estimates that arrive in slot s, one
-    after the other, by the rule in ``arrays``; ``index`` is [b, s, h, q]. Changes ``nodes.xhat[b,
-    h, :, q]`` (n,) and ``nodes.root[b, h, :, :, q]`` (n, n); the messages are the copies of all
-    estimates in ``scratch``.
+    after the other, by the rule in ``arrays``; ``index`` is [b, s, h, q]. Changes
+    ``nodes.xhat[b, h, :, q]`` (n,) and ``nodes.root[b, h, :, :, q]`` (n, n); the messages are the
+    copies of all estimates in ``scratch``.
     """
     b, s, h, q = index
     n, has_received = nodes.xhat.shape[2], False
@@ -252,7 +252,7 @@ class TrackState(NamedTuple):
 
     @property
     def P(self) -> FloatArray:
-        """``fused_root fused_root'`` (n, n)."""
+        """The covariance ``fused_root fused_root'`` (n, n) of the reported estimate."""
         return self.fused_root @ self.fused_root.T
 
 

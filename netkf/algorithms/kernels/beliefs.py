@@ -82,9 +82,9 @@ def add_part(lanes: Lanes, total: FloatArray, part: FloatArray, work: FloatArray
 def recentre_part(
     lanes: Lanes, part: FloatArray, before: FloatArray, after: FloatArray, out: FloatArray
 ) -> None:
-    """Move the centre c that the evidence ``part`` (n, n + 1, L), [Z, z] with ``Z (x - c) = z +
-    noise``, is relative to from ``before`` (n, L) to ``after`` (n, L): write the result into
-    ``out``, which may be ``part`` itself.
+    """Move the centre c that the evidence ``part`` (n, n + 1, L), [Z, z] with
+    ``Z (x - c) = z + noise``, is relative to from ``before`` (n, L) to ``after`` (n, L): write the
+    result into ``out``, which may be ``part`` itself.
 
     Axes: L runs side by side.
     """

@@ -121,8 +121,8 @@ def finish_lanes(
     unchanged: Any,
 ) -> None:
     """Write the estimate of the information ``total`` (n, n + 1, L), [Z, z] relative to
-    ``centre[h]`` of ``centre`` (H, n, L), into filter ``h`` of block ``b``: Z^-1 into ``root[b,
-    h]`` (n, n, L) and ``centre + Z^-1 z`` into ``xhat[b, h]`` (n, L).
+    ``centre[h]`` of ``centre`` (H, n, L), into filter ``h`` of block ``b``: Z^-1 into
+    ``root[b, h]`` (n, n, L) and ``centre + Z^-1 z`` into ``xhat[b, h]`` (n, L).
 
     Lanes with the flag ``unchanged`` (L,) keep their estimate; ``whitened`` (n, n + 1, L) is
     scratch. Axes: H filters, L runs side by side.

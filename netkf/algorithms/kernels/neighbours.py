@@ -128,8 +128,8 @@ def fuse_readings(
     h: int,
 ) -> None:
     """Update filter ``h`` of block ``b`` with its own reading of slot ``s`` and, if nodes ``share``
-    readings, with those that arrive in the first step of the slot's exchanges (``plan.up[b, s,
-    0]``).
+    readings, with those that arrive in the first step of the slot's exchanges
+    (``plan.up[b, s, 0]``).
 
     Changes ``nodes.xhat[b, h]`` (n, L) and ``nodes.root[b, h]`` (n, n, L), in L runs.
     """

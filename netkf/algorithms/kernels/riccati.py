@@ -60,8 +60,8 @@ def exponential_series(M: FloatArray, terms: int) -> FloatArray:
 
 
 def lyapunov_series(A: FloatArray, Q: FloatArray, terms: int) -> FloatArray:
-    """Return the power series (terms, n, n) in g of the noise covariance W(g) with ``dW/dg = A W +
-    W A' + Q`` and W(0) = 0; A and Q are (n, n).
+    """Return the power series (terms, n, n) in g of the noise covariance W(g) with
+    ``dW/dg = A W + W A' + Q`` and W(0) = 0; A and Q are (n, n).
     """
     series = np.zeros((terms, *A.shape))
     series[1] = Q
@@ -73,8 +73,8 @@ def lyapunov_series(A: FloatArray, Q: FloatArray, terms: int) -> FloatArray:
 
 
 def hamiltonian(A: FloatArray, Q: FloatArray, G: FloatArray) -> tuple[FloatArray, float]:
-    """Return the Hamiltonian (2 n, 2 n) ``[[-A', G s], [Q / s, A]]`` of the Riccati equation of ``P
-    / s`` and the scale ``s`` that balances ``Q`` against ``G``; A, Q and G are (n, n).
+    """Return the Hamiltonian (2 n, 2 n) ``[[-A', G s], [Q / s, A]]`` of the Riccati equation of
+    ``P / s`` and the scale ``s`` that balances ``Q`` against ``G``; A, Q and G are (n, n).
     """
     size_A, size_Q, size_G = (float(np.abs(matrix).max()) for matrix in (A, Q, G))
     # A floor, so that a plant without dynamics does not divide by zero below.

@@ -297,7 +297,7 @@ def transitions_at(
 
 
 def wide_zeros(*shape: int) -> Any:
-    """Return zeros in extended precision."""
+    """Return zeros of this ``shape`` in extended precision."""
     return np.zeros(shape, dtype=WIDE)
 
 
@@ -552,8 +552,8 @@ def propagate_by_levels(
     gap: float,
     scratch: FlowScratch,
 ) -> float:
-    """Propagate ``root[k]`` (n, n) and ``x[k]`` (n,) in place over the whole multiples of ``unit
-    2^level`` seconds in a ``gap``, by model ``m`` of the table; return the rest of the gap,
+    """Propagate ``root[k]`` (n, n) and ``x[k]`` (n,) in place over the whole multiples of
+    ``unit 2^level`` seconds in a ``gap``, by model ``m`` of the table; return the rest of the gap,
     seconds.
     """
     length, levels = table.unit[m] * (1 << level), table.sizes[m, 3]
@@ -698,8 +698,9 @@ def propagate_by_series(
     scratch: FlowScratch,
 ) -> None:
     """Propagate ``root[k]`` (n, n) and ``x[k]`` (n,) in place by model ``m`` of the table over the
-    gap for which ``scratch.values`` holds Q_g, exp(A g), F and G_g (see ``fill_values``).
-    ``reads``: use the information G_g first; otherwise the caller has done so.
+    gap for which ``scratch.values`` holds the noise Q_g, exp(A g), the transition F and the
+    information G_g of the readings (see ``fill_values``). ``reads``: use G_g first; otherwise the
+    caller has done so.
     """
     size, n, observed = scratch.size, len(scratch.size), table.sizes[m, 1] > 0
     S, mean = local_matrix(size, scratch.S), local_vector(size, scratch.mean)
@@ -736,8 +737,8 @@ def offset_of_F(n: int, observed: bool) -> int:
 def propagate_mean(
     lanes: Lanes, size: Size, x: FloatArray, values: FloatArray, moved: FloatArray
 ) -> None:
-    """Compute ``x = exp(A g) x`` (n, L) in place in L lanes; ``values`` (>= width, L) holds exp(A
-    g) by rows behind Q_g, and ``moved`` (n, L) is scratch.
+    """Compute ``x = exp(A g) x`` (n, L) in place in L lanes; ``values`` (>= width, L), as of
+    ``fill_values``, holds exp(A g) by rows behind Q_g, and ``moved`` (n, L) is scratch.
     """
     n, begin = len(size), len(size) * (len(size) + 1) // 2
     for i in range(n):
@@ -753,9 +754,9 @@ def propagate_mean(
 def condition_root(
     lanes: Lanes, size: Size, S: FloatArray, values: FloatArray, V: FloatArray
 ) -> None:
-    """Replace S (n, n, L), a lower triangular root of P in each of L lanes, by one of ``P (I + G
-    P)^-1``: the update with information G. ``values`` (>= width, L) holds the lower triangle of G
-    by rows, behind Q_g, exp(A g) and F; V (n, n, L) is scratch.
+    """Replace S (n, n, L), a lower triangular root of P in each of L lanes, by one of
+    ``P (I + G P)^-1``: the update with information G. ``values`` (>= width, L) holds the lower
+    triangle of G by rows, behind Q_g, exp(A g) and F; V (n, n, L) is scratch.
     """
     n = len(size)
     begin = n * (n + 1) // 2 + 2 * n * n

@@ -426,8 +426,8 @@ def predict_all(nodes: SlotNodes, scratch: SlotScratch, b: int) -> None:
 
 @kernel(inlined=True)
 def predict_mean(nodes: SlotNodes, scratch: SlotScratch, b: int, h: int) -> None:
-    """Replace ``nodes.xhat[b, h]`` (n, L), the estimate of filter ``h`` of block ``b``, by ``F
-    xhat`` for the next slot.
+    """Replace ``nodes.xhat[b, h]`` (n, L), the estimate of filter ``h`` of block ``b``, by
+    ``F xhat`` for the next slot.
 
     Axes: L runs side by side.
     """

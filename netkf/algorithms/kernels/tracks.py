@@ -47,7 +47,7 @@ class TrackScratch(NamedTuple):
 
 
 def track_scratch(k: int, n: int) -> TrackScratch:
-    """Return scratch for at most k tracks of n states."""
+    """Return scratch for the combination of a track of n states with at most k others."""
     K = max(k, 1) * n
     shapes = [(K, K), (K, K), (n, K), (n, K), (K,), (n, K + n), (n, n)]
     difference_cov, factor, cross_cov, white_cov, variance_scale, weights, work = (
@@ -61,8 +61,8 @@ def track_scratch(k: int, n: int) -> TrackScratch:
 
 @kernel
 def predict_joint(joint: FloatArray, F: FloatArray, Q: FloatArray, work: FloatArray) -> None:
-    """Predict the covariances ``joint`` (K, n, n) of all K pairs of tracks in place, ``P_ij <- F
-    P_ij F' + Q`` with F and Q (n, n); ``work`` (n, n) is scratch.
+    """Predict the covariances ``joint`` (K, n, n) of all K pairs of tracks in place,
+    ``P_ij <- F P_ij F' + Q`` with F and Q (n, n); ``work`` (n, n) is scratch.
     """
     for k in range(len(joint)):
         multiply_both(F, joint[k], F, work)
@@ -122,8 +122,8 @@ def update_joint(
 def close_track(
     P: FloatArray, H: FloatArray, rows: int, closed: FloatArray, work: FloatArray
 ) -> None:
-    """Update P (n, n) in place by a reading with ``rows`` whitened rows H (p, n); write ``I - K
-    H``, with the gain K of all rows, into ``closed`` (n, n). ``work`` (n, n) is scratch.
+    """Update P (n, n) in place by a reading with ``rows`` whitened rows H (p, n); write
+    ``I - K H``, with the gain K of all rows, into ``closed`` (n, n). ``work`` (n, n) is scratch.
     """
     n = len(P)
     for i in range(n):
