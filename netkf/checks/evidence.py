@@ -127,7 +127,7 @@ def judge(
     runs: int,
     level: float,
 ) -> list[Evidence]:
-    """Return the evidence for each promise.
+    """Return the evidence for each promise, from the ``samples`` of ``runs`` runs.
 
     With probability 1 - ``level`` at least, all intervals contain the truth: tests that are not
     exact share the level equally (Bonferroni). A promise with a failing assumption is not tested.

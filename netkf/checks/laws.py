@@ -75,8 +75,8 @@ def pool(
     """Return the finding of a row from its single comparisons and one of all values pooled.
 
     Each has its share of the level. If only a single comparison is significant, it is the finding;
-    otherwise the pooled one is, whose interval is far narrower. ``what`` describes the pooled
-    values.
+    otherwise the pooled one is, whose interval is far narrower, with its own ``tolerance``.
+    ``what`` describes the pooled values.
     """
     single_decides = single.margin[2] < 0.0 and not pooled.low > 0.0
     if single_decides or not pooled.value >= 0.0:

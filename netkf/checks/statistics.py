@@ -84,7 +84,9 @@ def student_interval(value: float, deviation: float, count: int, level: float) -
 
 
 def _normal_quantile(probability: float) -> float:
-    """Return the quantile of the standard normal law."""
+    """Return the value that a standard normal variable does not exceed with this
+    ``probability``.
+    """
     return float(scipy.special.ndtri(probability))
 
 
@@ -257,7 +259,9 @@ def distance_to_law(
 
 
 def band_around(value: float, width: float, detectable: float = math.nan) -> Interval:
-    """Return the interval ``value`` +- ``width``, clipped to [0, 1], for a distance of laws."""
+    """Return the interval ``value`` +- ``width``, clipped to [0, 1], for a distance of laws;
+    ``detectable`` is the distance that it would have shown with probability POWER.
+    """
 
     def limits(value: float, factor: float) -> tuple[float, float]:
         """Return the limits for another distance and ``factor`` times the samples."""
@@ -276,7 +280,9 @@ def scale_interval(total: float, freedom: float, level: float) -> Interval:
     """
 
     def quantiles(freedom: float) -> tuple[float, float]:
-        """Return the upper and lower quantile of chi-square."""
+        """Return the quantiles of chi-square with ``freedom`` degrees, exceeded with probabilities
+        level / 2 and 1 - level / 2.
+        """
         tails = 1.0 - level / 2.0, level / 2.0
         upper, lower = (2.0 * float(scipy.special.gammaincinv(freedom / 2.0, p)) for p in tails)
         return upper, lower

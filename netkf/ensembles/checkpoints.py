@@ -55,7 +55,7 @@ class RunIdentity:
     block: int
 
     def of(self, number: int) -> dict[str, Any]:
-        """Return the identity of a block."""
+        """Return the identity of block ``number`` of these runs."""
         return {**asdict(self), "number": number}
 
     @property
@@ -125,7 +125,9 @@ class BlockCheckpoints:
         self._numbers.add(number)
 
     def load(self, number: int) -> RunStatistics:
-        """Return a block without its traces; raises EngineError if it was damaged meanwhile."""
+        """Return block ``number`` without its traces; raises EngineError if it was damaged
+        meanwhile.
+        """
         with self._expect_block(number), _open_block(self._block_path(number)) as arrays:
             return _restore_statistics(arrays)
 
@@ -149,7 +151,7 @@ class BlockCheckpoints:
         return sorted(file for file in files if file.stem.isdecimal())
 
     def _block_path(self, number: int) -> Path:
-        """Return the path of a block."""
+        """Return the path of block ``number``."""
         return self._folder / f"{number:06d}.npz"
 
     def _check(self, file: Path, identity: dict[str, Any]) -> None:

@@ -216,7 +216,9 @@ def ensemble_table(ensemble: Ensemble) -> dict[str, np.ndarray]:
     i, j = np.triu_indices(n)
 
     def upper(values: FloatArray) -> list[FloatArray]:
-        """Return the columns (T N,) of the upper triangle of matrices (T, N, n, n), row by row."""
+        """Return the columns (T N,) of the upper triangle of the matrices ``values`` (T, N, n, n),
+        row by row.
+        """
         return list(values[:, :, i, j].reshape(rows, -1).T)
 
     columns = [

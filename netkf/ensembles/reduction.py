@@ -152,7 +152,9 @@ def reduction_scratch(filters: int, n: int, largest: int) -> ReductionScratch:
     nodes, rows = (depth, wide, columns), (LANES, wide, columns)
 
     def in_lanes(numbers: int) -> FloatArray:
-        """Return aligned scratch with lanes for ``numbers`` numbers of each chunk."""
+        """Return aligned scratch (wide ``numbers`` + L, L) with L lanes, for ``numbers`` numbers of
+        each of ``wide`` sample times.
+        """
         return np.asarray(aligned((wide * numbers + LANES, LANES)))
 
     return ReductionScratch(
@@ -403,8 +405,8 @@ def reduce_group(
     t: int,
     count: int,
 ) -> bool:
-    """Fill ``scratch.rows`` for ``count`` samples from number ``t`` on of the ``active`` runs from
-    ``first`` on, one run in each lane; return True if no run lacks one of them.
+    """Fill ``scratch.rows`` for ``count`` samples from number ``t`` on of the ``active`` runs of
+    ``b`` from ``first`` on, one run in each lane; return True if no run lacks one of them.
 
     Adds the samples to ``sums.averages`` of these runs, and sets ``sums.rounding_from``.
     """
@@ -684,9 +686,10 @@ def mark_blurred(
 
 @kernel(compact=True)
 def is_blurred(b: Batch, r: int, t: int) -> bool:
-    """Return True if rounding blurs sample ``t`` of run ``r``, by the rule of
-    ``trace.run.rounding_from``: rounding errors of the state exceed a fraction 1 / BLUR of the
-    smallest standard deviation.
+    """Return True if rounding blurs sample ``t`` of run ``r`` of the batch ``b``: rounding errors
+    of the state exceed a fraction 1 / BLUR of the smallest standard deviation.
+
+    The rule is that of ``trace.run.rounding_from``.
     """
     filters, n = b.error.shape[2:]
     largest, min_variance, square = 0.0, np.inf, 0.0

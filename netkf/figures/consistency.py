@@ -64,7 +64,9 @@ def nees_figure(data: FigureData) -> Picture:
 
 
 def _nees_claim(inside: float, mean: float, n: int) -> str:
-    """Return a sentence on the share of samples ``inside`` the band and on their mean."""
+    """Return a sentence on the share of samples ``inside`` the band and on their ``mean``, for n
+    states.
+    """
     claim = f"{inside:.0%} of the samples lie in the {CONFIDENCE:.0%} band of NEES"
     return f"{claim}; their mean is {mean:.3g} where exact covariances give {n}"
 

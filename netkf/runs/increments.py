@@ -105,10 +105,12 @@ def record_increments(algorithm: Filter, intervals: list[WhitenedInnovation]) ->
         """
 
         def init(self, model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo) -> TimedState:
+            """Return the state at time 0 with the estimate ``mean`` (n,), ``cov`` (n, n)."""
             inner = base.init(self, model, mean, cov, node)
             return TimedState(inner, -1 if base.pooled else node.node, 0.0, (mean, None))
 
         def predict(self, state: TimedState, gap: float) -> TimedState:
+            """Return the state predicted over ``gap`` seconds, with the estimate before it."""
             start = base.estimate(self, state.inner)
             inner = base.predict(self, state.inner, gap)
             return TimedState(inner, state.node, state.time + gap, start)
@@ -127,17 +129,21 @@ def record_increments(algorithm: Filter, intervals: list[WhitenedInnovation]) ->
             return state._replace(inner=base.update(self, state.inner, reading))
 
         def emit(self, state: TimedState, exchange: Any) -> tuple[TimedState, Any]:
+            """Return the state and the payload of its message, as the filter does."""
             inner, payload = base.emit(self, state.inner, exchange)
             return state._replace(inner=inner), payload
 
         def absorb(self, state: TimedState, messages: Sequence[Any], exchange: Any) -> TimedState:
+            """Return the state after ``messages``, as the filter does."""
             return state._replace(inner=base.absorb(self, state.inner, messages, exchange))
 
         def estimate(self, state: TimedState) -> tuple[FloatArray, FloatArray | None]:
+            """Return xhat (n,) and P (n, n) or None, as the filter does."""
             estimate: tuple[FloatArray, FloatArray | None] = base.estimate(self, state.inner)
             return estimate
 
         def shift(self, state: TimedState, offset: FloatArray) -> TimedState:
+            """Return the state with the estimate moved by ``offset`` (n,)."""
             return state._replace(inner=base.shift(self, state.inner, offset))
 
         def max_measurement_interval(self, state: TimedState) -> float:

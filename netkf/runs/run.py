@@ -207,6 +207,7 @@ def _create_output(
 ) -> _Output:
     """Create the run directory with scenario.toml and a manifest, and return it with its sinks.
 
+    The run is number ``replica`` of the runs of ``seed``, by the ``engine`` of that name;
     ``tables`` says whether Parquet tables are written. Raises ScenarioError if the directory is not
     empty or cannot hold a copy of the scenario, and WriteError.
     """
@@ -231,7 +232,9 @@ def _create_output(
 def _simulate(
     engine: Engine, scenario: Scenario, replica: int, recorder: Recorder, progress: Progress
 ) -> tuple[str, float]:
-    """Simulate and return the status of the run and its wall-clock seconds without compiling."""
+    """Simulate run number ``replica``; return its status and its wall-clock seconds without
+    compiling.
+    """
     start, compiled_before = time.perf_counter(), compiling.seconds_spent()
     status = engine.run(scenario, Streams(scenario.seed, replica), recorder, progress)
     compile_seconds = compiling.seconds_spent() - compiled_before

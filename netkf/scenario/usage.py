@@ -77,7 +77,9 @@ def usage_notes(usage: Mapping[str, Use]) -> tuple[str, ...]:
 
 
 def _make_use(path: str, rows: int, unused: int) -> Use:
-    """Return the use of the table in a file: the number of rows, and of those not used."""
+    """Return the use of the table in the file ``path``: its number of ``rows``, and of those
+    ``unused``.
+    """
     return {"path": path, "rows": rows, "unused": unused}
 
 

@@ -385,5 +385,5 @@ def _student_interval(
 
 
 def _excludes_zero(low: float, high: float) -> bool:
-    """Return True if an interval is finite and lies on one side of zero."""
+    """Return True if the interval ``low`` .. ``high`` is finite and lies on one side of zero."""
     return bool(np.isfinite([low, high]).all() and (low > 0.0 or high < 0.0))

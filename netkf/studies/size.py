@@ -121,6 +121,8 @@ def _describe_quantity(problem: SizingProblem, low: float, simulated: str) -> st
 def _choose_task(problem: SizingProblem, low: float, engine: Engine) -> tuple[BlockTask, str, int]:
     """Return the task to simulate, a description of its quantity, and the runs before the first
     decision.
+
+    ``low`` is the lower end of the range, at which it is tried whether expected errors are known.
     """
     quantity = f"{QUANTITIES[problem.target.quantity]}, over the runs"
     if problem.target.of_errors and expected_errors_known(problem.at(low)):

@@ -162,6 +162,8 @@ def _check_delivery_probabilities(
 ) -> None:
     """Check that the delivery probabilities of a link are from 0 to 1, in both states of the
     channel, and 0 or 1 if the loss is deterministic; the mean may be nan.
+
+    ``table_probability`` is the entry of the graph's table for the link.
     """
     part, where = watched.part, f"{watched.name}.{watched.defined_name('delivery_probability')}"
     for bad in (False, True):

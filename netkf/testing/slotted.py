@@ -29,7 +29,9 @@ class SlotTrial(Trial):
     slots = 0
 
     def model(self, has_sensor: bool) -> SlotModel:
-        """Return the model of a node in slots of PERIOD seconds."""
+        """Return the model of a node in slots of PERIOD seconds: F and Q (n, n), H (p, n) and R
+        (p, p), with p = 0 unless it ``has_sensor``.
+        """
         return SlotModel(self.system.M, self.system.Q, *self.matrices(has_sensor), PERIOD)
 
     def run(self) -> None:

@@ -65,7 +65,7 @@ class Trial(ABC):
 
     @abstractmethod
     def model(self, has_sensor: bool) -> Any:
-        """Return the model of a node with or without a sensor."""
+        """Return the model of a node, with a sensor if it ``has_sensor``."""
 
     @abstractmethod
     def run(self) -> None:
@@ -136,7 +136,7 @@ class Trial(ABC):
         return Reading(self.random.normal(size=len(H)) + H @ self.offset, H, R, time)
 
     def matrices(self, has_sensor: bool) -> tuple[FloatArray, FloatArray]:
-        """Return H (p, n) and R (p, p) of a node, with p = 0 if it has no sensor."""
+        """Return H (p, n) and R (p, p) of a node, with p = 0 unless it ``has_sensor``."""
         system = self.system
         return (system.H, system.R) if has_sensor else (system.H[:0], system.R[:0, :0])
 

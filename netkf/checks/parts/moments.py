@@ -166,7 +166,9 @@ def compare_variances(
         return nothing_to_see(VARIANCE_TOLERANCE)
 
     def interval(square: float, fourth: float, count: float, level_part: float) -> Interval:
-        """Return the interval of a variance relative to the stated one, at level ``level_part``."""
+        """Return the interval of a variance relative to the stated one, at level ``level_part``,
+        from the sums of ``count`` squares (``square``) and fourth powers (``fourth``).
+        """
         # The relative variance of a sum of squares is (kurtosis - 1) / count, that of chi-square
         # with f degrees of freedom 2 / f: hence f = 2 count / (kurtosis - 1), kurtosis - 1 being
         # 2 + excess. A sample excess below 0 counts as 0, which widens the interval.
@@ -281,7 +283,8 @@ def compare_cells(cells: FloatArray, labels: list[str], level: float, noun: str)
 
 
 def _cell_interval(count: float, total: float, level: float) -> Interval:
-    """Return the interval of the distance between a cell's share of ranks and 1 / CELLS.
+    """Return the interval of the distance between a cell's share of ranks, ``count`` out of
+    ``total``, and 1 / CELLS.
 
     The interval misses the truth with at most the probability ``level``.
     """
@@ -289,7 +292,7 @@ def _cell_interval(count: float, total: float, level: float) -> Interval:
 
 
 def _cell_label(k: int) -> str:
-    """Return the range of ranks of a cell as text."""
+    """Return the range of ranks of cell ``k``, from 0 to CELLS - 1, as text."""
     return f"rank {k / CELLS:.2f} to {(k + 1) / CELLS:.2f}"
 
 

@@ -94,7 +94,7 @@ class PseudoStateRule(ErrorRule):
 
 
 def _difference_name(estimator: int) -> Hashable:
-    """Return the name of the error of yhat - G xhat."""
+    """Return the name of the error of yhat - G xhat of node ``estimator`` (its index)."""
     return ("difference", estimator)
 
 

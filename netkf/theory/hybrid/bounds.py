@@ -325,7 +325,7 @@ class _PiecewiseSolution:
 
     def _jacobian(self, t: float, y: FloatArray) -> Any:
         """Return the sparse Jacobian (N m, N m), per second, of the right-hand side at the packed
-        solution ``y`` (N m,).
+        solution ``y`` (N m,); the time ``t`` does not matter.
         """
         linear = self._packed.linear(self._packed.unpack(y.reshape(self._packed.start.shape)))
         # With a delay the arrivals are known from earlier pieces and do not depend on y.
@@ -333,8 +333,8 @@ class _PiecewiseSolution:
 
 
 def _growth_event(limit: float) -> Callable[[float, FloatArray], float]:
-    """Return an event for ``solve_ivp`` that ends it where the largest entry of the solution
-    exceeds ``limit``; never if that is infinite.
+    """Return an event for ``solve_ivp``, a function of the time and the solution (N m,), that ends
+    it where the largest entry exceeds ``limit``; never if that is infinite.
     """
 
     def margin(_: float, y: FloatArray) -> float:
@@ -411,8 +411,8 @@ def _limit_evaluations(slope: Slope) -> Slope:
     evaluations_left = MAX_EXPLICIT_EVALUATIONS
 
     def limited(t: float, y: FloatArray) -> FloatArray:
-        """Return dy/dt (N m,) at time ``t`` (seconds); raises StiffError after too many
-        evaluations.
+        """Return dy/dt (N m,) at ``y`` (N m,) and time ``t`` (seconds); raises StiffError after too
+        many evaluations.
         """
         nonlocal evaluations_left
         evaluations_left -= 1

@@ -274,7 +274,7 @@ def _heard_by_all(c: scipy.sparse.csr_array) -> np.ndarray | None:
 
 
 def _stationary(c: scipy.sparse.csr_array) -> FloatArray:
-    """Return w (M,) with ``w (D - C) = 0`` and sum 1, D the row sums of the rates C (M, M) of M
+    """Return w (M,) with ``w (D - c) = 0`` and sum 1, D the row sums of the rates c (M, M) of M
     nodes.
 
     The nodes must be strongly connected. Raises TheoryError if the residual is too large.

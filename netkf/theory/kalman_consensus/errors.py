@@ -37,6 +37,8 @@ class KcfRule(ErrorRule):
     def elapse(self, gap: float, columns: slice | None, noise: FloatArray | None) -> None:
         """Forget the predictions and readings of an earlier instant if ``gap`` (seconds) is
         positive; a message of this instant must find those of this instant only.
+
+        The plant's noise is not needed: predictions are not kept over a gap.
         """
         if gap > 0.0:
             self._forget()
@@ -57,7 +59,9 @@ class KcfRule(ErrorRule):
         return name in self.errors.roots
 
     def _prediction_name(self, estimator: int) -> Hashable:
-        """Return the name of the node's prediction of this instant."""
+        """Return the name of the error of the prediction of node ``estimator`` at this instant: the
+        estimate itself until a reading has changed it.
+        """
         return _prior_name(estimator) if self._has_error(_prior_name(estimator)) else estimator
 
     def sense(self, time: float, observations: EstimatorObservations) -> None:
