@@ -193,6 +193,9 @@ def _widen_arguments(function: Any) -> None:
         return kinds.int64 if isinstance(general, kinds.Integer) and general.signed else general
 
     def template_of_widened(args: Any, kws: Any) -> Any:
+        """Return numba's template of a call, given the types ``args`` and ``kws`` of its arguments,
+        each made more general.
+        """
         named = {name: widen(kind) for name, kind in kws.items()}
         return template_for(tuple(widen(kind) for kind in args), named)
 
@@ -211,6 +214,9 @@ def _use_compile_settings(dispatcher: Any, config: Any) -> None:
     compile_for = dispatcher._compile_for_args
 
     def compile_with_settings(*args: Any, **kwargs: Any) -> Any:
+        """Compile the kernel for these arguments with other settings of LLVM, and restore them;
+        numba calls it for a kernel that has no code for the types of its arguments yet.
+        """
         level, started = config.OPT, time.perf_counter()
         config.OPT = type(level)(2)
         set_option("netkf", f"-unroll-threshold={UNROLLED}")

@@ -266,6 +266,9 @@ class _Matrix:
     """An array as a matrix: rows are the first axis, columns all others, which are contiguous."""
 
     def __init__(self, builder: Any, kind: Any, value: Any) -> None:
+        """Take an LLVM array ``value`` of numba type ``kind``; its number of columns is the product
+        of all axes but the first.
+        """
         shape = [builder.extract_value(value, [SHAPE, axis]) for axis in range(kind.ndim)]
         self._data = builder.extract_value(value, DATA)
         self._builder, self._columns = builder, ir.Constant(I64, 1)

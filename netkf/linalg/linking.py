@@ -127,6 +127,9 @@ def _only_outermost(
     """
 
     def choose(*args: Any, **kwargs: Any) -> Any:
+        """Call ``original`` or ``inner``, depending on whether the function now in ``stage`` is
+        outermost.
+        """
         return (inner if _is_linked(stage) else original)(*args, **kwargs)
 
     return choose

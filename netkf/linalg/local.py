@@ -31,7 +31,7 @@ def local_vector(size: Size, scratch: FloatArray) -> FloatArray:  # noqa: ARG001
 def local_lanes_matrix(size: Size, lanes: Lanes, scratch: FloatArray) -> FloatArray:  # noqa: ARG001
     """Return, in kernels, an uninitialised array (n, n, L) for L lanes, valid until the calling
     kernel returns: on the stack if ``size`` is a tuple, else ``scratch`` (n, n, L). Called from
-    Python it raises TypeError.
+    Python it raises TypeError. ``lanes`` is a tuple of length L.
     """
     raise TypeError("local_lanes_matrix is for kernels")
 
@@ -39,6 +39,6 @@ def local_lanes_matrix(size: Size, lanes: Lanes, scratch: FloatArray) -> FloatAr
 def local_lanes_vector(size: Size, lanes: Lanes, scratch: FloatArray) -> FloatArray:  # noqa: ARG001
     """Return, in kernels, an uninitialised array (n, L) for L lanes, valid until the calling kernel
     returns: on the stack if ``size`` is a tuple, else ``scratch`` (n, L). Called from Python it
-    raises TypeError.
+    raises TypeError. ``lanes`` is a tuple of length L.
     """
     raise TypeError("local_lanes_vector is for kernels")

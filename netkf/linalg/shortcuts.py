@@ -183,7 +183,10 @@ def _without_liveness(run: Callable[..., Any]) -> Callable[..., Any]:
     canonicalize: Any = transforms.canonicalize_cfg
 
     def run_without_liveness(self: Any, emit_dels: bool = False, **options: Any) -> None:
-        """Post-process ``self.func_ir`` without its live variables, a generator as numba does."""
+        """Post-process the IR of one function, ``self.func_ir``, without the analysis of its live
+        variables; a generator as numba does. ``emit_dels``: insert ``del`` statements, as numba
+        asks for.
+        """
         function = self.func_ir
         if function.is_generator:
             run(self, emit_dels, **options)

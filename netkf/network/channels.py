@@ -384,6 +384,7 @@ class ChannelSampler:
     """
 
     def __init__(self, channel: Channel, generator: Callable[[str], np.random.Generator]) -> None:
+        """Make the streams that the channel draws from, by ``generator(purpose)``."""
         self._loss, self._delay = channel.loss, channel.delay
         self._fixed_delay = channel.delay.fixed or 0.0
         self._bad: bool | None = None

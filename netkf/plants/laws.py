@@ -50,6 +50,9 @@ class GridLaws:
     """
 
     def __init__(self, A: FloatArray, B: FloatArray, period: float) -> None:
+        """Compute the laws of one step of ``period`` seconds of ``dx = A x dt + B dw``, with ``A``
+        (n, n) and ``B`` (n, m).
+        """
         self.n, self.period = len(A), period
         self.A, self.B = A, B
         self.to_end, self.to_moments = _response_series(A, period)

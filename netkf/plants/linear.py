@@ -131,6 +131,9 @@ class LinearPath:
         random: np.random.Generator,
         frame_slots: int | None = None,
     ) -> None:
+        """Begin at slot 0 with the state ``start`` (n,); ``root`` (n, q) is the factor of the noise
+        that ``random`` draws, ``frame_slots`` the slots of a frame.
+        """
         self._steps, self._root, self._random = steps, root, random
         self.frame_slots = frame_slots
         # States (S, n) of the slots from ``_first`` on, each before a rebase, and the state after a

@@ -104,6 +104,9 @@ class DiffusionPaths:
         cuts: Sequence[Cuts],
         frame_steps: int | None = None,
     ) -> None:
+        """Begin B paths at time 0 in the states ``start`` (B, n); the other arguments are those of
+        the class.
+        """
         self.laws, self._normals, self._cuts = laws, normals, cuts
         self.frame_steps = frame_steps
         self._x, self._drawn = start, 0
@@ -423,6 +426,9 @@ class DiffusionPath:
     """
 
     def __init__(self, paths: DiffusionPaths, horizon: float = 0.0) -> None:
+        """Begin the path of one run, the first of ``paths``, at time 0; frames begin before
+        ``horizon`` (seconds).
+        """
         self.laws, self.period, self._paths = paths.laws, paths.laws.period, paths
         self.frame_times = self._frame_times(horizon)
         self._moves = Transitions(self.laws.A, self.laws.B) if len(self.frame_times) else None
@@ -649,6 +655,7 @@ def fill_moments_between(
     lanes, (L,) each, where u is the share of the piece that has passed; ``size`` has length n.
 
     ``integrals`` (2 W, L), W = ``width``, are those that ``fill_integrals`` wrote for both ends.
+    ``lanes`` is a tuple of length L.
     """
     n, last = len(size), first + share
     # P_1 of the interval is (u - middle) scale. Row 0: int x. Row 1: int x P_1. The second integral

@@ -74,6 +74,7 @@ class RegressorReadings(SlotReadings):
         random: np.random.Generator,
         driving: np.random.Generator,
     ) -> None:
+        """Draw the noise of readings from ``random`` and the regressor's state from ``driving``."""
         super().__init__(sensor.H, sensor.R, random)
         self._C, self._s = sensor.C, LinearPath(sensor.steps, sensor.drive, sensor.start, driving)
 

@@ -174,6 +174,9 @@ class SensorPath:
         random: np.random.Generator,
         cutting: np.random.Generator,
     ) -> None:
+        """Begin at time 0: H (p, n), R (p, p), generators ``random`` of the noise on the grid and
+        ``cutting`` of parts of steps.
+        """
         self.H = H
         # The noise is drawn with unit intensity and multiplied by the Cholesky factor of R.
         self._root = cholesky(R)
@@ -255,7 +258,7 @@ def fill_reading(
 
     Its first moments begin at ``out[row]``, its second moments at ``out[q + row]``. ``x_moments``
     (2, n, L) are those of x, ``noise`` (2, p, L) those of unit white noise; H of S sensors is
-    (S, p, n, L), root (S, p, p, L) and lower triangular.
+    (S, p, n, L), root (S, p, p, L) and lower triangular. ``lanes`` is a tuple of length L.
     """
     # First moments of all rows come before the second ones, as filters stack sensors.
     half = len(out) // 2
@@ -295,7 +298,7 @@ def divide(
 
     The four moments of the parts are independent, with variances g and g / 3 for a part of g
     seconds; they are drawn from their exact law given the two moments of the whole. The formulas
-    avoid cancellation when a part is short.
+    avoid cancellation when a part is short. ``lanes`` is a tuple of length L.
     """
     w = 1.0 - u
     # At least 1 / 4 for every u in [0, 1], so that the divisions below are safe.

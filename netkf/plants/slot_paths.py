@@ -45,7 +45,8 @@ def draw_normals(
     """Fill ``normals`` (>= count, L) with the next ``count`` standard normals of L streams.
 
     Lane q takes them from row ``first + q * stride`` of the ``states`` (K, >= 4) of K streams if q
-    < ``runs``, the number of runs left; idle lanes keep their values. Steps these states.
+    < ``runs``, the number of runs left; idle lanes keep their values. Steps these states. ``lanes``
+    is a tuple of length L.
     """
     # Lanes in the inner loop: numbers of different streams do not wait for each other.
     for j in range(count):
@@ -66,7 +67,7 @@ def draw_starts(
     """Write the states x(0) = mean + root z of R runs into ``x`` (B, n, L), B blocks of L runs,
     where z (q,) are the next standard normals of the stream of each run, ``states`` (R, >= 4).
 
-    ``mean`` (n,), ``root`` (n, q); ``scratch`` (q, L).
+    ``mean`` (n,), ``root`` (n, q); ``scratch`` (q, L). ``lanes`` is a tuple of length L.
     """
     for b in range(len(x)):
         first, count = b * len(lanes), root.shape[1]
@@ -95,7 +96,8 @@ def move_path(
 
     ``local[b, s]`` (n, L) gets the state in the frame before a rebase in this slot; with frames
     ``absolute[b, s]`` (n, L) gets the state in the plant's coordinates; both are (B, S, n, L), for
-    B blocks and S slots. ``normals`` (q, L) drive the step; ``moved`` (n, L) is scratch.
+    B blocks and S slots. ``normals`` (q, L) drive the step; ``moved`` (n, L) is scratch. ``lanes``
+    is a tuple of length L.
     """
     n = len(path.F)
     # Before a rebase: the errors of this slot are still in coordinates of the old frame.
@@ -147,6 +149,7 @@ def draw_paths(
     ``path`` behind these slots.
 
     Each run draws from its own stream, ``states`` (R, >= 4); ``scratch`` (2, max(n, q), L).
+    ``lanes`` is a tuple of length L.
     """
     for b in range(local.shape[0]):
         first = b * len(lanes)
@@ -202,7 +205,7 @@ def draw_readings(
 
     x (B, S, n, L) are the states, ``regressors`` (D, B, S, k, L) those of D regressors of k
     components. Run r draws the noise of sensor m from row r M + m of ``states`` (R M, >= 4);
-    ``scratch`` (p, L).
+    ``scratch`` (p, L). ``lanes`` is a tuple of length L.
     """
     count = len(sensors.estimator)
     for b in range(x.shape[0] if count > 0 else 0):
@@ -239,6 +242,7 @@ def read_row(
 
     x (B, S, n, L) are the states, ``regressors`` (D, B, S, k, L) those of D regressors of k
     components, for B blocks and S slots, ``normals`` (p, L) the standard normals of the reading.
+    ``lanes`` is a tuple of length L.
     """
     estimator, row, d = sensors.estimator[m], sensors.row[m] + i, sensors.driven[m]
     # total = (noise factor) z, row i

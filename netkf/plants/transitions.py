@@ -28,6 +28,9 @@ class Transitions:
     """
 
     def __init__(self, A: FloatArray, B: FloatArray) -> None:
+        """Compute the terms of the power series of exp(A g) and exp(A g) B for short gaps g, with
+        ``A`` (n, n) and ``B`` (n, m).
+        """
         self.n = len(A)
         self._norm = float(np.abs(A).sum(axis=0).max())
         powers = [np.eye(self.n)]

@@ -119,6 +119,9 @@ class SampledTruth:
         at: TruthTimes,
         frames: bool,
     ) -> None:
+        """Draw the whole path from ``start`` (n,) on, at the times ``at``; ``moves`` are the
+        transitions of the plant, and marks are frame times if ``frames``.
+        """
         self._moves = moves
         samples, probes, marks = at
         self.frame_times = marks if frames else np.empty(0)

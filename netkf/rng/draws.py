@@ -120,7 +120,7 @@ def next_unit(states: np.ndarray, k: int) -> float:
 def next_units(lanes: Lanes, states: np.ndarray, b: int, k: int, units: FloatArray) -> None:
     """Write the next uniform number of stream ``k`` for the L runs of block ``b`` into ``units[b,
     k]`` (L,) of ``units`` (B, K, L), from ``states`` (B, K, 4, L), which it steps. There are K
-    streams in each run, and B blocks.
+    streams in each run, and B blocks. ``lanes`` is a tuple of length L.
     """
     # No branch depends on a word, so that the compiler computes several lanes with one instruction.
     for q in range(len(lanes)):

@@ -204,9 +204,14 @@ def _expected_ticks(scenario: Scenario) -> float:
 
 
 class BatchDraws:
-    """All random numbers of a batch of runs, drawn up to the horizon."""
+    """All random numbers of a batch of runs, drawn up to the horizon. ``replicas`` are the numbers
+    of its R runs and ``seed`` is that of all their streams.
+    """
 
     def __init__(self, scenario: Scenario, seed: int, replicas: range) -> None:
+        """Draw ticks, paths and noise of the R runs ``replicas`` (their numbers) up to the horizon,
+        from streams of ``seed``.
+        """
         streams = ReplicaStreams(seed, replicas.start, len(replicas))
         self._scenario, self.replicas, blocks = scenario, replicas, blocks_to_the_end(scenario)
         self.paths = Paths(scenario, streams, blocks)
@@ -259,9 +264,10 @@ class BatchDraws:
 
 
 class RunDraws:
-    """The draws of one run of a batch."""
+    """The draws of one run of a batch. ``run`` is its number in the batch, from 0."""
 
     def __init__(self, batch: BatchDraws, scenario: Scenario, run: int) -> None:
+        """Take views of the draws of run number ``run`` (0 to R - 1) of a batch."""
         self._batch, self._run, self.instants = batch, run, batch.instants
         self.states: States = PathStates(scenario, batch.paths.frame_times)
         shared, count = batch.sensing, len(batch.sensing.rows)

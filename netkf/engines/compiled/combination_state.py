@@ -173,9 +173,9 @@ def _make_gains(scenario: Scenario, state: Simulation) -> dict[str, Any]:
 
 @kernel
 def keep_prediction(state: Simulation, combination: CombinationState, h: int) -> None:
-    """Copy the estimate and root of node ``h`` to ``prior`` and ``prior_root`` of ``combination``:
-    they are its prediction, before any reading of this instant is used. Sets ``nodes[h].reading``
-    to -1.
+    """Copy the estimate and root of node ``h`` (index) to ``prior`` and ``prior_root`` of
+    ``combination``: they are its prediction, before any reading of this instant is used. Sets
+    ``nodes[h].reading`` to -1.
     """
     copy_state(state.size, combination.prior, combination.prior_root, h, state.xhat, state.root, h)
     # A reading of an earlier instant is not sent any more.
@@ -256,9 +256,9 @@ def sample_with_gain(
 
 @kernel
 def fuse_inbox(state: Simulation, combination: CombinationState, h: int) -> None:
-    """Fuse the estimate of node ``h`` with each one in its inbox, one after the other, with the
-    weight that minimises the trace or the determinant of the fused covariance. Changes row ``h`` of
-    ``state.xhat`` and ``state.root``.
+    """Fuse the estimate of node ``h`` (index) with each one in its inbox, one after the other, with
+    the weight that minimises the trace or the determinant of the fused covariance. Changes row
+    ``h`` of ``state.xhat`` and ``state.root``.
     """
     m = state.nodes[h].inbox
     while m != -1:
@@ -282,7 +282,7 @@ def send_prediction(state: Simulation, combination: CombinationState, m: int, h:
 
 @kernel
 def use_readings_heard(state: Simulation, h: int, now: float) -> None:
-    """Update node ``h`` with the samples in its inbox that arrive without delay, at ``now``
+    """Update node ``h`` (index) with the samples in its inbox that arrive without delay, at ``now``
     (seconds), as if it had taken them itself. Changes row ``h`` of ``state.xhat`` and
     ``state.root``.
     """
@@ -298,8 +298,8 @@ def use_readings_heard(state: Simulation, h: int, now: float) -> None:
 @kernel
 def add_consensus(state: Simulation, combination: CombinationState, h: int) -> None:
     """Add the consensus term on predictions, ``gamma P sum_j (xbar_j - xbar)``, to
-    ``state.xhat[h]``: xbar and P are the prior of node ``h``, the xbar_j the priors in its inbox,
-    and gamma is ``epsilon / (norm of P + 1)``.
+    ``state.xhat[h]``: xbar and P are the prior of node ``h`` (index), the xbar_j the priors in its
+    inbox, and gamma is ``epsilon / (norm of P + 1)``.
     """
     n = state.xhat.shape[1]
     for i in range(n):

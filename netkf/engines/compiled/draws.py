@@ -81,6 +81,10 @@ class Paths:
         blocks: int,
         sampled: FloatArray = NO_TIMES,
     ) -> None:
+        """Make the random streams of the R runs, and ``frame_times`` (F,) in seconds, at which a
+        frame begins; nothing is drawn but initial states. ``blocks`` and ``sampled`` (T,): see the
+        class.
+        """
         self._blocks = blocks
         # Separate streams for the path, for the states at probes and for those at samples, so that
         # none depends on how many numbers the others take.
@@ -199,6 +203,9 @@ class Noise:
     """
 
     def __init__(self, scenario: Scenario, streams: Streams | ReplicaStreams, steps: int) -> None:
+        """Make the random streams of all S sensors in R runs, and ``sensing`` with space for the
+        noise of ``steps`` steps.
+        """
         shared, keys = _sensor_fields(scenario)
         self._noise = StreamNormals(streams.seed_words("noise", keys))
         cuts = StreamNormals(streams.seed_words("cut", keys))

@@ -614,9 +614,9 @@ def combine_with_state(
 
 @kernel
 def predict_payloads(state: Simulation, h: int, now: float) -> float:
-    """Predict the estimates that messages in the inbox of node ``h`` carry from when they were sent
-    to ``now`` (seconds), without readings, in ``state.pool_x`` and ``pool_root``. Return the sum of
-    the weights of all these messages.
+    """Predict the estimates that messages in the inbox of node ``h`` (index) carry from when they
+    were sent to ``now`` (seconds), without readings, in ``state.pool_x`` and ``pool_root``. Return
+    the sum of the weights of all these messages.
     """
     # The last model of the table has no sensors: prediction alone, as readings since then are
     # unknown here.
@@ -662,8 +662,8 @@ def combine(state: Simulation, h: int, now: float) -> None:
 
 @kernel
 def combine_convex(state: Simulation, h: int, own: float) -> None:
-    """Combine node ``h`` with its inbox by H (7) and (9): x = w x + sum w_j x_j and P = w P + sum
-    w_j P_j, with the own weight w = ``own`` and the weight w_j of each directed link. Changes
+    """Combine node ``h`` (index) with its inbox by H (7) and (9): x = w x + sum w_j x_j and P = w P
+    + sum w_j P_j, with the own weight w = ``own`` and the weight w_j of each directed link. Changes
     ``state.xhat[h]`` and ``root[h]``, the root of P.
     """
     # w P first, then + w_j P_j for each message.
@@ -678,9 +678,9 @@ def combine_convex(state: Simulation, h: int, own: float) -> None:
 
 @kernel
 def intersect(state: Simulation, h: int, own: float, total: float) -> None:
-    """Combine node ``h`` with its inbox by covariance intersection, D (8) and (9): P^-1 = w P^-1 +
-    sum w_j P_j^-1, with the own weight w = ``own`` and the weight w_j of each directed link divided
-    by ``total``. Changes ``state.xhat[h]`` and ``root[h]``, the root of P.
+    """Combine node ``h`` (index) with its inbox by covariance intersection, D (8) and (9): P^-1 = w
+    P^-1 + sum w_j P_j^-1, with the own weight w = ``own`` and the weight w_j of each directed link
+    divided by ``total``. Changes ``state.xhat[h]`` and ``root[h]``, the root of P.
     """
     xhat, root, pool, directions = state.xhat, state.root, state.pool, state.directions
     scratch = state.update_scratch

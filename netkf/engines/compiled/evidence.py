@@ -188,10 +188,10 @@ def send_evidence(state: Simulation, evidence: EvidenceArrays, m: int, h: int) -
 
 @kernel
 def absorb_evidence(state: Simulation, evidence: EvidenceArrays, h: int, now: float) -> None:
-    """Replace ``evidence.received`` of each sender in the inbox of node ``h`` by what its message
-    carries, unless the present one was sent later; then update the belief in ``state.xhat[h]`` and
-    ``root[h]``. The estimates in the messages, the centres of their evidence, are predicted to
-    ``now`` (seconds) already.
+    """Replace ``evidence.received`` of each sender in the inbox of node ``h`` (index) by what its
+    message carries, unless the present one was sent later; then update the belief in
+    ``state.xhat[h]`` and ``root[h]``. The estimates in the messages, the centres of their evidence,
+    are predicted to ``now`` (seconds) already.
     """
     m, maps = state.nodes[h].inbox, evidence.maps
     while m != -1:

@@ -122,6 +122,9 @@ class Source:
     states: States
 
     def __init__(self, scenario: Scenario, streams: Streams) -> None:
+        """Draw the sample times of all sensors, and make the sources of ticks, noise and path;
+        without a sensing grid read all samples at once.
+        """
         times = scenario.sample_times(streams)
         self._samples = samples = SampleTables(scenario, streams, times)
         self._sampled = sampled = all_sample_times(times)
@@ -181,6 +184,9 @@ class Workspace:
     """The tables of a scenario and the arrays of a run, reused for one run after another."""
 
     def __init__(self, scenario: Scenario) -> None:
+        """Compute the filters at time 0 and the tables of a scenario, and allocate the arrays of a
+        run.
+        """
         self._scenario, self._senders = scenario, senders_of(scenario)
         self._start, (entities, directions) = filters_at_start(scenario), entity_records(scenario)
         # A copy, since directed links count the messages of a run.
@@ -320,7 +326,9 @@ def empty_samples(
 
 
 class FlowRun:
-    """One run in continuous time, recorded by ``recorder``."""
+    """One run in continuous time, recorded by ``recorder``. ``draws`` gives its random numbers,
+    ``workspace`` its arrays, and ``progress`` is called with the simulated seconds.
+    """
 
     def __init__(
         self,
@@ -330,6 +338,9 @@ class FlowRun:
         recorder: Recorder,
         progress: Progress,
     ) -> None:
+        """Set up the state of a run at time 0 from its random numbers ``draws``, in the arrays of
+        ``workspace``; ``progress`` is called with the simulated seconds.
+        """
         self._scenario, self._recorder, self._progress = scenario, recorder, progress
         recorder.exact_errors = scenario.exact_errors
         self._draws, self._state = draws, workspace.begin(draws, not recorder.counts_only)
@@ -456,7 +467,9 @@ class FlowRun:
         last = [count - 1]
 
         def pass_rows_on(k: int) -> None:
-            """Record the rows before sample ``k``, the first one that is not finite."""
+            """Record the rows before sample number ``k`` of the buffer, the first one that is not
+            finite.
+            """
             last[0] = k
             self._record_rows(int(buffer.rows[0, k]), buffer.counts[0, k])
 

@@ -157,8 +157,8 @@ def remember(
 
 @kernel
 def forget(history: History, h: int, since: float) -> None:
-    """Free the events in ``history`` of node ``h`` that no late reading can reach: those from
-    ``since`` (seconds) on stay, and one before it.
+    """Free the events in ``history`` of node ``h`` (index) that no late reading can reach: those
+    from ``since`` (seconds) on stay, and one before it.
     """
     past = history.past
     k = history.newest[h]

@@ -301,8 +301,8 @@ def _rates_and_probabilities(scenario: Scenario) -> tuple[FloatArray, FloatArray
 
 
 class PoissonSchedules:
-    """The ticks of some runs of a scenario with Poisson clocks: window by window, or
-    all at once.
+    """The ticks of some runs of a scenario with Poisson clocks: window by window, or all at once.
+    ``bits``: outcomes are arrival bits, if no message takes time.
     """
 
     def __init__(
@@ -312,6 +312,9 @@ class PoissonSchedules:
         senders: Senders | None = None,
         bits: bool = False,
     ) -> None:
+        """Seed the streams of ticks and losses of all runs, and draw the first tick of each entity;
+        ``senders`` defaults to those of the scenario, ``bits``: outcomes are arrival bits.
+        """
         runs = streams.runs
         senders = senders_of(scenario) if senders is None else senders
         ticks, count = StreamBatch(streams, "clock", senders.entities), len(senders.entities) * runs

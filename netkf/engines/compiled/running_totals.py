@@ -202,10 +202,10 @@ def fill_inverse_root(out: FloatArray, root: FloatArray, h: int) -> None:
 
 @kernel
 def hear(state: Simulation, totals: Totals, h: int, now: float) -> None:
-    """Add the growth of each total in the inbox of node ``h`` since its sender was last heard,
-    predicted to ``now`` (seconds), to the mass of the node: ``totals.weight[h]``, ``state.xhat[h]``
-    and ``root[h]``. A total older than the last one heard adds nothing. The totals are stored as
-    ``totals.heard``.
+    """Add the growth of each total in the inbox of node ``h`` (index) since its sender was last
+    heard, predicted to ``now`` (seconds), to the mass of the node: ``totals.weight[h]``,
+    ``state.xhat[h]`` and ``root[h]``. A total older than the last one heard adds nothing. The
+    totals are stored as ``totals.heard``.
     """
     gain, pool, heard, offered = totals.gain, state.pool, totals.heard, totals.offered
     # Two passes over the inbox: first the sum of all growth, because the totals are not stored as
@@ -246,9 +246,9 @@ def hear(state: Simulation, totals: Totals, h: int, now: float) -> None:
 
 @kernel
 def gain_mass(state: Simulation, totals: Totals, h: int, factor: float, share: float) -> None:
-    """Add the mass ``totals.gain`` = (weight, U (n, n), u (n,)) to node ``h``: ``P^-1 <- (w P^-1 +
-    N U) / w+`` with the new weight w+, and the estimate likewise. Changes ``state.xhat[h]`` and
-    ``root[h]``, the root of P. ``factor`` is (w+ / w)^1/2, ``share`` is N / w+.
+    """Add the mass ``totals.gain`` = (weight, U (n, n), u (n,)) to node ``h`` (index): ``P^-1 <- (w
+    P^-1 + N U) / w+`` with the new weight w+, and the estimate likewise. Changes ``state.xhat[h]``
+    and ``root[h]``, the root of P. ``factor`` is (w+ / w)^1/2, ``share`` is N / w+.
     """
     root, gain, n = state.root, totals.gain, state.xhat.shape[1]
     inner, half, vectors = totals.scratch[0], totals.scratch[1], totals.scratch[2]
@@ -277,9 +277,9 @@ def gain_mass(state: Simulation, totals: Totals, h: int, factor: float, share: f
 
 @kernel
 def update_root_by_gain(state: Simulation, h: int, values: FloatArray, vectors: FloatArray) -> None:
-    """Replace the root S = ``state.root[h]`` (n, n) of node ``h`` by the lower triangular root of
-    ``S V D^-1 V' S'``, with the eigenvalues D on the diagonal of ``values`` (n, n), raised to at
-    least 1, and the eigenvectors V = ``vectors`` (n, n), in columns.
+    """Replace the root S = ``state.root[h]`` (n, n) of node ``h`` (index) by the lower triangular
+    root of ``S V D^-1 V' S'``, with the eigenvalues D on the diagonal of ``values`` (n, n), raised
+    to at least 1, and the eigenvectors V = ``vectors`` (n, n), in columns.
     """
     root, F, n = state.root, state.flow_scratch.values, state.xhat.shape[1]
     wide, noise = state.flow_scratch.wide, state.flow_scratch.T
@@ -302,7 +302,7 @@ def update_root_by_gain(state: Simulation, h: int, values: FloatArray, vectors: 
 def move_by_gain(
     state: Simulation, h: int, gain: FloatArray, share: float, innovation: FloatArray
 ) -> None:
-    """Correct ``state.xhat[h]`` of node ``h`` by the mass ``gain`` (1 + n n + n,) =
+    """Correct ``state.xhat[h]`` of node ``h`` (index) by the mass ``gain`` (1 + n n + n,) =
     (weight, U by rows, u): ``xhat += P share (u - U xhat)`` with the new P; ``innovation`` (n,) is
     scratch.
     """

@@ -16,7 +16,7 @@ from netkf.scenario.scenario import Scenario
 
 class SampledSensor(NamedTuple):
     """One sensor: the ``times`` (K,) of its ``samples``, their ``indices`` (K,) among all samples
-    of the run, and the ``order`` of the sensor.
+    of the run, and the number ``order`` of the sensor among all; ``times`` are in seconds.
     """
 
     times: FloatArray
@@ -27,12 +27,17 @@ class SampledSensor(NamedTuple):
 
 class SampleTables:
     """The samples of one run. Their values are filled in by ``read`` once the states are drawn,
-    which do not depend on estimates.
+    which do not depend on estimates. ``times`` (K,) in seconds are the sample times of each sensor,
+    by (node id, number of the sensor at the node).
     """
 
     def __init__(
         self, scenario: Scenario, streams: Streams, times: dict[tuple[int, int], FloatArray]
     ) -> None:
+        """Sort the samples of all sensors by time into ``instants``, without their values;
+        ``times`` (K,) in seconds are those of each sensor, by (node id, number of the sensor at the
+        node).
+        """
         placed = [
             (node, placed_sensor)
             for node, sensors in scenario.sampled_sensors.items()

@@ -96,6 +96,9 @@ class TickSource:
     def __init__(
         self, scenario: Scenario, streams: Streams | ReplicaStreams, senders: Senders
     ) -> None:
+        """Make the random streams of all E entities, or, for clocks that are not Poisson,
+        generators and the origins of their ticks.
+        """
         clock, runs, entities = (
             scenario.network.activation,
             streams.runs,
@@ -201,6 +204,9 @@ class Outcomes:
     def __init__(
         self, scenario: Scenario, streams: Streams | ReplicaStreams, senders: Senders
     ) -> None:
+        """Make the random streams of losses and delays of all runs, and tables of delivery
+        probabilities (W,) where these depend on the W directed links only.
+        """
         self._channel = channel = scenario.network.channel
         runs = streams.runs
         self._senders, self._directions = senders, len(senders.directions)
@@ -352,6 +358,9 @@ class EntityDraws:
     def __init__(
         self, scenario: Scenario, streams: Streams | ReplicaStreams, senders: Senders
     ) -> None:
+        """Make the random streams of ticks and outcomes of all entities; the length of the blocks
+        that are drawn depends on their number.
+        """
         self.count = len(senders.entities) * streams.runs
         self._clocks = TickSource(scenario, streams, senders)
         self._outcomes = Outcomes(scenario, streams, senders)
@@ -394,6 +403,9 @@ class Schedule:
     def __init__(
         self, scenario: Scenario, streams: Streams, senders: Senders | None = None
     ) -> None:
+        """Draw the first ticks of each entity, whose rate decides the length of all windows;
+        ``senders`` defaults to those of the scenario.
+        """
         senders = senders_of(scenario) if senders is None else senders
         self._draws = draws = EntityDraws(scenario, streams, senders)
         window_ticks = min(max(TICKS_A_LINK * draws.count, MIN_WINDOW_TICKS), MAX_WINDOW_TICKS)
@@ -438,6 +450,9 @@ class ReadingsSchedule:
         t: FloatArray,
         index: np.ndarray,
     ) -> None:
+        """Take the times ``t`` (K,) in seconds of all transmissions and the index ``index`` (K,) of
+        each sending node, and make the streams of their outcomes.
+        """
         self._outcomes = Outcomes(scenario, streams, senders)
         self._t, self._index, self._begin = t, index, 0
         self._sent = np.zeros(len(senders.entities), dtype=np.int64)

@@ -49,6 +49,9 @@ class DirectionDraws:
     """
 
     def __init__(self, scenario: Scenario, streams: Streams, ends: Link, index: int) -> None:
+        """Make the sampler of the directed link with the node ids ``ends`` (sender, receiver) and
+        this ``index``.
+        """
         self.ends, self.index, self.messages = ends, index, 0
         self.probability = scenario.table_probability(ends)
         self._sampler = ChannelSampler(
@@ -90,6 +93,9 @@ class SlotEvents:
     """Makes the messages and events of one run, slot after slot."""
 
     def __init__(self, scenario: Scenario, streams: Streams, setup: SlotSetup) -> None:
+        """Make the streams of matchings and of all directed links of one run; no slot has been made
+        yet.
+        """
         self._scenario, self._setup, self._algorithm = scenario, setup, scenario.node_filter
         self._random = streams.generator("matching")
         self._directions = [

@@ -172,7 +172,7 @@ def draw_link(
     (index in the block of slots), in all L runs of block ``b``; write 1 or 0 into ``up``
     (B, S, E, W, L) for its one or two directed links. Links that are not ``fresh`` keep their last
     draws, which ``channels`` stores. Dimensions: B blocks of L runs, S slots of E exchange steps, W
-    directed links.
+    directed links. ``lanes`` is a tuple of length L.
     """
     uniforms = channels.loss_uniform
     for d in range(channels.directions_per_link):
@@ -262,7 +262,7 @@ def draw_broadcasts(
     """Draw which messages of broadcasts, which use every link in every step, arrive: write 1 into
     ``up`` (B, S, E, W, L), which holds zeros before. Slots that are not ``exchanged`` (S,) stay 0;
     links draw anew in the steps that are ``fresh`` (E,). Dimensions: B blocks of L runs, S slots of
-    E exchange steps, W directed links.
+    E exchange steps, W directed links. ``lanes`` is a tuple of length L.
     """
     for b in range(up.shape[0]):
         for s in range(up.shape[1]):
@@ -286,7 +286,8 @@ def draw_matched(
     (B, S, E, W, L), which holds zeros before. ``active`` (R, S, E, A) gets the indices of the
     paired links in order, ``pair_count`` (R, S, E) their number. Slots that are not ``exchanged``
     (S,) stay 0; links draw anew in the steps that are ``fresh`` (E,). Dimensions: B blocks of L
-    runs, R runs in all, S slots of E exchange steps, W directed links, at most A pairs.
+    runs, R runs in all, S slots of E exchange steps, W directed links, at most A pairs. ``lanes``
+    is a tuple of length L.
     """
     for b in range(up.shape[0]):
         for s in range(up.shape[1]):
@@ -311,7 +312,7 @@ def draw_pairs(
     messages on their links arrive: write these into ``up`` (B, S, E, W, L), the paired links into
     ``active`` (R, S, E, A), and their number into ``pair_count`` (R, S, E). ``fresh``: links draw
     anew. Dimensions: B blocks of L runs, R runs in all, S slots of E exchange steps, W directed
-    links, at most A pairs.
+    links, at most A pairs. ``lanes`` is a tuple of length L.
     """
     first = b * len(lanes)
     for q in range(min(len(lanes), len(pair_count) - first)):
@@ -328,7 +329,7 @@ def mark_all_senders(
 ) -> None:
     """Write 1 into ``sent`` (B, S, E, N, L), for B blocks of L runs and S slots, for all nodes with
     links, in the slots that are ``exchanged`` (S,): broadcasts ask each of them for a message in
-    each of the E steps.
+    each of the E steps. ``lanes`` is a tuple of length L.
     """
     for b in range(sent.shape[0]):
         for s in range(sent.shape[1]):
@@ -348,7 +349,8 @@ def mark_paired_senders(
 
     Dimensions are B blocks of L runs, S slots of E exchange steps, N nodes, at most A pairs.
     ``pair_count`` (R, S, E) is the number of pairs of each of the R = B L runs, and the first so
-    many entries of ``active`` (R, S, E, A) are the indices of their links.
+    many entries of ``active`` (R, S, E, A) are the indices of their links. ``lanes`` is a tuple of
+    length L.
     """
     for r in range(pair_count.shape[0]):
         for s in range(pair_count.shape[1]):
@@ -682,7 +684,8 @@ def count_events(
 ) -> None:
     """Add to ``counts`` (R, KINDS) the number of events of each kind in S slots of each of R runs,
     as many as ``make_rows`` would write; ``scratch`` (KINDS, L) for the L runs of a block.
-    ``pairwise``: nodes swap with a peer, instead of absorbing broadcasts.
+    ``pairwise``: nodes swap with a peer, instead of absorbing broadcasts. ``lanes`` is a tuple of
+    length L.
     """
     for b in range(messages.up.shape[0]):
         for kind in range(len(scratch)):
@@ -715,7 +718,7 @@ def count_events(
 @kernel(inlined=True)
 def add_count(lanes: Lanes, scratch: FloatArray, kind: int, number: Any) -> None:
     """Add ``number``, (L,) lanes or one number for all, to the count ``scratch[kind]`` of
-    ``scratch`` (KINDS, L).
+    ``scratch`` (KINDS, L). ``lanes`` is a tuple of length L.
     """
     store(lanes, scratch, kind, load(lanes, scratch, kind) + number)
 
@@ -735,7 +738,8 @@ def count_step(
 ) -> None:
     """Add the events of the exchange step of ``stage`` in the L runs of block ``b`` to ``scratch``
     (KINDS, L), but those of nodes that stop, in step number ``stopping``, to ``counts`` (R, KINDS)
-    of all R runs. ``pairwise``: nodes swap with a peer, instead of absorbing broadcasts.
+    of all R runs. ``pairwise``: nodes swap with a peer, instead of absorbing broadcasts. ``lanes``
+    is a tuple of length L.
     """
     stops = stage.step == stopping
     if pairwise:
@@ -777,7 +781,7 @@ def count_matched_pairs(
 ) -> None:
     """Add the ticks of pairs in the step of ``stage``, and their messages, all as lost for now, in
     the L runs of block ``b`` to ``scratch`` (KINDS, L); of ``counts`` (R, KINDS) only the number R
-    of runs is used.
+    of runs is used. ``lanes`` is a tuple of length L.
     """
     first = b * len(lanes)
     for r in range(first, min(first + len(lanes), len(counts))):
@@ -804,7 +808,8 @@ def count_silent(
     b: int,
 ) -> None:
     """Subtract the messages that silent nodes do not send in the step of ``stage``, in the L runs
-    of block ``b``, from the counts SEND and LOST of ``scratch`` (KINDS, L).
+    of block ``b``, from the counts SEND and LOST of ``scratch`` (KINDS, L). ``lanes`` is a tuple of
+    length L.
     """
     silent = spread(lanes, 0.0)
     for w in range(len(channels.ends) * channels.directions_per_link):
@@ -827,7 +832,7 @@ def count_stops(
     lanes: Lanes, traced: TracedNodes, stage: SlotStage, counts: np.ndarray, b: int
 ) -> None:
     """Add the nodes that stop in the slot of ``stage``, in the L runs of block ``b``, to the count
-    STOP of ``counts`` (R, KINDS) of all R runs.
+    STOP of ``counts`` (R, KINDS) of all R runs. ``lanes`` is a tuple of length L.
     """
     first = b * len(lanes)
     for r in range(first, min(first + len(lanes), len(counts))):

@@ -96,6 +96,9 @@ class SlotRuns:
     def __init__(
         self, scenario: Scenario, streams: Streams | ReplicaStreams, store_all: bool = False
     ) -> None:
+        """Set up R runs, one for each replica of ``streams``, at slot 0: filters, truth, readings
+        and messages. ``store_all``: keep the samples of all slots in ``samples``.
+        """
         self.setup: SlotSetup = slot_setup(scenario)
         self._scenario, self._streams = scenario, streams
         self._first = Streams(streams.seed, streams.replica)
@@ -127,7 +130,9 @@ class SlotRuns:
         self._begin_messages()
 
     def _begin_truth(self) -> None:
-        """Draw the initial states of the plant in all runs, or load the recorded truth."""
+        """Draw the initial states of the plant in all runs into ``self._path``, or load the
+        recorded truth as ``self._truth``.
+        """
         plant, setup = self._scenario.slot_plant, self.setup
         self._truth: Any = None
         self._path: Path | None = None
@@ -147,7 +152,10 @@ class SlotRuns:
         self._path = Path(F, noise, setup.frame, x, origin)
 
     def _begin_readings(self) -> None:
-        """Create the random streams and regressor paths from which readings are drawn."""
+        """Create what readings are drawn from: ``_noise`` (R K, 4), the random streams of the K
+        sensors that kernels read in R runs; ``_regressors``, a path and its streams for each sensor
+        with a random H; and ``_recorded``, the readings of recorded sensors.
+        """
         setup, streams = self.setup, self._streams
         entities = [(s.node, s.placed_sensor.ordinal) for s in setup.kernel_sensors]
         # One stream for each drawn sensor of each run.
@@ -165,7 +173,10 @@ class SlotRuns:
         ]
 
     def _begin_messages(self) -> None:
-        """Create the channels and matchings of all runs, with their random streams."""
+        """Create ``_channels`` and ``_matchings`` of all runs, with their random streams; and, for
+        filters that draw random numbers to decide whether to send, the streams ``_triggers``
+        (B, N, 4, L) of N nodes in B blocks of L runs.
+        """
         setup, streams, links = self.setup, self._streams, len(self.setup.ends)
         # Empty arrays tell the kernels to draw nothing.
         no_streams = np.zeros((0, 0, 4, LANES), dtype=np.uint64)
@@ -556,7 +567,9 @@ def _record_block(
     times = block.times.start[block.sampled]
 
     def pass_rows_on(k: int) -> None:
-        """Record the events before sample ``k``, the first one that is not finite."""
+        """Record the events before sample number ``k`` of the block, the first one that is not
+        finite.
+        """
         recorder.extend(rows[: rows_before[k]])
 
     samples = StateSamples(times, x, xhat, P, error)

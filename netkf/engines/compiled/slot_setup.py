@@ -58,6 +58,9 @@ class SlotSetup:
     """Times, links and sensors of a scenario in slots, and the states of its filters at slot 0."""
 
     def __init__(self, scenario: Scenario) -> None:
+        """Compute everything that all runs of a scenario share, in the attributes that the methods
+        set.
+        """
         algorithm, topology = scenario.node_filter, scenario.topology
         self.algorithm: Filter = algorithm
         self.n, self.nodes = scenario.plant.n, np.array(scenario.nodes, dtype=np.int64)
@@ -389,9 +392,10 @@ QUICK_FLOPS = 1 << 25
 
 
 def matching_lists(scenario: Scenario) -> tuple[int, float, np.ndarray, np.ndarray]:
-    """Return the first two fields of ``slot_messages.Matchings`` (protocol, probability) and its
-    lists ``first`` (K + 1,), ``members`` (M,): list k of K lists of links is
-    ``members[first[k]:first[k + 1]]``.
+    """Return the matching protocol of a scenario as kernels take it: its index in PROTOCOLS (-1: no
+    matchings), its parameter ``lazy`` or ``p``, and K lists of link indices as ``first`` (K + 1,)
+    and ``members`` (M,): list k is ``members[first[k]:first[k + 1]]``, the links of node k for
+    node-wakeup, matching k for uniform-maximal.
     """
     activation, topology = scenario.network.activation, scenario.topology
     if not isinstance(activation, Matching):

@@ -62,6 +62,9 @@ class PathStates:
     """
 
     def __init__(self, scenario: Scenario, frame_times: FloatArray) -> None:
+        """Begin at time 0 with the origin 0; ``frame_times`` (F,) in seconds are those at which it
+        moves.
+        """
         self.frame_times = frame_times
         # Without frames the origin never moves, and no transition is needed.
         self._moves = (

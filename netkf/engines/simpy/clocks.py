@@ -114,12 +114,14 @@ def _link_activations(
 
     # A factory for each link, so that the closure binds these ends and not those of the last link.
     def activation(link: tuple[int, int], entity: int) -> Activation:
-        """Return the activation of a link: both ends send to each other."""
+        """Return the activation of ``link`` (i, j), in which both ends send to each other;
+        ``entity`` is its index, which orders simultaneous arrivals.
+        """
         i, j = link
         exchange = LinkExchange(scenario, transmitter, nodes, link, entity)
 
         def activate(now: float) -> None:
-            """Send a message in each direction."""
+            """Send a message in each direction at ``now`` (seconds)."""
             recorder.append((now, TICK, i, j, -1, -1, NAN))
             # Both payloads are computed before either end receives.
             exchange.exchange((nodes[i].emit(now, (j,)), nodes[j].emit(now, (i,))))
@@ -140,12 +142,14 @@ def _direction_activations(
     """
 
     def activation(link: tuple[int, int], entity: int) -> Activation:
-        """Return the activation of a directed link: its sender sends one message."""
+        """Return the activation of the directed ``link`` (sender, receiver): its sender sends one
+        message; ``entity`` is its index, which orders simultaneous arrivals.
+        """
         i, j = link
         direction = transmitter.directed_link(link, entity, nodes[j], transmitter.sampler(link))
 
         def activate(now: float) -> None:
-            """Send one message."""
+            """Send one message at ``now`` (seconds)."""
             recorder.append((now, TICK, i, j, -1, -1, NAN))
             # Drawn in any case: even if nothing is sent, the channel takes its step.
             outcome = direction.sampler.draw()
@@ -178,7 +182,9 @@ def broadcasts(
         receivers, sent = tuple(direction.link[1] for direction in directions[node]), 0
 
         def transmit(now: float) -> None:
-            """Send one payload to each neighbour, each with an outcome of its own."""
+            """Send one payload to each neighbour at ``now`` (seconds), each with an outcome of its
+            own.
+            """
             nonlocal sent
             # Drawn even if the filter sends nothing, so that the network does not depend on it.
             outcomes = [direction.sampler.draw() for direction in directions[node]]
@@ -212,7 +218,7 @@ def _node_activations(
         """Return the activation of a node: a broadcast with a row for the tick."""
 
         def activate(now: float) -> None:
-            """Record the tick, then broadcast."""
+            """Record the tick at ``now`` (seconds), then broadcast."""
             # The tick has its own row; transmit() adds that of the broadcast if there is one.
             recorder.append((now, TICK, node, -1, -1, -1, NAN))
             transmit[node](now)
@@ -238,7 +244,9 @@ def _transmit_after_samples(
         clocked_node = nodes[node]
 
         def transmit_now(now: float, node: int = node, entity: int = clocked_node.entity) -> None:
-            """Broadcast as soon as all samples of this instant have been used."""
+            """Broadcast at ``now`` (seconds), as soon as all samples of this instant have been
+            used.
+            """
             # At the rank of ticks: by then all nodes have used their samples of this instant.
             timeline.call_at(now, Rank.TICK, entity, lambda _: transmit[node](now))
 

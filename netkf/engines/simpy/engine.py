@@ -55,7 +55,10 @@ class SimpyEngine(Engine):
     def run(
         self, scenario: Scenario, streams: Streams, recorder: Recorder, progress: Progress
     ) -> str:
-        """Simulate up to the horizon and return the status, "complete" or "diverged"."""
+        """Simulate up to the horizon with the random numbers of ``streams``, pass events and
+        samples to ``recorder``, and return the status, "complete" or "diverged". ``progress`` is
+        called with the simulated time in seconds.
+        """
         simulation = _Simulation(scenario, streams, recorder, progress)
         # Slots and clocks share the timeline, but no process.
         processes = simulation.slots() if scenario.slotted else simulation.clocks()
@@ -81,6 +84,9 @@ class _Simulation:
     def __init__(
         self, scenario: Scenario, streams: Streams, recorder: Recorder, progress: Progress
     ) -> None:
+        """Make the timeline and the transmitter of a run; ``progress`` is called with the simulated
+        seconds.
+        """
         self.timeline = Timeline()
         self._scenario, self._streams = scenario, streams
         self._recorder, self._progress = recorder, progress

@@ -40,7 +40,7 @@ class Node:
     """A filter with its inbox.
 
     ``entity`` is the index of the node, ``node`` its id in the trace, -1 for a filter that all
-    nodes share.
+    nodes share. ``start`` is its estimate (n,) and covariance (n, n) at time 0.
     """
 
     def __init__(
@@ -52,6 +52,9 @@ class Node:
         start: tuple[FloatArray, FloatArray],
         info: NodeInfo,
     ) -> None:
+        """Set up the filter with its ``model`` and its estimate ``start`` = (xhat (n,), P (n, n))
+        at time 0, and an empty inbox; ``node`` is an id, ``entity`` an index.
+        """
         self.node, self.entity, self.info, self.model = node, entity, info, model
         self.algorithm = algorithm
         self.state = algorithm.init(model, *start, info)
@@ -100,6 +103,9 @@ class ClockedNode(Node):
         increments: list[Any],
         *arguments: Any,
     ) -> None:
+        """Set up a node at time 0 with its increment sensors, which read the ``truth``;
+        ``arguments`` are those of Node.
+        """
         super().__init__(*arguments)
         self._timeline, self._recorder, self._truth = timeline, recorder, truth
         self._increments = increments

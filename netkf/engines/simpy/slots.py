@@ -54,6 +54,7 @@ class SlotSchedule:
     """Computes the stages of every slot from the schedule of the filter."""
 
     def __init__(self, scenario: Scenario) -> None:
+        """Take the schedule of the filter and the number of steps of each of its exchanges."""
         self._algorithm, self._plant = scenario.node_filter, scenario.slot_plant
         self.horizon = scenario.horizon
         phases = self._algorithm.schedule or ()
@@ -138,6 +139,9 @@ class SlotNode(Node):
         streams: Streams,
         *arguments: Any,
     ) -> None:
+        """Set up a node with closed inbox, in slots of ``period`` seconds; ``arguments`` are those
+        of Node.
+        """
         super().__init__(*arguments)
         # Only randomised filters draw from this stream.
         randomised = self.algorithm.randomised
@@ -254,6 +258,9 @@ class Reader:
     def __init__(
         self, recorder: Recorder, schedule: SlotSchedule, node: int, entity: int, carrier: SlotNode
     ) -> None:
+        """Take the sensors of ``node`` (id; index ``entity``), whose readings the filter
+        ``carrier`` uses.
+        """
         self._recorder, self._schedule = recorder, schedule
         self._node, self._entity, self._carrier = node, entity, carrier
 
@@ -286,6 +293,9 @@ class SlotClock:
         transmitter: Transmitter,
         nodes: dict[int, SlotNode],
     ) -> None:
+        """Make the exchange of each link between the ``nodes`` (by id), and the stream of
+        matchings.
+        """
         self._scenario, self._recorder, self._schedule = scenario, recorder, schedule
         self._nodes, self._algorithm = nodes, scenario.node_filter
         # A pooled filter appears once.

@@ -50,6 +50,9 @@ class DirectedLink:
         receiver: Receiver,
         sampler: ChannelSampler,
     ) -> None:
+        """Take probability and weight of the direction ``link`` = (sender, receiver) from the
+        scenario; no message has been sent.
+        """
         self.link, self.entity, self.sampler, self.receiver = link, entity, sampler, receiver
         # Probability in the table and weight do not change in a run.
         self.table_probability = scenario.table_probability(link)
@@ -63,6 +66,7 @@ class Transmitter:
     def __init__(
         self, scenario: Scenario, streams: Streams, timeline: Timeline, recorder: Recorder
     ) -> None:
+        """Take channel and horizon from the scenario; no message is under way."""
         self._scenario, self._streams = scenario, streams
         self._timeline, self._recorder = timeline, recorder
         self._channel = scenario.network.channel
@@ -170,6 +174,9 @@ class LinkExchange:
         link: Link,
         entity: int,
     ) -> None:
+        """Make the one or two directions of ``link`` (i, j), whose index is ``entity``, between the
+        ``receivers`` (nodes by id).
+        """
         i, j = link
         self._transmitter, self._shared = transmitter, scenario.network.channel.symmetric
         # Outcomes of the last draw, for held links.
