@@ -69,13 +69,17 @@ class DeliveringLoss(Loss):
         return self.given.stateful
 
     def next_state(self, bad: bool | None, random: np.random.Generator) -> bool:
-        """Return the next state by the model ``given``."""
+        """Return the next state of the channel, True if it is bad, by the model ``given``."""
         return self.given.next_state(bad, random)
 
     def delivery_probability(
         self, link: Link, message: int, bad: bool, table_probability: float
     ) -> float:
-        """Return 1 for chosen messages, else the probability of the model ``given``."""
+        """Return 1 for chosen messages, else the probability of the model ``given``.
+
+        ``message`` is the number of the message on its ``link``, ``bad`` the state of the channel,
+        and ``table_probability`` the entry of the graph's table for the link.
+        """
         chosen = self.deliveries.chosen
         if chosen is None or (*link, message) in chosen:
             return 1.0
@@ -171,6 +175,9 @@ class Replayer:
     """
 
     def __init__(self, scenario: Scenario, seed: int, replica: int, node: int, at: float) -> None:
+        """Take the run by its scenario, ``seed`` and ``replica``; states are those of ``node`` (its
+        id) at ``at`` seconds. Nothing is simulated yet.
+        """
         self.scenario, self._seed, self._replica = scenario, seed, replica
         self._node, self.at, self.count = scenario.nodes.index(node), at, 0
         self._deliveries = Deliveries()
@@ -182,7 +189,7 @@ class Replayer:
 
     @cached_property
     def log(self) -> IntArray:
-        """The EVENT rows of the unchanged run, up to the state at ``at``."""
+        """The E EVENT rows (E,) of the unchanged run, up to the state at ``at``."""
         return self._replay(frozenset(), to_horizon=False)
 
     @cached_property
@@ -196,7 +203,9 @@ class Replayer:
 
     @cached_property
     def full_log(self) -> IntArray:
-        """The EVENT rows of the run with all messages delivered."""
+        """The E EVENT rows (E,) of the run with all messages delivered, up to the state at
+        ``at``.
+        """
         return self._replay(None, to_horizon=False)
 
     def outcome(self, chosen: Iterable[MessageKey] | None = (), error: bool = False) -> Outcome:
@@ -216,8 +225,10 @@ class Replayer:
         return self._outcomes[keys, to_horizon]
 
     def _replay(self, chosen: Chosen | None, to_horizon: bool) -> IntArray:
-        """Simulate the run again with the ``chosen`` messages delivered, or all for None; return
-        the rows of events.
+        """Simulate the run again with the ``chosen`` messages delivered, or all for None, to the
+        instant or ``to_horizon``; return the EVENT rows (E,) up to the instant.
+
+        Adds 1 to ``count`` and stores the state of the node in ``_outcomes``.
         """
         self.count += 1
         hurried: Chosen = frozenset()

@@ -136,7 +136,11 @@ def why(
 def _check_run(
     run: Run | str | Path, scenario: Scenario | None, replica: int | None, trust: bool
 ) -> tuple[Run, Scenario]:
-    """Return a run with all its events, and its scenario; raises ScenarioError."""
+    """Return a run with all its events, and its scenario; raises ScenarioError.
+
+    ``run`` may be a directory, of an ensemble with the run number ``replica``; ``trust`` imports
+    classes of modules in it. ``scenario`` is for a run that does not know its own.
+    """
     name = "run" if isinstance(run, Run) else shorten(run)
     if not isinstance(run, Run):
         run = _read_run(run, replica, trust)
@@ -157,7 +161,9 @@ def _check_run(
 
 
 def _read_run(directory: str | Path, replica: int | None, trust: bool) -> Run:
-    """Return a run that is read back from its directory; raises ScenarioError."""
+    """Return a run that is read back from its directory, of an ensemble run number ``replica``;
+    raises ScenarioError. ``trust`` imports classes of modules in the directory.
+    """
     stored = open_directory(directory, trust=trust)
     if isinstance(stored, Run):
         return stored
@@ -173,7 +179,9 @@ def _default_replays(events: int) -> int:
 
 
 def _check_instant(run: Run, scenario: Scenario, node: int, at: float) -> float:
-    """Return the time that is asked about, in slots the start of its slot."""
+    """Return the time ``at`` (seconds) that is asked about, in slots the start of its slot; raises
+    ScenarioError if the run has no such time or no such ``node`` (id).
+    """
     if node not in scenario.topology.index:
         listed = ", ".join(map(str, scenario.nodes[:8]))
         listed += ", ..." if len(scenario.nodes) > 8 else ""
@@ -189,7 +197,9 @@ def _check_instant(run: Run, scenario: Scenario, node: int, at: float) -> float:
 
 
 def _require_same_events(logged: IntArray, replayed: IntArray) -> None:
-    """Raise ScenarioError if a replay does not have the events of the run."""
+    """Raise ScenarioError if the EVENT rows ``replayed`` (E,) of a replay are not those ``logged``
+    (E,) of the run.
+    """
     same = len(logged) == len(replayed) and all(
         np.array_equal(logged[name], replayed[name], equal_nan=logged[name].dtype.kind == "f")
         for name in logged.dtype.names or ()
@@ -208,6 +218,9 @@ class _Evidence:
     """
 
     def __init__(self, replayer: Replayer, node: int, most: int) -> None:
+        """Find the messages and the flow of information in the run for ``node`` (its id), with
+        searches for up to ``most`` missing messages, by replays of the run.
+        """
         self._replayer, self._node, self._most = replayer, node, most
         self.scenario = replayer.scenario
         talks, links = self.scenario.node_filter.talks, self.scenario.topology.directions
@@ -233,7 +246,9 @@ class _Evidence:
         }
 
     def candidates(self) -> list[Candidate]:
-        """Return the unused messages from which information could have reached the node."""
+        """Return the unused messages from which information could have reached the node, each with
+        the number of missing messages that it takes.
+        """
         candidates = []
         for m in np.flatnonzero(self._flow.cost).tolist():
             needed = self._reach.needed(m)
@@ -295,7 +310,9 @@ class _Evidence:
         )
 
     def _find_last_message(self, sender: int) -> tuple[int | None, int]:
-        """Return the last used message from ``sender``, and the number of unused ones since."""
+        """Return the index of the last used message from ``sender`` (its id), None without one, and
+        the number of unused ones since.
+        """
         messages = self.messages
         direct = (messages.sender == sender) & (messages.receiver == self._node)
         used = np.flatnonzero(direct & (messages.outcome == USED))
@@ -307,17 +324,23 @@ class _Evidence:
 
 
 def _time_known(newest: Newest | None) -> float:
-    """Return the time at which a reading became known, nan without one."""
+    """Return the last time in seconds up to which information is included, nan if it is to the end,
+    or without any.
+    """
     return math.nan if newest is None else newest.known
 
 
 def _is_newer(reading: float, than: float) -> bool:
-    """Return True if a reading is newer than another, any than none."""
+    """Return True if the time of a ``reading`` is later than that of another, any being later than
+    none (nan).
+    """
     return reading > than or (math.isnan(than) and not math.isnan(reading))
 
 
 def _describe_missing(messages: Messages, m: int) -> Missing:
-    """Return the outcome and the times of a message that did not arrive in time."""
+    """Return the outcome and the times (seconds) of message ``m``, its index, which did not arrive
+    in time.
+    """
     return Missing(
         messages.key(m),
         OUTCOMES[int(messages.outcome[m])],
@@ -364,7 +387,9 @@ def _make_what_ifs(
 def _group_by_missing(
     sources: Sequence[InformationSource],
 ) -> dict[tuple[MessageKey, ...], list[InformationSource]]:
-    """Return the sources whose readings missing messages would have made newer, by these."""
+    """Return the sources grouped by the missing messages that would have made their readings newer,
+    the keys being tuples of these messages.
+    """
     groups: dict[tuple[MessageKey, ...], list[InformationSource]] = {}
     for source in sources:
         if source.missing:

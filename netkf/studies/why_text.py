@@ -96,7 +96,9 @@ def _message_entries(
 
 
 def _message_entry(explanation: Explanation, key: MessageKey) -> dict[str, Any]:
-    """Return a message as an entry of the document."""
+    """Return the missing message ``key`` as an entry of the document: its ids, outcome, and times
+    in seconds.
+    """
     missing = explanation.missing[key]
     return {
         "sender": key.sender,

@@ -86,7 +86,9 @@ def sampling_clocks(scenario: Scenario) -> ClockGroup:
 
 
 def count_ticks(scenario: Scenario, run: Run) -> TickCounts | None:
-    """Return the counts of a run's ticks in the network; None without clocks."""
+    """Return the counts of a run's ticks in the network, in W windows of it and for each of E
+    clocks (W, E); None without clocks.
+    """
     group = network_clocks(scenario)
     if not group.entities:
         return None
@@ -103,7 +105,9 @@ def count_ticks(scenario: Scenario, run: Run) -> TickCounts | None:
 
 
 def count_samples(scenario: Scenario, streams: Streams) -> TickCounts | None:
-    """Return the counts of the times at which sensors sample in a run; None without clocks."""
+    """Return the counts of the times at which E sensors sample in a run, in W windows of it (W, E);
+    None without clocks.
+    """
     group = sampling_clocks(scenario)
     if not group.entities:
         return None
@@ -114,7 +118,9 @@ def count_samples(scenario: Scenario, streams: Streams) -> TickCounts | None:
 
 
 def count_drawn_ticks(scenario: Scenario, seed: int, replica: int) -> np.ndarray:
-    """Return how often each clock of the network ticks in a replica, (E,), from its stream."""
+    """Return how often each of E clocks of the network ticks in one ``replica`` of the runs of
+    ``seed``, (E,), from its stream.
+    """
     clock: Any = scenario.network.activation
     streams = Streams(seed, replica)
     ticks = [
@@ -131,7 +137,9 @@ def count_drawn_ticks(scenario: Scenario, seed: int, replica: int) -> np.ndarray
 
 
 def draw_samples(scenario: Scenario, seed: int, replica: int) -> np.ndarray:
-    """Return how often each sensor samples in a replica, (E,), from its stream."""
+    """Return how often each of E sensors samples in one ``replica`` of the runs of ``seed``, (E,),
+    from its stream.
+    """
     times = scenario.sample_times(Streams(seed, replica))
     return np.array([len(times[entity]) for entity in sampling_clocks(scenario).entities])
 
@@ -139,7 +147,7 @@ def draw_samples(scenario: Scenario, seed: int, replica: int) -> np.ndarray:
 def count_by_window(
     scenario: Scenario, times: np.ndarray, indices: np.ndarray, size: int
 ) -> np.ndarray:
-    """Return how often each of ``size`` indices occurs in each window of a run, (W, size).
+    """Return how often each of ``size`` indices occurs in each of W windows of a run, (W, size).
 
     ``times`` (K,) in seconds and ``indices`` (K,) are those of K events.
     """
@@ -147,7 +155,8 @@ def count_by_window(
 
 
 def _by_window(times: np.ndarray, indices: np.ndarray, size: int, horizon: float) -> np.ndarray:
-    """Return the counts (W, size) of :func:`count_by_window` in equal parts of [0, ``horizon``].
+    """Return how often each of ``size`` indices occurs in each of W equal parts of [0, ``horizon``]
+    (seconds), (W, size), from the ``times`` (K,) and ``indices`` (K,) of K events.
 
     Counts of different windows are independent, as those of different runs are, so that
     correlations between clocks can be detected in fewer runs.
@@ -162,7 +171,7 @@ def _count_in_windows(
     group: ClockGroup, times: np.ndarray, clock_of_tick: np.ndarray, horizon: float
 ) -> TickCounts:
     """Return the counts of K ticks in a run of ``horizon`` seconds, from their ``times`` (K,) in
-    seconds and the indices (K,) of their clocks in ``group``.
+    seconds and the indices ``clock_of_tick`` (K,) of their clocks in ``group``.
     """
     size = len(group.entities)
     windows = _by_window(times, clock_of_tick, size, horizon)
@@ -205,19 +214,20 @@ class TickSample(NamedTuple):
 
     @property
     def before(self) -> np.ndarray:
-        """Time of the tick before, 0 before the first."""
+        """Time (K,) in seconds of the tick before on the same clock, 0 before the first."""
         before = np.concatenate([[0.0], self.times[:-1]])[: len(self.times)]
         return np.where(self.first, 0.0, before)
 
 
 def _as_uniform(clock: Any, ticks: TickSample, horizon: float) -> np.ndarray:
-    """Return the gap before each tick as a number (K,) that is uniform in [0, 1) and independent of
-    those before it under the stated law; nan where no law is known.
+    """Return the gap before each of K ticks as a number (K,) that is uniform in [0, 1) and
+    independent of those before it under the stated law; nan where no law is known.
 
-    The end of a run censors long gaps, which the transform must allow for. Given the number of
-    ticks in a run, those of a Poisson clock are independent uniform times: with m ticks still to
-    come in the remaining time, a gap exceeds a share v of it with probability (1 - v)^m. For other
-    renewal clocks the law of a gap is conditioned on its end being before that of the run.
+    The end of a run, at ``horizon`` seconds, censors long gaps, which the transform must allow for.
+    Given the number of ticks in a run, those of a Poisson clock are independent uniform times: with
+    m ticks still to come in the remaining time, a gap exceeds a share v of it with probability (1 -
+    v)^m. For other renewal clocks the law of a gap is conditioned on its end being before that of
+    the run.
     """
     gaps, remaining = ticks.times - ticks.before, horizon - ticks.before
     if clock.memoryless:
@@ -307,7 +317,8 @@ def distance_from_lattice(clock: Any, ticks: TickSample) -> float:
 
 
 def correlate_neighbours(uniform: np.ndarray, first: np.ndarray) -> FloatArray:
-    """Return the ``products`` (3,) of :class:`TickCounts` for a series ``uniform`` (K,).
+    """Return sums (3,) over neighbouring numbers u, v of a series ``uniform`` (K,), made normal: of
+    u v, of (u^2 + v^2) / 2, and their number.
 
     Numbers that are nan, and the pairs of a number marked as ``first`` (K,) of its clock with the
     one before it, are left out.
