@@ -26,7 +26,9 @@ AnyFilter = Filter | FlowFilter | SlotFilter
 
 
 def adapt(algorithm: AnyFilter) -> Filter:
-    """Return ``algorithm``, wrapped if it keeps a deprecated contract."""
+    """Return ``algorithm`` as a filter of today's contract: wrapped in an adapter if it keeps a
+    deprecated one.
+    """
     if isinstance(algorithm, FlowFilter):
         return FlowAdapter(algorithm)
     if isinstance(algorithm, SlotFilter):
@@ -57,7 +59,7 @@ class _Adapter(Filter):
         return float(self.inner.weight(degree, peer_degree))
 
     def largest_degree(self) -> float:
-        """Return the largest degree that the wrapped filter allows."""
+        """Return the largest number of neighbours that a node may have by the wrapped filter."""
         return float(self.inner.largest_degree())
 
 
@@ -141,7 +143,7 @@ class SlotAdapter(_Adapter):
         return self.inner.absorb(state, exchange.phase, [tuple(m[1:]) for m in messages])
 
     def steps(self, phase: int) -> int:
-        """Return how often the wrapped filter repeats exchange number ``phase``."""
+        """Return how often the wrapped filter repeats exchange number ``phase`` of a slot."""
         return int(self.inner.steps(phase))
 
     def redraws_links(self, phase: int, step: int) -> bool:

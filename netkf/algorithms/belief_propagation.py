@@ -138,8 +138,8 @@ def belief_slots(
     arrays: BeliefArrays,
 ) -> None:
     """Simulate H filters by belief propagation over the S slots of a plan, in B blocks of L runs:
-    in each slot they predict, read, exchange evidence ``arrays.steps`` times and compute their
-    beliefs.
+    in each slot they predict, read, exchange evidence (information about the state)
+    ``arrays.steps`` times and compute their beliefs.
 
     Changes ``nodes.xhat`` (B, H, n, L), ``nodes.root`` (B, H, n, n, L) and the evidence in
     ``arrays`` in place, and writes ``samples`` in the slots that have one.
@@ -217,9 +217,9 @@ def update_beliefs(
     b: int,
     h: int,
 ) -> None:
-    """Compute the belief of filter ``h`` of block ``b``, the sum of its prior and all evidence:
-    writes ``nodes.xhat[b, h]`` (n, L) and ``nodes.root[b, h]`` (n, n, L). If messages are kept, the
-    centre of the filter's evidence in ``arrays`` moves to the new belief.
+    """Compute the belief of filter ``h`` of block ``b``, the sum of its prior and all evidence
+    (information): writes ``nodes.xhat[b, h]`` (n, L) and ``nodes.root[b, h]`` (n, n, L). If
+    messages are kept, the evidence of the filter in ``arrays`` is made relative to the new belief.
 
     Axes: L runs side by side.
     """
@@ -242,7 +242,8 @@ def update_beliefs(
 @kernel
 def add_part_single(parts: FloatArray, total: FloatArray, work: FloatArray) -> None:
     """Add all ``parts`` (K, n, n + 1, 1), K pieces of independent evidence of one run, to ``total``
-    (n, n + 1, 1) in place; ``work`` of the same shape is scratch.
+    (n, n + 1, 1) in place; evidence is a root [Z, z] of information Z' Z. ``work`` of the shape of
+    ``total`` is scratch.
     """
     for k in range(len(parts)):
         add_part(ONE, total, parts[k], work)
@@ -253,8 +254,8 @@ def add_reading_single(
     y: FloatArray, H: FloatArray, centre: FloatArray, total: FloatArray, work: FloatArray
 ) -> None:
     """Add a whitened reading of one node in one run, y (1, 1, 1, p, 1) and H (1, 1, 1, p, n, 1), to
-    the evidence ``total`` (n, n + 1, 1) in place, relative to ``centre`` (1, n, 1); ``work``
-    (n, n + 1, 1) is scratch.
+    the evidence ``total`` (n, n + 1, 1), a root [Z, z] of information relative to ``centre``
+    (1, n, 1), in place; ``work`` (n, n + 1, 1) is scratch.
     """
     add_reading_pair(ONE, total, 1.0, y, H, (0, 0, 0), y.shape[3], centre, work)
 
@@ -272,8 +273,8 @@ def predict_part_single(
 
 @kernel
 def recentre_part_single(part: FloatArray, before: FloatArray, after: FloatArray) -> None:
-    """Move the centre that the evidence ``part`` (n, n + 1, 1) of one run is relative to from
-    ``before`` (n, 1) to ``after`` (n, 1), in place.
+    """Move the centre c that the evidence ``part`` (n, n + 1, 1) of one run, [Z, z] with
+    ``Z (x - c) = z + noise``, is relative to from ``before`` (n, 1) to ``after`` (n, 1), in place.
     """
     recentre_part(ONE, part, before, after, part)
 
@@ -319,9 +320,9 @@ class BeliefPropagation(Filter):
     def slot_arrays(
         self, states: Sequence[Any], infos: Sequence[NodeInfo], runs: int
     ) -> tuple[BeliefArrays]:
-        """Return the arrays of ``slot_kernel`` for ``runs`` runs of H nodes that start in these
-        ``states`` and have the degrees in ``infos``: the initial evidence of all nodes, and
-        scratch.
+        """Return the arrays of the compiled ``slot_kernel`` for ``runs`` runs of H nodes that start
+        in these ``states`` and have the degrees in ``infos``: the initial evidence of all nodes,
+        and scratch.
         """
         keeps, H, n = self.memory == ALL, len(states), len(states[0].xhat)
         W, D = sum(info.degree for info in infos), max(info.degree for info in infos)
@@ -342,7 +343,9 @@ class BeliefPropagation(Filter):
         )
 
     def check_scenario(self, scenario: Any) -> None:
-        """Raise ScenarioError where messages are kept and the plant has noise."""
+        """Raise ScenarioError if messages are kept (``memory`` "all", or clocks) and the plant of a
+        ``netkf.Scenario`` has process noise, which would make them dependent.
+        """
         if scenario.slotted and self.memory == SLOT:
             return
         key, Q = ("Q", scenario.slot_belief[1]) if scenario.slotted else ("B", scenario.belief[1])
@@ -358,7 +361,9 @@ class BeliefPropagation(Filter):
             )
 
     def scenario_notes(self, scenario: Any) -> tuple[str, ...]:
-        """Return a note where the graph has loops."""
+        """Return a note for the user where the graph of a ``netkf.Scenario`` has loops, on which P
+        is too small; else nothing.
+        """
         if is_forest(scenario):
             return ()
         return (
@@ -446,7 +451,7 @@ def is_forest(scenario: Any) -> bool:
 
 def merge_evidence(parts: Sequence[FloatArray]) -> FloatArray:
     """Return the sum (n, n + 1) of several pieces of independent evidence, ``parts`` (n, n + 1)
-    each, all relative to one centre.
+    each, as a root [Z, z] of information; all are relative to one centre.
     """
     # The kernel adds the other pieces to the first one; the stack is a copy.
     stack = np.stack(parts)[..., None]
@@ -522,8 +527,8 @@ def backward(model: Any, gap: float) -> FloatArray:
 
 
 def predict_evidence(evidence: FloatArray, back: FloatArray) -> FloatArray:
-    """Return ``evidence`` (n, n + 1) predicted to a later state; ``back`` (n, n) is the inverse
-    transition.
+    """Return ``evidence`` (n, n + 1), a root [Z, z] of information, predicted to a later state of a
+    plant without noise: Z times ``back`` (n, n), the inverse transition.
     """
     predicted = np.array(evidence)[..., None]
     back = np.ascontiguousarray(back)
@@ -532,8 +537,8 @@ def predict_evidence(evidence: FloatArray, back: FloatArray) -> FloatArray:
 
 
 def recentre_evidence(evidence: FloatArray, before: FloatArray, after: FloatArray) -> FloatArray:
-    """Return ``evidence`` (n, n + 1) with the centre that it is relative to moved from ``before``
-    (n,) to ``after`` (n,).
+    """Return ``evidence`` (n, n + 1), a root [Z, z] of information relative to the centre
+    ``before`` (n,), relative to ``after`` (n,) instead.
     """
     result, old_centre, new_centre = (
         np.array(values)[..., None] for values in (evidence, before, after)

@@ -125,8 +125,8 @@ class PseudoStates(NamedTuple):
 
 
 def pseudo_states(F: FloatArray, information: FloatArray) -> PseudoStates:
-    """Return the matrices (n, n) of pseudo-states for the transition F (n, n), ``information``
-    (n, n) being that of all sensors.
+    """Return the matrices (n, n) of the pseudo-state ``G x``: G = ``information`` (n, n), that of
+    all sensors, its pseudo-inverse, and those of its prediction by the transition F (n, n).
     """
     # Sensors may leave directions unobserved: G is singular then, and G^+ G projects on the others.
     inverse = np.asarray(np.linalg.pinv(information, hermitian=True))
@@ -342,7 +342,7 @@ class PseudoState(NamedTuple):
 
     @property
     def gains(self) -> NodeGains:
-        """The node's gains of this slot."""
+        """The node's gains of this slot, from the sequence that all nodes of the design share."""
         return gain_sequence(self.design).at(self.slot)[self.node_index]
 
 
@@ -384,7 +384,8 @@ def pseudo_slots(
     arrays: PseudoArrays,
 ) -> None:
     """Simulate H filters by consensus plus innovations over the S slots of a plan, in B blocks of L
-    runs: in each slot they predict, then correct by readings and messages.
+    runs: in each slot they predict, then correct their estimates of the pseudo-state ``G x`` by
+    readings and messages, and those of the state by these.
 
     Changes ``nodes.xhat`` (B, H, n, L), ``nodes.root`` (B, H, n, n, L) and ``arrays.yhat``
     (B, H, n, L) in place and writes ``samples`` in the slots that have one.
@@ -416,8 +417,8 @@ def correct_all(
     s: int,
 ) -> None:
     """Correct all H filters of block ``b`` by their readings and messages of slot ``s``: changes
-    ``nodes.xhat[b]`` and ``arrays.yhat[b]`` (H, n, L), and sets ``nodes.root[b]`` (H, n, n, L) to
-    the roots that belong to the gains.
+    ``nodes.xhat[b]`` and the estimates ``arrays.yhat[b]`` (H, n, L) of the pseudo-state G x, and
+    sets ``nodes.root[b]`` (H, n, n, L) to the roots that belong to the gains.
 
     Axes: L runs side by side.
     """
@@ -446,7 +447,7 @@ def correct_all(
 def predict_pseudo_single(
     x: FloatArray, y: FloatArray, A: FloatArray, coupling: FloatArray, work: FloatArray
 ) -> None:
-    """Replace the estimate of the pseudo-state of one node in one run, y (1, 1, n, 1), by
+    """Replace the estimate y (1, 1, n, 1) of the pseudo-state G x of one node in one run by
     ``A y + coupling x`` with its estimate x (1, 1, n, 1) of the state; A and ``coupling`` are
     (n, n), ``work`` (n, 1) is scratch.
     """
@@ -498,9 +499,9 @@ class ConsensusInnovations(Filter):
     def slot_arrays(
         self, states: Sequence[Any], infos: Sequence[NodeInfo], runs: int
     ) -> tuple[PseudoArrays]:
-        """Return the arrays of ``slot_kernel`` for ``runs`` runs of H nodes that start in these
-        ``states``: the first pseudo-states (B, H, n, L) in B blocks of L runs, the gains of slot 0,
-        and scratch.
+        """Return the arrays of the compiled ``slot_kernel`` for ``runs`` runs of H nodes that start
+        in these ``states``: the first pseudo-states (B, H, n, L) in B blocks of L runs, the gains
+        of slot 0, and scratch.
         """
         H, n = len(states), len(states[0].xhat)
         yhat = in_lanes(np.stack([state.yhat for state in states]), blocks_of(runs))
@@ -518,7 +519,9 @@ class ConsensusInnovations(Filter):
         return (arrays[0]._replace(table_row=rows, gains=gains),)
 
     def check_scenario(self, scenario: Any) -> None:
-        """Raise ScenarioError unless all estimates have the same start."""
+        """Raise ScenarioError unless all estimates of a ``netkf.Scenario`` have the same mean and
+        covariance at the start, from which gains are computed.
+        """
         require_common_start(scenario, "from which gains are computed", "hcmci")
 
     def payload_numbers(self, n: int, rows: int, phase: int) -> int:
@@ -545,8 +548,9 @@ class ConsensusInnovations(Filter):
         return PseudoState(mean, root, model, pseudo.G @ mean, pseudo, None, 0, design, node.place)
 
     def predict(self, state: PseudoState, gap: float) -> PseudoState:
-        """Return the state ``gap`` seconds later: both estimates are predicted, the root follows
-        from the gains of the new slot, and no reading is kept.
+        """Return the state ``gap`` seconds later: the estimates of the state and of the
+        pseudo-state are predicted, the root follows from the gains of the new slot, and no reading
+        is kept.
         """
         slot, n = state.slot, len(state.xhat)
         xhat, yhat = state.xhat, state.yhat.reshape(1, 1, n, 1).copy()
@@ -565,7 +569,7 @@ class ConsensusInnovations(Filter):
 
     def emit(self, state: PseudoState, exchange: Exchange) -> tuple[PseudoState, PseudoEstimate]:
         """Return the state, unchanged, and the payload: the prediction ``yhat`` (n,) of the
-        pseudo-state.
+        pseudo-state G x.
         """
         return state, PseudoEstimate(state.yhat, state.node_index, state.pseudo.G)
 
@@ -604,8 +608,9 @@ class ConsensusInnovations(Filter):
 def correct_estimates(
     state: PseudoState, gains: NodeGains, received: Sequence[FloatArray]
 ) -> tuple[FloatArray, FloatArray]:
-    """Return xhat (n,) and yhat (n,) of a node after an exchange in which it ``received`` the
-    estimates (n,) of pseudo-states to which the gains B belong, one by one.
+    """Return the estimates xhat (n,) of the state and yhat (n,) of the pseudo-state of a node after
+    an exchange in which it ``received`` the estimates (n,) of pseudo-states to which the gains B
+    belong, one by one.
     """
     n, y = len(state.xhat), np.stack([state.yhat, *received])[None, :, :, None]
     links, up = star_of([1.0] * len(received))

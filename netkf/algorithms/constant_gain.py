@@ -254,7 +254,10 @@ class ConstantGain(Filter):
         return usable(gain_rate(state.gain, state.model.H) if state.loop is not None else 0.0)
 
     def check_scenario(self, scenario: Any) -> None:
-        """Raise ScenarioError where gains do not fit the readings of the nodes."""
+        """Raise ScenarioError where the gains do not fit a ``netkf.Scenario``: sensors whose H or
+        rows vary, another number of gains than of nodes, or a gain that is not n x p for the p rows
+        of a node.
+        """
         for k, sensor in enumerate(scenario.sensors):
             if sensor.varying or isinstance(getattr(sensor, "path", None), SourceFile):
                 raise ScenarioError(
@@ -279,7 +282,9 @@ class ConstantGain(Filter):
 
 
 def _check_kinds(scenario: Any, node: int, placed: Sequence[Any]) -> None:
-    """Raise ScenarioError if a node has readings at several times, which one gain cannot weigh."""
+    """Raise ScenarioError if ``node`` has readings at several times, which one gain cannot weigh;
+    ``placed`` are its sensors.
+    """
     if scenario.slotted or len(placed) < 2:
         return
     if any(

@@ -167,8 +167,9 @@ def predict_copies(
 def rebase_copies(
     readings: ReadingBlock, lanes: Lanes, arrays: TriggeredCiArrays, b: int, s: int
 ) -> None:
-    """Move the origin of all C copies in block ``b`` to the true state of slot ``s``, where a frame
-    begins: subtract ``readings.local[b, s]`` (n, L) from each of ``arrays.x[b]`` (C, n, L).
+    """Move the origin of all C copies of estimates in block ``b`` to the true state of slot ``s``:
+    subtract ``readings.local[b, s]`` (n, L) from each of ``arrays.x[b]`` (C, n, L). The caller does
+    so where that of the estimates moves.
 
     Axes: L runs side by side.
     """
@@ -389,9 +390,9 @@ class EventTriggeredCi(Filter):
     def slot_arrays(
         self, states: Sequence[Any], infos: Sequence[NodeInfo], runs: int
     ) -> tuple[TriggeredCiArrays]:
-        """Return the arrays of ``slot_kernel`` for ``runs`` runs of H nodes with W directed links,
-        counted from ``infos``: thresholds, and space for W + 2 H copies of estimates, none of which
-        exists yet.
+        """Return the arrays of the compiled ``slot_kernel`` for ``runs`` runs of H nodes with W
+        directed links, counted from ``infos``: thresholds, and space for W + 2 H copies of
+        estimates, none of which exists yet.
         """
         (H, n), blocks = (len(states), len(states[0].xhat)), blocks_of(runs)
         W, alpha = sum(info.degree for info in infos), self.thresholds[0]
@@ -416,7 +417,9 @@ class EventTriggeredCi(Filter):
         return (1.0 + math.sqrt(alpha)) * math.sqrt(1.0 + delta)
 
     def scenario_notes(self, scenario: Any) -> tuple[str, ...]:
-        """Return a note where messages may be lost."""
+        """Return a note for the user where messages of a ``netkf.Scenario`` may be lost or late,
+        which makes P too small; else nothing.
+        """
         channel = scenario.network.channel
         lossless = all(
             channel.loss.mean_delivery(link, scenario.table_probability(link)) == 1.0
@@ -461,7 +464,9 @@ class EventTriggeredCi(Filter):
         return state._replace(sent=own), own
 
     def is_near(self, state: TriggeredState, sent: Estimate) -> bool:
-        """Return True if the copy ``sent`` is within both thresholds of the estimate."""
+        """Return True if the copy ``sent`` of a node's estimate, predicted to now, is within both
+        thresholds of the estimate in ``state``.
+        """
         (alpha, delta), n = self.thresholds, len(state.xhat)
         x = np.stack([state.xhat, sent.xhat]).reshape(1, 2, n, 1)
         root = np.stack([state.root, sent.root]).reshape(1, 2, n, n, 1)

@@ -309,7 +309,9 @@ class Filter(Component):
         """
 
     def estimate(self, state: Any) -> tuple[FloatArray, FloatArray | None]:
-        """Return ``xhat`` (n,) and ``P`` (n, n) now; P is None if the filter has none."""
+        """Return the estimate ``xhat`` (n,) and its covariance ``P`` (n, n) now; P is None if the
+        filter has none.
+        """
         return state.xhat, state.root @ state.root.T
 
     def shift(self, state: Any, offset: FloatArray) -> Any:

@@ -101,7 +101,9 @@ class FlowFilter(Component):
         return state.xhat, state.P
 
     def weight(self, degree: int, peer_degree: int) -> float:
-        """Return the weight that a node of ``degree`` links gives to one of ``peer_degree``."""
+        """Return the weight that a node of ``degree`` links gives to a message of one of
+        ``peer_degree`` links; by default the Metropolis weight.
+        """
         return 1.0 / (1.0 + max(degree, peer_degree))
 
     def largest_degree(self) -> float:
@@ -121,7 +123,9 @@ def interval_end(now: float, time: float, stretch: float) -> float:
 
 
 def predict(model: FlowModel, payload: Payload, age: float) -> Payload:
-    """Return a payload predicted ``age`` seconds ahead by the model, without readings."""
+    """Return a ``payload``, estimate (n,) and covariance (n, n), predicted ``age`` seconds ahead by
+    the model, without readings.
+    """
     if age <= 0.0:
         return payload
     P, xhat = propagate_riccati(

@@ -115,7 +115,9 @@ class Gossip(Filter):
     unrolled: ClassVar[bool] = True
 
     def absorb(self, state: State, messages: Sequence[Message], exchange: Exchange) -> State:
-        """Replace the node's pair by the partner's, predicted to now."""
+        """Return the state with the estimate and root of the last of the messages, predicted to
+        now, in place of the node's own.
+        """
         if not messages:
             return state
         _, _, pair, age = messages[-1]

@@ -41,11 +41,15 @@ class Hybrid(Filter):
     def _pairs(
         self, state: State, messages: Sequence[Message]
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return weights (k,), estimates (k, n) and roots (k, n, n) now, the node's own first."""
+        """Return weights (k,), estimates (k, n) and roots (k, n, n) of the node itself, first, and
+        of its k - 1 messages, predicted to now.
+        """
         return weighted_pairs(state, messages)
 
     def weight(self, degree: int, peer_degree: int) -> float:
-        """Return ``epsilon``, the weight of every link."""
+        """Return ``epsilon``, the weight of every link, whatever the degrees of the nodes at its
+        ends.
+        """
         return self.epsilon
 
     def largest_degree(self) -> float:

@@ -123,8 +123,8 @@ def consensus_slots(
     arrays: ConsensusArrays,
 ) -> None:
     """Simulate H filters by consensus on information over the S slots of a plan, in B blocks of L
-    runs: in each slot they predict, make their pairs, mix them in ``arrays.steps`` steps, and
-    compute estimates.
+    runs: in each slot they predict, make information pairs of predictions and readings, mix these
+    with their neighbours' in ``arrays.steps`` steps, and compute estimates.
 
     Changes ``nodes.xhat`` (B, H, n, L) and ``nodes.root`` (B, H, n, n, L) in place and writes
     ``samples`` in the slots that have one; ``arrays.parts`` is overwritten.
@@ -159,12 +159,12 @@ def begin_all(
     b: int,
     s: int,
 ) -> None:
-    """Write the initial pairs of all H filters of block ``b``, from their predictions and their
-    readings of slot ``s``, into copy 0 of ``arrays.parts`` (2, K, H, n, n + 1, L).
+    """Write the K initial information pairs of all H filters of block ``b``, from their predictions
+    and their readings of slot ``s``, as roots [Z, z] into copy 0 of ``arrays.parts``
+    (2, K, H, n, n + 1, L).
 
     The predictions are copied to ``scratch.xhat`` (H, n, L) and the inverses of their roots to
-    ``scratch.root`` (H, n, n, L), where the steps of the slot read them. Axes: K information pairs,
-    L runs side by side.
+    ``scratch.root`` (H, n, n, L), where the steps of the slot read them. Axes: L runs side by side.
     """
     for h in range(len(nodes.rows)):
         for i in range(nodes.xhat.shape[2]):
@@ -181,10 +181,9 @@ def begin_all(
 def begin_part_single(
     nodes: SlotNodes, readings: ReadingBlock, scratch: SlotScratch, arrays: ConsensusArrays
 ) -> None:
-    """Write the initial pairs of one filter in one run, from its prediction in ``nodes`` and its
-    reading, into ``arrays.parts[0]`` of ``arrays.parts`` (2, K, 1, n, n + 1, 1).
-
-    Axes: K information pairs.
+    """Write the K initial information pairs of one filter in one run, from its prediction in
+    ``nodes`` and its reading, as roots [Z, z] into ``arrays.parts[0]`` of ``arrays.parts``
+    (2, K, 1, n, n + 1, 1).
     """
     begin_all(nodes, readings, scratch, arrays, 0, 0)
 
@@ -193,12 +192,12 @@ def begin_part_single(
 def mix_parts_single(
     parts: FloatArray, links: SlotLinks, up: Any, centre: FloatArray, work: Any
 ) -> None:
-    """Do a consensus step of one node in one run, the first of ``parts`` (2, K, H, n, n + 1, 1):
-    read copy 0 of its pairs and those of its senders, write copy 1 of its own.
+    """Do a consensus step of one node in one run: read copy 0 of its K information pairs, the first
+    of H nodes in ``parts`` (2, K, H, n, n + 1, 1), and of those of its senders, and write copy 1 of
+    its own.
 
     ``centre`` (H, n, 1) are the means that pairs are relative to, ``up`` (1, 1, 1, W, 1) flags the
-    messages, and ``work`` (2, n, n + 1, 1) is scratch. Axes: W directed links, H nodes, K
-    information pairs.
+    messages of W senders, and ``work`` (2, n, n + 1, 1) is scratch.
     """
     mix_parts(ONE, parts, 0, 0, links, up, (0, 0, 0), centre, work[0], work[1])
 
@@ -214,11 +213,11 @@ def write_estimate_single(
     work: FloatArray,
 ) -> None:
     """Write the estimate x (1, 1, n, 1) and its root (1, 1, n, n, 1) of one node in one run from
-    its pairs ``parts[0]`` of ``parts`` (2, K, 1, n, n + 1, 1) and its prediction, which count as
-    often as ``counts`` (K + 1,) says.
+    its K information pairs ``parts[0]`` of ``parts`` (2, K, 1, n, n + 1, 1) and its prediction,
+    which count as often as ``counts`` (K + 1,) says.
 
     ``root`` and ``centre`` (1, n, 1) hold the prediction; ``inverse`` (1, n, n, 1) and ``work``
-    (2, n, n + 1, 1) are scratch. Axes: K information pairs.
+    (2, n, n + 1, 1) are scratch.
     """
     invert_lanes(ONE, inverse, root, 0, 0)
     write_estimate(ONE, root, x, 0, 0, parts, 0, counts, inverse, centre, work[0], work[1])
@@ -244,7 +243,9 @@ class InformationConsensus(Filter):
 
     @abstractmethod
     def recipe(self, nodes: int) -> Recipe:
-        """Return the recipe of combinations for a network of N ``nodes``."""
+        """Return the recipe for a network of N ``nodes``: from which information pairs begin, and
+        how often each counts.
+        """
 
     def exchange_steps(self, phase: int) -> int:
         """Return ``steps``, the number of steps of the only exchange of a slot."""
@@ -253,7 +254,7 @@ class InformationConsensus(Filter):
     def slot_arrays(
         self, states: Sequence[Any], infos: Sequence[NodeInfo], runs: int
     ) -> tuple[ConsensusArrays]:
-        """Return the arrays of ``slot_kernel`` for H nodes: steps, recipe, and scratch
+        """Return the arrays of the compiled ``slot_kernel`` for H nodes: steps, recipe, and scratch
         (2, K, H, n, n + 1, L) for the K pairs of all nodes; ``runs`` does not matter, since blocks
         of L runs use it one after the other.
         """
@@ -342,8 +343,9 @@ class Hcmci(InformationConsensus):
     one_way: ClassVar[bool] = True
 
     def recipe(self, nodes: int) -> Recipe:
-        """Return the recipe of the paper's Algorithm for a network of N ``nodes``, for the variant
-        that was chosen.
+        """Return the recipe of the paper's Algorithm for a network of N ``nodes`` and the variant
+        that was chosen: from which shares of prediction and reading the pairs begin, and how often
+        each counts in the estimate.
         """
         omega = float(nodes) if self.novelty_weight is None else self.novelty_weight
         # Rows: shares of prediction and reading in a pair; then how often each pair counts, and the
@@ -356,11 +358,15 @@ class Hcmci(InformationConsensus):
 
     @property
     def P_by_design(self) -> tuple[str, str]:  # type: ignore[override]
-        """CI keeps P above the covariance of its error."""
+        """How P compares with the covariance of its error in slots and under clocks: "larger" for
+        consensus on information, else "", nothing proved.
+        """
         return ("larger", "larger") if self.consensus == INFORMATION else ("", "")
 
     def check_scenario(self, scenario: Any) -> None:
-        """Raise ScenarioError where clocks or settings do not go with the variant."""
+        """Raise ScenarioError if a ``netkf.Scenario`` has clocks and the variant is not
+        "information", or if a novelty weight is given to that variant, which does not use it.
+        """
         if not scenario.slotted and self.consensus != INFORMATION:
             raise ScenarioError(
                 "filter.consensus",

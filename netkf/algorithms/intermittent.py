@@ -155,7 +155,9 @@ class Intermittent(Filter):
 
     @property
     def max_age(self) -> float:
-        """Seconds beyond which a reading that arrives is too old to use."""
+        """Seconds beyond which a reading that arrives is too old to use; infinity
+        without a window.
+        """
         if self.late == "drop":
             return 0.0
         return math.inf if self.window is None else self.window
@@ -226,7 +228,9 @@ class Intermittent(Filter):
 
 
 def _use_reading(state: IntermittentState, reading: Reading) -> IntermittentState:
-    """Return the state after a reading of the present instant."""
+    """Return the state after a ``reading`` of the present instant, with updated estimate and root;
+    if late readings are used exactly, the reading is an event of the past from now on.
+    """
     # A reading without rows changes nothing.
     if not len(reading.y):
         return state

@@ -164,7 +164,9 @@ class Kcf(Filter):
     def slot_arrays(
         self, states: Sequence[Any], infos: Sequence[NodeInfo], runs: int
     ) -> tuple[KcfArrays]:
-        """Return the settings that ``slot_kernel`` needs, the same for all nodes and runs."""
+        """Return the settings that the compiled ``slot_kernel`` needs: epsilon, and whether
+        readings are shared, the same for all nodes and runs.
+        """
         return (KcfArrays(self.epsilon, self.share_readings),)
 
     def payload_numbers(self, n: int, rows: int, phase: int) -> int:

@@ -77,12 +77,12 @@ class FlowModel:
 
     @cached_property
     def riccati(self) -> RiccatiTable:
-        """Table of the Riccati flow of P with this node's readings."""
+        """Table of the Riccati flow of the covariance P (n, n) with this node's readings."""
         return riccati_table(self.A, self.Q, self.information, self.horizon)
 
     @cached_property
     def prediction(self) -> RiccatiTable:
-        """Table of the Riccati flow of P without readings."""
+        """Table of the Riccati flow of the covariance P (n, n) without readings."""
         return riccati_table(self.A, self.Q, np.zeros_like(self.A), self.horizon)
 
     @cached_property
@@ -92,12 +92,12 @@ class FlowModel:
 
     @cached_property
     def flow(self) -> FlowTable:
-        """Table of the flow of the root of P with this node's readings."""
+        """Table of the flow of the root (n, n) of P with this node's readings."""
         return _shared_flow_table(self.A, self.Q, self.H, self.R, self.horizon)
 
     @cached_property
     def unobserved_flow(self) -> FlowTable:
-        """Table of the flow of the root of P without readings."""
+        """Table of the flow of the root (n, n) of P without readings."""
         nothing = np.zeros((0, len(self.A)))
         return _shared_flow_table(self.A, self.Q, nothing, np.zeros((0, 0)), self.horizon)
 

@@ -255,7 +255,8 @@ def exchange_mass(
     s: int,
 ) -> None:
     """Exchange mass once in slot ``s`` of block ``b``, P steps 2.1 to 2.3: all H nodes send shares
-    of their mass, mix what arrives, and update their estimates of the network.
+    of their mass (weight, number of nodes and information), mix what arrives, and update their
+    estimates of the network.
 
     Changes in block ``b`` of ``arrays`` ``mass``, ``information``, ``number`` and the running sums,
     and writes the slot into ``samples.stopped[b]`` (H, L) where a node stops. Axes: L runs side by
@@ -297,7 +298,8 @@ def silence_stopped(plan: SlotPlan, samples: SlotSamples, b: int, s: int) -> Non
 @kernel
 def add_to_totals(arrays: PushSumArrays, scratch: SlotScratch, b: int) -> None:
     """Add the share of each of H nodes of block ``b``, ``arrays.share`` (H, m, L), to the total
-    that it has offered to each of its neighbours, ``arrays.offered[b]`` (H, m, L).
+    that it has offered to each of its neighbours, ``arrays.offered[b]`` (H, m, L). A share is a
+    part of a node's mass, of m = 2 + n n numbers.
 
     Axes: L runs side by side.
     """
@@ -320,7 +322,7 @@ def receive_totals(
 ) -> None:
     """Set the mass of node ``h`` of block ``b``, ``arrays.mass[b, h]`` (m, L), to the growth of the
     totals that arrive in slot ``s``, plus its own share. Totals that arrive replace the last ones
-    in ``arrays.heard[b]`` (W, m, L).
+    in ``arrays.heard[b]`` (W, m, L). A mass has m = 2 + n n numbers.
 
     Axes: W directed links, L runs side by side.
     """
@@ -351,9 +353,9 @@ def mix_mass(
     s: int,
     h: int,
 ) -> Any:
-    """Set the mass of node ``h`` of block ``b``, ``arrays.mass[b, h]`` (m, L), to the shares that
-    it keeps and receives in slot ``s``, P (3)-(5); return the number (L,) of shares that arrived.
-    The mass from before is left in ``arrays.before`` (m, L).
+    """Set the mass of node ``h`` of block ``b``, ``arrays.mass[b, h]`` (m, L), m = 2 + n n, to the
+    shares that it keeps and receives in slot ``s``, P (3)-(5); return the number (L,) of shares
+    that arrived. The mass from before is left in ``arrays.before`` (m, L).
 
     Axes: L runs side by side.
     """
@@ -394,8 +396,9 @@ def update_network_estimate(
     received: Any,
     slot: int,
 ) -> None:
-    """Update the network estimate of node ``h`` of block ``b`` from its mass, P (6), and apply the
-    stop rule; ``received`` (L,) is the number of shares that arrived in slot number ``slot``.
+    """Update the estimates of the number of nodes and of the information of all sensors of node
+    ``h`` of block ``b`` from its mass, P (6), and apply the stop rule; ``received`` (L,) is the
+    number of shares that arrived in slot number ``slot``.
 
     Changes ``arrays.information[b, h]`` (n, n, L) and ``arrays.number[b, h]`` (L,), except where
     the node stopped before, and writes the slot into ``samples.stopped[b, h]`` (L,) where it stops
@@ -426,8 +429,9 @@ def update_network_estimate(
 
 @kernel
 def stops(arrays: PushSumArrays, b: int, h: int, q: int, all_up: bool) -> bool:
-    """Return True if node ``h`` of block ``b`` stops in this slot in lane ``q``, one of L runs;
-    ``all_up``: all its links were up. Overwrites the scratch ``arrays.stop``.
+    """Return True if node ``h`` of block ``b`` freezes its network estimate in this slot, in lane
+    ``q``, one of L runs; ``all_up``: all its links were up. Compares the new mass and estimates in
+    ``arrays`` with the former ones; overwrites the scratch ``arrays.stop``.
     """
     stop, n = arrays.stop, arrays.new_information.shape[0]
     for i in range(arrays.mass.shape[2]):
@@ -450,11 +454,12 @@ def correct(
     s: int,
     h: int,
 ) -> None:
-    """Correct filter ``h`` of block ``b`` by its reading of slot ``s``, step 4, P (7) and (8), with
-    what it knows of the network in ``arrays``; with asymptotic gains also predict it, step 3.
-    Changes ``nodes.xhat[b, h]`` (n, L) and ``nodes.root[b, h]`` (n, n, L).
+    """Correct filter ``h`` of block ``b`` by its reading of slot ``s``, step 4, with the
+    information and the number of nodes of the whole network, as it knows them, in place of its own:
+    P (7) and (8). With asymptotic gains also predict it, step 3.
 
-    Axes: L runs side by side.
+    Changes ``nodes.xhat[b, h]`` (n, L) and ``nodes.root[b, h]`` (n, n, L). Axes: L runs side by
+    side.
     """
     n, lanes = nodes.xhat.shape[2], scratch.lanes
     if arrays.asymptotic:
@@ -493,8 +498,9 @@ def add_gain_single(
 
 @kernel
 def split_mass_single(mass: FloatArray, degree: int, share: FloatArray) -> None:
-    """Write into ``share`` (1, m, 1) the mass (1, 1, m, 1) of one node in one run over ``degree`` +
-    1, its message to each of ``degree`` neighbours.
+    """Write into ``share`` (1, m, 1) the ``mass`` (1, 1, m, 1) of one node in one run over
+    ``degree`` + 1, its message to each of ``degree`` neighbours; m = 2 + n n numbers: weight,
+    number of nodes and information.
     """
     split_mass(ONE, mass, 0, 0, degree, share)
 
@@ -502,7 +508,8 @@ def split_mass_single(mass: FloatArray, degree: int, share: FloatArray) -> None:
 @kernel
 def keep_share_single(mass: FloatArray, share: FloatArray, times: int) -> None:
     """Add ``times`` times its own ``share`` (1, m, 1) to the ``mass`` (1, 1, m, 1) that one node
-    received in one run, in place, P (3)-(5).
+    received in one run, in place, P (3)-(5); m = 2 + n n numbers: weight, number of nodes and
+    information.
     """
     keep_share(ONE, mass, 0, 0, share, times, False)
 
@@ -513,8 +520,8 @@ def learn_network_single(
 ) -> None:
     """Write the information of all sensors, C~ / w, into ``information`` (n, n, 1) and the number
     of nodes, n~ / w, into ``number`` (1, 1), as one node estimates them in one run from its
-    ``mass`` (1, 1, m, 1), P (6). While its weight w is 0 these are its own information ``alone``
-    (1, n, n) and 1.
+    ``mass`` (1, 1, 2 + n n, 1) of w, n~ and C~, P (6). While its weight w is 0 these are its own
+    information ``alone`` (1, n, n) and 1.
     """
     learn_network(ONE, mass, 0, 0, alone, information, number)
 
@@ -586,7 +593,9 @@ class PushSum(Filter):
         return n * (n + 1) // 2 + (2 if phase == MASS else 1 + n)
 
     def slot_stopping(self) -> int:
-        """Return the exchange after which nodes may stop: that of mass."""
+        """Return the number of the exchange of a slot after which nodes may stop: that of mass, or
+        -1 if none ever stops.
+        """
         # Without exchanges of mass there is nothing to stop.
         return MASS if not self.asymptotic and self.stop != "never" else -1
 
@@ -603,9 +612,9 @@ class PushSum(Filter):
     def slot_arrays(
         self, states: Sequence[Any], infos: Sequence[NodeInfo], runs: int
     ) -> tuple[PushSumArrays]:
-        """Return the arrays of ``slot_kernel`` for ``runs`` runs of H nodes that start in these
-        ``states`` and have the degrees in ``infos``: masses and network estimates of all runs,
-        settings, and scratch.
+        """Return the arrays of the compiled ``slot_kernel`` for ``runs`` runs of H nodes that start
+        in these ``states`` and have the degrees in ``infos``: masses and network estimates of all
+        runs, settings, and scratch.
         """
         network_estimates = [state.network for state in states]
         alone = np.stack([state.model.information for state in states])
@@ -709,8 +718,10 @@ class PushSum(Filter):
         return state, None if silent else share(state.mass, state.degree)
 
     def absorb(self, state: Any, messages: Sequence[Message], exchange: Exchange) -> Any:
-        """Return the state after all messages of a step: with its mass mixed and its network
-        estimate updated, steps 2.2 and 2.3, or with z averaged, step 5.2.
+        """Return the state after all messages of a step: in the first exchange of a slot with its
+        mass mixed and its network estimate updated, steps 2.2 and 2.3, in the second with its
+        estimate averaged with those of its neighbours, step 5.2; under clocks with the growth of
+        all running sums added.
         """
         if isinstance(state, RunningSums):
             return running_sums.absorb_totals(state, messages)
@@ -767,7 +778,7 @@ class PushSum(Filter):
         return state._replace(xhat=xhat, root=root)
 
     def stopped(self, state: Any) -> bool:
-        """Return True if G^(i) and N^(i) are frozen."""
+        """Return True if the node's estimate of the network, G^(i) and N^(i), is frozen."""
         return not isinstance(state, RunningSums) and bool(state.stopped)
 
     def conserved(self, state: Any) -> Mapping[str, float | Sequence[float]]:
@@ -803,7 +814,10 @@ class PushSum(Filter):
         return payload + offset if len(payload) == len(offset) else payload
 
     def check_scenario(self, scenario: Any) -> None:
-        """Raise ScenarioError where leader, delta or the sensors do not fit the slots."""
+        """Raise ScenarioError where the settings do not fit a ``netkf.Scenario`` in slots: the
+        leader is no node, gamma or delta is missing or averaging would not contract, a sensor
+        varies, or P_inf does not exist.
+        """
         if not scenario.slotted:
             return
         self._check_leader(scenario)
@@ -897,7 +911,7 @@ def correct_estimate(
 ) -> FloatArray:
     """Return the estimate (n,) of P (8): the prediction ``predicted`` (n,) plus ``number`` times
     the gain of the reading y (p,), H (p, n), R (p, p), which may have no rows; ``root`` (n, n) is
-    that of P (7).
+    that of the covariance after the reading, P (7).
     """
     n, x = len(predicted), np.array(predicted, dtype=np.float64)
     if len(y):
@@ -915,8 +929,8 @@ def correct_estimate(
 
 
 def share(mass: FloatArray, degree: int) -> FloatArray:
-    """Return the mass (2 + n n,) that a node of ``degree`` neighbours sends to each of them:
-    ``mass`` over degree + 1.
+    """Return the mass (2 + n n,), weight, number of nodes and information, that a node of
+    ``degree`` neighbours sends to each of them: ``mass`` over degree + 1.
     """
     part = np.empty(mass.shape)
     split_mass_single(mass.reshape(1, 1, -1, 1), degree, part.reshape(1, -1, 1))

@@ -158,7 +158,7 @@ class SlotFilter(Component):
         return np.inf
 
     def estimate(self, state: Any) -> tuple[FloatArray, FloatArray]:
-        """Return ``xhat`` (n,) and ``P`` (n, n)."""
+        """Return the estimate ``xhat`` (n,) and its covariance ``P`` (n, n)."""
         return state.xhat, state.root @ state.root.T
 
 

@@ -396,9 +396,9 @@ class ScheduledReadings(Filter):
     def slot_arrays(
         self, states: Sequence[Any], infos: Sequence[NodeInfo], runs: int
     ) -> tuple[ScheduledArrays]:
-        """Return the arrays of ``slot_kernel`` for ``runs`` runs of H nodes with W directed links,
-        counted from ``infos``: triggers, and empty tables of the W + H sensors that nodes know of
-        each other and of themselves.
+        """Return the arrays of the compiled ``slot_kernel`` for ``runs`` runs of H nodes with W
+        directed links, counted from ``infos``: triggers, and empty tables of the W + H sensors that
+        nodes know of each other and of themselves.
         """
         models, blocks = [state.model for state in states], blocks_of(runs)
         (H, n), W = (len(models), len(states[0].xhat)), sum(info.degree for info in infos)
@@ -765,12 +765,12 @@ class WrappedState(NamedTuple):
 
     @property
     def xhat(self) -> FloatArray:
-        """The estimate (n,) of the filter."""
+        """The estimate (n,) of the wrapped filter."""
         return np.asarray(self.inner.xhat)
 
     @property
     def root(self) -> FloatArray:
-        """The root (n, n) of its covariance."""
+        """The root (n, n) of the covariance of the wrapped filter's estimate."""
         return np.asarray(self.inner.root)
 
 
@@ -799,7 +799,9 @@ class TriggeredMessages(Filter):
 
     @cached_property
     def slot_kernel(self) -> TriggeredSlots | None:
-        """The slots of the filter with the trigger, where the filter is compiled."""
+        """The compiled simulation of slots with the trigger, or None where the wrapped filter has
+        none or its innovations cannot be computed from outside.
+        """
         inner, plan = self.inner, trigger_plan(self.inner)
         # A kernel is that of its own class only: it ignores what a derived class changes.
         is_compiled = type(inner) in built_in_filters().values() and inner.slot_kernel is not None
@@ -812,9 +814,9 @@ class TriggeredMessages(Filter):
     def slot_arrays(
         self, states: Sequence[Any], infos: Sequence[NodeInfo], runs: int
     ) -> tuple[Any, ...]:
-        """Return the arguments of ``slot_kernel`` for ``runs`` runs of H nodes that start in these
-        ``states``: the arrays of the trigger, the wrapped filter's states, and the arrays of its
-        kernel.
+        """Return the arguments of the compiled ``slot_kernel`` for ``runs`` runs of H nodes that
+        start in these ``states``: the arrays of the trigger, the wrapped filter's states, and the
+        arrays of its kernel.
         """
         inner = [state.inner for state in states]
         arrays = trigger_arrays([state.model for state in inner], self.Y, runs)
@@ -879,7 +881,7 @@ class TriggeredMessages(Filter):
         return state._replace(inner=self.inner.shift(state.inner, offset))
 
     def stopped(self, state: WrappedState) -> bool:
-        """Return True once the filter has stopped."""
+        """Return True once the wrapped filter has frozen its network estimate."""
         return self.inner.stopped(state.inner)
 
     def conserved(self, state: WrappedState) -> Any:
@@ -923,7 +925,10 @@ class StochasticTrigger(Delegate):
         return TriggeredMessages(self.Y, self.inner)
 
     def check_scenario(self, scenario: Any) -> None:
-        """Raise ScenarioError where the filter or Y do not fit."""
+        """Raise ScenarioError if the filter that sends does not run in slots, sends nothing or has
+        a trigger itself, or if Y is a matrix that does not fit the readings of each node of a
+        ``netkf.Scenario``.
+        """
         inner = self.inner
         if isinstance(inner, Delegate) or inner.schedule is None or not inner.talks:
             raise ScenarioError(

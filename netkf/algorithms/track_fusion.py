@@ -177,7 +177,9 @@ class PairFusion(Filter):
     def slot_arrays(
         self, states: Sequence[Any], infos: Sequence[NodeInfo], runs: int
     ) -> tuple[FusionArrays]:
-        """Return the settings and scratch of ``slot_kernel``, the same for all nodes and runs."""
+        """Return the settings and scratch of the compiled ``slot_kernel``, the same for all nodes
+        and runs.
+        """
         n = len(states[0].xhat)
         shapes = [(2 * n + 2, n), (n,), (n, n), (n,), (n, n)]
         scratch = [np.zeros(shape) for shape in shapes]
@@ -456,8 +458,9 @@ class BarShalomCampo(Filter):
     def slot_arrays(
         self, states: Sequence[Any], infos: Sequence[NodeInfo], runs: int
     ) -> tuple[TrackArrays]:
-        """Return the arrays of ``slot_kernel`` for ``runs`` runs of H nodes that start in these
-        ``states`` and hear the nodes in ``infos``: the tracks with their covariances, and scratch.
+        """Return the arrays of the compiled ``slot_kernel`` for ``runs`` runs of H nodes that start
+        in these ``states`` and hear the nodes in ``infos``: the tracks with their covariances, and
+        scratch.
         """
         H, n, start = len(states), len(states[0].xhat), states[0].start
         max_degree = max(info.degree for info in infos)
@@ -499,7 +502,9 @@ class BarShalomCampo(Filter):
         return tracks.xhat
 
     def check_scenario(self, scenario: Any) -> None:
-        """Raise ScenarioError unless all tracks have the same start and each H is fixed."""
+        """Raise ScenarioError unless all tracks of a ``netkf.Scenario`` have the same start and
+        each sensor a fixed H.
+        """
         why = "where cross-covariances begin"
         require_common_start(scenario, why, INTERSECTION)
         for k, sensor in enumerate(scenario.sensors):
@@ -626,8 +631,8 @@ def updated_joint(joint: FloatArray, sensors: Sequence[FloatArray]) -> FloatArra
 
 
 def add_senders(state: TrackState, messages: Sequence[Message]) -> TrackState:
-    """Return the state extended by the new senders of messages: their ids, sensors, and the joint
-    covariance of all tracks.
+    """Return the state extended by the new senders of ``messages``: their ids, their sensors, and
+    the joint covariance (m, m, n, n) of the errors of all m tracks that are known then.
     """
     new_messages = [message for message in messages if message.sender not in state.senders]
     if not new_messages:

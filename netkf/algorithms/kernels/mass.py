@@ -24,7 +24,8 @@ def split_mass(
     lanes: Lanes, mass: FloatArray, b: int, h: int, degree: int, share: FloatArray
 ) -> None:
     """Write into ``share[h]`` (m, L) the message of node ``h`` of block ``b`` to each of its
-    ``degree`` neighbours: its mass, m = 2 + n n entries of ``mass`` (B, H, m, L), over degree + 1.
+    ``degree`` neighbours: its mass, m = 2 + n n numbers (weight, number of nodes and information)
+    of ``mass`` (B, H, m, L), over degree + 1.
 
     Axes: B blocks of L runs, H nodes.
     """
@@ -39,10 +40,10 @@ def keep_share(
     lanes: Lanes, mass: FloatArray, b: int, h: int, share: FloatArray, times: Any, unchanged: Any
 ) -> None:
     """Add ``times`` (L,) times its own ``share[h]`` (m, L) to the mass that node ``h`` of block
-    ``b`` received, ``mass[b, h]`` of ``mass`` (B, H, m, L), in place, P (3)-(5), except in lanes
-    with the flag ``unchanged`` (L,).
+    ``b`` received, ``mass[b, h]`` of ``mass`` (B, H, m, L), m = 2 + n n, in place, P (3)-(5),
+    except in lanes with the flag ``unchanged`` (L,).
 
-    ``times`` is 1 for the node itself plus 1 for each of its links that failed. Axes: B blocks of
+    ``times`` is 1 for the node itself plus 1 for each of its links that failed. Axes: B blocks of L
     runs, H nodes.
     """
     # A share that could not be sent stays here, so that the sums of w, n~ and C~ over the network

@@ -27,7 +27,7 @@ def predict_pseudo(
     coupling: FloatArray,
     predicted: FloatArray,
 ) -> None:
-    """Predict the estimate of the pseudo-state of filter ``h`` of block ``b`` to the next slot:
+    """Predict the estimate of the pseudo-state G x of filter ``h`` of block ``b`` to the next slot:
     replace yhat = ``y[b, h]`` (n, L) by ``A yhat + coupling xhat``, with xhat = ``x[b, h]`` of the
     present slot.
 
@@ -162,8 +162,9 @@ def correct_state(
 def shift_pseudo(
     lanes: Lanes, y: FloatArray, readings: ReadingBlock, G: FloatArray, b: int, s: int
 ) -> None:
-    """Move the origin of the pseudo-states ``y[b]`` (H, n, L) of block ``b`` to G x of slot ``s``,
-    if a frame begins there: subtract G (n, n) times the true state ``readings.local[b, s]`` (n, L).
+    """Move the origin of the estimates ``y[b]`` (H, n, L) of the pseudo-states G x in block ``b``,
+    if that of the states moves in slot ``s`` (``readings.rebased[s]``): subtract G (n, n) times the
+    true state ``readings.local[b, s]`` (n, L).
 
     Axes: H filters, L runs side by side.
     """

@@ -444,7 +444,9 @@ def substitute(lower: FloatArray, right: FloatArray) -> FloatArray:
 
 
 def stack_tables(tables: Sequence[FlowTable]) -> FlowTable:
-    """Return one table of all models of ``tables``, in their order."""
+    """Return one table of all M models of ``tables``, in their order: their arrays stacked along
+    the first axis.
+    """
 
     def padded(parts: list[FloatArray], fill: float) -> FloatArray:
         """Return the arrays ``parts`` (M_i, ...) of several tables stacked along their first axis,
@@ -927,10 +929,12 @@ def gain_root(
 ) -> None:
     """Correct the prediction ``x[k]`` (n,) at the end of a ``gap`` in seconds, entry ``k`` of x
     (K, n), in place by the ``moments`` (2 p,) of its readings, which are overwritten with the
-    innovations: ``x += (U + S S' W) innovations``, with the root S = ``root[k]`` (n, n).
+    innovations ``moments - C x``: ``x += (U + S S' W) innovations``, with the root S = ``root[k]``
+    (n, n).
 
-    U, W and C are power series in the gap, the rows of ``series`` of a GainTable; their reach is
-    ``reach[:, column]``. ``values`` (>= row length) is scratch. Axes: K estimates.
+    U and W (n, 2 p) and C (2 p, n) are power series in the gap, the rows of ``series`` (terms, ...)
+    of a GainTable; ``reach[:, column]`` (terms,) is the longest gap for which the terms so far
+    suffice. ``values`` (>= row length) is scratch. Axes: K estimates.
     """
     fill_series(values, 3 * len(size) * len(moments), series, reach, column, gap)
     use_moments(ONE, size, root[k], x[k], values, moments)
@@ -1001,7 +1005,9 @@ class _Scratches(threading.local):
         self.scratches: dict[tuple[int, ...], FlowScratch] = {}
 
     def of(self, table: FlowTable) -> FlowScratch:
-        """Return scratch arrays that fit ``table``, not cleared."""
+        """Return scratch arrays of the sizes that ``table`` needs, shared by its thread's calls and
+        not cleared.
+        """
         # Scratch holds no results, so tables of equal shapes may share it.
         sizes = table.series.shape[3], *table.whitened_H.shape[1:]
         if sizes not in self.scratches:
