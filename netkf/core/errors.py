@@ -24,6 +24,7 @@ class WriteError(NetkfError, OSError):
     """A file cannot be written; ``str(error)`` is one line with the reason and the path."""
 
     def __init__(self, cause: OSError, path: object) -> None:
+        """Take the reason from the error ``cause`` of the system, and the ``path`` of the file."""
         reason = os.strerror(cause.errno) if cause.errno else str(cause)
         # The path is not passed on: with three arguments OSError would choose a subclass.
         super().__init__(cause.errno, reason)
@@ -42,6 +43,9 @@ class ScenarioError(NetkfError, ValueError):
     def __init__(
         self, key: str, rule: str, value: object = None, remedy: str = "", file: str = ""
     ) -> None:
+        """Store the ``key`` at fault, the ``rule`` that it breaks, its ``value``, the ``remedy``
+        and the name of the ``file``, "" if there is none.
+        """
         self.key, self.rule, self.value, self.remedy, self.file = key, rule, value, remedy, file
         super().__init__(key, rule, value, remedy, file)
 
@@ -57,6 +61,9 @@ class ScenarioError(NetkfError, ValueError):
 
     def __str__(self) -> str:
         # All texts are limited: they may contain names of keys, classes and files of any length.
+        """Return the mistake as one line, ``file: key: rule; got value; remedy``, each part
+        shortened.
+        """
         file, key = shorten(self.file, 1000), shorten(self.key, 120)
         rule, remedy = shorten(self.rule, 1000), shorten(self.remedy, 700)
         got = "" if self.value is None else f"; got {quote(self.value)}"

@@ -106,12 +106,16 @@ class Component:
                 setattr(cls, former, own_attributes[name])
 
     def __post_init__(self) -> None:
+        """Check and convert each field by its rule; raises ScenarioError for a value that breaks
+        it.
+        """
         for field in dataclasses.fields(self):
             value, rule = getattr(self, field.name), field.metadata.get("rule")
             if rule is not None and not (value is None and field.default is None):
                 object.__setattr__(self, field.name, rule(field.name, value))
 
     def __eq__(self, other: object) -> bool:
+        """Return True if both components have the same class and equal fields."""
         if type(self) is not type(other):
             return NotImplemented
         return all(

@@ -112,6 +112,9 @@ class Fields(AttributeTemplate):
 
 
 def _field_pointer(builder: Any, address: Any, offset: int, llvm_type: Any) -> Any:
+    """Emit the address of a field, ``offset`` bytes after ``address``, as a pointer to
+    ``llvm_type``.
+    """
     pointer = builder.gep(address, [ir.Constant(I64, offset)])
     return builder.bitcast(pointer, ir.PointerType(llvm_type))
 
@@ -181,6 +184,7 @@ def _struct_from_memory(_: Any, memory: Any, cls: ClassType) -> Any:
     """
 
     def take_address(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        """Emit the address of the first word of the array ``memory``, as that of a struct."""
         array = context.make_array(sig.args[0])(context, builder, args[0])
         return builder.bitcast(array.data, cgutils.voidptr_t)
 

@@ -126,6 +126,9 @@ class Struct(metaclass=StructClass):
         cls.struct_kinds, cls.struct_offsets = kinds, offsets
 
     def __setattr__(self, name: str, value: Any) -> None:
+        """Write a field: a number into ``memory``, or the address and shape of an array, the
+        address of a struct. Raises TypeError for another type than the field had at first.
+        """
         word, kind = self.struct_offsets[name], self.struct_kinds[name]
         if isinstance(kind, tuple):
             # Compiled code assumes the type and computes strides itself: anything else would read
@@ -148,6 +151,7 @@ class Struct(metaclass=StructClass):
             self.__dict__[name] = value
 
     def __reduce__(self) -> tuple[Any, ...]:
+        """Return what pickle needs to make the struct again: its class, n and fields."""
         cls, size = type(self), getattr(self, "size", None)
         # A class made by of_size() has no importable name: its base and n are pickled.
         base, n = (cls.__base__, len(size)) if isinstance(size, tuple) else (cls, None)
@@ -155,6 +159,9 @@ class Struct(metaclass=StructClass):
 
     def __getattr__(self, name: str) -> Any:
         # Numbers are read from the memory, where kernels may have changed them.
+        """Return the present value of a number, which ``memory`` holds; other fields are plain
+        attributes.
+        """
         kind = self.struct_kinds.get(name)
         if kind is not np.int64 and kind is not np.float64:
             raise AttributeError(name)

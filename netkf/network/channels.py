@@ -154,6 +154,9 @@ class GilbertElliott(Loss):
     mean_burst: float | None = field(number(low=1.0), default=None)
 
     def __post_init__(self) -> None:
+        """Check the fields; raises ScenarioError unless one of the two forms is given, and
+        possible.
+        """
         super().__post_init__()
         chain = {name: getattr(self, name) for name in ("to_bad", "to_good")}
         means = {name: getattr(self, name) for name in ("mean_loss", "mean_burst")}
@@ -321,6 +324,7 @@ class UniformDelay(Delay):
     high: float = field(number(low=0.0))
 
     def __post_init__(self) -> None:
+        """Check the fields; raises ScenarioError if ``high`` is below ``low``."""
         super().__post_init__()
         if self.high < self.low:
             raise ScenarioError("high", "must be at least low", self.high, "swap the two")

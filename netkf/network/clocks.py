@@ -123,6 +123,9 @@ class Poisson(LinkClock):
     )
 
     def __post_init__(self) -> None:
+        """Check the fields; raises ScenarioError for an entry of ``rates`` that does not fit
+        ``at``.
+        """
         super().__post_init__()
         length, rule = (2, _node_rate) if self.at == "nodes" else (3, _link_rate)
         for k, entry in enumerate(self.rates):
@@ -220,6 +223,9 @@ class Renewal(LinkClock):
     high: float | None = field(positive, default=None)
 
     def __post_init__(self) -> None:
+        """Check the fields; raises ScenarioError for a parameter that the distribution lacks or
+        does not take, and for gaps below MIN_GAP seconds on average.
+        """
         super().__post_init__()
         needed, one_of = PARAMETERS[self.distribution]
         for name in ("shape", "low", "high", "mean", "rate", "scale"):
@@ -311,6 +317,7 @@ class Periodic(LinkClock):
     jitter: float = field(number(low=0.0), default=0.0)
 
     def __post_init__(self) -> None:
+        """Check the fields; raises ScenarioError if phase or jitter are not below the period."""
         super().__post_init__()
         for name in ("phase", "jitter"):
             value = getattr(self, name)

@@ -65,6 +65,9 @@ class Matching(SlotActivation):
     p: float | None = field(number(above=0.0, high=1.0), default=None)
 
     def __post_init__(self) -> None:
+        """Check the fields; raises ScenarioError for a parameter of another protocol, or a missing
+        one.
+        """
         super().__post_init__()
         for name, owner in (("lazy", "one-edge"), ("p", "independent")):
             if getattr(self, name) is not None and self.protocol != owner:
@@ -154,7 +157,9 @@ def _shares_node(link: Link, pairs: list[Link]) -> bool:
 
 
 def _node_wakeup(topology: Topology, random: np.random.Generator) -> list[Link]:
-    """Return the link of a uniform node with a uniform neighbour."""
+    """Draw a node uniformly and one of its neighbours uniformly; return their link [(i, j)], i < j,
+    or an empty list if the node has no neighbours.
+    """
     node = topology.nodes[int(random.integers(len(topology.nodes)))]
     uniform = random.random()
     peers = sorted({j if i == node else i for i, j in topology.links if node in (i, j)})
@@ -165,20 +170,26 @@ def _node_wakeup(topology: Topology, random: np.random.Generator) -> list[Link]:
 
 
 def _random_greedy(topology: Topology, random: np.random.Generator) -> list[Link]:
-    """Return a maximal matching: links in random order, each if both ends are free."""
+    """Draw an order of all links and return the maximal matching that takes each link, in this
+    order, if both ends are free.
+    """
     links = topology.links
     order = random.permutation(len(links)).tolist()
     return _choose_greedily([links[k] for k in order])
 
 
 def _uniform_maximal(topology: Topology, random: np.random.Generator) -> list[Link]:
-    """Return one of all maximal matchings, each with equal probability."""
+    """Draw one of all maximal matchings of the graph, each with equal probability, and return its
+    links.
+    """
     matchings = maximal_matchings(topology.links)
     return list(matchings[int(random.integers(len(matchings)))])
 
 
 def _choose_greedily(links: list[Link]) -> list[Link]:
-    """Return the links that are chosen if each is taken in turn when both of its ends are free."""
+    """Return those of ``links`` that are chosen if each is taken in turn when both of its ends are
+    free.
+    """
     matched: set[int] = set()
     chosen = []
     for i, j in links:

@@ -69,6 +69,7 @@ class RecordedPlant(LinearPlant):
     path: SourceFile = field(source_file)
 
     def __post_init__(self) -> None:
+        """Check the fields and read the table; raises ScenarioError for a mistake in either."""
         super().__post_init__()
         _ = self.table  # a mistake in the file is found on construction
 
@@ -117,6 +118,7 @@ class RecordedDiffusion(Diffusion):
     path: SourceFile = field(source_file)  # type: ignore[assignment]
 
     def __post_init__(self) -> None:
+        """Check the fields and read the table; raises ScenarioError for a mistake in either."""
         super().__post_init__()
         _ = self.table  # a mistake in the file is found on construction
 
@@ -193,6 +195,9 @@ class RecordedSensor(Sensor):
     nodes: tuple[int, ...] = field(list_of(integer(), "node ids"), default=None)
 
     def __post_init__(self) -> None:
+        """Take nodes and H from the table where they are not given; raise ScenarioError if H is
+        missing or the file has a mistake.
+        """
         super().__post_init__()
         nodes: tuple[int, ...] | None = self.nodes
         if nodes is None:

@@ -59,6 +59,9 @@ class Run(NotebookTable):
     scenario: Any = None
 
     def __repr__(self) -> str:
+        """Return one line: status, number and span of samples, nodes, states, events, seed and
+        replica.
+        """
         span = f"{self.times[0]:g} .. {self.times[-1]:g} s" if len(self.times) else "nothing"
         return (
             f"<netkf.Run: {self.status}, {len(self.times)} samples of {span}, {len(self.nodes)} "

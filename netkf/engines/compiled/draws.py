@@ -116,8 +116,8 @@ class Paths:
         return self._paths.following(self._blocks, max_steps)
 
     def block(self, block: Block, together: int = 1) -> PathBlock:
-        """Return a block of steps as arrays for the event loop, which simulates ``together`` runs
-        at a time.
+        """Return a block of steps of all R runs as arrays for the event loop, which simulates
+        ``together`` runs at a time: the block has a cache for so many.
         """
         ends, laws = block.ends, self._paths.laws
         n = laws.n

@@ -197,6 +197,7 @@ def set_moments(readings: LaneReadings, q: int, moments: FloatArray) -> None:
     """
     rows, n = readings.rows, moments.shape[1]
     half = rows.shape[1] // 2
+    # With these shares end_readings() takes the integrals of this lane as those of a whole piece.
     readings.first[0, q], readings.share[0, q] = 0.0, 1.0
     for i in range(n):
         rows[q, i] = rows[q, n + i] = 0.0

@@ -68,7 +68,9 @@ def max_moments(filters: Filters) -> int:
 
 
 def unobserved_series(filters: Filters) -> LaneSeries:
-    """Return the series of Q_g and exp(A g) in the gap, of all models without sensors."""
+    """Return the power series in the gap g of all models without sensors: of exp(A g) and of Q_g,
+    the covariance of the noise over the gap.
+    """
     n, table = filters.xhat.shape[1], filters.table
     selected = table.sizes[:, 1] == 0
     width = n * (n + 1) // 2 + n * n
@@ -76,8 +78,9 @@ def unobserved_series(filters: Filters) -> LaneSeries:
 
 
 def sensing_series(filters: Filters, period: float) -> LaneSeries:
-    """Return the series of Q_g, exp(A g), F and G_g with the gains U, W and C, for gaps up to
-    ``period`` seconds, of all models with increment sensors.
+    """Return the power series in the gap g, up to ``period`` seconds, of all models with increment
+    sensors: of Q_g, exp(A g), F and G_g, by which a covariance moves (P <- Q_g + F P (I + G_g P)^-1
+    F'), and of the gains U, W and C of a reading (kernels.gains).
     """
     n, table = filters.xhat.shape[1], filters.table
     width, selected = n * (n + 1) + 2 * n * n, table.sizes[:, 1] > 0

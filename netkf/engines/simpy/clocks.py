@@ -178,7 +178,7 @@ def broadcasts(
         )
 
     def activation(node: int) -> Activation:
-        """Return the broadcast of a node: one payload to all its neighbours."""
+        """Return the broadcast of ``node`` (id): one payload to all its receivers."""
         receivers, sent = tuple(direction.link[1] for direction in directions[node]), 0
 
         def transmit(now: float) -> None:
@@ -215,7 +215,7 @@ def _node_activations(
     transmit = broadcasts(scenario, recorder, transmitter, nodes)
 
     def activation(node: int) -> Activation:
-        """Return the activation of a node: a broadcast with a row for the tick."""
+        """Return the activation of ``node`` (id): a broadcast with a row for the tick."""
 
         def activate(now: float) -> None:
             """Record the tick at ``now`` (seconds), then broadcast."""
