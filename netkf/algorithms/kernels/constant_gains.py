@@ -140,7 +140,8 @@ def correct_by_innovation(
     x: FloatArray, k: int, H: FloatArray, L: FloatArray, y: FloatArray, updated: FloatArray
 ) -> None:
     """Add ``L (y - H x)`` to ``x[k]`` (n,), entry ``k`` of x (K, n), for a sample y (p,) with H
-    (p, n) and gain L (n, p); ``updated`` (n,) is scratch.
+    (>= p, n) and gain L (n, >= p), of which the first p rows and columns count; ``updated`` (n,) is
+    scratch.
 
     Axes: K estimates.
     """

@@ -757,8 +757,9 @@ def condition_root(
     lanes: Lanes, size: Size, S: FloatArray, values: FloatArray, V: FloatArray
 ) -> None:
     """Replace S (n, n, L), a lower triangular root of P in each of L lanes, by one of
-    ``P (I + G P)^-1``: the update with information G. ``values`` (>= width, L) holds the lower
-    triangle of G by rows, behind Q_g, exp(A g) and F; V (n, n, L) is scratch.
+    ``P (I + G P)^-1``: the update with the information G of the readings of a gap. ``values``
+    (>= width, L), as of ``fill_values``, holds the lower triangle of G by rows, behind the noise,
+    exp(A g) and the transition of the gap; V (n, n, L) is scratch.
     """
     n = len(size)
     begin = n * (n + 1) // 2 + 2 * n * n

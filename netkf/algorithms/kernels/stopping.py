@@ -36,10 +36,10 @@ class MassStep(NamedTuple):
 
 @kernel
 def has_stopped(rule: int, tolerance: float, step: MassStep, all_up: bool) -> bool:
-    """Return True if a node stops after this ``step`` by ``rule``, an index in RULES: PAPER, if it
-    has information, whose change has a spectral norm below ``tolerance``; SAFE, if its network
-    estimate changed by less than ``tolerance`` (relative) while all its links were up (``all_up``)
-    and its weight is positive; NEVER.
+    """Return True if a node stops after this ``step`` by ``rule``, an index in RULES. NEVER: it
+    does not. PAPER: if it has information, whose change has a spectral norm below ``tolerance``.
+    SAFE: if its network estimate changed by less than ``tolerance`` (relative) while all its links
+    were up (``all_up``) and its weight is positive.
     """
     if rule == PAPER:
         # P step 2.3 waits until information has reached the node, since a mass of zero does not
