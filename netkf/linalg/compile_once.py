@@ -90,8 +90,8 @@ else:
     import fcntl
 
     def _wait_for(opened: int) -> None:
-        """Lock the open file, or give up after MAX_WAIT seconds (its owner may be suspended) or if
-        the file system has no locks.
+        """Lock the file with the descriptor ``opened``, or give up after MAX_WAIT seconds (the
+        owner of its lock may be suspended) or if the file system has no locks.
         """
         end = time.monotonic() + MAX_WAIT
         while time.monotonic() < end:
@@ -105,6 +105,6 @@ else:
                 return
 
     def _unlock(opened: int) -> None:
-        """Unlock the open file."""
+        """Unlock the file with the descriptor ``opened``."""
         with suppress(OSError):
             fcntl.flock(opened, fcntl.LOCK_UN)

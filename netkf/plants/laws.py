@@ -42,9 +42,11 @@ class GridLaws:
     """The laws of all paths of ``dx = A x dt + B dw`` on the sensing grid of one ``period`` (s);
     ``A`` (n, n), ``B`` (n, m).
 
-    to_end, to_moments  power series of the response to the state at the start of a step response
-    (3, n, n) that response over one period noise_factor        (3 n, 3 n) lower triangular root of
-    the covariance of end and moments course_table        the table that ``paths.fill_course`` uses
+    to_end, to_moments  power series of the response to the state at the start of a step,
+                        (terms, n n + 1) and (terms, 2 n n + 1)
+    response            (3, n, n) that response over one period
+    noise_factor        (3 n, 3 n) lower triangular root of the covariance of end and moments
+    course_table        the table that ``paths.fill_course`` uses
 
     Laws of states inside a step are computed on demand and cached.
     """
@@ -148,7 +150,8 @@ def fill_impulses(
     of ``out`` (., K m) from ``row`` on.
 
     By Gauss quadrature ``out out'`` is the covariance of end and moments. Noise after ``end`` has
-    no effect. ``B`` is (n, m); the series ``to_end`` and ``to_moments`` are those of GridLaws.
+    no effect. ``B`` is (n, m); ``to_end`` (terms, n n + 1) and ``to_moments`` (terms, 2 n n + 1)
+    are the power series of GridLaws, of exp(A g) and of its two moments over a gap g.
     """
     n, m = B.shape
     for k in range(len(instants)):
@@ -206,8 +209,8 @@ def course_table(to_end: FloatArray, n: int, longest: float) -> FloatArray:
     (D, W) of the course of x over a piece of at most ``longest`` seconds.
 
     Rows 0 .. n - 1 are the factors of the state at the start, to be scaled by powers of the length
-    of the piece; the other n those of the coefficients of the cubic. ``to_end`` is the series of
-    GridLaws.
+    of the piece; the other n those of the coefficients of the cubic. ``to_end`` (terms, n n + 1) is
+    the power series of exp(A g) of GridLaws.
     """
     # Later terms are below rounding, see linalg/series.
     needed = int(np.searchsorted(to_end[:-1, -1], longest)) + 1

@@ -384,12 +384,14 @@ def fill_steps(
     """Write S sensing steps of B paths into ``out``: states at their starts and ends (B, S, n),
     moments (B, S, 2, n) and cubics (B, S, 3, n).
 
-    normals     (B, S, 3 n) standard normal numbers factor      (3 n, 3 n) GridLaws.noise_factor:
-    covariance root of end and moments of one step response    (3, n, n) GridLaws.response: their
-    response to the state at the start period      length of a step in seconds frame_steps steps
-    from one frame to the next; 0: no frames drawn       number of steps of these paths before this
-    call x           (B, n) state before the steps, replaced by the one after them noise
-    (3 n,) scratch
+    normals     (B, S, 3 n) standard normal numbers
+    factor      (3 n, 3 n) GridLaws.noise_factor: covariance root of end and moments of one step
+    response    (3, n, n) GridLaws.response: their response to the state at the start
+    period      length of a step in seconds
+    frame_steps steps from one frame to the next; 0: no frames
+    drawn       number of steps of these paths before this call
+    x           (B, n) state before the steps, replaced by the one after them
+    noise       (3 n,) scratch
     """
     x_start, x_end, moments, cubic = out
     runs, steps, n = x_start.shape

@@ -103,7 +103,7 @@ def sampling_ticks(
     """Return the times (K,) in seconds, below the ``horizon``, at which a sensor samples.
 
     ``entity`` is the node and the number of the sensor among those of that node. Streams:
-    "sampling" and "sampling phase".
+    "sampling" and "sampling phase". ``generator`` returns the sensor's stream for such a purpose.
     """
     phase = partial(generator, "sampling phase")
     return generate_ticks(clock, entity, phase, generator("sampling"), horizon, "sampling")

@@ -125,7 +125,8 @@ class Transitions:
 
 
 def noise_factors(noise: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return ``S`` (K, n, n), lower triangular, and ``D`` (K, n, c) with ``S D = noise`` (K, n, c).
+    """Return ``S`` (K, n, n), lower triangular, and ``D`` (K, n, c) with ``S D = noise`` (K, n, c),
+    for K matrices of c columns.
 
     The rows of D are orthonormal; where a row of ``noise`` depends on those before it, its row of D
     and its column of S are zero. Gram-Schmidt, each row twice (Kahan and Parlett): Householder

@@ -105,7 +105,7 @@ def together(nodes: int, runs: int) -> int:
 
 def pause_of(state: Simulation, ticks: int, count: int) -> float:
     """Return the simulated time in seconds after which ``count`` runs with ``ticks`` ticks each
-    process their visits: as long as the queue of visits has space for.
+    process their visits, predictions of nodes: as long as the queue of visits has space for.
     """
     nodes = len(state.nodes)
     visits_per_run = (
@@ -117,8 +117,8 @@ def pause_of(state: Simulation, ticks: int, count: int) -> float:
 
 def simulate_together(state: Simulation, visits: Visits, batch: BatchArrays, group: int) -> None:
     """Simulate all R runs of a batch up to the horizon, ``group`` of them at a time; the results
-    are in ``batch`` and the samples in ``state.buffer``. ``visits`` is scratch space for ``group``
-    runs.
+    are in ``batch`` and the samples in ``state.buffer``. ``visits`` is an empty queue, scratch
+    space for ``group`` runs.
     """
     ticks = int(batch.first[-1]) // len(batch.lengths)
     pause, progress = pause_of(state, ticks, group), np.zeros(group, dtype=PROGRESS)
@@ -149,8 +149,9 @@ def simulate_agenda(
     pause: float,
 ) -> int:
     """Simulate the R runs of a batch, G = ``len(progress)`` of them together, which process their
-    visits every ``pause`` seconds of simulated time. If ``progress`` is empty simulate one run
-    until it needs something from Python. Return the request, DONE for a batch.
+    visits (predictions of one node, or of two that then combine) every ``pause`` seconds of
+    simulated time. If ``progress`` is empty simulate one run until it needs something from Python.
+    Return the request, DONE for a batch.
 
     ``visits_memory`` and ``batch_memory`` are the blocks of memory (int64 words) of a Visits and a
     BatchArrays, since numba dispatches on arrays faster than on structs; ``progress`` (G,) are
@@ -247,9 +248,9 @@ def resume(state: Simulation, batch: BatchArrays, progress: np.ndarray, k: int) 
 
 @kernel
 def run_agenda(state: Simulation, visits: Visits, until: float) -> int:
-    """Go through the events of the present run before ``until`` (seconds): queue visits, and
-    process them whenever the queue is full. Return why it stopped (WANT_..., DONE or PAUSE). The
-    last visits are still queued then.
+    """Go through the events of the present run before ``until`` (seconds): queue visits,
+    predictions of one node or of two that then combine, and process them whenever the queue is
+    full. Return why it stopped (WANT_..., DONE or PAUSE). The last visits are still queued then.
     """
     request = FULL
     # A batch has space for all of its samples: WANT_SAMPLES comes after the last one and is
@@ -263,9 +264,10 @@ def run_agenda(state: Simulation, visits: Visits, until: float) -> int:
 
 @kernel
 def queue_events(state: Simulation, visits: Visits, until: float) -> int:
-    """Go through the events of the present run before ``until`` (seconds) and queue visits; return
-    why it stopped (WANT_..., DONE, PAUSE or FULL). Moves the positions ``tick_at``, ``grid_at``,
-    ... of ``state`` behind these events.
+    """Go through the events of the present run before ``until`` (seconds) and queue visits,
+    predictions of one node or of two that then combine; return why it stopped (WANT_..., DONE,
+    PAUSE or FULL). Moves the positions ``tick_at``, ``grid_at``, ... of ``state`` behind these
+    events.
     """
     nodes = len(state.nodes)
     first, max_visits = (state.run - state.first_run) * nodes, nodes + 2 + state.most_messages
@@ -307,8 +309,9 @@ def end_of_ticks(state: Simulation) -> float:
 
 @kernel
 def queue_ticks(state: Simulation, visits: Visits, first: int, until: float) -> None:
-    """Queue the visits of the next tick, and of all later ticks before ``until`` (seconds) while
-    the queue has space. ``first`` is the place of the run's first node in ``state.xhat``.
+    """Queue the visits, predictions of nodes that send and receive, of the next tick, and of all
+    later ticks before ``until`` (seconds) while the queue has space. ``first`` is the place of the
+    run's first node in ``state.xhat``.
     """
     ticks, space = state.ticks, len(visits.records) - 2 - state.most_messages
     queue_tick(state, visits, first, ticks.t[state.tick_at])
@@ -319,9 +322,9 @@ def queue_ticks(state: Simulation, visits: Visits, first: int, until: float) -> 
 
 @kernel
 def queue_tick(state: Simulation, visits: Visits, first: int, now: float) -> None:
-    """Queue the visits of the next tick, at ``now`` (seconds); record or count its messages and
-    their absorption, and advance ``state.tick_at``. ``first`` is the place of the run's first node
-    in ``state.xhat``.
+    """Queue the visits, predictions of nodes that send and receive, of the next tick, at ``now``
+    (seconds); record or count its messages and their absorption, and advance ``state.tick_at``.
+    ``first`` is the place of the run's first node in ``state.xhat``.
     """
     ticks, nodes, k = state.ticks, state.nodes, state.tick_at
     entity, bits = state.entities[ticks.entity[k]], ticks.arrival_bits[k]

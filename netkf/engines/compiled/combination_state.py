@@ -98,7 +98,8 @@ class CombinationState(Struct):
 
 def combination_state_of(scenario: Scenario, state: Simulation) -> CombinationState | None:
     """Return the extra arrays that the filter's combination needs, at time 0, None if it needs
-    none. Its ``lanes`` and ``evidence`` are views of ``state.xhat`` and ``state.root``.
+    none. Its ``lanes``, and parts of its ``evidence``, are views of ``state.xhat`` and
+    ``state.root``.
     """
     if state.combination_kind not in (BEST, INVERSE, GAINS, PREDICTIONS, BELIEFS):
         return None

@@ -205,8 +205,8 @@ class SlotEvents:
                 self._end_step(exchange_step, up[step])
 
     def _iterate_steps(self, slot: int) -> Iterator[Step]:
-        """Yield the E steps of the exchanges of slot number ``slot`` in order, none if nothing is
-        exchanged.
+        """Yield the E steps of the exchanges of slot number ``slot`` in order, with their phase and
+        times in seconds; none if nothing is exchanged.
         """
         setup, algorithm, repeats = self._setup, self._algorithm, [0, 0]
         # At the horizon filters that predict are only sampled.

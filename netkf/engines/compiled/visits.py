@@ -261,8 +261,10 @@ def queue_sample(state: Simulation, visits: Visits, first: int) -> None:
 
 @kernel
 def process_visits(state: Simulation, visits: Visits) -> None:
-    """Process all queued visits, level by level, and empty the queue. Changes ``state.xhat``,
-    ``root`` and ``now`` of the nodes visited, and stores samples in ``state.buffer``.
+    """Process all queued visits, level by level, and empty the queue: a visit predicts one node to
+    a time, or two nodes that then combine their estimates, or stores a sample. Changes
+    ``state.xhat``, ``root`` and ``now`` of the nodes visited, and stores samples in
+    ``state.buffer``.
     """
     for level in range(1, visits.top + 1):
         process_level(state, visits, visits.first[level])
