@@ -132,8 +132,8 @@ class BlockCheckpoints:
             return _restore_statistics(arrays)
 
     def traces(self) -> Iterator[Trace]:
-        """Yield the traces of all blocks in the order of replicas; raises EngineError as ``load``
-        does.
+        """Yield the traces of all blocks in the order of replicas; raises EngineError if a block
+        was damaged meanwhile.
         """
         for number in sorted(self._numbers):
             file = self._block_path(number)

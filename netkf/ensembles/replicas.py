@@ -123,6 +123,12 @@ def _gather(
 ) -> Any:
     """Return the merged result of all blocks: known ones are loaded, others run on the pool, and
     all are merged as they complete.
+
+    job      : all the work as one job, whose ``size`` is that of numbered blocks, 0 without such
+    together : smallest number of replicas in a block run in this process, None for the default
+    merge    : joins the results of neighbours
+    blocks   : which numbered blocks are known
+    progress : called with the numbers of runs done and of all runs after each block
     """
     tree, runs_done, known = MergeTree(merge), 0, blocks.known
 

@@ -136,7 +136,9 @@ def _read_averages(rows: list[dict[str, Any]]) -> tuple[FloatArray, FloatArray]:
 def _read_samples(path: Path, scenario: Scenario) -> dict[str, Any]:
     """Return the arrays of an ensemble in ensemble.parquet, by the names of Ensemble's attributes.
 
-    Raises DamagedError if the table does not have the columns and rows of the scenario.
+    For T times and N nodes: ``runs`` (T,) the runs that reached each time, means and standard
+    errors of P and of e e' (T, N, n, n), those of NEES (T, N). Raises DamagedError if the table
+    does not have the columns and rows of the scenario.
     """
     n, N = scenario.plant.n, len(scenario.nodes)
     i, j = np.triu_indices(n)

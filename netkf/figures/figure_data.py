@@ -268,7 +268,10 @@ def reduce_samples(
 
 
 def reduce_ensemble(scenario: Scenario, ensemble: Ensemble, promised: PromisedTraces) -> FigureData:
-    """Return the data to draw of an ensemble with its bounds and limits."""
+    """Return what a figure of an ensemble shows: means over the runs as traces (T, N), and limits.
+
+    promised : traces of the bounds and limits that theory gives for the scenario's filter
+    """
     default_status = "diverged" if ensemble.diverged else "complete"
     return FigureData(
         scenario,

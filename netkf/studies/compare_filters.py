@@ -219,8 +219,12 @@ def _make_row(
 
 
 def _candidates(scenario: Scenario, filters: Any, engine: str) -> tuple[FilterEntry, ...]:
-    """Return the filters with their scenarios; raises ScenarioError for what is no list of filters,
-    and if none can run.
+    """Return the filters with their scenarios, or with the reason why they cannot run, in their
+    order.
+
+    ``filters`` are names, tables or objects as in ``netkf.compare_filters``; ``engine`` is the name
+    of the engine that is to run them. Raises ScenarioError for what is no list of filters, for
+    filters that do not differ, and if none can run.
     """
     if isinstance(filters, str) or not isinstance(filters, Sequence) or not filters:
         rule, remedy = "must be a list of filters", 'such as ["hcmci", "icf"]'
@@ -241,7 +245,11 @@ def _candidates(scenario: Scenario, filters: Any, engine: str) -> tuple[FilterEn
 
 
 def _make_candidate(scenario: Scenario, choice: Choice, engine: str) -> FilterEntry:
-    """Return a filter with its scenario, or with the reason why it cannot run here."""
+    """Return a filter with its scenario, or with the reason why it cannot run here.
+
+    ``scenario`` is changed to this filter alone; ``engine`` is the name of the engine that is to
+    run it.
+    """
     if isinstance(choice, Filter):
         filtering = dataclasses.replace(scenario.filter, algorithm=choice)
         make = partial(dataclasses.replace, scenario, filter=filtering)

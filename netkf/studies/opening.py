@@ -112,7 +112,14 @@ def _read_sweep(folder: Path, scenario: Scenario, manifest: dict[str, Any]) -> S
 
 
 def _read_table(path: Path, keys: tuple[str, ...]) -> pd.DataFrame:
-    """Return the table of a sweep: numbers, and texts in columns of keys and of the status."""
+    """Return the table of a sweep: a row for each point, its columns in the order of the file.
+
+    keys : keys of the scenario that were swept: columns of their values, numbers or texts
+
+    Columns other than these and ``status`` (text) hold numbers. Raises DamagedError if a column of
+    keys, counts of runs, results or the status is missing or double, or if another column holds
+    texts.
+    """
     import pandas as pd
 
     names = column_names(path)

@@ -90,7 +90,11 @@ class GridPoint(NamedTuple):
 
 
 def expand_grid(scenario: Scenario, grid: Mapping[str, Sequence[Any]]) -> list[GridPoint]:
-    """Return all points, the last key running fastest; raises ScenarioError for a bad value."""
+    """Return all points, the last key running fastest; raises ScenarioError for a bad value.
+
+    ``grid`` has the values of each key that is varied, by the key's path such as
+    ``network.activation.rate``.
+    """
     values = check_grid(grid)
     points = [
         dict(zip(values, chosen, strict=True)) for chosen in itertools.product(*values.values())

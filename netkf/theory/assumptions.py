@@ -45,7 +45,11 @@ def assumptions(scenario: Scenario) -> pd.DataFrame:
 
 
 def assumption_rows(scenario: Scenario) -> list[AssumptionRow]:
-    """Return the rows of the table of ``assumptions``."""
+    """Return a row for each assumption on a scenario: text, equation, whether it holds, and why.
+
+    In continuous time they are those of H, in slots those of the filter's paper or, without one, of
+    any filter in slots.
+    """
     rows = _slot_rows(scenario) if scenario.slotted else _clock_rows(scenario)
     if not scenario.is_linear:
         rows = [("readings are linear in the state", "all papers", False, NONLINEAR), *rows]

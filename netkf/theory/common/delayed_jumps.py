@@ -186,9 +186,8 @@ class DelayedJumps:
         return np.asarray((self._coupling @ columns).reshape(M, k, M).swapaxes(0, 1))
 
     def _driven_by(self, Phi: FloatArray) -> FloatArray:
-        """Return the right-hand side (k + 1, M, M) of the boundary value problem of ``_residual``
-        for white noise of covariance Phi (M, M) per second, which enters its second equation (entry
-        0).
+        """Return the right-hand side (k + 1, M, M) of the boundary value problem for white noise of
+        covariance Phi (M, M) per second, which enters its second equation (entry 0).
         """
         right = np.zeros((self.points + 1, *Phi.shape))
         right[0] = Phi

@@ -50,8 +50,9 @@ def steady_covariance_bound(scenario: Scenario) -> FloatArray:
 
 @lru_cache(maxsize=8)
 def _steady_bound(scenario: Scenario) -> FloatArray:
-    """Return the steady bound (N, n, n), cached because several promises are about it; raises the
-    errors of ``steady_covariance_bound``.
+    """Return the steady bound (N, n, n), cached because several promises are about it.
+
+    Raises TheoryError if there is none and if H(12) does not apply.
     """
     equations = coupled_riccati(scenario)
     P = steady_state(equations)

@@ -143,7 +143,8 @@ def steady_covariance(F: ArrayLike, Q: ArrayLike, H: ArrayLike, R: ArrayLike) ->
 def filtered_covariance(F: FloatArray, Q: FloatArray, H: FloatArray, R: FloatArray) -> FloatArray:
     """Return the steady covariance (n, n) after a reading, P (12); P* is that before it.
 
-    F and Q are (n, n), H (p, n), R (p, p); raises the errors of ``steady_covariance``.
+    F and Q are (n, n), H (p, n), R (p, p). Raises TheoryError if (F, H) is not detectable or P*
+    cannot be computed precisely.
     """
     P = steady_covariance(F, Q, H, R)
     information = H.T @ np.linalg.solve(R, H)

@@ -218,7 +218,10 @@ class ErrorFlow:
         self, times: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         """Return the transposes (K, n, n) of the four blocks of exp(M s) (2 n, 2 n), row by row, at
-        K ``times`` s in seconds, without the scale.
+        K ``times`` s in seconds.
+
+        M, with the rows (-A' G) and (Q A), is the Hamiltonian of ``dP/dt = A P + P A' + Q - P G P``
+        with ``G = H' R^-1 H``.
         """
         n, c = self._n, self._scale
         E = np.swapaxes(self._exp(times), 1, 2)

@@ -24,7 +24,10 @@ def push_sum_error_covariance(scenario: Scenario) -> FloatArray:
 
 
 def covariance_of_steps(steps: EstimationSteps) -> FloatArray:
-    """Return the covariance (N, n, n) of ``push_sum_error_covariance`` for given steps 4 and 5."""
+    """Return the steady covariance (N, n, n) of the nodes' errors for given steps 4 and 5.
+
+    Raises TheoryError if there is none: the mean-square radius of the steps is not below 1.
+    """
     return _covariance(steps, radius(steps))
 
 

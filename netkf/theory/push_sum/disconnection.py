@@ -161,7 +161,11 @@ def _read_graph(graph: Any) -> tuple[list[Any], list[Edge], bool]:
 
 
 def _link_probability(link: Edge, delivery: float | Mapping[Edge, float] | None) -> float:
-    """Return the probability that a link is up; raises TheoryError if there is none in [0, 1]."""
+    """Return the probability that a ``link`` is up: ``delivery``, or its entry for the link in
+    either direction.
+
+    Raises TheoryError if there is none, or none in [0, 1].
+    """
     p: Any = None
     if isinstance(delivery, Mapping):
         p = delivery.get(link, delivery.get(link[::-1]))
