@@ -17,9 +17,11 @@ import scipy.sparse
 import scipy.sparse.linalg
 
 from netkf.core.errors import TheoryError
-from netkf.linalg.arrays import ArrayLike, FloatArray, symmetric
+from netkf.linalg.arrays import ArrayLike, FloatArray
 from netkf.scenario.scenario import Scenario
 from netkf.theory.hybrid.coupled import coupled_riccati
+from netkf.theory.hybrid.linearised import is_stable, solve_map
+from netkf.theory.hybrid.packed import LinearisedRiccati, PackedRiccati
 from netkf.theory.hybrid.steady import steady_covariance_bound
 
 MAX_DENSE = 500  # unknowns up to which the exponential of the whole map is computed
@@ -35,35 +37,37 @@ def constant_gain_bound(
     itself if every node uses its L_i (derived). Raises TheoryError for sampled sensors, delays and
     wrong shapes, and if there is no steady state.
     """
-    A, right, start = _linear_equation(scenario, gains)
-    N, n, _ = start.shape
+    linear, constant = _linear_equation(scenario, gains)
+    packed = linear.packed
     if times is None:
-        return symmetric(_steady(A, right, n).reshape(N, n, n))
+        return _steady(linear, constant)
     moments = np.atleast_1d(np.asarray(times, dtype=np.float64))
     if not np.isfinite(moments).all() or (np.diff(moments, prepend=0.0) < 0.0).any():
         raise TheoryError("times must be finite, increasing and not negative")
     # An entry that stays 1 makes the constant term part of a linear map.
-    above = scipy.sparse.hstack([A, scipy.sparse.csr_array(right[:, None])])
-    below = scipy.sparse.csr_array((1, len(right) + 1))
+    above = scipy.sparse.hstack([linear.matrix(), constant.reshape(-1, 1)])
+    below = scipy.sparse.csr_array((1, constant.size + 1))
     all_times = scipy.sparse.csc_array(scipy.sparse.vstack([above, below]))
-    y, bounds = np.append(start.reshape(-1), 1.0), []
+    y, bounds = np.append(packed.start.reshape(-1), 1.0), []
     for gap in np.diff(moments, prepend=0.0):
         if all_times.shape[0] <= MAX_DENSE:
             y = scipy.linalg.expm(all_times.toarray() * gap) @ y
         elif gap > 0.0:
             y = scipy.sparse.linalg.expm_multiply(all_times * gap, y)
-        bounds.append(symmetric(y[:-1].reshape(N, n, n)))
+        bounds.append(packed.unpack(y[:-1].reshape(constant.shape)))
     return np.array(bounds)
 
 
 def _linear_equation(
     scenario: Scenario, gains: Sequence[ArrayLike] | None
-) -> tuple[scipy.sparse.csr_array, FloatArray, FloatArray]:
-    """Return the matrix (N n^2, N n^2), the constant term (N n^2,) and the start (N, n, n)."""
+) -> tuple[LinearisedRiccati, FloatArray]:
+    """Return the linear map of upper triangles (N, m), m = n (n + 1) / 2, and the constant term
+    (N, m), ``L_i R_i L_i' + Q``.
+    """
     equations = coupled_riccati(scenario)
     if equations.samples or equations.jumps or equations.delay:
         raise TheoryError("constant gains are for sensors in continuous time and no delay")
-    A, N, n = equations.A, len(equations.start), len(equations.A)
+    n = len(equations.A)
     observations = [scenario.observation_matrices(node, believed=True) for node in scenario.nodes]
     if gains is None:
         P = steady_covariance_bound(scenario)
@@ -71,23 +75,17 @@ def _linear_equation(
     gain_matrices = [np.asarray(L, dtype=np.float64) for L in gains]
     if [L.shape for L in gain_matrices] != [(n, len(H)) for H, _ in observations]:
         raise TheoryError("gains must have one (n, p_i) array for each node")
-    eye, blocks, constant = np.eye(n), [], np.empty((N, n, n))
-    for i, (L, (H, R)) in enumerate(zip(gain_matrices, observations, strict=True)):
-        closed = A - L @ H
-        blocks.append(np.kron(closed, eye) + np.kron(eye, closed))
-        constant[i] = L @ R @ L.T + equations.Q
-    leaving = scipy.sparse.diags_array(np.asarray(equations.coupling.sum(axis=1)).reshape(-1))
-    exchange = scipy.sparse.csr_array(equations.coupling - leaving)
-    matrix = scipy.sparse.block_diag(blocks) + scipy.sparse.kron(exchange, np.eye(n * n))
-    return scipy.sparse.csr_array(matrix), constant.reshape(-1), np.array(equations.start)
+    pairs = list(zip(gain_matrices, observations, strict=True))
+    corrections = np.array([L @ H for L, (H, _) in pairs])
+    packed = PackedRiccati(equations)
+    constant = packed.pack(np.array([L @ R @ L.T for L, (_, R) in pairs]) + equations.Q)
+    return packed.linear_with_gains(corrections), constant
 
 
-def _steady(A: scipy.sparse.csr_array, right: FloatArray, n: int) -> FloatArray:
-    """Return the steady state (N n^2,); raises TheoryError if the gains do not stabilise."""
-    factors = scipy.sparse.linalg.splu(scipy.sparse.csc_array(A))
-    # The map generates positive maps: it is stable iff -A X = I has a positive definite solution.
-    eye = np.tile(np.eye(n).reshape(-1), len(right) // (n * n))
-    X = symmetric(factors.solve(-eye).reshape(-1, n, n))
-    if not np.isfinite(X).all() or not np.linalg.eigvalsh(X)[:, 0].min() > 0.0:
+def _steady(linear: LinearisedRiccati, constant: FloatArray) -> FloatArray:
+    """Return the steady state (N, n, n) for the ``constant`` term (N, m); raises TheoryError if the
+    gains do not stabilise the filters.
+    """
+    if not is_stable(linear):
         raise TheoryError("constant gains do not stabilise the filters: there is no steady state")
-    return np.asarray(factors.solve(-right))
+    return linear.packed.unpack(solve_map(linear, constant))

@@ -31,15 +31,22 @@ def solve_linearised(
     right: FloatArray,
     tolerance: float = RESIDUAL_TOLERANCE,
 ) -> FloatArray:
-    """Return the solution X (N, m) of ``op_P(X) = -right``, for ``right`` (N, m) and the gains of P
-    (N, n, n); nan if the map is singular.
+    """Return the solution X (N, m) of H(12) linearised at P (N, n, n), see :func:`solve_map`.
 
-    Rows hold the m entries of the upper triangle of each node's matrix. The norm of the residual is
-    at most ``tolerance`` times that of ``right``, or as small as rounding lets it be. Raises
-    TheoryError if neither method can solve for so many unknowns.
+    m = n (n + 1) / 2 entries of the upper triangle for each of N nodes, as in ``right`` (N, m).
     """
-    linear = packed.linear(P)
-    eliminates = right.size <= FEW_UNKNOWNS or packed.eliminates_cheaply
+    return solve_map(packed.linear(P), right, tolerance)
+
+
+def solve_map(
+    linear: LinearisedRiccati, right: FloatArray, tolerance: float = RESIDUAL_TOLERANCE
+) -> FloatArray:
+    """Return the solution X (N, m) of ``linear(X) = -right``; nan if the map is singular.
+
+    The norm of its residual is at most ``tolerance`` times that of ``right`` (N, m), or as small as
+    rounding lets it be. Raises TheoryError if neither method can solve for so many unknowns.
+    """
+    eliminates = right.size <= FEW_UNKNOWNS or linear.packed.eliminates_cheaply
     with np.errstate(all="ignore"):
         X = None if eliminates else _solve_by_gmres(linear, right, tolerance)
         if X is None and not eliminates and right.size > MAX_ELIMINATED:
@@ -48,6 +55,21 @@ def solve_linearised(
                 "network has no small cuts to eliminate them by"
             )
         return _eliminate(linear, right) if X is None else X
+
+
+def is_stable(linear: LinearisedRiccati) -> bool:
+    """Return True if all solutions of ``dX/dt = linear(X)`` vanish with time.
+
+    The map generates positive maps, so that it is stable if and only if a positive definite X has a
+    negative definite image at every node: the solution X for -I, with a residual that nowhere
+    reaches I.
+    """
+    packed = linear.packed
+    P = packed.equations.start
+    right = packed.pack(np.broadcast_to(np.eye(P.shape[-1]), P.shape))
+    tolerance = 0.1 / float(np.linalg.norm(right))
+    X = packed.unpack(solve_map(linear, right, tolerance))
+    return bool(np.isfinite(X).all() and np.linalg.eigvalsh(X)[:, 0].min() > 0.0)
 
 
 def _eliminate(linear: LinearisedRiccati, right: FloatArray) -> FloatArray:

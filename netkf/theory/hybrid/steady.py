@@ -20,7 +20,7 @@ from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray
 from netkf.scenario.scenario import Scenario
 from netkf.theory.hybrid.coupled import CoupledRiccati, coupled_riccati
-from netkf.theory.hybrid.linearised import solve_linearised
+from netkf.theory.hybrid.linearised import is_stable, solve_linearised
 from netkf.theory.hybrid.packed import PackedRiccati
 from netkf.theory.hybrid.samples import transmits_at_samples
 
@@ -129,18 +129,6 @@ def _newton(packed: PackedRiccati, P: FloatArray) -> FloatArray:
     return packed.unpack(Y + change)
 
 
-def _is_stabilised(packed: PackedRiccati, P: FloatArray) -> bool:
-    """Return True if the gains of P (N, n, n) stabilise the linearisation X -> op(X) of H(12).
-
-    op generates positive maps, so that it is stable if and only if a positive definite X has a
-    negative definite op(X) at every node: op(X) = -I, with a residual that nowhere reaches I.
-    """
-    right = packed.pack(np.broadcast_to(np.eye(P.shape[-1]), P.shape))
-    tolerance = 0.1 / float(np.linalg.norm(right))
-    X = packed.unpack(solve_linearised(packed, P, right, tolerance))
-    return bool(np.isfinite(X).all() and np.linalg.eigvalsh(X)[:, 0].min() > 0.0)
-
-
 def _find_stabilising(packed: PackedRiccati, first: FloatArray | None = None) -> FloatArray | None:
     """Return covariances (N, n, n) whose gains stabilise H(12), or None if none were found.
 
@@ -155,7 +143,7 @@ def _find_stabilising(packed: PackedRiccati, first: FloatArray | None = None) ->
     drift = float(np.abs(equations.A).max()) + 1e-9
     step = 0.1 / (drift + leaving) if first is None else 1.0 / drift
     for _ in range(MAX_STEPS):
-        if _is_stabilised(packed, P):
+        if is_stable(packed.linear(P)):
             return P
         # One implicit step of dP/dt = H12(P): 0 = H12(P+) + (P - P+) / step.
         shift = equations.A - 0.5 / step * np.eye(n)
