@@ -45,7 +45,8 @@ def constant_gain_bound(
     if not np.isfinite(moments).all() or (np.diff(moments, prepend=0.0) < 0.0).any():
         raise TheoryError("times must be finite, increasing and not negative")
     # An entry that stays 1 makes the constant term part of a linear map.
-    above = scipy.sparse.hstack([linear.matrix(), constant.reshape(-1, 1)])
+    column = scipy.sparse.csc_array(constant.reshape(-1, 1))
+    above = scipy.sparse.hstack([linear.matrix(), column])
     below = scipy.sparse.csr_array((1, constant.size + 1))
     all_times = scipy.sparse.csc_array(scipy.sparse.vstack([above, below]))
     y, bounds = np.append(packed.start.reshape(-1), 1.0), []
