@@ -49,7 +49,11 @@ NUMBERS = ("margin", "low", "high", "tolerance", "seen", "expected", "off", "det
 
 
 def save_verdict(directory: Path, scenario: Scenario, verdict: Verdict, text: str = "") -> None:
-    """Write scenario.toml, verdict.json, verdict.csv, verdict.txt and results.npz."""
+    """Write scenario.toml, verdict.json, verdict.csv, verdict.txt and results.npz into
+    ``directory``.
+
+    ``text`` is that of verdict.txt; by default it is made from the verdict.
+    """
     with defer_signals():  # an interrupt must not leave a verdict that does not match its results
         _save_verdict(directory, scenario, verdict, text or verdict_text(verdict, scenario.claim))
 

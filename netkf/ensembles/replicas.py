@@ -37,8 +37,10 @@ class NumberedBlocks(NamedTuple):
 def replicate(
     task: Task, scenario: Scenario, runs: int, seed: int | None = None, **options: Any
 ) -> list[Any]:
-    """Return ``task(scenario, seed, replica)`` for the replicas ``first`` .. ``first + runs - 1``,
-    in their order; ``options`` are those of ``replicate_blocks``.
+    """Return ``task(scenario, seed, replica)`` for ``runs`` replicas, in their order.
+
+    ``options`` are those of ``replicate_blocks``, such as ``first``, the number of the first
+    replica (default: 0), and ``pool``.
     """
     block_task = partial(each_replica, partial(_as_list, task), operator.add)
     results: list[Any] = replicate_blocks(block_task, operator.add, scenario, runs, seed, **options)

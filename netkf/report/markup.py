@@ -38,7 +38,8 @@ def table_box(
 ) -> str:
     """Return a table in a box of its own scroll bar, so that the page never scrolls sideways.
 
-    ``header`` has the titles of the columns; the first cell of each row is the row's title.
+    ``header`` has the titles of the columns; the first cell of each of the ``rows`` is its title.
+    ``css_class`` is that of the table in the page's style sheet.
     """
     head = "".join(f'<th scope="col">{text(cell)}</th>' for cell in header)
     lines = []

@@ -184,7 +184,7 @@ def _merge_verdict(entries: list[_Entry]) -> list[_Entry]:
 def _report_command(
     directories: Sequence[str | Path], replica: int | None, trust: bool, out: Path | None
 ) -> str:
-    """Return the command line that makes the page."""
+    """Return the command line that makes the page, from the arguments of ``write_report``."""
     command = ["netkf", "report", *map(str, directories)]
     command += ["--replica", str(replica)] if replica is not None else []
     command += ["--trust"] if trust else []
@@ -205,9 +205,11 @@ def _compare(entries: list[_Entry], directories: Sequence[str | Path]) -> Compar
 def _assemble_page(
     entries: list[_Entry], comparison: Comparison | str | None, command: str, budget: Budget
 ) -> str:
-    """Return the page as HTML, with at most about as much data of each run as ``budget`` allows.
+    """Return the page of one or two ``entries`` as HTML, with at most about as much data of each
+    run as ``budget`` allows.
 
-    ``command`` is the command line that makes the page.
+    ``comparison`` of the two is left out if None, and a text if there is none; ``command`` is the
+    command line that makes the page.
     """
     packer = Packer()
     runs = [

@@ -251,8 +251,11 @@ def _build_component(
 ) -> Any:
     """Return the component of a table with the key ``kind``, or WAITING.
 
-    ``family`` is one of registry.KINDS. ``is_inner`` says that the table is the key ``inner`` of
-    another filter; it then has no keys of ``Filtering``.
+    family       : one of registry.KINDS
+    origin       : says from where a user's class may be imported
+    value        : the table, or a component to build again
+    default_kind : kind of a table without the key; None if the key is required
+    is_inner     : the table is the key ``inner`` of another filter, without keys of ``Filtering``
     """
     table = _as_dict(value)
     kind = table.pop("kind", default_kind)

@@ -60,7 +60,10 @@ def _scenario_table(
     filtering: Filtering,
     with_defaults: bool,
 ) -> dict[str, Any]:
-    """Return the tables of a scenario file, with these components instead of the scenario's own."""
+    """Return the tables of a scenario file, with these components instead of the scenario's own.
+
+    ``with_defaults``: keys at their defaults are written too.
+    """
     table = _field_values(scenario, with_defaults)
     table["plant"] = _kind_table("plant", plant, with_defaults)
     table["sensors"] = [_sensor_table(sensor, with_defaults) for sensor in scenario.sensors]

@@ -308,10 +308,11 @@ def _compare_quantity(
 def _pair_runs(
     first: RunDirectory, other: RunDirectory, quantity: str, node: int, level: float, entry: Entry
 ) -> Entry | None:
-    """Return the ``entry`` with a paired difference, run by run, and its interval at ``level``;
-    None if the runs do not have the same truth.
+    """Return the ``entry`` with a paired difference, run by run; None if the runs do not have the
+    same truth.
 
-    ``node`` is an id, -1 for all nodes together.
+    Its interval misses the true difference with probability ``level``. ``node`` is an id, -1 for
+    all nodes together.
     """
     end = min(first.rounding_from, other.rounding_from)
     base_values, values = (finished.by_run(quantity, node, end) for finished in (first, other))

@@ -151,8 +151,11 @@ def compare_filters(
 
     A filter is a kind (``"hcmci"``), a table (``{"kind": "hcmci", "steps": 3}``) or an object of
     netkf.parts; the start and the model of the scenario's own filter hold for all of them, and its
-    settings for its own kind. A filter that cannot run there says why in its row. Raises
-    ScenarioError if none can, or if there is no such kind.
+    settings for its own kind. A filter that cannot run there says why in its row. All marks of
+    differences are right together with probability ``confidence``. ``runs``, ``seed`` and the other
+    options are those of ``netkf.monte_carlo``, for each filter.
+
+    Raises ScenarioError if no filter can run, or if there is no such kind.
     """
     if not isinstance(scenario, Scenario):
         raise ScenarioError("", "compare_filters takes a netkf.Scenario", scenario, LOAD)
@@ -205,8 +208,11 @@ def _make_row(
     n: int,
     level: float,
 ) -> ComparedFilter:
-    """Return the row of a filter, with differences from the ``first`` one in intervals that miss
-    with probability ``level``; n is the number of states.
+    """Return the row of a filter called ``label``, with differences from the ``first`` one (None:
+    this is the first) in intervals that miss with probability ``level``.
+
+    ``values`` are the filter's averages over the runs, ``traffic`` that of replica 0; n is the
+    number of states.
     """
     diverged = int(values.diverged.sum())
     return ComparedFilter(

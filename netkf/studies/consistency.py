@@ -304,11 +304,12 @@ def consistency(
     scheduler: str | None = None,
     engine: str = "auto",
 ) -> Consistency:
-    """Compare NEES and, in slots, NIS with their expected values.
+    """Compare NEES and, in slots, NIS of ``runs`` runs with their expected values.
 
     The verdicts compare the NEES of each run with its exact expected value given the events of the
     run (run by run, Student's interval; all nodes together at ``confidence``), or with n if that is
-    unknown (push-sum with frozen or asymptotic gains, a user's own filter).
+    unknown (push-sum with frozen or asymptotic gains, a user's own filter). ``seed`` and the
+    options from ``workers`` on are those of ``netkf.monte_carlo``.
 
     Raises ScenarioError for bad arguments and if there is no truth.
     """

@@ -113,6 +113,7 @@ class _Search:
     """Traces of P by replays, and the gains (decreases of the trace) of sets of messages."""
 
     def __init__(self, replayer: Replayer, limit: float) -> None:
+        """Take the replayer of a run, and the ``limit`` that the trace of P is to reach."""
         self._replayer, self._limit = replayer, limit
         self._gains: dict[tuple[MessageKey, ...], float] = {}
 

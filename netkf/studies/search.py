@@ -151,14 +151,16 @@ def decide_by_theory(problem: SizingProblem, value: float) -> Probe:
 
 
 def decide_by_both(problem: SizingProblem, plan: SimulationPlan, value: float) -> Probe:
-    """Return the probe of a value from a bound if that reaches the target, else by simulation."""
+    """Return the probe of a ``value`` of the key from a bound if that reaches the target, else by
+    simulation as planned.
+    """
     bound = decide_by_theory(problem, value)
     return decide_by_simulation(problem, plan, value) if bound.target == NOT_SHOWN else bound
 
 
 def decide_by_simulation(problem: SizingProblem, plan: SimulationPlan, value: float) -> Probe:
-    """Return the probe of a value from simulations: the number of runs is doubled until the
-    interval of the quantity is on one side of the limit.
+    """Return the probe of a ``value`` of the key from simulations as planned: the number of runs is
+    doubled until the interval of the quantity is on one side of the limit.
     """
     scenario, target = problem.at(value), problem.target
     central = central_trace(scenario) if target.quantity == "within_central" else None
@@ -191,7 +193,9 @@ def decide_by_simulation(problem: SizingProblem, plan: SimulationPlan, value: fl
 
 
 def _is_futile(probe: Probe, target: Target, runs: int) -> bool:
-    """Return True if after a quarter of ``runs`` the forecast is more than FUTILE times these."""
+    """Return True if after a quarter of ``runs``, the most allowed, more than FUTILE times as many
+    are forecast to decide the value of the ``probe``.
+    """
     return probe.runs >= runs // 4 and _runs_to_decide(probe, target) > FUTILE * runs
 
 
@@ -209,6 +213,7 @@ class Search:
     """A bisection between two values of a key, which keeps all probes."""
 
     def __init__(self, problem: SizingProblem, decide: Callable[[float], Probe]) -> None:
+        """Take the problem, and the function that returns the probe of a value of the key."""
         self._problem, self._decide = problem, decide
         self.probes: list[Probe] = []
 

@@ -109,8 +109,10 @@ def size(
 
 
 def _describe_quantity(problem: SizingProblem, low: float, simulated: str) -> str:
-    """Return the description of the simulated quantity, after that of the bound that is tried
-    first.
+    """Return the description ``simulated`` of the simulated quantity, after that of the bound that
+    is tried first, if any.
+
+    ``low`` is the value of the key at which the bound is described.
     """
     if problem.by != "both":
         return simulated
@@ -155,7 +157,9 @@ def _check_range(scenario: Scenario, key: str, low: float, high: float) -> bool:
 
 
 def _choose_method(scenario: Scenario, key: str, ends: tuple[float, float], target: Target) -> str:
-    """Return theory if it is exact at both ends, both if it is a bound, else simulation."""
+    """Return "theory" if theory gives the target's quantity exactly at both ``ends`` of the range
+    of ``key``, "both" if it gives a bound, else "simulation".
+    """
     scenarios = [scenario.replace({key: end}) for end in ends]
     try:
         for at_end in scenarios:

@@ -117,7 +117,11 @@ def plan_sweep(
 def _simulate_points(
     plan: SweepPlan, options: PoolOptions, progress: Progress | None
 ) -> Iterator[Row]:
-    """Yield the row of each point when it is finished."""
+    """Yield the row of each point when it is finished.
+
+    ``options`` are those of the pool of workers; ``progress`` is called with the numbers of points
+    done and of all points after each point.
+    """
     with shared_pool(plan.runs, options) as pool:
         for k, point in enumerate(plan.points):
             with explain_failures(point.scenario):
@@ -129,7 +133,9 @@ def _simulate_points(
 
 
 def _make_row(point: GridPoint, metrics: RunMetrics) -> Row:
-    """Return the row of a grid point."""
+    """Return the row of a grid point, as ``netkf.sweep`` documents it, from the metrics of its
+    runs.
+    """
     quantities: dict[str, MeanEstimate] = {
         "worst_rms": square_root_of(worst_node(metrics.mean_square)),
         "mean_rms": square_root_of(all_nodes(metrics.mean_square)),
@@ -187,10 +193,13 @@ def sweep_to_directory(
 ) -> CompletedSweep:
     """Sweep and write sweep.parquet, sweep.csv, the base scenario.toml and manifest.json.
 
-    ``take`` is given a complete sweep before its files are written, which may fail; ``finish`` adds
-    its files to the directory before the manifest says that the sweep is complete. A sweep that is
-    interrupted keeps the rows that it had. Raises ScenarioError and WriteError before anything
-    runs, InterruptedRunError when interrupted.
+    out      : directory, new or empty; None: the first free runs/NAME-sweep-k
+    progress : called with the numbers of points done and of all points after each point
+    take     : called with a complete sweep before its files are written, which may fail
+    finish   : adds its files to the directory before the manifest says that the sweep is complete
+
+    A sweep that is interrupted keeps the rows that it had. Raises ScenarioError and WriteError
+    before anything runs, InterruptedRunError when interrupted.
     """
     import pandas as pd
 
@@ -232,7 +241,9 @@ def _write_rows(completed: CompletedSweep) -> None:
 
 
 def _write_manifest(directory: Path, plan: SweepPlan, points_done: int, status: str) -> None:
-    """Write manifest.json of a sweep with ``points_done`` points."""
+    """Write manifest.json of a sweep with ``points_done`` points into ``directory``; ``status`` is
+    "complete", "interrupted" or "failed".
+    """
     manifest = {
         "name": plan.base.name,
         "versions": versions(),

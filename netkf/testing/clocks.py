@@ -372,7 +372,8 @@ def _check_uniform(uniform: FloatArray, where: str, rule: str, remedy: str) -> F
     """Check that ``uniform`` (E, runs, length), the values of the stated distribution function at
     the gaps of E entities, is uniform in [0, 1] and that neighbouring gaps are uncorrelated.
 
-    Returns the same numbers scaled to mean 0 and variance 1.
+    Returns the same numbers scaled to mean 0 and variance 1. Messages say ``where`` the fault is
+    (the method), the broken ``rule`` and the ``remedy``.
     """
     distance = kolmogorov_distance(uniform.reshape(-1))
     # P(sqrt(N) D > x) <= 2 exp(-2 x^2), Massart 1990.

@@ -137,7 +137,8 @@ def _draw_matchings(
 ) -> np.ndarray:
     """Draw the matchings of ``slots`` slots and return a mask (slots, L) of the paired links.
 
-    Checks that the pairs are links and that no node is in two pairs.
+    Checks that the pairs are links and that no node is in two pairs; messages blame the method
+    ``where``.
     """
     index = {link: k for k, link in enumerate(topology.links)}
     is_paired = np.zeros((slots, len(index)), dtype=bool)

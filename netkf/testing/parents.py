@@ -111,8 +111,10 @@ def _trial_pairs(child: WatchedPart, parent: WatchedPart) -> Iterator[tuple[Tria
 def _clock_trial_pairs(
     child: WatchedPart, parent: WatchedPart, system: System, clock: str | None
 ) -> Iterator[tuple[Trial, Trial, str]]:
-    """Yield pairs of trials in continuous time, with samples and, if both filters take them, with
-    increments.
+    """Yield pairs of trials of child and parent in continuous time, with samples and, if both
+    filters take them, with increments; each with "round", the name of a trial's unit of time.
+
+    ``clock`` is what a node transmits by: the kind of activation, None if filters do not talk.
     """
     # The clock "readings" ticks when a node has taken a sample.
     needs_samples = child.part.needs_samples or parent.part.needs_samples or clock == "readings"

@@ -100,7 +100,9 @@ def check_plant_object(part: Any, seed: int) -> None:
 
 
 def _check_form(part: Any, name: str) -> None:
-    """Check the shapes of the matrices of a plant, and that ``start_cov`` is a covariance."""
+    """Check the shapes of the matrices of a plant, and that ``start_cov`` is a covariance; ``name``
+    is the class in messages.
+    """
     n = part.n
     matrix = part.F if isinstance(part, LinearPlant) else getattr(part, "A", np.zeros((n, n)))
     fits = isinstance(n, int) and matrix.shape == (n, n)
@@ -175,7 +177,8 @@ def _check_starts(
 ) -> None:
     """Check mean (n,) and covariance (n, n) of x(0) (n,), which ``start`` draws from a generator.
 
-    ``is_inherited`` says that the class does not override the method behind ``start``.
+    ``where`` is the method that messages blame, ``seed`` that of the generators. ``is_inherited``
+    says that the class does not override the method behind ``start``.
     """
     whitening = compute_whitening(part.start_cov)
     count = STARTS if len(whitening.factor) else FEW_STARTS
@@ -255,7 +258,8 @@ def _check_noise(
 def _check_slots(part: LinearPlant, copy: LinearPlant, name: str, seed: int) -> None:
     """Check a plant in slots: repeatable paths, moving frames, the law of x(0) and of the noise.
 
-    ``copy`` is the plant after pickling.
+    ``copy`` is the plant after pickling, ``name`` the class in messages, ``seed`` that of the
+    random generators.
     """
     where = f"{name}.truth"
 
@@ -350,7 +354,10 @@ def moment_law(A: FloatArray, B: FloatArray, gap: float) -> tuple[FloatArray, Fl
 
 def _check_diffusion(part: Diffusion, copy: Diffusion, name: str, seed: int) -> None:
     """Check a plant in continuous time: x(0), paths at sample and probe times, and paths on the
-    sensing grid. ``copy`` is the plant after pickling.
+    sensing grid.
+
+    ``copy`` is the plant after pickling, ``name`` the class in messages, ``seed`` that of the
+    random generators.
     """
     eigenvalues = np.linalg.eigvals(part.A)
     speed, growth = float(np.abs(eigenvalues).max()), float(eigenvalues.real.max())
@@ -370,8 +377,10 @@ def _check_sampled(
     """Check paths at sample and probe times: repeatable, the same without probes, and with noise of
     the stated law.
 
-    ``scale`` is the time constant of the plant, and the longest run without loss of digits, both in
-    seconds.
+    part, copy : the plant, and the same after pickling
+    where      : method that messages blame, such as ``MyPlant.sampled_truth``
+    seed       : that of the random generators
+    scale      : time constant of the plant, and the longest run without loss of digits, in seconds
     """
     time_constant, max_seconds = scale
     times = np.cumsum(time_constant * np.tile(GAPS, LENGTH // len(GAPS)))
@@ -422,6 +431,8 @@ def _check_sampled(
 def _check_grid(part: Diffusion, name: str, seed: int, steps: int) -> None:
     """Check the first ``steps`` steps of paths on the sensing grid: the same for several runs at
     once and for one, with cuts and without, and with noise of the stated law.
+
+    ``name`` is the class in messages, ``seed`` that of the random generators.
     """
     where, period = f"{name}.paths", float(part.sensing_period or 0.0)
     blocks = -(-steps // BLOCK)
@@ -477,8 +488,10 @@ def _check_one_path(
     part: Diffusion, where: str, cut: Any, times: tuple[FloatArray, FloatArray], seed: int
 ) -> None:
     """Check that ``path``, which draws one run, gives the states of ``cut``, the block that
-    ``paths`` drew for the same run; ``times`` are its probe and sample times (K,) and (K',) in
-    seconds.
+    ``paths`` drew for the same run with the same ``seed``.
+
+    ``times`` are its probe and sample times (K,) and (K',) in seconds; ``where`` is the method that
+    messages blame.
     """
     plant_random, probe_random, sample_random = (
         _make_generator(seed, 1, purpose) for purpose in ("plant", "probe", "samples")

@@ -39,6 +39,7 @@ class SensorReader:
     method = "slot_path"
 
     def __init__(self, sensor: Any, name: str) -> None:
+        """Take the ``sensor``, with a matrix H (p, n), and the name of its class."""
         self.sensor, self.where = sensor, f"{name}.{self.method}"
         self.p, self.n = len(sensor.R), sensor.H.shape[1]
 
@@ -131,6 +132,7 @@ class IncrementReader:
     """
 
     def __init__(self, sensor: Any, name: str) -> None:
+        """Take the ``sensor``, with a matrix H (p, n), and the name of its class."""
         self.sensor, self.where = sensor, f"{name}.path"
         self.p, self.n = len(sensor.R), sensor.H.shape[1]
 

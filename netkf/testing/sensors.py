@@ -125,6 +125,8 @@ def _check_same_readings(
     """Check that readings depend only on their streams, numbers and states: they stay the same if
     others are read in between, if some are left out or taken together, and for ``copy``, which
     reads the sensor after pickling.
+
+    ``nodes`` are ids of nodes with the sensor; ``seed`` is that of states and streams.
     """
     node, streams, x = nodes[0], Streams(seed), _make_states(seed, SHORT_LENGTH, reader.n)
     numbers = list(range(SHORT_LENGTH))
@@ -244,8 +246,11 @@ def _check_laws(reader: SensorReader, nodes: tuple[int, ...], seed: int) -> None
 
 
 def _check_increments(reader: IncrementReader, node: int, seed: int) -> None:
-    """Check the moments of increments: those of pieces add up to those of steps, equal streams give
-    equal ones, another state changes them by H times its integral, and their noise is white.
+    """Check the moments of increments at ``node`` (its id): those of pieces add up to those of
+    steps, equal streams give equal ones, another state changes them by H times its integral, and
+    their noise is white.
+
+    ``seed`` is that of states and streams.
     """
     x, other_x = _make_states(seed, 2, reader.n)
     streams = Streams(seed)
@@ -283,8 +288,8 @@ def _check_increments(reader: IncrementReader, node: int, seed: int) -> None:
 
 
 def _check_increment_noise(reader: IncrementReader, node: int, x: FloatArray, seed: int) -> None:
-    """Check that the noise of increments at the constant state ``x`` (n,) is white with the stated
-    R (p, p), in RUNS runs of STEPS steps.
+    """Check that the noise of increments of ``node`` (its id) at the constant state ``x`` (n,) is
+    white with the stated R (p, p), in RUNS runs of STEPS steps with ``seed``.
     """
     factor = compute_whitening(reader.sensor.R).factor
     whitened = []
@@ -304,7 +309,9 @@ def _check_regressors(
     sensor: RegressorSensor, reader: SensorReader, nodes: tuple[int, ...], seed: int
 ) -> None:
     """Check that H is C s, with s[k+1] = A s[k] + B xi and s[0] = ``start``: mean and covariance of
-    H in each slot, independence of the noise of readings and of two nodes.
+    H in each slot, independence of the noise of readings and of two of the ``nodes`` (ids).
+
+    ``seed`` is that of the streams.
     """
     slots, x = range(REGRESSOR_SLOTS), np.zeros((REGRESSOR_SLOTS, reader.n))
     pair = nodes[:2]
@@ -356,8 +363,10 @@ def _check_regressor_steps(sensor: RegressorSensor, H: FloatArray, labels: Noise
 
 
 def _check_times(sensor: Any, name: str, nodes: tuple[int, ...], seed: int) -> None:
-    """Check the sample times of a sensor: inside the run, increasing, the same from equal streams,
-    independent of the length of the run, and as many as the clock states.
+    """Check the sample times of a sensor at ``nodes`` (ids): inside the run, increasing, the same
+    from equal streams, independent of the length of the run, and as many as the clock states.
+
+    ``name`` is the class in messages, ``seed`` that of the streams.
     """
     where, horizon = f"{name}.sample_times", 30.0
     rate = sensor.sampling.mean_rate((nodes[0], 0)) if isinstance(sensor.sampling, Clock) else 1.0
@@ -382,8 +391,10 @@ def _check_times(sensor: Any, name: str, nodes: tuple[int, ...], seed: int) -> N
 
 
 def _check_sampling_rate(sensor: Any, where: str, nodes: tuple[int, ...], seed: int) -> None:
-    """Check the number of samples of many runs against the mean rate of the clock, if it has
-    one.
+    """Check the number of samples of many runs against the mean rate of the clock, if it has one.
+
+    ``nodes`` are ids, runs have the seeds ``seed`` + 1, + 2, ..., and messages blame the method
+    ``where``.
     """
     rate = sensor.sampling.mean_rate((nodes[0], 0))
     if not rate > 0.0:
@@ -422,6 +433,8 @@ def _read_times(sensor: Any, where: str, node: int, seed: int, horizon: float) -
 def _check_nonlinear(sensor: NonlinearSensor, name: str, seed: int) -> None:
     """Check that ``h`` and ``jacobian`` depend on the state and the node alone, have shapes that
     fit R, and that the Jacobian has the derivatives of ``h``.
+
+    ``name`` is the class in messages, ``seed`` that of the states tried.
     """
     positions = {node: (0.7 * k, -0.4 * k) for k, node in enumerate(sensor.nodes)}
     sensor = sensor.located(positions)
@@ -449,7 +462,7 @@ def _check_nonlinear(sensor: NonlinearSensor, name: str, seed: int) -> None:
 
 def _find_state_size(sensor: NonlinearSensor, name: str) -> int:
     """Return the smallest number of states, up to MAX_STATES, that ``h`` and ``jacobian`` accept;
-    raises AssertionError if there is none.
+    raises AssertionError, which names the class by ``name``, if there is none.
     """
     for n in range(1, MAX_STATES + 1):
         if _accepts_state_size(sensor, n):

@@ -198,7 +198,8 @@ def compare_means(sums: NoiseMoments, labels: list[str], level: float) -> Findin
     """Test the null hypothesis that every entry has mean 0 and is uncorrelated with the state.
 
     The mean of ``count`` entries of variance 1 is taken to be normal with variance 1 / count. Means
-    and correlations with states get half of the level each, if states are known.
+    and correlations with states get half of the ``level`` each, if states are known. ``labels``
+    name the entries of the noise in messages.
     """
     counts = np.diagonal(sums.together)
     if counts.max() < MIN_COUNT:
@@ -244,7 +245,8 @@ def compare_correlations(sums: NoiseMoments, labels: list[str], level: float) ->
 
     Under it there are no correlations between entries, with any entry one step before, of an entry
     with itself 2 to FURTHER + 1 steps before, and of |entry| with itself one step before (which
-    would show a varying variance). All comparisons share the level (Bonferroni).
+    would show a varying variance). All comparisons share the ``level`` (Bonferroni). ``labels``
+    name the entries in messages.
     """
     entries = [*_between(sums, labels), *_in_time(sums, labels), *_in_size(sums, labels)]
     entries = [entry for entry in entries if entry[1] >= MIN_COUNT]

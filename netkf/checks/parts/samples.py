@@ -54,7 +54,9 @@ PART_TYPES: dict[str, type[Any]] = {
 
 
 def summarise_parts(scenario: Scenario, run: Run) -> PartSummary:
-    """Return the summary of one run."""
+    """Return counts and sums of a run, by which the parts of the scenario are compared with their
+    laws.
+    """
     streams = Streams(run.seed, run.replica)
     return PartSummary(
         count_ticks(scenario, run),

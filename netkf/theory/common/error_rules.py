@@ -47,6 +47,9 @@ class ErrorRule:
     def __init__(
         self, scenario: Scenario, errors: StackedErrors, times: Collection[float] = ()
     ) -> None:
+        """Take the stacked ``errors`` of the scenario's nodes, which the rule changes, and
+        ``times``.
+        """
         self.scenario, self.errors, self.times = scenario, errors, times
 
     def sense(self, time: float, observations: EstimatorObservations) -> None:

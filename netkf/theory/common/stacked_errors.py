@@ -31,6 +31,9 @@ class Roots:
     """Square roots (n, n) of P of estimates, by name; each is a copy, and is set as a whole."""
 
     def __init__(self, stack: GaussianStack, owner: Mapping[Hashable, int | None]) -> None:
+        """Take the ``stack`` that holds the roots, and by ``owner`` the estimator whose increments
+        each estimate uses.
+        """
         self._stack, self._owner = stack, owner
 
     def __contains__(self, name: Hashable) -> bool:

@@ -168,10 +168,12 @@ def _from_tick_to_tick(
 ) -> SlotJumps:
     """Return the system from one exchange to the next, for periodic clocks that tick together.
 
-    Messages take ``delay`` seconds and are predicted over them. If no node has increments, a
-    predicted message has the error that the sender has at the arrival, as if it had been sent then.
-    Raises TheoryError if clocks differ, sensors do not sample at the ticks, the delay is not below
-    the period, or nodes have increments beside a delay.
+    ``clock`` is that of the messages, ``flow`` the dynamics between events, ``samples`` those of
+    the nodes that sample at ticks. Messages over ``directions`` take ``delay`` seconds and are
+    predicted over them. If no node has increments, a predicted message has the error that the
+    sender has at the arrival, as if it had been sent then. Raises TheoryError if clocks differ,
+    sensors do not sample at the ticks, the delay is not below the period, or nodes have increments
+    beside a delay.
     """
     _require_one_clock(clock, samples)
     N, n, _ = flow.drift.shape

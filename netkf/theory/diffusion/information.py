@@ -122,8 +122,8 @@ def _make_sources(scenario: Scenario) -> list[_Source]:
 def _draw_pasts(
     scenario: Scenario, sources: list[_Source], runs: int, random: np.random.Generator
 ) -> list[FloatArray]:
-    """Return for each source its states (runs, m) at random slots, the same slots for all
-    sources.
+    """Return for each source its states (runs, m) at ``runs`` random slots, the same slots for all
+    sources; m differs from source to source.
     """
     last = max(1, int(scenario.horizon / scenario.slot_plant.period))
     slots = random.integers(last, size=runs)

@@ -204,7 +204,8 @@ def _exact_row(
 ) -> AssumptionRow:
     """Return a row that holds if the radius that ``measure`` computes is below 1.
 
-    ``heavy``: mention heavy tails of averages over runs.
+    name  : the row's text and its equation
+    heavy : mention heavy tails of averages over runs
     """
     try:
         radius = measure()
