@@ -93,7 +93,9 @@ def stability_figure(data: FigureData) -> Picture:
 
 
 def _map_stable(scenario: Scenario, rates: Sequence[float]) -> np.ndarray:
-    """Return for DELIVERIES x increasing ``rates`` (1/s) if H(12) has a steady state."""
+    """Return a mask (D, K), True where H(12) has a steady state, for the D delivery probabilities
+    DELIVERIES and K increasing ``rates`` (1/s).
+    """
     stable = np.zeros((len(DELIVERIES), len(rates)), dtype=bool)
     first = 0
     # From a threshold on all rates have a steady state, and with fewer deliveries it is not lower:
@@ -116,8 +118,12 @@ def sweep_figure(name: str, table: Any, keys: Sequence[str], status: str) -> Pic
     """Draw the largest RMS error of a sweep over one or two keys, and mark points at which runs
     diverged or there is no bound.
 
-    ``name`` is that of the scenario, ``table`` has a row for each point, ``status`` is that of the
-    manifest. Raises UnavailableError for more keys, and without a finished point.
+    name   : that of the scenario
+    table  : a row for each point, as ``netkf.sweep`` returns it
+    keys   : paths of the keys that were varied, which are columns of the table
+    status : that of the manifest, such as "complete"
+
+    Raises UnavailableError for more keys, and without a finished point.
     """
     points = f"{name}: {len(table)} points"
     if status != "complete":
@@ -141,6 +147,8 @@ def sweep_figure(name: str, table: Any, keys: Sequence[str], status: str) -> Pic
 def _draw_sweep_curves(axes: Any, table: Any, keys: list[str]) -> None:
     """Draw the largest and the mean RMS error of a sweep over one key with 95% intervals, and the
     root of the bound.
+
+    ``table`` is that of the sweep, a row for each point; ``keys`` is a list of the one key.
     """
     positions, labels = _axis_positions(axes.set_xscale, table[keys[0]])
     order = np.argsort(positions, kind="stable")
@@ -171,8 +179,11 @@ def _draw_sweep_curves(axes: Any, table: Any, keys: list[str]) -> None:
 
 
 def _draw_sweep_map(axes: Any, table: Any, keys: list[str]) -> None:
-    """Draw a cell for each point of a sweep over two keys, coloured by the largest RMS error, with
-    crosses where runs diverged and circles where there is no bound.
+    """Draw a cell for each point of a sweep over two ``keys``, those of the horizontal and the
+    vertical axis, coloured by the largest RMS error, with crosses where runs diverged and circles
+    where there is no bound.
+
+    ``table`` is that of the sweep, a row for each point.
     """
     x_values, y_values = (list(dict.fromkeys(table[key].tolist())) for key in keys)
     errors = np.full((len(y_values), len(x_values)), np.nan)
@@ -202,8 +213,10 @@ def _draw_sweep_map(axes: Any, table: Any, keys: list[str]) -> None:
 
 
 def _describe_best(table: Any, keys: Sequence[str]) -> str:
-    """Return a sentence on the point of a sweep whose largest RMS error is smallest, and on the
-    number of points at which runs diverged.
+    """Return a sentence on the point of a sweep whose largest RMS error is smallest, with its
+    values of ``keys``, and on the number of points at which runs diverged.
+
+    ``table`` is that of the sweep, a row for each point.
     """
     finite = table[np.isfinite(table["worst_rms"])]
     diverged = int(table["status"].astype(str).str.contains("diverged").sum())
@@ -216,8 +229,8 @@ def _describe_best(table: Any, keys: Sequence[str]) -> str:
 
 
 def _axis_positions(set_scale: Callable[[str], Any], values: Any) -> tuple[FloatArray, list[str]]:
-    """Return the positions (K,) of a column of values on an axis, and the labels of the positions
-    0, 1, ..; numbers are their own positions and have no labels.
+    """Return the positions (K,) of a column of K ``values`` (a pandas Series) on an axis, and the
+    labels of the positions 0, 1, ..; numbers are their own positions and have no labels.
 
     ``set_scale`` is called with "log" if the numbers need a logarithmic axis.
     """
@@ -296,15 +309,17 @@ def law_figure(data: FigureData) -> Picture:
 
 
 def _draw_tail(axes: Any, sample: FloatArray, colour: str, dashes: str, label: str) -> None:
-    """Draw the share of a sorted ``sample`` (K,) that is at least as large as each of its values,
-    as a step function.
+    """Draw the share of an increasing ``sample`` (K,) that is at least as large as each of its
+    values, as a step function in this colour, dash pattern (of matplotlib) and legend ``label``.
     """
     share = 1.0 - np.arange(len(sample)) / len(sample)
     axes.plot(sample, share, color=colour, ls=dashes, label=label, drawstyle="steps-post")
 
 
 def _tail_claim(values: FloatArray) -> str:
-    """Return a sentence on the median and the 99% quantile of the finite traces of P."""
+    """Return a sentence on the median and the 99% quantile of the finite traces of P among
+    ``values`` (T, N), of N nodes at T times; there must be one.
+    """
     finite = values[np.isfinite(values)]
     median, high = np.quantile(finite, (0.5, 0.99))
     return f"The median trace of P is {median:.3g}; 1% of samples exceed {high:.3g}"

@@ -30,12 +30,13 @@ MAX_DENSE = 500  # unknowns up to which the exponential of the whole map is comp
 def constant_gain_bound(
     scenario: Scenario, times: Any = None, gains: Sequence[ArrayLike] | None = None
 ) -> FloatArray:
-    """Return the bound (T, N, n, n) on the mean covariance with constant ``gains``, at ``times``.
+    """Return the bound (T, N, n, n) on the mean covariance with constant ``gains``, at T ``times``.
 
-    ``gains`` has L_i (n, p_i) for each node; by default those of the steady state of H(12). Times
-    in seconds, increasing; for None the steady state (N, n, n) is returned. It is the mean of P_i
-    itself if every node uses its L_i (derived). Raises TheoryError for sampled sensors, delays and
-    wrong shapes, and if there is no steady state.
+    times : (T,) in seconds, increasing; for None the steady state (N, n, n) is returned
+    gains : L_i (n, p_i) for each of N nodes; by default those of the steady state of H(12)
+
+    The bound is the mean of P_i itself if every node uses its L_i (derived). Raises TheoryError for
+    sampled sensors, delays and wrong shapes, and if there is no steady state.
     """
     linear, constant = _linear_equation(scenario, gains)
     packed = linear.packed
@@ -64,6 +65,9 @@ def _linear_equation(
 ) -> tuple[LinearisedRiccati, FloatArray]:
     """Return the linear map of upper triangles (N, m), m = n (n + 1) / 2, and the constant term
     (N, m), ``L_i R_i L_i' + Q``.
+
+    ``gains`` are L_i (n, p_i) for each of N nodes, None for those of the steady state of H(12).
+    Raises TheoryError for sampled sensors, jumps, delays and wrong shapes.
     """
     equations = coupled_riccati(scenario)
     if equations.samples or equations.jumps or equations.delay:
@@ -84,8 +88,10 @@ def _linear_equation(
 
 
 def _steady(linear: LinearisedRiccati, constant: FloatArray) -> FloatArray:
-    """Return the steady state (N, n, n) for the ``constant`` term (N, m); raises TheoryError if the
-    gains do not stabilise the filters.
+    """Return the steady state (N, n, n) of the ``linear`` map with the ``constant`` term (N, m), m
+    = n (n + 1) / 2.
+
+    Raises TheoryError if the gains do not stabilise the filters.
     """
     if not is_stable(linear):
         raise TheoryError("constant gains do not stabilise the filters: there is no steady state")

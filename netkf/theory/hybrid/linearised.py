@@ -31,9 +31,12 @@ def solve_linearised(
     right: FloatArray,
     tolerance: float = RESIDUAL_TOLERANCE,
 ) -> FloatArray:
-    """Return the solution X (N, m) of H(12) linearised at P (N, n, n), see :func:`solve_map`.
+    """Return the solution X (N, m) of ``op_P(X) = -right``, for H(12) linearised at P (N, n, n).
 
-    m = n (n + 1) / 2 entries of the upper triangle for each of N nodes, as in ``right`` (N, m).
+    m = n (n + 1) / 2 entries of the upper triangle for each of N nodes, as in ``right`` (N, m); nan
+    if the map is singular. The norm of the residual is at most ``tolerance`` times that of
+    ``right``, or as small as rounding lets it be. Raises TheoryError if there are too many
+    unknowns.
     """
     return solve_map(packed.linear(P), right, tolerance)
 
@@ -43,8 +46,10 @@ def solve_map(
 ) -> FloatArray:
     """Return the solution X (N, m) of ``linear(X) = -right``; nan if the map is singular.
 
-    The norm of its residual is at most ``tolerance`` times that of ``right`` (N, m), or as small as
-    rounding lets it be. Raises TheoryError if neither method can solve for so many unknowns.
+    X and ``right`` (N, m) hold the m = n (n + 1) / 2 entries of the upper triangle for each of N
+    nodes. The norm of the residual is at most ``tolerance`` times that of ``right``, or as small as
+    rounding lets it be. Raises TheoryError if neither elimination nor GMRES can solve for so many
+    unknowns.
     """
     eliminates = right.size <= FEW_UNKNOWNS or linear.packed.eliminates_cheaply
     with np.errstate(all="ignore"):
@@ -58,11 +63,12 @@ def solve_map(
 
 
 def is_stable(linear: LinearisedRiccati) -> bool:
-    """Return True if all solutions of ``dX/dt = linear(X)`` vanish with time.
+    """Return True if all solutions of ``dX/dt = linear(X)``, an (n, n) matrix for each of N nodes,
+    vanish with time.
 
     The map generates positive maps, so that it is stable if and only if a positive definite X has a
     negative definite image at every node: the solution X for -I, with a residual that nowhere
-    reaches I.
+    reaches I. Raises TheoryError if there are too many unknowns to solve for.
     """
     packed = linear.packed
     P = packed.equations.start
