@@ -272,7 +272,9 @@ def _check_address(address: object) -> None:
 
 
 def _unreachable(address: str, reason: str) -> ScenarioError:
-    """Return the error for a scheduler that does not answer."""
+    """Return the error for a scheduler at this ``address`` that does not answer, for this
+    ``reason``.
+    """
     remedy = 'start one with "dask scheduler" and give its address, tcp://HOST:PORT'
     return ScenarioError("scheduler", f"cannot be reached ({reason})", address, remedy)
 

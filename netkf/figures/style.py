@@ -215,7 +215,9 @@ def draw_message(axes: Any, message: str) -> None:
 
 
 def message_figure(claim: str, message: str, caption: Sequence[str]) -> Picture:
-    """Return a figure that shows only a message, such as the reason why there are no data."""
+    """Return a figure that shows only a message, such as the reason why there are no data, with the
+    title ``claim`` and the sentences of the ``caption``.
+    """
     figure = new_figure(7.4, 2.2)
     draw_message(figure.add_subplot(), message)
     finish_figure(figure, claim, caption)

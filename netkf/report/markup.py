@@ -55,7 +55,9 @@ def table_box(
 
 
 def section(element_id: str, title: str, body: str) -> str:
-    """Return a section with a heading; ``body`` is HTML."""
+    """Return a section with the heading ``title``; ``body`` is HTML, ``element_id`` the id to link
+    to.
+    """
     return (
         f'<section id="{element_id}" aria-labelledby="{element_id}-title">'
         f'<h2 id="{element_id}-title">{text(title)}</h2>{body}</section>'

@@ -100,8 +100,11 @@ def write_report(
     """Write the page of one directory, or of two side by side, and return its path.
 
     The path is ``out``, by default ``report.html`` in the first directory. A second directory may
-    hold the verdict of ``netkf check`` on the first. Raises ScenarioError if netkf did not write a
-    directory or ``out`` is a file other than a page, WriteError if the page cannot be written.
+    hold the verdict of ``netkf check`` on the first. ``replica`` is the number of the run of an
+    ensemble to show, None for the first; with ``trust`` the classes that scenarios name are also
+    imported from their directories and the current folder, which executes these modules. Raises
+    ScenarioError if netkf did not write a directory or ``out`` is a file other than a page,
+    WriteError if the page cannot be written.
     """
     path = Path(directories[0]) / "report.html" if out is None else out
     _require_page(path)

@@ -68,14 +68,16 @@ def size(
     ``by`` is "theory" (a bound on the quantity, or its exact value), "simulation", or None: the
     exact value where it is known; else the bound where that reaches the target, and simulation
     where it does not. By simulation, runs are added at each value until an interval decides, at
-    most ``runs``; all values share the same random draws, and all decisions together are right
-    with probability ``confidence``. If the exact covariance of the errors given the events of a run
-    is known and cheap (small networks in slots) it replaces the squared errors, which takes far
-    fewer runs. The quantity is assumed to be monotone in the key; that is checked at the values
-    that are tried.
+    most ``runs``; all values share the same random draws, and all decisions together are right with
+    probability ``confidence``. If the exact covariance of the errors given the events of a run is
+    known and cheap (small networks in slots) it replaces the squared errors, which takes far fewer
+    runs. The quantity is assumed to be monotone in the key; that is checked at the values that are
+    tried.
 
-    Raises ScenarioError for a wrong key, range or target, TheoryError with ``by="theory"`` if
-    theory has no answer.
+    ``seed``, ``workers``, ``executor``, ``scheduler`` and ``engine`` are those of
+    ``netkf.monte_carlo``; ``progress`` is called with a line of text as simulations go on. Raises
+    ScenarioError for a wrong key, range or target, TheoryError with ``by="theory"`` if theory has
+    no answer.
     """
     if not isinstance(scenario, Scenario):
         raise ScenarioError("", "size takes a netkf.Scenario", scenario, LOAD)

@@ -62,7 +62,8 @@ def sweep(
     engine: str = "auto",
     progress: Progress | None = None,
 ) -> pd.DataFrame:
-    """Simulate every point of a grid of key paths, ``{"network.activation.rate": [1.0, 2.0]}``.
+    """Simulate every point of a grid of key paths, ``vary`` =
+    ``{"network.activation.rate": [1.0, 2.0]}``.
 
     All points use the same seed, so the same truth, readings and channel draws: differences between
     rows are due to the keys. A row has the varied keys, ``runs``; ``worst_rms`` (of the node with
@@ -72,7 +73,9 @@ def sweep(
     and ``lost`` per run; ``status``, complete or diverged. All but messages are averages over the
     samples after time 0.
 
-    Raises ScenarioError, before anything runs, for a wrong key or value.
+    ``workers``, ``executor``, ``scheduler`` and ``engine`` are those of ``netkf.monte_carlo``;
+    ``progress(done, wanted)`` is called with numbers of points. Raises ScenarioError, before
+    anything runs, for a wrong key or value.
     """
     import pandas as pd
 

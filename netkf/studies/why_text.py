@@ -91,7 +91,7 @@ def why_document(explanation: Explanation) -> dict[str, Any]:
 def _message_entries(
     explanation: Explanation, keys: Sequence[MessageKey] | None
 ) -> list[dict[str, Any]] | None:
-    """Return messages as entries of the document."""
+    """Return the messages ``keys`` as entries of the document; None for None."""
     return None if keys is None else [_message_entry(explanation, key) for key in keys]
 
 
@@ -353,7 +353,7 @@ def _age_at_sample(explanation: Explanation, seconds: float) -> float:
 
 
 def _format_time_before(explanation: Explanation, seconds: float) -> str:
-    """Return a time as text, with its distance from the sample."""
+    """Return a time in seconds as text, with its distance from the sample."""
     # A filtered sample has the time of the beginning of its slot, before the slot's exchanges.
     since = (
         "in this slot" if seconds > explanation.at else f"{explanation.at - seconds:.4g} s before"

@@ -24,9 +24,10 @@ def is_recorded(channel: Channel) -> bool:
 
 
 def true_model_row(scenario: Scenario, source: str, matrices: str) -> AssumptionRow:
-    """Return the row that says if the filters' model is the true one; ``matrices`` names it.
+    """Return the row that says if the filters' model is the true one.
 
-    The verdict is None for recorded states or readings, which have no known model.
+    ``source`` is the equation of the paper, ``matrices`` a text on what is the same, such as "same
+    F, Q and R". The verdict is None for recorded states or readings, which have no known model.
     """
     if not scenario.is_random:
         return TRUE_MODEL, source, None, UNKNOWN_LAW

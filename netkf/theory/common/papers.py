@@ -16,7 +16,9 @@ def paper_module(scenario: Scenario, name: str) -> ModuleType:
 
 
 def paper_function(scenario: Scenario, module: str, name: str) -> Any:
-    """Return a function of a paper's module, or None if paper, module or function is missing."""
+    """Return the function ``name`` of a ``module`` of the paper of the scenario's filter, or None
+    if paper, module or function is missing.
+    """
     paper = scenario.node_filter.paper
     if not paper or importlib.util.find_spec(f"netkf.theory.{paper}.{module}") is None:
         return None

@@ -35,7 +35,9 @@ def slot_plant_rows(scenario: Scenario) -> list[AssumptionRow]:
 
 
 def start_rows(scenario: Scenario, source: str) -> list[AssumptionRow]:
-    """Return one row: each P_i(0) is at least the second moment of the node's first error."""
+    """Return one row, with the equation ``source``: each P_i(0) is at least the second moment of
+    the node's first error.
+    """
     plant, smallest = scenario.plant, np.inf
     starts = (scenario.initial_estimate(node) for node in scenario.nodes)
     # Most networks have one start for all nodes.
@@ -60,6 +62,8 @@ def model_and_start_rows(
 ) -> list[AssumptionRow]:
     """Return the rows of a filter in slots of which little is assumed: that it knows the model,
     those about its network, ``between``, and its first covariances.
+
+    ``source`` is the equation or section of the paper that the rows name.
     """
     return [
         true_model_row(scenario, source, "same F, Q and R"),

@@ -121,7 +121,11 @@ def _probability(
 def _link_probabilities(
     graph: Any, delivery: float | Mapping[Edge, float] | None
 ) -> tuple[int, dict[tuple[int, int], float]]:
-    """Return the number of nodes and the probability of each link, by the indices of its ends."""
+    """Return the number of nodes and the probability of each link, by the indices of its ends.
+
+    ``graph`` and ``delivery`` are those of ``disconnection_probability``. Raises TheoryError for
+    directed graphs and links without a probability in [0, 1].
+    """
     if isinstance(graph, Scenario):
         if delivery is None:
             delivery = _channel_probabilities(graph)

@@ -101,7 +101,9 @@ def slot_lines(results: dict[str, Any], number: Callable[[Any], str]) -> list[st
     """Return the results as lines for a terminal; ``number`` formats a value."""
 
     def text(name: str, make: Callable[[Any], str] = number) -> str:
-        """Return a value as text, or the reason why there is none."""
+        """Return the value ``name`` of the results as text, which ``make`` formats, or the reason
+        why there is none.
+        """
         value = results[name]
         return value["reason"] or make(value["value"])
 
