@@ -484,7 +484,9 @@ class GossipChecks(PaperChecks):
         return _summarise(scenario, run)
 
     def collect(self, scenario: Scenario, stacked: Any, seed: int) -> GossipSamples:
-        """Return the samples that the tests take, from stacked summaries."""
+        """Return the samples that the tests take, from stacked summaries of the runs of
+        ``seed``.
+        """
         return GossipSamples(scenario, stacked, seed)
 
     def assumptions(self, scenario: Scenario) -> list[Assumption]:

@@ -317,7 +317,9 @@ class HybridChecks(PaperChecks):
     """Promises of H, Theorems 2, 3 and Proposition 4."""
 
     def collect(self, scenario: Scenario, stacked: Any, seed: int) -> HybridSamples:
-        """Return the samples that the tests take, from stacked summaries."""
+        """Return the samples that the tests take, from stacked summaries of the runs of
+        ``seed``.
+        """
         return HybridSamples(scenario, stacked, seed)
 
     def assumptions(self, scenario: Scenario) -> list[Assumption]:

@@ -645,7 +645,9 @@ class IntermittentChecks(PaperChecks):
         return _summarise(scenario, run)
 
     def collect(self, scenario: Scenario, stacked: Any, seed: int) -> IntermittentSamples:
-        """Return the samples that the tests take, from stacked summaries."""
+        """Return the samples that the tests take, from stacked summaries of the runs of
+        ``seed``.
+        """
         return IntermittentSamples(scenario, stacked, seed)
 
     def assumptions(self, scenario: Scenario) -> list[Assumption]:

@@ -379,7 +379,9 @@ class PushSumChecks(PaperChecks):
         return PushSumSummary(**vars(summarise_exactly(scenario, run)), drift=drift)
 
     def collect(self, scenario: Scenario, stacked: Any, seed: int) -> PushSumSamples:
-        """Return the samples that the tests take, from stacked summaries."""
+        """Return the samples that the tests take, from stacked summaries of the runs of
+        ``seed``.
+        """
         return PushSumSamples(scenario, stacked, seed)
 
     def assumptions(self, scenario: Scenario) -> list[Assumption]:

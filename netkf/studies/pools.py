@@ -27,7 +27,9 @@ class _OpenPool(Pool):
         return self._pool.submit(job)
 
     def next_size(self, left: int, runs: int) -> int:
-        """Return the size of the next block."""
+        """Return the number of runs of the next block, when ``left`` of ``runs`` are not yet
+        submitted.
+        """
         return self._pool.next_size(left, runs)
 
     def wait(self, futures: Collection[Future[Any]]) -> Collection[Future[Any]]:

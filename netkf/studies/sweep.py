@@ -104,8 +104,9 @@ def plan_sweep(
     seed: int | None = None,
     engine: str = "auto",
 ) -> SweepPlan:
-    """Return a plan of ``runs`` runs at each point of the grid ``vary`` (values by key path), all
-    of which can be run; raises ScenarioError or EngineError.
+    """Return a plan of ``runs`` runs, with ``seed`` (None: the scenario's), at each point of the
+    grid ``vary`` (values by key path), all of which can be run; raises ScenarioError or
+    EngineError.
     """
     if not isinstance(scenario, Scenario):
         raise ScenarioError("", "sweep takes a netkf.Scenario", scenario, LOAD)

@@ -91,7 +91,7 @@ def why_document(explanation: Explanation) -> dict[str, Any]:
 def _message_entries(
     explanation: Explanation, keys: Sequence[MessageKey] | None
 ) -> list[dict[str, Any]] | None:
-    """Return the messages ``keys`` as entries of the document; None for None."""
+    """Return the messages ``keys`` as entries of the document, in their order; None for None."""
     return None if keys is None else [_message_entry(explanation, key) for key in keys]
 
 

@@ -227,8 +227,11 @@ def _check_channel_state(watched: WatchedPart) -> None:
 
 
 def _check_fractions(watched: WatchedPart, links: dict[Link, float], seed: int) -> None:
-    """Check simulated outcomes on all directed ``links`` against ``mean_delivery``,
-    ``independent`` and the law of bursts of a class derived from GilbertElliott.
+    """Check simulated outcomes on all directed ``links`` against ``mean_delivery``, ``independent``
+    and the law of bursts of a class derived from GilbertElliott.
+
+    ``links`` has for each link its entry in the graph's table of probabilities; ``seed`` is that of
+    the simulations.
     """
     part, where = watched.part, f"{watched.name}.mean_delivery"
     stated = np.array([part.mean_delivery(link, p) for link, p in links.items()])
@@ -332,7 +335,8 @@ def _simulate_deliveries(part: Loss, links: dict[Link, float], seed: int) -> Flo
     """Return outcomes (CHAINS, LENGTH, L) of messages over L directed links: 1 if the engine would
     deliver the message, else 0.
 
-    As in the engine, each directed link has random streams of its own.
+    ``links`` has for each link its entry in the graph's table of probabilities. As in the engine,
+    each directed link has random streams of its own, derived from ``seed``.
     """
     delivered = np.zeros((CHAINS, LENGTH, len(links)))
     for chain in range(CHAINS):

@@ -235,7 +235,9 @@ def _first_difference(one: FloatArray, other: FloatArray) -> int:
 
 
 def _check_gaps(watched: WatchedPart, entities: tuple[Entity, ...], seed: int) -> None:
-    """Check the mean and the law of the gaps between ticks, from simulated runs of all entities."""
+    """Check the mean and the law of the gaps between ticks, from runs of all entities simulated
+    with ``seed``.
+    """
     part, runs = watched.part, max(2, CHAINS // len(entities))
     stated = np.array([watched.call("mean_rate", entity) for entity in entities])
     not_positive = stated[stated <= 0.0]
@@ -285,8 +287,8 @@ def _check_stated_law(watched: WatchedPart, gaps: FloatArray, times: FloatArray)
 
 
 def _read_chain(part: Any, entity: Entity, seed: int, run: int, stream: int) -> FloatArray:
-    """Return the first LENGTH ticks (LENGTH,) of an entity in a ``run``, in seconds, fewer if the
-    clock stops.
+    """Return the first LENGTH ticks (LENGTH,) of an entity in a ``run`` of ``seed``, in seconds,
+    fewer if the clock stops.
 
     ``stream`` numbers the generators of the entity; entities with different numbers are
     independent.

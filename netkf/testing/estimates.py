@@ -36,7 +36,9 @@ def check_estimate(
 
 
 def _check_array(where: str, name: str, array: Any, shape: tuple[int, ...]) -> None:
-    """Raise AssertionError unless an array is float64, finite and of this ``shape``."""
+    """Raise AssertionError unless an array is float64, finite and of this ``shape``; messages call
+    it ``name`` and blame the method ``where``.
+    """
     demand(array.shape == shape, where, f"{name} must have the shape {shape}", str(array.shape))
     demand(array.dtype == np.float64, where, f"{name} must be float64", str(array.dtype))
     remedy = "return None where the filter has no P" if name == "P" else ""

@@ -101,7 +101,8 @@ def _check_recorded(part: RecordedSlots, name: str) -> None:
 
 
 def _check_network(watched: WatchedPart, copy: Any, topology: Topology, seed: int) -> None:
-    """Check the draws on one graph: form, repeatability, frequencies, independence of slots.
+    """Check the draws of ``seed`` on one graph: form, repeatability, frequencies, independence of
+    slots.
 
     ``copy`` is the object after pickling, which must draw the same.
     """
@@ -128,7 +129,7 @@ def _check_network(watched: WatchedPart, copy: Any, topology: Topology, seed: in
 
 
 def _make_generator(seed: int, run: int) -> np.random.Generator:
-    """Return the random generator of the matchings of a run."""
+    """Return the random generator of the matchings of a ``run`` (its number) of ``seed``."""
     return Streams(seed, run).generator("matching")
 
 
@@ -158,7 +159,9 @@ def _draw_matchings(
 
 
 def _demand_matching(where: str, pairs: list[Link], slot: int) -> None:
-    """Raise AssertionError if a node is in two of the ``pairs`` of a slot."""
+    """Raise AssertionError, which blames the method ``where``, if a node is in two of the ``pairs``
+    of a slot.
+    """
     nodes = [node for pair in pairs for node in pair]
     if len(set(nodes)) < len(nodes):
         fail(where, "must have every node in one pair at most", f"{list(pairs)} in slot {slot}")
@@ -216,8 +219,8 @@ def _check_frequencies(
 
 
 def _check_slots_independent(where: str, topology: Topology, is_paired: np.ndarray) -> None:
-    """Check that any two links are paired independently up to MAX_LAG slots apart, from
-    ``is_paired`` (slots, L).
+    """Check that any two of L links are paired independently up to MAX_LAG slots apart, from
+    ``is_paired`` (slots, L); messages blame the method ``where``.
     """
     p, slots = is_paired.mean(axis=0), len(is_paired)
     expected = p[:, None] * p

@@ -130,13 +130,13 @@ def _move_start(part: Any) -> tuple[Any, FloatArray] | None:
 
 
 def _make_generator(seed: int, run: int, purpose: str = "plant") -> np.random.Generator:
-    """Return the random generator of a run for a purpose."""
+    """Return the random generator of a ``run`` (its number) of ``seed`` for a purpose."""
     return Streams(seed, run).generator(purpose)
 
 
 def _demand_same(where: str, one: FloatArray, other: FloatArray, when: str) -> None:
-    """Check that two paths (K, n) from equal streams are equal; ``when`` says in messages how the
-    ``other`` one was drawn.
+    """Check that two paths (K, n) from equal streams are equal; messages blame the method
+    ``where``, and ``when`` says in them how the ``other`` path was drawn.
     """
     difference = scaled_difference(one, other)
     demand(
@@ -154,7 +154,7 @@ def _demand_moved(
     """Check that a path from a start moved by ``offset`` (n,), ``moved`` (K, n), differs from the
     path ``x`` (K, n) by the transition matrices ``Phi`` (K, n, n) times the offset.
 
-    ``law`` is the name of these matrices for messages.
+    In messages ``where`` is the method to blame and ``law`` the name of these matrices.
     """
     expected = Phi @ offset
     error = np.abs(moved - x - expected)

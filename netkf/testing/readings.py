@@ -98,7 +98,7 @@ class SampleReader(SensorReader):
 
 def make_readers(sensor: Sensor, name: str) -> list[SensorReader]:
     """Return the reader of a sensor, in a list: of its samples if it has a sampling clock or its
-    class overrides ``samples``, else of its readings in slots.
+    class overrides ``samples``, else of its readings in slots. ``name`` is that of the class.
     """
     has_clock = getattr(sensor, "sampling", None) is not None
     overrides_samples = type(sensor).samples not in (Sensor.samples, LinearSensor.samples)
@@ -188,8 +188,8 @@ class IncrementReader:
 
 
 def demand_matrices(sensor: Any, name: str) -> None:
-    """Raise AssertionError unless H (p, n) and R (p, p) of a sensor are matrices of these
-    shapes.
+    """Raise AssertionError unless H (p, n) and R (p, p) of a sensor are matrices of these shapes;
+    ``name`` is that of its class.
     """
     for field in ("H", "R"):
         matrix = getattr(sensor, field, None)

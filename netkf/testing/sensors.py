@@ -115,7 +115,9 @@ def check_sensor_object(part: Any, seed: int) -> None:
 
 
 def _make_states(seed: int, count: int, n: int, run: int = 0) -> FloatArray:
-    """Return random states (count, n) at which sensors are read, others for each ``run``."""
+    """Return random states (count, n) at which sensors are read, others for each ``run`` of
+    ``seed``.
+    """
     return 3.0 * Streams(seed, run).generator("testing").normal(size=(count, n))
 
 
@@ -415,8 +417,8 @@ def _check_sampling_rate(sensor: Any, where: str, nodes: tuple[int, ...], seed: 
 
 
 def _read_times(sensor: Any, where: str, node: int, seed: int, horizon: float) -> FloatArray:
-    """Return the sample times (K,), in seconds, of the sensor at ``node`` in a run of ``horizon``
-    seconds with ``seed``, which must be a float64 vector.
+    """Return the sample times (K,), in seconds, of the sensor at ``node`` (its id) in a run of
+    ``horizon`` seconds with ``seed``; the method ``where`` must return them as a float64 vector.
     """
     streams = Streams(seed)
 

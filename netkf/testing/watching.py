@@ -299,9 +299,10 @@ class WatchedPart:
         return {path.strip("[]'"): leaf for path, leaf in collect_leaves(attributes).items()}
 
     def _call_method(self, where: str, method: str, arguments: tuple[Any, ...]) -> Any:
-        """Call a method and return the result.
+        """Call a method with these ``arguments`` and return the result.
 
-        Raises AssertionError if the method fails or uses a global generator.
+        Raises AssertionError, which blames ``where``, if the method fails or uses a global
+        generator.
         """
         before = global_generator_states()
         try:
