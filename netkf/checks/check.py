@@ -283,7 +283,9 @@ def _judge_base(scenario: Scenario, results: list[ReplicaResult]) -> list[Eviden
 
 
 def _require_covariances(scenario: Scenario, results: list[ReplicaResult]) -> None:
-    """Raise TheoryError if the results hold no covariance that could be checked."""
+    """Raise TheoryError if the results hold no covariance that could be checked, or if runs
+    diverged as those of the built-in filter do, which leaves no limits to look at.
+    """
     summaries = [result.summary for result in results if result.summary is not None]
     diverged = len(results) - len(summaries)
     # A class that diverges where its base does not breaks a promise; a built-in one says nothing.

@@ -112,7 +112,12 @@ class BlockCheckpoints:
         return statistics
 
     def save(self, number: int, statistics: RunStatistics, identity: RunIdentity) -> None:
-        """Write block ``number`` with the traces that its runs left; raises WriteError."""
+        """Write block ``number`` with the ``statistics`` of its runs and the traces that these
+        left; raises WriteError.
+
+        ``identity`` is that of the scenario, seed and installation, by which a resumed run knows
+        its blocks.
+        """
         with writing_file(self._folder):
             self._folder.mkdir(exist_ok=True)
         # In memory first: on a full disk some versions of numpy leave their file open.

@@ -232,8 +232,10 @@ def _create_output(
 def _simulate(
     engine: Engine, scenario: Scenario, replica: int, recorder: Recorder, progress: Progress
 ) -> tuple[str, float]:
-    """Simulate run number ``replica``; return its status and its wall-clock seconds without
-    compiling.
+    """Simulate run number ``replica`` of the scenario's seed; return its status ("complete" or
+    "diverged") and its wall-clock seconds without compiling.
+
+    ``recorder`` takes events and states; ``progress`` is called as the run goes on.
     """
     start, compiled_before = time.perf_counter(), compiling.seconds_spent()
     status = engine.run(scenario, Streams(scenario.seed, replica), recorder, progress)

@@ -180,7 +180,9 @@ class _Innovations:
         self._noise = _plant_noise(scenario, self._streams, self._slots)
 
     def of_node(self, i: int) -> Iterator[tuple[float, float]]:
-        """Yield the NIS and its expected value (nan if unknown) in each slot of the i-th node."""
+        """Yield the NIS of the i-th node's readings and its expected value (nan if unknown) in each
+        slot where errors are not blurred; nothing without a sensor or for nonlinear readings.
+        """
         placed = self._scenario.placed_sensors.get(self._run.nodes[i], ())
         # A nonlinear reading has no H given the errors alone.
         if not placed or not self._scenario.is_linear:
