@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from netkf.studies.information import MessageKey
+from netkf.network.deliveries import MessageKey
 from netkf.studies.message_sets import SmallestSet
 
 GOOD_ENOUGH = 0.05

@@ -19,6 +19,7 @@ from typing import NamedTuple
 import numpy as np
 
 from netkf.linalg.arrays import FloatArray
+from netkf.network.deliveries import MessageKey
 from netkf.plants.recorded import RecordedSensor
 from netkf.scenario.derived import DerivedScenario
 from netkf.trace.schema import CODES
@@ -31,14 +32,6 @@ refused ones were too old for the filter, unused ones were replaced by another m
 instant.
 """
 USED, LOST, LATE, REFUSED, UNDER_WAY, UNUSED = range(len(OUTCOMES))
-
-
-class MessageKey(NamedTuple):
-    """The identity of a message: its directed link and its number on that link."""
-
-    sender: int
-    receiver: int
-    number: int
 
 
 @dataclass(frozen=True, eq=False)

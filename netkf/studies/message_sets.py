@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from netkf.linalg.arrays import FloatArray
-from netkf.studies.information import MessageKey
+from netkf.network.deliveries import MessageKey
 from netkf.studies.replay import Replayer
 
 NEGLIGIBLE = 1e-2

@@ -10,18 +10,15 @@ parts are then drawn anew, given the same whole.)
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Iterable
-from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from netkf.core.fields import field, instance_of
 from netkf.linalg.arrays import FloatArray
-from netkf.network.channels import Channel, Delay, Loss, NoDelay
-from netkf.network.graphs import Link, Topology
+from netkf.network.channels import Channel, NoDelay
+from netkf.network.deliveries import Chosen, Deliveries, DeliveringLoss, HurryingDelay, MessageKey
 from netkf.runs.simulate import simulate
 from netkf.scenario.scenario import Scenario
 from netkf.studies.information import (
@@ -29,121 +26,9 @@ from netkf.studies.information import (
     REFUSED,
     UNDER_WAY,
     IntArray,
-    MessageKey,
     match_messages,
     rows_until,
 )
-
-Chosen = frozenset[MessageKey]
-
-
-class Deliveries:
-    """The messages that are delivered in the next replay in any case: ``chosen``, all if None.
-    Those in ``hurried`` take no time.
-    """
-
-    def __init__(self) -> None:
-        self.chosen: Chosen | None = frozenset()
-        self.hurried: Chosen = frozenset()
-
-
-@dataclass(frozen=True, eq=False)
-class DeliveringLoss(Loss):
-    """The loss model ``given`` of the run, except that the messages of ``deliveries`` arrive.
-
-    All but the chosen messages have the same draws and fates as in the run.
-    """
-
-    given: Loss = field(instance_of(Loss))
-    # A mutable object, set before each replay: one scenario with its cached tables serves all.
-    deliveries: Deliveries = field(instance_of(Deliveries))
-
-    @property
-    def deterministic(self) -> bool:
-        """The value of the model ``given``, so that the same numbers are drawn."""
-        return self.given.deterministic
-
-    @property
-    def stateful(self) -> bool:
-        """The value of the model ``given``, so that the same numbers are drawn."""
-        return self.given.stateful
-
-    def next_state(self, bad: bool | None, random: np.random.Generator) -> bool:
-        """Return the next state of the channel, True if it is bad, by the model ``given``."""
-        return self.given.next_state(bad, random)
-
-    def delivery_probability(
-        self, link: Link, message: int, bad: bool, table_probability: float
-    ) -> float:
-        """Return 1 for chosen messages, else the probability of the model ``given``.
-
-        ``message`` is the number of the message on its ``link``, ``bad`` the state of the channel,
-        and ``table_probability`` the entry of the graph's table for the link.
-        """
-        chosen = self.deliveries.chosen
-        if chosen is None or (*link, message) in chosen:
-            return 1.0
-        return self.given.delivery_probability(link, message, bad, table_probability)
-
-    def mean_delivery(self, link: Link, table_probability: float) -> float:
-        """Return nan: this is one outcome, not a law."""
-        return math.nan
-
-    @property
-    def independent(self) -> bool:
-        """Return False: this is one outcome, not a law."""
-        return False
-
-    def check(self, topology: Topology) -> None:
-        """Raise ScenarioError if the model ``given`` does not fit the graph."""
-        self.given.check(topology)
-
-
-@dataclass(frozen=True, eq=False)
-class HurryingDelay(Delay):
-    """The delay model ``given`` of the run, except that hurried messages of ``deliveries`` take no
-    time.
-    """
-
-    given: Delay = field(instance_of(Delay))
-    deliveries: Deliveries = field(instance_of(Deliveries))
-
-    def draw(self, random: np.random.Generator) -> float:
-        """Return a draw of the model ``given``."""
-        return self.given.draw(random)
-
-    @property
-    def fixed(self) -> float | None:
-        """The value of the model ``given``."""
-        return self.given.fixed
-
-    @property
-    def longest(self) -> float:
-        """The value of the model ``given``."""
-        return self.given.longest
-
-    @property
-    def is_random(self) -> bool:
-        """The value of the model ``given``, so that the same numbers are drawn."""
-        return self.given.is_random
-
-    def message_delay(self, link: Link, message: int, drawn: float) -> float:
-        """Return the delay in seconds: 0 for hurried messages, else that of the model ``given``.
-
-        ``message`` is the number of the message on its link, and ``drawn`` the delay that was drawn
-        for it. A message that is recorded as lost has no delay (nan): it takes no time if it is
-        among the chosen ones, which this replay delivers.
-        """
-        chosen, key = self.deliveries.chosen, (*link, message)
-        if key in self.deliveries.hurried:
-            return 0.0
-        seconds = self.given.message_delay(link, message, drawn)
-        delivered = chosen is None or key in chosen
-        return 0.0 if delivered and math.isnan(seconds) else seconds
-
-    def check(self, topology: Topology) -> None:
-        """Raise ScenarioError if the model ``given`` does not fit the graph."""
-        self.given.check(topology)
 
 
 class Outcome(NamedTuple):

@@ -15,6 +15,7 @@ from netkf.core.errors import ScenarioError
 from netkf.core.fields import integer, number
 from netkf.core.printable import shorten
 from netkf.ensembles.stored import StoredEnsemble
+from netkf.network.deliveries import MessageKey
 from netkf.scenario.scenario import Scenario
 from netkf.studies.explanation import GOOD_ENOUGH, Explanation, InformationSource, Missing, WhatIf
 from netkf.studies.information import (
@@ -23,7 +24,6 @@ from netkf.studies.information import (
     Flow,
     IntArray,
     KeptReadings,
-    MessageKey,
     Messages,
     Newest,
     Reach,

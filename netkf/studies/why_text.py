@@ -7,10 +7,10 @@ from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
 from netkf.core.printable import shorten
+from netkf.network.deliveries import MessageKey
 from netkf.runs.files import to_json_value
 from netkf.runs.tables import format_number, format_table, shorten_rows
 from netkf.studies.explanation import GOOD_ENOUGH, Explanation, InformationSource, WhatIf
-from netkf.studies.information import MessageKey
 from netkf.studies.message_sets import SmallestSet
 
 if TYPE_CHECKING:
