@@ -67,7 +67,7 @@ class Replayer:
         self._node, self.at, self.count = scenario.nodes.index(node), at, 0
         self._deliveries = Deliveries()
         self._short, self._full = (
-            _delivering(_shorten(scenario, at, to_horizon), self._deliveries)
+            delivering(_shorten(scenario, at, to_horizon), self._deliveries)
             for to_horizon in (False, True)
         )
         self._outcomes: dict[tuple[Chosen | None, bool], Outcome] = {}
@@ -130,7 +130,7 @@ class Replayer:
         return rows_until(self.scenario, run.log, self.at)
 
 
-def _delivering(scenario: Scenario, deliveries: Deliveries) -> Scenario:
+def delivering(scenario: Scenario, deliveries: Deliveries) -> Scenario:
     """Return the scenario in which the messages of ``deliveries`` are delivered."""
     network = scenario.network
     channel_of_run = network.channel

@@ -7,11 +7,13 @@ from dataclasses import replace
 
 import networkx as nx
 import numpy as np
+import pandas as pd
 import pytest
 
 import netkf
 from netkf.cli.main import main
 from netkf.core.errors import ScenarioError
+from netkf.network.deliveries import Deliveries, MessageKey
 from netkf.scenario.reading import from_table
 from netkf.studies.information import (
     KeptReadings,
@@ -22,7 +24,7 @@ from netkf.studies.information import (
     search_back,
 )
 from netkf.studies.message_sets import Candidate, find_smallest_set
-from netkf.studies.replay import MessageKey, Replayer
+from netkf.studies.replay import Replayer, delivering
 from netkf.studies.why import why
 
 FLOW = {"kind": "diffusion", "A": [[-0.3]], "B": [[1.0]], "cov": [[1.0]]}
@@ -291,6 +293,43 @@ def test_what_ifs_are_those_of_a_run_from_recorded_losses(runs, name, node, at, 
     none_lost = netkf.simulate(scenario.replace({"network.channel.loss": {"kind": "none"}}))
     if name in ("hybrid", "gossip"):  # elsewhere some messages are late or under way
         assert found.what_ifs[-1].trace == pytest.approx(np.trace(none_lost.P[k, node]), rel=1e-9)
+
+
+CHANNELS = {
+    "directions": {"loss": HALF, "symmetric": False},
+    "links": {"loss": HALF, "symmetric": True},
+    "bursts": {
+        "loss": {
+            "kind": "gilbert-elliott",
+            "to_bad": 0.3,
+            "to_good": 0.4,
+            "deliver_good": 0.9,
+            "deliver_bad": 0.2,
+        }
+    },
+}
+
+
+@pytest.mark.parametrize("channel", CHANNELS)
+@pytest.mark.parametrize("name", ["gossip", "diffusion", "readings", "push-sum"])
+def test_both_engines_deliver_the_chosen_messages(runs, name, channel):
+    """Compiled slots draw the messages of many slots together, SimPy one at a time."""
+    scenario = runs[name][0].replace({"network.channel": CHANNELS[channel]})
+    events = netkf.simulate(scenario).events
+    lost = [
+        MessageKey(r.node, r.peer, r.message) for r in events[events.kind == "lost"].itertuples()
+    ]
+    assert len(lost) > 10
+    deliveries = Deliveries()
+    replayed = delivering(scenario, deliveries)
+    for chosen in (frozenset(lost[:1]), frozenset(lost[3::4]), frozenset(lost[-2:]), None):
+        deliveries.chosen = chosen
+        compiled, simpy = (netkf.simulate(replayed, engine=e) for e in ("compiled", "simpy"))
+        pd.testing.assert_frame_equal(compiled.events, simpy.events)
+        np.testing.assert_allclose(compiled.xhat, simpy.xhat, rtol=1e-9, atol=1e-12)
+        now = compiled.events[compiled.events.kind == "lost"]
+        still_lost = [(r.node, r.peer, r.message) for r in now.itertuples()]
+        assert still_lost == ([] if chosen is None else [key for key in lost if key not in chosen])
 
 
 @pytest.mark.parametrize(("name", "outcome"), [("refused", "refused"), ("late", "late")])

@@ -48,6 +48,7 @@ from netkf.engines.compiled.slot_setup import BATCH_BYTES, AssignedSensor, SlotS
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.lanes import LANES, MANY, aligned, blocks_of, by_run, in_lanes, unset
 from netkf.linalg.portable import solve_lower
+from netkf.network.deliveries import Deliveries
 from netkf.network.graphs import Link
 from netkf.plants.slot_paths import Path, draw_paths, draw_readings, draw_starts
 from netkf.rng.draws import StreamBatch
@@ -353,7 +354,36 @@ class SlotRuns:
             mark_paired_senders(MANY, channels, messages.active, messages.pair_count, messages.sent)
         elif decided:
             mark_all_senders(MANY, channels, exchanged, messages.sent)
+        if setup.deliveries is not None:
+            self._deliver_chosen(setup.deliveries, times, messages)
         return messages
+
+    def _deliver_chosen(
+        self, deliveries: Deliveries, times: SlotTimes, messages: SlotMessages
+    ) -> None:
+        """Write 1 into ``messages.up`` (1, S, E, W, L) for the messages that a replay of one run
+        delivers whatever was drawn.
+        """
+        setup, each = self.setup, self.setup.directions_per_link
+        is_sent = np.zeros(messages.up.shape[1:4], dtype=bool)
+        is_sent[times.exchanged] = setup.talks
+        if len(messages.active):
+            is_active = np.zeros((*is_sent.shape[:2], len(setup.ends)), dtype=bool)
+            for step in np.ndindex(*is_sent.shape[:2]):
+                pairs = messages.active[(0, *step)][: messages.pair_count[(0, *step)]]
+                is_active[(*step, pairs)] = True
+            is_sent &= np.repeat(is_active, each, axis=2)
+        if deliveries.chosen is None:
+            messages.up[0, ..., 0][is_sent] = 1
+            return
+        index = {direction: w for w, direction in enumerate(setup.directions)}
+        for sender, receiver, number in deliveries.chosen:
+            w = index[sender, receiver]
+            # The messages of this direction in the block, in order, by slot and step.
+            sent_slots, sent_steps = np.nonzero(is_sent[:, :, w])
+            k = number - int(self._sent[w])
+            if 0 <= k < len(sent_slots):
+                messages.up[0, sent_slots[k], sent_steps[k], w, 0] = 1
 
     def _missed_readings(self, messages: SlotMessages, count: int) -> np.ndarray:
         """Return (S, E, N) bool: nodes that send nothing in a step of the next S = ``count`` slots
@@ -511,13 +541,9 @@ class SlotRuns:
         """Return by name the sums over all nodes that exchanges conserve: (R, 2), their values at
         the start and at the last sample.
         """
-        start_values: list[Any] = [self.setup.algorithm.conserved(s) for s in self.setup.states]
         conserved, sums = {}, by_run(self._conserved, self.runs)
-        for k, name in enumerate(start_values[0]):
+        for k, (name, start) in enumerate(self.setup.conserved_at_start.items()):
             # fsum, so that the sums add no rounding of their own to that of the exchanges.
-            start = math.fsum(
-                np.concatenate([np.atleast_1d(values[name]) for values in start_values])
-            )
             now = [math.fsum(column) for column in sums[:, :, k].tolist()]
             conserved[name] = np.array([[start, value] for value in now])
         return conserved

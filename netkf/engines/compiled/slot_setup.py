@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -21,6 +23,7 @@ from netkf.linalg.arrays import FloatArray
 from netkf.linalg.lanes import LANES, aligned, blocks_of
 from netkf.linalg.portable import cholesky, solve_lower
 from netkf.network.channels import GilbertElliott, identical_per_link
+from netkf.network.deliveries import Deliveries, DeliveringLoss
 from netkf.network.graphs import Link
 from netkf.network.matchings import PROTOCOLS, Broadcast, Matching, maximal_matchings
 from netkf.plants.recorded import RecordedSensor
@@ -236,6 +239,15 @@ class SlotSetup:
         self.xhat = np.stack([state.xhat for state in self.states])
         self.root = np.stack([state.root for state in self.states])
 
+    @cached_property
+    def conserved_at_start(self) -> dict[str, float]:
+        """By name the sums over all nodes that exchanges conserve, in slot 0."""
+        values = [self.algorithm.conserved(state) for state in self.states]
+        return {
+            name: math.fsum(np.concatenate([np.atleast_1d(sums[name]) for sums in values]))
+            for name in values[0]
+        }
+
     def _make_links(self, scenario: Scenario) -> SlotLinks:
         """Return the W directed links sorted by receiver, with their weights (W,)."""
         index = scenario.topology.index
@@ -263,6 +275,10 @@ class SlotSetup:
         """
         channel, each = scenario.network.channel, self.directions_per_link
         self.loss, bad = channel.loss, (False, True)
+        # A replay draws as its run does, and then delivers the messages that it was told to.
+        self.deliveries: Deliveries | None = None
+        if isinstance(channel.loss, DeliveringLoss):
+            self.loss, self.deliveries = channel.loss.given, channel.loss.deliveries
         self.is_chain = type(self.loss) is GilbertElliott
         # The probabilities of a user's own loss model are computed in Python, message by message.
         self.has_known_probabilities = identical_per_link(self.loss) or self.is_chain
@@ -326,6 +342,9 @@ class SlotSetup:
     def _draws_everything(self, scenario: Scenario) -> bool:
         """Return True if kernels can draw all messages; otherwise Python makes them one by one."""
         network = scenario.network
+        # Which message has which number is known before the exchange, unless nodes may be silent.
+        if self.deliveries is not None and (self.decides or self.may_miss):
+            return False
         # Kernels know broadcasts and matchings without delay, with the built-in losses.
         exchanges = type(network.activation) in (Matching, Broadcast) or not self.algorithm.talks
         return self.has_known_probabilities and network.channel.delay.fixed == 0.0 and exchanges
