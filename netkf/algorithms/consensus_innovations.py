@@ -576,8 +576,9 @@ class ConsensusInnovations(Filter):
     def absorb(
         self, state: PseudoState, messages: Sequence[Message], exchange: Exchange
     ) -> PseudoState:
-        """Return the state at the end of the slot: the pseudo-state corrected by messages and the
-        node's reading, the state by the pseudo-state, and the root that belongs to the gains.
+        """Return the state of a node at the end of the slot: messages and the node's own reading
+        correct its estimate of the pseudo-state, this corrects its estimate of the state, and the
+        root of P is the one that follows from the gains of the slot.
         """
         # A lost message takes its gain with it: only the B of senders that were heard are used.
         gains, order = state.gains, state.design.heard[state.node_index]
@@ -588,12 +589,14 @@ class ConsensusInnovations(Filter):
         return state._replace(xhat=xhat, yhat=yhat, root=gains.root)
 
     def shift(self, state: PseudoState, offset: FloatArray) -> PseudoState:
-        """Return the state with ``offset`` (n,) added to the estimate, and what follows from it to
-        the pseudo-state and the reading; gains multiply differences, and do not change.
+        """Return the state with ``offset`` (n,) added to the estimate of the plant's state x, G
+        ``offset`` to that of the pseudo-state G x, and H ``offset`` to the reading; gains multiply
+        differences, and do not change.
         """
         reading = state.reading
         if reading is not None:
-            reading = reading[0] + reading[1] @ offset, reading[1]
+            y, H = reading
+            reading = y + H @ offset, H
         return state._replace(
             xhat=state.xhat + offset, yhat=state.yhat + state.pseudo.G @ offset, reading=reading
         )

@@ -43,17 +43,18 @@ class Pair(NamedTuple):
 def find_largest(
     distances: Sequence[tuple[Interval, str]], tolerance: float, message: str
 ) -> Finding:
-    """Return the finding on labelled distances that should all be 0, up to ``tolerance``;
-    ``message`` begins its text.
+    """Return the finding on pairs (interval of a distance, label), where all distances should be 0,
+    up to ``tolerance``; ``message`` begins its text.
 
-    The reported one has the largest lower limit. The intervals must hold jointly: each at its share
-    of the level.
+    It reports the distance with the largest lower limit. The caller makes each interval at a share
+    of the level, so that all of them together miss with at most its probability.
     """
     chosen, label = max(distances, key=lambda item: (item[0].low, item[0].value))
     widest = max(interval.high for interval, _ in distances)
     detectable = max(interval.detectable for interval, _ in distances)
     number = "1 comparison" if len(distances) == 1 else f"{len(distances)} comparisons"
     text = f"{message} in {number}, {label}"
+    # The margin (value, low, high) is minus the distance, so that its limits change places.
     margin = -chosen.value, -widest, -chosen.low
     finding = Finding(margin, tolerance, text, detectable=detectable)
 
@@ -72,7 +73,8 @@ POOLED_TOLERANCE = 0.1
 def pool(
     single: Finding, pooled: Interval, what: str, tolerance: float = POOLED_TOLERANCE
 ) -> Finding:
-    """Return the finding of a row from its single comparisons and one of all values pooled.
+    """Return the finding of one promise from that of its single comparisons and the interval of one
+    comparison of all values pooled.
 
     Each has its share of the level. If only a single comparison is significant, it is the finding;
     otherwise the pooled one is, whose interval is far narrower, with its own ``tolerance``.

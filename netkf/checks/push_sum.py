@@ -400,14 +400,20 @@ class PushSumChecks(PaperChecks):
         ]
 
     def promises(self, scenario: Scenario) -> tuple[Promise, ...]:
-        """Return the promises about a scenario; one on the certified gamma if it exists."""
+        """Return the promises about a scenario.
+
+        Networks that are small enough for a search have two more, about the number gamma of
+        averaging steps in a slot, if their subject exists: the limit for ever more steps (P Theorem
+        4), and the gamma that P Theorem 6 certifies to keep mean squares bounded.
+        """
         promised = with_promised_filter(scenario)
         promises: tuple[Promise, ...] = PROMISES
         if getattr(promised.filter.algorithm, "running_sums", False):
-            # Running sums conserve mass whatever is lost.
+            # Running sums conserve mass (the first promise) whatever is lost.
             promises = (dataclasses.replace(PROMISES[0], needs=()), *PROMISES[1:])
         if not searches_gamma(promised):
             return promises
+        # These functions raise TheoryError where the limit or the gamma does not exist.
         with contextlib.suppress(TheoryError):
             large_gamma_limits(promised)
             promises = (*promises, LIMIT)

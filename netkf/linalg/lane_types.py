@@ -186,9 +186,11 @@ def _scatter(*_: Any) -> Any:
 
 @lower_builtin(names.turn, types.BaseTuple, types.Array, types.Integer, types.Array)
 def lower_turn(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-    """Emit the transposition of L x L entries of ``rows``, from a column on, into ``out``. numba
-    calls it for ``turn(lanes, rows, column, out)``: ``sig`` has the types of the call, ``args`` its
-    LLVM values.
+    """Emit the transposition of the L x L entries of ``rows`` (L, W) from ``column`` on into the L
+    rows of ``out`` (W, L) from number ``column`` on.
+
+    numba calls it for ``turn(lanes, rows, column, out)``: ``sig`` has the types of the call,
+    ``args`` its LLVM values.
     """
     count = len(sig.args[0])
     rows, out = (_Matrix(builder, sig.args[k], args[k]) for k in (1, 3))
@@ -203,10 +205,12 @@ def lower_turn(context: Any, builder: Any, sig: Any, args: Any) -> Any:
 
 @lower_builtin(names.gather, types.BaseTuple, types.Array, types.Array, types.Integer, types.Array)
 def lower_gather(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-    """Emit one vector load per lane, from the row of ``array`` with the lane's index, and the
-    transposition of these; a negative index (no row) reads row 0. numba calls it for
-    ``gather(lanes, array, places, first, out)``: ``sig`` has the types of the call, ``args`` its
-    LLVM values.
+    """Emit one vector load per lane, for lane q of L entries from column ``first`` on of row
+    ``places[q]`` of ``array`` (K, W), and the transposition of these into the L rows of ``out``
+    (W, L) from ``first`` on. Where ``places[q]`` is negative, row 0 is read.
+
+    numba calls it for ``gather(lanes, array, places, first, out)``: ``sig`` has the types of the
+    call, ``args`` its LLVM values.
     """
     count = len(sig.args[0])
     array, out = (_Matrix(builder, sig.args[k], args[k]) for k in (1, 4))
@@ -227,16 +231,20 @@ def lower_gather(context: Any, builder: Any, sig: Any, args: Any) -> Any:
     *(types.BaseTuple, types.Array, types.Integer, types.Array, types.Array, types.Integer),
 )
 def lower_scatter(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-    """Emit a transposition and one masked store per lane, into the row of ``array`` with the lane's
-    index; lanes with a negative index store nothing. numba calls it for ``scatter(lanes, rows,
-    first, array, places, count)``: ``sig`` has the types of the call, ``args`` its LLVM values.
+    """Emit a transposition and one masked store per lane: lane q of the ``count`` rows of ``rows``
+    (W, L) from number ``first`` on is stored in row ``places[q]`` of ``array`` (K, W), in the
+    columns from ``first`` on; nothing is stored where ``places[q]`` is negative.
+
+    numba calls it for ``scatter(lanes, rows, first, array, places, count)``: ``sig`` has the types
+    of the call, ``args`` its LLVM values.
     """
     count = len(sig.args[0])
     rows, array = (_Matrix(builder, sig.args[k], args[k]) for k in (1, 3))
     begin, zero = context.cast(builder, args[2], sig.args[2], types.intp), ir.Constant(I64, 0)
-    used_lanes = _splat(builder, context.cast(builder, args[5], sig.args[5], types.intp), count)
+    # After the transposition a vector has the entries of one lane; only the first args[5] are used.
+    used_entries = _splat(builder, context.cast(builder, args[5], sig.args[5], types.intp), count)
     is_used = builder.icmp_signed(
-        "<", ir.Constant(ir.VectorType(I64, count), list(range(count))), used_lanes
+        "<", ir.Constant(ir.VectorType(I64, count), list(range(count))), used_entries
     )
     lines = [rows.line(builder.add(begin, ir.Constant(I64, k)), count) for k in range(count)]
     vectors = [builder.load(line, align=8) for line in lines]

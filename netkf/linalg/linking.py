@@ -122,14 +122,15 @@ def _count_depth(stage: str, original: Callable[..., Any]) -> Callable[..., Any]
 def _only_outermost(
     stage: str, original: Callable[..., Any], inner: Callable[..., Any]
 ) -> Callable[..., Any]:
-    """Return a function that calls ``original`` while numba compiles the outermost function, else
-    ``inner``, with the same arguments; ``stage`` ("compile" or "finalize") is what is nested.
+    """Return a replacement of numba's method ``original``: it calls ``original`` for the outermost
+    compiled function, and ``inner``, which leaves out work that only this one needs (such as the
+    generation of machine code), for the functions that it calls, with the same arguments.
+    ``stage``, "compile" or "finalize", is the method of numba whose depth of nested calls tells the
+    outermost function from the others.
     """
 
     def choose(*args: Any, **kwargs: Any) -> Any:
-        """Call ``original`` or ``inner``, depending on whether the function now in ``stage`` is
-        outermost.
-        """
+        """Call ``inner`` for an inner function, else ``original``."""
         return (inner if _is_linked(stage) else original)(*args, **kwargs)
 
     return choose

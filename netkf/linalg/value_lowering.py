@@ -71,7 +71,12 @@ class ValueBuilder(ir.IRBuilder):
     """An IR builder that reads entries of structures from the values that were inserted."""
 
     def extract_value(self, agg: Any, idx: Any, name: str = "") -> Any:
-        """Return entry ``idx`` of an aggregate, without an instruction if it was inserted."""
+        """Return the entry of an LLVM structure or array ``agg`` at ``idx``, an index or a sequence
+        of nested indices; ``name`` is that of the result in the IR.
+
+        No ``extractvalue`` instruction is emitted if the entry was inserted by an ``insertvalue``
+        before: then the inserted value is returned.
+        """
         indices = list(idx) if isinstance(idx, list | tuple) else [idx]
         # An entry of an entry is one extraction from the outer aggregate.
         if isinstance(agg, instructions.ExtractValue):

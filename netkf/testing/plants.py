@@ -384,6 +384,7 @@ def _check_sampled(
     """
     time_constant, max_seconds = scale
     times = np.cumsum(time_constant * np.tile(GAPS, LENGTH // len(GAPS)))
+    # At least eight times, two for each gap, however fast the plant grows.
     times = times[times <= max(max_seconds, times[7])]
     sample_times, probe_times = np.delete(times, np.s_[::3]), times[::3]
     horizon = float(times[-1]) * 1.01
@@ -440,8 +441,10 @@ def _check_grid(part: Diffusion, name: str, seed: int, steps: int) -> None:
     sample_times = period * np.array([2.5, 5.6])
 
     def draw_paths(runs: Sequence[int], cut: bool = False) -> Any:
-        """Return the steps of ``runs`` (their numbers) on the grid as a block (see plants.paths),
-        with ``cut`` cut at the probe and sample times.
+        """Return what the plant's ``paths`` gives for the first ``blocks`` blocks of BLOCK steps of
+        the grid, for R ``runs`` (their numbers): one piece for each step, but with ``cut`` steps
+        are divided at the probe and sample times. Its fields ``x_start`` and ``x_end`` (R, pieces,
+        n) are the states at both ends of each piece.
         """
         plant_normals, probe_normals, sample_normals = (
             GeneratorNormals([_make_generator(seed, run, purpose) for run in runs])
@@ -487,11 +490,13 @@ def _check_grid(part: Diffusion, name: str, seed: int, steps: int) -> None:
 def _check_one_path(
     part: Diffusion, where: str, cut: Any, times: tuple[FloatArray, FloatArray], seed: int
 ) -> None:
-    """Check that ``path``, which draws one run, gives the states of ``cut``, the block that
-    ``paths`` drew for the same run with the same ``seed``.
+    """Check that the plant's method ``path``, which draws one run, gives the states of ``cut``, the
+    block that its ``paths`` drew for the same run (number 1) with the same ``seed``.
 
-    ``times`` are its probe and sample times (K,) and (K',) in seconds; ``where`` is the method that
-    messages blame.
+    where : method that messages blame
+    cut   : block of the run, whose K'' pieces end at the times ``end`` (K'',) in the states
+            ``x_end`` (1, K'', n)
+    times : its probe and sample times (K,) and (K',) in seconds
     """
     plant_random, probe_random, sample_random = (
         _make_generator(seed, 1, purpose) for purpose in ("plant", "probe", "samples")
@@ -499,6 +504,7 @@ def _check_one_path(
     path = call_user_function(
         where, part.path, plant_random, probe_random, times[0], sample_random, times[1]
     )
+    # Every probe and sample time is the end of a piece; of all other ends the first ones will do.
     all_times = np.unique(np.concatenate([cut.end[:20], *times]))
     with guard_user_code(where):
         x = np.array([path.local(time) for time in all_times.tolist()])

@@ -801,11 +801,14 @@ def condition_root(
 def use_information(
     table: FlowTable, m: int, root: FloatArray, k: int, gap: float, scratch: FlowScratch
 ) -> None:
-    """Update ``root[k]`` (n, n) of ``root`` (K, n, n) in place with the information Gamma' Gamma
-    that the readings of a ``gap`` give, in seconds and below one unit, by model ``m`` of the table:
-    row by row of Gamma, as observations of unit noise.
+    """Update ``root[k]`` (n, n) of ``root`` (K, n, n), a lower triangular root of P, in place with
+    the information Gamma' Gamma that the readings of a ``gap`` give, by model ``m`` of the table:
+    row by row of Gamma, as observations of unit noise. The gap, in seconds, is shorter than one
+    cell of the table (``table.unit[m]``).
 
-    Axes: K estimates.
+    Gamma consists of blocks of q rows: block j is ``gap^(j + 1/2)`` times a power series in gap.
+    ``table.gamma[m, j]`` (terms, 1 + q n) has a row for each term of it: the longest gap for which
+    the terms so far are enough, then the coefficients. Axes: K estimates.
     """
     n, q, rows, observed = len(scratch.size), table.sizes[m, 0], scratch.rows, scratch.observed
     gamma, width = table.gamma, q * n
@@ -817,7 +820,8 @@ def use_information(
             break
         for j in range(width):
             rows[j] = gamma[m, block, 0, j + 1]
-        # The power series of this block at the gap, two terms at a time.
+        # The power series of this block at the gap, two terms at a time: ``odd`` and ``even`` are
+        # powers of the gap; column 0 tells whether the terms so far are enough.
         term, even = 0, 1.0
         while gap > gamma[m, block, term, 0]:
             odd = even * gap

@@ -304,10 +304,12 @@ def _check_gaps(group: Group, samples: PartSamples, level: float) -> Finding:
     """
     counts = group(samples).counts
     finding = compare_cells(counts.cells.sum(axis=0), ["all clocks"], level / 2.0, "gaps")
-    products = counts.products.sum(axis=0)
-    if products[2] < 10 * CELLS:
+    # Over pairs (u, v) of neighbouring gaps: the sums of u v and of (u^2 + v^2) / 2, and the number
+    # of pairs.
+    products, squares, pairs = counts.products.sum(axis=0)
+    if pairs < 10 * CELLS:
         return finding
-    correlation = correlation_interval(float(products[0] / products[1]), products[2], level / 2.0)
+    correlation = correlation_interval(float(products / squares), pairs, level / 2.0)
     distance = deviation_interval(0.0, correlation)
     if distance.low > 0.0 and not finding.margin[2] < 0.0:
         label = "neighbouring gaps"

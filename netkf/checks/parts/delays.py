@@ -141,11 +141,11 @@ def _check_law(samples: Any, level: float) -> Finding:
         )
         distance = _mean_interval(excess[k] / number[k], number[k], level / (3.0 * len(frequent)))
         intervals.append((distance._replace(detectable=detectable), f"from {sender} to {receiver}"))
-    products = counts.products.sum(axis=0)
-    if products[2] >= 10 * CELLS:
-        correlation = correlation_interval(
-            float(products[0] / products[1]), products[2], level / 3.0
-        )
+    # Over pairs (u, v) of neighbouring delays: the sums of u v and of (u^2 + v^2) / 2, and the
+    # number of pairs.
+    products, squares, pairs = counts.products.sum(axis=0)
+    if pairs >= 10 * CELLS:
+        correlation = correlation_interval(float(products / squares), pairs, level / 3.0)
         intervals.append(
             (deviation_interval(0.0, correlation), "neighbouring ones, their correlation")
         )

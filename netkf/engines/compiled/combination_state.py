@@ -257,10 +257,12 @@ def sample_with_gain(
 
 @kernel
 def fuse_inbox(state: Simulation, combination: CombinationState, h: int) -> None:
-    """Fuse the estimate of node ``h`` (index) with each one in its inbox, one after the other, with
+    """Fuse the estimate of node ``h`` (index) with each one in its inbox, one after the other, by
+    covariance intersection, or inverse covariance intersection if the combination is INVERSE, with
     the weight that minimises the trace or the determinant of the fused covariance. Changes row
-    ``h`` of ``state.xhat`` and ``state.root``.
+    ``h`` of ``state.xhat`` (N, n) and ``state.root`` (N, n, n), lower triangular roots of P.
     """
+    # The inbox is a linked list of messages in the pool; -1 ends it.
     m = state.nodes[h].inbox
     while m != -1:
         fuse_pair(

@@ -422,7 +422,7 @@ class FlowRun:
     def _enlarge_pool(self) -> None:
         """Enlarge the pool of messages and every array that has an entry for each of them."""
         add_messages(self._state, self._state.most_messages)
-        # Totals are offered by message: their array grows with the pool.
+        # ``offered`` has a row for each message: the total that it carries.
         if self._totals is not None:
             grown = np.zeros((len(self._state.pool), self._totals.sent.shape[1]))
             grown[: len(self._totals.offered)] = self._totals.offered

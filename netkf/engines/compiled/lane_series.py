@@ -79,8 +79,12 @@ def unobserved_series(filters: Filters) -> LaneSeries:
 
 def sensing_series(filters: Filters, period: float) -> LaneSeries:
     """Return the power series in the gap g, up to ``period`` seconds, of all models with increment
-    sensors: of Q_g, exp(A g), F and G_g, by which a covariance moves (P <- Q_g + F P (I + G_g P)^-1
-    F'), and of the gains U, W and C of a reading (kernels.gains).
+    sensors, in this order of values:
+
+    Q_g, exp(A g), F, G_g : noise, transition without readings, transition and information of the
+        readings (Q_g and G_g as lower triangles); P moves to ``Q_g + F P (I + G_g P)^-1 F'``
+    U, W, C : gains by which the q moments of a reading correct the mean, 3 n q values
+        (kernels.gains)
     """
     n, table = filters.xhat.shape[1], filters.table
     width, selected = n * (n + 1) + 2 * n * n, table.sizes[:, 1] > 0
@@ -88,7 +92,7 @@ def sensing_series(filters: Filters, period: float) -> LaneSeries:
     cells = min(table.series.shape[1], math.ceil(period / table.unit.min()) + 1)
     unit = table.unit[selected]
     flow = table.series[selected][:, :cells, :, :width]
-    gains = padded_gains(filters)[selected[:-1]]  # the last model has no sensors
+    gains = padded_gains(filters)[selected[:-1]]  # the last model, without sensors, has none
     terms = max(flow.shape[2], gains.shape[1])
     combined = np.zeros((*flow.shape[:2], terms, width + gains.shape[2]))
     combined[:, :, : flow.shape[2], : flow.shape[3]] = flow

@@ -301,8 +301,8 @@ def _rates_and_probabilities(scenario: Scenario) -> tuple[FloatArray, FloatArray
 
 
 class PoissonSchedules:
-    """The ticks of some runs of a scenario with Poisson clocks: window by window, or all at once.
-    ``bits``: outcomes are arrival bits, if no message takes time.
+    """The ticks of some runs of a scenario with Poisson clocks, and which of their messages arrive:
+    window by window, or all at once.
     """
 
     def __init__(
@@ -312,8 +312,14 @@ class PoissonSchedules:
         senders: Senders | None = None,
         bits: bool = False,
     ) -> None:
-        """Seed the streams of ticks and losses of all runs, and draw the first tick of each entity;
-        ``senders`` defaults to those of the scenario, ``bits``: outcomes are arrival bits.
+        """Seed the streams of ticks and losses of all runs, and draw the first tick of each entity
+        (a node, link or direction that has a clock).
+
+        streams : random streams of one run or of several
+        senders : the entities and the directions that each sends on; by default the scenario's
+        bits    : whether the outcomes of a tick are one integer with a bit for each of its
+                  messages, 1 if it arrives, instead of a delay for each; only if no message takes
+                  time
         """
         runs = streams.runs
         senders = senders_of(scenario) if senders is None else senders

@@ -808,10 +808,12 @@ def count_silent(
     b: int,
 ) -> None:
     """Subtract the messages that silent nodes do not send in the step of ``stage``, in the L runs
-    of block ``b``, from the counts SEND and LOST of ``scratch`` (KINDS, L). ``lanes`` is a tuple of
+    of block ``b``, from the counts SEND and LOST of ``scratch`` (KINDS, L): the caller has added a
+    message of each direction to both, as if all were sent and lost. ``lanes`` is a tuple of
     length L.
     """
     silent = spread(lanes, 0.0)
+    # Directions w, of which link w // directions_per_link has one or two, from its ends.
     for w in range(len(channels.ends) * channels.directions_per_link):
         if channels.talks[stage.step, w] == 1:
             sends = load_flags(

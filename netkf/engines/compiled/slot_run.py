@@ -482,8 +482,8 @@ class SlotRuns:
         return ReadingBlock(y, H, local, rebased)
 
     def events(self, block: SlotBlock) -> tuple[np.ndarray, np.ndarray]:
-        """Return the EVENT rows (K,) of a block of slots of one run, and the number of rows before
-        each of its T samples, (T,).
+        """Return the rows (K,) of the table of events, of dtype EVENT, of a block of slots of one
+        run, and the number of rows before each of its T samples, (T,).
         """
         if self._events is not None:
             return self._events.rows(self._stopped[0, :, 0])
@@ -491,8 +491,8 @@ class SlotRuns:
         return self._rows(block, 0, len(block.times.start), before_sample), before_sample
 
     def first_events(self, block: SlotBlock) -> Iterator[np.ndarray]:
-        """Yield the EVENT rows (K,) of the first run of a batch in a block of slots, for some slots
-        at a time.
+        """Yield the rows (K,) of the table of events, of dtype EVENT, of the first run of a batch
+        in a block of slots, for some slots at a time.
         """
         size = max(1, LONG // max(1, self.setup.rows_of(1)))
         # Samples of a batch are counted from the first of the run.
@@ -504,9 +504,9 @@ class SlotRuns:
     def _rows(
         self, block: SlotBlock, first: int, stop: int, before_sample: np.ndarray
     ) -> np.ndarray:
-        """Return the EVENT rows (K,) of the first run in the slots with indices ``first`` to
-        ``stop`` - 1 of a block; write the number of rows before each sample into ``before_sample``
-        (T,).
+        """Return the rows (K,) of the table of events, of dtype EVENT, of the first run in the
+        slots with indices ``first`` to ``stop`` - 1 of a block, in the order of time; write the
+        number of rows before each of the T samples into ``before_sample`` (T,).
         """
         setup = self.setup
         # Space for the largest number of rows.

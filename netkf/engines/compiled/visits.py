@@ -434,9 +434,13 @@ def begin_interval(state: Simulation, visits: Visits, q: int) -> None:
 def assign_lane(
     visits: Visits, kind: int, q: int, place: int, v: int, m: int, now: float, end: float
 ) -> None:
-    """Assign lane ``q`` of ``kind`` (UNOBSERVED or SENSING) to the node at ``place`` (index in
-    ``state.xhat``) with model number ``m``, for its prediction from ``now`` to ``end`` (seconds) on
-    the way to visit ``v`` (index in ``visits.records``).
+    """Assign lane ``q`` to the prediction of a node from ``now`` to ``end`` (seconds), which leads
+    towards the time of its visit.
+
+    kind  : UNOBSERVED for the lanes of nodes without increment sensors, SENSING for those with them
+    place : index of the node in ``state.xhat`` and ``state.root``
+    v     : index of the visit in ``visits.records``
+    m     : row of the node's model in the FlowTable ``state.table``
     """
     lane = visits.lanes[kind, q]
     lane.visit, lane.model, lane.now, lane.end = v, m, now, end

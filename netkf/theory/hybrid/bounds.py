@@ -166,14 +166,18 @@ class _PiecewiseSolution:
                 )
 
     def _piece_end(self, begin: float, last: float) -> float:
-        """Return how far the piece from ``begin`` may reach, at most to ``last``, all in seconds:
-        inside it the delayed terms are known.
+        """Return the latest end of the piece from ``begin``, at most ``last``, all in seconds.
+
+        A piece as long as the delay takes all its delayed terms from the pieces before. If the
+        delay is much shorter than the time between messages, a piece is half of that time long
+        instead, and ``_iterate`` finds the delayed terms that lie inside it.
         """
         delay = self._packed.equations.delay
         if delay == 0.0:
             return last
         if begin < delay:
             return min(last, delay)
+        # The largest sum of the coefficients c_ij of a node: rates of arrivals (1/s) times weights.
         inflow = float(self._packed.leaving.max())
         return min(last, begin + max(delay, 0.5 / max(inflow, 1e-300)))
 

@@ -1,5 +1,8 @@
 """The steady state of H(12), and the least link rates for which it exists.
 
+H(12) is the system of coupled Riccati equations whose solution P bounds the error covariances of
+all nodes in continuous time.
+
 A steady state exists if and only if some gains make the linearisation of H(12) stable (for a
 controllable plant). The search for such gains follows H(12) itself by implicit steps, whose length
 grows as long as the gains stabilise the shifted problem. If a steady state exists, the steps reach
@@ -222,9 +225,11 @@ def _no_steady_state(scenario: Scenario, equations: CoupledRiccati) -> str:
 
 
 def threshold_factor(equations: CoupledRiccati) -> float | None:
-    """Return the least factor on all link rates for which H(12) has a steady state.
+    """Return the least factor on all link rates for which H(12), the coupled Riccati ``equations``
+    of the bounds on the covariances of all nodes, has a steady state.
 
-    By bisection to 1e-6, or 1e-3 for large networks; None if no factor up to 1e6 suffices.
+    By bisection and extrapolation to the relative accuracy 1e-6, or 1e-3 for large networks; None
+    if no factor up to 1e6 suffices.
     """
     low = _necessary_factor(equations)
     if low is None:
@@ -235,6 +240,7 @@ def threshold_factor(equations: CoupledRiccati) -> float | None:
         if high > MAX_FACTOR:
             return None
     fine = 1e-6 if equations.start.size <= FEW_UNKNOWNS else 1e-3
+    # Points (factor, 1 / max P), from which guesses extrapolate to 1 / max P = 0.
     points, guesses = [(high, 1.0 / float(np.abs(P).max()))], 0
     while high / low > 1.0 + fine:
         factor = float(np.sqrt(low * high))

@@ -137,8 +137,10 @@ def _largest_ratio(image: FloatArray, L: FloatArray) -> float:
 
 
 def _is_small(residual: FloatArray, X: FloatArray, tolerance: float) -> bool:
-    """Return True if every entry of the ``residual`` (S, M, M) is below ``tolerance`` times the
-    standard deviations of its row and column in the second moments X (S, M, M).
+    """Return True if every entry of the ``residual`` (S, M, M) of S equations is below
+    ``tolerance`` times the standard deviations of its row and column.
+
+    Their squares are the diagonal of the sum of the S second moments X (S, M, M).
     """
     variances = np.abs(np.diagonal(X, axis1=1, axis2=2)).sum(axis=0)
     deviations = np.sqrt(variances)
