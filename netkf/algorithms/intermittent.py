@@ -144,14 +144,21 @@ class Intermittent(Filter):
     def init(
         self, model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo
     ) -> IntermittentState:
-        """Return the state at time 0, before any reading, with estimate ``mean`` (n,) and
-        covariance ``cov`` (n, n).
+        """Return the state of ``node`` at time 0, before any reading, with estimate ``mean`` (n,)
+        and covariance ``cov`` (n, n); ``model`` is that of the plant and the node's sensors.
         """
         root = first_root(cov)
         # The start is the first entry of the past: every late reading has a state before it.
-        start = Past(0.0, None, None, mean, root, None)
-        span = self.history_span(node.max_delay)
-        return IntermittentState(mean, root, model, None, 0.0, start, span)
+        start = Past(time=0.0, reading=None, offset=None, xhat=mean, root=root, before=None)
+        return IntermittentState(
+            xhat=mean,
+            root=root,
+            model=model,
+            unsent=None,
+            time=0.0,
+            past=start,
+            lag=self.history_span(node.max_delay),
+        )
 
     @property
     def max_age(self) -> float:
@@ -257,7 +264,7 @@ def _use_late(state: IntermittentState, reading: Reading, now: float) -> Intermi
         past = past.before
     model = state.model
     # The late reading, with the state before it, takes its place in time.
-    late_event = Past(reading.time, reading, None, *past[3:5], None)
+    late_event = Past(reading.time, reading, None, past.xhat, past.root, None)
     # Forward again: predict to each event, and repeat it.
     for event in [late_event, *reversed(later_events)]:
         xhat, root = past.xhat, past.root

@@ -33,11 +33,12 @@ class TriggerSummary(ReplicaSummary):
 
 
 def check_rate(samples: RunSamples, level: float) -> Finding:
-    """Test the null hypothesis that nodes send with their stated probability given the past.
+    """Return the interval of the ratio of the messages sent to those expected, a test that nodes
+    send with their stated probability given the past.
 
-    Under it the number of messages of a run less the sum of the probabilities is a martingale with
-    mean 0; Student's interval is over the independent runs. The interval of the finding misses the
-    truth with at most the probability ``level``.
+    If they do, the number of messages of a run less the sum of the probabilities is a martingale
+    with mean 0; Student's interval is over the independent runs. The interval of the finding misses
+    the truth with at most the probability ``level``.
     """
     sent, expected = samples.runs.sends.T
     total = float(expected.mean())
@@ -70,14 +71,22 @@ class TriggerChecks(EquationChecks):
     summary_type = TriggerSummary
 
     def summarise(self, scenario: Scenario, run: Run) -> TriggerSummary:
-        """Return the summary of a run whose samples are at ``check_times``."""
+        """Return the summary of a run whose samples are at ``check_times``; ``sends`` is nan unless
+        every node hears every other without losses, so that silence is information.
+        """
         sends = np.full(2, np.nan)
         if all_hear_all(scenario):
             sends[:] = expected_sends(with_promised_filter(scenario), run)
         return TriggerSummary(**vars(summarise_exactly(scenario, run)), sends=sends)
 
     def promises(self, scenario: Scenario) -> tuple[Promise, ...]:
-        """Return the promises about a scenario; all assume that no message is lost."""
+        """Return the promises about a scenario, in the order of the report: those about the
+        equations, and after the first of them those about silent slots and the rate of messages.
+
+        All of them need the assumptions that every node hears all others and that the filters know
+        the models: with losses silence would not be information.
+        """
+        # ``needs`` are parts of the names of assumptions in the table of the report.
         equations = [
             dataclasses.replace(
                 promise, needs=(*promise.needs, "every node hears", "the filters know")

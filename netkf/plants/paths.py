@@ -583,9 +583,14 @@ def fill_course(
     (t - start) / length, 0 <= u <= 1.
 
     The coefficients ``out`` (D, W >= 2 n) are such that the integral of x from the start to u is
-    ``u sum_d u^d out[d, :n]``, and that of x u is ``u^2 sum_d u^d out[d, n : 2 n]``. ``table``
-    (D, 2 n, W) is GridLaws.course_table; ``x_start`` (K, n) and ``cubic`` (K, 3, n) are the states
-    at the starts and the cubics of K pieces. ``size`` has length n.
+    ``u sum_d u^d out[d, :n]``, and that of x u is ``u^2 sum_d u^d out[d, n : 2 n]``: from them
+    the moments of x over any part of the piece are computed. W is 2 n rounded up to whole lanes.
+
+    x is the response e^{A s} x to the state at the start plus a cubic, the contribution of the
+    noise. ``x_start`` (K, n) are the states at the starts of K pieces and ``cubic`` (K, 3, n) the
+    coefficients of u, u^2 and u^3, times the length. Rows 0 .. n - 1 of each ``table[d]``
+    (D, 2 n, W) multiply the former, for a length of 1, and the other n rows the latter
+    (GridLaws.course_table). ``size`` has length n.
     """
     n, power = len(size), length  # power = length^(d + 1)
     for d in range(len(out)):

@@ -222,8 +222,9 @@ class SensorPath:
 
 
 def step_noise(normals: FloatArray, period: float) -> FloatArray:
-    """Return the two moments (..., 2, p) of unit white noise over ``period`` seconds from standard
-    ``normals`` (..., 2, p): independent, with variances g and g / 3 for g = ``period``.
+    """Return the two moments (..., 2, p) of unit white noise over ``period`` seconds, its integrals
+    with the Legendre polynomials P_0 and P_1, from standard ``normals`` (..., 2, p): independent,
+    with variances g and g / 3 for g = ``period``.
     """
     return np.asarray(normals * np.sqrt(np.array([[period], [period / 3.0]])))
 
@@ -231,9 +232,12 @@ def step_noise(normals: FloatArray, period: float) -> FloatArray:
 def reading(
     x_moments: FloatArray, H: FloatArray, noise: FloatArray, root: FloatArray
 ) -> FloatArray:
-    """Return the two moments (2, p) of dy = H x dt + root dw over an interval, from those of x,
-    ``x_moments`` (2, n), and of unit white noise w, ``noise`` (2, p); H (p, n), ``root`` (p, p)
-    lower triangular.
+    """Return the two moments (2, p) of the reading dy = H x dt + root dw over an interval.
+
+    The moments of a signal are its integrals over the interval with the Legendre polynomials
+    P_0 = 1 and P_1 of it. ``x_moments`` (2, n) are those of x, ``noise`` (2, p) those of unit white
+    noise dw; H is (p, n), ``root`` (p, p) the lower triangular root of the covariance of the noise
+    per second.
     """
     out = np.empty(2 * len(H))
     fill_reading(ONE, H[0], out, 0, len(H), x_moments, H[None], noise, root[None], 0)
@@ -276,10 +280,12 @@ def fill_reading(
 def cut(
     whole: FloatArray, normals: FloatArray, u: float, length: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Return noise moments (2, p) of the first part of an interval, a share ``u`` of its ``length``
-    in seconds, and of the remaining part, given those of the ``whole`` (2, p).
+    """Return the noise moments (2, p) of the first part of an interval, a share ``u`` of its
+    ``length`` in seconds, and those (2, p) of the remaining part, drawn given those of the
+    ``whole`` (2, p).
 
-    ``normals`` (2, p) are standard normal; see ``divide``.
+    The moments of white noise are its integrals with the Legendre polynomials P_0 and P_1 of the
+    interval. ``normals`` (2, p) are the standard normal numbers to draw from; see ``divide``.
     """
     first, remaining = np.empty(whole.shape), whole.copy()
     divide(ONE, first, remaining, normals, u, length)

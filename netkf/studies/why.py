@@ -219,7 +219,7 @@ class _Evidence:
 
     def __init__(self, replayer: Replayer, node: int, most: int) -> None:
         """Find the messages and the flow of information in the run for ``node`` (its id), with
-        searches for up to ``most`` missing messages, by replays of the run.
+        searches for sets of up to ``most`` missing messages, by replays of the run.
         """
         self._replayer, self._node, self._most = replayer, node, most
         self.scenario = replayer.scenario
@@ -246,10 +246,12 @@ class _Evidence:
         }
 
     def candidates(self) -> list[Candidate]:
-        """Return the unused messages from which information could have reached the node, each with
-        the number of missing messages that it takes.
+        """Return the messages that were not used in the run but from which information could have
+        reached the node, each with the least number of such missing messages (itself and those that
+        pass its information on) that would have to come for that.
         """
         candidates = []
+        # The cost of a message is 1 if it was not used in the run, else 0.
         for m in np.flatnonzero(self._flow.cost).tolist():
             needed = self._reach.needed(m)
             if needed is not None:

@@ -45,8 +45,10 @@ class Trial(ABC):
     def __init__(
         self, watched: WatchedPart, system: System, shift: FloatArray | None = None
     ) -> None:
-        """Start the filters of all nodes of the ``system`` (n states); ``shift`` (n,), if any,
-        moves the truth during the run.
+        """Start the user's filter, ``watched.part``, at each of 2 or 3 connected nodes; all but
+        node 1 have the sensor of the ``system`` (n states).
+
+        ``shift`` (n,), if any, moves the truth during the run.
         """
         self.watched, self.part, self.system = watched, watched.part, system
         self.random = Streams(0).generator("testing")
@@ -58,6 +60,7 @@ class Trial(ABC):
         self.offset = np.zeros(len(system.M))
         """The present shift of the truth (n,)."""
         self.nodes, self.weights = _make_network(self.part)
+        # Filters must also work at nodes without a sensor: node 1 is one.
         models = [self.model(has_sensor=node != 1) for node in self.nodes]
         self.states = [self._start(node, models) for node in self.nodes]
         self.models = models
@@ -65,11 +68,15 @@ class Trial(ABC):
 
     @abstractmethod
     def model(self, has_sensor: bool) -> Any:
-        """Return the model of a node, with a sensor if it ``has_sensor``."""
+        """Return the model of the plant and of its sensor that the filter of a node is given;
+        without rows of readings unless the node ``has_sensor``.
+        """
 
     @abstractmethod
     def run(self) -> None:
-        """Run the trial once: time, readings, messages, and the shift of the truth."""
+        """Let time pass, and call the filters of all nodes with readings, messages and the shift
+        of the truth; a trial is run once.
+        """
 
     def _start(self, node: int, models: Sequence[Any]) -> Any:
         """Return the state of a node at time 0, whose estimate was checked."""
@@ -112,7 +119,9 @@ class Trial(ABC):
             self.record_estimate(node, self.states[node], method)
 
     def emit(self, node: int, exchange: Exchange) -> Any:
-        """Call ``emit`` for a node and return the payload, or None if it sends nothing."""
+        """Call ``emit`` of the filter at a node for this ``exchange`` of messages; return the
+        payload of its message, or None if it sends nothing.
+        """
         pair = self.watched.call("emit", self.states[node], exchange)
         is_pair = type(pair) is tuple and len(pair) == 2
         where = f"{self.watched.name}.emit"

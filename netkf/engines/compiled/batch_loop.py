@@ -49,8 +49,8 @@ ALONE = -1
 
 def simulate_batch(state: Simulation, batch: BatchArrays) -> None:
     """Simulate all R runs of a batch up to the horizon, or until an estimate is no longer finite.
-    Writes ``lengths``, ``counts`` and ``diverged`` of ``batch``, and the samples into
-    ``state.buffer``.
+    Writes the numbers of samples and of events of each run and whether it diverged into
+    ``batch`` (``lengths``, ``counts``, ``diverged``), and the samples into ``state.buffer``.
     """
     run, resumed = 0, False
     while run < len(batch.lengths):

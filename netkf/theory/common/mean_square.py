@@ -171,14 +171,21 @@ def is_quickly_solved(scenario: Scenario) -> bool:
 def _choose_solver(
     scenario: Scenario,
 ) -> Callable[[Scenario], tuple[float, FloatArray | None]] | None:
-    """Return the paper's own function from a scenario in slots to its radius and covariances
-    (N, n, n), the latter None if the radius is not below 1; None if the paper has no such function
-    or the scenario runs under clocks.
+    """Return a special solver for filters in slots that combine estimates like this scenario's, or
+    None if there is none or the scenario runs under clocks.
+
+    It maps the scenario to the spectral radius of the mean-square dynamics of the errors and to
+    their steady covariances (N, n, n), which are None if the radius is not below 1. It is in the
+    module ``steady_errors`` of the paper's folder and has the name of the combination, such as
+    ``tracks_in_slots``.
     """
+    if not scenario.slotted:
+        return None
+    combination = scenario.node_filter.combination.replace(" ", "_")
     solver: Callable[[Scenario], tuple[float, FloatArray | None]] | None = paper_function(
-        scenario, "steady_errors", f"{scenario.node_filter.combination}_in_slots".replace(" ", "_")
+        scenario, "steady_errors", f"{combination}_in_slots"
     )
-    return solver if scenario.slotted else None
+    return solver
 
 
 def _system_maker(scenario: Scenario) -> Callable[[Scenario], LinearErrors] | None:

@@ -1,4 +1,10 @@
-"""The bound H(12) over time: explicit, implicit and piecewise integration, all checked."""
+"""The bound H(12) over time: explicit, implicit and piecewise integration, all checked.
+
+H(12), equation (12) of the paper H on the hybrid filter, are coupled Riccati equations of the
+covariances of N nodes (theory/hybrid/coupled.py). Their solution bounds the mean of the filters'
+random covariances from above. It is packed here: of each covariance (n, n) only the
+m = n (n + 1) / 2 entries of the upper triangle.
+"""
 
 from __future__ import annotations
 
@@ -36,11 +42,12 @@ _GAUSS, _GAUSS_WEIGHTS = np.polynomial.legendre.leggauss(5)
 
 
 def covariance_bound(scenario: Scenario, times: Any) -> FloatArray:
-    """Return the solution (T, N, n, n) of H(12) at ``times`` (seconds, increasing).
+    """Return the upper bound (T, N, n, n) on the mean covariances E[P_i(t)] of N nodes at T
+    ``times`` (seconds, increasing): the solution of the coupled Riccati equations H(12).
 
     The rates are the effective ones of the channel; for filters that do not communicate the
-    solution is their own covariance. It bounds E[P_i(t)] by H Theorem 2, and by
-    docs/poisson_samples.md for sensors that sample by Poisson clocks or at known times. Integrated
+    solution is their own covariance. That it is a bound is H Theorem 2, and docs/poisson_samples.md
+    for sensors that sample by Poisson clocks or at known times. Integrated
     with relative tolerance 1e-10 and returned only if the defect is below that (below 1e-7 with a
     delay or samples, or where H(12) is stiff). Raises TheoryError, with the reason, if the theorem
     does not apply.
@@ -139,14 +146,15 @@ class _PiecewiseSolution:
         return self._outputs[piece](t).reshape(start.shape)
 
     def extend(self, last: float) -> None:
-        """Integrate up to time ``last`` (seconds); appends pieces to ``_outputs`` and
-        ``_piece_ends``.
+        """Integrate the coupled Riccati equations of all nodes' covariances up to time ``last``
+        (seconds), and append the pieces of their solution to ``_outputs`` and ``_piece_ends``.
 
-        With a delay this goes piece by piece, and nothing arrives in the first one. A piece is one
-        delay long, so that all that arrives in it is known; if the delay is much shorter than the
-        time between messages, a piece is half that time long, and its own arrivals are found by
-        Picard iteration, which reduces the error by a factor 2 k in round k. Pieces end where the
-        solution jumps and where messages sent at jumps arrive.
+        If messages have a delay, the covariances of one delay ago enter the equations, which are
+        then solved piece by piece; nothing arrives in the first one. A piece is one delay long, so
+        that all that arrives in it is known; if the delay is much shorter than the time between
+        messages, a piece is half that time long, and its own arrivals are found by Picard
+        iteration, which reduces the error by a factor 2 k in round k. Pieces end where the solution
+        jumps, since sensors sample there, and where messages sent at jumps arrive.
         """
         delay = self._packed.equations.delay
         while self._piece_ends[-1] < last:

@@ -1,4 +1,9 @@
-"""Averages of the random Riccati equation: over one path, and bounds on the mean over all paths."""
+"""Averages of the random Riccati equation: over one path, and bounds on the mean over all paths.
+
+P is the one-step prediction covariance of the Kalman filter with intermittent observations. In each
+slot a reading arrives with the probability ``delivery``; without one ``P+ = F P F' + Q``. R (140)
+and the like are equations of the paper R (theory/intermittent/riccati.py); R alone is a matrix.
+"""
 
 from __future__ import annotations
 
@@ -50,15 +55,16 @@ def path_average(
     seed: int,
     start: ArrayLike | None = None,
 ) -> PathAverage:
-    """Return the average of ``function`` over ``slots`` slots of one path, R (140).
+    """Return the average of ``function`` of P, the one-step prediction covariance, over ``slots``
+    slots of one simulated path, R (140).
 
     F and Q are (n, n), H (p, n), R (p, p); readings arrive with probability ``delivery``, drawn
     with ``seed``. By R Proposition 25 the average converges to the integral of the function over
-    the invariant law, for almost every start by that law; R recommends a point of its support, and
-    P* is the default (``start`` is an (n, n) covariance). ``function`` maps covariances (K, n, n)
-    to K numbers. It must be integrable: below the critical probability the average of P itself
-    diverges, and the standard error says nothing then. Raises TheoryError for wrong arguments or if
-    P* does not exist.
+    the invariant law, for almost every start by that law; the paper recommends a point of its
+    support. ``start`` (n, n) is P_0, by default P*, the steady covariance if all readings arrive.
+    ``function`` maps covariances (K, n, n) to K numbers. It must be integrable: below the critical
+    probability the average of P itself diverges, and the standard error says nothing then. Raises
+    TheoryError for wrong arguments or if P* does not exist.
     """
     system, g = check_system(F, Q, H, R), check_delivery(delivery)
     slots, seed = as_integer("slots", slots, BATCHES), as_integer("seed", seed, 0)
@@ -116,14 +122,18 @@ def mean_covariance_bounds(
     slots: int,
     start: ArrayLike,
 ) -> MeanBounds:
-    """Return bounds on E[P_t], from the covariance ``start`` (n, n) on, for t = 0 .. ``slots``.
+    """Return bounds on the mean of the one-step prediction covariance P_t for t = 0 .. ``slots``,
+    from P_0 = ``start`` (n, n) on.
 
-    F and Q are (n, n), H (p, n), R (p, p); readings arrive with probability g = ``delivery``. The
-    lower one counts slots without a reading only, ``S+ = (1 - g) F S F' + Q``; the upper one
-    applies Jensen's inequality to the concave f_1, ``X+ = (1 - g) f_0(X) + g f_1(X)``. The lower
-    one grows without bound if (1 - g) alpha^2 >= 1 for the largest modulus alpha of the eigenvalues
-    of F, which is R (29) up to the probability (31); the upper one stays bounded above R (32).
-    Raises TheoryError for wrong arguments.
+    F and Q are (n, n), H (p, n), R (p, p); readings arrive with probability g = ``delivery``. A
+    slot maps P to ``f_0(P) = F P F' + Q`` without a reading, and to ``f_1(P)``, the step of the
+    Riccati equation, with one.
+
+    The lower bound S counts slots without a reading only, ``S+ = (1 - g) F S F' + Q``; the upper
+    one X applies Jensen's inequality to the concave f_1, ``X+ = (1 - g) f_0(X) + g f_1(X)``. The
+    lower one grows without bound if (1 - g) alpha^2 >= 1 for the largest modulus alpha of the
+    eigenvalues of F: equation (29) of the paper R, for probabilities g up to (31). The upper one
+    stays bounded for g above (32). Raises TheoryError for wrong arguments.
     """
     system, g = check_system(F, Q, H, R), check_delivery(delivery)
     first = as_covariance("start", start, len(system.F))
