@@ -690,6 +690,12 @@ class TriggeredSlots:
         """Simulate the filters over the S slots of a plan in place: changes ``nodes``, the
         decisions in ``arrays``, ``plan.sent`` and ``plan.up``, and writes ``samples``. ``states``
         are those in which nodes start, ``more`` the arrays of the inner filter's kernel.
+
+        ``plan.part`` says whether only the decisions are wanted (SENDING), only what follows from
+        the messages that arrive (ARRIVING), or both. ``plan.sent`` flags the nodes that are asked
+        for a message, and then those that send one. If the order of a slot is ``split``, the
+        decisions are about estimates between the exchange and the reading: the inner kernel is
+        called for each of the two.
         """
         carried_nodes = nodes._replace(xhat=self._inner.carried_estimates(nodes.xhat, more))
         for s in range(plan.up.shape[1]):

@@ -197,7 +197,8 @@ class DiffusionChecks(PaperChecks):
     def summarise(self, scenario: Scenario, run: Run) -> DiffusionSummary:
         """Return the summary of a run at its K checked times and N sampled nodes, with the exact
         covariances ``alone`` (N, n, n) of the errors at the end of the same run without
-        cooperation.
+        cooperation: nan in all but the first ALONE runs, and if the errors of all nodes together
+        are too many for exact covariances.
         """
         sampled = sampled_indices(scenario)
         alone = np.full(run.P[0, sampled].shape, np.nan)

@@ -618,9 +618,9 @@ def fill_state_moments(
     length: float,
     scratch: FloatArray,
 ) -> None:
-    """Write the two moments of x, its integrals with P_0 and P_1, over ``gap`` seconds into ``out``
-    (2, n); these begin ``since`` seconds after the start of a piece of ``length`` seconds. ``size``
-    has length n.
+    """Write the two moments of the state x over an interval of ``gap`` seconds into ``out`` (2, n):
+    its integrals with the Legendre polynomials P_0 = 1 and P_1 of the interval, which begins
+    ``since`` seconds after the start of a piece of ``length`` seconds. ``size`` has length n.
 
     ``course`` (D, W), D of W polynomials, are the coefficients that ``fill_course`` wrote for the
     piece, ``scratch`` (2 W,).

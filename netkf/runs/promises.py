@@ -91,7 +91,8 @@ def compute_promises(scenario: Scenario) -> dict[str, Any]:
 
 
 def _sufficient_link_rate(scenario: Scenario) -> dict[str, Any]:
-    """Return the link rate, 1/s, from which on the steady bound is close to its limit S.
+    """Return the link rate, 1/s, from which on the steady bound is close to S, its limit
+    for ever faster links.
 
     ``value`` is the rate (None if links differ), ``factor`` the same as a multiple of the rates in
     the scenario, and ``delta`` the distance from S, CLOSE_TO_S of its norm; None with a ``reason``.

@@ -397,13 +397,13 @@ def _identifier(expression: ast.expr) -> str:
 def _iterate_statements(body: list[Any]) -> Iterator[ast.stmt]:
     """Yield the statements that a module executes when it is imported.
 
-    Those inside ``if``, ``try``, ``with`` and loops are among them, those inside functions and
-    classes are not.
+    Those inside ``if``, ``try``, ``with``, ``match`` and loops are among them, those inside
+    functions and classes are not.
     """
     for node in body:
         if isinstance(node, ast.stmt):
             yield node
         if not isinstance(node, ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
-            for block in ("body", "orelse", "handlers", "finalbody"):
+            for block in ("body", "orelse", "handlers", "finalbody", "cases"):
                 statements = getattr(node, block, None)
                 yield from _iterate_statements(statements if isinstance(statements, list) else [])

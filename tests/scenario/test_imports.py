@@ -201,6 +201,10 @@ PACKAGES = {
     },
     "good:R": {"good.py": "import netkf\n\n\nclass P(netkf.parts.Hybrid):\n    pass\n\n\nR = P\n"},
     "good:S": {"good/__init__.py": "from good.all import *\n", "good/all.py": PART + "S = P\n"},
+    "good:T": {
+        "good.py": "import sys\n\nmatch sys.platform:\n    case _:\n"
+        "        from netkf.parts import Hybrid\n\n\nclass T(Hybrid):\n    pass\n"
+    },
 }
 
 

@@ -66,8 +66,11 @@ def learn_network(
 ) -> None:
     """Write the information of all sensors G = C~ / w and the number of nodes N = n~ / w as node
     ``h`` of block ``b`` estimates them, P (6), into ``information`` (n, n, L) and ``number``
-    (1, L), from its mass in ``mass`` (B, H, 2 + n n, L). While its weight w is exactly 0, these are
-    its own information ``alone[h]`` of ``alone`` (H, n, n) and 1.
+    (1, L). While its weight w is exactly 0, these are its own information ``alone[h]`` of ``alone``
+    (H, n, n) and 1.
+
+    ``mass`` (B, H, 2 + n n, L) holds the shares of each node in three sums over the network: the
+    weight w, the number of nodes n~, and the n n entries of the information C~.
 
     Axes: B blocks of L runs, H nodes.
     """

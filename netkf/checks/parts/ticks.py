@@ -299,10 +299,12 @@ def ticks_on_lattice(clock: Any) -> bool:
 
 
 def distance_from_lattice(clock: Any, ticks: TickSample) -> float:
-    """Return the largest distance in seconds of a tick from its allowed times; 0 for clocks that
-    are not on a lattice.
+    """Return the largest distance in seconds of a tick from its allowed times; 0 for clocks whose
+    ticks are not at multiples of a period.
 
-    All ticks of a clock with a random phase may be shifted by one common time.
+    A tick may be late by the clock's jitter. All ticks of a clock with a random phase may also be
+    shifted by one common time of at most a period: the lateness of its ticks may then differ among
+    them by the jitter, and that of the first tick be at most period and jitter.
     """
     if not ticks_on_lattice(clock) or not len(ticks.times):
         return 0.0

@@ -150,10 +150,12 @@ class Source:
         return self._windows.following()
 
     def path(self, together: int = 1) -> PathBlock:
-        """Return the next block of steps of the path, or a single piece without an end if nothing
-        senses increments. Draws the noise of these steps into ``sensing``, and reads the samples
-        taken during them into ``instants``. ``together`` is the number of runs whose cache the
-        block has space for.
+        """Return the next block of steps of the path of the true state; one piece that lasts for
+        the whole run if no sensor has increments, since the state is needed at samples only then.
+
+        Draws the noise of these steps into ``sensing``, and reads the samples taken during them
+        into ``instants``. The event loop simulates ``together`` runs side by side: the block has a
+        cache of path polynomials for each of them.
         """
         if not self._grid:
             return no_path(self._n)

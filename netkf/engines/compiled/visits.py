@@ -244,7 +244,10 @@ def queue_visit(state: Simulation, visits: Visits, time: float, place: int) -> N
 @kernel
 def queue_sample(state: Simulation, visits: Visits, first: int) -> None:
     """Queue sample number ``state.samples`` of all N nodes of the present run, at the places
-    ``first`` to ``first`` + N - 1 of ``state.xhat``, one level above all their visits.
+    ``first`` to ``first`` + N - 1 of ``state.xhat``.
+
+    A visit is a job at one or two nodes that waits in the queue. Visits of one level are computed
+    side by side, level after level: the sample is one level above all visits of these nodes.
     """
     level = 0
     for h in range(len(state.nodes)):
@@ -253,6 +256,7 @@ def queue_sample(state: Simulation, visits: Visits, first: int) -> None:
     for h in range(len(state.nodes)):
         visits.level[first + h] = level
     v = append_visit(state, visits, level, 0.0, first, ALL_NODES)
+    # Samples have no piece of the path; the field holds their number.
     visits.records[v].piece = state.samples
 
 

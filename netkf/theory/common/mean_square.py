@@ -224,11 +224,15 @@ def _slot_map(system: SlotJumps) -> tuple[PositiveMap, FloatArray]:
 
 
 def _clock_map(system: ClockJumps) -> tuple[PositiveMap, FloatArray | None]:
-    """Return the map ``X -> L^-1(inflow(X))`` of second moments (S, M, M), where
-    ``L X = -(B X + X B')`` is what errors lose between jumps, and ``L^-1(noise)`` (S, M, M).
+    """Return the map ``X -> L^-1(inflow(X))`` of second moments X (S, M, M) of the errors of a
+    network under clocks, and ``L^-1(noise)`` (S, M, M). ``L X = -(B X + X B')`` is what errors lose
+    per second between jumps, ``inflow`` what they gain per second by jumps at ticks, and ``noise``
+    what the plant and the readings add.
 
-    Steady moments X are a fixed point of ``X = L^-1(inflow(X)) + L^-1(noise)``. The second result
-    is None if some B is not stable: errors then grow even between jumps.
+    The errors of all nodes have M entries together. The channels have S states (1 if they have
+    none), in each of which moments are weighted by its ``stationary`` probability. Steady moments X
+    are a fixed point of ``X = L^-1(inflow(X)) + L^-1(noise)``. The second result is None if some B
+    is not stable: errors then grow even between jumps.
     """
     if max(np.linalg.eigvals(B).real.max() for B in system.flows) >= 0.0:
         return system.inflow, None

@@ -1,7 +1,7 @@
 """The steady state of H(12), and the least link rates for which it exists.
 
-H(12) is the system of coupled Riccati equations whose solution P bounds the error covariances of
-all nodes in continuous time.
+H(12) is the system of coupled Riccati equations whose solution P_i bounds the mean of the random
+covariance of each filter i in continuous time.
 
 A steady state exists if and only if some gains make the linearisation of H(12) stable (for a
 controllable plant). The search for such gains follows H(12) itself by implicit steps, whose length

@@ -338,8 +338,9 @@ class _GainSearch:
         """Return ``(s - L)^-1 I`` (n, n) times a power of two that brings its trace to about 1, or
         None if it is not positive definite.
 
-        L is the map with these ``probabilities`` and ``gains`` (n, p), one for each set of
-        readings.
+        L is the linear part of the mean Riccati map with fixed gains, X to the sum of p (F + K H) X
+        (F + K H)' over all sets of readings that may arrive, with these ``probabilities`` p and
+        ``gains`` K (n, p), one for each set.
         """
         n, operator = len(self._F), self._operator(probabilities, gains)
         identity = np.eye(n).reshape(-1)[self._pick]

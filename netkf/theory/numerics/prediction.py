@@ -342,8 +342,9 @@ def propagate_state(
     """Return the state's transition (n, n) and its response (n, 8 m) to the plant's inputs, over a
     ``gap`` in seconds.
 
-    ``plant`` is the pair A (n, n), B (n, m). The inputs are those of :class:`ErrorFlow`: m at each
-    of the 8 nodes of the gap, the inputs of one node side by side.
+    ``plant`` is the pair A (n, n), B (n, m). The inputs are independent with variance 1: the m of
+    the noise at each of 8 quadrature nodes (instants of the gap), those of one instant side by
+    side, so that response times its transpose is the covariance of the noise over the gap.
     """
     A, B = plant
     E = ShortExponential(A)(np.append((1.0 - NODES) * gap, gap))
