@@ -212,6 +212,10 @@ def reduce_batch(batch: RunBatch, pieces: Sequence[slice]) -> Reduced:
     """Return the values of all R runs of a batch, with moments of samples for each of ``pieces``:
     adjacent slices that cover all runs.
 
+    The columns of the moments are, for each filter, the upper triangles of P and of e e' (e is the
+    error) and the NEES. The averages of a run are its mean square error, mean trace of P and mean
+    NEES over the samples after time 0.
+
     The last sample of a run that diverged is left out.
     """
     runs, count, filters, n = batch.error.shape
