@@ -13,14 +13,13 @@ import scipy.special
 from netkf.checks.evidence import Finding, Promise, find_identity
 from netkf.checks.laws import find_largest
 from netkf.checks.parts.moments import (
-    CELLS,
     compare_cells,
-    correlation_interval,
     with_best,
 )
 from netkf.checks.parts.samples import PartSamples
 from netkf.checks.parts.ticks import (
     ClockGroup,
+    correlation_of_neighbours,
     count_drawn_ticks,
     draw_samples,
     network_clocks,
@@ -304,12 +303,9 @@ def _check_gaps(group: Group, samples: PartSamples, level: float) -> Finding:
     """
     counts = group(samples).counts
     finding = compare_cells(counts.cells.sum(axis=0), ["all clocks"], level / 2.0, "gaps")
-    # Over pairs (u, v) of neighbouring gaps: the sums of u v and of (u^2 + v^2) / 2, and the number
-    # of pairs.
-    products, squares, pairs = counts.products.sum(axis=0)
-    if pairs < 10 * CELLS:
+    correlation = correlation_of_neighbours(counts.products, level / 2.0)
+    if correlation is None:
         return finding
-    correlation = correlation_interval(float(products / squares), pairs, level / 2.0)
     distance = deviation_interval(0.0, correlation)
     if distance.low > 0.0 and not finding.margin[2] < 0.0:
         label = "neighbouring gaps"

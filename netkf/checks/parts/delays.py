@@ -15,11 +15,10 @@ from netkf.checks.parts.moments import (
     CELLS,
     MIN_COUNT,
     compare_cells,
-    correlation_interval,
     count_cells,
 )
 from netkf.checks.parts.sources import stated_part
-from netkf.checks.parts.ticks import correlate_neighbours
+from netkf.checks.parts.ticks import correlate_neighbours, correlation_of_neighbours
 from netkf.checks.statistics import Interval, detectable_shift, deviation_interval
 from netkf.linalg.arrays import FloatArray
 from netkf.network.channels import ExponentialDelay, LognormalDelay, UniformDelay
@@ -141,11 +140,8 @@ def _check_law(samples: Any, level: float) -> Finding:
         )
         distance = _mean_interval(excess[k] / number[k], number[k], level / (3.0 * len(frequent)))
         intervals.append((distance._replace(detectable=detectable), f"from {sender} to {receiver}"))
-    # Over pairs (u, v) of neighbouring delays: the sums of u v and of (u^2 + v^2) / 2, and the
-    # number of pairs.
-    products, squares, pairs = counts.products.sum(axis=0)
-    if pairs >= 10 * CELLS:
-        correlation = correlation_interval(float(products / squares), pairs, level / 3.0)
+    correlation = correlation_of_neighbours(counts.products, level / 3.0)
+    if correlation is not None:
         intervals.append(
             (deviation_interval(0.0, correlation), "neighbouring ones, their correlation")
         )

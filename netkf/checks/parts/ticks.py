@@ -14,8 +14,9 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy.special
 
-from netkf.checks.parts.moments import count_cells
+from netkf.checks.parts.moments import CELLS, correlation_interval, count_cells
 from netkf.checks.parts.sources import stated_part
+from netkf.checks.statistics import Interval
 from netkf.core.clock import Entity, generate_ticks
 from netkf.linalg.arrays import FloatArray
 from netkf.network.clocks import LinkClock, OnReadings, Periodic, Renewal
@@ -329,3 +330,15 @@ def correlate_neighbours(uniform: np.ndarray, first: np.ndarray) -> FloatArray:
     pairs = ~first[1:] & np.isfinite(normal[1:]) & np.isfinite(normal[:-1])
     u, v = normal[1:][pairs], normal[:-1][pairs]
     return np.array([u @ v, 0.5 * (u @ u + v @ v), float(len(u))])
+
+
+def correlation_of_neighbours(products: FloatArray, level: float) -> Interval | None:
+    """Return an interval for the correlation of neighbouring numbers from the ``products`` (R, 3)
+    of R runs, see :func:`correlate_neighbours`; None for fewer than 10 CELLS pairs.
+
+    The interval misses the truth with at most the probability ``level``.
+    """
+    total, squares, pairs = products.sum(axis=0)
+    if pairs < 10 * CELLS:
+        return None
+    return correlation_interval(float(total / squares), pairs, level)

@@ -101,7 +101,6 @@ class SlotEvents:
         self._directions = [
             DirectionDraws(scenario, streams, ends, k) for k, ends in enumerate(setup.directions)
         ]
-        self._indices = {direction.ends: direction.index for direction in self._directions}
         each, count = setup.directions_per_link, setup.streams_per_link
         # Directions of a link are neighbours; a directed graph has one of them.
         pairs = [direction.ends for direction in self._directions[::each]]
@@ -368,7 +367,7 @@ class SlotEvents:
             arrived = self._inbox[node]
             for peer in sorted(arrived):
                 number, age = arrived[peer]
-                up[self._indices[peer, node]] = 1
+                up[self._setup.index_of_direction[peer, node]] = 1
                 if self._algorithm.pairwise:
                     self._append_row((step.end, SWAP, node, peer, number, step.phase, age))
             if not self._algorithm.pairwise:

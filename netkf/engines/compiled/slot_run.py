@@ -354,7 +354,8 @@ class SlotRuns:
             mark_paired_senders(MANY, channels, messages.active, messages.pair_count, messages.sent)
         elif decided:
             mark_all_senders(MANY, channels, exchanged, messages.sent)
-        if setup.deliveries is not None:
+        # No chosen messages at all: the run as it was.
+        if setup.deliveries is not None and setup.deliveries.chosen != frozenset():
             self._deliver_chosen(setup.deliveries, times, messages)
         return messages
 
@@ -376,9 +377,8 @@ class SlotRuns:
         if deliveries.chosen is None:
             messages.up[0, ..., 0][is_sent] = 1
             return
-        index = {direction: w for w, direction in enumerate(setup.directions)}
         for sender, receiver, number in deliveries.chosen:
-            w = index[sender, receiver]
+            w = setup.index_of_direction[sender, receiver]
             # The messages of this direction in the block, in order, by slot and step.
             sent_slots, sent_steps = np.nonzero(is_sent[:, :, w])
             k = number - int(self._sent[w])

@@ -240,8 +240,13 @@ class SlotSetup:
         self.root = np.stack([state.root for state in self.states])
 
     @cached_property
+    def index_of_direction(self) -> dict[Link, int]:
+        """The index in ``directions`` of each directed link."""
+        return {direction: w for w, direction in enumerate(self.directions)}
+
+    @cached_property
     def conserved_at_start(self) -> dict[str, float]:
-        """By name the sums over all nodes that exchanges conserve, in slot 0."""
+        """The sums over all nodes that exchanges conserve, in slot 0, by name."""
         values = [self.algorithm.conserved(state) for state in self.states]
         return {
             name: math.fsum(np.concatenate([np.atleast_1d(sums[name]) for sums in values]))

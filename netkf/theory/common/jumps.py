@@ -161,8 +161,8 @@ class ClockJumps:
 
     @cached_property
     def _pairs(self) -> list[tuple[IntArray, IntArray, FloatArray]]:
-        """For each clock all P ordered pairs of its directions, as two arrays (P,) of indices, and
-        the rates (S, P) per second, by mode, at which both messages arrive.
+        """All P ordered pairs of directions of each clock, as two arrays (P,) of indices, and the
+        rates (S, P) per second, by mode, at which both messages arrive.
         """
         assert self.directions is not None
         pairs = []

@@ -48,25 +48,23 @@ def steady_covariance_bound(scenario: Scenario) -> FloatArray:
     there is none, with the threshold that the link rates would have to reach, and if H(12) does not
     apply.
     """
-    return _steady_bound(scenario).copy()
-
-
-@lru_cache(maxsize=8)
-def _steady_bound(scenario: Scenario) -> FloatArray:
-    """Return the steady bound (N, n, n), cached because several promises are about it.
-
-    Raises TheoryError if there is none and if H(12) does not apply.
-    """
-    equations = coupled_riccati(scenario)
-    P = steady_state(equations)
+    P = _steady_state_of(scenario)
     if P is None:
-        raise TheoryError(_no_steady_state(scenario, equations))
-    return P
+        raise TheoryError(_no_steady_state(scenario, coupled_riccati(scenario)))
+    return P.copy()
 
 
 def has_steady_state(scenario: Scenario) -> bool:
     """Return True if H(12) has a steady state; raises TheoryError if H(12) does not apply."""
-    return steady_state(coupled_riccati(scenario)) is not None
+    return _steady_state_of(scenario) is not None
+
+
+@lru_cache(maxsize=8)
+def _steady_state_of(scenario: Scenario) -> FloatArray | None:
+    """Return the steady state (N, n, n) of H(12), None if there is none; cached because several
+    promises and assumptions are about it. Raises TheoryError if H(12) does not apply.
+    """
+    return steady_state(coupled_riccati(scenario))
 
 
 def has_stabilising_gains(scenario: Scenario) -> bool:
