@@ -154,8 +154,11 @@ class ReplicaResult(NamedTuple):
 def run_replica(
     scenario: Scenario, seed: int, replica: int, engine: str | Engine = "auto"
 ) -> ReplicaResult:
-    """Simulate and summarise one ``replica`` of the runs of ``seed`` of a scenario from
-    :func:`with_check_times`.
+    """Simulate and summarise one ``replica`` of the runs of ``seed`` of a scenario whose samples
+    are at the times that promises are checked at (:func:`with_check_times`).
+
+    A user's filter class is also run as its built-in base (the twin), for the first TWIN_RUNS
+    replicas and where it diverged, to see whether the two compute the same.
     """
     run, promised = simulate(scenario, seed, replica, engine), with_promised_filter(scenario)
     diverged, difference = run.status == "diverged", math.nan
@@ -170,8 +173,10 @@ def run_replica(
 
 
 def _error_difference(run: Run, twin: Run) -> float:
-    """Return the largest difference between the errors of two runs with the same true state, in
-    units of sqrt(tr P) of ``twin``; nan if rounding always exceeds 0.1 TWIN_TOLERANCE.
+    """Return the largest difference between the errors of a ``run`` with a user's filter class and
+    of its ``twin``, the same true state and messages with the built-in base of that class.
+
+    It is in units of sqrt(tr P) of ``twin``; nan if rounding always exceeds 0.1 TWIN_TOLERANCE.
     """
     common = min(len(run.times), len(twin.times))
     size = np.sqrt(np.trace(twin.P[:common], axis1=-2, axis2=-1))[..., None]
@@ -191,9 +196,11 @@ def _error_difference(run: Run, twin: Run) -> float:
 
 
 def _same_as_base(results: list[ReplicaResult], level: float) -> Finding:
-    """Compare the first replicas with those of the filter that the class derives from.
+    """Compare the errors of the first TWIN_RUNS replicas of a user's filter class with those of the
+    built-in filter that it derives from; the differences are in ``results``.
 
-    No interval is estimated, so that ``level`` is not used.
+    Serves as the test of the promise SAME_AS_BASE. No interval is estimated, so that ``level`` is
+    not used.
     """
     differences = [result.difference for result in results[:TWIN_RUNS]]
     if np.isnan(differences).all():
@@ -205,13 +212,15 @@ def _same_as_base(results: list[ReplicaResult], level: float) -> Finding:
 
 
 def _none_diverged(results: list[ReplicaResult], level: float) -> Finding:
-    """Count the runs that ended early.
+    """Count the runs that ended early because they diverged: the test of the promise NONE_DIVERGED,
+    whose margin is minus their share.
 
     No interval is estimated, so that ``level`` is not used.
     """
     diverged = sum(result.diverged for result in results)
     message = f"{diverged} of {len(results)} runs ended early, so no other promise is looked at"
-    return Finding((-diverged / len(results),) * 3, 0.0, message)
+    margin = -diverged / len(results)
+    return Finding((margin, margin, margin), 0.0, message)
 
 
 SAME_AS_BASE = Promise(
@@ -234,15 +243,20 @@ def judge_replicas(
     scenario: Scenario, results: Iterable[ReplicaResult], seed: int, confidence: float
 ) -> Verdict:
     """Return the verdict on a scenario from the ``results`` of its replicas of ``seed``, in their
-    order; all intervals hold together with probability ``confidence``.
+    order: one row (holds, broken, undecided, not promised) for each promise of its filter's paper,
+    and each test of its clocks, channels, plant and sensors against the laws that they state.
 
-    Raises TheoryError if there are no covariances with which promises could be compared.
+    All intervals hold together with probability ``confidence``. Raises TheoryError if there are no
+    covariances with which promises could be compared.
     """
     checks, replicas = find_checks(scenario), list(results)
     _require_covariances(scenario, replicas)
     make_verdict = partial(Verdict, scenario.name, len(replicas), seed, confidence)
     if any(result.diverged for result in replicas):
-        return make_verdict(tuple(judge([NONE_DIVERGED], replicas, [], len(replicas), 1.0)))
+        # The test is exact: it needs no assumptions and none of the level.
+        return make_verdict(
+            tuple(judge([NONE_DIVERGED], replicas, assumptions=[], runs=len(replicas), level=1.0))
+        )
     stacked = stack_summaries([result.summary for result in replicas if result.summary is not None])
     promised = with_promised_filter(scenario)
     parts = stack_parts(
@@ -261,20 +275,27 @@ def judge_replicas(
         len(replicas),
         0.5 * (1.0 - confidence),
     )
-    rows += judge(part_promises(parts), parts, [], len(replicas), 0.5 * (1.0 - confidence))
+    rows += judge(
+        part_promises(parts),
+        parts,
+        assumptions=[],
+        runs=len(replicas),
+        level=0.5 * (1.0 - confidence),
+    )
     return make_verdict((*_judge_base(scenario, replicas), *rows))
 
 
 def _judge_base(scenario: Scenario, results: list[ReplicaResult]) -> list[Evidence]:
-    """Return the row that compares a user's filter class with its built-in base; empty for a
-    built-in class.
+    """Return the row of the verdict that compares a user's filter class with the built-in class
+    that it derives from; an empty list for a built-in filter.
 
-    A class that overrides only weights of links may differ by design: then nothing is promised.
+    A class that overrides only weights of links (LINK_WEIGHTS) may differ by design: then nothing
+    is promised.
     """
     overridden = own_attributes(scenario.filter.algorithm)
     if not overridden:
         return []
-    (row,) = judge([SAME_AS_BASE], results, [], len(results), 1.0)
+    (row,) = judge([SAME_AS_BASE], results, assumptions=[], runs=len(results), level=1.0)
     listed = ", ".join(overridden)
     if row.verdict == BROKEN and set(overridden) <= set(LINK_WEIGHTS):
         reason = f"it differs by design: {listed} is its own; {row.evidence}"
@@ -284,7 +305,7 @@ def _judge_base(scenario: Scenario, results: list[ReplicaResult]) -> list[Eviden
 
 def _require_covariances(scenario: Scenario, results: list[ReplicaResult]) -> None:
     """Raise TheoryError if the results hold no covariance that could be checked, or if runs
-    diverged as those of the built-in filter do, which leaves no limits to look at.
+    diverged as those of the built-in filter do (``expected``), which leaves no limits to look at.
     """
     summaries = [result.summary for result in results if result.summary is not None]
     diverged = len(results) - len(summaries)
@@ -361,7 +382,7 @@ def _look_again(
     may_continue: bool,
 ) -> Verdict:
     """Return the verdict on all ``results`` so far, of the replicas of ``seed``, with the decisions
-    of ``earlier`` looks kept.
+    of ``earlier`` looks kept. A look is one judgement of all promises on the runs done by then.
 
     ``may_continue``: further looks are planned, so that this one may spend only its share of the
     error probability 1 - ``confidence`` (alpha spending).
@@ -393,7 +414,9 @@ def _require_earlier(scenario: Scenario, earlier: Verdict | None, seed: int, run
 
 
 def _require_laws(scenario: Scenario) -> None:
-    """Raise an error before anything runs if there is nothing to check."""
+    """Raise an error before anything runs if there is nothing to check: no promises, no random
+    input whose distribution could be tested, or a horizon too short for a growth test.
+    """
     find_checks(scenario)
     if not scenario.is_random:
         raise TheoryError(

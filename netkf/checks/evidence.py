@@ -127,7 +127,8 @@ def judge(
     runs: int,
     level: float,
 ) -> list[Evidence]:
-    """Return the evidence for each promise, from the ``samples`` of ``runs`` runs.
+    """Return the evidence for each promise (a statement of a paper or of a part of the scenario,
+    with its test), from the ``samples`` of ``runs`` runs that the tests take.
 
     With probability 1 - ``level`` at least, all intervals contain the truth: tests that are not
     exact share the level equally (Bonferroni). A promise with a failing assumption is not tested.
@@ -163,7 +164,9 @@ def _run_test(promise: Promise, samples: Any, level: float) -> Finding:
 
 
 def _is_needed(promise: Promise, row: Assumption) -> bool:
-    """Return True if a promise relies on an assumption."""
+    """Return True if a promise relies on an assumption: ``promise.needs`` are substrings of its
+    name or source, and tests for Gaussian noises need GAUSSIAN besides.
+    """
     needs = (*promise.needs, GAUSSIAN) if promise.test in GAUSSIAN_TESTS else promise.needs
     return any(need in f"{row.assumption} [{row.source}]" for need in needs)
 
@@ -172,8 +175,10 @@ def _judge(promise: Promise, finding: Finding, runs: int) -> Evidence:
     """Return the row with the verdict that follows from the interval of a finding about ``runs``
     runs.
 
-    A promise is broken if the whole interval of the margin is below 0, and holds if the interval is
-    above - tolerance. If neither, more runs may decide, and their number is forecast.
+    The margin is how far the promise is from being broken. A promise is broken if the whole
+    interval of the margin is below 0, and holds if the interval is above - tolerance. If neither,
+    more runs may decide, and their number is forecast. A promise about a limit that is not reached
+    (``early``) or about errors that rounding hides (``blurred``) is undecided.
     """
     (margin, low, high), tolerance, message = finding[:3]
     needed = None
@@ -200,30 +205,31 @@ def _judge(promise: Promise, finding: Finding, runs: int) -> Evidence:
     if math.isnan(off) and low < high:
         off = max(0.0, -margin)
     return Evidence(
-        promise.statement,
-        promise.source,
-        "hold",
-        margin,
-        low,
-        high,
-        tolerance,
-        verdict,
-        needed,
-        message,
-        finding.seen,
-        finding.expected,
-        off,
-        finding.detectable,
-        needed,
-        finding.replica if verdict == BROKEN else None,
+        promise=promise.statement,
+        source=promise.source,
+        assumptions="hold",
+        margin=margin,
+        low=low,
+        high=high,
+        tolerance=tolerance,
+        verdict=verdict,
+        needed=needed,
+        evidence=message,
+        seen=finding.seen,
+        expected=finding.expected,
+        off=off,
+        detectable=finding.detectable,
+        runs_needed=needed,
+        replica=finding.replica if verdict == BROKEN else None,
     )
 
 
 def _factor_needed(finding: Finding, max_factor: float) -> float:
-    """Return the factor on the runs at which a promise that holds is expected to be decided; inf if
-    it exceeds ``max_factor``.
+    """Return the factor by which the number of runs must grow until an undecided promise is
+    expected to be decided, if it holds; inf if it exceeds ``max_factor``.
 
-    The measured distance is taken to be sampling error. Without a forecast the limit shrinks as
+    It is decided once the upper limit of the distance from the promise is within the tolerance. The
+    measured distance is taken to be sampling error. Without a forecast the limit shrinks as
     1 / sqrt(runs); otherwise the factor is found by bisection on a logarithmic scale.
     """
     low, tolerance = finding.margin[1], finding.tolerance
@@ -248,15 +254,25 @@ def _describe_horizon(seconds: float) -> str:
 
 
 def _unpromised_row(promise: Promise, reason: str) -> Evidence:
-    """Return the row of a promise whose assumptions fail, with the reason."""
+    """Return the row of a promise that was not tested because assumptions fail, with the reason."""
     nan = math.nan
     return Evidence(
-        promise.statement, promise.source, reason, nan, nan, nan, nan, NOT_PROMISED, None, ""
+        promise.statement,
+        promise.source,
+        assumptions=reason,
+        margin=nan,
+        low=nan,
+        high=nan,
+        tolerance=nan,
+        verdict=NOT_PROMISED,
+        needed=None,
+        evidence="",
     )
 
 
 def find_identity(deviation: float, allowed: float, message: str) -> Finding:
-    """Return the finding on paths that should be equal up to rounding.
+    """Return the finding of a test that compares two computations of the same values, which should
+    be equal up to rounding: broken if ``deviation`` exceeds ``allowed``.
 
     ``deviation`` is their largest relative deviation, ``allowed`` the bound on that from rounding.
     """
@@ -267,8 +283,8 @@ def find_identity(deviation: float, allowed: float, message: str) -> Finding:
 
 
 def find_nothing(tolerance: float) -> Finding:
-    """Return the finding, with this ``tolerance``, of a test whose errors are all blurred by
-    rounding: undecided.
+    """Return the finding, with this ``tolerance``, of a test without any usable estimation error,
+    because rounding of a large state is of the size of the errors: undecided.
     """
     nan = math.nan
     message = (

@@ -23,12 +23,14 @@ MAX_ENTRIES = 6400
 
 
 def check_slots(scenario: Scenario) -> tuple[int, ...]:
-    """Return the slots at which promises are checked: 2, 5, half of the horizon and its last slot.
+    """Return the slots (numbers of sampling periods) at which promises are checked: 2, 5, half of
+    the horizon and its last slot.
 
     For filters whose estimate is filtered (not predicted) the last slot is one earlier, because the
     estimate at the horizon includes exchanges that the trace does not record.
     """
     period = scenario.slot_plant.period
+    # 1e-9: a horizon of a whole number of periods keeps its last slot despite rounding.
     last = max(1, int(np.floor(scenario.horizon / period + 1e-9)))
     if scenario.slotted and not scenario.node_filter.predicts:
         last = max(1, int(np.ceil(scenario.horizon / period - 1e-9)) - 1)
@@ -53,8 +55,9 @@ def errors_at_once(scenario: Scenario) -> int:
 def probe_times(scenario: Scenario) -> list[float]:
     """Return the times in seconds at which runs are sampled.
 
-    They are those of :func:`check_times`, and further ones spread evenly over the horizon that only
-    tests of all errors pooled use.
+    They are those at which single covariances are compared (:func:`check_times`), and further ones
+    spread evenly over the horizon, used only by tests that pool the errors of all times. The more
+    errors one time has, the fewer further ones (POOLED_ERRORS, MAX_POOLED).
     """
     checked = check_times(scenario)
     count = min(MAX_POOLED, POOLED_ERRORS // errors_at_once(scenario))
@@ -62,7 +65,7 @@ def probe_times(scenario: Scenario) -> list[float]:
     if scenario.slotted:
         period = scenario.slot_plant.period
         even = [round(period * max(1, round(time / period)), 12) for time in even]
-    # Further times come in addition to the checked ones, and are thinned evenly to ``count``.
+    # The further times are thinned evenly, so that there are ``count`` in all with the checked ones.
     others = sorted(set(even) - set(checked))
     spare = min(max(count - len(checked), 0), len(others))
     chosen = np.linspace(0, len(others) - 1, spare).round().astype(int).tolist()
@@ -96,7 +99,9 @@ def sampled_nodes(scenario: Scenario) -> list[int]:
 
 
 def sampling_note(scenario: Scenario) -> str:
-    """Return a note on the nodes of a large network that are left out; else empty."""
+    """Return a text for the verdict on the nodes of a large network whose samples are not kept;
+    empty if those of all nodes are.
+    """
     count, nodes = len(sampled_indices(scenario)), len(scenario.nodes)
     if count == nodes:
         return ""

@@ -44,7 +44,9 @@ def verdict_text(verdict: Verdict, claim: str = "", command: str = "") -> str:
 
 
 def _legend_lines(verdict: Verdict) -> list[str]:
-    """Return a line for each paper whose letter occurs in a source."""
+    """Return a line with the title of each paper whose letter (PAPERS) occurs in the source of a
+    row, such as "G Theorem 8".
+    """
     # A letter stands for a paper only at the beginning of a source or of one of its parts.
     sources = "; ".join(row.source for row in verdict.rows)
     return [
@@ -73,7 +75,9 @@ def _summary_lines(verdict: Verdict) -> list[str]:
 
 
 def _broken_again(broken: list[Evidence], command: str) -> list[str]:
-    """Return the broken promises, each with the command that replays a run that shows it."""
+    """Return lines that repeat the broken promises in short, each with the command that replays a
+    run that shows it: ``command`` followed by the number of that run.
+    """
     lines = []
     for row in broken:
         values = ""
@@ -88,12 +92,13 @@ def _broken_again(broken: list[Evidence], command: str) -> list[str]:
 
 
 def _describe_row(row: Evidence) -> str:
-    """Return the deviation, tolerance and detectable error of a row, then its evidence; or the
-    failing assumptions.
+    """Return the text below a promise: the runs that would decide it, its measured deviation, and
+    the evidence; or the assumptions that fail, if it was not tested.
     """
     if row.verdict == NOT_PROMISED:
         return row.assumptions
     parts = [f"needs about {row.needed:,} runs"] if row.needed is not None else []
+    # A row that compares exactly has no interval: low and high are equal.
     if row.low < row.high:
         parts.append(
             f"off by {row.off:.3g}, at most {max(0.0, -row.low):.3g}{_describe_limits(row)}"

@@ -25,7 +25,7 @@ def allowed_deviation(size: FloatArray, terms: ArrayLike, base: float) -> FloatA
 
 def first_wrong(gap: FloatArray, size: FloatArray, terms: ArrayLike, base: float) -> int | None:
     """Return the index of the first run whose deviations ``gap`` (R, ...) exceed what rounding
-    explains, or None.
+    explains, so that it can be replayed; None if there is none.
 
     ``size`` (R, ...) and ``terms`` are the sizes of the results and of the largest quantities that
     they were computed from, ``base`` the share of ``size`` that is allowed in any case.
@@ -38,7 +38,9 @@ def first_wrong(gap: FloatArray, size: FloatArray, terms: ArrayLike, base: float
 def compare_identities(
     gap: FloatArray, size: FloatArray, terms: ArrayLike, base: float, message: str
 ) -> Finding:
-    """Return the finding on many identities: that of the largest deviation over its allowed one.
+    """Return the finding on many pairs of values that should be equal up to rounding, such as
+    covariances and their replay: the pair with the largest deviation relative to what rounding
+    explains decides.
 
     gap   : absolute deviations (R, ...); nan or infinite ones exceed every finite one
     size  : sizes (at least 0) of the compared results, such as traces of covariances, in the shape

@@ -117,10 +117,12 @@ class RunSamples:
 
 
 def check_replay(samples: RunSamples, level: float) -> Finding:
-    """Compare every covariance with the one that the equations give for the events of its run.
+    """Compare every covariance of the runs, ``runs.P`` (R, K, N, n, n), with ``runs.replayed``: the
+    same computed by the equations of the filter from the events of the run (ticks, losses, delays)
+    without the engine.
 
-    The finding is undecided if no run could be replayed. No interval is estimated, so that
-    ``level`` is not used.
+    Only some runs are replayed, the entries of the others are nan. The finding is undecided if none
+    was. No interval is estimated, so that ``level`` is not used.
     """
     replayed = ~np.isnan(samples.runs.replayed).all(axis=(1, 2, 3, 4))
     P, expected = samples.runs.P[replayed], samples.runs.replayed[replayed]
@@ -136,9 +138,10 @@ def check_replay(samples: RunSamples, level: float) -> Finding:
         f"{gap.size:,} covariances replayed from the events of their runs; the worst in run "
         f"{np.flatnonzero(replayed)[run]} at {label}"
     )
+    # Size of the values, of the terms whose rounding errors they inherit, and relative tolerance.
     limits = size, samples.largest_terms(expected), REPLAY_TOLERANCE
     finding = compare_identities(gap, *limits, message)
-    return with_departure(finding, samples, gap, limits, np.flatnonzero(replayed))
+    return with_departure(finding, samples, gap, limits, replicas=np.flatnonzero(replayed))
 
 
 def with_departure(
@@ -148,7 +151,8 @@ def with_departure(
     limits: tuple[FloatArray, ArrayLike, float],
     replicas: IntArray | None = None,
 ) -> Finding:
-    """Return the finding with the run, time and node at which a path first departs.
+    """Return a finding on covariances that should equal others up to rounding, with the run, time
+    and node added at which the first deviation is too large, so that this run can be replayed.
 
     ``gap`` (R, K', N) are absolute deviations at the last K' checked times, ``limits`` the
     arguments of :func:`allowed_deviation`, and ``replicas`` (R,) the numbers of the runs, 0 to
@@ -157,10 +161,10 @@ def with_departure(
     wrong = ~(gap <= allowed_deviation(*limits))
     if not wrong.any():
         return finding
-    # The earliest time of all runs, and there the first run and node.
+    # argwhere is in row-major order: the earliest time of all runs, and there the first run, node.
     time, run, node = np.argwhere(np.swapaxes(wrong, 0, 1))[0].tolist()
     replica = run if replicas is None else int(replicas[run])
-    time += len(samples.time_labels) - wrong.shape[1]
+    time += len(samples.time_labels) - wrong.shape[1]  # among all checked times
     label = samples.point_labels[time * len(samples.nodes) + node]
     text = f"{finding.message}; first seen to depart in run {replica} at {label}"
     return finding._replace(message=text, replica=replica)
@@ -180,8 +184,9 @@ def relative_difference(P: FloatArray, expected: FloatArray) -> FloatArray:
 
 
 def check_growth(samples: RunSamples, level: float) -> Finding:
-    """Compare the growth of the law of P in the second half of the horizon with that of P replayed
-    by the equations; see :func:`compare_growth`.
+    """Test that the distribution of P over the runs is bounded: compare its growth in the second
+    half of the horizon with that of P replayed by the filter's equations from the events of the
+    runs (:func:`compare_growth`).
 
     The interval of the finding misses the truth with at most the probability ``level``.
     """
@@ -189,6 +194,7 @@ def check_growth(samples: RunSamples, level: float) -> Finding:
     # Only some runs are replayed, the entries of the others are nan.
     replays = replayed[~np.isnan(replayed).all(axis=(1, 2, 3, 4))]
     pairs, expected = [], []
+    # The last two checked times are half of the horizon and its end.
     for i, node in enumerate(samples.nodes):
         pairs.append(Pair(f"node {node}", P[:, -2, i], P[:, -1, i]))
         expected.append((replays[:, -2, i], replays[:, -1, i]) if len(replays) else None)

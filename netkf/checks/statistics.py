@@ -125,12 +125,12 @@ def affine(interval: Interval, scale: float, shift: float) -> Interval:
 
 
 def with_drawn(interval: Interval, sample_factor: Callable[[float], float]) -> Interval:
-    """Return the interval of an estimate whose samples do not grow in proportion to the runs:
-    ``factor`` times the runs mean ``sample_factor(factor)`` times the samples.
+    """Return ``interval`` with a forecast for an estimate whose samples do not grow in proportion
+    to the runs: ``factor`` times the runs mean ``sample_factor(factor)`` times the samples.
     """
 
     def limits(value: float, factor: float) -> tuple[float, float]:
-        """Return the limits of the interval for ``factor`` times the runs."""
+        """Return the limits for ``factor`` times the runs, as :meth:`Interval.limits` asks."""
         actual = sample_factor(factor)
         # The caller has divided the value by sqrt(factor); it shrinks by sqrt(actual) only.
         return interval.limits(value * math.sqrt(factor / actual), actual)
@@ -139,11 +139,12 @@ def with_drawn(interval: Interval, sample_factor: Callable[[float], float]) -> I
 
 
 def deviation_interval(expected: float, interval: Interval) -> Interval:
-    """Return an interval for |quantity - expected| from one for the quantity."""
+    """Return an interval for the distance |quantity - expected| from one for the quantity."""
     covers = interval.low <= expected <= interval.high
     ends = abs(interval.low - expected), abs(interval.high - expected)
     low = 0.0 if covers else min(ends)
     distance = abs(interval.value - expected)
+    # A forecast keeps the estimate on the same side of the expected value, only nearer to it.
     side = math.copysign(1.0, interval.value - expected)
 
     def limits(value: float, factor: float) -> tuple[float, float]:
@@ -201,8 +202,8 @@ def law_excess(
 
 def _ecdf_gaps(first: FloatArray, second: FloatArray, rounding: float) -> FloatArray:
     """Return the differences (V,) of the empirical distribution functions of two samples ``first``
-    (S,) and ``second`` (S',), at the V distinct values of both; values closer than ``rounding`` are
-    one.
+    (S,) and ``second`` (S',), at the V distinct values of both, as comparisons of distributions
+    need them; values closer than ``rounding``, or equal to DIGITS digits, are one.
     """
     a, b = np.sort(first), np.sort(second)
     points = np.sort(np.concatenate([a, b]))
@@ -216,9 +217,10 @@ def _ecdf_gaps(first: FloatArray, second: FloatArray, rounding: float) -> FloatA
 
 def _band_interval(gaps: FloatArray, a: int, b: int, level: float, grow: bool) -> Interval:
     """Return the interval of the largest of the ``gaps`` (V,) between two empirical distribution
-    functions of ``a`` and ``b`` samples; ``grow``: further runs add to the second sample too.
+    functions of ``a`` and ``b`` samples, from a Dvoretzky-Kiefer-Wolfowitz band around each.
 
-    The interval misses the truth with at most the probability ``level``.
+    ``grow``: further runs add to the second sample too, not to the first only. The interval misses
+    the truth with at most the probability ``level``.
     """
     value = max(0.0, float(gaps.max()))
     widths = band_width(a, level / 2.0), band_width(b, level / 2.0)
@@ -230,7 +232,7 @@ def _band_interval(gaps: FloatArray, a: int, b: int, level: float, grow: bool) -
         reach = first + (second / math.sqrt(factor) if grow else second)
         return value - reach, value + reach
 
-    # At any one point the variance of the difference is at most 1/(4a) + 1/(4b).
+    # At any one point the standard deviation of the difference is at most sqrt(1/(4a) + 1/(4b)).
     spread = 0.5 * math.sqrt(1.0 / a + 1.0 / b)
     detectable = min(1.0, width + _normal_quantile(POWER) * spread)
     ends = max(0.0, value - width), min(1.0, value + width)
@@ -259,7 +261,9 @@ def distance_to_law(
 
 
 def band_around(value: float, width: float, detectable: float = math.nan) -> Interval:
-    """Return the interval ``value`` +- ``width``, clipped to [0, 1], for a distance of laws;
+    """Return the interval ``value`` +- ``width``, clipped to [0, 1], for a distance between two
+    distribution functions; the width shrinks as 1 / sqrt(runs).
+
     ``detectable`` is the distance that it would have shown with probability POWER.
     """
 
@@ -330,8 +334,8 @@ def quadratic_interval(total: float, weights: FloatArray, level: float) -> Inter
 
 
 def _quadratic_quantile(weights: FloatArray, tail: float, upper: bool) -> float:
-    """Return the quantile that the sum of :func:`quadratic_interval`, with ``weights`` (K,),
-    exceeds (``upper``), or stays below, with probability ``tail``.
+    """Return the quantile that a sum of squares of independent standard normal numbers with
+    ``weights`` (K,) exceeds (``upper``), or stays below, with probability ``tail``.
     """
     # The saddle point of a value x solves K'(s) = sum w / (1 - 2 s w) = x, with K the cumulant
     # generating function. K' increases up to its pole, so that bisection over s finds the quantile.
@@ -405,7 +409,8 @@ def pearson_test(counts: np.ndarray, probabilities: FloatArray) -> tuple[float, 
     """Return the p-value of Pearson's chi-square test and its number of cells.
 
     ``counts`` (C,) and ``probabilities`` (C,) are those of C cells in decreasing order of
-    probability; the last cells, with expected counts below MIN_EXPECTED, are pooled.
+    probability; the last cells, with expected counts below MIN_EXPECTED, are pooled, and so is the
+    last of the others with them.
     """
     expected = probabilities * counts.sum()
     frequent = max(1, int((expected >= MIN_EXPECTED).sum()))
