@@ -65,7 +65,7 @@ def probe_times(scenario: Scenario) -> list[float]:
     if scenario.slotted:
         period = scenario.slot_plant.period
         even = [round(period * max(1, round(time / period)), 12) for time in even]
-    # The further times are thinned evenly, so that there are ``count`` in all with the checked ones.
+    # The further times are thinned evenly: with the checked ones there are ``count``.
     others = sorted(set(even) - set(checked))
     spare = min(max(count - len(checked), 0), len(others))
     chosen = np.linspace(0, len(others) - 1, spare).round().astype(int).tolist()

@@ -1,0 +1,55 @@
+"""Sentences at the top of a page, from summaries and comparisons made up for them."""
+
+from types import SimpleNamespace
+
+import pytest
+
+from netkf.report import claims
+
+
+def _sentence(rows, runs):
+    nodes = [
+        {"node": i, "mean_trace": mean, "mean_trace_se": error, "bound": bound}
+        for i, (mean, error, bound) in enumerate(rows)
+    ]
+    (text,) = claims._describe_bound(
+        SimpleNamespace(summary={"nodes": nodes, "bound": "H (12), exact"}, runs=runs)
+    )
+    return text
+
+
+def test_a_node_that_exceeds_its_bound_is_found_behind_one_with_a_larger_ratio():
+    text = _sentence([(1.3, 0.3, 1.0), (1.1, 0.01, 1.0), (0.5, 0.1, 1.0)], runs=100)
+    assert "is exceeded by more than 2.2 standard errors at 1 of 3 nodes" in text
+    assert "at node 1, ratio 1.1" in text
+
+
+def test_chance_at_one_of_many_nodes_exceeds_no_bound():
+    # 2.5 standard errors at one node: usual for the largest of 200, not for a single node.
+    highest = (1.25, 0.1, 1.0)
+    assert "holds; closest: " in _sentence([highest] + [(0.9, 0.1, 1.0)] * 199, runs=100)
+    assert "is exceeded by more than 1.7 standard errors" in _sentence([highest], runs=100)
+
+
+def test_a_covariance_that_equals_its_bound_holds():
+    assert " holds; " in _sentence([(1.0 + 1e-12, 0.0, 1.0)], runs=10)
+    assert "is exceeded" in _sentence([(1.0 + 1e-6, 0.0, 1.0)], runs=10)
+
+
+@pytest.mark.parametrize(("mean", "side"), [(1.2, "above"), (0.8, "below")])
+def test_a_single_run_exceeds_no_bound(mean, side):
+    assert f"P was {side} it" in _sentence([(mean, None, 1.0)], runs=1)
+
+
+def test_unknown_consistency_is_no_inconsistency():
+    def row(name, consistency):
+        rms = SimpleNamespace(value=1.0, real=False)
+        return SimpleNamespace(
+            filter=name, ran=True, status="complete", consistency=consistency, values={"rms": rms}
+        )
+
+    rows = [row("a", "consistent"), row("b", "-"), row("c", "too sure")]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(claims, "_rms_error", lambda row: row.values["rms"])
+        sentences = claims._describe_filters(SimpleNamespace(rows=rows, runs=1, first="a"))
+    assert "P does not describe the errors of c (too sure)" in sentences
