@@ -31,7 +31,9 @@ if TYPE_CHECKING:
 
 
 def _declare(parser: argparse.ArgumentParser) -> None:
-    """Declare the options of ``netkf check``."""
+    """Declare the options of ``netkf check``, which tests the promises of the filter's paper on
+    simulated runs and prints a row with a verdict for each.
+    """
     parser.add_argument(
         "--runs", type=parse_count, default=500, help="number of runs (default: 500)"
     )

@@ -116,7 +116,7 @@ def _run_ensemble(scenario: Scenario, options: argparse.Namespace) -> int:
     from netkf.ensembles.directory import EnsembleOptions, runs_to_directory
     from netkf.ensembles.pools import PoolOptions
 
-    pool = PoolOptions(options.workers, None, options.scheduler)
+    pool = PoolOptions(workers=options.workers, scheduler=options.scheduler)
     ensemble_options = EnsembleOptions(
         options.engine, options.trace or "first", options.resume, pool
     )

@@ -59,7 +59,9 @@ def _declare(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(options: argparse.Namespace) -> int:
-    """Explain a sample of a run; return the exit status.
+    """Print and write into a directory why the error of one node at one time of a run is as large
+    as it is: which readings had reached it, and which lost messages mattered. Return the exit
+    status.
 
     Raises ScenarioError for ``--node`` without ``--at``, or the reverse.
     """

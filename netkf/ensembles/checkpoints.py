@@ -72,7 +72,9 @@ class BlockCheckpoints:
         self._numbers: set[int] = set()
 
     def stored_block_size(self) -> int | None:
-        """Return the number of runs in a block, from the first readable block; None without one."""
+        """Return the number of runs in a block (consecutive replicas whose results are one file),
+        from the first readable file; None without one.
+        """
         for file in self._block_paths():
             with contextlib.suppress(DamagedError), _open_block(file) as arrays:
                 size = _read_texts(arrays)["identity"]["block"]

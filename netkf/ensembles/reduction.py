@@ -554,11 +554,12 @@ def add_total(lanes: Lanes, totals: FloatArray, f: int, a: int, number: Any) -> 
 def fill_single_nees(
     b: Batch, sums: Sums, scratch: ReductionScratch, r: int, t: int, f: int, q: int
 ) -> None:
-    """Write NEES of sample ``t`` of run ``r`` and filter ``f`` into ``scratch.nees[q]``, lane q, by
-    Gaussian elimination with pivoting.
+    """Write NEES of sample ``t`` of run ``r`` and filter ``f`` into ``scratch.nees[q]``, where q is
+    the lane of that run (runs are reduced side by side), by Gaussian elimination with pivoting.
 
-    Sets ``sums.regular[r]`` to False if P is singular. Takes NEES from ``b.known_nees`` where that
-    has it.
+    It is for samples whose P is not positive definite, for which the factorisation without pivoting
+    of all lanes fails. Sets ``sums.regular[r]`` to False if P is singular. The NEES of a run that
+    stored its own (``b.has_nees[r]``) is taken from ``b.known_nees``.
     """
     error, P = b.error[r, t, f : f + 1], b.P[r, t, f : f + 1]
     if not fill_nees(error, P, scratch.single_nees, scratch.single_factor, scratch.single_solved):

@@ -95,7 +95,7 @@ class AgeSawtooth(NamedTuple):
 
 def _sum_excess(values: FloatArray, levels: FloatArray) -> FloatArray:
     """Return the sum of ``max(0, value - level)`` over K ``values`` (K,), for each of L ``levels``
-    (L,).
+    (L,): the time above each level, from the ages at the ends of all segments of a sawtooth.
     """
     descending = np.sort(values)[::-1]
     sums = np.concatenate([[0.0], np.cumsum(descending)])

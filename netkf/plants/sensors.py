@@ -174,8 +174,9 @@ class SensorPath:
         random: np.random.Generator,
         cutting: np.random.Generator,
     ) -> None:
-        """Begin at time 0: H (p, n), R (p, p), generators ``random`` of the noise on the grid and
-        ``cutting`` of parts of steps.
+        """Begin at time 0: H (p, n), R (p, p), generators ``random`` of the noise in steps of the
+        sensing grid and ``cutting`` of that in parts of a step, which is divided where a node is
+        needed within it. With two generators the noise on the grid does not depend on the network.
         """
         self.H = H
         # The noise is drawn with unit intensity and multiplied by the Cholesky factor of R.
@@ -296,8 +297,9 @@ def cut(
 def divide(
     lanes: Lanes, first: FloatArray, rest: FloatArray, normals: FloatArray, u: Any, length: Any
 ) -> None:
-    """Divide the two noise moments ``rest`` (2, p, L) of p rows in L lanes of an interval of
-    ``length`` seconds in two.
+    """Divide an interval of ``length`` seconds in two, and with it the two moments ``rest``
+    (2, p, L) of the measurement noise v: its integrals with the Legendre polynomials P_0 = 1 and
+    P_1 (-1 .. 1 over the interval), for p readings in each of L lanes (runs side by side).
 
     Those of its first part, a share ``u`` of the length, are written to ``first`` (2, p, L), those
     of the remaining part replace ``rest``. ``normals`` (2, p, L) are standard normal.

@@ -196,7 +196,9 @@ def _report_command(
 
 
 def _compare(entries: list[_Entry], directories: Sequence[str | Path]) -> Comparison | str | None:
-    """Return the comparison of two entries, the reason why there is none, or None for one entry."""
+    """Return the comparison of the first two of the directories on a page, with one of ``entries``
+    each; the reason why there is none, if a run did not finish; or None for a single directory.
+    """
     if len(entries) < 2:
         return None
     have_ended = all(

@@ -73,8 +73,10 @@ class ExpectedIncrements:
 
 
 def _expected_increments_of_models() -> Callable[[Any], ExpectedIncrements]:
-    """Return a function from a model to its predictions of increments, which are set up once for
-    each model.
+    """Return a function from a node's model to its ExpectedIncrements, which predict the increments
+    y = int dy that the node reads, as H times the integral of the predicted state.
+
+    They are set up once for each model.
     """
     cache: dict[int, tuple[Any, ExpectedIncrements]] = {}
 

@@ -89,6 +89,7 @@ def with_filter(scenario: Scenario, filtering: Any) -> Scenario:
     same topology, which need not be drawn again.
     """
     copy = dataclasses.replace(scenario, filter=filtering)
+    # These are no fields, so that replace() does not copy them.
     for name in ("_folder", "_trust", "topology"):
         if name in scenario.__dict__:
             copy.__dict__[name] = scenario.__dict__[name]

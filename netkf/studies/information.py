@@ -299,6 +299,9 @@ class Reach:
     def messages_from(self, segment: int, budget: int) -> list[int]:
         """Return the indices of the messages on the path from ``segment`` (its index) to the node,
         in the order of sending, if at most ``budget`` messages of cost 1 are used.
+
+        A segment is an interval of the log in which one node's information accumulates. A message
+        that the run did not use (lost, late) costs 1, a used one 0.
         """
         path: list[int] = []
         while self.via[budget, segment] != NEVER:

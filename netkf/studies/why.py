@@ -313,7 +313,7 @@ class _Evidence:
 
     def _find_last_message(self, sender: int) -> tuple[int | None, int]:
         """Return the index of the last used message from ``sender`` (its id), None without one, and
-        the number of unused ones since.
+        the number of those since that it has not used: lost, late, unused or still under way.
         """
         messages = self.messages
         direct = (messages.sender == sender) & (messages.receiver == self._node)

@@ -180,7 +180,9 @@ def _unheard_sentence(neighbours: list[InformationSource]) -> str:
 
 
 def _reading_sentences(explanation: Explanation) -> Iterator[str]:
-    """Yield sentences about the newest readings that reached the node, and those kept away."""
+    """Yield sentences about the newest reading of each other sensor whose information the node's
+    estimate contains, and about newer ones that did not reach it because messages were lost.
+    """
     sensors = [s for s in explanation.sources if s.sensor and s.node != explanation.node]
     with_reading = sorted(
         (s for s in sensors if not math.isnan(s.reading)), key=lambda s: s.reading

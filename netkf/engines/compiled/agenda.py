@@ -399,8 +399,12 @@ def record_tick(
 def queue_pairs(state: Simulation, visits: Visits, k: int, first: int, now: float) -> None:
     """Queue the visits of tick ``k`` (index in ``state.ticks``) at ``now`` (seconds), some messages
     of which arrive: one visit of both ends of a link, or one of the sender with each receiver of a
-    broadcast. ``first`` is the place of the run's first node in ``state.xhat``; raises
-    ``visits.level`` of all these nodes.
+    broadcast.
+
+    A visit is a record of work to be done later: predict two nodes to ``now`` and combine what
+    they sent each other. Visits of one level touch different nodes, so that they are computed side
+    by side; a node's next visit is in a higher level. ``first`` is the row of the run's first node
+    in ``state.xhat``; raises ``visits.level`` of all these nodes.
     """
     bits, directions, outgoing = state.ticks.arrival_bits[k], state.directions, state.outgoing
     entity = state.entities[state.ticks.entity[k]]

@@ -175,8 +175,8 @@ def _make_gains(scenario: Scenario, state: Simulation) -> dict[str, Any]:
 @kernel
 def keep_prediction(state: Simulation, combination: CombinationState, h: int) -> None:
     """Copy the estimate and root of node ``h`` (index) to ``prior`` and ``prior_root`` of
-    ``combination``: they are its prediction, before any reading of this instant is used. Sets
-    ``nodes[h].reading`` to -1.
+    ``combination``: they are its prediction, before any reading of this instant is used, which
+    consensus on predictions sends. Sets ``nodes[h].reading`` to -1.
     """
     copy_state(state.size, combination.prior, combination.prior_root, h, state.xhat, state.root, h)
     # A reading of an earlier instant is not sent any more.

@@ -493,6 +493,10 @@ def _sums(terms: FloatArray, receivers: np.ndarray) -> dict[str, tuple[float, fl
     """Return the total weight of running sums at the start and now, as {"weight": (start, now)}:
     the weights that nodes hold, plus the totals sent, minus the totals heard.
 
+    Nodes send the total of all shares of their weight so far, so that a later message makes up for
+    a lost one; what was sent and not heard yet is under way. The sum stays N if none is lost for
+    good, which the trace reports.
+
     ``terms`` (2 N + W,) are these for N nodes, N nodes and W directed links; ``receivers`` (N,) is
     the number of nodes that hear each node.
     """

@@ -209,12 +209,17 @@ def set_moments(readings: LaneReadings, q: int, moments: FloatArray) -> None:
 def end_readings(state: Simulation, readings: LaneReadings) -> None:
     """Write the moments of the readings of all L lanes, which ``begin_reading`` has prepared, into
     ``readings.moments`` (q, L), and take the noise that they use away from ``state.sensing.noise``.
+
+    A reading is H times the integral of x plus noise, both with two moments over its interval. A
+    lane is one node's prediction; L of them are computed side by side.
     """
     r, size, p = readings, state.size, readings.noise.shape[1]
+    # The integrals of x: one row for each lane is turned into one column for each lane.
     for j in range(0, r.rows.shape[1], LANES):
         turn(MANY, r.rows, j, r.integrals)
     first, share = load(MANY, r.first, 0), load(MANY, r.share, 0)
     fill_moments_between(MANY, size, r.x, r.integrals, r.rows.shape[1] // 2, first, share)
+    # The noise of each sensor's step is divided where the reading ends; the next one gets the rest.
     step_noise = state.sensing.noise
     for j in range(0, 2 * p, LANES):
         gather(MANY, step_noise, r.noise_row, j, r.noise)

@@ -291,8 +291,8 @@ def is_poisson(scenario: Scenario) -> bool:
 
 @once_per_scenario
 def _rates_and_probabilities(scenario: Scenario) -> tuple[FloatArray, FloatArray]:
-    """Return ticks per second (E,) of each of E entities of a run, and the delivery probability
-    (W,) of each of W directed links.
+    """Return ticks per second (E,) of each of E entities of a run, the links or nodes that have a
+    clock of their own, and the delivery probability (W,) of each of W directed links.
     """
     clock, senders = scenario.network.activation, senders_of(scenario)
     assert isinstance(clock, LinkClock)

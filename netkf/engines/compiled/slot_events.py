@@ -140,8 +140,9 @@ class SlotEvents:
         the number of slots S and ``up`` (1, S, E, W), which is 1 where a message on directed link w
         is used in step e.
 
-        If nodes may be silent it is one slot, and ``sent`` (E, N) says which of the nodes that are
-        ``asked`` send. Dimensions: E exchange steps in a slot, W directed links.
+        If nodes may be silent (event-triggered filters) it is one slot: ``asked`` says which nodes
+        have a message to send in it, and ``sent`` (E, N) which of them send it. Dimensions: E
+        exchange steps in a slot (rounds of messages), W directed links.
         """
         setup, arrivals = self._setup, []
         self._rows, self._sent = [], sent

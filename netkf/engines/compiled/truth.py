@@ -49,8 +49,10 @@ class CompleteStates:
     def states_at(
         self, times: FloatArray, path: PathBlock, pieces: np.ndarray
     ) -> tuple[FloatArray, FloatArray]:
-        """Return local and absolute states (T, n) each at ``times`` (T,) in seconds; ``path`` and
-        ``pieces`` are not used.
+        """Return the states (T, n) at ``times`` (T,) in seconds, relative to the origin of the
+        frame of that time, and absolute.
+
+        ``path`` and ``pieces`` are not used: this truth was drawn, or recorded, before the run.
         """
         local, absolute = self.truth.states(times)
         return local, absolute

@@ -150,6 +150,9 @@ class Transmitter:
     def shift(self, algorithm: Filter, offset: FloatArray) -> None:
         """Shift all messages under way by ``offset`` (n,), predicted back to the time of sending:
         the origin of coordinates has moved by ``-offset``.
+
+        The origin follows the state of an unstable plant, whose size would cost the errors their
+        digits; the engine calls this after it has shifted the nodes.
         """
         now = self._timeline.now
         for key, envelope in self._under_way.items():
