@@ -182,8 +182,10 @@ def _search_least(
 ) -> float:
     """Return the least level lambda_k found: by drawing, at states 0, and by a search from both.
 
-    ``past`` holds the states (K, m) of each source in K pasts, ``values`` (K,) the levels there;
-    ``window`` is h in slots.
+    The level is the least eigenvalue of the mean information that ``window`` slots of regressors
+    bring, given the past; the condition of the diffusion paper asks that it stays above 0. A source
+    is a random process that makes regressors. ``past`` holds the states (K, m) of each source in K
+    pasts, ``values`` (K,) the levels there.
     """
     # The least level may be attained far from all pasts drawn.
     lowest = int(np.argmin(values))
@@ -212,9 +214,10 @@ def _search(
     ends = np.cumsum([0, *(len(sources[k].start) for k in moving)])
 
     def level(x: FloatArray) -> float:
-        """Return the level at the past ``x``, the states of all sources that are not fixed, side by
-        side.
+        """Return the level (least eigenvalue of the mean information) at the past ``x``, the states
+        of all sources that are not fixed, side by side.
         """
+        # _levels takes many pasts at once: here it is one.
         states = [s[None] for s in start]
         for index, k in enumerate(moving):
             states[k] = x[None, ends[index] : ends[index + 1]]

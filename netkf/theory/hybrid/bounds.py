@@ -71,8 +71,11 @@ def covariance_bound(scenario: Scenario, times: Any) -> FloatArray:
 
 
 def _solve_coupled(packed: PackedRiccati, times: FloatArray) -> FloatArray:
-    """Return the solution (T, N, m) at T ``times`` (seconds), for each node the m = n (n + 1) / 2
-    entries of the upper triangle of its covariance.
+    """Return the bound on the mean of each node's P over time, the solution of the Riccati
+    equations of all nodes, coupled by the link rates (H equation 12).
+
+    It is (T, N, m) at T ``times`` (seconds), for each node the m = n (n + 1) / 2 entries of the
+    upper triangle of its covariance.
     """
     equations = packed.equations
     # Without delay the right-hand side is quadratic, and Taylor series are fastest unless stiff.
@@ -87,7 +90,9 @@ def _solve_coupled(packed: PackedRiccati, times: FloatArray) -> FloatArray:
 
 
 def _covariance_scale(packed: PackedRiccati) -> float:
-    """Return the size of the covariances that matter: of the start and of Q."""
+    """Return the size against which entries of covariances count as zero: the largest entry of the
+    covariances at the start and of Q.
+    """
     sizes = (np.abs(packed.start).max(), np.abs(packed.equations.Q).max())
     return max(*(float(size) for size in sizes), 1e-300)
 

@@ -117,7 +117,9 @@ def reason_without_bound(scenario: Scenario) -> str | None:
 
 
 def _reason_of_samples(scenario: Scenario) -> str | None:
-    """Return the reason why docs/poisson_samples.md does not apply, or None if it applies."""
+    """Return the reason why the bound on the mean covariance does not cover the sensors that sample
+    at random times (docs/poisson_samples.md proves it for Poisson times), or None if it does.
+    """
     if not scenario.is_linear:
         return f"not promised: {NONLINEAR}"
     for node, placed_sensor in randomly_sampled_sensors(scenario):
@@ -213,7 +215,8 @@ def coupled_riccati(scenario: Scenario) -> CoupledRiccati:
 
 
 def has_balanced_rates(scenario: Scenario) -> bool | None:
-    """Return True if both directions of each link have one rate, so that the limit is S of H(13).
+    """Return True if both directions of each link have one rate: then the bound tends to S as links
+    become faster, the steady covariance with the mean information of all nodes (H equation 13).
 
     None if the rates are not known beforehand.
     """

@@ -64,8 +64,9 @@ def link_rate_for(scenario: Scenario, delta: float) -> LinkRate:
     equations, S = _require_talk(scenario), limit_covariance(scenario)
 
     def excess(log_factor: float) -> float:
-        """Return the logarithm of distance over ``delta`` with all rates times
-        exp(``log_factor``).
+        """Return the logarithm of the distance between the steady bound and its limit S for fast
+        links over ``delta``, the distance asked for, with all link rates times exp(``log_factor``);
+        its root is the answer.
         """
         distance = _distance(equations, S, math.exp(log_factor))
         if distance is None:

@@ -135,7 +135,8 @@ class PackedRiccati:
         self, change: FloatArray, group: PoissonSamples, P: FloatArray, sent: FloatArray | None
     ) -> None:
         """Add to ``change`` (N, m), in place, ``s (g(P) - P)`` of the sensors of a ``group`` with
-        Poisson rates s, and the arrivals of estimates that nodes sent at these samples.
+        Poisson rates s, where g is the update by a sample, and the arrivals of estimates that nodes
+        sent at these samples, by the rates ``group.heard`` of receivers and samples.
 
         P (N, n, n) are the present covariances, ``sent`` (N, n, n) those one delay ago (None: no
         delay).

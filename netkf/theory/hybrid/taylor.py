@@ -27,10 +27,12 @@ class StiffError(Exception):
 def solve_by_taylor_series(
     packed: PackedRiccati, times: FloatArray, scale: float, max_orders: int, limit: float
 ) -> FloatArray:
-    """Return the solution (T, N, m) at ``times`` (seconds, increasing), from ``packed.start`` at 0.
+    """Return the solution (T, N, m) at ``times`` (seconds, increasing) of the coupled Riccati
+    equations that bound the mean of P at N nodes (H equation 12), from ``packed.start`` at 0.
 
-    A step is accepted if its last terms are negligible and its polynomial satisfies the equation at
-    its end; ``scale`` is the size of the covariances that matter. Raises StiffError after
+    Each covariance is packed into its m = n (n + 1) / 2 distinct entries. A step is accepted if its
+    last terms are negligible and its polynomial satisfies the equation at its end; entries far
+    below ``scale`` need not be accurate. Raises StiffError after
     ``max_orders`` coefficients or if steps shrink to nothing, and TheoryError if an entry exceeds
     ``limit``.
     """

@@ -86,7 +86,7 @@ def triangular_root(factor: FloatArray) -> FloatArray:
         factor = np.pad(factor, widths)
     if factor.ndim == 2:
         return triangular(factor)
-    # parts' = Z U, so parts parts' = U' U: U' is the root, with arbitrary signs of its columns.
+    # factor' = Z U, so factor factor' = U' U: U' is the root, with arbitrary signs of its columns.
     return np.swapaxes(np.linalg.qr(np.swapaxes(factor, -1, -2), mode="r"), -1, -2)
 
 

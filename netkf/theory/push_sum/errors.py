@@ -116,8 +116,12 @@ class AveragingRule(ErrorRule):
         return self._arrivals.get((slot, phase, step), np.zeros((self._N, self._N)))
 
     def sense(self, time: float, observations: EstimatorObservations) -> None:
-        """Update the estimates of all nodes, P step 4, with the G and N that the masses estimate, P
-        (6)-(8); changes errors and roots of P.
+        """Update the estimates of all nodes with their readings (push-sum paper, step 4), by the
+        total information G and the number N of nodes that each has learned from push-sum, its
+        equations 6 to 8. Changes errors and roots of P.
+
+        It is called at each sensing time of the run. Columns of ``_z``: 0 the weight, 1 the
+        mass whose ratio to the weight is N, from 2 on that for G.
         """
         n, errors = self.errors.n, self.errors
         heard = self._z[:, 0] > 0.0  # before any weight arrives a node knows its own sensor only

@@ -75,9 +75,10 @@ def push_sum_noise(scenario: Scenario, gammas: Sequence[int]) -> FloatArray:
 def push_sum_covariances(scenario: Scenario, gammas: Sequence[int]) -> FloatArray:
     """Return the exact steady error covariances (G, N, n, n) of all nodes for each of G ``gammas``.
 
-    As ``push_sum_error_covariance`` for the scenario with that gamma; nan where the mean-square
-    radius is not below 1. P Theorem 4 says that they tend to P_inf. Raises TheoryError if
-    asymptotic gains do not exist or the links are not drawn independently.
+    Gamma is the number of averaging steps in a slot. The gains are those that the filters reach
+    after a long time; nan where the errors of a gamma grow without limit in mean square. With
+    gamma they tend to P_inf, the covariance of the central filter (push-sum paper, Theorem 4).
+    Raises TheoryError if such gains do not exist or the links are not drawn independently.
     """
     steps = estimation_steps(scenario)
     N, n, _ = steps.closed.shape
