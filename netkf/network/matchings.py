@@ -237,7 +237,9 @@ def _greedy_probabilities(links: tuple[Link, ...]) -> tuple[float, ...]:
 
     @cache
     def probabilities(free: int) -> tuple[float, ...]:
-        """Return the probability that each link is chosen among the ``free`` ones, a bit mask."""
+        """Return the probability that each link is in the matching if those of ``free`` (a bit
+        mask) may still be chosen: the mean over the link that is chosen next.
+        """
         candidates = [a for a in range(count) if free >> a & 1]
         total = [0.0] * count
         for a in candidates:

@@ -70,6 +70,10 @@ def max_moments(filters: Filters) -> int:
 def unobserved_series(filters: Filters) -> LaneSeries:
     """Return the power series in the gap g of all models without sensors: of exp(A g) and of Q_g,
     the covariance of the noise over the gap.
+
+    A model is the matrices with which a node predicts. Its series are expanded anew in each cell of
+    ``unit`` seconds; column 1 of ``table.sizes`` is 0 if it observes nothing, and the first
+    ``width`` values are Q_g (a triangle) and exp(A g).
     """
     n, table = filters.xhat.shape[1], filters.table
     selected = table.sizes[:, 1] == 0

@@ -162,7 +162,9 @@ class StackedErrors:
         """Add inputs for the noises of readings, p for an estimator with p readings; return their
         columns by estimator.
 
-        Use the columns before any other operation that adds inputs.
+        Inputs are independent random numbers of variance 1; all errors are linear in them, and the
+        stack holds the coefficients, one column for each input. Use the columns before any other
+        operation that adds inputs, which may move them.
         """
         ends = np.cumsum(
             [0, *(len(observation.H) for observation in observations.values())]

@@ -59,9 +59,10 @@ def error_rule(
     run; it changes ``errors``, the stacked errors of all nodes, event by event. Raises TheoryError
     for sensors that give increments.
 
-    ``messages`` are those of the run that arrived (none in slots, where the rule gets them slot by
-    slot).
+    All filters' rules are made by a function with these arguments; ``messages``, those of the run
+    that arrived, are not used here.
     """
+    # Without a trace nothing says which messages of a slot arrived.
     if scenario.slotted:
         require_traced_exchanges(scenario, run)
     elif any(scenario.increment_sensors.values()):

@@ -36,7 +36,7 @@ def effective_weights(
     scenario: Scenario, weights: Sequence[FloatArray]
 ) -> tuple[FloatArray, FloatArray]:
     """Return the weights (N, N) of the predictions and those of the readings (N, N) in the
-    estimates.
+    estimates after an exchange, in which nodes average pairs (information vector and matrix).
 
     Entry (i, j) is the number of times that node i counts the information of node j. ``weights``
     (N, N) of each step are those of the messages that arrived in it, 0 for others.
@@ -47,6 +47,9 @@ def effective_weights(
     for heard in weights:
         # A node gives the weight of lost messages to its own pair.
         mixing = (heard + np.diag(np.maximum(1.0 - heard.sum(axis=1), 0.0))) @ mixing
+    # A node averages K pairs, each a multiple (``shares``) of the information of its prediction and
+    # of its reading. The estimate is the sum of these pairs and of the node's own prediction, each
+    # times its entry of ``counts``.
     shares, counts = algorithm.recipe(N)
     times = counts[:-1] @ shares
     return times[0] * mixing + counts[-1] * np.eye(N), times[1] * mixing
