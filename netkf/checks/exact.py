@@ -74,8 +74,11 @@ SINGULAR = 1e-12
 
 def summarise_exactly(scenario: Scenario, run: Run) -> ReplicaSummary:
     """Return the summary of a run at its K checked times and N sampled nodes: P (K, N, n, n),
-    errors (K, N, n), NEES (K, N), and the exact law of the errors if those of all nodes are few
-    enough.
+    errors (K, N, n), NEES (K, N), and the exact law of the errors.
+
+    The errors are Gaussian given the events of the run (ticks, losses, delays), from which theory
+    computes their covariance. This is left out (nan) for later replicas, if the nodes have too many
+    errors together, and if the equations of the filter are not known.
     """
     time_indices, sampled = checked_samples(scenario, run.times), sampled_indices(scenario)
     _, nees = errors(run.error, run.P)
@@ -86,20 +89,23 @@ def summarise_exactly(scenario: Scenario, run: Run) -> ReplicaSummary:
         e[time_indices][:, sampled],
         nees[time_indices][:, sampled],
     )
+    # A summary without exact law has a field for the errors of all nodes at all sample times.
+    error_count = len(run.times) * errors_at_once(scenario)
     if run.replica < max_replayed(scenario) and few_errors(scenario).holds:
         try:
             law = error_law(with_promised_filter(scenario), run)
         except TheoryError:  # an assumption says so, and rows that need them are not promised
-            return _summary_without_replay(P, e, nees, len(run.times) * errors_at_once(scenario))
+            return _summary_without_replay(P, e, nees, error_count)
         return _replayed_summary(scenario, run, law, e, nees)
-    return _summary_without_replay(P, e, nees, len(run.times) * errors_at_once(scenario))
+    return _summary_without_replay(P, e, nees, error_count)
 
 
 def max_replayed(scenario: Scenario) -> int:
-    """Return the number of replicas whose exact covariances are computed.
+    """Return the number of replicas, the first ones, whose exact error covariances are computed
+    from their events (replayed), which takes far longer than a summary.
 
-    It is what ENOUGH_ERRORS (and in slots ENOUGH_RUNS) take, within the limits of MAX_REPLAYED,
-    MIN_REPLAYED and MAX_REPLAYED_STEPS.
+    They have enough errors to reveal a wrong covariance (ENOUGH_ERRORS, and in slots ENOUGH_RUNS),
+    within the limits of MAX_REPLAYED, MIN_REPLAYED and the time that MAX_REPLAYED_STEPS allow.
     """
     per_run = len(probe_times(scenario)) * errors_at_once(scenario)
     steps, min_replicas = integration_steps(scenario), 0
@@ -113,7 +119,7 @@ def max_replayed(scenario: Scenario) -> int:
 def _summary_without_replay(
     P: FloatArray, e: FloatArray, nees: FloatArray, size: int
 ) -> ReplicaSummary:
-    """Return a summary of one run without exact covariances, whose fields are then nan.
+    """Return a summary of one run without exact covariances: the fields for them are nan.
 
     At K checked times and N sampled nodes: ``P`` (K, N, n, n), errors ``e`` (K, N, n) and ``nees``
     (K, N). ``size`` is the number of errors of all nodes at all sample times.
@@ -129,6 +135,7 @@ def _summary_without_replay(
         Sigma=unknown,
         whole=np.tile(pair, (times, 1)),
         joint=pair,
+        # A sum of squares and as many weights as errors, as in a summary with exact covariances.
         quadratic=np.full(1 + size, np.nan),
         bias=np.full((n, n + 1), np.nan),
     )
@@ -137,10 +144,12 @@ def _summary_without_replay(
 def _replayed_summary(
     scenario: Scenario, run: Run, law: ErrorLaw, e: FloatArray, nees: FloatArray
 ) -> ReplicaSummary:
-    """Return the summary of a run with the exact law of its errors.
+    """Return the summary of a run with the exact ``law`` of its errors: their mean and covariance,
+    and P by the filter's equations, given the events of the run.
 
     ``e`` (K, N, n) and ``nees`` (K, N) are those at the K checked times and N sampled nodes; they
-    become nan where the rounding of large states exceeds the exact deviation of the errors.
+    become nan where the rounding of large states exceeds the exact deviation of the errors. The law
+    is of M estimators: the nodes, or one pooled filter that all nodes share.
     """
     time_indices, sampled = checked_samples(scenario, run.times), sampled_indices(scenario)
     nodes, times, estimators, n = (
@@ -154,6 +163,7 @@ def _replayed_summary(
     stacked = np.einsum("kakb->kab", law.covariance.reshape(times, size, times, size))
     mean = law.mean.reshape(times, estimators, n)
     Sigma, replayed = diagonal_blocks(stacked, estimators), law.P
+    # Errors less their exact mean are normal with mean 0.
     centred = run.error[:, :estimators] - mean
     floor = np.maximum((BLUR * run.rounding) ** 2, _variance_floor(scenario))
     squares = whiten_errors(
@@ -164,19 +174,33 @@ def _replayed_summary(
     if estimators < nodes:  # all share one pooled filter
         mean, Sigma, replayed = (np.repeat(part, nodes, axis=1) for part in (mean, Sigma, replayed))
     blurred = blurred_samples(run, Sigma)[time_indices][:, sampled]
-    if blurred.any():
+    if blurred.any():  # the sum over all errors is spoilt by any of them
         quadratic = np.full_like(quadratic, np.nan)
     e = np.where(blurred[..., None], np.nan, e)
     nees = np.where(np.isnan(e).any(axis=-1), np.nan, nees)
     replayed, mean, Sigma = (part[time_indices][:, sampled] for part in (replayed, mean, Sigma))
     P = run.P[time_indices][:, sampled]
-    return ReplicaSummary(P, e, nees, replayed, mean, Sigma, squares, joint, quadratic, bias)
+    return ReplicaSummary(
+        P,
+        e,
+        nees,
+        replayed,
+        mean,
+        Sigma,
+        whole=squares,
+        joint=joint,
+        quadratic=quadratic,
+        bias=bias,
+    )
 
 
 def _pool_times(
     e: FloatArray, covariance: FloatArray, floor: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the fields ``joint`` (2,) and ``bias`` (n, n + 1) of ReplicaSummary.
+    """Return two statistics of the errors at all times of a run together, fields of ReplicaSummary.
+
+    ``joint`` (2,) is e' C^-1 e with C their joint covariance, and its degrees of freedom; ``bias``
+    (n, n + 1) is the information matrix and vector of a constant bias of all errors.
 
     ``e`` (K, M, n) are the errors of M estimators at K times less their mean, ``covariance``
     (K M n, K M n) is their joint covariance. Directions of variance below ``floor`` are left out,
@@ -198,7 +222,9 @@ def _pool_times(
 
 
 def _pool_nees(e: FloatArray, P: FloatArray, law: ErrorLaw) -> FloatArray:
-    """Return the field ``quadratic`` (1 + K M n,) of ReplicaSummary; nan if some P is singular.
+    """Return the sum of the NEES of a run and its weights (1 + K M n,), the field ``quadratic`` of
+    ReplicaSummary: the sum is one of squares of independent standard normal numbers times these
+    weights. All are nan if some P is singular.
 
     The sum is over ``e' P^-1 e`` at all times and estimators, each scaled to the expected value n,
     so that a moment of a far too small P does not outweigh all others. ``e`` (K, M, n) are errors
@@ -223,7 +249,8 @@ def _pool_nees(e: FloatArray, P: FloatArray, law: ErrorLaw) -> FloatArray:
 
 
 def nees_shares(whitened: FloatArray) -> FloatArray:
-    """Return the scales (K,) that bring NEES to the expected value n.
+    """Return the factors (K,) that scale each of K NEES to the expected value n, so that none
+    outweighs the others in a sum.
 
     The expected NEES is the trace of ``whitened`` (K, n, n), L Sigma L' with L' L = P^-1; the scale
     is 0 where that is 0.
@@ -244,8 +271,8 @@ def _nearly_singular(P: FloatArray) -> np.ndarray:
 
 
 def _variance_floor(scenario: Scenario) -> float:
-    """Return the variance below which errors are rounding: (OPERATIONS EPS)^2 times the sum of
-    tr P(0) and the covariance that one reading gives.
+    """Return the variance below which errors of estimates are rounding: (OPERATIONS EPS)^2 times
+    the sum of tr P(0) and the smallest variance that one reading alone gives.
     """
     information = float(np.linalg.norm(scenario.node_infos[0].information, 2))
     reading_variance = 1.0 / information if information > 0.0 else 0.0
@@ -253,7 +280,9 @@ def _variance_floor(scenario: Scenario) -> float:
 
 
 def few_errors(scenario: Scenario) -> Assumption:
-    """Return the assumption that the joint error covariance of all nodes can be computed."""
+    """Return the assumption that the joint error covariance of all nodes can be computed, a row of
+    the table of assumptions: it holds for up to MAX_ERRORS errors at one time.
+    """
     size = len(scenario.nodes) * scenario.plant.n
     evidence = f"{size} errors of all nodes together, at most {MAX_ERRORS}"
     return Assumption("exact errors are within reach", "netkf", size <= MAX_ERRORS, evidence)
@@ -262,12 +291,13 @@ def few_errors(scenario: Scenario) -> Assumption:
 def whiten_errors(
     e: FloatArray, stacked: FloatArray, min_variance: float, floor: FloatArray | float = 0.0
 ) -> FloatArray:
-    """Return ``e' Sigma^-1 e`` of the errors of all nodes and its degrees of freedom, (K, 2).
+    """Return ``e' Sigma^-1 e`` of the errors of all nodes and its degrees of freedom, (K, 2), at K
+    times: chi-square if Sigma is their covariance.
 
-    ``e`` (K, N, n) are errors, ``stacked`` (K, N n, N n) joint covariances. Eigenvectors count if
-    their variance is above ``min_variance`` times the largest one and above ``floor`` (K,), the
-    variance of rounding errors. Small variances matter: they are those of the differences between
-    nodes.
+    ``e`` (K, N, n) are errors less their mean, ``stacked`` (K, N n, N n) joint covariances Sigma.
+    Eigenvectors count if their variance is above ``min_variance`` times the largest one and above
+    ``floor`` (K,), the variance of rounding errors. Small variances matter: they are those of the
+    differences between nodes.
     """
     finite = np.asarray(np.isfinite(stacked).all(axis=(-1, -2)))
     values, vectors = np.linalg.eigh(np.where(finite[:, None, None], stacked, 0.0))
@@ -296,13 +326,14 @@ def with_base_filter(scenario: Scenario) -> Scenario:
 
 
 def promised_filter(algorithm: Any) -> Any:
-    """Return the filter whose promises are checked.
+    """Return the filter whose promises (statements of its paper) are checked for ``algorithm``.
 
     It is the given one if its class is built in or overrides only weights of links; otherwise one
     of the built-in class that it derives from, with the same parameters.
 
     Raises TheoryError for a class that derives from no built-in one, and for one that declares
-    ``talks = False`` although its base talks, since promises about the base are about messages.
+    ``talks = False`` (sends no messages) although its base sends some, since promises about the
+    base are about messages.
     """
     built_in, name = built_in_class(algorithm), type(algorithm).__name__
     if built_in is None:
@@ -321,18 +352,22 @@ def promised_filter(algorithm: Any) -> Any:
 
 
 def check_upper_bound(samples: RunSamples, level: float) -> Finding:
-    """Check P >= Sigma, the exact error covariance, by the least eigenvalue of P - Sigma.
+    """Check that P of the runs is at least Sigma, the exact covariance of the errors given the
+    events of the run, by the least eigenvalue of P - Sigma.
 
-    No interval is estimated, so that ``level`` is not used.
+    ``runs.P`` and ``runs.Sigma`` are (R, K, N, n, n). No interval is estimated, so that ``level``
+    is not used.
     """
     max_runs = max_replayed(samples.scenario)
     P, Sigma = samples.runs.P[:max_runs], samples.runs.Sigma[:max_runs]
     size = np.trace(Sigma, axis1=-2, axis2=-1)
+    # Covariances that are not finite count as below Sigma; eigvalsh needs finite entries.
     gap = np.nan_to_num(P - Sigma, nan=-1e300, posinf=1e300, neginf=-1e300)
     shortfall = np.maximum(-np.linalg.eigvalsh(gap)[..., 0], 0.0)
     message = (
         f"least eigenvalue of P - Sigma relative to its trace in {shortfall.size:,} covariances"
     )
+    # Size of the values, of the terms whose rounding errors they inherit, and relative tolerance.
     limits = size, samples.largest_terms(samples.runs.replayed[:max_runs]), BOUND_TOLERANCE
     finding = compare_identities(shortfall, *limits, message)
     return with_departure(finding, samples, shortfall, limits)
@@ -340,11 +375,12 @@ def check_upper_bound(samples: RunSamples, level: float) -> Finding:
 
 @gaussian_test
 def check_error_covariance(samples: RunSamples, level: float) -> Finding:
-    """Test the null hypothesis that errors have their exact mean and covariance Sigma.
+    """Test the null hypothesis that errors have their exact mean and covariance Sigma, computed
+    from the events of each run, in the runs that were replayed (the first ``max_replayed``).
 
     Under it the sum of e' Sigma^-1 e over the runs is chi-square, at every node and time and for
-    all nodes at a time (half of the level together), and for all errors of all times (the other
-    half).
+    all nodes at a time (``runs.whole``), which together err with at most half the probability
+    ``level``, and for all errors of all times (``runs.joint``), which has the other half.
     """
     runs, scenario = samples.runs, samples.scenario
     n, max_runs = scenario.plant.n, max_replayed(scenario)
@@ -372,10 +408,11 @@ def check_error_covariance(samples: RunSamples, level: float) -> Finding:
 
 
 def _compare_pooled(joint: FloatArray, level: float) -> Interval:
-    """Return an interval for the relative difference between the pooled squared errors and their
-    degrees of freedom, both summed over the rows of ``joint`` (R, 2).
+    """Return an interval for the relative difference between the squared errors, whitened by their
+    exact covariance and pooled over times, nodes and runs, and their degrees of freedom.
 
-    The interval misses the truth with at most the probability ``level``.
+    A row of ``joint`` (R, 2) has both for one run. The interval misses the truth with at most the
+    probability ``level``.
     """
     total, freedom = joint[np.isfinite(joint).all(axis=1)].sum(axis=0).tolist()
     if not freedom > 0.0:
@@ -387,8 +424,9 @@ def check_bias(samples: RunSamples, level: float) -> Finding:
     """Test the null hypothesis that errors less their exact mean have no constant bias, the same at
     all nodes and times.
 
-    The bias is estimated by generalised least squares. Its length is in standard deviations of an
-    error: it is whitened by the mean covariance of all nodes and times.
+    The bias is estimated by generalised least squares from ``runs.bias`` (R, n, n + 1), which has
+    the information matrix and vector of each replayed run. Its length is in standard deviations of
+    an error: it is whitened by the mean covariance of all nodes and times.
 
     The interval of the finding misses the truth with at most the probability ``level``.
     """
@@ -413,8 +451,9 @@ def check_bias(samples: RunSamples, level: float) -> Finding:
 
 
 def _length_interval(spread: FloatArray, z: FloatArray, level: float) -> Interval:
-    """Return an interval for |spread m|, where ``z`` (k,) is normal with mean m and covariance I
-    and ``spread`` is (d, k). It excludes 0 if and only if |z|^2 exceeds its chi-square quantile.
+    """Return an interval for the length |spread m| of a bias, where ``z`` (k,) is normal with mean
+    m and covariance I and ``spread`` (d, k) turns m into the bias. It excludes 0 if and only if
+    |z|^2 exceeds its chi-square quantile.
 
     The interval misses the truth with at most the probability ``level``.
     """
@@ -426,12 +465,14 @@ def _length_interval(spread: FloatArray, z: FloatArray, level: float) -> Interva
     excess = float(np.linalg.norm(z)) - reach
     low = max(value - max_reach, excess * max(smallest, 1e-9 * float(sizes[0])), 0.0)
     detectable = max_reach + float(scipy.special.ndtri(POWER)) * float(sizes[0])
-    return Interval(value, low if excess > 0.0 else 0.0, value + max_reach, detectable, value, 0.0)
+    low = low if excess > 0.0 else 0.0
+    return Interval(value, low, value + max_reach, detectable, seen=value, expected=0.0)
 
 
 @gaussian_test
 def check_expected_nees(samples: RunSamples, level: float) -> Finding:
-    """Test the null hypothesis that NEES has its expected value given the events of each run.
+    """Test the null hypothesis that NEES has its expected value given the events of each run, which
+    is not n where P is not the covariance Sigma of the errors.
 
     Given the events NEES is a quadratic form of Gaussian errors (less their exact mean): a sum of
     squares of standard normal numbers weighted by the eigenvalues of P^-1 Sigma. So is its sum over
@@ -442,7 +483,7 @@ def check_expected_nees(samples: RunSamples, level: float) -> Finding:
     runs, n = samples.runs, samples.scenario.plant.n
     max_runs = max_replayed(samples.scenario)
     P, Sigma = runs.replayed[:max_runs], runs.Sigma[:max_runs]
-    inverse, m = np.linalg.pinv(P), runs.mean[:max_runs]
+    inverse, m = np.linalg.pinv(P), runs.mean[:max_runs]  # m is the exact mean of the errors
     weights = np.linalg.eigvals(inverse @ Sigma).real
     weights = np.maximum(weights, 0.0).reshape(len(P), -1, n)
     mean = weights.sum(axis=(0, 2))
@@ -456,6 +497,7 @@ def check_expected_nees(samples: RunSamples, level: float) -> Finding:
         return find_nothing(NEES_TOLERANCE)
     if not len(tested):
         return find_unknown("NEES does not exist: P is singular or not finite", NEES_TOLERANCE)
+    # Factors that scale each NEES to the expected value n: its expected value is the weights' sum.
     intervals, sizes = [], weights.sum(axis=2, keepdims=True)
     units = np.divide(n, sizes, out=np.zeros(sizes.shape), where=sizes > 0.0)
     for k in tested.tolist():
@@ -466,14 +508,14 @@ def check_expected_nees(samples: RunSamples, level: float) -> Finding:
         f"mean NEES {nees[:, tested].mean():.4g}, exact errors say "
         f"{mean[tested].mean() / len(P):.4g}, n is {n}; largest relative difference"
     )
-    pooled = _expected_together(runs.quadratic[:max_runs], 0.5 * level)
+    pooled = _pooled_expected_nees(runs.quadratic[:max_runs], 0.5 * level)
     finding = pool(
         find_largest(intervals, NEES_TOLERANCE, message), pooled, EVERYTHING, NEES_TOLERANCE
     )
     return finding._replace(message=finding.message + samples.blurred_note, most_runs=max_runs)
 
 
-def _expected_together(quadratic: FloatArray, level: float) -> Interval:
+def _pooled_expected_nees(quadratic: FloatArray, level: float) -> Interval:
     """Return an interval for the relative difference between the NEES pooled over times, nodes and
     runs and its expected value.
 
@@ -488,10 +530,12 @@ def _expected_together(quadratic: FloatArray, level: float) -> Interval:
 
 @gaussian_test
 def check_nees(samples: RunSamples, level: float) -> Finding:
-    """Test the null hypothesis that errors are Gaussian with covariance P, given the exchanges.
+    """Test the null hypothesis that errors are Gaussian with covariance P of the filter, given the
+    messages that were exchanged.
 
-    Under it NEES is chi-square with n degrees of freedom at every point, and so is its sum over
-    runs. The interval of the finding misses the truth with at most the probability ``level``.
+    Under it NEES is chi-square with n degrees of freedom at every node and time, and its sum over R
+    runs with R n degrees. The interval of the finding misses the truth with at most the probability
+    ``level``.
     """
     n, nees = samples.scenario.plant.n, samples.runs.nees.reshape(samples.count, -1)
     if np.isnan(samples.runs.e).all():
@@ -500,6 +544,7 @@ def check_nees(samples: RunSamples, level: float) -> Finding:
     finding = compare_chi_square(nees / n, freedom, samples.point_labels, level / 2.0, "NEES")
     finite = nees[:, np.isfinite(nees).all(axis=0)]
     if finite.size:
+        # A chi-square variable with n degrees of freedom has mean n and half of its variance n.
         expected = np.full(finite.shape, float(n))
         finding = pool(
             finding,

@@ -73,16 +73,19 @@ POOLED_TOLERANCE = 0.1
 def pool(
     single: Finding, pooled: Interval, what: str, tolerance: float = POOLED_TOLERANCE
 ) -> Finding:
-    """Return the finding of one promise from that of its single comparisons and the interval of one
-    comparison of all values pooled.
+    """Return the finding of one promise from that of its comparisons one by one (at each node and
+    time), ``single``, and the interval ``pooled`` of one comparison of all values together.
 
-    Each has its share of the level. If only a single comparison is significant, it is the finding;
-    otherwise the pooled one is, whose interval is far narrower, with its own ``tolerance``.
-    ``what`` describes the pooled values.
+    The caller gives each a part of the error probability. If only a single comparison is
+    significant, it is the finding; otherwise the pooled one is, whose interval is far narrower,
+    with its own ``tolerance``. ``what`` describes the pooled values.
     """
+    # The upper end of a margin below 0: the single comparison breaks the promise. A pooled value of
+    # nan (nothing could be pooled) leaves the single comparisons too.
     single_decides = single.margin[2] < 0.0 and not pooled.low > 0.0
     if single_decides or not pooled.value >= 0.0:
         return single
+    # The margin (value, low, high) is minus the distance, so that its limits change places.
     margin = -pooled.value, -pooled.high, -pooled.low
     text = f"{what}; one by one: {single.message}: {max(0.0, -single.margin[0]):.3g}"
     return single._replace(
@@ -104,11 +107,13 @@ def _rounding_of(P: FloatArray, start: float) -> float:
 
 
 def compare_laws(pairs: Sequence[Pair], level: float, start: float = 0.0) -> Finding:
-    """Test the null hypothesis that both samples of each pair have the same law.
+    """Test the null hypothesis that both samples of covariances of each pair have the same
+    probability distribution (law), within LAW_TOLERANCE.
 
-    Diagonal entries are compared one by one by :func:`law_distance`, which needs no moments, at
-    equal shares of the level. ``start`` is the largest trace at time 0, whose rounding errors
-    remain in P.
+    Diagonal entries are compared one by one by a Kolmogorov-Smirnov distance
+    (:func:`law_distance`), which needs no moments; all comparisons together err with at most the
+    probability ``level``. ``start`` is the largest trace at time 0, whose rounding errors remain in
+    P. The finding is ``early`` if a limit distribution is not reached by then.
     """
     single_level, early = level / sum(pair.first.shape[-1] for pair in pairs), False
     intervals = []
@@ -125,7 +130,8 @@ def compare_laws(pairs: Sequence[Pair], level: float, start: float = 0.0) -> Fin
                 low = law_distance(first, expected, single_level / 2.0, blur).low
                 distance = law_distance(first, second, single_level / 2.0, blur)
                 distance = distance._replace(low=low, high=max(distance.high, low))
-                early |= law_distance(expected, second, 0.5).value > LAW_TOLERANCE
+                # Only the value is used, for which the level does not matter.
+                early |= law_distance(expected, second, level=0.5).value > LAW_TOLERANCE
             intervals.append((distance, f"at {pair.label}, entry {k}"))
     finding = find_largest(intervals, LAW_TOLERANCE, "largest distance of distribution functions")
     differs = any(distance.low > 0.0 for distance, _ in intervals)
@@ -136,17 +142,22 @@ def diagonal_distances(first: FloatArray, second: FloatArray) -> FloatArray:
     """Return the largest differences (n,), one for each state, between the empirical distribution
     functions of the diagonals of two samples ``first`` (S, n, n) and ``second`` (S', n, n).
     """
+    # Only the value of each interval is used, for which the level does not matter.
     return np.array(
-        [law_distance(first[:, k, k], second[:, k, k], 0.5).value for k in range(first.shape[-1])]
+        [
+            law_distance(first[:, k, k], second[:, k, k], level=0.5).value
+            for k in range(first.shape[-1])
+        ]
     )
 
 
 def growth_intervals(earlier: FloatArray, later: FloatArray, level: float) -> list[Interval]:
-    """Return an interval for each of the n diagonal entries of two samples of covariances,
-    ``earlier`` (S, n, n) and ``later`` (S', n, n): the largest P(later > GROWTH x) - P(earlier > x)
-    over all x.
+    """Return an interval for the growth between two samples of covariances, ``earlier`` (S, n, n)
+    and ``later`` (S', n, n), for each of the n diagonal entries.
 
-    Each interval misses the truth with at most the probability ``level``.
+    The growth is the largest P(later > GROWTH x) - P(earlier > x) over all x: 0 if the later entry
+    is stochastically at most GROWTH times the earlier one. Each interval misses the truth with at
+    most the probability ``level``.
     """
     return [
         law_excess(GROWTH * earlier[:, k, k], later[:, k, k], level)
@@ -159,13 +170,14 @@ def compare_growth(
     expected: Sequence[tuple[FloatArray, FloatArray] | None],
     level: float,
 ) -> Finding:
-    """Test the null hypothesis that covariances stay stochastically bounded.
+    """Test the null hypothesis that covariances stay stochastically bounded, by samples at half of
+    the horizon and at its end.
 
     Under it the later sample of each pair, ``second``, is stochastically at most GROWTH times the
     earlier one, ``first``. In a short horizon laws may still grow, so that ``expected`` has for
     each pair two samples (S, n, n) of the laws that both should have: only faster growth than
-    theirs breaks the promise. Where it is None, growth leaves the row undecided. ``level`` is
-    shared by all comparisons.
+    theirs breaks the promise. Where it is None, growth leaves the row undecided. All comparisons
+    together err with at most the probability ``level``.
     """
     single_level, early = 0.5 * level / sum(pair.first.shape[-1] for pair in pairs), False
     intervals = []
@@ -191,18 +203,19 @@ def compare_chi_square(
     ratios: FloatArray, freedom: Sequence[float], labels: Sequence[str], level: float, name: str
 ) -> Finding:
     """Test the null hypothesis that squares over their degrees of freedom, ``ratios`` (R, K), have
-    mean 1.
+    mean 1, such as NEES / n at K points of R runs.
 
     Under it the sum of the squares of column k over all R runs is chi-square with ``freedom[k]``
-    degrees of freedom. Columns that are not finite are left out, and the others share the
-    ``level``. ``labels`` (K) say what the columns are, ``name`` what the squares are called in the
-    message.
+    degrees of freedom. Columns that are not finite are left out; the tests of the others together
+    err with at most the probability ``level``. ``labels`` (K) say what the columns are, ``name``
+    what the squares are called in the message.
     """
     finite = np.flatnonzero(np.isfinite(ratios).all(axis=0))
     if not len(finite):
         return find_unknown(f"{name} does not exist: singular or not finite", NEES_TOLERANCE)
     intervals = []
     for k in finite.tolist():
+        # freedom[k] is that of all runs: the sum of squares is the mean ratio times it.
         total = float(ratios[:, k].mean()) * freedom[k]
         ratio = scale_interval(total, freedom[k], level / len(finite))
         intervals.append((deviation_interval(1.0, ratio), f"at {labels[k]}"))
@@ -211,7 +224,9 @@ def compare_chi_square(
 
 
 def exact_start(scenario: Scenario) -> Assumption:
-    """Return the assumption that every filter starts with the mean and the covariance of x(0)."""
+    """Return the assumption that every filter starts with the mean and the covariance of x(0), a
+    row of the table of assumptions that says whether it holds.
+    """
     plant = scenario.plant
     different = [
         node

@@ -409,8 +409,8 @@ def pearson_test(counts: np.ndarray, probabilities: FloatArray) -> tuple[float, 
     """Return the p-value of Pearson's chi-square test and its number of cells.
 
     ``counts`` (C,) and ``probabilities`` (C,) are those of C cells in decreasing order of
-    probability; the last cells, with expected counts below MIN_EXPECTED, are pooled, and so is the
-    last of the others with them.
+    probability; the last cells, with expected counts below MIN_EXPECTED, are pooled with the last
+    frequent one.
     """
     expected = probabilities * counts.sum()
     frequent = max(1, int((expected >= MIN_EXPECTED).sum()))
