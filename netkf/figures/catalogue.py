@@ -12,7 +12,12 @@ from netkf.figures.error import error_figure, quantiles_figure, ratios_figure
 from netkf.figures.figure_data import FigureData, UnavailableError, reduce_result
 from netkf.figures.network import network_figure
 from netkf.figures.pictures import overview
-from netkf.figures.stability import law_figure, stability_figure, sweep_figure
+from netkf.figures.stability import (
+    law_figure,
+    reason_to_omit_stability,
+    stability_figure,
+    sweep_figure,
+)
 from netkf.figures.style import FORMATS, Picture, message_figure, style_context, write_figure
 from netkf.figures.traffic import age_figure, delivery_figure, links_figure
 from netkf.runs.files import make_directory
@@ -62,8 +67,9 @@ class FigureSet:
         """The names of the figures of this kind of result."""
         return ("stability",) if self._sweep is not None else tuple(FIGURES)
 
-    def draw(self, name: str) -> Picture:
-        """Return the figure of this name, or one with the reason why it cannot be drawn.
+    def draw(self, name: str, *, omit_slow: bool = False) -> Picture:
+        """Return the figure of this name, or one with the reason why it cannot be drawn; with
+        ``omit_slow`` also with the reason why a figure that takes minutes is left out.
 
         Raises ScenarioError for an unknown name.
         """
@@ -77,9 +83,13 @@ class FigureSet:
                     sweep = self._sweep
                     return sweep_figure(sweep.scenario.name, sweep.table, sweep.keys, sweep.status)
                 assert self._data is not None
+                if omit_slow and name == "stability":
+                    reason = reason_to_omit_stability(self._data)
+                    if reason is not None:
+                        raise UnavailableError(reason)
                 return FIGURES[name](self._data)
-            except UnavailableError as reason:
-                return message_figure(*self._explain(name, str(reason)))
+            except UnavailableError as unavailable:
+                return message_figure(*self._explain(name, str(unavailable)))
 
     def _explain(self, name: str, reason: str) -> tuple[str, str, list[str]]:
         """Return title, message and caption of a figure that cannot be drawn for this reason."""
@@ -90,19 +100,21 @@ class FigureSet:
 
 
 def plot_to_files(result: Any, names: tuple[str, ...], out: Path, file_format: str) -> list[Path]:
-    """Write the figures of these names, all of them if there are no names, and return their paths.
+    """Write the figures of these names, and return their paths; without names those of all figures,
+    of which one that takes minutes is left out and its file says so.
 
     They are written as ``out`` if its suffix is that of a picture file, else as
     ``out``/NAME.``file_format``. Raises ScenarioError for unknown names, before any file is
     written, and WriteError if a file cannot be written.
     """
     figure_set = FigureSet(result)
+    omit_slow = not names
     names = names or figure_set.names
     is_file = out.suffix.removeprefix(".").lower() in FORMATS and not out.is_dir()
     if is_file and len(names) > 1:
         rule, remedy = "is one file for several figures", "name a directory, or one --figure"
         raise ScenarioError("--out", rule, str(out), remedy)
-    figures = {name: figure_set.draw(name) for name in names}
+    figures = {name: figure_set.draw(name, omit_slow=omit_slow) for name in names}
     paths = {name: out if is_file else out / f"{name}.{file_format}" for name in names}
     for name, figure in figures.items():
         make_directory(paths[name].parent)

@@ -188,6 +188,29 @@ def test_the_command_writes_files(results, tmp_path, capsys):
         assert len(line.splitlines()) == 1
 
 
+def test_a_map_that_takes_minutes_is_drawn_on_request_only(results, monkeypatch, capsys, tmp_path):
+    monkeypatch.setattr(netkf.figures.stability, "MAX_UNKNOWNS", 1)
+    monkeypatch.setattr(
+        netkf.figures.catalogue, "FIGURES", {name: FIGURES[name] for name in ("stability", "links")}
+    )
+    run = results("ring")
+    folder = netkf.save(run, run.scenario, tmp_path / "run")
+    drawn = {}
+    monkeypatch.setattr(
+        netkf.figures.catalogue,
+        "write_figure",
+        lambda figure, path: drawn.setdefault(path.stem, figure),
+    )
+    assert main(["plot", str(folder)]) == 0
+    assert set(drawn) == {"stability", "links"}
+    left_out = " ".join(" ".join(text for text, _ in shown_texts(drawn["stability"])).split())
+    assert "it takes minutes for 6 nodes of 2 states" in left_out
+    assert "netkf plot --figure stability" in left_out
+    drawn.clear()
+    assert main(["plot", str(folder), "--figure", "stability"]) == 0
+    assert "steady state" in drawn["stability"].get_suptitle()
+
+
 def test_a_missing_matplotlib_is_one_line(results, monkeypatch, capsys, tmp_path):
     import sys
 
