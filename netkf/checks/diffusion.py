@@ -35,9 +35,11 @@ from netkf.theory.diffusion.information import MAX_REGRESSORS, few_regressors
 from netkf.trace.run import Run
 
 ALONE = MIN_REPLAYED
-"""Number of runs repeated without cooperation; few suffice to compare exact mean squares."""
+"""Number of runs repeated without cooperation (each sensor's filter by itself, on the same
+readings); few suffice to compare exact mean squares.
+"""
 PASTS = 400
-"""Number of drawn pasts of the regressors from which the level of D (19) is estimated."""
+"""Number of drawn pasts of the regressors from which the excitation, D (19), is estimated."""
 DRAWS = 20
 """Number of errors drawn from each exact covariance."""
 
@@ -50,7 +52,9 @@ class DiffusionSummary(ReplicaSummary):
 
 
 def _without_cooperation(scenario: Scenario) -> Scenario:
-    """Return the scenario with the same filters and no weight for the estimates of others."""
+    """Return the scenario with the same filters and no weight for the estimates of others (weight
+    matrix I), sampled at the last time only.
+    """
     promised: Any = with_promised_filter(scenario).filter.algorithm
     algorithm = dataclasses.replace(promised, weights=np.eye(len(scenario.nodes)))
     chosen = dataclasses.replace(scenario.filter, algorithm=algorithm)
@@ -58,11 +62,14 @@ def _without_cooperation(scenario: Scenario) -> Scenario:
 
 
 def _sensors_excite(samples: RunSamples, level: float) -> Finding:
-    """Compute the excitation lambda of D (19) for the network, which must be positive; the level of
-    the test is not used.
+    """Check that the sensors of the network together excite every direction of the state: lambda
+    of D (19), the least eigenvalue of the information expected from the next few slots given the
+    regressors so far, must be positive for every past of the regressors.
+
+    No runs are looked at and no interval is estimated, so that ``level`` is not used.
     """
     levels = information_level(samples.scenario, PASTS, samples.seed)
-    network = levels[levels["node"] == -1].iloc[0]
+    network = levels[levels["node"] == -1].iloc[0]  # the row of all sensors together
     best_sensor = float(levels.loc[levels["node"] != -1, "level"].max())
     message = (
         f"computed, not simulated: least level over the pasts looked at {network['level']:.3g} "
@@ -75,7 +82,8 @@ def _sensors_excite(samples: RunSamples, level: float) -> Finding:
 
 
 def _cooperation_helps(samples: RunSamples, level: float) -> Finding:
-    """Compare exact mean-square errors at the end with those of the same runs without cooperation.
+    """Compare exact mean-square errors at the end with those of the same runs without cooperation,
+    where each node filters its own readings only.
 
     The node with the largest error counts in both cases. No interval is estimated, so that
     ``level`` is not used.
@@ -92,15 +100,16 @@ def _cooperation_helps(samples: RunSamples, level: float) -> Finding:
 
 
 def _errors_bounded(samples: RunSamples, level: float) -> Finding:
-    """Compare the growth of the law of squared errors in the second half of the horizon with that
-    of Gaussian errors that have the exact covariances.
+    """Test that errors stay bounded: compare the growth of the law of e e' at each node, from half
+    of the horizon to its end, with that of Gaussian errors drawn with the exact covariances of the
+    runs that were replayed.
 
     The interval of the finding misses the truth with at most the probability ``level``.
     """
     e, Sigma = samples.runs.e[:, -2:], samples.runs.Sigma[: max_replayed(samples.scenario), -2:]
     if np.isnan(e).all():
         return find_nothing(LAW_TOLERANCE)
-    square = e[..., :, None] * e[..., None, :]
+    square = e[..., :, None] * e[..., None, :]  # (R, 2, N, n, n): at half time and the end
     random = Streams(samples.seed).generator("tracking errors")
     pairs, expected = [], []
     for i, node in enumerate(samples.nodes):
@@ -109,6 +118,7 @@ def _errors_bounded(samples: RunSamples, level: float) -> Finding:
         expected.append((half, end) if np.isfinite(Sigma[:, :, i]).all() else None)
     finding = compare_growth(pairs, expected, level)
     message = finding.message.replace("P(P > ", "P(e^2 > ")
+    # The level of noise on which the paper's bound on the errors depends, where it has a law.
     with contextlib.suppress(TheoryError):
         sigma = tracking_level(samples.scenario).sigma
         message += f"; sigma_p of D (29) is {sigma:.3g} for p = 2"
@@ -117,7 +127,8 @@ def _errors_bounded(samples: RunSamples, level: float) -> Finding:
 
 def _draw_squares(Sigma: FloatArray, random: np.random.Generator) -> FloatArray:
     """Return e e' (DRAWS R, n, n) of Gaussian errors e, DRAWS of them with the variances of each of
-    R covariances ``Sigma`` (R, n, n); entries of an error are independent.
+    R covariances ``Sigma`` (R, n, n). Entries of an error are drawn independently, because only
+    the diagonals of e e' are compared.
     """
     deviations = np.sqrt(np.maximum(np.diagonal(Sigma, axis1=1, axis2=2), 0.0))
     e = random.standard_normal((DRAWS, *deviations.shape)) * deviations
@@ -195,10 +206,12 @@ class DiffusionChecks(PaperChecks):
     summary_type = DiffusionSummary
 
     def summarise(self, scenario: Scenario, run: Run) -> DiffusionSummary:
-        """Return the summary of a run at its K checked times and N sampled nodes, with the exact
-        covariances ``alone`` (N, n, n) of the errors at the end of the same run without
-        cooperation: nan in all but the first ALONE runs, and if the errors of all nodes together
-        are too many for exact covariances.
+        """Return what the tests need of one ``run``, which was sampled at ``probe_times``; called
+        for every replica, in the process that simulated it.
+
+        Besides the values of ReplicaSummary these are the exact covariances ``alone`` (N, n, n) of
+        the errors at the end of the same run without cooperation: nan in all but the first ALONE
+        runs, and if the errors of all nodes together are too many for exact covariances.
         """
         sampled = sampled_indices(scenario)
         alone = np.full(run.P[0, sampled].shape, np.nan)
@@ -209,11 +222,14 @@ class DiffusionChecks(PaperChecks):
         return DiffusionSummary(**vars(summarise_exactly(scenario, run)), alone=alone)
 
     def assumptions(self, scenario: Scenario) -> list[Assumption]:
-        """Return the assumptions of the tests beyond those of D."""
+        """Return the assumptions of the tests beyond those of the diffusion paper, each with
+        whether it holds here: a promise is tested only if those that it ``needs`` hold.
+        """
         models_agree = scenario.filters_know_the_truth
         try:
             _require_few_regressors(scenario)
-            levels = information_level(scenario, 100, 0)
+            # The excitation by each sensor alone, D (5); node -1 is the network of all sensors.
+            levels = information_level(scenario, runs=100, seed=0)
             highest = float(levels.loc[levels["node"] != -1, "level"].max())
             needs_others = highest <= 0.0
             evidence = f"the best sensor alone has level {highest:.3g} of D (5)"
@@ -231,17 +247,19 @@ class DiffusionChecks(PaperChecks):
         ]
 
     def promises(self, scenario: Scenario) -> tuple[Promise, ...]:
-        """Return the promises about a scenario; D (19) only if its level can be computed."""
+        """Return the statements about a scenario's filter that are tested; that its sensors excite
+        every direction, D (19), only if the excitation can be computed in reasonable time.
+        """
         try:
             _require_few_regressors(scenario)
-            information_level(scenario, 2, 0)
+            information_level(scenario, runs=2, seed=0)
         except TheoryError:
             return tuple(p for p in PROMISES if p.source != "D (19)")
         return PROMISES
 
 
 def _require_few_regressors(scenario: Scenario) -> None:
-    """Raise TheoryError if the levels of all sensors would take minutes."""
+    """Raise TheoryError if computing the excitation by all sensors would take minutes."""
     if not few_regressors(scenario):
         raise TheoryError(f"not looked at beyond {MAX_REGRESSORS} sensors whose H varies")
 

@@ -57,7 +57,9 @@ from netkf.theory.gossip.matchings import effective_matching
 from netkf.trace.run import Run
 
 WINDOW = 40
-"""Number of last readings of a pair from which its bound is computed."""
+"""Number of last readings that updated a pair (estimate, covariance) from which the bound on its
+covariance is computed.
+"""
 UNKNOWN = 1e9
 """Standard deviation of each state that stands for an unknown state."""
 FAR_START = 30.0
@@ -70,13 +72,16 @@ PROBABILITY_TOLERANCE = 0.05  # of a probability: smaller errors change no concl
 
 @dataclass(frozen=True, eq=False)
 class GossipSummary(ReplicaSummary):
-    """Adds values at the K slots and at the last one; ``replayed`` is the recursion G (10) along
-    the swaps of the run.
+    """Adds values at the K slots and at the last one; ``replayed`` is the recursion of the gossip
+    paper, G (10), along the swaps of the run: neighbours swap their pairs (estimate, covariance),
+    then each node updates the pair that it holds with its own reading.
 
-    bounds    : (K, N, n, n) covariances from the last WINDOW readings of each pair alone
-    tokens    : (N, n, n) covariance of each token at the last slot; arbitrary if pairs were copied
-    moves     : number of slots, from slot 1 on, in which j handed its pair to i, for each (i, j) of
-                :func:`_pairs_to_count`
+    bounds    : (K, N, n, n) covariances that the last WINDOW readings of each node's pair give
+                alone, from an unknown state on: upper bounds on P
+    tokens    : (N, n, n) covariance at the last slot of the pair that started at each node (token
+                k is the pair that started at node k); arbitrary if pairs were copied, not swapped
+    moves     : (M,) number of slots, from slot 1 on, in which j handed its pair to i, for each of
+                the M (i, j) of :func:`_pairs_to_count`
     slots     : number of slots counted in ``moves``
     """
 
@@ -88,19 +93,24 @@ class GossipSummary(ReplicaSummary):
 
 def _summarise(scenario: Scenario, run: Run) -> GossipSummary:
     """Return the summary of a run at K slots and N sampled nodes: exact errors, and P (K, N, n, n)
-    replayed along the paths of tokens.
+    replayed by the Riccati recursion along the nodes that each pair (estimate, covariance) visited.
     """
     slots = list(check_slots(scenario))
     sources, table = pair_sources(scenario, run, slots[-1]), gossip_modes(scenario)
+    # Square roots of P(0), (N', n, n) for all N' nodes.
     starts, n, sampled = initial_roots(scenario), scenario.plant.n, sampled_indices(scenario)
     replayed, bounds = [], []
     for slot in slots:
+        # Where the pairs that the nodes hold now started, and the nodes that they were at since.
         history = trace_tokens(sources, slot)
         origin, path = history.origin[sampled], history.path[sampled]
         replayed.append(table.covariances(starts[origin], path, [slot])[0])
+        # The bound: the same recursion over the last readings only, from an unknown state on.
         recent = path[:, -WINDOW:]
         unknown = np.repeat(UNKNOWN * np.eye(n)[None], len(recent), axis=0)
         bounds.append(table.covariances(unknown, recent, [recent.shape[1]])[0])
+    # The node that holds each token at the end; any node if pairs were copied, since then the
+    # replay differs from P and the covariances of tokens mean nothing.
     positions = token_positions(sources, slots[-1])
     holders = np.full(len(starts), -1) if positions is None else positions
     exact = vars(summarise_exactly(scenario, run)) | {"replayed": np.array(replayed)}
@@ -114,8 +124,9 @@ def _summarise(scenario: Scenario, run: Run) -> GossipSummary:
 
 
 def _pairs_to_count(scenario: Scenario) -> tuple[IntArray, IntArray]:
-    """Return the indices i and j, (K,) each, of the K pairs of nodes whose moves are counted: all
-    pairs, or in a large network the ends of links, in both directions.
+    """Return the indices i and j, (M,) each, of the M ordered pairs of nodes for which it is
+    counted how often j handed its pair (estimate, covariance) to i: all, or in a large network the
+    ends of links, in both directions.
     """
     if len(sampled_indices(scenario)) == len(scenario.nodes):
         i, j = np.nonzero(~np.eye(len(scenario.nodes), dtype=bool))
@@ -127,10 +138,11 @@ def _pairs_to_count(scenario: Scenario) -> tuple[IntArray, IntArray]:
 
 
 def _count_moves(scenario: Scenario, sources: np.ndarray) -> np.ndarray:
-    """Return the number (K,) of slots in which j handed its pair to i, for each of the K pairs
-    (i, j) that are counted; ``sources`` (slots, N) is the node whose pair each node used in each
-    slot.
+    """Return the number (M,) of slots in which j handed its pair (estimate, covariance) to i, for
+    each of the M (i, j) of :func:`_pairs_to_count`; ``sources`` (slots, N) is the index of the node
+    whose pair each node used in each slot.
     """
+    # The move of a pair from j to i is coded as the number i N + j.
     size = len(scenario.nodes)
     codes, counts = np.unique(np.arange(size) * size + sources, return_counts=True)
     i, j = _pairs_to_count(scenario)
@@ -141,8 +153,9 @@ def _count_moves(scenario: Scenario, sources: np.ndarray) -> np.ndarray:
 
 
 class ChainSamples(NamedTuple):
-    """S simulations of the switched chain of G (20): a pair whose node is a Markov chain with
-    transition matrix Abar, and whose covariance that node's reading updates.
+    """S simulations of the switched chain of G (20): the node that holds one pair (estimate,
+    covariance) is a Markov chain with transition matrix Abar (the mean matching: entry (i, j) is
+    the probability that i gets j's pair in a slot), and that node's reading updates the covariance.
 
     P         : (K, S, n, n) covariances at the K slots
     restarted : (S, n, n) covariances at the last slot from a start about 1000 times larger
@@ -156,11 +169,15 @@ class ChainSamples(NamedTuple):
 
 @dataclass(frozen=True)
 class GossipSamples(RunSamples):
-    """Adds samples of the switched chain, the reference for the laws of the runs."""
+    """Adds samples of the switched chain (:class:`ChainSamples`), with whose laws those of P in the
+    runs are compared.
+    """
 
     @cached_property
     def matching(self) -> FloatArray:
-        """Mean matching Abar (N, N), with the losses of the channel."""
+        """Mean matching Abar (N, N): the probability that i gets j's pair in a slot, with the
+        losses of the channel.
+        """
         return effective_matching(self.scenario)
 
     @cached_property
@@ -171,14 +188,19 @@ class GossipSamples(RunSamples):
         return chains
 
     def draw_reference(self) -> ChainSamples:
-        """Return the samples of :attr:`reference`, drawn from a stream of their own."""
+        """Return the samples of :attr:`reference`, drawn from a random stream of their own;
+        :func:`kept_reference` calls this once for all looks at the runs of a seed.
+        """
         slots = list(check_slots(self.scenario))
-        return self._draw_paths("switched chain", slots, reference_count(self.scenario, 1))
+        # One law is represented: that of one chain that wanders over all nodes.
+        return self._draw_paths("switched chain", slots, reference_count(self.scenario, laws=1))
 
     def _draw_paths(self, purpose: str, slots: list[int], count: int) -> ChainSamples:
-        """Return S = ``count`` chains, with their covariances (K, S, n, n) after K numbers of
-        ``slots``; ``purpose`` names the random stream that they are drawn from.
+        """Return S = ``count`` simulated switched chains, with their covariances (K, S, n, n) after
+        K increasing numbers of ``slots``; ``purpose`` names the random stream that they are drawn
+        from. A chain starts at a uniformly drawn node, with the P(0) of that node.
         """
+        # Square roots of P(0) (N, n, n), which the recursions work with.
         starts, random = initial_roots(self.scenario), Streams(self.seed).generator(purpose)
         positions = _draw_chains(self.matching, slots[-1], count, random)
         table, start_roots = gossip_modes(self.scenario), starts[positions[:, 0]]
@@ -187,15 +209,20 @@ class GossipSamples(RunSamples):
         return ChainSamples(table.covariances(start_roots, positions, slots), restarted, positions)
 
     def later(self, slots: int) -> ChainSamples:
-        """Return a few samples after half of ``slots`` and after all of them."""
+        """Return a few chains, with their covariances after half of ``slots`` and after all of
+        them; :func:`with_horizon` calls this with more and more slots to find out how long a
+        horizon must be until the law of the covariances has settled.
+        """
         return self._draw_paths("later chain", [slots // 2, slots], MIN_CHAINS // 4)
 
 
 def _draw_chains(
     matching: FloatArray, slots: int, count: int, random: np.random.Generator
 ) -> np.ndarray:
-    """Return positions (count, slots) of stationary Markov chains with transition matrix
-    ``matching`` (N, N), by inversion of its cumulative rows.
+    """Return the node indices (count, slots) of ``count`` stationary Markov chains in each slot.
+
+    Their transition matrix is ``matching`` (N, N), the mean matching: the next node is drawn by
+    inversion of the cumulative sums of its rows.
     """
     cumulative = np.cumsum(matching, axis=1)
     positions = np.empty((count, slots), dtype=int)
@@ -209,12 +236,15 @@ def _draw_chains(
 
 
 def _walks_bound(samples: GossipSamples, level: float) -> Finding:
-    """Check P <= bound, the covariance from the last WINDOW readings of the pair, G Lemma 14.
+    """Check that no P of the runs (R, K, N, n, n) exceeds its bound, G Lemma 14: the covariance
+    that the last WINDOW readings which updated the node's pair give alone, from an unknown state.
 
-    No interval is estimated, so that ``level`` is not used.
+    The bound is large (UNKNOWN) where these readings do not detect the state. No interval is
+    estimated, so that ``level`` is not used.
     """
     P, bound = samples.runs.P, samples.runs.bounds
     size = np.trace(bound, axis1=-2, axis2=-1)
+    # A covariance that is not finite exceeds every bound.
     with np.errstate(invalid="ignore"):
         gap = np.where(np.isfinite(P), bound - P, -np.inf)
         finite = np.isfinite(gap).all(axis=(-1, -2))
@@ -228,14 +258,16 @@ def _walks_bound(samples: GossipSamples, level: float) -> Finding:
     )
     # The root of the bound is computed from one of size UNKNOWN, whose rounding errors it inherits.
     terms = np.maximum(UNKNOWN * np.sqrt(size), samples.largest_terms(P))
+    # Size of the values, of the terms whose rounding errors they inherit, and relative tolerance.
     limits = size, terms, BOUND_TOLERANCE
     finding = compare_identities(shortfall, *limits, message)
     return with_departure(finding, samples, shortfall, limits)
 
 
 def _tokens_move(samples: GossipSamples, level: float) -> Finding:
-    """Test the null hypothesis that j hands its pair to i with probability Abar_ij, independently
-    in each slot: then the numbers of moves are binomial.
+    """Test the null hypothesis that j hands its pair (estimate, covariance) to i with probability
+    Abar_ij (``samples.matching``), independently in each slot: then the numbers of moves, over all
+    slots of all runs, are binomial.
 
     The interval of the finding misses the truth with at most the probability ``level``.
     """
@@ -252,9 +284,10 @@ def _tokens_move(samples: GossipSamples, level: float) -> Finding:
 
 
 def _random_sensor(samples: GossipSamples, level: float) -> Finding:
-    """Compare the law of P at a random sensor with that of the switched chain, G (67).
+    """Compare the law (probability distribution) of P at a node drawn at random with that of the
+    switched chain (:class:`ChainSamples`), G (67).
 
-    The sensor is drawn anew for each run and slot, so that each run gives one independent value.
+    The node is drawn anew for each run and slot, so that each run gives one independent value.
     The interval of the finding misses the truth with at most the probability ``level``.
     """
     random = Streams(samples.seed).generator("random sensor")
@@ -268,11 +301,13 @@ def _random_sensor(samples: GossipSamples, level: float) -> Finding:
 
 
 def _each_sensor(samples: GossipSamples, level: float) -> Finding:
-    """Compare law(Phat_n(t)) with law(Ptilde(t) given ptilde(t - 1) = n), from G (19).
+    """Compare the law of P at each node and checked slot t with that of the switched chains
+    (:class:`ChainSamples`) that took their last reading, in slot t - 1, at this node; the two are
+    equal by G (19).
 
     The interval of the finding misses the truth with at most the probability ``level``.
     """
-    P, _, positions = samples.reference
+    P, positions = samples.reference.P, samples.reference.positions
     pairs = [
         Pair(
             f"slot {slot}, node {node}", samples.runs.P[:, k, i], P[k, positions[:, slot - 1] == i]
@@ -284,16 +319,18 @@ def _each_sensor(samples: GossipSamples, level: float) -> Finding:
 
 
 def _sensors_together(samples: GossipSamples, level: float) -> Finding:
-    """Compare P(tr P_n >= x) at all sensors n with the switched chain, at every time and for all x.
+    """Compare the probability P(tr P_n >= x) at all nodes n with that of the switched chain
+    (:class:`ChainSamples`), at every checked slot and for all x.
 
-    Its mean over the sensors equals that of the chain, G (67), which gives (28) and (29) in the
-    limit; hence it exceeds N times that of the chain at no sensor, (27). Both comparisons use bands
+    Its mean over the nodes equals that of the chain, G (67), which gives G (28) and (29) in the
+    limit; hence it exceeds N times that of the chain at no node, G (27). Both comparisons use bands
     around empirical distribution functions (:func:`band_width`). The interval of the finding misses
     the truth with at most the probability ``level``.
     """
     traces = np.trace(samples.runs.P, axis1=-2, axis2=-1)
     expected = np.trace(samples.reference.P, axis1=-2, axis2=-1)
     N, band_level = traces.shape[2], level / (2 * traces.shape[1])
+    # Half widths of the bands around the law at one node and around that of the chain.
     widths = band_width(len(traces), band_level / N), band_width(expected.shape[1], band_level)
     intervals = []
     for k, slot in enumerate(check_slots(samples.scenario)):
@@ -311,19 +348,21 @@ def _sensors_together(samples: GossipSamples, level: float) -> Finding:
 
 
 def _share_from(values: FloatArray, points: FloatArray) -> FloatArray:
-    """Return the shares (K,) of a sample ``values`` (S,) that are at least each of the ``points``
-    (K,).
+    """Return for each of the ``points`` (V,) the share of a sample ``values`` (S,) that is at least
+    as large, an empirical P(value >= point).
     """
     below = np.searchsorted(np.sort(round_digits(values)), points, "left")
     return np.asarray(1.0 - below / len(values))
 
 
 def _check_tokens(samples: GossipSamples, level: float) -> Finding:
-    """Compare the law of each token at the end with that of the stationary switched chain.
+    """Compare the law at the end of the covariance of each token, the pair (estimate, covariance)
+    that started at one node, with that of the stationary switched chain (:class:`ChainSamples`).
 
     Chains that start where the token does have the exact law at this time; their distance from the
-    stationary one tells whether the horizon is long enough. The interval of the finding misses the
-    truth with at most the probability ``level``.
+    stationary one tells whether the horizon is long enough: if not, the finding is ``early`` and
+    gets a horizon that would do. Its interval misses the truth with at most the probability
+    ``level``.
     """
     last, pairs = len(check_slots(samples.scenario)) - 1, []
     chain, origin = samples.reference.P[last], samples.reference.positions[:, 0]
@@ -337,15 +376,17 @@ def _check_tokens(samples: GossipSamples, level: float) -> Finding:
 
 
 def _check_initial_condition(samples: GossipSamples, level: float) -> Finding:
-    """Compare the law at each sensor at the end with that of chains at this sensor that started
-    with a covariance about 1000 times larger.
+    """Compare the law of P at each node at the end with that of simulated switched chains
+    (:class:`ChainSamples`) at this node that started with a covariance about 1000 times larger.
 
-    The interval of the finding misses the truth with at most the probability ``level``.
+    Only a difference from the chains with the start of the runs breaks the promise; if the two
+    kinds of chains still differ, the finding is ``early`` and gets a horizon that would do. Its
+    interval misses the truth with at most the probability ``level``.
     """
     P, restarted, positions = samples.reference
     pairs = []
     for i, node in enumerate(samples.nodes):
-        here = positions[:, -1] == i
+        here = positions[:, -1] == i  # chains whose last reading was that of this node
         pairs.append(Pair(f"node {node}", samples.runs.P[:, -1, i], restarted[here], P[-1, here]))
     finding = compare_laws(pairs, level, samples.first_trace)
     return (
@@ -354,11 +395,12 @@ def _check_initial_condition(samples: GossipSamples, level: float) -> Finding:
 
 
 def _check_bounded(samples: GossipSamples, level: float) -> Finding:
-    """Compare the growth of the law of P at each sensor with that of the chains at this sensor.
+    """Test that P stays stochastically bounded: compare the growth of its law at each node, from
+    half of the horizon to its end, with that of simulated switched chains at this node.
 
     The interval of the finding misses the truth with at most the probability ``level``.
     """
-    runs, (chain, _, positions) = samples.runs.P, samples.reference
+    runs, chain, positions = samples.runs.P, samples.reference.P, samples.reference.positions
     half = check_slots(samples.scenario)[-2]
     pairs, expected = [], []
     for i, node in enumerate(samples.nodes):
@@ -370,18 +412,26 @@ def _check_bounded(samples: GossipSamples, level: float) -> Finding:
 
 
 def _growth_of(chain: ChainSamples) -> float:
-    """Return the growth of the law of the chain between the last two numbers of slots."""
-    return max(interval.value for interval in growth_intervals(chain.P[-2], chain.P[-1], 0.5))
+    """Return the growth (:func:`growth_intervals`) of the law of the chain's covariance between the
+    last two slots of the samples ``chain``, which tends to 0; :func:`with_horizon` looks for the
+    slot at which it is small.
+    """
+    # Only the value of each interval is used, for which the level does not matter.
+    intervals = growth_intervals(chain.P[-2], chain.P[-1], level=0.5)
+    return max(interval.value for interval in intervals)
 
 
 def _start_memory(chain: ChainSamples) -> float:
-    """Return the distance between the laws of the chain at the last slot from the two starts."""
+    """Return the distance at the last slot between the laws of the chain's covariance from P(0) and
+    from a start about 1000 times larger, which tends to 0; used as :func:`_growth_of` is.
+    """
     return float(diagonal_distances(chain.P[-1], chain.restarted).max())
 
 
 def _token_memory(chain: ChainSamples) -> float:
     """Return the largest distance between the law of chains that start at one node and that of all
-    chains, at the last slot; nan if all nodes have fewer than MIN_TOKENS chains.
+    chains, at the last slot; nan if all nodes have fewer than MIN_TOKENS chains. It tends to 0, and
+    is used as :func:`_growth_of` is.
     """
     last, origin = chain.P[-1], chain.positions[:, 0]
     starts = [start for start in np.unique(origin) if (origin == start).sum() >= MIN_TOKENS]
@@ -473,24 +523,28 @@ PROMISES = (
 
 
 class GossipChecks(PaperChecks):
-    """Promises of G, Propositions 6, 7, Theorems 8, 10."""
+    """Promises of the gossip paper G, Propositions 6, 7, Theorems 8, 10."""
 
     summary_type = GossipSummary
 
     slots_only = True
 
     def summarise(self, scenario: Scenario, run: Run) -> GossipSummary:
-        """Return the summary of a run whose samples are at ``check_slots``."""
+        """Return what the tests need of one ``run``, which was sampled at ``probe_times``; called
+        for every replica, in the process that simulated it.
+        """
         return _summarise(scenario, run)
 
     def collect(self, scenario: Scenario, stacked: Any, seed: int) -> GossipSamples:
-        """Return the samples that the tests take, from stacked summaries of the runs of
-        ``seed``.
+        """Return the object that every test of a promise gets, from the summaries of all runs of
+        ``seed`` stacked along a first axis R; called once, after the last run.
         """
         return GossipSamples(scenario, stacked, seed)
 
     def assumptions(self, scenario: Scenario) -> list[Assumption]:
-        """Return the assumptions of the tests beyond those of G."""
+        """Return the assumptions of the tests beyond those of the gossip paper, each with whether
+        it holds here: a promise is tested only if those that it ``needs`` hold.
+        """
         try:
             effective_matching(scenario)
             is_known, evidence = (
@@ -507,7 +561,9 @@ class GossipChecks(PaperChecks):
         ]
 
     def promises(self, scenario: Scenario) -> tuple[Promise, ...]:
-        """Return the promises about a scenario."""
+        """Return the statements about the gossip filter that are tested: the same for every
+        scenario.
+        """
         return PROMISES
 
 

@@ -60,18 +60,23 @@ class HybridSamples(RunSamples):
 
     @cached_property
     def bound(self) -> FloatArray:
-        """The bound (K, N, n, n) of H (12) at the sampled nodes."""
+        """The upper bound (K, N, n, n) on the mean of P over the ticks of the links, at the K
+        checked times and the sampled nodes: the coupled Riccati equations of the hybrid paper,
+        H (12).
+        """
         times = np.array(check_times(self.scenario))
         all_nodes = covariance_bound(with_promised_filter(self.scenario), times)
         return all_nodes[:, sampled_indices(self.scenario)]
 
 
 def _variance_exists(scenario: Scenario) -> Assumption:
-    """Return the assumption that P has a variance, without which no interval for its mean holds.
+    """Return the assumption that P, which is random since links tick at random, has a variance: a
+    row of the table of assumptions. Without a variance no interval for the mean of P holds.
 
     It holds if every node detects the state alone, and otherwise if second moments of P decay.
     """
     name, source = "the covariance has a variance", "derived"
+    # Nodes whose own readings leave a mode that does not decay unseen: their P may grow for long.
     unobserved = [
         node
         for node, model in zip(scenario.nodes, scenario.models, strict=True)
@@ -95,8 +100,12 @@ def _variance_exists(scenario: Scenario) -> Assumption:
 
 
 def _mean_below_bound(samples: HybridSamples, level: float) -> Finding:
-    """Test E[P] <= calP of H (12): at each point the largest eigenvalue of the mean of P relative
-    to the bound is at most 1. Points share the level.
+    """Test that the mean of P over the runs stays below its bound (``samples.bound``, the coupled
+    Riccati equations H (12) of the hybrid paper): at each checked time and node the largest
+    eigenvalue of the mean relative to the bound is at most 1.
+
+    The interval of the finding misses the truth with at most the probability ``level``, of which
+    each time and node has an equal part.
     """
     P, bound = samples.runs.P, samples.bound
     _, times, nodes = P.shape[:3]
@@ -131,9 +140,10 @@ def _relative_excess(P: FloatArray, bound: FloatArray, level: float) -> Interval
 
 
 def _bound_settles(samples: HybridSamples, level: float) -> Finding:
-    """Compute the bound of H (12) at 10, 100, ... horizons and compare it with its steady state.
+    """Check that the bound on the mean of P, the coupled Riccati equations H (12) of the hybrid
+    paper, reaches its steady state: compute it at 10, 100, ... horizons until it is close.
 
-    No interval is estimated, so that ``level`` is not used.
+    No runs are looked at and no interval is estimated, so that ``level`` is not used.
     """
     promised = with_promised_filter(samples.scenario)
     steady_bound, distance, factor = steady_covariance_bound(promised), np.inf, 1.0
@@ -150,11 +160,14 @@ def _bound_settles(samples: HybridSamples, level: float) -> Finding:
 
 
 def _bound_approaches_limit(samples: HybridSamples, level: float) -> Finding:
-    """Compute the exponent of the distance between the steady bound and S: -1 for fast links.
+    """Check that the steady bound on the mean of P approaches its limit S for ever faster links at
+    least as fast as one over their rate (H Theorem 3 of the hybrid paper).
 
-    No interval is estimated, so that ``level`` is not used.
+    The exponent is computed from two scenarios, whose rates differ by a factor 10. No runs are
+    looked at and no interval is estimated, so that ``level`` is not used.
     """
     promised = with_promised_filter(samples.scenario)
+    # Links so fast that the distance is already in its power law.
     S, first = limit_covariance(promised), _mixing_factor(promised)
     distances = []
     for factor in (first, 10.0 * first):
@@ -180,9 +193,10 @@ def _bound_approaches_limit(samples: HybridSamples, level: float) -> Finding:
 
 
 def _constant_gains_are_worse(samples: HybridSamples, level: float) -> Finding:
-    """Check that H (12) is at most the bound for the constant gains of its steady state.
+    """Check H Remark 1 of the hybrid paper: the bound on the mean of P, H (12), whose gains vary
+    with time, is at most the one for the constant gains of its steady state, at all checked times.
 
-    No interval is estimated, so that ``level`` is not used.
+    No runs are looked at and no interval is estimated, so that ``level`` is not used.
     """
     promised, times = (
         with_promised_filter(samples.scenario),
@@ -202,9 +216,11 @@ def _constant_gains_are_worse(samples: HybridSamples, level: float) -> Finding:
 
 
 def _mixing_factor(scenario: Scenario) -> float:
-    """Return a factor on the rates of links that makes mixing 100 times faster than the filters.
+    """Return a factor on the rates of links, 1 or more, with which exchanges make the estimates of
+    all nodes agree 100 times faster than the filters themselves change.
 
-    The speed (1/s) of a filter is bounded by |A| + |S| |H' V^-1 H|.
+    The speed (1/s) of a filter is bounded by |A| + |S| |H' V^-1 H|, with S the limit of P for fast
+    links.
     """
     S, slowest = limit_covariance(scenario), _slowest_mixing(coupling(scenario))
     models = {id(model): model for model in scenario.models}.values()  # nodes share them
@@ -217,8 +233,11 @@ def _mixing_factor(scenario: Scenario) -> float:
 
 
 def _slowest_mixing(mixing: scipy.sparse.csr_array) -> float:
-    """Return the second smallest real part (1/s) of the eigenvalues of the Laplacian of the
-    coupling; raises TheoryError if the iteration for large networks fails.
+    """Return the rate (1/s) at which differences between nodes decay under exchanges alone: the
+    second smallest real part of the eigenvalues of the Laplacian of ``mixing`` (N, N).
+
+    ``mixing[i, j]`` is the rate at which i hears j times the weight that i gives to j. Raises
+    TheoryError if the iteration for large networks fails.
     """
     leaving = np.asarray(mixing.sum(axis=1)).reshape(-1)
     laplacian = scipy.sparse.csc_array(scipy.sparse.diags_array(leaving) - mixing)
@@ -317,14 +336,17 @@ class HybridChecks(PaperChecks):
     """Promises of H, Theorems 2, 3 and Proposition 4."""
 
     def collect(self, scenario: Scenario, stacked: Any, seed: int) -> HybridSamples:
-        """Return the samples that the tests take, from stacked summaries of the runs of
-        ``seed``.
+        """Return the object that every test of a promise gets, from the summaries of all runs of
+        ``seed`` stacked along a first axis R; called once, after the last run.
         """
         return HybridSamples(scenario, stacked, seed)
 
     def assumptions(self, scenario: Scenario) -> list[Assumption]:
-        """Return the assumptions of the tests beyond those of H."""
+        """Return the assumptions of the tests beyond those of the hybrid paper, each with whether
+        it holds here: a promise is tested only if those that it ``needs`` hold.
+        """
         promised = with_promised_filter(scenario)
+        # H(12) are the coupled Riccati equations that bound the mean of P.
         reason = reason_without_bound(promised)
         return [
             Assumption(
@@ -337,13 +359,15 @@ class HybridChecks(PaperChecks):
         ]
 
     def promises(self, scenario: Scenario) -> tuple[Promise, ...]:
-        """Return the promises about a scenario; those on limits only if the limits exist."""
+        """Return the statements about a scenario's filter that are tested: those of all scenarios,
+        and each of COMPUTED, on limits of the bound on the mean of P, whose subject exists here.
+        """
         listed, promised = list(PROMISES), with_promised_filter(scenario)
-        for promise, compute in zip(
-            COMPUTED, (_require_known_steadiness, _constant_gains, _require_limit), strict=True
-        ):
+        # One function for each of COMPUTED raises TheoryError if its subject does not exist.
+        requirements = _require_known_steadiness, _require_constant_gains, _require_limit
+        for promise, require in zip(COMPUTED, requirements, strict=True):
             try:
-                compute(promised)
+                require(promised)
             except TheoryError:
                 continue
             listed.append(promise)
@@ -351,7 +375,9 @@ class HybridChecks(PaperChecks):
 
 
 def _settling_rows(scenario: Scenario) -> list[Assumption]:
-    """Return the assumption that H(12) has a steady state; empty if that cannot be decided."""
+    """Return the assumption that the bound on the mean of P, H (12), has a steady state, as a list
+    of one row of the table of assumptions; empty if that cannot be decided.
+    """
     try:
         settles = has_steady_state(scenario)
     except TheoryError:
@@ -370,8 +396,10 @@ def _require_known_steadiness(scenario: Scenario) -> None:
     has_steady_state(scenario)
 
 
-def _constant_gains(scenario: Scenario) -> None:
-    """Raise TheoryError if there is no bound with constant gains other than H (12) itself."""
+def _require_constant_gains(scenario: Scenario) -> None:
+    """Raise TheoryError if there is no bound with constant gains other than H (12), the bound on
+    the mean of P, itself.
+    """
     if not scenario.filter.algorithm.talks:
         raise TheoryError("without messages the gains are those of Kalman-Bucy filters")
     if has_steady_state(scenario):
@@ -379,7 +407,9 @@ def _constant_gains(scenario: Scenario) -> None:
 
 
 def _require_limit(scenario: Scenario) -> None:
-    """Raise TheoryError if the steady bound has no limit S."""
+    """Raise TheoryError if the steady bound on the mean of P has no limit S for ever faster links,
+    or it cannot be computed for links fast enough.
+    """
     if len(scenario.nodes) == 1 or scenario.network.channel.delay.fixed != 0.0:
         raise TheoryError("S is the limit for links that take no time")
     faster = _with_faster_links(scenario, 10.0 * _mixing_factor(scenario))

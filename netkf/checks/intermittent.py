@@ -77,11 +77,13 @@ Direction = tuple[int, int]
 
 @dataclass(frozen=True, eq=False)
 class IntermittentSummary(ReplicaSummary):
-    """Adds values at the last slot, and counts for the D directions that can carry readings.
+    """Adds values at the last slot, and counts for the D directed links that can carry readings.
 
-    ``replayed`` is the recursion R (15)-(18) along the arrivals of the run, from P(0). Along them:
+    ``replayed`` is the Riccati recursion, R (15)-(18), with the readings that arrived in the run,
+    from P(0). With the same readings:
 
-    in_support : (N, n, n) P from the start P* of each node: a point of the support, R Theorem 10
+    in_support : (N, n, n) P from the start P*, the steady covariance of a node that gets all
+                 readings: a point of the support of the invariant law, R Theorem 10
     spread     : (N,) trace of the difference between P from a very large start and P from 0; the
                  recursion is monotone, so that any other start ends between these two
     averages   : (N,) averages of 1 / (1 + tr P) over the second half of the slots
@@ -96,17 +98,21 @@ class IntermittentSummary(ReplicaSummary):
 
 
 def _heard_directions(scenario: Scenario) -> list[Direction]:
-    """Return (sender, receiver) of all directed links that can carry readings."""
+    """Return (sender, receiver) of all D directed links that can carry readings: those from nodes
+    with sensors.
+    """
     senders = sensing_neighbours(scenario)
     return [(sender, node) for node in scenario.nodes for sender in senders[node]]
 
 
 @lru_cache(maxsize=8)
 def _least_roots(scenario: Scenario) -> FloatArray:
-    """Return the roots (W, n, n) of P* of each of W sampled nodes, with all readings that can reach
-    it; nan if it does not exist.
+    """Return for each of W sampled nodes the Cholesky root (n, n) of P*, the steady covariance with
+    all readings that can reach the node and so the least point of the support of the law of P; nan
+    if it does not exist. Cached, because every replica of a scenario needs it.
     """
-    arrivals, n = all_arrivals(scenario, 1), scenario.plant.n
+    # Without losses all slots are alike: one slot has the readings of each node.
+    arrivals, n = all_arrivals(scenario, slots=1), scenario.plant.n
     F, Q = scenario.slot_belief
     modes = arrivals.table.modes
     roots = np.full((len(arrivals.sequences), n, n), np.nan)
@@ -122,11 +128,11 @@ def _least_roots(scenario: Scenario) -> FloatArray:
 
 def _summarise(scenario: Scenario, run: Run) -> IntermittentSummary:
     """Return the summary of a run at K slots and N sampled nodes: exact errors, and P (K, N, n, n)
-    replayed along its arrivals.
+    replayed, that is computed by the Riccati recursion from the readings that arrived in the run.
 
     P is replayed from P(0) to all checked slots. To the last slot only it is also replayed from 0
-    and from a very large start, which should converge, and from P*, which stays in the support of
-    the invariant law.
+    and from a very large start, which should converge, and from P* (the steady covariance with all
+    readings), which stays in the support of the invariant law.
     """
     slots = list(check_slots(scenario))
     last = slots[-1:]
@@ -149,15 +155,19 @@ def _summarise(scenario: Scenario, run: Run) -> IntermittentSummary:
 
 
 def _roots_above(*roots: FloatArray) -> FloatArray:
-    """Return roots (W, n, n) of FAR_START^2 times the sum of the given covariances, plus I."""
+    """Return roots (W, n, n) of a start covariance far above all of the given ones: FAR_START^2
+    times their sum, plus I. The arguments are roots of covariances too, (W, n, n) each.
+    """
     total = sum(root @ np.swapaxes(root, -1, -2) for root in roots)
     above = FAR_START**2 * total + np.eye(roots[0].shape[-1])
     return np.asarray(np.linalg.cholesky(above), dtype=np.float64)
 
 
 def _count_messages(scenario: Scenario, run: Run, kind: str, slots: int) -> np.ndarray:
-    """Return the number (D,) of events of a kind in each direction in the first ``slots`` slots."""
-    # A message is sent by the node of its row, and delivered to it.
+    """Return how many readings were sent (``kind`` "send") or delivered ("deliver") over each of
+    the D directed links of :func:`_heard_directions` in the first ``slots`` slots of a run.
+    """
+    # In the log a message is sent by the node of its row, but delivered to it.
     sender, receiver = ("node", "peer") if kind == "send" else ("peer", "node")
     rows = run.log[run.log["kind"] == CODES[kind]]
     rows = rows[scenario.slot_plant.slots_of(rows["t"]) < slots]
@@ -166,24 +176,27 @@ def _count_messages(scenario: Scenario, run: Run, kind: str, slots: int) -> np.n
 
 
 def _path_averages(table: ModeTable, roots: FloatArray, sequences: np.ndarray) -> FloatArray:
-    """Return the averages (K,) of ``1 / (1 + tr P)`` over the second half of the slots along each
-    of K sequences of modes (K, slots), from start ``roots`` (K, n, n).
+    """Return for each of K filters the average of ``1 / (1 + tr P)`` over the second half of the
+    slots, an average over time that is compared with one over runs.
 
-    The function is bounded, so that its mean exists for every law of P.
+    A row of ``sequences`` (K, slots) has the mode (index in ``table`` of a set of readings) that
+    updates one filter in each slot; ``roots`` (K, n, n) are those of the start covariances. The
+    averaged function is bounded, so that its mean exists for every law of P.
     """
     first, averages = sequences.shape[1] // 2, []
     for all_slots in trace_paths(roots, sequences, *table):
-        path = all_slots[first:]
+        path = all_slots[first:]  # (slots, n, n) roots S with P = S S', so tr P is their square sum
         averages.append(float((1.0 / (1.0 + np.einsum("tab,tab->t", path, path))).mean()))
     return np.array(averages)
 
 
 class ArrivalSamples(NamedTuple):
-    """S simulated filters of each of N nodes, with arrivals drawn by the stated probabilities.
+    """S simulated covariances of each of N nodes: readings arrive independently, with the delivery
+    probabilities that the scenario states.
 
     P         : (N, K, S, n, n) covariances at the K slots
     restarted : (N, S, n, n) covariances at the last slot from a start about 1000 times larger
-    averages  : (N, S') averages over the slots of the first S' filters
+    averages  : (N, S') averages of 1 / (1 + tr P) over the slots, for the first S' of them
     """
 
     P: FloatArray
@@ -193,7 +206,9 @@ class ArrivalSamples(NamedTuple):
 
 @dataclass(frozen=True)
 class IntermittentSamples(RunSamples):
-    """Adds simulated filters with independent arrivals, the reference for the laws of the runs."""
+    """Adds simulated covariances with independent arrivals (:class:`ArrivalSamples`), with whose
+    laws those of P in the runs are compared.
+    """
 
     @cached_property
     def reference(self) -> ArrivalSamples:
@@ -203,18 +218,20 @@ class IntermittentSamples(RunSamples):
         return arrivals
 
     def draw_reference(self) -> ArrivalSamples:
-        """Return the samples of :attr:`reference`, drawn from streams of their own."""
-        count = reference_count(self.scenario, len(self.nodes))
+        """Return the samples of :attr:`reference`, drawn from random streams of their own;
+        :func:`kept_reference` calls this once for all looks at the runs of a seed.
+        """
+        count = reference_count(self.scenario, laws=len(self.nodes))
         return self._draw_arrivals("arrivals", list(check_slots(self.scenario)), count, MAX_PATHS)
 
     def _draw_arrivals(
         self, purpose: str, slots: list[int], samples: int, paths: int
     ) -> ArrivalSamples:
-        """Return S = ``samples`` filters of each of N sampled nodes, with their covariances
-        (N, K, S, n, n) after K numbers of ``slots``, and averages (N, S') over the slots of the
+        """Return S = ``samples`` simulated covariances of each of N sampled nodes, (N, K, S, n, n)
+        after each of K increasing numbers of ``slots``, and averages (N, S') over the slots for the
         first S' = ``paths``.
 
-        ``purpose`` names the random stream that arrivals are drawn from.
+        ``purpose`` names the random stream from which it is drawn which readings arrive.
         """
         sampled = sampled_indices(self.scenario).tolist()
         per_node = [self._draw_node(purpose, k, slots, samples, paths) for k in sampled]
@@ -223,10 +240,11 @@ class IntermittentSamples(RunSamples):
     def _draw_node(
         self, purpose: str, k: int, slots: list[int], samples: int, paths: int
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return the fields of ArrivalSamples for the k-th node: (K, S, n, n), (S, n, n), (S',).
+        """Return the fields of ArrivalSamples for the k-th node of the scenario: covariances
+        (K, S, n, n), those from a larger start (S, n, n), and averages over the slots (S',).
 
-        S = ``samples`` filters at K numbers of ``slots``, and averages of the first S' = ``paths``;
-        ``purpose`` names their random stream.
+        They are those of S = ``samples`` simulated filters after each of K numbers of ``slots``,
+        and averages for the first S' = ``paths``; ``purpose`` names their random stream.
         """
         scenario = self.scenario
         node = scenario.nodes[k]
@@ -253,12 +271,18 @@ class IntermittentSamples(RunSamples):
         return table.covariances(start_roots, sequences, slots), restarted, averages
 
     def later(self, slots: int) -> ArrivalSamples:
-        """Return a few samples after half of ``slots`` and after all of them, without averages."""
-        return self._draw_arrivals("later arrivals", [slots // 2, slots], MIN_CHAINS // 4, 0)
+        """Return a few simulated covariances after half of ``slots`` and after all of them, without
+        averages; :func:`with_horizon` calls this with more and more slots to find out how long a
+        horizon must be until their law has settled.
+        """
+        halves, samples = [slots // 2, slots], MIN_CHAINS // 4
+        return self._draw_arrivals("later arrivals", halves, samples, paths=0)
 
 
 def _delivery_probability(scenario: Scenario, direction: Direction) -> float:
-    """Return the probability that a reading arrives in time; raises TheoryError if unknown."""
+    """Return the probability that a reading sent over a directed link (sender, receiver) arrives
+    within its slot; raises TheoryError if losses or delays give no such probability.
+    """
     channel = scenario.network.channel
     if not channel.loss.independent:
         raise TheoryError("losses come in bursts or recorded")
@@ -270,7 +294,8 @@ def _delivery_probability(scenario: Scenario, direction: Direction) -> float:
 
 
 def _above_least(samples: IntermittentSamples, level: float) -> Finding:
-    """Check that no P is below that of the path without losses, which converges to P*.
+    """Check that no P of the runs (R, K, N, n, n) is below the covariance of a filter without any
+    losses from the same start, which converges to P*, the least point of the support of the law.
 
     No interval is estimated, so that ``level`` is not used.
     """
@@ -285,21 +310,23 @@ def _above_least(samples: IntermittentSamples, level: float) -> Finding:
         )
     shortfall = np.maximum(-gap[..., 0], 0.0)
     message = f"{size.size:,} covariances against the path without losses"
+    # Size of the values, of the terms whose rounding errors they inherit, and relative tolerance.
     limits = np.nan_to_num(size), samples.largest_terms(samples.runs.P), BOUND_TOLERANCE
     finding = compare_identities(shortfall, *limits, message)
     return with_departure(finding, samples, shortfall, limits)
 
 
 def _in_support(samples: IntermittentSamples, level: float) -> Finding:
-    """Compare P at the end with the point of the support to which the same arrivals lead from P*.
+    """Compare P at the end with the point of the support of its invariant law to which the readings
+    of the run lead from P*, the steady covariance with all readings.
 
-    Both lie between the paths from a very large start and from 0, and may differ by the spread of
-    these two, which vanishes once P has become independent of its start. If no spread has vanished
-    yet, the horizon that would do is extrapolated from the rate at which the median spread decays.
-    No interval is estimated, so that ``level`` is not used.
+    Both lie between the covariances from a very large start and from 0, and may differ by the
+    spread of these two, which vanishes once P has become independent of its start. If no spread has
+    vanished yet, the horizon that would do is extrapolated from the rate at which the median spread
+    decays. No interval is estimated, so that ``level`` is not used.
     """
     P, point, spread = samples.runs.P[:, -1], samples.runs.in_support, samples.runs.spread
-    finite = np.isfinite(point).all(axis=(0, -1, -2))
+    finite = np.isfinite(point).all(axis=(0, -1, -2))  # nodes for which P* exists
     size = np.trace(point, axis1=-2, axis2=-1)[:, finite]
     converged = spread[:, finite] < SUPPORT_TOLERANCE * size
     message = (
@@ -309,13 +336,17 @@ def _in_support(samples: IntermittentSamples, level: float) -> Finding:
     gap = np.maximum(np.abs(P - point).max(axis=(-1, -2)) - np.maximum(spread, 0.0), 0.0)[:, finite]
     steady_roots = np.nan_to_num(_least_roots(samples.scenario))
     starts = initial_roots(samples.scenario)[sampled_indices(samples.scenario)]
+    # Rounding errors are those of the very large start: its trace is the square sum of its root.
     terms = np.sum(_roots_above(starts, steady_roots)[finite] ** 2, axis=(-2, -1))
+    # Size of the values, of the terms whose rounding errors they inherit, and relative tolerance.
     limits = size, terms, SUPPORT_TOLERANCE
     finding = compare_identities(gap, *limits, message)
     finding = finding._replace(replica=first_wrong(gap, *limits))
     if converged.any() or finding.margin[0] < 0.0:
         return finding
     end = samples.scenario.horizon
+    # The spread has shrunk from about FAR_START^2 times the size of P, at a rate that is taken to
+    # be constant; the horizon grows by the ratio of the wanted to the reached logarithms.
     with np.errstate(divide="ignore", invalid="ignore"):
         log_decay = (
             np.log(FAR_START**2 / np.median(spread[:, finite] / size)) if finite.any() else 0.0
@@ -323,16 +354,17 @@ def _in_support(samples: IntermittentSamples, level: float) -> Finding:
     decay_factor = (
         math.log(FAR_START**2 / SUPPORT_TOLERANCE) / log_decay if log_decay > 0.0 else math.inf
     )
+    # 20 % more, in case the decay slows down.
     return finding._replace(early=True, horizon=1.2 * decay_factor * end)
 
 
 def _check_arrival_counts(samples: IntermittentSamples, level: float) -> Finding:
     """Test the null hypothesis that readings arrive independently with the stated probability, R
-    (12): then their numbers are binomial.
+    (12): then the number that arrived over each directed link, in all runs, is binomial.
 
     The interval of the finding misses the truth with at most the probability ``level``.
     """
-    pairs = _heard_directions(samples.scenario)
+    pairs = _heard_directions(samples.scenario)  # (sender, receiver) of each directed link
     sent, arrived = samples.runs.sent.sum(axis=0), samples.runs.arrived.sum(axis=0)
     intervals = []
     for k, pair in enumerate(pairs):
@@ -344,7 +376,9 @@ def _check_arrival_counts(samples: IntermittentSamples, level: float) -> Finding
 
 
 def _law_of_arrivals(samples: IntermittentSamples, level: float) -> Finding:
-    """Compare the law of P at each node and time with that of filters with independent arrivals.
+    """Compare the law (probability distribution) of P at each node and checked slot with that of
+    simulated covariances (``samples.reference``) whose readings arrive independently, with the
+    stated probabilities.
 
     The interval of the finding misses the truth with at most the probability ``level``.
     """
@@ -357,7 +391,9 @@ def _law_of_arrivals(samples: IntermittentSamples, level: float) -> Finding:
 
 
 def _check_bounded(samples: IntermittentSamples, level: float) -> Finding:
-    """Compare the growth of the law of P with that of filters with independent arrivals.
+    """Test that P stays stochastically bounded: compare the growth of its law at each node, from
+    half of the horizon to its end, with that of simulated covariances whose readings arrive
+    independently, with the stated probabilities.
 
     The interval of the finding misses the truth with at most the probability ``level``.
     """
@@ -371,11 +407,14 @@ def _check_bounded(samples: IntermittentSamples, level: float) -> Finding:
 
 
 def _check_initial_condition(samples: IntermittentSamples, level: float) -> Finding:
-    """Compare the law of P at the end with that from a start a thousand times larger.
+    """Compare the law of P at the end with that of simulated covariances from a start about a
+    thousand times larger.
 
-    The interval of the finding misses the truth with at most the probability ``level``.
+    Only a difference from simulated covariances with the start of the runs breaks the promise; if
+    the two kinds of simulated ones still differ, the finding is ``early`` and gets a horizon that
+    would do. Its interval misses the truth with at most the probability ``level``.
     """
-    P, restarted, _ = samples.reference
+    P, restarted = samples.reference.P, samples.reference.restarted
     pairs = [
         Pair(f"node {node}", samples.runs.P[:, -1, i], restarted[i], P[i, -1])
         for i, node in enumerate(samples.nodes)
@@ -386,20 +425,25 @@ def _check_initial_condition(samples: IntermittentSamples, level: float) -> Find
 
 def _growth_of(reference: ArrivalSamples) -> float:
     """Return the largest excess of P(later P > GROWTH x) over P(earlier P > x), over all x and
-    nodes, between the last two numbers of slots in ``reference``.
+    nodes, between the last two numbers of slots in ``reference``. It tends to 0;
+    :func:`with_horizon` looks for the slot at which it is small.
     """
-    return max(g.value for P in reference.P for g in growth_intervals(P[-2], P[-1], 0.5))
+    # Only the value of each interval is used, for which the level does not matter.
+    return max(g.value for P in reference.P for g in growth_intervals(P[-2], P[-1], level=0.5))
 
 
 def _memory_of(reference: ArrivalSamples) -> float:
-    """Return the largest distance between the laws at the last slot from the two starts."""
+    """Return the largest distance over the nodes, at the last slot, between the laws of covariances
+    from P(0) and from a start about 1000 times larger. It tends to 0, and is used as
+    :func:`_growth_of` is.
+    """
     pairs = zip(reference.P, reference.restarted, strict=True)
     return max(float(diagonal_distances(P[-1], restarted).max()) for P, restarted in pairs)
 
 
 def _averages_of_paths(samples: IntermittentSamples, level: float) -> Finding:
-    """Compare the averages of 1 / (1 + tr P) over the slots of one path with those of paths with
-    independent arrivals, by their laws over runs.
+    """Compare averages of 1 / (1 + tr P) over the slots of one run with those of simulated
+    covariances whose readings arrive independently, by their distributions over the runs.
 
     The interval of the finding misses the truth with at most the probability ``level``.
     """
@@ -420,10 +464,12 @@ def _averages_of_paths(samples: IntermittentSamples, level: float) -> Finding:
 
 
 def _outage_factors(scenario: Scenario) -> dict[int, float]:
-    """Return the factor (1 - g) alpha^2 per slot of each sampled node without a sensor, with g the
-    probability that any reading arrives and alpha the spectral radius of F.
+    """Return, by id of each sampled node without a sensor, the factor (1 - g) alpha^2 by which
+    slots without any reading multiply E[P], with g the probability that a reading arrives in a slot
+    and alpha the spectral radius of F.
 
-    E[P] diverges if it is 1 or more, R (29), (31): outages alone make it grow by this factor.
+    E[P] diverges if it is 1 or more, R (29), (31). Nodes with losses or delays for which g is
+    unknown are left out.
     """
     factors, neighbours = {}, sensing_neighbours(scenario)
     alpha = float(np.abs(np.linalg.eigvals(scenario.slot_belief[0])).max())
@@ -441,8 +487,9 @@ def _outage_factors(scenario: Scenario) -> dict[int, float]:
 
 
 def _mean_diverges(samples: IntermittentSamples, level: float) -> Finding:
-    """Compute the lower bound on E[P] of the node with the largest outage factor, at the horizon
-    and at twice the horizon, and check that it grows.
+    """Check that E[P] diverges: compute a lower bound on it, at the horizon and at twice the
+    horizon, for the node whose slots without readings multiply it by the largest factor
+    (:func:`_outage_factors`), and check that it grows.
 
     No interval is estimated, so that ``level`` is not used.
     """
@@ -469,8 +516,9 @@ def _mean_diverges(samples: IntermittentSamples, level: float) -> Finding:
 
 
 def _scalar_laws(scenario: Scenario) -> dict[int, ScalarLaw]:
-    """Return the exact law of P, by index of the sampled node, for the nodes of a scalar scenario
-    that get their only reading over one link.
+    """Return the exact invariant law of P, by index among the sampled nodes, for the nodes that
+    have no sensor and one neighbour with a sensor, if the plant is scalar; other nodes are left
+    out, and those for which the law has no closed form.
     """
     laws, neighbours = {}, sensing_neighbours(scenario)
     for k, node in enumerate(sampled_nodes(scenario)):
@@ -488,20 +536,23 @@ def _scalar_laws(scenario: Scenario) -> dict[int, ScalarLaw]:
 
 
 def _outage_counts(samples: IntermittentSamples, level: float) -> Finding:
-    """Test the null hypothesis that P at the end falls between the holes of its support with the
-    exact probabilities.
+    """Test the null hypothesis that P at the end falls between the holes of its support (intervals
+    that a scalar P never enters) with the exact probabilities.
 
-    After an outage of k slots, of probability g (1 - g)^k, P lies between the k-th and the next
-    hole, R Proposition 24. The exact law at the last slot gives the probabilities also when the
-    start still matters. Counts of a cell are binomial; Pearson's p-value is added to the message.
-    The interval of the finding misses the truth with at most the probability ``level``.
+    After an outage of k slots (the last k without a reading), of probability g (1 - g)^k with g
+    that of an arrival, P lies between the k-th and the next hole, R Proposition 24. The exact law
+    at the last slot gives the probabilities also when the start still matters. Counts of a cell are
+    binomial; Pearson's p-value is added to the message. The interval of the finding misses the
+    truth with at most the probability ``level``.
     """
     laws, intervals, tests = _scalar_laws(samples.scenario), [], []
     single_level = level / (len(laws) * (CELLS + 1))
     for k, law in laws.items():
         edges = _outage_edges(law)
+        # The cell of each run: the number of slots without a reading at its end, at most CELLS.
         cells = np.searchsorted(edges, samples.runs.P[:, -1, k, 0, 0])
         counts = np.bincount(cells, minlength=CELLS + 1)
+        # The differences of the distribution function at the edges are the cells' probabilities.
         below = np.concatenate([[0.0], _law_at_end(samples, k, law)(edges), [1.0]])
         for cell, probability in enumerate(np.diff(below).tolist()):
             interval = probability_interval(int(counts[cell]), int(counts.sum()), single_level)
@@ -516,10 +567,10 @@ def _outage_counts(samples: IntermittentSamples, level: float) -> Finding:
 def _law_at_end(
     samples: IntermittentSamples, k: int, law: ScalarLaw
 ) -> Callable[[FloatArray], FloatArray]:
-    """Return the exact distribution function of P at the k-th sampled node in the last slot, a
-    function from points (K,) to probabilities (K,).
+    """Return the exact distribution function of P at the k-th sampled node in the last slot, from
+    its start P(0) on: a function from points (K,) to probabilities (K,).
 
-    ``law`` is the law of the scalar system of that node.
+    ``law`` is the invariant law of the scalar system of that node, which P approaches.
     """
     node = int(sampled_indices(samples.scenario)[k])
     start = float(samples.first_covariances[node, 0, 0])
@@ -527,9 +578,13 @@ def _law_at_end(
 
 
 def _outage_edges(law: ScalarLaw) -> FloatArray:
-    """Return the middles (CELLS,) of the holes above outages of 0, 1, 2, ... slots."""
+    """Return points (CELLS,) that separate the values of a scalar P by the length of the outage
+    (slots without a reading) before them: the k-th is the middle of the interval that P never
+    enters above its values after outages of k slots.
+    """
     edge = np.array(0.5 * sum(law.hole))
     edges = []
+    # A slot without a reading maps each such interval (hole) to the next.
     for _ in range(CELLS):
         edges.append(float(edge))
         edge = law.without(edge)
@@ -537,7 +592,8 @@ def _outage_edges(law: ScalarLaw) -> FloatArray:
 
 
 def _scalar_law_exact(samples: IntermittentSamples, level: float) -> Finding:
-    """Compare P at the end with its exact distribution function at that time.
+    """Compare the empirical distribution of P at the end with its exact distribution function at
+    that time, for the nodes of a scalar scenario for which this is known.
 
     The interval of the finding misses the truth with at most the probability ``level``.
     """
@@ -634,24 +690,31 @@ DIVERGES = Promise(
 
 
 class IntermittentChecks(PaperChecks):
-    """Promises of R, Theorems 9, 10, Propositions 8, 24, 25 and (29)."""
+    """Promises of the paper R on intermittent observations: Theorems 9, 10, Propositions 8, 24, 25
+    and (29).
+    """
 
     summary_type = IntermittentSummary
 
     slots_only = True
 
     def summarise(self, scenario: Scenario, run: Run) -> IntermittentSummary:
-        """Return the summary of a run whose samples are at ``check_slots``."""
+        """Return what the tests need of one ``run``, which was sampled at ``probe_times``; called
+        for every replica, in the process that simulated it.
+        """
         return _summarise(scenario, run)
 
     def collect(self, scenario: Scenario, stacked: Any, seed: int) -> IntermittentSamples:
-        """Return the samples that the tests take, from stacked summaries of the runs of
-        ``seed``.
+        """Return the object that every test of a promise gets, from the summaries of all runs of
+        ``seed`` stacked along a first axis R; called once, after the last run.
         """
         return IntermittentSamples(scenario, stacked, seed)
 
     def assumptions(self, scenario: Scenario) -> list[Assumption]:
-        """Return the assumptions of the tests beyond those of R."""
+        """Return the assumptions of the tests beyond those of the paper on intermittent
+        observations, each with whether it holds here: a promise is tested only if those that it
+        ``needs`` hold.
+        """
         try:
             is_known, evidence = True, "a known probability for each direction"
             for direction in _heard_directions(scenario):
@@ -669,7 +732,10 @@ class IntermittentChecks(PaperChecks):
         ]
 
     def promises(self, scenario: Scenario) -> tuple[Promise, ...]:
-        """Return the promises about a scenario; more if the exact law of a node is known."""
+        """Return the statements about a scenario's filter that are tested: those of all scenarios,
+        that E[P] diverges if losses are so frequent, and those on the exact law of a scalar P if it
+        is known for a node.
+        """
         grows = max(_outage_factors(scenario).values(), default=0.0) >= 1.0
         divergence = (DIVERGES,) if grows else ()
         return PROMISES + divergence + (SCALAR if _scalar_laws(scenario) else ())

@@ -31,7 +31,8 @@ MAX_OPERATIONS = 1e10
 
 class ModeTable(NamedTuple):
     """The plant of a scenario's filters, ``F`` and ``root_Q`` (n, n) with Q = root_Q root_Q', and
-    their modes. Covariances P are represented by roots S (n, n) with P = S S'.
+    their modes: sets of readings that can update a covariance in one slot. Covariances P are
+    represented by roots S (n, n) with P = S S'.
     """
 
     F: FloatArray
@@ -47,21 +48,26 @@ class ModeTable(NamedTuple):
     def covariances(
         self, roots: FloatArray, sequences: np.ndarray, lengths: list[int]
     ) -> FloatArray:
-        """Return the covariances (L, K, n, n) after the first ``lengths`` (L increasing numbers) of
-        the modes of each of K ``sequences`` (K, T), from start ``roots`` (K, n, n).
+        """Return the covariances (L, K, n, n) of K filters after each of L increasing numbers of
+        slots, ``lengths``, from the roots of their start covariances, ``roots`` (K, n, n).
+
+        A row of ``sequences`` (K, T) has the index of the mode (set of readings) that updates one
+        filter in each slot.
         """
         results, applied = [], 0
         for length in lengths:
+            # From the last length on: the roots are those after ``applied`` slots.
             roots, applied = self.apply(roots, sequences[:, applied:length]), length
             results.append(roots @ np.swapaxes(roots, -1, -2))
         return np.array(results)
 
 
 def reference_count(scenario: Scenario, laws: int) -> int:
-    """Return the number of chains that represent each of ``laws`` laws: fewer for more laws, larger
-    plants and networks.
+    """Return the number of simulated covariances by which each of ``laws`` probability
+    distributions is represented when those of the runs are compared with it: fewer for more
+    distributions, larger plants and networks.
     """
-    step = (3 * scenario.plant.n) ** 3
+    step = (3 * scenario.plant.n) ** 3  # operations for one update of one covariance
     budget = MAX_OPERATIONS if len(scenario.nodes) <= MAX_NODES else 0.1 * MAX_OPERATIONS
     affordable = budget / (laws * check_slots(scenario)[-1] * step)
     return int(np.clip(affordable, MIN_CHAINS, MAX_CHAINS))
@@ -69,8 +75,10 @@ def reference_count(scenario: Scenario, laws: int) -> int:
 
 @lru_cache(maxsize=1)
 def kept_reference(samples: type[Any], scenario: Scenario, seed: int) -> Any:
-    """Return ``samples.draw_reference()``, the sample that runs are compared with; cached, so that
-    all looks at runs of one seed share it.
+    """Return the simulated covariances that those of the runs are compared with; cached, so that
+    all looks at runs of one seed share them.
+
+    ``samples`` is a subclass of RunSamples, whose ``draw_reference`` needs no runs (None).
     """
     return samples(scenario, None, seed).draw_reference()
 
@@ -78,10 +86,12 @@ def kept_reference(samples: type[Any], scenario: Scenario, seed: int) -> Any:
 def with_horizon(
     samples: Any, finding: Finding, distance: Callable[[Any], float], tolerance: float
 ) -> Finding:
-    """Return the finding with the horizon in seconds at which a law is close to its limit.
+    """Return a finding that the limit of a law is not reached, with the horizon in seconds added at
+    which it would be; nan if that cannot be computed in a few seconds.
 
-    ``distance`` is a function of the chains that ``samples.later`` draws for a number of slots; it
-    returns the distance of their law from its limit, which is to become half of ``tolerance``.
+    ``samples.later(slots)`` simulates a few covariances for a number of slots; ``distance`` is a
+    function of its result and returns how far their law is from its limit, which is to become half
+    of ``tolerance``.
     """
     scenario = samples.scenario
     slots = slots_until(
@@ -94,14 +104,16 @@ def with_horizon(
 
 
 def slots_until(distance: Callable[[int], float], slots: int, n: int, tolerance: float) -> float:
-    """Return a number of slots after which ``distance`` is at most half of ``tolerance``.
+    """Return a number of slots after which ``distance``, a function of such a number, is at most
+    half of ``tolerance``.
 
-    The number is doubled from ``slots`` on; nan if chains of n states would take too long.
-    ``distance`` takes a number of slots and draws about MIN_CHAINS / 4 chains.
+    The number is doubled from ``slots`` on. Each call of ``distance`` simulates about MIN_CHAINS /
+    4 covariances (n, n) for so many slots; nan if that would take too long.
     """
     operations, count = 0.0, slots
     while True:
         count *= 2
+        # About (3 n)^3 operations for each covariance and slot.
         operations += 0.25 * MIN_CHAINS * count * (3 * n) ** 3
         if operations > 0.1 * MAX_OPERATIONS:
             return math.nan
@@ -126,10 +138,11 @@ class TokenHistory(NamedTuple):
 
 
 def pair_sources(scenario: Scenario, run: Run, slots: int) -> np.ndarray:
-    """Return the index (slots, N) of the node whose pair each node used in each slot, from the
-    swaps of a run; a node that swapped with nobody used its own.
+    """Return the index (slots, N) of the node whose pair (estimate, covariance) each of the N nodes
+    used in each of the first ``slots`` slots, from the swaps in the log of a run of a gossip
+    filter; a node that swapped with nobody used its own.
     """
-    index = scenario.topology.index
+    index = scenario.topology.index  # index of each node id
     sources = np.tile(np.arange(len(index)), (slots, 1))
     swaps = run.log[run.log["kind"] == CODES["swap"]]
     slot = scenario.slot_plant.slots_of(swaps["t"])
@@ -141,13 +154,15 @@ def pair_sources(scenario: Scenario, run: Run, slots: int) -> np.ndarray:
 
 
 def trace_tokens(sources: np.ndarray, slot: int) -> TokenHistory:
-    """Return the history of the pairs that the N nodes hold at the start of a ``slot``: where each
-    started (N,), and its node in each slot (N, slot).
+    """Return the history of the pairs (estimate, covariance) that the N nodes of a gossip filter
+    hold at the start of a ``slot``: the node where each started (N,), and the node that held it in
+    each slot before (N, slot).
 
-    ``sources`` (slots, N) is the node whose pair each node used in each slot, from
+    ``sources`` (slots, N) is the index of the node whose pair each node used in each slot, from
     :func:`pair_sources`.
     """
     path = np.empty((sources.shape[1], slot), dtype=int)
+    # Backwards in time: the node that held, in slot t, the pair that node k holds at the end.
     holder = np.arange(sources.shape[1])
     for t in range(slot - 1, -1, -1):
         path[:, t] = holder  # swaps come first: the reading of slot t is that of the new holder
@@ -156,10 +171,11 @@ def trace_tokens(sources: np.ndarray, slot: int) -> TokenHistory:
 
 
 def token_positions(sources: np.ndarray, slot: int) -> np.ndarray | None:
-    """Return p_n(slot - 1) (N,), the index of the node where token n took its last reading, G (13);
-    None if pairs were copied, so that tokens are no permutation.
+    """Return the index (N,) of the node where each token took its last reading, in slot - 1: token
+    n is the pair (estimate, covariance) that started at node n, p_n(slot - 1) of G (13).
 
-    ``sources`` (slots, N) is the node whose pair each node used in each slot.
+    ``sources`` (slots, N) is the index of the node whose pair each node used in each slot. None if
+    pairs were copied, so that the tokens at the nodes are no permutation of those at the start.
     """
     origin = trace_tokens(sources, slot).origin
     if len(set(origin.tolist())) < len(origin):
@@ -170,7 +186,9 @@ def token_positions(sources: np.ndarray, slot: int) -> np.ndarray | None:
 
 
 def gossip_modes(scenario: Scenario) -> ModeTable:
-    """Return the modes of a gossip filter: mode k is the reading of the k-th node, G (11)."""
+    """Return the table of the readings that can update a covariance of a gossip filter in one slot:
+    mode k is the reading of the k-th node, G (11).
+    """
     F, Q = scenario.slot_belief
     readings = [(model.H, model.R) for model in scenario.slot_models]
     return ModeTable(F, square_root(Q), reading_modes(readings, len(F)))
@@ -198,8 +216,9 @@ def sensing_neighbours(scenario: Scenario) -> dict[int, tuple[int, ...]]:
 
 
 def intermittent_modes(scenario: Scenario, sets: list[tuple[int, ...]]) -> ModeTable:
-    """Return the modes of an intermittent filter: mode m is all readings of the nodes (ids)
-    ``sets[m]``, with their stacked H (p, n) and R (p, p), R (17).
+    """Return the table of the sets of readings that can update a covariance in one slot under
+    intermittent observations: mode m is all readings of the nodes (ids) ``sets[m]``, with their
+    stacked H (p, n) and block diagonal noise covariance (p, p), equation 17 of that paper.
     """
     F, Q = scenario.slot_belief
     index = scenario.topology.index
@@ -212,8 +231,10 @@ def intermittent_modes(scenario: Scenario, sets: list[tuple[int, ...]]) -> ModeT
 
 
 def find_arrivals(scenario: Scenario, run: Run, slots: int) -> Arrivals:
-    """Return the readings that W sampled nodes used in the first ``slots`` slots of a run, a node's
-    own and those delivered by the trace, as sequences (W, slots) of modes.
+    """Return the readings that W sampled nodes used in the first ``slots`` slots of a run: in each
+    slot a node's own and those that the trace says were delivered to it. Each set of readings that
+    occurs is one mode, and ``sequences`` (W, slots) has the index of the mode of each node and
+    slot.
     """
     delivered = run.log[run.log["kind"] == CODES["deliver"]]
     # A reading belongs to the slot in which it was sent, not to that of its arrival.
@@ -235,7 +256,8 @@ def find_arrivals(scenario: Scenario, run: Run, slots: int) -> Arrivals:
 
 def all_arrivals(scenario: Scenario, slots: int) -> Arrivals:
     """Return the readings that W sampled nodes would use in each of ``slots`` slots if none were
-    lost, as sequences (W, slots) of modes.
+    lost, which gives the smallest covariances. Each set of readings is one mode, and ``sequences``
+    (W, slots) has the index of the mode of each node and slot.
     """
     neighbours = sensing_neighbours(scenario)
     modes: dict[tuple[int, ...], int] = {}

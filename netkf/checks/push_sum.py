@@ -69,15 +69,16 @@ SQUARE_TOLERANCE, BIAS_TOLERANCE = 0.3, 0.45
 HEAVY_TAILS = 0.885
 """Mean-square radius above which squared errors have too heavy tails for a test of their mean."""
 MAX_CERTIFIED = 20
-"""Largest gamma up to which the exact minimum is searched."""
+"""Largest gamma (number of averaging steps in a slot) up to which the exact minimum is searched."""
 MAX_STEPS = 4096
 """Averaging steps up to which errors are compared with those of the central filter."""
 
 
 @dataclass(frozen=True, eq=False)
 class PushSumSummary(ReplicaSummary):
-    """Adds ``drift`` (2,): the relative drift of the totals of the push-sum variables w and n~,
-    which exchanges should conserve.
+    """Adds ``drift`` (2,): how far the totals over all nodes of the push-sum weight w and of the
+    push-sum number n~ are at the end from those at the start, relative; exchanges should conserve
+    both.
     """
 
     drift: FloatArray
@@ -102,21 +103,25 @@ class PushSumSamples(RunSamples):
         """
         Sigma, e = self.runs.Sigma[self.followed, -1], self.runs.e[self.followed, -1]
         values, vectors = np.linalg.eigh(Sigma)
+        # Smaller variances are rounding: they are raised, so that they do not blow up a component.
         floor = MIN_VARIANCE * values[..., -1:]
         components = np.einsum("rnab,rna->rnb", vectors, e)
         return np.asarray(components / np.sqrt(np.maximum(values, floor)))
 
     @cached_property
     def steady_root(self) -> FloatArray:
-        """W (N, n, n) with W S W' = I, for the exact steady covariance S of each node's error."""
+        """W (N, n, n) with W S W' = I, for the exact steady covariance S of each sampled node's
+        error, by theory and averaged over the links that fail.
+        """
         Sigma = push_sum_error_covariance(with_promised_filter(self.scenario))
         values, vectors = np.linalg.eigh(Sigma[sampled_indices(self.scenario)])
         return np.swapaxes(vectors / np.sqrt(values)[:, None, :], 1, 2)
 
     @cached_property
     def ratios(self) -> tuple[FloatArray, FloatArray]:
-        """Mean squares |W e|^2 / n (R', N) of the errors e in units of the steady covariance, and
-        the eigenvalues (R', N, n) of W Sigma W', their covariance given the links.
+        """Mean squares |W e|^2 / n (R', N) of the errors e at the end in units of the steady
+        covariance (W is ``steady_root``), and the eigenvalues (R', N, n) of W Sigma W', their
+        covariance given which links were up.
 
         Each |W e|^2 is a sum of squares of n standard normal numbers with these weights.
         """
@@ -127,12 +132,15 @@ class PushSumSamples(RunSamples):
 
 
 def _mass_conserved(samples: PushSumSamples, level: float) -> Finding:
-    """Compare the totals of weight and number at the end with 1 and N.
+    """Check that exchanges conserve mass: the totals over all nodes of the push-sum weight (1) and
+    of the push-sum number (N) at the end of the runs are those of the start, up to rounding.
 
     No interval is estimated, so that ``level`` is not used.
     """
     drift = np.abs(samples.runs.drift)
     message = f"drift of the totals of weight and number in {len(samples.runs.P)} runs"
+    # Size of the compared values, of the terms whose rounding errors they inherit, and relative
+    # tolerance: the drift is relative, and every addition may add a rounding error.
     limits = np.ones_like(drift), _count_exchanges(samples), 1e-9
     finding = compare_identities(drift, *limits, message)
     return finding._replace(replica=first_wrong(drift, *limits))
@@ -144,12 +152,12 @@ def _count_exchanges(samples: PushSumSamples) -> float:
 
 
 def _at_steady_state(samples: PushSumSamples, level: float) -> Finding:
-    """Compare P of every node at the end with P_inf.
+    """Compare P of every node at the end with its limit P_inf (n, n), the steady covariance of the
+    Kalman filter that gets all readings.
 
-    The row is undecided where the replay along the links of these runs is as far from P_inf: then
-    the horizon is too short.
-
-    No interval is estimated, so that ``level`` is not used.
+    The finding is ``early`` (undecided) if P computed by the filter's equations from the links of
+    these runs (``runs.replayed``) is as far from P_inf: then the horizon is too short. No interval
+    is estimated, so that ``level`` is not used.
     """
     limit = push_sum_limits(with_promised_filter(samples.scenario)).P
     was_replayed = ~np.isnan(samples.runs.replayed[:, -1, 0, 0, 0])
@@ -168,10 +176,11 @@ def _at_steady_state(samples: PushSumSamples, level: float) -> Finding:
 
 
 def _horizon_factor(samples: PushSumSamples, limit: FloatArray) -> float:
-    """Return the factor on the horizon at which P is within STEADY_TOLERANCE of ``limit`` (n, n).
+    """Return the factor on the horizon at which P is within STEADY_TOLERANCE of its ``limit``
+    (n, n), as advice for a verdict that is undecided because the horizon is too short.
 
-    It is extrapolated from the decay of the distance between half of the time and the end; nan if
-    the distance does not decay.
+    It is extrapolated from the decay of the distance of the replayed P from half of the horizon to
+    its end; nan if the distance does not decay.
     """
     P = samples.runs.replayed[~np.isnan(samples.runs.replayed[:, -1, 0, 0, 0])]
     half, last = (float(relative_difference(P[:, k], limit).max()) for k in (-2, -1))
@@ -184,8 +193,9 @@ def _horizon_factor(samples: PushSumSamples, limit: FloatArray) -> float:
 def _check_unbiased(samples: PushSumSamples, level: float) -> Finding:
     """Test the null hypothesis that errors at the end have mean 0, in all directions at once.
 
-    Under it the mean of R' whitened errors is normal with covariance I / R' at every node. The
-    interval of the finding misses the truth with at most the probability ``level``.
+    Under it the mean of R' errors, each whitened by its exact covariance, is normal with covariance
+    I / R' at every node. The interval of the finding misses the truth with at most the probability
+    ``level``.
     """
     if not len(samples.followed):
         return find_unknown("no run has errors that were followed exactly", BIAS_TOLERANCE)
@@ -198,7 +208,8 @@ def _check_unbiased(samples: PushSumSamples, level: float) -> Finding:
     for i, node in enumerate(nodes):
         bias = float(np.linalg.norm(samples.standardised[:, i].mean(axis=0)))
         detectable = radius + float(scipy.special.ndtri(POWER)) / math.sqrt(count)
-        distance = Interval(bias, max(0.0, bias - radius), bias + radius, detectable, bias, 0.0)
+        low = max(0.0, bias - radius)
+        distance = Interval(bias, low, bias + radius, detectable, seen=bias, expected=0.0)
         intervals.append((distance, f"at node {node}"))
     message = "largest bias, in standard deviations of an error,"
     return find_largest(intervals, BIAS_TOLERANCE, message)._replace(most_runs=max_runs)
@@ -213,7 +224,8 @@ def _gaussian_radius(level: float, n: int) -> float:
 def _mean_square(samples: PushSumSamples, level: float) -> Finding:
     """Test the null hypothesis that mean-square errors at the end are the exact steady ones.
 
-    Given the links of a run, |W e|^2 is a quadratic form of normal numbers; summed over the runs it
+    Given which links of a run were up, |W e|^2 (the squared error in units of the steady
+    covariance, ``samples.ratios``) is a quadratic form of normal numbers; summed over the runs it
     gives an interval for the factor on its expected value. The promise is broken only if mean
     squares differ from those expected for the links of these runs; the upper limit is for their
     distance from the steady ones. The interval of the finding misses the truth with at most the
@@ -225,6 +237,7 @@ def _mean_square(samples: PushSumSamples, level: float) -> Finding:
     if not (np.isfinite(squares).all() and np.isfinite(weights).all()):
         return find_nothing(SQUARE_TOLERANCE)
     nodes, n, intervals = samples.nodes, samples.scenario.plant.n, []
+    # Mean squares expected at each node for the links of these runs; 1 in the steady state.
     expected = weights.mean(axis=(0, 2))
     for i, node in enumerate(nodes):
         scale = quadratic_interval(
@@ -236,17 +249,20 @@ def _mean_square(samples: PushSumSamples, level: float) -> Finding:
     message = "largest relative difference of mean squares from the exact ones"
     max_runs = max_replayed(samples.scenario)
     finding = find_largest(intervals, SQUARE_TOLERANCE, message)._replace(most_runs=max_runs)
+    # Early if already the expected mean squares are not the steady ones, unless the promise is
+    # broken: the lower limits are those of the distance from what is expected.
     off_limit = float(np.abs(expected - 1.0).max())
     early = off_limit > SQUARE_TOLERANCE and not any(
-        from_replay.low > 0.0 for from_replay, _ in intervals
+        distance.low > 0.0 for distance, _ in intervals
     )
     return finding._replace(early=early)
 
 
 def _gamma_certified(samples: PushSumSamples, level: float) -> Finding:
-    """Check that the gamma that Theorem 6 certifies is at least the exact minimum.
+    """Check that gamma, the number of averaging steps in a slot, of the bound of P Theorem 6 (which
+    is to keep mean-square errors bounded) is at least the exact minimum for that.
 
-    No interval is estimated, so that ``level`` is not used.
+    No runs are looked at and no interval is estimated, so that ``level`` is not used.
     """
     scenario = with_promised_filter(samples.scenario)
     gamma, needed = minimum_gamma(scenario, "mean-square"), exact_minimum_gamma(scenario)
@@ -256,10 +272,12 @@ def _gamma_certified(samples: PushSumSamples, level: float) -> Finding:
 
 
 def _many_steps(samples: PushSumSamples, level: float) -> Finding:
-    """Compute error covariances and averaging noise for gamma = 1, 2, 4, ... and compare them with
-    their limits, until they agree to STEADY_TOLERANCE or gamma exceeds MAX_STEPS.
+    """Check that with ever more averaging steps in a slot (gamma) the steady error covariances
+    (N, n, n), and the covariance of the noise that averaging leaves (P Lemma 4), come to their
+    limits: compute them for gamma = 1, 2, 4, ... until they agree to STEADY_TOLERANCE or gamma
+    exceeds MAX_STEPS.
 
-    No interval is estimated, so that ``level`` is not used.
+    No runs are looked at and no interval is estimated, so that ``level`` is not used.
     """
     scenario = with_promised_filter(samples.scenario)
     limits, gamma, distance = large_gamma_limits(scenario), 1, np.inf
@@ -373,20 +391,27 @@ class PushSumChecks(PaperChecks):
     slots_only = True
 
     def summarise(self, scenario: Scenario, run: Run) -> PushSumSummary:
-        """Return the summary of a run whose samples are at ``check_slots``."""
+        """Return what the tests need of one ``run``, which was sampled at ``probe_times``; called
+        for every replica, in the process that simulated it.
+        """
+        # ``sums`` are the totals of weight and number at the start (exact) and at the end.
         drift = np.array([(total - exact) / exact for exact, total in run.sums.values()])
         drift = drift if len(drift) else np.full(2, np.nan)
         return PushSumSummary(**vars(summarise_exactly(scenario, run)), drift=drift)
 
     def collect(self, scenario: Scenario, stacked: Any, seed: int) -> PushSumSamples:
-        """Return the samples that the tests take, from stacked summaries of the runs of
-        ``seed``.
+        """Return the object that every test of a promise gets, from the summaries of all runs of
+        ``seed`` stacked along a first axis R; called once, after the last run.
         """
         return PushSumSamples(scenario, stacked, seed)
 
     def assumptions(self, scenario: Scenario) -> list[Assumption]:
-        """Return the assumptions of the tests beyond those of P."""
+        """Return the assumptions of the tests beyond those of the push-sum paper, each with whether
+        it holds here: a promise is tested only if those that it ``needs`` hold.
+        """
         try:
+            # Errors have a steady mean square if the mean-square radius is below 1, and a fourth
+            # moment, as a test of mean squares needs, if it is well below.
             radius = push_sum_radius(with_promised_filter(scenario))
             light = radius <= HEAVY_TAILS
             evidence = f"mean-square radius {radius:.4g}, light tails below {HEAVY_TAILS}"
@@ -426,7 +451,10 @@ class PushSumChecks(PaperChecks):
 
 
 def _every_slot(scenario: Scenario) -> Assumption:
-    """Return the assumption that the filter follows steps 2 and 3 of P in every slot."""
+    """Return the assumption that every node averages its push-sum masses with its neighbours and
+    computes its gain from them in every slot (steps 2 and 3 of the push-sum paper), on which the
+    exact covariances rely: a row of the table of assumptions.
+    """
     algorithm = with_promised_filter(scenario).filter.algorithm
     holds = algorithm.stop == "never" and not algorithm.asymptotic  # type: ignore[union-attr]
     evidence = "exchanged for ever" if holds else "gains are frozen or taken from the limit"
