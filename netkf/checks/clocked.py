@@ -41,8 +41,8 @@ class ClockedSummary(ReplicaSummary):
 
 
 def _mass_conserved(samples: RunSamples, level: float) -> Finding:
-    """Compare the total weight of all nodes at the end, messages in flight included, with that at
-    the start.
+    """Check that exchanges conserve mass: the total push-sum weight of all nodes at the end,
+    messages in flight included, is that at the start, up to rounding.
 
     No interval is estimated, so that ``level`` is not used.
     """
@@ -53,6 +53,8 @@ def _mass_conserved(samples: RunSamples, level: float) -> Finding:
     if isinstance(clock, LinkClock):
         rate = sum(clock.mean_rate(entity) for entity in clock.entities(scenario.topology))
     terms = 1.0 + scenario.horizon * float(np.nan_to_num(rate))
+    # Size of the compared values, of the terms whose rounding errors they inherit, and relative
+    # tolerance; the drift is relative already.
     limits = np.ones_like(drift), terms, MASS_TOLERANCE
     finding = compare_identities(drift, *limits, message)
     return finding._replace(replica=first_wrong(drift, *limits))
@@ -102,19 +104,24 @@ class ClockedChecks(PaperChecks):
     summary_type = ClockedSummary
 
     def summarise(self, scenario: Scenario, run: Run) -> ClockedSummary:
-        """Return the summary of a run whose samples are at ``check_times``."""
+        """Return what the tests need of one ``run``, which was sampled at ``probe_times``; called
+        for every replica, in the process that simulated it.
+        """
         drift = [abs(total - start) / abs(start) for start, total in run.sums.values()]
         fields = vars(summarise_exactly(scenario, run))
         return ClockedSummary(**fields, drift=max(drift, default=0.0))
 
     def assumptions(self, scenario: Scenario) -> list[Assumption]:
-        """Return the assumptions of the tests."""
+        """Return the assumptions of the tests, each with whether it holds here: a promise is tested
+        only if those that it ``needs`` hold.
+        """
         return [exact_start(scenario), few_errors(scenario)]
 
     def promises(self, scenario: Scenario) -> tuple[Promise, ...]:
-        """Return the promises about a scenario.
+        """Return the statements about a scenario's filter that are tested.
 
-        Push-sum conserves mass, but its P is no bound: a node counts its own samples N times.
+        Push-sum conserves mass, but its P is no upper bound on the covariance of its error: a node
+        counts its own samples N times.
         """
         if with_promised_filter(scenario).node_filter.combination == "sums":
             return (MASS_CONSERVED, *PROMISES)

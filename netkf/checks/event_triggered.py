@@ -16,7 +16,8 @@ from netkf.scenario.scenario import Scenario
 
 
 def check_nees_bound(samples: RunSamples, level: float) -> Finding:
-    """Test the null hypothesis that the mean of NEES / n is at most 1 at every time and node.
+    """Test the null hypothesis that the mean of NEES / n is at most 1 at every time and node, as it
+    is if P is at least the second moment of the error.
 
     Decisions to send depend on the data, so that errors given the events are not Gaussian. Hence
     Student's interval for the mean over the runs is used, with the level shared by all points.

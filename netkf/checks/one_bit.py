@@ -32,8 +32,9 @@ class BitChecks(PaperChecks):
     slots_only: ClassVar[bool] = True
 
     def summarise(self, scenario: Scenario, run: Run) -> ReplicaSummary:
-        """Return the summary of a run at its K checked times and N sampled nodes, with P
-        (K, N, n, n) replayed from the bits that arrived.
+        """Return what the test needs of one ``run``: P at its K checked times and N sampled nodes,
+        and the same (K, N, n, n) computed by the equations from the bits that arrived
+        (``replayed``). Called for every replica, in the process that simulated it.
         """
         summary = summarise_exactly(scenario, run)
         if run.replica >= max_replayed(scenario):

@@ -71,8 +71,9 @@ class TriggerChecks(EquationChecks):
     summary_type = TriggerSummary
 
     def summarise(self, scenario: Scenario, run: Run) -> TriggerSummary:
-        """Return the summary of a run whose samples are at ``check_times``; ``sends`` is nan unless
-        every node hears every other without losses, so that silence is information.
+        """Return what the tests need of one ``run``, which was sampled at ``probe_times``; called
+        for every replica, in the process that simulated it. ``sends`` is nan unless every node
+        hears every other without losses, so that silence is information.
         """
         sends = np.full(2, np.nan)
         if all_hear_all(scenario):

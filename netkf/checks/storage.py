@@ -59,7 +59,9 @@ def save_verdict(directory: Path, scenario: Scenario, verdict: Verdict, text: st
 
 
 def _save_verdict(directory: Path, scenario: Scenario, verdict: Verdict, text: str) -> None:
-    """Write scenario, results, table, text and JSON of a verdict into a directory."""
+    """Write scenario, results, table, text and JSON of a verdict into a directory, the JSON last:
+    it has digests of the others, and a directory without it holds no verdict.
+    """
     if not (directory / "scenario.toml").exists():
         write_scenario(directory, scenario)
     results = io.BytesIO()
@@ -147,7 +149,9 @@ def _infinite_numbers(verdict: Verdict) -> list[tuple[int, str, bool]]:
 
 
 def _read_rows(document: dict[str, Any]) -> tuple[Evidence, ...]:
-    """Return the rows of a document."""
+    """Return the rows (one for each promise) of the JSON ``document`` of a verdict, in which nan
+    and infinite numbers were stored as null and listed apart.
+    """
     rows = [dict(row) for row in document["rows"]]
     for row in rows:
         row |= {name: np.nan for name in NUMBERS if row[name] is None}
@@ -157,9 +161,10 @@ def _read_rows(document: dict[str, Any]) -> tuple[Evidence, ...]:
 
 
 def _result_columns(results: tuple[ReplicaResult, ...]) -> dict[str, np.ndarray]:
-    """Return all results as arrays with a first axis over the replicas, by name: "summary.NAME" and
-    "PART.NAME" are fields of the summaries of the runs that did not diverge, the first axis over
-    these.
+    """Return the results of all replicas as arrays, by name, for a file without pickles.
+
+    "difference", "expected" and "diverged" have a first axis over all replicas; "summary.NAME" and
+    "PART.NAME", the fields of their summaries, one over those that did not diverge.
     """
     columns = {
         "difference": np.array([result.difference for result in results]),
@@ -181,7 +186,9 @@ def _result_columns(results: tuple[ReplicaResult, ...]) -> dict[str, np.ndarray]
 
 
 def _read_results(path: Path, scenario: Scenario) -> list[ReplicaResult]:
-    """Return the results of the replicas in the file ``path``, in order."""
+    """Return the results of the replicas in the file ``path``, in order: the inverse of
+    :func:`_result_columns`. The class of a summary follows from the scenario's filter.
+    """
     with np.load(path, allow_pickle=False) as file:
         columns = {name: file[name] for name in file.files}
     chosen = with_check_times(scenario)

@@ -26,7 +26,8 @@ below which P counts as steady.
 
 
 def check_exact_covariance(samples: RunSamples, level: float) -> Finding:
-    """Compare P with the exact covariance Sigma of the error, up to rounding.
+    """Check that P of the runs is Sigma, the exact covariance of the error given the events of the
+    run, up to rounding; both are (R, K, N, n, n).
 
     No interval is estimated, so that ``level`` is not used.
     """
@@ -34,6 +35,7 @@ def check_exact_covariance(samples: RunSamples, level: float) -> Finding:
     P, Sigma = samples.runs.P[:max_runs], samples.runs.Sigma[:max_runs]
     size = np.trace(Sigma, axis1=-2, axis2=-1)
     gap = np.nan_to_num(np.abs(P - Sigma).max(axis=(-1, -2)), nan=1e300, posinf=1e300)
+    # Size of the values, of the terms whose rounding errors they inherit, and relative tolerance.
     limits = size, samples.largest_terms(samples.runs.replayed[:max_runs]), EXACT_TOLERANCE
     message = f"largest entry of P - Sigma relative to its trace in {gap.size:,} covariances"
     return with_departure(compare_identities(gap, *limits, message), samples, gap, limits)
@@ -49,10 +51,11 @@ EXACT = Promise(
 
 
 def check_steady(samples: RunSamples, level: float) -> Finding:
-    """Compare P at the end of the runs with that of steady tracks.
+    """Compare P at the end of the runs with that of steady tracks: the Kalman filters of the nodes
+    (tracks) in their steady state, fused by their exact cross-covariances.
 
-    While the initial P may still matter, the row is undecided and has the horizon that suffices. No
-    interval is estimated, so that ``level`` is not used.
+    While the initial P may still matter, the finding is ``early`` (undecided) and has the horizon
+    that suffices. No interval is estimated, so that ``level`` is not used.
     """
     radius, steady = tracks_in_slots(samples.scenario)
     expected = steady[sampled_indices(samples.scenario)]

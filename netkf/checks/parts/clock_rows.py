@@ -83,7 +83,7 @@ class ClockSamples(NamedTuple):
 
 
 def _network_clocks(samples: PartSamples) -> ClockSamples:
-    """Return the samples of the network's clocks."""
+    """Return the tick counts of the network's clocks in all runs, as tests of clocks get them."""
     scenario = samples.scenario
     return ClockSamples(
         scenario, samples.seed, network_clocks(scenario), samples.ticks, count_drawn_ticks
@@ -91,13 +91,14 @@ def _network_clocks(samples: PartSamples) -> ClockSamples:
 
 
 def _sampling_clocks(samples: PartSamples) -> ClockSamples:
-    """Return the samples of the sensors' clocks."""
+    """Return the counts of the sensors' sampling times in all runs, as tests of clocks get them."""
     scenario = samples.scenario
     group = sampling_clocks(scenario)
     return ClockSamples(scenario, samples.seed, group, samples.sampling, draw_samples)
 
 
 Group = Callable[[PartSamples], ClockSamples]
+"""Selects the clocks that a test is about: those of the network, or those of the sensors."""
 
 
 @lru_cache(maxsize=4)
@@ -134,8 +135,9 @@ def _counts_of_each(clocks: ClockSamples) -> np.ndarray:
 
 
 def _number_drawn(clocks: ClockSamples, runs: float) -> int:
-    """Return the number of further replicas, beside ``runs`` runs, in which only the clocks are
-    drawn.
+    """Return the number of further replicas, beside ``runs`` simulated runs, in which only the
+    clocks are drawn (at little cost), so that a rate of one clock that is off by WANTED_RATE would
+    be detected, within the limits of MAX_DRAWN, MAX_DRAWN_TICKS and DRAWN_PER_RUN.
     """
     ticks_per_run = clocks.rates * clocks.scenario.horizon
     further_replicas = min(
@@ -148,7 +150,8 @@ def _number_drawn(clocks: ClockSamples, runs: float) -> int:
 
 
 def _check_rates(group: Group, samples: PartSamples, level: float) -> Finding:
-    """Test the null hypothesis that clocks tick at their stated rates.
+    """Test the null hypothesis that clocks tick at their stated rates; ``group`` selects the clocks
+    of the network or those of the sensors from the samples.
 
     Compared with rate times horizon are the total ticks, for Poisson clocks also those in each
     window of the run, and the ticks of each clock; each of the three groups gets level / 3, shared
@@ -191,7 +194,8 @@ def _check_rates(group: Group, samples: PartSamples, level: float) -> Finding:
 
 
 def _ticks_of_start(clocks: ClockSamples, counts: np.ndarray) -> FloatArray:
-    """Return the slack (E,) in ticks between the mean count of each clock in a run and rate T.
+    """Return the slack (E,) in ticks by which the mean count of each clock in a run of T seconds
+    may differ from rate T although its rate is right.
 
     A renewal process that starts with the run has a mean number of ticks between rate T - 1 and
     rate T + c^2 in T seconds, with c the coefficient of variation of its gaps (Lorden 1970). Where
@@ -206,17 +210,21 @@ def _ticks_of_start(clocks: ClockSamples, counts: np.ndarray) -> FloatArray:
 
 
 def _rates_by_window(windows: np.ndarray, mean: float, level: float) -> list[tuple[Interval, str]]:
-    """Return labelled intervals for the relative error of the total rate in each window.
+    """Return labelled intervals for the relative error of the total rate of Poisson clocks in each
+    of W windows (equal parts) of the run.
 
-    ``windows`` (R, W, E) are ticks and ``mean`` is the stated mean total of a run; no intervals if
-    there is only one window, since that is the whole run. The probability that any of them misses
-    the truth is at most ``level``.
+    ``windows`` (R, W, E) are the ticks of E clocks in R runs and ``mean`` is the stated mean total
+    of a run; no intervals if there is only one window, since that is the whole run. The probability
+    that any of them misses the truth is at most ``level``.
     """
     window_ticks = windows.sum(axis=2)
     count = window_ticks.shape[1]
     return [
         (
-            _count_interval(window_ticks[:, k], mean / count, level / count, True, 0.0),
+            # Poisson counts are right from the start of a run on: no slack for a transient.
+            _count_interval(
+                window_ticks[:, k], mean / count, level / count, poisson=True, first_ticks=0.0
+            ),
             f"all clocks in part {k + 1} of {count} of the run",
         )
         for k in range(count if count > 1 else 0)
@@ -296,7 +304,8 @@ def _poisson_interval(total: float, mean: float, level: float) -> Interval:
 
 
 def _check_gaps(group: Group, samples: PartSamples, level: float) -> Finding:
-    """Test the null hypothesis that gaps follow the stated law and are independent.
+    """Test the null hypothesis that gaps between ticks follow the stated law and are independent;
+    ``group`` selects the clocks of the network or those of the sensors from the samples.
 
     Under it the gaps, as uniform numbers, fill CELLS cells of equal probability evenly, and
     neighbouring gaps, as normal numbers, have correlation 0; each test gets half of the level.
@@ -317,7 +326,8 @@ def _check_gaps(group: Group, samples: PartSamples, level: float) -> Finding:
 
 
 def _check_lattice(group: Group, samples: PartSamples, level: float) -> Finding:
-    """Compare the times of ticks of deterministic clocks with the stated times.
+    """Compare the times of ticks of deterministic clocks with the stated times; ``group`` selects
+    the clocks of the network or those of the sensors from the samples.
 
     No interval is estimated, so that ``level`` is not used.
     """
@@ -328,14 +338,15 @@ def _check_lattice(group: Group, samples: PartSamples, level: float) -> Finding:
 
 
 def _clocks_apart(group: Group, samples: PartSamples, level: float) -> Finding:
-    """Test the null hypothesis that the clocks are independent Poisson processes.
+    """Test the null hypothesis that the clocks are independent Poisson processes; ``group`` selects
+    the clocks of the network or those of the sensors from the samples.
 
     Under it the total count of a window is Poisson, so that its variance equals its mean, and no
     two clocks have correlated counts; each test gets half of the level.
     """
     clocks = group(samples)
     ticks = clocks.counts.ticks
-    counts = ticks.reshape(-1, ticks.shape[2])
+    counts = ticks.reshape(-1, ticks.shape[2])  # (windows of all runs, clocks)
     mean = float((clocks.rates * samples.scenario.horizon).sum()) / ticks.shape[1]
     values = counts.sum(axis=1) - mean
     # (x - m)^2 of a Poisson x with mean m has the variance 2 m^2 + m instead of 2 m^2 as for a
@@ -355,9 +366,10 @@ def _clocks_apart(group: Group, samples: PartSamples, level: float) -> Finding:
 def largest_correlation(
     values: FloatArray, level: float
 ) -> tuple[Interval, tuple[int, int]] | None:
-    """Return an interval for the largest |correlation| of two columns, and their indices.
+    """Return an interval for the largest |correlation| of two columns of ``values`` (K, L), such as
+    the counts of two clocks, and the indices of the two.
 
-    ``values`` (K, L) have mean 0 and independent rows; the products of two standardised columns are
+    Columns have mean 0 and rows are independent; the products of two standardised columns are
     averaged by Student's interval, with Bonferroni's correction for all pairs. None with fewer than
     two varying columns or 100 rows. The interval misses the truth with at most the probability
     ``level``.
@@ -381,7 +393,11 @@ def largest_correlation(
 
 
 def _promises(clocks: ClockSamples, group: Group, sentences: dict[str, str]) -> list[Promise]:
-    """Return the promises about a group of clocks; ``sentences`` states each test by its name."""
+    """Return the promises about the ``clocks`` that ``group`` selects from the samples: which tests
+    apply depends on whether they are Poisson, deterministic or of another known law. ``sentences``
+    has the statement of each promise by a short name.
+    """
+    # Rows (name, test, whether it is exact, that is uses none of the level).
     rows: list[tuple[str, Callable[..., Finding], bool]] = [("rates", _check_rates, False)]
     if clocks.poisson:
         rows += [("exponential", _check_gaps, False), ("apart", _clocks_apart, False)]
@@ -412,7 +428,9 @@ SAMPLING_SENTENCES = {
 
 
 def clock_promises(samples: PartSamples) -> list[Promise]:
-    """Return the promises about clocks whose law is stated and that the runs can test."""
+    """Return the promises about the clocks of the network and those of the sensors, if their rates
+    are stated and the runs have ticks of them.
+    """
     promises: list[Promise] = []
     for counts, group, sentences in (
         (samples.ticks, _network_clocks, NETWORK_SENTENCES),

@@ -33,9 +33,10 @@ MEAN_TOLERANCE = 0.05
 
 
 class DelayCounts(NamedTuple):
-    """Delays of the messages of one run over D directions, as uniform numbers u.
+    """Delays of the messages of one run over D directions (directed links), as numbers u that are
+    uniform in [0, 1] under the stated law: P(delay <= this one), given that it is logged.
 
-    cells    : (CELLS, 1) numbers in cells of equal probability
+    cells    : (CELLS, 1) numbers of u in equal parts of [0, 1]
     products : (3,) sums over neighbouring delays of a direction, as in TickCounts
     sums     : (2, D) of each direction the number of delays and the sum of u - 1/2
     off      : () largest distance in seconds of a delay from a stated constant
@@ -56,7 +57,9 @@ def stated_delay(scenario: Scenario) -> Any:
 
 
 def delay_law(delay: Any, seconds: FloatArray) -> FloatArray | None:
-    """Return P(delay <= ``seconds``) (K,); None if the law is unknown or has no density."""
+    """Return P(delay <= ``seconds``) (K,) under the law that ``delay`` states; None if the law is
+    unknown or has no density.
+    """
     seconds = np.maximum(seconds, 0.0)
     # By exact type: a class with statements of its own has a law of its own.
     if type(delay) is ExponentialDelay:
@@ -71,8 +74,8 @@ def delay_law(delay: Any, seconds: FloatArray) -> FloatArray | None:
 
 
 def count_delays(scenario: Scenario, run: Run) -> DelayCounts | None:
-    """Return the delays of the messages of a run, as uniform numbers: counts in cells (CELLS, 1),
-    and sums (2, D) for each of D directions; None without links or a stated law of the delays.
+    """Return counts and sums by which the delays of the messages of a run are compared with their
+    stated law, over D directions (directed links); None without links or a stated law.
 
     Only messages that arrive before the run ends are in the log. So the law of a delay is
     conditioned on its being at most the time from sending to the end of the run.
@@ -99,6 +102,7 @@ def count_delays(scenario: Scenario, run: Run) -> DelayCounts | None:
     counted = np.isfinite(uniform) & ~shares_draws(scenario)[directions]
     order = np.lexsort((rows["message"][counted], directions[counted]))
     ranks, directions = uniform[counted][order], directions[counted][order]
+    # The first message of each direction has no neighbour before it.
     first = np.ones(len(ranks), dtype=bool)
     first[1:] = directions[1:] != directions[:-1]
     sums = [
@@ -123,9 +127,9 @@ def _check_fixed(samples: Any, level: float) -> Finding:
 def _check_law(samples: Any, level: float) -> Finding:
     """Test the null hypothesis that delays follow their stated law and are independent.
 
-    Under it the uniform numbers of :class:`DelayCounts` fill the cells evenly, have the mean 1/2 in
-    each direction, and are not correlated with those of the message before; each of the three
-    tests gets a third of the level.
+    Under it P(delay <= the one seen) is uniform in [0, 1] (:class:`DelayCounts`): these numbers
+    fill the cells evenly, have the mean 1/2 in each direction (directed link), and are not
+    correlated with those of the message before; each of the three tests gets a third of the level.
     """
     counts = samples.delays
     finding = compare_cells(counts.cells.sum(axis=0), ["all"], level / 3.0, "delays")
@@ -145,6 +149,7 @@ def _check_law(samples: Any, level: float) -> Finding:
         intervals.append(
             (deviation_interval(0.0, correlation), "neighbouring ones, their correlation")
         )
+    # The law of all delays is reported if it is wrong, or if no direction is significantly off.
     if finding.margin[2] < 0.0 or not any(distance.low > 0.0 for distance, _ in intervals):
         return finding
     return find_largest(intervals, MEAN_TOLERANCE, "largest difference of a mean rank from 1/2")

@@ -15,7 +15,8 @@ from netkf.trace.schema import CODES
 
 
 class LossCounts(NamedTuple):
-    """Counts of the messages of one run over D directions.
+    """Counts of the messages of one run over D directions (directed links), from which it is
+    tested how often, and how independently, messages are lost.
 
     sent, lost : (W, D) messages in each of W equal windows of the run
     followed   : (D,) losses after which another message was sent
@@ -51,8 +52,9 @@ def direction_indices(scenario: Scenario) -> dict[tuple[int, int], int]:
 
 
 def count_losses(scenario: Scenario, run: Run) -> LossCounts | None:
-    """Return the counts (W, D) of sent and lost messages of a run, in W windows of it and by
-    direction; None without links.
+    """Return the counts (W, D) of sent and lost messages of a run, in W windows (equal parts) of it
+    and for each of D directions (directed links), and counts of losses that follow or accompany
+    each other; None without links.
     """
     indices, log = direction_indices(scenario), run.log
     sends, losses = (log[log["kind"] == CODES[kind]] for kind in ("send", "lost"))
@@ -113,7 +115,8 @@ def reversed_directions(scenario: Scenario) -> np.ndarray:
 
 
 def count_pairs(scenario: Scenario, run: Run) -> PairCounts | None:
-    """Return for each of L links the number (L,) of slots of a run in which it was in the matching;
+    """Return for each of L links the number (L,) of slots of a run in which it was in the matching
+    (the pairs of nodes that exchange in a slot), and in which it was in two matchings in a row;
     None without drawn matchings.
     """
     if not isinstance(scenario.network.activation, Matching):
@@ -124,9 +127,10 @@ def count_pairs(scenario: Scenario, run: Run) -> PairCounts | None:
     ids = zip(rows["node"].tolist(), rows["peer"].tolist(), strict=True)
     link_of_row = np.array([links[min(e), max(e)] for e in ids], dtype=np.int64)
     count = np.bincount(link_of_row, minlength=len(links))
+    # One integer for each link and slot: the same link one slot before has that less len(links).
     keys = slots * len(links) + link_of_row
     repeated = np.isin(keys - len(links), keys)
-    first = scenario.node_filter.first_slot
+    first = scenario.node_filter.first_slot  # filters may exchange nothing in slot 0
     total = int(np.ceil(scenario.horizon / scenario.slot_plant.period - 1e-9)) - first
     return PairCounts(
         count, np.bincount(link_of_row[repeated], minlength=len(links)), np.array(float(total))

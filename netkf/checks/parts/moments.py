@@ -77,10 +77,11 @@ class NoiseMoments(NamedTuple):
 
 
 def moments(z: FloatArray, states: FloatArray | None = None) -> NoiseMoments:
-    """Return the sums over a series z (S, d), in which missing entries are nan.
+    """Return the sums from which variances, means, correlations and the law of a series of whitened
+    noises z (S, d) are tested; missing entries are nan. Sums of several runs can be added.
 
     ``states`` (S, n, d) are the states, in units of their root mean square, to which each noise was
-    added; 0 where none is known.
+    added, or which the sensor read; 0 where none is known.
     """
     present = np.isfinite(z)
     # Missing entries are 0, so that they add nothing to sums of products, and have the weight 0.
@@ -88,6 +89,7 @@ def moments(z: FloatArray, states: FloatArray | None = None) -> NoiseMoments:
     z = np.where(present, z, 0.0)
     rank = np.where(present, 2.0 * scipy.special.ndtr(np.abs(z)) - 1.0, 0.0)
     square = z**2
+    # For each lag k the fields of ``further``: number of pairs, and products and squares over them.
     lagged_terms = [
         [
             weight[k:] * weight[:-k],
@@ -130,9 +132,10 @@ def moments(z: FloatArray, states: FloatArray | None = None) -> NoiseMoments:
 
 
 def count_cells(u: FloatArray, present: np.ndarray) -> FloatArray:
-    """Return the counts (CELLS, d) of numbers u (S, d) in [0, 1] in each of CELLS equal cells, of S
-    values of d entries; only those in the mask ``present`` (S, d) count.
+    """Return the histogram (CELLS, d) of each column of u (S, d), numbers in [0, 1], with CELLS
+    equal cells; only those in the mask ``present`` (S, d) count.
     """
+    # The cell of each number, coded together with its column.
     index = np.minimum((CELLS * u).astype(np.int64), CELLS - 1) * u.shape[1] + np.arange(u.shape[1])
     counts = np.bincount(index[present], minlength=CELLS * u.shape[1])
     return counts.reshape(CELLS, u.shape[1]).astype(float)
@@ -153,8 +156,9 @@ def whitening_matrix(covariance: FloatArray) -> FloatArray:
 def compare_variances(
     sums: NoiseMoments, labels: list[str], level: float, noun: str, gaussian: bool = True
 ) -> Finding:
-    """Test the null hypothesis that every entry has variance 1: all entries pooled, all in each
-    part of a run, and one by one, with level / 3 for each of the three.
+    """Test the null hypothesis that every entry of a whitened noise, given by its ``sums`` over all
+    runs, has variance 1: all entries pooled, all in each part of a run, and one by one, with level
+    / 3 for each of the three.
 
     Sums of squares of Gaussian numbers are chi-square. Otherwise (``gaussian`` false) the degrees
     of freedom of the chi-square law are those that match the variance of the sum, from the sample
@@ -195,7 +199,8 @@ def compare_variances(
 
 
 def compare_means(sums: NoiseMoments, labels: list[str], level: float) -> Finding:
-    """Test the null hypothesis that every entry has mean 0 and is uncorrelated with the state.
+    """Test the null hypothesis that every entry of a whitened noise, given by its ``sums`` over all
+    runs, has mean 0 and is uncorrelated with the state to which it is added.
 
     The mean of ``count`` entries of variance 1 is taken to be normal with variance 1 / count. Means
     and correlations with states get half of the ``level`` each, if states are known. ``labels``
@@ -221,13 +226,15 @@ def compare_means(sums: NoiseMoments, labels: list[str], level: float) -> Findin
 
 
 def _with_states(sums: NoiseMoments, labels: list[str], level: float) -> list[tuple[Interval, str]]:
-    """Return labelled intervals for the correlations of entries with the states they are added to.
+    """Return labelled intervals for the correlations of the entries of a whitened noise with the
+    states they are added to, from the ``sums`` over all runs.
 
     States within a run are correlated, so that the independent values are the sums of the products
     over each run; their mean under the null hypothesis is 0, which makes the sum of their squares
     an estimate of the variance. The probability that any of them misses the truth is at most
     ``level``.
     """
+    # (n, d) each: number of products, their sum, sum over runs of squared sums, number of runs.
     counts, products, squares, runs = sums.states
     comparable = np.argwhere((runs >= MIN_RUNS) & (squares > 0.0)).tolist()
     intervals = []
@@ -241,19 +248,20 @@ def _with_states(sums: NoiseMoments, labels: list[str], level: float) -> list[tu
 
 
 def compare_correlations(sums: NoiseMoments, labels: list[str], level: float) -> Finding:
-    """Test the null hypothesis that the noise is white.
+    """Test the null hypothesis that a whitened noise is white, from its ``sums`` over all runs.
 
     Under it there are no correlations between entries, with any entry one step before, of an entry
     with itself 2 to FURTHER + 1 steps before, and of |entry| with itself one step before (which
     would show a varying variance). All comparisons share the ``level`` (Bonferroni). ``labels``
     name the entries in messages.
     """
-    entries = [*_between(sums, labels), *_in_time(sums, labels), *_in_size(sums, labels)]
-    entries = [entry for entry in entries if entry[1] >= MIN_COUNT]
-    if not entries:
+    # Each is (correlation, number of pairs, label).
+    correlations = [*_between(sums, labels), *_in_time(sums, labels), *_in_size(sums, labels)]
+    correlations = [entry for entry in correlations if entry[1] >= MIN_COUNT]
+    if not correlations:
         return nothing_to_see(CORRELATION_TOLERANCE)
-    single_level, intervals = level / len(entries), []
-    for value, count, label in entries:
+    single_level, intervals = level / len(correlations), []
+    for value, count, label in correlations:
         intervals.append(
             (deviation_interval(0.0, correlation_interval(value, count, single_level)), label)
         )
@@ -262,7 +270,9 @@ def compare_correlations(sums: NoiseMoments, labels: list[str], level: float) ->
 
 def compare_cells(cells: FloatArray, labels: list[str], level: float, noun: str) -> Finding:
     """Test the null hypothesis that numbers are uniform in [0, 1), from their counts in ``cells``
-    (CELLS, d): of all d columns together, and of each column, with half of the level each.
+    (CELLS, d), equal parts of [0, 1): of all d columns together, and of each column, with half of
+    the level each. The numbers are gaps, delays or noises, transformed by the distribution function
+    that they should have.
 
     Cells have equal probability, so that a count is binomial with probability 1 / CELLS (interval
     of Clopper and Pearson). ``noun`` names the numbers in the message.
@@ -281,12 +291,12 @@ def compare_cells(cells: FloatArray, labels: list[str], level: float, noun: str)
                 distance = _cell_interval(count, counts[column], single_level)
                 intervals.append((distance, f"{label}, {_cell_label(k)}"))
     message = f"{counts.sum():,.0f} {noun}, largest difference of a share from 1/{CELLS}"
-    return with_best(intervals, SHARE_TOLERANCE, message, CELLS)
+    return with_best(intervals, SHARE_TOLERANCE, message, overall_count=CELLS)
 
 
 def _cell_interval(count: float, total: float, level: float) -> Interval:
-    """Return the interval of the distance between a cell's share of ranks, ``count`` out of
-    ``total``, and 1 / CELLS.
+    """Return the interval of the distance between a cell's share of the numbers in [0, 1),
+    ``count`` out of ``total``, and its probability 1 / CELLS.
 
     The interval misses the truth with at most the probability ``level``.
     """
@@ -318,7 +328,9 @@ def correlation_interval(value: float, count: float, level: float) -> Interval:
 
 
 def _between(sums: NoiseMoments, labels: list[str]) -> Iterator[tuple[float, float, str]]:
-    """Yield correlation, count and label of all pairs of entries."""
+    """Yield correlation, number of terms and label of all pairs of entries of a noise at the same
+    time, from its ``sums`` over all runs.
+    """
     correlations = _correlations(sums.second, sums.squares[0], sums.squares[0].T)
     for i in range(len(labels)):
         for j in range(i):
@@ -330,7 +342,9 @@ def _between(sums: NoiseMoments, labels: list[str]) -> Iterator[tuple[float, flo
 
 
 def _in_time(sums: NoiseMoments, labels: list[str]) -> Iterator[tuple[float, float, str]]:
-    """Yield correlation, count and label of all entries with all entries just before."""
+    """Yield correlation, number of terms and label of all entries of a noise with all entries one
+    step before, from its ``sums`` over all runs.
+    """
     correlations = _correlations(sums.lagged, *sums.squares[1:])
     for i, label in enumerate(labels):
         for j, earlier_label in enumerate(labels):
@@ -339,9 +353,11 @@ def _in_time(sums: NoiseMoments, labels: list[str]) -> Iterator[tuple[float, flo
 
 
 def _in_size(sums: NoiseMoments, labels: list[str]) -> Iterator[tuple[float, float, str]]:
-    """Yield correlation, count and label of each entry with itself 2 to FURTHER + 1 steps before,
-    and of the rank of |entry| with that one step before.
+    """Yield correlation, number of terms and label of each entry of a noise with itself 2 to
+    FURTHER + 1 steps before, and of the rank of |entry| (its probability under the normal law) with
+    that one step before, from the ``sums`` over all runs.
     """
+    # (FURTHER, d) each: number of terms, and sums of products and of squares over these terms.
     count, *lag_sums = np.moveaxis(sums.further, 1, 0)
     correlations = _correlations(*lag_sums)
     for i, label in enumerate(labels):
@@ -380,6 +396,7 @@ def with_best(
     values, which is more precise, and the message adds the largest deviation of a part.
     """
     finding = find_largest(intervals[:overall_count], tolerance, message)
+    # An interval of a deviation that excludes 0 is significant.
     if any(distance.low > 0.0 for distance, _ in intervals):
         everything = finding.detectable
         return find_largest(intervals, tolerance, message)._replace(detectable=everything)

@@ -49,7 +49,9 @@ def _stated_loss(scenario: Scenario) -> Any:
 
 @lru_cache(maxsize=8)
 def loss_probabilities(scenario: Scenario) -> FloatArray:
-    """Return the stated long-run loss (D,) of each direction; nan if unknown before a run."""
+    """Return the stated long-run probability (D,) that a message is lost on each of D directions
+    (directed links); nan if unknown before a run.
+    """
     loss, directions = _stated_loss(scenario), scenario.topology.directions
     delivery = [loss.mean_delivery(d, scenario.table_probability(d)) for d in directions]
     return 1.0 - np.array(delivery)
@@ -62,13 +64,15 @@ def _direction_label(scenario: Scenario, k: int) -> str:
 
 
 def _check_losses(samples: PartSamples, level: float) -> Finding:
-    """Test the null hypothesis that each direction loses its stated share of messages.
+    """Test the null hypothesis that each direction (directed link) loses its stated share of
+    messages.
 
     Three groups of comparisons get level / 3 each: all directions together, the same in each window
     of the run, and every direction.
     """
     scenario, counts = samples.scenario, samples.fates
     q = loss_probabilities(scenario)
+    # Messages (R, D) of each run and direction, and the indices of directions with any.
     sent, lost = counts.sent.sum(axis=1), counts.lost.sum(axis=1)
     in_use = np.flatnonzero(sent.sum(axis=0) > 0)
     intervals = [(_loss_interval(scenario, sent, lost, q, in_use, level / 3.0), "all directions")]
@@ -137,7 +141,8 @@ def _loss_interval(
 def _share_of_bounded_runs(
     excess: FloatArray, sent: np.ndarray, expected: float, level: float
 ) -> Interval:
-    """Return an interval for the lost share of messages that holds for every law of a run.
+    """Return an interval for the lost share of messages that holds whatever the law of the losses
+    within a run, for losses too rare for a sample variance; only runs are independent.
 
     ``excess`` (R,) is the number of messages lost in each run less the expected number, ``sent``
     (R,) the number of messages, ``expected`` the stated share. By Hoeffding's bound
@@ -164,8 +169,9 @@ def _share_of_bounded_runs(
 
 
 def _share_at(centre: float, end: float, limit: float) -> float:
-    """Return the m between ``centre`` and ``end`` (0 or 1) with KL(centre, m) = ``limit``, by
-    bisection; m is ``end`` if the divergence stays below the limit.
+    """Return a limit of Hoeffding's interval for a probability estimated as ``centre``: the m
+    between ``centre`` and ``end`` (0 or 1) at which the Kullback-Leibler divergence KL(centre, m)
+    of Bernoulli laws is ``limit``, by bisection; m is ``end`` if the divergence stays below it.
     """
     inner, outer = centre, end
     for _ in range(60):
@@ -179,13 +185,14 @@ def _share_at(centre: float, end: float, limit: float) -> float:
 
 
 def _is_independent(scenario: Scenario) -> bool:
-    """Return True if messages are lost independently of each other.
+    """Return True if the scenario states that messages are lost independently of each other.
 
     The loss must state so, and every exchange must redraw the links: a filter may keep the outcome
     of a link for several exchanges of a slot.
     """
     filter_ = scenario.node_filter
     if scenario.slotted:
+        # A slot has phases in which nodes exchange, and each of these one or more exchanges.
         phases = range((filter_.schedule or ()).count("exchange"))
         steps = [(phase, k) for phase in phases for k in range(filter_.exchange_steps(phase))]
         if not all(filter_.redraws_links(*step) for step in steps):
@@ -202,6 +209,9 @@ def _losses_apart(samples: PartSamples, level: float) -> Finding:
     """
     scenario, counts = samples.scenario, samples.fates
     q, sent = loss_probabilities(scenario), counts.sent.sum(axis=1)
+    # Each job compares the number of pairs of messages that were both lost with its expected value:
+    # (label, number of these pairs, number of all pairs, loss probability of the second message of
+    # a pair, variance of the former number for each pair), over R runs and D directions.
     pairs = np.maximum(sent - 1, 0)
     # Where both directions of a link share one draw, each event is counted twice.
     repeated_variance = _neighbours_variance(q) * (
@@ -265,10 +275,13 @@ def loss_twice(chain: GilbertElliott) -> float:
 
 
 def _one_step_a_message(scenario: Scenario) -> bool:
-    """Return True if the chain of a direction makes one step for each of its messages."""
+    """Return True if the two-state chain of losses of a direction (directed link) makes one step
+    for each of its messages, so that the loss after a loss can be compared with the chain's.
+    """
     clock, channel = scenario.network.activation, scenario.network.channel
     if isinstance(clock, Matching):
         return True
+    # Broadcasts of two nodes at different times would both step a chain that they share.
     at_once = isinstance(clock, LinkClock) and clock.at == "links"
     return at_once or (isinstance(clock, LinkClock) and not channel.symmetric)
 
@@ -283,7 +296,9 @@ def _neighbours_variance(p: Any) -> Any:
 
 
 def _directions_apart(scenario: Scenario) -> bool:
-    """Return True if both directions of a link carry messages at once but draw their own losses."""
+    """Return True if both directions of a link carry messages at once but draw their own losses, so
+    that it can be tested whether the two are independent.
+    """
     clock = scenario.network.activation
     at_once = getattr(clock, "at", "links") == "links"
     return at_once and not scenario.network.channel.symmetric
@@ -292,8 +307,9 @@ def _directions_apart(scenario: Scenario) -> bool:
 def _correlation_of_runs(
     excess: FloatArray, count: np.ndarray, scale: FloatArray, variance: FloatArray, level: float
 ) -> Interval | None:
-    """Return an interval for the correlation of the two events of a pair, from R independent runs
-    with D directions (or links); None with fewer than MIN_RUNS runs.
+    """Return an interval for the correlation of two events, such as the losses of two successive
+    messages, from how often both happened in R independent runs with D directions (or links); None
+    with fewer than MIN_RUNS runs.
 
     excess   : (R, D) number of pairs in which both events happened, less its expected value if
                they are independent
@@ -317,17 +333,17 @@ def _correlation_of_runs(
 
 
 def _links_apart(samples: PartSamples, level: float) -> list[tuple[Interval, str]]:
-    """Return labelled intervals for the largest and for the mean correlation of losses of two
-    links, from their counts in the windows of all runs.
+    """Return labelled intervals for the largest and for the mean correlation of the numbers of
+    losses of two links, from their counts in the windows (equal parts) of all runs.
 
     The probability that any of them misses the truth is at most ``level``.
     """
     scenario, counts = samples.scenario, samples.fates
     # One direction of a link stands for both, which may share their draws.
-    estimate: dict[tuple[int, int], int] = {}
+    direction_of_link: dict[tuple[int, int], int] = {}
     for k, (i, j) in enumerate(scenario.topology.directions):
-        estimate.setdefault((min(i, j), max(i, j)), k)
-    columns = np.array(list(estimate.values()))
+        direction_of_link.setdefault((min(i, j), max(i, j)), k)
+    columns = np.array(list(direction_of_link.values()))
     excess = (counts.lost - counts.sent * loss_probabilities(scenario)).reshape(
         -1, counts.sent.shape[2]
     )
@@ -382,7 +398,9 @@ def _mean_correlation(excess: FloatArray, variance: FloatArray, level: float) ->
 
 @lru_cache(maxsize=8)
 def pair_probabilities(scenario: Scenario) -> FloatArray | None:
-    """Return the stated probability (L,) of each link in a matching; None if it is not known."""
+    """Return the stated probability (L,) that each of L links is in the matching of a slot (the
+    pairs of nodes that exchange); None if it is not known.
+    """
     stated = stated_part(scenario.network.activation, "slot activation")
     if not isinstance(stated, Matching):
         return None
@@ -395,7 +413,8 @@ def pair_probabilities(scenario: Scenario) -> FloatArray | None:
 
 
 def _check_matchings(samples: PartSamples, level: float) -> Finding:
-    """Test the null hypothesis that matchings have their stated mean and are independent.
+    """Test the null hypothesis that matchings (the pairs of nodes that exchange in a slot) contain
+    each link with its stated probability and are independent.
 
     Compared with the mean matching are the number of pairs in a slot (Student's interval over the
     runs) and the probability that each link is paired (Clopper and Pearson); and a link that is
@@ -455,7 +474,9 @@ MATCHINGS = Promise(
 
 
 def network_promises(samples: PartSamples) -> list[Promise]:
-    """Return the promises about the network whose law is stated and that the runs can test."""
+    """Return what the scenario states about its clocks, matchings, losses and delays, as promises
+    that the runs can test; parts without a stated law have none.
+    """
     promises = clock_promises(samples)
     scenario = samples.scenario
     drawn = samples.pairs is not None and scenario.node_filter.talks

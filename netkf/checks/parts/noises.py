@@ -53,8 +53,9 @@ class PathLaw(NamedTuple):
 
 @lru_cache(maxsize=8)
 def path_law(scenario: Scenario) -> PathLaw | None:
-    """Return the law of the path by the matrices of the scenario: the transition (n, n) of a step,
-    and the whitening (d, n) of its noise; None for recorded states.
+    """Return the law of the true state at up to MAX_STEPS + 1 times of a run, by the matrices of
+    the scenario: the transition (n, n) of a step between two times, and the whitening (d, n) of its
+    noise, with which simulated paths are compared; None for recorded states.
     """
     if not scenario.plant.is_random:
         return None
@@ -97,8 +98,9 @@ def _discretise(A: FloatArray, B: FloatArray, gap: float) -> tuple[FloatArray, F
 
 
 def plant_moments(scenario: Scenario, streams: Streams) -> NoiseMoments | None:
-    """Return the sums of products (d, d), and further ones, of the whitened noise (d,) in the steps
-    of one path; None without noise or path law.
+    """Return the sums (:class:`NoiseMoments`) over the plant's noise in the steps of one run's true
+    path, whitened by its stated covariance to d entries; None for plants without noise and for
+    recorded states.
     """
     law = path_law(scenario)
     if law is None or not len(law.white):
@@ -121,7 +123,9 @@ def _standardise(x: FloatArray, sizes: FloatArray) -> FloatArray:
 
 
 def _states(scenario: Scenario, streams: Streams, law: PathLaw) -> FloatArray:
-    """Return the states (S + 1, n) of one run at ``law.times``."""
+    """Return the true states (S + 1, n) of the run of ``streams`` at ``law.times``, drawn again
+    from its stream.
+    """
     if scenario.slotted:
         truth = scenario.slot_plant.truth(streams.generator("plant"))
         return np.array([truth.absolute(slot) for slot in range(len(law.times))])
@@ -139,7 +143,9 @@ def _choose_times(scenario: Scenario) -> Scenario:
 
 
 def start_states(scenario: Scenario, seed: int, count: int) -> FloatArray:
-    """Return x(0) (count, n) of replicas 0 to ``count`` - 1 of the runs of ``seed``."""
+    """Return x(0) (count, n) of replicas 0 to ``count`` - 1 of the runs of ``seed``, each drawn
+    from the replica's own stream as a run would draw it.
+    """
     # Built-in classes draw all replicas in one call, with the same numbers as one by one.
     if type(scenario.plant) in (LinearPlant, Diffusion):
         seed_words = ReplicaStreams(seed, 0, count).seed_words("plant", [()])
@@ -171,7 +177,9 @@ class SensorLaw(NamedTuple):
 
 @lru_cache(maxsize=8)
 def sensor_laws(scenario: Scenario) -> tuple[SensorLaw, ...]:
-    """Return the laws of the sensors with drawn noise, up to MAX_ROWS rows in all."""
+    """Return the laws by which readings are whitened, one for each sensor with drawn (not recorded)
+    noise, until their readings together have MAX_ROWS rows.
+    """
     laws: list[SensorLaw] = []
     rows = 0
     for node, placed_sensors in scenario.placed_sensors.items():
@@ -183,7 +191,7 @@ def sensor_laws(scenario: Scenario) -> tuple[SensorLaw, ...]:
             rows += len(stated.R)
             if rows > MAX_ROWS:
                 return tuple(laws)
-            # A random regressor comes with each reading.
+            # An H that varies is random and comes with each reading.
             H = None if stated.varying else np.asarray(stated.H)
             label = (
                 f"sensor {placed_sensor.ordinal} of node {node}"
@@ -197,7 +205,9 @@ def sensor_laws(scenario: Scenario) -> tuple[SensorLaw, ...]:
 
 
 def reading_labels(scenario: Scenario) -> list[str]:
-    """Return the labels of the entries of the moments of readings."""
+    """Return a label for each of the d noises of readings that are tested, in the order of their
+    sums: one for each row of each sensor.
+    """
     return [
         f"reading {row} of {law.label}" if len(law.root) > 1 else f"the reading of {law.label}"
         for law in sensor_laws(scenario)
@@ -206,8 +216,9 @@ def reading_labels(scenario: Scenario) -> list[str]:
 
 
 def reading_moments(scenario: Scenario, streams: Streams) -> NoiseMoments | None:
-    """Return the sums of products (d, d), and further ones, of the whitened noises (d,) of all
-    readings; None without drawn sensors.
+    """Return the sums (:class:`NoiseMoments`) over the noises of the sensors' first readings in the
+    run of ``streams``, whitened by their stated covariances to d entries; None without drawn
+    sensors.
 
     Sensors read states drawn here, of typical size, since their noise must not depend on the state.
     The k-th noises of all sensors form one vector; entries of sensors with fewer readings are nan.
@@ -258,8 +269,8 @@ def _whitened_noises(
 
 
 def _typical_states(scenario: Scenario, random: np.random.Generator, count: int) -> FloatArray:
-    """Return ``count`` Gaussian states (count, n) with the mean of x(0), and the covariance of x(0)
-    plus the noise of ten steps.
+    """Return ``count`` Gaussian states (count, n) for sensors to read, with the mean of x(0), and
+    the covariance of x(0) plus the noise of ten steps: of the size that the plant's states have.
     """
     root = square_root(_typical_covariance(scenario))
     plant: Any = scenario.plant
@@ -296,10 +307,13 @@ class _Grid(NamedTuple):
 def _increment_noises(
     scenario: Scenario, streams: Streams, law: SensorLaw, random: np.random.Generator
 ) -> Iterator[tuple[FloatArray, FloatArray]]:
-    """Yield whitened noises (2, p) of increments, and the two states (2, n) they were added to.
+    """Yield whitened noises (2, p) of the increments dy of a continuous sensor, and the two states
+    (2, n) they were added to, drawn from ``random``.
 
-    Every other step is cut in two, which the sensor samples by a bridge. Each piece of a step has
-    two moments, of variances R length and R length / 3 over its length in seconds.
+    Every other step is cut in two, as the event of a link would cut it; the sensor then draws the
+    two parts conditionally on their sum (a bridge). For each piece of a step the sensor gives two
+    moments of dy over the piece, whose noises have variances R length and R length / 3, with the
+    length in seconds.
     """
     sensor: Any = scenario.sensors[law.placed_sensor.entry]
     node, ordinal = law.node, law.placed_sensor.ordinal

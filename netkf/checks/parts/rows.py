@@ -36,23 +36,26 @@ def _number_labels(noun: str, count: int) -> list[str]:
 
 @lru_cache(maxsize=4)
 def _start_moments(scenario: Scenario, seed: int) -> NoiseMoments:
-    """Return the moments of STARTS whitened initial states."""
+    """Return the sums of STARTS states x(0), drawn again from their streams and whitened by the
+    stated mean and covariance, by which rows about the start are tested; cached.
+    """
     return moments(whitened_starts(scenario, start_states(scenario, seed, STARTS)))
 
 
 def _start_variance(samples: PartSamples, level: float) -> Finding:
-    """Compare the variances of the initial states with the stated covariance.
+    """Test that x(0) has the stated covariance: whitened by it, states x(0) have variance 1.
 
     The interval of the finding misses the truth with at most the probability ``level``.
     """
     sums = _start_moments(samples.scenario, samples.seed)
+    # The entries of a whitened state are numbered: they are eigenvectors, not states.
     labels = _number_labels("direction", len(sums.first))
     gaussian = not is_own_class(samples.scenario.plant, "plant")
     return compare_variances(sums, labels, level, "directions of x(0)", gaussian)
 
 
 def _start_mean(samples: PartSamples, level: float) -> Finding:
-    """Compare the means of the initial states with the stated ones.
+    """Test that x(0) has the stated mean: less that and whitened, states x(0) have mean 0.
 
     The interval of the finding misses the truth with at most the probability ``level``.
     """
@@ -61,13 +64,15 @@ def _start_mean(samples: PartSamples, level: float) -> Finding:
 
 
 def _step_moments(samples: PartSamples) -> tuple[NoiseMoments, list[str]]:
-    """Return the moments of the plant's noise and their labels."""
+    """Return the sums over all runs of the plant's noise, whitened by its stated covariance, and a
+    label for each of its entries.
+    """
     sums = total(samples.steps)
     return sums, _number_labels("direction", len(sums.first))
 
 
 def _step_variance(samples: PartSamples, level: float) -> Finding:
-    """Compare the variances of the plant's noise with the stated ones.
+    """Test that the plant's noise has its stated covariance: whitened by it, it has variance 1.
 
     The interval of the finding misses the truth with at most the probability ``level``.
     """
@@ -93,7 +98,8 @@ def _step_correlation(samples: PartSamples, level: float) -> Finding:
 
 
 def _reading_variance(samples: PartSamples, level: float) -> Finding:
-    """Compare the variances of the readings' noise with R.
+    """Test that noises of the readings have their stated covariances R: whitened by these, they
+    have variance 1.
 
     The interval of the finding misses the truth with at most the probability ``level``.
     """
@@ -124,10 +130,11 @@ def _own_sensors(scenario: Scenario) -> bool:
 
 
 def gaussian_noises(samples: PartSamples) -> Assumption:
-    """Return the assumption that all noises are Gaussian, which rows about squared errors need.
+    """Return the assumption that all noises are Gaussian, a row of the table of assumptions, which
+    tests of squared errors need.
 
     Built-in noises are Gaussian; those of a user's class, which states only a covariance, are
-    tested by their counts in cells.
+    tested by how they fill cells that have equal probability under the normal law.
     """
     scenario, tested = samples.scenario, []
     if is_own_class(scenario.plant, "plant"):
@@ -143,8 +150,11 @@ def gaussian_noises(samples: PartSamples) -> Assumption:
 
 
 def _fills_evenly(cells: FloatArray) -> bool:
-    """Return False if the test of ``cells`` (CELLS, d) rejects the Gaussian law at LAW_LEVEL."""
+    """Return False if noises are found not to be Gaussian, at LAW_LEVEL: ``cells`` (CELLS, d) are
+    the numbers of d whitened entries in cells of equal probability under the normal law.
+    """
     finding = compare_cells(cells, [""] * cells.shape[1], LAW_LEVEL, "")
+    # Rejected if the upper end of the margin (value, low, high) is below 0.
     return not finding.margin[2] < 0.0
 
 
@@ -170,7 +180,9 @@ SENSOR_ROWS = (
 
 
 def part_promises(samples: PartSamples) -> tuple[Promise, ...]:
-    """Return the promises about the parts of the scenario that these samples can test."""
+    """Return what a scenario itself states about its start, plant, sensors, clocks, channels and
+    matchings, as promises that these samples can test; a user's own class may break one.
+    """
     scenario = samples.scenario
     promises: list[Promise] = []
     if scenario.plant.is_random and np.any(scenario.plant.start_cov):

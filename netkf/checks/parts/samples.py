@@ -54,8 +54,9 @@ PART_TYPES: dict[str, type[Any]] = {
 
 
 def summarise_parts(scenario: Scenario, run: Run) -> PartSummary:
-    """Return counts and sums of a run, by which the parts of the scenario are compared with their
-    laws.
+    """Return counts and sums of a run, by which the parts of the scenario (clocks, losses,
+    matchings, plant, sensors) are compared with the laws that they state; called for every
+    replica, in the process that simulated it. Noises are drawn again from the run's streams.
     """
     streams = Streams(run.seed, run.replica)
     return PartSummary(
@@ -71,7 +72,8 @@ def summarise_parts(scenario: Scenario, run: Run) -> PartSummary:
 
 @dataclass(frozen=True)
 class PartSamples:
-    """The summaries of R runs of one seed; their fields have a first axis of length R.
+    """The summaries of R runs of one seed, which all tests of parts get; the arrays in them have a
+    first axis of length R.
 
     See :class:`PartSummary` for the fields; a part that the scenario lacks is None.
     """
@@ -88,8 +90,8 @@ class PartSamples:
 
 
 def stack_parts(scenario: Scenario, seed: int, summaries: Sequence[PartSummary]) -> PartSamples:
-    """Return the summaries of R runs as arrays with a first axis of length R, part by part; None
-    for a part that no run has.
+    """Return the ``summaries`` of R runs of ``seed`` as one object for the tests, whose arrays have
+    a first axis of length R; None for a part (clocks, losses, ...) that no run has.
     """
     columns: dict[str, Any] = dict.fromkeys(PartSummary._fields)
     for name in PartSummary._fields:

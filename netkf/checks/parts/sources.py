@@ -29,12 +29,14 @@ def is_own_class(part: Any, family: str) -> bool:
 
 
 def stated_part(part: Any, family: str) -> Any:
-    """Return the part that states the law of ``part``.
+    """Return the object whose stated law (rate, loss probability, covariance, ...) a clock,
+    channel, plant or sensor ``part`` is tested against.
 
     It is the part itself if its class is built in, derives from no built-in class, or overrides one
-    of the STATEMENTS of its family; otherwise an instance of the built-in base class with the same
-    fields.
+    of the STATEMENTS of its ``family`` (kind of part, such as "loss"); otherwise an instance of the
+    built-in base class with the same fields.
     """
+    # The first built-in class among the ancestors; 0 if that is the class itself or there is none.
     built_in, ancestors = set(KINDS[family].values()), type(part).__mro__
     index = next((k for k, cls in enumerate(ancestors) if cls in built_in), 0)
     own_names = {name for cls in ancestors[:index] for name in vars(cls)}

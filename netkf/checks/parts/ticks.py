@@ -33,7 +33,8 @@ class TickCounts(NamedTuple):
     """Counts of the ticks of E clocks in one run.
 
     ticks    : (W, E) ticks in each of W equal windows of the run
-    cells    : (CELLS, 1) gaps, as uniform numbers, in cells of equal probability
+    cells    : (CELLS, 1) numbers of gaps between ticks, transformed by their stated distribution
+               function to uniform numbers, in equal parts of [0, 1)
     products : (3,) over pairs of neighbouring gaps, as standard normal numbers u and v: the sum of
                u v, the sum of (u^2 + v^2) / 2, and the number of pairs
     off      : () largest distance in seconds of a tick from the times of a deterministic clock
@@ -57,8 +58,8 @@ class ClockGroup(NamedTuple):
 
 @lru_cache(maxsize=8)
 def network_clocks(scenario: Scenario) -> ClockGroup:
-    """Return the clocks of the network; empty if no messages are sent or nothing random decides
-    when.
+    """Return the clocks of the network that are compared with their stated laws, one for each node
+    or link; empty if no messages are sent or no clock decides when.
     """
     clock = scenario.network.activation
     silent = not scenario.filter.algorithm.talks
@@ -120,7 +121,7 @@ def count_samples(scenario: Scenario, streams: Streams) -> TickCounts | None:
 
 def count_drawn_ticks(scenario: Scenario, seed: int, replica: int) -> np.ndarray:
     """Return how often each of E clocks of the network ticks in one ``replica`` of the runs of
-    ``seed``, (E,), from its stream.
+    ``seed``, (E,), drawn from the clocks' streams without simulating anything else.
     """
     clock: Any = scenario.network.activation
     streams = Streams(seed, replica)
@@ -139,7 +140,7 @@ def count_drawn_ticks(scenario: Scenario, seed: int, replica: int) -> np.ndarray
 
 def draw_samples(scenario: Scenario, seed: int, replica: int) -> np.ndarray:
     """Return how often each of E sensors samples in one ``replica`` of the runs of ``seed``, (E,),
-    from its stream.
+    drawn from the sensors' streams without simulating anything else.
     """
     times = scenario.sample_times(Streams(seed, replica))
     return np.array([len(times[entity]) for entity in sampling_clocks(scenario).entities])
@@ -171,8 +172,9 @@ def _by_window(times: np.ndarray, indices: np.ndarray, size: int, horizon: float
 def _count_in_windows(
     group: ClockGroup, times: np.ndarray, clock_of_tick: np.ndarray, horizon: float
 ) -> TickCounts:
-    """Return the counts of K ticks in a run of ``horizon`` seconds, from their ``times`` (K,) in
-    seconds and the indices ``clock_of_tick`` (K,) of their clocks in ``group``.
+    """Return the counts by which the clocks of ``group`` are compared with their stated laws, from
+    the ``times`` (K,) in seconds of the K ticks of a run of ``horizon`` seconds, and the indices
+    ``clock_of_tick`` (K,) of their clocks in the group.
     """
     size = len(group.entities)
     windows = _by_window(times, clock_of_tick, size, horizon)
@@ -186,7 +188,7 @@ def _count_in_windows(
     number = np.arange(len(sorted_times)) - first_row[sorted_clocks]
     # Under the null hypothesis the gaps, transformed by their stated law, are uniform in [0, 1).
     uniform, largest_error = np.full(len(sorted_times), np.nan), 0.0
-    for clock in dict.fromkeys(group.stated):
+    for clock in dict.fromkeys(group.stated):  # clocks of one law share one object
         rows = np.array([stated is clock for stated in group.stated])[sorted_clocks]
         ticks = TickSample(
             sorted_times[rows], number[rows], ticks_of_clock[sorted_clocks[rows]], is_first[rows]
@@ -250,6 +252,7 @@ def gap_law(clock: Any, gaps: np.ndarray) -> np.ndarray:
     """Return P(gap <= ``gaps``) (K,) of a renewal clock, ``gaps`` in seconds; nan where gaps are
     constant or their law is unknown.
     """
+    # By exact type: a class with statements of its own has a law of its own.
     if type(clock) is not Renewal:
         return np.full(len(gaps), np.nan)
     shape, mean = clock.shape or 1.0, 1.0 / clock.mean_rate(())
@@ -266,7 +269,9 @@ def gap_law(clock: Any, gaps: np.ndarray) -> np.ndarray:
 
 
 def relative_variance(clock: Any) -> float:
-    """Return the squared coefficient of variation of the gaps; nan if their law is unknown."""
+    """Return the squared coefficient of variation of a clock's gaps (variance over squared mean) by
+    its stated law; nan if that is unknown.
+    """
     if ticks_on_lattice(clock):
         return 0.0
     if type(clock) is not Renewal:
@@ -283,12 +288,13 @@ def relative_variance(clock: Any) -> float:
 
 
 def _lattice_times(clock: Any, number: np.ndarray) -> np.ndarray:
-    """Return the times (K,) in seconds of the ticks with indices ``number`` (K,), without jitter
-    and random phase.
+    """Return the times (K,) in seconds at which a clock of constant gaps makes the ticks with
+    indices ``number`` (K,), without jitter and random phase.
     """
     if isinstance(clock, Renewal):
         return np.asarray((number + 1) / clock.mean_rate(()))
     phase = 0.0 if isinstance(clock.phase, str) else clock.phase
+    # With phase 0 the first tick is at one period, since there is none at time 0.
     return np.asarray(phase + clock.period * (number + (clock.phase == 0.0)))
 
 
@@ -300,8 +306,8 @@ def ticks_on_lattice(clock: Any) -> bool:
 
 
 def distance_from_lattice(clock: Any, ticks: TickSample) -> float:
-    """Return the largest distance in seconds of a tick from its allowed times; 0 for clocks whose
-    ticks are not at multiples of a period.
+    """Return the largest distance in seconds of one of the K ticks of a clock's law from its
+    allowed times; 0 for clocks whose ticks are not at multiples of a period.
 
     A tick may be late by the clock's jitter. All ticks of a clock with a random phase may also be
     shifted by one common time of at most a period: the lateness of its ticks may then differ among
@@ -311,7 +317,7 @@ def distance_from_lattice(clock: Any, ticks: TickSample) -> float:
         return 0.0
     late = ticks.times - _lattice_times(clock, ticks.number)
     jitter = getattr(clock, "jitter", 0.0)
-    if isinstance(getattr(clock, "phase", None), str):
+    if isinstance(getattr(clock, "phase", None), str):  # a random phase for each clock
         starts = np.flatnonzero(ticks.first)
         spread = np.maximum.reduceat(late, starts) - np.minimum.reduceat(late, starts)
         excess = late[starts] - (clock.period + jitter)
@@ -320,8 +326,9 @@ def distance_from_lattice(clock: Any, ticks: TickSample) -> float:
 
 
 def correlate_neighbours(uniform: np.ndarray, first: np.ndarray) -> FloatArray:
-    """Return sums (3,) over neighbouring numbers u, v of a series ``uniform`` (K,), made normal: of
-    u v, of (u^2 + v^2) / 2, and their number.
+    """Return the sums (3,) from which :func:`correlation_of_neighbours` tests that successive gaps
+    (or delays) are independent: over neighbours u, v of a series ``uniform`` (K,) of uniform
+    numbers, made normal, those of u v and of (u^2 + v^2) / 2, and their number.
 
     Numbers that are nan, and the pairs of a number marked as ``first`` (K,) of its clock with the
     one before it, are left out.
