@@ -12,7 +12,14 @@ from netkf.checks.parts.delays import delay_law
 from netkf.checks.parts.network_rows import loss_twice
 from netkf.checks.parts.sources import stated_part
 from netkf.linalg.arrays import FloatArray
-from netkf.network.channels import Channel, ChannelSampler, Delay, GilbertElliott, Loss
+from netkf.network.channels import (
+    Channel,
+    ChannelSampler,
+    Delay,
+    GilbertElliott,
+    Loss,
+    stream_purposes,
+)
 from netkf.network.channels import delay_depends_on_message as overrides_message_delay
 from netkf.network.graphs import Complete, Link, Topology
 from netkf.rng.streams import Streams
@@ -338,11 +345,12 @@ def _simulate_deliveries(part: Loss, links: dict[Link, float], seed: int) -> Flo
     ``links`` has for each link its entry in the graph's table of probabilities. As in the engine,
     each directed link has random streams of its own, derived from ``seed``.
     """
-    delivered = np.zeros((CHAINS, LENGTH, len(links)))
+    delivered, channel = np.zeros((CHAINS, LENGTH, len(links))), Channel(loss=part)
     for chain in range(CHAINS):
-        streams = Streams(seed + 7, chain)
+        # All seeds in one call: each alone takes longer than the draws.
+        streams = Streams(seed + 7, chain).with_seeds(stream_purposes(channel), tuple(links))
         for k, (link, table_probability) in enumerate(links.items()):
-            sampler = ChannelSampler(Channel(loss=part), partial(_make_generator, streams, link))
+            sampler = ChannelSampler(channel, partial(_make_generator, streams, link))
             uniform, bad, _ = sampler.draws(LENGTH)
             probabilities = [
                 part.delivery_probability(link, message, is_bad, table_probability)

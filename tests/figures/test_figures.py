@@ -45,7 +45,7 @@ def shown_texts(figure):
 
 def assert_well_laid_out(figure):
     with style_context():
-        figure.draw(figure.canvas.get_renderer())
+        figure.draw_without_rendering()
     texts = shown_texts(figure)
     width, height = figure.bbox.width, figure.bbox.height
     for words, box in texts:
