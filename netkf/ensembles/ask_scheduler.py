@@ -16,7 +16,9 @@ CONNECT_SECONDS = 5
 
 
 def scheduler_answers(address: str, seconds: float) -> bool:
-    """Return True if a Dask scheduler answers at ``address`` within some seconds."""
+    """Return True if a Dask scheduler answers at ``address`` within ``seconds``, as a process finds
+    out that runs this module.
+    """
     # -P keeps Python from importing modules of the current folder.
     command = [sys.executable, "-P", "-m", "netkf.ensembles.ask_scheduler", address]
     null = subprocess.DEVNULL

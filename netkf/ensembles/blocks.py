@@ -59,7 +59,8 @@ class Job(NamedTuple):
 
 
 def work(job: Job) -> Any:
-    """Return the result of a block of work, in a worker or in this process.
+    """Do a block of work, in a worker or in this process; return what its task returns for its
+    replicas.
 
     Raises EngineError with the name of the class if a plugged-in class fails.
     """
@@ -76,8 +77,8 @@ def work(job: Job) -> Any:
 
 
 def each_replica(task: Task, merge: Merge, scenario: Scenario, seed: int, replicas: range) -> Any:
-    """Return the results of ``task(scenario, seed, replica)`` for each of ``replicas``, merged by
-    the tree over replicas with ``merge``.
+    """Call ``task(scenario, seed, replica)`` for each of ``replicas``; return its results, merged
+    into one by ``merge(a, b)`` along the binary tree over replicas (neighbours first).
     """
     tree = MergeTree(merge)
     for k, replica in enumerate(replicas):
@@ -86,7 +87,9 @@ def each_replica(task: Task, merge: Merge, scenario: Scenario, seed: int, replic
 
 
 def pack_scenario(scenario: Scenario) -> PackedScenario:
-    """Return a scenario for other processes; raises EngineError where it cannot be pickled."""
+    """Return a scenario in the form that is sent to worker processes; raises EngineError if it
+    cannot be pickled, or has a class that workers cannot import.
+    """
     name = find_unimportable_class(scenario)
     if name is not None:
         message = f"workers cannot import the class {name} of a notebook, a prompt or a function"
@@ -102,7 +105,9 @@ def pack_scenario(scenario: Scenario) -> PackedScenario:
 
 
 def _plugged_in_modules(scenario: Scenario) -> set[tuple[str, str]]:
-    """Return the module of each plugged-in class, with the folder that it can be imported from."""
+    """Return (module name, folder to import it from) for each class of the scenario that a user
+    wrote, so that workers can import it too; not for classes in the script itself (__main__).
+    """
     modules = set()
     for part in user_components(scenario):
         name = type(part).__module__
@@ -120,7 +125,9 @@ _scenarios: dict[str, Scenario] = {}
 
 
 def unpack_scenario(packed: PackedScenario) -> Scenario:
-    """Return the unpickled scenario; a worker keeps the last MAX_SCENARIOS with their caches."""
+    """Return the unpickled scenario, in a worker, which keeps the last MAX_SCENARIOS with what they
+    have cached; ``packed`` may lack the pickle of one that was sent before.
+    """
     scenario = _scenarios.get(packed.digest)
     if scenario is None:
         while len(_scenarios) >= MAX_SCENARIOS:
@@ -130,7 +137,9 @@ def unpack_scenario(packed: PackedScenario) -> Scenario:
 
 
 def _check_versions(required_versions: tuple[tuple[str, str], ...]) -> None:
-    """Raise EngineError if this worker lacks the required versions: results could differ."""
+    """Raise EngineError unless this worker has the ``required_versions`` of packages, (name,
+    version) each, that the command has: with others, results could differ in the last bits.
+    """
     installed = versions()
     differences = [
         (name, installed.get(name, "none"), required)

@@ -83,9 +83,10 @@ class BlockCheckpoints:
         return None
 
     def find(self, identity: RunIdentity) -> tuple[list[int], list[str]]:
-        """Return the numbers of the blocks of a run, in order, and lines about removed ones.
+        """Return the numbers of the stored blocks (consecutive replicas) of the runs with this
+        ``identity``, in order, and lines for the user about removed ones.
 
-        Files that are unreadable or belong to another run are removed.
+        Files that are unreadable or belong to other runs are removed.
         """
         bad: list[tuple[str, str]] = []
         for file in self._block_paths():
@@ -101,8 +102,10 @@ class BlockCheckpoints:
         return sorted(self._numbers), _describe(bad)
 
     def readable(self, scenario_digest: str, seed: int) -> list[RunStatistics]:
-        """Return the statistics of the blocks of a scenario and a seed that can be read, in order,
-        whatever installation made them; nothing is removed.
+        """Return the statistics of all blocks of runs of a scenario (by its digest) and ``seed``
+        that can be read, in order, whatever installation made them; nothing is removed.
+
+        They serve to show the results of an interrupted ensemble, not to resume it.
         """
         statistics = []
         identity = {"scenario": scenario_digest, "seed": seed}
@@ -114,8 +117,8 @@ class BlockCheckpoints:
         return statistics
 
     def save(self, number: int, statistics: RunStatistics, identity: RunIdentity) -> None:
-        """Write block ``number`` with the ``statistics`` of its runs and the traces that these
-        left; raises WriteError.
+        """Write the file of block ``number``, with the ``statistics`` of its runs and the traces
+        (events and samples of single runs) in them; raises WriteError.
 
         ``identity`` is that of the scenario, seed and installation, by which a resumed run knows
         its blocks.
@@ -139,8 +142,8 @@ class BlockCheckpoints:
             return _restore_statistics(arrays)
 
     def traces(self) -> Iterator[Trace]:
-        """Yield the traces of all blocks in the order of replicas; raises EngineError if a block
-        was damaged meanwhile.
+        """Yield the traces (events and samples of a run) that the blocks of this run have, in the
+        order of replicas; raises EngineError if a block was damaged since it was found or saved.
         """
         for number in sorted(self._numbers):
             file = self._block_path(number)
@@ -162,7 +165,9 @@ class BlockCheckpoints:
         return self._folder / f"{number:06d}.npz"
 
     def _check(self, file: Path, identity: dict[str, Any]) -> None:
-        """Raise DamagedError unless a file is intact, has this identity and fits the scenario."""
+        """Raise DamagedError unless a block's file is intact, its stored identity has the values of
+        ``identity``, and its arrays fit the scenario.
+        """
         with _open_block(file, verified=False) as arrays:
             stored = _read_texts(arrays).get("identity")
             for key, value in identity.items():
@@ -172,8 +177,11 @@ class BlockCheckpoints:
                 raise DamagedError("does not fit the scenario")
 
     def _has_form(self, statistics: RunStatistics) -> bool:
-        """Return True if all arrays have the shapes of statistics of the scenario."""
+        """Return True if all arrays of ``statistics``, read from a file, have the shapes and types
+        that those of this scenario have.
+        """
         count, n = len(self._scenario.nodes), self._scenario.plant.n
+        # Columns and rows of moments; those that are not listed have one row.
         columns = {"samples": count * (n * (n + 1) + 1), "averages": 3 * (count + 1)}
         rows = {"samples": len(self._scenario.times)}
         moments = [(getattr(statistics, name), name) for name in PARTS]
@@ -188,11 +196,12 @@ class BlockCheckpoints:
         )
 
     def _restore_trace(self, arrays: Any, k: int) -> Trace:
-        """Return the k-th trace of a block from its stored ``arrays``; raises DamagedError if it
-        does not fit the scenario.
+        """Return the k-th trace (events and samples of one run) of a block from its stored
+        ``arrays``; raises DamagedError if it does not fit the scenario.
         """
         trace: Any = Trace(*(arrays[f"trace_{k}_{name}"] for name in Trace._fields))
         T, N, n = len(trace.times), len(self._scenario.nodes), self._scenario.plant.n
+        # replica, log, times, x, xhat, P, error
         shapes = [(), (len(trace.log),), (T,), (T, n), (T, N, n), (T, N, n, n), (T, N, n)]
         types = [np.dtype(np.int64), EVENT, *[np.dtype(np.float64)] * 5]
         if [(field.dtype, field.shape) for field in trace] != list(zip(types, shapes, strict=True)):
@@ -220,7 +229,9 @@ def is_block_size(value: object) -> bool:
 
 
 def _block_number(file: Path, identity: RunIdentity) -> int:
-    """Return the number of the block in a file; raises DamagedError."""
+    """Return the number of the block in a file, from the name of the file; raises DamagedError if
+    runs with this ``identity`` have no such block.
+    """
     number = int(file.stem[:12])
     if file.name != f"{number:06d}.npz" or number >= identity.blocks:
         raise DamagedError("has a number that no block has")
@@ -228,7 +239,9 @@ def _block_number(file: Path, identity: RunIdentity) -> int:
 
 
 def _describe(bad: list[tuple[str, str]]) -> list[str]:
-    """Return a line about ``bad`` blocks (name, reason), which are simulated again; or none."""
+    """Return a line for the user about ``bad`` files of blocks (name, reason), whose runs are
+    simulated again; an empty list if there are none.
+    """
     if not bad:
         return []
     listed = ", ".join(f"{name} {reason}" for name, reason in bad[:3])
@@ -237,7 +250,9 @@ def _describe(bad: list[tuple[str, str]]) -> list[str]:
 
 
 def _verify(file: Path) -> None:
-    """Raise DamagedError unless a file ends with the digest of all bytes before its last line."""
+    """Raise DamagedError unless the file of a block ends with a line that has the digest of all
+    bytes before it.
+    """
     with reading_file(file), file.open("rb") as opened:
         length = max(0, opened.seek(0, os.SEEK_END) - SEAL_BYTES)
         opened.seek(length)
@@ -259,8 +274,8 @@ def _digest(file: BinaryIO, length: int) -> bytes:
 
 @contextlib.contextmanager
 def _open_block(file: Path, verified: bool = True) -> Iterator[Any]:
-    """Yield the arrays of a block's file, with its digest checked unless ``verified`` before;
-    raises DamagedError for anything wrong with it.
+    """Yield the arrays, by name, of a block's npz file; raises DamagedError for anything wrong with
+    it. The digest at its end is checked unless the file was ``verified`` before.
     """
     try:
         if not verified:
@@ -268,13 +283,15 @@ def _open_block(file: Path, verified: bool = True) -> Iterator[Any]:
         with np.load(file, allow_pickle=False) as arrays:
             yield arrays
     except (DamagedError, EngineError, KeyboardInterrupt, GeneratorExit):
-        raise
+        raise  # not about the file's bytes, or explained already
     except Exception as error:  # of zipfile, zlib, numpy and json, whatever the bytes are
         raise DamagedError(f"cannot be read ({type(error).__name__})") from None
 
 
 def _as_arrays(statistics: RunStatistics, identity: dict[str, Any]) -> dict[str, Any]:
-    """Return the statistics of a block as arrays by name, for one npz file."""
+    """Return the statistics of a block and its ``identity`` as arrays by name, for one npz file;
+    ``_restore_statistics`` reads them.
+    """
     arrays: dict[str, Any] = {"totals": statistics.totals}
     moments = {name: getattr(statistics, name) for name in PARTS}
     moments |= {
@@ -301,7 +318,7 @@ def _read_texts(arrays: Any) -> dict[str, Any]:
 
 
 def _restore_statistics(arrays: Any) -> RunStatistics:
-    """Return the statistics of a block from the arrays of its file."""
+    """Return the statistics of a block, without its traces, from the arrays of its file."""
 
     def moments(name: str) -> Moments:
         """Return the moments of one quantity."""

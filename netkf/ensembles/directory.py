@@ -137,14 +137,15 @@ def _open_directory(
     engine: str,
     width: int,
 ) -> _DirectoryWriter | None:
-    """Return the writer of a new directory for ``runs`` runs, or of the one to resume; None if that
-    is complete.
+    """Return the writer of a new directory for the results of ``runs`` runs, or of the directory
+    ``out`` whose runs are to be resumed; None if that is complete.
 
-    ``engine`` is the name of the engine, ``width`` the number of blocks that run at a time.
+    ``engine`` is the name of the engine, ``width`` the number of blocks (parts of the replicas)
+    that are simulated at a time.
     """
     size = block_size(runs, width)
     if options.trace == "full":
-        size = min(size, MAX_TRACED_BLOCK)
+        size = min(size, MAX_TRACED_BLOCK)  # events of all runs of a block are in memory
     digest = scenario_digest(scenario)
     plan = RunIdentity(
         digest, scenario.seed, runs, options.trace, engine, installation_digest(), size
@@ -162,8 +163,11 @@ def _open_directory(
 def _write_files(
     writer: _DirectoryWriter, statistics: RunStatistics
 ) -> tuple[Path, str, dict[str, Any], Ensemble, PromisedTraces]:
-    """Write all files but the manifest; return the directory, the status ("complete" or
-    "diverged"), the summary, the ensemble and the promised traces.
+    """Write ensemble.parquet, summary.json and the events and states of traced runs: all files but
+    the manifest, which comes last.
+
+    Returns the first fields of FinishedEnsemble: the directory, the status ("complete" or
+    "diverged"), the summary, the ensemble, and the traces of covariances that theory promises.
     """
     directory, scenario, plan = writer.directory, writer.scenario, writer.plan
     ensemble = ensemble_of(scenario, statistics, plan.seed, plan.engine)
@@ -202,9 +206,11 @@ class _DirectoryWriter:
         return {"full": self.plan.runs, "first": 1, "none": 0}[self.plan.trace]
 
     def begin(self, note: Callable[[str], None] | None) -> None:
-        """Write the manifest and the scenario, and find the stored blocks.
+        """Write the manifest and the scenario, and find the stored blocks (files with the results
+        of some consecutive replicas) of a run that is resumed.
 
-        ``note`` is called with a line about each block that is simulated again.
+        ``note``, if there is one, is called with a line for the user about those that are damaged
+        and simulated again.
         """
         # The manifest comes first: if the process is killed, it states that the run is unfinished.
         self.note()
@@ -219,7 +225,9 @@ class _DirectoryWriter:
     def simulate(
         self, task: Callable[..., RunStatistics], pool: Pool, progress: Progress | None
     ) -> RunStatistics:
-        """Return the statistics of all runs: stored blocks are read, the others simulated."""
+        """Return the statistics of all runs: stored blocks are read, the others simulated on
+        ``pool`` by ``task(scenario, seed, replicas)``, and stored.
+        """
         finished_blocks = {number: partial(self.blocks.load, number) for number in self._known}
         blocks = NumberedBlocks(self.plan.block, finished_blocks, self.save_block)
         statistics: RunStatistics = replicate_blocks(
@@ -232,8 +240,8 @@ class _DirectoryWriter:
         return min(self.plan.block, self.plan.runs - number * self.plan.block)
 
     def save_block(self, number: int, statistics: RunStatistics) -> RunStatistics:
-        """Store completed block ``number``, and return its statistics without the traces, which
-        would fill the memory.
+        """Store completed block ``number`` and return its statistics without the traces (events and
+        samples of single runs), which would fill the memory; called as each block completes.
         """
         self.blocks.save(number, statistics, self.plan)
         self._done += self._runs_in_block(number)
@@ -262,9 +270,13 @@ class _DirectoryWriter:
         return explain_failure(self.scenario, error, self.directory)
 
     def end(self, status: str, statistics: RunStatistics) -> None:
-        """Write the final manifest, with the digests of all other files."""
+        """Write the final manifest, with ``status`` ("complete" or "diverged") and the digests of
+        all other files, after which ``note`` writes nothing any more.
+        """
         entries = self._identity_entries(
-            diverged=int(statistics.totals[1]), events=int(statistics.totals[0])
+            # totals: numbers of events and of diverged runs
+            diverged=int(statistics.totals[1]),
+            events=int(statistics.totals[0]),
         )
         entries["fingerprint"] = statistics.fingerprint
         self._manifest.write(status, entries, self.plan.runs, names=run_file_names(self.scenario))

@@ -36,8 +36,8 @@ class MergeTree:
         self._waiting[level, k] = value
 
     def result(self) -> Any:
-        """Return the merged result of all nodes; nodes at the end without a neighbour are merged
-        from right to left.
+        """Return the merged result of all nodes that were added; nodes at the end that wait for a
+        neighbour, which does not come, are merged from right to left.
         """
         values = [value for _, value in sorted(self._waiting.items(), key=_first)]
         total = values.pop()
@@ -47,15 +47,18 @@ class MergeTree:
 
 
 def _first(item: tuple[tuple[int, int], Any]) -> int:
-    """Return the index of the first block in a node of the tree."""
+    """Return the index of the first block in a node of the tree, by which nodes are sorted."""
     (level, k), _ = item
     return k << level
 
 
 def aligned_pieces(first: int, stop: int) -> Iterator[tuple[int, int]]:
-    """Yield the largest nodes (level, k) that cover the leaves ``first`` .. ``stop - 1``."""
+    """Yield the largest nodes of the binary tree that cover the leaves ``first`` .. ``stop - 1``;
+    node (level, k) covers the leaves k 2^level .. (k + 1) 2^level - 1.
+    """
     while first < stop:
         level = (stop - first).bit_length() - 1
+        # A node may begin only at a multiple of its size.
         if first:
             level = min(level, (first & -first).bit_length() - 1)
         yield level, first >> level

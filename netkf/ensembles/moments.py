@@ -36,10 +36,11 @@ class Moments(NamedTuple):
 
 
 def moments_of(values: FloatArray, size: FloatArray) -> Moments:
-    """Return the moments of R observations ``values`` (R, S, C) of S rows of C quantities.
+    """Return the mean and M2 (sum of squared deviations) of R observations ``values`` (R, S, C),
+    each of S rows of C quantities.
 
-    They are merged in the binary tree over R; ``size`` (R, S) is 1 where an observation exists and
-    0 where it does not. Both arrays are overwritten.
+    Neighbours are merged pairwise, in a binary tree over R. ``size`` (R, S) is 1 where an
+    observation exists and 0 where it does not. Both arrays are overwritten.
     """
     _, rows, columns = values.shape
     mean, M2 = np.empty((rows, columns)), np.empty((rows, columns))
@@ -70,10 +71,10 @@ def _stack_pair(a: FloatArray, b: FloatArray) -> FloatArray:
 def merge_pair(
     size: FloatArray, mean: FloatArray, M2: FloatArray, a: int, b: int, s: int, t: int
 ) -> None:
-    """Merge the moments of observation ``b`` into those of ``a`` in place (Chan, Golub and LeVeque
-    1983, (2.1)).
+    """Merge the size, mean and M2 (sum of squared deviations) of entry ``b`` into those of entry
+    ``a`` in place (Chan, Golub and LeVeque 1983, (2.1)).
 
-    Of R observations with S rows of C quantities only row ``s`` is merged: of ``size`` (R, S), of
+    Of R entries with S rows of C quantities only row ``s`` is merged: of ``size`` (R, S), of
     ``mean`` (R, S, C), and as row ``t`` of ``M2`` (R, S', C), which may hold fewer rows.
     """
     total = size[a, s] + size[b, s]
@@ -101,11 +102,11 @@ def merge_two(size: FloatArray, mean: FloatArray, M2: FloatArray) -> None:
 def merge_leaves(
     size: FloatArray, values: FloatArray, work: FloatArray, mean: FloatArray, M2: FloatArray
 ) -> None:
-    """Write ``mean`` and ``M2`` (S, C) of R observations ``values`` (R, S, C), merged in the binary
-    tree over R.
+    """Write ``mean`` and ``M2`` (S, C), the sum of squared deviations, of R observations ``values``
+    (R, S, C), merged pairwise in a binary tree over R.
 
-    S counts rows and C the quantities of a row; ``size`` (R, S) and ``values`` are overwritten,
-    ``work`` (R, 1, C) is scratch.
+    S counts rows and C the quantities of a row. ``size`` (R, S), 1 where an observation exists and
+    else 0, and ``values`` are overwritten; ``work`` (R, 1, C) is scratch.
     """
     # Row by row, so that the values of a row are still in the cache when they are merged again.
     for s in range(values.shape[1]):
@@ -117,11 +118,11 @@ def merge_leaves(
 
 @kernel
 def merge_row(size: FloatArray, values: FloatArray, work: FloatArray, s: int) -> None:
-    """Merge row ``s`` of R observations into observation 0, in place: its mean into
-    ``values[0, s]``, its M2 into ``work[0, 0]``.
+    """Merge row ``s`` of R observations pairwise in a binary tree, in place: the mean ends in
+    ``values[0, s]``, M2 (the sum of squared deviations) in ``work[0, 0]``.
 
-    ``size`` (R, S) numbers of observations, ``values`` (R, S, C) and ``work`` (R, 1, C), which is
-    scratch.
+    ``size`` (R, S) is 1 where an observation exists, else 0, and becomes the number merged;
+    ``values`` (R, S, C) are the observations, ``work`` (R, 1, C) is scratch.
     """
     runs = len(values)
     # A single observation has M2 = 0.

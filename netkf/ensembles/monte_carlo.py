@@ -144,12 +144,13 @@ def monte_carlo(
 
 
 def ensemble_of(scenario: Scenario, statistics: RunStatistics, seed: int, engine: str) -> Ensemble:
-    """Return the ensemble that the ``statistics`` of all runs describe, with means of P and e e'
-    (T, N, n, n) and of NEES (T, N).
+    """Return the ensemble that the ``statistics`` of all runs describe: means over runs of P and of
+    e e' (T, N, n, n), e the error, and of NEES (T, N), averages over time, and counts.
 
     ``seed`` and ``engine`` (its name) are those of the runs. Errors and NEES are nan from the time
     on at which rounding blurs them in some run.
     """
+    # Columns of the samples: for each node the upper triangles of P and e e', and NEES.
     samples, shape = statistics.samples, (len(scenario.times), len(scenario.nodes), -1)
     means = np.where(samples.size[:, None] > 0.0, samples.mean, np.nan)
     n = scenario.plant.n
@@ -157,6 +158,7 @@ def ensemble_of(scenario: Scenario, statistics: RunStatistics, seed: int, engine
     se_P, se_error, se_nees = _unpack_samples(samples.standard_error().reshape(shape), n)
     for errors in (mean_error, mean_nees, se_error, se_nees):
         errors[scenario.times >= statistics.rounding_from] = np.nan
+    # Numbers of messages in all runs, from their means over runs.
     totals = statistics.messages.mean[0] * statistics.messages.size
     return Ensemble(
         scenario.times,
@@ -210,7 +212,8 @@ def _unpack_samples(values: FloatArray, n: int) -> tuple[FloatArray, FloatArray,
 
 def ensemble_table(ensemble: Ensemble) -> dict[str, np.ndarray]:
     """Return the columns (T N,) of ensemble.parquet by name, with one row for each of T times and,
-    within it, each of N nodes; those of errors only with ground truth.
+    within it, each of N nodes: means and standard errors of P, and with ground truth of e e' (e is
+    the error) and NEES.
     """
     n, rows = ensemble.mean_P.shape[-1], len(ensemble.times) * len(ensemble.nodes)
     i, j = np.triu_indices(n)
@@ -233,5 +236,6 @@ def ensemble_table(ensemble: Ensemble) -> dict[str, np.ndarray]:
         ensemble.se_nees.reshape(rows),
     ]
     names = ensemble_columns(n)
+    # Without ground truth: time, node, runs, and means and standard errors of P.
     column_count = len(names) if ensemble.truth_known else 3 + 2 * len(i)
     return dict(zip(names[:column_count], columns[:column_count], strict=True))

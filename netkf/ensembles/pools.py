@@ -54,11 +54,14 @@ class Pool(ABC):
 
     @abstractmethod
     def submit(self, job: Job) -> Future[Any]:
-        """Submit a block; return the future of its result."""
+        """Submit a job, a block of replicas; return the future of its result.
+
+        Pools that work in this process may run the block before they return.
+        """
 
     def next_size(self, left: int, runs: int) -> int:
         """Return the number of runs of the next block, a power of two, when ``left`` of ``runs``
-        are not yet submitted.
+        are not yet submitted; asked before each block is made.
         """
         return block_size(runs, self.width)
 
@@ -79,13 +82,16 @@ class LocalPool(Pool):
         self._size = 1
 
     def submit(self, job: Job) -> Future[Any]:
-        """Run the block at once; return its completed future."""
+        """Run the block of replicas at once, in this process; return its completed future, whose
+        result may be an exception of the block.
+        """
         future: Future[Any] = Future()
         started, compile_seconds = time.perf_counter(), seconds_spent()
         try:
             future.set_result(work(job))
         except Exception as error:
             future.set_exception(error)
+        # Compilation, which is slow but happens once, says nothing about later blocks.
         self._note_duration(
             job, time.perf_counter() - started - (seconds_spent() - compile_seconds)
         )
@@ -96,8 +102,8 @@ class LocalPool(Pool):
         return self._size
 
     def _note_duration(self, job: Job, seconds: float) -> None:
-        """Double the size of blocks if one of full size took less than QUICK_SECONDS, not counting
-        compilation.
+        """Double the size of the next blocks if ``job``, of full size, took less than
+        QUICK_SECONDS; ``seconds`` are without compilation.
         """
         # The caller may have made the block larger than asked, as a full set of SIMD lanes.
         if seconds < QUICK_SECONDS and len(job.replicas) >= self._size:
@@ -120,8 +126,11 @@ class AdaptivePool(LocalPool):
         self._begun, self._seconds, self._runs, self._spent = False, 0.0, 0, 0.0
 
     def submit(self, job: Job) -> Future[Any]:
-        """Run the block here, or submit it to worker processes once they are worth it."""
+        """Run the block of replicas in this process, or, once starting worker processes would save
+        time, submit it to them; return the future of its result.
+        """
         if job.scenario is not self._scenario:
+            # The times of another scenario say nothing about this one.
             self._scenario, self._size = job.scenario, 1
             self._begun, self._seconds, self._runs = False, 0.0, 0
         if self._processes is None and self._worth_processes(job):
@@ -138,17 +147,21 @@ class AdaptivePool(LocalPool):
         return block_size(left, self.width)
 
     def _note_duration(self, job: Job, seconds: float) -> None:
-        """Add the seconds of a block to the estimate; a quick first one only filled caches."""
+        """Add the ``seconds`` of a block, without compilation, to the estimate of seconds for each
+        run; not those of the first block of a scenario, which mostly fills caches, if it was quick.
+        """
         super()._note_duration(job, seconds)
         self._spent += seconds
-        if self._begun or seconds > 1.0:  # the first block fills caches
+        if self._begun or seconds > 1.0:
             self._seconds += seconds
             self._runs += len(job.replicas)
         self._begun = True
 
     def _worth_processes(self, job: Job) -> bool:
-        """Return True if processes would save more time than they take to start."""
-        expected = 0.0
+        """Return True if worker processes would save more time in the runs that are left, those of
+        ``job`` and after it, than they take to start.
+        """
+        expected = 0.0  # seconds that the runs left take in this process
         if self._seconds > WARM:
             expected = self._seconds / self._runs * (job.stop - job.start)
         if self._open_ended:
@@ -174,7 +187,9 @@ class RemotePool(Pool):
         self._packed: tuple[object, PackedScenario] | None = None
 
     def submit(self, job: Job) -> Future[Any]:
-        """Submit a block with the packed scenario; return its future."""
+        """Submit a block of replicas with the scenario in packed (pickled) form; return the future
+        of its result. Blocks of the same scenario share one pickle.
+        """
         if isinstance(job.scenario, Scenario):
             if self._packed is None or self._packed[0] is not job.scenario:
                 self._packed = job.scenario, self._pack(job.scenario)
@@ -182,12 +197,14 @@ class RemotePool(Pool):
         return self._send(job)
 
     def _pack(self, scenario: Scenario) -> PackedScenario:
-        """Return the scenario in the form that is sent to workers."""
+        """Return the scenario in the form that is sent to workers; subclasses may add to it."""
         return pack_scenario(scenario)
 
     @abstractmethod
     def _send(self, job: Job) -> Future[Any]:
-        """Submit a block whose scenario is packed; return its future."""
+        """Submit a block whose scenario is packed (pickled) to the pool's workers; return the
+        future of its result. Subclasses say how.
+        """
 
 
 class ExecutorPool(RemotePool):
@@ -241,13 +258,15 @@ class DaskPool(RemotePool):
         return future
 
     def wait(self, futures: Collection[Future[Any]]) -> Collection[Future[Any]]:
-        """Wait until one of the futures is done; return all that are.
+        """Wait until one of the ``futures`` of submitted blocks is done; return all that are.
 
-        Raises EngineError if the scheduler does not answer for PATIENCE seconds.
+        Raises EngineError if the scheduler does not answer for PATIENCE seconds, or has lost a
+        block.
         """
         answered = time.monotonic()
         while True:
             done = wait(futures, timeout=LOOK_SECONDS, return_when=FIRST_COMPLETED).done
+            # Futures that the scheduler has lost are marked as cancelled.
             lost = [future for future in done if future.cancelled()]
             now = time.monotonic()
             if self._client.status == "running":
@@ -307,7 +326,8 @@ def cores() -> int:
 
 
 def block_size(runs: int, width: int) -> int:
-    """Return the number of runs in a block, a power of two, for ``runs`` runs on ``width`` workers.
+    """Return the number of runs in a block, the unit of work that one worker does at a time, for
+    ``runs`` runs on ``width`` workers: a power of two.
 
     Every worker gets about ROUNDS blocks, so that all end at nearly the same time, within the
     limits MAX_BLOCK and MAX_BLOCKS.
@@ -341,9 +361,10 @@ ANYWHERE = PoolOptions()
 
 
 def make_pool(blocks: int, options: PoolOptions = ANYWHERE, open_ended: bool = False) -> Pool:
-    """Return the pool that the options ask for, for ``blocks`` blocks; ``open_ended`` if more jobs
-    follow.
+    """Return the pool, in which blocks of replicas are simulated, that the options ask for: at most
+    ``blocks`` worker processes, an executor, or a Dask scheduler.
 
+    An ``open_ended`` pool is for several jobs, one after another.
     Raises ScenarioError if the options ask for two pools, or for one of the wrong kind.
     """
     workers, executor, scheduler = options.workers, options.executor, options.scheduler

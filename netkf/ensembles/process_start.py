@@ -41,8 +41,8 @@ def start_server() -> None:
     """Start the server that workers are forked from, unless it runs or the system has none. It
     imports PRELOADED while this process goes on.
 
-    Ctrl-C and SIGTERM reach all processes of a terminal or a job. The server and the workers block
-    them: this process alone handles them, and kills the workers.
+    Ctrl-C and SIGTERM reach all processes of a terminal or a batch job. The server and the workers
+    block them: this process alone handles them, and kills the workers.
     """
     if process_context().get_start_method() != "forkserver":
         return
@@ -83,8 +83,9 @@ def block_signals() -> Iterator[None]:
 
 @contextmanager
 def limit_blas_threads() -> Iterator[None]:
-    """Limit the numerical libraries of processes that are started within the block to one thread
-    each, by environment variables that they read when they are loaded.
+    """Limit the numerical libraries of processes that are started within the ``with`` block to one
+    thread each, by environment variables that they read when they are loaded: there is one worker
+    process for each core.
     """
     old_values = {name: os.environ.get(name) for name in ONE_THREAD}
     os.environ.update(dict.fromkeys(ONE_THREAD, "1"))

@@ -108,7 +108,7 @@ class ReductionScratch(Struct):
     totals : (F, 3, L) sums for the averages
     z, factor, nees, not_definite : (n, L), (n, n, L), (L,), (L,) of one sample: error, factor of P,
              NEES, and 1 where P is not positive definite
-    clear, traced : (L,) 1 where the sample counts in averages of errors, and of P
+    error_used, P_used : (L,) 1 where the sample counts in averages of errors, and of P
     rows, work, size : (L, S, C), (L, S, C), (L, S) columns of each run, their M2 and number
     node_size, mean, M2 : (D, S), (D, S, C), (D, S, C) of the nodes of the tree over runs that wait
              for a neighbour
@@ -127,8 +127,8 @@ class ReductionScratch(Struct):
     factor: FloatArray
     nees: FloatArray
     not_definite: FloatArray
-    clear: FloatArray
-    traced: FloatArray
+    error_used: FloatArray
+    P_used: FloatArray
     rows: FloatArray
     work: FloatArray
     size: FloatArray
@@ -143,11 +143,15 @@ class ReductionScratch(Struct):
 
 
 def reduction_scratch(filters: int, n: int, largest: int) -> ReductionScratch:
-    """Return scratch for ``filters`` filters of n states, in chunks of at most ``largest`` runs."""
+    """Return the arrays that ``reduce_runs`` overwrites, for ``filters`` filters of n states; at
+    most ``largest`` runs are merged into one result.
+    """
+    # For each filter the upper triangles of P and of e e', and NEES.
     columns = filters * (n * (n + 1) + 1)
     times = max(1, NUMBERS_AT_ONCE // columns)
     # Transpositions move L entries at a time, possibly beyond the last column.
     wide = times + -(-LANES // columns)
+    # More nodes of the binary tree over runs never wait for a neighbour at the same time.
     depth = largest.bit_length() + 1
     nodes, rows = (depth, wide, columns), (LANES, wide, columns)
 
@@ -168,8 +172,8 @@ def reduction_scratch(filters: int, n: int, largest: int) -> ReductionScratch:
         factor=aligned((n, n, LANES)),
         nees=aligned((LANES,)),
         not_definite=aligned((LANES,)),
-        clear=aligned((LANES,)),
-        traced=aligned((LANES,)),
+        error_used=aligned((LANES,)),
+        P_used=aligned((LANES,)),
         rows=np.zeros(rows),
         work=np.zeros(rows),
         size=np.empty((LANES, times)),
@@ -192,10 +196,11 @@ class _ScratchCache(threading.local):
         self._scratch = reduction_scratch(1, 1, 1)
 
     def of(self, filters: int, n: int, largest: int) -> ReductionScratch:
-        """Return scratch for ``filters`` filters of n states and chunks of at most ``largest``
-        runs, not cleared.
+        """Return the arrays that ``reduce_runs`` overwrites, for ``filters`` filters of n states;
+        at most ``largest`` runs are merged into one result.
 
-        The arrays are kept for the next call, which gets larger ones if it needs them.
+        The arrays, whose contents are left from the last use, are kept for the next call, which
+        gets larger ones if it needs them.
         """
         if filters * n * n > MAX_SCRATCH_ENTRIES:
             return reduction_scratch(filters, n, largest)
@@ -209,14 +214,14 @@ _scratch_cache = _ScratchCache()
 
 
 def reduce_batch(batch: RunBatch, pieces: Sequence[slice]) -> Reduced:
-    """Return the values of all R runs of a batch, with moments of samples for each of ``pieces``:
-    adjacent slices that cover all runs.
+    """Return averages of each of the R runs of a batch, and moments of the samples over the runs of
+    each of ``pieces``: adjacent slices that cover all runs, each a node of the binary tree along
+    which the runs of an ensemble are merged.
 
     The columns of the moments are, for each filter, the upper triangles of P and of e e' (e is the
     error) and the NEES. The averages of a run are its mean square error, mean trace of P and mean
-    NEES over the samples after time 0.
-
-    The last sample of a run that diverged is left out.
+    NEES over the samples after time 0. The last sample of a run that diverged, whose numbers are
+    broken, is left out.
     """
     runs, count, filters, n = batch.error.shape
     bounds = np.array([0, *(piece.stop for piece in pieces)])
@@ -231,6 +236,7 @@ def reduce_batch(batch: RunBatch, pieces: Sequence[slice]) -> Reduced:
     )
     arrays = _batch_arrays(batch)
     scratch = _scratch_cache.of(filters, n, largest)
+    # The type of MANY tells the kernels how many runs, L, fill the SIMD lanes.
     reduce_runs(MANY, arrays, bounds, sums, scratch)
     if not sums.regular.all():
         # Some P is exactly singular. In such runs a P that is singular up to rounding is no better:
@@ -246,7 +252,9 @@ def reduce_batch(batch: RunBatch, pieces: Sequence[slice]) -> Reduced:
 
 
 def _batch_arrays(batch: RunBatch) -> Batch:
-    """Return the arrays of a batch of R runs with F filters, as contiguous arrays for kernels."""
+    """Return the arrays of a batch of R runs with F filters, as contiguous arrays for kernels; no
+    NEES is known yet, so that the kernels compute all of them.
+    """
     runs = len(batch)
     x, P, error = (np.ascontiguousarray(part) for part in (batch.x, batch.P, batch.error))
     return Batch(
@@ -268,7 +276,9 @@ def _batch_arrays(batch: RunBatch) -> Batch:
 
 
 def _nees_of_irregular(batch: Batch, regular: np.ndarray) -> FloatArray:
-    """Return NEES (R, T, F) of the runs that are not ``regular`` (R,); other runs are not set."""
+    """Return NEES (R, T, F) of the runs that are not ``regular`` (R,), in which some P is singular;
+    it is nan where P is, or nearly is. Other runs are not set.
+    """
     nees = np.empty(batch.error.shape[:3])
     for r in np.flatnonzero(~regular):
         count = batch.sample_counts[r]
@@ -281,10 +291,12 @@ def _nees_of_irregular(batch: Batch, regular: np.ndarray) -> FloatArray:
 def reduce_runs(
     lanes: Lanes, b: Batch, bounds: np.ndarray, sums: Sums, scratch: ReductionScratch
 ) -> None:
-    """Fill ``sums`` for the R runs of the batch ``b``; piece k has the runs ``bounds[k]`` to
+    """Fill ``sums`` for the R runs of the batch ``b``: averages of each run, and moments over the
+    runs of each piece, merged in a binary tree. Piece k has the runs ``bounds[k]`` to
     ``bounds[k + 1] - 1``, for K pieces and ``bounds`` (K + 1,).
 
-    Runs go through in groups of L lanes; ``scratch`` is overwritten.
+    Groups of L runs are computed side by side, one run in each SIMD lane; ``scratch`` is
+    overwritten.
     """
     for k in range(len(bounds) - 1):
         # A few sample times of all runs of a piece at a time.
@@ -295,7 +307,8 @@ def reduce_runs(
                 complete = reduce_group(lanes, b, sums, scratch, first, active, t, count)
                 add_node(lanes, scratch, active, count, depth, complete)
                 depth += 1
-                # A binary counter: each trailing one of the group's number completes a node.
+                # Group 0, 1, 2, ... of a piece: each trailing 1 in the binary form of its number
+                # means that two neighbouring nodes of the tree are complete and can be merged.
                 number = (first - bounds[k]) // len(lanes)
                 while number & 1 == 1:
                     depth = join_nodes(scratch, depth, count)
@@ -314,8 +327,8 @@ def reduce_runs(
 
 @kernel(compact=True)
 def join_nodes(scratch: ReductionScratch, depth: int, count: int) -> int:
-    """Merge the last two of ``depth`` waiting nodes of the tree over runs, at ``count`` sample
-    times; return depth - 1, the number that waits now.
+    """Merge the last two of ``depth`` nodes of the binary tree over runs that wait for a neighbour,
+    at ``count`` sample times; return depth - 1, the number that waits now.
 
     Changes node depth - 2 of ``scratch.node_size``, ``mean`` and ``M2``.
     """
@@ -328,8 +341,8 @@ def join_nodes(scratch: ReductionScratch, depth: int, count: int) -> int:
 def add_node(
     lanes: Lanes, scratch: ReductionScratch, active: int, count: int, node: int, complete: bool
 ) -> None:
-    """Merge the ``active`` runs of a group of L, and store the result as waiting ``node`` of the
-    tree over runs.
+    """Merge the moments of a group of ``active`` runs, at most L, and store the result as number
+    ``node`` of the nodes of the binary tree over runs that wait for a neighbour.
 
     Reads ``scratch.rows`` and ``size``, and sets ``node_size``, ``mean`` and ``M2`` of the node at
     ``count`` sample times. ``complete`` says that no run lacks one of these samples.
@@ -349,10 +362,11 @@ def add_node(
 
 @kernel
 def merge_whole(lanes: Lanes, scratch: ReductionScratch, count: int, node: int) -> None:
-    """Merge the ``rows`` of L runs that all have the samples, as ``merge_row`` does but L columns
-    at a time.
+    """Merge the ``scratch.rows`` of L runs that all have the samples into means and sums of squared
+    deviations M2, in a binary tree as ``merge_row`` does, but L columns at a time.
 
-    Sets ``node_size``, ``mean`` and ``M2`` of the waiting ``node`` at ``count`` sample times.
+    Sets ``node_size``, ``mean`` and ``M2`` of number ``node`` of the nodes that wait for a
+    neighbour, at ``count`` sample times; M2 of inner nodes is in ``scratch.work``.
     """
     rows, work, mean_of, M2_of = scratch.rows, scratch.work, scratch.mean, scratch.M2
     for s in range(count):
@@ -360,7 +374,7 @@ def merge_whole(lanes: Lanes, scratch: ReductionScratch, count: int, node: int) 
     for c in range(0, count * rows.shape[2], len(lanes)):
         stride = 1
         while stride < len(lanes):
-            # Both sides have ``stride`` observations: each has the weight 1 / 2 in the mean.
+            # Pairs of nodes with ``stride`` runs each: each has the weight 1 / 2 in the mean.
             for a in range(0, len(lanes), 2 * stride):
                 mean = load(lanes, rows, a, 0, c)
                 delta = load(lanes, rows, a + stride, 0, c) - mean
@@ -388,7 +402,8 @@ def gather_samples(
     """Transpose columns ``start`` to ``start + count`` of ``samples`` (R, columns) for the
     ``active`` runs from ``first`` on into the L lanes of ``out`` (>= count, L).
 
-    Idle lanes repeat the last run; ``lines`` (L, >= count) is scratch.
+    Afterwards each run has a SIMD lane of its own. Lanes beyond the active ones repeat the last
+    run; ``lines`` (L, >= count) is scratch.
     """
     for q in range(len(lanes)):
         r = first + min(q, active - 1)
@@ -409,10 +424,12 @@ def reduce_group(
     t: int,
     count: int,
 ) -> bool:
-    """Fill ``scratch.rows`` for ``count`` samples from number ``t`` on of the ``active`` runs of
-    ``b`` from ``first`` on, one run in each lane; return True if no run lacks one of them.
+    """Fill ``scratch.rows`` (P, e e' and NEES) for ``count`` samples from number ``t`` on of the
+    ``active`` runs of ``b`` from ``first`` on, one run in each SIMD lane; return True if no run
+    lacks one of these samples.
 
-    Adds the samples to ``sums.averages`` of these runs, and sets ``sums.rounding_from``.
+    Adds the samples to ``sums.averages`` of these runs, and sets ``sums.rounding_from``, the time
+    from which rounding blurs their errors.
     """
     filters, n = b.error.shape[2:]
     entries, complete, sample_counts, totals, averages = (
@@ -444,6 +461,7 @@ def reduce_group(
     )
     if not b.exact:
         gather_samples(lanes, b.x_rows, first, active, t * n, count * n, scratch.lines, scratch.x)
+    # The averages so far go into lanes, and back at the end.
     for q in range(active):
         complete = complete and t + count <= sample_counts[first + q]
         for f in range(filters):
@@ -469,8 +487,8 @@ def reduce_group(
 def mark_missing(
     b: Batch, scratch: ReductionScratch, first: int, active: int, t: int, count: int
 ) -> None:
-    """Set ``scratch.size`` to 1 for samples that a run has, else to 0, with zeros in
-    ``scratch.rows``.
+    """Set ``scratch.size`` to 1 for samples that a run has, else (it diverged and ended before) to
+    0, with zeros in ``scratch.rows``, so that merging the moments of runs leaves them out.
 
     For ``count`` samples from number ``t`` on of the ``active`` runs from ``first`` on.
     """
@@ -494,13 +512,14 @@ def reduce_sample(
     s: int,
     f: int,
 ) -> None:
-    """Fill the columns of sample ``t`` for filter ``f``, and add it to the averages, in L lanes.
+    """Fill the columns (P, e e', NEES) of sample ``t`` for filter ``f``, and add it to the sums of
+    the averages over time, in L lanes.
 
-    The group has the ``active`` runs from ``first`` on, one in each lane, and the sample is its
-    number ``s``. Changes ``scratch.columns`` and ``scratch.totals[f]``.
+    The ``active`` runs from ``first`` on have one SIMD lane each; ``s`` is the number of the sample
+    among those in ``scratch``. Changes ``scratch.columns`` and ``scratch.totals[f]``.
     """
     # Loaded from the struct once instead of in each step of the loops.
-    errors_of, P, columns, factor, z = (
+    error_lanes, P, columns, factor, z = (
         scratch.error,
         scratch.P,
         scratch.columns,
@@ -519,15 +538,15 @@ def reduce_sample(
     square = spread(lanes, 0.0)
     trace = spread(lanes, 0.0)
     for i in range(n):
-        e = load(lanes, errors_of, index + i)
+        e = load(lanes, error_lanes, index + i)
         store(lanes, z, i, e)
         square += e * e
         trace += load(lanes, P, index_P + i * n + i)
         for j in range(i, n):
             entry = load(lanes, P, index_P + i * n + j)
-            store(lanes, factor, j, i, entry)
+            store(lanes, factor, j, i, entry)  # lower triangle, which is factorised below
             store(lanes, columns, column, entry)
-            store(lanes, columns, half + column, e * load(lanes, errors_of, index + j))
+            store(lanes, columns, half + column, e * load(lanes, error_lanes, index + j))
             column += 1
     if any_lane(nees_of_lanes(lanes, scratch)):
         # A P that is not positive definite needs pivoting, one run at a time.
@@ -536,16 +555,17 @@ def reduce_sample(
                 fill_single_nees(b, sums, scratch, first + q, t, f, q)
     nees = load(lanes, scratch.nees, 0)
     store(lanes, columns, last, nees)
-    clear, traced = load(lanes, scratch.clear, 0) > 0.0, load(lanes, scratch.traced, 0) > 0.0
-    add_total(lanes, scratch.totals, f, 0, select(clear, square, 0.0))
-    add_total(lanes, scratch.totals, f, 1, select(traced, trace, 0.0))
-    add_total(lanes, scratch.totals, f, 2, select(clear, nees, 0.0))
+    error_used = load(lanes, scratch.error_used, 0) > 0.0
+    P_used = load(lanes, scratch.P_used, 0) > 0.0
+    add_total(lanes, scratch.totals, f, 0, select(error_used, square, 0.0))
+    add_total(lanes, scratch.totals, f, 1, select(P_used, trace, 0.0))
+    add_total(lanes, scratch.totals, f, 2, select(error_used, nees, 0.0))
 
 
 @kernel(inlined=True)
 def add_total(lanes: Lanes, totals: FloatArray, f: int, a: int, number: Any) -> None:
-    """Add the value ``number`` of L lanes to ``totals[f, a]`` (L,): the sum over time of average a
-    of filter f.
+    """Add the value ``number`` of L lanes to ``totals[f, a]`` (L,), the sum over time for filter f
+    of squared errors (a = 0), traces of P (1) or NEES (2).
     """
     store(lanes, totals, f, a, load(lanes, totals, f, a) + number)
 
@@ -555,11 +575,12 @@ def fill_single_nees(
     b: Batch, sums: Sums, scratch: ReductionScratch, r: int, t: int, f: int, q: int
 ) -> None:
     """Write NEES of sample ``t`` of run ``r`` and filter ``f`` into ``scratch.nees[q]``, where q is
-    the lane of that run (runs are reduced side by side), by Gaussian elimination with pivoting.
+    the SIMD lane of that run, by Gaussian elimination with pivoting.
 
     It is for samples whose P is not positive definite, for which the factorisation without pivoting
-    of all lanes fails. Sets ``sums.regular[r]`` to False if P is singular. The NEES of a run that
-    stored its own (``b.has_nees[r]``) is taken from ``b.known_nees``.
+    of all lanes fails. Sets ``sums.regular[r]`` to False if P is singular; ``reduce_batch`` then
+    computes the NEES of that run otherwise and calls again with ``b.has_nees[r]``, upon which it is
+    taken from ``b.known_nees``.
     """
     error, P = b.error[r, t, f : f + 1], b.P[r, t, f : f + 1]
     if not fill_nees(error, P, scratch.single_nees, scratch.single_factor, scratch.single_solved):
@@ -571,11 +592,12 @@ def fill_single_nees(
 def mark_averaged(
     b: Batch, sums: Sums, scratch: ReductionScratch, first: int, active: int, t: int
 ) -> None:
-    """Mark the runs in whose averages sample ``t`` counts, as summaries of single runs count it.
+    """Mark the runs in whose averages over time sample ``t`` counts, by the rule of summaries of
+    single runs.
 
-    Sets, for the ``active`` runs from ``first`` on, one in each lane, ``scratch.clear`` to 1 where
-    errors count, which is after time 0 and before rounding blurs them, and ``scratch.traced`` to 1
-    where P counts, else to 0.
+    Sets, for the ``active`` runs from ``first`` on, one in each SIMD lane, ``scratch.error_used``
+    to 1 where errors count, which is after time 0 and before rounding blurs them, and
+    ``scratch.P_used`` to 1 where P counts, else to 0.
     """
     # Loaded from the structs once instead of in each step of the loop.
     times, sample_counts, diverged, rounding_from = (
@@ -584,48 +606,49 @@ def mark_averaged(
         b.diverged,
         sums.rounding_from,
     )
-    clear_runs, traced_runs = scratch.clear, scratch.traced
+    error_used, P_used = scratch.error_used, scratch.P_used
     for q in range(active):
         r = first + q
         blurred_from = rounding_from[r]  # seconds; errors are mostly rounding from then on
         # Without samples after time 0 all samples count.
         begin = b.start if b.start < sample_counts[r] else 0
         exists = begin <= t < sample_counts[r]
-        clear = exists and times[t] < blurred_from
+        error_counts = exists and times[t] < blurred_from
         # Covariances do not suffer from rounding, but those of a diverging run grow without bound.
-        traced = clear or (exists and not (diverged[r] and times[begin] < blurred_from))
-        clear_runs[q] = 1.0 if clear else 0.0
-        traced_runs[q] = 1.0 if traced else 0.0
+        ends_with_errors = diverged[r] and times[begin] < blurred_from
+        P_counts = error_counts or (exists and not ends_with_errors)
+        error_used[q] = 1.0 if error_counts else 0.0
+        P_used[q] = 1.0 if P_counts else 0.0
 
 
 @kernel(compact=True)
 def divide_averages(b: Batch, sums: Sums, r: int) -> None:
-    """Divide ``sums.averages[r]`` (F, 3), sums of run ``r`` over its samples, by the numbers of
-    samples in them.
+    """Divide ``sums.averages[r]`` (F, 3), sums over the samples of run ``r`` of squared errors,
+    traces of P and NEES of F filters, by the numbers of samples that ``mark_averaged`` counted.
 
-    Sums begin at sample ``b.start``, or at 0 if the run diverged before it. Those of squared errors
-    and NEES end where rounding errors exceed the errors, the trace of P with them if the run
-    diverged.
+    Sums begin at sample ``b.start``, the first after time 0, or at 0 if the run diverged before it.
+    Those of squared errors and NEES end where rounding blurs the errors, those of traces of P with
+    them if the run diverged.
     """
     count = b.sample_counts[r]
     first = b.start if b.start < count else 0
-    clear_end = first
-    while clear_end < count and b.times[clear_end] < sums.rounding_from[r]:
-        clear_end += 1
-    traced_end = clear_end if b.diverged[r] and clear_end > first else count
+    error_end = first
+    while error_end < count and b.times[error_end] < sums.rounding_from[r]:
+        error_end += 1
+    P_end = error_end if b.diverged[r] and error_end > first else count
     for f in range(sums.averages.shape[1]):
-        sums.averages[r, f, 0] /= clear_end - first
-        sums.averages[r, f, 1] /= traced_end - first
-        sums.averages[r, f, 2] /= clear_end - first
+        sums.averages[r, f, 0] /= error_end - first
+        sums.averages[r, f, 1] /= P_end - first
+        sums.averages[r, f, 2] /= error_end - first
 
 
 @kernel(inlined=True)
 def nees_of_lanes(lanes: Lanes, scratch: ReductionScratch) -> Any:
-    """Write NEES ``e' P^-1 e`` of L samples, one in each lane, into ``scratch.nees`` (L,), and
-    return the lanes whose P is not positive definite or not finite.
+    """Write NEES ``e' P^-1 e`` of L samples, one in each SIMD lane, into ``scratch.nees`` (L,), and
+    return flags of the lanes whose P is not positive definite or not finite.
 
-    ``scratch.not_definite`` (L,) counts their bad pivots. On entry ``scratch.factor`` (n, n, L) is
-    P and ``scratch.z`` (n, L) the error e; both are overwritten.
+    ``scratch.not_definite`` (L,) counts pivots that are not positive. On entry ``scratch.factor``
+    (n, n, L) is P and ``scratch.z`` (n, L) the error e; both are overwritten.
     """
     # P = G D G' with G unit lower triangular, and e' P^-1 e = z' D^-1 z with G z = e.
     schur = scratch.factor
@@ -660,29 +683,32 @@ def mark_blurred(
     t: int,
     s: int,
 ) -> None:
-    """Set ``sums.rounding_from`` to the time of sample ``t``, number ``s`` of a group, in the runs
-    in which this is the first sample that rounding blurs.
+    """Set ``sums.rounding_from`` to the time of sample ``t`` in those runs in which it is the first
+    sample that rounding blurs: rounding errors of the state are not small compared to the standard
+    deviation of the errors (see ``is_blurred``).
 
-    The group has the ``active`` runs from ``first`` on, one in each lane.
+    The ``active`` runs from ``first`` on have one SIMD lane each; ``s`` is the number of the sample
+    among those in ``scratch``.
     """
     # A fast sufficient test of all lanes by squares, without a root; is_blurred() decides about the
     # runs that it does not clear. Comparisons with nan are false, as in is_blurred().
     filters, n = b.error.shape[2:]
-    errors_of, P = scratch.error, scratch.P
+    error_lanes, P = scratch.error, scratch.P
     largest, min_variance = spread(lanes, 0.0), spread(lanes, np.inf)
     for f in range(s * filters, (s + 1) * filters):
         for i in range(n):
             variance = load(lanes, P, f * n * n + i * n + i)
             min_variance = select(variance < min_variance, variance, min_variance)
             if b.exact:
-                size = magnitude(load(lanes, errors_of, f * n + i))
+                size = magnitude(load(lanes, error_lanes, f * n + i))
                 largest = select(size > largest, size, largest)
+    # Errors computed as x - xhat are as coarse as the states x: no step if errors are exact.
     for index in range(0 if b.exact else s * n, 0 if b.exact else (s + 1) * n):
         size = magnitude(load(lanes, scratch.x, index))
         largest = select(size > largest, size, largest)
     bound = ROUNDING * BLUR * largest
-    clear = (min_variance < np.inf) & (bound * bound < 0.5 * min_variance)
-    if any_lane(select(clear, 0.0, 1.0) > 0.0):
+    surely_sharp = (min_variance < np.inf) & (bound * bound < 0.5 * min_variance)
+    if any_lane(select(surely_sharp, 0.0, 1.0) > 0.0):
         for r in range(first, first + active):
             decided = t >= b.lengths[r] or b.times[t] >= sums.rounding_from[r]
             if not decided and is_blurred(b, r, t):
@@ -694,7 +720,8 @@ def is_blurred(b: Batch, r: int, t: int) -> bool:
     """Return True if rounding blurs sample ``t`` of run ``r`` of the batch ``b``: rounding errors
     of the state exceed a fraction 1 / BLUR of the smallest standard deviation.
 
-    The rule is that of ``trace.run.rounding_from``.
+    The rule is that of ``trace.run.rounding_from``, which decides for single runs. With ``b.exact``
+    errors were not computed as x - xhat, and only their own size decides.
     """
     filters, n = b.error.shape[2:]
     largest, min_variance, square = 0.0, np.inf, 0.0

@@ -37,7 +37,8 @@ class NumberedBlocks(NamedTuple):
 def replicate(
     task: Task, scenario: Scenario, runs: int, seed: int | None = None, **options: Any
 ) -> list[Any]:
-    """Return ``task(scenario, seed, replica)`` for ``runs`` replicas, in their order.
+    """Call ``task(scenario, seed, replica)`` for ``runs`` replicas (runs that differ in their
+    random numbers), in worker processes if that pays; return its results in the order of replicas.
 
     ``options`` are those of ``replicate_blocks``, such as ``first``, the number of the first
     replica (default: 0), and ``pool``.
@@ -123,8 +124,9 @@ def _gather(
     blocks: NumberedBlocks,
     progress: Progress,
 ) -> Any:
-    """Return the merged result of all blocks: known ones are loaded, others run on the pool, and
-    all are merged as they complete.
+    """Return the merged result of all blocks of replicas: known ones (of a resumed command) are
+    loaded, others run on the pool, and all are merged in the binary tree over replicas as they
+    complete.
 
     job      : all the work as one job, whose ``size`` is that of numbered blocks, 0 without such
     together : smallest number of replicas in a block run in this process, None for the default
@@ -137,6 +139,7 @@ def _gather(
     def take(block: Job, result: Any) -> None:
         """Add the result of a block to the tree and report progress."""
         nonlocal runs_done
+        # A block of 2^level replicas, the k-th of this size, is the node (level, k) of the tree.
         tree.add(block.start // block.size, result, block.size.bit_length() - 1)
         runs_done += len(block.replicas)
         progress(runs_done, job.stop)
@@ -151,8 +154,11 @@ def _gather(
 def _make_blocks(
     pool: Pool, job: Job, together: int | None, known: Mapping[int, Callable[[], Any]]
 ) -> Iterator[Job]:
-    """Yield the blocks that are not known, in order, of the job's block size or, if that is 0, of
-    sizes that the pool chooses as blocks are submitted.
+    """Yield the parts (blocks of replicas) of ``job`` that are to be simulated, in order: those not
+    ``known`` (number of a block -> function that loads its result), of the job's block size or, if
+    that is 0, of sizes that the pool chooses as blocks are submitted.
+
+    ``together`` is the smallest size of a block in this process, None for the default.
     """
     if job.size:
         for number in range(-(-job.stop // job.size)):
@@ -164,7 +170,7 @@ def _make_blocks(
     start, min_size = 0, together or (LANES if slotted else 1)
     while start < job.stop:
         size = pool.next_size(job.stop - start, job.stop)
-        if pool.ahead == 1:
+        if pool.ahead == 1:  # blocks run one at a time, in this process
             size = max(size, min_size)
         if start:
             size = min(size, start & -start)  # a block is a node of the tree
@@ -173,7 +179,8 @@ def _make_blocks(
 
 
 def _complete_blocks(pool: Pool, blocks: Iterator[Job]) -> Iterator[tuple[Job, Any]]:
-    """Yield blocks and their results as they complete.
+    """Submit ``blocks`` of replicas to the pool, as many at a time as it allows, and yield each
+    with its result as it completes.
 
     Raises EngineError if workers die again and again, or are lost.
     """

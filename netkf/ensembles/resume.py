@@ -53,10 +53,12 @@ class StoredBlocks(NamedTuple):
 def find_stored_blocks(
     out: Path | None, scenario: Scenario, plan: RunIdentity
 ) -> StoredBlocks | None:
-    """Return the blocks of the ensemble in the directory ``out``, None if it is new or empty.
+    """Return the directory ``out`` with the size of the blocks (files with the results of some
+    consecutive replicas) that a stopped command left there; None if it is new or empty.
 
-    Raises ScenarioError unless the directory holds a run of this plan and of this installation
-    only, whose files were not changed since they were written.
+    ``plan`` is what the command would run now. Raises ScenarioError unless the directory holds a
+    run of this plan and of this installation only, whose files were not changed since they were
+    written.
     """
     if out is None:
         remedy = "add --out DIR with the directory of the run that was stopped"
@@ -65,7 +67,8 @@ def find_stored_blocks(
     if not (out / "manifest.json").exists():
         if not _has_own_files(out, scenario):
             return None
-        # Each block names its run: blocks of other runs are removed when they are read.
+        # Stopped before the manifest was written. Each block names its run: blocks of other runs
+        # are removed when they are read.
         _check_scenario(out, scenario)
         return StoredBlocks(out, size, False)
     manifest = read_manifest(out)
@@ -99,7 +102,9 @@ def find_stored_blocks(
 
 
 def _describe_difference(stored: Any, planned: Any) -> Any:
-    """Return the entries of a stored table that differ from the planned one; other values whole."""
+    """Return what an error message shows of a value of the manifest that differs from the planned
+    one: of a table (versions, machine) the stored entries that differ, else the stored value.
+    """
     if isinstance(stored, dict) and isinstance(planned, dict):
         return {
             key: stored.get(key)
@@ -115,8 +120,8 @@ def clear_unfinished_runs(
     replica: int = 0,
     note: Callable[[str], None] | None = None,
 ) -> bool:
-    """Remove the files of a single run, number ``replica``, that was stopped; return False if it is
-    finished.
+    """Remove the files of a single run, number ``replica``, that was stopped, so that ``--resume``
+    can do it again; return False if it is finished and stays.
 
     The files of a finished run that were changed since are removed too, and ``note`` is called with
     a line about them. Raises ScenarioError if the directory holds another run.
@@ -147,7 +152,7 @@ def clear_unfinished_runs(
 
 
 def remove_unfinished(directory: Path, scenario: Scenario, names: Collection[str]) -> None:
-    """Remove the files ``names`` of a command that was stopped.
+    """Remove the files ``names`` that a stopped command left in ``directory``.
 
     Raises ScenarioError if they are of another scenario, or the only copies of what this one reads.
     """
@@ -157,8 +162,8 @@ def remove_unfinished(directory: Path, scenario: Scenario, names: Collection[str
 
 
 def _check_sources_elsewhere(directory: Path, scenario: Scenario) -> None:
-    """Raise ScenarioError if the tables and modules of a scenario are those in the directory that
-    is cleared: they may be the only copies.
+    """Raise ScenarioError if the scenario reads tables or Python modules that lie in ``directory``,
+    whose files are to be removed: they may be the only copies.
     """
     files = [source.full for source in source_files(scenario)]
     files += [file for file in find_module_files(scenario).values() if file is not None]
@@ -170,9 +175,10 @@ def _check_sources_elsewhere(directory: Path, scenario: Scenario) -> None:
 
 
 def _has_own_files(directory: Path, scenario: Scenario) -> bool:
-    """Return True if a directory without a manifest has files, all of a run that was stopped.
+    """Return True if a directory without a manifest has files, all with names that a run of the
+    scenario writes: a run was stopped there before it wrote its manifest.
 
-    Raises ScenarioError if it has others.
+    Raises ScenarioError if it has other files.
     """
     if not directory.is_dir() or not any(directory.iterdir()):
         return False
@@ -183,7 +189,9 @@ def _has_own_files(directory: Path, scenario: Scenario) -> bool:
 
 
 def _check_scenario(directory: Path, scenario: Scenario) -> None:
-    """Raise ScenarioError if scenario.toml of a directory is not that of its run."""
+    """Raise ScenarioError if a directory has a scenario.toml that is not the ``scenario`` to run as
+    netkf writes it, with all defaults.
+    """
     path, text = directory / "scenario.toml", to_toml(resolve_defaults(scenario))
     if not path.exists():
         return
@@ -196,7 +204,9 @@ def _check_scenario(directory: Path, scenario: Scenario) -> None:
 
 
 def _require(path: Path, check: Callable[[], None], remedy: str) -> None:
-    """Call a check; a DamagedError becomes a ScenarioError that names the file and the remedy."""
+    """Call ``check``, of the file or directory ``path``; a DamagedError that it raises becomes a
+    ScenarioError, which tells the user what is wrong and the ``remedy``.
+    """
     try:
         check()
     except DamagedError as error:

@@ -67,7 +67,10 @@ class RunStatistics(NamedTuple):
 
 
 def merge(a: RunStatistics, b: RunStatistics) -> RunStatistics:
-    """Return the statistics of the runs of ``a`` followed by those of ``b``."""
+    """Return the statistics of the runs of ``a`` and ``b`` together; the replicas of ``a`` come
+    directly before those of ``b``, as in the binary tree over replicas.
+    """
+    # A conserved sum keeps the drift of largest size, with its sign.
     conserved = {
         name: (merge_moments(sums, b.conserved[name][0]), max(drift, b.conserved[name][1], key=abs))
         for name, (sums, drift) in a.conserved.items()
@@ -87,11 +90,14 @@ def merge(a: RunStatistics, b: RunStatistics) -> RunStatistics:
 def block_statistics(
     scenario: Scenario, seed: int, replicas: range, engine: Engine, traces: int = 0
 ) -> RunStatistics:
-    """Return the merged statistics of a block of ``replicas``, which it simulates with ``seed``;
-    the traces of the first ``traces`` replicas of the ensemble are kept.
+    """Simulate a block of ``replicas`` with ``seed``, and return the statistics of their runs,
+    merged in the binary tree over replicas.
+
+    Of the first ``traces`` replicas of the ensemble (not of the block) events and samples are kept.
     """
     tree, count = MergeTree(merge), 0
     for batch, batch_traces in _batches(scenario, seed, replicas, engine, traces):
+        # The nodes (level, k) of the tree that consist of runs of this batch.
         pieces = list(aligned_pieces(count, count + len(batch)))
         values = run_values(batch, scenario, count)
         for number, (level, k) in enumerate(pieces):
@@ -107,8 +113,8 @@ def _batches(
 ) -> Iterator[tuple[RunBatch, tuple[Trace, ...]]]:
     """Yield batches of the runs of ``replicas``, simulated with ``seed``, with their traces.
 
-    A run with a trace (one of the first ``traces`` of the ensemble) is a batch of its own; the
-    batch of replica 0 has a fingerprint.
+    A run with a trace (all its events and samples; one of the first ``traces`` of the ensemble) is
+    a batch of its own; the batch of replica 0 has a fingerprint, the digest of that run's events.
     """
     for replica in range(replicas.start, min(traces, replicas.stop)):
         yield _traced_run(scenario, seed, replica, engine)
@@ -122,7 +128,7 @@ def _traced_run(
     scenario: Scenario, seed: int, replica: int, engine: Engine
 ) -> tuple[RunBatch, tuple[Trace, ...]]:
     """Simulate one ``replica`` of the runs of ``seed``; return it as a batch of one run, and its
-    trace.
+    trace: all its events and samples.
     """
     sink, memory = batch_sink(scenario, range(replica, replica + 1)), MemorySink()
     recorder = Recorder([sink, memory])
@@ -157,15 +163,17 @@ class RunValues(NamedTuple):
 
 
 def run_values(batch: RunBatch, scenario: Scenario, first: int = 0) -> RunValues:
-    """Return the values of the R runs of a batch, such as averages (R, N + 1, 3) and counts of
-    messages (R, 5), with averages for every node.
+    """Return what statistics need of the R runs of a batch: averages over time (R, N + 1, 3) of
+    squared error, trace of P and NEES, of each node and of all, counts of messages (R, 5), and
+    moments of the samples.
 
-    ``first`` is the index of the batch's first run in the tree over all runs.
+    ``first`` is the index of the batch's first run in the binary tree over all runs.
     """
     # The largest nodes of the tree that consist of runs of this batch.
     indices = [(k << level, level) for level, k in aligned_pieces(first, first + len(batch))]
     slices = [slice(at - first, at - first + (1 << level)) for at, level in indices]
     reduced, nodes = reduce_batch(batch, slices), len(scenario.nodes)
+    # A pooled filter, which has the readings of all nodes, is stored once and stands for each node.
     copies, averages = nodes // batch.error.shape[2], reduced.averages
     if copies > 1:
         averages = np.repeat(averages, nodes, axis=1)
@@ -183,8 +191,8 @@ def run_values(batch: RunBatch, scenario: Scenario, first: int = 0) -> RunValues
 
 
 def _mean_of_nodes(averages: FloatArray) -> FloatArray:
-    """Return the means (R, 1, 3) over the N nodes of the ``averages`` (R, N, 3) of R runs, added in
-    the order of nodes.
+    """Return the means (R, 1, 3) over the N nodes of the ``averages`` (R, N, 3) of R runs, for the
+    row of summaries about all nodes; they are added in the order of nodes.
     """
     # accumulate() adds in order; sum() may add in another one, and would give other bits.
     total = np.add.accumulate(averages, axis=1)[:, -1:]
@@ -192,8 +200,10 @@ def _mean_of_nodes(averages: FloatArray) -> FloatArray:
 
 
 def merge_runs(values: RunValues, piece: int) -> RunStatistics:
-    """Return the statistics of the runs of piece number ``piece`` of ``values``, merged by the tree
-    over them; its fingerprint is empty.
+    """Return the statistics of the runs ``values.pieces[piece]`` of a batch, a node of the binary
+    tree over all runs, along which they are merged.
+
+    The fingerprint and the traces are empty; ``block_statistics`` adds them.
     """
     runs = values.pieces[piece]
     samples = values.samples[piece]
@@ -231,12 +241,15 @@ def merge_runs(values: RunValues, piece: int) -> RunStatistics:
 
 
 def count_messages(counts: np.ndarray, slotted: bool) -> FloatArray:
-    """Return the counts (R, 5) of R runs, columns as MESSAGES, from the numbers of events by kind,
-    ``counts`` (R, len(KINDS)); transmissions are nan if runs are ``slotted``.
+    """Return the numbers (R, 5) of messages that were sent, delivered, lost and in flight at the
+    end, and of transmissions (one broadcast sends several messages), in R runs.
+
+    They come from the numbers of events by kind, ``counts`` (R, len(KINDS)). Transmissions are nan
+    if runs are ``slotted``: slots have no transmit events.
     """
-    of = dict(zip(KINDS, counts.T.astype(np.float64), strict=True))
-    sent, delivered, lost = of["send"], of["deliver"], of["lost"] + of["late"]
+    events = dict(zip(KINDS, counts.T.astype(np.float64), strict=True))
+    sent, delivered, lost = events["send"], events["deliver"], events["lost"] + events["late"]
     # Without broadcasts every message is a transmission of its own.
-    single = np.where(of["transmit"] > 0.0, of["transmit"], sent)
-    transmissions = np.full(len(counts), math.nan) if slotted else single
+    under_clocks = np.where(events["transmit"] > 0.0, events["transmit"], sent)
+    transmissions = np.full(len(counts), math.nan) if slotted else under_clocks
     return np.stack([sent, delivered, lost, sent - delivered - lost, transmissions], axis=1)

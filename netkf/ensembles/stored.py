@@ -43,8 +43,8 @@ class StoredEnsemble(WithPromises, Ensemble):
     status: str
 
     def replica(self, number: int = 0) -> StoredRun:
-        """Return run ``number`` of the ensemble, from 0 on; raises ScenarioError if its trace was
-        not kept.
+        """Return run ``number`` of the ensemble, from 0 on; raises ScenarioError if its events and
+        samples (its trace) were not kept.
         """
         assert self.scenario is not None
         where = shorten(self.directory)
@@ -63,8 +63,10 @@ class StoredEnsemble(WithPromises, Ensemble):
 
 
 def read_ensemble(directory: Path, scenario: Scenario, manifest: dict[str, Any]) -> StoredEnsemble:
-    """Return the ensemble in a directory whose ``manifest`` has passed runs.stored.MANIFEST_FORM.
+    """Return the ensemble that netkf run left in a directory; the caller has checked that its
+    ``manifest`` (manifest.json) has the right keys and types.
 
+    An interrupted ensemble, which has no ensemble.parquet yet, has the runs of its finished blocks.
     Raises DamagedError for files that are not as netkf writes them.
     """
     stored: dict[str, Any] = {
@@ -105,8 +107,8 @@ def read_ensemble(directory: Path, scenario: Scenario, manifest: dict[str, Any])
 
 
 def _of_blocks(directory: Path, scenario: Scenario, manifest: dict[str, Any]) -> Ensemble:
-    """Return the ensemble of the runs in the blocks of an interrupted one; raises DamagedError if
-    there are none.
+    """Return the ensemble of the runs in the blocks (files with the statistics of some consecutive
+    replicas) that an interrupted ensemble has finished; raises DamagedError if there are none.
     """
     blocks = BlockCheckpoints(directory, scenario)
     blocks_statistics = blocks.readable(scenario_digest(scenario), int(manifest["seed"]))
@@ -119,7 +121,9 @@ def _of_blocks(directory: Path, scenario: Scenario, manifest: dict[str, Any]) ->
 
 
 def _read_averages(rows: list[dict[str, Any]]) -> tuple[FloatArray, FloatArray]:
-    """Return means and standard errors (N + 1, 3) of an ensemble from rows of its summary."""
+    """Return means (N + 1, 3) of square error, trace of P and NEES over time and runs, and their
+    standard errors (N + 1, 3), from ``rows`` of summary.json: one for each node and one for all.
+    """
 
     def column(name: str) -> FloatArray:
         """Return one quantity (N + 1,) of all nodes and, last, of all together; nan where a row
@@ -127,6 +131,8 @@ def _read_averages(rows: list[dict[str, Any]]) -> tuple[FloatArray, FloatArray]:
         """
         return np.array([row.get(name) for row in rows], dtype=np.float64)
 
+    # The summary has the root of the mean square error; the standard error of its square is 2 rms
+    # times that of the root.
     rms, rms_se = column("rms_error"), column("rms_error_se")
     means = [rms**2, column("mean_trace"), column("mean_nees")]
     errors = [2.0 * rms * rms_se, column("mean_trace_se"), column("mean_nees_se")]
@@ -174,8 +180,8 @@ def _read_samples(path: Path, scenario: Scenario) -> dict[str, Any]:
 
 
 def _select_columns(table: pd.DataFrame, names: list[str], shape: tuple[int, int]) -> FloatArray:
-    """Return the columns ``names`` as an array (T, N, columns), ``shape`` being (T, N); those that
-    the table lacks are nan.
+    """Return the columns ``names`` of a ``table`` with T N rows, sorted by time and node, as an
+    array (T, N, columns); ``shape`` is (T, N), and columns that the table lacks are nan.
     """
     return np.asarray(
         table.reindex(columns=names).to_numpy(dtype=np.float64).reshape(*shape, len(names))

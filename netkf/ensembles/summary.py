@@ -16,11 +16,13 @@ from netkf.scenario.usage import record_usage
 def summarise_ensemble(
     scenario: Scenario, statistics: RunStatistics, promised: PromisedTraces
 ) -> dict[str, Any]:
-    """Return the summary of an ensemble, with the keys of one run's summary.
+    """Return the content of an ensemble's summary.json, with the keys of one run's summary.
 
     ``rms_error`` is the root of the mean square error of all runs; a key that ends in ``_se`` is a
-    standard error.
+    standard error. ``promised`` are the traces of covariances that theory promises: the bound on
+    the mean of P over time, its limit, and that of a centralised filter.
     """
+    # (N + 1, 3): of each node and of all, the mean square error, mean trace of P and mean NEES.
     mean = statistics.averages.mean.reshape(-1, 3)
     error = statistics.averages.standard_error().reshape(-1, 3)
     bound = _mean_bounds(scenario, promised)
@@ -50,6 +52,7 @@ def summarise_ensemble(
             name: {"exact": sums.mean[0, 0], "total": sums.mean[0, 1], "drift": drift}
             for name, (sums, drift) in statistics.conserved.items()
         }
+    # Which recorded data runs used: the same in all runs, unless one diverged and ended early.
     records = {} if statistics.totals[1] else record_usage(scenario, None)
     if records:
         summary["records"] = records
@@ -75,7 +78,9 @@ def _chi_square(scenario: Scenario, statistics: RunStatistics) -> dict[str, floa
 
 
 def _mean_bounds(scenario: Scenario, promised: PromisedTraces) -> list[float | None]:
-    """Return averages of the bound over the samples after time 0, of the nodes and of all."""
+    """Return averages over the samples after time 0 of the bound that theory promises on the trace
+    of P, of each node and of all together; None for each if there is no bound.
+    """
     if promised.bound is None:
         return [None] * (len(scenario.nodes) + 1)
     after_start: FloatArray = promised.bound[scenario.times > 0.0]

@@ -69,7 +69,8 @@ class _Worker:
             sender.close()
 
     def send(self, task: _Task) -> None:
-        """Send a task to an idle worker; raises OSError if the worker is dead.
+        """Send a task (a block of replicas to simulate) to this idle worker; raises OSError if the
+        worker process is dead.
 
         The scenario is left out if it is the one of the worker's last task.
         """
@@ -82,8 +83,10 @@ class _Worker:
         self._jobs.send_bytes(pickle.dumps(job, pickle.HIGHEST_PROTOCOL))
 
     def receive(self) -> Any:
-        """Return the result of the task; raises OSError or EOFError if the worker died, else what
-        the task raised, with the worker's traceback as its cause.
+        """Wait for the answer of the worker, and return the result of its task.
+
+        Raises OSError or EOFError if the worker died, else what the task raised, with the worker's
+        traceback as its cause.
         """
         result, raised, traceback_text = pickle.loads(self.results.recv_bytes())
         if raised is None:
@@ -123,14 +126,19 @@ class WorkerProcesses:
         self._waiting: deque[_Task] = deque()
 
     def submit(self, job: Job) -> Future[Any]:
-        """Submit a job, which starts at once if a worker is idle; return its future."""
+        """Submit a job (a block of replicas), which starts at once if a worker is idle; return the
+        future of its result, which is set within ``wait``.
+        """
         future: Future[Any] = Future()
         self._waiting.append(_Task(job, future))
         self._hand_out()
         return future
 
     def wait(self, futures: Collection[Future[Any]]) -> list[Future[Any]]:
-        """Wait until one of the futures is done; return all that are."""
+        """Wait until one of the ``futures`` of submitted jobs is done; return all that are.
+
+        Meanwhile results are received, and idle workers get further jobs.
+        """
         while True:
             done = [future for future in futures if future.done()]
             if done:
@@ -149,7 +157,7 @@ class WorkerProcesses:
             worker.join(0.0 if at_once or worker.task is not None else GRACE)
 
     def _hand_out(self) -> None:
-        """Send waiting tasks to idle workers, and start workers up to the width."""
+        """Send waiting tasks to idle workers, and start workers up to the allowed number."""
         while self._waiting:
             worker = next(
                 (candidate for candidate in self._workers if candidate.task is None), None
@@ -158,7 +166,7 @@ class WorkerProcesses:
                 return
             task = self._waiting.popleft()
             if not task.future.running() and not task.future.set_running_or_notify_cancel():
-                continue
+                continue  # it was cancelled
             if worker is None:
                 worker = _Worker(_may_hide_main(task.job))
                 self._workers.append(worker)
@@ -168,7 +176,9 @@ class WorkerProcesses:
                 self._discard_worker(worker)
 
     def _receive_result(self, worker: _Worker) -> None:
-        """Set the future of a worker's task to its result or error; replace a dead worker."""
+        """Take the answer of a worker, and set the future of its task to the result or error; a
+        dead worker is removed and its task queued again.
+        """
         assert worker.task is not None
         future = worker.task.future
         try:
@@ -202,7 +212,9 @@ class WorkerProcesses:
 
 
 def _may_hide_main(job: Job) -> bool:
-    """Return True if no class of the scenario is defined in the user's script (__main__)."""
+    """Return True if workers need not import the user's script (__main__), which would run it
+    again: no class of the job's scenario is defined there.
+    """
     return isinstance(job.scenario, PackedScenario) and b"__main__" not in job.scenario.payload
 
 
@@ -216,7 +228,9 @@ def _serve(jobs: Connection, results: Connection) -> None:
 
 
 def _run_job(message: bytes) -> bytes:
-    """Run a pickled job; return the pickle of (pickled result, pickled exception, traceback)."""
+    """Run a pickled job in a worker; return its answer, the pickle of (pickled result, pickled
+    exception, text of the traceback), of which the result or the exception is None.
+    """
     try:
         answer: tuple[bytes | None, bytes | None, str]
         answer = pickle.dumps(work(pickle.loads(message)), pickle.HIGHEST_PROTOCOL), None, ""
@@ -226,7 +240,9 @@ def _run_job(message: bytes) -> bytes:
 
 
 def _pickled_error(error: Exception) -> bytes:
-    """Return the pickle of an exception, or of an EngineError if it cannot be pickled."""
+    """Return the pickle of an exception that a worker sends to its parent, or of an EngineError
+    with its text if it cannot be pickled or read back.
+    """
     try:
         payload = pickle.dumps(error, pickle.HIGHEST_PROTOCOL)
         pickle.loads(payload)
