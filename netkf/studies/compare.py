@@ -146,8 +146,8 @@ class RunDirectory:
         return math.inf if stored is None else float(stored)
 
     def by_run(self, quantity: str, node: int, end: float) -> pd.Series[float] | None:
-        """Return the average of ``quantity`` over time for each run, at ``node`` (an id, -1 for all
-        nodes together); None if the states were not kept.
+        """Return the average of ``quantity`` over time for each run, indexed by its number, at
+        ``node`` (an id, -1 for all nodes together); None if the states were not kept.
 
         For ``rms_error`` it is the squared error. Of errors and NEES only samples before ``end``
         (seconds) count.
@@ -162,8 +162,10 @@ class RunDirectory:
 
 
 def read_directory(directory: Path) -> RunDirectory:
-    """Return the directory of a finished run; raises ScenarioError if it is not one, or if its
-    manifest, its summary or its scenario was changed since the run ended.
+    """Read manifest.json and summary.json of the directory of a finished run or ensemble.
+
+    Raises ScenarioError if it is not such a directory, or if the manifest, the summary or the
+    scenario was changed since the run ended.
     """
     where = shorten(directory)
     if not directory.is_dir():
@@ -174,7 +176,7 @@ def read_directory(directory: Path) -> RunDirectory:
             rule = f"holds a run that did not finish ({shorten(manifest['status'], 30)})"
             raise ScenarioError(where, rule, None, "finish it with netkf run --resume")
         summary = _read(directory, "summary.json", SUMMARY)
-        if SEAL in manifest:  # older versions wrote none
+        if SEAL in manifest:  # a digest of the manifest itself; older versions wrote none
             with add_file_name("manifest.json"):
                 check_seal(manifest)
         check_files(directory, manifest, ["scenario.toml", "summary.json"])
@@ -182,7 +184,9 @@ def read_directory(directory: Path) -> RunDirectory:
 
 
 def _read(directory: Path, name: str, form: dict[str, Any]) -> dict[str, Any]:
-    """Return a JSON document of a run directory; raises DamagedError if its form is wrong."""
+    """Return a JSON document of a run directory; raises DamagedError unless it has the keys and
+    types that ``form`` lists.
+    """
     with add_file_name(name):
         document = read_document(directory / name)
         require_form(document, form)
@@ -222,7 +226,7 @@ class Comparison(NotebookTable):
     @property
     def table(self) -> pd.DataFrame:
         """A row per quantity and node, -1 for all nodes, with the value of every directory;
-        ``differs`` names those that differ from the first for certain.
+        ``differs`` names those directories that differ from the first for certain.
         """
         rows = []
         for row in self.rows:
@@ -281,7 +285,9 @@ def compare(directories: Sequence[str | Path], confidence: float = 0.95) -> Comp
 
 
 def _read_all(directories: Sequence[str | Path]) -> list[RunDirectory]:
-    """Return the run directories; raises ScenarioError."""
+    """Return the runs or ensembles that the arguments of ``netkf.compare`` name; raises
+    ScenarioError if that is no list, or a directory is not that of a finished run.
+    """
     if isinstance(directories, (str, Path)) or not isinstance(directories, Sequence):
         remedy = "give all of them in one list: netkf.compare([one, other])"
         raise ScenarioError("directories", "must be a list", directories, remedy)
@@ -300,6 +306,7 @@ def _compare_quantity(
     entry = Entry(value, se)
     if other is first or value is None:
         return entry
+    # Run by run if both had the same truth, which is more accurate, else as independent runs.
     return _pair_runs(first, other, quantity, node, level, entry) or _welch_difference(
         first.value(quantity, node), entry, (first.runs, other.runs), level
     )
@@ -308,8 +315,8 @@ def _compare_quantity(
 def _pair_runs(
     first: RunDirectory, other: RunDirectory, quantity: str, node: int, level: float, entry: Entry
 ) -> Entry | None:
-    """Return the ``entry`` with a paired difference, run by run; None if the runs do not have the
-    same truth.
+    """Return the ``entry`` (the value of ``other``) with its difference from ``first``, taken run
+    by run; None if the two do not have the same true states, or have not kept the states.
 
     Its interval misses the true difference with probability ``level``. ``node`` is an id, -1 for
     all nodes together.
@@ -318,11 +325,11 @@ def _pair_runs(
     base_values, values = (finished.by_run(quantity, node, end) for finished in (first, other))
     if base_values is None or values is None or not _same_truth(first, other):
         return None
-    gaps = np.asarray((values - base_values).dropna(), dtype=np.float64)
-    if len(gaps) < 2:
+    differences = np.asarray((values - base_values).dropna(), dtype=np.float64)
+    if len(differences) < 2:
         return None
-    mean, error = mean_over_runs(gaps)
-    ends = _student_interval(mean, error, len(gaps) - 1, level)
+    mean, error = mean_over_runs(differences)
+    ends = _student_interval(mean, error, len(differences) - 1, level)
     method = "paired" if quantity != "rms_error" else "paired, mean squares"
     return entry._replace(
         difference=mean, low=ends[0], high=ends[1], real=_excludes_zero(*ends), method=method
@@ -330,8 +337,11 @@ def _pair_runs(
 
 
 def _same_truth(first: RunDirectory, other: RunDirectory) -> bool:
-    """Return True if the samples have equal states wherever both have runs and times."""
+    """Return True if both ensembles have the same true states x in all samples (run and time) that
+    both have kept, so that differences may be taken run by run.
+    """
     base_samples, samples = first.samples, other.samples
+    # The same seed is not enough: keys of the plant may differ.
     if (
         base_samples is None
         or samples is None

@@ -86,7 +86,9 @@ class ComparedFilter:
         return bool(self.quantities)
 
     def document(self) -> dict[str, Any]:
-        """Return plain values, one level deep."""
+        """Return plain values, one level deep: the row of the table, nan where a quantity is
+        missing.
+        """
         row: dict[str, Any] = {"filter": self.filter}
         for name in QUANTITIES:
             quantity = self.quantities.get(name, Quantity(math.nan, math.nan))
@@ -174,10 +176,12 @@ def compare_filters(
             if progress is not None:
                 progress(k + 1, len(candidates))
     first = next(iter(values))
+    # Bonferroni: all differences from the first filter hold together.
     level = (1.0 - confidence) / (len(QUANTITIES) * max(1, len(values) - 1))
     rows = []
     for label, scenario_of_filter, reason in candidates:
         if scenario_of_filter is None:
+            # No quantities, consistency and traffic, but the reason why it cannot run.
             rows.append(ComparedFilter(label, {}, "-", math.nan, math.nan, reason))
             continue
         base = values[first] if label != first else None
@@ -191,8 +195,8 @@ def compare_filters(
 
 
 def _simulate(scenario: Scenario, runs: int, seed: int, engine: str, pool: Pool) -> FilterValues:
-    """Return the values of all ``runs`` replicas of ``seed`` of one filter, simulated by the
-    ``engine`` of that name.
+    """Simulate ``runs`` replicas of ``seed`` of a scenario with one of the compared filters on the
+    ``pool``; return their errors and NEES, run by run. ``engine`` is the name of the engine.
     """
     with explain_failures(scenario):
         task = partial(block_values, engine=choose_engine(engine, scenario))
@@ -225,8 +229,8 @@ def _make_row(
 
 
 def _candidates(scenario: Scenario, filters: Any, engine: str) -> tuple[FilterEntry, ...]:
-    """Return the filters with their scenarios, or with the reason why they cannot run, in their
-    order.
+    """Return the filters to compare, in their order: each with a label and the scenario with this
+    filter in place of its own, or with the reason why it cannot run.
 
     ``filters`` are names, tables or objects as in ``netkf.compare_filters``; ``engine`` is the name
     of the engine that is to run them. Raises ScenarioError for what is no list of filters, for
@@ -251,16 +255,16 @@ def _candidates(scenario: Scenario, filters: Any, engine: str) -> tuple[FilterEn
 
 
 def _make_candidate(scenario: Scenario, choice: Choice, engine: str) -> FilterEntry:
-    """Return a filter with its scenario, or with the reason why it cannot run here.
+    """Return the filter ``choice`` with a label and ``scenario`` with this filter in place of its
+    own, or with the reason why it cannot run there.
 
-    ``scenario`` is changed to this filter alone; ``engine`` is the name of the engine that is to
-    run it.
+    ``engine`` is the name of the engine that is to run it.
     """
     if isinstance(choice, Filter):
         filtering = dataclasses.replace(scenario.filter, algorithm=choice)
         make = partial(dataclasses.replace, scenario, filter=filtering)
         label = _make_label(name_of("filter", choice), {})
-    else:
+    else:  # the name of a kind, or a table of a scenario file
         table = _filter_table(scenario, choice)
         settings = (
             {} if isinstance(choice, str) else {k: v for k, v in choice.items() if k != "kind"}
@@ -278,8 +282,8 @@ def _make_candidate(scenario: Scenario, choice: Choice, engine: str) -> FilterEn
 
 
 def _distinct_labels(filters: Sequence[Choice], labels: list[str]) -> list[str]:
-    """Return the labels of filters, of objects with the settings in which those of one label differ
-    from each other.
+    """Return the ``labels`` of filters made distinct where that is possible: filters given as
+    objects of one kind, which share a label, get the settings added in which they differ.
     """
     distinct = list(labels)
     for label in {item for item in labels if labels.count(item) > 1}:
@@ -294,11 +298,13 @@ def _distinct_labels(filters: Sequence[Choice], labels: list[str]) -> list[str]:
 
 
 def _differing_settings(filters: Sequence[Any]) -> list[dict[str, str]]:
-    """Return for each filter the settings, shortened, that are not the same in all of them."""
+    """Return for each of several filters of one kind the settings, by name, that are not the same
+    in all of them, as short texts for labels.
+    """
     tables = [_filter_settings(algorithm) for algorithm in filters]
     names = dict.fromkeys(name for table in tables for name in table)
     differing = [name for name in names if len({table.get(name) for table in tables}) > 1]
-    # What is left out of a table is at its default.
+    # A setting that a table leaves out is at its default, which the filter has as an attribute.
     return [
         {name: shorten(table.get(name, str(getattr(algorithm, name)))) for name in differing}
         for algorithm, table in zip(filters, tables, strict=True)
@@ -316,8 +322,10 @@ def _make_label(kind: str, settings: Mapping[str, Any]) -> str:
 
 
 def _filter_table(scenario: Scenario, choice: Any) -> dict[str, Any]:
-    """Return the table [filter] of a choice; raises ScenarioError for a kind that is unknown and
-    for what is neither a kind nor a table.
+    """Return the table [filter] of a scenario file for a ``choice``, the name of a kind or a table:
+    with the start and the model of the scenario's own filter, unless it has others.
+
+    Raises ScenarioError for a kind that is unknown, and for what is neither a kind nor a table.
     """
     if not isinstance(choice, (str, Mapping)):
         remedy = "give kinds, tables {kind = ...} or filters"
@@ -326,13 +334,14 @@ def _filter_table(scenario: Scenario, choice: Any) -> dict[str, Any]:
     table = {"kind": choice} if isinstance(choice, str) else dict(choice)
     kind = table.get("kind")
     kinds = sorted(list_kinds("filter"))
+    # A kind with a colon, module:Class, is a user's class.
     if not isinstance(kind, str) or (":" not in kind and kind not in kinds):
         hint = suggest_nearest(kind, kinds) if isinstance(kind, str) else ""
         raise ScenarioError(
             "filters", "is no filter", kind, f"{hint}filters are {', '.join(kinds)}"
         )
     carried = {key: value for key, value in own_table.items() if key in CARRIED}
-    if isinstance(choice, str) and kind == own_table["kind"]:
+    if isinstance(choice, str) and kind == own_table["kind"]:  # with the scenario's settings
         return dict(own_table)
     return {**carried, **table}
 

@@ -72,12 +72,14 @@ def run_consistency(
     scenario: Scenario, seed: int, replica: int, engine: str | Engine = "auto"
 ) -> RunConsistency:
     """Simulate one ``replica`` of the runs of ``seed``; return its NEES (T, N) after time 0, and
-    the means over time (N,) of NEES and NIS of the N nodes, with their expected values.
+    the means over time (N,) of NEES and NIS of the N nodes, with their expected values given the
+    events of the run. A task of ``replicate``.
     """
     run = simulate(scenario, seed, replica, engine)
     _, nees = errors(run.error, run.P)
     after_start = np.flatnonzero(run.times > 0.0)
     sigma = _exact_covariance(scenario, run)
+    # Samples in which the error is mostly rounding, by its standard deviation of P and of Sigma.
     blurred = blurred_samples(run, run.P)
     blurred |= False if sigma is None else blurred_samples(run, sigma)
     nis, expected_nis = _mean_nis(scenario, run, sigma, blurred)
@@ -110,7 +112,9 @@ def _count_errors(scenario: Scenario) -> int:
 
 
 def _exact_covariance(scenario: Scenario, run: Run) -> FloatArray | None:
-    """Return Sigma (T, N, n, n) given the events; None where it is unknown or out of reach."""
+    """Return Sigma (T, N, n, n), the exact covariance of each node's errors given the events of the
+    run; None if theory has none for this filter, or the network is too large.
+    """
     if _count_errors(scenario) > MAX_ERRORS:
         return None
     try:
@@ -120,8 +124,8 @@ def _exact_covariance(scenario: Scenario, run: Run) -> FloatArray | None:
 
 
 def _expected_nees(P: FloatArray, sigma: FloatArray | None) -> FloatArray:
-    """Return tr(P^-1 Sigma) (T, N), from ``P`` and ``sigma`` (T, N, n, n) at T times and N nodes;
-    nan if Sigma is unknown or P is singular.
+    """Return the expected NEES tr(P^-1 Sigma) (T, N), from ``P`` and the exact covariance ``sigma``
+    of the errors, (T, N, n, n) each at T times and N nodes; nan if Sigma is unknown or P singular.
     """
     expected = np.full(P.shape[:2], np.nan)
     if sigma is None:
@@ -137,7 +141,7 @@ def _mean_nis(
     scenario: Scenario, run: Run, sigma: FloatArray | None, blurred: np.ndarray
 ) -> tuple[FloatArray, FloatArray]:
     """Return the mean NIS (N,) of each node's own readings and its expected value (N,), over the
-    samples that are not ``blurred`` (T, N).
+    samples that rounding has not ``blurred`` (T, N).
 
     ``sigma`` (T, N, n, n) are the exact covariances of the errors, if known. Both are nan in
     continuous time, where predictions at readings are not sampled.
@@ -164,12 +168,13 @@ class _Innovations:
         self, scenario: Scenario, run: Run, sigma: FloatArray | None, blurred: np.ndarray
     ) -> None:
         """Take a run with its T samples: the exact covariances ``sigma`` (T, N, n, n) of the
-        errors, if known, and the mask ``blurred`` (T, N) of errors to leave out.
+        errors, None if unknown, and the mask ``blurred`` (T, N) of errors to leave out.
         """
         self._scenario, self._run, self._sigma, self._blurred = scenario, run, sigma, blurred
         self._streams = Streams(run.seed, run.replica)
         # Samples of a predicting filter are predictions; others are predicted by one slot.
         self._steps = 0 if scenario.node_filter.predicts else 1
+        # Innovations exist where the sample that the prediction comes from was taken.
         slots = np.round(run.times / scenario.slot_plant.period).astype(int).tolist()
         self._samples = [
             k
@@ -183,11 +188,13 @@ class _Innovations:
         """Yield the NIS of the i-th node's readings and its expected value (nan if unknown) in each
         slot where errors are not blurred; nothing without a sensor or for nonlinear readings.
         """
+        # Where the node's sensors are listed in the scenario.
         placed = self._scenario.placed_sensors.get(self._run.nodes[i], ())
         # A nonlinear reading has no H given the errors alone.
         if not placed or not self._scenario.is_linear:
             return
         sensors = [self._scenario.slot_path(self._streams, self._run.nodes[i], p) for p in placed]
+        # A scenario may give the filters another R than the one that readings are drawn with.
         believed_R, true_R = (
             block_diagonal(
                 [self._scenario.noise_covariance(p.entry, believed=believed) for p in placed]
@@ -195,11 +202,12 @@ class _Innovations:
             for believed in (True, False)
         )
         for k, slot, noise in zip(self._samples, self._slots, self._noise, strict=True):
-            source = k - self._steps
+            source = k - self._steps  # the sample that is, or is advanced to, the prediction
             if self._blurred[k, i] or self._blurred[source, i]:
                 continue
             H = np.concatenate([sensor.matrix(slot) for sensor in sensors])
             e, P, Sigma = self._prediction(source, i, noise if self._steps else None)
+            # The innovation H e + noise: sensors read the error in place of the state.
             v = np.concatenate([sensor.reading(slot, e) for sensor in sensors])
             S = H @ P @ H.T + believed_R
             expected = np.nan
@@ -213,14 +221,14 @@ class _Innovations:
         """Return the error (n,) of the prediction of the i-th node, its P (n, n), and its exact
         covariance (n, n), None if unknown.
 
-        They are those of sample k or, with the plant's ``noise`` (n,) of the step, one slot on.
+        They are those of sample k or, with the plant's ``noise`` (n,) of the step, one slot later.
         """
         run, plant = self._run, self._scenario.slot_plant
         e, P = run.error[k, i], run.P[k, i]
         Sigma = None if self._sigma is None else self._sigma[k, i]
         if noise is None:
             return e, P, Sigma
-        F, Q = self._scenario.slot_belief
+        F, Q = self._scenario.slot_belief  # of the filters' model, which may differ from the plant
         model_is_true = np.array_equal(F, plant.F)
         if Sigma is not None:
             Sigma = plant.F @ Sigma @ plant.F.T + plant.Q if model_is_true else None
@@ -231,8 +239,10 @@ class _Innovations:
 
 
 def _plant_noise(scenario: Scenario, streams: Streams, slots: list[int]) -> list[FloatArray]:
-    """Return the plant's noise (n,) of the steps that end in ``slots``: with F = 0 in place of the
-    plant's F the state is the noise of the last step, with the same draws.
+    """Return the plant's noise w (n,) of the steps x(k + 1) = F x(k) + w that end in ``slots``.
+
+    With F = 0 in place of the plant's F the state is the noise of the last step, with the same
+    draws.
     """
     plant = scenario.slot_plant
     memoryless = dataclasses.replace(plant, F=np.zeros_like(plant.F))
@@ -329,26 +339,30 @@ def consistency(
 
 
 def _without_horizon(scenario: Scenario) -> Scenario:
-    """Return the scenario without a sample at the horizon for filtered estimates in slots, which
-    has no exact covariance: the trace lacks the exchanges of the slot that begins there.
+    """Return the scenario without the sample at the horizon if that is a filtered estimate of nodes
+    that exchange in slots: it has no exact covariance, since the events of a run end before the
+    exchanges of the slot that begins there.
     """
     node_filter = scenario.node_filter
     if not scenario.slotted or not node_filter.talks or node_filter.predicts:
         return scenario
-    over = [scenario.slot_plant.over(slot, scenario.horizon) for slot in scenario.sampled_slots]
-    times = scenario.times[~np.array(over)]
-    if all(over) or not (times > 0.0).any():
+    over_end = [scenario.slot_plant.over(slot, scenario.horizon) for slot in scenario.sampled_slots]
+    times = scenario.times[~np.array(over_end)]
+    # The only samples after time 0 stay.
+    if all(over_end) or not (times > 0.0).any():
         return scenario
-    return dataclasses.replace(scenario, probe=times) if any(over) else scenario
+    return dataclasses.replace(scenario, probe=times) if any(over_end) else scenario
 
 
 def judge_consistency(
     scenario: Scenario, runs: Sequence[RunConsistency], confidence: float
 ) -> Consistency:
-    """Return the consistency of a scenario from several of its ``runs``; all intervals of the nodes
-    hold together with probability ``confidence``.
+    """Return for each node whether its NEES over several ``runs`` is as expected; all intervals of
+    the nodes hold together with probability ``confidence``.
     """
+    # ``level`` is the probability that some interval misses.
     n, count, level = scenario.plant.n, len(runs), 1.0 - confidence
+    # Chi-square bounds on the mean NEES of a sample over the runs: its sum has n runs degrees.
     low, high = (
         2.0 * float(scipy.special.gammaincinv(0.5 * count * n, q)) / count
         for q in (0.5 * level, 1.0 - 0.5 * level)
@@ -375,7 +389,7 @@ def judge_consistency(
 
 
 def _covariance_given(runs: Sequence[RunConsistency]) -> bool:
-    """Return True if the filter gives covariances."""
+    """Return True if the filter gives covariances; without them there is no NEES."""
     return any(run.covariance_given[0] for run in runs)
 
 
@@ -398,23 +412,25 @@ def _share_inside(runs: Sequence[RunConsistency], low: float, high: float) -> Fl
 def _judge_node(
     scenario: Scenario, runs: Sequence[RunConsistency], i: int, share_inside: float, quantile: float
 ) -> NodeConsistency:
-    """Return the verdict on the i-th node by the interval of its mean NEES over the runs,
-    ``quantile`` standard errors wide to each side.
+    """Return the result of the i-th node, with a verdict (a sentence) by whether the interval of
+    its mean NEES minus the expected one, run by run, contains 0.
 
-    ``share_inside`` is the share of its samples whose mean NEES lies in the chi-square bounds.
+    The interval reaches ``quantile`` standard errors to each side. ``share_inside`` is the share of
+    the node's samples whose mean NEES over the runs lies in the chi-square bounds.
     """
     nees = np.array([run.nees[i] for run in runs])
     expected = np.array([run.expected[i] for run in runs])
     is_known = bool(np.isfinite(expected).all())
-    gaps = nees - (expected if is_known else scenario.plant.n)
-    width = quantile * float(gaps.std(ddof=1)) / math.sqrt(len(runs))
+    # NEES of an exact P has the mean n.
+    excesses = nees - (expected if is_known else scenario.plant.n)
+    width = quantile * float(excesses.std(ddof=1)) / math.sqrt(len(runs))
     if not _covariance_given(runs):
         verdict = NO_COVARIANCE
     elif np.isfinite(_blurred_from(runs)) and np.isnan(nees).any():
         verdict = UNDECIDED
     else:
         mean = float(expected.mean()) if is_known else None
-        verdict = _verdict(scenario, float(gaps.mean()), width, mean)
+        verdict = _verdict(scenario, float(excesses.mean()), width, mean)
     return NodeConsistency(
         scenario.nodes[i],
         float(nees.mean()),
@@ -427,18 +443,18 @@ def _judge_node(
     )
 
 
-def _verdict(scenario: Scenario, gap: float, width: float, expected: float | None) -> str:
-    """Return the verdict on NEES that is ``gap`` (+- ``width``) above its ``expected`` value, or
-    above n if that is None.
+def _verdict(scenario: Scenario, excess: float, width: float, expected: float | None) -> str:
+    """Return the verdict, a sentence, on a mean NEES that is ``excess`` (+- ``width``) above its
+    ``expected`` value, or above n if that is None: BROKEN if the two differ for certain.
     """
     n = scenario.plant.n
-    if not math.isfinite(gap):
+    if not math.isfinite(excess):
         return "no NEES: P is singular or not finite"
     if expected is None:
-        side = "near n" if abs(gap) <= width else "above n" if gap > 0.0 else "below n"
+        side = "near n" if abs(excess) <= width else "above n" if excess > 0.0 else "below n"
         return f"{side}; what it should be is not known"
-    if abs(gap) > width:
-        return f"BROKEN: errors are {'larger' if gap > 0.0 else 'smaller'} than they should be"
+    if abs(excess) > width:
+        return f"BROKEN: errors are {'larger' if excess > 0.0 else 'smaller'} than they should be"
     if abs(expected / n - 1.0) <= BIAS_TOLERANCE:
         return "as it should be"
     return f"as it should be: {_explain_bias(scenario, expected < n)}"

@@ -65,12 +65,15 @@ class Messages:
 
 
 def match_messages(log: IntArray, swaps: bool, slotted: bool) -> Messages:
-    """Return the M messages of an EVENT ``log`` (E,), which must begin with the run.
+    """Return the M messages of an EVENT ``log`` (E,), which must begin with the run: when each was
+    sent, arrived and used, or why it was not used.
 
     With ``swaps`` a receiver uses one message of an instant only, that of the sender with the
     largest id. A message with a ``late`` event was too late if the run is ``slotted``, else
     refused.
     """
+    # Messages are sorted by directed link and number, so that an event about a message finds it by
+    # the first message of its link and the number.
     kind = log["kind"]
     rows = np.flatnonzero(kind == CODES["send"])
     rows = rows[np.lexsort((log["message"][rows], log["peer"][rows], log["node"][rows]))]
@@ -92,8 +95,9 @@ def match_messages(log: IntArray, swaps: bool, slotted: bool) -> Messages:
     arrived[indices], used_row[indices] = log["t"][deliveries], _next_use(log, deliveries)
     outcome[indices] = np.where(used_row[indices] == NEVER, UNDER_WAY, USED)
     if swaps:
-        chosen = np.flatnonzero(outcome == USED)
-        outcome[chosen[~_last_of_instant(used_row[chosen], sender[chosen], rows[chosen])]] = UNUSED
+        arrivals = np.flatnonzero(outcome == USED)
+        counts = _last_of_instant(used_row[arrivals], sender[arrivals], rows[arrivals])
+        outcome[arrivals[~counts]] = UNUSED
     sent, phase = log["t"][rows], log["phase"][rows]
     return Messages(sender, receiver, number, sent, arrived, phase, outcome, rows, used_row)
 
@@ -108,11 +112,12 @@ class _Links(NamedTuple):
     start: IntArray
 
     def indices(self, sender: IntArray, receiver: IntArray, number: IntArray) -> IntArray:
-        """Return the indices (K,), among the messages of all links, of K messages given by
-        ``sender``, ``receiver`` and ``number`` on their link, (K,) each.
+        """Return the indices (K,), among the messages of all links, of K messages given by the ids
+        of ``sender`` and ``receiver`` and their ``number`` on that link, (K,) each.
         """
         if not len(self.start):
             return np.empty(0, dtype=np.int64)
+        # Each pair of ids becomes one integer, which one sorted search finds for all messages.
         ids = np.unique(np.concatenate([self.sender, self.receiver]))
         keys = np.searchsorted(ids, self.sender) * len(ids) + np.searchsorted(ids, self.receiver)
         message_keys = np.searchsorted(ids, sender) * len(ids) + np.searchsorted(ids, receiver)
@@ -120,8 +125,9 @@ class _Links(NamedTuple):
 
 
 def _next_use(log: IntArray, rows: IntArray) -> IntArray:
-    """Return the row of ``log`` (an EVENT array) in which the node of each of ``rows`` (K,) next
-    uses arrived messages, by an absorb or a swap event; NEVER (-1) if it does not.
+    """Return for each of the ``rows`` (K,) of an EVENT ``log``, arrivals of messages, the row of
+    the absorb or swap event by which its node next uses what has arrived; NEVER (-1) if it does
+    not.
     """
     # One sorted search for all nodes: keys order the uses by node, then by row of the log. The
     # result may be a use by the following node, which the last line rejects.
@@ -136,8 +142,9 @@ def _next_use(log: IntArray, rows: IntArray) -> IntArray:
 
 
 def _last_of_instant(used: IntArray, sender: IntArray, sent_row: IntArray) -> IntArray:
-    """Return a mask (K,) of the messages that count if a receiver uses one message at an instant:
-    that of the sender with the largest id, and of several from it the last sent.
+    """Return a mask (K,) of the messages that a filter which swaps estimates really uses: it takes
+    over only one at an instant, that of the sender with the largest id, and of several from this
+    one the last sent.
 
     ``used`` (K,) is the row of the log at which each of K messages is used, ``sender`` (K,) the id
     of its sender, and ``sent_row`` (K,) the row at which it was sent.
@@ -151,8 +158,9 @@ def _last_of_instant(used: IntArray, sender: IntArray, sent_row: IntArray) -> In
 
 
 def at_once(messages: Messages, log: IntArray) -> Messages:
-    """Return the ``messages`` with unused ones taken to be used when they were sent, in the EVENT
-    ``log`` (E,): only ``used_row`` differs.
+    """Return ``messages`` for a search of what would have reached a node had all been used: those
+    that were not used are taken to be used when they were sent, in the EVENT ``log`` (E,). Only
+    ``used_row`` differs.
 
     The time at which they would have arrived is unknown; so ages found with these are lower bounds.
     """
@@ -170,7 +178,7 @@ def rows_until(scenario: DerivedScenario, log: IntArray, at: float) -> IntArray:
 
 def _count_events(scenario: DerivedScenario, times: FloatArray, at: float) -> int:
     """Return the number of events, of those at the increasing ``times`` (E,) in seconds, that
-    influence the sample at ``at`` seconds.
+    influence the sample at ``at`` seconds; these are the first events.
     """
     if not scenario.slotted:
         return int(np.searchsorted(times, at, side="right"))
@@ -210,10 +218,12 @@ class Flow:
 def find_flow(
     scenario: DerivedScenario, log: IntArray, messages: Messages, used: IntArray | None = None
 ) -> Flow:
-    """Return the flow of information in an EVENT ``log`` (E,) with these M messages.
+    """Return the flow of information in an EVENT ``log`` (E,): segments, in each of which the
+    information of one node accumulates, joined by the M ``messages``.
 
-    ``used`` (M,) bool marks the messages that cost nothing: those that were used in the original
-    run, of which the log may be a replay; by default those used in this log.
+    ``used`` (M,) bool marks the messages of cost 0: those that were used in the original run, of
+    which the log may be a replay; by default those used in this log. Others cost 1, so that a
+    search can count how many missing messages a path needs.
     """
     used = messages.outcome == USED if used is None else used
     nodes = np.array(scenario.nodes)
@@ -240,14 +250,14 @@ def find_flow(
         origin=origin,
         target=np.searchsorted(nodes, messages.receiver),
         cost=1 - used,
-        last={n: k for k, n in enumerate(scenario.nodes)},
+        last={n: k for k, n in enumerate(scenario.nodes)},  # segment k is that of the k-th node
         pooled=scenario.node_filter.pooled,
     )
 
 
 def _carry_readings(combination: str, messages: Messages) -> IntArray:
-    """Return a mask (M,) of the messages that carry the reading of their sender and
-    nothing else.
+    """Return a mask (M,) of the messages that carry the reading of their sender and nothing else,
+    by what the filter sends: its ``combination``. All others carry the sender's whole estimate.
     """
     if combination == "readings, then estimates":
         return np.asarray(messages.phase == 0)
@@ -255,7 +265,8 @@ def _carry_readings(combination: str, messages: Messages) -> IntArray:
 
 
 def _swap_flow(nodes: IntArray, rows: int, messages: Messages, used: IntArray) -> Flow:
-    """Return the flow of a filter that swaps: each swap begins a new segment of its receiver.
+    """Return the flow of information of a filter that swaps: each swap replaces all that the
+    receiver knew, and so begins a new segment (interval of rows of the log) of this node.
 
     ``nodes`` (N,) are ids, ``rows`` is the number of rows of the log, and the mask ``used`` (M,)
     has the messages that were used.
@@ -265,12 +276,13 @@ def _swap_flow(nodes: IntArray, rows: int, messages: Messages, used: IntArray) -
     start = np.concatenate([np.zeros(len(nodes), np.int64), messages.used_row[swapped]])
     order = np.lexsort((start, node))
     node, start = node[order], start[order]
+    # One sorted key for each segment: its node, then its first row.
     indices, length = np.searchsorted(nodes, node), rows + 1
     keys = indices * length + start
 
     def segment(segment_nodes: IntArray, row: IntArray) -> IntArray:
-        """Return the index (K,) of the segment of each of ``segment_nodes`` (K,), ids, at an event
-        ``row`` (K,).
+        """Return the index (K,) of the segment of each of ``segment_nodes`` (K,), ids, that
+        contains the event at ``row`` (K,), as one does that begins there.
         """
         sought_keys = np.searchsorted(nodes, segment_nodes) * length + row
         return np.asarray(np.searchsorted(keys, sought_keys, side="right") - 1)
@@ -285,7 +297,8 @@ def _swap_flow(nodes: IntArray, rows: int, messages: Messages, used: IntArray) -
 
 @dataclass(frozen=True, eq=False)
 class Reach:
-    """The result of a backward search from one node at the end of a log, for budgets b = 0 .. B.
+    """The result of a backward search from one node at the end of a log, for budgets b = 0 .. B:
+    numbers of messages of cost 1 (not used in the run) that a path may take.
 
     deadline : (B + 1, G) row before which the information of a segment reaches the node if b
                messages of cost 1 are used; NEVER if it does not
@@ -297,8 +310,8 @@ class Reach:
     via: IntArray
 
     def messages_from(self, segment: int, budget: int) -> list[int]:
-        """Return the indices of the messages on the path from ``segment`` (its index) to the node,
-        in the order of sending, if at most ``budget`` messages of cost 1 are used.
+        """Return the indices of the messages on the path from ``segment`` (its index) to the node
+        of the search, in the order of sending, if at most ``budget`` messages of cost 1 are used.
 
         A segment is an interval of the log in which one node's information accumulates. A message
         that the run did not use (lost, late) costs 1, a used one 0.
@@ -312,10 +325,11 @@ class Reach:
         return path
 
     def needed(self, message: int) -> int | None:
-        """Return the number of messages of cost 1 that must be used, ``message`` (its index)
-        included, for its information to reach the node; None if it exceeds the budget of the
-        search.
+        """Return how many messages that the run did not use (those of cost 1) must be used,
+        ``message`` (its index) included, for its information to reach the node of the search; None
+        if they are more than the search allowed.
         """
+        # ``deadline`` is the row before which information has to be in a segment to reach the node.
         used, cost = self.flow.messages.used_row[message], int(self.flow.cost[message])
         for budget in range(len(self.deadline) - cost):
             if NEVER < used < self.deadline[budget, self.flow.target[message]]:
@@ -324,13 +338,19 @@ class Reach:
 
 
 def search_back(flow: Flow, node: int, budget: int = 0) -> Reach:
-    """Return the backward search from ``node`` (its id) at the end of the log, along messages of
-    cost 0 and at most ``budget`` others: tables (budget + 1, G) over the G segments of the flow.
+    """Search from ``node`` (its id) at the end of the log backwards for the information that can
+    have reached it, along messages of cost 0 (used in the run) and at most ``budget`` others.
+
+    The result has for each of 0 .. ``budget`` others and each of the G segments of the flow
+    (intervals of the log in which one node's information accumulates) the row of the log before
+    which information in the segment reaches the node, its deadline, and the first message of the
+    path.
     """
     segments = len(flow.node)
     deadline = [[NEVER] * segments for _ in range(budget + 1)]
     via = [[NEVER] * segments for _ in range(budget + 1)]
     for layer in deadline:
+        # The estimate at the end of the log has all that its segment then has.
         for segment in flow.last.values() if flow.pooled else (flow.last[node],):
             layer[segment] = flow.rows
     usable = np.flatnonzero((flow.messages.used_row != NEVER) & (flow.cost <= budget))
@@ -364,16 +384,18 @@ class KeptReadings:
         }
 
     def _with_values(self, node: int, rows: IntArray) -> IntArray:
-        """Return the rows (K,) of the log at which a node took a reading that had values, of the
-        ``rows`` (K',) at which it took any.
+        """Return the rows (K,) of the log at which ``node`` took a reading that had values, of the
+        ``rows`` (K',) of its sense events.
 
-        In slots a node with sensors reads in every slot, but a record may lack rows.
+        In slots a node with sensors has such an event in every slot, but a recorded sensor, which
+        reads from a table, may lack rows.
         """
         scenario = self._scenario
         sensors = [scenario.sensors[position.entry] for position in scenario.placed_sensors[node]]
         if not scenario.slotted or not all(isinstance(s, RecordedSensor) for s in sensors):
             return rows
         recorded = [s.row_times for s in sensors if isinstance(s, RecordedSensor)]
+        # A table of readings may have rows of several nodes.
         times = [t for listed in recorded for other, t in listed if other == node]
         slots_of = scenario.slot_plant.slots_of
         return rows[np.isin(slots_of(self._times[rows]), slots_of(np.array(times)))]
@@ -416,12 +438,14 @@ class Newest(NamedTuple):
 def newest_information(
     reach: Reach, log: IntArray, readings: KeptReadings, budget: int
 ) -> dict[int, Newest]:
-    """Return the newest information, by node, that reached the node of a search with at most
-    ``budget`` messages of cost 1.
+    """Return for each node, by id, the newest information of it that can have reached the node of
+    the search ``reach``, with at most ``budget`` messages that the run did not use (cost 1).
 
     ``log`` (E,) are the EVENT rows of the run, ``readings`` those that its nodes took.
     """
     flow, newest = reach.flow, dict[int, Newest]()
+    # Information that was in a segment (an interval of rows in which that of one node accumulates)
+    # before the row ``deadline`` reaches the node; NEVER if none does.
     deadline = reach.deadline[budget]
     for segment in np.flatnonzero(deadline != NEVER).tolist():
         node, end = int(flow.node[segment]), int(deadline[segment])
@@ -436,8 +460,9 @@ def newest_information(
 
 
 def _age_key(reading: float, known: float) -> tuple[float, float]:
-    """Return a key of the times of a ``reading`` and up to which information is ``known``, both in
-    seconds, that sorts missing times (nan) first.
+    """Return a key that sorts information by age, oldest first: by the time of its newest
+    ``reading``, then by the time up to which it is ``known``, both in seconds, missing ones (nan)
+    first.
     """
     return (
         -np.inf if np.isnan(reading) else reading,
@@ -446,9 +471,10 @@ def _age_key(reading: float, known: float) -> tuple[float, float]:
 
 
 def route(reach: Reach, segment: int, budget: int) -> tuple[int, ...]:
-    """Return the nodes through which information of ``segment`` reaches the node of the search,
-    using at most ``budget`` messages of cost 1.
+    """Return the ids of the nodes through which information of ``segment`` (an interval of the log,
+    by its index) reaches the node of the search, from its own node to that one, using at most
+    ``budget`` messages that the run did not use.
     """
     path: Iterable[int] = reach.messages_from(segment, budget)
-    hops = [int(reach.flow.messages.receiver[m]) for m in path]
-    return (int(reach.flow.node[segment]), *hops)
+    receivers = [int(reach.flow.messages.receiver[m]) for m in path]
+    return (int(reach.flow.node[segment]), *receivers)

@@ -77,14 +77,25 @@ def find_smallest_set(
     most: int,
     replays: int,
 ) -> SmallestSet:
-    """Return the smallest set of candidates whose arrival brings the trace of P to ``limit``.
+    """Return the smallest set of candidates (messages that the run did not use) whose delivery
+    brings the trace of P at the node of the ``replayer`` to at most ``limit``.
 
     Sets of at most ``most`` messages are tried, with at most ``replays`` replays of the run.
     """
     search = _Search(replayer, limit)
-    first, base = replayer.count, search.trace(())
+    first, base = replayer.count, search.trace(())  # replays before; trace of the run as it was
     if base <= limit:
-        return SmallestSet((), base, limit, most, most, len(candidates), 0, math.nan, 0)
+        return SmallestSet(
+            messages=(),
+            trace=base,
+            limit=limit,
+            most=most,
+            complete=most,
+            candidates=len(candidates),
+            considered=0,
+            since=math.nan,
+            replays=0,
+        )
     recent = search.drop_oldest(sorted(candidates, key=lambda c: (c.sent, c.key)))
     complete, messages = 0, None
     for size in range(1, most + 1):
@@ -128,7 +139,8 @@ class _Search:
         return largest if self._gains.get(largest, 0.0) > 0.0 else ()
 
     def drop_oldest(self, candidates: Sequence[Candidate]) -> list[Candidate]:
-        """Return ``candidates``, which are in the order of sending, without the oldest ones.
+        """Return ``candidates``, missing messages in the order of sending, without the oldest ones,
+        so that the search has fewer sets to try.
 
         All that are left out change the trace together by at most NEGLIGIBLE times the decrease
         that the limit asks for. Their number is found by bisection.
@@ -153,8 +165,8 @@ class _Search:
     def find_set(
         self, candidates: Sequence[Candidate], size: int, max_count: int
     ) -> tuple[tuple[MessageKey, ...] | None, bool]:
-        """Return a set of ``size`` messages with which the trace is at most the limit, else None;
-        and True if all sets of this size were considered.
+        """Return a set of ``size`` of the candidates (missing messages) whose delivery brings the
+        trace to at most the limit, else None; and True if all sets of this size were considered.
 
         Of single messages it is the one with the smallest trace, of larger sets the first that is
         tried. The search ends when the replayer's number of replays reaches ``max_count``.
@@ -176,8 +188,8 @@ class _Search:
     def _list_sets(
         self, candidates: Sequence[Candidate], size: int
     ) -> tuple[Iterator[tuple[MessageKey, ...]], bool]:
-        """Return the sets of ``size`` messages in decreasing order of expected gain, and True if
-        these are all sets.
+        """Return the sets of ``size`` candidates in decreasing order of expected gain (decrease of
+        the trace), in which they are to be tried, and True if these are all sets.
 
         If there are more than MAX_SETS, the least promising messages are left out. Of sets with
         equal gain those of later messages come first.
@@ -187,10 +199,12 @@ class _Search:
         count = len(ranked)
         while math.comb(count, size) > MAX_SETS:
             count = max(size, int(0.9 * count))
+        # All sets, as rows of indices into ``ranked``; those that cannot matter are dropped.
         numbers = itertools.chain.from_iterable(itertools.combinations(range(count), size))
         chosen = np.fromiter(numbers, np.intp, math.comb(count, size) * size).reshape(-1, size)
         needed = np.array([c.needed for c in ranked[:count]], dtype=np.intp)
         chosen = chosen[_are_joined(needed[chosen])]
+        # Keys in sorted order, so that a set has one form whatever the ranks of its members.
         keys = sorted(c.key for c in ranked[:count])
         index_of_key = {key: k for k, key in enumerate(keys)}
         indices = np.array([index_of_key[c.key] for c in ranked[:count]], dtype=np.intp)
@@ -206,7 +220,8 @@ class _Search:
         index_of_key: Mapping[MessageKey, int],
         single_gains: Mapping[MessageKey, float],
     ) -> FloatArray:
-        """Return the expected gain (S,) of each set.
+        """Return the expected gain (S,), the decrease of the trace, of each of S sets, by which
+        they are sorted.
 
         It is the sum of the gains of its single messages and, for each pair that was replayed, of
         the gain of the pair beyond those of its two messages. ``members`` (S, size) are the indices
@@ -230,10 +245,12 @@ class _Search:
 
 
 def _are_joined(needed: np.ndarray) -> np.ndarray:
-    """Return a mask (S,) of the sets all of whose members can matter; ``needed`` (S, size) is
-    ``Candidate.needed`` of their members.
+    """Return a mask (S,) of those of S sets of missing messages all of whose members can change the
+    node's estimate.
 
-    A member cannot matter if the set has too few other messages to carry it on to the node.
+    ``needed`` (S, size) is for each member how many missing messages, itself included, must be
+    delivered for its information to reach the node; a set that has too few to carry a member on is
+    left out.
     """
     # A message that needs k messages, itself included, needs one of each lower number: sorted, the
     # numbers are at most 1, 2, 3, ...

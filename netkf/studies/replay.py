@@ -78,8 +78,10 @@ class Replayer:
         return self._replay(frozenset(), to_horizon=False)
 
     @cached_property
-    def hurried(self) -> Chosen:
-        """The messages that were not lost but not used by then: late, refused or under way."""
+    def delayed(self) -> Chosen:
+        """The messages that were not lost but not used by ``at`` because of their delay: late,
+        refused or under way. Replays deliver them without delay.
+        """
         scenario = self.scenario
         swaps = scenario.node_filter.combination == "swap"
         messages = match_messages(self.log, swaps, scenario.slotted)
@@ -94,15 +96,18 @@ class Replayer:
         return self._replay(None, to_horizon=False)
 
     def outcome(self, chosen: Iterable[MessageKey] | None = (), error: bool = False) -> Outcome:
-        """Return the state with the ``chosen`` messages delivered, all for None; cached.
+        """Return the node's state at ``at`` in a replay with the ``chosen`` messages delivered
+        whatever was drawn, all messages for None; cached.
 
-        ``error`` asks for the error too, which may take the whole run; it is nan otherwise.
+        ``error`` asks for the error x - xhat too, which may take a replay of the whole run; without
+        it the error may not be that of the run.
         """
         keys = None if chosen is None else frozenset(chosen)
+        # The true state between two samples of sensors depends on the later one too.
         to_horizon = error and bool(self.scenario.sampled_sensors)
         if (keys, to_horizon) not in self._outcomes:
             if keys is None and not to_horizon:
-                _ = self.full_log
+                _ = self.full_log  # this replay also keeps its log
             elif keys == frozenset() and not to_horizon:
                 _ = self.log
             else:
@@ -110,16 +115,17 @@ class Replayer:
         return self._outcomes[keys, to_horizon]
 
     def _replay(self, chosen: Chosen | None, to_horizon: bool) -> IntArray:
-        """Simulate the run again with the ``chosen`` messages delivered, or all for None, to the
-        instant or ``to_horizon``; return the EVENT rows (E,) up to the instant.
+        """Simulate the run again with the ``chosen`` messages delivered, or all for None, to
+        the time ``at`` or ``to_horizon``; return the EVENT rows (E,) up to ``at``.
 
         Adds 1 to ``count`` and stores the state of the node in ``_outcomes``.
         """
         self.count += 1
-        hurried: Chosen = frozenset()
+        without_delay: Chosen = frozenset()
         if chosen is None or chosen:
-            hurried = self.hurried if chosen is None else chosen & self.hurried
-        self._deliveries.chosen, self._deliveries.hurried = chosen, hurried
+            without_delay = self.delayed if chosen is None else chosen & self.delayed
+        # The channel models of both scenarios read these when messages are sent.
+        self._deliveries.chosen, self._deliveries.hurried = chosen, without_delay
         scenario = self._full if to_horizon else self._short
         run = simulate(scenario, self._seed, self._replica)
         k = self._node
@@ -131,7 +137,9 @@ class Replayer:
 
 
 def delivering(scenario: Scenario, deliveries: Deliveries) -> Scenario:
-    """Return the scenario in which the messages of ``deliveries`` are delivered."""
+    """Return the scenario in which the channel delivers the messages that ``deliveries`` names at
+    the time of a replay, whatever is drawn, and all others as in ``scenario``.
+    """
     network = scenario.network
     channel_of_run = network.channel
     loss, delay = DeliveringLoss(channel_of_run.loss, deliveries), channel_of_run.delay
@@ -143,8 +151,8 @@ def delivering(scenario: Scenario, deliveries: Deliveries) -> Scenario:
 
 
 def _shorten(scenario: Scenario, at: float, to_horizon: bool) -> Scenario:
-    """Return the scenario with ``at`` seconds as its last sample, which also ends there unless it
-    runs ``to_horizon``.
+    """Return the scenario of replays for the state at ``at`` seconds, its last sample; it ends
+    there unless it runs ``to_horizon``.
 
     Earlier samples stay: with continuous readings they decide where the readings of an interval are
     split. The true state between two samples of sensors depends on the later one too, so that
@@ -152,6 +160,7 @@ def _shorten(scenario: Scenario, at: float, to_horizon: bool) -> Scenario:
     """
     times = scenario.times
     probe = np.append(times[times < at], at)
+    # Events at ``at`` itself, and in slots those of its slot, belong to the state.
     margin = scenario.slot_plant.period if scenario.slotted else max(1e-9, 1e-12 * at)
     end = scenario.horizon if to_horizon else min(scenario.horizon, at + margin)
     return _with(scenario, probe=probe, horizon=end)

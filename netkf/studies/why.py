@@ -101,6 +101,7 @@ def why(
     """
     run, run_scenario = _check_run(run, scenario, replica, trust)
     at = _check_instant(run, run_scenario, node, at)
+    # Keyword names are those of the command line: --most, --below, --replays.
     most = integer(low=1, high=MAX_MISSING)("most", most)
     limit = None if below is None else number(above=0.0)("below", below)
     replayer = Replayer(run_scenario, run.seed, run.replica, node, at)
@@ -114,6 +115,7 @@ def why(
     sources = evidence.sources()
     smallest = None
     if math.isfinite(outcome.trace):
+        # outcome(None): the state with every message delivered.
         target = (1.0 + GOOD_ENOUGH) * replayer.outcome(None).trace if limit is None else limit
         wanted = _default_replays(len(replayer.log)) if replays is None else replays
         count = integer(low=1)("replays", wanted)
@@ -136,10 +138,12 @@ def why(
 def _check_run(
     run: Run | str | Path, scenario: Scenario | None, replica: int | None, trust: bool
 ) -> tuple[Run, Scenario]:
-    """Return a run with all its events, and its scenario; raises ScenarioError.
+    """Return the run that ``netkf.why`` is asked about, with all its events, and its scenario;
+    raises ScenarioError if there is none, or arguments contradict it.
 
-    ``run`` may be a directory, of an ensemble with the run number ``replica``; ``trust`` imports
-    classes of modules in it. ``scenario`` is for a run that does not know its own.
+    ``run`` may be a directory: of a run, or of an ensemble, in which ``replica`` is the number of
+    the run. ``trust`` imports classes of modules in it. ``scenario`` is for a run in memory that
+    does not know its own.
     """
     name = "run" if isinstance(run, Run) else shorten(run)
     if not isinstance(run, Run):
@@ -161,8 +165,10 @@ def _check_run(
 
 
 def _read_run(directory: str | Path, replica: int | None, trust: bool) -> Run:
-    """Return a run that is read back from its directory, of an ensemble run number ``replica``;
-    raises ScenarioError. ``trust`` imports classes of modules in the directory.
+    """Return a run that is read back from its ``directory``, or run number ``replica`` (None: 0) of
+    the ensemble there; raises ScenarioError if the directory holds something else.
+
+    ``trust`` imports classes of modules in the directory.
     """
     stored = open_directory(directory, trust=trust)
     if isinstance(stored, Run):
@@ -197,8 +203,8 @@ def _check_instant(run: Run, scenario: Scenario, node: int, at: float) -> float:
 
 
 def _require_same_events(logged: IntArray, replayed: IntArray) -> None:
-    """Raise ScenarioError if the EVENT rows ``replayed`` (E,) of a replay are not those ``logged``
-    (E,) of the run.
+    """Raise ScenarioError unless the EVENT rows ``replayed`` (E,) of a replay, in which nothing was
+    changed, are those ``logged`` (E,) by the run: only then replays with changes say something.
     """
     same = len(logged) == len(replayed) and all(
         np.array_equal(logged[name], replayed[name], equal_nan=logged[name].dtype.kind == "f")
@@ -217,11 +223,13 @@ class _Evidence:
     have been used. Otherwise they are taken to be used when they were sent (at_once).
     """
 
-    def __init__(self, replayer: Replayer, node: int, most: int) -> None:
-        """Find the messages and the flow of information in the run for ``node`` (its id), with
-        searches for sets of up to ``most`` missing messages, by replays of the run.
+    def __init__(self, replayer: Replayer, node: int, max_missing: int) -> None:
+        """Find the messages of the run, and search for all paths on which information reached, or
+        with up to ``max_missing`` missing messages could have reached, ``node`` (its id).
+
+        ``replayer`` replays the run as it was and with all messages delivered.
         """
-        self._replayer, self._node, self._most = replayer, node, most
+        self._replayer, self._node, self._max_missing = replayer, node, max_missing
         self.scenario = replayer.scenario
         talks, links = self.scenario.node_filter.talks, self.scenario.topology.directions
         self._links = frozenset(links if talks else ())
@@ -237,7 +245,9 @@ class _Evidence:
         self._log = replayer.full_log if self.same_sends else replayer.log
         usable = full if self.same_sends else at_once(self.messages, self._log)
         self._flow: Flow = find_flow(self.scenario, self._log, usable, was_used)
-        self._reach: Reach = search_back(self._flow, node, most)
+        self._reach: Reach = search_back(self._flow, node, max_missing)
+        # The same search in the replay with all messages tells what the node could have had at
+        # best.
         full_flow = find_flow(self.scenario, replayer.full_log, full)
         self._full_search = replayer.full_log, search_back(full_flow, node)
         self.missing: dict[MessageKey, Missing] = {
@@ -248,7 +258,8 @@ class _Evidence:
     def candidates(self) -> list[Candidate]:
         """Return the messages that were not used in the run but from which information could have
         reached the node, each with the least number of such missing messages (itself and those that
-        pass its information on) that would have to come for that.
+        pass its information on) that would have to come for that. The smallest set is sought among
+        them.
         """
         candidates = []
         # The cost of a message is 1 if it was not used in the run, else 0.
@@ -260,26 +271,29 @@ class _Evidence:
         return candidates
 
     def sources(self) -> tuple[InformationSource, ...]:
-        """Return the information that had reached the node from every other node and its sensor."""
+        """Return what had reached the node from every other node, and from its own sensor: ages of
+        messages and readings, and what missing messages would have changed.
+        """
         scenario, at = self.scenario, self._replayer.at
         readings = KeptReadings(scenario, self._log, at)
+        # Newest information of each node with at most 0, 1, ... missing messages delivered.
         by_budget = [
             newest_information(self._reach, self._log, readings, budget)
-            for budget in range(self._most + 1)
+            for budget in range(self._max_missing + 1)
         ]
         log, reach = self._full_search
         without_losses = newest_information(reach, log, KeptReadings(scenario, log, at), 0)
         nodes = [n for n in scenario.nodes if n != self._node or n in scenario.placed_sensors]
         return tuple(
-            self._make_source(n, [b.get(n) for b in by_budget], without_losses.get(n))
+            self._make_source(n, [newest.get(n) for newest in by_budget], without_losses.get(n))
             for n in nodes
         )
 
     def _make_source(
         self, node: int, newest_by_budget: Sequence[Newest | None], without_losses: Newest | None
     ) -> InformationSource:
-        """Return the newest reading of ``node`` that the estimate has, and the missing messages
-        that would have brought a newer one.
+        """Return what the estimate has from ``node``: last message, newest reading and its route,
+        and the missing messages that would have brought a newer one.
 
         ``newest_by_budget`` is the newest information with 0, 1, ... missing messages delivered,
         ``without_losses`` that with all of them.
@@ -289,6 +303,7 @@ class _Evidence:
         path_nodes: tuple[int, ...] = ()
         if newest_by_budget[0] is not None:
             path_nodes = route(self._reach, newest_by_budget[0].segment, 0)
+        # The fewest missing messages with which a newer reading would have come, if any.
         budget = next((b for b, r in enumerate(with_more, 1) if _is_newer(r, reading)), None)
         missing: tuple[Missing, ...] = ()
         if budget is not None:
@@ -312,8 +327,9 @@ class _Evidence:
         )
 
     def _find_last_message(self, sender: int) -> tuple[int | None, int]:
-        """Return the index of the last used message from ``sender`` (its id), None without one, and
-        the number of those since that it has not used: lost, late, unused or still under way.
+        """Return the index of the last message that the node used of those that ``sender`` (an id)
+        sent to it, None without one, and the number of those sent since then that it did not use:
+        lost, late, replaced by another or still under way.
         """
         messages = self.messages
         direct = (messages.sender == sender) & (messages.receiver == self._node)
@@ -326,8 +342,8 @@ class _Evidence:
 
 
 def _time_known(newest: Newest | None) -> float:
-    """Return the last time in seconds up to which information is included, nan if it is to the end,
-    or without any.
+    """Return the last time in seconds up to which a node's information is included in the estimate;
+    nan if that is the end of the log, or if there is no information (None).
     """
     return math.nan if newest is None else newest.known
 
@@ -340,8 +356,8 @@ def _is_newer(reading: float, than: float) -> bool:
 
 
 def _describe_missing(messages: Messages, m: int) -> Missing:
-    """Return the outcome and the times (seconds) of message ``m``, its index, which did not arrive
-    in time.
+    """Return message ``m`` (its index), which was not used, as tables and texts name it: its ids
+    and number, why it was not used, and its times in seconds.
     """
     return Missing(
         messages.key(m),
@@ -354,8 +370,8 @@ def _describe_missing(messages: Messages, m: int) -> Missing:
 def _make_what_ifs(
     replayer: Replayer, sources: Sequence[InformationSource], smallest: SmallestSet | None
 ) -> tuple[tuple[WhatIf, ...], int]:
-    """Return the trace of P and the error in the run as it was and in its replays, and how many
-    replays with newer readings were left out because the run is long.
+    """Return the trace of P and the error in the run as it was and in replays with more messages
+    delivered, and how many replays with newer readings were left out because the run is long.
 
     Each replay delivers one set of messages that did not arrive in the run: those that would have
     brought newer readings of a node, all of these, the ``smallest`` set that brings the trace below
@@ -364,12 +380,13 @@ def _make_what_ifs(
     # Label and messages of each replay; None stands for every message.
     delivered_sets: list[tuple[str, tuple[MessageKey, ...] | None]] = [("as it was", ())]
     newer = _group_by_missing(sources)
-    # If there are too many, replay those that gain the most time; ``sorted`` is stable.
+    # If there are too many, replay those that make a reading newer by the most time; ``sorted`` is
+    # stable.
     count = _default_replays(len(replayer.log))
     replayed = set(sorted(newer, key=lambda keys: -max(map(_time_gained, newer[keys])))[:count])
-    for keys, gaining in newer.items():
+    for keys, sources_of_keys in newer.items():
         if keys in replayed:
-            nodes = ", ".join(str(source.node) for source in gaining)
+            nodes = ", ".join(str(source.node) for source in sources_of_keys)
             delivered_sets.append((f"newer readings of node {nodes}", keys))
     if len(newer) > 1:
         together = tuple(sorted({key for keys in newer for key in keys}))
@@ -389,8 +406,9 @@ def _make_what_ifs(
 def _group_by_missing(
     sources: Sequence[InformationSource],
 ) -> dict[tuple[MessageKey, ...], list[InformationSource]]:
-    """Return the sources grouped by the missing messages that would have made their readings newer,
-    the keys being tuples of these messages.
+    """Return the sources (nodes whose information reached the node) grouped by the missing messages
+    that would have brought newer readings of them: one replay serves a group. The keys are tuples
+    of these messages.
     """
     groups: dict[tuple[MessageKey, ...], list[InformationSource]] = {}
     for source in sources:
@@ -409,7 +427,9 @@ def _time_gained(source: InformationSource) -> float:
 
 
 def _replay_notes(evidence: _Evidence, left_out: int) -> tuple[str, ...]:
-    """Return notes on the limits of the replays, of which ``left_out`` were not made."""
+    """Return sentences for the user on the limits of the replays, of which ``left_out`` were not
+    made because the run is long.
+    """
     notes = []
     if left_out:
         notes.append(

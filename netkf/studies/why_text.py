@@ -20,9 +20,12 @@ MAX_ROWS, MAX_LISTED = 20, 4
 
 
 def source_table(explanation: Explanation) -> pd.DataFrame:
-    """Return a row for each source of an explanation: ages in seconds, nan if unknown."""
+    """Return a row for each source of an explanation (a node whose information could reach the
+    node that is asked about): times and ages in seconds, nan if unknown.
+    """
     import pandas as pd
 
+    # Ages are also known for 1, 2, ... ``budget`` more messages delivered.
     budget = len(explanation.sources[0].with_more) if explanation.sources else 0
     rows = [
         {
@@ -49,7 +52,9 @@ def source_table(explanation: Explanation) -> pd.DataFrame:
 
 
 def why_document(explanation: Explanation) -> dict[str, Any]:
-    """Return plain JSON values; what is unknown is None."""
+    """Return an explanation as plain JSON values, as ``netkf why --json`` prints them; what is
+    unknown is None.
+    """
     smallest = explanation.smallest
     document: dict[str, Any] = {
         "scenario": explanation.scenario,
@@ -96,8 +101,8 @@ def _message_entries(
 
 
 def _message_entry(explanation: Explanation, key: MessageKey) -> dict[str, Any]:
-    """Return the missing message ``key`` as an entry of the document: its ids, outcome, and times
-    in seconds.
+    """Return the message ``key``, which was not used in the run, as an entry of the JSON document:
+    its ids and number, why it was not used, and its times in seconds.
     """
     missing = explanation.missing[key]
     return {
@@ -134,7 +139,9 @@ def write_sentences(explanation: Explanation) -> list[str]:
 
 
 def _state_sentences(explanation: Explanation) -> Iterator[str]:
-    """Yield the sentence about the estimate: trace of P and error."""
+    """Yield the sentence about the estimate of the node at the time asked about: trace of P and
+    length of the error.
+    """
     run = f"seed {explanation.seed}, replica {explanation.replica}"
     scenario = shorten(explanation.scenario, 60)
     sentence = f"Node {explanation.node} at {explanation.at:g} s ({scenario}, {run})"
@@ -148,7 +155,9 @@ def _state_sentences(explanation: Explanation) -> Iterator[str]:
 
 
 def _heard_sentences(explanation: Explanation) -> Iterator[str]:
-    """Yield sentences about the neighbours that the node heard, and about lost messages."""
+    """Yield sentences about the neighbours from which the node has used a message, and when the
+    last ones were sent, and about messages since then that it has not used.
+    """
     neighbours = [s for s in explanation.sources if s.neighbour]
     if not neighbours:
         yield f"No other node sends to node {explanation.node}."
@@ -168,7 +177,9 @@ def _heard_sentences(explanation: Explanation) -> Iterator[str]:
 
 
 def _unheard_sentence(neighbours: list[InformationSource]) -> str:
-    """Return the sentence on the messages of neighbours that were not used since the last ones."""
+    """Return the sentence on the messages that ``neighbours`` sent since the last one that the node
+    used from each of them.
+    """
     unheard = sum(s.unheard for s in neighbours)
     counts = [f"{s.unheard} of node {s.node}" for s in neighbours if s.unheard]
     noun = "message" if unheard == 1 else "messages"
@@ -205,22 +216,28 @@ def _reading_sentences(explanation: Explanation) -> Iterator[str]:
 def _missed_reading_sentences(
     explanation: Explanation, sensors: list[InformationSource]
 ) -> Iterator[str]:
-    """Yield sentences about the messages that would have brought newer readings of ``sensors``."""
-    kept_away = [s for s in sensors if s.missing]
-    for source in kept_away[:MAX_LISTED]:
+    """Yield sentences about the missing messages that would have brought newer readings of
+    ``sensors``, nodes with sensors.
+    """
+    kept_from_newer = [s for s in sensors if s.missing]
+    for source in kept_from_newer[:MAX_LISTED]:
+        # with_more[k - 1]: time of the newest reading with k more messages.
         newest = source.with_more[len(source.missing) - 1]
         messages = _join_with_and([str(m) for m in source.missing])
         age = f"{explanation.at - newest:.4g} s old"
         yield f"A newer reading of node {source.node}, {age}, would have come with {messages}."
-    if len(kept_away) > MAX_LISTED:
-        others = len(kept_away) - MAX_LISTED
+    if len(kept_from_newer) > MAX_LISTED:
+        others = len(kept_from_newer) - MAX_LISTED
         yield f"Newer readings of {others} other nodes would have come too, with these or others."
-    if sensors and not kept_away:
+    if sensors and not kept_from_newer:
         yield "No newer reading was kept away by up to three messages that did not come."
 
 
 def _smallest_sentences(explanation: Explanation) -> Iterator[str]:
-    """Yield the sentences on the smallest set of messages that would have sufficed."""
+    """Yield the sentences on the smallest set of missing messages that would have brought trace P
+    down to the limit, or on why none was found; none if the filter gives no P.
+    """
+    # The last replay is the one in which no message is missing.
     smallest, no_losses = explanation.smallest, explanation.what_ifs[-1]
     if smallest is None:
         return
@@ -265,7 +282,9 @@ def _smallest_sentences(explanation: Explanation) -> Iterator[str]:
 
 
 def _format_limit(explanation: Explanation, smallest: SmallestSet) -> str:
-    """Return the limit on the trace as text, with its origin if it is the default one."""
+    """Return the limit that a set of messages had to bring trace P down to as text; the default
+    limit with its meaning, relative to the run in which no message is missing.
+    """
     usual = (1.0 + GOOD_ENOUGH) * explanation.what_ifs[-1].trace
     where = f", {1.0 + GOOD_ENOUGH:g} times that with no message missing"
     is_default = math.isclose(smallest.limit, usual, rel_tol=1e-9)
@@ -273,7 +292,9 @@ def _format_limit(explanation: Explanation, smallest: SmallestSet) -> str:
 
 
 def _describe_search(smallest: SmallestSet) -> str:
-    """Return the number of messages that the search considered, as text."""
+    """Return a text on the effort of the search for the smallest set: how many messages could have
+    mattered, how many of them it considered, and the number of replays.
+    """
     sentence = f"{smallest.candidates} messages could have mattered"
     if smallest.considered < smallest.candidates:
         if not smallest.considered:
@@ -284,12 +305,14 @@ def _describe_search(smallest: SmallestSet) -> str:
 
 
 def _source_table(explanation: Explanation) -> str:
-    """Return the table of sources: sensors and neighbours first."""
-    chosen = [
+    """Return the table of sources (nodes whose information could reach the node) for a terminal:
+    those with a sensor or a link to it; the others are only counted.
+    """
+    listed = [
         s for s in explanation.sources if s.sensor or s.neighbour or s.node == explanation.node
     ]
-    others = len(explanation.sources) - len(chosen)
-    budget = len(chosen[0].with_more) if chosen else 0
+    others = len(explanation.sources) - len(listed)
+    budget = len(listed[0].with_more) if listed else 0
     header = ["from", "last heard", "missed since", "newest reading", "age"]
     header += [f"+{k}" for k in range(1, budget + 1)] + ["none lost", "way"]
     rows = [
@@ -304,7 +327,7 @@ def _source_table(explanation: Explanation) -> str:
             ),
             _format_route(s),
         ]
-        for s in chosen
+        for s in listed
     ]
     text = format_table(header, shorten_rows(rows, MAX_ROWS), left_columns=1)
     other_text = f"\n{others} other nodes have no sensor and no link to it." if others else ""
@@ -315,7 +338,9 @@ def _source_table(explanation: Explanation) -> str:
 
 
 def _replay_table(explanation: Explanation) -> str:
-    """Return the table of replays."""
+    """Return the table of replays, runs repeated with some missing messages delivered: trace P, its
+    change, and the error if the truth is known.
+    """
     truth = any(math.isfinite(w.error) for w in explanation.what_ifs)
     header = ["replayed with", "messages", "trace P", "change", *(["error"] if truth else [])]
     rows = [
@@ -364,7 +389,9 @@ def _format_time_before(explanation: Explanation, seconds: float) -> str:
 
 
 def _format_route(source: InformationSource) -> str:
-    """Return the nodes on the way of a reading as text."""
+    """Return as text the nodes through which the newest reading of a source came, in the middle
+    shortened.
+    """
     if not source.route:
         return "-"
     if len(source.route) == 1:
