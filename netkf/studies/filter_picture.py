@@ -40,12 +40,12 @@ def filter_picture(scenario: Scenario, completed: CompletedComparison) -> None:
         panels[0].set_yticks(range(len(rows)), labels, parse_math=False)
         panels[0].invert_yaxis()
         runs = f"{completed.comparison.runs:,} runs on the same draws; bars: two standard errors."
-        finish_figure(figure, _claim(rows), [f"{scenario.name}: {runs}"])
+        finish_figure(figure, _make_title(rows), [f"{scenario.name}: {runs}"])
     write_figure(figure, completed.directory / "filters.png")
 
 
-def _claim(rows: list[ComparedFilter]) -> str:
-    """Return a sentence on the filter with the smallest RMS error."""
+def _make_title(rows: list[ComparedFilter]) -> str:
+    """Return the title of the figure, a sentence on the filter with the smallest RMS error."""
     finite_rows = [row for row in rows if math.isfinite(row.quantities["rms_error"].value)]
     if not finite_rows:
         return "No filter has a finite error"

@@ -47,9 +47,10 @@ def block_values(scenario: Scenario, seed: int, replicas: range, engine: Engine)
 
 def _batch_values(scenario: Scenario, batch: RunBatch) -> FilterValues:
     """Return squared error, largest error, NEES and whether it diverged, (R,) each, of the R runs
-    of a batch.
+    of a batch, for the comparison of filters run by run.
     """
     values = run_values(batch, scenario)
+    # (R, 3): squared error, trace of P and NEES, means over time and nodes.
     all_nodes_mean = values.averages[:, -1]
     largest = [
         _largest_error(batch, r, float(end)) for r, end in enumerate(values.rounding_from.tolist())
@@ -86,8 +87,8 @@ class Traffic(NamedTuple):
 
 
 def count_traffic(scenario: Scenario, seed: int, engine: Engine) -> Traffic:
-    """Return the traffic of replica 0 of the runs of ``seed``, with 8 bytes for each number of a
-    message.
+    """Simulate replica 0 of the runs of ``seed`` and return what its nodes send: the number of
+    transmissions (a broadcast counts once) and bytes, 8 for each number of a message.
     """
     log, slotted = simulate(scenario, seed, 0, engine).log, scenario.slotted
     sent = log[log["kind"] == CODES["send"]]
@@ -96,10 +97,12 @@ def count_traffic(scenario: Scenario, seed: int, engine: Engine) -> Traffic:
         sent = np.unique(sent[["t", "phase", "node"]])
     elif (log["kind"] == CODES["transmit"]).any():
         sent = log[log["kind"] == CODES["transmit"]]
+    # Number of readings of each node, which some filters send.
     rows = {
         node: sum(len(scenario.sensors[placed_sensor.entry].R) for placed_sensor in placed)
         for node, placed in scenario.placed_sensors.items()
     }
+    # The exchange of the slot, by which some filters send different things; -1 under clocks.
     phases = sent["phase"].tolist() if slotted else [-1] * len(sent)
     numbers = sum(
         scenario.node_filter.payload_numbers(scenario.plant.n, rows.get(node, 0), phase)
@@ -149,8 +152,8 @@ def estimate_quantities(
 
 
 def _influences(values: FilterValues, n: int) -> dict[str, tuple[float, FloatArray]]:
-    """Return each quantity with its influence values (R,), one for each of R runs of a scenario
-    with n states.
+    """Return each quantity (a function of means over runs) with its influence values (R,), the
+    linear contributions of R runs of a scenario with n states.
 
     The standard error of the quantity is that of the mean of its influence values, and paired
     differences of two filters follow from differences of these (delta method).
@@ -183,8 +186,9 @@ def _width(values: FloatArray, level: float) -> float:
 
 
 def credibility(values: FilterValues, n: int, level: float) -> str:
-    """Return "too sure", "too careful" or "consistent" by the interval of NEES / n, which misses
-    with probability ``level``, "-" where NEES is unknown or one run shows nothing.
+    """Return whether P fits the errors of a filter: "too sure", "too careful" or "consistent", as
+    the interval of NEES / n, which misses with probability ``level``, lies above, below or around
+    1; "-" where NEES is unknown or one run shows nothing.
     """
     ratios = values.nees / n
     mean, width = float(ratios.mean()), _width(ratios, level)

@@ -57,9 +57,10 @@ def block_metrics(scenario: Scenario, seed: int, replicas: range, engine: Engine
 
 
 def _batch_metrics(values: RunValues) -> RunMetrics:
-    """Return squared errors and traces of P (R, N) and counts of messages (R, 5) of R runs from
-    their averages.
+    """Return what sweeps and searches use of the ``values`` of the R runs of a batch: squared
+    errors and traces of P (R, N) of each node, and counts of messages (R, 5).
     """
+    # averages (R, N + 1, 3): squared error, trace of P, NEES; the last row is of all nodes.
     return RunMetrics(
         values.averages[:, :-1, 0],
         values.averages[:, :-1, 1],
@@ -75,8 +76,8 @@ def join_metrics(*parts: RunMetrics) -> RunMetrics:
 
 
 def expected_metrics(scenario: Scenario, seed: int, replica: int, engine: Engine) -> RunMetrics:
-    """Return the metrics of one ``replica`` of the runs of ``seed``, with the expected squared
-    error given its events.
+    """Simulate one ``replica`` of the runs of ``seed`` and return its metrics, in which the squared
+    error is replaced by its exact expectation given the events of the run.
 
     The conditional expectation removes the variance that the noises cause (Rao-Blackwell), so that
     far fewer runs are enough.
@@ -87,21 +88,30 @@ def expected_metrics(scenario: Scenario, seed: int, replica: int, engine: Engine
     square = time_average(scenario, _expected_squares(scenario, run))[None]
     trace = time_average(scenario, np.trace(run.P, axis1=2, axis2=3))[None]
     counts = np.array([[run.count(kind) for kind in KINDS]])
-    messages = count_messages(counts, scenario.slotted)
-    return RunMetrics(square, trace, messages, np.zeros((1, 1)), np.full((1, 1), np.inf))
+    return RunMetrics(
+        mean_square=square,
+        trace=trace,
+        messages=count_messages(counts, scenario.slotted),
+        diverged=np.zeros((1, 1)),
+        rounding_from=np.full((1, 1), np.inf),  # expectations do not suffer from rounding
+    )
 
 
 def _expected_squares(scenario: Scenario, run: Run) -> FloatArray:
-    """Return E|x - xhat_i|^2 (T, N) given the events of a run; raises TheoryError if not known."""
+    """Return E|x - xhat_i|^2 (T, N), the exact mean squared error of each node i given the events
+    of a run; raises TheoryError if theory does not know it for this scenario.
+    """
     if not scenario.slotted:
         return expected_squares(scenario, run)
     return np.asarray(np.trace(error_covariance(scenario, run), axis1=2, axis2=3))
 
 
 def expected_errors_known(scenario: Scenario) -> bool:
-    """Return True if ``expected_metrics`` exists and takes about the time of a few runs.
+    """Return True if ``expected_metrics``, the exact expected squared errors given the events of a
+    run, exist and take about the time of a few runs to compute.
 
-    In continuous time it does for the hybrid filter with increments and instant messages.
+    In continuous time they do for the hybrid filter with continuous readings (increments) and
+    messages without delay.
     """
     errors = len(scenario.nodes) * scenario.plant.n
     if not scenario.is_random or errors > (MAX_ERRORS if scenario.slotted else MAX_COUPLED):
@@ -158,10 +168,11 @@ def time_average(scenario: Scenario, values: FloatArray) -> FloatArray:
 
 
 def bound_traces(scenario: Scenario) -> FloatArray:
-    """Return the traces (N,) of the covariance bound, averaged over the samples after time 0.
+    """Return the traces (N,) of the bound on the mean of each node's P, averaged over the samples
+    after time 0.
 
-    The bound is that of H(12), or the covariance itself if nodes do not exchange anything. Raises
-    TheoryError if there is none.
+    In continuous time it is the bound of the hybrid paper, H equation (12); in slots the covariance
+    itself, if nodes do not exchange anything. Raises TheoryError if there is none.
     """
     if not scenario.slotted:
         bound = covariance_bound(scenario, scenario.times)
@@ -169,6 +180,7 @@ def bound_traces(scenario: Scenario) -> FloatArray:
     if scenario.filter.algorithm.talks:
         raise TheoryError("H(12) is about filters in continuous time")
     _require_fixed_H(scenario)
+    # A pooled filter has the readings of all nodes.
     pooled = scenario.filter.algorithm.pooled
     models = [scenario.pooled_slot_model] * len(scenario.nodes) if pooled else scenario.slot_models
     starts = [scenario.initial_estimate(node)[1] for node in scenario.nodes]
@@ -200,8 +212,8 @@ def _require_fixed_H(scenario: Scenario) -> None:
 
 
 def _slot_traces(scenario: Scenario, model: SlotModel, start: FloatArray) -> FloatArray:
-    """Return the traces (T,) of P at the T samples of a Kalman filter with ``model``, from P(0) =
-    ``start`` (n, n).
+    """Return the traces (T,) of P at the T samples of a Kalman filter in slots with ``model``, from
+    P(0) = ``start`` (n, n): of predictions if the scenario's filter predicts, else after updates.
     """
     predicts = scenario.filter.algorithm.predicts  # type: ignore[union-attr]
     # At most n rows with the same information: a central filter may read hundreds.

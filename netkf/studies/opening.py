@@ -80,6 +80,7 @@ def open(directory: str | Path, *, trust: bool = False) -> Stored:
         manifest = _read_manifest(folder)
         check_files(folder, manifest, ["scenario.toml"])
         scenario = load(folder / "scenario.toml", trust=trust)
+        # The manifest tells what wrote the directory: only sweeps have ``vary``, and so on.
         if "vary" in manifest:
             return _read_sweep(folder, scenario, manifest)
         if "filters" in manifest:
@@ -93,14 +94,18 @@ def open(directory: str | Path, *, trust: bool = False) -> Stored:
 
 
 def _read_manifest(folder: Path) -> dict[str, Any]:
-    """Return the manifest of a directory; raises DamagedError."""
+    """Return manifest.json of a directory, which tells what kind of results it holds; raises
+    DamagedError if it is missing or not as netkf writes it.
+    """
     if not folder.is_dir():
         raise DamagedError("it is no directory" if folder.exists() else "it does not exist")
     return read_checked_document(folder, "manifest.json", MANIFEST_FORM)
 
 
 def _read_sweep(folder: Path, scenario: Scenario, manifest: dict[str, Any]) -> StoredSweep:
-    """Return a sweep; one that was interrupted at once has a table without rows."""
+    """Return the sweep in a directory with its ``manifest``; one that was interrupted at once has a
+    table without rows. Raises DamagedError.
+    """
     import pandas as pd
 
     require_form(manifest["vary"], {}, "vary")

@@ -38,12 +38,14 @@ def parse_grid(settings: Sequence[str]) -> dict[str, list[Any]]:
 
 
 def _even_values(key: str, start: str, stop: str, count: str) -> list[Any]:
-    """Return the values of START:STOP:COUNT, whole numbers if all are whole."""
+    """Return ``count`` evenly spaced values from ``start`` to ``stop``, which are texts of the
+    command line; integers if all are whole and both ends were written so.
+    """
     try:
         low, high, number = float(start), float(stop), int(count)
         integers = [int(start), int(stop)]
     except ValueError:
-        integers = []
+        integers = []  # wrong texts are refused below
     if not _are_finite(start, stop) or not 2 <= int(count) <= MAX_POINTS:
         rule = f"range of {key} must be START:STOP:COUNT with two numbers and a count of at least 2"
         raise ScenarioError("--vary", rule, f"{start}:{stop}:{count}", "correct it")
@@ -62,7 +64,9 @@ def _are_finite(*texts: str) -> bool:
 
 
 def check_grid(grid: Any) -> dict[str, list[Any]]:
-    """Return the values of each key, at least one; raises ScenarioError at --vary."""
+    """Return the values of each key of a ``grid`` that a user gave, as lists with at least one
+    value; raises ScenarioError, which names --vary, for anything else or too many points.
+    """
     if not isinstance(grid, Mapping) or not grid:
         raise ScenarioError("--vary", "needs a key with its values", grid or None, "KEY=V1,V2,...")
     values_by_key = {}
@@ -90,7 +94,8 @@ class GridPoint(NamedTuple):
 
 
 def expand_grid(scenario: Scenario, grid: Mapping[str, Sequence[Any]]) -> list[GridPoint]:
-    """Return all points, the last key running fastest; raises ScenarioError for a bad value.
+    """Return all points of a grid, each with its values of the keys and the scenario that has them,
+    the last key running fastest; raises ScenarioError for a bad value.
 
     ``grid`` has the values of each key that is varied, by the key's path such as
     ``network.activation.rate``.
@@ -117,7 +122,9 @@ def table_value(value: Any) -> Any:
 
 
 def parse_interval(setting: str) -> tuple[str, float | int, float | int]:
-    """Return the key and the ends of ``key.path=LOW:HIGH``; raises ScenarioError at --vary."""
+    """Return the key and the ends, integers if written so, of the text ``key.path=LOW:HIGH`` of the
+    command line; raises ScenarioError, which names --vary.
+    """
     key, text = split_setting("--vary", setting)
     low, colon, high = text.partition(":")
     if not colon or not _are_finite(low, high):
@@ -134,6 +141,7 @@ def is_integer_key(scenario: Scenario, key: str) -> bool:
     Raises ScenarioError at --vary if it is neither.
     """
     value: Any = resolve_defaults(scenario)
+    # Follow the path, such as sensors[0].R, through tables and lists.
     for name in key.replace("[", ".").replace("]", "").split("."):
         try:
             value = value[int(name)] if isinstance(value, (list, tuple)) else value[name]

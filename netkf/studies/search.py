@@ -140,29 +140,33 @@ class SimulationPlan:
 
 
 def decide_by_theory(problem: SizingProblem, value: float) -> Probe:
-    """Return the probe of a value from a bound or an exact quantity."""
+    """Return the result (probe) of trying a ``value`` of the key by theory, which gives the
+    quantity of the target exactly or an upper bound on it.
+    """
     scenario, target = problem.at(value), problem.target
     quantity, _ = quantity_by_theory(scenario, target)
     reached = quantity <= target.limit
     if theory_is_exact(scenario, target):
         state = REACHED if reached else MISSED
         return Probe(value, quantity, quantity, quantity, 0, state, EXACT)
+    # The quantity lies between 0 and the bound.
     return Probe(value, quantity, 0.0, quantity, 0, REACHED if reached else NOT_SHOWN, BOUND)
 
 
 def decide_by_both(problem: SizingProblem, plan: SimulationPlan, value: float) -> Probe:
-    """Return the probe of a ``value`` of the key from a bound if that reaches the target, else by
-    simulation as planned.
+    """Return the result (probe) of trying a ``value`` of the key: by theory if its upper bound
+    shows that the target is reached, else by simulation as planned.
     """
     bound = decide_by_theory(problem, value)
     return decide_by_simulation(problem, plan, value) if bound.target == NOT_SHOWN else bound
 
 
 def decide_by_simulation(problem: SizingProblem, plan: SimulationPlan, value: float) -> Probe:
-    """Return the probe of a ``value`` of the key from simulations as planned: the number of runs is
-    doubled until the interval of the quantity is on one side of the limit.
+    """Return the result (probe) of trying a ``value`` of the key by simulations as planned: the
+    number of runs is doubled until the interval of the quantity is on one side of the limit.
     """
     scenario, target = problem.at(value), problem.target
+    # This target divides by the trace of P of a filter with all readings.
     central = central_trace(scenario) if target.quantity == "within_central" else None
     simulated, metrics = 0, []
     if plan.progress is not None:
@@ -200,12 +204,13 @@ def _is_futile(probe: Probe, target: Target, runs: int) -> bool:
 
 
 def _runs_to_decide(probe: Probe, target: Target) -> float:
-    """Return the forecast number of runs that decide a value, if its estimate is right; nan if
-    unknown.
+    """Return the forecast number of runs after which the interval of a ``probe`` (a tried value of
+    the key) no longer contains the limit, if its estimate is right; nan if unknown.
     """
     width, distance = 0.5 * (probe.high - probe.low), abs(probe.quantity - target.limit)
     if not math.isfinite(width):
         return math.nan
+    # Widths fall with the root of the number of runs.
     return 1.1 * probe.runs * (width / distance) ** 2 if distance > 0.0 else math.inf
 
 
@@ -218,13 +223,15 @@ class Search:
         self.probes: list[Probe] = []
 
     def run(self, low: float, high: float, confidence: float, quantity: str) -> Sizing:
-        """Search between the values ``low`` and ``high`` of the key and return the result.
+        """Try values of the key between ``low`` and ``high``, by bisection, and return the smallest
+        (or largest) one that reaches the target, with all that were tried.
 
         All decisions together hold with probability ``confidence``; ``quantity`` describes the
         quantity.
         """
         first, last = self._probe(low), self._probe(high)
         grows = self._detect_growth(first, last)
+        # The end at which the quantity is smaller should reach the target, the other may not.
         good, bad = (first, last) if grows else (last, first)
         value: float | None = None
         misses: float | None = None
@@ -252,14 +259,16 @@ class Search:
         )
 
     def _detect_growth(self, first: Probe, last: Probe) -> bool:
-        """Return True if the quantity grows with the key; bounds are compared with bounds only."""
+        """Return True if the quantity grows with the key from the probe ``first``, the lower end of
+        the range, to ``last``; upper bounds are compared with upper bounds only.
+        """
         if BOUND in (first.by, last.by) and first.by != last.by:
             first, last = (decide_by_theory(self._problem, end.value) for end in (first, last))
         return last.quantity > first.quantity
 
     def _bisect(self, value: float, misses: float) -> tuple[float, float]:
-        """Return two neighbouring values, of which the first reaches the target and the second does
-        not, from two such values, ``value`` and ``misses``, further apart.
+        """Return two neighbouring values of the key, of which the first reaches the target and the
+        second does not, from two such values, ``value`` and ``misses``, further apart.
         """
         while len(self.probes) < MAX_PROBES[self._problem.by]:
             middle = self._value_between(*sorted((value, misses)))
@@ -282,8 +291,8 @@ class Search:
         return self.probes[-1]
 
     def _value_between(self, low: float, high: float) -> float | None:
-        """Return a value between ``low`` and ``high``, an integer or rounded to DIGITS; None if
-        there is none.
+        """Return the value of the key to try next between ``low`` and ``high``, an integer or
+        rounded to DIGITS significant digits; None if there is none between them.
         """
         if self._problem.integer:
             middle = (low + high) // 2
@@ -302,7 +311,8 @@ def advise(
     misses: float | None,
     grows: bool,
 ) -> str:
-    """Return advice on range and runs of the next search, empty if this one was conclusive.
+    """Return a text that advises the user on range and number of runs of a next search; empty if
+    this one, with its ``probes`` (values that were tried), was conclusive.
 
     ``value`` is the last value of the key that reaches the target and ``misses`` the first that
     does not, None if there is none; ``grows`` says that the quantity grows with the key.
@@ -324,8 +334,9 @@ def advise(
 
 
 def _advise_beyond(problem: SizingProblem, end: Probe, inner: Probe, grows: bool) -> str:
-    """Return advice on a range beyond the probe ``end``, extrapolated from it and the next one,
-    ``inner``; an empty string if their quantities are not positive and finite.
+    """Return a text that advises on a range beyond the probe ``end``, at which the target was not
+    reached, extrapolated from it and the next one, ``inner``; empty if their quantities are not
+    positive and finite.
 
     ``grows`` says that the quantity grows with the key.
     """
@@ -333,8 +344,10 @@ def _advise_beyond(problem: SizingProblem, end: Probe, inner: Probe, grows: bool
     numbers = (end.value, inner.value, end.quantity, inner.quantity)
     if not all(math.isfinite(x) and x > 0.0 for x in numbers) or end.value == inner.value:
         return ""
+    # quantity ~ key^power, so that the limit is at end.value exp(needed).
     power = math.log(end.quantity / inner.quantity) / math.log(end.value / inner.value)
     needed = math.log(problem.target.limit / end.quantity) / power if power else math.inf
+    # The quantity falls towards smaller keys if it grows with the key.
     is_outside = (needed < 0.0) if grows else (needed > 0.0)
     if is_outside and abs(needed) <= math.log(MAX_EXTRAPOLATION):
         return _advise_range(problem, end.value, end.value * math.exp(MARGIN * needed))
@@ -345,7 +358,9 @@ def _advise_beyond(problem: SizingProblem, end: Probe, inner: Probe, grows: bool
 
 
 def _advise_range(problem: SizingProblem, end: float, next_end: float) -> str:
-    """Return the advice to search between ``end`` and ``next_end``, or why that is impossible."""
+    """Return the text that advises to search between the values ``end`` and ``next_end`` of the
+    key, or why that is impossible; empty if there is nothing to advise.
+    """
     if end == 0.0:
         return ""
     next_end = round(next_end) if problem.integer else float(f"{next_end:.2g}")
@@ -370,8 +385,8 @@ def _advise_runs(probe: Probe, target: Target) -> str:
 def _describe_certainty(
     probes: tuple[Probe, ...], confidence: float, grows: bool, none_reached: bool
 ) -> str:
-    """Return a sentence on the certainty of the answer, which holds with probability
-    ``confidence``, and its assumptions.
+    """Return a sentence for the user on how certain the answer of a search is, all of whose
+    decisions hold with probability ``confidence``, and what it assumes.
 
     ``grows`` says that the quantity grows with the key, ``none_reached`` that no probe reaches the
     target.

@@ -111,8 +111,8 @@ def size(
 
 
 def _describe_quantity(problem: SizingProblem, low: float, simulated: str) -> str:
-    """Return the description ``simulated`` of the simulated quantity, after that of the bound that
-    is tried first, if any.
+    """Return the text that tells the user what number is compared with the limit: ``simulated``
+    describes the simulated one; a bound that is tried first is put before it.
 
     ``low`` is the value of the key at which the bound is described.
     """
@@ -123,12 +123,13 @@ def _describe_quantity(problem: SizingProblem, low: float, simulated: str) -> st
 
 
 def _choose_task(problem: SizingProblem, low: float, engine: Engine) -> tuple[BlockTask, str, int]:
-    """Return the task to simulate, a description of its quantity, and the runs before the first
-    decision.
+    """Return the task that simulates a block of replicas for a probe of the key, a description of
+    the quantity that it gives, and the number of runs before the first decision.
 
     ``low`` is the lower end of the range, at which it is tried whether expected errors are known.
     """
     quantity = f"{QUANTITIES[problem.target.quantity]}, over the runs"
+    # Expected squared errors vary less from run to run than squared errors: fewer runs suffice.
     if problem.target.of_errors and expected_errors_known(problem.at(low)):
         task = partial(expected_metrics, engine=engine)
         exact = ", each with its exact expected squared error given its events"
@@ -142,8 +143,8 @@ def _count_looks(runs: int, first: int) -> int:
 
 
 def _check_range(scenario: Scenario, key: str, low: float, high: float) -> bool:
-    """Return True if the ``key`` is an integer; raises ScenarioError for a range ``low`` ..
-    ``high`` that does not fit it, or a wrong key.
+    """Return True if the ``key`` to search has integers as values, False if it has other numbers;
+    raises ScenarioError for a range ``low`` .. ``high`` that does not fit it, or a wrong key.
     """
     is_integer = is_integer_key(scenario, key)
     for end in (low, high):
@@ -159,8 +160,9 @@ def _check_range(scenario: Scenario, key: str, low: float, high: float) -> bool:
 
 
 def _choose_method(scenario: Scenario, key: str, ends: tuple[float, float], target: Target) -> str:
-    """Return "theory" if theory gives the target's quantity exactly at both ``ends`` of the range
-    of ``key``, "both" if it gives a bound, else "simulation".
+    """Return how values of ``key`` are compared with the target if the user does not say: "theory"
+    if theory gives the target's quantity exactly at both ``ends`` of the range, "both" (theory,
+    then simulation) if it gives an upper bound, else "simulation".
     """
     scenarios = [scenario.replace({key: end}) for end in ends]
     try:

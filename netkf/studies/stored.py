@@ -54,8 +54,9 @@ class StoredComparison(FilterComparison):
 
 
 def read_comparison(directory: Path, base: Scenario, manifest: dict[str, Any]) -> StoredComparison:
-    """Return the comparison of filters in a directory, whose manifest has passed that of runs;
-    raises DamagedError.
+    """Return the comparison that ``netkf compare-filters`` left in a directory; the caller has
+    checked that the ``manifest`` has the keys of those of runs. ``base`` is the scenario that the
+    filters ran in. Raises DamagedError for files that are not as netkf writes them.
     """
     require_form(manifest, COMPARISON)
     _require_confidence(manifest)
@@ -85,7 +86,7 @@ def read_comparison(directory: Path, base: Scenario, manifest: dict[str, Any]) -
 
 
 def _read_filter(row: dict[str, Any]) -> ComparedFilter:
-    """Return a filter of a comparison from its row in the table."""
+    """Return a filter of a comparison from its row in the stored table, by column names."""
     quantities = {
         key: Quantity(row[key], *(row[f"{key}_{part}"] for part in PARTS)) for key in QUANTITIES
     }
@@ -152,7 +153,8 @@ class StoredVerdict(NotebookTable):
 
 
 def read_verdict(directory: Path, trust: bool = False) -> StoredVerdict:
-    """Return the verdict in a directory; raises DamagedError, or ScenarioError for its scenario.
+    """Return the verdict that ``netkf check`` left in a directory: whether runs kept what theory
+    promises. Raises DamagedError, or ScenarioError for its scenario.
 
     With ``trust`` classes that the scenario names are also imported from that directory and the
     current folder.

@@ -137,8 +137,8 @@ def _simulate_points(
 
 
 def _make_row(point: GridPoint, metrics: RunMetrics) -> Row:
-    """Return the row of a grid point, as ``netkf.sweep`` documents it, from the metrics of its
-    runs.
+    """Return the row of a grid point in the table of a sweep: the varied values, means over the
+    runs with standard errors, bounds by theory (nan without one), messages and status.
     """
     quantities: dict[str, MeanEstimate] = {
         "worst_rms": square_root_of(worst_node(metrics.mean_square)),
@@ -159,7 +159,9 @@ def _make_row(point: GridPoint, metrics: RunMetrics) -> Row:
 
 
 def _describe_status(scenario: Scenario, metrics: RunMetrics) -> str:
-    """Return a note on divergence and rounding for the table."""
+    """Return the ``status`` of a grid point in the table: "complete" or how many runs diverged, and
+    from when on rounding blurs errors, which are left out then.
+    """
     diverged = int(metrics.diverged.sum())
     status = f"{diverged} diverged" if diverged else "complete"
     blurred = float(metrics.rounding_from.min())
@@ -218,6 +220,7 @@ def sweep_to_directory(
         for row in _simulate_points(plan, pool, progress):
             rows.append(row)  # noqa: PERF402 - an interrupted sweep keeps its rows
         status = "complete"
+    # Whatever happens, the rows so far and the status are written.
     except KeyboardInterrupt:
         raise InterruptedRunError(directory) from None
     except Exception:

@@ -23,7 +23,9 @@ MAX_LENGTH = 30  # characters of a cell
 
 
 def format_sweep(lines: pd.DataFrame, keys: Sequence[str]) -> str:
-    """Return the table of a sweep, one row per point; of long tables the ends."""
+    """Return the table of a sweep (``lines``, one for each point of the grid) for a terminal, with
+    the values of the varied ``keys``; of long tables the first and last rows.
+    """
     header = [*keys, *(name.replace("_", " ") for name in COLUMNS), "messages", "status"]
     rows = [
         [
@@ -49,7 +51,9 @@ def _format_with_error(value: float | None, error: float | None) -> str:
 
 
 def format_sizing(sizing: Sizing) -> str:
-    """Return the values that were tried, the answer, and how sure it is."""
+    """Return the result of ``netkf.size`` for a terminal: a table of the values of the key that
+    were tried, the answer, how sure it is, and what to do next.
+    """
     header = [sizing.key, sizing.target.quantity, "at least", "at most", "runs", "target", "by"]
     rows = [
         [
@@ -63,7 +67,7 @@ def format_sizing(sizing: Sizing) -> str:
         ]
         for p in sorted(sizing.probes)
     ]
-    if sizing.by == "theory":
+    if sizing.by == "theory":  # no runs, no intervals
         header = [header[0], f"{sizing.target.quantity} ({sizing.probes[0].by})", header[-2]]
         rows = [[f"{p.value:g}", f"{p.quantity:.7g}", p.target] for p in sorted(sizing.probes)]
     lines = [format_table(header, rows), ""]
@@ -102,7 +106,9 @@ def format_answer(sizing: Sizing) -> str:
 
 
 def format_consistency(consistency: Consistency) -> str:
-    """Return one row per node, and a legend of the columns."""
+    """Return the result of ``netkf.consistency`` for a terminal: one row per node with NEES and NIS
+    beside their expected values, and a legend of the columns.
+    """
     header = ["node", "NEES", "should be", "inside", "NIS", "should be", "verdict"]
     rows = [
         [
@@ -133,7 +139,9 @@ def format_consistency(consistency: Consistency) -> str:
 
 
 def format_filters(comparison: FilterComparison) -> str:
-    """Return one row per filter, reasons of those that cannot run, and a legend of the columns."""
+    """Return the result of ``netkf.compare_filters`` for a terminal: one row per filter, reasons of
+    those that cannot run, and a legend of the columns.
+    """
     header = ["filter", "RMS error", "difference", "worst instant", "difference", "NEES / n"]
     header += ["difference", "consistency", "transmissions", "kB"]
     ran = [row for row in comparison.rows if row.ran]
@@ -165,7 +173,9 @@ def format_filters(comparison: FilterComparison) -> str:
 
 
 def _format_quantity(cells: Quantity) -> tuple[str, str]:
-    """Return the value with its standard error, and the difference with half its interval."""
+    """Return the texts of two cells: the value with its standard error, and the difference from the
+    first filter with half its interval, starred if the interval excludes 0.
+    """
     difference = "-"
     if math.isfinite(cells.difference):
         width = 0.5 * (cells.high - cells.low)
@@ -176,7 +186,9 @@ def _format_quantity(cells: Quantity) -> tuple[str, str]:
 
 
 def format_comparison(comparison: Comparison) -> str:
-    """Return directories side by side; a star marks significant differences from the first."""
+    """Return the result of ``netkf.compare`` for a terminal: finished runs side by side; a star
+    marks significant differences from the first.
+    """
     numbered = [f"({k + 1})" for k in range(len(comparison.directories))]
     lines = [
         f"{mark} {shorten(directory)}: {shorten(name)}, {runs:,} run{'s' if runs > 1 else ''}"

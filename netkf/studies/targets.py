@@ -53,7 +53,9 @@ class QuantityInterval(NamedTuple):
 
 
 def parse_target(text: Any) -> Target:
-    """Return the target of a text like ``worst_rms<=0.5``; raises ScenarioError at --target."""
+    """Return the target, a quantity and its upper limit, of a text like ``worst_rms<=0.5``; raises
+    ScenarioError, which names --target, for any other text.
+    """
     match = re.fullmatch(r"\s*(\w+)\s*<=\s*(\S+)\s*", text) if isinstance(text, str) else None
     listed = ", ".join(QUANTITIES)
     if match is None or match[1] not in QUANTITIES:
@@ -69,11 +71,13 @@ def parse_target(text: Any) -> Target:
 
 
 def quantity_by_theory(scenario: Scenario, target: Target) -> tuple[float, str]:
-    """Return an upper bound on the quantity, or the quantity itself, and a text that says which.
+    """Return an upper bound on the quantity of the target, or the quantity itself, for ``scenario``
+    without simulation, and a text for the user that says which of the two it is, and why.
 
     Raises TheoryError if theory has no answer.
     """
     traces, algorithm = bound_traces(scenario), scenario.filter.algorithm
+    # Without exchange the bound of bound_traces() is the covariance itself.
     message = "exact: the covariance of filters that do not talk"
     if algorithm.talks:
         message = "an upper bound: the trace of H(12), which E[P_i] stays below"
@@ -120,22 +124,24 @@ def _explain_errors(scenario: Scenario) -> str:
 def quantity_by_simulation(
     metrics: RunMetrics, target: Target, level: float, central: float | None
 ) -> QuantityInterval:
-    """Return the quantity with an interval that misses the truth with probability ``level``.
+    """Return the quantity of the target over the runs of ``metrics``, with an interval that misses
+    its true value with probability ``level``.
 
     The interval is Student's, simultaneous for all nodes (Bonferroni) if the target is about the
-    worst node. ``central`` is the trace of the centralised filter to divide by, or None.
+    worst node. ``central`` is the trace of P of the centralised filter to divide by, or None.
     """
     values = metrics.mean_square if target.of_errors else metrics.trace
     if (np.isnan(values) & ~(metrics.diverged > 0)).any():
         # Rounding hides the errors of some run: nothing can be decided.
         return QuantityInterval(math.nan, -math.inf, math.inf)
-    values = np.where(metrics.diverged > 0, np.inf, values)
+    values = np.where(metrics.diverged > 0, np.inf, values)  # a run that diverged is the worst
     columns = values if target.of_worst else values.mean(axis=1, keepdims=True)
     runs, count = columns.shape
     with np.errstate(over="ignore", invalid="ignore"):
         mean = columns.mean(axis=0)
         error = columns.std(axis=0, ddof=1) / math.sqrt(runs)
     width = float(scipy.special.stdtrit(runs - 1, 1.0 - level / (2.0 * count))) * error
+    # Estimate, lower and upper end of the worst column.
     ends = np.array([mean.max(), (mean - width).max(), (mean + width).max()])
     if central is not None:
         ends /= central
