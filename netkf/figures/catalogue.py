@@ -92,11 +92,13 @@ class FigureSet:
                 return message_figure(*self._explain(name, str(unavailable)))
 
     def _explain(self, name: str, reason: str) -> tuple[str, str, list[str]]:
-        """Return title, message and caption of a figure that cannot be drawn for this reason."""
-        claim = f"No {name.upper() if name in ACRONYMS else name} to show"
+        """Return title, message and caption of the picture that stands for figure ``name``, which
+        cannot be drawn for this ``reason``.
+        """
+        headline = f"No {name.upper() if name in ACRONYMS else name} to show"
         if self._data is None:
-            return claim, reason, [f"{self._sweep.scenario.name}, a sweep."]
-        return self._data.title(claim), reason, self._data.caption()
+            return headline, reason, [f"{self._sweep.scenario.name}, a sweep."]
+        return self._data.title(headline), reason, self._data.caption()
 
 
 def plot_to_files(result: Any, names: tuple[str, ...], out: Path, file_format: str) -> list[Path]:
@@ -114,6 +116,7 @@ def plot_to_files(result: Any, names: tuple[str, ...], out: Path, file_format: s
     if is_file and len(names) > 1:
         rule, remedy = "is one file for several figures", "name a directory, or one --figure"
         raise ScenarioError("--out", rule, str(out), remedy)
+    # All are drawn before the first is written: unknown names leave no files.
     figures = {name: figure_set.draw(name, omit_slow=omit_slow) for name in names}
     paths = {name: out if is_file else out / f"{name}.{file_format}" for name in names}
     for name, figure in figures.items():

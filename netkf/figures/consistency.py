@@ -57,22 +57,24 @@ def nees_figure(data: FigureData) -> Picture:
     note = f"Band: chi-square with {data.runs * n:,} degrees of freedom{divisor}."
     finish_figure(
         figure,
-        data.title(_nees_claim(inside, float(values.mean()), n)),
+        data.title(_nees_headline(inside, float(values.mean()), n)),
         data.caption(note, notes="nees"),
     )
     return figure
 
 
-def _nees_claim(inside: float, mean: float, n: int) -> str:
-    """Return a sentence on the share of samples ``inside`` the band and on their ``mean``, for n
-    states.
+def _nees_headline(inside: float, mean: float, n: int) -> str:
+    """Return the headline of the figure: a sentence on the share of samples whose NEES is
+    ``inside`` the interval that holds if P is exact, and on their ``mean``, for n states.
     """
-    claim = f"{inside:.0%} of the samples lie in the {CONFIDENCE:.0%} band of NEES"
-    return f"{claim}; their mean is {mean:.3g} where exact covariances give {n}"
+    headline = f"{inside:.0%} of the samples lie in the {CONFIDENCE:.0%} band of NEES"
+    return f"{headline}; their mean is {mean:.3g} where exact covariances give {n}"
 
 
 def require_innovations(data: FigureData) -> Innovations:
-    """Return the innovations of a run; raises UnavailableError if there are none."""
+    """Return the innovations of a run, for which it is replayed; raises UnavailableError, with the
+    reason for the reader of the figure, if there are none.
+    """
     if data.run is None:
         raise UnavailableError(
             "Only single runs have innovations: draw netkf.open(DIR).replica(0)."
@@ -86,7 +88,8 @@ def require_innovations(data: FigureData) -> Innovations:
 
 
 def nis_figure(data: FigureData) -> Picture:
-    """Draw the NIS of the readings over time with the interval of its means.
+    """Draw the NIS (squared innovations in units of their covariances) of the readings over time,
+    with the interval of its means if P is exact.
 
     Raises UnavailableError if there are no innovations.
     """
@@ -94,16 +97,17 @@ def nis_figure(data: FigureData) -> Picture:
     figure = new_figure(7.4, 4.2)
     share, mean = draw_nis(figure.add_subplot(), innovations)
     count = len(innovations.nis)
-    claim = f"NIS per row of a reading is {mean:.3g} where exact covariances give 1; "
-    claim += f"{share:.0%} of {count:,} readings lie in their {CONFIDENCE:.0%} interval"
+    headline = f"NIS per row of a reading is {mean:.3g} where exact covariances give 1; "
+    headline += f"{share:.0%} of {count:,} readings lie in their {CONFIDENCE:.0%} interval"
     note = "Dots: single readings; line: means of bins, with the interval of each if P is exact."
-    finish_figure(figure, data.title(claim), data.caption(note))
+    finish_figure(figure, data.title(headline), data.caption(note))
     return figure
 
 
 def draw_nis(axes: Any, innovations: Innovations) -> tuple[float, float]:
-    """Draw NIS divided by its degrees of freedom over time, reading by reading and as means of
-    bins; return the share of readings in their interval and the mean.
+    """Draw NIS (the squared innovation in units of its covariance) divided by its degrees of
+    freedom over time, reading by reading and as means over bins of time; return the share of
+    readings in the interval that holds if P is exact, and the mean.
     """
     finite = np.isfinite(innovations.nis)
     times, nis = innovations.times[finite], innovations.nis[finite]
@@ -153,6 +157,7 @@ def whiteness_figure(data: FigureData) -> Picture:
     if not curves:
         raise UnavailableError(f"No node has {MIN_READINGS} readings of one kind.")
     smallest, lags = min(counts.values()), len(next(iter(curves.values())))
+    # ``curves``: for each node the autocorrelations (lags,); ``counts``: its numbers of readings.
     # An autocorrelation of white noise has a standard deviation of about 1 / sqrt(count).
     band = NORMAL_QUANTILE / np.sqrt(smallest)
     outside = sum(
@@ -164,12 +169,12 @@ def whiteness_figure(data: FigureData) -> Picture:
     axes = figure.add_subplot()
     _draw_correlations(axes, curves, worst, band, lags)
     share = outside / (lags * len(curves))
-    verdict = (
+    judgement = (
         "as expected of white noise" if share <= WHITE_SHARE else "so innovations are not white"
     )
-    claim = f"{share:.0%} of autocorrelations are outside their 95% band, {verdict}"
+    headline = f"{share:.0%} of autocorrelations are outside their 95% band, {judgement}"
     note = f"Band: 1.96 / root of {smallest:,}, the fewest readings of a node. Lags count readings."
-    finish_figure(figure, data.title(claim), data.caption(note))
+    finish_figure(figure, data.title(headline), data.caption(note))
     return figure
 
 

@@ -32,8 +32,9 @@ MAX_ROWS = 60  # nodes whose labels still fit beside each other
 
 
 def error_figure(data: FigureData) -> Picture:
-    """Draw the errors, and below them the roots of trace P, over time with the bound; without
-    ground truth the estimates and the NIS.
+    """Draw the errors, and below them the roots of trace P, over time, with the bound that theory
+    gives on trace P; without ground truth the estimates and the NIS (squared innovations in units
+    of their covariances).
 
     Raises UnavailableError without samples.
     """
@@ -47,7 +48,7 @@ def error_figure(data: FigureData) -> Picture:
         sentences = _interval_notes(data)
     else:
         sentences = _draw_innovations(lower, data)
-    finish_figure(figure, data.title(bound_claim(data)), data.caption(*sentences, notes="bound"))
+    finish_figure(figure, data.title(bound_headline(data)), data.caption(*sentences, notes="bound"))
     return figure
 
 
@@ -61,7 +62,9 @@ def _interval_notes(data: FigureData) -> list[str]:
 
 
 def _draw_innovations(axes: Any, data: FigureData) -> list[str]:
-    """Draw the NIS, or the reason why there is none, and return the sentences of the caption."""
+    """Draw the NIS (squared innovations in units of their covariances), for scenarios without
+    ground truth, or the reason why there is none; return the sentences of the caption.
+    """
     try:
         innovations = require_innovations(data)
     except UnavailableError as error:
@@ -71,21 +74,22 @@ def _draw_innovations(axes: Any, data: FigureData) -> list[str]:
     return ["There is no ground truth: readings are compared with their predictions (NIS)."]
 
 
-def bound_claim(data: FigureData) -> str:
-    """Return a sentence on how many nodes stay below the bound; without a bound on the range of the
-    errors.
+def bound_headline(data: FigureData) -> str:
+    """Return the headline of a figure: a sentence on how many nodes have a trace P below the bound
+    that theory gives, or without a bound on the range of the errors.
     """
     rows = [row for row in data.node_averages if _is_known(row.get("ratio"))]
     if rows:
-        return (_mean_claim if data.runs > 1 else _run_claim)(rows)
+        return (_mean_headline if data.runs > 1 else _one_run_headline)(rows)
     if data.shows_errors:
-        return _size_claim(data)
+        return _error_range_headline(data)
     return "Without ground truth: the estimates of the nodes and their innovations"
 
 
-def _run_claim(rows: list[dict[str, Any]]) -> str:
-    """Return a sentence on how many nodes of one run have a trace P below the bound, from their
-    averages. It is no verdict, because the bound is on the mean over runs.
+def _one_run_headline(rows: list[dict[str, Any]]) -> str:
+    """Return the headline of one run: how many nodes have a trace P below the bound, from their
+    averages over time (``ratio`` is that of trace P to the bound). It does not say whether the
+    bound holds, because that is on the mean over runs.
     """
     below, count = sum(row["ratio"] <= 1.0 for row in rows), len(rows)
     if count == 1:
@@ -93,9 +97,9 @@ def _run_claim(rows: list[dict[str, Any]]) -> str:
     return f"In this run {below} of {count} nodes claim no more than the bound"
 
 
-def _mean_claim(rows: list[dict[str, Any]]) -> str:
-    """Return a sentence on how many nodes have a mean trace P below or above the bound, by the 95%
-    intervals of the ratios in the averages ``rows``.
+def _mean_headline(rows: list[dict[str, Any]]) -> str:
+    """Return the headline of an ensemble: how many nodes have a mean trace P below or above the
+    bound, by the 95% intervals of the ``ratio`` of the two in ``rows``, the averages of each node.
     """
     margins = [NORMAL_QUANTILE * _known_or_zero(row.get("ratio_se")) for row in rows]
     above = sum(row["ratio"] - m > 1.0 for row, m in zip(rows, margins, strict=True))
@@ -109,8 +113,8 @@ def _mean_claim(rows: list[dict[str, Any]]) -> str:
     return f"{below} of {count} nodes stay below the bound in the mean, the others are undecided"
 
 
-def _size_claim(data: FigureData) -> str:
-    """Return a sentence on the range of the nodes' RMS errors."""
+def _error_range_headline(data: FigureData) -> str:
+    """Return the headline of a figure without a bound: the range of the nodes' RMS errors."""
     values = [row["rms_error"] for row in data.node_averages if _is_known(row.get("rms_error"))]
     if not values:
         return "The errors of the nodes over time"
@@ -157,22 +161,22 @@ def quantiles_figure(data: FigureData) -> Picture:
     largest = np.nanmax(values, axis=1)
     axes.plot(times, largest, color=SENSING, ls="--", lw=1.1, label="worst node")
     name = "error" if data.shows_errors else "root of trace P"
-    claim = _mark_worst(axes, data, times, values, name)
+    headline = _mark_worst(axes, data, times, values, name)
     set_scale(axes, values)
     axes.margins(y=0.15)
     axes.set(xlabel=SECONDS, ylabel=f"{label}, units of the state")
     draw_legend(axes)
     values_of = "means over the runs" if data.runs > 1 else "this run"
     caption = data.caption(f"Quantiles over the nodes of {values_of}, at each sample.")
-    finish_figure(figure, data.title(claim), caption)
+    finish_figure(figure, data.title(headline), caption)
     return figure
 
 
 def _mark_worst(
     axes: Any, data: FigureData, times: FloatArray, values: FloatArray, name: str
 ) -> str:
-    """Mark the largest value of each of the three worst nodes, and return a sentence on the largest
-    of all, which is called ``name``.
+    """Mark the largest value of each of the three nodes with the largest ones, and return the
+    headline of the figure, a sentence on the largest of all; ``name`` is what the values are.
 
     ``values`` (T, N) are those at ``times`` (T,); samples that are not averaged are not marked.
     """
@@ -180,7 +184,7 @@ def _mark_worst(
     rows = rows if len(rows) else np.arange(len(times))
     averaged = np.where(np.isfinite(values[rows]), values[rows], -np.inf)
     worst_nodes = np.argsort(-averaged.max(axis=0), kind="stable")[:MARKED_SAMPLES]
-    claim = ""
+    headline = ""
     for rank, k in enumerate(worst_nodes.tolist()):
         row = int(rows[int(np.argmax(averaged[:, k]))])
         t, value = times[row], values[row, k]
@@ -197,11 +201,11 @@ def _mark_worst(
             label=f"worst of node {data.nodes[k]}: {value:.3g} at {t:g} s",
         )
         of_node = f"of node {data.nodes[k]} at {t:g} s"
-        claim = claim or f"The largest {name} after the start is {value:.3g}, {of_node}"
-    if not claim:
+        headline = headline or f"The largest {name} after the start is {value:.3g}, {of_node}"
+    if not headline:
         return "No error is finite"
     median = float(np.nanmedian(values[rows]))
-    return f"{claim}, {_compare_with_median(values[rows], median)}"
+    return f"{headline}, {_compare_with_median(values[rows], median)}"
 
 
 def _compare_with_median(values: FloatArray, median: float) -> str:
@@ -213,8 +217,8 @@ def _compare_with_median(values: FloatArray, median: float) -> str:
 
 
 def ratios_figure(data: FigureData) -> Picture:
-    """Draw for each node its mean trace of P divided by the bound; without a bound its mean NEES
-    divided by n.
+    """Draw for each node its mean trace of P divided by the bound that theory gives; without a
+    bound its mean NEES divided by n, the number of states.
 
     Raises UnavailableError if neither is known.
     """
@@ -229,6 +233,7 @@ def ratios_figure(data: FigureData) -> Picture:
         rows = [row for row in data.node_averages if _is_known(row.get(key))]
         if not rows:
             raise UnavailableError("There are no ratios: no bound applies and NEES is unknown.")
+    # Large networks: the nodes with the smallest and the largest ratios.
     rows = sorted(rows, key=lambda row: row[key])
     if len(rows) > MAX_ROWS:
         rows = [*rows[: MAX_ROWS // 2], *rows[-MAX_ROWS // 2 :]]
@@ -244,18 +249,18 @@ def ratios_figure(data: FigureData) -> Picture:
         if len(data.node_averages) > MAX_ROWS
         else ""
     )
-    claim = bound_claim(data) if key == "ratio" else _nees_claim(rows, key, scale)
+    headline = bound_headline(data) if key == "ratio" else _nees_headline(rows, key, scale)
     finish_figure(
         figure,
-        data.title(claim),
+        data.title(headline),
         data.caption(bars, selection, notes="bound" if key == "ratio" else "nees"),
     )
     return figure
 
 
-def _nees_claim(rows: list[dict[str, Any]], key: str, scale: float) -> str:
-    """Return a sentence on the range of the ratios of squared errors to P, ``row[key] * scale`` of
-    each node's row, without a bound.
+def _nees_headline(rows: list[dict[str, Any]], key: str, scale: float) -> str:
+    """Return the headline of a figure of NEES / n: the range of the nodes' ratios of squared errors
+    to what P says, ``row[key] * scale`` of each row.
     """
     ratios = [row[key] * scale for row in rows]
     span = f"{min(ratios):.3g} to {max(ratios):.3g}" if len(ratios) > 1 else f"{ratios[0]:.3g}"

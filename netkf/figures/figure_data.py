@@ -137,10 +137,10 @@ class FigureData:
         return f"{self.runs:,} runs, seed {self.seed}"
 
     def caption(self, *sentences: str, notes: str = "") -> list[str]:
-        """Return the paragraphs of a caption: the scenario, the runs, how they ended and the
-        ``sentences``; then notes on departures from the papers.
+        """Return the paragraphs of a figure's caption: the scenario, the runs, how they ended and
+        the ``sentences``; then notes on assumptions of the papers that the scenario does not meet.
 
-        ``notes`` selects those on the "bound", on "nees", or on "both"; none if empty.
+        ``notes`` selects those on the "bound" on P, on "nees", or on "both"; none if empty.
         """
         n = len(self.nodes)
         origin = f"{self.scenario.name}: {n} node{'s' if n > 1 else ''}, {self.count_text}."
@@ -177,12 +177,14 @@ class FigureData:
         notes = [(note, "nees" if "NEES" in note else "bound") for note in self.promised.notes]
         return [f"Note: {note}." for note, kind in notes if topic in (kind, "both")]
 
-    def title(self, claim: str) -> str:
-        """Return a claim as the title of a figure, which says first if the run ended early."""
+    def title(self, headline: str) -> str:
+        """Return the title of a figure: the ``headline``, a sentence on what the figure shows,
+        after a word if the run ended early.
+        """
         prefixes = {"diverged": "Diverged: ", "interrupted": "Interrupted: ", "failed": "Failed: "}
         if self.status == "diverged" and self.runs > 1:
-            return claim  # some runs diverged: the caption says how many
-        return prefixes.get(self.status, "") + claim
+            return headline  # some runs diverged: the caption says how many
+        return prefixes.get(self.status, "") + headline
 
 
 def reduce_result(result: Any) -> FigureData:
@@ -201,7 +203,10 @@ def reduce_result(result: Any) -> FigureData:
 
 
 def _reduce_run(run: Run) -> FigureData:
-    """Return the data to draw of a run, simulated or read from a directory."""
+    """Return the data to draw of a run, simulated or read from a directory; its averages are those
+    of its summary.json, or computed as that would be.
+    """
+    # The sink collects the samples as it does while a run is simulated.
     sink = SummarySink()
     sink.exact_errors = run.exact_errors
     sink.events(run.log)
@@ -224,7 +229,9 @@ def _reduce_run(run: Run) -> FigureData:
 
 
 def reduce_completed_run(scenario: Scenario, completed: CompletedRun) -> FigureData:
-    """Return the data to draw of a run that was just simulated and written to a directory."""
+    """Return the data to draw of a run that was just simulated and written to a directory, for its
+    picture run.png.
+    """
     status = "diverged" if completed.samples.diverged else completed.status
     return reduce_samples(
         scenario,
@@ -243,8 +250,10 @@ def reduce_samples(
     summary: dict[str, Any],
     **attributes: Any,
 ) -> FigureData:
-    """Return the data to draw of the samples of one run and its summary; ``attributes`` are further
-    ones of FigureData.
+    """Return the data to draw of one run, from the samples that ``sink`` collected, the bounds and
+    limits that theory gives (``promised``), and the contents of summary.json.
+
+    ``attributes`` are further attributes of FigureData.
     """
     shape = len(sink.times), len(scenario.nodes)
     error, trace, nees, first_component = (
@@ -268,7 +277,8 @@ def reduce_samples(
 
 
 def reduce_ensemble(scenario: Scenario, ensemble: Ensemble, promised: PromisedTraces) -> FigureData:
-    """Return what a figure of an ensemble shows: means over the runs as traces (T, N), and limits.
+    """Return the data to draw of an ensemble: means over its runs of squared error, trace of P and
+    NEES, (T, N) each, with standard errors.
 
     promised : traces of the bounds and limits that theory gives for the scenario's filter
     """
@@ -298,7 +308,9 @@ def reduce_ensemble(scenario: Scenario, ensemble: Ensemble, promised: PromisedTr
 def _average_rows(
     scenario: Scenario, ensemble: Ensemble, promised: PromisedTraces
 ) -> list[dict[str, Any]]:
-    """Return the averages of each node over time with their standard errors, as in summary.json."""
+    """Return a row of averages over time for each node, with standard errors, by the names in
+    summary.json; ``promised`` has the bound on the trace of P, if theory gives one.
+    """
     after_start = ensemble.times > 0.0
     bound = None if promised.bound is None else promised.bound[after_start].mean(axis=0)
     rows = []

@@ -45,7 +45,8 @@ def _compute_layout(topology: Topology) -> Positions:
 
 
 def _pivot_layout(topology: Topology) -> Positions:
-    """Return positions along the two principal axes of the distances to PIVOTS nodes.
+    """Return positions for a large network: along the two principal axes of the distances, in
+    links, from each node to PIVOTS of them.
 
     Each pivot takes one search of the network. Source: Brandes and Pich, Eigensolver methods for
     progressive multidimensional scaling (Pivot MDS), Graph Drawing 2006.

@@ -22,7 +22,9 @@ MAX_ASPECT = 2.2
 
 
 def network_figure(data: FigureData) -> Picture:
-    """Draw the network once for each known quantity of the nodes."""
+    """Draw the network once for each known quantity of the nodes (errors, messages and bytes sent),
+    which their colours show.
+    """
     positions = get_positions(data.scenario.topology)
     quantities = _colour_quantities(data)
     aspect = _network_aspect(positions)
@@ -40,7 +42,7 @@ def network_figure(data: FigureData) -> Picture:
     for axes, (label, values) in zip(panels, quantities.items(), strict=True):
         draw_network(axes, data, values, label, positions)
     panels[0].legend(loc="upper left", bbox_to_anchor=(0.0, 0.0), ncols=2)
-    finish_figure(figure, data.title(_make_claim(data)), data.caption(_explain_widths(data)))
+    finish_figure(figure, data.title(_make_headline(data)), data.caption(_explain_widths(data)))
     return figure
 
 
@@ -60,11 +62,13 @@ def node_values(data: FigureData, key: str) -> dict[int, float]:
 
 
 def _colour_quantities(data: FigureData) -> dict[str, dict[int, float]]:
-    """Return the known quantities of the nodes: for each label the values by node."""
+    """Return the quantities that colours of nodes show, as far as they are known: for each label
+    of a colour bar the values by node id.
+    """
     key, label = error_label(data)
     quantities = {label: node_values(data, key)}
     if data.runs == 1 and any("sent" in row for row in data.node_averages):
-        kilobytes = _message_bytes(data) / 1000.0
+        kilobytes = _message_bytes(data) / 1000.0  # of a transmission
         quantities["messages sent, all hearers counted"] = node_values(data, "sent")
         transmissions = node_values(data, "transmissions")
         quantities["kilobytes transmitted"] = {
@@ -91,8 +95,10 @@ def _explain_widths(data: FigureData) -> str:
     return links + (energy if data.runs == 1 else "")
 
 
-def _make_claim(data: FigureData) -> str:
-    """Return a sentence that names the nodes with the largest and the smallest error."""
+def _make_headline(data: FigureData) -> str:
+    """Return the headline of the figure: a sentence that names the nodes with the largest and the
+    smallest error, or trace of P without ground truth.
+    """
     key, _ = error_label(data)
     values = {n: v for n, v in node_values(data, key).items() if math.isfinite(v)}
     quantity = "RMS error" if data.shows_errors else "mean trace of P"
@@ -177,8 +183,8 @@ def _draw_links(axes: Any, data: FigureData, positions: Positions) -> None:
 def _draw_nodes(
     axes: Any, data: FigureData, positions: Positions, values: Mapping[int, float]
 ) -> Any:
-    """Draw the nodes, white if their value is nan; return the mappable of the colour bar, None if
-    all values are nan.
+    """Draw the nodes, coloured by their ``values``, white if that is nan; return what matplotlib
+    makes the colour bar from, None if all values are nan.
     """
     finite = [value for value in values.values() if math.isfinite(value)]
     low, high = (min(finite), max(finite)) if finite else (0.0, 1.0)

@@ -79,8 +79,10 @@ def root_interval(root: FloatArray, se: FloatArray) -> tuple[FloatArray, FloatAr
 
 
 def draw_errors(axes: Any, data: FigureData, bound: bool = False) -> None:
-    """Draw the error of each node and the RMS error of all over time, with the root of the bound if
-    ``bound``; without ground truth the first component of the estimates instead.
+    """Draw the error of each node and the RMS error of all over time; without ground truth the
+    first component of the estimates instead.
+
+    With ``bound`` the root of the bound that theory gives on trace P is drawn too.
     """
     if not data.shows_errors:
         _draw_estimates(axes, data)
@@ -112,8 +114,8 @@ def _draw_estimates(axes: Any, data: FigureData) -> None:
 
 
 def draw_covariances(axes: Any, data: FigureData) -> None:
-    """Draw the roots of the traces of P over time, with the bound and the limits, or a message if
-    the filter gives no covariance.
+    """Draw the roots of the traces of P over time, with the bound and the limits that theory gives,
+    or a message if the filter gives no covariance.
     """
     if not np.isfinite(data.trace).any():
         draw_message(axes, f"{NO_COVARIANCE}: trace P is unavailable")
@@ -128,7 +130,9 @@ def draw_covariances(axes: Any, data: FigureData) -> None:
 
 
 def draw_promises(axes: Any, times: FloatArray, promised: PromisedTraces) -> None:
-    """Draw the bound over ``times`` (T,) and the limits, as square roots of traces."""
+    """Draw what theory gives to compare trace P with, as square roots: the bound over ``times``
+    (T,), its limit, and the trace of a centralised filter.
+    """
     if promised.bound is not None:
         _draw_bound(axes, times, np.sqrt(promised.bound))
     limits: tuple[tuple[float, str, Any], ...] = (
@@ -141,8 +145,8 @@ def draw_promises(axes: Any, times: FloatArray, promised: PromisedTraces) -> Non
 
 
 def _draw_bound(axes: Any, times: FloatArray, roots: FloatArray) -> None:
-    """Draw the bounds ``roots`` (T, N) of N nodes over ``times`` (T,) in seconds, only the largest
-    and smallest if nodes differ.
+    """Draw ``roots`` (T, N), the square roots of the bounds on trace P of N nodes (hybrid paper, H
+    equation 12), over ``times`` (T,) in seconds, only the largest and smallest if nodes differ.
     """
     same = np.allclose(roots.max(axis=1), roots.min(axis=1))
     label = "bound H(12)" if same else "bound H(12): largest"

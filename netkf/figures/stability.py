@@ -54,7 +54,8 @@ MAX_TEXT = 24
 
 
 def stability_figure(data: FigureData) -> Picture:
-    """Draw for which link rates and delivery probabilities the bound H(12) has a steady state.
+    """Draw a map: for which link rates and delivery probabilities the bound on the mean of P over
+    time (hybrid paper, H equation 12) has a steady state, by theory alone.
 
     Raises UnavailableError if the bound does not apply, or without a rate and a delivery
     probability.
@@ -86,12 +87,12 @@ def stability_figure(data: FigureData) -> Picture:
     axes.minorticks_off()
     axes.set(xlabel=f"{RATE}, 1/s", ylabel=DELIVERY)
     draw_legend(axes)
-    claim = f"The bound of this scenario {verb} steady state; it has one "
-    claim += f"at {int(stable.sum())} of {stable.size} points of rate and delivery"
+    headline = f"The bound of this scenario {verb} steady state; it has one "
+    headline += f"at {int(stable.sum())} of {stable.size} points of rate and delivery"
     caption = data.caption(
         "From theory alone: no simulation. Existence of the steady state of H(12)."
     )
-    finish_figure(figure, claim, caption)
+    finish_figure(figure, headline, caption)
     return figure
 
 
@@ -114,8 +115,9 @@ def reason_to_omit_stability(data: FigureData) -> str | None:
 
 
 def _map_stable(scenario: Scenario, rates: Sequence[float]) -> np.ndarray:
-    """Return a mask (D, K), True where H(12) has a steady state, for the D delivery probabilities
-    DELIVERIES and K increasing ``rates`` (1/s).
+    """Return a mask (D, K), True where the bound on the mean of P (hybrid paper, H equation 12) has
+    a steady state, for the D delivery probabilities DELIVERIES and K increasing ``rates`` (1/s) of
+    the links.
     """
     stable = np.zeros((len(DELIVERIES), len(rates)), dtype=bool)
     first = 0
@@ -129,8 +131,8 @@ def _map_stable(scenario: Scenario, rates: Sequence[float]) -> np.ndarray:
 
 
 def _is_stable(scenario: Scenario, rate: float, delivery: float) -> bool:
-    """Return True if H(12) has a steady state with this link rate (1/s) and delivery
-    probability.
+    """Return True if the bound on the mean of P (hybrid paper, H equation 12) has a steady state
+    with this link rate (1/s) and delivery probability.
     """
     return has_stabilising_gains(scenario.replace({RATE: rate, DELIVERY: delivery}))
 
@@ -167,7 +169,7 @@ def sweep_figure(name: str, table: Any, keys: Sequence[str], status: str) -> Pic
 
 def _draw_sweep_curves(axes: Any, table: Any, keys: list[str]) -> None:
     """Draw the largest and the mean RMS error of a sweep over one key with 95% intervals, and the
-    root of the bound.
+    root of the bound on the trace of P.
 
     ``table`` is that of the sweep, a row for each point; ``keys`` is a list of the one key.
     """
@@ -245,8 +247,8 @@ def _describe_best(table: Any, keys: Sequence[str]) -> str:
         return "No point has a finite error"
     best = finite.loc[finite["worst_rms"].idxmin()]
     settings = ", ".join(f"{key.rpartition('.')[2]} = {_format_value(best[key])}" for key in keys)
-    claim = f"The largest RMS error is smallest, {best['worst_rms']:.3g}, at {settings}"
-    return claim + (f"; runs diverge at {diverged} of {len(table)} points" if diverged else "")
+    headline = f"The largest RMS error is smallest, {best['worst_rms']:.3g}, at {settings}"
+    return headline + (f"; runs diverge at {diverged} of {len(table)} points" if diverged else "")
 
 
 def _axis_positions(set_scale: Callable[[str], Any], values: Any) -> tuple[FloatArray, list[str]]:
@@ -276,8 +278,9 @@ SAME_TRACES = 1e-6
 
 
 def law_figure(data: FigureData) -> Picture:
-    """Draw the share of samples whose trace of P exceeds a value, and that of the invariant law of
-    P if the paper R applies: readings of one sensor that arrive independently.
+    """Draw the share of samples whose trace of P exceeds a value, and that of the law of P in the
+    steady state, if the paper on the random Riccati equation (R) applies: readings of one sensor
+    that arrive independently.
 
     Raises UnavailableError without samples and covariances, and for an ensemble.
     """
@@ -285,6 +288,7 @@ def law_figure(data: FigureData) -> Picture:
     data.require_covariance()
     if data.runs > 1:
         raise UnavailableError("The law of P is that of single runs, and these are means of many.")
+    # The first samples still depend on P(0).
     after_start = data.times >= START_SHARE * data.times[-1]
     traces = data.trace[after_start]
     traces = np.where(traces < MAX_TRACE, traces, np.nan)
@@ -303,13 +307,13 @@ def law_figure(data: FigureData) -> Picture:
         if sample.size:
             label = f"run, nodes {description}" if has_both else "run, all nodes"
             _draw_tail(axes, sample, colour, dashes, label)
-    claim = _tail_claim(traces)
+    headline = _tail_headline(traces)
     law_traces = _sample_invariant_law(data)
     if law_traces is not None:
         label = f"invariant law, {LAW_SAMPLES:,} draws"
         _draw_tail(axes, np.sort(law_traces), EXACT, ":", label)
         run_mean = traces[:, _hears_one_sensor(data.scenario)].mean()
-        claim = (
+        headline = (
             f"Mean trace of P {run_mean:.3g} in the run; the invariant law has "
             f"{law_traces.mean():.3g}"
         )
@@ -325,7 +329,7 @@ def law_figure(data: FigureData) -> Picture:
     axes.set(xlabel="trace of P, squared units of the state", ylabel="share of samples above")
     draw_legend(axes)
     note = "The first fifth of the samples is left out. Samples of one run are not independent."
-    finish_figure(figure, data.title(claim), data.caption(note))
+    finish_figure(figure, data.title(headline), data.caption(note))
     return figure
 
 
@@ -337,7 +341,7 @@ def _draw_tail(axes: Any, sample: FloatArray, colour: str, dashes: str, label: s
     axes.plot(sample, share, color=colour, ls=dashes, label=label, drawstyle="steps-post")
 
 
-def _tail_claim(values: FloatArray) -> str:
+def _tail_headline(values: FloatArray) -> str:
     """Return a sentence on the median and the 99% quantile of the finite traces of P among
     ``values`` (T, N), of N nodes at T times; there must be one.
     """
@@ -347,7 +351,9 @@ def _tail_claim(values: FloatArray) -> str:
 
 
 def _hears_one_sensor(scenario: Scenario) -> np.ndarray:
-    """Return (N,) bool: True for nodes without a sensor whose neighbours have one sensor in all."""
+    """Return (N,) bool: True for nodes without a sensor whose neighbours have one sensor in all, so
+    that their P follows the random Riccati equation with one reading that arrives or not.
+    """
     neighbours = {
         node: [i for i, j in scenario.topology.directions if j == node] for node in scenario.nodes
     }
@@ -361,8 +367,9 @@ def _hears_one_sensor(scenario: Scenario) -> np.ndarray:
 
 
 def _sample_invariant_law(data: FigureData) -> FloatArray | None:
-    """Return traces (LAW_SAMPLES,) of P drawn from its invariant law, None unless the scenario is
-    the model of the paper R: one sensor, linear readings, and independent losses.
+    """Return traces (LAW_SAMPLES,) of P drawn from its law in the steady state; None unless the
+    scenario is the model of the paper on the random Riccati equation (R): one sensor, linear
+    readings, and independent losses.
     """
     scenario = data.scenario
     loss = scenario.network.channel.loss

@@ -108,12 +108,12 @@ def new_figure(width: float = 7.4, height: float = 4.4) -> Picture:
     return figure
 
 
-def finish_figure(figure: Figure, claim: str, caption: Sequence[str]) -> None:
-    """Put the claim above a figure and the paragraphs of its caption below, broken into lines that
-    fit its width.
+def finish_figure(figure: Figure, headline: str, caption: Sequence[str]) -> None:
+    """Put the headline (what the figure shows, as a sentence) above a figure and the paragraphs of
+    its caption below, broken into lines that fit its width.
     """
     width = 0.94 * float(figure.get_size_inches()[0]) * POINTS_PER_INCH
-    title = break_lines(claim, width, TITLE_SIZE, "bold")
+    title = break_lines(headline, width, TITLE_SIZE, "bold")
     figure.suptitle(title, x=0.01, ha="left", fontsize=TITLE_SIZE, color=INK, fontweight="bold")
     lines = [break_lines(sentence, width, CAPTION_SIZE) for sentence in caption if sentence]
     figure.supxlabel("\n".join(lines), x=0.01, ha="left", fontsize=CAPTION_SIZE, color=MUTED)
@@ -189,14 +189,18 @@ def draw_legend(axes: Any, columns: int | None = None) -> None:
 
 
 def _axes_width(axes: Any) -> float:
-    """Return the width of the cell of the figure's grid that the axes are in, in points."""
+    """Return the width of the cell of the figure's grid that the axes are in, in points:
+    constrained layout decides on that of the axes themselves only when it draws.
+    """
     cell = axes.get_subplotspec()
     share = cell.get_position(axes.figure).width if cell else 1.0
     return share * float(axes.figure.get_size_inches()[0]) * POINTS_PER_INCH
 
 
 def _legend_columns(labels: Sequence[str], width: float) -> int:
-    """Return the largest number of columns in which a legend fits ``width`` points."""
+    """Return the largest number of columns in which a legend with these ``labels`` fits ``width``
+    points.
+    """
     # Handle, gaps and column spacing take about six font sizes.
     widths = [text_width(label, LEGEND_SIZE) + 6.0 * LEGEND_SIZE for label in labels]
     for count in range(len(labels), 1, -1):
@@ -214,13 +218,13 @@ def draw_message(axes: Any, message: str) -> None:
     axes.axis("off")
 
 
-def message_figure(claim: str, message: str, caption: Sequence[str]) -> Picture:
+def message_figure(headline: str, message: str, caption: Sequence[str]) -> Picture:
     """Return a figure that shows only a message, such as the reason why there are no data, with the
-    title ``claim`` and the sentences of the ``caption``.
+    title ``headline`` and the sentences of the ``caption``.
     """
     figure = new_figure(7.4, 2.2)
     draw_message(figure.add_subplot(), message)
-    finish_figure(figure, claim, caption)
+    finish_figure(figure, headline, caption)
     return figure
 
 

@@ -43,7 +43,7 @@ def newest_arrivals(log: np.ndarray, node: int) -> tuple[FloatArray, FloatArray]
     """Return the times (K,) at which K messages arrived at a ``node`` (id), and for each the time
     (K,) at which the newest message so far was sent, in seconds.
 
-    ``log`` (E,) are the EVENT rows of a run.
+    ``log`` (E,) are the EVENT rows of a run. The age of information follows from these.
     """
     arrivals = log[(log["kind"] == CODES["deliver"]) & (log["node"] == node)]
     # A message that overtakes others makes them old before they arrive.
@@ -63,8 +63,8 @@ class AgeSawtooth(NamedTuple):
     low: FloatArray
 
     def mean(self, edges: FloatArray) -> FloatArray:
-        """Return the time averages (B,) of the age, in seconds, in B bins between ``edges``
-        (B + 1,) in seconds, which begin at time 0.
+        """Return the averages (B,) of the age of information, in seconds, over B bins of time
+        between ``edges`` (B + 1,) in seconds, which begin at time 0.
         """
         length = self.stop - self.start
         # The integral of the age up to each segment, then up to each edge within its segment.
@@ -75,8 +75,8 @@ class AgeSawtooth(NamedTuple):
         return np.asarray(np.diff(integral) / np.diff(edges))
 
     def largest(self, edges: FloatArray) -> FloatArray:
-        """Return the largest age (B,), in seconds, in each of B bins between ``edges`` (B + 1,) in
-        seconds.
+        """Return the largest age of information (B,), in seconds, in each of B bins of time between
+        ``edges`` (B + 1,) in seconds.
         """
         # The age is largest at the end of the bin, or of a segment within it.
         last = np.searchsorted(self.start, edges[1:], side="left") - 1
@@ -95,8 +95,9 @@ class AgeSawtooth(NamedTuple):
 
 def _sum_excess(values: FloatArray, levels: FloatArray) -> FloatArray:
     """Return the sum of ``max(0, value - level)`` over K ``values`` (K,), for each of L ``levels``
-    (L,): the time above each level, from the ages at the ends of all segments of a sawtooth.
+    (L,), from which ``time_above`` finds for how long an age is above each level.
     """
+    # Values above a level: their sum, less the level for each of them.
     descending = np.sort(values)[::-1]
     sums = np.concatenate([[0.0], np.cumsum(descending)])
     above = len(descending) - np.searchsorted(descending[::-1], levels, side="right")
@@ -118,7 +119,8 @@ def age_of_information(log: np.ndarray, node: int, end: float) -> AgeSawtooth:
 
 
 def age_figure(data: FigureData) -> Picture:
-    """Draw the age of information over time, means and maxima over the nodes, and its distribution.
+    """Draw the age of information (time since the newest message that a node has received was sent)
+    over time, median and largest over the nodes, and its distribution.
 
     Raises UnavailableError without events, or if no node can receive messages.
     """
@@ -134,20 +136,20 @@ def age_figure(data: FigureData) -> Picture:
     _draw_ages(left, np.linspace(0.0, end, AGE_BINS + 1), ages)
     _draw_age_distribution(right, ages, means, end)
     worst = int(means.argmax())
-    claim = f"On average the freshest message that a node has heard is {means.mean():.3g} s old"
+    headline = f"On average the freshest message that a node has heard is {means.mean():.3g} s old"
     if len(means) > 1:
-        claim += f"; node {receivers[worst]} waits longest, {means[worst]:.3g} s"
+        headline += f"; node {receivers[worst]} waits longest, {means[worst]:.3g} s"
     note = (
         "Age of information: time since the freshest message that a node has heard was sent. "
         f"Left: means and maxima over {end / AGE_BINS:.3g} s."
     )
-    finish_figure(figure, data.title(claim), data.caption(note))
+    finish_figure(figure, data.title(headline), data.caption(note))
     return figure
 
 
 def _draw_ages(axes: Any, edges: FloatArray, ages: list[AgeSawtooth]) -> None:
-    """Draw the median of the nodes' mean ages and the largest age in B bins between ``edges``
-    (B + 1,), in seconds.
+    """Draw the median of the nodes' mean ages of information, the range of 90% of the nodes, and
+    the largest age, in B bins of time between ``edges`` (B + 1,), in seconds.
     """
     # Samples of a sawtooth at the times of a grid would alias with the clocks; means do not.
     centres = 0.5 * (edges[:-1] + edges[1:])
@@ -170,8 +172,9 @@ def _draw_ages(axes: Any, edges: FloatArray, ages: list[AgeSawtooth]) -> None:
 def _draw_age_distribution(
     axes: Any, ages: list[AgeSawtooth], means: FloatArray, end: float
 ) -> None:
-    """Draw the share of the time until ``end`` for which the age exceeds a value: of all nodes, and
-    of those with the largest and the smallest of the mean ages ``means`` (N,).
+    """Draw the share of the time until ``end`` (seconds) for which the age of information exceeds a
+    value: of all nodes, and of those with the largest and the smallest of the mean ages ``means``
+    (N,).
     """
     largest = max(float((age.low + age.stop - age.start).max()) for age in ages)
     levels = np.linspace(0.0, largest, AGE_LEVELS)
@@ -212,8 +215,8 @@ class DirectedMessages(NamedTuple):
 
 
 def messages_by_direction(log: np.ndarray) -> list[DirectedMessages]:
-    """Return the messages of each direction that have an outcome, ordered by sender and receiver,
-    from the EVENT rows ``log`` (E,) of a run.
+    """Return the messages of each direction (from one node to another) that have an outcome,
+    ordered by sender and receiver, from the EVENT rows ``log`` (E,) of a run.
     """
     arrivals = log[log["kind"] == CODES["deliver"]]
     losses = log[np.isin(log["kind"], (CODES["lost"], CODES["late"]))]
@@ -233,8 +236,8 @@ def messages_by_direction(log: np.ndarray) -> list[DirectedMessages]:
 def _times_by_direction(
     senders: np.ndarray, receivers: np.ndarray, times: FloatArray
 ) -> dict[tuple[int, int], FloatArray]:
-    """Return the sorted times (M,), in seconds, of each pair (sender, receiver), from K events with
-    ``senders``, ``receivers`` (ids) and ``times``, (K,) each.
+    """Return for each pair (sender, receiver) the sorted times (M,) in seconds of its events, of K
+    events with ``senders``, ``receivers`` (ids) and ``times``, (K,) each.
     """
     if not len(times):
         return {}
@@ -247,15 +250,16 @@ def _times_by_direction(
 
 
 def links_figure(data: FigureData) -> Picture:
-    """Draw the messages of each direction at their times: ticks for delivered ones, crosses for
-    lost ones. Of long runs and large networks an interval and a selection of directions are drawn.
+    """Draw the messages of each direction (from one node to another) at their times: ticks for
+    delivered ones, crosses for lost ones. Of long runs and large networks an interval and a
+    selection of directions are drawn.
 
     Raises UnavailableError without messages.
     """
     directions = _require_messages(data)
     rows = select_evenly(np.arange(len(directions)), MAX_DIRECTIONS)
     selection = [directions[k] for k in rows.tolist()]
-    end = _readable_end(selection, _last_time(data))
+    end = _readable_end(selection, _last_time(data))  # seconds
     figure = new_figure(8.4, min(9.0, 2.0 + 0.16 * len(selection)))
     axes = figure.add_subplot()
     for row, direction in enumerate(selection):
@@ -263,9 +267,10 @@ def links_figure(data: FigureData) -> Picture:
             (direction.delivered, "|", INK, 5.0),
             (direction.lost, "x", LOST, 4.0),
         ):
-            shown = times[times <= end]
+            drawn_times = times[times <= end]
             style: dict[str, Any] = {"ls": "", "marker": marker, "ms": size, "mew": 0.9}
-            axes.plot(shown, np.full(len(shown), row), color=colour, **style)
+            axes.plot(drawn_times, np.full(len(drawn_times), row), color=colour, **style)
+    # Empty series for the legend.
     axes.plot([], [], "|", color=INK, label="delivered")
     axes.plot([], [], "x", color=LOST, label="lost")
     labels = [f"{direction.sender} to {direction.receiver}" for direction in selection]
@@ -277,7 +282,7 @@ def links_figure(data: FigureData) -> Picture:
     draw_legend(axes)
     lost = sum(len(direction.lost) for direction in directions)
     total = lost + sum(len(direction.delivered) for direction in directions)
-    claim = f"{lost:,} of {total:,} messages were lost ({lost / total:.1%})"
+    headline = f"{lost:,} of {total:,} messages were lost ({lost / total:.1%})"
     omissions = []
     if len(selection) < len(directions):
         omissions.append(f"{len(selection)} of {len(directions)} directions")
@@ -286,7 +291,7 @@ def links_figure(data: FigureData) -> Picture:
     note = "All messages are shown."
     if omissions:
         note = f"Shown: {' of '.join(omissions)}; the claim counts all."
-    finish_figure(figure, data.title(claim), data.caption(note))
+    finish_figure(figure, data.title(headline), data.caption(note))
     return figure
 
 
@@ -313,8 +318,8 @@ def wilson_interval(delivered: int, total: int) -> tuple[float, float]:
 
 
 def delivery_figure(data: FigureData) -> Picture:
-    """Draw the share of messages delivered in each direction with its interval, and the share lost
-    over time.
+    """Draw the share of messages delivered in each direction (from one node to another) with its
+    interval, and the share lost over time.
 
     Raises UnavailableError without messages.
     """
@@ -326,20 +331,21 @@ def delivery_figure(data: FigureData) -> Picture:
     left, right = figure.subplots(1, 2, width_ratios=[1.3, 1.0])
     misses = _draw_shares(left, data, directions, shares)
     _draw_losses(right, directions, _last_time(data))
-    claim = f"{delivered.sum() / totals.sum():.1%} of {totals.sum():,} messages arrived"
+    headline = f"{delivered.sum() / totals.sum():.1%} of {totals.sum():,} messages arrived"
     if shares.min() < shares.max():
-        claim += f"; by direction between {shares.min():.0%} and {shares.max():.0%}"
+        headline += f"; by direction between {shares.min():.0%} and {shares.max():.0%}"
     note = "Intervals: Wilson, 95%."
     if misses is not None:
         note += f" {misses} of {len(directions)} intervals exclude the scenario's probability."
-    finish_figure(figure, data.title(claim), data.caption(note))
+    finish_figure(figure, data.title(headline), data.caption(note))
     return figure
 
 
 def _draw_shares(
     axes: Any, data: FigureData, directions: list[DirectedMessages], shares: FloatArray
 ) -> int | None:
-    """Draw the delivered ``shares`` (L,) of the directions in increasing order, with intervals.
+    """Draw the ``shares`` (L,) of messages delivered in L directions (from one node to another) in
+    increasing order, with intervals.
 
     Return the number of intervals that exclude the delivery probability of the scenario, None if it
     has none.
@@ -373,8 +379,8 @@ def _draw_shares(
 
 
 def _delivery_probability(data: FigureData, direction: DirectedMessages) -> float:
-    """Return the mean delivery probability of a direction by the scenario's channel, nan if the
-    channel does not say it.
+    """Return the mean probability that a message of this direction (from one node to another) is
+    delivered, by the scenario's model of losses; nan if the model does not know it.
     """
     link = direction.sender, direction.receiver
     loss = data.scenario.network.channel.loss

@@ -49,10 +49,12 @@ FALSE_ALARM = 0.01
 def describe_source(
     source: ReportSource, messages: np.ndarray, readings: Innovations | str | None = None
 ) -> list[str]:
-    """Return sentences about a source, the most important first, without full stops.
+    """Return the sentences at the top of the page about a source (the contents of one directory):
+    what its data say, the most important first, without full stops.
 
-    ``messages`` are the M MESSAGE rows (M,) of its run (none without a run), ``readings`` the
-    innovations of the run, or None or the reason why there are none.
+    ``messages`` are the MESSAGE rows (M,) of its run, one for each of M messages sent, with its
+    outcome; none without a run. ``readings`` are the innovations of the run, or None or the reason
+    why there are none.
     """
     if source.kind == "sweep":
         return [*_describe_status(source), *_describe_sweep(source)]
@@ -79,7 +81,8 @@ def describe_source(
 def describe_differences(
     comparison: Comparison | str, first: ReportSource, second: ReportSource
 ) -> list[str]:
-    """Return sentences on how two sources differ, the ``first`` called A and the ``second`` B.
+    """Return sentences on how two sources (contents of directories) differ, the ``first`` called A
+    and the ``second`` B.
 
     They are the statistically certain differences of all nodes together and the first event in
     which the recorded runs differ, or only ``comparison`` if it is the reason why there is none.
@@ -87,14 +90,14 @@ def describe_differences(
     if isinstance(comparison, str):
         return [comparison]
     sentences = []
-    for quantity, node, entries in comparison.rows:
-        entry = entries[1]
-        if entry.real and node < 0:
+    for quantity, node, (value_of_A, value_of_B) in comparison.rows:
+        # ``real``: the interval of the difference excludes 0. Node -1 stands for all nodes.
+        if value_of_B.real and node < 0:
             name = LABELS.get(quantity, f"messages {quantity}")
             sentences.append(
-                f"Certain: {name} of B is {format_number(entry.value)}, of A "
-                f"{format_number(entries[0].value)}; the difference lies in "
-                f"{format_number(entry.low)} .. {format_number(entry.high)}"
+                f"Certain: {name} of B is {format_number(value_of_B.value)}, of A "
+                f"{format_number(value_of_A.value)}; the difference lies in "
+                f"{format_number(value_of_B.low)} .. {format_number(value_of_B.high)}"
             )
     if not sentences and min(comparison.runs) < 2:
         sentences = ["Single runs have no intervals, so no difference is certain"]
@@ -122,7 +125,9 @@ def _describe_first_difference(first: ReportSource, second: ReportSource) -> lis
 
 
 def _describe_status(source: ReportSource) -> list[str]:
-    """Return sentences on interruption, failure or divergence, and on a network of one node."""
+    """Return sentences on what limits the results of a source: interruption, failure, divergence
+    of the run that is shown, or a network of one node.
+    """
     sentences, run = [], source.run
     if source.status == "interrupted":
         sentences.append(_describe_interruption(source))
@@ -144,7 +149,9 @@ def _describe_status(source: ReportSource) -> list[str]:
 
 
 def _describe_interruption(source: ReportSource) -> str:
-    """Return a sentence on how many runs, or how much of the only run, were done."""
+    """Return a sentence on how many runs, or how much of the only run, an interrupted command had
+    done.
+    """
     runs = source.manifest["runs"]
     if runs["wanted"] > 1:
         progress = f"{runs['done']:,} of {runs['wanted']:,} runs are done"
@@ -157,9 +164,10 @@ def _describe_interruption(source: ReportSource) -> str:
 
 
 def _describe_worst_node(source: ReportSource, run: StoredRun, messages: np.ndarray) -> list[str]:
-    """Return sentences on the worst node of a recorded run; empty if no sample is finite.
+    """Return sentences on the node of a recorded run with the largest RMS error (of P without
+    ground truth), its worst sample and the reasons; empty if no sample is finite.
 
-    ``messages`` are the M MESSAGE rows (M,) of the run.
+    ``messages`` are the MESSAGE rows (M,) of the run, one for each message sent.
     """
     if source.worst is None:
         return []
@@ -169,7 +177,7 @@ def _describe_worst_node(source: ReportSource, run: StoredRun, messages: np.ndar
     skips_start = run.times[0] <= 0.0 < worst.time
     if not worst.by_error:
         start = "after time 0 " if skips_start else ""
-        claim = (
+        finding = (
             "There is no ground truth: errors are unavailable. By its own covariance node "
             f"{worst.node} was least certain: square root of mean trace P "
             f"{format_number(worst.value)}, the largest of {count} nodes; "
@@ -179,21 +187,21 @@ def _describe_worst_node(source: ReportSource, run: StoredRun, messages: np.ndar
         overall = source.summary.get("overall", {}).get("rms_error")
         rank = f", the largest of {count} nodes (all nodes {format_number(overall)})"
         start = "After time 0 its" if skips_start else "Its"
-        claim = (
+        finding = (
             f"Node {worst.node} was worst: RMS error {format_number(worst.value)} over time"
             f"{rank if count > 1 else ''}. {start} error was largest at "
             f"{_format_time(worst.time)}: {format_number(worst.peak)}"
         )
-    return [claim, *_explain_worst(source, run, messages, source.worst)]
+    return [finding, *_explain_worst(source, run, messages, source.worst)]
 
 
 def _explain_worst(
     source: ReportSource, run: StoredRun, messages: np.ndarray, samples: WorstSamples
 ) -> list[str]:
-    """Return sentences on the worst sample after the start-up: the messages that the node had
-    received by then, and whether P allows the error.
+    """Return sentences on the worst node's worst sample after the start-up of its filter: the
+    messages that it had received by then, and whether P allows the error.
 
-    ``messages`` are the M MESSAGE rows (M,) of the run.
+    ``messages`` are the MESSAGE rows (M,) of the run, one for each message sent.
     """
     worst = samples.explained
     received = messages[messages["receiver"] == worst.node]
@@ -201,6 +209,7 @@ def _explain_worst(
     if samples.start is not None:
         sentences.append(_describe_start_up(samples.overall, worst, samples.start))
     if len(received):
+        # Messages that arrived later did not influence the sample.
         cutoff = float(source.cutoffs(np.array([worst.time]))[0])
         sentences.append(
             _describe_last_messages(received, worst, cutoff)
@@ -213,8 +222,10 @@ def _explain_worst(
 
 
 def _describe_start_up(worst: WorstSample, later: WorstSample, start: StartUp) -> str:
-    """Return sentences saying that the worst sample was in the start-up, and which ``later`` sample
-    is explained instead.
+    """Return sentences saying that the worst sample was in the start-up, the time in which trace P
+    falls from its initial value, and which ``later`` sample is explained instead.
+
+    ``start`` has trace P at the first sample, at the worst one and on average over the last ones.
     """
     sentence = (
         f"The filters had just started at {_format_time(worst.time)}: trace P was "
@@ -257,11 +268,11 @@ def _judge_error(source: ReportSource, run: StoredRun, worst: WorstSample) -> li
 
 
 def _describe_last_messages(received: np.ndarray, worst: WorstSample, cutoff: float) -> str:
-    """Return a sentence on the last message from each neighbour before the worst sample.
+    """Return a sentence on the last message that the node of the worst sample had received from
+    each neighbour by then, and on how many messages were lost or late since.
 
-    ``received`` are the MESSAGE rows (M,) to the node of that sample, lost ones included; only
-    arrivals until ``cutoff`` (seconds) count. Messages lost or late since the last arrival are
-    counted.
+    ``received`` are the MESSAGE rows (M,) of all messages sent to that node, lost ones included;
+    only arrivals until ``cutoff`` (seconds) count.
     """
     # For each sender the seconds since its last message that arrived was sent, inf without one.
     ages, missing = [], 0
@@ -291,12 +302,13 @@ def _compare_delivery(messages: np.ndarray, received: np.ndarray) -> str:
     """Return a sentence that compares the delivery ratio of the messages to a node with that of all
     messages of the run; empty if they differ by chance.
 
-    Both are MESSAGE rows, ``messages`` of the run and ``received`` those to the node, lost ones
-    included.
+    Both are MESSAGE rows, one for each message sent: ``messages`` of the run and ``received`` those
+    to the node, lost ones included.
     """
     node_count, total = max(1, len(received)), max(1, len(messages))
     node_ratio = int((received["outcome"] == DELIVERED).sum()) / node_count
     overall_ratio = int((messages["outcome"] == DELIVERED).sum()) / total
+    # Standard deviation of the node's ratio if its messages arrive like all others.
     deviation = math.sqrt(overall_ratio * (1.0 - overall_ratio) / node_count)
     if abs(node_ratio - overall_ratio) <= ARRIVAL_DEVIATIONS * deviation:
         return ""
@@ -309,10 +321,11 @@ def _compare_delivery(messages: np.ndarray, received: np.ndarray) -> str:
 def _judge_age(
     source: ReportSource, run: StoredRun, received: np.ndarray, worst: WorstSample
 ) -> str:
-    """Return a sentence on whether the node's information was unusually old at its worst sample;
+    """Return a sentence on whether the node's information (seconds since the newest message that it
+    had received on a link was sent, averaged over its links) was unusually old at its worst sample;
     empty if there are too few samples to compare with.
 
-    ``received`` are the MESSAGE rows (M,) to that node, lost ones included.
+    ``received`` are the MESSAGE rows (M,) of the messages sent to that node, lost ones included.
     """
     cutoffs = source.cutoffs(run.times)
     ages: FloatArray = information_age(received, (worst.node,), run.times, cutoffs)[:, 0]
@@ -355,10 +368,11 @@ def _describe_ensemble(source: ReportSource) -> list[str]:
 
 
 def _describe_bound(source: ReportSource) -> list[str]:
-    """Return a sentence that compares the mean traces of P over time with the bound on them, at the
-    node where it is exceeded most clearly, or else at the node that comes closest to it.
+    """Return a sentence that compares the mean trace of P over time with the bound that theory
+    promises on its mean over runs, at the node that exceeds it most clearly, or else at the node
+    that comes closest to it.
 
-    The bound is on the mean over runs: a single run cannot break it.
+    A single run cannot break the bound, and the sentence on one says so.
     """
     summary = source.summary
     if not summary:
@@ -366,6 +380,7 @@ def _describe_bound(source: ReportSource) -> list[str]:
     rows = [row for row in summary["nodes"] if row["bound"] and row["mean_trace"] is not None]
     if not rows:
         return [f"No bound: {summary.get('bound', 'unknown')}{PAPER}"]
+    # The text is like "H(12), promised by ...": the name of the bound comes first.
     bound = summary["bound"].split(",")[0]
     # The node with the largest ratio need not be one that exceeds the bound beyond its error.
     margin = _standard_errors_allowed(len(rows), source.runs)
@@ -413,11 +428,12 @@ def _format_trace_error(row: dict[str, Any]) -> str:
 
 
 def _describe_verdict(source: ReportSource) -> list[str]:
-    """Return a sentence that counts the verdicts of ``netkf check``, and one for each broken
-    promise.
+    """Return a sentence that counts the results of ``netkf check``, which tests on many runs what
+    theory promises for the scenario, and one sentence for each promise that the runs broke.
     """
     verdict = source.verdict or {}
     rows = verdict.get("rows", [])
+    # Each row is one promise; its verdict is holds, broken, undecided or not promised.
     counts = Counter(str(row["verdict"]) for row in rows)
     broken = counts["broken"]
     if broken:
@@ -436,7 +452,9 @@ def _describe_verdict(source: ReportSource) -> list[str]:
 
 
 def _describe_sweep(source: ReportSource) -> list[str]:
-    """Return a sentence on the point of a sweep with the smallest RMS error of its worst node."""
+    """Return a sentence on the best point of a sweep, a grid of values of keys: that at which the
+    largest RMS error of any node is smallest.
+    """
     assert source.sweep is not None
     table, keys = source.sweep.table, source.sweep.keys
     if not len(table):

@@ -59,10 +59,12 @@ def run_data(
     budget: Budget,
     packer: Packer,
 ) -> dict[str, Any]:
-    """Return the data of a recorded run for the live views, as JSON values.
+    """Return the data of a recorded run for the live views, in which the page animates it, as JSON
+    values; its scripts read the keys.
 
-    ``messages`` are the M MESSAGE rows (M,) of the run, ``readings`` its innovations or the reason
-    why there are none. Columns of numbers are added to ``packer``, and the data refer to them.
+    ``messages`` are the MESSAGE rows (M,) of the run, one for each message sent; ``readings`` its
+    innovations or the reason why there are none; ``budget`` limits the numbers of messages and
+    sample values. Columns of numbers are added to ``packer``, and the data refer to them.
     """
     worst = None if source.worst is None else source.worst.explained
     horizon = float(source.scenario.horizon)
@@ -106,7 +108,9 @@ def run_data(
 
 
 def thinning_rules(data: dict[str, Any]) -> list[str]:
-    """Return sentences on the rows that ``run_data`` left out of the data of a run, if any."""
+    """Return sentences for the reader of the page on what ``run_data`` left out of the ``data`` of
+    a long run; an empty list if nothing.
+    """
     rules = []
     messages, totals = data["messages"], data["totals"]
     if messages["step"] > 1:
@@ -140,7 +144,7 @@ def thinning_rules(data: dict[str, Any]) -> list[str]:
 
 
 def sample_indices(run: StoredRun, max_values: int, instant: float) -> np.ndarray:
-    """Return the sorted indices (K,) of the K samples that a page holds.
+    """Return the sorted indices (K,) of the K samples of a run that a page holds.
 
     They are all samples, or if these have more than ``max_values`` numbers every k-th, the last
     one, the one at ``instant`` (seconds), and that with the largest error of each node.
@@ -163,7 +167,7 @@ def sample_indices(run: StoredRun, max_values: int, instant: float) -> np.ndarra
 
 
 def positions(source: ReportSource, run: StoredRun) -> list[list[float]]:
-    """Return a position [x, y] between 0 and 1 for each node, y downwards.
+    """Return the position [x, y] at which the page draws each node, between 0 and 1, y downwards.
 
     They are the positions of the scenario to scale or, if a node has none, a layout by the links.
     """
@@ -191,7 +195,8 @@ def _make_layout(source: ReportSource, run: StoredRun) -> dict[int, Any]:
 
 
 def _flow_kind(source: ReportSource) -> str:
-    """Return how messages change the information of their receivers.
+    """Return how messages change the information of their receivers, as the page's scripts need to
+    know to show it.
 
     ``combine``: receivers combine the estimates with their own; ``swap``: two nodes exchange their
     estimates; ``readings``: messages carry readings, which receivers do not forward; ``pooled``:
@@ -204,7 +209,7 @@ def _flow_kind(source: ReportSource) -> str:
 
 
 def _state_axes(source: ReportSource, run: StoredRun, worst: WorstSample | None) -> list[int]:
-    """Return the indices of the two components of the state to show first.
+    """Return the indices of the two components of the state that the page shows first.
 
     They are the first two that sensors measure, unless another component had the largest error at
     the worst sample: then the two components with the largest errors.
@@ -246,7 +251,9 @@ def _interval_scales() -> dict[str, float]:
 
 
 def _drawing_limits(source: ReportSource) -> dict[str, Any]:
-    """Return the finite limits of trace P, by the labels of the horizontal lines that show them."""
+    """Return the traces of P that theory gives as limits, those that are finite, by the labels of
+    the horizontal lines that show them.
+    """
     promised = source.promised
     if promised is None:
         return {}
@@ -257,14 +264,15 @@ def _drawing_limits(source: ReportSource) -> dict[str, Any]:
 def _sample_columns(
     source: ReportSource, run: StoredRun, rows: np.ndarray, messages: np.ndarray, packer: Packer
 ) -> dict[str, Any]:
-    """Return the samples with the indices ``rows`` (K,) as packed columns, their number K, the step
-    between them, and the interval of NEES.
+    """Return the samples with the indices ``rows`` (K,) for the live views: their columns as added
+    to ``packer``, their number K, the step between them (1: none left out), and the interval of
+    the NEES of a sample if P is exact.
 
-    ``messages`` are the MESSAGE rows of the run, for the ages of information. Columns are added to
-    ``packer``.
+    ``messages`` are the MESSAGE rows of the run, one for each message sent, from which the ages of
+    the nodes' information follow.
     """
     n = run.x.shape[1]
-    i, j = np.triu_indices(n)
+    i, j = np.triu_indices(n)  # P is symmetric: its upper triangle is enough
     total = len(run.times)
     times = run.times[rows]
     ages = information_age(messages, run.nodes, times, source.cutoffs(times))
@@ -278,6 +286,7 @@ def _sample_columns(
         columns["x"] = packer.add(run.x[rows], "f8")
         columns["sq_error"] = packer.add(run.sq_error[rows], "f8")
         columns["nees"] = packer.add(run.nees[rows], "f8")
+    # (T, N) bound on the trace of P by theory.
     bound = source.promised.bound if source.promised is not None else None
     if bound is not None and bound.shape == (total, len(run.nodes)):
         columns["bound"] = packer.add(bound[rows], "f8")
@@ -290,7 +299,8 @@ def _sample_columns(
 
 
 def _message_columns(thinned: ThinnedMessages, run: StoredRun, packer: Packer) -> dict[str, Any]:
-    """Return messages as packed columns, with the rule by which they were thinned.
+    """Return the messages of a run for the live views: columns as added to ``packer``, their
+    number, and the rule by which they were thinned.
 
     ``travel`` is 0 for a message that took no time, else the time (s) at which it ended; ``number``
     is the difference from the previous row modulo 2^32.
@@ -322,8 +332,8 @@ def _message_columns(thinned: ThinnedMessages, run: StoredRun, packer: Packer) -
 def _event_columns(
     run: StoredRun, kinds: tuple[str, ...], max_events: int, packer: Packer
 ) -> dict[str, Any]:
-    """Return the events of these kinds as packed columns, every k-th if there are more than
-    ``max_events``.
+    """Return the events of these ``kinds`` for the live views, every k-th if there are more than
+    ``max_events``: columns as added to ``packer``, k, the number of all, and the names of codes.
     """
     codes = [CODES[kind] for kind in kinds]
     rows = run.log[np.isin(run.log["kind"], codes)]

@@ -104,7 +104,7 @@ class ReportSource:
 
     @property
     def knowledge(self) -> str:
-        """The messages that estimates sampled at t include: ``until`` (arrived at t or earlier),
+        """Which messages estimates sampled at t include: ``until`` (arrived at t or earlier),
         ``before`` (earlier than t: slots whose samples are predictions) or ``slot`` (also those of
         the slot that begins at t: slots whose samples are filtered).
         """
@@ -165,23 +165,27 @@ def read_source(directory: Path, replica: int | None = None, trust: bool = False
 def _choose_run(
     stored: StoredRun | StoredEnsemble, replica: int | None
 ) -> tuple[StoredRun | None, StoredEnsemble | None]:
-    """Return the run to animate, None if none was recorded, and its ensemble, None for a run of its
-    own.
+    """Return the run that the page animates, None if none was recorded, and the ensemble that it is
+    from, None for a run of its own.
 
-    Raises ScenarioError if ``replica`` is not in the directory.
+    ``replica`` is the number of the run that the user asks for, None for the first. Raises
+    ScenarioError if ``replica`` is not in the directory.
     """
     if isinstance(stored, StoredRun):
         if replica is not None and replica != stored.replica:
             where = shorten(stored.directory)
             raise ScenarioError(where, "holds no replica", replica, "leave out --replica")
         return stored, None
+    # Without a trace (events and samples) of any run there is nothing to animate.
     if replica is None and not (stored.directory / "states.parquet").exists():
         return None, stored
     return stored.replica(replica or 0), stored
 
 
 def _verdict_manifest(stored: StoredVerdict) -> dict[str, Any]:
-    """Return the manifest entries of a verdict: such a directory has no manifest.json."""
+    """Return the entries of a manifest for a verdict of ``netkf check``, whose directory has no
+    manifest.json, so that pages treat it like other directories.
+    """
     runs = {"done": stored.runs, "wanted": stored.runs}
     versions = stored.document.get("versions", {})
     return {"seed": stored.seed, "status": "complete", "runs": runs, "versions": versions}

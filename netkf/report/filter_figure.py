@@ -64,7 +64,7 @@ def _draw_row(row: ComparedFilter, k: int, scale: float) -> str:
     """
     error, y = row.quantities["rms_error"].value, ROW_HEIGHT * k + ROW_HEIGHT // 2 + 4
     axis_end, high = WIDTH - NUMBER_WIDTH, _bar_end(row)
-    low = max(0.0, 2.0 * error - high)
+    low = max(0.0, 2.0 * error - high)  # the bar is symmetric about the error
     x, left, right = (min(axis_end, LABEL_WIDTH + scale * value) for value in (error, low, high))
     is_outside = LABEL_WIDTH + scale * error > axis_end
     number = format_number(error) + (" (off the axis)" if is_outside else "")

@@ -41,8 +41,8 @@ class NodeMeans(NamedTuple):
 
 
 def read_innovations(source: ReportSource) -> Innovations | str | None:
-    """Return the innovations of the run of a source, by a replay, or the reason why there are none;
-    None without a run that has samples.
+    """Return the innovations of the run of a source (the contents of one directory), for which the
+    run is replayed, or the reason why there are none; None without a run that has samples.
     """
     if source.run is None or not len(source.run.times):
         return None
@@ -55,11 +55,12 @@ def read_innovations(source: ReportSource) -> Innovations | str | None:
 
 
 def node_means(readings: Innovations) -> NodeMeans:
-    """Return the mean NIS (M,) of each of M nodes with readings, with limits (M,) that hold if P is
-    exact.
+    """Return the mean over time of each node's NIS (squared innovation in units of its covariance,
+    per scalar reading), (M,) for M nodes with readings, with limits (M,) that hold if P is exact.
     """
     finite = np.isfinite(readings.nis)
     nodes, columns = np.unique(readings.nodes[finite], return_inverse=True)
+    # Numbers of scalar readings, the degrees of freedom, and sums of NIS of each node.
     freedom, sums = (
         np.asarray(np.bincount(columns, weights=values[finite], minlength=len(nodes)), np.float64)
         for values in (readings.rows, readings.nis)
@@ -82,9 +83,9 @@ def describe_innovations(readings: Innovations) -> str:
     sentence += " the squared innovation in units of its covariance (NIS per row; "
     sentence += "1 if P is exact) is "
     if len(nodes) == 1:
-        place = f"at node {nodes[0]}" if nodes[0] >= 0 else "of the filter of all readings"
+        where = f"at node {nodes[0]}" if nodes[0] >= 0 else "of the filter of all readings"
         judgement = _judge_mean(means[0], low[0], high[0])
-        return f"{sentence}{format_number(means[0])} {place}, {judgement}"
+        return f"{sentence}{format_number(means[0])} {where}, {judgement}"
     smallest, largest = int(np.argmin(means)), int(np.argmax(means))
     sentence += f"{format_number(means[smallest])} (node {nodes[smallest]}) to "
     sentence += f"{format_number(means[largest])} (node {nodes[largest]})"
@@ -116,8 +117,9 @@ def _judge_mean(mean: float, low: float, high: float) -> str:
 def innovation_columns(
     readings: Innovations | str | None, nodes: tuple[int, ...], max_readings: int, packer: Packer
 ) -> dict[str, Any] | None:
-    """Return the NIS of the readings as packed columns, with the means and the autocorrelations of
-    each node; every k-th reading if there are more than ``max_readings``; None without innovations.
+    """Return the NIS (normalised squared innovations) of the readings for the live views, as
+    columns added to ``packer``, with the means and the autocorrelations of each node; every k-th
+    reading if there are more than ``max_readings``; None without innovations.
 
     Nodes are given by their index in ``nodes``, -1 for readings that one filter uses together.
     """

@@ -32,8 +32,8 @@ REPLAYED_EVENTS, MIN_REPLAYS, MAX_REPLAYS = 300_000, 5, 60
 
 
 def explain_worst(source: ReportSource) -> Explanation | str | None:
-    """Return the explanation of ``netkf why`` for the worst sample of a single run after the
-    start-up, or the reason why there is none.
+    """Return the explanation of ``netkf why``, from replays with missing messages delivered, for
+    the worst sample of a single run after the start-up, or the reason why there is none.
 
     It is None without a single recorded run in which nodes send messages.
     """
@@ -60,7 +60,9 @@ def _why_command(source: ReportSource, worst: WorstSample) -> str:
 
 
 def describe_mending(explanation: Explanation) -> str:
-    """Return a sentence on how much better the worst sample would be with the missing messages."""
+    """Return a sentence on how much smaller trace P and the error of the worst sample would be had
+    no message been missing, as replays of the run show.
+    """
     # The first replay is the run as it was, the last one has no message missing.
     actual, best = explanation.what_ifs[0], explanation.what_ifs[-1]
     same_trace = math.isnan(actual.trace) or math.isclose(

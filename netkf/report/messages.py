@@ -40,10 +40,11 @@ class ThinnedMessages(NamedTuple):
 
 
 def join_messages(log: np.ndarray) -> np.ndarray:
-    """Return M MESSAGE rows (M,), ordered by sender, receiver and number, from the EVENT rows
-    ``log`` (E,) of a run.
+    """Return one MESSAGE row for each of the M messages sent in a run, (M,), ordered by sender,
+    receiver and number: its send event joined with that of its delivery or loss.
 
-    Raises ValueError if an outcome belongs to no send event, or if ids or numbers are too large.
+    ``log`` (E,) are the EVENT rows of the run. Raises ValueError if an outcome belongs to no send
+    event, or if ids or numbers are too large.
     """
     sends = log[log["kind"] == CODES["send"]]
     messages = np.zeros(len(sends), dtype=MESSAGE)
@@ -67,7 +68,7 @@ def _message_keys(
     rows: np.ndarray, node_columns: tuple[str, str], number_column: str = "number"
 ) -> np.ndarray:
     """Return one integer for each of M ``rows``, (M,), which identifies its message and orders by
-    sender, receiver and number.
+    sender, receiver and number, so that events find their message by a sorted search.
 
     ``node_columns`` are the names of the columns of sender and receiver, ``number_column`` that of
     the number. Raises ValueError for ids of 2^20 and more, or numbers of 2^24 and more, which runs
@@ -83,11 +84,11 @@ def _message_keys(
 def _set_outcomes(
     messages: np.ndarray, rows: np.ndarray, outcome: int, node_columns: tuple[str, str]
 ) -> None:
-    """Set the ``outcome``, ``ended`` and ``age`` of those ``messages`` (M,), in place, that EVENT
-    ``rows`` (K,) are about.
+    """Set the ``outcome`` (delivered, lost or late), ``ended`` and ``age`` of those ``messages``
+    (M,), in place, that EVENT ``rows`` (K,) are about.
 
-    ``node_columns`` are the names of their columns of sender and receiver. Raises ValueError if a
-    row is about none of the messages.
+    ``node_columns`` are the names of the events' columns of sender and receiver. Raises ValueError
+    if a row is about none of the messages.
     """
     if not len(rows):
         return
@@ -102,7 +103,8 @@ def _set_outcomes(
 
 
 def thin_messages(messages: np.ndarray, max_messages: int, instant: float) -> ThinnedMessages:
-    """Return at most about ``max_messages`` of the MESSAGE rows ``messages`` (M,).
+    """Return at most about ``max_messages`` of the MESSAGE rows ``messages`` (M,), one for each
+    message of a run, so that the page does not become too large.
 
     If there are more, half of those returned are all messages of an interval around ``instant``
     (seconds), and the other half is spread over the run.

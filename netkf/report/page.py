@@ -65,16 +65,16 @@ POLICY = (
 )
 """Content security policy of a page, with the hashes of its script and its style sheet."""
 MIN_BUDGET = 500
-"""Messages below which a budget is not halved again."""
+"""Messages below which the limits on data are not halved again."""
 MARK = b'<meta name="generator" content="netkf '
 """Bytes among the first HEAD ones of every page, by which a page is told from other files."""
 HEAD = 4096
 
 
-class _Entry(NamedTuple):
-    """A source of a page and the results of the computations that take long.
+class _AnalysedSource(NamedTuple):
+    """A source (the contents of one directory) and the results of the computations that take long.
 
-    messages : the MESSAGE rows of its run, none without a run
+    messages : the MESSAGE rows of its run, one for each message sent; none without a run
     worst    : the explanation of its worst sample, or the reason why there is none
     readings : the innovations of its run, or the reason why there are none
     """
@@ -86,7 +86,7 @@ class _Entry(NamedTuple):
 
     @property
     def is_live(self) -> bool:
-        """True if the run can be shown in the live views."""
+        """True if the run can be shown in the live views, in which the page animates it."""
         run = self.source.run
         return run is not None and len(run.times) > 0 and len(run.nodes) <= MAX_NODES
 
@@ -140,36 +140,39 @@ def make_page(
     """
     if not 1 <= len(directories) <= 2:
         raise ScenarioError("report", "takes one or two directories", len(directories))
-    entries = [_read_entry(Path(directory), replica, trust) for directory in directories]
+    entries = [_analyse_directory(Path(directory), replica, trust) for directory in directories]
     entries = _merge_verdict(entries)
     command = _report_command(directories, replica, trust, out)
     comparison = _compare(entries, directories)
-    budget = Budget(BUDGET.messages // len(entries), BUDGET.values // len(entries))
+    # Data of the runs are thinned until the page is small enough.
+    data_limits = Budget(BUDGET.messages // len(entries), BUDGET.values // len(entries))
     while True:
-        page = _assemble_page(entries, comparison, command, budget)
-        if len(page.encode("utf-8")) <= MAX_BYTES or budget.messages < MIN_BUDGET:
+        page = _assemble_page(entries, comparison, command, data_limits)
+        if len(page.encode("utf-8")) <= MAX_BYTES or data_limits.messages < MIN_BUDGET:
             return page
-        budget = budget.halve()
+        data_limits = data_limits.halve()
 
 
-def _read_entry(directory: Path, replica: int | None, trust: bool) -> _Entry:
-    """Return the contents of a directory, with its messages, explanation and innovations.
+def _analyse_directory(directory: Path, replica: int | None, trust: bool) -> _AnalysedSource:
+    """Read a directory of the page and do what takes long once: join its messages, explain its
+    worst sample by replays, and compute its innovations.
 
     Raises ScenarioError if netkf did not write the directory, or if its files are damaged.
     """
     source = read_source(directory, replica, trust)
     if source.run is None:
-        return _Entry(source, np.empty(0, dtype=MESSAGE))
+        return _AnalysedSource(source, np.empty(0, dtype=MESSAGE))
     with damage_named(directory):
         try:
             messages = join_messages(source.run.log)
         except ValueError as error:
             raise DamagedError(f"events.parquet: {error}") from None
-    return _Entry(source, messages, explain_worst(source), read_innovations(source))
+    return _AnalysedSource(source, messages, explain_worst(source), read_innovations(source))
 
 
-def _merge_verdict(entries: list[_Entry]) -> list[_Entry]:
-    """Return the entries; if they are a run or an ensemble and a verdict, one entry of both.
+def _merge_verdict(entries: list[_AnalysedSource]) -> list[_AnalysedSource]:
+    """Return the read directories of a page; if they are a run or an ensemble and the verdict of
+    ``netkf check`` on it, one entry that has both.
 
     Raises ScenarioError if two directories of other kinds are not runs and ensembles.
     """
@@ -195,9 +198,12 @@ def _report_command(
     return shlex.join(command)
 
 
-def _compare(entries: list[_Entry], directories: Sequence[str | Path]) -> Comparison | str | None:
-    """Return the comparison of the first two of the directories on a page, with one of ``entries``
-    each; the reason why there is none, if a run did not finish; or None for a single directory.
+def _compare(
+    entries: list[_AnalysedSource], directories: Sequence[str | Path]
+) -> Comparison | str | None:
+    """Return the differences of the two ``directories`` of a page, which ``entries`` are the
+    contents of; the reason why there are none, if a run did not finish; or None for a single
+    directory.
     """
     if len(entries) < 2:
         return None
@@ -208,17 +214,22 @@ def _compare(entries: list[_Entry], directories: Sequence[str | Path]) -> Compar
 
 
 def _assemble_page(
-    entries: list[_Entry], comparison: Comparison | str | None, command: str, budget: Budget
+    entries: list[_AnalysedSource],
+    comparison: Comparison | str | None,
+    command: str,
+    data_limits: Budget,
 ) -> str:
-    """Return the page of one or two ``entries`` as HTML, with at most about as much data of each
-    run as ``budget`` allows.
+    """Return the page of one or two ``entries`` (read directories) as HTML, with at most about as
+    many messages and sample values of each run as ``data_limits`` allow.
 
-    ``comparison`` of the two is left out if None, and a text if there is none; ``command`` is the
-    command line that makes the page.
+    ``comparison`` is that of the two: a text if it is only the reason why there is none, None for
+    one entry. ``command`` is the command line that makes the page.
     """
-    packer = Packer()
+    packer = Packer()  # collects columns of numbers as one compressed text
     runs = [
-        run_data(entry.source, entry.source.run, entry.messages, entry.readings, budget, packer)
+        run_data(
+            entry.source, entry.source.run, entry.messages, entry.readings, data_limits, packer
+        )
         for entry in entries
         if entry.is_live and entry.source.run is not None
     ]
@@ -252,9 +263,9 @@ def _assemble_page(
     )
 
 
-def _page_header(entries: list[_Entry], comparison: Comparison | str | None) -> str:
-    """Return the head of the page as HTML: the names of the scenarios and the sentences on the
-    sources and their differences.
+def _page_header(entries: list[_AnalysedSource], comparison: Comparison | str | None) -> str:
+    """Return the head of the page as HTML: the names of the scenarios, the sentences on what the
+    data of the ``entries`` (read directories) say, and those on their differences, if any.
     """
     parts = []
     for letter, entry in zip("AB", entries, strict=False):
@@ -275,8 +286,10 @@ def _page_header(entries: list[_Entry], comparison: Comparison | str | None) -> 
     return f'<header class="top">{heading}{"".join(parts)}</header>'
 
 
-def _source_sentences(entry: _Entry) -> list[str]:
-    """Return the sentences on a source, those from replays after the one that begins with Why."""
+def _source_sentences(entry: _AnalysedSource) -> list[str]:
+    """Return the sentences at the top of the page about a read directory: what its data say and,
+    after the sentence that begins with Why, what replays with the missing messages say.
+    """
     sentences = describe_source(entry.source, entry.messages, entry.readings)
     if isinstance(entry.worst, Explanation):
         after_why = (k for k, line in enumerate(sentences, 1) if line.startswith("Why: "))
@@ -289,18 +302,21 @@ def _source_sentences(entry: _Entry) -> list[str]:
 
 
 def _main_sections(
-    entries: list[_Entry],
+    entries: list[_AnalysedSource],
     comparison: Comparison | str | None,
     command: str,
     rules: list[str],
     live: bool,
 ) -> str:
-    """Return the sections of the page as HTML.
+    """Return the sections of the page below its head as HTML, for the ``entries`` (read
+    directories) and their ``comparison``, as ``_assemble_page`` describes them.
 
-    ``rules`` are the sentences on data that were left out; ``live`` is True with live views.
+    ``rules`` are the sentences on data that were left out; ``live`` is True if the page animates a
+    run.
     """
     sources = [entry.source for entry in entries]
     parts = [_asset("live.html") if live else _explain_no_live_views(sources)]
+    # What would have reduced the worst error of each run.
     explanations = [mending_section(e.source, e.worst) for e in entries if e.worst is not None]
     if explanations:
         title = "What would have mended the worst sample"
@@ -321,7 +337,7 @@ def _main_sections(
     return "<main>" + "".join(parts) + "</main>"
 
 
-def _curve_area(entries: list[_Entry]) -> str:
+def _curve_area(entries: list[_AnalysedSource]) -> str:
     """Return the element in which the page's script draws the curves, and notes on innovations that
     could not be computed, as HTML.
     """
@@ -338,7 +354,9 @@ def _difference_tables(comparison: Comparison | str) -> str:
 
 
 def _explain_no_live_views(sources: list[ReportSource]) -> str:
-    """Return a section with the reason why the page has no live views, as HTML."""
+    """Return a section with the reason why the page has no live views, which animate a recorded
+    run, as HTML.
+    """
     untraced_kinds = {"sweep": "sweep", "verdict": "verdict", "filters": "comparison of filters"}
     if sources[0].kind in untraced_kinds:
         reason = (
@@ -355,7 +373,9 @@ def _explain_no_live_views(sources: list[ReportSource]) -> str:
 
 
 def _result_tables(source: ReportSource) -> str:
-    """Return the tables of a source's verdict, sweep, filters or averages as HTML."""
+    """Return the tables of a source (the contents of one directory) as HTML: of the verdict of
+    ``netkf check`` and of its sweep, its compared filters or its averages.
+    """
     parts = []
     if source.verdict is not None:
         parts.append(tables.verdict_table(source))
@@ -377,7 +397,7 @@ def _result_tables(source: ReportSource) -> str:
 
 
 def _scenario_text(source: ReportSource) -> str:
-    """Return the scenario file of a source as HTML."""
+    """Return the text of a source's scenario file as HTML, in a box that scrolls by itself."""
     label = f"scenario.toml of {source.label}"
     return (
         f"<h3>{text(label)}</h3>"
@@ -394,8 +414,8 @@ def _event_counts(run: StoredRun) -> str:
 
 
 def _describe_origin(sources: list[ReportSource], command: str, rules: list[str]) -> str:
-    """Return the commands that make the page and its sources, the versions, the counts of events,
-    and the ``rules`` by which data were left out, as HTML.
+    """Return the commands that make the page and the results in its ``sources`` (directories), the
+    versions, the counts of events, and sentences (``rules``) on data that were left out, as HTML.
     """
     parts = [paragraph("This page was made by:"), _command_box(command)]
     for source in sources:
@@ -418,7 +438,9 @@ def _command_box(command: str) -> str:
 
 
 def _source_command(source: ReportSource) -> str:
-    """Return the command line that computes the results of a source again."""
+    """Return the command line that computes the results of a source, the contents of one
+    directory, again.
+    """
     subcommands = {"sweep": "sweep", "verdict": "check", "filters": "compare-filters"}
     subcommand = subcommands.get(source.kind, "run")
     command = f"netkf {subcommand} {shlex.quote(source.label + '/scenario.toml')}"
@@ -453,7 +475,9 @@ def _asset(name: str) -> str:
 
 @cache
 def _script() -> str:
-    """Return uPlot and the page's own scripts as one; the latter share a function's scope."""
+    """Return the script of the page: uPlot, a library that draws curves, and the page's own files,
+    which share the scope of one function.
+    """
     # The licence of uPlot requires its text in every copy.
     licence = "/*! uPlot\n" + _asset("uPlot.LICENSE.txt").replace("*/", "") + "*/\n"
     scripts = "\n".join(_asset(name) for name in SCRIPTS)

@@ -29,7 +29,9 @@ INTERVAL_WIDTH = 2.0
 
 
 def verdict_table(source: ReportSource) -> str:
-    """Return the rows of the verdict of ``netkf check`` as a table, broken promises first."""
+    """Return the results of ``netkf check``, which tests on many runs what theory promises, as a
+    table: one row for each promise, broken ones first.
+    """
     verdict = source.verdict or {}
     rows = sorted(verdict.get("rows", []), key=_verdict_rank)
     cells = [
@@ -37,6 +39,7 @@ def verdict_table(source: ReportSource) -> str:
             "BROKEN" if row["verdict"] == "broken" else row["verdict"],
             row["promise"],
             row["source"],
+            # measured and promised value, their distance, and the error that would have been seen
             format_number(row["seen"]),
             format_number(row["expected"]),
             format_number(row["off"]),
@@ -51,13 +54,17 @@ def verdict_table(source: ReportSource) -> str:
 
 
 def _verdict_rank(row: dict[str, Any]) -> int:
-    """Return the index of a row's verdict in VERDICT_ORDER, the last for other verdicts."""
+    """Return the sort key of a row of a verdict: the index of its result in VERDICT_ORDER, broken
+    promises first; unknown results come last.
+    """
     verdict = row["verdict"]
     return VERDICT_ORDER.index(verdict) if verdict in VERDICT_ORDER else len(VERDICT_ORDER)
 
 
 def summary_section(source: ReportSource) -> str:
-    """Return the table of averages that ``netkf run`` prints, with its notes."""
+    """Return the table of averages over time that ``netkf run`` prints for each node, with notes on
+    messages and bounds, as HTML.
+    """
     summary = source.summary
     if not summary:
         return paragraph("There is no summary: the runs ended before it was written")
@@ -91,7 +98,9 @@ def _summary_cells(row: dict[str, Any]) -> list[str]:
 
 
 def _bound_notes(source: ReportSource) -> list[str]:
-    """Return notes on the bound of trace P, its limit and the centralised filter."""
+    """Return notes below the table of averages on what trace P is compared with: its bound by
+    theory, the limit of the bound, and the trace of a centralised filter.
+    """
     summary = source.summary
     notes = [] if any(row["bound"] for row in summary["nodes"]) else [f"bound: {summary['bound']}"]
     if source.promised is not None:
@@ -105,8 +114,8 @@ def _bound_notes(source: ReportSource) -> list[str]:
 
 
 def _explain_limit(label: str) -> str:
-    """Return sentences that define the limit of the bound, which is called ``label``, and compare
-    it with the centralised covariance.
+    """Return sentences that tell the reader what the limit called ``label`` is (of the bound on
+    trace P as links tick ever faster), and how it compares with the centralised covariance.
     """
     weights = "1/N" if label.startswith("limit S") else "their weights"
     return (
@@ -123,11 +132,11 @@ def _format_count(value: Any) -> str:
 
 
 def comparison_section(comparison: Comparison) -> str:
-    """Return a table of the differences of two directories, A and B, below a sentence that counts
-    the certain ones.
+    """Return a table of the differences of the runs in two directories, A and B, below a sentence
+    that counts the certain ones (whose intervals exclude 0), as HTML.
     """
     rows = []
-    for quantity, node, (first, second) in comparison.rows:
+    for quantity, node, (first, second) in comparison.rows:  # node -1: all nodes
         label = quantity if node < 0 else f"{quantity} of node {node}"
         values = (_format_value(first), _format_value(second))
         rows.append([label, *values, *_difference_cells(second)])
@@ -166,7 +175,9 @@ def _difference_cells(entry: Entry) -> list[str]:
 
 
 def filters_table(comparison: StoredComparison) -> str:
-    """Return a table of the compared filters, with their differences from the first one."""
+    """Return a table of the filters that were run on the same draws, with their differences from
+    the first one, as HTML.
+    """
     header = ["filter"]
     for name in ("RMS error", "worst instant", "NEES / n"):
         header += [name, f"difference from {comparison.first}", "certain?"]
@@ -195,7 +206,9 @@ def filters_table(comparison: StoredComparison) -> str:
 
 
 def _quantity_cells(quantity: Quantity) -> list[str]:
-    """Return the value, its difference and whether the difference is certain as three texts."""
+    """Return the texts of three cells: the value, its difference from that of the first filter with
+    its interval, and whether the difference is certain.
+    """
     value = format_number(quantity.value) + format_standard_error(quantity.se)
     if not math.isfinite(quantity.difference):
         return [value, "-", "-"]
@@ -205,7 +218,9 @@ def _quantity_cells(quantity: Quantity) -> list[str]:
 
 
 def sweep_table(source: ReportSource) -> str:
-    """Return a table of the first MAX_ROWS points of a sweep."""
+    """Return a table of the first MAX_ROWS points of a sweep, each with its values of the varied
+    keys, as HTML.
+    """
     assert source.sweep is not None
     points = source.sweep.table
     if not len(points):

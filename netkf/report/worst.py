@@ -75,17 +75,20 @@ class StartUp(NamedTuple):
 def find_worst_after_start_up(
     run: StoredRun, summary: Mapping[str, Any], worst: WorstSample
 ) -> tuple[WorstSample, StartUp | None]:
-    """Return the worst sample of a node after its start-up, and the start-up if ``worst``, its
-    worst sample of all, lies in it; else ``worst`` itself and None.
+    """Return the worst sample of a node after the start-up of its filter, in which trace P falls
+    from its initial value, and the start-up, if ``worst``, the node's worst sample of all, lies in
+    it; else ``worst`` itself and None.
 
     The start-up ends when trace P has decreased halfway from its first value to the mean of its
     last ones.
     """
+    # Column of the node and row of its worst sample in the arrays of the run.
     column, row = run.nodes.index(worst.node), int(np.searchsorted(run.times, worst.time))
     traces = np.trace(run.P[:, column], axis1=1, axis2=2)
     first, now = float(traces[0]), float(traces[row])
     last = float(traces[-max(1, int(LATE_SHARE * len(traces))) :].mean())
     low = np.flatnonzero(traces <= 0.5 * (first + last))
+    # No start-up, or the worst sample comes after it.
     if not last < START_UP_RATIO * first or not len(low) or low[0] <= row:
         return worst, None
     averaged = summary_samples(run, summary)
