@@ -62,7 +62,9 @@ def _declare(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(options: argparse.Namespace) -> int:
-    """Check the promises of a scenario; return the exit status, 1 if one is broken."""
+    """Test on simulated runs what theory promises for a scenario, such as bounds on P; return the
+    exit status, 1 if a promise is broken.
+    """
     from netkf.runs.directory_lock import lock_directory
 
     # Promises are checked at other times than those of ``probe``, which therefore need not fit the
@@ -73,14 +75,16 @@ def _run(options: argparse.Namespace) -> int:
 
 
 def _check(scenario: Scenario, options: argparse.Namespace) -> int:
-    """Check the promises, write the verdict with ``--out``, and print it; return the exit status.
+    """Test what theory promises for a scenario, write the verdict (a row for each promise: holds,
+    broken, undecided or not promised) with ``--out``, and print it; return the exit status.
 
-    It is printed even if its files cannot be written.
+    The verdict is printed even if its files cannot be written.
     """
     from netkf.checks.points import sampling_note
     from netkf.checks.report import verdict_json, verdict_text
 
     earlier = _open_verdict_directory(scenario, options)
+    # ``earlier``: the verdict in --out that --resume adds runs to.
     # The same command again: it may have been stopped after it wrote its verdict.
     is_complete = earlier is not None and options.until is None and earlier.runs == options.runs
     if earlier is not None and is_complete:
@@ -104,7 +108,9 @@ def _check(scenario: Scenario, options: argparse.Namespace) -> int:
 
 
 def _run_check(scenario: Scenario, options: argparse.Namespace, earlier: Verdict | None) -> Verdict:
-    """Return the verdict on ``--runs`` runs, which include those of an ``earlier`` verdict."""
+    """Return the verdict (a row for each promise of theory) on ``--runs`` runs, which include those
+    of an ``earlier`` verdict that is resumed; only the others are simulated.
+    """
     from netkf.checks.check import check
     from netkf.checks.looks import MAX_LOOKED_RUNS
 
@@ -124,8 +130,9 @@ def _run_check(scenario: Scenario, options: argparse.Namespace, earlier: Verdict
 
 @contextlib.contextmanager
 def _explain_interrupt(options: argparse.Namespace, earlier: Verdict | None) -> Iterator[None]:
-    """Add to a KeyboardInterrupt of the block, with ``--out``, a message on what is in the
-    directory: runs are written only together with their verdict.
+    """Add to a KeyboardInterrupt of the ``with`` block, if there is ``--out``, a message on what is
+    in the directory: the ``earlier`` verdict or nothing, because runs are written only together
+    with the verdict on all of them.
     """
     try:
         yield
@@ -140,8 +147,8 @@ def _explain_interrupt(options: argparse.Namespace, earlier: Verdict | None) -> 
 
 
 def _open_verdict_directory(scenario: Scenario, options: argparse.Namespace) -> Verdict | None:
-    """Make the directory of ``--out``, or, with ``--resume``, return the verdict in it if it is
-    complete.
+    """Make the directory of ``--out``, or, with ``--resume``, return the verdict of an earlier
+    ``netkf check`` in it, to which runs are added, if its files are complete.
 
     Raises ScenarioError for ``--resume`` without ``--out``, and if the directory does not fit.
     """
@@ -162,7 +169,8 @@ def _open_verdict_directory(scenario: Scenario, options: argparse.Namespace) -> 
 def _write_verdict(
     scenario: Scenario, verdict: Verdict, text: str, options: argparse.Namespace
 ) -> None:
-    """Write the files of a verdict unless ``text`` is empty, and its picture if it is missing.
+    """Write the files of a verdict into ``--out``, with ``text`` as the terminal shows it, unless
+    that is empty, which means that they are there; and its picture if it is missing.
 
     Raises WriteError if a file cannot be written.
     """
@@ -176,8 +184,8 @@ def _write_verdict(
 
 
 def _replay_command(options: argparse.Namespace) -> str:
-    """Return the command line that simulates a replica of this check, up to the replica's number,
-    which is to be appended.
+    """Return the command line that simulates one run of this check, up to its number, which the
+    caller appends: a broken promise names a run that shows it.
     """
     command = ["netkf", "run", str(options.scenario)]
     for change in options.set:

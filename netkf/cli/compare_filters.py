@@ -48,7 +48,9 @@ def _declare(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(options: argparse.Namespace) -> int:
-    """Compare filters in the directory of ``--out``, if any; return the exit status."""
+    """Compare filters while no other command can write into the directory of ``--out``, if there
+    is one; return the exit status.
+    """
     from netkf.runs.directory_lock import lock_directory
 
     with lock_directory(options.out, must_be_empty=True):
@@ -56,7 +58,8 @@ def _run(options: argparse.Namespace) -> int:
 
 
 def _compare(options: argparse.Namespace) -> int:
-    """Compare filters, write the files of ``--out``, and print the table; return the exit status.
+    """Simulate the scenario with each of ``--filters`` on the same draws, write the files of
+    ``--out``, and print the table of the comparison; return the exit status.
 
     The table is printed even if its files cannot be written.
     """

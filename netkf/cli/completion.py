@@ -20,8 +20,8 @@ class PrintCompletion(argparse.Action):
         values: Any,
         option_string: str | None = None,
     ) -> None:
-        """Print the script for the shell ``values`` and raise SystemExit; with status 2 if shtab is
-        missing.
+        """Print the completion script for the shell named ``values`` and raise SystemExit; with
+        status 2 if the package shtab is missing. Called by argparse when it meets the option.
         """
         try:
             import shtab

@@ -64,7 +64,11 @@ class _Outcome:
 
 
 def _run_command(arguments: Sequence[str], interruption: Interruption) -> int:
-    """Run a command, print its message on standard error, and return the exit status."""
+    """Run a command line, print the message about its error on standard error, if any, and return
+    the exit status.
+
+    Signals raise KeyboardInterrupt only while ``interruption`` is armed.
+    """
     with safe_streams():
         try:
             interruption.arm()
@@ -78,9 +82,10 @@ def _run_command(arguments: Sequence[str], interruption: Interruption) -> int:
 
 
 def _execute(arguments: Sequence[str], interruption: Interruption) -> _Outcome:
-    """Run a command and return its outcome, also of its errors.
+    """Run a command line and return its exit status and the message about its error, if any.
 
-    Raises KeyboardInterrupt if it is interrupted, and SystemExit for bad usage.
+    ``interruption`` knows whether a signal was received. Raises KeyboardInterrupt if the command is
+    interrupted, and SystemExit for bad usage.
     """
     try:
         options = make_parser().parse_args(arguments)
@@ -108,7 +113,9 @@ def _report_interrupt(detail: str) -> _Outcome:
 
 
 def _describe_error(error: Exception) -> str | None:
-    """Return the message about an expected error, None for an unexpected one."""
+    """Return the one-line message about an expected error, such as a bad file or a full disk; None
+    for an unexpected one, which gets a traceback.
+    """
     if isinstance(error, NetkfError):
         return str(error)
     if isinstance(error, OSError):

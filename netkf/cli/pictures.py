@@ -34,8 +34,8 @@ def load_drawing(name: tuple[str, str]) -> Callable[..., Any] | None:
 
 
 def draw_picture(name: tuple[str, str], *results: Any) -> None:
-    """Call a drawing function (module, function) with ``results``; print a note with the reason if
-    there is no picture.
+    """Call the drawing function ``name`` = (module, function) with ``results``, for the picture of
+    a finished command; print a note with the reason if there is no picture.
     """
     draw = load_drawing(name)
     if draw is None:

@@ -43,6 +43,7 @@ def _run(options: argparse.Namespace) -> int:
         raise ScenarioError("plot", rule, None, remedy) from None
     from netkf.studies.opening import open as open_directory
 
+    # Empty: all figures.
     names = tuple(name for text in options.figure for name in _figure_names(text))
     has_several = len(options.directories) > 1
     if has_several and options.out is not None and options.out.suffix.removeprefix(".") in FORMATS:

@@ -71,8 +71,8 @@ class Interruption:
         self._disarmed, self._armed = True, False
 
     def _receive(self, number: int, frame: FrameType | None) -> None:
-        """Handle the first signal: note that it was received, and raise KeyboardInterrupt if
-        armed.
+        """Handle Ctrl-C or SIGTERM, the first of them only: remember that it was received, and
+        raise KeyboardInterrupt if the command is running (armed).
         """
         if self.received or self._disarmed:
             return
@@ -87,6 +87,8 @@ class Interruption:
     def _handle_unraisable(self, unraisable: Any) -> None:
         """Send a signal again if Python has dropped its KeyboardInterrupt, as it does in finalizers
         and callbacks of C code; other exceptions go to the previous hook.
+
+        Called by Python as sys.unraisablehook.
         """
         if unraisable.exc_type is None or not issubclass(unraisable.exc_type, KeyboardInterrupt):
             self._previous_hook(unraisable)
@@ -95,7 +97,9 @@ class Interruption:
             _thread.start_new_thread(self._send_again, (number,))
 
     def _send_again(self, number: signal.Signals) -> None:
-        """Send a signal to the main thread after RESEND_SECONDS."""
+        """Send a signal to the main thread again after RESEND_SECONDS, as if it were the first;
+        runs in a thread of its own.
+        """
         time.sleep(RESEND_SECONDS)
         self.received = False
         # A signal to that very thread also ends its blocking system calls.
@@ -107,9 +111,8 @@ class Interruption:
 
 
 def end_later(status: int, seconds: float, message: str = "") -> None:
-    """End the process with ``status`` after some seconds, even if its main thread is blocked.
-
-    Then ``message`` is written to standard error.
+    """Start a thread that writes ``message`` to standard error after some ``seconds`` and ends the
+    process with ``status``, even if the main thread is blocked; return at once.
     """
 
     def end() -> None:
@@ -199,7 +202,9 @@ class SafeStream:
 
     @contextlib.contextmanager
     def _handle_failures(self) -> Iterator[None]:
-        """Raise OutputError for failures of writing in the block, or ignore them."""
+        """Within a ``with`` block that writes, raise OutputError for failures, or ignore them if
+        the stream is lossy; after a broken pipe discard all further output.
+        """
         try:
             yield
         except BrokenPipeError:

@@ -29,22 +29,24 @@ class ProgressLine:
         if self._printed:
             _print_direct("")
 
-    def show(self, text: str) -> None:
-        """Replace the line by a text."""
+    def replace(self, text: str) -> None:
+        """Replace the line by a text; do nothing without a terminal."""
         if self._is_terminal:
             self._printed = True
             _print_direct(one_line(text))
 
     def report(self, text: str) -> None:
         """Replace the line by a text; without a terminal print it every REPORT_SECONDS seconds."""
-        self.show(text)
+        self.replace(text)
         now = time.monotonic()
         if not self._is_terminal and now - self._reported >= REPORT_SECONDS:
             self._reported = now
             print(f"netkf: {text}", file=sys.stderr, flush=True)
 
     def make_time_update(self, horizon: float) -> Callable[[float], None]:
-        """Return a function of the simulated time (s) that shows its percentage of ``horizon``."""
+        """Return a callback of an engine: a function of the simulated time (s) that shows its
+        percentage of ``horizon`` (s) on the line.
+        """
         last_percent = -1
 
         def update(seconds: float) -> None:
@@ -54,13 +56,13 @@ class ProgressLine:
             percent = int(100.0 * seconds / horizon)
             if percent != last_percent:
                 last_percent = percent
-                self.show(f"{percent:3d} % of {horizon:g} simulated seconds")
+                self.replace(f"{percent:3d} % of {horizon:g} simulated seconds")
 
         return update
 
     def make_count_update(self, unit: str) -> Callable[[int, int], None]:
-        """Return a function of the numbers (done, wanted) that shows both, in ``unit``, and the
-        estimated time left.
+        """Return a callback for work of many parts: a function of the numbers (done, wanted) that
+        shows both on the line, in ``unit`` ("runs", "points"), and the estimated time left.
         """
         first_update: tuple[float, int] | None = None
 
@@ -73,13 +75,13 @@ class ProgressLine:
                 first_update = now, done
             seconds, finished = now - first_update[0], done - first_update[1]
             left = f", about {seconds * (wanted - done) / finished:.0f} s left" if finished else ""
-            self.show(f"{done:,} of {wanted:,} {unit}{left}")
+            self.replace(f"{done:,} of {wanted:,} {unit}{left}")
 
         return update
 
 
 def _print_direct(text: str) -> None:
-    """Replace the current line of the terminal by a text."""
+    """Replace the current line of the terminal by a text, past the escaping of SafeStream."""
     # SafeStream.write would escape the control characters that clear the line.
     write = getattr(sys.stderr, "direct", sys.stderr.write)
     write(f"{CLEAR_LINE}{text}")

@@ -78,7 +78,10 @@ def _run(options: argparse.Namespace) -> int:
 
 
 def _run_once(scenario: Scenario, options: argparse.Namespace) -> int:
-    """Simulate one run into a directory and print its summary; return the exit status."""
+    """Simulate one run into the directory ``--out`` and print its summary; return the exit status.
+
+    With ``--resume`` a run that was stopped there is done again, and a finished one stays.
+    """
     from netkf.ensembles.resume import clear_unfinished_runs
     from netkf.runs.run import run_to_directory
 
@@ -112,7 +115,9 @@ def _run_once(scenario: Scenario, options: argparse.Namespace) -> int:
 
 
 def _run_ensemble(scenario: Scenario, options: argparse.Namespace) -> int:
-    """Simulate several runs into a directory and print their summary; return the exit status."""
+    """Simulate several runs into the directory ``--out`` and print averages over them; return the
+    exit status. With ``--resume`` only runs that are missing there are simulated.
+    """
     from netkf.ensembles.directory import EnsembleOptions, runs_to_directory
     from netkf.ensembles.pools import PoolOptions
 
@@ -150,8 +155,8 @@ def _print_note(note: str) -> None:
 
 
 def _print_summary(scenario: Scenario, completed: Any) -> None:
-    """Print the notes on a scenario, its title, and the table of averages of a completed run or
-    ensemble.
+    """Print the notes on a scenario, its title, and the table of averages of a CompletedRun or a
+    FinishedEnsemble.
     """
     from netkf.runs.files import missing_modules
     from netkf.runs.tables import summary_table
@@ -164,8 +169,8 @@ def _print_summary(scenario: Scenario, completed: Any) -> None:
 
 
 def _print_ensemble(completed: Any, runs: int) -> None:
-    """Print the duration of an ensemble of ``runs`` runs, the number of diverged runs, and its
-    directory.
+    """Print the duration of an ensemble of ``runs`` runs (a FinishedEnsemble), the number of
+    diverged runs, and its directory.
     """
     ensemble, seconds = completed.ensemble, max(completed.seconds, 1e-9)
     print(

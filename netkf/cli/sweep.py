@@ -67,7 +67,7 @@ def _run(options: argparse.Namespace) -> int:
                 PoolOptions(options.workers, None, options.scheduler),
                 progress=line.make_count_update("points"),
                 finish=None if options.no_plot else draw,
-                take=completed.append,
+                take=completed.append,  # called before files are written, which may fail
             )
     finally:
         # Without a completed sweep the list is empty.

@@ -13,7 +13,9 @@ def _declare(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(options: argparse.Namespace) -> int:
-    """Print the promises of the theory for a scenario; return the exit status."""
+    """Print what theory says about a scenario without simulation: assumptions, bounds on P and
+    limits; return the exit status.
+    """
     scenario = load_scenario(options)
     # These imports take half a second, which an invalid scenario need not wait for.
     from netkf.runs.failures import explain_failures

@@ -75,7 +75,8 @@ def _run(options: argparse.Namespace) -> int:
 
 
 def _explain(options: argparse.Namespace) -> int:
-    """Explain a sample, write the files of ``--out``, and print the text; return the exit status.
+    """Explain the estimate of ``--node`` at ``--at`` seconds (default: the worst sample), write the
+    files of ``--out``, and print the text; return the exit status.
 
     The text is printed even if its files cannot be written.
     """
@@ -106,7 +107,8 @@ def _explain(options: argparse.Namespace) -> int:
 
 
 def _find_worst_sample(options: argparse.Namespace) -> tuple[int, float]:
-    """Return the node and the time (s) of the worst sample after the start-up, and print a note.
+    """Return the node and the time (s) of the worst sample of a run, that with the largest error of
+    the worst node after the start-up of its filter, and print a note on it.
 
     Raises ScenarioError if the directory has no samples of a single run.
     """
