@@ -101,9 +101,10 @@ def file_digests(directory: Path, names: Iterable[str]) -> dict[str, str]:
 
 
 def check_files(directory: Path, manifest: Mapping[str, Any], names: Iterable[str] = ()) -> None:
-    """Raise DamagedError if a file is missing or does not have its digest in the manifest.
+    """Raise DamagedError if a file in ``directory`` is missing or does not have the digest that the
+    ``manifest`` lists for it.
 
-    Checks the ``names`` that the manifest lists; by default, all files that it lists.
+    Checks those of ``names`` that the manifest lists; by default, all files that it lists.
     """
     digests = manifest.get("files", {})
     require_form(digests, {}, "files")
@@ -128,7 +129,8 @@ TEXTS = "a list of texts"
 
 
 def require_form(value: Any, form: Any, key_path: str = "") -> None:
-    """Raise DamagedError unless a JSON value has a form; messages name its ``key_path``.
+    """Raise DamagedError unless a JSON value has a ``form``, a description of keys and types;
+    messages name its ``key_path``.
 
     A form is NUMBER, COUNT, TEXT or TEXTS, a list [form of every item], or a dictionary {key: form
     of its value}. Keys that end in ``?`` are optional, and other keys are allowed.
@@ -144,6 +146,7 @@ def require_form(value: Any, form: Any, key_path: str = "") -> None:
                 raise DamagedError(f"lacks {inner_path}")
     elif isinstance(form, list):
         _raise_unless(isinstance(value, list), "a list", key_path)
+        # A list in a form has one item, the form of all items.
         for item in value:
             require_form(item, form[0], key_path)
     else:

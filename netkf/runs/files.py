@@ -86,7 +86,8 @@ def write_json(path: Path, value: Any) -> None:
 
 
 def json_text(value: Any, margin: str = "\n") -> str:
-    """Return the text of ``json.dumps(to_json_value(value), indent=2)``, computed faster.
+    """Return a value as indented JSON text, that of ``json.dumps(to_json_value(value), indent=2)``,
+    computed faster.
 
     ``margin`` is the line break and the indentation of the line that the value begins on. The
     standard library indents in plain Python, with a call for each number; here each dictionary or
@@ -188,7 +189,8 @@ def copied_file_names(scenario: Scenario) -> list[str]:
 
 def holds_only(directory: Path, names: Collection[str]) -> bool:
     """Return True if a directory holds nothing but files of these ``names`` (paths relative to it),
-    their temporary files (NAME.part) and checkpoints of an ensemble.
+    their temporary files (NAME.part) and stored blocks of an ensemble, so that clearing it loses
+    nothing of the user's.
     """
     allowed = {*names, *(f"{name}.part" for name in names), BLOCKS_FOLDER}
     allowed |= {str(folder) for name in names for folder in Path(name).parents}
@@ -215,7 +217,8 @@ def remove_files(directory: Path, names: Iterable[str]) -> None:
 
 
 def check_sources(scenario: Scenario) -> None:
-    """Raise ScenarioError if a run directory could not hold a copy of the scenario.
+    """Raise ScenarioError if a run directory could not hold a copy of the scenario, from which the
+    run could be repeated; called before anything is simulated.
 
     That is if a class is defined where scenario.toml cannot import it from, or if a file that the
     scenario names has the name of a file that netkf writes.
@@ -263,7 +266,7 @@ def _copy(source: Path, target: Path) -> None:
 
 def scenario_digest(scenario: Scenario) -> str:
     """Return the SHA-256, in hexadecimal, of a scenario with all defaults filled in, together with
-    the files and modules that it names.
+    the files and modules that it names, by which resumed commands know their own results.
     """
     digest = hashlib.sha256(to_toml(resolve_defaults(scenario)).encode())
     files = {source.name: source.full for source in source_files(scenario)}

@@ -62,10 +62,13 @@ class ExpectedIncrements:
     def whitened_innovation(
         self, xhat: FloatArray, P: FloatArray, y: FloatArray, gap: float
     ) -> FloatArray:
-        """Return the innovation (p,) of increments y (p,) over ``gap`` seconds, times the inverse
-        Cholesky factor of its covariance S; ``xhat`` (n,) and ``P`` (n, n) are those at the start.
+        """Return the innovation y - H E[z] (p,) of increments y = int dy (p,) over ``gap`` seconds,
+        times the inverse Cholesky factor of its covariance S; z is the integral of the state.
+
+        ``xhat`` (n,) and ``P`` (n, n) are the estimate at the start of the interval.
         """
         n, H = self._n, self._H
+        # Transition of (x, z) over the gap, and a square root of its noise covariance.
         F, root = self._equation.discretise(gap)
         J = F[n:, :n]  # integral of exp(A s) over the gap, so that E[z] = J xhat
         S = H @ (J @ P @ J.T + root[n:] @ root[n:].T) @ H.T + self._R * gap
@@ -91,8 +94,9 @@ def _expected_increments_of_models() -> Callable[[Any], ExpectedIncrements]:
 
 
 def record_increments(algorithm: Filter, intervals: list[WhitenedInnovation]) -> Filter:
-    """Return a filter with the estimates of ``algorithm`` that appends the whitened innovation of
-    each measured increment to ``intervals``.
+    """Return a filter with the estimates of ``algorithm`` that also appends, for each interval of
+    continuous readings, the innovation times the inverse Cholesky factor of its covariance to
+    ``intervals``; a replay of a run with it gives the innovations of the run.
 
     Its states are TimedState, which wrap those of ``algorithm``.
     """
@@ -118,8 +122,8 @@ def record_increments(algorithm: Filter, intervals: list[WhitenedInnovation]) ->
             return TimedState(inner, state.node, state.time + gap, start)
 
         def update(self, state: TimedState, reading: Increments | Reading) -> TimedState:
-            """Update by ``reading``; of increments, append the whitened innovation to ``intervals``
-            first.
+            """Update by ``reading`` as the filter does; of increments (an interval of a continuous
+            sensor), append the innovation from the estimate at its start to ``intervals`` first.
             """
             xhat, P = state.start
             if isinstance(reading, Increments) and P is not None and np.isfinite(P).all():

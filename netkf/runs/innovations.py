@@ -97,8 +97,9 @@ def with_filter(scenario: Scenario, filtering: Any) -> Scenario:
 
 
 def _record_samples(algorithm: Filter, samples: list[RecordedSample]) -> Filter:
-    """Return a filter with the estimates of ``algorithm`` that appends each sample that it is
-    updated with to ``samples``, in place.
+    """Return a filter with the estimates of ``algorithm`` that also appends each reading that it is
+    updated with, and the estimate before it, to ``samples``: a replay of a run with it gives the
+    readings, which traces do not contain.
     """
     base: Any = type(algorithm)
 
@@ -125,9 +126,10 @@ def _record_samples(algorithm: Filter, samples: list[RecordedSample]) -> Filter:
 def _collect_innovations(
     run: Run, samples: list[RecordedSample], intervals: list[WhitenedInnovation]
 ) -> Innovations:
-    """Return the innovations of the M recorded samples and intervals of a run, in order of time:
+    """Return the innovations of the M readings that a replay of a run recorded, in order of time:
     times, nodes and NIS, (M,) each, and the whitened innovations (p,).
 
+    ``samples`` are readings at an instant, ``intervals`` those of continuous sensors.
     Raises NetkfError if there are none, or no covariance to judge them by.
     """
     nodes, samples = _match_nodes(run, [sample for sample in samples if len(sample.reading.y)])
@@ -194,7 +196,7 @@ def chi_square_interval(freedom: FloatArray, probability: float) -> tuple[FloatA
 
 def innovation_series(recorded: Innovations) -> dict[int, FloatArray]:
     """Return, by node with at least MIN_READINGS readings, the first components (M,) of the
-    whitened innovations of its M readings.
+    whitened innovations of its M readings: white noise if P is exact.
     """
     first_components = np.array([values[0] for values in recorded.whitened])
     series = {}

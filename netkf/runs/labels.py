@@ -30,10 +30,12 @@ def covariance_bias(scenario: Scenario) -> str:
     the design of the filter; empty if neither is known.
     """
     algorithm = scenario.filter.algorithm
-    design = scenario.node_filter.P_by_design[0 if scenario.slotted else 1]
+    in_slots, in_continuous_time = scenario.node_filter.P_by_design
+    design = in_slots if scenario.slotted else in_continuous_time
     # P_by_design is about the steps of the built-in class, with links and linear readings.
     if overridden(algorithm) or not scenario.topology.links or not scenario.is_linear:
         return ""
+    # With a wrong model P need not be larger.
     return "" if design == "larger" and not scenario.filters_know_the_truth else design
 
 

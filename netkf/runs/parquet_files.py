@@ -108,7 +108,8 @@ def _open_arrow_file(path: Path, mode: str) -> Any:
 def _read_columns(
     file: Any, source: Any, name: str, columns: Sequence[str], run: int | None
 ) -> Any:
-    """Return an Arrow table with the columns, only the rows of one ``run`` unless that is None.
+    """Return an Arrow table with the ``columns`` of a Parquet file, only the rows of one ``run``
+    unless that is None.
 
     ``file`` is the ParquetFile of ``source``. Raises DamagedError, which begins with the ``name``
     of the file, if it has more than MAX_READ_ROWS rows.
@@ -159,7 +160,9 @@ class ParquetSink(Sink):
         self._rows = 0
 
     def events(self, rows: np.ndarray) -> None:
-        """Write a block ``rows`` (E,) of EVENT rows as a row group of events.parquet."""
+        """Write a block ``rows`` (E,) of EVENT rows as a row group of events.parquet; the recorder
+        of the run calls it with each block.
+        """
         if self._events is not None:
             self._events.write(event_columns(rows, self._replica, self._event_count))
             self._event_count += len(rows)
@@ -167,7 +170,8 @@ class ParquetSink(Sink):
     def states(
         self, t: FloatArray, x: FloatArray, xhat: FloatArray, P: FloatArray, error: FloatArray
     ) -> None:
-        """Collect T samples of N nodes, and write them when they fill a row group.
+        """Collect T samples of N nodes, and write them when they fill a row group; the recorder of
+        the run calls it with each block of samples.
 
         ``t`` (T,) seconds, ``x`` (T, n), ``xhat`` and ``error`` (T, N, n), ``P`` (T, N, n, n).
         """
@@ -178,7 +182,9 @@ class ParquetSink(Sink):
                 self._flush()
 
     def _flush(self) -> None:
-        """Write the samples that have been collected as a row group."""
+        """Write the samples that have been collected as a row group (a part of the file that is
+        read as a whole) of states.parquet.
+        """
         if self._states is None or not self._samples:
             return
         columns = zip(*self._samples, strict=True)
@@ -238,7 +244,9 @@ class TraceTables:
             self._flush()
 
     def _flush(self) -> None:
-        """Write the tables that have been collected, a row group each."""
+        """Write the events and samples of the runs that have been collected, as a row group (a part
+        of a file that is read as a whole) of each table.
+        """
         for pending, table in (
             (self._pending_events, self._events),
             (self._pending_states, self._states),
@@ -288,7 +296,9 @@ class _Table:
         self._closed = False
 
     def write(self, columns: dict[str, Any] | pd.DataFrame) -> None:
-        """Append rows as a row group; the first call creates the file."""
+        """Append rows as a row group (a part of the file that is read as a whole); the first call
+        creates the file, and its columns give the schema.
+        """
         table = pa.Table.from_pandas(pd.DataFrame(columns), preserve_index=False)
         with self._discard_on_failure():
             if self._writer is None:

@@ -48,12 +48,14 @@ LIMITS: dict[str, Callable[[Scenario], FloatArray]] = {
 
 
 def compute_promises(scenario: Scenario) -> dict[str, Any]:
-    """Return what theory states about a scenario, as plain JSON (`netkf theory --json`).
+    """Return what theory states about a scenario without simulation, its promises, as plain JSON
+    (`netkf theory --json`).
 
-    The assumptions; in continuous time the bound at the horizon and in the steady state, link rates
-    and limits; in slots the promises of the filter's paper or the centralised covariance; the exact
-    steady error covariance of linear filters with constant gains. Matrices are dictionaries with
-    ``value`` and ``trace``; if one does not exist these are None and ``reason`` says why.
+    The assumptions; in continuous time the bound on the mean of P at the horizon and in the steady
+    state, link rates and limits; in slots what the filter's paper promises, or the centralised
+    covariance; the exact steady error covariance of linear filters with constant gains. Matrices
+    are dictionaries with ``value`` and ``trace``; if one does not exist these are None and
+    ``reason`` says why.
     """
     promises: dict[str, Any] = {
         "scenario": scenario.name,
@@ -70,6 +72,7 @@ def compute_promises(scenario: Scenario) -> dict[str, Any]:
         ],
     }
     if scenario.slotted:
+        # The modules of a paper on filters in slots have functions of these names, if any.
         slot_promises = paper_function(scenario, "promises", "slot_promises")
         if slot_promises is not None:
             promises[scenario.node_filter.paper] = slot_promises(scenario)
@@ -85,14 +88,15 @@ def compute_promises(scenario: Scenario) -> dict[str, Any]:
         promises["steady_bound"] = _steady_bound(scenario)
         promises["link_rate"] = _sufficient_link_rate(scenario)
         for name, function in LIMITS.items():
+            # The default argument keeps the present function of the loop.
             promises[name] = _value_or_reason(lambda function=function: function(scenario))  # type: ignore[misc]
     document: dict[str, Any] = to_json_value(promises)
     return document
 
 
 def _sufficient_link_rate(scenario: Scenario) -> dict[str, Any]:
-    """Return the link rate, 1/s, from which on the steady bound is close to S, its limit
-    for ever faster links.
+    """Return the link rate, 1/s, from which on the steady bound on the mean of P is close to S, its
+    limit for ever faster links, as an entry of the promises.
 
     ``value`` is the rate (None if links differ), ``factor`` the same as a multiple of the rates in
     the scenario, and ``delta`` the distance from S, CLOSE_TO_S of its norm; None with a ``reason``.
@@ -111,9 +115,9 @@ def _sufficient_link_rate(scenario: Scenario) -> dict[str, Any]:
 
 
 def _steady_error(scenario: Scenario) -> dict[str, Any]:
-    """Return the exact steady error covariances (N, n, n) of N nodes as a dictionary with
-    ``value``, ``trace``, ``reason`` and the mean-square ``radius``; without a value the ``reason``
-    says why.
+    """Return the exact steady error covariances (N, n, n) of N nodes as an entry of the promises: a
+    dictionary with ``value``, ``trace`` and ``reason``, which says why there is no value, and
+    ``radius``, the spectral radius of the mean-square dynamics, below 1 if errors stay bounded.
     """
 
     def covariance() -> FloatArray:
@@ -140,8 +144,8 @@ def _slot_central_covariance(scenario: Scenario) -> FloatArray:
 
 
 def _steady_bound(scenario: Scenario) -> dict[str, Any]:
-    """Return the steady bounds (N, n, n) on P of N nodes as a dictionary: ``value`` and ``trace``
-    as lists, or None for both and the ``reason``.
+    """Return the steady-state bounds (N, n, n) on the mean of P of N nodes as an entry of the
+    promises: ``value`` and ``trace`` as lists, or None for both and the ``reason``.
 
     Nodes that do not exchange messages may have one or not: then the value has nan for those
     without, next to the reason.
@@ -168,8 +172,8 @@ def _steady_bound(scenario: Scenario) -> dict[str, Any]:
 
 
 def _value_or_reason(function: Callable[[], FloatArray]) -> dict[str, Any]:
-    """Return a dictionary with the ``value`` of a function, one matrix (n, n) or a stack (N, n, n),
-    as lists, its ``trace``, and ``reason`` None.
+    """Return an entry of the promises: a dictionary with the ``value`` of a function, one matrix
+    (n, n) or a stack (N, n, n), as lists, its ``trace``, and ``reason`` None.
 
     If the function raises TheoryError value and trace are None and ``reason`` is the message.
     """
@@ -182,7 +186,9 @@ def _value_or_reason(function: Callable[[], FloatArray]) -> dict[str, Any]:
 
 
 def promises_text(scenario: Scenario, promises: dict[str, Any]) -> str:
-    """Return the ``promises`` of :func:`compute_promises` as text for a terminal."""
+    """Return what theory states about a scenario, the ``promises`` of :func:`compute_promises`, as
+    text for a terminal.
+    """
     title = f"{scenario.name}: {scenario.claim}" if scenario.claim else scenario.name
     lines = [title, "", "assumptions", *_assumption_lines(promises["assumptions"])]
     paper = scenario.node_filter.paper
@@ -199,7 +205,9 @@ def promises_text(scenario: Scenario, promises: dict[str, Any]) -> str:
 
 
 def _steady_error_lines(scenario: Scenario, promises: dict[str, Any]) -> list[str]:
-    """Return the line on the exact steady error covariances; no line if they were not computed."""
+    """Return the line of ``netkf theory`` on the exact steady error covariances of the nodes; no
+    line if they were not computed.
+    """
     if "steady_error" not in promises:
         return []
     error, title = promises["steady_error"], "trace of the steady error covariance, exact"
@@ -215,7 +223,9 @@ def _steady_error_lines(scenario: Scenario, promises: dict[str, Any]) -> list[st
 
 
 def _assumption_lines(rows: list[dict[str, Any]]) -> list[str]:
-    """Return the lines on assumptions, with their evidence wrapped and indented below each."""
+    """Return the lines of ``netkf theory`` on the assumptions of the paper: for each whether it
+    holds, and below it the evidence, wrapped and indented.
+    """
     lines = []
     for row in rows:
         lines.append(f"  {MARKS[row['holds']]:7}  {row['assumption']}  [{row['source']}]")
@@ -225,8 +235,8 @@ def _assumption_lines(rows: list[dict[str, Any]]) -> list[str]:
 
 
 def _bound_lines(scenario: Scenario, promises: dict[str, Any]) -> list[str]:
-    """Return the lines on the bounds on P: reasons why they do not exist, and a table of traces by
-    node.
+    """Return the lines of ``netkf theory`` on the bounds on the mean of P at the horizon and in the
+    steady state: reasons why they do not exist, and a table of traces by node.
     """
     lines = ["", "trace of the bound on E[P_i]"]
     columns = {
@@ -244,7 +254,9 @@ def _bound_lines(scenario: Scenario, promises: dict[str, Any]) -> list[str]:
 
 
 def _limit_lines(scenario: Scenario, promises: dict[str, Any]) -> list[str]:
-    """Return the lines on the traces of limits to compare P with, and on link rates."""
+    """Return the lines of ``netkf theory`` on traces to compare P with: limits for ever faster
+    links, a centralised filter, and the link rate that comes close to the limit.
+    """
     error_limit = "limit of the true error covariance (derived)" + delay_suffix(scenario)
     labels = {
         "limit_covariance": f"{limit_label(scenario)}, as links tick ever faster",
@@ -262,7 +274,9 @@ def _limit_lines(scenario: Scenario, promises: dict[str, Any]) -> list[str]:
 
 
 def _link_rate_line(link_rate: dict[str, Any]) -> str:
-    """Return the line on the link rates of H Theorem 3."""
+    """Return the line on the link rate from which on the steady bound is close to its limit S
+    (hybrid paper, H Theorem 3).
+    """
     rates = f"{format_number(link_rate['factor'])} times the rates given"
     if link_rate["value"] is not None:
         rates = f"links from {format_number(link_rate['value'])} per second on"
@@ -270,7 +284,7 @@ def _link_rate_line(link_rate: dict[str, Any]) -> str:
 
 
 def _bound_table(scenario: Scenario, columns: list[dict[str, Any]]) -> str:
-    """Return a table of the traces of bounds with a row per node.
+    """Return a table of the traces of the bounds on the mean of P, with a row per node.
 
     ``columns`` are the bounds at the horizon and in the steady state. Of more than MAX_NODES nodes
     only those with the smallest, middle and largest bounds are listed.

@@ -36,7 +36,9 @@ def versions() -> dict[str, str]:
 
 @cache
 def _cached_versions() -> dict[str, str]:
-    """Return the versions of netkf, Python, packages and BLAS; the same dictionary every time."""
+    """Return the versions of netkf, Python, packages and BLAS, on which the last bits of results
+    depend; the same dictionary every time.
+    """
     result = {"netkf": __version__, "source": source_digest(), "python": platform.python_version()}
     for package in PACKAGES:
         try:

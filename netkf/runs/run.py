@@ -181,7 +181,7 @@ class _Output:
         sums: dict[str, tuple[float, float]],
         status: str,
     ) -> dict[str, Any]:
-        """Write summary.json and return its contents.
+        """Write summary.json, averages over time and counts of messages, and return its contents.
 
         ``count`` returns the number of events of a kind; ``sums`` has, by name, the exact value and
         the last total of each conserved sum. Raises WriteError.
@@ -205,7 +205,8 @@ class _Output:
 def _create_output(
     scenario: Scenario, out: Path | None, seed: int, replica: int, engine: str, tables: bool
 ) -> _Output:
-    """Create the run directory with scenario.toml and a manifest, and return it with its sinks.
+    """Create the run directory with scenario.toml and a manifest, and return it with its sinks,
+    which take the events and samples of the run.
 
     The run is number ``replica`` of the runs of ``seed``, by the ``engine`` of that name;
     ``tables`` says whether Parquet tables are written. Raises ScenarioError if the directory is not
@@ -233,7 +234,7 @@ def _simulate(
     engine: Engine, scenario: Scenario, replica: int, recorder: Recorder, progress: Progress
 ) -> tuple[str, float]:
     """Simulate run number ``replica`` of the scenario's seed; return its status ("complete" or
-    "diverged") and its wall-clock seconds without compiling.
+    "diverged") and its wall-clock seconds without those in which kernels were compiled.
 
     ``recorder`` takes events and states; ``progress`` is called as the run goes on.
     """
@@ -246,7 +247,8 @@ def _simulate(
 def _keep_partial_results(
     output: _Output, recorder: Recorder, is_complete: bool, error: BaseException
 ) -> None:
-    """Finish the files of a run that stopped with ``error`` and write the error to its manifest.
+    """Finish the files of a run that stopped with ``error``, so that its results until then can be
+    read, and write the error to its manifest.
 
     ``is_complete`` says whether the simulation itself was complete, so that only writing failed.
     """
@@ -255,7 +257,12 @@ def _keep_partial_results(
         with contextlib.suppress(Exception):  # a full disk fails again, and ``error`` says so
             finish()
     if not (output.directory / "summary.json").exists():
-        unknown = PromisedTraces(None, np.nan, np.nan, f"not computed: the run {ENDINGS[status]}")
+        unknown = PromisedTraces(
+            bound=None,
+            limit=np.nan,
+            central=np.nan,
+            reason=f"not computed: the run {ENDINGS[status]}",
+        )
         with contextlib.suppress(OSError):
             output.write_summary(unknown, recorder.count, recorder.sums, status)
     output.manifest.write(status, _event_totals(recorder), is_complete, error)

@@ -137,10 +137,11 @@ def read_checked_document(directory: Path, name: str, form: Mapping[str, Any]) -
 def read_run(
     directory: Path, scenario: Scenario, manifest: dict[str, Any], replica: int | None = None
 ) -> StoredRun:
-    """Return the run in a directory, or one ``replica`` of an ensemble that was traced.
+    """Return the run in a directory, or one ``replica`` of the ensemble there whose events and
+    samples were kept.
 
-    ``manifest`` has the form MANIFEST_FORM. Raises DamagedError if a file is not as netkf writes
-    it.
+    ``manifest`` has the keys and types of MANIFEST_FORM. Raises DamagedError if a file is not as
+    netkf writes it.
     """
     check_files(directory, manifest, [*TABLE_FILES, "summary.json"])
     summary = read_checked_document(directory, "summary.json", SUMMARY_FORM)
@@ -179,7 +180,8 @@ def _status_of_log(log: np.ndarray) -> str:
 
 
 def _read_sums(conserved: Any) -> dict[str, tuple[float, float]]:
-    """Return (exact value, last total) of each conserved sum, by name.
+    """Return (exact value, last total) of each sum over all nodes that exchanges should conserve,
+    by name.
 
     ``conserved`` is the entry of summary.json. Raises DamagedError if it has another form.
     """
@@ -210,7 +212,7 @@ def _read_states(
         table = read_numbers(path, names, replica, allow_empty=True)
     else:
         table = pd.DataFrame({name: np.empty(0) for name in names})
-    T = len(table) // N
+    T = len(table) // N  # the table has a row for each time and node
     times = table["t"].to_numpy(dtype=np.float64)[::N]
     has_all_rows = (
         len(table) == T * N

@@ -61,8 +61,9 @@ class SummarySink(Sink):
         self.transmissions = Transmissions()
 
     def events(self, rows: np.ndarray) -> None:
-        """Count the messages in a block ``rows`` (E,) of EVENT rows, and note nodes that diverged;
-        changes ``transmissions``, ``delivered`` and ``diverged``.
+        """Count the messages in a block ``rows`` (E,) of EVENT rows, and collect nodes that
+        diverged; changes ``transmissions``, ``delivered`` and ``diverged``. The recorder of the run
+        calls it with each block.
         """
         self.transmissions.add(rows)
         self.diverged += rows["node"][rows["kind"] == CODES["diverged"]].tolist()
@@ -79,7 +80,8 @@ class SummarySink(Sink):
         ``nees`` and ``first_component``; P is not stored.
 
         ``t`` (T,) seconds, ``x`` (T, n), ``xhat`` and ``error`` (T, N, n), ``P`` (T, N, n, n). Sets
-        ``rounding_from`` at the first blurred sample.
+        ``rounding_from`` at the first sample whose errors are mostly rounding. The recorder of the
+        run calls it with each block.
         """
         if not len(t):
             return
@@ -117,7 +119,8 @@ class SampleIndices(NamedTuple):
 def select_averaged_samples(
     times: FloatArray, rounding_from: float, diverged: bool
 ) -> SampleIndices:
-    """Return the indices of the samples at ``times`` (T,) whose averages a summary has.
+    """Return the indices of those samples at ``times`` (T,) that the averages over time in a
+    summary are taken over.
 
     These are the samples after time 0 (all of them if none is later), without the last sample of a
     run that ``diverged``. Errors from ``rounding_from`` on are left out because rounding dominates
@@ -162,7 +165,8 @@ class PromisedTraces:
 
 
 def promise_traces(scenario: Scenario, times: FloatArray) -> PromisedTraces:
-    """Return the bounds at the sample ``times`` (T,) of a run, and the limits, of a scenario.
+    """Return the traces that theory gives to compare those of P with: the bound on the mean of P at
+    the sample ``times`` (T,), its limit for ever faster links, and a centralised filter.
 
     If theory does not apply or takes too much memory, the reason is given instead.
     """
@@ -185,12 +189,13 @@ def promise_traces(scenario: Scenario, times: FloatArray) -> PromisedTraces:
 
 
 def _require_small_bound(scenario: Scenario, samples: int) -> None:
-    """Raise TheoryError if the bound H(12) at so many ``samples`` takes more than
-    MAX_BOUND_BYTES.
+    """Raise TheoryError if the bound on the mean of P (hybrid paper, H equation 12) at so many
+    ``samples`` takes more memory than MAX_BOUND_BYTES.
     """
     if reason_without_bound(scenario):
         return
     n = scenario.plant.n
+    # Numbers that computing it stores: at each sample, and for the terms of a series.
     entries = (samples * (1.5 * n * n + n) + SERIES_TERMS * n * (n + 1)) * len(scenario.nodes)
     if 8.0 * entries > MAX_BOUND_BYTES:
         raise TheoryError(
@@ -264,7 +269,8 @@ def summarise(
 def _average_rows(
     scenario: Scenario, sink: SummarySink, promised: PromisedTraces
 ) -> tuple[list[dict[str, Any]], dict[str, Any]]:
-    """Return a row of averages over time for each node, and one for all nodes together.
+    """Return a row of averages over time for each node, and one for all nodes together, as
+    summary.json has them; ``promised`` has the bound on the trace of P, if theory gives one.
 
     A row is a dictionary: the averages by their names in summary.json, of nodes also ``node``.
     """
@@ -279,6 +285,7 @@ def _average_rows(
             columns.append(promised.bound[indices.covariances].mean(axis=0))
         by_node = _averages(*columns)
         overall = _averages(*(np.array([column.mean()]) for column in columns))
+    # by_node: for each name a list of N values; overall: of one.
     nodes = [
         {"node": node, **{name: values[k] for name, values in by_node.items()}}
         for k, node in enumerate(scenario.nodes)
@@ -314,7 +321,8 @@ def summary_notes(
 
 
 def conserved_sums(sums: dict[str, tuple[float, float]]) -> dict[str, Any]:
-    """Return the entry of summary.json on sums over all nodes that exchanges should conserve.
+    """Return the entry of summary.json on sums over all nodes that exchanges should conserve, such
+    as the masses of push-sum.
 
     ``sums`` has (exact value, total at the last sample) by name; the entry adds the relative
     deviation of the total, ``drift``.

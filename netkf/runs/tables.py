@@ -87,7 +87,9 @@ def summary_table(
 
 
 def _node_table(summary: dict[str, Any]) -> Iterator[str]:
-    """Yield the table of nodes, what it omits, and an empty line."""
+    """Yield the lines of the table of averages by node: the table, what it omits, and an empty
+    line; of large networks only the nodes with the largest and smallest errors are listed.
+    """
     nodes = sorted(summary["nodes"], key=lambda row: row["node"])
     listed = _best_and_worst(nodes) if len(nodes) > MAX_NODES else nodes
     omitted = len(nodes) - len(listed)
@@ -165,7 +167,9 @@ def _message_line(messages: dict[str, Any]) -> str:
 
 
 def _describe_conserved(sums: dict[str, dict[str, float]]) -> str:
-    """Return the conserved sums of summary.json with their relative drift, as text."""
+    """Return text on the sums over all nodes that exchanges should conserve (push-sum masses), from
+    summary.json, with their relative drift.
+    """
     totals = [
         f"{name} {format_number(entry['total'])} of {format_number(entry['exact'])} "
         f"({entry['drift']:+.1e})"

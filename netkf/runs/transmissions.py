@@ -48,8 +48,8 @@ class Transmissions:
         self._add_slot_messages(sends[in_slots])
 
     def _add_slot_messages(self, sends: np.ndarray) -> None:
-        """Count the distinct senders of each step (time, phase) in ``sends`` (K,), ``send`` rows of
-        slots.
+        """Count the transmissions in ``sends`` (K,), the ``send`` rows of slots: one for each
+        distinct sender in each step (time, phase) of an exchange.
 
         The first step of a block may continue the last one of the block before: its senders are
         counted once.
