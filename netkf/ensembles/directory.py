@@ -240,14 +240,17 @@ class _DirectoryWriter:
         return min(self.plan.block, self.plan.runs - number * self.plan.block)
 
     def save_block(self, number: int, statistics: RunStatistics) -> RunStatistics:
-        """Store completed block ``number`` and return its statistics without the traces (events and
-        samples of single runs), which would fill the memory; called as each block completes.
+        """Store block ``number`` (the results of some consecutive replicas), from which a stopped
+        command can be resumed; called as each block completes.
+
+        Returns its statistics without the traces (events and samples of single runs), which would
+        fill the memory.
         """
         self.blocks.save(number, statistics, self.plan)
         self._done += self._runs_in_block(number)
         self.simulated += self._runs_in_block(number)
         if time.monotonic() - self._last_note >= NOTE_SECONDS:
-            self.note()
+            self.note()  # writes the number of runs done to the manifest
         return statistics._replace(traces=())
 
     def note(self, status: str = "interrupted", error: BaseException | None = None) -> None:

@@ -332,8 +332,11 @@ def _message_columns(thinned: ThinnedMessages, run: StoredRun, packer: Packer) -
 def _event_columns(
     run: StoredRun, kinds: tuple[str, ...], max_events: int, packer: Packer
 ) -> dict[str, Any]:
-    """Return the events of these ``kinds`` for the live views, every k-th if there are more than
-    ``max_events``: columns as added to ``packer``, k, the number of all, and the names of codes.
+    """Return the events of these ``kinds`` for the live views of a page, every k-th if there are
+    more than ``max_events``: columns, k, the number of all, and the names of the codes of kinds.
+
+    Columns are added to ``packer``, which compresses the numbers of the page; the result refers to
+    them.
     """
     codes = [CODES[kind] for kind in kinds]
     rows = run.log[np.isin(run.log["kind"], codes)]

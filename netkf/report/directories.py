@@ -118,15 +118,16 @@ class ReportSource:
         return float(self.scenario.slot_plant.period) if self.scenario.slotted else 0.0
 
     def cutoffs(self, times: FloatArray) -> FloatArray:
-        """Return the latest arrival times (T,) of messages that samples at ``times`` (T,) include,
-        in seconds.
+        """Return the latest arrival times (T,) of messages that the estimates sampled at ``times``
+        (T,) include, in seconds; ``knowledge`` is the rule.
         """
         knowledge = self.knowledge
-        if knowledge == "until":
+        if knowledge == "until":  # under clocks: all that arrived by then
             return times
         # nextafter excludes arrivals at the very instant.
         if knowledge == "before":
             return np.nextafter(times, -np.inf)
+        # Filtered samples have the exchanges of the slot that begins there: until its end.
         ends = (np.floor(times / self.period + SLOT_ROUNDING) + 1.0) * self.period
         return np.asarray(np.nextafter(ends, -np.inf))
 

@@ -72,7 +72,9 @@ def node_means(readings: Innovations) -> NodeMeans:
 
 
 def describe_innovations(readings: Innovations) -> str:
-    """Return a sentence on the mean NIS of the nodes, and on how many of them contradict P."""
+    """Return a sentence on the mean NIS of the nodes (squared innovations in units of their
+    covariances), and on how many of them contradict P; ``readings`` are the innovations of a run.
+    """
     nodes, means, low, high = node_means(readings)
     count = int(np.isfinite(readings.nis).sum())
     sentence = f"Over {count:,} readings"

@@ -44,7 +44,8 @@ def lock_directory(directory: Path | None, must_be_empty: bool = False) -> Itera
 
 @contextlib.contextmanager
 def _hold_lock(directory: Path) -> Iterator[None]:
-    """Hold the lock of a directory during the body.
+    """Hold the lock of a directory during the body of the ``with`` statement, so that no other
+    netkf command writes into it.
 
     If the file system does not support locks, print a note and run the body without a lock.
     """
@@ -64,7 +65,9 @@ def _hold_lock(directory: Path) -> Iterator[None]:
 
 
 def _lock_or_refuse(descriptor: int, directory: Path) -> None:
-    """Lock an open file; raises ScenarioError and closes it if another process holds the lock."""
+    """Lock the open file ``descriptor`` that stands for ``directory``, without waiting; raises
+    ScenarioError and closes it if another process holds the lock.
+    """
     try:
         _lock_file(descriptor)
     except (BlockingIOError, PermissionError):  # the latter on Windows

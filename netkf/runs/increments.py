@@ -76,8 +76,9 @@ class ExpectedIncrements:
 
 
 def _expected_increments_of_models() -> Callable[[Any], ExpectedIncrements]:
-    """Return a function from a node's model to its ExpectedIncrements, which predict the increments
-    y = int dy that the node reads, as H times the integral of the predicted state.
+    """Return a function from a node's model to its ExpectedIncrements, which give innovations of
+    the increments y = int dy that a continuous sensor of the node reads over an interval: y minus H
+    times the integral of the predicted state.
 
     They are set up once for each model.
     """

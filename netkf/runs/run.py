@@ -183,8 +183,9 @@ class _Output:
     ) -> dict[str, Any]:
         """Write summary.json, averages over time and counts of messages, and return its contents.
 
-        ``count`` returns the number of events of a kind; ``sums`` has, by name, the exact value and
-        the last total of each conserved sum. Raises WriteError.
+        ``promised`` are the traces of covariances that theory gives to compare with. ``count``
+        returns the number of events of a kind; ``sums`` has, by name, the exact value and the last
+        total of each sum over all nodes that exchanges should conserve. Raises WriteError.
         """
         messages = {
             "sent": count("send"),
@@ -194,7 +195,8 @@ class _Output:
         summary = summarise(self.scenario, self.samples, promised, messages)
         if sums:
             summary["conserved"] = conserved_sums(sums)
-        # A run that ended early did not use all of a record that a complete run would have used.
+        # How much of the recorded tables (readings, losses) the run has used; a run that ended
+        # early did not use all that a complete one would have.
         if status == "complete":
             usage = record_usage(self.scenario, self.links[0].sent if self.links else {})
             summary |= {"records": usage} if usage else {}

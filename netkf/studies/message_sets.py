@@ -97,6 +97,7 @@ def find_smallest_set(
             replays=0,
         )
     recent = search.drop_oldest(sorted(candidates, key=lambda c: (c.sent, c.key)))
+    # ``complete``: the size up to which all sets were tried without success.
     complete, messages = 0, None
     for size in range(1, most + 1):
         # Half of the replays for single messages, a quarter for pairs, and so on.
@@ -225,14 +226,17 @@ class _Search:
 
         It is the sum of the gains of its single messages and, for each pair that was replayed, of
         the gain of the pair beyond those of its two messages. ``members`` (S, size) are the indices
-        of the sets' messages in ``index_of_key``.
+        of the sets' messages in ``index_of_key``; ``single_gains`` are those of single messages, 0
+        if not replayed.
         """
         size, messages = members.shape[1], len(index_of_key)
         single = np.array([single_gains[key] for key in index_of_key])
         gains = np.zeros(len(members))
         for column in members.T:
             gains += single[column]
+        # Pairs are known only when larger sets are tried.
         if size > 2:
+            # Gain of a pair less those of its two messages, by their indices.
             interactions = np.zeros((messages, messages))
             for pair, pair_gain in self._gains.items():
                 if len(pair) == 2 and set(pair) <= index_of_key.keys():

@@ -136,9 +136,10 @@ def parse_interval(setting: str) -> tuple[str, float | int, float | int]:
 
 
 def is_integer_key(scenario: Scenario, key: str) -> bool:
-    """Return True if a key of a scenario is an integer, False if it is another number.
+    """Return True if the value of a ``key`` (a path such as ``network.activation.rate``) is an
+    integer in the scenario, so that a search tries integers only; False for another number.
 
-    Raises ScenarioError at --vary if it is neither.
+    Raises ScenarioError, which names --vary, if it is neither.
     """
     value: Any = resolve_defaults(scenario)
     # Follow the path, such as sensors[0].R, through tables and lists.

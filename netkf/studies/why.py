@@ -375,7 +375,8 @@ def _make_what_ifs(
 
     Each replay delivers one set of messages that did not arrive in the run: those that would have
     brought newer readings of a node, all of these, the ``smallest`` set that brings the trace below
-    its limit (or the best set tried), and every message.
+    its limit (or the best set tried), and every message. ``sources`` tell for each other node which
+    missing messages would have brought newer readings of it.
     """
     # Label and messages of each replay; None stands for every message.
     delivered_sets: list[tuple[str, tuple[MessageKey, ...] | None]] = [("as it was", ())]
