@@ -22,7 +22,9 @@ from netkf.cli.progress import ProgressLine
 
 
 def _declare(parser: argparse.ArgumentParser) -> None:
-    """Declare the options of ``netkf compare-filters``."""
+    """Declare the options of ``netkf compare-filters``, which runs several filters on the same
+    draws, on its ``parser``; called when the command line is built.
+    """
     parser.add_argument(
         "--filters",
         required=True,

@@ -19,7 +19,9 @@ from netkf.cli.options import (
 
 
 def _declare(parser: argparse.ArgumentParser) -> None:
-    """Declare the options of ``netkf consistency``."""
+    """Declare the options of ``netkf consistency``, which tests if P describes the errors, on its
+    ``parser``; called when the command line is built.
+    """
     parser.add_argument("--runs", type=parse_count, default=50, help="number of runs (default: 50)")
     parser.add_argument(
         "--confidence",

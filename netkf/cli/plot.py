@@ -13,7 +13,9 @@ FORMATS = ("png", "svg", "pdf")
 
 
 def _declare(parser: argparse.ArgumentParser) -> None:
-    """Declare the options of ``netkf plot``."""
+    """Declare the options of ``netkf plot``, which draws figures of finished runs, on its
+    ``parser``; called when the command line is built.
+    """
     parser.add_argument("directories", type=Path, nargs="+", metavar="DIR", help="run directory")
     parser.add_argument(
         "--figure",

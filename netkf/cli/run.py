@@ -33,7 +33,9 @@ MAX_LISTED_NODES = 12  # nodes that a note lists
 
 
 def _declare(parser: argparse.ArgumentParser) -> None:
-    """Declare the options of ``netkf run``."""
+    """Declare the options of ``netkf run``, which simulates a scenario into a directory, on its
+    ``parser``; called when the command line is built.
+    """
     parser.add_argument("--runs", type=parse_count, help="number of independent runs (default: 1)")
     parser.add_argument(
         "--replica", type=parse_replica, help="run this replica of an ensemble (default: 0)"

@@ -22,7 +22,9 @@ from netkf.core.errors import ScenarioError
 
 
 def _declare(parser: argparse.ArgumentParser) -> None:
-    """Declare the options of ``netkf size``."""
+    """Declare the options of ``netkf size``, which searches a key of the scenario for the value
+    that just meets a target, on its ``parser``; called when the command line is built.
+    """
     add_vary(parser, "KEY.PATH=LOW:HIGH", "the key to search and its range")
     parser.add_argument(
         "--target",

@@ -29,7 +29,9 @@ if TYPE_CHECKING:
 
 
 def _declare(parser: argparse.ArgumentParser) -> None:
-    """Declare the options of ``netkf sweep``."""
+    """Declare the options of ``netkf sweep``, which simulates every point of a grid of values of
+    keys, on its ``parser``; called when the command line is built.
+    """
     add_vary(
         parser,
         "KEY.PATH=V1,V2,...",

@@ -8,7 +8,9 @@ from netkf.cli.options import Command, add_json, load_scenario, print_json, prin
 
 
 def _declare(parser: argparse.ArgumentParser) -> None:
-    """Declare the options of ``netkf theory``."""
+    """Declare the options of ``netkf theory``, which prints what theory says without simulation, on
+    its ``parser``; called when the command line is built.
+    """
     add_json(parser)
 
 

@@ -23,7 +23,9 @@ if TYPE_CHECKING:
 
 
 def _declare(parser: argparse.ArgumentParser) -> None:
-    """Declare the options of ``netkf why``."""
+    """Declare the options of ``netkf why``, which explains the estimate of a node of a finished
+    run, on its ``parser``; called when the command line is built.
+    """
     parser.add_argument("directory", type=Path, metavar="DIR", help="run directory")
     parser.add_argument(
         "--node", type=int, metavar="I", help="id of the node (default: the worst node)"

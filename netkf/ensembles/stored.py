@@ -66,7 +66,8 @@ def read_ensemble(directory: Path, scenario: Scenario, manifest: dict[str, Any])
     """Return the ensemble that netkf run left in a directory; the caller has checked that its
     ``manifest`` (manifest.json) has the right keys and types.
 
-    An interrupted ensemble, which has no ensemble.parquet yet, has the runs of its finished blocks.
+    An interrupted ensemble, which has no ensemble.parquet yet, has the runs of its finished blocks
+    (files with the results of some consecutive replicas).
     Raises DamagedError for files that are not as netkf writes them.
     """
     stored: dict[str, Any] = {

@@ -63,7 +63,7 @@ def draw_nodes(axes: Any, data: FigureData, values: FloatArray, se: FloatArray |
         label = "nodes" if len(indices) > 1 else "the node"
         if has_both:
             label = f"nodes {description}"
-        axes.plot([], [], color=colour, lw=1.4, label=label)
+        axes.plot([], [], color=colour, lw=1.4, label=label)  # for the legend
     if len(data.times) == 1:  # a line of one sample is invisible
         count = len(data.nodes)
         axes.plot(np.repeat(data.times, count), values.ravel(), ".", color=INK, ms=4)

@@ -472,8 +472,9 @@ def _describe_sweep(source: ReportSource) -> list[str]:
 
 
 def _describe_filters(comparison: StoredComparison) -> list[str]:
-    """Return sentences on compared filters: the best one, certain differences from the first one,
-    inconsistent covariances, and filters that could not run.
+    """Return sentences on filters that were run on the same draws: the best one, certain
+    differences from the first one, P that does not describe the errors, and filters that could not
+    run.
     """
     rows = [row for row in comparison.rows if row.ran and math.isfinite(_rms_error(row).value)]
     if not rows:

@@ -130,10 +130,12 @@ def information_age(
 
     A sample includes the messages that arrived until its cutoff, ``cutoffs`` (T,) in seconds.
     Before the first delivery the age is the time since the start; it is nan for a node without
-    incoming links. ``messages`` (M,) are MESSAGE rows ordered as by ``join_messages``.
+    incoming links. ``messages`` (M,) are MESSAGE rows, one for each message sent, ordered as by
+    ``join_messages``.
     """
     total = np.zeros((len(times), len(nodes)))
     links = np.zeros(len(nodes))
+    # The messages of each directed link are neighbours.
     ends = np.flatnonzero((np.diff(messages["sender"]) != 0) | (np.diff(messages["receiver"]) != 0))
     for link in np.split(messages, ends + 1) if len(messages) else []:
         column = int(np.searchsorted(nodes, link["receiver"][0]))
@@ -150,8 +152,9 @@ def information_age(
 
 
 def count_traffic(messages: np.ndarray, horizon: float, bins: int) -> dict[str, list[int]]:
-    """Return for each outcome the numbers (bins,) of messages sent in each of ``bins`` equal
-    intervals of a run of ``horizon`` seconds; ``messages`` are its MESSAGE rows (M,).
+    """Return for each outcome (delivered, lost, ...) the numbers (bins,) of messages sent in each
+    of ``bins`` equal intervals of a run of ``horizon`` seconds, for a chart on the page;
+    ``messages`` are its MESSAGE rows (M,), one for each message sent.
     """
     edges = np.linspace(0.0, max(horizon, 1e-300), bins + 1)
     names = {"delivered": DELIVERED, "lost": LOST, "late": LATE, "under way": UNDER_WAY}

@@ -123,8 +123,8 @@ class StoredRun(WithPromises, Run):
 def read_checked_document(directory: Path, name: str, form: Mapping[str, Any]) -> dict[str, Any]:
     """Return the JSON document in the file ``name`` of a directory.
 
-    Raises DamagedError if it does not have the ``form`` (see documents.require_form) or if it has a
-    seal that does not fit.
+    Raises DamagedError if it does not have the keys and types of ``form`` (see
+    documents.require_form), or if it has a seal, a digest of its other entries, that does not fit.
     """
     with add_file_name(name):
         document = read_document(directory / name)

@@ -321,7 +321,7 @@ def _pair_runs(
     Its interval misses the true difference with probability ``level``. ``node`` is an id, -1 for
     all nodes together.
     """
-    end = min(first.rounding_from, other.rounding_from)
+    end = min(first.rounding_from, other.rounding_from)  # errors are mostly rounding after it
     base_values, values = (finished.by_run(quantity, node, end) for finished in (first, other))
     if base_values is None or values is None or not _same_truth(first, other):
         return None

@@ -152,9 +152,9 @@ def _last_of_instant(used: IntArray, sender: IntArray, sent_row: IntArray) -> In
     order = np.lexsort((sent_row, sender, used))
     last = np.ones(len(used), dtype=bool)
     last[:-1] = used[order][1:] != used[order][:-1]
-    counts = np.empty(len(used), dtype=bool)
-    counts[order] = last
-    return counts
+    is_last = np.empty(len(used), dtype=bool)
+    is_last[order] = last  # back in the order of the arguments
+    return is_last
 
 
 def at_once(messages: Messages, log: IntArray) -> Messages:
@@ -221,9 +221,9 @@ def find_flow(
     """Return the flow of information in an EVENT ``log`` (E,): segments, in each of which the
     information of one node accumulates, joined by the M ``messages``.
 
-    ``used`` (M,) bool marks the messages of cost 0: those that were used in the original run, of
-    which the log may be a replay; by default those used in this log. Others cost 1, so that a
-    search can count how many missing messages a path needs.
+    ``search_back`` follows it backwards. ``used`` (M,) bool marks the messages of cost 0: those
+    that were used in the original run, of which the log may be a replay; by default those used in
+    this log. Others cost 1, so that a search can count how many missing messages a path needs.
     """
     used = messages.outcome == USED if used is None else used
     nodes = np.array(scenario.nodes)

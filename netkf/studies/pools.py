@@ -39,10 +39,13 @@ class _OpenPool(Pool):
 
 @contextmanager
 def shared_pool(runs: int, options: PoolOptions) -> Iterator[Pool]:
-    """Yield a pool for several scenarios of ``runs`` runs each; it is closed at the end."""
+    """Yield one pool of workers for several scenarios of ``runs`` runs each, so that processes that
+    were started for one serve the next; it is closed at the end of the ``with`` statement.
+    """
     pool = make_pool(runs, options, open_ended=True)
     done = False
     try:
+        # replicate_blocks() closes its pool; that of this one does nothing.
         yield _OpenPool(pool)
         done = True
     finally:

@@ -74,14 +74,14 @@ def read_comparison(directory: Path, base: Scenario, manifest: dict[str, Any]) -
     if [row.filter for row in rows] != manifest["filters"] or not any(row.ran for row in rows):
         raise DamagedError(f"{FILTERS} does not have the filters of the manifest")
     return StoredComparison(
-        base.name,
-        manifest["runs"]["done"],
-        manifest["seed"],
-        manifest["confidence"],
-        tuple(rows),
-        directory,
-        manifest,
-        base,
+        scenario=base.name,
+        runs=manifest["runs"]["done"],
+        seed=manifest["seed"],
+        confidence=manifest["confidence"],
+        rows=tuple(rows),
+        directory=directory,
+        manifest=manifest,
+        base=base,
     )
 
 

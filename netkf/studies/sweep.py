@@ -68,10 +68,10 @@ def sweep(
     All points use the same seed, so the same truth, readings and channel draws: differences between
     rows are due to the keys. A row has the varied keys, ``runs``; ``worst_rms`` (of the node with
     the largest), ``mean_rms`` (of all nodes together), ``mean_trace`` and ``worst_trace`` of P,
-    each with its standard error ``_se`` over runs; ``bound`` and ``central``, mean traces of H(12)
-    and of the covariance of the centralised filter if they exist; messages ``sent``, ``delivered``
-    and ``lost`` per run; ``status``, complete or diverged. All but messages are averages over the
-    samples after time 0.
+    each with its standard error ``_se`` over runs; ``bound`` and ``central``, mean traces of the
+    bound on P (hybrid paper, H equation 12) and of the covariance of the centralised filter if they
+    exist; messages ``sent``, ``delivered`` and ``lost`` per run; ``status``, complete or diverged.
+    All but messages are averages over the samples after time 0.
 
     ``workers``, ``executor``, ``scheduler`` and ``engine`` are those of ``netkf.monte_carlo``;
     ``progress(done, wanted)`` is called with numbers of points. Raises ScenarioError, before
