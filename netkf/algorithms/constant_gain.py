@@ -1,9 +1,10 @@
-"""The hybrid filter with constant gains, H Remark 1: simpler, and never better than Riccati gains.
+"""The hybrid filter with constant gains, paper H Remark 1: simpler, and never better than Riccati
+gains.
 
     dxhat = A xhat dt + L (dy - H xhat dt),   dP/dt = (A - L H) P + P (A - L H)' + L R L' + Q
 
 for increments; a sample or a reading in slots moves the estimate by ``L (y - H xhat)`` and P to
-``(I - L H) P (I - L H)' + L R L'``. Resets are those of H (7) and (9).
+``(I - L H) P (I - L H)' + L R L'``. Resets are those of paper H (7) and (9).
 """
 
 from __future__ import annotations
@@ -236,8 +237,8 @@ class ConstantGain(Filter):
     def absorb(
         self, state: ConstantGainState, messages: Sequence[Message], exchange: Exchange
     ) -> ConstantGainState:
-        """Return the state after a reset by H (7) and (9): the convex combination of the node's
-        estimate and covariance with those of all messages.
+        """Return the state after a reset by paper H (7) and (9): the convex combination of the
+        node's estimate and covariance with those of all messages.
         """
         if not messages:
             return state

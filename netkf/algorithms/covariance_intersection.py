@@ -1,4 +1,4 @@
-"""Covariance intersection in continuous time: the combination of D (8), (9) over link clocks."""
+"""Covariance intersection in continuous time: the combination of paper D (8), (9) over clocks."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ class CovarianceIntersection(Hybrid):
     inverts: ClassVar[bool] = True
 
     def absorb(self, state: State, messages: Sequence[Message], exchange: Exchange) -> State:
-        """Return the state after covariance intersection, D (8) and (9), of the node's estimate
-        with those of all messages, with values from before the reset.
+        """Return the state after covariance intersection, paper D (8) and (9), of the node's
+        estimate with those of all messages, with values from before the reset.
         """
         weights, means, roots = self._pairs(state, messages)
         xhat, root = intersect_roots(weights, means, roots)

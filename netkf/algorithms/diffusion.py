@@ -106,8 +106,9 @@ def diffusion_slots(
     scratch: SlotScratch,
     weights: DiffusionWeights,
 ) -> None:
-    """Simulate H diffusion filters over the S slots of a plan, D (6)-(9), in B blocks of L runs: in
-    each slot they read, predict and combine, with the own ``weights`` (H,) and those of the links.
+    """Simulate H diffusion filters over the S slots of a plan, paper D (6)-(9), in B blocks of L
+    runs: in each slot they read, predict and combine, with the own ``weights`` (H,) and those of
+    the links.
 
     Changes ``nodes.xhat`` (B, H, n, L) and ``nodes.root`` (B, H, n, n, L) in place and writes
     ``samples``, of the predictions with which slots begin.
@@ -149,7 +150,7 @@ def combine_senders(
     h: int,
 ) -> None:
     """Combine filter ``h`` of block ``b`` with the messages that arrive in slot ``s``, by
-    covariance intersection, D (8) and (9): changes ``nodes.xhat[b, h]`` (n, L) and
+    covariance intersection, paper D (8) and (9): changes ``nodes.xhat[b, h]`` (n, L) and
     ``nodes.root[b, h]`` (n, n, L).
 
     ``weights`` holds the own weights (H,), ``links`` those of messages. The messages are in
@@ -249,7 +250,7 @@ class DiffusionFilter(Filter):
         self, state: DiffusionState, messages: Sequence[Message], exchange: Exchange
     ) -> DiffusionState:
         """Return the state after covariance intersection of the node's estimate with those of all
-        messages, D (8) and (9).
+        messages, paper D (8) and (9).
         """
         own, shares = self.share(state.own, [message.weight for message in messages])
         # Nothing to combine, or all weight is the node's own.

@@ -258,7 +258,8 @@ def combine_copies(
     h: int,
 ) -> None:
     """Combine the estimate of filter ``h`` of block ``b`` with those that arrive in slot ``s`` and
-    with the copies of silent neighbours' estimates, whose covariances are enlarged: D (8) and (9).
+    with the copies of silent neighbours' estimates, whose covariances are enlarged: paper D (8) and
+    (9).
 
     Changes ``nodes.xhat[b, h]`` (n, L) and ``nodes.root[b, h]`` (n, n, L); the estimates that
     arrive replace the copies of their links in ``arrays``. Axes: L runs side by side.

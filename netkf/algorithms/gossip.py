@@ -1,4 +1,4 @@
-"""The gossip interactive Kalman filter of Kar and Moura, G (10)."""
+"""The gossip interactive Kalman filter of Kar and Moura, paper G (10)."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ def gossip_slots(
     samples: SlotSamples,
     scratch: SlotScratch,
 ) -> None:
-    """Simulate H gossip filters over the S slots of a plan in B blocks of L runs, G (10): in each
-    slot they swap estimates in pairs, then read and predict.
+    """Simulate H gossip filters over the S slots of a plan in B blocks of L runs, paper G (10): in
+    each slot they swap estimates in pairs, then read and predict.
 
     Changes ``nodes.xhat`` (B, H, n, L) and ``nodes.root`` (B, H, n, n, L) in place and writes
     ``samples``, of the predictions with which slots begin.

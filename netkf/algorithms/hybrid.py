@@ -1,4 +1,4 @@
-"""The hybrid Kalman-Bucy filter of Tanwani (CDC 2021), H (4), (7), (9)."""
+"""The hybrid Kalman-Bucy filter of Tanwani (CDC 2021), paper H (4), (7), (9)."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ class Hybrid(Filter):
     schedule: ClassVar[tuple[str, ...] | None] = None
 
     def absorb(self, state: State, messages: Sequence[Message], exchange: Exchange) -> State:
-        """Return the state after a reset by H (7) and (9): the convex combination of the node's
-        estimate and covariance with those of all messages, all values from before the reset.
+        """Return the state after a reset by paper H (7) and (9): the convex combination of the
+        node's estimate and covariance with those of all messages, all values from before the reset.
         """
         weights, means, roots = self._pairs(state, messages)
         xhat, root = combine_roots(weights, means, roots)

@@ -1,4 +1,6 @@
-"""The Kalman filter with intermittent observations, R (15)-(18); late readings are used exactly."""
+"""The Kalman filter with intermittent observations, paper R (15)-(18); late readings are used
+exactly.
+"""
 
 from __future__ import annotations
 
@@ -87,8 +89,8 @@ def intermittent_slots(
     samples: SlotSamples,
     scratch: SlotScratch,
 ) -> None:
-    """Simulate H intermittent filters over the S slots of a plan, R (15)-(18), in B blocks of L
-    runs: in each slot they use their own readings and those that arrive, then predict.
+    """Simulate H intermittent filters over the S slots of a plan, paper R (15)-(18), in B blocks of
+    L runs: in each slot they use their own readings and those that arrive, then predict.
 
     Changes ``nodes.xhat`` (B, H, n, L) and ``nodes.root`` (B, H, n, n, L) in place and writes
     ``samples``, of the predictions with which slots begin.
@@ -184,7 +186,7 @@ class Intermittent(Filter):
         return state._replace(xhat=xhat, root=root, time=state.time + gap, unsent=None)
 
     def update(self, state: IntermittentState, reading: Reading) -> IntermittentState:
-        """Return the state after the reading, R (15)-(18), which is kept to be sent."""
+        """Return the state after the reading, paper R (15)-(18), which is kept to be sent."""
         return _use_reading(state, reading)._replace(unsent=reading if len(reading.y) else None)
 
     def emit(

@@ -77,8 +77,9 @@ MAX_SPREAD = 1e14
 
 
 class NetworkInformation(NamedTuple):
-    """A node's estimate of the network: the ``information`` (n, n) of all sensors, G^(i) of P (6),
-    and the ``number`` of nodes, N^(i); with asymptotic gains the ``root`` (n, n) of P_inf.
+    """A node's estimate of the network: the ``information`` (n, n) of all sensors, G^(i) of
+    paper P (6), and the ``number`` of nodes, N^(i); with asymptotic gains the ``root`` (n, n) of
+    P_inf.
     """
 
     information: FloatArray
@@ -100,7 +101,7 @@ class PushSumState(NamedTuple):
 
     xhat, root : estimate (n,), z between the exchanges, and root (n, n) of its covariance
     model : of the plant and the node's sensors
-    mass : (2 + n^2,), weight w, number n~ and information C~ of P (3)-(5)
+    mass : (2 + n^2,), weight w, number n~ and information C~ of paper P (3)-(5)
     network : the node's estimate of the network, from its mass
     stopped : whether that is frozen
     degree : nominal number of links
@@ -134,7 +135,7 @@ class PushSumArrays(NamedTuple):
     offered, heard : then the totals that nodes have offered (B, H, m, L), and those last heard on
                      each of W directions (B, W, m, L)
     share, before : scratch, shares (H, m, L) that nodes send, and a mass (m, L) before a step
-    new_information, new_number : scratch, P (6) of this slot (n, n, L) and (1, L)
+    new_information, new_number : scratch, paper P (6) of this slot (n, n, L) and (1, L)
     silent : scratch (L,), 1 where a node has stopped in an earlier slot
     stop : scratch of the stop rule, for one lane
     """
@@ -254,9 +255,9 @@ def exchange_mass(
     b: int,
     s: int,
 ) -> None:
-    """Exchange mass once in slot ``s`` of block ``b``, P steps 2.1 to 2.3: all H nodes send shares
-    of their mass (weight, number of nodes and information), mix what arrives, and update their
-    estimates of the network.
+    """Exchange mass once in slot ``s`` of block ``b``, paper P steps 2.1 to 2.3: all H nodes send
+    shares of their mass (weight, number of nodes and information), mix what arrives, and update
+    their estimates of the network.
 
     Changes in block ``b`` of ``arrays`` ``mass``, ``information``, ``number`` and the running sums,
     and writes the slot into ``samples.stopped[b]`` (H, L) where a node stops. Axes: L runs side by
@@ -285,7 +286,7 @@ def exchange_mass(
 @kernel
 def silence_stopped(plan: SlotPlan, samples: SlotSamples, b: int, s: int) -> None:
     """Write 0 into ``plan.sent[b, s, MASS]`` (H, L) for nodes of block ``b`` that stopped before
-    slot ``s``: they send no mass, P step 2.3.
+    slot ``s``: they send no mass, paper P step 2.3.
 
     Axes: H nodes, L runs side by side.
     """
@@ -354,8 +355,8 @@ def mix_mass(
     h: int,
 ) -> Any:
     """Set the mass of node ``h`` of block ``b``, ``arrays.mass[b, h]`` (m, L), m = 2 + n n, to the
-    shares that it keeps and receives in slot ``s``, P (3)-(5); return the number (L,) of shares
-    that arrived. The mass from before is left in ``arrays.before`` (m, L).
+    shares that it keeps and receives in slot ``s``, paper P (3)-(5); return the number (L,) of
+    shares that arrived. The mass from before is left in ``arrays.before`` (m, L).
 
     Axes: L runs side by side.
     """
@@ -397,8 +398,8 @@ def update_network_estimate(
     slot: int,
 ) -> None:
     """Update the estimates of the number of nodes and of the information of all sensors of node
-    ``h`` of block ``b`` from its mass, P (6), and apply the stop rule; ``received`` (L,) is the
-    number of shares that arrived in slot number ``slot``.
+    ``h`` of block ``b`` from its mass, paper P (6), and apply the stop rule; ``received`` (L,) is
+    the number of shares that arrived in slot number ``slot``.
 
     Changes ``arrays.information[b, h]`` (n, n, L) and ``arrays.number[b, h]`` (L,), except where
     the node stopped before, and writes the slot into ``samples.stopped[b, h]`` (L,) where it stops
@@ -456,7 +457,7 @@ def correct(
 ) -> None:
     """Correct filter ``h`` of block ``b`` by its reading of slot ``s``, step 4, with the
     information and the number of nodes of the whole network, as it knows them, in place of its own:
-    P (7) and (8). With asymptotic gains also predict it, step 3.
+    paper P (7) and (8). With asymptotic gains also predict it, step 3.
 
     Changes ``nodes.xhat[b, h]`` (n, L) and ``nodes.root[b, h]`` (n, n, L). Axes: L runs side by
     side.
@@ -489,9 +490,9 @@ def add_gain_single(
     H: FloatArray,
     scratch: FloatArray,
 ) -> None:
-    """Correct the estimate x (1, 1, n, 1) of one filter in one run in place, P (8): ``x += number S
-    S' H' (y - H x)`` with its root S (1, 1, n, n, 1) and a whitened reading y (1, 1, 1, p, 1), H
-    (1, 1, 1, p, n, 1); ``scratch`` is (2, n, 1).
+    """Correct the estimate x (1, 1, n, 1) of one filter in one run in place, paper P (8):
+    ``x += number S S' H' (y - H x)`` with its root S (1, 1, n, n, 1) and a whitened reading y
+    (1, 1, 1, p, 1), H (1, 1, 1, p, n, 1); ``scratch`` is (2, n, 1).
     """
     add_gain(ONE, x, root, 0, 0, number, y, 0, H, y.shape[3], scratch[0], scratch[1])
 
@@ -508,7 +509,7 @@ def split_mass_single(mass: FloatArray, degree: int, share: FloatArray) -> None:
 @kernel
 def keep_share_single(mass: FloatArray, share: FloatArray, times: int) -> None:
     """Add ``times`` times its own ``share`` (1, m, 1) to the ``mass`` (1, 1, m, 1) that one node
-    received in one run, in place, P (3)-(5); m = 2 + n n numbers: weight, number of nodes and
+    received in one run, in place, paper P (3)-(5); m = 2 + n n numbers: weight, number of nodes and
     information.
     """
     keep_share(ONE, mass, 0, 0, share, times, False)
@@ -520,8 +521,8 @@ def learn_network_single(
 ) -> None:
     """Write the information of all sensors, C~ / w, into ``information`` (n, n, 1) and the number
     of nodes, n~ / w, into ``number`` (1, 1), as one node estimates them in one run from its
-    ``mass`` (1, 1, 2 + n n, 1) of w, n~ and C~, P (6). While its weight w is 0 these are its own
-    information ``alone`` (1, n, n) and 1.
+    ``mass`` (1, 1, 2 + n n, 1) of w, n~ and C~, paper P (6). While its weight w is 0 these are its
+    own information ``alone`` (1, n, n) and 1.
     """
     learn_network(ONE, mass, 0, 0, alone, information, number)
 
@@ -743,9 +744,9 @@ class PushSum(Filter):
         return self._learn_network(state._replace(mass=mass), state.mass, all_up)
 
     def _learn_network(self, state: PushSumState, before: FloatArray, all_up: bool) -> PushSumState:
-        """Return the state with the network estimate that follows from its mass, P (6), and with
-        ``stopped`` by the stop rule. ``before`` (2 + n n,) is the mass before the step; ``all_up``:
-        all links of the node were up.
+        """Return the state with the network estimate that follows from its mass, paper P (6), and
+        with ``stopped`` by the stop rule. ``before`` (2 + n n,) is the mass before the step;
+        ``all_up``: all links of the node were up.
         """
         # Frozen by the safe rule: the mass was mixed, but the estimate is not updated any more.
         if state.stopped:
@@ -764,8 +765,8 @@ class PushSum(Filter):
         return state._replace(network=estimate, stopped=stopped)
 
     def update(self, state: Any, reading: Reading) -> Any:
-        """Return the state after a reading by steps 3 and 4, P (7) and (8), from the prediction of
-        the slot.
+        """Return the state after a reading by steps 3 and 4, paper P (7) and (8), from the
+        prediction of the slot.
         """
         if isinstance(state, RunningSums):
             return running_sums.update_sums(state, reading)
@@ -909,9 +910,9 @@ def correct_estimate(
     H: FloatArray,
     R: FloatArray,
 ) -> FloatArray:
-    """Return the estimate (n,) of P (8): the prediction ``predicted`` (n,) plus ``number`` times
-    the gain of the reading y (p,), H (p, n), R (p, p), which may have no rows; ``root`` (n, n) is
-    that of the covariance after the reading, P (7).
+    """Return the estimate (n,) of paper P (8): the prediction ``predicted`` (n,) plus ``number``
+    times the gain of the reading y (p,), H (p, n), R (p, p), which may have no rows; ``root``
+    (n, n) is that of the covariance after the reading, paper P (7).
     """
     n, x = len(predicted), np.array(predicted, dtype=np.float64)
     if len(y):
@@ -938,9 +939,9 @@ def share(mass: FloatArray, degree: int) -> FloatArray:
 
 
 def conserve_mass(mass: FloatArray, received: Sequence[FloatArray], degree: int) -> FloatArray:
-    """Return the mass (2 + n n,) by P (3)-(5): the shares ``received`` and the node's own share of
-    its former ``mass``, which it keeps once for itself and once for each link of its ``degree``
-    that failed.
+    """Return the mass (2 + n n,) by paper P (3)-(5): the shares ``received`` and the node's own
+    share of its former ``mass``, which it keeps once for itself and once for each link of its
+    ``degree`` that failed.
     """
     total = np.array(sum(received, np.zeros(mass.shape)))
     # The same kernels as in slots, on arrays of one node: both engines round alike.
@@ -950,8 +951,9 @@ def conserve_mass(mass: FloatArray, received: Sequence[FloatArray], degree: int)
 
 
 def network(mass: FloatArray, model: SlotModel) -> NetworkInformation:
-    """Return the information of all sensors C~ / w (n, n) and the number of nodes n~ / w, P (6),
-    from the ``mass`` (2 + n n,) of a node, or the node's own values while its weight is exactly 0.
+    """Return the information of all sensors C~ / w (n, n) and the number of nodes n~ / w,
+    paper P (6), from the ``mass`` (2 + n n,) of a node, or the node's own values while its weight
+    is exactly 0.
     """
     alone = model.information
     information, number = np.empty((*alone.shape, 1)), np.empty((1, 1))
@@ -960,8 +962,9 @@ def network(mass: FloatArray, model: SlotModel) -> NetworkInformation:
 
 
 def correct_root_alone(root: FloatArray, information: FloatArray) -> FloatArray:
-    """Return the root (n, n) of ``(P^-1 + G)^-1 = P (I + G P)^-1``, P (7), for the lower triangular
-    ``root`` (n, n) of P, possibly singular, and the information G = ``information`` (n, n).
+    """Return the root (n, n) of ``(P^-1 + G)^-1 = P (I + G P)^-1``, paper P (7), for the lower
+    triangular ``root`` (n, n) of P, possibly singular, and the information G = ``information``
+    (n, n).
     """
     n = len(root)
     result, information_lanes = (np.array(a).reshape(1, 1, n, n, 1) for a in (root, information))
@@ -973,7 +976,7 @@ def correct_root_alone(root: FloatArray, information: FloatArray) -> FloatArray:
 
 def average_estimates(z: FloatArray, received: Sequence[FloatArray], delta: float) -> FloatArray:
     """Return ``z`` (n,) plus 1 / delta of the differences to the estimates (n,) that were
-    ``received``, P (9).
+    ``received``, paper P (9).
     """
     x = np.stack([z, *received])[None, :, :, None]
     links, up = star_of([0.0] * len(received))
@@ -982,7 +985,7 @@ def average_estimates(z: FloatArray, received: Sequence[FloatArray], delta: floa
 
 
 def asymptotic_root(F: FloatArray, Q: FloatArray, information: FloatArray) -> FloatArray | None:
-    """Return the root of P_inf (n, n), P (12): the steady covariance of a filter with F and Q
+    """Return the root of P_inf (n, n), paper P (12): the steady covariance of a filter with F and Q
     (n, n) that has all the ``information`` (n, n) in each slot, after its reading; None if there is
     none.
 

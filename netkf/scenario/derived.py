@@ -359,7 +359,7 @@ class DerivedScenario(ScenarioModel):
     def weight(self, receiver: int, sender: int) -> float:
         """Return the weight that ``receiver`` gives to messages of ``sender``.
 
-        It is pi_ij of H (7) and a_ji of D (8).
+        It is pi_ij of paper H (7) and a_ji of paper D (8).
         """
         node_filter, topology = self.node_filter, self.topology
         pair_weights = node_filter.pair_weights

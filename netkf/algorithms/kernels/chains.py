@@ -1,7 +1,8 @@
 """Random Riccati recursions of many chains side by side, in square-root form.
 
 In each slot a mode m selects one of several readings for a chain: ``f_m(P) = F P F' + Q - F P H_m'
-(H_m P H_m' + R_m)^-1 H_m P F'``, R (17) and G (11); a reading of no rows is ``f_0``, R (16).
+(H_m P H_m' + R_m)^-1 H_m P F'``, paper R (17) and paper G (11); a reading of no rows is ``f_0``,
+paper R (16).
 """
 
 from __future__ import annotations

@@ -5,9 +5,9 @@ Between messages every node has the covariance P_i and the error e_i = x - xhat_
     dP_i/dt = A P_i + P_i A' + Q - P_i G_i P_i,
     d cov(e_i, e_j)/dt = K_i cov + cov K_j' + Qt + (P_i Gt_i P_i where i = j),   K_i = A - P_i G_i,
 
-where G_i = H_i' R_i^-1 H_i is the information per second that the filter assumes, and Gt_i =
-H_i' R_i^-1 Rt_i R_i^-1 H_i that of the true noise Rt_i through the same gain; Qt is the true Q. At
-an instant of messages both are mixed with the weights of H (7), (9). The integrator is the
+where G_i = H_i' R_i^-1 H_i is the information per second that the filter assumes, and Gt_i = H_i'
+R_i^-1 Rt_i R_i^-1 H_i that of the true noise Rt_i through the same gain; Qt is the true Q. At an
+instant of messages both are mixed with the weights of paper H (7), (9). The integrator is the
 classical Runge-Kutta method of order 4, with steps short against all rates, so that its error is
 far below what sizing and tables need.
 """
@@ -93,8 +93,8 @@ def mix(
     P0: FloatArray,
     S0: FloatArray,
 ) -> None:
-    """Apply the M messages of one instant, H (7) and (9), in place to the covariances P (N, n, n)
-    of the filters and those of their true errors, S_ij = cov(e_i, e_j) (N, N, n, n).
+    """Apply the M messages of one instant, paper H (7) and (9), in place to the covariances P
+    (N, n, n) of the filters and those of their true errors, S_ij = cov(e_i, e_j) (N, N, n, n).
 
     Message k moves node ``rows[k]`` by ``weights[k]`` towards node ``columns[k]``, (M,) each, all
     from the values before the instant. P0 and S0 are scratch, shaped like P and S. Axes: N nodes.

@@ -1,4 +1,4 @@
-"""Kernels of covariance intersection, D (8) and (9), for filters in slots, on lanes.
+"""Kernels of covariance intersection, paper D (8) and (9), for filters in slots, on lanes.
 
 Information is carried as a root too, ``P^-1 = Z' Z``; the formulas are those of ``root_update``.
 

@@ -1,7 +1,8 @@
-"""Kernels of the push-sum filter: mixing of mass, the quotients of P (6), and averaging.
+"""Kernels of the push-sum filter: mixing of mass, the quotients of paper P (6), and averaging.
 
-A mass (2 + n n,) holds the weight w, the number of nodes n~ and the information C~ of P (3)-(5).
-The order of every sum is fixed, since the rounding of masses decides in which slot a node stops.
+A mass (2 + n n,) holds the weight w, the number of nodes n~ and the information C~ of
+paper P (3)-(5). The order of every sum is fixed, since the rounding of masses decides in which slot
+a node stops.
 
 Node ``h`` of block ``b`` has index ``[b, h]`` of stacks with lanes (``netkf.linalg.lanes``): masses
 (B, H, m, L), roots (B, H, n, n, L).
@@ -40,7 +41,7 @@ def keep_share(
     lanes: Lanes, mass: FloatArray, b: int, h: int, share: FloatArray, times: Any, unchanged: Any
 ) -> None:
     """Add ``times`` (L,) times its own ``share[h]`` (m, L) to the mass that node ``h`` of block
-    ``b`` received, ``mass[b, h]`` of ``mass`` (B, H, m, L), m = 2 + n n, in place, P (3)-(5),
+    ``b`` received, ``mass[b, h]`` of ``mass`` (B, H, m, L), m = 2 + n n, in place, paper P (3)-(5),
     except in lanes with the flag ``unchanged`` (L,).
 
     ``times`` is 1 for the node itself plus 1 for each of its links that failed. Axes: B blocks of L
@@ -65,7 +66,7 @@ def learn_network(
     number: FloatArray,
 ) -> None:
     """Write the information of all sensors G = C~ / w and the number of nodes N = n~ / w as node
-    ``h`` of block ``b`` estimates them, P (6), into ``information`` (n, n, L) and ``number``
+    ``h`` of block ``b`` estimates them, paper P (6), into ``information`` (n, n, L) and ``number``
     (1, L). While its weight w is exactly 0, these are its own information ``alone[h]`` of ``alone``
     (H, n, n) and 1.
 
@@ -97,9 +98,9 @@ def correct_root(
     remainder: FloatArray,
     scratch: SlotScratch,
 ) -> None:
-    """Replace ``root[b, h]`` (n, n, L) of filter ``h`` of block ``b`` by the root of ``(P^-1 +
-    G)^-1 = P (I + G P)^-1``, P (7), with the information G = ``information[b, h]`` of
-    ``information`` (B, H, n, n, L); ``remainder`` (n, n, L) is scratch.
+    """Replace ``root[b, h]`` (n, n, L) of filter ``h`` of block ``b`` by the root of
+    ``(P^-1 + G)^-1 = P (I + G P)^-1``, paper P (7), with the information G = ``information[b, h]``
+    of ``information`` (B, H, n, n, L); ``remainder`` (n, n, L) is scratch.
 
     Axes: B blocks of L runs, H nodes.
     """
@@ -174,9 +175,9 @@ def add_gain(
     projected: FloatArray,
     root_projected: FloatArray,
 ) -> None:
-    """Correct the estimate ``x[b, h]`` (n, L) of filter ``h`` of block ``b`` in place, P (8): ``x
-    += number S S' H' (y - H x)`` with the root S = ``root[b, h]`` (n, n, L) and the ``number`` (L,)
-    of nodes that it knows of.
+    """Correct the estimate ``x[b, h]`` (n, L) of filter ``h`` of block ``b`` in place, paper P (8):
+    ``x += number S S' H' (y - H x)`` with the root S = ``root[b, h]`` (n, n, L) and the ``number``
+    (L,) of nodes that it knows of.
 
     The reading of slot ``s`` has ``rows`` whitened rows ``y[b, s, h]`` of y (B, S, H, p, L) and H
     (B, S, H, p, n, L); ``projected`` and ``root_projected`` (n, L) are scratch. Axes: B blocks of L

@@ -169,8 +169,8 @@ def combine_convex_roots(
     h: int,
 ) -> None:
     """Replace ``nodes.xhat[b, h]`` (n, L) and ``nodes.root[b, h]`` (n, n, L) of filter ``h`` of
-    block ``b`` by the convex combination of it and those that arrive in slot ``s``, H (7) and (9),
-    from the copies of all filters in ``scratch`` (see ``copy_pairs``).
+    block ``b`` by the convex combination of it and those that arrive in slot ``s``, paper H (7) and
+    (9), from the copies of all filters in ``scratch`` (see ``copy_pairs``).
 
     The weights of messages that do not arrive go to the own estimate. Axes: L runs side by side.
     """

@@ -269,7 +269,7 @@ def add_root(
 ) -> None:
     """Add to the estimate ``x[k]`` (n,) and the covariance P of ``root[k]`` (n, n), in place,
     ``weight`` >= 0 times those of entry ``m`` of ``other_x`` (M, n) and ``other`` (M, n, n): one
-    term of the convex combinations H (7) and (9). All roots are lower triangular.
+    term of the convex combinations, paper H (7) and (9). All roots are lower triangular.
 
     Axes: M other estimates.
     """
@@ -340,7 +340,7 @@ def add_to_intersection(
     scratch: UpdateScratch,
 ) -> None:
     """Add ``weight`` times the information of the estimate ``x[k]`` (n,) with the root ``root[k]``
-    (n, n) to ``scratch.total`` (n, n + 1), one term of D (8).
+    (n, n) to ``scratch.total`` (n, n + 1), one term of paper D (8).
 
     Means are relative to ``centre[m]`` (n,), the same for all terms of one intersection. Changes
     ``scratch.total`` and ``scratch.whitened`` only; a weight of 0 adds nothing.

@@ -109,8 +109,8 @@ def step_root(
     rows: np.ndarray,
     work: FloatArray,
 ) -> None:
-    """Replace root ``chain`` of ``roots`` (K, n, n), lower triangular, by that of f_m(P), R (17):
-    update with reading ``m`` of M and predict.
+    """Replace root ``chain`` of ``roots`` (K, n, n), lower triangular, by that of f_m(P),
+    paper R (17): update with reading ``m`` of M and predict.
 
     F and ``root_Q`` are (n, n); H (M, p, n), ``root_R`` (M, p, p) and ``rows`` (M,) give the
     readings, of which the first ``rows[m]`` rows count. ``work`` (>= p + n, >= 2 n + p) is scratch.

@@ -1,4 +1,5 @@
-"""When a node of the push-sum filter freezes its network estimate: P step 2.3 and a safe form.
+"""When a node of the push-sum filter freezes its network estimate: paper P step 2.3 and a safe
+form.
 
 Both engines call these kernels, so that rounding is the same and a node stops in the same slot.
 """
@@ -20,7 +21,7 @@ class MassStep(NamedTuple):
 
     before, mass : (2 + n n,), its mass before the step and after it: weight, number of nodes and
                    information (n, n) by rows
-    former, information : (n, n), G^(i) of P (6), before and after
+    former, information : (n, n), G^(i) of paper P (6), before and after
     former_number, number : (1,), N^(i), before and after
     work : (n, n), scratch
     """

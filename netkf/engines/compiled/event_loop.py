@@ -662,9 +662,9 @@ def combine(state: Simulation, h: int, now: float) -> None:
 
 @kernel
 def combine_convex(state: Simulation, h: int, own: float) -> None:
-    """Combine node ``h`` (index) with its inbox by H (7) and (9): x = w x + sum w_j x_j and P = w P
-    + sum w_j P_j, with the own weight w = ``own`` and the weight w_j of each directed link. Changes
-    ``state.xhat[h]`` and ``root[h]``, the root of P.
+    """Combine node ``h`` (index) with its inbox by paper H (7) and (9): x = w x + sum w_j x_j and P
+    = w P + sum w_j P_j, with the own weight w = ``own`` and the weight w_j of each directed link.
+    Changes ``state.xhat[h]`` and ``root[h]``, the root of P.
     """
     # w P first, then + w_j P_j for each message.
     xhat, root, pool, directions = state.xhat, state.root, state.pool, state.directions
@@ -678,9 +678,9 @@ def combine_convex(state: Simulation, h: int, own: float) -> None:
 
 @kernel
 def intersect(state: Simulation, h: int, own: float, total: float) -> None:
-    """Combine node ``h`` (index) with its inbox by covariance intersection, D (8) and (9): P^-1 = w
-    P^-1 + sum w_j P_j^-1, with the own weight w = ``own`` and the weight w_j of each directed link
-    divided by ``total``. Changes ``state.xhat[h]`` and ``root[h]``, the root of P.
+    """Combine node ``h`` (index) with its inbox by covariance intersection, paper D (8) and (9):
+    P^-1 = w P^-1 + sum w_j P_j^-1, with the own weight w = ``own`` and the weight w_j of each
+    directed link divided by ``total``. Changes ``state.xhat[h]`` and ``root[h]``, the root of P.
     """
     xhat, root, pool, directions = state.xhat, state.root, state.pool, state.directions
     scratch = state.update_scratch

@@ -667,10 +667,11 @@ def combine_lanes(
     other_x: FloatArray,
     other_S: FloatArray,
 ) -> None:
-    """Write the convex combination H (7) and (9) of the estimates in L lanes, w x + w_j x_j (n, L)
-    and the root (n, n, L) of w P + w_j P_j, into ``visits.moved`` and ``visits.V``: of x (n, L) and
-    S (n, n, L), the root of P, with ``other_x`` and ``other_S`` (x_j and the root of P_j), with the
-    weights of ``side`` (0: the first nodes of the visits receive, 1: the second ones).
+    """Write the convex combination of paper H (7) and (9) of the estimates in L lanes, w x + w_j
+    x_j (n, L) and the root (n, n, L) of w P + w_j P_j, into ``visits.moved`` and ``visits.V``: of x
+    (n, L) and S (n, n, L), the root of P, with ``other_x`` and ``other_S`` (x_j and the root of
+    P_j), with the weights of ``side`` (0: the first nodes of the visits receive, 1: the second
+    ones).
     """
     size, n, values = state.size, len(state.size), visits.in_lanes
     total, wide = local_lanes_matrix(size, MANY, visits.V), local_lanes_matrix(size, MANY, visits.T)
