@@ -1,8 +1,8 @@
 """Building a scenario from the tables of a file; errors name the path of the wrong key.
 
-Tables are built from the inside out. A table whose class must not be imported yet gives WAITING
-instead of an object, and so does every table that contains it; the other keys are checked all the
-same.
+Importing a user's module executes it, so that a file is first checked as if no module could be
+imported. Tables are built from the inside out: one of a user's class then gives NOT_IMPORTED instead
+of an object, and so does every table that contains it; the other keys are checked all the same.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ UNKNOWN = "is not a key here"
 TABLES = ("plant", "network", "filter")
 FILTERING_KEYS = ("mean", "cov", "model")  # in the table of a filter, beside those of its kind
 
-WAITING = object()
+NOT_IMPORTED = object()
 """Stands for an object whose class is not imported yet, or that contains such an object."""
 
 # The class to build is a parameter: this module cannot import Scenario, which imports it.
@@ -126,7 +126,7 @@ def build_scenario(cls: type[S], table: Mapping[str, Any], origin: Origin) -> S:
     # Importing a module executes it, and a file that is refused must execute nothing: everything
     # is checked without imports first.
     scenario = _build(cls, table, origin._replace(imports=False))
-    if scenario is WAITING:
+    if scenario is NOT_IMPORTED:
         scenario = _build(cls, table, origin)
     # Scenario.replace needs these to look up files and modules.
     object.__setattr__(scenario, "_folder", origin.folder)
@@ -136,7 +136,9 @@ def build_scenario(cls: type[S], table: Mapping[str, Any], origin: Origin) -> S:
 
 
 def _build(cls: type[S], table: Mapping[str, Any], origin: Origin) -> Any:
-    """Return a scenario of class ``cls`` from the tables of a file, or WAITING."""
+    """Return a scenario of class ``cls`` from the tables of a file, or NOT_IMPORTED if ``origin``
+    forbids to import a user's class in it; then all that needs no import has been checked.
+    """
     values = dict(table)
     version = values.pop("format", None)
     if version is None:
@@ -148,7 +150,7 @@ def _build(cls: type[S], table: Mapping[str, Any], origin: Origin) -> Any:
         values["plant"] = _call_under("plant", partial(_build_plant, origin), values["plant"])
     plant = values.get("plant")
     time = "slot " if isinstance(plant, SLOTTED) else ""
-    if plant is WAITING:
+    if plant is NOT_IMPORTED:
         time = "unknown"
     builders: dict[str, Callable[[Any], Any]] = {
         "sensors": partial(_build_sensors, origin),
@@ -172,8 +174,8 @@ def _call_under(key: str, builder: Callable[[Any], Any], value: Any) -> Any:
 def _build_object(
     cls: type[Any], values: dict[str, Any], origin: Origin, other_keys: tuple[str, ...] = ()
 ) -> Any:
-    """Return an object of class ``cls`` with fields ``values``, or WAITING if a value of them is
-    WAITING: it stands for an object whose class must not be imported yet.
+    """Return an object of class ``cls`` with fields ``values``, or NOT_IMPORTED if one of them is:
+    it stands for an object whose class must not be imported yet.
 
     ``other_keys`` are keys of the same table in the file that were taken out of ``values``; an
     error about an unknown key lists them too.
@@ -185,13 +187,13 @@ def _build_object(
     for name, value in values.items():
         if rules[name] is source_file and isinstance(value, str):
             values[name] = SourceFile(value, origin.folder)
-    if any(map(_is_waiting, values.values())):
+    if any(map(_has_missing_class, values.values())):
         # No object can be made yet, but mistakes in other fields are found before any import.
         for name, value in values.items():
             rule = rules[name]
-            if rule is not None and not _is_waiting(value):
+            if rule is not None and not _has_missing_class(value):
                 rule(name, value)
-        return WAITING
+        return NOT_IMPORTED
     return _construct(cls, values)
 
 
@@ -212,9 +214,11 @@ def _check_keys(
             raise ScenarioError(name, "is missing", None, remedy)
 
 
-def _is_waiting(value: Any) -> bool:
-    """Return True if a value is WAITING or a tuple that contains it."""
-    return value is WAITING or (isinstance(value, tuple) and any(map(_is_waiting, value)))
+def _has_missing_class(value: Any) -> bool:
+    """Return True if a value is NOT_IMPORTED or a tuple that contains it."""
+    return value is NOT_IMPORTED or (
+        isinstance(value, tuple) and any(map(_has_missing_class, value))
+    )
 
 
 def _construct(cls: type[Any], values: dict[str, Any]) -> Any:
@@ -234,7 +238,7 @@ def _construct(cls: type[Any], values: dict[str, Any]) -> Any:
 
 
 def _build_plant(origin: Origin, value: Any) -> Any:
-    """Return the plant of a table, or WAITING."""
+    """Return the plant of a table, or NOT_IMPORTED if its class must not be imported yet."""
     table = _as_dict(value)
     # Two kinds exist for both models of time; the keys tell which one is meant.
     in_both_times = table.get("kind") in ("recorded", "unknown")
@@ -249,7 +253,8 @@ def _build_component(
     default_kind: str | None = None,
     is_inner: bool = False,
 ) -> Any:
-    """Return the component of a table with the key ``kind``, or WAITING.
+    """Return the component of a table with the key ``kind``, or NOT_IMPORTED if its class must not
+    be imported yet.
 
     family       : one of registry.KINDS
     origin       : says from where a user's class may be imported
@@ -273,7 +278,7 @@ def _build_component(
     if family == "filter" and isinstance(table.get("inner"), (Mapping, Component)):
         builder = partial(_build_component, family, origin, is_inner=True)
         table["inner"] = _call_under("inner", builder, table["inner"])
-    return WAITING if cls is None else _build_object(cls, table, origin, other_keys)
+    return NOT_IMPORTED if cls is None else _build_object(cls, table, origin, other_keys)
 
 
 def _as_dict(value: Any) -> dict[str, Any]:
@@ -286,7 +291,9 @@ def _as_dict(value: Any) -> dict[str, Any]:
 
 
 def _build_sensors(origin: Origin, value: Any) -> tuple[Any, ...]:
-    """Return the sensors of a list of tables; those whose class is not imported are WAITING."""
+    """Return the sensors of a list of tables; NOT_IMPORTED stands for those whose class must not be
+    imported yet.
+    """
     if not isinstance(value, (list, tuple)):
         raise ScenarioError("", "must be a list of tables", value, "write [[sensors]]")
     builder = partial(_build_sensor, origin)
@@ -294,7 +301,9 @@ def _build_sensors(origin: Origin, value: Any) -> tuple[Any, ...]:
 
 
 def _build_sensor(origin: Origin, value: Any) -> Any:
-    """Return the sensor of a table with its sampling clock, or WAITING."""
+    """Return the sensor of a table with its sampling clock, or NOT_IMPORTED if the class of one of
+    them must not be imported yet.
+    """
     table = _as_dict(value)
     if isinstance(table.get("sampling"), (Mapping, Component)):
         builder = partial(_build_component, "sampling", origin)
@@ -303,7 +312,7 @@ def _build_sensor(origin: Origin, value: Any) -> Any:
 
 
 def _build_network(origin: Origin, time: str, value: Any) -> Any:
-    """Return the network of a table, or WAITING if a class in it must not be imported yet.
+    """Return the network of a table, or NOT_IMPORTED if a class in it must not be imported yet.
 
     ``time`` is the plant's model of time: "slot ", "" for continuous time, or "unknown".
     """
@@ -320,10 +329,11 @@ def _build_network(origin: Origin, time: str, value: Any) -> Any:
 
 
 def _build_activation(origin: Origin, time: str, value: Any) -> Any:
-    """Return the activation of a table, or WAITING.
+    """Return the activation (clocks or matchings) of a table, or NOT_IMPORTED if its class must not
+    be imported yet.
 
     ``time`` is the plant's model of time as the prefix of the family "activation": "slot ", "" for
-    continuous time, or "unknown" if the plant is WAITING.
+    continuous time, or "unknown" if the plant is NOT_IMPORTED.
     """
     if time == "unknown":
         # Build it if its kind exists for one model of time only.
@@ -334,13 +344,15 @@ def _build_activation(origin: Origin, time: str, value: Any) -> Any:
             if isinstance(kind, str) and kind in KINDS[f"{prefix}activation"]
         ]
         if len(prefixes) > 1:
-            return WAITING
+            return NOT_IMPORTED
         time = prefixes[0] if prefixes else ""
     return _build_component(f"{time}activation", origin, value)
 
 
 def _build_channel(origin: Origin, value: Any) -> Any:
-    """Return the channel of a table, or WAITING."""
+    """Return the channel of a table, or NOT_IMPORTED if the class of its loss or delay must not be
+    imported yet.
+    """
     table = _as_dict(value)
     for family in ("loss", "delay"):
         if family in table:
@@ -350,7 +362,8 @@ def _build_channel(origin: Origin, value: Any) -> Any:
 
 
 def _build_filtering(origin: Origin, value: Any) -> Any:
-    """Return the filter of a table with its initial estimate and model, or WAITING.
+    """Return the filter of a table with its initial estimate and model, or NOT_IMPORTED if its
+    class must not be imported yet.
 
     The keys of ``Filtering`` and those of the algorithm are in one table of the file.
     """
