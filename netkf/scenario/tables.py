@@ -1,8 +1,8 @@
 """Building a scenario from the tables of a file; errors name the path of the wrong key.
 
 Importing a user's module executes it, so that a file is first checked as if no module could be
-imported. Tables are built from the inside out: one of a user's class then gives NOT_IMPORTED instead
-of an object, and so does every table that contains it; the other keys are checked all the same.
+imported. Tables are built from the inside out: one of a user's class then gives NOT_IMPORTED
+instead of an object, and so does every table that contains it; other keys are checked all the same.
 """
 
 from __future__ import annotations
