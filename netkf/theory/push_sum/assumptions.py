@@ -23,7 +23,9 @@ HEAVY_TAIL_RADIUS = 0.885  # above it mean squares over runs have no useful inte
 
 
 def slot_rows(scenario: Scenario) -> list[AssumptionRow]:
-    """Return the rows of P: plant, links, consensus gain, freezing of gains and moments."""
+    """Return the assumptions of the push-sum paper as rows (assumption, source, whether it holds,
+    evidence) of the table: on plant, links, consensus gain, freezing of gains and moments.
+    """
     return [
         *_plant_rows(scenario),
         *_link_rows(scenario),
@@ -34,7 +36,9 @@ def slot_rows(scenario: Scenario) -> list[AssumptionRow]:
 
 
 def _plant_rows(scenario: Scenario) -> list[AssumptionRow]:
-    """Return the rows on controllability, observability and the filters' model."""
+    """Return the assumptions, as rows of the table, on controllability, observability and the
+    filters' model.
+    """
     F, Q = scenario.slot_belief
     # (F, Q^1/2) is controllable if and only if (F', Q) is observable.
     idle = unobservable_mode(F.T, Q)
@@ -55,7 +59,9 @@ def _plant_rows(scenario: Scenario) -> list[AssumptionRow]:
 
 
 def _observability_row(scenario: Scenario) -> AssumptionRow:
-    """Return the row: all sensors together observe every mode."""
+    """Return the assumption, as a row of the table, that all sensors together observe every mode of
+    the plant.
+    """
     F, _ = scenario.slot_belief
     informations = [model.information for model in scenario.slot_models]
     hidden = unobservable_mode(F, np.sum(informations, axis=0))
@@ -69,8 +75,8 @@ def _observability_row(scenario: Scenario) -> AssumptionRow:
 
 
 def _link_rows(scenario: Scenario) -> list[AssumptionRow]:
-    """Return the rows about the graph and the losses."""
-    law: Averaging | None
+    """Return the assumptions, as rows of the table, about the graph and the losses of links."""
+    law: Averaging | None  # with which probabilities links are up; None if there is no such law
     try:
         law, reason = averaging_law(scenario), ""
     except TheoryError as error:
@@ -84,7 +90,7 @@ def _link_rows(scenario: Scenario) -> list[AssumptionRow]:
 
 
 def _graph_row(scenario: Scenario) -> AssumptionRow:
-    """Return the row: the graph is undirected and connected."""
+    """Return the assumption, as a row of the table, that the graph is undirected and connected."""
     topology = scenario.topology
     components = len(topology.components)
     return (
@@ -97,7 +103,9 @@ def _graph_row(scenario: Scenario) -> AssumptionRow:
 
 
 def _fresh_links_row(scenario: Scenario, law: Averaging | None, reason: str) -> AssumptionRow:
-    """Return the row on independent draws; ``reason`` says why the links have no such law."""
+    """Return the assumption, as a row of the table, that links fail anew in each averaging step;
+    ``reason`` says why they have no ``law``, if it is None.
+    """
     name, source = "links fail anew in each averaging step", "P Assumption 3"
     filter_ = push_sum_filter(scenario)
     if law is None:
@@ -112,7 +120,9 @@ def _fresh_links_row(scenario: Scenario, law: Averaging | None, reason: str) -> 
 
 
 def _joint_failure_row(scenario: Scenario, law: Averaging | None) -> AssumptionRow:
-    """Return the row on the symmetry of failures."""
+    """Return the assumption, as a row of the table, that both directions of a link fail together;
+    ``law`` has the links' probabilities, None if they have none.
+    """
     joint = scenario.network.channel.symmetric
     if law is not None:
         # Both directions have one probability, and each is up exactly if both are.
@@ -128,7 +138,9 @@ def _joint_failure_row(scenario: Scenario, law: Averaging | None) -> AssumptionR
 
 
 def _connection_row(scenario: Scenario) -> AssumptionRow:
-    """Return the row: with positive probability all links that are up connect all nodes."""
+    """Return the assumption, as a row of the table, that the links which are up connect all nodes
+    with a positive probability: the disconnection probability p_d is below 1.
+    """
     name, source = "p_d < 1: the network is whole at times", "P Assumption 3"
     try:
         cut = disconnection_probability(scenario)
@@ -140,7 +152,9 @@ def _connection_row(scenario: Scenario) -> AssumptionRow:
 
 
 def _gain_rows(scenario: Scenario) -> list[AssumptionRow]:
-    """Return the rows on the consensus gain delta."""
+    """Return the assumptions, as rows of the table, on the consensus gain delta of averaging steps
+    z <- (I - L / delta) z, with L the Laplacian of the graph.
+    """
     # One step multiplies disagreement by I - L / delta, of norm below 1 for delta > rho(L) / 2.
     delta, bound = push_sum_filter(scenario).delta, consensus_gain_bound(scenario)
     local = f"nodes can tell from degrees that rho(L) <= {min(bound.local, bound.nodes)}"
@@ -161,7 +175,9 @@ def _gain_rows(scenario: Scenario) -> list[AssumptionRow]:
 
 
 def _stop_row(scenario: Scenario) -> AssumptionRow:
-    """Return the row on gains that freeze too early."""
+    """Return the assumption, as a row of the table, that no gain is frozen before push-sum has
+    converged: the filter's option ``stop`` lets a node stop exchanging masses.
+    """
     filter_, loss = push_sum_filter(scenario), scenario.network.channel.loss
     lossless = isinstance(scenario.network.activation, Broadcast) and all(
         loss.mean_delivery(direction, scenario.table_probability(direction)) == 1.0
@@ -183,7 +199,10 @@ def _stop_row(scenario: Scenario) -> AssumptionRow:
 
 
 def _moment_rows(scenario: Scenario) -> list[AssumptionRow]:
-    """Return the exact and the certified conditions on means and mean squares."""
+    """Return the conditions under which the errors' means vanish and their mean squares stay
+    bounded, as rows of the table: for each the exact one, and that of the paper, whose theorems
+    certify it if there are enough averaging steps (gamma).
+    """
     return [
         _exact_row(
             ("the estimates become unbiased", "P (30), derived"),
@@ -202,7 +221,8 @@ def _moment_rows(scenario: Scenario) -> list[AssumptionRow]:
 def _exact_row(
     name: tuple[str, str], measure: Callable[[], float], heavy: bool = False
 ) -> AssumptionRow:
-    """Return a row that holds if the radius that ``measure`` computes is below 1.
+    """Return a row of the table of assumptions that holds if the spectral radius of the errors'
+    dynamics that ``measure`` computes is below 1.
 
     name  : the row's text and its equation
     heavy : mention heavy tails of averages over runs
@@ -221,7 +241,10 @@ def _exact_row(
 
 
 def _certified_row(scenario: Scenario, moment: Moment, source: str) -> AssumptionRow:
-    """Return the row: gamma is at least the certified one for a moment."""
+    """Return the row of the table that says whether gamma, the number of averaging steps in a slot,
+    is at least the one for which the paper's theorem ``source`` certifies stable errors: in the
+    mean, or in the mean square (``moment``).
+    """
     gamma = push_sum_filter(scenario).gamma
     name = f"gamma is certified for the {moment.replace('-', ' ')}"
     try:

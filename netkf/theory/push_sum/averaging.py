@@ -32,7 +32,8 @@ MAX_OUTCOMES_AT_ONCE = 8192  # bounds the memory of the products
 
 @dataclass(frozen=True, eq=False)
 class Averaging:
-    """The law of gamma averaging steps on N = ``nodes`` nodes with consensus gain ``delta``.
+    """The law of gamma averaging steps z <- M z on N = ``nodes`` nodes with consensus gain
+    ``delta``, where each node moves towards those that it hears, by 1/delta of the difference.
 
     links  : (E, 2) indices of the two ends of each of E links
     hears  : (E, 2) probabilities that the first end hears the second, and that the second the first
@@ -74,8 +75,9 @@ class Averaging:
         N, (i, j) = self.nodes, self.links.T
         step = self.mean_step.toarray()
         expected = np.kron(step, step)
-        # Each link adds cov(b, b) d: ``difference`` computes d from the four entries of a link, and
-        # ``spread`` adds it, times covariances, to the same four.
+        # To E[M] Y E[M]' each link adds cov(b, b) d with d = Y_ii - Y_ij - Y_ji + Y_jj and b_ij = 1
+        # if i hears j: ``difference`` computes d from the four entries of a link, and ``spread``
+        # adds it, times covariances, to the same four.
         entry_indices = (i * N + i, i * N + j, j * N + i, j * N + j)
         spread = np.zeros((N * N, len(i)))
         difference = np.zeros((len(i), N * N))
@@ -102,8 +104,9 @@ class Averaging:
         node_indices = np.arange(N)
         for _ in range(self.gamma):
             Z = Y.reshape(N, n, N, n)
+            # The second moment of the difference of the two ends of each link.
             d = Z[i, :, i] - Z[i, :, j] - Z[j, :, i] + Z[j, :, j]
-            # E[M] Y E[M]', then the covariances of each link in its four blocks
+            # E[M] Y E[M]', then what the randomness of each link adds in its four blocks.
             Y = self._multiply(self._multiply(Y).T).T.copy()
             Z = Y.reshape(N, n, N, n)
             at_node = np.zeros((N, n, n))
@@ -131,7 +134,9 @@ class Averaging:
 
     @cached_property
     def _covariances(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Covariance matrix of (b_ij, b_ji) over delta^2, row by row, (E,) each."""
+        """Covariance matrix of (b_ij, b_ji) over delta^2 of each of E links, row by row, (E,) each;
+        b_ij = 1 if i hears j in an averaging step, else 0.
+        """
         first, second = self.hears.T
         # cov(b_ij, b_ji) = P(both) - p q; variances p (1 - p) and q (1 - q)
         covariance = (self.both - first * second) / self.delta**2
@@ -140,7 +145,8 @@ class Averaging:
 
     @cached_property
     def _moments(self) -> tuple[FloatArray, FloatArray]:
-        """Mean (N, N) and mean Kronecker square (N^2, N^2) of M^gamma over all outcomes of a draw.
+        """Mean (N, N) and mean Kronecker square (N^2, N^2) of M^gamma if one draw of the links is
+        held over all steps of a slot: averages over all outcomes of the draw.
 
         Raises TheoryError if there are too many.
         """
@@ -170,9 +176,9 @@ class Averaging:
 
     @cached_property
     def _link_outcomes(self) -> list[tuple[FloatArray, FloatArray]]:
-        """Probabilities (K,) and terms (K, N^2) of M of the K possible outcomes of each link.
-
-        M is the identity less one term of each link.
+        """Probabilities (K,) and terms (K, N^2) of the K possible outcomes of each link in a step:
+        both ends hear each other, one of them, or none. The step's matrix M is the identity less
+        the term of each link.
         """
         N, outcomes = self.nodes, []
         for (i, j), (first_hears, second_hears), both_hear in zip(
@@ -186,6 +192,8 @@ class Averaging:
                     1.0 - first_hears - second_hears + both_hear,
                 ]
             )
+            # The first end hears in outcomes 0 and 1, which gives row i entries 1 and -1 in columns
+            # i and j; the second in outcomes 0 and 2.
             terms = np.zeros((4, N, N))
             terms[[[0], [1]], i, [i, j]] = terms[[[0], [2]], j, [j, i]] = [1.0, -1.0]
             possible = probabilities > 1e-15
@@ -198,8 +206,8 @@ class Averaging:
 def _tabulate(
     outcomes: list[tuple[FloatArray, FloatArray]], size: int
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the probabilities (K,) and the sums of terms (K, size) of all K outcomes of several
-    links together.
+    """Return the probabilities (K,) of all K joint outcomes of several independent links, and the
+    sums (K, size) of the links' terms of the averaging matrix in each.
 
     ``outcomes`` has for each link the probabilities (k,) and terms (k, size) of its own k outcomes.
     """

@@ -21,7 +21,8 @@ Degrees = Literal["nominal", "last"]
 def mass_totals(
     graph: Scenario | Topology, up: ArrayLike, degrees: Degrees = "nominal"
 ) -> FloatArray:
-    """Return the total mass (T + 1,) of all nodes after 0 .. T slots, from a total of 1.
+    """Return the total mass (T + 1,) of all nodes after 0 .. T slots of push-sum exchanges, from a
+    total of 1.
 
     ``up`` (T, E) says which links of the graph, in its order, are up in each slot, in both
     directions. Every node starts with 1/N. ``degrees`` "nominal" divides by the degree in the whole
@@ -38,6 +39,7 @@ def mass_totals(
     if degrees not in ("nominal", "last"):
         raise TheoryError(f'degrees must be "nominal" or "last", got {degrees!r}')
     nominal = np.bincount(links.reshape(-1), minlength=N) + 1.0
+    # ``nominal`` and ``last_degrees`` are degrees plus 1: a node keeps one share itself.
     z, last_degrees, totals = np.full(N, 1.0 / N), nominal, [1.0]
     for row in present:
         open_, closed = links[row], links[~row]
@@ -60,6 +62,7 @@ def leader_agreement(scenario: Scenario, slots: int, leader: int | None = None) 
     probabilities of the channel, afresh in each slot. Exact, over all sets of nodes that may know.
     Raises TheoryError for more than 12 nodes and for links that are not drawn independently.
     """
+    # The law of the links: which nodes hear each other in a step.
     averaging, slots = averaging_law(scenario), as_integer("slots", slots, 0)
     if averaging.nodes > MAX_NODES:
         raise TheoryError(
@@ -85,7 +88,8 @@ def leader_agreement(scenario: Scenario, slots: int, leader: int | None = None) 
 
 
 def _spread(law: FloatArray, missed: FloatArray) -> FloatArray:
-    """Return the law (2^N,) of the set of informed nodes one slot later, from ``law`` (2^N,).
+    """Return the probabilities (2^N,) of all sets of informed nodes one slot later, from those now,
+    ``law`` (2^N,); a node is informed if it knows the leader, and it tells its neighbours.
 
     The index of a set is a bit mask of node indices; ``missed`` (N, N) is the probability that node
     i (row) does not hear node j (column) in a slot.

@@ -47,7 +47,8 @@ class GammaConstants(NamedTuple):
 
 
 def gamma_constants(scenario: Scenario) -> GammaConstants:
-    """Return the constants of P Theorems 5 and 6.
+    """Return the constants of P Theorems 5 and 6 of the push-sum paper, which certify that with
+    gamma averaging steps in a slot the mean errors vanish, and mean squares stay bounded.
 
     Raises TheoryError if a condition of the theorems fails: delta at or below rho(L), a singular
     P_inf, links held over the steps or failing in one direction.
@@ -57,20 +58,23 @@ def gamma_constants(scenario: Scenario) -> GammaConstants:
 
 @lru_cache(maxsize=8)
 def _bound_constants(scenario: Scenario) -> GammaConstants:
-    """Return the constants, cached: both theorems use them, and p_d takes time."""
+    """Return the constants of :func:`gamma_constants`, cached: both theorems use them, and the
+    probability that link failures disconnect the network takes time.
+    """
     steps = estimation_steps(scenario)
     law, P, N = steps.averaging, steps.limits.P, steps.limits.N
     _require_conditions(scenario, law, P)
     F, G = scenario.slot_belief[0], steps.limits.G
     size = float(np.linalg.norm(P, 2))
-    # The mean of all A_i is (I - P_inf G) F, the error dynamics of the central filter, P (34).
-    joint = steps.closed.mean(axis=0)
+    # The mean of all A_i = (I - K_i H_i) F is (I - P_inf G) F, the error dynamics of the central
+    # filter, P (34).
+    central = steps.closed.mean(axis=0)
     # P (54), from the path, which has the least algebraic connectivity of all connected graphs.
     gap = (1.0 - np.cos(np.pi / N)) / law.delta
     theta = 1.0 - float(law.hears.min(initial=1.0)) * gap
     cut = _disconnection_bound(scenario, law)
     return GammaConstants(
-        contraction=_weighted_norm(joint.T, P) ** 2,
+        contraction=_weighted_norm(central.T, P) ** 2,
         printed=(1.0 + N * size * _weighted_norm(G, P)) * _weighted_norm(F, P),
         sharp=max(_weighted_norm(closed.T, P) for closed in steps.closed),
         mean=theta,
@@ -98,7 +102,9 @@ def _require_conditions(scenario: Scenario, law: Averaging, P: FloatArray) -> No
 
 
 def _disconnection_bound(scenario: Scenario, law: Averaging) -> float:
-    """Return the disconnection probability p_d, or the upper end of its interval."""
+    """Return the probability p_d that link failures disconnect the network in an averaging step, or
+    the upper end of its interval where it is only estimated.
+    """
     links, nodes = law.links, scenario.nodes
     up = {(nodes[i], nodes[j]): float(p) for (i, j), p in zip(links, law.both, strict=True)}
     return disconnection_probability(scenario.topology, up).high
@@ -113,7 +119,8 @@ def _weighted_norm(A: FloatArray, P: FloatArray) -> float:
 
 
 def minimum_gamma(scenario: Scenario, moment: Moment = "mean", sharp: bool = False) -> int:
-    """Return the smallest gamma that P Theorem 5 or 6 certifies; the scenario's own is ignored.
+    """Return the smallest gamma (number of averaging steps in a slot) that Theorem 5 or 6 of the
+    push-sum paper certifies; the scenario's own is ignored.
 
     Theorem 5 for ``moment`` "mean" (asymptotically unbiased), Theorem 6 for "mean-square"
     (bounded). c_B is that printed in P (37), or ``max_i |A_i'|_P`` if that is larger; ``sharp``
@@ -125,7 +132,7 @@ def minimum_gamma(scenario: Scenario, moment: Moment = "mean", sharp: bool = Fal
     test = {"mean": theorem_5, "mean-square": theorem_6}[_check_moment(moment)]
 
     def certified(gamma: int) -> bool:
-        """Return True if this gamma passes the test."""
+        """Return True if the theorem's bound on the error dynamics contracts with this gamma."""
         return test(constants, bound, gamma) < 1.0
 
     return _least_certified(certified, constants)
@@ -145,7 +152,8 @@ class CorollaryTwo(NamedTuple):
 
 
 def corollary_2(scenario: Scenario, sharp: bool = False) -> CorollaryTwo:
-    """Return gamma of P (44) beside that of P Theorem 5, from which it does not follow.
+    """Return gamma of P (44), Corollary 2 of the push-sum paper, beside that of P Theorem 5, from
+    which the corollary does not follow.
 
     With ``a = sqrt(lambda)`` and ``t = theta^gamma``, rho(A_R) < 1 means
     ``t < (1 - a) / (c_B (1 - a + c_B))``; P (44), ``t < ((1 - a) / c_B)^2``, is weaker where
@@ -169,8 +177,9 @@ def _check_moment(moment: str) -> Moment:
 
 
 def _least_certified(certified: Callable[[int], bool], constants: GammaConstants) -> int:
-    """Return the smallest certified gamma by doubling and bisection, since the bounds decrease with
-    gamma; raises TheoryError if there is none up to MAX_STEPS.
+    """Return the smallest gamma for which ``certified`` is true, by doubling and bisection, since
+    the theorems' bounds decrease with gamma; raises TheoryError, with the ``constants`` of the
+    bounds, if there is none up to MAX_STEPS.
     """
     high = 1
     while not certified(high):
@@ -195,9 +204,13 @@ def theorem_5(constants: GammaConstants, bound: float, gamma: int) -> float:
 
 
 def theorem_6(constants: GammaConstants, bound: float, gamma: int) -> float:
-    """Return rho(A_S(gamma)) of P (45) with c_B = ``bound``; below 1 it certifies gamma."""
+    """Return the spectral radius of the matrix A_S(gamma) of P (45), with c_B = ``bound``: below 1
+    it certifies, by P Theorem 6, that mean-square errors stay bounded with gamma averaging steps.
+    """
     root_lambda, bound_square = constants.contraction**0.5, bound * bound
     mean_factor, square_factor = constants.mean**gamma, constants.mean_square**gamma
+    # Norms of second moments: of the mean of all nodes, of the mean with the disagreement (twice),
+    # and of the disagreement.
     return _spectral_radius(
         [
             [root_lambda * root_lambda, bound * root_lambda, bound * root_lambda, bound_square],
@@ -231,7 +244,8 @@ def searches_gamma(scenario: Scenario) -> bool:
 def exact_minimum_gamma(
     scenario: Scenario, moment: Moment = "mean-square", most: int = MAX_EXACT
 ) -> int:
-    """Return the smallest gamma for which the exact radius of the moment's dynamics is below 1.
+    """Return the smallest gamma (number of averaging steps in a slot) with which the errors' mean,
+    or mean square (``moment``), is stable: the exact spectral radius of its dynamics is below 1.
 
     The radius is ``push_sum_radius`` for "mean-square"; the scenario's own gamma is ignored. Raises
     TheoryError if there is none up to ``most``.

@@ -24,7 +24,8 @@ def push_sum_error_covariance(scenario: Scenario) -> FloatArray:
 
 
 def covariance_of_steps(steps: EstimationSteps) -> FloatArray:
-    """Return the steady covariance (N, n, n) of the nodes' errors for given steps 4 and 5.
+    """Return the steady covariance (N, n, n) of the nodes' errors for given estimation ``steps``:
+    the linear system of updates by readings and averaging steps (steps 4 and 5 of the paper).
 
     Raises TheoryError if there is none: the mean-square radius of the steps is not below 1.
     """
@@ -32,8 +33,9 @@ def covariance_of_steps(steps: EstimationSteps) -> FloatArray:
 
 
 def _covariance(steps: EstimationSteps, value: float) -> FloatArray:
-    """Return the steady covariance (N, n, n) of the nodes' errors under steps 4 and 5, whose
-    mean-square radius is ``value``; raises TheoryError unless it is below 1.
+    """Return the steady covariance (N, n, n) of the nodes' errors under the estimation ``steps``,
+    whose mean-square radius (spectral radius of the second moments' recursion) is ``value``; raises
+    TheoryError unless it is below 1.
     """
     if not value < 1.0:
         raise TheoryError(
@@ -43,7 +45,8 @@ def _covariance(steps: EstimationSteps, value: float) -> FloatArray:
     N, n, _ = steps.closed.shape
     scale = steps.scale
     scales = np.tile(scale, N)
-    # E[(M (x) I) cov(h) (M (x) I)'], the constant term of the equation
+    # States in units of P_inf's deviations; then the stacked second moments X of all nodes solve
+    # X = T(X) + E[(M (x) I) cov(h) (M (x) I)'] with M the averaging and h the noises of a slot.
     noise = symmetric(steps.averaging.second_moment(steps.noise / np.outer(scales, scales)))
     X = fixed_point(second_moment_map(steps.averaging, steps.scaled), noise[None], value)[0]
     nodes = np.arange(N)

@@ -98,8 +98,9 @@ def _scenario_probability(scenario: Scenario, seed: int, samples: int | None) ->
 def _probability(
     nodes: int, probabilities: dict[tuple[int, int], float], seed: int, samples: int | None
 ) -> Probability:
-    """Return the exact probability p_d that the links which are up do not connect all nodes if few
-    enough partitions occur, else an estimate from ``samples`` draws with ``seed``.
+    """Return the probability p_d that the links which are up do not connect all nodes: exact if
+    the method over partitions of nodes into connected parts needs few enough of them, else an
+    estimate from ``samples`` draws with ``seed``.
 
     ``nodes`` is their number; ``probabilities`` are those that a link (pair of node indices) is up.
     """
@@ -108,11 +109,11 @@ def _probability(
         if p > 0.0:
             neighbours[i][j] = neighbours[j][i] = p
     if not _is_connected(neighbours):
-        return Probability(1.0, 1.0, 1.0, True)
+        return Probability(1.0, 1.0, 1.0, exact=True)
     order = _elimination_order(neighbours)
     cut = None if order is None else _exact_probability(neighbours, order)
     if cut is not None:
-        return Probability(cut, cut, cut, True)
+        return Probability(cut, cut, cut, exact=True)
     if samples is None:
         samples = int(np.clip(NODE_SAMPLES / nodes, MIN_SAMPLES, MAX_SAMPLES))
     return _estimate(nodes, probabilities, seed, samples)
@@ -219,12 +220,12 @@ def _is_connected(neighbours: list[dict[int, float]]) -> bool:
 
 
 def _elimination_order(neighbours: list[dict[int, float]]) -> list[int] | None:
-    """Return an order of the nodes (indices) for ``_exact_probability``, in which few are open at a
-    time.
+    """Return an order of the nodes (indices) for ``_exact_probability``, which takes one node after
+    the other, in which few are open at a time: taken, but with neighbours still to come.
 
     ``neighbours`` has the probabilities of the links of each node, by the index of the other end.
     It is the greedy order of least effort from several first nodes; None if in each of them more
-    than MAX_OPEN nodes are open.
+    than MAX_OPEN nodes are open at a time.
     """
     nodes = range(len(neighbours))
     roots = sorted(nodes, key=lambda node: len(neighbours[node]))[:MAX_ROOTS]
@@ -237,10 +238,11 @@ def _greedy_order(neighbours: list[dict[int, float]], root: int) -> tuple[float,
     which begins at node ``root``.
 
     ``neighbours`` has the probabilities of the links of each node, by the index of the other end.
-    The next node is the one that closes the most open nodes and then adds the fewest candidates.
-    None as soon as more than MAX_OPEN nodes are open.
+    A node is open while it is in the order and some of its neighbours are not. The next node is the
+    one that closes the most open nodes and then adds the fewest candidates. None as soon as more
+    than MAX_OPEN nodes are open.
     """
-    waiting = [set(links) for links in neighbours]
+    waiting = [set(links) for links in neighbours]  # the neighbours of each node still to come
     effort, order, opened, eliminated = 0.0, [], set[int](), set[int]()
     candidates = {root}
     while candidates:
@@ -248,7 +250,7 @@ def _greedy_order(neighbours: list[dict[int, float]], root: int) -> tuple[float,
         for node in candidates:
             adjacent = neighbours[node].keys()
             closed = sum(len(waiting[neighbour]) == 1 for neighbour in adjacent & opened)
-            stays = int(not adjacent <= eliminated)
+            stays = int(not adjacent <= eliminated)  # the node itself would be open
             ranked.append((stays - closed, len(adjacent - eliminated - candidates), node))
         node = min(ranked)[-1]
         order.append(node)
@@ -260,7 +262,7 @@ def _greedy_order(neighbours: list[dict[int, float]], root: int) -> tuple[float,
         if len(opened) > MAX_OPEN:
             return None
         candidates = (candidates | neighbours[node].keys()) - eliminated
-        effort += 3.0 ** len(opened)
+        effort += 3.0 ** len(opened)  # about the number of partitions of the open nodes
     return effort, order
 
 
@@ -268,8 +270,9 @@ def _exact_probability(neighbours: list[dict[int, float]], order: list[int]) -> 
     """Return the probability that the network is disconnected, None for too many partitions.
 
     ``neighbours`` has the probabilities of the links of each node, by the index of the other end,
-    and ``order`` lists all nodes. A partition is represented by the labels of the open nodes'
-    parts, numbered in order of appearance.
+    and ``order`` lists all nodes, which are added one by one with their links to earlier ones. A
+    node is open until all its neighbours are added. A partition says which open nodes are connected
+    so far: the tuple of the labels of their parts, numbered in order of appearance.
     """
     index = {node: k for k, node in enumerate(order)}
     # A node stays open until all of its neighbours have been opened.
@@ -298,11 +301,11 @@ def _exact_probability(neighbours: list[dict[int, float]], order: list[int]) -> 
 def _apply_link(
     states: dict[tuple[int, ...], float], index: int, up: float
 ) -> dict[tuple[int, ...], float]:
-    """Return the probability of each partition after the link between open node ``index`` and the
-    last open node, which is up with probability ``up``.
+    """Return the probability of each partition of the open nodes into connected parts after the
+    link between open node ``index`` and the last open node, which is up with probability ``up``.
 
     ``states`` has the probabilities before it; a partition is the tuple of the labels of the open
-    nodes' parts.
+    nodes' parts. A node is open while some of its links are still to come.
     """
     partitions: defaultdict[tuple[int, ...], float] = defaultdict(float)
     for labels, p in states.items():
@@ -324,7 +327,8 @@ def _close_nodes(
     among the open ones), and the probability of a cut: that of the partitions with a part of which
     no node stays open.
 
-    ``states`` has the probabilities before, by the labels of the open nodes' parts.
+    ``states`` has the probabilities before, by the labels of the connected parts of the open nodes:
+    those with links still to come.
     """
     partitions: defaultdict[tuple[int, ...], float] = defaultdict(float)
     lost = []
@@ -373,4 +377,4 @@ def _estimate(
     tail = 0.5 * (1.0 - CONFIDENCE)
     low = scipy.special.betaincinv(cut, samples - cut + 1, tail) if cut else 0.0
     high = scipy.special.betaincinv(cut + 1, samples - cut, 1.0 - tail) if cut < samples else 1.0
-    return Probability(cut / samples, float(low), float(high), False)
+    return Probability(cut / samples, float(low), float(high), exact=False)

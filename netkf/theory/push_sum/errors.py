@@ -34,7 +34,8 @@ from netkf.trace.schema import CODES
 
 
 def require_known_errors(scenario: Scenario, run: Run) -> None:
-    """Raise TheoryError if the errors in slots cannot be replayed.
+    """Raise TheoryError if the exact errors of a run in slots cannot be computed from its events
+    (:class:`AveragingRule`).
 
     That is so for frozen or asymptotic gains, for filters whose F differs from the plant's, for
     sensors whose H varies, and for samples at the horizon, since the trace lacks the exchanges of a
@@ -52,13 +53,15 @@ def require_known_errors(scenario: Scenario, run: Run) -> None:
 
 
 class AveragingRule(ErrorRule):
-    """Rule in slots: masses are exchanged once, estimates averaged in gamma steps."""
+    """Rule by which errors change in slots: push-sum masses are exchanged once in a slot (phase 0),
+    estimates averaged in gamma steps (phase 1), and then updated by readings.
+    """
 
     takes_messages = False
 
     def __init__(self, scenario: Scenario, errors: StackedErrors, run: Run) -> None:
-        """Take the errors at time 0 and the messages of the run that arrived; masses ``_z``
-        (N, 2 + n^2) begin as in P (3).
+        """Take the stacked errors of all nodes at time 0, and which messages of the run arrived;
+        the nodes' push-sum masses ``_z`` (N, 2 + n^2) begin as in P (3) of the push-sum paper.
         """
         super().__init__(scenario, errors)
         algorithm: Any = scenario.filter.algorithm
@@ -80,15 +83,17 @@ class AveragingRule(ErrorRule):
         self._heard = np.zeros((self._N, *self._z.shape))
 
     def exchange(self, slot: int, phase: int, messages: Sequence[SentMessage]) -> None:
-        """Exchange the masses, P (3)-(5) (``phase`` 0), or average the estimates of all nodes in
-        gamma steps, P step 5 (``phase`` 1).
+        """Exchange the push-sum masses, P (3)-(5) (``phase`` 0), or average the estimates of all
+        nodes in gamma steps, P step 5 (``phase`` 1); called by the replay for each phase of a slot.
 
-        Phase 0 changes ``_z`` (and the running sums), phase 1 the errors in the stack.
+        Phase 0 changes ``_z`` (and the running sums), phase 1 the errors in the stack. Which
+        messages arrived is known from the log, so that ``messages`` are not used.
         """
         if phase == 0:
             received = self._arrived_weights(slot, 0, 0)
             shares = self._z / self._nu[:, None]
             if self._running:
+                # A receiver gains what was offered since it last heard the sender.
                 self._offered = self._offered + shares
                 news = np.where(received[..., None] > 0.0, self._offered - self._heard, 0.0)
                 self._heard, self._z = self._heard + news, shares + news.sum(axis=1)
@@ -104,6 +109,7 @@ class AveragingRule(ErrorRule):
             # z <- (I - L / delta) z with the Laplacian L of the links that are up in this step.
             laplacian = np.diag(received.sum(axis=1)) - received
             mixing = mixing - laplacian @ mixing / self._delta
+        # The errors of all nodes are mixed as their estimates are: weights sum to 1.
         stack = self.errors.stack
         indices = stack.indices(estimators)
         forms = stack.table[indices, :, : stack.used].reshape(self._N, -1)
@@ -111,7 +117,7 @@ class AveragingRule(ErrorRule):
 
     def _arrived_weights(self, slot: int, phase: int, step: int) -> FloatArray:
         """Return a table (N, N), receiver by sender, that is 1 where a message arrived in this
-        ``step`` of an exchange, ``phase`` of a ``slot``, else 0.
+        averaging ``step`` of a ``phase`` (0: masses, 1: estimates) of a ``slot``, else 0.
         """
         return self._arrivals.get((slot, phase, step), np.zeros((self._N, self._N)))
 
@@ -152,18 +158,20 @@ class RunningTotalsRule(ErrorRule):
     def __init__(
         self, scenario: Scenario, errors: StackedErrors, rounds: Mapping[float, Sequence[int]]
     ) -> None:
-        """Take the errors at time 0, and ``rounds``: the indices of the nodes that broadcast, by
-        time (seconds).
+        """Take the stacked errors of all nodes at time 0, and ``rounds``: the indices of the nodes
+        that broadcast, by time (seconds).
         """
         super().__init__(scenario, errors, rounds)
         if errors.follows:
             raise TheoryError("the exact errors are known for filters that have the plant's A")
         plant, n = scenario.diffusion, errors.n
         self._A, self._rounds = plant.A, rounds
+        # Decay rate of the fastest mode, by which the information of old totals fades.
         self._rate = max(0.0, -float(np.linalg.eigvals(plant.A).real.min()))
         self._weights = [1.0] * errors.estimators
         # The weight of each total; the stack has their information and errors.
         self._totals: dict[Hashable, float] = {}
+        # The number of the last message heard over each (sender, receiver).
         self._number: dict[tuple[int, int], int] = {}
         self._receivers = [0] * errors.estimators
         for sender, _ in scenario.topology.directions:
@@ -172,8 +180,9 @@ class RunningTotalsRule(ErrorRule):
             self._put_total(("sent", estimator), 0.0, np.zeros((n, n)), np.zeros((n, 0)))
 
     def _put_total(self, name: Hashable, weight: float, U: FloatArray, form: FloatArray) -> None:
-        """Set the total ``name``: its weight, its information U (n, n) and the ``form`` (n, inputs)
-        of its error.
+        """Set the total ``name`` (of mass sent by a node, in a message, or last heard): its weight,
+        its information U (n, n) and the ``form`` (n, inputs) of its error, the matrix that gives
+        the error as a linear function of all noises so far.
         """
         stack, self._totals[name] = self.errors.stack, weight
         stack.put(name, form)
@@ -186,7 +195,8 @@ class RunningTotalsRule(ErrorRule):
         return U
 
     def elapse(self, gap: float, columns: slice | None, noise: FloatArray | None) -> None:
-        """Predict the information and errors of all totals by ``gap`` seconds.
+        """Predict the information and errors of all totals by ``gap`` seconds; called by the replay
+        between events. The errors of the estimates have been predicted already.
 
         The plant's noise over the gap is ``noise`` (n, k) times the k inputs in ``columns``.
         """
@@ -206,8 +216,9 @@ class RunningTotalsRule(ErrorRule):
         )
 
     def sense(self, time: float, observations: EstimatorObservations) -> None:
-        """Update by samples, each counted N / w times, and then add the shares of the nodes that
-        broadcast now, at ``time`` (seconds), to their totals.
+        """Update the errors by the readings at ``time`` (seconds), each counted N / w times (w the
+        node's push-sum weight, N nodes), and then add the shares of the nodes that broadcast now to
+        their totals; called by the replay at times of samples and broadcasts.
         """
         columns, number = self.errors.reading_noises(observations), self.errors.estimators
         for estimator, observation in observations.items():
@@ -217,8 +228,8 @@ class RunningTotalsRule(ErrorRule):
             self._add_share(estimator)
 
     def _add_share(self, estimator: int) -> None:
-        """Add the share 1 / (receivers + 1) of the mass of node ``estimator`` to its total for each
-        receiver; changes that total and the node's weight.
+        """Add the share 1 / (receivers + 1) of the push-sum mass of node ``estimator`` to the total
+        that it has ever offered to each receiver; changes that total and the node's weight.
 
         The mass is ``(w / N) (P^-1, P^-1 xhat)``, and its error ``-(w / N) P^-1 e``.
         """
@@ -235,7 +246,9 @@ class RunningTotalsRule(ErrorRule):
         self._weights[estimator] = weight - count * (new_total - old_total)
 
     def send(self, messages: Sequence[SentMessage]) -> None:
-        """Store the sender's present total for each message."""
+        """Store the sender's present total for each message, until it arrives; called by the replay
+        when messages are sent.
+        """
         for message in messages:
             name = ("sent", message.sender)
             self.errors.stack.copy(name, message)
@@ -243,7 +256,8 @@ class RunningTotalsRule(ErrorRule):
 
     def arrive(self, time: float, messages: Sequence[SentMessage]) -> None:
         """Add to each receiver's mass the difference between the totals received now, at ``time``
-        (seconds), and last; changes weights, errors and roots of P.
+        (seconds), and last; changes weights, errors and roots of P. Called by the replay when
+        messages arrive.
         """
         for estimator in sorted({message.receiver for message in messages}):
             received = [m for m in messages if m.receiver == estimator]
@@ -253,13 +267,15 @@ class RunningTotalsRule(ErrorRule):
         self.errors.stack.drop(messages)
 
     def _receive_totals(self, estimator: int, messages: Sequence[SentMessage]) -> None:
-        """Add the growth of the received totals to the mass of node ``estimator``, and update its
-        estimate.
+        """Add the growth of the received totals, since those last heard over the same links, to the
+        push-sum mass of node ``estimator``, and update the error of its estimate.
 
         Changes the node's weight, error and root of P, and the totals last heard over the links of
         the ``messages``.
         """
         errors, n = self.errors, self.errors.n
+        # The gain in weight and information, and the form of its error u - U x: the matrix that
+        # gives it as a linear function of all noises so far.
         weight, U, form = 0.0, np.zeros((n, n)), np.zeros((n, 1))
         for message in messages:
             link, heard = (message.sender, estimator), ("heard", message.sender, estimator)
@@ -301,8 +317,9 @@ def _read_rounds(scenario: Scenario, run: Run) -> dict[float, list[int]]:
 def error_rule(
     scenario: Scenario, errors: StackedErrors, run: Run, messages: Sequence[SentMessage]
 ) -> ErrorRule:
-    """Return the rule by which the push-sum filter uses the readings and messages of a run; it
-    changes ``errors``, the stacked errors of all nodes, event by event.
+    """Return the rule by which the replay of a run, which computes exact errors from its events,
+    changes ``errors``, the stacked errors of all nodes, as the push-sum filter uses readings and
+    messages.
 
     ``messages`` are those of the run that arrived. Raises TheoryError if the errors in slots are
     not known.

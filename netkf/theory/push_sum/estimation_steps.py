@@ -17,14 +17,16 @@ from netkf.theory.push_sum.limits import PushSumLimits, push_sum_filter, push_su
 
 @dataclass(frozen=True, eq=False)
 class EstimationSteps:
-    """Dynamics ``e+ = (M (x) I)(diag(A_i) e + h)`` of the stacked errors, P (25).
+    """Dynamics ``e+ = (M (x) I)(diag(A_i) e + h)`` of the stacked errors of all nodes in a slot,
+    P (25): every node predicts and updates by its reading (step 4), then estimates are averaged by
+    the random matrix M (N, N) of gamma averaging steps (step 5).
 
     averaging : the law of M
     closed    : (N, n, n) A_i = (I - K_i H_i) F
     process   : (N, n, n) I - K_i H_i, by which the plant's noise enters h, P (27)
     sensor_noise : (N, n, n) K_i R_i K_i', the covariance of the sensors' noise in h
     Q         : (n, n) of the plant
-    limits    : the limits of steps 2 and 3, from which the gains are computed
+    limits    : the limits of the push-sum masses (steps 2 and 3), from which the gains K_i are
     """
 
     averaging: Averaging
@@ -61,9 +63,10 @@ class EstimationSteps:
 
 
 def estimation_steps(scenario: Scenario, averaging: Averaging | None = None) -> EstimationSteps:
-    """Return steps 4 and 5 of a scenario, with its own links or the given ``averaging``, as a
-    linear system: the closed loops and noise factors (N, n, n) of the nodes, and the law of
-    averaging.
+    """Return how the push-sum filter's errors change in a slot once its gains have converged, as a
+    linear system: the closed loops (I - K_i H_i) F and noise factors (N, n, n) of the nodes (step
+    4), and the law of averaging over links that may fail (step 5): the scenario's own links or the
+    given ``averaging``.
 
     The filters' Q and R may differ from the truth, their F may not. Raises TheoryError if
     asymptotic gains do not exist or the links are not drawn independently.
@@ -83,8 +86,9 @@ def estimation_steps(scenario: Scenario, averaging: Averaging | None = None) -> 
 
 
 def averaging_law(scenario: Scenario, delivery: float | None = None) -> Averaging:
-    """Return the law of step 5 for the scenario's channel, or with one ``delivery`` probability for
-    all links.
+    """Return the law of the push-sum filter's averaging steps (step 5): the probabilities with
+    which the links of the scenario's channel are up, or one ``delivery`` probability for all links,
+    and the consensus gain.
 
     Raises TheoryError for recorded links, for losses that depend on the past, and for delays by
     which messages can be late.

@@ -32,9 +32,9 @@ class LargeGamma(NamedTuple):
 
 
 def large_gamma_limits(scenario: Scenario) -> LargeGamma:
-    """Return the limits of P Lemma 4 and P Theorem 4 for gamma to infinity: the covariance
-    (N n, N n) of the transformed noise, and that of the steady errors (n, n), which is the same at
-    all nodes.
+    """Return the limits for ever more averaging steps in a slot (gamma to infinity): the covariance
+    (N n, N n) of the noise that averaging leaves, P Lemma 4, and that of the steady errors (n, n),
+    which is the same at all nodes, P Theorem 4.
 
     The scenario's own gamma is ignored. Raises TheoryError where they do not hold: a graph that is
     not connected, links that are held over the steps or fail in one direction, a delta at or below
@@ -98,7 +98,9 @@ def _with_gamma(steps: EstimationSteps, gamma: int) -> EstimationSteps:
 
 
 def _require_averaging(scenario: Scenario, steps: EstimationSteps) -> None:
-    """Raise TheoryError unless gamma steps converge to the mean of all nodes as gamma grows."""
+    """Raise TheoryError unless gamma averaging steps converge to the mean of all nodes as gamma
+    grows, as P Theorem 4 assumes.
+    """
     law = steps.averaging
     if law.held and not law.deterministic:
         raise TheoryError('P Theorem 4 needs links = "fresh": a draw that is held cuts the network')
@@ -112,8 +114,9 @@ def _require_averaging(scenario: Scenario, steps: EstimationSteps) -> None:
 
 
 def _steady_mean(steps: EstimationSteps, noise: FloatArray) -> FloatArray:
-    """Return X (n, n) with ``X = A_C X A_C' + noise``, the covariance of the mean error over nodes;
-    ``noise`` (n, n) is what a slot adds to it.
+    """Return the steady covariance X (n, n) of the mean of all nodes' errors, which solves
+    ``X = A_C X A_C' + noise`` with A_C the mean of their closed loops; ``noise`` (n, n) is what a
+    slot adds to it.
     """
     central = steps.closed.mean(axis=0)
     return symmetric(np.asarray(scipy.linalg.solve_discrete_lyapunov(central, noise)))

@@ -15,11 +15,12 @@ from netkf.theory.intermittent.riccati import filtered_covariance
 
 
 class PushSumLimits(NamedTuple):
-    """Limits of steps 2 and 3, in the order of the nodes.
+    """Limits of what push-sum averages (step 2 of the push-sum paper: each node's masses C~, n~ and
+    w) and of what nodes compute from it (step 3), in the order of the nodes.
 
-    mass      : (N, n, n) of C~, P (16)
-    number    : (N,) of n~, P (17)
-    weight    : (N,) of w, P (18)
+    mass      : (N, n, n) of C~, a node's share of the information of all sensors, P (16)
+    number    : (N,) of n~, a node's share of the number of nodes, P (17)
+    weight    : (N,) of w, a node's share of a total of 1, P (18)
     G         : (n, n) of every G^(i), the sum of all H_i' R_i^-1 H_i, P (10)
     N         : of every N^(i), P (11)
     P         : (n, n) of every P^(i): P_inf of P (12), the filtered covariance of the Kalman filter
@@ -37,8 +38,9 @@ class PushSumLimits(NamedTuple):
 
 
 def push_sum_limits(scenario: Scenario) -> PushSumLimits:
-    """Return the limits, by node, of the mass (N, n, n) and of the gains (n, p) of P Theorem 1, and
-    of Theorem 2 (in probability) for failing links.
+    """Return the limits, by node, of the push-sum masses and of the gains (n, p) that follow from
+    them: of P Theorem 1 of the push-sum paper, and of its Theorem 2 (in probability) for failing
+    links.
 
     Theorem 2 needs links that fail in both directions together. F, Q, H and R are those that the
     filters assume. Raises TheoryError if the graph is not connected or P_inf does not exist, for
@@ -53,7 +55,8 @@ def push_sum_limits(scenario: Scenario) -> PushSumLimits:
     if component_count > 1:
         raise TheoryError(f"the graph must be connected, it has {component_count} parts")
     models, degrees = scenario.slot_models, scenario.topology.degrees
-    # Node i has degree + 1 shares, so that the stationary weight is proportional to that, P (18).
+    # A node splits its mass into degree + 1 shares, one for each neighbour and one for itself, so
+    # that the stationary weight is proportional to that, P (18).
     share = np.array([degrees[node] + 1.0 for node in scenario.nodes])
     share /= share.sum()
     # H_i' R_i^-1, whose products with H_i sum to G, P (10)
@@ -67,7 +70,9 @@ def push_sum_limits(scenario: Scenario) -> PushSumLimits:
 
 
 def push_sum_filter(scenario: Scenario) -> Any:
-    """Return the scenario's filter; raises TheoryError unless it is the push-sum filter."""
+    """Return the scenario's filter; raises TheoryError unless it is the push-sum filter, with all
+    equations as they are built in.
+    """
     algorithm: Any = scenario.filter.algorithm
     name, built_in = type(algorithm).__name__, built_in_filters()["push-sum"]
     if not isinstance(algorithm, built_in):
@@ -95,10 +100,11 @@ class GainBound(NamedTuple):
 
 
 def consensus_gain_bound(graph: Scenario | Topology) -> GainBound:
-    """Return rho(L) and two upper bounds on it.
+    """Return three lower bounds on the consensus gain delta of averaging steps z <- (I - L / delta)
+    z: the spectral radius rho(L) of the graph's Laplacian, and two upper bounds on it.
 
-    The largest degree of a node, or that plus one as in P, lies *below* rho(L) on every graph with
-    a link. Raises TheoryError for directed graphs.
+    The largest degree of a node, or that plus one as in the push-sum paper, lies *below* rho(L) on
+    every graph with a link. Raises TheoryError for directed graphs.
     """
     topology = graph.topology if isinstance(graph, Scenario) else graph
     if topology.directed:

@@ -42,7 +42,9 @@ def push_sum_radius(scenario: Scenario) -> float:
 
 @lru_cache(maxsize=8)
 def _cached_radius(scenario: Scenario) -> float:
-    """Return the radius, cached: assumptions, promises and the error covariance all use it."""
+    """Return the mean-square radius (:func:`push_sum_radius`), cached: the tables of assumptions
+    and results and the error covariance all use it.
+    """
     return radius(estimation_steps(scenario))
 
 
@@ -64,7 +66,9 @@ def push_sum_stability(
 
 
 def radius(steps: EstimationSteps) -> float:
-    """Return the spectral radius of T, the largest over groups of states that do not mix.
+    """Return the mean-square radius, by which second moments of the errors grow in a slot in the
+    long run: the spectral radius of their linear map T, the largest over groups of states that do
+    not mix.
 
     Raises TheoryError for networks with more than MAX_ROWS states in a group.
     """
@@ -72,7 +76,9 @@ def radius(steps: EstimationSteps) -> float:
 
 
 def mean_radius(steps: EstimationSteps) -> float:
-    """Return the spectral radius of the mean dynamics, P (30); unbiased estimates if below 1."""
+    """Return the spectral radius of the mean errors' dynamics, P (30): if it is below 1, estimates
+    become unbiased.
+    """
     return max(_mean_radius(steps.averaging, closed) for closed in _groups(steps.scaled))
 
 
@@ -89,8 +95,9 @@ def _mean_radius(law: Averaging, closed: FloatArray) -> float:
 
 
 def _mean_radius_by_arnoldi(law: Averaging, closed: FloatArray) -> float:
-    """Return the radius of the mean dynamics of a large network, with the closed loops ``closed``
-    (N, n, n); raises TheoryError if it is not found.
+    """Return the spectral radius of the mean errors' dynamics of a large network by Arnoldi's
+    method, with the closed loops ``closed`` (N, n, n) of the nodes; raises TheoryError if it does
+    not converge.
     """
     N, n, _ = closed.shape
 
@@ -119,10 +126,11 @@ def _mean_radius_by_arnoldi(law: Averaging, closed: FloatArray) -> float:
 
 
 def _groups(closed: FloatArray) -> list[FloatArray]:
-    """Return the A_i (N, k, k) of each group of k states that no A_i mixes with others, such as
-    plane axes; ``closed`` (N, n, n) are the A_i of all states.
+    """Return the nodes' closed loops A_i (N, k, k) for each group of k states that no A_i mixes
+    with others, such as plane axes; ``closed`` (N, n, n) are the A_i of all states.
 
-    The cross covariance of two groups grows no faster than the geometric mean of their own.
+    Radii are computed for each group alone, since the cross covariance of two groups grows no
+    faster than the geometric mean of their own.
     """
     size = np.abs(closed).max(axis=0)
     # Two states mix if some A_i has an entry between them.
@@ -133,8 +141,9 @@ def _groups(closed: FloatArray) -> list[FloatArray]:
 
 
 def _radius(law: Averaging, closed: FloatArray) -> float:
-    """Return the spectral radius of T for one group of n states with the closed loops ``closed``
-    (N, n, n); raises TheoryError if it is too large or not found.
+    """Return the mean-square radius for one group of n states: the spectral radius of the map T of
+    the errors' second moments, with the closed loops ``closed`` (N, n, n) of the nodes and the
+    ``law`` of averaging. Raises TheoryError if the group is too large or the radius not found.
     """
     if law.deterministic:  # M is fixed, so that T is the square of the mean dynamics
         return _mean_radius(law, closed) ** 2
@@ -154,7 +163,7 @@ def second_moment_map(law: Averaging, closed: FloatArray) -> PositiveMap:
     N, n, _ = closed.shape
 
     def left(X: FloatArray) -> FloatArray:
-        """Return diag(A_j) X (N n, N n) for X (N n, N n)."""
+        """Return the product diag(A_j) X (N n, N n) with X (N n, N n), of block diagonal A_j."""
         return np.asarray(closed @ X.reshape(N, n, N * n)).reshape(X.shape)
 
     return lambda X: symmetric(law.second_moment(left(left(X[0]).T)))[None]

@@ -28,17 +28,18 @@ MAX_LEADER_SLOTS, AGREEMENT = 200, 0.99  # slots of an election; probability tha
 
 
 def slot_promises(scenario: Scenario) -> dict[str, Any]:
-    """Return the results by name, each ``{"value", "reason"}`` with JSON values.
+    """Return what theory says about a scenario's push-sum filter, by name, for ``netkf theory``:
+    each result is ``{"value", "reason"}`` with JSON values.
 
     One of the two is None; the reason says why there is no value.
     """
 
     def limit() -> float:
-        """Return the trace of the limit of P."""
+        """Return the trace of P_inf, to which P of every node tends."""
         return float(np.trace(push_sum_limits(scenario).P))
 
     def central() -> float:
-        """Return the trace of the central covariance."""
+        """Return the trace of the steady covariance of the Kalman filter with all readings."""
         return float(np.trace(central_covariance(scenario)))
 
     def by_node() -> list[float]:
@@ -56,7 +57,7 @@ def slot_promises(scenario: Scenario) -> dict[str, Any]:
         return exact_minimum_gamma(scenario, most=MAX_STEPS)
 
     def cut() -> list[float]:
-        """Return the interval of the disconnection probability."""
+        """Return the interval of the probability that failing links disconnect the network."""
         probability = disconnection_probability(scenario)
         return [probability.low, probability.high]
 
@@ -98,7 +99,9 @@ def _value_or_reason(function: Callable[[], Any]) -> dict[str, Any]:
 
 
 def slot_lines(results: dict[str, Any], number: Callable[[Any], str]) -> list[str]:
-    """Return the results as lines for a terminal; ``number`` formats a value."""
+    """Return the ``results`` of :func:`slot_promises` as lines for a terminal; ``number`` formats a
+    value.
+    """
 
     def text(name: str, make: Callable[[Any], str] = number) -> str:
         """Return the value ``name`` of the results as text, which ``make`` formats, or the reason
