@@ -57,7 +57,9 @@ def assumption_rows(scenario: Scenario) -> list[AssumptionRow]:
 
 
 def _slot_rows(scenario: Scenario) -> list[AssumptionRow]:
-    """Return the rows of the filter's paper, or those of any filter in slots."""
+    """Return the assumptions for a scenario in slots, as rows of the table: those of the filter's
+    paper, or of any filter in slots if it has none.
+    """
     paper_rows = paper_function(scenario, "assumptions", "slot_rows")
     if paper_rows is None:
         return [*slot_plant_rows(scenario), *start_rows(scenario, "G (10)")]
@@ -66,7 +68,9 @@ def _slot_rows(scenario: Scenario) -> list[AssumptionRow]:
 
 
 def _clock_rows(scenario: Scenario) -> list[AssumptionRow]:
-    """Return the rows of H for a scenario in continuous time."""
+    """Return the assumptions of the hybrid paper, as rows of the table, for a scenario in
+    continuous time.
+    """
     rows = _plant_rows(scenario)
     if scenario.filter.algorithm.talks:
         network = [*_link_clock_rows(scenario), *_channel_rows(scenario)]
@@ -75,7 +79,7 @@ def _clock_rows(scenario: Scenario) -> list[AssumptionRow]:
 
 
 def _graph_rows(scenario: Scenario) -> list[AssumptionRow]:
-    """Return the rows on the graph and on the weights of the filter."""
+    """Return the assumptions, as rows of the table, on the graph and on the filter's weights."""
     topology = scenario.topology
     components = len(topology.components)
     rows: list[AssumptionRow] = [
@@ -93,7 +97,9 @@ def _graph_rows(scenario: Scenario) -> list[AssumptionRow]:
 
 
 def _plant_rows(scenario: Scenario) -> list[AssumptionRow]:
-    """Return the rows on controllability, observability, the filters' model and sampling."""
+    """Return the assumptions, as rows of the table, on controllability, observability, the filters'
+    model and the times of sampled sensors.
+    """
     plant = scenario.diffusion
     # (A, B) is controllable if and only if (A', B') is observable; Q = B B' has the same kernel.
     idle = unobservable_mode(plant.A.T, plant.Q)
@@ -115,7 +121,9 @@ def _plant_rows(scenario: Scenario) -> list[AssumptionRow]:
 
 
 def _judge_observability(scenario: Scenario) -> tuple[bool | None, str]:
-    """Return verdict and evidence on (A, H) with the sensors of all nodes."""
+    """Return whether (A, H) is observable with the sensors of all nodes together (None: not known),
+    and a text that says why.
+    """
     if any(sensor.varying for sensor in scenario.sensors):
         return None, "H differs from reading to reading"
     A, n = scenario.diffusion.A, scenario.plant.n
@@ -168,7 +176,9 @@ def _information(scenario: Scenario, entries: tuple[int, ...]) -> np.ndarray:
 
 
 def _link_clock_rows(scenario: Scenario) -> list[AssumptionRow]:
-    """Return the rows on rates and laws of the link clocks."""
+    """Return the assumptions, as rows of the table, on rates and laws of the clocks at which nodes
+    transmit.
+    """
     clock = scenario.network.activation
     assert isinstance(clock, LinkClock)
     if transmits_at_samples(scenario):
@@ -212,7 +222,9 @@ def _link_clock_rows(scenario: Scenario) -> list[AssumptionRow]:
 
 
 def _channel_rows(scenario: Scenario) -> list[AssumptionRow]:
-    """Return the rows on losses, delays and the symmetry of arrivals."""
+    """Return the assumptions, as rows of the table, on losses, delays and the symmetry of
+    arrivals.
+    """
     channel = scenario.network.channel
     # Thinning a Poisson process by independent losses gives a Poisson process of lower rate, and a
     # fixed delay only shifts it; a random delay or dependent losses do neither.

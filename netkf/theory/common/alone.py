@@ -42,4 +42,4 @@ def silent_jumps(scenario: Scenario) -> SlotJumps:
     gains = [steady_gain(F, Q, *sensor) for sensor in sensors]
     closed = np.stack([np.eye(len(F)) - K @ H for K, (H, _) in zip(gains, sensors, strict=True)])
     noise = block_diagonal([K @ R @ K.T for K, R in zip(gains, true, strict=True)])
-    return SlotJumps(scenario.slot_plant.F, scenario.slot_plant.Q, closed, noise, None)
+    return SlotJumps(scenario.slot_plant.F, scenario.slot_plant.Q, closed, noise, directions=None)

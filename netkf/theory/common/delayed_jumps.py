@@ -161,7 +161,9 @@ class DelayedJumps:
 
     @cached_property
     def _message_noise(self) -> tuple[FloatArray, FloatArray]:
-        """F (k + 1, n, M) of one message, all of which have the same noise, and Q_d (n, n).
+        """What the plant's noise of the delay adds to the moments of messages: its covariance F(s)
+        (k + 1, n, M) with the errors s seconds earlier, at the k + 1 points s of the delay, the
+        same for all messages, and its own covariance (n, n).
 
         An impulse of the plant's noise moves errors by h, ``dh/ds = B h + G e^{U s}``, and messages
         that are under way by e^{A s}: ``F(s) = e^{A s} int_0^{d - s} e^{A u} Q h(u)' du``.
@@ -199,13 +201,14 @@ class DelayedJumps:
         """
         heard = self._mean[1] @ np.tile(self._message_noise[0], (1, self.nodes, 1))
         right = np.tensordot(self._integral, heard, 1)
-        jump_noise = self._inflow(self._moments(np.zeros_like(right), True))
+        jump_noise = self._inflow(self._moments(np.zeros_like(right), noise=True))
         right[0] = self.instant.noise + 2.0 * symmetric(heard[0]) + jump_noise
         return np.asarray(right)
 
     def _residual(self, K: FloatArray, right: FloatArray, jumps: bool) -> FloatArray:
-        """Return the residuals (k + 1, M, M) of the boundary value problem for K and a
-        ``right``-hand side, of the same shape; the first axis are the k + 1 points of the delay.
+        """Return the residuals (k + 1, M, M) of the boundary value problem for the autocovariances
+        K(s) = E[E(t) E(t - s)'] of the M errors and a ``right``-hand side, of the same shape; the
+        first axis are the k + 1 points s of the delay.
 
         Entry 0 is the residual of its second equation, the others are those of the first equation
         integrated from 0 to each point. With ``jumps`` Phi is the inflow computed from K.
@@ -217,7 +220,7 @@ class DelayedJumps:
         # The antisymmetric part of this entry is the condition K(0) = K(0)'.
         residual[0] = right[0] + 2.0 * symmetric(driven[0] + heard[0]) + 0.5 * (K[0].T - K[0])
         if jumps:
-            residual[0] += self._inflow(self._moments(K, False))
+            residual[0] += self._inflow(self._moments(K, noise=False))
         return np.asarray(residual)
 
     @cached_property
@@ -239,10 +242,11 @@ class DelayedJumps:
         return {}
 
     def _by_elimination(self, right: FloatArray, jumps: bool) -> FloatArray:
-        """Return the solution K (k + 1, M, M) of a small problem by dense LU factors.
+        """Return the autocovariances K (k + 1, M, M) that solve a small boundary value problem, by
+        dense LU factors, which are cached in ``_factors``.
 
-        ``right`` (k + 1, M, M) is the right-hand side; with ``jumps`` Phi depends on K. The factors
-        are cached in ``_factors``.
+        ``right`` (k + 1, M, M) is the right-hand side; with ``jumps`` the white noise Phi of the
+        jumps is not given but follows from K.
         """
         if jumps not in self._factors:
             units = np.eye(right.size).reshape(right.size, *right.shape)
@@ -253,11 +257,12 @@ class DelayedJumps:
         )
 
     def _solve(self, right: FloatArray, jumps: bool, tolerance: float) -> FloatArray:
-        """Return the solution K (k + 1, M, M) of the boundary value problem to a relative
-        ``tolerance``.
+        """Return the autocovariances K (k + 1, M, M) of the M errors that solve the boundary value
+        problem to a relative ``tolerance``.
 
         ``right`` (k + 1, M, M) is the right-hand side at the k + 1 points of the delay; with
-        ``jumps`` Phi depends on K. Small problems are solved by elimination, others by GMRES.
+        ``jumps`` the white noise Phi of the jumps is not given but follows from K. Small problems
+        are solved by elimination, others by GMRES.
         """
         if right.size <= MAX_DENSE:
             return self._by_elimination(right, jumps)
@@ -277,10 +282,12 @@ class DelayedJumps:
         return np.asarray(solution).reshape(right.shape)
 
     def _autocovariances(self, right: FloatArray, jumps: bool) -> FloatArray:
-        """Return K (k + 1, M, M) at the k + 1 points of the delay, by iterative refinement.
+        """Return the autocovariances K(s) = E[E(t) E(t - s)'] of the M errors, (k + 1, M, M) at the
+        k + 1 points s of the delay, by iterative refinement of :meth:`_solve`.
 
-        ``right`` (k + 1, M, M) is the right-hand side; with ``jumps`` Phi includes the inflow
-        computed from K. Raises TheoryError if the refinement does not converge.
+        ``right`` (k + 1, M, M) is the right-hand side; with ``jumps`` the white noise Phi of the
+        jumps is not given but follows from K. Raises TheoryError if the refinement does not
+        converge.
         """
         K = self._solve(right, jumps, FIRST_TOLERANCE)
         for _ in range(MAX_ROUNDS):
@@ -317,17 +324,18 @@ class DelayedJumps:
         """Return T(Phi) (1, M, M), the Phi that jumps cause in errors driven by white noise of
         covariance Phi (1, M, M) per second; T is a positive map.
         """
-        K = self._autocovariances(self._driven_by(Phi[0]), False)
-        return self._inflow(self._moments(K, False))[None]
+        K = self._autocovariances(self._driven_by(Phi[0]), jumps=False)
+        return self._inflow(self._moments(K, noise=False))[None]
 
     @cached_property
     def is_bounded(self) -> bool:
-        """True if it is proved that the spectral radius of ``apply_jumps``, T, is below 1: some
-        positive definite Phi (M, M) solves ``Phi = T(Phi) + I``.
+        """True if it is proved that mean squares of the errors are bounded: the spectral radius of
+        ``apply_jumps``, the map T from white noise to the noise that jumps cause under it, is below
+        1, because some positive definite Phi (M, M) solves ``Phi = T(Phi) + I``.
         """
         unit = self._driven_by(np.eye(len(self.instant.drift)))
         try:
-            moments = self._moments(self._autocovariances(unit, True), False)
+            moments = self._moments(self._autocovariances(unit, jumps=True), noise=False)
         except TheoryError:  # near 1, or above it
             return False
         eigenvalues = np.linalg.eigvalsh(self._inflow(moments))
@@ -336,7 +344,7 @@ class DelayedJumps:
     @cached_property
     def covariance(self) -> FloatArray:
         """E[E E'] (1, M, M) under all noises and jumps."""
-        return symmetric(self._autocovariances(self._driven_by_noises(), True)[:1])
+        return symmetric(self._autocovariances(self._driven_by_noises(), jumps=True)[:1])
 
     @cached_property
     def mean_is_stable(self) -> bool:
@@ -373,8 +381,8 @@ def chebyshev_points(K: int) -> FloatArray:
 
 
 def chebyshev_integrals(K: int) -> FloatArray:
-    """Return the matrix (K + 1, K + 1) of integrals from 0 to each of the points over polynomials
-    of degree K that are given at the points of [0, 1].
+    """Return the matrix (K + 1, K + 1) that maps the values of a polynomial of degree K at the
+    Chebyshev points of [0, 1] (:func:`chebyshev_points`) to its integrals from 0 to each of them.
     """
     x = 2.0 * chebyshev_points(K) - 1.0
     coefficients = np.linalg.inv(np.polynomial.chebyshev.chebvander(x, K))

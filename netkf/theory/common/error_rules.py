@@ -54,7 +54,8 @@ class ErrorRule:
 
     def sense(self, time: float, observations: EstimatorObservations) -> None:
         """Update the errors and roots of P of each estimator by its readings at ``time``
-        (seconds, or the slot).
+        (seconds, or the slot); called by the replay at every time of samples, messages or
+        ``times``, before ``send`` and ``arrive``.
         """
         columns = self.errors.reading_noises(observations)
         for estimator, observation in observations.items():
@@ -84,7 +85,9 @@ class EstimateExchangeRule(ErrorRule):
     """Filters that send their estimate, which the receiver predicts to the time of arrival."""
 
     def send(self, messages: Sequence[SentMessage]) -> None:
-        """Copy the sender's estimate for each message that arrives later."""
+        """Copy the sender's present error and root of P for each message that arrives later; the
+        replay predicts the copies until then.
+        """
         for message in messages:
             if message.late:
                 self.errors.copy(message.sender, message, None)
@@ -125,8 +128,9 @@ class EstimateExchangeRule(ErrorRule):
     def combine(
         self, node: int, weights: list[float], roots: list[FloatArray]
     ) -> tuple[FloatArray, Iterable[FloatArray]]:
-        """Return the root (n, n) of the new P, and factors (n, n): the new error is the sum of the
-        errors, each multiplied by its factor.
+        """Return how the filter combines a node's estimate with messages, called for every receiver
+        at every arrival: the root (n, n) of the new P, and factors (n, n); the new error is the sum
+        of the errors, each multiplied by its factor.
 
         ``roots`` (n, n) of P are those of the node's estimate and of the k messages, in this order,
         which is also that of the factors; ``weights`` (k) are those of the messages.

@@ -65,7 +65,9 @@ class SlotJumps:
 
     @cached_property
     def _mean(self) -> FloatArray:
-        """E[D] (S, M, M) by mode, the mean change of the stacked errors in one exchange."""
+        """E[D] (S, M, M), the mean change of the stacked errors in one exchange in each of S modes
+        (joint states of links with bursty losses).
+        """
         assert self.directions is not None
         return self.directions.mean(self.nodes, self._all)
 
@@ -73,8 +75,9 @@ class SlotJumps:
         """Return the second moments (S, M, M) one slot later, from those X (S, M, M) of the M = N n
         stacked errors in each of S modes.
 
-        Each is weighted by the probability of its mode, so that their sum is the second moment.
-        ``noise`` adds the noises of plant and readings; without it the map is linear.
+        A mode is a joint state of the links with bursty losses (S = 1 without such). Each moment is
+        weighted by the probability of its mode, so that their sum is the second moment. ``noise``
+        adds the noises of plant and readings; without it the map is linear.
         """
         N = self.nodes
         weight = self.directions.stationary if self.directions else np.ones(1)
@@ -91,6 +94,7 @@ class SlotJumps:
         """
         directions, mean = self.directions, self._mean
         assert directions is not None
+        # With u the errors after readings and s those that are exchanged: E[s s'] and E[u s'].
         source, cross = updated, updated
         if self.on_predictions:
             source = predicted
@@ -134,8 +138,8 @@ class ClockJumps:
 
     @cached_property
     def _chains(self) -> list[IntArray]:
-        """Channels (chains of the losses) that make a step at the ticks of each clock: for each
-        entry of ``ticks`` an array of their indices.
+        """Two-state chains of bursty losses (one for each link or direction) that make a step at
+        the ticks of each clock: for each entry of ``ticks`` an array of their indices.
         """
         assert self.directions is not None
         return [
@@ -144,14 +148,17 @@ class ClockJumps:
 
     @cached_property
     def flows(self) -> FloatArray:
-        """B (S, M, M) of ``inflow``, per second: the mean drift of the M = N n errors in each of S
-        modes, while the mode stays.
+        """Mean drift B (S, M, M) of the M = N n errors, per second, in each of S modes (joint
+        states of links with bursty losses), while the mode stays; it is the linear part of the
+        equation of second moments, of which ``inflow`` is the rest.
         """
         drifts, eye = np.tile(self.drift, (self.shape[0], 1, 1)), np.eye(len(self.drift))
         for node, rate, lost in self.samples:
             _block_slice(drifts, self.nodes, node)[...] -= rate * lost
         for k, (rate, tick_directions) in enumerate(self.ticks):
             assert self.directions is not None
+            # A tick moves the errors by their mean if the mode stays; otherwise moments leave the
+            # mode, at half the rate since B acts from both sides.
             stay = self.directions.stay(self._chains[k])[:, None, None]
             drifts += (
                 rate * stay * self.directions.mean(self.nodes, tick_directions)

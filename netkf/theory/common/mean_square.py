@@ -80,8 +80,8 @@ def steady_error_covariance(scenario: Scenario) -> FloatArray:
 
 @lru_cache(maxsize=8)
 def _solve(scenario: Scenario) -> tuple[float, FloatArray | None]:
-    """Return the mean-square radius, and the steady error covariances (N, n, n) of the nodes if it
-    is below 1, else None.
+    """Return the mean-square radius (:func:`mean_square_radius`), and the steady error covariances
+    (N, n, n) of the nodes if it is below 1, else None.
 
     With delays the radius is 0 if it is only proved to be below 1. The last 8 results are cached.
     """
@@ -113,15 +113,17 @@ def _solve(scenario: Scenario) -> tuple[float, FloatArray | None]:
 
 @lru_cache(maxsize=8)
 def _make_system(scenario: Scenario) -> LinearErrors:
-    """Return the errors as a linear system of which mean squares can be computed."""
+    """Return the errors of all nodes as a linear system with jumps (:func:`linear_errors`), cached;
+    raises TheoryError if there is none, or it is too large for its mean squares to be computed.
+    """
     system = linear_errors(scenario)
     _require_size(system.shape)
     return system
 
 
 def linear_errors(scenario: Scenario) -> LinearErrors:
-    """Return the errors of a scenario's filter as a linear system with jumps; raises TheoryError if
-    they are none.
+    """Return the errors of a scenario's filter as a linear system with jumps at readings and
+    messages; raises TheoryError if they are none, because gains depend on what happens.
     """
     _require_known_law(scenario)
     make = _system_maker(scenario)

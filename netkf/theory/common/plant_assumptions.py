@@ -10,7 +10,10 @@ from netkf.theory.intermittent.riccati import undetectable_slot_mode
 
 
 def slot_plant_rows(scenario: Scenario) -> list[AssumptionRow]:
-    """Return rows about F and Q: stabilisable, Q definite, true model (G S.1, R Theorem 9)."""
+    """Return the assumptions on the plant that the papers about slots share, as rows (assumption,
+    source, whether it holds, evidence) of the table: (F, Q^1/2) is stabilisable, Q is definite, and
+    the filters know the true model.
+    """
     plant = scenario.slot_plant
     smallest = float(np.linalg.eigvalsh(plant.Q)[0])
     # (F, Q^1/2) is stabilisable if and only if (F', Q^1/2) is detectable.
@@ -35,8 +38,8 @@ def slot_plant_rows(scenario: Scenario) -> list[AssumptionRow]:
 
 
 def start_rows(scenario: Scenario, source: str) -> list[AssumptionRow]:
-    """Return one row, with the equation ``source``: each P_i(0) is at least the second moment of
-    the node's first error.
+    """Return the assumption, as a list of one row of the table, that each P_i(0) is at least the
+    second moment of the node's first error; ``source`` is the equation that the row names.
     """
     plant, smallest = scenario.plant, np.inf
     starts = (scenario.initial_estimate(node) for node in scenario.nodes)

@@ -61,8 +61,9 @@ class Directions(NamedTuple):
         return probabilities
 
     def advance(self, X: FloatArray, chains: IntArray) -> FloatArray:
-        """Return second moments (S, M, M) by mode after a step of the given ``chains`` (indices),
-        from those X (S, M, M) before it; each is weighted by the probability of its mode.
+        """Return second moments (S, M, M) by mode after a step of the given ``chains`` (indices of
+        two-state chains of bursty losses, whose joint state is the mode), from those X (S, M, M)
+        before it; each is weighted by the probability of its mode.
         """
         if self.steps is None:
             return X
@@ -75,8 +76,8 @@ class Directions(NamedTuple):
         return X
 
     def stay(self, chains: IntArray) -> FloatArray:
-        """Return the probability (S,), by mode, that a step of the given ``chains`` (indices)
-        leaves the mode as it is.
+        """Return the probability (S,), by mode, that a step of the given ``chains`` (indices of
+        two-state chains of bursty losses, whose joint state is the mode) leaves the mode as it is.
         """
         if self.steps is None:
             return np.ones(1)
@@ -112,6 +113,7 @@ class Directions(NamedTuple):
         blocks = np.swapaxes(Z.reshape(S, N, n, N, n), 2, 3)
         i, j = self.receiver[first], self.sender[first]
         k, m = self.receiver[second], self.sender[second]
+        # E[(e_j - e_i)(e_m - e_k)'] of the senders j, m and the receivers i, k of each pair.
         gap = blocks[:, j, m] - blocks[:, j, k] - blocks[:, i, m] + blocks[:, i, k]
         turned = np.swapaxes(self.weight[second], 1, 2)
         terms = factor[:, :, None, None] * (self.weight[first] @ gap @ turned)
@@ -148,7 +150,8 @@ def _join_blocks(blocks: FloatArray) -> FloatArray:
 def directions_of(
     scenario: Scenario, weights: dict[tuple[int, int], FloatArray], wait: float
 ) -> Directions:
-    """Return the directions of a scenario with ``weights`` (n, n) for each (sender, receiver).
+    """Return the directed links of a scenario, with the law of their losses and the ``weights``
+    (n, n) that receivers give to messages, for each (sender, receiver).
 
     Messages that take more than ``wait`` seconds count as lost. Raises TheoryError if losses or
     delays have no law that is known here. The order is that of ``weights``.
@@ -200,7 +203,8 @@ def _require_law(scenario: Scenario) -> None:
 def _deliveries(
     scenario: Scenario, links: list[tuple[int, int]], source: IntArray, chains: int
 ) -> FloatArray:
-    """Return the delivery probabilities (S, K) of K ``links`` (sender, receiver), by mode.
+    """Return the delivery probabilities (S, K) of K ``links`` (sender, receiver), by mode: joint
+    state, good or bad, of the channels with bursty (Gilbert-Elliott) losses.
 
     ``source`` (K,) is the index of the chain of each link, ``chains`` their number; with bursts
     there are S = 2^chains modes, else one. Raises TheoryError for more than MAX_CHAINS.
@@ -228,8 +232,8 @@ def _deliveries(
 
 
 def _source_of(scenario: Scenario, link: tuple[int, int]) -> tuple[int, int]:
-    """Return the link whose draw decides on a direction; both directions have the same if they
-    fail together.
+    """Return the link (sender, receiver) whose random draw decides if a message over ``link``
+    arrives; both directions have the same one if they fail together.
     """
     return min(link, link[::-1]) if _fail_together(scenario) else link
 

@@ -31,10 +31,11 @@ from netkf.trace.schema import CODES
 
 
 def replay_covariances(scenario: Scenario, run: Run) -> FloatArray:
-    """Return the joint error covariance (T, M n, M n) of M estimators at ``run.times``.
+    """Return the exact joint error covariance (T, M n, M n) of M estimators at ``run.times``, given
+    the events of the run (ticks, losses, delays): the run is replayed on the errors alone.
 
-    M = 1 if all nodes share one pooled filter. Raises TheoryError for a filter whose equations are
-    not known here.
+    An estimator is a node's filter, or (M = 1) the pooled one that all nodes share. Raises
+    TheoryError for a filter whose equations are not known here.
     """
     errors = _stacked_errors(scenario)
     # The generator stops at each sample, when the errors have their values of that time.
@@ -69,8 +70,9 @@ def replay_law(scenario: Scenario, run: Run) -> ErrorLaw:
 
 
 def _stacked_errors(scenario: Scenario) -> StackedErrors:
-    """Return the errors of all estimators of a scenario at time 0; raises TheoryError for a filter
-    whose equations are not known here.
+    """Return the errors at time 0 of all estimators of a scenario (the filters of its nodes, or one
+    pooled filter), on which a run is replayed; raises TheoryError for a filter whose equations are
+    not known here.
     """
     require_known_filter(scenario)
     return StackedErrors(scenario, len(nodes_by_estimator(scenario)))
@@ -119,7 +121,9 @@ def delivered_messages(scenario: Scenario, run: Run) -> list[SentMessage]:
 
 
 def _replay_instants(scenario: Scenario, run: Run, errors: StackedErrors) -> Iterator[None]:
-    """Replay a run in continuous time, which changes ``errors``; yield at each of ``run.times``."""
+    """Apply the events of a run in continuous time to the stacked ``errors``, which it changes;
+    yield at each of ``run.times``, so that the caller can read the errors then.
+    """
     messages = delivered_messages(scenario, run)
     rule = _make_rule(scenario, errors, run, messages)
     propagator = ErrorPropagator(scenario, errors)
@@ -169,7 +173,9 @@ def _group_by_time(messages: list[SentMessage], column: int) -> dict[float, list
 def _make_rule(
     scenario: Scenario, errors: StackedErrors, run: Run, messages: list[SentMessage]
 ) -> ErrorRule:
-    """Return the error rule of the filter's paper, or that of filters without messages."""
+    """Return the rule by which the filter of the scenario changes the stacked ``errors`` at
+    readings and messages: that of its paper, or that of filters without messages.
+    """
     if not scenario.node_filter.paper:
         return ErrorRule(scenario, errors)
     rule: ErrorRule = paper_module(scenario, "errors").error_rule(scenario, errors, run, messages)
@@ -177,7 +183,8 @@ def _make_rule(
 
 
 def _replay_slots(scenario: Scenario, run: Run, errors: StackedErrors) -> Iterator[None]:
-    """Replay a run in slots, which changes ``errors``; yield at each of ``run.times``.
+    """Apply the events of a run in slots to the stacked ``errors``, which it changes; yield at each
+    of ``run.times``, so that the caller can read the errors then.
 
     A sample shows the state before its slot for filters that predict, else the state after it.
     """
@@ -186,7 +193,7 @@ def _replay_slots(scenario: Scenario, run: Run, errors: StackedErrors) -> Iterat
     # In slots all predictions are the same: x+ = F x + w, e+ = F_f e + (F - F_f) x + w.
     noise = square_root(plant.Q)
     prediction = Prediction(plant.F, F, plant.F - F, noise, noise, square_root(Q))
-    rule = _make_rule(scenario, errors, run, [])
+    rule = _make_rule(scenario, errors, run, [])  # it gets the messages slot by slot
     observe = slot_observations(scenario, run)
     arrivals = _exchanged_messages(scenario, run) if rule.takes_messages else {}
     processed = 0
@@ -206,7 +213,8 @@ def _replay_slot(
     observations: EstimatorObservations,
     arrivals: dict[tuple[int, int], list[SentMessage]],
 ) -> None:
-    """Apply the ``phases`` of one ``slot`` in the filter's order; changes the errors of ``rule``.
+    """Apply one ``slot`` to the errors of ``rule``, which changes them: the ``phases`` ("predict",
+    "sense" and one or more "exchange") in the filter's order.
 
     ``observations`` are the readings of the slot, ``arrivals`` the messages that arrived in time,
     by slot and number of the exchange (0-based) within it.

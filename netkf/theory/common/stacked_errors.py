@@ -82,7 +82,8 @@ class StackedErrors:
         self._add_offsets(scenario)
 
     def _add_offsets(self, scenario: Scenario) -> None:
-        """Add to each error the difference of the plant's and the filter's first means.
+        """Add to each error its mean at time 0: the difference of the plant's and the filter's
+        first means.
 
         The differences multiply one more input, which is the constant 1. Reductions of the stack
         rotate the inputs; the vector OFFSET, the constant times a unit vector, is rotated with
@@ -104,8 +105,8 @@ class StackedErrors:
             self.stack.add(name, column, offset[:, None])
 
     def keep(self) -> None:
-        """Store the present forms of the errors of all estimators for ``law``; appends to
-        ``_kept``.
+        """Store the present forms of the errors of all estimators (their coefficients of the random
+        inputs) for ``law``; appends to ``_kept``.
         """
         self._kept.append(self.stack.freeze(range(self.estimators)))
 
@@ -143,7 +144,9 @@ class StackedErrors:
         return np.asarray(S @ np.swapaxes(S, 1, 2))
 
     def copy(self, name: Hashable, new: Hashable, owner: int | None) -> None:
-        """Copy estimate ``name`` to ``new``, which from now on has the given owner."""
+        """Copy estimate ``name`` to ``new``: ``owner`` is the estimator whose increments the copy
+        uses from now on, None for a message, which is only predicted.
+        """
         self.stack.copy(name, new)
         self.owner[new] = owner
 
@@ -269,8 +272,8 @@ class ErrorPropagator:
         self._predictor = Predictor(A, B, A_f, B_f)
 
     def advance(self, time: float) -> tuple[float, slice | None, FloatArray | None]:
-        """Advance to ``time`` (seconds); return the gap since the last call and the plant's noise
-        over it.
+        """Advance all errors and roots of P to ``time`` (seconds); return the gap since the last
+        call and the plant's noise over it.
 
         The noise is a matrix (n, k), by which it enters the state, and the columns of its k inputs:
         the arguments of ``ErrorRule.elapse``. Both are None if a sensor senses increments, or for
@@ -291,7 +294,9 @@ class ErrorPropagator:
         return gap, None, None
 
     def _estimates_by_flow(self) -> list[tuple[ErrorFlow, list[Hashable]]]:
-        """Return the estimates that share a flow, so that they are propagated together."""
+        """Return each flow (the dynamics of errors with certain sensors) with the names of the
+        estimates that share it, so that they are propagated together.
+        """
         flows = self._flows
         assert flows is not None
         groups: dict[int, tuple[ErrorFlow, list[Hashable]]] = {}
@@ -301,7 +306,9 @@ class ErrorPropagator:
         return list(groups.values())
 
     def _step(self, gap: float) -> None:
-        """Propagate all estimates, and the state, over ``gap`` seconds, at most one unit."""
+        """Propagate all estimates, and the state, over ``gap`` seconds, at most the ``unit`` of any
+        flow, the time over which its series and quadrature hold.
+        """
         flows, errors = self._flows, self._errors
         assert flows is not None
         groups = self._estimates_by_flow()
@@ -355,8 +362,8 @@ class ErrorPropagator:
 
 
 def integration_steps(scenario: Scenario) -> int:
-    """Return the least number of steps in which the errors of a run are propagated, 0 if no sensor
-    senses increments.
+    """Return the least number of steps in which the errors of a run are propagated, by which its
+    cost is estimated; 0 if no sensor senses increments.
     """
     if scenario.slotted:
         return 0

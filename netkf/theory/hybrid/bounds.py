@@ -441,7 +441,8 @@ def _limit_evaluations(slope: Slope) -> Slope:
 
 
 def _check_defect(slope: Slope, output: Any) -> None:
-    """Compare the change over steps of the solver with the integral of the slope.
+    """Check a numerical solution against its differential equation: compare its change over steps
+    of the solver with the integral of the ``slope``.
 
     ``output`` is the dense solution (N m,) of ``solve_ivp``, of which up to MAX_CHECKED_STEPS steps
     are checked. Raises TheoryError if they differ by more than DEFECT_TOLERANCE, relative.

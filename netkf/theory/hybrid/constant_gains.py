@@ -30,7 +30,8 @@ MAX_DENSE = 500  # unknowns up to which the exponential of the whole map is comp
 def constant_gain_bound(
     scenario: Scenario, times: Any = None, gains: Sequence[ArrayLike] | None = None
 ) -> FloatArray:
-    """Return the bound (T, N, n, n) on the mean covariance with constant ``gains``, at T ``times``.
+    """Return the upper bound (T, N, n, n) on the mean of each filter's P over the ticks of the
+    links, at T ``times``, which H(12) would be with constant ``gains``.
 
     times : (T,) in seconds, increasing; for None the steady state (N, n, n) is returned
     gains : L_i (n, p_i) for each of N nodes; by default those of the steady state of H(12)
@@ -63,7 +64,8 @@ def constant_gain_bound(
 def _linear_equation(
     scenario: Scenario, gains: Sequence[ArrayLike] | None
 ) -> tuple[LinearisedRiccati, FloatArray]:
-    """Return the linear map of upper triangles (N, m), m = n (n + 1) / 2, and the constant term
+    """Return the equation of the bound with constant gains L_i, dP/dt = map(P) + constant: the
+    linear map of the nodes' upper triangles (N, m), m = n (n + 1) / 2, and the constant term
     (N, m), ``L_i R_i L_i' + Q``.
 
     ``gains`` are L_i (n, p_i) for each of N nodes, None for those of the steady state of H(12).

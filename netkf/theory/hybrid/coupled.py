@@ -91,7 +91,9 @@ class CoupledRiccati(NamedTuple):
 
 
 def reason_without_bound(scenario: Scenario) -> str | None:
-    """Return the reason why H Theorem 2 does not apply to a scenario, or None if it applies."""
+    """Return the reason why H Theorem 2 of the hybrid paper, that the solution of the coupled
+    Riccati equations H(12) bounds the mean of P, does not apply to a scenario; None if it applies.
+    """
     algorithm, network = scenario.filter.algorithm, scenario.network
     if not scenario.slotted and not algorithm.talks:
         return _reason_of_samples(scenario)
@@ -162,7 +164,8 @@ def increment_informations(scenario: Scenario) -> FloatArray:
 
 @lru_cache(maxsize=4)
 def coupling(scenario: Scenario) -> scipy.sparse.csr_array:
-    """Return c (N, N), sparse: rate (per second) of arrivals from j at i, times their weight.
+    """Return the coefficients c (N, N), sparse, by which messages couple the nodes' covariances:
+    rate (per second) of arrivals from j at i, times the weight that i gives them.
 
     Calls with one scenario return the same array, which must not be modified.
     """
@@ -179,8 +182,9 @@ def coupling(scenario: Scenario) -> scipy.sparse.csr_array:
 
 
 def coupled_riccati(scenario: Scenario) -> CoupledRiccati:
-    """Return the equations H(12) of a scenario with N nodes: coefficients (n, n), information
-    (N, n, n), rates of arrivals (N, N) and P(0) (N, n, n).
+    """Return the coupled Riccati equations H(12) of a scenario with N nodes, whose solution bounds
+    the mean of each filter's P: coefficients (n, n), information (N, n, n), rates of arrivals
+    (N, N) and P(0) (N, n, n).
 
     Raises TheoryError if H(12) does not apply.
     """
@@ -203,14 +207,14 @@ def coupled_riccati(scenario: Scenario) -> CoupledRiccati:
     return CoupledRiccati(
         A,
         Q,
-        increment_informations(scenario),
-        coupling(scenario),
-        T,
-        q,
-        delay,
-        start,
-        poisson_samples(scenario),
-        sample_jumps(scenario),
+        G=increment_informations(scenario),
+        coupling=coupling(scenario),
+        T=T,
+        q=q,
+        delay=delay,
+        start=start,
+        samples=poisson_samples(scenario),
+        jumps=sample_jumps(scenario),
     )
 
 
@@ -277,8 +281,8 @@ def _heard_by_all(c: scipy.sparse.csr_array) -> np.ndarray | None:
 
 
 def _stationary(c: scipy.sparse.csr_array) -> FloatArray:
-    """Return w (M,) with ``w (D - c) = 0`` and sum 1, D the row sums of the rates c (M, M) of M
-    nodes.
+    """Return the weights w (M,) of M nodes' information in the limit of fast links: the left null
+    vector, ``w (D - c) = 0`` with sum 1, of the Laplacian of the rates c (M, M), D their row sums.
 
     The nodes must be strongly connected. Raises TheoryError if the residual is too large.
     """

@@ -13,7 +13,9 @@ from netkf.trace.run import Run
 
 
 class ResetRule(EstimateExchangeRule):
-    """The reset H (7), (9), or D (8), (9) for covariance intersection."""
+    """The reset of a node's estimate by messages: a weighted mean of estimates and of P, H (7), (9)
+    of the hybrid paper, or covariance intersection, D (8), (9) of the diffusion paper.
+    """
 
     def combine(
         self, node: int, weights: list[float], roots: list[FloatArray]

@@ -28,7 +28,9 @@ from netkf.theory.numerics.matrices import algebraic_riccati, lyapunov
 
 
 def limit_covariance(scenario: Scenario) -> FloatArray:
-    """Return S (n, n) of H(13), the limit of H(12) as the link rates grow (H Theorem 3).
+    """Return S (n, n), the limit as the link rates grow of the steady bound H(12) on the mean of
+    each filter's P: the solution of the Riccati equation H(13) with the mean information of all
+    nodes (H Theorem 3 of the hybrid paper).
 
     If the two directions of links have different rates of arrival, the nodes' information is
     weighted by the left null vector of the coupling instead of 1/N (derived). Sensors that sample
@@ -52,7 +54,9 @@ def limit_covariance(scenario: Scenario) -> FloatArray:
 
 
 def _require_limit(scenario: Scenario) -> None:
-    """Raise TheoryError for filters and clocks that H(13) is not about."""
+    """Raise TheoryError for filters and clocks that H(13), the equation of the limit S for fast
+    links, is not about.
+    """
     algorithm = scenario.filter.algorithm
     if not algorithm.talks:
         return
@@ -70,7 +74,8 @@ def _require_limit(scenario: Scenario) -> None:
 def _shared_equation(
     scenario: Scenario, A: FloatArray, Q: FloatArray, G: FloatArray, w: FloatArray
 ) -> CoupledRiccati:
-    """Return H(12) of N nodes that share one covariance, as equations of a single node.
+    """Return the Riccati equations H(12) of N nodes that share one covariance, as they do in the
+    limit of fast links, in the form of the equations of a single node.
 
     A and Q (n, n) are the drift and noise that the filters assume, G (n, n) is the information per
     second of the increments of all nodes, each with its weight w (N,); the rate of a sensor that
@@ -82,8 +87,19 @@ def _shared_equation(
         nodes, rate = np.zeros(len(group.nodes), dtype=int), group.rate * w[group.nodes]
         groups.append(PoissonSamples(nodes, group.H, group.R, rate, silent))
     start = np.asarray(scenario.initial_estimate(scenario.nodes[0])[1])[None]
-    nothing, eye = scipy.sparse.csr_array((1, 1)), np.eye(len(A))
-    return CoupledRiccati(A, Q, G[None], nothing, eye, 0.0 * eye, 0.0, start, tuple(groups))
+    # No messages, so that nothing is predicted over a delay: T = I, q = 0.
+    eye, none = np.eye(len(A)), scipy.sparse.csr_array((1, 1))
+    return CoupledRiccati(
+        A,
+        Q,
+        G[None],
+        coupling=none,
+        T=eye,
+        q=0.0 * eye,
+        delay=0.0,
+        start=start,
+        samples=tuple(groups),
+    )
 
 
 def true_limit_covariance(scenario: Scenario) -> FloatArray:

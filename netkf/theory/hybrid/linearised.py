@@ -31,7 +31,8 @@ def solve_linearised(
     right: FloatArray,
     tolerance: float = RESIDUAL_TOLERANCE,
 ) -> FloatArray:
-    """Return the solution X (N, m) of ``op_P(X) = -right``, for H(12) linearised at P (N, n, n).
+    """Return the solution X (N, m) of ``op_P(X) = -right``, where op_P is the linearisation at P
+    (N, n, n) of the coupled Riccati equations H(12), which bound the mean of N filters' P.
 
     m = n (n + 1) / 2 entries of the upper triangle for each of N nodes, as in ``right`` (N, m); nan
     if the map is singular. The norm of the residual is at most ``tolerance`` times that of

@@ -32,18 +32,20 @@ class LinkRate(NamedTuple):
 
 
 def link_rate_threshold(scenario: Scenario) -> LinkRate:
-    """Return the link rates from which on H(12) has a steady state.
+    """Return the link rates from which on H(12), the coupled Riccati equations that bound the mean
+    of each filter's P, has a steady state.
 
     Below them the bound grows without limit although all rates are positive and the graph is
     connected, so that H Proposition 4 is false as printed. To 1e-6, or 1e-3 for large networks.
     Raises TheoryError if H(12) does not apply or no rate suffices.
     """
     equations = _require_talk(scenario)
-    if _distance(equations, None, 1e-9) is not None:
+    # A steady state for hardly any messages: every node has one by itself.
+    if steady_state(equations.scale_rates(1e-9)) is not None:
         return _with_rate(scenario, 0.0)
     slow = 1.0
     # The search goes upwards, so it starts from rates that are too slow.
-    while _distance(equations.scale_rates(slow), None, 1.0) is not None:
+    while steady_state(equations.scale_rates(slow)) is not None:
         slow *= 0.1
     factor = threshold_factor(equations.scale_rates(slow))
     if factor is None:
@@ -73,6 +75,7 @@ def link_rate_for(scenario: Scenario, delta: float) -> LinkRate:
             return NO_STEADY_STATE
         return math.log(max(distance, 1e-300) / delta)
 
+    # An interval low .. high of the logarithm with the root in it: upwards, then downwards.
     step, low, high = math.log(4.0), 0.0, 0.0
     while excess(high) > 0.0:
         low, high = high, high + step
@@ -90,23 +93,23 @@ def link_rate_for(scenario: Scenario, delta: float) -> LinkRate:
 
 
 def _require_talk(scenario: Scenario) -> CoupledRiccati:
-    """Return the coupled equations; raises TheoryError if no message ever arrives."""
+    """Return the coupled Riccati equations H(12) of a scenario, which bound the mean of each
+    filter's P; raises TheoryError if no message ever arrives.
+    """
     equations = coupled_riccati(scenario)
     if not equations.coupling.nnz:
         raise TheoryError("no message ever arrives, so that rates of links change nothing")
     return equations
 
 
-def _distance(equations: CoupledRiccati, S: FloatArray | None, factor: float) -> float | None:
-    """Return ``max_i |calP_i - S|_F`` with all link rates times ``factor``, or 0 if S is None; None
-    if there is no steady state.
+def _distance(equations: CoupledRiccati, S: FloatArray, factor: float) -> float | None:
+    """Return ``max_i |calP_i - S|_F`` with all link rates times ``factor``; None if there is no
+    steady state.
 
     calP_i (n, n) is the steady bound of node i, S (n, n) the limit for fast links.
     """
     P = steady_state(equations.scale_rates(factor))
-    if P is None or S is None:
-        return None if P is None else 0.0
-    return float(np.linalg.norm(P - S, axis=(1, 2)).max())
+    return None if P is None else float(np.linalg.norm(P - S, axis=(1, 2)).max())
 
 
 def _with_rate(scenario: Scenario, factor: float) -> LinkRate:

@@ -186,7 +186,8 @@ class PackedRiccati:
         return series
 
     def linear(self, P: FloatArray) -> LinearisedRiccati:
-        """Return H(12) linearised at ``P`` (N, n, n), that is with the gains of P held fixed.
+        """Return the coupled Riccati equations H(12), which bound the mean of each node's P,
+        linearised at ``P`` (N, n, n), that is with the gains of P held fixed.
 
         P minimises the right-hand side over gains, so that their change has no first-order effect.
         """
@@ -213,8 +214,9 @@ class PackedRiccati:
         return LinearisedRiccati(blocks, heard, self)
 
     def _blocks(self, nodes: np.ndarray, corrections: FloatArray) -> FloatArray:
-        """Return the maps (N, m, m) of rows X_i by ``(A - C_i) X_i + X_i (A - C_i)'`` and by the
-        rate at which X_i leaves.
+        """Return each node's own part (N, m, m) of the linearised equations, as maps of rows X_i
+        (the m entries of a symmetric matrix): ``(A - C_i) X_i + X_i (A - C_i)'`` less X_i times the
+        rate at which it is replaced by what arrives.
 
         ``corrections`` (S, n, n) has the C_i of the S ``nodes`` (S,); C_i is 0 at all others.
         """
@@ -242,7 +244,9 @@ class LinearisedRiccati(NamedTuple):
     packed: PackedRiccati
 
     def arriving(self, X: FloatArray) -> FloatArray:
-        """Return the arrivals (N, m) per second at each node for rows X (N, m) of all nodes."""
+        """Return what messages from other nodes add per second at each node, (N, m), for rows X
+        (N, m) of all nodes, the upper triangles of their covariances.
+        """
         total = np.zeros_like(X)
         for rates, nodes, maps in self.heard:
             sent = X[nodes]
@@ -250,7 +254,9 @@ class LinearisedRiccati(NamedTuple):
         return total
 
     def mean_map(self) -> FloatArray:
-        """Return the map (m, m) of the mean over the nodes of rows that are equal everywhere."""
+        """Return the map (m, m) that gives the mean over the nodes of the image of rows that are
+        equal everywhere; it is the coarse part of a preconditioner.
+        """
         total = self.blocks.mean(axis=0)
         for rates, _, maps in self.heard:
             # the rate at which each sender is heard, over the number of nodes

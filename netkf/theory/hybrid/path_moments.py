@@ -53,7 +53,9 @@ def expected_squares(scenario: Scenario, run: Run) -> FloatArray:
 
 
 def _require_exact_model(scenario: Scenario) -> None:
-    """Raise TheoryError unless the filters follow H with increments and instant messages."""
+    """Raise TheoryError unless the filters are those of the hybrid paper, with sensors that give
+    increments and messages without delay, for whose errors the quadrature is.
+    """
     if scenario.slotted or scenario.sampled_sensors or not scenario.is_random:
         raise TheoryError("mean squares by quadrature are for random increments")
     if scenario.node_filter.combination != "convex" or overridden(scenario.filter.algorithm):

@@ -42,7 +42,8 @@ FEW_UNKNOWNS = 400  # up to which the threshold is found to 1e-6
 
 
 def steady_covariance_bound(scenario: Scenario) -> FloatArray:
-    """Return the steady state (N, n, n) of H(12), with a relative residual below 1e-9.
+    """Return the steady bound (N, n, n) on the mean of each filter's P: the steady state of the
+    coupled Riccati equations H(12) of the hybrid paper, with a relative residual below 1e-9.
 
     Newton's method from gains that a linear equation has proved stabilising. Raises TheoryError if
     there is none, with the threshold that the link rates would have to reach, and if H(12) does not
@@ -68,7 +69,8 @@ def _steady_state_of(scenario: Scenario) -> FloatArray | None:
 
 
 def has_stabilising_gains(scenario: Scenario) -> bool:
-    """Return True if some gains stabilise H(12), which then has a steady state.
+    """Return True if some gains stabilise H(12), the coupled Riccati equations that bound the mean
+    of each filter's P, which then have a steady state.
 
     Takes about half the time of :func:`has_steady_state`, which computes that state and so also
     finds plants with a mode that is neither driven nor damped. Raises TheoryError if H(12) does not
@@ -78,7 +80,8 @@ def has_stabilising_gains(scenario: Scenario) -> bool:
 
 
 def steady_by_node(scenario: Scenario) -> FloatArray:
-    """Return each node's own steady covariance (N, n, n), nan if it has none.
+    """Return the steady covariance (N, n, n) that each node's filter has by itself, in a network
+    without messages; nan if it has none.
 
     Raises TheoryError if nodes communicate.
     """
@@ -91,7 +94,8 @@ def steady_by_node(scenario: Scenario) -> FloatArray:
 
 
 def steady_state(equations: CoupledRiccati) -> FloatArray | None:
-    """Return the steady state (N, n, n) of the equations, or None if there is none.
+    """Return the steady state (N, n, n) of the coupled Riccati ``equations`` that bound the mean of
+    each of N filters' P, or None if there is none.
 
     Raises TheoryError for samples at known times, which lead to a cycle, and if the residual of the
     computed state is too large.
@@ -123,7 +127,8 @@ def steady_state(equations: CoupledRiccati) -> FloatArray | None:
 
 
 def _stabilising_covariances(packed: PackedRiccati) -> FloatArray | None:
-    """Return covariances (N, n, n) whose gains stabilise H(12), or None if there are none.
+    """Return covariances (N, n, n) whose gains stabilise H(12), the coupled Riccati equations of N
+    nodes, so that Newton's method can start from them; None if there are none.
 
     Raises TheoryError for samples at known times.
     """
@@ -139,8 +144,8 @@ def _stabilising_covariances(packed: PackedRiccati) -> FloatArray | None:
 
 
 def _newton(packed: PackedRiccati, P: FloatArray) -> FloatArray:
-    """Return the fixed point (N, n, n) of H(12) with the gains of P (N, n, n) held fixed
-    (Kleinman).
+    """Return one step (N, n, n) of Newton's method for the steady state of the coupled Riccati
+    equations H(12): their fixed point with the gains of P (N, n, n) held fixed (Kleinman).
 
     Solved for the change of P, so that a few digits of it are enough.
     """
@@ -150,7 +155,8 @@ def _newton(packed: PackedRiccati, P: FloatArray) -> FloatArray:
 
 
 def _find_stabilising(packed: PackedRiccati, first: FloatArray | None = None) -> FloatArray | None:
-    """Return covariances (N, n, n) whose gains stabilise H(12), or None if none were found.
+    """Return covariances (N, n, n) whose gains stabilise H(12), the coupled Riccati equations that
+    bound the mean of each of N nodes' P, or None if none were found.
 
     The search follows H(12) by implicit steps; it starts from ``first`` (N, n, n), or from the
     first covariances of the nodes.
@@ -179,8 +185,9 @@ def _find_stabilising(packed: PackedRiccati, first: FloatArray | None = None) ->
 
 
 def _implicit_step(implicit: PackedRiccati, P: FloatArray) -> FloatArray | None:
-    """Return the solution (N, n, n) of an ``implicit`` step from P (N, n, n), closely enough to
-    follow H(12), or None if the step is too long.
+    """Return the covariances (N, n, n) after an implicit Euler step of the coupled Riccati
+    equations from P (N, n, n), closely enough to follow their solution, or None if the step is too
+    long. ``implicit`` are the equations whose steady state the step leads to.
 
     Q + P / step is positive definite. So the gains of P stabilise the equations of the step if and
     only if their fixed point with these gains is positive definite too.
@@ -195,7 +202,9 @@ def _implicit_step(implicit: PackedRiccati, P: FloatArray) -> FloatArray | None:
 
 
 def _no_steady_state(scenario: Scenario, equations: CoupledRiccati) -> str:
-    """Return the message that says why there is no steady state and what would give one."""
+    """Return the text of an error that says why the bound on the mean of P, H(12), has no steady
+    state and what would give one.
+    """
     if not equations.talks:
         unsteady = np.isnan(steady_by_node(scenario)[:, 0, 0])
         unsteady_nodes = [
@@ -261,7 +270,8 @@ def threshold_factor(equations: CoupledRiccati) -> float | None:
 def _steady_at(
     equations: CoupledRiccati, factor: float, first: FloatArray | None
 ) -> FloatArray | None:
-    """Return the steady state (N, n, n), to a few digits, with link rates times ``factor``.
+    """Return the steady state (N, n, n) of the coupled Riccati ``equations`` of N nodes, to a few
+    digits, with link rates times ``factor``, for the search for the least factor that has one.
 
     None if there is none. The search starts from ``first`` (N, n, n), if given.
     """
@@ -292,7 +302,8 @@ def _guess(points: list[tuple[float, float]], low: float, high: float, fine: flo
 
 
 def _necessary_factor(equations: CoupledRiccati) -> float | None:
-    """Return a factor on all link rates at or below which H(12) has no steady state.
+    """Return a factor on all link rates at or below which H(12), the coupled Riccati equations that
+    bound the mean of each node's P, has no steady state; cheap to compute.
 
     None if no factor gives it one. The covariances of nodes without sensors grow at least as if all
     other nodes had no error: by the largest eigenvalue of their own coupling and 2 a, where a is
@@ -318,7 +329,7 @@ def _necessary_factor(equations: CoupledRiccati) -> float | None:
 
 def _longest_lag(M: scipy.sparse.csc_array) -> float | None:
     """Return a lower bound on the largest eigenvalue of ``M^-1`` (seconds), for M (K, K) per
-    second.
+    second: the time in which information reaches K nodes without sensors from the others.
 
     None if M, whose off-diagonal entries are at most 0, is not a nonsingular M-matrix, so that some
     eigenvalue of M is at most 0. The least factor by which a step of the power method multiplies an

@@ -23,7 +23,10 @@ BOUNDED_MEAN = "readings arrive often enough for a bounded mean (sufficient)"
 
 
 def slot_rows(scenario: Scenario) -> list[AssumptionRow]:
-    """Return the rows of R: plant, detectability, arrivals and first covariances."""
+    """Return the assumptions of the paper on intermittent observations, as rows (assumption,
+    source, whether it holds, evidence) of the table: on plant, detectability, arrivals and first
+    covariances.
+    """
     return [
         *slot_plant_rows(scenario),
         *_detectability_rows(scenario),
@@ -45,7 +48,9 @@ def _reachable_readings(scenario: Scenario) -> dict[int, FloatArray]:
 
 
 def _detectability_rows(scenario: Scenario) -> list[AssumptionRow]:
-    """Return the row on detectability from the readings that reach each node."""
+    """Return the assumption, as a list of one row of the table, that (F, H) is detectable at every
+    node from all readings that can reach it.
+    """
     F = scenario.slot_plant.F
     name = "(F, H) is detectable at every node"
     try:
@@ -61,7 +66,9 @@ def _detectability_rows(scenario: Scenario) -> list[AssumptionRow]:
 
 
 def _arrival_rows(scenario: Scenario) -> list[AssumptionRow]:
-    """Return the rows on independent and on sufficiently frequent arrivals."""
+    """Return the assumptions, as rows of the table, that readings arrive independently, and often
+    enough for a bounded mean of P.
+    """
     channel = scenario.network.channel
     loss = channel.loss
     # R (12) needs independent arrivals of positive probability.
@@ -92,7 +99,10 @@ def _arrival_rows(scenario: Scenario) -> list[AssumptionRow]:
 
 
 def _bounded_mean_row(scenario: Scenario) -> AssumptionRow:
-    """Return the row on R (32), for the node at which arrivals are least sufficient."""
+    """Return the row of the table on the sufficient condition R (32) for a bounded mean of P: some
+    gains make errors contract in the mean square. Its evidence is about the node at which readings
+    arrive least sufficiently.
+    """
     F, sensing = scenario.slot_plant.F, set(scenario.sensing_nodes)
     least_sufficient: tuple[float, int, list[float]] | None = None
     for node, H in _reachable_readings(scenario).items():

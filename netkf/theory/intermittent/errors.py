@@ -45,7 +45,8 @@ class ReadingExchangeRule(ErrorRule):
 
     def sense(self, time: float, observations: EstimatorObservations) -> None:
         """Update each version of each estimate by the readings of ``time`` (seconds, or the slot)
-        that arrive before its end.
+        that arrive before its end; called by the replay before messages of this time arrive. A
+        version has all readings that will have arrived by its end, late ones included.
         """
         self._observations, self._columns = observations, self.errors.reading_noises(observations)
         for estimator in range(self.errors.estimators):
@@ -80,7 +81,8 @@ class ReadingExchangeRule(ErrorRule):
 
     def arrive(self, time: float, messages: Sequence[SentMessage]) -> None:
         """Use readings that come in time, or replace an estimate by its version that ends at
-        ``time`` (seconds, or the slot).
+        ``time`` (seconds, or the slot), which has used the late reading as if it had come in time;
+        called by the replay when messages arrive.
         """
         for estimator in {m.receiver for m in messages}:
             if time in self._versions[estimator]:

@@ -112,7 +112,8 @@ def covariance_root(P: FloatArray) -> FloatArray:
 
 
 def steady_covariance(F: ArrayLike, Q: ArrayLike, H: ArrayLike, R: ArrayLike) -> FloatArray:
-    """Return P* (n, n), the stabilising fixed point of f_1, for F and Q (n, n), H (p, n), R (p, p).
+    """Return P* (n, n), the steady one-step prediction covariance with a reading in every slot: the
+    stabilising fixed point of the Riccati step f_1, for F and Q (n, n), H (p, n), R (p, p).
 
     Raises TheoryError if (F, H) is not detectable, with the mode, and if the computed P* fails the
     check of its residual or does not stabilise the filter.
@@ -193,7 +194,8 @@ class CriticalProbability(NamedTuple):
 
 
 def critical_probability(F: ArrayLike, H: ArrayLike) -> tuple[float, float]:
-    """Return the bounds (lower, upper) on the critical delivery probability, R (31) and (32).
+    """Return the bounds (lower, upper) on the critical delivery probability, above which the mean
+    of P stays bounded: R (31) and (32) of the paper on intermittent observations.
 
     F is (n, n), H (p, n). The upper bound is the smallest g for which some K makes the mean of the
     Kronecker squares contract. Policy iteration over K inside a root search over g finds it to
@@ -228,8 +230,9 @@ def critical_certificate(F: ArrayLike, H: ArrayLike) -> CriticalProbability:
 
 
 def _critical_bounds(F: FloatArray, H: FloatArray, search: _GainSearch) -> tuple[float, float]:
-    """Return R (31) and R (32) for F (n, n) and H (p, n), with the ``search`` over gains for them;
-    raises TheoryError if the latter is not found.
+    """Return a lower and an upper bound on the critical delivery probability, R (31) and R (32),
+    for F (n, n) and H (p, n), with the ``search`` over gains for them; raises TheoryError if the
+    upper one is not found.
     """
     moduli = np.abs(np.linalg.eigvals(F))
     alpha = float(moduli.max())
@@ -291,8 +294,9 @@ class _GainSearch:
         self._pick = rows * n + columns
 
     def best(self, probabilities: Sequence[float]) -> tuple[float, list[FloatArray], FloatArray]:
-        """Return the least spectral radius, the gains K_s (n, p) that attain it, and the Perron
-        matrix (n, n), for the ``probabilities`` p_s of the sets of readings.
+        """Return the least spectral radius of the mean-square dynamics L over all gains, the gains
+        K_s (n, p) that attain it, and the Perron matrix (n, n) of L with them, for the
+        ``probabilities`` p_s of the sets of readings.
         """
         n = len(self._F)
         gains = self._improve([np.zeros((n, len(H))) for H in self._readings], np.eye(n))
@@ -369,8 +373,9 @@ class _GainSearch:
         return improved
 
     def _operator(self, probabilities: Sequence[float], gains: list[FloatArray]) -> FloatArray:
-        """Return L with these ``probabilities`` and ``gains`` (n, p) as a matrix (m, m) on the m =
-        n (n + 1) / 2 entries of upper triangles.
+        """Return the mean-square dynamics L with these ``probabilities`` and ``gains`` (n, p) of
+        the sets of readings, as a matrix (m, m) on the m = n (n + 1) / 2 entries of upper
+        triangles.
         """
         kron = np.zeros((len(self._F) ** 2,) * 2)
         for p, K, H in zip(probabilities, gains, self._readings, strict=True):
@@ -381,8 +386,9 @@ class _GainSearch:
     def _perron(
         self, probabilities: Sequence[float], gains: list[FloatArray]
     ) -> tuple[float, FloatArray]:
-        """Return the spectral radius of L with these ``probabilities`` and ``gains`` (n, p), and
-        its Perron matrix X (n, n), of positive trace.
+        """Return the spectral radius of the mean-square dynamics L with these ``probabilities`` and
+        ``gains`` (n, p), and its Perron matrix X (n, n), the semidefinite eigenvector of the
+        radius, of positive trace.
         """
         values, vectors = np.linalg.eig(self._operator(probabilities, gains))
         k = int(np.argmax(values.real))
@@ -392,7 +398,8 @@ class _GainSearch:
 
 
 def support(F: ArrayLike, Q: ArrayLike, H: ArrayLike, R: ArrayLike, depth: int) -> FloatArray:
-    """Return all compositions (2^depth, n, n) of ``depth`` maps f_0 or f_1, applied to P*.
+    """Return all compositions (2^depth, n, n) of ``depth`` maps, each f_0 (a slot without a
+    reading) or f_1 (one with it), applied to P*, the fixed point of f_1.
 
     F and Q are (n, n), H (p, n), R (p, p). The binary digits of the index k are the maps of entry
     k, the leading digit being applied last. By R Theorem 10 the closure of these points over all
@@ -460,7 +467,8 @@ def couple_from_the_past(
     empty: np.ndarray,
 ) -> tuple[FloatArray, np.ndarray]:
     """Return K exact draws (K, n, n) from the invariant law of a switched Riccati recursion, and
-    the last mode (K,) of each, by coupling from the past (Propp and Wilson 1996).
+    the last mode (K,) of each, by coupling from the past (Propp and Wilson 1996). A mode says which
+    readings update a covariance in a slot.
 
     ``draw(following, T)`` returns the T modes before those in ``following`` (K, S);
     ``propagate(roots, modes)`` applies modes (K, T) to roots (K, n, n); ``empty`` is an array

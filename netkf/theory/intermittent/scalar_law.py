@@ -52,11 +52,16 @@ class ScalarLaw:
 
     @property
     def hole(self) -> tuple[float, float]:
-        """The open interval (sup f_1, f_0(P*)), which has probability 0."""
+        """The open interval between the largest value after a slot with a reading and the least
+        after one without, (sup f_1, f_0(P*)), which P never enters.
+        """
         return self.F**2 * self.R / self.H**2 + self.Q, float(self.without(np.array(self.least)))
 
     def cdf(self, x: ArrayLike) -> FloatArray:
-        """Return P(X <= x), exact to about 1e-15, elementwise: an array of the shape of ``x``."""
+        """Return P(X <= x) for a covariance X with the invariant law, exact to about 1e-15,
+        elementwise: an array of the shape of ``x``. It goes back slot by slot: from x one learns if
+        the last slot had a reading, and the point before it that has the same probability.
+        """
         point = np.array(x, dtype=np.float64)
         total, weight = np.zeros_like(point), np.ones_like(point)
         top = self.hole[0]
@@ -77,7 +82,8 @@ class ScalarLaw:
         """Return P(P_t <= x) after t = ``slots`` slots from P_0 = ``start``, exact, an array of the
         shape of ``x``.
 
-        P_t is f_0(P_{t-1}) with probability 1 - g and f_1(P_{t-1}) with probability g, so that the
+        P_t is f_0(P_{t-1}) (a slot without a reading) with probability 1 - g and f_1(P_{t-1}) (one
+        with a reading) with probability g, so that the
         distribution function obeys ``P(P_t <= x) = (1 - g) P(P_{t-1} <= f_0^-1(x)) + g P(P_{t-1} <=
         f_1^-1(x))``. At or above P* one of the two terms is 0 or 1; below P*, which only a smaller
         start reaches, both count.
@@ -90,22 +96,26 @@ class ScalarLaw:
         for _ in range(slots):
             lowest.append(self.with_reading(lowest[-1]))
             highest.append(self.without(highest[-1]))
+        # Backwards in time, each x becomes several weighted points; ``owner`` is the index of x.
+        # A point above all values counts in full, one below all of them not at all.
         for slots_left in range(slots, -1, -1):
             above = point >= highest[slots_left] * (1.0 - 1e-15)
             np.add.at(total, owner[above], weight[above])
             open_ = ~above & (point >= lowest[slots_left] * (1.0 - 1e-15)) & (weight > NEGLIGIBLE)
             point, owner, weight = point[open_], owner[open_], weight[open_]
             reduced = (point - self.Q) / self.F**2
-            scratch = self.R - self.H**2 * reduced
+            # f_0^-1 and f_1^-1 of each point; the latter is infinite at or above sup f_1.
+            denominator = self.R - self.H**2 * reduced
             with np.errstate(divide="ignore", invalid="ignore"):
-                preimage = np.where(scratch > 0.0, reduced * self.R / scratch, np.inf)
+                preimage = np.where(denominator > 0.0, reduced * self.R / denominator, np.inf)
             point = np.concatenate([reduced, preimage])
             owner = np.concatenate([owner, owner])
             weight = np.concatenate([weight * (1.0 - self.delivery), weight * self.delivery])
         return total.reshape(x.shape)
 
     def quantile(self, u: ArrayLike) -> FloatArray:
-        """Return the least x with P(X <= x) >= u, an array of the shape of ``u``.
+        """Return the least x with P(X <= x) >= u for a covariance X with the invariant law, an
+        array of the shape of ``u``.
 
         ``u`` must lie in [0, 1), otherwise it raises TheoryError.
         """
@@ -131,7 +141,8 @@ class ScalarLaw:
         return P
 
     def mean(self) -> float:
-        """Return E[X] to about 1e-9 relative, infinite if (1-g) F^2 >= 1.
+        """Return the mean E of a covariance X with the invariant law to about 1e-9 relative,
+        infinite if (1-g) F^2 >= 1; f_0 is a slot without a reading, f_1 one with it.
 
         E = g E[f_1(X)] + (1-g)(F^2 E + Q), and E[f_1(X)] lies between two sums over all
         compositions of 18 maps, applied to P* and to infinity. Raises TheoryError if these differ
@@ -160,8 +171,9 @@ def scalar_law(
     """Return the exact invariant law of a scalar system: F, Q, H and R are numbers or 1 x 1
     matrices, and readings arrive with probability ``delivery``.
 
-    Raises TheoryError if the system is not scalar, has no P*, or if the images of f_0 and f_1
-    overlap, so that the recursion has two branches.
+    Raises TheoryError if the system is not scalar, has no steady covariance P* with all readings,
+    or if the values of P after a slot without a reading (f_0) and those after one with it (f_1)
+    overlap, so that the recursion of the distribution function has two branches.
     """
     system = check_system(*(np.atleast_2d(value) for value in (F, Q, H, R)))
     if len(system.F) != 1 or len(system.H) != 1:
