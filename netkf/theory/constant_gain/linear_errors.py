@@ -78,7 +78,8 @@ class SampledNode(NamedTuple):
 
 
 def clock_jumps(scenario: Scenario) -> ClockJumps | DelayedJumps | SlotJumps:
-    """Return the linear system of the errors in continuous time.
+    """Return the errors of all nodes in continuous time as a linear system with jumps at readings
+    and messages, of which exact steady mean squares are computed.
 
     Clocks are Poisson processes of links, directions or nodes, or periodic and all tick together;
     then the system is that from tick to tick. Raises TheoryError for other clocks, random delays,
@@ -143,8 +144,9 @@ def _sampled_nodes(scenario: Scenario) -> list[SampledNode]:
 def _poisson_samples(
     scenario: Scenario, samples: list[SampledNode]
 ) -> tuple[tuple[tuple[int, float, FloatArray], ...], FloatArray]:
-    """Return (node, rate in 1/s, correction) of each sensor, and the noise per second (N n, N n)
-    that its samples bring. Raises TheoryError for clocks that are not Poisson processes.
+    """Return (node, rate in 1/s, correction L H) of each sensor that samples, and the covariance
+    per second (N n, N n) that all samples add to the stacked errors. Raises TheoryError for clocks
+    that are not Poisson processes.
     """
     N, n = len(scenario.nodes), scenario.plant.n
     noise, sampled_nodes = np.zeros((N * n, N * n)), []

@@ -20,7 +20,9 @@ MAX_NODES = 2000  # of a network whose diameter is computed, from the distances 
 
 
 def slot_rows(scenario: Scenario) -> list[AssumptionRow]:
-    """Return the rows of D: weights, plant, information, arrivals and first covariances."""
+    """Return the assumptions of the diffusion paper, as rows (assumption, source, whether it holds,
+    evidence) of the table: on weights, plant, information, arrivals and first covariances.
+    """
     return [
         *_weight_rows(scenario),
         *_plant_rows(scenario),
@@ -47,7 +49,7 @@ def sparse_weights(scenario: Scenario) -> scipy.sparse.csr_array:
 
 
 def _weight_rows(scenario: Scenario) -> list[AssumptionRow]:
-    """Return the rows on balanced weights and on strong connection."""
+    """Return the assumptions, as rows of the table, on balanced weights and strong connection."""
     W = sparse_weights(scenario)
     W.eliminate_zeros()
     unbalanced = float(np.abs(W.sum(axis=1) - 1.0).max())
@@ -69,7 +71,9 @@ def _weight_rows(scenario: Scenario) -> list[AssumptionRow]:
 
 
 def _judge_mixing(W: scipy.sparse.csr_array) -> tuple[bool | None, str]:
-    """Return the verdict and evidence on W^diameter > 0 for a strongly connected network."""
+    """Return whether some power of the weight matrix W (N, N) of a strongly connected network is
+    positive (None: not known), as the diffusion paper assumes, and a text that says why.
+    """
     if len(W.indptr) - 1 > MAX_NODES:
         positive = bool((W.diagonal() > 0.0).all())  # sufficient: every node keeps a share
         evidence = f"the diameter is not computed beyond {MAX_NODES:,} nodes"
@@ -92,7 +96,9 @@ def _judge_mixing(W: scipy.sparse.csr_array) -> tuple[bool | None, str]:
 
 
 def _plant_rows(scenario: Scenario) -> list[AssumptionRow]:
-    """Return the rows on the random walk and on Q and r of the filters."""
+    """Return the assumptions, as rows of the table, that the parameter is a random walk, and on Q
+    and r of the filters.
+    """
     plant = scenario.slot_plant
     F, Q = scenario.slot_belief
     smallest = float(np.linalg.eigvalsh(Q)[0])
@@ -152,7 +158,9 @@ def _information_row(scenario: Scenario) -> AssumptionRow:
 
 
 def _arrival_row(scenario: Scenario) -> AssumptionRow:
-    """Return the row on messages that arrive in time."""
+    """Return the assumption, as a row of the table, that every message arrives in time, so that
+    weights are fixed.
+    """
     channel = scenario.network.channel
     rates = [
         channel.loss.mean_delivery(link, scenario.table_probability(link))

@@ -122,8 +122,9 @@ def _make_sources(scenario: Scenario) -> list[_Source]:
 def _draw_pasts(
     scenario: Scenario, sources: list[_Source], runs: int, random: np.random.Generator
 ) -> list[FloatArray]:
-    """Return for each source its states (runs, m) at ``runs`` random slots, the same slots for all
-    sources; m differs from source to source.
+    """Return for each source (a random process that makes regressors) its states (runs, m) at
+    ``runs`` random slots, the same slots for all sources; m differs from source to source. They are
+    the pasts for which the excitation of the next slots is computed.
     """
     last = max(1, int(scenario.horizon / scenario.slot_plant.period))
     slots = random.integers(last, size=runs)
@@ -131,8 +132,9 @@ def _draw_pasts(
 
 
 def _draw_states(source: _Source, slots: np.ndarray, random: np.random.Generator) -> FloatArray:
-    """Return the states (K, m) of a source at K ``slots`` (K,), each drawn from the Gaussian law
-    that the state has in that slot; 1 for a fixed regressor.
+    """Return the states (K, m) of a ``source`` of regressors (phi = C s with s <- A s + noise) at K
+    ``slots`` (K,), each drawn from the Gaussian law that s has in that slot; 1 for a fixed
+    regressor.
     """
     normals = random.standard_normal((len(slots), len(source.start)))
     if not source.drive.size:
@@ -150,7 +152,8 @@ def _draw_states(source: _Source, slots: np.ndarray, random: np.random.Generator
 
 
 def _sensor_rows(sources: list[_Source], past: list[FloatArray], window: int) -> list[LevelRow]:
-    """Return a row of the table for each sensor alone; fixed sensors of one kind share its numbers.
+    """Return the row of the table of excitation levels (:func:`information_level`) for each sensor
+    alone; sensors of one kind whose regressor is fixed share its numbers.
 
     ``past`` holds the states (K, m) of each source in K pasts, ``window`` is h in slots.
     """
@@ -164,8 +167,8 @@ def _sensor_rows(sources: list[_Source], past: list[FloatArray], window: int) ->
 
 
 def _make_row(node: int, sources: list[_Source], past: list[FloatArray], window: int) -> LevelRow:
-    """Return the row of the table for the given ``sources``: the whole network (``node`` -1), or
-    one sensor.
+    """Return the row of the table of excitation levels (:func:`information_level`) for the given
+    ``sources`` of regressors: the whole network (``node`` -1), or one sensor.
 
     ``past`` holds the states (K, m) of each source in K pasts, ``window`` is h in slots.
     """
@@ -200,8 +203,8 @@ def _search_least(
 def _search(
     sources: list[_Source], past: list[FloatArray], start: list[FloatArray], window: int
 ) -> list[float]:
-    """Return the level at the past ``start``, and that found from it by the simplex method of
-    Nelder and Mead.
+    """Return the level (least eigenvalue of the mean information of the next slots) at the past
+    ``start``, and the least one found from it by the simplex method of Nelder and Mead.
 
     ``start`` holds one state (m,) of each source. The search stays within the range of the pasts
     drawn, ``past`` with (K, m) states of each source, and is left out for a level of 0 and for
@@ -237,7 +240,8 @@ def _search(
 
 
 def _levels(sources: list[_Source], past: list[FloatArray], window: int) -> FloatArray:
-    """Return the levels lambda_k (K,) of the ``sources`` together, for K pasts.
+    """Return the levels lambda_k (K,), D (19), of the ``sources`` of regressors together, for K
+    pasts.
 
     ``past`` holds the states (K, m) of each source, ``window`` is h in slots. A level is the least
     eigenvalue of the mean excitation by the sources, 0 if it is below rounding.
@@ -270,8 +274,9 @@ def _group_by_kind(sources: list[_Source]) -> list[list[int]]:
 
 
 def _window_excitation(source: _Source, states: FloatArray, window: int) -> FloatArray:
-    """Return the sum (K, n, n) of ``E[phi phi' / (1 + |phi|^2)]`` over the ``window`` slots after K
-    pasts, in which the source has the ``states`` (K, m).
+    """Return the sum (K, n, n) of ``E[phi phi' / (1 + |phi|^2)]``, with phi the regressor of a
+    ``source``, over the ``window`` slots after K pasts, in which the source has the ``states``
+    (K, m).
     """
     mean, cov, n = states, np.zeros_like(source.A), len(source.C)
     total = np.zeros((len(states), n, n))
@@ -283,7 +288,8 @@ def _window_excitation(source: _Source, states: FloatArray, window: int) -> Floa
 
 
 def normalised_outer(mean: FloatArray, cov: FloatArray) -> FloatArray:
-    """Return ``E[phi phi' / (1 + |phi|^2)]`` (K, n, n) for Gaussian phi.
+    """Return ``E[phi phi' / (1 + |phi|^2)]`` (K, n, n), the mean excitation by a Gaussian regressor
+    phi in a slot.
 
     phi has K means ``mean`` (K, n) and one covariance ``cov`` (n, n). 1 / (1 + r) is the integral
     of exp(-u (1 + r)) over u > 0, so that only Gaussian integrals remain.

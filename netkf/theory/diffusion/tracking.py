@@ -33,7 +33,8 @@ class TrackingLevel(NamedTuple):
 def tracking_level(
     scenario: Scenario, p: float = 2.0, beta: float = 2.5, samples: int = 100_000, seed: int = 0
 ) -> TrackingLevel:
-    """Return sigma_p of D (29) for the true noises of a scenario, and the bound that it gives.
+    """Return the level of noise sigma_p, D (29) of the diffusion paper, for the true noises of a
+    scenario, and the shape of the bound on tracking errors that it gives.
 
     ``xi_k = |V_k| + |Delta_{k+1}|`` with the noises of all sensors and the parameter's increment,
     once for each node, and ``sigma_p = | xi log^beta(e + xi) |_Lp``. Gaussian noises have all
@@ -54,7 +55,9 @@ def tracking_level(
 
 
 def _draw_noises(scenario: Scenario, samples: int, random: np.random.Generator) -> FloatArray:
-    """Return draws (samples,) of xi; raises TheoryError if a noise is recorded."""
+    """Return draws (samples,) of xi, the norm of all noises of a slot, D (29): that of the sensors'
+    noises plus that of the parameter's increment; raises TheoryError if a noise is recorded.
+    """
     if not scenario.slotted or not scenario.is_random:
         raise TheoryError("D (29) needs noises in slots with a law, not a record")
     squares = np.zeros(samples)

@@ -18,7 +18,9 @@ MAX_LISTED = 12  # matchings that a row names
 
 
 def slot_rows(scenario: Scenario) -> list[AssumptionRow]:
-    """Return the rows of G: matching, plant, walk, swaps and first covariances."""
+    """Return the assumptions of the gossip paper, as rows (assumption, source, whether it holds,
+    evidence) of the table: on matching, plant, walk, swaps and first covariances.
+    """
     return [
         *_matching_rows(scenario),
         *slot_plant_rows(scenario),
@@ -29,7 +31,9 @@ def slot_rows(scenario: Scenario) -> list[AssumptionRow]:
 
 
 def _matching_rows(scenario: Scenario) -> list[AssumptionRow]:
-    """Return the row on the mean matching, G C.1."""
+    """Return the assumption, as a list of one row of the table, that the mean matching (the
+    probabilities that nodes swap in a slot) is irreducible and aperiodic, G C.1.
+    """
     name = "the mean matching is irreducible and aperiodic"
     try:
         mean = _mean_swaps(scenario)
@@ -58,7 +62,9 @@ def _mean_swaps(scenario: Scenario) -> FloatArray:
 
 
 def _walk_rows(scenario: Scenario) -> list[AssumptionRow]:
-    """Return the row on weak detectability, G D.1."""
+    """Return the assumption, as a list of one row of the table, of weak detectability, G D.1: the
+    readings of the nodes along some walk over paired nodes determine the state.
+    """
     name = "some walk on the network detects the state (weak detectability)"
     try:
         walk = detecting_walk(scenario)
@@ -79,7 +85,9 @@ def _walk_rows(scenario: Scenario) -> list[AssumptionRow]:
 
 
 def _swap_rows(scenario: Scenario) -> list[AssumptionRow]:
-    """Return the row on exchanges that are swaps."""
+    """Return the assumption, as a list of one row of the table, that every exchange is a swap of
+    the two nodes' pairs (estimate, covariance), also where messages are lost.
+    """
     channel = scenario.network.channel
     # A swap needs both messages: if one is lost, its pair exists twice and the other is gone.
     lossless = type(channel.loss).__name__ == "NoLoss"

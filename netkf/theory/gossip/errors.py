@@ -19,8 +19,9 @@ class SwapRule(EstimateExchangeRule):
     def combine(
         self, node: int, weights: list[float], roots: list[FloatArray]
     ) -> tuple[FloatArray, FloatArray]:
-        """Return the root (n, n) of P of the last message, and the factors (J, n, n) of the J
-        errors: the identity for the last one, zero for all others.
+        """Return how a node combines its estimate with messages: the root (n, n) of P of the last
+        message, and the factors (J, n, n) of the J errors: the identity for the last one, zero for
+        all others.
 
         ``roots`` are J roots (n, n) of P: that of the ``node`` first, then those of the messages,
         whose ``weights`` have no meaning here.

@@ -34,7 +34,8 @@ class SwitchedSamples(NamedTuple):
 
 def switched_samples(scenario: Scenario, samples: int, seed: int) -> SwitchedSamples:
     """Return ``samples`` independent draws, covariances (samples, n, n) and nodes (samples,), from
-    mu^Abar of a gossip scenario, G Theorem 8.
+    the law mu^Abar to which the covariances of a gossip filter tend, G Theorem 8: that of the
+    switched chain, a covariance whose node moves by the mean matching Abar.
 
     Coupling from the past: the chain of nodes is drawn backwards from the uniform law, and the
     Riccati recursion runs through ever longer pasts until a start at 0 and one at a huge covariance

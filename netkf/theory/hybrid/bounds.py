@@ -342,7 +342,7 @@ class _PiecewiseSolution:
 
     def _jacobian(self, t: float, y: FloatArray) -> Any:
         """Return the sparse Jacobian (N m, N m), per second, of the right-hand side at the packed
-        solution ``y`` (N m,); the time ``t`` does not matter.
+        solution ``y`` (N m,), as the implicit solver asks for it; the time ``t`` does not matter.
         """
         linear = self._packed.linear(self._packed.unpack(y.reshape(self._packed.start.shape)))
         # With a delay the arrivals are known from earlier pieces and do not depend on y.
@@ -389,7 +389,8 @@ class _SampleJumps:
         return time in self._samples or time in self._arrivals
 
     def apply(self, time: float, Y: FloatArray) -> FloatArray:
-        """Return Y (N, m) after the samples of this ``time`` (seconds) and then its arrivals.
+        """Return the packed bound Y (N, m) just after ``time`` (seconds), at which sensors sample
+        or messages arrive that were sent at samples.
 
         Messages that nodes send at their samples are stored in ``_arrivals`` until they arrive.
         """

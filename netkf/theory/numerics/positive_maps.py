@@ -74,9 +74,9 @@ def _count_numbers(shape: Shape) -> int:
 
 
 def _confirm(T: PositiveMap, X: FloatArray, value: float) -> float:
-    """Return the radius ``value`` of the positive map ``T``, with eigenvector X (S, M, M), if a
-    different search, for the largest modulus from another start, finds the same; raises TheoryError
-    if not.
+    """Return the spectral radius ``value`` found for the positive map ``T``, with eigenvector X
+    (S, M, M), which X does not prove, if a different search, for the eigenvalue of largest modulus
+    from another start, finds the same; raises TheoryError if not.
     """
     start = X + np.diag(np.linspace(0.5, 1.5, X.shape[-1])) * np.trace(X.sum(axis=0))
     second_value, _ = _extreme_eigenvalue(T, start, "LM")
@@ -90,8 +90,8 @@ def _confirm(T: PositiveMap, X: FloatArray, value: float) -> float:
 def _extreme_eigenvalue(
     T: PositiveMap, start: FloatArray, which: Literal["LR", "LM"]
 ) -> tuple[float, FloatArray]:
-    """Return the modulus of an extreme eigenvalue of T, and its eigenvector X (S, M, M) of positive
-    trace.
+    """Return the modulus of an extreme eigenvalue of the positive map T on stacks of S symmetric
+    matrices, and its eigenvector X (S, M, M) of positive trace.
 
     ``which`` is "LR" for the rightmost eigenvalue, "LM" for that of largest modulus. Arnoldi's
     method begins at ``start`` (S, M, M), which has a component along X if it is positive definite.

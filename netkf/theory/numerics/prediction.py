@@ -228,7 +228,13 @@ class ErrorFlow:
         return E[:, :n, :n], E[:, n:, :n] / c, E[:, :n, n:] * c, E[:, n:, n:]
 
     def transition(self, roots: FloatArray, gap: float) -> FlowTransition:
-        """Return the transition of K filters with ``roots`` (K, n, n) of P over ``gap`` seconds."""
+        """Return how the errors and roots of P of K filters, which have the ``roots`` (K, n, n) at
+        its start, change over a ``gap`` in seconds, at most ``unit``.
+
+        Let M be the Hamiltonian of the Riccati equation and [X; Y](s) = exp(M s) [I; P]: the
+        error's transition from s to the end g is ``Phi(g, s) = X(g)^-T X(s)^T``.
+        """
+        # The transposed blocks T11 .. T22 of exp(M s), at the quadrature nodes and at the end.
         times, weights = NODES * gap, WEIGHTS * gap
         T11, T12, T21, T22 = self._exponential_blocks(np.append(times, gap))
         F = np.linalg.inv(T11[-1])
@@ -260,7 +266,8 @@ class ErrorFlow:
     def move(
         self, stack: GaussianStack, names: Sequence[Hashable], gap: float, columns: tuple[int, int]
     ) -> None:
-        """Move errors, which do not depend on the state, and the roots of P over ``gap`` seconds.
+        """Propagate errors, which do not depend on the state, and the roots of their P over ``gap``
+        seconds, at most ``unit``: as :meth:`transition`, in compiled code.
 
         Changes ``stack.table`` and ``stack.matrices`` of the vectors ``names``. ``columns``: the
         first of the plant's 8 m inputs, and the first of n inputs of each error.
@@ -278,9 +285,12 @@ class ErrorFlow:
     def _update_gramian(
         self, roots: FloatArray, gamma_rows: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return ``J = (I + P G)^-1``, ``J P`` and the root S Z_1 of J P, (K, n, n) each.
+        """Return ``J = (I + P G)^-1``, ``J P`` and the root S Z_1 of J P, (K, n, n) each: how the
+        readings of a gap change K covariances P at its start, about which they give the information
+        G = Gamma' Gamma.
 
-        ``roots`` (K, n, n) are S with P = S S'; ``gamma_rows`` (8, p, n) are the rows of Gamma.
+        ``roots`` (K, n, n) are S with P = S S'; ``gamma_rows`` (8, p, n) are the rows of Gamma, p
+        for each node of the quadrature. The QR factorisation is [I; Gamma S] = Z U.
         """
         n, Gamma = self._n, gamma_rows.reshape(-1, self._n)
         eye = np.broadcast_to(np.eye(n), roots.shape)
@@ -319,8 +329,9 @@ class ErrorFlow:
         return triangular_root(factor)
 
     def _response_through_state(self, FJ: FloatArray, FC: FloatArray, gap: float) -> FloatArray:
-        """Return the response (K, 8, n, m) of the errors of K filters, by way of the state, to the
-        m noises of the plant at each of the 8 nodes of a ``gap`` in seconds.
+        """Return the response (K, 8, n, m) of the errors of K filters to the m noises of the plant
+        at each of the 8 nodes of a ``gap`` in seconds, by way of the state: noise moves the state,
+        and errors follow the state because the filters' A is not the plant's.
 
         FJ and FC (K, n, n) give the error's transition from s,
         ``Phi(g, s) = FJ T11(s) + FC T12(s)``.

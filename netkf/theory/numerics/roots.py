@@ -36,7 +36,8 @@ class ErrorTable(NamedTuple):
 @kernel
 def triangularise(factor: FloatArray, n: int, columns: int) -> None:
     """Overwrite the first n columns of ``factor`` (n, at least n) by the lower triangular S (n, n)
-    with ``S S' = factor factor'``, the product being over the first ``columns`` columns.
+    with ``S S' = factor factor'``, the product being over the first ``columns`` columns: S is a
+    root of the covariance of which ``factor`` is one with more columns.
 
     Columns from n on are overwritten with intermediate values.
     """
@@ -91,8 +92,9 @@ def divide_by_transpose(rows: FloatArray, L: FloatArray, count: int, n: int) -> 
 
 @kernel
 def multiply_form(form: FloatArray, matrix: FloatArray, used: int, scratch: FloatArray) -> None:
-    """Replace the first ``used`` columns of a form (n, width) by ``matrix form``, for a ``matrix``
-    (n, n); ``scratch`` (n, used) is overwritten.
+    """Multiply an error by a ``matrix`` (n, n) in place: replace the first ``used`` columns of its
+    ``form`` (n, width), which has the coefficients of the error as a linear function of random
+    inputs, by ``matrix form``; ``scratch`` (n, used) is overwritten.
     """
     n = matrix.shape[0]
     for i in range(n):
@@ -111,8 +113,8 @@ def multiply_form(form: FloatArray, matrix: FloatArray, used: int, scratch: Floa
 
 @kernel
 def add_columns(form: FloatArray, first: int, matrix: FloatArray, sign: float) -> None:
-    """Add ``sign matrix`` (n, k) to k columns of a ``form`` (n, width) in place, from
-    ``first`` on.
+    """Add ``sign matrix`` (n, k) times k random inputs to an error: to the k columns from ``first``
+    on of its ``form`` (n, width), the coefficients of the inputs, in place.
     """
     for i in range(matrix.shape[0]):
         for k in range(matrix.shape[1]):
@@ -128,10 +130,11 @@ def predict_estimates(
     root: FloatArray,
     first: int,
 ) -> None:
-    """Predict the errors at ``indices`` and the roots of their P.
+    """Predict in place the errors at ``indices`` of the table and the roots of their P.
 
     ``e+ = F e + noise w`` and ``P+ = F P F' + root root'``. F is (n, n), ``noise`` (n, k)
-    multiplies the inputs from column ``first`` on, ``root`` is (n, r).
+    multiplies the inputs w, whose coefficients in the errors are the columns from ``first`` on, and
+    ``root`` is (n, r).
     """
     forms, matrices, used = errors
     n, r = F.shape[0], root.shape[1]
@@ -249,7 +252,8 @@ def average_roots(weights: FloatArray, roots: FloatArray) -> FloatArray:
 
 @kernel(allocates=True)
 def mixed_form(forms: FloatArray, sources: IntArray, factors: FloatArray, used: int) -> FloatArray:
-    """Return ``sum_j W_j e_j`` (n, used), a linear form of the first ``used`` inputs.
+    """Return the form (n, used) of the error ``sum_j W_j e_j``: its coefficients of the first
+    ``used`` random inputs, of which all errors are linear functions.
 
     ``factors`` are W (J, n, n); the e_j are the ``forms`` (vectors, n, width) at the indices
     ``sources`` (J,).
@@ -301,10 +305,11 @@ def fade_totals(
     noise: FloatArray,
     first: int,
 ) -> None:
-    """Predict the totals of push-sum with running sums at ``indices``; changes their matrices and
-    forms.
+    """Predict the running totals of push-sum (the sums of all masses that a node has ever sent) at
+    ``indices`` to a later time; changes their matrices and forms.
 
-    The matrices of ``totals`` are their information U, the forms are their errors u - U x.
+    The matrices of ``totals`` are their information U, the forms their errors u - U x as linear
+    functions of random inputs.
     ``U+ = s F^-T U F^-1`` and ``(u - U x)+ = s F^-T (u - U x) - U+ w``, with ``inverse`` F^-1
     (n, n), s = ``fading``, and the plant's noise w = ``noise`` (n, k) times the inputs from column
     ``first`` on. Totals without information are left alone.
@@ -430,7 +435,7 @@ def flow_blocks(
     series: FloatArray, unit: float, scale: float, gap: float, nodes: FloatArray
 ) -> FloatArray:
     """Return the transposes (K + 1, 4, n, n) of the four blocks of exp(M s), row by row, at the
-    ``nodes`` (K,) of a gap and at its end.
+    ``nodes`` (K,) of a gap and at its end; M is the Hamiltonian of the Riccati equation of P.
 
     ``series`` (T, 2 n, 2 n) are the terms of the power series of exp(M s) in s / unit for
     covariances in units of ``scale``, which is removed from the result. ``nodes`` are fractions of
@@ -453,7 +458,8 @@ def flow_blocks(
 def flow_gramian(
     blocks: FloatArray, whitened: FloatArray, root_weights: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return F (n, n) and Gamma (K p, n) of a gap, see :mod:`netkf.theory.numerics.prediction`.
+    """Return F (n, n) and Gamma (K p, n) of a gap with continuous readings, from which the
+    covariance at its end follows for any covariance P at its start.
 
     F is the transition ``X(g)^-T`` without readings' effect on P(0), Gamma' Gamma the information
     that the readings of the gap give about the state at its start. ``blocks`` (K + 1, 4, n, n) are

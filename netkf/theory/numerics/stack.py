@@ -59,7 +59,8 @@ class GaussianStack:
         return np.array([self._index[name] for name in names], dtype=np.int64)
 
     def inputs(self, count: int) -> slice:
-        """Add ``count`` inputs, independent of all before, and return their columns.
+        """Add ``count`` inputs, standard normal numbers independent of all before, and return their
+        columns in the forms (coefficients of the inputs) of all vectors.
 
         The columns are valid until the next call.
         """

@@ -60,8 +60,9 @@ def update_covariance_root(
 def average_covariances(
     weights: list[float], roots: list[FloatArray]
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the root (n, n) of ``sum_j w_j P_j`` and the factors (J, n, n) of the errors, H (7),
-    (9).
+    """Return the reset of the hybrid paper, H (7) and (9), in which a node averages J estimates and
+    their P_j: the root (n, n) of ``sum_j w_j P_j``, and the factors (J, n, n) by which the new
+    error combines the J errors.
 
     ``weights`` are J numbers that add up to 1, ``roots`` J roots (n, n) of the P_j. The estimate is
     the convex combination, so that each error is multiplied by its weight.
@@ -75,7 +76,8 @@ def average_covariances(
 def intersect_covariances(
     weights: list[float], roots: list[FloatArray]
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the root (n, n) of P and the factors (J, n, n) of covariance intersection, D (8), (9).
+    """Return the covariance intersection of J estimates, D (8) and (9) of the diffusion paper: the
+    root (n, n) of the new P, and the factors (J, n, n) by which the new error combines the errors.
 
     ``weights`` are J numbers that add up to 1, ``roots`` J roots (n, n) of the P_j.
     ``P^-1 = sum_j w_j P_j^-1``; error j is multiplied by ``w_j P P_j^-1``.

@@ -31,7 +31,9 @@ def one_bit_update(P: ArrayLike, H: ArrayLike, R: ArrayLike) -> FloatArray:
 
 
 def bit_covariances(scenario: Scenario, run: Run) -> FloatArray:
-    """Return P (T, N, n, n) at the T times of a run in slots, from the messages that arrived."""
+    """Return P (T, N, n, n) of the sign-of-innovations filters of N nodes at the T times of a run
+    in slots, computed by their equations from which nodes' bits arrived.
+    """
     nodes, index, plant = scenario.nodes, scenario.topology.index, scenario.slot_plant
     F, Q = scenario.slot_belief
     sensors = [scenario.observation_matrices(node, believed=True) for node in nodes]
