@@ -313,7 +313,8 @@ def _check_independent(
     watched: WatchedPart, delivered: FloatArray, links: tuple[Link, ...]
 ) -> None:
     """Check that the outcomes ``delivered`` (C, K, L), 0 or 1, of C runs, K messages and L links
-    are independent of those of other links, and of those up to MAX_LAG messages later.
+    are independent of those of other links, and of those up to MAX_LAG messages later, as the loss
+    states by ``independent``.
     """
     p = delivered.mean(axis=(0, 1))
     expected = np.outer(p, p)

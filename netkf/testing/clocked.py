@@ -91,7 +91,9 @@ class ClockTrial(Trial):
         return FlowModel(self._A, self.system.Q, H, R, HORIZON, interval)
 
     def run(self) -> None:
-        """Check that ``predict`` composes, under one of the clocks, and run all rounds."""
+        """Run all rounds: time passes, sensors read, and nodes exchange messages; before that check
+        that predictions over two gaps compose, in the trial of one clock only.
+        """
         if self._clock in (None, *self.part.clocks[:1]):
             for node in self.nodes:
                 self._check_composition(node)
@@ -164,8 +166,9 @@ class ClockTrial(Trial):
                     self.step(node, "update", self.sample(node, self._time))
 
     def _moments(self, start: FloatArray, gap: float) -> FloatArray:
-        """Return moments (2 p,) of increments over ``gap`` seconds: noise, plus the effect of a
-        truth that is shifted by ``start`` (n,) at the beginning.
+        """Return the two moments (2 p,) of increments dy over ``gap`` seconds, as sensors give
+        them, the integrals of dy and of z dy with z from -1 to 1 over the gap: noise, plus the
+        effect of a truth that is shifted by ``start`` (n,) at the beginning.
         """
         noise = self.random.normal(size=2 * len(self.system.H)) * np.sqrt(gap)
         # Integrals of H e^{A s} start over s, weighted with the Legendre polynomials 1 and z.

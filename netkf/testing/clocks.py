@@ -97,8 +97,9 @@ def _all_entities(part: Any) -> tuple[Entity, ...]:
 
 
 def _check_entity(watched: WatchedPart, entity: Entity) -> None:
-    """Check that the ticks of one entity increase, are the same from equal generators, and do not
-    depend on how many are asked for at once.
+    """Check that the ticks of the clock of one ``entity`` (a link, direction or node, by ids)
+    increase, are the same from equal generators, and do not depend on how many are asked for at
+    once.
     """
     _check_origin(watched, entity)
     in_one_block = _read_ticks(watched, entity, BLOCKS[0])
@@ -124,7 +125,9 @@ def _check_entity(watched: WatchedPart, entity: Entity) -> None:
 
 
 def _check_interleaved(watched: WatchedPart, entities: tuple[Entity, ...]) -> None:
-    """Check that the ticks of each entity stay the same when other entities tick in between."""
+    """Check that the ticks of the clocks of some ``entities`` (links, directions or nodes, by ids)
+    stay the same when the others tick in between.
+    """
     part, where = watched.part, f"{watched.name}.ticks"
     with guard_user_code(where):
         alone = [list(_iterate_ticks(part, entity, k)) for k, entity in enumerate(entities)]
@@ -176,7 +179,8 @@ def _check_origin(watched: WatchedPart, entity: Entity) -> None:
 
 
 def _read_ticks(watched: WatchedPart, entity: Entity, blocks: tuple[int, ...]) -> FloatArray:
-    """Return the ticks (K,) of an entity in seconds, asked for in ``blocks`` of these sizes.
+    """Return the ticks (K,) of the clock of an ``entity`` (a link, direction or node) in seconds,
+    asked for in ``blocks`` of these sizes, from a generator with a fixed seed.
 
     Each block must be a float64 vector of at most its size, and empty after the clock stopped.
     """
@@ -235,8 +239,8 @@ def _first_difference(one: FloatArray, other: FloatArray) -> int:
 
 
 def _check_gaps(watched: WatchedPart, entities: tuple[Entity, ...], seed: int) -> None:
-    """Check the mean and the law of the gaps between ticks, from runs of all entities simulated
-    with ``seed``.
+    """Check the mean and the law of the gaps between ticks against what the user's clock states,
+    from runs of all ``entities`` (links, directions or nodes with a clock) simulated with ``seed``.
     """
     part, runs = watched.part, max(2, CHAINS // len(entities))
     stated = np.array([watched.call("mean_rate", entity) for entity in entities])
@@ -287,14 +291,15 @@ def _check_stated_law(watched: WatchedPart, gaps: FloatArray, times: FloatArray)
 
 
 def _read_chain(part: Any, entity: Entity, seed: int, run: int, stream: int) -> FloatArray:
-    """Return the first LENGTH ticks (LENGTH,) of an entity in a ``run`` of ``seed``, in seconds,
-    fewer if the clock stops.
+    """Return the first LENGTH ticks (LENGTH,) of the clock of an ``entity`` (a link, direction or
+    node) in a ``run`` of ``seed``, in seconds, fewer if the clock stops.
 
     ``stream`` numbers the generators of the entity; entities with different numbers are
     independent.
     """
     random = Streams(seed, run).generator("testing", stream)
     origin = part.origin(entity, lambda: Streams(seed, run).generator("phase", stream))
+    # From tick number 0 and time 0 on.
     return np.asarray(part.ticks(entity, origin, 0, 0.0, random, LENGTH))
 
 
@@ -319,8 +324,9 @@ def _check_generators_used(
 def _check_rates(
     watched: WatchedPart, entities: tuple[Entity, ...], gaps: FloatArray, stated: FloatArray
 ) -> None:
-    """Check the mean of ``gaps`` (E, runs, length) of E entities, in seconds, against their
-    ``stated`` rates (E,) in 1/s; entities with nan are compared with the median of all.
+    """Check the mean of ``gaps`` (E, runs, length) between ticks, in seconds, of the clocks of E
+    entities (links, directions or nodes) against their ``stated`` rates (E,) in 1/s; entities with
+    nan are compared with the median of all.
     """
     where, rule = f"{watched.name}.mean_rate", "must be the mean ticks per second in the long run"
     is_stated = ~np.isnan(stated)

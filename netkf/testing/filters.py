@@ -80,7 +80,9 @@ def former_names(node_filter: Filter) -> dict[str, str]:
 
 
 def _check_class_variables(watched: WatchedPart) -> None:
-    """Check the types and values of the class variables of a filter, such as ``clocks``."""
+    """Check the types and values of the class variables by which a user's filter states what it
+    does, such as ``clocks``; ``watched`` is the filter.
+    """
     part, name = watched.part, watched.name
     for flag in FLAGS:
         value = getattr(part, flag)
@@ -98,8 +100,9 @@ def _check_class_variables(watched: WatchedPart) -> None:
 
 
 def _check_schedule(watched: WatchedPart) -> None:
-    """Check the phases of a slot, the number of steps of each exchange, and that its first step
-    redraws the links.
+    """Check the schedule of a user's filter in slots: the names and order of the phases of a slot
+    ("predict", "sense", "exchange"), the number of steps of each exchange, and that in its first
+    step it is drawn anew which links are up.
     """
     part, where = watched.part, f"{watched.name}.{watched.defined_name('schedule')}"
     schedule = part.schedule

@@ -73,8 +73,7 @@ def check_matching_object(part: Any, topology: Topology | None, seed: int) -> No
         isinstance(part, Matching),
         watched.name,
         "must be derived from Matching, RecordedSlots or Broadcast",
-        None,
-        "derive it from netkf.parts.Matching and define draw and mean",
+        remedy="derive it from netkf.parts.Matching and define draw and mean",
     )
     before = watched.attributes()
     for network in accepted:

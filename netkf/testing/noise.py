@@ -36,8 +36,8 @@ class Deviation(NamedTuple):
 
 
 def critical_value(count: int) -> float:
-    """Return the number of standard errors beyond which one of ``count`` two-sided tests of a
-    family fails.
+    """Return the number of standard errors beyond which one of ``count`` two-sided tests fails, so
+    that all of them together (a family) fail by chance with the probability LEVEL / FAMILIES.
     """
     return float(-ndtri(0.5 * LEVEL / (FAMILIES * max(count, 1))))
 
@@ -46,6 +46,7 @@ def largest_deviation(values: FloatArray, min_values: int = MIN_VALUES) -> Devia
     """Return the most significant of the means of ``values`` (N, ...) over the first axis that
     differ significantly from zero; None if none does or N is less than ``min_values``.
 
+    The means are one family of tests, which together err with the probability LEVEL / FAMILIES.
     Values must be uncorrelated along the first axis.
     """
     count = len(values)
@@ -201,8 +202,9 @@ def check_independent(
 
 
 def minus_log_level(count: int) -> float:
-    """Return ``-log(level)`` for the significance level of each of ``count`` two-sided tests of a
-    family.
+    """Return ``-log(level)`` for the significance level of each of ``count`` two-sided tests that
+    together (a family) fail by chance with the probability LEVEL / FAMILIES; for bounds of the form
+    P(deviation) <= 2 exp(-exponent).
     """
     return math.log(2.0 * FAMILIES * max(count, 1) / LEVEL)
 

@@ -85,8 +85,9 @@ def largest_difference(child: WatchedPart, parent: WatchedPart) -> Difference | 
 
 
 def _trial_pairs(child: WatchedPart, parent: WatchedPart) -> Iterator[tuple[Trial, Trial, str]]:
-    """Yield pairs of trials of two filters with the same systems, readings and messages, each with
-    the unit of its time, "slot" or "round".
+    """Yield pairs of trials of a user's filter and of the built-in one that it derives from, with
+    the same systems, readings and messages, each with the unit of its time, "slot" or "round". A
+    trial is a short run of the filter at a few connected nodes.
     """
     parts = child.part, parent.part
     slots = None
@@ -111,16 +112,18 @@ def _trial_pairs(child: WatchedPart, parent: WatchedPart) -> Iterator[tuple[Tria
 def _clock_trial_pairs(
     child: WatchedPart, parent: WatchedPart, system: System, clock: str | None
 ) -> Iterator[tuple[Trial, Trial, str]]:
-    """Yield pairs of trials of child and parent in continuous time, with samples and, if both
-    filters take them, with increments; each with "round", the name of a trial's unit of time.
+    """Yield pairs of trials (short runs at a few nodes) of a user's filter and of the built-in one
+    that it derives from in continuous time, with samples and, if both filters take them, with
+    increments; each with "round", the name of a trial's unit of time.
 
-    ``clock`` is what a node transmits by: the kind of activation, None if filters do not talk.
+    ``clock`` is the kind of clock by which nodes transmit, None if filters send no messages.
     """
     # The clock "readings" ticks when a node has taken a sample.
     needs_samples = child.part.needs_samples or parent.part.needs_samples or clock == "readings"
     for increments in (False,) if needs_samples else (False, True):
         first, second = (
-            ClockTrial(watched, system, None, clock, increments) for watched in (child, parent)
+            ClockTrial(watched, system, shift=None, clock=clock, increments=increments)
+            for watched in (child, parent)
         )
         if len(first.nodes) == len(second.nodes):
             yield first, second, "round"

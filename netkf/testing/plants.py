@@ -256,7 +256,8 @@ def _check_noise(
 
 
 def _check_slots(part: LinearPlant, copy: LinearPlant, name: str, seed: int) -> None:
-    """Check a plant in slots: repeatable paths, moving frames, the law of x(0) and of the noise.
+    """Check a user's plant in slots: repeatable paths, also if states are kept relative to a moving
+    origin (in frames), the law of x(0) and that of the noise.
 
     ``copy`` is the plant after pickling, ``name`` the class in messages, ``seed`` that of the
     random generators.
@@ -284,6 +285,7 @@ def _check_slots(part: LinearPlant, copy: LinearPlant, name: str, seed: int) -> 
     when = "when slots are left out or asked for twice"
     _demand_same(where, path[gaps], draw_path(part, gaps), when)
     with guard_user_code(where):
+        # The same run once more, in frames.
         _compare_frames(part, where, path, part.truth(_make_generator(seed, 0), True))
     moved = _move_start(part)
     if moved is not None:
@@ -303,8 +305,9 @@ def _check_slots(part: LinearPlant, copy: LinearPlant, name: str, seed: int) -> 
 def _compare_frames(part: LinearPlant, where: str, path: FloatArray, truth: Any) -> None:
     """Check the ``truth`` of a run with moving frames against its ``path`` (K, n) without them.
 
-    Absolute states must be those of the path, and local states the same less the origin of the
-    frame, which moves by F and is the state where the frame begins.
+    A frame is a part of a run in which states are kept as differences from an origin, so that large
+    states lose no digits. Absolute states must be those of the path, and local states the same less
+    the origin of the frame, which moves by F and is the state where the frame begins.
     """
     frame = truth.frame_slots
     origin = np.zeros(part.n)
@@ -386,6 +389,7 @@ def _check_sampled(
     times = np.cumsum(time_constant * np.tile(GAPS, LENGTH // len(GAPS)))
     # At least eight times, two for each gap, however fast the plant grows.
     times = times[times <= max(max_seconds, times[7])]
+    # Every third time is one at which the state is only looked at; sensors sample at the others.
     sample_times, probe_times = np.delete(times, np.s_[::3]), times[::3]
     horizon = float(times[-1]) * 1.01
 
@@ -430,8 +434,9 @@ def _check_sampled(
 
 
 def _check_grid(part: Diffusion, name: str, seed: int, steps: int) -> None:
-    """Check the first ``steps`` steps of paths on the sensing grid: the same for several runs at
-    once and for one, with cuts and without, and with noise of the stated law.
+    """Check the first ``steps`` steps of a plant's paths on the sensing grid, the times at which
+    continuous sensors read: they are the same for several runs at once and for one, with steps cut
+    in between and without, and have noise of the stated law.
 
     ``name`` is the class in messages, ``seed`` that of the random generators.
     """

@@ -44,7 +44,9 @@ class SensorReader:
         self.p, self.n = len(sensor.R), sensor.H.shape[1]
 
     def make_path(self, streams: Streams, node: int) -> Any:
-        """Return the path of a node in a run with these random streams."""
+        """Return the object that gives the readings of a node in one run, its path, which the
+        sensor makes with the run's random ``streams``.
+        """
 
         def generator(purpose: str) -> np.random.Generator:
             """Return the random generator for a purpose of the sensor at the node."""
@@ -173,8 +175,8 @@ class IncrementReader:
         return IncrementPieces(np.array(all_moments), np.array(spans), np.array(step))
 
     def combine(self, pieces: IncrementPieces) -> FloatArray:
-        """Return the moments (S, 2, p) of the increments over S steps from those of their
-        pieces.
+        """Return the two moments (S, 2, p) of the increments over S whole steps, the integrals of
+        dy and of P_1 dy (P_1: Legendre polynomial), from those of the pieces of the steps.
         """
         total = np.zeros((int(pieces.step[-1]) + 1, 2, self.p))
         for moments, (start, end), k in zip(*pieces, strict=True):

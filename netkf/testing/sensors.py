@@ -124,9 +124,9 @@ def _make_states(seed: int, count: int, n: int, run: int = 0) -> FloatArray:
 def _check_same_readings(
     reader: SensorReader, copy: SensorReader, nodes: tuple[int, ...], seed: int
 ) -> None:
-    """Check that readings depend only on their streams, numbers and states: they stay the same if
-    others are read in between, if some are left out or taken together, and for ``copy``, which
-    reads the sensor after pickling.
+    """Check that readings depend only on their random streams, numbers and states: they stay the
+    same if others are read in between, if some are left out or taken together, and for ``copy``,
+    which reads the sensor after pickling. A path gives the readings of one node in one run.
 
     ``nodes`` are ids of nodes with the sensor; ``seed`` is that of states and streams.
     """
@@ -248,9 +248,9 @@ def _check_laws(reader: SensorReader, nodes: tuple[int, ...], seed: int) -> None
 
 
 def _check_increments(reader: IncrementReader, node: int, seed: int) -> None:
-    """Check the moments of increments at ``node`` (its id): those of pieces add up to those of
-    steps, equal streams give equal ones, another state changes them by H times its integral, and
-    their noise is white.
+    """Check the two moments of the increments dy (integrals over a time) that ``node`` (its id)
+    reads: those over pieces of steps add up to those of the steps, equal streams give equal ones,
+    another state changes them by H times its integral, and their noise is white.
 
     ``seed`` is that of states and streams.
     """
@@ -386,7 +386,7 @@ def _check_times(sensor: Any, name: str, nodes: tuple[int, ...], seed: int) -> N
         first, shorter, repeated = runs
         is_same = np.array_equal(first, repeated)
         remedy = "use the generators given"
-        demand(is_same, where, "must be the same for equal streams", None, remedy)
+        demand(is_same, where, "must be the same for equal streams", remedy=remedy)
         is_same = np.array_equal(first[first < 0.4 * horizon], shorter)
         rule = "must not depend on the length of the run"
         demand(is_same, where, rule, f"{len(shorter)} times before 0.4 T")

@@ -20,7 +20,8 @@ TOLERANCE = 1e-9  # relative to the estimates before the shift is subtracted
 
 
 def make_trials(watched: WatchedPart, shift: FloatArray | None = None) -> Iterator[Trial]:
-    """Yield the trials of a filter on all systems, in every kind of time that it supports.
+    """Yield the trials of a filter, each a short run of a few connected nodes on one small random
+    system: in slots and under each kind of clock, as far as the filter supports them.
 
     In each trial of a system of n states the truth is shifted by the first n components of
     ``shift`` (k,), unless that is None.
@@ -41,7 +42,8 @@ def make_trials(watched: WatchedPart, shift: FloatArray | None = None) -> Iterat
 
 
 def check_shift(watched: WatchedPart, trials: Sequence[Trial]) -> None:
-    """Check that a filter commutes with a shift of the truth.
+    """Check that a filter commutes with a shift of the truth, on which simulations of growing
+    states rely: they move the truth back to 0 from time to time, and all estimates with it.
 
     Each of the ``trials``, which have run, is repeated with a truth that is shifted on the way:
     estimates must be shifted like the truth, and covariances must be the same.
@@ -52,7 +54,9 @@ def check_shift(watched: WatchedPart, trials: Sequence[Trial]) -> None:
 
 
 def _compare_trials(watched: WatchedPart, trial: Trial, shifted: Trial) -> None:
-    """Check that the estimates of a trial equal those of a shifted one less the shift."""
+    """Check that the estimates of a ``trial`` (a short run of the user's filter at a few nodes)
+    equal those of the same trial with a shifted truth, from which the shift is subtracted already.
+    """
     # The shift itself adds an estimate of each node.
     others = [estimate for estimate in shifted.estimates if estimate.after != "shift"]
     for one, other in zip(trial.estimates, others, strict=True):

@@ -35,7 +35,10 @@ class SlotTrial(Trial):
         return SlotModel(self.system.M, self.system.Q, *self.matrices(has_sensor), PERIOD)
 
     def run(self) -> None:
-        """Run the phases of the schedule in all slots; the truth is shifted near the end."""
+        """Run the phases of the filter's schedule in all slots; the truth, and with it all states,
+        is shifted near the end: before the slot for filters that predict, whose estimates are of
+        its start, else after it.
+        """
         part, slots = self.part, self.slots or trial_slots(self.part)
         for slot in range(slots):
             if part.predicts and slot == slots - SLOTS_AFTER_SHIFT:
@@ -79,8 +82,8 @@ class SlotTrial(Trial):
             self.step(node, "update", reading)
 
     def _exchange(self, exchange: Exchange, lost: bool) -> None:
-        """Run one step of an exchange, with all messages ``lost`` or none, and check conserved
-        sums.
+        """Run one step of an exchange of messages at all nodes, with all messages ``lost`` or none,
+        and check that the sums over the nodes that the filter calls ``conserved`` do not change.
         """
         before = self.conserved_sums()
         payloads = {node: self.emit(node, exchange) for node in self._talking_nodes(exchange.slot)}

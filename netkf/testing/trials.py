@@ -79,7 +79,10 @@ class Trial(ABC):
         """
 
     def _start(self, node: int, models: Sequence[Any]) -> Any:
-        """Return the state of a node at time 0, whose estimate was checked."""
+        """Return the state that the filter's ``init`` makes for a node at time 0, from its model
+        and what it is told of the network; ``models`` are those of all nodes. Its estimate is
+        checked and recorded.
+        """
         degree = len(self.nodes) - 1
         own_weight = max(0.0, 1.0 - float(self.weights[:, node].sum()))
         information = np.stack([model.information for model in models])

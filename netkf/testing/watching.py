@@ -72,7 +72,7 @@ def make_part(
         for attribute in sorted(dir(cls))
         if getattr(_static_attribute(cls, attribute), "__isabstractmethod__", False)
     ]
-    demand(not missing, name, f"must define {', '.join(missing)}", None, "write what is missing")
+    demand(not missing, name, f"must define {', '.join(missing)}", remedy="write what is missing")
     if not isinstance(part, type):
         demand(not settings, name, "settings go with a class", sorted(settings), "leave them out")
         return part
@@ -89,9 +89,8 @@ _PLAIN = frozenset((str, bytes, bool, int, float, complex, type(None)))
 
 
 def collect_leaves(value: Any) -> Leaves:
-    """Return copies of all numbers, texts and arrays in a value, by their paths.
-
-    Generators and callables are left out.
+    """Return copies of all numbers, texts and arrays in a value, by their paths such as ``.P[0]``,
+    so that it can be found out later what has changed. Generators and callables are left out.
     """
     leaves: Leaves = {}
     _add_leaves([("", value)], "", set(), leaves)
@@ -101,7 +100,8 @@ def collect_leaves(value: Any) -> Leaves:
 def _add_leaves(
     members: Iterable[tuple[str, Any]], path: str, ancestors: set[int], leaves: Leaves
 ) -> None:
-    """Add the leaves in the ``members`` (name, value) of the value at ``path`` to ``leaves``.
+    """Add copies of the numbers, texts and arrays (leaves) in the ``members`` (name, value) of the
+    value at ``path`` to ``leaves``, by their paths.
 
     ``ancestors`` are the ids of the values that contain the members, so that cycles end.
     """
@@ -140,7 +140,9 @@ def _list_members(value: Any) -> Iterable[tuple[str, Any]]:
 
 
 def differing_path(one: Leaves, other: Leaves) -> str | None:
-    """Return the path of the first leaf in which two values differ; None if all are equal."""
+    """Return the path, such as ``.P[0]``, of the first number, text or array in which two values
+    differ, given as the results of :func:`collect_leaves`; None if all are equal.
+    """
     if one.keys() != other.keys():
         return (
             min(one.keys() ^ other.keys(), key=len, default="")
@@ -233,7 +235,9 @@ class WatchedPart:
         self._results: list[tuple[str, Any, Leaves]] = []
 
     def defined_name(self, method: str) -> str:
-        """Return the name by which the user's class defines a method or property."""
+        """Return the name by which the user's class defines a method or property, for messages: it
+        may still use a deprecated name of the contract.
+        """
         if method in self._former_names:
             return self._former_names[method]
         cls: Any = type(self._owner)
@@ -261,16 +265,14 @@ class WatchedPart:
                 fail(
                     where,
                     f"must not change its arguments, but changed {name}{path}",
-                    None,
-                    remedy,
+                    remedy=remedy,
                 )
         path = differing_path(attributes, self.attributes())
         demand(
             path is None,
             where,
             f"must not change its own object, but changed {path}",
-            None,
-            "keep what changes in the state that is handed in and returned",
+            remedy="keep what changes in the state that is handed in and returned",
         )
         result_leaves = [collect_leaves(result) for result in results]
         path = differing_path(result_leaves[0], result_leaves[-1])
@@ -289,7 +291,9 @@ class WatchedPart:
         return _UncheckedPart(self.part, self._owner, self._former_names)
 
     def attributes(self) -> Leaves:
-        """Return the leaves of the attributes of the component, except for cached properties."""
+        """Return copies of the numbers, texts and arrays in the attributes of the user's object, by
+        their paths, except for cached properties, which a call may compute and store.
+        """
         cls: Any = type(self._owner)
         attributes = {
             name: value
@@ -318,8 +322,7 @@ class WatchedPart:
             global_generator_states() == before,
             where,
             "must not use or seed global generators (numpy.random.*, random.*)",
-            None,
-            "draw from the generator that is handed in",
+            remedy="draw from the generator that is handed in",
         )
         return result
 
@@ -336,8 +339,7 @@ class WatchedPart:
                 path is None,
                 where,
                 f"returned something that a later call changed ({(path or '').lstrip('.')})",
-                None,
-                "return copies, share no buffers",
+                remedy="return copies, share no buffers",
             )
 
     def demand_unchanged(self, before: Leaves) -> None:
@@ -349,8 +351,7 @@ class WatchedPart:
             path is None,
             self.name,
             f"must not change its own object, but changed {path}",
-            None,
-            "keep what changes in the paths and states that its methods return",
+            remedy="keep what changes in the paths and states that its methods return",
         )
 
     def pickle_copy(self) -> Any:
@@ -395,8 +396,7 @@ def guard_user_code(where: str) -> Iterator[None]:
         global_generator_states() == before,
         where,
         "must not use or seed global generators (numpy.random.*, random.*)",
-        None,
-        "draw from the generator that is handed in",
+        remedy="draw from the generator that is handed in",
     )
 
 
