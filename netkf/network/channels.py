@@ -47,8 +47,8 @@ class Loss(Component):
     ) -> float:
         """Return the probability that message number ``message`` from link[0] reaches link[1].
 
-        ``bad`` is the state of the link. ``table_probability`` is the entry of the graph's table
-        for that direction, 1 without one.
+        ``bad``: the link is in the bad one of its two states, in which losses come in bursts.
+        ``table_probability`` is the entry of the graph's table for that direction, 1 without one.
         """
         raise NotImplementedError
 
