@@ -326,11 +326,13 @@ def _restore_statistics(arrays: Any) -> RunStatistics:
 
     texts = _read_texts(arrays)
     return RunStatistics(
-        moments("samples"),
-        moments("averages"),
-        moments("messages"),
-        arrays["totals"],
-        {name: (moments(f"conserved_{name}"), float(d)) for name, d in texts["conserved"].items()},
-        float(texts["rounding_from"]),
-        str(texts["fingerprint"]),
+        samples=moments("samples"),
+        averages=moments("averages"),
+        messages=moments("messages"),
+        totals=arrays["totals"],
+        conserved={
+            name: (moments(f"conserved_{name}"), float(d)) for name, d in texts["conserved"].items()
+        },
+        rounding_from=float(texts["rounding_from"]),
+        fingerprint=str(texts["fingerprint"]),
     )

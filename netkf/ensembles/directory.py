@@ -148,7 +148,13 @@ def _open_directory(
         size = min(size, MAX_TRACED_BLOCK)  # events of all runs of a block are in memory
     digest = scenario_digest(scenario)
     plan = RunIdentity(
-        digest, scenario.seed, runs, options.trace, engine, installation_digest(), size
+        scenario=digest,
+        seed=scenario.seed,
+        runs=runs,
+        trace=options.trace,
+        engine=engine,
+        installation=installation_digest(),
+        block=size,
     )
     unfinished = find_stored_blocks(out, scenario, plan) if options.resume else None
     if unfinished is None:
@@ -194,7 +200,9 @@ class _DirectoryWriter:
         self.scenario, self.directory, self.plan = scenario, directory, plan
         self.blocks = BlockCheckpoints(directory, scenario)
         name, seed = scenario.name, scenario.seed
-        self._manifest = Manifest(directory, name, seed, 0, plan.engine, plan.runs)
+        self._manifest = Manifest(
+            directory=directory, name=name, seed=seed, replica=0, engine=plan.engine, runs=plan.runs
+        )
         self._known: list[int] = []
         self._done = self.simulated = 0
         self._last_note = 0.0

@@ -161,30 +161,30 @@ def ensemble_of(scenario: Scenario, statistics: RunStatistics, seed: int, engine
     # Numbers of messages in all runs, from their means over runs.
     totals = statistics.messages.mean[0] * statistics.messages.size
     return Ensemble(
-        scenario.times,
-        scenario.nodes,
-        samples.size.astype(np.int64),
-        mean_P,
-        se_P,
-        mean_error,
-        se_error,
-        mean_nees,
-        se_nees,
-        statistics.averages.mean.reshape(-1, 3),
-        statistics.averages.standard_error().reshape(-1, 3),
-        {
+        times=scenario.times,
+        nodes=scenario.nodes,
+        runs=samples.size.astype(np.int64),
+        mean_P=mean_P,
+        se_P=se_P,
+        mean_error=mean_error,
+        se_error=se_error,
+        mean_nees=mean_nees,
+        se_nees=se_nees,
+        average=statistics.averages.mean.reshape(-1, 3),
+        se_average=statistics.averages.standard_error().reshape(-1, 3),
+        messages={
             name: round(total)
             for name, total in zip(MESSAGES, totals.tolist(), strict=True)
             if np.isfinite(total)
         },
-        int(statistics.totals[1]),
-        int(statistics.totals[0]),
-        seed,
-        engine,
-        statistics.fingerprint,
-        scenario.plant.truth_known,
-        statistics.rounding_from,
-        scenario,
+        diverged=int(statistics.totals[1]),
+        events=int(statistics.totals[0]),
+        seed=seed,
+        engine=engine,
+        fingerprint=statistics.fingerprint,
+        truth_known=scenario.plant.truth_known,
+        rounding_from=statistics.rounding_from,
+        scenario=scenario,
     )
 
 

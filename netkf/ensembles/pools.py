@@ -365,6 +365,7 @@ def make_pool(blocks: int, options: PoolOptions = ANYWHERE, open_ended: bool = F
     ``blocks`` worker processes, an executor, or a Dask scheduler.
 
     An ``open_ended`` pool is for several jobs, one after another.
+
     Raises ScenarioError if the options ask for two pools, or for one of the wrong kind.
     """
     workers, executor, scheduler = options.workers, options.executor, options.scheduler

@@ -91,7 +91,15 @@ def replicate_blocks(
         pool = make_pool(-(-runs // (blocks.size or 1)), pool)
     ended = False
     try:
-        job = Job(scenario, task, seed, first, 0, runs, blocks.size)
+        job = Job(
+            scenario=scenario,
+            task=task,
+            seed=seed,
+            first=first,
+            start=0,
+            stop=runs,
+            size=blocks.size,
+        )
         result = _gather(pool, job, together, merge, blocks, progress or _report_nothing)
         ended = True
     finally:

@@ -70,7 +70,7 @@ def find_stored_blocks(
         # Stopped before the manifest was written. Each block names its run: blocks of other runs
         # are removed when they are read.
         _check_scenario(out, scenario)
-        return StoredBlocks(out, size, False)
+        return StoredBlocks(directory=out, block=size, finished=False)
     manifest = read_manifest(out)
     if manifest["runs"]["wanted"] != plan.runs:
         rule, value = "the run was begun with another number of runs", manifest["runs"]["wanted"]
@@ -98,7 +98,7 @@ def find_stored_blocks(
         _require(out, lambda: check_files(out, manifest), "start in a new directory")
     if is_block_size(manifest.get("block")):
         size = manifest["block"]
-    return StoredBlocks(out, size, finished)
+    return StoredBlocks(directory=out, block=size, finished=finished)
 
 
 def _describe_difference(stored: Any, planned: Any) -> Any:

@@ -76,14 +76,14 @@ def merge(a: RunStatistics, b: RunStatistics) -> RunStatistics:
         for name, (sums, drift) in a.conserved.items()
     }
     return RunStatistics(
-        merge_moments(a.samples, b.samples),
-        merge_moments(a.averages, b.averages),
-        merge_moments(a.messages, b.messages),
-        a.totals + b.totals,
-        conserved,
-        min(a.rounding_from, b.rounding_from),
-        a.fingerprint,
-        a.traces + b.traces,
+        samples=merge_moments(a.samples, b.samples),
+        averages=merge_moments(a.averages, b.averages),
+        messages=merge_moments(a.messages, b.messages),
+        totals=a.totals + b.totals,
+        conserved=conserved,
+        rounding_from=min(a.rounding_from, b.rounding_from),
+        fingerprint=a.fingerprint,
+        traces=a.traces + b.traces,
     )
 
 
@@ -135,7 +135,15 @@ def _traced_run(
     status = engine.run(scenario, Streams(seed, replica), recorder, silent)
     sink.finish(recorder, status)
     run = collect_run(scenario, memory, recorder, seed, replica, engine.name, status)
-    trace = Trace(replica, run.log, run.times, run.x, run.xhat, run.P, run.error)
+    trace = Trace(
+        replica=replica,
+        log=run.log,
+        times=run.times,
+        x=run.x,
+        xhat=run.xhat,
+        P=run.P,
+        error=run.error,
+    )
     return sink.batch(), (trace,)
 
 
@@ -178,15 +186,15 @@ def run_values(batch: RunBatch, scenario: Scenario, first: int = 0) -> RunValues
     if copies > 1:
         averages = np.repeat(averages, nodes, axis=1)
     return RunValues(
-        slices,
-        reduced.samples,
-        copies,
-        np.concatenate([averages, _mean_of_nodes(averages)], axis=1),
-        count_messages(batch.counts, scenario.slotted),
-        batch.counts.sum(axis=1),
-        batch.diverged,
-        reduced.rounding_from,
-        dict(batch.sums),
+        pieces=slices,
+        samples=reduced.samples,
+        copies=copies,
+        averages=np.concatenate([averages, _mean_of_nodes(averages)], axis=1),
+        messages=count_messages(batch.counts, scenario.slotted),
+        events=batch.counts.sum(axis=1),
+        diverged=batch.diverged,
+        rounding_from=reduced.rounding_from,
+        sums=dict(batch.sums),
     )
 
 
@@ -230,13 +238,13 @@ def merge_runs(values: RunValues, piece: int) -> RunStatistics:
     of_averages = slice(0, -len(MESSAGES))
     of_messages = slice(-len(MESSAGES), None)
     return RunStatistics(
-        samples,
-        Moments(size, mean[:, of_averages].copy(), M2[:, of_averages].copy()),
-        Moments(size.copy(), mean[:, of_messages].copy(), M2[:, of_messages].copy()),
-        np.array([values.events[runs].sum(), values.diverged[runs].sum()]),
-        conserved,
-        float(values.rounding_from[runs].min()),
-        "",
+        samples=samples,
+        averages=Moments(size, mean[:, of_averages].copy(), M2[:, of_averages].copy()),
+        messages=Moments(size.copy(), mean[:, of_messages].copy(), M2[:, of_messages].copy()),
+        totals=np.array([values.events[runs].sum(), values.diverged[runs].sum()]),
+        conserved=conserved,
+        rounding_from=float(values.rounding_from[runs].min()),
+        fingerprint="",
     )
 
 

@@ -53,7 +53,7 @@ def summarise_ensemble(
             for name, (sums, drift) in statistics.conserved.items()
         }
     # Which recorded data runs used: the same in all runs, unless one diverged and ended early.
-    records = {} if statistics.totals[1] else record_usage(scenario, None)
+    records = {} if statistics.totals[1] else record_usage(scenario, sent=None)
     if records:
         summary["records"] = records
     return summary

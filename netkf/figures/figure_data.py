@@ -261,13 +261,13 @@ def reduce_samples(
         for values in (sink.sq_error, sink.trace, sink.nees, sink.first_component)
     )
     return FigureData(
-        scenario,
-        np.array(sink.times),
-        error,
-        trace,
-        nees,
-        summary["nodes"],
-        promised,
+        scenario=scenario,
+        times=np.array(sink.times),
+        sq_error=error,
+        trace=trace,
+        nees=nees,
+        node_averages=summary["nodes"],
+        promised=promised,
         rounding_from=np.inf if sink.rounding_from is None else sink.rounding_from,
         first_component=first_component,
         delivered=sink.delivered,
@@ -284,16 +284,16 @@ def reduce_ensemble(scenario: Scenario, ensemble: Ensemble, promised: PromisedTr
     """
     default_status = "diverged" if ensemble.diverged else "complete"
     return FigureData(
-        scenario,
-        ensemble.times,
-        np.trace(ensemble.mean_error, axis1=2, axis2=3),
-        np.trace(ensemble.mean_P, axis1=2, axis2=3),
-        ensemble.mean_nees,
-        _average_rows(scenario, ensemble, promised),
-        promised,
-        ensemble.seed,
+        scenario=scenario,
+        times=ensemble.times,
+        sq_error=np.trace(ensemble.mean_error, axis1=2, axis2=3),
+        trace=np.trace(ensemble.mean_P, axis1=2, axis2=3),
+        nees=ensemble.mean_nees,
+        node_averages=_average_rows(scenario, ensemble, promised),
+        promised=promised,
+        seed=ensemble.seed,
         # Only ensembles that were read from a directory have a status.
-        getattr(ensemble, "status", default_status),
+        status=getattr(ensemble, "status", default_status),
         runs=int(ensemble.runs.max(initial=0)),
         diverged=ensemble.diverged,
         rounding_from=ensemble.rounding_from,

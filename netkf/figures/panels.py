@@ -108,7 +108,7 @@ def _draw_estimates(axes: Any, data: FigureData) -> None:
     if data.first_component is None:
         draw_message(axes, NO_TRUTH)
         return
-    draw_nodes(axes, data, data.first_component, None)
+    draw_nodes(axes, data, data.first_component, se=None)
     axes.set(ylabel="estimate, first component", xlabel=SECONDS)
     draw_legend(axes)
 
@@ -165,7 +165,7 @@ def draw_nees(axes: Any, data: FigureData) -> None:
     if not np.isfinite(values).any():
         draw_message(axes, "NEES is unavailable: it needs an error and a regular P")
         return
-    draw_nodes(axes, data, values, None)
+    draw_nodes(axes, data, values, se=None)
     if len(data.nodes) > 1:
         mean = values.mean(axis=1)
         axes.plot(data.times, mean, color=INK, lw=2.0, label="mean of all nodes", zorder=4)

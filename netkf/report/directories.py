@@ -160,7 +160,15 @@ def read_source(directory: Path, replica: int | None = None, trust: bool = False
     run, ensemble = _choose_run(stored, replica)
     scenario = stored.scenario
     assert isinstance(scenario, Scenario)
-    return ReportSource(label, stored.manifest, scenario, text, run, ensemble, verdict=verdict)
+    return ReportSource(
+        label=label,
+        manifest=stored.manifest,
+        scenario=scenario,
+        scenario_text=text,
+        run=run,
+        ensemble=ensemble,
+        verdict=verdict,
+    )
 
 
 def _choose_run(

@@ -54,11 +54,11 @@ def find_worst_sample(run: StoredRun, summary: Mapping[str, Any]) -> WorstSample
     column = int(np.nanargmax(np.where(np.isfinite(means), means, -np.inf)))
     row = int(rows[np.argmax(square[rows, column])])
     return WorstSample(
-        run.nodes[column],
-        float(run.times[row]),
-        math.sqrt(max(0.0, float(means[column]))),
-        math.sqrt(max(0.0, float(square[row, column]))),
-        by_error,
+        node=run.nodes[column],
+        time=float(run.times[row]),
+        value=math.sqrt(max(0.0, float(means[column]))),
+        peak=math.sqrt(max(0.0, float(square[row, column]))),
+        by_error=by_error,
     )
 
 

@@ -147,7 +147,14 @@ def _collect_innovations(
     order = np.argsort(times, kind="stable")
     rows = np.array([len(values) for values in whitened])
     ordered = [whitened[k] for k in order.tolist()]
-    return Innovations(times[order], nodes[order], rows[order], nis[order], ordered, len(intervals))
+    return Innovations(
+        times=times[order],
+        nodes=nodes[order],
+        rows=rows[order],
+        nis=nis[order],
+        whitened=ordered,
+        increments=len(intervals),
+    )
 
 
 def _match_nodes(

@@ -86,7 +86,7 @@ def read_flags(path: Path, column: str) -> np.ndarray:
         types_by_name = dict(zip(file.schema_arrow.names, file.schema_arrow.types, strict=True))
         if not pa.types.is_boolean(types_by_name.get(column, pa.null())):
             raise DamagedError(f"{path.name} has no column {column} of truth values")
-        flags = _read_columns(file, source, path.name, [column], None)[column]
+        flags = _read_columns(file, source, path.name, [column], run=None)[column]
         if flags.null_count:
             raise DamagedError(f"{path.name} has missing values")
         return np.asarray(flags.to_numpy(), dtype=bool)
@@ -195,7 +195,7 @@ class ParquetSink(Sink):
             state_table(
                 self._replica,
                 self._nodes,
-                StateSamples(times, x, xhat, P, error),
+                StateSamples(times=times, x=x, xhat=xhat, P=P, error=error),
                 self._truth_known,
             )
         )
@@ -206,6 +206,7 @@ class ParquetSink(Sink):
         # samples are written, the table of events is finished nevertheless.
         with contextlib.ExitStack() as callbacks:
             if self._states is not None:
+                # Without samples there is no states.parquet.
                 callbacks.callback(self._states.close, None)
             if self._events is not None:
                 callbacks.callback(self._events.close, _empty_event_columns)
@@ -338,11 +339,11 @@ class _Table:
 
     @contextlib.contextmanager
     def _discard_on_failure(self) -> Iterator[None]:
-        """Remove the unfinished file if the body raises; its OSErrors become WriteErrors."""
+        """Remove the unfinished file if the body raises; OSErrors of the body become WriteErrors."""
         try:
             with writing_file(self._path):
                 yield
         except BaseException:
-            self._closed = False
+            self._closed = False  # discard() does nothing to a closed file
             self.discard()
             raise

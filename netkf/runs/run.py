@@ -105,14 +105,14 @@ def run_to_directory(
         promised = promise_traces(scenario, np.array(output.samples.times))
         summary = output.write_summary(promised, recorder.count, recorder.sums, status)
         completed = CompletedRun(
-            output.directory,
-            status,
-            summary,
-            output.samples,
-            promised,
-            recorder.total,
-            seconds,
-            chosen_engine.name,
+            directory=output.directory,
+            status=status,
+            summary=summary,
+            samples=output.samples,
+            promised=promised,
+            events=recorder.total,
+            seconds=seconds,
+            engine=chosen_engine.name,
         )
         if finish is not None:
             finish(completed)
@@ -140,7 +140,9 @@ def save(run: Run, scenario: Scenario, directory: str | Path) -> Path:
     if run.nodes != scenario.nodes or run.x.shape[1] != scenario.plant.n:
         rule = "must be a run of this scenario: its nodes or its state differ"
         raise ScenarioError("run", rule, run, "save it with the scenario it was simulated from")
-    output = _create_output(scenario, Path(directory), run.seed, run.replica, run.engine, True)
+    output = _create_output(
+        scenario, Path(directory), run.seed, run.replica, run.engine, tables=True
+    )
     for sink in output.sinks:
         sink.events(run.log)
         sink.exact_errors = run.exact_errors
@@ -218,17 +220,19 @@ def _create_output(
     directory = create_output_directory(out, scenario.name)
     channel = scenario.network.channel
     is_recorded = isinstance(channel.loss, RecordedLoss) or isinstance(channel.delay, RecordedDelay)
-    manifest = Manifest(directory, scenario.name, seed, replica, engine)
+    manifest = Manifest(
+        directory=directory, name=scenario.name, seed=seed, replica=replica, engine=engine
+    )
     # Written first, so that the directory of a process that is killed says "interrupted".
     manifest.write("interrupted", {})
     write_scenario(directory, scenario, seed)
     return _Output(
-        directory,
-        scenario,
-        SummarySink(),
-        ParquetSink(directory, scenario, replica, tables),
-        [SentPerLink()] if is_recorded else [],
-        manifest,
+        directory=directory,
+        scenario=scenario,
+        samples=SummarySink(),
+        tables=ParquetSink(directory, scenario, replica, tables),
+        links=[SentPerLink()] if is_recorded else [],
+        manifest=manifest,
     )
 
 

@@ -179,12 +179,12 @@ def promise_traces(scenario: Scenario, times: FloatArray) -> PromisedTraces:
         reason = str(error)
     notes = (_steady_note(scenario), mismatch_note(scenario), nees_note(scenario))
     return PromisedTraces(
-        bound,
-        _trace_or_nan(limit_covariance, scenario),
-        _trace_or_nan(central_covariance, scenario),
-        reason or reason_without_bound(scenario) or "",
-        limit_label(scenario),
-        tuple(filter(None, notes)),
+        bound=bound,
+        limit=_trace_or_nan(limit_covariance, scenario),
+        central=_trace_or_nan(central_covariance, scenario),
+        reason=reason or reason_without_bound(scenario) or "",
+        limit_label=limit_label(scenario),
+        notes=tuple(filter(None, notes)),
     )
 
 

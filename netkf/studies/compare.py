@@ -275,12 +275,12 @@ def compare(directories: Sequence[str | Path], confidence: float = 0.95) -> Comp
     ]
     rows += [ComparedRow(q, -1, tuple(Entry(*run.value(q, -1)) for run in runs)) for q in TRACES]
     return Comparison(
-        tuple(str(run.directory) for run in runs),
-        tuple(str(run.manifest.get("name", "")) for run in runs),
-        tuple(run.runs for run in runs),
-        confidence,
-        tuple(rows),
-        tuple(tuple(run.summary.get("notes", ())) for run in runs),
+        directories=tuple(str(run.directory) for run in runs),
+        names=tuple(str(run.manifest.get("name", "")) for run in runs),
+        runs=tuple(run.runs for run in runs),
+        confidence=confidence,
+        rows=tuple(rows),
+        notes=tuple(tuple(run.summary.get("notes", ())) for run in runs),
     )
 
 

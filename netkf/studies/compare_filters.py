@@ -182,7 +182,16 @@ def compare_filters(
     for label, scenario_of_filter, reason in candidates:
         if scenario_of_filter is None:
             # No quantities, consistency and traffic, but the reason why it cannot run.
-            rows.append(ComparedFilter(label, {}, "-", math.nan, math.nan, reason))
+            rows.append(
+                ComparedFilter(
+                    filter=label,
+                    quantities={},
+                    consistency="-",
+                    transmissions=math.nan,
+                    bytes=math.nan,
+                    status=reason,
+                )
+            )
             continue
         base = values[first] if label != first else None
         row = _make_row(label, values[label], base, traffic[label], scenario.plant.n, level)
@@ -191,7 +200,9 @@ def compare_filters(
                 row, predicts=scenario_of_filter.slotted and scenario_of_filter.node_filter.predicts
             )
         )
-    return FilterComparison(scenario.name, count, root, confidence, tuple(rows))
+    return FilterComparison(
+        scenario=scenario.name, runs=count, seed=root, confidence=confidence, rows=tuple(rows)
+    )
 
 
 def _simulate(scenario: Scenario, runs: int, seed: int, engine: str, pool: Pool) -> FilterValues:
@@ -277,7 +288,7 @@ def _make_candidate(scenario: Scenario, choice: Choice, engine: str) -> FilterEn
         candidate = make()
         choose_engine(engine, candidate)
     except (ScenarioError, EngineError) as error:
-        return FilterEntry(label, None, f"cannot run here: {error}")
+        return FilterEntry(label, scenario=None, reason=f"cannot run here: {error}")
     return FilterEntry(label, candidate)
 
 

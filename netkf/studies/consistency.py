@@ -85,13 +85,13 @@ def run_consistency(
     nis, expected_nis = _mean_nis(scenario, run, sigma, blurred)
     times = run.times[blurred.any(axis=1) & (run.times > 0.0)]
     return RunConsistency(
-        np.where(blurred, np.nan, nees)[after_start],
-        _mean(nees[after_start], blurred[after_start]),
-        _mean(_expected_nees(run.P, sigma)[after_start], blurred[after_start]),
-        nis,
-        expected_nis,
-        times[:1] if len(times) else np.full(1, np.inf),
-        np.array([np.isfinite(run.P).any()]),
+        samples=np.where(blurred, np.nan, nees)[after_start],
+        nees=_mean(nees[after_start], blurred[after_start]),
+        expected=_mean(_expected_nees(run.P, sigma)[after_start], blurred[after_start]),
+        nis=nis,
+        expected_nis=expected_nis,
+        blurred_from=times[:1] if len(times) else np.full(1, np.inf),
+        covariance_given=np.array([np.isfinite(run.P).any()]),
     )
 
 
@@ -385,7 +385,16 @@ def judge_consistency(
     if np.isfinite(blurred_from):
         reason = f"from {blurred_from:g} s on rounding of a large state blurs errors"
         notes = (*notes, f"{reason}: those samples are left out; shorten the horizon")
-    return Consistency(scenario.name, n, count, confidence, low, high, tuple(rows), notes)
+    return Consistency(
+        scenario=scenario.name,
+        n=n,
+        runs=count,
+        confidence=confidence,
+        low=low,
+        high=high,
+        rows=tuple(rows),
+        notes=notes,
+    )
 
 
 def _covariance_given(runs: Sequence[RunConsistency]) -> bool:
@@ -432,14 +441,14 @@ def _judge_node(
         mean = float(expected.mean()) if is_known else None
         verdict = _verdict(scenario, float(excesses.mean()), width, mean)
     return NodeConsistency(
-        scenario.nodes[i],
-        float(nees.mean()),
-        width,
-        float(expected.mean()),
-        share_inside,
-        float(np.mean([run.nis[i] for run in runs])),
-        float(np.mean([run.expected_nis[i] for run in runs])),
-        verdict,
+        node=scenario.nodes[i],
+        nees=float(nees.mean()),
+        width=width,
+        expected=float(expected.mean()),
+        inside=share_inside,
+        nis=float(np.mean([run.nis[i] for run in runs])),
+        expected_nis=float(np.mean([run.expected_nis[i] for run in runs])),
+        verdict=verdict,
     )
 
 

@@ -142,7 +142,7 @@ def estimate_quantities(
             base_value, influence_difference = base[name][0], influence - base[name][1]
             width = _width(influence_difference, level)
             gap = value - base_value
-            # Filters that are one algorithm differ by rounding.
+            # For certain, not by chance. Filters that are one algorithm differ by rounding.
             real = runs > 1 and abs(gap) > max(width, ROUNDING * abs(value))
             quantity = quantity._replace(
                 difference=gap, low=gap - width, high=gap + width, real=bool(real)

@@ -99,7 +99,17 @@ def match_messages(log: IntArray, swaps: bool, slotted: bool) -> Messages:
         counts = _last_of_instant(used_row[arrivals], sender[arrivals], rows[arrivals])
         outcome[arrivals[~counts]] = UNUSED
     sent, phase = log["t"][rows], log["phase"][rows]
-    return Messages(sender, receiver, number, sent, arrived, phase, outcome, rows, used_row)
+    return Messages(
+        sender=sender,
+        receiver=receiver,
+        number=number,
+        sent=sent,
+        arrived=arrived,
+        phase=phase,
+        outcome=outcome,
+        sent_row=rows,
+        used_row=used_row,
+    )
 
 
 class _Links(NamedTuple):
@@ -292,7 +302,16 @@ def _swap_flow(nodes: IntArray, rows: int, messages: Messages, used: IntArray) -
     target = segment(messages.receiver, np.maximum(messages.used_row, 0))
     last = segment(nodes, np.full(len(nodes), rows))
     ends = dict(zip(nodes.tolist(), last.tolist(), strict=True))
-    return Flow(messages, rows, node, start, origin, target, 1 - used, ends)
+    return Flow(
+        messages=messages,
+        rows=rows,
+        node=node,
+        start=start,
+        origin=origin,
+        target=target,
+        cost=1 - used,
+        last=ends,
+    )
 
 
 @dataclass(frozen=True, eq=False)

@@ -62,11 +62,11 @@ def _batch_metrics(values: RunValues) -> RunMetrics:
     """
     # averages (R, N + 1, 3): squared error, trace of P, NEES; the last row is of all nodes.
     return RunMetrics(
-        values.averages[:, :-1, 0],
-        values.averages[:, :-1, 1],
-        values.messages,
-        values.diverged[:, None],
-        values.rounding_from[:, None],
+        mean_square=values.averages[:, :-1, 0],
+        trace=values.averages[:, :-1, 1],
+        messages=values.messages,
+        diverged=values.diverged[:, None],
+        rounding_from=values.rounding_from[:, None],
     )
 
 

@@ -148,9 +148,25 @@ def decide_by_theory(problem: SizingProblem, value: float) -> Probe:
     reached = quantity <= target.limit
     if theory_is_exact(scenario, target):
         state = REACHED if reached else MISSED
-        return Probe(value, quantity, quantity, quantity, 0, state, EXACT)
+        return Probe(
+            value=value,
+            quantity=quantity,
+            low=quantity,
+            high=quantity,
+            runs=0,
+            target=state,
+            by=EXACT,
+        )
     # The quantity lies between 0 and the bound.
-    return Probe(value, quantity, 0.0, quantity, 0, REACHED if reached else NOT_SHOWN, BOUND)
+    return Probe(
+        value=value,
+        quantity=quantity,
+        low=0.0,
+        high=quantity,
+        runs=0,
+        target=REACHED if reached else NOT_SHOWN,
+        by=BOUND,
+    )
 
 
 def decide_by_both(problem: SizingProblem, plan: SimulationPlan, value: float) -> Probe:
@@ -245,17 +261,17 @@ class Search:
             self._probe(self._value_between(low, high) or low)
         problem, probes = self._problem, tuple(self.probes)
         return Sizing(
-            problem.key,
-            problem.target,
-            problem.by,
-            value,
-            misses,
-            grows,
-            confidence,
-            probes,
-            quantity,
-            _describe_certainty(probes, confidence, grows, value is None),
-            advise(problem, probes, value, misses, grows),
+            key=problem.key,
+            target=problem.target,
+            by=problem.by,
+            value=value,
+            misses=misses,
+            grows=grows,
+            confidence=confidence,
+            probes=probes,
+            quantity=quantity,
+            sure=_describe_certainty(probes, confidence, grows, value is None),
+            advice=advise(problem, probes, value, misses, grows),
         )
 
     def _detect_growth(self, first: Probe, last: Probe) -> bool:

@@ -95,7 +95,7 @@ def size(
     is_integer = _check_range(base, key, low, high)
     engine_used = choose_engine(engine, base.replace({key: low}))
     chosen = by or _choose_method(base, key, (low, high), parsed)
-    problem = SizingProblem(base, key, is_integer, parsed, chosen)
+    problem = SizingProblem(scenario=base, key=key, integer=is_integer, target=parsed, by=chosen)
     if chosen == "theory":
         quantity = quantity_by_theory(problem.at(low), parsed)[1]
         return Search(problem, partial(decide_by_theory, problem)).run(low, high, 1.0, quantity)
@@ -104,7 +104,9 @@ def size(
     # Bonferroni over all values and all interim looks at each of them.
     level = (1.0 - confidence) / (MAX_PROBES["simulation"] * _count_looks(runs, first))
     with shared_pool(runs, PoolOptions(workers, executor, scheduler)) as pool:
-        plan = SimulationPlan(task, runs, level, pool, progress, first)
+        plan = SimulationPlan(
+            task=task, runs=runs, level=level, pool=pool, progress=progress, first=first
+        )
         method = decide_by_both if chosen == "both" else decide_by_simulation
         decide = partial(method, problem, plan)
         return Search(problem, decide).run(low, high, confidence, quantity)

@@ -92,14 +92,14 @@ def _read_filter(row: dict[str, Any]) -> ComparedFilter:
     }
     sent, size = (int(row[k]) if math.isfinite(row[k]) else math.nan for k in TRAFFIC)
     return ComparedFilter(
-        row["filter"],
+        filter=row["filter"],
         # A filter that cannot run there has no quantities, and no consistency.
-        quantities if row["consistency"] != "-" else {},
-        row["consistency"],
-        sent,
-        size,
-        row["status"],
-        row["predicts"],
+        quantities=quantities if row["consistency"] != "-" else {},
+        consistency=row["consistency"],
+        transmissions=sent,
+        bytes=size,
+        status=row["status"],
+        predicts=row["predicts"],
     )
 
 

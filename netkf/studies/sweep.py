@@ -115,7 +115,7 @@ def plan_sweep(
     points = expand_grid(base, vary)
     for point in points:
         choose_engine(engine, point.scenario)
-    return SweepPlan(base, vary, points, runs, engine)
+    return SweepPlan(base=base, vary=vary, points=points, runs=runs, engine=engine)
 
 
 def _simulate_points(
