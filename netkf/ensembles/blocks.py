@@ -153,7 +153,9 @@ def _check_versions(required_versions: tuple[tuple[str, str], ...]) -> None:
 
 
 def _unpickle(packed: PackedScenario) -> Scenario:
-    """Return the scenario in a worker, after its modules have been made importable there."""
+    """Return the scenario of ``packed`` in a worker, after the folders of its plugged-in classes
+    have been made importable there; raises EngineError if one cannot be imported.
+    """
     if packed.versions:
         _check_versions(packed.versions)
     for name, folder in packed.modules:

@@ -85,7 +85,9 @@ class Ensemble(NotebookTable):
         return plot_by_name(self, figure)
 
     def _notebook_table(self) -> pd.DataFrame:
-        """Return averages over the samples after time 0, a row per node and one for all."""
+        """Return the table that notebooks show for the ensemble: averages over the samples after
+        time 0, a row per node and one for all.
+        """
         import pandas as pd
 
         mean, error = self.average, self.se_average

@@ -214,7 +214,9 @@ def _require(path: Path, check: Callable[[], None], remedy: str) -> None:
 
 
 def read_manifest(directory: Path) -> dict[str, Any]:
-    """Return ``manifest.json`` of a directory; raises ScenarioError if it is missing or damaged."""
+    """Return manifest.json of a directory that runs are to be resumed in; raises ScenarioError if
+    it is missing or damaged.
+    """
     try:
         manifest = read_document(directory / "manifest.json")
         require_form(manifest, MANIFEST)

@@ -49,7 +49,9 @@ class _Worker:
     """A worker process with its two pipes, and the task it works on (None if idle)."""
 
     def __init__(self, hide_main: bool) -> None:
-        """Start the process; with ``hide_main`` it does not import the user's script."""
+        """Start the process and its two pipes, for jobs and for results; with ``hide_main`` it does
+        not import the user's script, which would run it again.
+        """
         receiver, self._jobs = multiprocessing.Pipe(duplex=False)
         self.results, sender = multiprocessing.Pipe(duplex=False)
         self.task: _Task | None = None
@@ -199,7 +201,9 @@ class WorkerProcesses:
             future.set_result(result)
 
     def _discard_worker(self, worker: _Worker) -> None:
-        """Remove a dead worker and queue its task again, or fail it after MAX_ATTEMPTS deaths."""
+        """Remove a dead worker and queue its task again; after MAX_ATTEMPTS deaths, which the task
+        may cause, let its future fail.
+        """
         self._workers.remove(worker)
         worker.end()
         worker.join(0.0)

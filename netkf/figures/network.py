@@ -84,7 +84,9 @@ def _message_bytes(data: FigureData) -> int:
 
 
 def _explain_widths(data: FigureData) -> str:
-    """Return the sentences of the caption on widths of links and bytes of transmissions."""
+    """Return the sentences of the figure's caption on widths of links and, for one run, bytes of
+    transmissions.
+    """
     size = _message_bytes(data)
     links = "Links are as wide as the messages that they delivered. " if data.delivered else ""
     if len(data.scenario.topology.links) > MAX_LINKS:

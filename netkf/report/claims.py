@@ -348,7 +348,9 @@ def _judge_age(
 
 
 def _describe_ensemble(source: ReportSource) -> list[str]:
-    """Return a sentence on the worst node over all finished runs of an ensemble."""
+    """Return a sentence on the node of an ensemble with the largest RMS error over all finished
+    runs.
+    """
     ensemble = source.ensemble
     assert ensemble is not None
     errors = np.sqrt(ensemble.average[:, 0])  # RMS errors of the nodes, then of all together

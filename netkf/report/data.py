@@ -184,7 +184,9 @@ def positions(source: ReportSource, run: StoredRun) -> list[list[float]]:
 
 
 def _make_layout(source: ReportSource, run: StoredRun) -> dict[int, Any]:
-    """Return coordinates (2,) for each node, computed from the links."""
+    """Return coordinates (2,) at which a page draws each node of a network without positions,
+    computed from its links.
+    """
     graph: networkx.Graph[int] = networkx.Graph()
     graph.add_nodes_from(run.nodes)
     graph.add_edges_from(source.scenario.topology.links)

@@ -66,7 +66,9 @@ class ReportSource:
 
     @property
     def kind(self) -> str:
-        """The kind of the directory: run, ensemble, sweep, filters or verdict."""
+        """The kind of results in the directory: run, ensemble, sweep, filters (a comparison of
+        them) or verdict (of ``netkf check``).
+        """
         if self.sweep is not None:
             return "sweep"
         if self.filters is not None:

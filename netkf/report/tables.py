@@ -164,7 +164,9 @@ def _format_value(entry: Entry) -> str:
 
 
 def _difference_cells(entry: Entry) -> list[str]:
-    """Return the difference, its interval and whether it is certain as three texts."""
+    """Return the texts of three cells: the difference from the first directory, its interval, and
+    whether the interval excludes 0.
+    """
     if entry.difference is None:
         return ["-", "-", "-"]
     interval = "-"

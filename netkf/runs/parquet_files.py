@@ -201,7 +201,9 @@ class ParquetSink(Sink):
         )
 
     def close(self) -> None:
-        """Finish both files and rename them from NAME.part; raises WriteError."""
+        """Write what is left, finish events.parquet and states.parquet and rename them from
+        NAME.part; raises WriteError.
+        """
         # Callbacks run in reverse order and all of them run: if the disk is full when the last
         # samples are written, the table of events is finished nevertheless.
         with contextlib.ExitStack() as callbacks:
@@ -339,7 +341,7 @@ class _Table:
 
     @contextlib.contextmanager
     def _discard_on_failure(self) -> Iterator[None]:
-        """Remove the unfinished file if the body raises; OSErrors of the body become WriteErrors."""
+        """Remove the unfinished file if the body raises; OSErrors of it become WriteErrors."""
         try:
             with writing_file(self._path):
                 yield

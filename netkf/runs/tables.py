@@ -129,7 +129,9 @@ def _row_cells(name: str, row: dict[str, Any]) -> list[str]:
 
 
 def _limit_lines(summary: dict[str, Any], limit: str) -> list[str]:
-    """Return the line on the limits to compare traces with; no line if none is known."""
+    """Return the line on what theory gives to compare traces of P with: the limit of the bound on
+    them (called ``limit``) and a centralised filter; no line if none is known.
+    """
     traces = {limit: summary["limit"], "centralised filter": summary["central"]}
     limits = [
         f"{label} {format_number(value)}"
@@ -140,7 +142,9 @@ def _limit_lines(summary: dict[str, Any], limit: str) -> list[str]:
 
 
 def _nees_lines(nees: dict[str, Any]) -> list[str]:
-    """Return the line on the NEES of an ensemble; no line for a single run."""
+    """Return the line on how many mean NEES of an ensemble lie in the interval that holds if P is
+    exact; no line for a single run.
+    """
     if not math.isfinite(nees.get("inside", math.nan)):
         return []
     return [
@@ -151,7 +155,7 @@ def _nees_lines(nees: dict[str, Any]) -> list[str]:
 
 
 def _message_line(messages: dict[str, Any]) -> str:
-    """Return the line on the numbers of messages and transmissions."""
+    """Return the line on the numbers of messages sent, delivered and lost, and of transmissions."""
     transmissions = messages.get("transmissions")
     if transmissions is None or math.isnan(transmissions):  # in slots they are not counted
         transmissions = messages["sent"]

@@ -238,7 +238,7 @@ class Comparison(NotebookTable):
         return pd.DataFrame(rows)
 
     def document(self) -> dict[str, Any]:
-        """Return plain JSON values."""
+        """Return the comparison as plain JSON values, as ``netkf compare --json`` prints it."""
         rows = [
             {"quantity": q, "node": node, "entries": [entry._asdict() for entry in entries]}
             for q, node, entries in self.rows

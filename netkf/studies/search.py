@@ -389,7 +389,9 @@ def _advise_range(problem: SizingProblem, end: float, next_end: float) -> str:
 
 
 def _advise_runs(probe: Probe, target: Target) -> str:
-    """Return advice on the number of runs for an undecided value, or an empty string."""
+    """Return a text on how many runs would decide the ``probe``, a value of the key that was tried;
+    empty if it is decided.
+    """
     runs = _runs_to_decide(probe, target) if probe.target == UNDECIDED else math.nan
     if math.isnan(runs):
         return ""

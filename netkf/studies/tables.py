@@ -81,7 +81,7 @@ def format_sizing(sizing: Sizing) -> str:
 
 
 def format_answer(sizing: Sizing) -> str:
-    """Return the answer of a search as one sentence."""
+    """Return the answer of a search for a value of a key that reaches a target, as one sentence."""
     values = [probe.value for probe in sizing.probes]
     span = f"{min(values):g} .. {max(values):g}"
     if sizing.value is None:

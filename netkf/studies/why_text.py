@@ -116,7 +116,9 @@ def _message_entry(explanation: Explanation, key: MessageKey) -> dict[str, Any]:
 
 
 def format_why(explanation: Explanation) -> str:
-    """Return the answer for a terminal: sentences, the table of sources, the table of replays."""
+    """Return an explanation for a terminal: sentences, the table of sources (what had reached the
+    node from whom), and the table of replays with missing messages.
+    """
     lines = [
         *write_sentences(explanation),
         "",
@@ -129,7 +131,9 @@ def format_why(explanation: Explanation) -> str:
 
 
 def write_sentences(explanation: Explanation) -> list[str]:
-    """Return the answer in sentences, one line each."""
+    """Return an explanation in sentences, one line each: on the estimate, the messages, the
+    readings and the smallest set of messages that was missing.
+    """
     return [
         *_state_sentences(explanation),
         *_heard_sentences(explanation),
