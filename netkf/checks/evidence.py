@@ -180,7 +180,7 @@ def _judge(promise: Promise, finding: Finding, runs: int) -> Evidence:
     more runs may decide, and their number is forecast. A promise about a limit that is not reached
     (``early``) or about errors that rounding hides (``blurred``) is undecided.
     """
-    (margin, low, high), tolerance, message = finding[:3]
+    (margin, low, high), tolerance, message = finding.margin, finding.tolerance, finding.message
     needed = None
     if finding.blurred:
         verdict = UNDECIDED

@@ -139,7 +139,9 @@ def with_drawn(interval: Interval, sample_factor: Callable[[float], float]) -> I
 
 
 def deviation_interval(expected: float, interval: Interval) -> Interval:
-    """Return an interval for the distance |quantity - expected| from one for the quantity."""
+    """Return an interval for the distance |quantity - expected| from the ``interval`` of a
+    quantity that should be ``expected``; it excludes 0 if and only if the given one excludes that.
+    """
     covers = interval.low <= expected <= interval.high
     ends = abs(interval.low - expected), abs(interval.high - expected)
     low = 0.0 if covers else min(ends)
@@ -152,7 +154,15 @@ def deviation_interval(expected: float, interval: Interval) -> Interval:
         ends = interval.limits(expected + side * value, factor)
         return 0.0, max(abs(end - expected) for end in ends)
 
-    return Interval(distance, low, max(ends), interval.detectable, interval.value, expected, limits)
+    return Interval(
+        distance,
+        low,
+        max(ends),
+        interval.detectable,
+        seen=interval.value,
+        expected=expected,
+        again=limits,
+    )
 
 
 def band_width(samples: int, level: float) -> float:

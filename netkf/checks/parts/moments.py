@@ -331,6 +331,7 @@ def _between(sums: NoiseMoments, labels: list[str]) -> Iterator[tuple[float, flo
     """Yield correlation, number of terms and label of all pairs of entries of a noise at the same
     time, from its ``sums`` over all runs.
     """
+    # The squares of both factors are summed over the same terms as the products.
     correlations = _correlations(sums.second, sums.squares[0], sums.squares[0].T)
     for i in range(len(labels)):
         for j in range(i):
@@ -345,7 +346,8 @@ def _in_time(sums: NoiseMoments, labels: list[str]) -> Iterator[tuple[float, flo
     """Yield correlation, number of terms and label of all entries of a noise with all entries one
     step before, from its ``sums`` over all runs.
     """
-    correlations = _correlations(sums.lagged, *sums.squares[1:])
+    # The squares of both factors are summed over the same pairs as the products.
+    correlations = _correlations(sums.lagged, sums.squares[1], sums.squares[2])
     for i, label in enumerate(labels):
         for j, earlier_label in enumerate(labels):
             pairs = float(sums.pairs[i, j])

@@ -76,7 +76,7 @@ def path_law(scenario: Scenario) -> PathLaw | None:
 def _sizes(plant: Any, Phi: FloatArray, W: FloatArray, steps: int) -> FloatArray:
     """Return the root mean squares (steps, n) of the states before each of ``steps`` steps
     ``x+ = Phi x + w``, with Phi (n, n) and the covariance W (n, n) of w, from the start of
-    ``plant`` on.
+    ``plant`` on: the units of states when their correlation with the noise is tested.
     """
     mean, covariance, sizes = plant.start_mean, plant.start_cov, []
     for _ in range(steps):

@@ -88,8 +88,8 @@ def sampling_clocks(scenario: Scenario) -> ClockGroup:
 
 
 def count_ticks(scenario: Scenario, run: Run) -> TickCounts | None:
-    """Return the counts of a run's ticks in the network, in W windows of it and for each of E
-    clocks (W, E); None without clocks.
+    """Return the counts by which the E clocks of the network are compared with their stated laws,
+    from the ticks of a run in W windows (equal parts) of it; None without clocks.
     """
     group = network_clocks(scenario)
     if not group.entities:
@@ -107,8 +107,9 @@ def count_ticks(scenario: Scenario, run: Run) -> TickCounts | None:
 
 
 def count_samples(scenario: Scenario, streams: Streams) -> TickCounts | None:
-    """Return the counts of the times at which E sensors sample in a run, in W windows of it (W, E);
-    None without clocks.
+    """Return the counts by which the sampling clocks of E sensors are compared with their stated
+    laws, from the times at which they sample in a run, in W windows (equal parts) of it; None
+    without clocks. The times are drawn again from the run's ``streams``.
     """
     group = sampling_clocks(scenario)
     if not group.entities:

@@ -150,7 +150,9 @@ class DelayedJumps:
 
     def _apply_inverse(self, y: FloatArray) -> FloatArray:
         """Return the solution (k + 1, M, columns) of ``Y - integral B Y = y``, at the k + 1 points
-        of the delay, for y of the same shape: each column is a function of s with M = N n entries.
+        s of the delay, for y of the same shape: the differential equation dY/ds = B Y, driven by y,
+        with B (M, M) the mean drift of the M = N n errors. It is solved in every step that treats
+        errors over a delay.
 
         B is block diagonal, so that each node is solved by itself.
         """

@@ -32,7 +32,9 @@ def nodes_by_estimator(scenario: Scenario) -> list[tuple[int, ...]]:
 
 
 def _noises(scenario: Scenario) -> list[tuple[FloatArray, FloatArray]]:
-    """Return the assumed R (p, p) of each ``[[sensors]]`` entry and a root of the true one."""
+    """Return, for each ``[[sensors]]`` entry of the scenario, the noise covariance R (p, p) that
+    filters assume and a square root (p, p) of the true one, which may differ.
+    """
     # The gain is computed from the R that the filter assumes, the noise drawn with the true one.
     return [
         (
@@ -64,8 +66,9 @@ def increment_observations(scenario: Scenario) -> list[Observation]:
 
 
 def slot_observations(scenario: Scenario, run: Run) -> Callable[[int], EstimatorObservations]:
-    """Return a function from a slot (0-based) to the readings of that slot, by index of the
-    estimator; call it with increasing slots.
+    """Return a function from a slot (0-based) to the readings of that slot (H, the assumed R and a
+    root of the true R), by index of the estimator (the filter of a node, or one pooled filter);
+    call it with increasing slots.
 
     Estimators without sensors are missing; p is the number of readings of the slot.
     """
@@ -98,7 +101,9 @@ def slot_observations(scenario: Scenario, run: Run) -> Callable[[int], Estimator
 
 
 def timed_observations(scenario: Scenario, run: Run) -> dict[float, EstimatorObservations]:
-    """Return the samples of a run in continuous time, by time (seconds) and estimator.
+    """Return the readings of a run's sampled sensors in continuous time as H, the assumed R and a
+    root of the true R, by which errors are replayed: by time (seconds) and index of the estimator
+    that uses them (the filter of a node, or one pooled filter). The values read are not needed.
 
     Samples that one filter gets at one instant are one observation.
     """

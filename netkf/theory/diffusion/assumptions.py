@@ -33,9 +33,8 @@ def slot_rows(scenario: Scenario) -> list[AssumptionRow]:
 
 
 def sparse_weights(scenario: Scenario) -> scipy.sparse.csr_array:
-    """Return W (N, N), sparse: node i gives weight W[l, i] to the message of l, D (8).
-
-    These are the weights if all messages arrive.
+    """Return the weights W (N, N), sparse, by which nodes combine estimates, D (8): node i gives
+    weight W[l, i] to the estimate of l. These are the weights if all messages arrive.
     """
     index, own_weights = scenario.topology.index, scenario.own_weights
     size, directions = len(scenario.nodes), scenario.topology.directions

@@ -350,8 +350,9 @@ class _PiecewiseSolution:
 
 
 def _growth_event(limit: float) -> Callable[[float, FloatArray], float]:
-    """Return an event for ``solve_ivp``, a function of the time and the solution (N m,), that ends
-    it where the largest entry exceeds ``limit``; never if that is infinite.
+    """Return an event for scipy's ``solve_ivp``, a function of the time and the solution (N m,),
+    that ends it where the largest entry exceeds ``limit``, so that tolerances can be chosen anew;
+    never if that is infinite.
     """
 
     def margin(_: float, y: FloatArray) -> float:
@@ -425,7 +426,10 @@ def _joseph_update(P: FloatArray, observation: Observation) -> FloatArray:
 
 
 def _limit_evaluations(slope: Slope) -> Slope:
-    """Return ``slope``, which raises StiffError after MAX_EXPLICIT_EVALUATIONS calls."""
+    """Return the right-hand side ``slope`` of a differential equation as a function that raises
+    StiffError after MAX_EXPLICIT_EVALUATIONS calls, so that an explicit solver gives up and an
+    implicit one is tried.
+    """
     evaluations_left = MAX_EXPLICIT_EVALUATIONS
 
     def limited(t: float, y: FloatArray) -> FloatArray:

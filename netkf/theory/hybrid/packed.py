@@ -153,15 +153,17 @@ class PackedRiccati:
         change += group.heard @ arriving
 
     def series(self, Y: FloatArray, span: float, order: int) -> FloatArray:
-        """Return the Taylor coefficients (order + 1, N, m) of the solution through ``Y`` (N, m).
+        """Return the Taylor coefficients (order + 1, N, m) of the solution of the coupled Riccati
+        equations through ``Y`` (N, m), rows of m entries for the symmetric matrix of each node.
 
         Without delay, in powers of seconds / ``span``. The right-hand side is quadratic, so that
         each coefficient follows from those before it.
         """
         series = np.empty((order + 1, *Y.shape))
         series[0] = Y
-        # P G P is the sum of M_i M_j' over i + j = k with M = P C. Nodes come last, so that numpy
-        # runs along them; the half with i <= j and its transpose are enough.
+        # With G = C C' at nodes with a sensor, coefficient k of P G P is the sum of M_i M_j' over
+        # i + j = k with M = P C. Nodes come last, so that numpy runs along them; the half with i <=
+        # j and its transpose are enough.
         n, r, sensed = self._across.shape
         products = np.empty((order, n, r, sensed))
         for k in range(order):

@@ -110,7 +110,8 @@ def transmits_at_samples(scenario: Scenario) -> bool:
 
 
 def mean_link_weights(scenario: Scenario) -> dict[tuple[int, int], float]:
-    """Return delivery probability times weight of messages sent at samples.
+    """Return the mean effect of messages that nodes send when they sample: for each link the
+    delivery probability times the weight that the receiver gives to a message.
 
     Keys are the indices (receiver, sender); empty if the nodes do not transmit at samples.
     """

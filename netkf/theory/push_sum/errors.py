@@ -238,6 +238,8 @@ class RunningTotalsRule(ErrorRule):
             return
         weight, share = self._weights[estimator], 1.0 / (count + 1)
         inverse = np.linalg.inv(self.errors.roots[estimator])
+        # The information of the share, and the form of its error: a form is the matrix that gives
+        # an error as a linear function of all noises so far.
         U = (share * weight / self.errors.estimators) * (inverse.T @ inverse)
         old_total = self._totals[name]
         new_total, form = old_total + share * weight, stack.form(name) - U @ stack.form(estimator)

@@ -48,7 +48,9 @@ def slot_promises(scenario: Scenario) -> dict[str, Any]:
         return [float(trace) for trace in np.trace(covariance, axis1=1, axis2=2)]
 
     def exact_gamma() -> int:
-        """Return the least gamma with stable mean squares; raises TheoryError for large N n."""
+        """Return the least gamma (number of averaging steps in a slot) with stable mean-square
+        errors; raises TheoryError for large N n.
+        """
         if not searches_gamma(scenario):
             raise TheoryError(
                 f"not looked for: the nodes have more than {MAX_SEARCHED} states together; "
@@ -62,12 +64,15 @@ def slot_promises(scenario: Scenario) -> dict[str, Any]:
         return [probability.low, probability.high]
 
     def corollary() -> dict[str, float]:
-        """Return the numbers of Corollary 2 by name."""
-        result = corollary_2(scenario)
-        return result._asdict()
+        """Return the gamma that the paper's Corollary 2 calls sufficient for unbiased estimates,
+        and what its Theorem 5 says of it, by name.
+        """
+        return corollary_2(scenario)._asdict()
 
     def leader() -> int:
-        """Return the slots until all nodes know the leader with probability AGREEMENT."""
+        """Return the slots of a leader's election by max-consensus until all nodes know the leader
+        (the one node that starts with a push-sum weight) with probability AGREEMENT.
+        """
         probabilities = leader_agreement(scenario, MAX_LEADER_SLOTS)
         undecided = probabilities < AGREEMENT
         if undecided.all():

@@ -62,7 +62,8 @@ class ScheduleRule(ErrorRule):
 
     def exchange(self, slot: int, phase: int, messages: Sequence[SentMessage]) -> None:
         """Update the estimates of all nodes by every sensor of this ``slot``, whether it sent or
-        not; changes their errors and roots of P.
+        not; changes their errors and roots of P. Called by the replay once in a slot; who sent is
+        known from the log, so that ``messages`` are not used.
         """
         columns = self.errors.reading_noises(self._observations)
         for estimator, observation in self._observations.items():
@@ -73,10 +74,11 @@ class ScheduleRule(ErrorRule):
 
 
 def silence(reading: Observation, Y: float | FloatArray) -> Observation:
-    """Return the observation to which silence is equivalent: the same H (p, n), with noise R + Y^-1
-    (p, p).
+    """Return the observation to which a node's silence is equivalent for the others, who do not get
+    its ``reading``: the same H (p, n), with noise R + Y^-1 (p, p).
 
-    ``Y`` (p, p), or a number times I, is the matrix of the trigger.
+    ``Y`` (p, p), or a number times I, is the matrix of the stochastic trigger: a node is silent
+    with probability exp(-z' Y z / 2), z being the innovation of its reading.
     """
     R = silence_noise(reading.R, Y)
     # The true noise, whose root the reading has, may differ from the believed R.
