@@ -12,7 +12,9 @@ TREE = "the graph has no loops"
 
 
 def slot_rows(scenario: Scenario) -> list[AssumptionRow]:
-    """Return the rows about the model, the graph and the first covariances."""
+    """Return the assumptions, as rows of the table, about the model, the graph and the first
+    covariances.
+    """
     return model_and_start_rows(scenario, SOURCE, *weight_rows(scenario))
 
 

@@ -54,8 +54,8 @@ class BeliefRule(ErrorRule):
             errors.copy(estimator, _prior_name(estimator), estimator)
 
     def _put_evidence(self, name: Hashable, U: FloatArray, s: FloatArray) -> None:
-        """Set U (n, n) and the form of s (n, inputs) of the item of evidence ``name``, in the stack
-        of errors.
+        """Set an item of evidence ``name`` in the stack of errors: its information U (n, n), and
+        the form (n, inputs) of its s = sum of H' R^-1 v, the coefficients of all noises in it.
         """
         self._evidence.add(name)
         self.errors.stack.put(name, s)
@@ -67,7 +67,9 @@ class BeliefRule(ErrorRule):
         self.errors.stack.drop(names)
 
     def _sum_evidence(self, names: Sequence[Hashable]) -> tuple[FloatArray, FloatArray]:
-        """Return the sums of U (n, n) and of the forms of s (n, inputs) of the items present."""
+        """Return the evidence of several readings together: the sums of U (n, n) and of the forms
+        of s (n, inputs) of those of the items ``names`` that there are.
+        """
         stack, n = self.errors.stack, self.errors.n
         present_names = [name for name in names if name in self._evidence]
         U = sum((stack.matrices[stack.index(name)] for name in present_names), np.zeros((n, n)))
@@ -75,7 +77,7 @@ class BeliefRule(ErrorRule):
 
     def elapse(self, gap: float, columns: slice | None, noise: FloatArray | None) -> None:
         """Predict all evidence over ``gap`` seconds; changes U and s of every item. The plant's
-        noise, in ``columns``, is not needed.
+        noise, in ``columns``, is not needed. Called by the replay between events.
         """
         if gap > 0.0:
             self._predict_evidence(np.asarray(scipy.linalg.expm(-gap * self.scenario.belief[0])))
@@ -92,7 +94,9 @@ class BeliefRule(ErrorRule):
             self._put_evidence(name, back.T @ U @ back, back.T @ stack.form(name))
 
     def _begin_slot(self) -> None:
-        """Predict the evidence that is kept, or begin with the estimates as priors."""
+        """Prepare a slot: predict the evidence (U, s) that is kept from earlier slots; or, if the
+        filter keeps none, drop it and take the present estimates as priors.
+        """
         if self._keeps:
             self._predict_evidence(
                 np.asarray(np.linalg.inv(self.scenario.slot_belief[0]), dtype=np.float64)
@@ -105,7 +109,7 @@ class BeliefRule(ErrorRule):
 
     def sense(self, time: float, observations: EstimatorObservations) -> None:
         """Add the readings of ``time`` (seconds, or the slot) to the nodes' own evidence, and
-        update the beliefs of the nodes that read.
+        update the beliefs of the nodes that read. Called by the replay at every time of readings.
         """
         if self.scenario.slotted:
             self._begin_slot()
@@ -148,7 +152,8 @@ class BeliefRule(ErrorRule):
 
     def exchange(self, slot: int, phase: int, messages: Sequence[SentMessage]) -> None:
         """Pass the messages of all steps of exchange number ``phase`` of a ``slot`` that arrived;
-        changes the evidence and the beliefs of all nodes.
+        changes the evidence and the beliefs of all nodes. Called by the replay for each exchange of
+        a slot.
         """
         estimators = self.errors.estimators
         no_arrivals = np.zeros((estimators, estimators))
@@ -164,14 +169,16 @@ class BeliefRule(ErrorRule):
             self._update_belief(estimator)
 
     def send(self, messages: Sequence[SentMessage]) -> None:
-        """Store the contents of each message that arrives later."""
+        """Store the contents of each message that arrives later. Called by the replay when messages
+        leave.
+        """
         for message in messages:
             if message.late:
                 self._put_evidence(message, *self._evidence_for(message.sender, message.receiver))
 
     def arrive(self, time: float, messages: Sequence[SentMessage]) -> None:
         """Replace the earlier evidence of each sender, unless that was sent later, and update the
-        beliefs of the receivers at ``time`` (seconds).
+        beliefs of the receivers at ``time`` (seconds). Called by the replay when messages arrive.
         """
         late = [message for message in messages if message.late]
         # Contents first: a message has the sender's evidence before this instant's messages.
@@ -205,7 +212,8 @@ def error_rule(
     scenario: Scenario, errors: StackedErrors, run: Run, messages: Sequence[SentMessage]
 ) -> ErrorRule:
     """Return the rule by which the filter by belief propagation uses the readings and messages of a
-    run; it changes ``errors``, the stacked errors of all nodes, event by event.
+    run. The replay of the run, which computes its exact errors from its events, calls the rule at
+    each event; it changes ``errors``, the stacked errors of all nodes.
 
     ``messages`` are those of the run that arrived (none in slots, where the rule gets them slot by
     slot).

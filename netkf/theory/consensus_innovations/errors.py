@@ -41,8 +41,10 @@ class PseudoStateRule(ErrorRule):
             errors.stack.put(_difference_name(estimator), np.zeros((errors.n, 0)))
 
     def sense(self, time: float, observations: EstimatorObservations) -> None:
-        """Predict the differences yhat - G xhat of all nodes over a slot, and keep the readings of
-        the slot for ``exchange``; ``time`` is not used.
+        """Predict the differences of all nodes over a slot between the estimate yhat of the
+        pseudo-state G x (G the information of all sensors) and G xhat, and keep the readings of the
+        slot for ``exchange``; ``time`` is not used. Called by the replay at every time of
+        readings.
         """
         self._observations, self._slot, stack = observations, self._slot + 1, self.errors.stack
         # yhat - G xhat does not depend on the plant's noise, since yhat and G xhat share it.
@@ -59,7 +61,7 @@ class PseudoStateRule(ErrorRule):
         """Correct the estimates of all nodes by the messages and readings of the present slot;
         changes their errors, differences and roots of P.
 
-        ``slot`` and ``phase`` are not used.
+        ``slot`` and ``phase`` are not used. Called by the replay for each exchange of a slot.
         """
         errors, G, estimators = self.errors, self._pseudo.G, range(self.errors.estimators)
         columns = errors.reading_noises(self._observations)
@@ -102,7 +104,8 @@ def error_rule(
     scenario: Scenario, errors: StackedErrors, run: Run, messages: Sequence[SentMessage]
 ) -> ErrorRule:
     """Return the rule by which the filter by consensus plus innovations uses the readings and
-    messages of a run; it changes ``errors``, the stacked errors of all nodes, event by event.
+    messages of a run. The replay of the run, which computes its exact errors from its events, calls
+    the rule at each event; it changes ``errors``, the stacked errors of all nodes.
 
     ``messages`` are those of the run that arrived (none in slots, where the rule gets them slot by
     slot).

@@ -24,7 +24,7 @@ class ConstantGainRule(EstimateExchangeRule):
 
     def sense(self, time: float, observations: EstimatorObservations) -> None:
         """Move the error of each estimator to ``(I - L H) e - L v``, with its gain L (n, p);
-        changes its root of P with it.
+        changes its root of P with it. Called by the replay at every time of readings.
         """
         algorithm: Any = self.scenario.filter.algorithm
         errors = self.errors
@@ -47,7 +47,7 @@ class ConstantGainRule(EstimateExchangeRule):
 
         ``roots`` are J roots (n, n) of P: that of the ``node`` first, then those of the messages,
         whose ``weights`` are J - 1 numbers; the node's own estimate has the weight 1 - sum of
-        ``weights``.
+        ``weights``. Called by the replay for every receiver at every arrival.
         """
         return average_covariances([1.0 - sum(weights), *weights], roots)
 
@@ -56,8 +56,9 @@ def error_rule(
     scenario: Scenario, errors: StackedErrors, run: Run, messages: Sequence[SentMessage]
 ) -> ErrorRule:
     """Return the rule by which the filter with constant gains uses the readings and messages of a
-    run; it changes ``errors``, the stacked errors of all nodes, event by event. Raises TheoryError
-    for sensors that give increments.
+    run. The replay of the run, which computes its exact errors from its events, calls the rule at
+    each event; it changes ``errors``, the stacked errors of all nodes. Raises TheoryError for
+    sensors that give increments.
 
     All filters' rules are made by a function with these arguments; ``messages``, those of the run
     that arrived, are not used here.

@@ -24,7 +24,7 @@ class DiffusionRule(EstimateExchangeRule):
 
         ``roots`` are J roots (n, n) of P: that of the ``node`` first, then those of the messages,
         whose ``weights`` are J - 1 numbers. Weights of lost messages are shared as the filter does,
-        so that the weights sum to 1.
+        so that the weights sum to 1. Called by the replay for every receiver at every arrival.
         """
         algorithm: Any = self.scenario.filter.algorithm
         own_weight, heard_weights = algorithm.share(self.scenario.own_weights[node], weights)
@@ -34,8 +34,9 @@ class DiffusionRule(EstimateExchangeRule):
 def error_rule(
     scenario: Scenario, errors: StackedErrors, run: Run, messages: Sequence[SentMessage]
 ) -> ErrorRule:
-    """Return the rule by which the diffusion filter uses the readings and messages of a run; it
-    changes ``errors``, the stacked errors of all nodes, event by event.
+    """Return the rule by which the diffusion filter uses the readings and messages of a run. The
+    replay of the run, which computes its exact errors from its events, calls the rule at each
+    event; it changes ``errors``, the stacked errors of all nodes.
 
     ``messages`` are those of the run that arrived (none in slots, where the rule gets them slot by
     slot).

@@ -28,7 +28,7 @@ class DiffusionKalmanRule(ErrorRule):
 
     def sense(self, time: float, observations: EstimatorObservations) -> None:
         """Update by the nodes' own readings of the slot ``time``, and keep them for their
-        neighbours.
+        neighbours. Called by the replay at every time of readings.
         """
         self._observations, self._columns = observations, self.errors.reading_noises(observations)
         for estimator, observation in observations.items():
@@ -36,7 +36,8 @@ class DiffusionKalmanRule(ErrorRule):
 
     def exchange(self, slot: int, phase: int, messages: Sequence[SentMessage]) -> None:
         """Use the readings that arrived (``phase`` READINGS), or combine the estimates (the other
-        phase); changes errors and, with readings, roots of P of the receivers.
+        phase); changes errors and, with readings, roots of P of the receivers. Called by the replay
+        for each exchange of a slot.
         """
         if phase == READINGS:
             for message in messages:
@@ -63,8 +64,9 @@ class DiffusionKalmanRule(ErrorRule):
 def error_rule(
     scenario: Scenario, errors: StackedErrors, run: Run, messages: Sequence[SentMessage]
 ) -> ErrorRule:
-    """Return the rule by which the diffusion Kalman filter uses the readings and messages of a run;
-    it changes ``errors``, the stacked errors of all nodes, event by event.
+    """Return the rule by which the diffusion Kalman filter uses the readings and messages of a run.
+    The replay of the run, which computes its exact errors from its events, calls the rule at each
+    event; it changes ``errors``, the stacked errors of all nodes.
 
     ``messages`` are those of the run that arrived (none in slots, where the rule gets them slot by
     slot).

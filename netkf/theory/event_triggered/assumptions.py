@@ -12,7 +12,9 @@ NO_LOSS = "no message is lost"
 
 
 def slot_rows(scenario: Scenario) -> list[AssumptionRow]:
-    """Return the rows about the model, the messages and the first covariances."""
+    """Return the assumptions, as rows of the table, about the model, the messages and the first
+    covariances.
+    """
     lossless = all_messages_arrive(scenario)
     evidence = "neighbours have what was sent" if lossless else "a sender does not notice a loss"
     return model_and_start_rows(scenario, SOURCE, (NO_LOSS, SOURCE, lossless, evidence))

@@ -24,7 +24,8 @@ class SwapRule(EstimateExchangeRule):
         all others.
 
         ``roots`` are J roots (n, n) of P: that of the ``node`` first, then those of the messages,
-        whose ``weights`` have no meaning here.
+        whose ``weights`` have no meaning here. Called by the replay for every receiver at every
+        arrival.
         """
         n, others = self.errors.n, len(roots) - 1
         return roots[-1], np.concatenate([np.zeros((others, n, n)), np.eye(n)[None]])
@@ -33,8 +34,9 @@ class SwapRule(EstimateExchangeRule):
 def error_rule(
     scenario: Scenario, errors: StackedErrors, run: Run, messages: Sequence[SentMessage]
 ) -> ErrorRule:
-    """Return the rule by which the gossip filter uses the readings and messages of a run; it
-    changes ``errors``, the stacked errors of all nodes, event by event.
+    """Return the rule by which the gossip filter uses the readings and messages of a run. The
+    replay of the run, which computes its exact errors from its events, calls the rule at each
+    event; it changes ``errors``, the stacked errors of all nodes.
 
     ``messages`` are those of the run that arrived (none in slots, where the rule gets them slot by
     slot).

@@ -25,7 +25,7 @@ class ResetRule(EstimateExchangeRule):
 
         ``roots`` are J roots (n, n) of P: that of the ``node`` first, then those of the messages,
         whose ``weights`` are J - 1 numbers; the node's own estimate has the weight 1 - sum of
-        ``weights``.
+        ``weights``. Called by the replay for every receiver at every arrival.
         """
         all_weights = [1.0 - sum(weights), *weights]
         if self.scenario.node_filter.combination == "intersection":
@@ -37,7 +37,8 @@ def error_rule(
     scenario: Scenario, errors: StackedErrors, run: Run, messages: Sequence[SentMessage]
 ) -> ErrorRule:
     """Return the rule by which the hybrid filter, or covariance intersection, uses the readings and
-    messages of a run; it changes ``errors``, the stacked errors of all nodes, event by event.
+    messages of a run. The replay of the run, which computes its exact errors from its events, calls
+    the rule at each event; it changes ``errors``, the stacked errors of all nodes.
 
     ``messages`` are those of the run that arrived (none in slots, where the rule gets them slot by
     slot).

@@ -22,13 +22,17 @@ TOLERANCE = 1e-12  # of a count: rounding of products of weights
 
 
 def slot_rows(scenario: Scenario) -> list[AssumptionRow]:
-    """Return the rows about the model, the weights of readings and the first covariances."""
+    """Return the assumptions, as rows of the table, about the model, the weights of readings and
+    the first covariances.
+    """
     once: AssumptionRow = (ONCE, "derived", *_judge_counts(scenario))
     return model_and_start_rows(scenario, SOURCE, once)
 
 
 def _judge_counts(scenario: Scenario) -> tuple[bool, str]:
-    """Return verdict and evidence on the largest number of times that a node counts a reading."""
+    """Return whether no node counts a reading more than once in its estimate, as weights and
+    averaging may make it do, and a text with the largest number of times.
+    """
     weights, channel = step_weights(scenario), scenario.network.channel
     steps = scenario.node_filter.exchange_steps(0)
     # A node that hears nothing counts its own reading in full, whatever the weights.

@@ -67,12 +67,15 @@ class ConsensusRule(ErrorRule):
         self._observations: EstimatorObservations = {}
 
     def sense(self, time: float, observations: EstimatorObservations) -> None:
-        """Store the readings of the slot for ``exchange``."""
+        """Store the readings of the slot for ``exchange``. Called by the replay at every time of
+        readings.
+        """
         self._observations = observations
 
     def exchange(self, slot: int, phase: int, messages: Sequence[SentMessage]) -> None:
         """Update all estimates by the predictions and readings with their weights in exchange
-        ``phase`` of this ``slot``; changes errors and roots of P.
+        ``phase`` of this ``slot``; changes errors and roots of P. Called by the replay for each
+        exchange of a slot.
         """
         nothing = np.zeros_like(self._weights)
         heard = [
@@ -106,7 +109,8 @@ def error_rule(
     scenario: Scenario, errors: StackedErrors, run: Run, messages: Sequence[SentMessage]
 ) -> ErrorRule:
     """Return the rule by which the filter by consensus on information uses the readings and
-    messages of a run; it changes ``errors``, the stacked errors of all nodes, event by event.
+    messages of a run. The replay of the run, which computes its exact errors from its events, calls
+    the rule at each event; it changes ``errors``, the stacked errors of all nodes.
 
     ``messages`` are those of the run that arrived (none in slots, where the rule gets them slot by
     slot).

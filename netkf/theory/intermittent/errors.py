@@ -96,7 +96,8 @@ def error_rule(
     scenario: Scenario, errors: StackedErrors, run: Run, messages: Sequence[SentMessage]
 ) -> ErrorRule:
     """Return the rule by which the filter with intermittent observations uses the readings and
-    messages of a run; it changes ``errors``, the stacked errors of all nodes, event by event.
+    messages of a run. The replay of the run, which computes its exact errors from its events, calls
+    the rule at each event; it changes ``errors``, the stacked errors of all nodes.
 
     ``messages`` are those of the run that arrived (none in slots, where the rule gets them slot by
     slot).

@@ -38,13 +38,16 @@ class KcfRule(ErrorRule):
         """Forget the predictions and readings of an earlier instant if ``gap`` (seconds) is
         positive; a message of this instant must find those of this instant only.
 
-        The plant's noise is not needed: predictions are not kept over a gap.
+        The plant's noise is not needed: predictions are not kept over a gap. Called by the replay
+        between events.
         """
         if gap > 0.0:
             self._forget()
 
     def _forget(self) -> None:
-        """Drop the predictions and readings of the slot before."""
+        """Drop the predictions and readings that are kept of the slot or instant before; the
+        consensus is on predictions of one instant only.
+        """
         self.errors.drop(
             [
                 name
@@ -66,7 +69,7 @@ class KcfRule(ErrorRule):
 
     def sense(self, time: float, observations: EstimatorObservations) -> None:
         """Update by the nodes' own readings of ``time`` (seconds, or the slot), and keep their
-        predictions from before them.
+        predictions from before them. Called by the replay at every time of readings.
         """
         self._forget()
         for estimator in observations:
@@ -76,7 +79,9 @@ class KcfRule(ErrorRule):
             self.errors.update(estimator, observation, self._columns[estimator])
 
     def send(self, messages: Sequence[SentMessage]) -> None:
-        """Copy the sender's prediction for each message that arrives later."""
+        """Copy the sender's prediction for each message that arrives later. Called by the replay
+        when messages leave.
+        """
         for message in messages:
             if message.late:
                 self.errors.copy(self._prediction_name(message.sender), message, None)
@@ -84,7 +89,7 @@ class KcfRule(ErrorRule):
     def arrive(self, time: float, messages: Sequence[SentMessage]) -> None:
         """Add the consensus terms of messages that arrive at ``time`` (seconds, or the slot), and
         use the readings of those without delay; changes errors, and roots of P where readings are
-        used.
+        used. Called by the replay when messages arrive.
         """
         inboxes: dict[int, dict[int, SentMessage]] = {}
         # Messages of one sender can overtake each other: the last one sent counts.
@@ -133,8 +138,9 @@ def _prior_name(estimator: int) -> Hashable:
 def error_rule(
     scenario: Scenario, errors: StackedErrors, run: Run, messages: Sequence[SentMessage]
 ) -> ErrorRule:
-    """Return the rule by which the Kalman-consensus filter uses the readings and messages of a run;
-    it changes ``errors``, the stacked errors of all nodes, event by event.
+    """Return the rule by which the Kalman-consensus filter uses the readings and messages of a run.
+    The replay of the run, which computes its exact errors from its events, calls the rule at each
+    event; it changes ``errors``, the stacked errors of all nodes.
 
     ``messages`` are those of the run that arrived (none in slots, where the rule gets them slot by
     slot).

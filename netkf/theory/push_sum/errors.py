@@ -126,8 +126,9 @@ class AveragingRule(ErrorRule):
         total information G and the number N of nodes that each has learned from push-sum, its
         equations 6 to 8. Changes errors and roots of P.
 
-        It is called at each sensing time of the run. Columns of ``_z``: 0 the weight, 1 the
-        mass whose ratio to the weight is N, from 2 on that for G.
+        It is called at each sensing time of the run. Columns of ``_z``: 0 the weight, 1 the mass
+        whose ratio to the weight is N, from 2 on that for G. Called by the replay at every time of
+        readings.
         """
         n, errors = self.errors.n, self.errors
         heard = self._z[:, 0] > 0.0  # before any weight arrives a node knows its own sensor only

@@ -12,7 +12,9 @@ HEARD = "every node hears every other, without losses"
 
 
 def slot_rows(scenario: Scenario) -> list[AssumptionRow]:
-    """Return the rows about the model, the network and the first covariances."""
+    """Return the assumptions, as rows of the table, about the model, the network and the first
+    covariances.
+    """
     heard = all_hear_all(scenario)
     evidence = "silence is a decision" if heard else "who misses a message takes it for silence"
     return model_and_start_rows(scenario, SOURCE, (HEARD, SOURCE, heard, evidence))

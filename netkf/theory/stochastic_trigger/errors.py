@@ -57,7 +57,9 @@ class ScheduleRule(ErrorRule):
         self._observations: EstimatorObservations = {}
 
     def sense(self, time: float, observations: EstimatorObservations) -> None:
-        """Store the readings of the slot for ``exchange``."""
+        """Store the readings of the slot for ``exchange``. Called by the replay at every time of
+        readings.
+        """
         self._observations = observations
 
     def exchange(self, slot: int, phase: int, messages: Sequence[SentMessage]) -> None:
@@ -90,7 +92,8 @@ def error_rule(
     scenario: Scenario, errors: StackedErrors, run: Run, messages: Sequence[SentMessage]
 ) -> ErrorRule:
     """Return the rule by which filters under the stochastic trigger use the readings, sent or not,
-    of a run; it changes ``errors``, the stacked errors of all nodes, slot by slot.
+    of a run. The replay of the run, which computes its exact errors from its events, calls the rule
+    at each event; it changes ``errors``, the stacked errors of all nodes.
 
     Raises TheoryError where silence may be a loss, or the filters do not know the law of
     innovations.

@@ -15,7 +15,7 @@ SOURCES = {
 
 
 def slot_rows(scenario: Scenario) -> list[AssumptionRow]:
-    """Return the rows about the model and the first covariances."""
+    """Return the assumptions, as rows of the table, about the model and the first covariances."""
     source = SOURCES[scenario.node_filter.combination]
     rows = model_and_start_rows(scenario, source)
     if scenario.node_filter.combination != "tracks":

@@ -29,11 +29,11 @@ from netkf.trace.run import Run
 def fusion_weight(
     own_root: FloatArray, other_root: FloatArray, inverse: bool, trace: bool
 ) -> float:
-    """Return the weight, in 0 .. 1, of the first of two covariances with the roots ``own_root`` and
-    ``other_root`` (n, n).
+    """Return the weight, in 0 .. 1, of the first of two estimates that are fused, from the roots
+    ``own_root`` and ``other_root`` (n, n) of their covariances.
 
     ``inverse`` is for inverse covariance intersection, else covariance intersection; the weight
-    minimises the trace of the result, or its determinant without ``trace``.
+    minimises the trace of the fused covariance, or its determinant without ``trace``.
     """
     n = len(own_root)
     first, second = (np.ascontiguousarray(triangular_root(S)) for S in (own_root, other_root))
@@ -52,7 +52,7 @@ class PairRule(EstimateExchangeRule):
         the estimate of each message in turn, in the order of the senders.
 
         ``roots`` are J roots (n, n) of P: that of the ``node`` first, then those of the messages;
-        ``weights`` of links are not used.
+        ``weights`` of links are not used. Called by the replay for every receiver at every arrival.
         """
         algorithm: Any = self.scenario.filter.algorithm
         root, factors = roots[0], [np.eye(len(roots[0]))]
@@ -68,8 +68,9 @@ class PairRule(EstimateExchangeRule):
 def fuse_inversely(
     weights: list[float], roots: list[FloatArray]
 ) -> tuple[FloatArray, list[FloatArray]]:
-    """Return the root (n, n) of P and the factors (n, n) of both errors of inverse covariance
-    intersection, for two ``weights`` with sum 1 and two ``roots`` (n, n).
+    """Return the fusion of two estimates by inverse covariance intersection: the root (n, n) of P,
+    and the factors (n, n) by which the new error combines both errors, for two ``weights`` with sum
+    1 and two ``roots`` (n, n) of their covariances.
     """
     P_a, P_b = (S @ S.T for S in roots)
     inverses = [np.linalg.inv(P_a), np.linalg.inv(P_b)]
@@ -97,7 +98,7 @@ class TrackRule(ErrorRule):
 
     def sense(self, time: float, observations: EstimatorObservations) -> None:
         """Update the tracks by the readings of the slot ``time``; a node that hears nothing shows
-        its own.
+        its own. Called by the replay at every time of readings.
         """
         self._joint = updated_joint(predicted_joint(self._joint, self._models[0]), self._sensors)
         columns = self.errors.reading_noises(observations)
@@ -107,7 +108,7 @@ class TrackRule(ErrorRule):
 
     def exchange(self, slot: int, phase: int, messages: Sequence[SentMessage]) -> None:
         """Combine each node's track with those that it heard in this ``slot``; changes the errors
-        that nodes show, not the tracks.
+        that nodes show, not the tracks. Called by the replay for each exchange of a slot.
         """
         heard: dict[int, list[int]] = {}
         for message in messages:
@@ -144,7 +145,8 @@ def error_rule(
     scenario: Scenario, errors: StackedErrors, run: Run, messages: Sequence[SentMessage]
 ) -> ErrorRule:
     """Return the rule by which track fusion, by cross-covariances or by pairs, uses the readings
-    and messages of a run; it changes ``errors``, the stacked errors of all nodes, event by event.
+    and messages of a run. The replay of the run, which computes its exact errors from its events,
+    calls the rule at each event; it changes ``errors``, the stacked errors of all nodes.
     """
     if scenario.slotted:
         require_traced_exchanges(scenario, run)
