@@ -69,7 +69,9 @@ def _check_covariance(where: str, P: FloatArray) -> None:
 
 
 def check_state_pickles(watched: WatchedPart, state: Any) -> None:
-    """Check that a state can be pickled and that the copy gives the same estimate."""
+    """Check that a node's ``state`` of a user's filter can be pickled, as for worker processes, and
+    that the copy gives the same estimate.
+    """
     where = f"{watched.name}.init"
     try:
         copy = pickle.loads(pickle.dumps(state))

@@ -100,8 +100,8 @@ def _check_recorded(part: RecordedSlots, name: str) -> None:
 
 
 def _check_network(watched: WatchedPart, copy: Any, topology: Topology, seed: int) -> None:
-    """Check the draws of ``seed`` on one graph: form, repeatability, frequencies, independence of
-    slots.
+    """Check the matchings (pairs of nodes that exchange in a slot) that a user's class draws on one
+    graph with ``seed``: form, repeatability, frequencies, independence of slots.
 
     ``copy`` is the object after pickling, which must draw the same.
     """

@@ -166,7 +166,8 @@ def _name_components(i: int, j: int) -> str:
 
 def check_uncorrelated(one: FloatArray, other: FloatArray, labels: NoiseLabels, apart: str) -> None:
     """Check that unit noises ``one`` (..., q) and ``other`` (..., r), paired along all but the last
-    axis, are uncorrelated; ``apart`` says in messages how they are related.
+    axis, are uncorrelated; ``labels`` and ``apart`` say in messages which noises they are and how
+    they are related.
     """
     first, second = one.reshape(-1, one.shape[-1]), other.reshape(-1, other.shape[-1])
     deviation = largest_deviation(first[:, :, None] * second[:, None])

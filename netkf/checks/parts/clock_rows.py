@@ -307,8 +307,9 @@ def _check_gaps(group: Group, samples: PartSamples, level: float) -> Finding:
     """Test the null hypothesis that gaps between ticks follow the stated law and are independent;
     ``group`` selects the clocks of the network or those of the sensors from the samples.
 
-    Under it the gaps, as uniform numbers, fill CELLS cells of equal probability evenly, and
-    neighbouring gaps, as normal numbers, have correlation 0; each test gets half of the level.
+    Under it the gaps, which their stated distribution function transforms to uniform numbers, fill
+    CELLS cells of equal probability evenly, and neighbouring gaps, transformed further to normal
+    numbers, have correlation 0; each test gets half of the level.
     """
     counts = group(samples).counts
     finding = compare_cells(counts.cells.sum(axis=0), ["all clocks"], level / 2.0, "gaps")
@@ -316,6 +317,7 @@ def _check_gaps(group: Group, samples: PartSamples, level: float) -> Finding:
     if correlation is None:
         return finding
     distance = deviation_interval(0.0, correlation)
+    # The correlation is reported if it is significant, and the law of single gaps is not wrong.
     if distance.low > 0.0 and not finding.margin[2] < 0.0:
         label = "neighbouring gaps"
         return find_largest([(distance, label)], finding.tolerance, "largest correlation")

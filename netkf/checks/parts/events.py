@@ -77,9 +77,9 @@ def count_losses(scenario: Scenario, run: Run) -> LossCounts | None:
     return LossCounts(
         sent,
         lost,
-        np.bincount(lost_at[followed], minlength=size),
-        np.bincount(lost_at[after_loss], minlength=size),
-        np.bincount(lost_at[both_lost], minlength=size),
+        followed=np.bincount(lost_at[followed], minlength=size),
+        repeated=np.bincount(lost_at[after_loss], minlength=size),
+        both=np.bincount(lost_at[both_lost], minlength=size),
     )
 
 

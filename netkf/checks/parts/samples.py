@@ -60,13 +60,13 @@ def summarise_parts(scenario: Scenario, run: Run) -> PartSummary:
     """
     streams = Streams(run.seed, run.replica)
     return PartSummary(
-        count_ticks(scenario, run),
-        count_losses(scenario, run),
-        count_pairs(scenario, run),
-        plant_moments(scenario, streams),
-        reading_moments(scenario, streams),
-        count_delays(scenario, run),
-        count_samples(scenario, streams),
+        ticks=count_ticks(scenario, run),
+        fates=count_losses(scenario, run),
+        pairs=count_pairs(scenario, run),
+        steps=plant_moments(scenario, streams),
+        readings=reading_moments(scenario, streams),
+        delays=count_delays(scenario, run),
+        sampling=count_samples(scenario, streams),
     )
 
 

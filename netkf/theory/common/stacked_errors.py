@@ -212,9 +212,10 @@ class StackedErrors:
             self.roots[name] = root
 
     def predict(self, step: Prediction) -> slice:
-        """Predict all estimates, and the state if errors follow it, by one ``step``; changes the
-        stack and all roots of P. Return the columns of the k inputs of the plant's noise, which the
-        step adds.
+        """Predict the errors of all estimates and the roots of their P by one ``step``, and the
+        state if errors follow it, because the filters' A (or F) is not the plant's; changes the
+        stack. Return the columns of the k inputs of the plant's noise, random numbers that the step
+        adds.
         """
         stack, noise = self.stack, step.error_noise
         columns = stack.inputs(noise.shape[1])

@@ -132,8 +132,9 @@ def mean_covariance_bounds(
     The lower bound S counts slots without a reading only, ``S+ = (1 - g) F S F' + Q``; the upper
     one X applies Jensen's inequality to the concave f_1, ``X+ = (1 - g) f_0(X) + g f_1(X)``. The
     lower one grows without bound if (1 - g) alpha^2 >= 1 for the largest modulus alpha of the
-    eigenvalues of F: equation (29) of the paper R, for probabilities g up to (31). The upper one
-    stays bounded for g above (32). Raises TheoryError for wrong arguments.
+    eigenvalues of F, as equations 29 and 31 of the paper on intermittent observations say. The
+    upper one stays bounded for g above that paper's upper bound, equation 32, on the critical
+    probability. Raises TheoryError for wrong arguments.
     """
     system, g = check_system(F, Q, H, R), check_delivery(delivery)
     first = as_covariance("start", start, len(system.F))

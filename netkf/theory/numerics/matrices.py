@@ -75,9 +75,10 @@ def as_covariance(name: str, value: ArrayLike, n: int) -> FloatArray:
 def riccati_flow(P: ArrayLike, A: ArrayLike, Q: ArrayLike, G: ArrayLike, gap: float) -> FloatArray:
     """Solve dP = A P + P A' + Q - P G P from ``P`` over ``gap`` >= 0 seconds; return P(gap) (n, n).
 
-    All matrices are (n, n); ``G = H' R^-1 H``, H (4b). The relative error is about 1e-15 for any
-    gap. Raises TheoryError for wrong shapes, a P, Q or G that is not positive semidefinite, a
-    negative or infinite gap, and if the solution overflows.
+    This is the covariance of a Kalman-Bucy filter, H (4b) of the hybrid paper. All matrices are
+    (n, n); ``G = H' R^-1 H``. The relative error is about 1e-15 for any gap. Raises TheoryError for
+    wrong shapes, a P, Q or G that is not positive semidefinite, a negative or infinite gap, and if
+    the solution overflows.
     """
     drift = as_square("A", A)
     n = len(drift)

@@ -69,8 +69,8 @@ def steady_tracks(scenario: Scenario) -> tuple[FloatArray, float]:
 
 
 def _mean_reported_covariance(scenario: Scenario, joint: FloatArray, i: int) -> FloatArray:
-    """Return the mean covariance (n, n), over losses, of the estimate that node i (an index)
-    reports.
+    """Return the mean covariance (n, n), over losses, of the error of the estimate that node i (an
+    index) reports: the best combination of its own Kalman filter (its track) and those heard.
 
     ``joint`` (N, N, n, n) are the covariances of all steady tracks. Raises TheoryError if more than
     MAX_NEIGHBOURS links to the node have losses.
