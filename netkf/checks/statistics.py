@@ -125,8 +125,9 @@ def affine(interval: Interval, scale: float, shift: float) -> Interval:
 
 
 def with_drawn(interval: Interval, sample_factor: Callable[[float], float]) -> Interval:
-    """Return ``interval`` with a forecast for an estimate whose samples do not grow in proportion
-    to the runs: ``factor`` times the runs mean ``sample_factor(factor)`` times the samples.
+    """Return ``interval`` with another forecast of its limits with more runs, for an estimate whose
+    samples do not grow in proportion to the runs: ``factor`` times the runs mean
+    ``sample_factor(factor)`` times the samples.
     """
 
     def limits(value: float, factor: float) -> tuple[float, float]:

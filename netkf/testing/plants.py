@@ -233,7 +233,8 @@ def _draw_starts(
 def _check_noise(
     noise: FloatArray, S: FloatArray, states: FloatArray, labels: NoiseLabels, rule: str
 ) -> None:
-    """Check ``noise`` (R, K, q) of K steps of R runs, with the ``states`` (R, K, n) before each.
+    """Check the noise of a user's plant: ``noise`` (R, K, q) of K steps of R runs, with the
+    ``states`` (R, K, n) before each.
 
     It must be white with the covariance S (q, q), and independent of the states. ``rule`` is the
     message if it is not 0 in the directions in which S has no noise.
@@ -247,6 +248,7 @@ def _check_noise(
     if not e.size:
         return
     check_white(e, labels)
+    # The states before each step, and x(0) in units of its own deviations.
     flat_states = states.reshape(-1, states.shape[-1])
     check_independent(e.reshape(len(flat_states), -1), flat_states, labels, "the state before")
     start_factor = compute_whitening(np.atleast_2d(np.cov(states[:, 0].T))).factor
@@ -356,8 +358,9 @@ def moment_law(A: FloatArray, B: FloatArray, gap: float) -> tuple[FloatArray, Fl
 
 
 def _check_diffusion(part: Diffusion, copy: Diffusion, name: str, seed: int) -> None:
-    """Check a plant in continuous time: x(0), paths at sample and probe times, and paths on the
-    sensing grid.
+    """Check a user's plant in continuous time: x(0), paths at sample times (of sensors) and probe
+    times (at which the state is only looked at), and paths on the sensing grid, the regular times
+    at which continuous sensors read.
 
     ``copy`` is the plant after pickling, ``name`` the class in messages, ``seed`` that of the
     random generators.

@@ -153,7 +153,10 @@ def _entries(scenario: Scenario, node: int) -> tuple[int, ...]:
 
 
 def _sampling_rows(scenario: Scenario) -> list[AssumptionRow]:
-    """Return a row on the times of sampled sensors, which must be Poisson or known beforehand."""
+    """Return the assumption, as a list of one row of the table, that sensors which sample do so at
+    Poisson or at known times, for which the bound on the mean of P is proved; empty without such
+    sensors.
+    """
     if not scenario.sampled_sensors:
         return []
     name = "sensors sample by Poisson clocks or at known times"

@@ -87,7 +87,8 @@ def _sizes(plant: Any, Phi: FloatArray, W: FloatArray, steps: int) -> FloatArray
 
 def _discretise(A: FloatArray, B: FloatArray, gap: float) -> tuple[FloatArray, FloatArray]:
     """Return ``exp(A gap)`` (n, n) and the covariance ``int_0^gap e^{A s} B B' e^{A' s} ds`` (n, n)
-    of the noise over a ``gap`` in seconds (Van Loan 1978), for A (n, n) and B (n, m).
+    of the noise over a ``gap`` in seconds (Van Loan 1978), for A (n, n) and B (n, m): the law of a
+    step of the true path, by a formula that shares no code with the plant that is tested.
     """
     n = len(A)
     blocks = np.block([[-A, B @ B.T], [np.zeros((n, n)), A.T]])

@@ -124,8 +124,9 @@ class BeliefRule(ErrorRule):
             self._update_belief(estimator)
 
     def _update_belief(self, estimator: int) -> None:
-        """Set the error and the root of P of node ``estimator`` from its prior, its own evidence
-        and that received from its neighbours.
+        """Set the error and the root of P of node ``estimator`` from its prior, the information of
+        its own readings and that received from its neighbours: their sums U of H' R^-1 H and s of
+        H' R^-1 v.
         """
         errors, eye = self.errors, np.eye(self.errors.n)
         U, s = self._sum_evidence(

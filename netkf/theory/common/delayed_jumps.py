@@ -198,8 +198,10 @@ class DelayedJumps:
         return right
 
     def _driven_by_noises(self) -> FloatArray:
-        """Return the right-hand side (k + 1, M, M), at the k + 1 points of the delay, for the
-        noises of plant and readings, with the part of Phi that is due to the noise in messages.
+        """Return the right-hand side (k + 1, M, M), at the k + 1 points of the delay, of the
+        boundary value problem for the autocovariances of the errors under the noises of plant and
+        readings. It has the part of Phi, the white noise that stands for jumps, that is due to the
+        plant's noise in messages.
         """
         heard = self._mean[1] @ np.tile(self._message_noise[0], (1, self.nodes, 1))
         right = np.tensordot(self._integral, heard, 1)

@@ -88,8 +88,9 @@ class Directions(NamedTuple):
         return probability
 
     def mean(self, nodes: int, directions: IntArray) -> FloatArray:
-        """Return E[D] (S, N n, N n) by mode, the mean change of stacked errors by one exchange over
-        the given ``directions`` (indices); ``nodes`` is N.
+        """Return E[D] (S, N n, N n), the mean change of the stacked errors of N = ``nodes`` nodes
+        by one exchange over the given ``directions`` (indices of directed links), for each mode: a
+        joint state of the links with bursty losses.
         """
         n = self.weight.shape[-1]
         blocks = np.zeros((self.modes, nodes, nodes, n, n))

@@ -81,7 +81,9 @@ class PackedRiccati:
 
     @cached_property
     def eliminates_cheaply(self) -> bool:
-        """True if elimination has little fill-in, because the network has small cuts everywhere."""
+        """True if linear equations for all nodes can be solved by elimination with little fill-in,
+        because the network has small cuts everywhere: the band of its reordered matrix is narrow.
+        """
         coupling = scipy.sparse.csr_array(self.equations.coupling)
         order = scipy.sparse.csgraph.reverse_cuthill_mckee(coupling)
         index = np.empty(len(order), dtype=np.int64)

@@ -287,8 +287,8 @@ def _steady_at(
 
 
 def _guess(points: list[tuple[float, float]], low: float, high: float, fine: float) -> float:
-    """Return a factor close to the threshold, extrapolated from the last two ``points``, pairs
-    (factor, 1 / max P).
+    """Return a factor on all link rates close to the threshold above which the bound on the mean of
+    P has a steady state, extrapolated from the last two ``points``, pairs (factor, 1 / max P).
 
     The inverse of the covariances falls to 0 at the threshold, which lies between ``low`` and
     ``high``; it is sought to the relative accuracy ``fine``.

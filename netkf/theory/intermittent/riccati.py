@@ -430,7 +430,8 @@ def invariant_samples(
     samples: int,
     seed: int,
 ) -> FloatArray:
-    """Return independent draws (samples, n, n) from the invariant law of the Riccati equation.
+    """Return independent draws (samples, n, n) from the invariant law of the random Riccati
+    equation, to which the one-step prediction covariance tends.
 
     F and Q are (n, n), H (p, n), R (p, p); readings arrive with probability ``delivery``. Coupling
     from the past (Propp and Wilson, 1996): each draw has its own arrivals, drawn backwards from the
@@ -451,6 +452,7 @@ def invariant_samples(
     draws = np.empty((samples, n, n))
     for first in range(0, samples, MAX_SAMPLES_AT_ONCE):
         count = min(MAX_SAMPLES_AT_ONCE, samples - first)
+        # A slot without a reading is mode 0, one with a reading mode 1.
         draws[first : first + count], _ = couple_from_the_past(
             lambda following, T: random.random((len(following), T)) < delivery,
             lambda roots, arrivals: move_roots(roots, arrivals, F, square_root(Q), modes),

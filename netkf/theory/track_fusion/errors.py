@@ -107,8 +107,9 @@ class TrackRule(ErrorRule):
         self._combine_tracks({estimator: [] for estimator in range(self.errors.estimators)})
 
     def exchange(self, slot: int, phase: int, messages: Sequence[SentMessage]) -> None:
-        """Combine each node's track with those that it heard in this ``slot``; changes the errors
-        that nodes show, not the tracks. Called by the replay for each exchange of a slot.
+        """Combine each node's track (the estimate of its own Kalman filter) with those that it
+        heard in this ``slot``; changes the errors that nodes show, not the tracks. Called by the
+        replay for each exchange of a slot.
         """
         heard: dict[int, list[int]] = {}
         for message in messages:
