@@ -112,13 +112,13 @@ class FlowFilter(Component):
 
 
 @kernel
-def interval_end(now: float, time: float, stretch: float) -> float:
+def interval_end(now: float, time: float, length: float) -> float:
     """Return the end, in seconds, of a measurement interval that begins at ``now`` and lasts
-    ``stretch`` seconds, but ends at ``time`` at the latest.
+    ``length`` seconds, but ends at ``time`` at the latest.
 
     An interval too short to change the clock would repeat for ever; it ends at ``time`` instead.
     """
-    end = now + stretch
+    end = now + length
     return end if now < end < time else time
 
 

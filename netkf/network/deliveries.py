@@ -27,13 +27,13 @@ Chosen = frozenset[MessageKey]
 
 
 class Deliveries:
-    """The messages that are delivered in the next replay in any case: ``chosen``, all if None.
-    Those in ``hurried`` take no time.
+    """The messages that are delivered in the next replay of a run whatever was drawn: ``chosen``,
+    all if None. Those in ``without_delay`` take no time.
     """
 
     def __init__(self) -> None:
         self.chosen: Chosen | None = frozenset()
-        self.hurried: Chosen = frozenset()
+        self.without_delay: Chosen = frozenset()
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,9 +89,9 @@ class DeliveringLoss(Loss):
 
 
 @dataclass(frozen=True, eq=False)
-class HurryingDelay(Delay):
-    """The delay model ``given`` of the run, except that hurried messages of ``deliveries`` take no
-    time.
+class DelayUnlessWaived(Delay):
+    """The delay model ``given`` of the run, except that the messages in
+    ``deliveries.without_delay`` take no time.
     """
 
     given: Delay = field(instance_of(Delay))
@@ -117,14 +117,15 @@ class HurryingDelay(Delay):
         return self.given.is_random
 
     def message_delay(self, link: Link, message: int, drawn: float) -> float:
-        """Return the delay in seconds: 0 for hurried messages, else that of the model ``given``.
+        """Return the delay in seconds: 0 for a message in ``deliveries.without_delay``, else that of
+        the model ``given``.
 
         ``message`` is the number of the message on its link, and ``drawn`` the delay that was drawn
         for it. A message that is recorded as lost has no delay (nan): it takes no time if it is
         among the chosen ones, which this replay delivers.
         """
         chosen, key = self.deliveries.chosen, (*link, message)
-        if key in self.deliveries.hurried:
+        if key in self.deliveries.without_delay:
             return 0.0
         seconds = self.given.message_delay(link, message, drawn)
         delivered = chosen is None or key in chosen

@@ -18,7 +18,7 @@ import numpy as np
 
 from netkf.linalg.arrays import FloatArray
 from netkf.network.channels import Channel, NoDelay
-from netkf.network.deliveries import Chosen, Deliveries, DeliveringLoss, HurryingDelay, MessageKey
+from netkf.network.deliveries import Chosen, Deliveries, DeliveringLoss, DelayUnlessWaived, MessageKey
 from netkf.runs.simulate import simulate
 from netkf.scenario.scenario import Scenario
 from netkf.studies.information import (
@@ -125,7 +125,7 @@ class Replayer:
         if chosen is None or chosen:
             without_delay = self.delayed if chosen is None else chosen & self.delayed
         # The channel models of both scenarios read these when messages are sent.
-        self._deliveries.chosen, self._deliveries.hurried = chosen, without_delay
+        self._deliveries.chosen, self._deliveries.without_delay = chosen, without_delay
         scenario = self._full if to_horizon else self._short
         run = simulate(scenario, self._seed, self._replica)
         k = self._node
@@ -145,7 +145,7 @@ def delivering(scenario: Scenario, deliveries: Deliveries) -> Scenario:
     loss, delay = DeliveringLoss(channel_of_run.loss, deliveries), channel_of_run.delay
     # Without delays no message is late, and the engines have a faster path.
     if not isinstance(delay, NoDelay):
-        delay = HurryingDelay(delay, deliveries)
+        delay = DelayUnlessWaived(delay, deliveries)
     channel = Channel(loss=loss, delay=delay, symmetric=channel_of_run.symmetric)
     return _with(scenario, network=dataclasses.replace(network, channel=channel))
 

@@ -246,20 +246,20 @@ def replayed(scenario, run, node, at):
     return pd.DataFrame(event_columns(replayer.full_log, 0, 0))
 
 
-def recorded(scenario, run, chosen, folder, hurried=(), engine="auto"):
+def recorded(scenario, run, chosen, folder, without_delay=(), engine="auto"):
     """The run again from tables written by hand: the losses of its events but for the chosen ones,
-    and where some are hurried the delays of its events too.
+    and where some are without_delay the delays of its events too.
     """
     events, changes = run.events, {}
     lost = [(r.node, r.peer, r.message) for r in events[events.kind == "lost"].itertuples()]
     rows = [(*key, 0) for key in lost if key not in chosen]
     write(folder / "lost.csv", "sender,receiver,message,delivered", rows)
     changes["network.channel.loss"] = {"kind": "recorded", "path": "lost.csv"}
-    if hurried:
+    if without_delay:
         came = events[events.kind.isin(["deliver", "late"])]
         seconds = {(r.peer, r.node, r.message): r.age for r in came.itertuples()}
         sent = [(r.node, r.peer, r.message) for r in events[events.kind == "send"].itertuples()]
-        delays = [(*key, 0.0 if key in hurried else seconds.get(key, 1e3)) for key in sent]
+        delays = [(*key, 0.0 if key in without_delay else seconds.get(key, 1e3)) for key in sent]
         write(folder / "delays.csv", "sender,receiver,message,seconds", delays)
         changes["network.channel.delay"] = {"kind": "recorded", "path": "delays.csv"}
     object.__setattr__(scenario, "_folder", folder)
@@ -341,7 +341,7 @@ def test_a_message_that_came_too_late_is_replayed_without_delay(runs, name, outc
     mine = [m for m in found.missing.values() if m.outcome == outcome and m.key.receiver == node]
     key = max(mine, key=lambda m: m.sent).key
     outcome = Replayer(scenario, run.seed, 0, node, at).outcome([key])
-    again = recorded(scenario, run, set(), tmp_path, hurried={tuple(key)})
+    again = recorded(scenario, run, set(), tmp_path, without_delay={tuple(key)})
     assert outcome.trace == pytest.approx(np.trace(again.P[k, node]), rel=1e-9)
     assert abs(outcome.trace - found.trace) > 1e-9
 
