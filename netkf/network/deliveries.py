@@ -117,8 +117,8 @@ class DelayUnlessWaived(Delay):
         return self.given.is_random
 
     def message_delay(self, link: Link, message: int, drawn: float) -> float:
-        """Return the delay in seconds: 0 for a message in ``deliveries.without_delay``, else that of
-        the model ``given``.
+        """Return the delay in seconds: 0 for a message in ``deliveries.without_delay``, else that
+        of the model ``given``.
 
         ``message`` is the number of the message on its link, and ``drawn`` the delay that was drawn
         for it. A message that is recorded as lost has no delay (nan): it takes no time if it is

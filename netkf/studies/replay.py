@@ -18,7 +18,13 @@ import numpy as np
 
 from netkf.linalg.arrays import FloatArray
 from netkf.network.channels import Channel, NoDelay
-from netkf.network.deliveries import Chosen, Deliveries, DeliveringLoss, DelayUnlessWaived, MessageKey
+from netkf.network.deliveries import (
+    Chosen,
+    DelayUnlessWaived,
+    Deliveries,
+    DeliveringLoss,
+    MessageKey,
+)
 from netkf.runs.simulate import simulate
 from netkf.scenario.scenario import Scenario
 from netkf.studies.information import (

@@ -117,13 +117,34 @@ def test_a_sweep_comes_back_as_it_was(short, tmp_path):
 
 
 @pytest.fixture(scope="module")
-def compared(tmp_path_factory):
-    """A comparison of which one filter cannot run there, and its directory."""
-    slots = netkf.load(SCENARIOS / "push_sum_planar.toml", {"horizon": 2.0})
-    filters = ["push-sum", {"kind": "hcmci", "steps": 2}, "central", "hybrid"]
-    comparison = compare_filters(slots, filters, 4, workers=1)
-    folder = tmp_path_factory.mktemp("compared") / "filters"
-    return comparison, write_comparison(slots, comparison, folder).directory
+def compare(tmp_path_factory):
+    """A function: a comparison over some runs of which one filter cannot run there, and its
+    directory.
+    """
+
+    def compare(runs):
+        slots = netkf.load(SCENARIOS / "push_sum_planar.toml", {"horizon": 2.0})
+        filters = ["push-sum", {"kind": "hcmci", "steps": 2}, "central", "hybrid"]
+        comparison = compare_filters(slots, filters, runs, workers=1)
+        folder = tmp_path_factory.mktemp("compared") / "filters"
+        return comparison, write_comparison(slots, comparison, folder).directory
+
+    return compare
+
+
+@pytest.fixture(scope="module")
+def compared(compare):
+    return compare(4)
+
+
+def test_a_comparison_of_single_runs_comes_back_as_it_was(compare):
+    """One run leaves the consistency of all filters unknown, and that of one that cannot run."""
+    comparison, folder = compare(1)
+    found = netkf.open(folder)
+    assert [row.consistency for row in found.rows] == ["-"] * 4
+    assert [row.ran for row in found.rows] == [row.ran for row in comparison.rows]
+    pd.testing.assert_frame_equal(found.table, comparison.table)
+    assert format_filters(found) == format_filters(comparison)
 
 
 def test_a_comparison_of_filters_comes_back_as_it_was(compared):
