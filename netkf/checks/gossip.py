@@ -28,6 +28,7 @@ from netkf.checks.laws import (
     growth_intervals,
 )
 from netkf.checks.mode_sequences import (
+    FAR_START,
     MIN_CHAINS,
     gossip_modes,
     initial_roots,
@@ -62,8 +63,6 @@ covariance is computed.
 """
 UNKNOWN = 1e9
 """Standard deviation of each state that stands for an unknown state."""
-FAR_START = 30.0
-"""Factor on the roots of P(0) in a second start, whose covariance is about 1000 times larger."""
 MIN_TOKENS = 100
 """Number of chains that start at one node below which their law is not compared."""
 BOUND_TOLERANCE = 1e-8  # of P, relative: rounding of a long product

@@ -31,6 +31,7 @@ from netkf.checks.laws import (
     growth_intervals,
 )
 from netkf.checks.mode_sequences import (
+    FAR_START,
     MIN_CHAINS,
     ModeTable,
     all_arrivals,
@@ -64,8 +65,6 @@ from netkf.theory.intermittent.scalar_law import ScalarLaw, scalar_law
 from netkf.trace.run import Run
 from netkf.trace.schema import CODES
 
-FAR_START = 30.0
-"""Factor on the roots of P(0) in a second start, whose covariance is about 1000 times larger."""
 BOUND_TOLERANCE, SUPPORT_TOLERANCE = 1e-8, 1e-6
 PROBABILITY_TOLERANCE = 0.05
 MAX_PATHS = 2000

@@ -27,6 +27,8 @@ MAX_CHAINS, MIN_CHAINS = 20_000, 4_000
 """Limits on the number of simulated chains of a reference sample."""
 MAX_OPERATIONS = 1e10
 """Floating-point operations that a reference sample may take, about a few seconds."""
+FAR_START = 30.0
+"""Factor on the roots of P(0) in a second start, whose covariance is about 1000 times larger."""
 
 
 class ModeTable(NamedTuple):

@@ -1,8 +1,13 @@
 """Rows of assumptions under clocks, and "not known" for what a record does not show."""
 
+import dataclasses
+
 import pytest
 
+import netkf
 from netkf import theory
+from netkf.network import channels
+from tests.conftest import SCENARIOS
 
 PATH = {"kind": "path", "nodes": 2}
 
@@ -56,3 +61,17 @@ def test_records_leave_their_law_unknown(build, tmp_path):
         "Pi is doubly stochastic, 0 < epsilon <= 1/max degree",
         "sensors sample by Poisson clocks or at known times",
     }
+
+
+class NoLoss(channels.NoLoss):
+    """A loss of its own that bears the name of the lossless one."""
+
+    def delivery_probability(self, link, message, bad, table_probability):
+        return 0.5
+
+
+def test_only_the_channel_without_losses_makes_every_exchange_a_swap():
+    scenario = netkf.load(SCENARIOS / "gossip_ring.toml")
+    assert holds(scenario)["every exchange is a swap"]
+    network = dataclasses.replace(scenario.network, channel=channels.Channel(loss=NoLoss()))
+    assert not holds(dataclasses.replace(scenario, network=network))["every exchange is a swap"]

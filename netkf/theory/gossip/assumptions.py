@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray
+from netkf.network.channels import NoLoss
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.evidence import AssumptionRow
 from netkf.theory.common.plant_assumptions import slot_plant_rows, start_rows
@@ -90,7 +91,8 @@ def _swap_rows(scenario: Scenario) -> list[AssumptionRow]:
     """
     channel = scenario.network.channel
     # A swap needs both messages: if one is lost, its pair exists twice and the other is gone.
-    lossless = type(channel.loss).__name__ == "NoLoss"
+    # The exact class: one that derives from it may lose messages.
+    lossless = type(channel.loss) is NoLoss
     holds = lossless or channel.symmetric
     evidence = (
         "nothing is lost"
