@@ -73,5 +73,6 @@ class NoLoss(channels.NoLoss):
 def test_only_the_channel_without_losses_makes_every_exchange_a_swap():
     scenario = netkf.load(SCENARIOS / "gossip_ring.toml")
     assert holds(scenario)["every exchange is a swap"]
-    network = dataclasses.replace(scenario.network, channel=channels.Channel(loss=NoLoss()))
+    channel = channels.Channel(loss=NoLoss(), symmetric=False)
+    network = dataclasses.replace(scenario.network, channel=channel)
     assert not holds(dataclasses.replace(scenario, network=network))["every exchange is a swap"]
