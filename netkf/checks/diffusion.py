@@ -62,8 +62,8 @@ def _without_cooperation(scenario: Scenario) -> Scenario:
 
 
 def _sensors_excite(samples: RunSamples, level: float) -> Finding:
-    """Check that the sensors of the network together excite every direction of the state: lambda
-    of D (19), the least eigenvalue of the information expected from the next few slots given the
+    """Check that the sensors of the network together excite every direction of the state: lambda of
+    paper D (19), the least eigenvalue of the information expected from the next few slots given the
     regressors so far, must be positive for every past of the regressors.
 
     No runs are looked at and no interval is estimated, so that ``level`` is not used.
@@ -248,7 +248,7 @@ class DiffusionChecks(PaperChecks):
 
     def promises(self, scenario: Scenario) -> tuple[Promise, ...]:
         """Return the statements about a scenario's filter that are tested; that its sensors excite
-        every direction, D (19), only if the excitation can be computed in reasonable time.
+        every direction, paper D (19), only if the excitation can be computed in reasonable time.
         """
         try:
             _require_few_regressors(scenario)

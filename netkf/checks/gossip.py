@@ -152,7 +152,7 @@ def _count_moves(scenario: Scenario, sources: np.ndarray) -> np.ndarray:
 
 
 class ChainSamples(NamedTuple):
-    """S simulations of the switched chain of G (20): the node that holds one pair (estimate,
+    """S simulations of the switched chain of paper G (20): the node that holds one pair (estimate,
     covariance) is a Markov chain with transition matrix Abar (the mean matching: entry (i, j) is
     the probability that i gets j's pair in a slot), and that node's reading updates the covariance.
 
@@ -181,7 +181,7 @@ class GossipSamples(RunSamples):
 
     @cached_property
     def reference(self) -> ChainSamples:
-        """Samples of the switched chain of G (20)."""
+        """Samples of the switched chain of paper G (20)."""
         cls: Any = type(self)
         chains: ChainSamples = kept_reference(cls, self.scenario, self.seed)
         return chains
@@ -235,8 +235,9 @@ def _draw_chains(
 
 
 def _walks_bound(samples: GossipSamples, level: float) -> Finding:
-    """Check that no P of the runs (R, K, N, n, n) exceeds its bound, G Lemma 14: the covariance
-    that the last WINDOW readings which updated the node's pair give alone, from an unknown state.
+    """Check that no P of the runs (R, K, N, n, n) exceeds its bound, paper G Lemma 14: the
+    covariance that the last WINDOW readings which updated the node's pair give alone, from an
+    unknown state.
 
     The bound is large (UNKNOWN) where these readings do not detect the state. No interval is
     estimated, so that ``level`` is not used.
@@ -284,7 +285,7 @@ def _tokens_move(samples: GossipSamples, level: float) -> Finding:
 
 def _random_sensor(samples: GossipSamples, level: float) -> Finding:
     """Compare the law (probability distribution) of P at a node drawn at random with that of the
-    switched chain (:class:`ChainSamples`), G (67).
+    switched chain (:class:`ChainSamples`), paper G (67).
 
     The node is drawn anew for each run and slot, so that each run gives one independent value.
     The interval of the finding misses the truth with at most the probability ``level``.
@@ -302,7 +303,7 @@ def _random_sensor(samples: GossipSamples, level: float) -> Finding:
 def _each_sensor(samples: GossipSamples, level: float) -> Finding:
     """Compare the law of P at each node and checked slot t with that of the switched chains
     (:class:`ChainSamples`) that took their last reading, in slot t - 1, at this node; the two are
-    equal by G (19).
+    equal by paper G (19).
 
     The interval of the finding misses the truth with at most the probability ``level``.
     """
@@ -321,10 +322,10 @@ def _sensors_together(samples: GossipSamples, level: float) -> Finding:
     """Compare the probability P(tr P_n >= x) at all nodes n with that of the switched chain
     (:class:`ChainSamples`), at every checked slot and for all x.
 
-    Its mean over the nodes equals that of the chain, G (67), which gives G (28) and (29) in the
-    limit; hence it exceeds N times that of the chain at no node, G (27). Both comparisons use bands
-    around empirical distribution functions (:func:`band_width`). The interval of the finding misses
-    the truth with at most the probability ``level``.
+    Its mean over the nodes equals that of the chain, paper G (67), which gives paper G (28) and
+    (29) in the limit; hence it exceeds N times that of the chain at no node, paper G (27). Both
+    comparisons use bands around empirical distribution functions (:func:`band_width`). The interval
+    of the finding misses the truth with at most the probability ``level``.
     """
     traces = np.trace(samples.runs.P, axis1=-2, axis2=-1)
     expected = np.trace(samples.reference.P, axis1=-2, axis2=-1)

@@ -375,8 +375,8 @@ class HybridChecks(PaperChecks):
 
 
 def _settling_rows(scenario: Scenario) -> list[Assumption]:
-    """Return the assumption that the bound on the mean of P, H (12), has a steady state, as a list
-    of one row of the table of assumptions; empty if that cannot be decided.
+    """Return the assumption that the bound on the mean of P, paper H (12), has a steady state, as a
+    list of one row of the table of assumptions; empty if that cannot be decided.
     """
     try:
         settles = has_steady_state(scenario)
@@ -397,8 +397,8 @@ def _require_known_steadiness(scenario: Scenario) -> None:
 
 
 def _require_constant_gains(scenario: Scenario) -> None:
-    """Raise TheoryError if there is no bound with constant gains other than H (12), the bound on
-    the mean of P, itself.
+    """Raise TheoryError if there is no bound with constant gains other than paper H (12), the bound
+    on the mean of P, itself.
     """
     if not scenario.filter.algorithm.talks:
         raise TheoryError("without messages the gains are those of Kalman-Bucy filters")

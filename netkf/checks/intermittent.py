@@ -211,7 +211,7 @@ class IntermittentSamples(RunSamples):
 
     @cached_property
     def reference(self) -> ArrivalSamples:
-        """Samples of filters with independent arrivals, R (12)."""
+        """Samples of filters with independent arrivals, paper R (12)."""
         cls: Any = type(self)
         arrivals: ArrivalSamples = kept_reference(cls, self.scenario, self.seed)
         return arrivals
@@ -467,7 +467,7 @@ def _outage_factors(scenario: Scenario) -> dict[int, float]:
     slots without any reading multiply E[P], with g the probability that a reading arrives in a slot
     and alpha the spectral radius of F.
 
-    E[P] diverges if it is 1 or more, R (29), (31). Nodes with losses or delays for which g is
+    E[P] diverges if it is 1 or more, paper R (29), (31). Nodes with losses or delays for which g is
     unknown are left out.
     """
     factors, neighbours = {}, sensing_neighbours(scenario)
@@ -539,9 +539,9 @@ def _outage_counts(samples: IntermittentSamples, level: float) -> Finding:
     that a scalar P never enters) with the exact probabilities.
 
     After an outage of k slots (the last k without a reading), of probability g (1 - g)^k with g
-    that of an arrival, P lies between the k-th and the next hole, R Proposition 24. The exact law
-    at the last slot gives the probabilities also when the start still matters. Counts of a cell are
-    binomial; Pearson's p-value is added to the message. The interval of the finding misses the
+    that of an arrival, P lies between the k-th and the next hole, paper R Proposition 24. The exact
+    law at the last slot gives the probabilities also when the start still matters. Counts of a cell
+    are binomial; Pearson's p-value is added to the message. The interval of the finding misses the
     truth with at most the probability ``level``.
     """
     laws, intervals, tests = _scalar_laws(samples.scenario), [], []

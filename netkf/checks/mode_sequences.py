@@ -174,7 +174,7 @@ def trace_tokens(sources: np.ndarray, slot: int) -> TokenHistory:
 
 def token_positions(sources: np.ndarray, slot: int) -> np.ndarray | None:
     """Return the index (N,) of the node where each token took its last reading, in slot - 1: token
-    n is the pair (estimate, covariance) that started at node n, p_n(slot - 1) of G (13).
+    n is the pair (estimate, covariance) that started at node n, p_n(slot - 1) of paper G (13).
 
     ``sources`` (slots, N) is the index of the node whose pair each node used in each slot. None if
     pairs were copied, so that the tokens at the nodes are no permutation of those at the start.
@@ -189,7 +189,7 @@ def token_positions(sources: np.ndarray, slot: int) -> np.ndarray | None:
 
 def gossip_modes(scenario: Scenario) -> ModeTable:
     """Return the table of the readings that can update a covariance of a gossip filter in one slot:
-    mode k is the reading of the k-th node, G (11).
+    mode k is the reading of the k-th node, paper G (11).
     """
     F, Q = scenario.slot_belief
     readings = [(model.H, model.R) for model in scenario.slot_models]

@@ -259,8 +259,8 @@ def _mean_square(samples: PushSumSamples, level: float) -> Finding:
 
 
 def _gamma_certified(samples: PushSumSamples, level: float) -> Finding:
-    """Check that gamma, the number of averaging steps in a slot, of the bound of P Theorem 6 (which
-    is to keep mean-square errors bounded) is at least the exact minimum for that.
+    """Check that gamma, the number of averaging steps in a slot, of the bound of paper P Theorem 6
+    (which is to keep mean-square errors bounded) is at least the exact minimum for that.
 
     No runs are looked at and no interval is estimated, so that ``level`` is not used.
     """
@@ -429,7 +429,7 @@ class PushSumChecks(PaperChecks):
 
         Networks that are small enough for a search have two more, about the number gamma of
         averaging steps in a slot, if their subject exists: the limit for ever more steps (P Theorem
-        4), and the gamma that P Theorem 6 certifies to keep mean squares bounded.
+        4), and the gamma that paper P Theorem 6 certifies to keep mean squares bounded.
         """
         promised = with_promised_filter(scenario)
         promises: tuple[Promise, ...] = PROMISES

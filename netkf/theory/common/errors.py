@@ -20,12 +20,12 @@ from netkf.trace.run import Run
 def error_covariance(scenario: Scenario, run: Run, stacked: bool = False) -> FloatArray:
     """Return the covariance (T, N, n, n) of x - xhat_i at ``run.times``, given the run's events.
 
-    With ``stacked``, (T, N n, N n): the errors of all nodes together. H (10) says that each block
-    stays below P_i, which this shows without Monte Carlo. Regressors are those of the run; delays,
-    losses and filter models that differ from the truth are included; recorded states and readings
-    are treated as if they had the law that the scenario gives them. Raises TheoryError for a user's
-    subclass that overrides more than the weights, and for the push-sum filter with frozen or
-    asymptotic gains.
+    With ``stacked``, (T, N n, N n): the errors of all nodes together. Paper H (10) says that each
+    block stays below P_i, which this shows without Monte Carlo. Regressors are those of the run;
+    delays, losses and filter models that differ from the truth are included; recorded states and
+    readings are treated as if they had the law that the scenario gives them. Raises TheoryError for
+    a user's subclass that overrides more than the weights, and for the push-sum filter with frozen
+    or asymptotic gains.
     """
     joint = _replay_nodes(scenario, run)
     return joint if stacked else diagonal_blocks(joint, len(scenario.nodes))

@@ -33,8 +33,8 @@ def slot_rows(scenario: Scenario) -> list[AssumptionRow]:
 
 
 def sparse_weights(scenario: Scenario) -> scipy.sparse.csr_array:
-    """Return the weights W (N, N), sparse, by which nodes combine estimates, D (8): node i gives
-    weight W[l, i] to the estimate of l. These are the weights if all messages arrive.
+    """Return the weights W (N, N), sparse, by which nodes combine estimates, paper D (8): node i
+    gives weight W[l, i] to the estimate of l. These are the weights if all messages arrive.
     """
     index, own_weights = scenario.topology.index, scenario.own_weights
     size, directions = len(scenario.nodes), scenario.topology.directions
@@ -131,8 +131,8 @@ def _plant_rows(scenario: Scenario) -> list[AssumptionRow]:
 
 def _information_row(scenario: Scenario) -> AssumptionRow:
     """Return the row (assumption, source, whether it holds or None if undecided, evidence) on the
-    cooperative information condition D (19): given the past of the regressors H, the readings that
-    all sensors together take in the next window of slots excite every direction, if the least
+    cooperative information condition, paper D (19): given the past of the regressors H, the readings
+    that all sensors together take in the next window of slots excite every direction, if the least
     eigenvalue of their expected information, the level, is positive for each past.
     """
     name = "the sensors together excite every direction (sufficient)"

@@ -40,7 +40,8 @@ INTEGRAL_TOLERANCE = 1e-9  # safe bound on the relative error of the integral
 def information_level(
     scenario: Scenario, runs: int = 400, seed: int = 0, window: int | None = None
 ) -> pd.DataFrame:
-    """Return the conditional least eigenvalue lambda_k of D (19), and of D (5) for each sensor.
+    """Return the conditional least eigenvalue lambda_k of paper D (19), and of paper D (5) for each
+    sensor.
 
     A table with a row for the network (node -1) and for each sensor, and the columns
 
@@ -49,7 +50,7 @@ def information_level(
     level, low, high the least lambda_k over pasts, that is over states of the regressors:
                      ``runs`` pasts drawn from their law at random slots of the horizon, the one in
                      which all states are 0, and the result of a search within the range of these;
-                     the interval is that of the integral at that past. D (19) holds if it is
+                     the interval is that of the integral at that past. Paper D (19) holds if it is
                      positive
     mean, mean_low, mean_high   mean of lambda_k over the pasts drawn, with its 99 % interval
 
@@ -240,8 +241,8 @@ def _search(
 
 
 def _levels(sources: list[_Source], past: list[FloatArray], window: int) -> FloatArray:
-    """Return the levels lambda_k (K,), D (19), of the ``sources`` of regressors together, for K
-    pasts.
+    """Return the levels lambda_k (K,), paper D (19), of the ``sources`` of regressors together, for
+    K pasts.
 
     ``past`` holds the states (K, m) of each source, ``window`` is h in slots. A level is the least
     eigenvalue of the mean excitation by the sources, 0 if it is below rounding.

@@ -1,4 +1,4 @@
-"""The bound on the tracking error of the diffusion filter, D Theorem 4.2."""
+"""The bound on the tracking error of the diffusion filter, paper D Theorem 4.2."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ QUANTILE = 2.576  # of the standard normal law, for 99 % intervals
 
 
 class TrackingLevel(NamedTuple):
-    """The level of noise in D Theorem 4.2.
+    """The level of noise in paper D Theorem 4.2.
 
-    sigma, low, high : sigma_p of D (29), with its 99 % interval
+    sigma, low, high : sigma_p of paper D (29), with its 99 % interval
     shape            : ``sigma_p log^(1 + beta/2)(e + 1 / sigma_p)``, the bound on
                        limsup |error|_Lp without its constant c, which D does not give
     """
@@ -38,9 +38,9 @@ def tracking_level(
 
     ``xi_k = |V_k| + |Delta_{k+1}|`` with the noises of all sensors and the parameter's increment,
     once for each node, and ``sigma_p = | xi log^beta(e + xi) |_Lp``. Gaussian noises have all
-    moments, so that D Theorem 4.2 holds for every p >= 1 and beta > 2 if its other assumptions do:
-    the errors stay bounded in L_p, and go to 0 with the noises (D Remark 4.1). From ``samples``
-    draws. Raises TheoryError for plants and sensors without a law and wrong arguments.
+    moments, so that paper D Theorem 4.2 holds for every p >= 1 and beta > 2 if its other
+    assumptions do: the errors stay bounded in L_p, and go to 0 with the noises (D Remark 4.1). From
+    ``samples`` draws. Raises TheoryError for plants and sensors without a law and wrong arguments.
     """
     if not p >= 1.0 or not beta > 2.0:
         raise TheoryError(f"D (29) needs p >= 1 and beta > 2, got {p!r} and {beta!r}")
@@ -55,8 +55,9 @@ def tracking_level(
 
 
 def _draw_noises(scenario: Scenario, samples: int, random: np.random.Generator) -> FloatArray:
-    """Return draws (samples,) of xi, the norm of all noises of a slot, D (29): that of the sensors'
-    noises plus that of the parameter's increment; raises TheoryError if a noise is recorded.
+    """Return draws (samples,) of xi, the norm of all noises of a slot, paper D (29): that of the
+    sensors' noises plus that of the parameter's increment; raises TheoryError if a noise is
+    recorded.
     """
     if not scenario.slotted or not scenario.is_random:
         raise TheoryError("D (29) needs noises in slots with a law, not a record")

@@ -1,4 +1,4 @@
-"""The invariant law mu^Abar of the switched Riccati recursion, G Theorem 8, drawn exactly."""
+"""The invariant law mu^Abar of the switched Riccati recursion, paper G Theorem 8, drawn exactly."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ FAR_START_DEVIATIONS = 1e3  # standard deviations of the upper start, in units o
 
 
 class SwitchedSamples(NamedTuple):
-    """Independent draws of the switched chain of G (20) in its steady state.
+    """Independent draws of the switched chain of paper G (20) in its steady state.
 
     P    : (S, n, n) covariances, whose law is mu^Abar
     node : (S,) ids of the nodes whose reading each covariance took last. The covariances with
@@ -34,7 +34,7 @@ class SwitchedSamples(NamedTuple):
 
 def switched_samples(scenario: Scenario, samples: int, seed: int) -> SwitchedSamples:
     """Return ``samples`` independent draws, covariances (samples, n, n) and nodes (samples,), from
-    the law mu^Abar to which the covariances of a gossip filter tend, G Theorem 8: that of the
+    the law mu^Abar to which the covariances of a gossip filter tend, paper G Theorem 8: that of the
     switched chain, a covariance whose node moves by the mean matching Abar.
 
     Coupling from the past: the chain of nodes is drawn backwards from the uniform law, and the

@@ -9,7 +9,7 @@ from netkf.theory.common.evidence import AssumptionRow
 
 
 def weight_rows(scenario: Scenario) -> list[AssumptionRow]:
-    """Return the row: Pi = I - epsilon L is doubly stochastic, H (5)."""
+    """Return the row: Pi = I - epsilon L is doubly stochastic, paper H (5)."""
     algorithm: Any = scenario.filter.algorithm
     epsilon = algorithm.epsilon
     degree = max(scenario.topology.degrees.values())

@@ -135,7 +135,7 @@ def _reason_of_samples(scenario: Scenario) -> str | None:
 
 
 def require_bound(scenario: Scenario) -> None:
-    """Raise TheoryError with the reason if H Theorem 2 does not apply to a scenario."""
+    """Raise TheoryError with the reason if paper H Theorem 2 does not apply to a scenario."""
     reason = reason_without_bound(scenario)
     if reason is not None:
         raise TheoryError(reason)

@@ -36,8 +36,8 @@ def link_rate_threshold(scenario: Scenario) -> LinkRate:
     of each filter's P, has a steady state.
 
     Below them the bound grows without limit although all rates are positive and the graph is
-    connected, so that H Proposition 4 is false as printed. To 1e-6, or 1e-3 for large networks.
-    Raises TheoryError if H(12) does not apply or no rate suffices.
+    connected, so that paper H Proposition 4 is false as printed. To 1e-6, or 1e-3 for large
+    networks. Raises TheoryError if H(12) does not apply or no rate suffices.
     """
     equations = _require_talk(scenario)
     # A steady state for hardly any messages: every node has one by itself.
@@ -56,10 +56,11 @@ def link_rate_threshold(scenario: Scenario) -> LinkRate:
 def link_rate_for(scenario: Scenario, delta: float) -> LinkRate:
     """Return the smallest link rates for which the steady bound is within ``delta`` of S.
 
-    H Theorem 3 says that there are some: ``max_i |calP_i - S|_F <= delta`` in the steady state of
-    H(12), with all rates multiplied by one factor. The distance falls with the rates, in the end in
-    proportion to 1/rate; the factor is found to 1e-10. 0 if the nodes have S at any rate. Raises
-    TheoryError if H(12) or S do not apply or no rate up to 1e12 times the scenario's suffices.
+    Paper H Theorem 3 says that there are some: ``max_i |calP_i - S|_F <= delta`` in the steady
+    state of H(12), with all rates multiplied by one factor. The distance falls with the rates, in
+    the end in proportion to 1/rate; the factor is found to 1e-10. 0 if the nodes have S at any
+    rate. Raises TheoryError if H(12) or S do not apply or no rate up to 1e12 times the scenario's
+    suffices.
     """
     if as_numbers("delta", delta).size != 1 or not 0.0 < delta < math.inf:
         raise TheoryError(f"delta must be a positive number, got {delta!r}")

@@ -56,11 +56,11 @@ def path_average(
     start: ArrayLike | None = None,
 ) -> PathAverage:
     """Return the average of ``function`` of P, the one-step prediction covariance, over ``slots``
-    slots of one simulated path, R (140).
+    slots of one simulated path, paper R (140).
 
     F and Q are (n, n), H (p, n), R (p, p); readings arrive with probability ``delivery``, drawn
-    with ``seed``. By R Proposition 25 the average converges to the integral of the function over
-    the invariant law, for almost every start by that law; the paper recommends a point of its
+    with ``seed``. By paper R Proposition 25 the average converges to the integral of the function
+    over the invariant law, for almost every start by that law; the paper recommends a point of its
     support. ``start`` (n, n) is P_0, by default P*, the steady covariance if all readings arrive.
     ``function`` maps covariances (K, n, n) to K numbers. It must be integrable: below the critical
     probability the average of P itself diverges, and the standard error says nothing then. Raises

@@ -1,6 +1,6 @@
 """Intermittent observations: the random Riccati equation P_{t+1} = f_gamma(P_t) of R.
 
-In a slot without a reading ``f_0(P) = F P F' + Q``, with one ``f_1``, R (15)-(18). P is the
+In a slot without a reading ``f_0(P) = F P F' + Q``, with one ``f_1``, paper R (15)-(18). P is the
 one-step prediction covariance, ``delivery`` the probability that a reading arrives.
 """
 
@@ -70,7 +70,7 @@ def check_delivery(delivery: float) -> float:
 
 
 def lyapunov_step(P: ArrayLike, F: ArrayLike, Q: ArrayLike) -> FloatArray:
-    """Return ``f_0(P) = F P F' + Q`` (n, n), R (16), for P, F and Q (n, n): a slot without a
+    """Return ``f_0(P) = F P F' + Q`` (n, n), paper R (16), for P, F and Q (n, n): a slot without a
     reading.
 
     Raises TheoryError if shapes or definiteness are wrong.
@@ -85,7 +85,7 @@ def lyapunov_step(P: ArrayLike, F: ArrayLike, Q: ArrayLike) -> FloatArray:
 def riccati_step(
     P: ArrayLike, F: ArrayLike, Q: ArrayLike, H: ArrayLike, R: ArrayLike
 ) -> FloatArray:
-    """Return ``f_1(P) = F P F' + Q - F P H' (H P H' + R)^-1 H P F'`` (n, n), R (17).
+    """Return ``f_1(P) = F P F' + Q - F P H' (H P H' + R)^-1 H P F'`` (n, n), paper R (17).
 
     A slot with a reading; P, F and Q are (n, n), H (p, n), R (p, p). Computed from square roots by
     an orthogonal triangularisation, which subtracts nothing. Raises TheoryError if shapes or
@@ -142,7 +142,7 @@ def steady_covariance(F: ArrayLike, Q: ArrayLike, H: ArrayLike, R: ArrayLike) ->
 
 
 def filtered_covariance(F: FloatArray, Q: FloatArray, H: FloatArray, R: FloatArray) -> FloatArray:
-    """Return the steady covariance (n, n) after a reading, P (12); P* is that before it.
+    """Return the steady covariance (n, n) after a reading, paper P (12); P* is that before it.
 
     F and Q are (n, n), H (p, n), R (p, p). Raises TheoryError if (F, H) is not detectable or P*
     cannot be computed precisely.
@@ -179,8 +179,8 @@ def undetectable_slot_mode(F: FloatArray, H: FloatArray) -> complex | None:
 class CriticalProbability(NamedTuple):
     """Bounds on the delivery probability above which the mean covariance stays bounded.
 
-    lower  : R (31), necessary, not sufficient
-    upper  : R (32), sufficient from there on
+    lower  : paper R (31), necessary, not sufficient
+    upper  : paper R (32), sufficient from there on
     gain   : (n, p) K with spectral radius below 1 of ``(1-g) F x F + g (F+KH) x (F+KH)`` at
              ``g = upper + 1e-6``: proves the upper bound
     perron : (n, n) X >= 0 with ``min over K of (1-g) F X F' + g (F+KH) X (F+KH)' >= X`` at
@@ -206,8 +206,8 @@ def critical_probability(F: ArrayLike, H: ArrayLike) -> tuple[float, float]:
 
 
 def critical_certificate(F: ArrayLike, H: ArrayLike) -> CriticalProbability:
-    """Return the bounds R (31) and (32) on the critical delivery probability of the system with F
-    (n, n) and H (p, n), with a proof of the upper one from both sides.
+    """Return the bounds of paper R (31) and (32) on the critical delivery probability of the system
+    with F (n, n) and H (p, n), with a proof of the upper one from both sides.
 
     The upper bound g is the least probability at which some gain makes errors contract in the mean
     square: the result has a gain (n, p) that does so at g + 1e-6, and a matrix (n, n) that shows
@@ -230,9 +230,9 @@ def critical_certificate(F: ArrayLike, H: ArrayLike) -> CriticalProbability:
 
 
 def _critical_bounds(F: FloatArray, H: FloatArray, search: _GainSearch) -> tuple[float, float]:
-    """Return a lower and an upper bound on the critical delivery probability, R (31) and R (32),
-    for F (n, n) and H (p, n), with the ``search`` over gains for them; raises TheoryError if the
-    upper one is not found.
+    """Return a lower and an upper bound on the critical delivery probability, paper R (31) and
+    paper R (32), for F (n, n) and H (p, n), with the ``search`` over gains for them; raises
+    TheoryError if the upper one is not found.
     """
     moduli = np.abs(np.linalg.eigvals(F))
     alpha = float(moduli.max())
@@ -402,9 +402,9 @@ def support(F: ArrayLike, Q: ArrayLike, H: ArrayLike, R: ArrayLike, depth: int) 
     reading) or f_1 (one with it), applied to P*, the fixed point of f_1.
 
     F and Q are (n, n), H (p, n), R (p, p). The binary digits of the index k are the maps of entry
-    k, the leading digit being applied last. By R Theorem 10 the closure of these points over all
-    depths is the support of the invariant law; f_1(P*) = P*, so that each depth contains the ones
-    before. Raises TheoryError for a depth outside 0 .. 22 and if P* does not exist.
+    k, the leading digit being applied last. By paper R Theorem 10 the closure of these points over
+    all depths is the support of the invariant law; f_1(P*) = P*, so that each depth contains the
+    ones before. Raises TheoryError for a depth outside 0 .. 22 and if P* does not exist.
     """
     depth = as_integer("depth", depth, 0, MAX_DEPTH)
     F, Q, H, R = check_system(F, Q, H, R)

@@ -1,4 +1,4 @@
-"""Moments of P step 5: gamma averaging steps z_i <- z_i + 1/delta sum_j b_ij (z_j - z_i).
+"""Moments of paper P step 5: gamma averaging steps z_i <- z_i + 1/delta sum_j b_ij (z_j - z_i).
 
 One step is ``M = I - 1/delta sum of b_ij e_i (e_i - e_j)' + b_ji e_j (e_j - e_i)'`` over links,
 with b_ij = 1 if i hears j, independent between links. With ``d = Y_ii - Y_ij - Y_ji + Y_jj`` of
@@ -62,7 +62,7 @@ class Averaging:
 
     @cached_property
     def mean(self) -> FloatArray:
-        """E[M^gamma] (N, N), P (28) for fresh links."""
+        """E[M^gamma] (N, N), paper P (28) for fresh links."""
         if self.enumerated:
             return self._moments[0]
         return np.linalg.matrix_power(self.mean_step.toarray(), self.gamma)

@@ -26,10 +26,11 @@ def mass_totals(
 
     ``up`` (T, E) says which links of the graph, in its order, are up in each slot, in both
     directions. Every node starts with 1/N. ``degrees`` "nominal" divides by the degree in the whole
-    graph and replaces what does not arrive by a node's own share, P (3)-(5) corrected: the total
-    stays 1. "last" divides by the degree that a node saw in the slot before, the latest one that it
-    can know when it sends, as P (14) would need: then mass is lost or made where links change,
-    which is what P Remark 1 says cannot be synchronised. Raises TheoryError for wrong arguments.
+    graph and replaces what does not arrive by a node's own share, paper P (3)-(5) corrected: the
+    total stays 1. "last" divides by the degree that a node saw in the slot before, the latest one
+    that it can know when it sends, as paper P (14) would need: then mass is lost or made where
+    links change, which is what paper P Remark 1 says cannot be synchronised. Raises TheoryError for
+    wrong arguments.
     """
     topology = graph.topology if isinstance(graph, Scenario) else graph
     links = np.array([[topology.index[a], topology.index[b]] for a, b in topology.links])
@@ -57,10 +58,10 @@ def mass_totals(
 def leader_agreement(scenario: Scenario, slots: int, leader: int | None = None) -> FloatArray:
     """Return the probability (slots + 1,) that all nodes know the leader, from slot 0 on.
 
-    P Remark 3: every node broadcasts the largest id that it has heard of (max-consensus), and the
-    node whose id wins starts with w = 1; it is the largest one, or ``leader``. Links fail with the
-    probabilities of the channel, afresh in each slot. Exact, over all sets of nodes that may know.
-    Raises TheoryError for more than 12 nodes and for links that are not drawn independently.
+    Paper P Remark 3: every node broadcasts the largest id that it has heard of (max-consensus), and
+    the node whose id wins starts with w = 1; it is the largest one, or ``leader``. Links fail with
+    the probabilities of the channel, afresh in each slot. Exact, over all sets of nodes that may
+    know. Raises TheoryError for more than 12 nodes and for links that are not drawn independently.
     """
     # The law of the links: which nodes hear each other in a step.
     averaging, slots = averaging_law(scenario), as_integer("slots", slots, 0)

@@ -1,8 +1,9 @@
 """The number of averaging steps that the push-sum filter needs: certified by P and exact.
 
 P Theorems 5 and 6 bound error dynamics by small matrices of norms. Their constant c_B must be at
-least ``max_i |A_i'|_P``; the one printed in P (37) can be smaller (its |A| lacks a transpose), so
-the larger of the two is used here. Corollary 2 does not follow from Theorem 5 and is not used.
+least ``max_i |A_i'|_P``; the one printed in paper P (37) can be smaller (its |A| lacks a
+transpose), so the larger of the two is used here. Corollary 2 does not follow from Theorem 5 and is
+not used.
 """
 
 from __future__ import annotations
@@ -33,10 +34,10 @@ MAX_SEARCHED = 120  # states of all nodes, beyond which a search over gamma take
 class GammaConstants(NamedTuple):
     """The constants of P Theorems 5 and 6.
 
-    contraction   : least lambda with A_C P_inf A_C' <= lambda P_inf, P (34)
-    printed, sharp: c_B of P (37), and max_i |A_i'|_P that it stands for
-    mean          : theta of the link probability, P (54)
-    mean_square   : theta of the disconnection probability, P (59)
+    contraction   : least lambda with A_C P_inf A_C' <= lambda P_inf, paper P (34)
+    printed, sharp: c_B of paper P (37), and max_i |A_i'|_P that it stands for
+    mean          : theta of the link probability, paper P (54)
+    mean_square   : theta of the disconnection probability, paper P (59)
     """
 
     contraction: float
@@ -111,8 +112,8 @@ def _disconnection_bound(scenario: Scenario, law: Averaging) -> float:
 
 
 def _weighted_norm(A: FloatArray, P: FloatArray) -> float:
-    """Return |A|_P = sup over z of sqrt(z' A' P A z / z' P z), P (35), for A (n, n) and a positive
-    definite P (n, n).
+    """Return |A|_P = sup over z of sqrt(z' A' P A z / z' P z), paper P (35), for A (n, n) and a
+    positive definite P (n, n).
     """
     # The largest generalised eigenvalue of (A' P A, P).
     return float(np.sqrt(scipy.linalg.eigh(A.T @ P @ A, P, eigvals_only=True)[-1]))
@@ -123,9 +124,9 @@ def minimum_gamma(scenario: Scenario, moment: Moment = "mean", sharp: bool = Fal
     push-sum paper certifies; the scenario's own is ignored.
 
     Theorem 5 for ``moment`` "mean" (asymptotically unbiased), Theorem 6 for "mean-square"
-    (bounded). c_B is that printed in P (37), or ``max_i |A_i'|_P`` if that is larger; ``sharp``
-    uses the latter alone. The result is far from necessary: see ``exact_minimum_gamma``. Raises
-    TheoryError if no gamma is certified.
+    (bounded). c_B is that printed in paper P (37), or ``max_i |A_i'|_P`` if that is larger;
+    ``sharp`` uses the latter alone. The result is far from necessary: see ``exact_minimum_gamma``.
+    Raises TheoryError if no gamma is certified.
     """
     constants = gamma_constants(scenario)
     bound = constants.sharp if sharp else max(constants.printed, constants.sharp)
@@ -139,11 +140,11 @@ def minimum_gamma(scenario: Scenario, moment: Moment = "mean", sharp: bool = Fal
 
 
 class CorollaryTwo(NamedTuple):
-    """What P Corollary 2 says of a scenario, and what P Theorem 5 says.
+    """What paper P Corollary 2 says of a scenario, and what paper P Theorem 5 says.
 
-    gamma  : smallest one with P (44), with the same c_B as ``minimum_gamma``
-    radius : rho(A_R(gamma)) of P (36); the corollary says that it is below 1
-    needed : smallest gamma with rho(A_R) < 1, that of P Theorem 5
+    gamma  : smallest one with paper P (44), with the same c_B as ``minimum_gamma``
+    radius : rho(A_R(gamma)) of paper P (36); the corollary says that it is below 1
+    needed : smallest gamma with rho(A_R) < 1, that of paper P Theorem 5
     """
 
     gamma: int
@@ -156,7 +157,7 @@ def corollary_2(scenario: Scenario, sharp: bool = False) -> CorollaryTwo:
     which the corollary does not follow.
 
     With ``a = sqrt(lambda)`` and ``t = theta^gamma``, rho(A_R) < 1 means
-    ``t < (1 - a) / (c_B (1 - a + c_B))``; P (44), ``t < ((1 - a) / c_B)^2``, is weaker where
+    ``t < (1 - a) / (c_B (1 - a + c_B))``; paper P (44), ``t < ((1 - a) / c_B)^2``, is weaker where
     ``(1 - a)^2 > a c_B``. lambda, theta and c_B are ``contraction``, ``mean`` and the larger of
     ``printed`` and ``sharp`` of ``gamma_constants``; with ``sharp`` c_B is the latter. Raises
     TheoryError if a condition of the theorem fails or no gamma is certified.
@@ -197,15 +198,16 @@ def _least_certified(certified: Callable[[int], bool], constants: GammaConstants
 
 
 def theorem_5(constants: GammaConstants, bound: float, gamma: int) -> float:
-    """Return rho(A_R(gamma)) of P (36) with c_B = ``bound``; below 1 it certifies gamma."""
+    """Return rho(A_R(gamma)) of paper P (36) with c_B = ``bound``; below 1 it certifies gamma."""
     # Rows: the mean of all nodes, and the disagreement, which gamma steps reduce by theta^gamma.
     contracted = constants.mean**gamma * bound
     return _spectral_radius([[constants.contraction**0.5, contracted], [bound, contracted]])
 
 
 def theorem_6(constants: GammaConstants, bound: float, gamma: int) -> float:
-    """Return the spectral radius of the matrix A_S(gamma) of P (45), with c_B = ``bound``: below 1
-    it certifies, by P Theorem 6, that mean-square errors stay bounded with gamma averaging steps.
+    """Return the spectral radius of the matrix A_S(gamma) of paper P (45), with c_B = ``bound``:
+    below 1 it certifies, by paper P Theorem 6, that mean-square errors stay bounded with gamma
+    averaging steps.
     """
     root_lambda, bound_square = constants.contraction**0.5, bound * bound
     mean_factor, square_factor = constants.mean**gamma, constants.mean_square**gamma

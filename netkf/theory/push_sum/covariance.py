@@ -15,8 +15,8 @@ from netkf.theory.push_sum.mean_square import push_sum_radius, radius, second_mo
 def push_sum_error_covariance(scenario: Scenario) -> FloatArray:
     """Return the exact steady covariance (N, n, n) of x - xhat, in the order of the nodes.
 
-    The mean is over noises and links, for P steps 4-5 at the asymptotic gains. The filter's gains
-    converge to these if links fail in both directions together and no gain is frozen early (P
+    The mean is over noises and links, for paper P steps 4-5 at the asymptotic gains. The filter's
+    gains converge to these if links fail in both directions together and no gain is frozen early (P
     Theorem 2). The filters' Q and R may differ from the truth. Raises TheoryError if
     ``push_sum_radius`` is not below 1 or does not exist.
     """

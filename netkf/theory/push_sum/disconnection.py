@@ -1,4 +1,4 @@
-"""The probability that link failures disconnect a network: p_d of P Assumption 3.
+"""The probability that link failures disconnect a network: p_d of paper P Assumption 3.
 
 A transfer-matrix method over the nodes in an elimination order. A node is open while it has both
 eliminated neighbours and neighbours still to come. All that matters about the links so far is how

@@ -83,8 +83,9 @@ class AveragingRule(ErrorRule):
         self._heard = np.zeros((self._N, *self._z.shape))
 
     def exchange(self, slot: int, phase: int, messages: Sequence[SentMessage]) -> None:
-        """Exchange the push-sum masses, P (3)-(5) (``phase`` 0), or average the estimates of all
-        nodes in gamma steps, P step 5 (``phase`` 1); called by the replay for each phase of a slot.
+        """Exchange the push-sum masses, paper P (3)-(5) (``phase`` 0), or average the estimates of
+        all nodes in gamma steps, paper P step 5 (``phase`` 1); called by the replay for each phase
+        of a slot.
 
         Phase 0 changes ``_z`` (and the running sums), phase 1 the errors in the stack. Which
         messages arrived is known from the log, so that ``messages`` are not used.

@@ -1,4 +1,4 @@
-"""Limits of the push-sum filter for gamma to infinity: P Lemma 4 and Theorem 4."""
+"""Limits of the push-sum filter for gamma to infinity: paper P Lemma 4 and Theorem 4."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ class LargeGamma(NamedTuple):
 
 def large_gamma_limits(scenario: Scenario) -> LargeGamma:
     """Return the limits for ever more averaging steps in a slot (gamma to infinity): the covariance
-    (N n, N n) of the noise that averaging leaves, P Lemma 4, and that of the steady errors (n, n),
-    which is the same at all nodes, P Theorem 4.
+    (N n, N n) of the noise that averaging leaves, paper P Lemma 4, and that of the steady errors
+    (n, n), which is the same at all nodes, paper P Theorem 4.
 
     The scenario's own gamma is ignored. Raises TheoryError where they do not hold: a graph that is
     not connected, links that are held over the steps or fail in one direction, a delta at or below
@@ -51,12 +51,14 @@ def large_gamma_limits(scenario: Scenario) -> LargeGamma:
 
 
 def push_sum_noise(scenario: Scenario, gammas: Sequence[int]) -> FloatArray:
-    """Return the covariance (len(gammas), N n, N n) of the transformed noise of P (29), exactly.
+    """Return the covariance (len(gammas), N n, N n) of the transformed noise of paper P (29),
+    exactly.
 
     ``(T' (x) I) E[(M (x) I) cov(h) (M (x) I)'] (T (x) I)``, where (x) is the Kronecker product, M
     (N, N) the random product of gamma averaging steps, h (N n,) the stacked noises of the plant and
-    the sensors, and ``T = (v W)`` of P (75) with v = (1, .., 1) / sqrt(N) and W any orthonormal
-    complement. P Lemma 4 says what it tends to. Raises TheoryError as ``large_gamma_limits`` does.
+    the sensors, and ``T = (v W)`` of paper P (75) with v = (1, .., 1) / sqrt(N) and W any
+    orthonormal complement. Paper P Lemma 4 says what it tends to. Raises TheoryError as
+    ``large_gamma_limits`` does.
     """
     steps = estimation_steps(scenario)
     _require_averaging(scenario, steps)
@@ -99,7 +101,7 @@ def _with_gamma(steps: EstimationSteps, gamma: int) -> EstimationSteps:
 
 def _require_averaging(scenario: Scenario, steps: EstimationSteps) -> None:
     """Raise TheoryError unless gamma averaging steps converge to the mean of all nodes as gamma
-    grows, as P Theorem 4 assumes.
+    grows, as paper P Theorem 4 assumes.
     """
     law = steps.averaging
     if law.held and not law.deterministic:

@@ -1,4 +1,4 @@
-"""Limits of P steps 2 and 3, and bounds on the consensus gain of the push-sum filter."""
+"""Limits of paper P steps 2 and 3, and bounds on the consensus gain of the push-sum filter."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ class PushSumLimits(NamedTuple):
     """Limits of what push-sum averages (step 2 of the push-sum paper: each node's masses C~, n~ and
     w) and of what nodes compute from it (step 3), in the order of the nodes.
 
-    mass      : (N, n, n) of C~, a node's share of the information of all sensors, P (16)
-    number    : (N,) of n~, a node's share of the number of nodes, P (17)
-    weight    : (N,) of w, a node's share of a total of 1, P (18)
-    G         : (n, n) of every G^(i), the sum of all H_i' R_i^-1 H_i, P (10)
-    N         : of every N^(i), P (11)
+    mass      : (N, n, n) of C~, a node's share of the information of all sensors, paper P (16)
+    number    : (N,) of n~, a node's share of the number of nodes, paper P (17)
+    weight    : (N,) of w, a node's share of a total of 1, paper P (18)
+    G         : (n, n) of every G^(i), the sum of all H_i' R_i^-1 H_i, paper P (10)
+    N         : of every N^(i), paper P (11)
     P         : (n, n) of every P^(i): P_inf of P (12), the filtered covariance of the Kalman filter
                 that gets all readings
-    gains     : K^(i) = N P_inf H_i' R_i^-1, (n, p_i) each, P (13)
+    gains     : K^(i) = N P_inf H_i' R_i^-1, (n, p_i) each, paper P (13)
     """
 
     mass: FloatArray

@@ -1,8 +1,8 @@
-"""Exact mean squares of the errors of the push-sum filter: P steps 4-5 at asymptotic gains.
+"""Exact mean squares of the errors of the push-sum filter: paper P steps 4-5 at asymptotic gains.
 
-The stacked error obeys ``e+ = (M (x) I)(A e + h)``, A = diag(A_i), with independent M, P (25); its
-covariance ``X+ = T(X) + E[(M (x) I) cov(h) (M (x) I)']`` with the linear, positive map
-``T(X) = E[(M (x) I) A X A' (M (x) I)']`` (theory/numerics/positive_maps.py).
+The stacked error obeys ``e+ = (M (x) I)(A e + h)``, A = diag(A_i), with independent M,
+paper P (25); its covariance ``X+ = T(X) + E[(M (x) I) cov(h) (M (x) I)']`` with the linear,
+positive map ``T(X) = E[(M (x) I) A X A' (M (x) I)']`` (theory/numerics/positive_maps.py).
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ MEAN_KRYLOV_VECTORS, MEAN_RESTARTS = 40, 60
 
 
 def push_sum_radius(scenario: Scenario) -> float:
-    """Return the spectral radius of the mean-square error dynamics, P steps 4-5.
+    """Return the spectral radius of the mean-square error dynamics, paper P steps 4-5.
 
     At the asymptotic gains. Below 1 if and only if the errors stay bounded in the mean square (for
     a noise that drives every mode); single paths may stay bounded above 1. Exact: from the mean
@@ -76,8 +76,8 @@ def radius(steps: EstimationSteps) -> float:
 
 
 def mean_radius(steps: EstimationSteps) -> float:
-    """Return the spectral radius of the mean errors' dynamics, P (30): if it is below 1, estimates
-    become unbiased.
+    """Return the spectral radius of the mean errors' dynamics, paper P (30): if it is below 1,
+    estimates become unbiased.
     """
     return max(_mean_radius(steps.averaging, closed) for closed in _groups(steps.scaled))
 
