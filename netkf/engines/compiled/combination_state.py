@@ -97,9 +97,10 @@ class CombinationState(Struct):
 
 
 def combination_state_of(scenario: Scenario, state: Simulation) -> CombinationState | None:
-    """Return the extra arrays that the filter's combination needs, at time 0, None if it needs
-    none. Its ``lanes``, and parts of its ``evidence``, are views of ``state.xhat`` and
-    ``state.root``.
+    """Return the arrays that the filter's way of combining estimates needs besides those of the
+    event loop ``state``, at time 0; None for most combinations, which need none. ``lanes``, and
+    parts of ``evidence`` (of belief propagation), are views of ``state.xhat`` and ``state.root``:
+    the loop and the combination see the same estimates.
     """
     if state.combination_kind not in (BEST, INVERSE, GAINS, PREDICTIONS, BELIEFS):
         return None
@@ -130,8 +131,10 @@ def combination_state_of(scenario: Scenario, state: Simulation) -> CombinationSt
 
 
 def _make_gains(scenario: Scenario, state: Simulation) -> dict[str, Any]:
-    """Return the fields of a CombinationState for constant gains by name, from ``A`` (n, n) to
-    ``model`` (N,); zeros for filters of other combinations.
+    """Return the fields of a CombinationState for filters with constant gains L, by name, from
+    ``A`` (n, n) to ``model`` (N,): the closed loop A - L H of each node that reads increments, and
+    I - L H of each that takes samples. They are zeros for filters of other combinations, since
+    compiled code needs arrays of the same types.
     """
     N, n = state.xhat.shape
     algorithm: Any = scenario.node_filter
@@ -174,9 +177,10 @@ def _make_gains(scenario: Scenario, state: Simulation) -> dict[str, Any]:
 
 @kernel
 def keep_prediction(state: Simulation, combination: CombinationState, h: int) -> None:
-    """Copy the estimate and root of node ``h`` (index) to ``prior`` and ``prior_root`` of
-    ``combination``: they are its prediction, before any reading of this instant is used, which
-    consensus on predictions sends. Sets ``nodes[h].reading`` to -1.
+    """Store the estimate and root of node ``h`` (index), its prediction before any reading of this
+    instant is used, in ``prior`` and ``prior_root`` of ``combination``: consensus on predictions
+    sends these and not the updated estimate. Sets ``nodes[h].reading``, the newest sample of the
+    node, to -1.
     """
     copy_state(state.size, combination.prior, combination.prior_root, h, state.xhat, state.root, h)
     # A reading of an earlier instant is not sent any more.
@@ -187,15 +191,17 @@ def keep_prediction(state: Simulation, combination: CombinationState, h: int) ->
 def predict_with_gain(
     state: Simulation, combination: CombinationState, h: int, now: float, time: float
 ) -> None:
-    """Predict node ``h`` (index) from ``now`` to ``time`` (seconds) and use its increments by its
-    constant gain L (n, p), in intervals short against the rate of the gain. Changes row ``h`` of
-    ``state.xhat`` and ``state.root``.
+    """Predict node ``h`` (index) from ``now`` to ``time`` (seconds) and correct it by its
+    increments with the constant gain L (n, p) of its filter. The gap is divided into intervals that
+    are short against the rate of the error in the closed loop, over which readings are used at
+    once. Changes row ``h`` of ``state.xhat`` and ``state.root``.
     """
     piece, m, longest = state.piece, combination.model[h], usable(combination.rate[h])
     least = MIN_GAP_SHARE * (time - now)
     while now < time:
         end = time
         if longest < time - now:
+            # The lower bound grows, so that a fast gain does not ask for endlessly many intervals.
             end = interval_end(now, time, max(longest, least))
             least *= LONGER
         gap = end - now
@@ -204,6 +210,7 @@ def predict_with_gain(
             combination.x[0, i] = state.xhat[h, i]
             for j in range(combination.x.shape[1]):
                 combination.root[0, i, j] = 0.0
+        # The last model of the table has no sensors. The root is 0, as only the mean is needed.
         unobserved = len(state.table.unit) - 1
         propagate_root(
             state.table, unobserved, combination.root, combination.x, 0, gap, state.flow_scratch
@@ -241,7 +248,7 @@ def sample_with_gain(
         instants.y[s, :p],
         combination.x[0],
     )
-    # The update of P has the form of a prediction.
+    # The update of P has the form F P F' + Q of a prediction, with F = I - L H and Q = L R L'.
     predict_root(
         ONE,
         state.size,
@@ -258,15 +265,17 @@ def sample_with_gain(
 @kernel
 def fuse_inbox(state: Simulation, combination: CombinationState, h: int) -> None:
     """Fuse the estimate of node ``h`` (index) with each one in its inbox, one after the other, by
-    covariance intersection, or inverse covariance intersection if the combination is INVERSE, with
-    the weight that minimises the trace or the determinant of the fused covariance. Changes row
-    ``h`` of ``state.xhat`` (N, n) and ``state.root`` (N, n, n), lower triangular roots of P.
+    covariance intersection, or by inverse covariance intersection if the combination is INVERSE.
+    The weight of each fusion minimises the trace or the determinant of the fused covariance.
+    Changes row ``h`` of ``state.xhat`` (N, n) and ``state.root`` (N, n, n), lower triangular roots
+    of P.
     """
     # The inbox is a linked list of messages in the pool; -1 ends it.
     m = state.nodes[h].inbox
     while m != -1:
         fuse_pair(
             state.xhat[h], state.root[h], state.pool_x[m], state.pool_root[m],
+            # Whether by inverse intersection; whether the trace is minimised; scratch.
             combination.kind == INVERSE, combination.trace == 1, combination.pair,
         )  # fmt: skip
         m = state.pool[m].next
@@ -274,8 +283,10 @@ def fuse_inbox(state: Simulation, combination: CombinationState, h: int) -> None
 
 @kernel
 def send_prediction(state: Simulation, combination: CombinationState, m: int, h: int) -> None:
-    """Copy the prior of node ``h`` into message ``m`` (index in the pool), and set its ``tag`` to
-    the instant of the node's newest sample if readings are shared, otherwise to -1.
+    """Copy the prior of node ``h``, its prediction before the readings of this instant, into
+    message ``m`` (index in the pool of messages), as consensus on predictions sends it. If readings
+    are shared too, the ``tag`` of the message is the instant (index) of the node's newest sample,
+    otherwise -1.
     """
     copy_state(
         state.size, state.pool_x, state.pool_root, m, combination.prior, combination.prior_root, h
@@ -285,24 +296,26 @@ def send_prediction(state: Simulation, combination: CombinationState, m: int, h:
 
 @kernel
 def use_readings_heard(state: Simulation, h: int, now: float) -> None:
-    """Update node ``h`` (index) with the samples in its inbox that arrive without delay, at ``now``
-    (seconds), as if it had taken them itself. Changes row ``h`` of ``state.xhat`` and
-    ``state.root``.
+    """Update node ``h`` (index) with the samples of other nodes that messages in its inbox refer
+    to, at ``now`` (seconds), as if it had taken them itself; only samples of this very instant are
+    used. Changes row ``h`` of ``state.xhat`` and ``state.root``.
     """
     m = state.nodes[h].inbox
     while m != -1:
         message = state.pool[m]
-        # A late reading belongs to another instant.
+        # The tag is the instant of the sample, -1 if none was sent. A late one belongs to the past.
         if message.tag >= 0 and now - message.sent <= 0.0:
+            # 1.0: the noise of the sample is not scaled.
             use_instant(state, message.tag, state.root, state.xhat, h, 1.0)
         m = message.next
 
 
 @kernel
 def add_consensus(state: Simulation, combination: CombinationState, h: int) -> None:
-    """Add the consensus term on predictions, ``gamma P sum_j (xbar_j - xbar)``, to
-    ``state.xhat[h]``: xbar and P are the prior of node ``h`` (index), the xbar_j the priors in its
-    inbox, and gamma is ``epsilon / (norm of P + 1)``.
+    """Add the consensus term of consensus on predictions, ``gamma P sum_j (xbar_j - xbar)``, to
+    ``state.xhat[h]``: xbar and P are the prior of node ``h`` (index), its prediction before the
+    readings of this instant, the xbar_j the priors that messages in its inbox carry, and gamma is
+    ``epsilon / (norm of P + 1)``.
     """
     n = state.xhat.shape[1]
     for i in range(n):

@@ -69,8 +69,9 @@ class LaneReadings(Struct):
 
 
 def empty_readings(filters: Filters) -> LaneReadings:
-    """Return arrays for the readings of L nodes, with space for the largest number of moments of
-    any of these filters.
+    """Return arrays for the readings of L nodes side by side, one in each SIMD lane, with space for
+    the largest number of moments q of any of these filters: two for each row of a node's
+    increments.
     """
     n, q = filters.xhat.shape[1], int(filters.gains.moments.max())
     p, width = q // 2, 2 * course_width(n)
@@ -100,7 +101,7 @@ def empty_readings(filters: Filters) -> LaneReadings:
 @kernel
 def load_model(readings: LaneReadings, q: int, m: int, whitened_H: FloatArray) -> None:
     """Copy R^-1/2 H of model number ``m`` from ``whitened_H`` (M, q, n) of M models into lane ``q``
-    of ``readings.whitened_H``, unless the lane has it.
+    of ``readings.whitened_H``, unless the lane still holds it from an earlier reading.
     """
     if readings.model[q] == m:
         return
@@ -113,7 +114,8 @@ def load_model(readings: LaneReadings, q: int, m: int, whitened_H: FloatArray) -
 @kernel
 def load_sensor(readings: LaneReadings, q: int, sensing: Sensing, s: int) -> None:
     """Copy H and the root of R of sensor ``s`` (0 to S - 1) into lane ``q`` of ``readings.H`` and
-    ``readings.root``, unless the lane has them.
+    ``readings.root``, unless the lane still holds those of a sensor of the same kind (equal H and
+    R).
     """
     if readings.kind[q] == sensing.kind[s]:
         return
@@ -138,9 +140,11 @@ def read_alone(
     end: float,
     q: int,
 ) -> None:
-    """Write the moments of the readings of node ``h`` (index) of run number ``run`` over [now, end]
-    (seconds) into lane ``q`` of ``readings.moments``, by the scalar kernels; ``piece`` is the index
-    of a piece of the path in the step that ``end`` lies in.
+    """Write the readings of one node, in lane ``q`` of ``readings.moments`` (q, L), by the scalar
+    kernels: for networks in which some node has several sensors, which lanes do not handle. The
+    readings are the two moments of each row of increments of node ``h`` (index) of run number
+    ``run`` over [now, end] (seconds); ``piece`` is the index of a piece of the path in the step
+    that ``end`` lies in.
     """
     count = state.gains.moments[state.nodes[h].model]
     found, moments = state.scratch.moments[:count], readings.moments
@@ -164,9 +168,10 @@ def begin_reading(
     q: int,
 ) -> None:
     """Prepare the reading of node ``h`` (index) of run number ``run``, which has one sensor, over
-    [now, end] (seconds) in lane ``q``: draw its normals and integrate the path. ``piece`` is the
-    index of a piece of the path in the step that ``end`` lies in. ``end_readings`` computes the
-    readings of all lanes from what is written to ``readings``.
+    [now, end] (seconds) in lane ``q``: draw its normals and integrate the path of the true state.
+    ``piece`` is the index of a piece of the path in the step of the sensing grid that ``end`` lies
+    in. ``end_readings`` then computes the readings of all lanes at once from what is written to
+    ``readings``.
     """
     path, sensing, s = state.path, state.sensing, state.nodes[h].sensor
     load_sensor(readings, q, sensing, s)
@@ -180,10 +185,12 @@ def begin_reading(
             readings.normals[0, i, q], readings.normals[1, i, q] = normals[0, i], normals[1, i]
     k = piece_of(path, piece, end)
     start, stop = path.start[k], path.stop[k]
+    # A whole piece, or several: their moments are known already, no polynomial is needed.
     if now < start or (now == start and end == stop):
         fill_moments(state, run, piece, now, end)
         set_moments(readings, q, state.scratch.state_moments)
         return
+    # Inside one piece: integrate the polynomial of x there (its course) up to both ends.
     first, share = (now - start) / (stop - start), (end - now) / (stop - start)
     readings.first[0, q], readings.share[0, q] = first, share
     course = path.course[run - state.first_run, find_course(state, run, k)]
@@ -192,12 +199,15 @@ def begin_reading(
 
 @kernel
 def set_moments(readings: LaneReadings, q: int, moments: FloatArray) -> None:
-    """Set the two ``moments`` (2, n) of x over the reading of lane ``q``, a whole piece or several,
-    in ``readings.rows``, ``first`` and ``share``: as integrals over a piece that would have them.
+    """Write known moments of x into lane ``q``, for a reading that takes a whole piece of the path
+    or several: ``readings.rows``, ``first`` and ``share`` get values from which ``end_readings``,
+    which expects integrals of a polynomial over a part of a piece, computes just these ``moments``
+    (2, n), the integrals of x and of x times the Legendre polynomial P_1.
     """
     rows, n = readings.rows, moments.shape[1]
     half = rows.shape[1] // 2
-    # With these shares end_readings() takes the integrals of this lane as those of a whole piece.
+    # ``rows`` holds, for the start and for the end of the reading, the integral of x and that of u
+    # x, u from 0 to 1 over the piece: P_1 is 2 u - 1, hence half the sum of both moments.
     readings.first[0, q], readings.share[0, q] = 0.0, 1.0
     for i in range(n):
         rows[q, i] = rows[q, n + i] = 0.0
@@ -210,8 +220,8 @@ def end_readings(state: Simulation, readings: LaneReadings) -> None:
     """Write the moments of the readings of all L lanes, which ``begin_reading`` has prepared, into
     ``readings.moments`` (q, L), and take the noise that they use away from ``state.sensing.noise``.
 
-    A reading is H times the integral of x plus noise, both with two moments over its interval. A
-    lane is one node's prediction; L of them are computed side by side.
+    A reading is H times the integral of x plus noise, with weights 1 and P_1 (Legendre) over its
+    interval: its two moments. A lane holds one node; L of them are computed side by side.
     """
     r, size, p = readings, state.size, readings.noise.shape[1]
     # The integrals of x: one row for each lane is turned into one column for each lane.

@@ -54,8 +54,8 @@ class LaneSeries(Struct):
 
 @once_per_scenario
 def series_of_lanes(scenario: Scenario) -> tuple[LaneSeries, LaneSeries]:
-    """Return the series for nodes without increment sensors and that for nodes that read
-    increments.
+    """Return the power series by which nodes are predicted side by side (one in each SIMD lane):
+    those for nodes without increment sensors, and those for nodes that read increments.
     """
     filters = filters_at_start(scenario)
     period = float(scenario.diffusion.sensing_period or 0.0)
@@ -63,7 +63,10 @@ def series_of_lanes(scenario: Scenario) -> tuple[LaneSeries, LaneSeries]:
 
 
 def max_moments(filters: Filters) -> int:
-    """Return the largest number of moments that a node reads over an interval, two for each row."""
+    """Return the largest number q of moments that a node reads over an interval: each of its p rows
+    of increments gives two, its integrals weighted by 1 and by the Legendre polynomial P_1 of the
+    interval.
+    """
     return int(filters.gains.moments.max())
 
 
@@ -71,11 +74,12 @@ def unobserved_series(filters: Filters) -> LaneSeries:
     """Return the power series in the gap g of all models without sensors: of exp(A g) and of Q_g,
     the covariance of the noise over the gap.
 
-    A model is the matrices with which a node predicts. Its series are expanded anew in each cell of
-    ``unit`` seconds; column 1 of ``table.sizes`` is 0 if it observes nothing, and the first
-    ``width`` values are Q_g (a triangle) and exp(A g).
+    A model is the matrices with which a node predicts. The gap is divided into cells of ``unit``
+    seconds, each with an expansion of its own; the first ``width`` values are Q_g (a triangle) and
+    exp(A g).
     """
     n, table = filters.xhat.shape[1], filters.table
+    # Column 1 counts the blocks of observation rows: 0 if the model has no sensor.
     selected = table.sizes[:, 1] == 0
     width = n * (n + 1) // 2 + n * n
     return _united(table.series[selected][..., :width], table.unit[selected], selected)
@@ -83,7 +87,7 @@ def unobserved_series(filters: Filters) -> LaneSeries:
 
 def sensing_series(filters: Filters, period: float) -> LaneSeries:
     """Return the power series in the gap g, up to ``period`` seconds, of all models with increment
-    sensors, in this order of values:
+    sensors, in this order of values: A model is the matrices with which a node predicts and reads.
 
     Q_g, exp(A g), F, G_g : noise, transition without readings, transition and information of the
         readings (Q_g and G_g as lower triangles); P moves to ``Q_g + F P (I + G_g P)^-1 F'``
@@ -98,6 +102,7 @@ def sensing_series(filters: Filters, period: float) -> LaneSeries:
     flow = table.series[selected][:, :cells, :, :width]
     gains = padded_gains(filters)[selected[:-1]]  # the last model, without sensors, has none
     terms = max(flow.shape[2], gains.shape[1])
+    # One series of all values: prediction first, gains behind it.
     combined = np.zeros((*flow.shape[:2], terms, width + gains.shape[2]))
     combined[:, :, : flow.shape[2], : flow.shape[3]] = flow
     for k in range(len(combined)):
@@ -110,7 +115,8 @@ def sensing_series(filters: Filters, period: float) -> LaneSeries:
 
 def expand_around(series: FloatArray, middle: float) -> FloatArray:
     """Return the coefficients (terms, ...) around ``middle`` of the power series with the
-    coefficients ``series`` (terms, ...) around 0.
+    coefficients ``series`` (terms, ...) around 0. Cells of the gap other than the first are
+    expanded around their middles, where fewer terms suffice.
     """
     terms = len(series)
     powers = np.longdouble(middle) ** np.arange(terms)
@@ -124,8 +130,10 @@ def expand_around(series: FloatArray, middle: float) -> FloatArray:
 
 
 def padded_gains(filters: Filters) -> FloatArray:
-    """Return the series (M, terms, 3 n q) of the gains U, W and C of all M models, padded with
-    zeros to the largest number q of moments.
+    """Return the series (M, terms, 3 n q) of the gains U, W and C of all M models (matrices by
+    which nodes predict and read), padded with zeros to the largest number q of moments: lanes of
+    different models can then be computed together. U (n, q) and W (n, q) correct the mean by the
+    moments of a reading, with K = U + P W; C (q, n) predicts these moments.
     """
     n, max_rows, gains = filters.xhat.shape[1], max_moments(filters), filters.gains
     terms = gains.series.shape[1]
@@ -149,9 +157,10 @@ def padded_gains(filters: Filters) -> FloatArray:
 
 
 def _united(series: FloatArray, unit: FloatArray, selected: np.ndarray) -> LaneSeries:
-    """Return the table of ``series`` (M, cells, terms, E) of E values in M models, with equal
-    columns stored once and as many terms as cells of ``unit`` (M,) seconds need; ``selected`` flags
-    their models in a FlowTable.
+    """Return the table of ``series`` (M, cells, terms, E) of E values in M models, ready to be
+    evaluated: equal columns stored once, cells divided where that saves terms, only as many terms
+    as the cells of ``unit`` (M,) seconds need, and the width padded to whole lanes. ``selected``
+    flags their models in the FlowTable, which has others too.
     """
     indices: dict[bytes, int] = {}
     # 0.0 and not -0.0: they are the same number.
@@ -178,6 +187,7 @@ def _united(series: FloatArray, unit: FloatArray, selected: np.ndarray) -> LaneS
 def divide_cells(series: FloatArray, unit: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return the series (M, cells, terms, E) of E values in M models in shorter cells, and the
     length (M,) of these in seconds; ``unit`` (M,) is the length of the present cells of ``series``.
+    A shorter cell needs fewer terms for the same accuracy.
     """
     models, cells, terms, entries = series.shape
     parts = PARTS
@@ -199,14 +209,17 @@ def divide_cells(series: FloatArray, unit: FloatArray) -> tuple[FloatArray, Floa
 def terms_needed(series: FloatArray, unit: FloatArray) -> IntArray:
     """Return the number of terms (cells,) that each cell needs of ``series`` (M, cells, terms, E),
     whose cells are ``unit`` (M,) seconds long: what follows is below rounding at the ends of the
-    cell, for all E entries of all M models.
+    cell, for all E entries of all M models. A cell is an interval of the gap with an expansion of
+    its own.
     """
-    # From its middle a cell reaches half a unit, but the first one reaches a whole unit.
+    # Largest distance from the expansion point: half a unit from the middle of a cell, a whole unit
+    # in the first cell, which is expanded around its start.
     spans = np.repeat(0.5 * unit[:, None], series.shape[1], axis=1)
     spans[:, :1] *= 2.0
     sizes = np.abs(series) * (spans[..., None] ** np.arange(series.shape[2]))[..., None]
     remainder = np.cumsum(sizes[:, :, ::-1], axis=2)[:, :, ::-1]
     largest = sizes.max(axis=2, keepdims=True)
+    # Relative to each entry, and for entries that are nearly 0 relative to the largest one.
     tolerance = ROUNDING * largest + NOTHING * largest.max(axis=3, initial=0.0, keepdims=True)
     return np.asarray((remainder > tolerance).any(axis=(0, 3)).sum(axis=1))
 

@@ -89,11 +89,13 @@ class Channels(NamedTuple):
 
 @kernel
 def draw_matching(matchings: Matchings, ends: np.ndarray, r: int, active: np.ndarray) -> int:
-    """Write the indices of the links of one matching of run ``r`` into ``active`` (A,), which has
-    space for the largest one, in their order; return how many. ``ends`` (links, 2) are the indices
-    of the nodes at both ends of each link.
+    """Draw one matching of run ``r``, the set of links that exchange in a step, no two at one node:
+    write the indices of its links into ``active`` (A,), which has space for the largest one, in
+    their order; return how many. ``ends`` (links, 2) are the indices of the nodes at both ends of
+    each link.
 
-    The numbers are those that ``Matching.draw`` takes from the same stream, which advances.
+    The numbers are those that ``Matching.draw`` takes from the same stream,
+    which advances, so that both engines simulate the same run.
     """
     count, states = len(ends), matchings.states
     first, members = matchings.first, matchings.members
@@ -123,11 +125,12 @@ def draw_matching(matchings: Matchings, ends: np.ndarray, r: int, active: np.nda
 
 @kernel
 def _free_links(matchings: Matchings, ends: np.ndarray, r: int, active: np.ndarray) -> int:
-    """Write the indices of the links of a matching of run ``r`` to the front of ``active`` (A,),
-    which has space for the largest one; return their number. ``ends`` (links, 2) are the indices of
-    the nodes at both ends of each link.
+    """Draw a matching of run ``r`` for the protocols MAXIMAL and INDEPENDENT, which keep links
+    whose ends are free: write the indices of its links to the front of ``active`` (A,), which has
+    space for the largest one; return their number. ``ends`` (links, 2) are the indices of the nodes
+    at both ends of each link.
 
-    MAXIMAL visits the links in random order and takes each one whose ends are both free.
+    MAXIMAL goes through the links in random order and takes each one whose ends are both free.
     INDEPENDENT wakes each link with a probability and takes those that share no node with another
     link that is awake.
     """
@@ -143,6 +146,7 @@ def _free_links(matchings: Matchings, ends: np.ndarray, r: int, active: np.ndarr
             # Without a branch: its outcome is random, so the processor would mispredict it. If the
             # link is not free, the entry behind the last pair is written again with its own value.
             free = (busy[i] | busy[j]) ^ 1
+            # A full matching has no entry behind it, hence the minimum.
             index = min(pairs, len(active) - 1)
             active[index] += free * (order[k] - active[index])
             busy[i], busy[j] = (
@@ -169,10 +173,11 @@ def draw_link(
     lanes: Lanes, channels: Channels, b: int, link: int, fresh: bool, up: np.ndarray, s: int, e: int
 ) -> None:
     """Draw which messages of one activation of ``link`` (index) arrive, in step ``e`` of slot ``s``
-    (index in the block of slots), in all L runs of block ``b``; write 1 or 0 into ``up``
-    (B, S, E, W, L) for its one or two directed links. Links that are not ``fresh`` keep their last
-    draws, which ``channels`` stores. Dimensions: B blocks of L runs, S slots of E exchange steps, W
-    directed links. ``lanes`` is a tuple of length L.
+    (index in the block of slots), in all L runs of block ``b`` at once, one in each lane; write 1
+    or 0 into ``up`` (B, S, E, W, L) for its one or two directed links. A link is ``fresh`` in a
+    step that draws losses anew; otherwise it keeps its last draws, which ``channels`` stores.
+    Dimensions: B blocks of L runs, S slots of E exchange steps, W directed links. ``lanes`` is a
+    tuple of length L.
     """
     uniforms = channels.loss_uniform
     for d in range(channels.directions_per_link):
@@ -198,6 +203,7 @@ def draw_link(
         w = link * channels.directions_per_link + d
         if channels.talks[e, w] == 1:
             uniform = load(lanes, uniforms, b, k)
+            # Without channel states one comparison decides for all lanes.
             if len(channels.state_streams) == 0:
                 store_flags(lanes, up, b, s, e, w, uniform < channels.delivery[0, w])
                 continue
@@ -215,12 +221,13 @@ def draw_link_of_lane(
     channels: Channels, b: int, link: int, fresh: bool, up: np.ndarray, s: int, e: int, q: int
 ) -> None:
     """Draw which messages of one activation of ``link`` (index) arrive, in step ``e`` of slot
-    ``s``, in the run of lane ``q`` of block ``b`` alone; write 1 or 0 into ``up`` (B, S, E, W, L)
-    for its one or two directed links. A link that is not ``fresh`` keeps its last draws, which
-    ``channels`` stores. Dimensions: B blocks of L runs, S slots of E exchange steps, W directed
-    links.
+    ``s``, in the run of lane ``q`` of block ``b`` alone: matchings pair other links in each run.
+    Write 1 or 0 into ``up`` (B, S, E, W, L) for its one or two directed links. A link is ``fresh``
+    in a step that draws losses anew; otherwise it keeps its last draws, which ``channels`` stores.
+    Dimensions: B blocks of L runs, S slots of E exchange steps, W directed links.
     """
     for d in range(channels.directions_per_link):
+        # With one stream per link both directions use its draw; a uniform below 0 is not drawn yet.
         k = link * channels.streams_per_link + min(d, channels.streams_per_link - 1)
         if (
             d < channels.streams_per_link
@@ -244,9 +251,10 @@ def draw_link_of_lane(
 
 @kernel
 def next_state(bad: int, u: float, to_bad: float, to_good: float) -> int:
-    """Return the next state (1: bad) of the Gilbert-Elliott chain of one link, decided by the
-    uniform number ``u``: a good state turns bad with probability ``to_bad``, a bad one good with
-    ``to_good``. The first state, after ``bad`` = -1, has the stationary law.
+    """Return the next state (1: bad, 0: good) of the two-state Markov channel (Gilbert-Elliott) of
+    one link, decided by the uniform number ``u``: a good state turns bad with probability
+    ``to_bad``, a bad one good with ``to_good``. The first state, after ``bad`` = -1, has the
+    stationary law.
     """
     if bad < 0:
         return 1 if u < to_bad / (to_bad + to_good) else 0
@@ -259,10 +267,11 @@ def next_state(bad: int, u: float, to_bad: float, to_good: float) -> int:
 def draw_broadcasts(
     lanes: Lanes, channels: Channels, exchanged: np.ndarray, fresh: np.ndarray, up: np.ndarray
 ) -> None:
-    """Draw which messages of broadcasts, which use every link in every step, arrive: write 1 into
-    ``up`` (B, S, E, W, L), which holds zeros before. Slots that are not ``exchanged`` (S,) stay 0;
-    links draw anew in the steps that are ``fresh`` (E,). Dimensions: B blocks of L runs, S slots of
-    E exchange steps, W directed links. ``lanes`` is a tuple of length L.
+    """Draw which messages arrive when all nodes broadcast, so that every link is used in every
+    step: write 1 into ``up`` (B, S, E, W, L), which holds zeros before. Slots without an exchange,
+    where ``exchanged`` (S,) is False, stay 0; links draw losses anew in the steps that are
+    ``fresh`` (E,) and keep them in the others. Dimensions: B blocks of L runs, S slots of E
+    exchange steps, W directed links. ``lanes`` is a tuple of length L.
     """
     for b in range(up.shape[0]):
         for s in range(up.shape[1]):
@@ -282,12 +291,13 @@ def draw_matched(
     active: np.ndarray,
     pair_count: np.ndarray,
 ) -> None:
-    """Draw the matchings of all runs, and which messages on their links arrive: write 1 into ``up``
-    (B, S, E, W, L), which holds zeros before. ``active`` (R, S, E, A) gets the indices of the
-    paired links in order, ``pair_count`` (R, S, E) their number. Slots that are not ``exchanged``
-    (S,) stay 0; links draw anew in the steps that are ``fresh`` (E,). Dimensions: B blocks of L
-    runs, R runs in all, S slots of E exchange steps, W directed links, at most A pairs. ``lanes``
-    is a tuple of length L.
+    """Draw the matchings of all runs, the pairs of nodes that exchange in each step, and which
+    messages on their links arrive: write 1 into ``up`` (B, S, E, W, L), which holds zeros before.
+    ``active`` (R, S, E, A) gets the indices of the paired links in order, ``pair_count`` (R, S, E)
+    their number. Slots without an exchange, where ``exchanged`` (S,) is False, stay 0; links draw
+    losses anew in the steps that are ``fresh`` (E,). Dimensions: B blocks of L runs, R runs in all,
+    S slots of E exchange steps, W directed links, at most A pairs. ``lanes`` is a tuple of length
+    L.
     """
     for b in range(up.shape[0]):
         for s in range(up.shape[1]):
@@ -308,13 +318,14 @@ def draw_pairs(
     s: int,
     e: int,
 ) -> None:
-    """Draw the matchings of step ``e`` of slot ``s`` in all L runs of block ``b``, and which
-    messages on their links arrive: write these into ``up`` (B, S, E, W, L), the paired links into
-    ``active`` (R, S, E, A), and their number into ``pair_count`` (R, S, E). ``fresh``: links draw
-    anew. Dimensions: B blocks of L runs, R runs in all, S slots of E exchange steps, W directed
-    links, at most A pairs. ``lanes`` is a tuple of length L.
+    """Draw the matchings (which pairs of nodes exchange) of step ``e`` of slot ``s`` in all L runs
+    of block ``b``, and which messages on their links arrive: write these into ``up`` (B, S, E, W,
+    L), the paired links into ``active`` (R, S, E, A), and their number into ``pair_count`` (R, S,
+    E). ``fresh``: links draw losses anew. Dimensions: B blocks of L runs, R runs in all, S slots of
+    E exchange steps, W directed links, at most A pairs. ``lanes`` is a tuple of length L.
     """
     first = b * len(lanes)
+    # Run by run: the pairs are different in each. The last block may have fewer runs than lanes.
     for q in range(min(len(lanes), len(pair_count) - first)):
         r = first + q
         pairs = draw_matching(matchings, channels.ends, r, active[r, s, e])
@@ -327,9 +338,10 @@ def draw_pairs(
 def mark_all_senders(
     lanes: Lanes, channels: Channels, exchanged: np.ndarray, sent: np.ndarray
 ) -> None:
-    """Write 1 into ``sent`` (B, S, E, N, L), for B blocks of L runs and S slots, for all nodes with
-    links, in the slots that are ``exchanged`` (S,): broadcasts ask each of them for a message in
-    each of the E steps. ``lanes`` is a tuple of length L.
+    """Mark the nodes that broadcasts ask for a message, all nodes with links, in each of the E
+    steps of the S slots that are ``exchanged`` (S,): write 1 into ``sent`` (B, S, E, N, L), for N
+    nodes in B blocks of L runs. The filters then decide which of them send. ``lanes`` is a tuple of
+    length L.
     """
     for b in range(sent.shape[0]):
         for s in range(sent.shape[1]):
@@ -344,8 +356,8 @@ def mark_all_senders(
 def mark_paired_senders(
     lanes: Lanes, channels: Channels, active: np.ndarray, pair_count: np.ndarray, sent: np.ndarray
 ) -> None:
-    """Write 1 into ``sent`` (B, S, E, N, L) for both ends of all paired links: matchings ask each
-    of them for a message.
+    """Mark the nodes that matchings ask for a message, both ends of all paired links: write 1 into
+    ``sent`` (B, S, E, N, L). The filters then decide which of them send.
 
     Dimensions are B blocks of L runs, S slots of E exchange steps, N nodes, at most A pairs.
     ``pair_count`` (R, S, E) is the number of pairs of each of the R = B L runs, and the first so
@@ -363,9 +375,10 @@ def mark_paired_senders(
 
 @kernel
 def draw_uniforms(states: np.ndarray, sent: np.ndarray, uniform: FloatArray) -> None:
-    """Draw a uniform number for each node that is asked for a message (``sent``) into ``uniform``
-    (B, S, E, N, L), in the order of steps, from the streams ``states`` (B, N, 4, L). Dimensions: B
-    blocks of L runs, S slots of E exchange steps, N nodes.
+    """Draw a uniform number for each node that is asked for a message (``sent`` is 1), by which
+    filters that send at random decide whether to: into ``uniform`` (B, S, E, N, L), in the order of
+    steps, from the streams ``states`` (B, N, 4, L), one for each node and run. Dimensions: B blocks
+    of L runs, S slots of E exchange steps, N nodes.
     """
     for b in range(sent.shape[0]):
         for s in range(sent.shape[1]):
@@ -486,9 +499,10 @@ def write_row(
     age: float,
     row: int,
 ) -> int:
-    """Write one event of kind number ``kind`` (trace.schema.CODES) at the time of ``stage`` into
-    index ``row`` of the columns of ``rows``; return the next index. ``node`` and ``peer`` are ids
-    of nodes, ``message`` a number on its link (-1: none), ``age`` its seconds under way.
+    """Write one event into row number ``row`` of the event table ``rows`` of a run; return the
+    number of the next row. ``kind`` is an index in trace.schema.KINDS; the time and phase are those
+    of ``stage``, the part of a slot in which it happens; ``node`` and ``peer`` are ids of nodes,
+    ``message`` a number on its link (-1: none), ``age`` its seconds under way.
     """
     rows.t[row], rows.kind[row], rows.node[row], rows.peer[row] = stage.t, kind, node, peer
     rows.message[row], rows.phase[row], rows.age[row] = message, stage.phase, age
@@ -508,8 +522,10 @@ def make_rows(
     rows: Rows,
 ) -> int:
     """Write the events of the first run in the slots with indices ``first`` to ``stop`` - 1 into
-    ``rows``, in the order of time; return their number. Numbers messages in ``traced.sent``.
-    ``pairwise``: nodes swap with a peer, instead of absorbing broadcasts.
+    the event table ``rows``, in the order of time; return their number. A slot has ``stages``: a
+    reading of sensors and steps of exchanges. Messages are numbered on, by link, from
+    ``traced.sent``, which is advanced. ``pairwise``: nodes swap with a peer, instead of absorbing
+    broadcasts.
     """
     row = 0
     for s in range(first, stop):
@@ -526,8 +542,8 @@ def make_rows(
 
 @kernel
 def mark_sample(times: SlotTimes, s: int, rows: Rows, row: int) -> None:
-    """Store ``row``, the number of rows before the sample of slot ``s`` (index), in
-    ``rows.before_sample``, if the slot has a sample.
+    """Store ``row``, the number of event rows before the sample of slot ``s`` (index), in
+    ``rows.before_sample``, if the slot has a sample: a run that diverges ends with these rows.
     """
     k = times.sample[s]
     if k >= 0:
@@ -546,13 +562,15 @@ def _slot_rows(
     s: int,
     row: int,
 ) -> int:
-    """Write the events of the first run in slot ``s`` (index) into ``rows`` from index ``row`` on;
-    return the next index. Numbers messages in ``traced.sent``. ``pairwise``: nodes swap with a
-    peer.
+    """Write the events of the first run in slot ``s`` (index) into the event table ``rows`` from
+    row ``row`` on; return the number of the next row. A slot has ``stages``: a reading of sensors
+    and steps of exchanges. Messages are numbered on, by link, from ``traced.sent``. ``pairwise``:
+    nodes swap with a peer, instead of absorbing broadcasts.
     """
     now = times.start[s]
     for k in range(len(stages.step)):
         stage = SlotStage(times.first + s, s, stages.step[k], stages.phase[k], now)
+        # Step -1: sensors are read. The row of a "sense" has no peer, message or age.
         if stage.step < 0:
             if times.sensed[s]:
                 for node in traced.sensing:
@@ -576,10 +594,12 @@ def _write_sends(
     pairwise: bool,
     row: int,
 ) -> int:
-    """Write the messages that the first run sends in the step of ``stage`` into ``rows`` from index
-    ``row`` on: after the tick of each pair if exchanges are ``pairwise``, or after one "round" for
-    broadcasts; return the next index. Numbers messages in ``traced.sent``.
+    """Write the messages that the first run sends in an exchange step (``stage``) into the event
+    table ``rows`` from row ``row`` on: after the "tick" of each pair if exchanges are ``pairwise``,
+    or after one "round" for broadcasts; return the number of the next row. Messages are numbered
+    on, by link, from ``traced.sent``.
     """
+    # A "round" has no node, peer, message or age.
     if not pairwise:
         row = write_row(rows, stage, ROUND, -1, -1, -1, NAN, row)
     links = messages.pair_count[0, stage.s, stage.step] if pairwise else len(channels.ends)
@@ -602,9 +622,10 @@ def _link_rows(
     link: int,
     row: int,
 ) -> int:
-    """Write the messages that the first run sends on ``link`` (index) in the step of ``stage`` into
-    ``rows`` from index ``row`` on, each followed by its arrival or loss; return the next index.
-    Numbers messages in ``traced.sent``.
+    """Write the messages that the first run sends on ``link`` (index) in an exchange step
+    (``stage``) into the event table ``rows`` from row ``row`` on, each followed by its arrival or
+    loss; return the number of the next row. Messages of a direction are numbered on from
+    ``traced.sent``.
     """
     for end in range(channels.directions_per_link):
         w, i = link * channels.directions_per_link + end, channels.ends[link, end]
@@ -627,8 +648,9 @@ def _link_rows(
 
 @kernel
 def is_silent(messages: SlotMessages, b: int, stage: SlotStage, node: int, q: int) -> bool:
-    """Return True if ``node`` (an index) sends nothing in the step of ``stage``, in lane ``q`` of
-    block ``b``.
+    """Return True if the filter of ``node`` (an index) decided to send nothing in the exchange step
+    of ``stage``, in lane ``q`` (run) of block ``b``. ``messages.sent`` is empty for filters that
+    always send.
     """
     return len(messages.sent) > 0 and messages.sent[b, stage.s, stage.step, node, q] == 0
 
@@ -643,8 +665,9 @@ def _write_step_end(
     stopping: int,
     row: int,
 ) -> int:
-    """Write which nodes absorb or swap when the exchange step of ``stage`` ends, and which stop,
-    into ``rows`` from index ``row`` on, in the first run; return the next index.
+    """Write what happens in the first run when the exchange step of ``stage`` ends into the event
+    table ``rows`` from row ``row`` on: which nodes absorb or swap, and which stop; return the
+    number of the next row.
 
     Nodes that received something swap states with their peer if exchanges are ``pairwise``, else
     they absorb it. In step number ``stopping`` (-1: none) nodes may permanently freeze their
@@ -683,9 +706,9 @@ def count_events(
     counts: np.ndarray,
 ) -> None:
     """Add to ``counts`` (R, KINDS) the number of events of each kind in S slots of each of R runs,
-    as many as ``make_rows`` would write; ``scratch`` (KINDS, L) for the L runs of a block.
-    ``pairwise``: nodes swap with a peer, instead of absorbing broadcasts. ``lanes`` is a tuple of
-    length L.
+    for runs of a batch whose events are not stored: as many as ``make_rows`` would write.
+    ``scratch`` (KINDS, L) is for the L runs of a block. ``pairwise``: nodes swap with a peer,
+    instead of absorbing broadcasts. ``lanes`` is a tuple of length L.
     """
     for b in range(messages.up.shape[0]):
         for kind in range(len(scratch)):
@@ -697,6 +720,7 @@ def count_events(
                     add_count(lanes, scratch, SENSE, 1.0 * len(traced.sensing))
                 elif e >= 0 and times.exchanged[s]:
                     stage = SlotStage(times.first + s, s, e, stages.phase[k], 0.0)
+                    # The time of the stage, 0.0 here, is not used for counts.
                     count_step(
                         lanes,
                         channels,
@@ -736,10 +760,10 @@ def count_step(
     counts: np.ndarray,
     b: int,
 ) -> None:
-    """Add the events of the exchange step of ``stage`` in the L runs of block ``b`` to ``scratch``
-    (KINDS, L), but those of nodes that stop, in step number ``stopping``, to ``counts`` (R, KINDS)
-    of all R runs. ``pairwise``: nodes swap with a peer, instead of absorbing broadcasts. ``lanes``
-    is a tuple of length L.
+    """Add the events of an exchange step (``stage``) in the L runs of block ``b`` to ``scratch``
+    (KINDS, L), lane by lane; but those of nodes that stop, in step number ``stopping``, to
+    ``counts`` (R, KINDS) of all R runs. ``pairwise``: nodes swap with a peer,
+    instead of absorbing broadcasts. ``lanes`` is a tuple of length L.
     """
     stops = stage.step == stopping
     if pairwise:
@@ -779,9 +803,10 @@ def count_matched_pairs(
     counts: np.ndarray,
     b: int,
 ) -> None:
-    """Add the ticks of pairs in the step of ``stage``, and their messages, all as lost for now, in
-    the L runs of block ``b`` to ``scratch`` (KINDS, L); of ``counts`` (R, KINDS) only the number R
-    of runs is used. ``lanes`` is a tuple of length L.
+    """Add the ticks of pairs in the exchange step of ``stage``, and their messages, to the counts
+    ``scratch`` (KINDS, L) of the L runs of block ``b``. All messages count as lost for now: the
+    caller takes the delivered ones off again. Of ``counts`` (R, KINDS) only the number R of runs is
+    used. ``lanes`` is a tuple of length L.
     """
     first = b * len(lanes)
     for r in range(first, min(first + len(lanes), len(counts))):
@@ -807,10 +832,10 @@ def count_silent(
     scratch: FloatArray,
     b: int,
 ) -> None:
-    """Subtract the messages that silent nodes do not send in the step of ``stage``, in the L runs
-    of block ``b``, from the counts SEND and LOST of ``scratch`` (KINDS, L): the caller has added a
-    message of each direction to both, as if all were sent and lost. ``lanes`` is a tuple of
-    length L.
+    """Subtract the messages that silent nodes (whose filters decided not to send) do not send in
+    the exchange step of ``stage``, in the L runs of block ``b``, from the counts SEND and LOST of
+    ``scratch`` (KINDS, L): the caller has added a message of each direction to both, as if all were
+    sent and lost. ``lanes`` is a tuple of length L.
     """
     silent = spread(lanes, 0.0)
     # Directions w, of which link w // directions_per_link has one or two, from its ends.
@@ -833,8 +858,9 @@ def count_silent(
 def count_stops(
     lanes: Lanes, traced: TracedNodes, stage: SlotStage, counts: np.ndarray, b: int
 ) -> None:
-    """Add the nodes that stop in the slot of ``stage``, in the L runs of block ``b``, to the count
-    STOP of ``counts`` (R, KINDS) of all R runs. ``lanes`` is a tuple of length L.
+    """Add the nodes that stop, which permanently freeze their network estimate, in the slot of
+    ``stage``, in the L runs of block ``b``, to the count STOP of ``counts`` (R, KINDS) of all R
+    runs. ``lanes`` is a tuple of length L.
     """
     first = b * len(lanes)
     for r in range(first, min(first + len(lanes), len(counts))):
