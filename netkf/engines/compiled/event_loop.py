@@ -87,9 +87,9 @@ def event_loop(
     combination: CombinationState | None,
 ) -> int:
     """Simulate the run ``state`` until the loop needs something from Python; return the request
-    (WANT_... or DONE). ``totals``, ``history`` and ``combination`` hold the extra state that some
-    filters need (running sums, past events, see CombinationState), None for the others; all of
-    these are changed.
+    (WANT_... or DONE), after which Python calls the loop again. ``totals`` (running sums),
+    ``history`` (past events) and ``combination`` (see CombinationState) hold the extra state that
+    some filters need, None for the others; all of these are changed.
     """
     absorbs_at_once = totals is None and history is None
     while True:
@@ -135,8 +135,8 @@ def seek_piece(state: Simulation, now: float) -> None:
 
 @kernel
 def find_shortage(state: Simulation, history: History | None, event: int, now: float) -> int:
-    """Return the request for what an event (ON_...) at ``now`` (seconds) needs and lacks
-    (WANT_..., DONE), or GO_ON; nothing is changed.
+    """Return the request for what an event (ON_...) at ``now`` (seconds) needs and lacks (WANT_...,
+    DONE), or GO_ON if the event can happen; nothing is changed.
     """
     # Space for the worst case of one event, so that no handler has to stop half-way.
     request = GO_ON
@@ -161,7 +161,8 @@ def find_shortage(state: Simulation, history: History | None, event: int, now: f
 @kernel
 def next_event(state: Simulation) -> tuple[int, float]:
     """Return the next event (ON_...) of the run ``state`` and its time in seconds, NEVER if none is
-    left; ties go to the earlier kind.
+    left. Events of one instant happen in the order of these kinds: moves of the origin, readings of
+    increments, samples of sensors, ticks, deliveries, absorptions, stored samples.
     """
     # ``<`` keeps the earlier event of the list at equal times: the order of ranks.
     event, now = ON_REBASE, next_of(state.frames, state.frame_at)
@@ -218,7 +219,7 @@ def predict_participants(
 @kernel
 def count_participants(state: Simulation, event: int) -> int:
     """Return the number of nodes that are predicted to the time of an ``event`` (ON_...) before it
-    happens: none, one, both ends of a link, or all.
+    happens: none, one, both ends of a link, or all. ``participant`` says which.
     """
     count = 1
     # Samples and moves of the origin concern the states of all nodes at one time.
@@ -236,8 +237,8 @@ def count_participants(state: Simulation, event: int) -> int:
 @kernel
 def participant(state: Simulation, event: int, k: int) -> int:
     """Return the index in ``state.nodes`` of participant number ``k`` (from 0) of the next event,
-    which is of kind ``event`` (ON_...). For the first ON_ABSORB of an instant sorts
-    ``state.waiting``.
+    of kind ``event`` (ON_...): a node that is predicted to the event's time before it happens. For
+    the first ON_ABSORB of an instant sorts ``state.waiting``.
     """
     if event == ON_TICK:
         entity = state.entities[state.ticks.entity[state.tick_at]]
@@ -252,13 +253,14 @@ def participant(state: Simulation, event: int, k: int) -> int:
         return int(state.sensing.index[state.wake_at])
     if event == ON_SAMPLE:
         return int(state.instants.index[state.instant_at])
+    # Moves of the origin and stored samples concern all nodes.
     return k
 
 
 @kernel
 def max_readings(state: Simulation, event: int) -> int:
-    """Return the largest number of readings that the next event, of kind ``event`` (ON_...),
-    uses.
+    """Return the largest number of readings that the next event, of kind ``event`` (ON_...), uses:
+    so many free entries the history of readings needs before it.
     """
     if event == ON_SAMPLE:
         return 1
@@ -331,8 +333,8 @@ def predict(state: Simulation, combination: CombinationState | None, h: int, tim
 @kernel
 def on_sense(state: Simulation, now: float) -> None:
     """Record that the next node with increment sensors has used its increments up to ``now``
-    (seconds), a point of the sensing grid; advances ``state.wake_at``, and after the last node
-    ``state.grid_at``.
+    (seconds), a point of the sensing grid at which all such nodes read; the caller has predicted
+    it. Advances ``state.wake_at``, and after the last node ``state.grid_at``.
     """
     sensing = state.sensing
     record_event(state, now, SENSE, sensing.node[state.wake_at], -1, -1)
@@ -384,8 +386,9 @@ def on_tick(
     state: Simulation, totals: Totals | None, combination: CombinationState | None, now: float
 ) -> None:
     """Handle the next tick of a clock at ``now`` (seconds), or a transmission after a sample: send
-    one message on each directed link of its entity, and advance ``state.tick_at``. ``totals`` and
-    ``combination``, None if unused, have the contents of messages for some filters.
+    one message on each directed link of its entity (a link, a directed link or a node with a
+    clock), and advance ``state.tick_at``. ``totals`` and ``combination``, None if unused, have the
+    contents of messages for some filters.
     """
     ticks, nodes, k = state.ticks, state.nodes, state.tick_at
     entity = state.entities[ticks.entity[k]]
@@ -394,7 +397,8 @@ def on_tick(
     if state.clock_kind != AFTER_READINGS:
         record_event(state, now, TICK, nodes[i].id, nodes[j].id if j >= 0 else -1, -1)
     state.tick_at += 1
-    # A node without receivers does not transmit.
+    # Filters of running sums add a share to their totals first. A node without receivers does not
+    # transmit.
     if totals is not None and not offer_round(state, totals, i, now):
         return
     # A node's clock makes one transmission, which each receiver hears or loses.
@@ -463,7 +467,9 @@ def send(
 
 @kernel
 def is_lost(state: Simulation) -> bool:
-    """Return True if all messages of the next tick (number ``state.tick_at``) are lost."""
+    """Return True if all messages of the next tick (number ``state.tick_at``) are lost: then nodes
+    without increment sensors need no prediction for it.
+    """
     ticks = state.ticks
     entity = state.entities[ticks.entity[state.tick_at]]
     first = state.first_delay + ticks.first_outcome[state.tick_at]
@@ -543,9 +549,10 @@ def on_absorb(
     now: float,
 ) -> None:
     """Let the next node, ``state.waiting[state.absorbing]``, absorb all messages of this instant
-    ``now`` (seconds), in the order of senders. Changes its estimate in ``state.xhat`` and ``root``,
-    empties its inbox, and advances ``absorbing``. ``totals``, ``history``, ``combination``: extra
-    state of the filter, None if unused.
+    ``now`` (seconds), in the order of senders: combine its estimate with theirs in the way of its
+    filter. Changes its estimate in ``state.xhat`` and ``root``, empties its inbox, and advances
+    ``absorbing``. ``totals``, ``history``, ``combination``: extra state of the filter, None if
+    unused.
     """
     pool, h = state.pool, state.waiting[state.absorbing]
     node, oldest = state.nodes[h], 0.0
@@ -596,8 +603,10 @@ def use_messages(state: Simulation, history: History, h: int, now: float) -> Non
 def combine_with_state(
     state: Simulation, combination: CombinationState, h: int, now: float
 ) -> None:
-    """Combine node ``h`` (index in ``state.nodes``) with its inbox at ``now`` (seconds), for the
-    combinations that need a CombinationState. Changes ``state.xhat[h]`` and ``root[h]``.
+    """Combine node ``h`` (index in ``state.nodes``) with its inbox at ``now`` (seconds), for
+    filters that need the extra arrays of a CombinationState: consensus on predictions, constant
+    gains, belief propagation, and fusion with the best weight. Changes ``state.xhat[h]`` and
+    ``root[h]``.
     """
     if combination.kind == PREDICTIONS:
         use_readings_heard(state, h, now)
@@ -616,7 +625,7 @@ def combine_with_state(
 def predict_payloads(state: Simulation, h: int, now: float) -> float:
     """Predict the estimates that messages in the inbox of node ``h`` (index) carry from when they
     were sent to ``now`` (seconds), without readings, in ``state.pool_x`` and ``pool_root``. Return
-    the sum of the weights of all these messages.
+    the sum of the weights of all these messages; the node's own weight is 1 minus it.
     """
     # The last model of the table has no sensors: prediction alone, as readings since then are
     # unknown here.
@@ -637,8 +646,9 @@ def predict_payloads(state: Simulation, h: int, now: float) -> float:
 @kernel
 def combine(state: Simulation, h: int, now: float) -> None:
     """Combine node ``h`` (index in ``state.nodes``) with the estimates in its inbox, predicted to
-    ``now`` (seconds), in the way of the filter's ``combination_kind``. Changes ``state.xhat[h]``
-    and ``root[h]``.
+    ``now`` (seconds), in the way of the filter's ``combination_kind``: a convex combination,
+    covariance intersection, shares (covariance intersection with renormalised weights) or a swap.
+    Changes ``state.xhat[h]`` and ``root[h]``.
     """
     received_weight = predict_payloads(state, h, now)
     if state.combination_kind == CONVEX:
@@ -714,28 +724,28 @@ def on_probe(state: Simulation, totals: Totals | None) -> bool:
 
 @kernel
 def store_sample(state: Simulation, run: int, first: int, k: int) -> None:
-    """Store the estimates and covariances ``P = S S'`` of the N nodes at the places ``first`` to
-    ``first`` + N - 1 of ``state.xhat`` and ``root`` as sample ``k`` of run number ``run``, in
-    ``buffer.xhat[run, k]`` (N, n) and ``buffer.P[run, k]`` (N, n, n).
+    """Store the estimates and covariances ``P = S S'`` of the N nodes of a run, which are in the
+    rows ``first`` to ``first`` + N - 1 of ``state.xhat`` and ``root`` (S), as sample ``k`` of run
+    number ``run``, in ``buffer.xhat[run, k]`` (N, n) and ``buffer.P[run, k]`` (N, n, n).
     """
     xhat, P, root, n = state.buffer.xhat, state.buffer.P, state.root, len(state.size)
     for h in range(len(state.nodes)):
-        place = first + h
+        entry = first + h
         for i in range(n):
-            xhat[run, k, h, i] = state.xhat[place, i]
+            xhat[run, k, h, i] = state.xhat[entry, i]
             for j in range(i + 1):
                 # With the lower triangle of S only.
                 total = 0.0
                 for r in range(j + 1):
-                    total += root[place, i, r] * root[place, j, r]
+                    total += root[entry, i, r] * root[entry, j, r]
                 P[run, k, h, i, j] = P[run, k, h, j, i] = total
 
 
 @kernel
 def count_sample(state: Simulation) -> bool:
-    """Count the sample just stored: write the numbers of events so far, the next row and the piece
-    of the path to ``state.buffer``, and advance ``probe_at`` and ``samples``. Return False if there
-    is no space for another one.
+    """Count the sample just stored: write to ``state.buffer`` the numbers of events so far, the
+    next row and the piece of the path that the sample lies in, and advance ``probe_at`` and
+    ``samples``. Return False if there is no space for another one.
     """
     # A run that diverges at this sample ends with these counts and rows.
     buffer, run, k = state.buffer, state.run, state.samples

@@ -122,8 +122,10 @@ class Source:
     states: States
 
     def __init__(self, scenario: Scenario, streams: Streams) -> None:
-        """Draw the sample times of all sensors, and make the sources of ticks, noise and path;
-        without a sensing grid read all samples at once.
+        """Draw the sample times of all sensors, and make the sources of ticks, noise and the path
+        of the true state. The path is drawn block by block on the sensing grid, with the samples on
+        it; without a sensing grid (no sensor reads increments) the states at all samples are drawn
+        here at once.
         """
         times = scenario.sample_times(streams)
         self._samples = samples = SampleTables(scenario, streams, times)
@@ -150,8 +152,9 @@ class Source:
         return self._windows.following()
 
     def path(self, together: int = 1) -> PathBlock:
-        """Return the next block of steps of the path of the true state; one piece that lasts for
-        the whole run if no sensor has increments, since the state is needed at samples only then.
+        """Return the next block of steps of the path of the true state. If no sensor reads
+        increments it is one piece that lasts for the whole run, since the state is needed at
+        samples only then.
 
         Draws the noise of these steps into ``sensing``, and reads the samples taken during them
         into ``instants``. The event loop simulates ``together`` runs side by side: the block has a
@@ -175,7 +178,9 @@ class Source:
 
 
 def _make_windows(scenario: Scenario, streams: Streams, instants: Instants) -> Windows:
-    """Return the source of windows of ticks, for clocks or for transmissions after readings."""
+    """Return the source of ticks, which come in windows of time: Poisson and other clocks of the
+    network, or transmissions after readings.
+    """
     senders = senders_of(scenario)
     if senders.at == "readings":
         return ReadingsSchedule(scenario, streams, senders, instants.t, instants.index)
@@ -215,8 +220,9 @@ class Workspace:
         return self._start
 
     def visits(self, together: int = 1) -> Visits:
-        """Return an empty queue of visits with space for all nodes of ``together`` runs, reused
-        from earlier runs if it is large enough.
+        """Return an empty queue of visits (predictions of nodes that wait to be computed side by
+        side), with space for all nodes of ``together`` runs; it is reused from earlier runs if it
+        is large enough.
         """
         capacity = together * len(self._start.nodes)
         if self._visits is None or len(self._visits.level) < capacity:
@@ -228,17 +234,20 @@ class Workspace:
         self, draws: Draws, traced: bool, buffer: SampleBuffer | None = None, together: int = 1
     ) -> Simulation:
         """Return the state at time 0 of one run, or of ``together`` runs that write their samples
-        into ``buffer``; ``traced``: rows of events are written.
+        into ``buffer`` (None: the workspace's own), with the random numbers of ``draws``;
+        ``traced``: rows of events are written, not only counted.
         """
         start, instants, window = self._start, draws.instants, draws.window()
         entities, directions = self._records
-        # Records are shared by all runs of the workspace: numbers of messages start again.
+        # Records of links belong to the workspace: the numbers of their messages start again.
         directions["messages"] = 0
         pool = self._pool[0]
         # All messages are free: a linked list in the order of the pool.
         pool["next"] = np.arange(1, len(pool) + 1)
         path = draws.path(together)
-        scratch, flow, update = scratch_arrays(start.table, start.gains, instants, self._unrolled)
+        scratch, flow_arrays, update_arrays = scratch_arrays(
+            start.table, start.gains, instants, self._unrolled
+        )
         nodes, n = start.xhat.shape
         xhat, root = with_spare((together * nodes, n)), with_spare((together * nodes, n, n))
         xhat[:], root[:] = np.tile(start.xhat, (together, 1)), np.tile(start.root, (together, 1, 1))
@@ -269,8 +278,8 @@ class Workspace:
             rows=self._rows,
             counts=np.zeros(len(schema.KINDS), dtype=np.int64),
             scratch=scratch,
-            flow_scratch=flow,
-            update_scratch=update,
+            flow_scratch=flow_arrays,
+            update_scratch=update_arrays,
             traced=traced,
             **self._scalar_fields(instants),
             **dict.fromkeys(AT_START, 0),
@@ -278,8 +287,9 @@ class Workspace:
         return state
 
     def _scalar_fields(self, instants: Instants) -> dict[str, Any]:
-        """Return by name those scalar fields of a Simulation that are not 0 at the start, for a run
-        with the samples ``instants``.
+        """Return by name those scalar fields of a Simulation that are not 0 at the start of a run:
+        the filter's kind and limits, and the largest number of messages and rows that one event may
+        need, by which the loop asks for space in time. ``instants`` are the samples of the run.
         """
         algorithm: Any = self._scenario.node_filter
         max_messages = int(np.diff(self._senders.first).max(initial=0))
@@ -300,8 +310,8 @@ class Workspace:
 
 
 def ticks_of(window: Window) -> TickArrays:
-    """Return the K ticks of a window as a struct for kernels, with arrival bits 0 if it has
-    none.
+    """Return the K ticks of a window as a struct for kernels. Arrival bits (bit m is 1 if message m
+    of a tick arrives) are 0 if the window has none yet.
     """
     bits = window.arrival_bits
     if bits is None:
@@ -313,8 +323,8 @@ def empty_samples(
     shape: tuple[int, int, int, int], terms: int = 0, make: Callable[..., Any] = np.zeros
 ) -> SampleBuffer:
     """Return space for B samples of N filters in R runs of n states, ``shape`` being (R, B, N, n),
-    and for ``terms`` terms of conserved sums; ``make`` (np.zeros or np.empty) creates the arrays of
-    estimates and covariances.
+    and for ``terms`` terms of conserved sums (push-sum; 0 for other filters). ``make`` (np.zeros or
+    np.empty) creates the arrays of estimates and covariances.
     """
     runs, count, _, n = shape
     return SampleBuffer(
@@ -375,8 +385,9 @@ class FlowRun:
         return "complete"
 
     def _advance(self) -> int:
-        """Run the kernel that fits the filter until it needs something from Python; return its
-        request (WANT_... or DONE).
+        """Run the compiled loop that fits the filter until it needs something from Python; return
+        its request (WANT_... or DONE): visits in SIMD lanes, the loop of batches, which needs no
+        extra state, or the loop with extra state.
         """
         if self._visits is not None:
             return advance_alone(self._state, self._visits)
@@ -385,8 +396,9 @@ class FlowRun:
         return int(event_loop(self._state, self._totals, self._history, self._combination))
 
     def _fulfil(self, request: int) -> None:
-        """Fulfil a ``request`` (WANT_...) of the event loop: put the next ticks, the next steps of
-        the path or larger arrays into the state of the run, or move the origin.
+        """Fulfil a ``request`` (WANT_...) of the event loop, before the loop goes on: put the next
+        ticks, the next steps of the path or larger arrays into the state of the run, or move the
+        origin. Samples, WANT_SAMPLES, are recorded by the caller.
         """
         state = self._state
         if request == WANT_TICKS:
@@ -409,7 +421,8 @@ class FlowRun:
 
     def _rebase(self) -> None:
         """Make the present state of the plant the new origin of all states, estimates and messages,
-        and advance ``frame_at``.
+        so that numbers of an unstable plant stay small and keep their digits, and advance
+        ``frame_at``, the number of the next such move.
         """
         state, k = self._state, self._state.frame_at
         offset = -self._draws.states.offset(k, state.path, state.piece)
@@ -440,8 +453,8 @@ class FlowRun:
 
     def _record_rows(self, count: int, counts: np.ndarray) -> None:
         """Pass the first ``count`` event rows on to the recorder, which keeps their array, and
-        empty the buffer; in a run without rows pass on ``counts`` (kinds,), the number of events by
-        kind.
+        continue with an empty one. In a run without rows pass on ``counts`` (kinds,), the number of
+        events by kind.
         """
         state, recorder = self._state, self._recorder
         if not state.traced:
@@ -456,8 +469,8 @@ class FlowRun:
         state.rows = np.empty(len(rows), dtype=EVENT)
 
     def _record_samples(self) -> bool:
-        """Pass the samples in the buffer on to the recorder and empty the buffer; return False if
-        one of them is not finite.
+        """Pass the samples in the buffer on to the recorder, with the true states at their times,
+        and empty the buffer; return False if one of them is not finite, at which the run ends.
         """
         state, buffer = self._state, self._state.buffer
         count, state.samples = state.samples, 0
@@ -465,7 +478,8 @@ class FlowRun:
             return True
         times = state.probes[state.probe_at - count : state.probe_at].copy()
         local, x = self._draws.states.states_at(times, state.path, buffer.piece[0, :count])
-        # Index of the last sample that counts: the last one, or the first that is not finite.
+        # Index of the last sample that counts: the last one, or the first that is not finite. A
+        # list, so that the function below can set it.
         last = [count - 1]
 
         def pass_rows_on(k: int) -> None:
@@ -490,8 +504,8 @@ class FlowRun:
 
 
 def _sums(terms: FloatArray, receivers: np.ndarray) -> dict[str, tuple[float, float]]:
-    """Return the total weight of running sums at the start and now, as {"weight": (start, now)}:
-    the weights that nodes hold, plus the totals sent, minus the totals heard.
+    """Return the total weight of push-sum at the start and now, as {"weight": (start, now)}: the
+    weights that nodes hold, plus the totals sent, minus the totals heard.
 
     Nodes send the total of all shares of their weight so far, so that a later message makes up for
     a lost one; what was sent and not heard yet is under way. The sum stays N if none is lost for

@@ -131,8 +131,9 @@ class SlotRuns:
         self._begin_messages()
 
     def _begin_truth(self) -> None:
-        """Draw the initial states of the plant in all runs into ``self._path``, or load the
-        recorded truth as ``self._truth``.
+        """Create what the true states of the plant are drawn from: ``self._path``, with the initial
+        states drawn for all runs; or, for a plant without random numbers (such as a recorded one),
+        load its states as ``self._truth``, one for all runs.
         """
         plant, setup = self._scenario.slot_plant, self.setup
         self._truth: Any = None
@@ -154,8 +155,9 @@ class SlotRuns:
 
     def _begin_readings(self) -> None:
         """Create what readings are drawn from: ``_noise`` (R K, 4), the random streams of the K
-        sensors that kernels read in R runs; ``_regressors``, a path and its streams for each sensor
-        with a random H; and ``_recorded``, the readings of recorded sensors.
+        sensors whose readings kernels draw, in R runs; ``_regressors``, for each sensor with a
+        random H (regressors), the path of H as a plant of its own and its streams; and
+        ``_recorded``, the readings of recorded sensors.
         """
         setup, streams = self.setup, self._streams
         entities = [(s.node, s.placed_sensor.ordinal) for s in setup.kernel_sensors]
@@ -164,7 +166,7 @@ class SlotRuns:
         self._regressors: list[tuple[Path, np.ndarray]] = []
         for s, (A, drive, start) in zip(setup.regressor_sensors, setup.regressors, strict=True):
             x = in_lanes(start, self._blocks)
-            # No frame: regressors do not grow as an unstable plant does.
+            # Frame 0: the origin never moves, as regressors do not grow as an unstable plant does.
             path = Path(A, drive, 0, x, np.zeros(x.shape))
             states = StreamBatch(streams, "regressor", [(s.node, s.placed_sensor.ordinal)]).states
             self._regressors.append((path, states))
@@ -174,9 +176,10 @@ class SlotRuns:
         ]
 
     def _begin_messages(self) -> None:
-        """Create ``_channels`` and ``_matchings`` of all runs, with their random streams; and, for
-        filters that draw random numbers to decide whether to send, the streams ``_triggers``
-        (B, N, 4, L) of N nodes in B blocks of L runs.
+        """Create what messages are drawn from: ``_channels`` (losses) and ``_matchings`` (which
+        pairs of nodes exchange) of all runs, with their random streams; and, for filters that draw
+        random numbers to decide whether to send, the streams ``_triggers`` (B, N, 4, L) of N nodes
+        in B blocks of L runs.
         """
         setup, streams, links = self.setup, self._streams, len(self.setup.ends)
         # Empty arrays tell the kernels to draw nothing.
@@ -192,7 +195,7 @@ class SlotRuns:
             setup.delivery,
             self._in_lanes("loss", entities) if random_loss else no_streams,
             self._in_lanes("weather", entities) if random_loss and setup.is_chain else no_streams,
-            # -1: nothing drawn yet, and no channel state yet.
+            # Losses and steps of the channel state: -1, nothing drawn yet; and no state yet.
             np.full(shape, -1.0),
             np.full(shape, -1.0),
             np.full(shape, -1, dtype=np.int64),
@@ -226,8 +229,9 @@ class SlotRuns:
         return self._slot >= self.setup.slots
 
     def following(self, max_events: int, timed: bool = True) -> SlotBlock:
-        """Simulate the next slots, with about ``max_events`` events at most (0: no limit), and
-        return their results; ``timed``: compute the times of slots, which event rows need.
+        """Simulate the next slots in all R runs, with about ``max_events`` events at most (0: no
+        limit), and return their results: draw messages, true states and readings, then run the
+        filters' kernel on them. ``timed``: compute the times of slots, which event rows need.
         """
         setup = self.setup
         times, messages = self._next_messages(max_events, timed)
@@ -235,7 +239,8 @@ class SlotRuns:
         readings = self._draw_readings(times, local, rebased)
         sampled = np.flatnonzero(times.sample >= 0)
         samples = self.samples if self.samples is not None else self._empty_samples(len(sampled))
-        # Explicit lengths: reshape(-1) fails for the empty arrays of a block without a sample.
+        # Kernels take flat entries for each sample. Explicit lengths, since reshape(-1) fails for
+        # the empty arrays of a block without a sample.
         x, xhat, P, error = (
             part.reshape(*part.shape[:2], math.prod(part.shape[2:])) for part in samples
         )
@@ -254,6 +259,8 @@ class SlotRuns:
             algorithm.slot_kernel,
         )
         unread = self._missed_readings(messages, count)
+        # Filters decide who sends, and Python makes the messages: the kernel runs in two parts, up
+        # to the sending, and from the arrivals on.
         if self._events is not None and setup.decides:
             slot_kernel(self._nodes, readings, plan._replace(part=SENDING), *kernel_arguments)
             messages.sent[:, unread] = 0
@@ -268,7 +275,9 @@ class SlotRuns:
 
     def _next_messages(self, max_events: int, timed: bool) -> tuple[SlotTimes, SlotMessages]:
         """Return the times and messages of the next slots, with about ``max_events`` events at most
-        (0: no limit).
+        (0: no limit). How many slots they are depends on who makes the messages: kernels draw those
+        of many slots, Python (for channels and clocks of a user) those of some, or of one if
+        filters decide who sends.
         """
         setup, events = self.setup, self._events
         if events is None:
@@ -285,7 +294,9 @@ class SlotRuns:
         return self._next_times(count, True), _pack_messages(up, np.zeros((0,) * 4, dtype=np.uint8))
 
     def _empty_samples(self, count: int) -> SampledStates:
-        """Return space for T = ``count`` samples of all R runs, not initialised."""
+        """Return space for T = ``count`` samples of all R runs, not initialised, in memory that is
+        reused for the next results.
+        """
         runs, estimators, n = self.runs, self.setup.estimators, self.setup.n
         filter_shape = runs, count, estimators, n
         shapes = (runs, count, n), filter_shape, (*filter_shape, n), filter_shape
@@ -304,8 +315,9 @@ class SlotRuns:
         return np.asarray(~np.isfinite(by_run(self._total, self.runs)))
 
     def _next_times(self, count: int, timed: bool) -> SlotTimes:
-        """Return flags, samples and, if ``timed``, start times of the next S = ``count`` slots;
-        without ``timed`` the times are 0.
+        """Return, for the next S = ``count`` slots, whether events are recorded, sensors read and
+        messages exchanged, the indices of samples and, if ``timed``, the start times; without
+        ``timed`` these are 0.
         """
         setup, algorithm, plant = self.setup, self.setup.algorithm, self._scenario.slot_plant
         slots = np.arange(self._slot, self._slot + count)
@@ -327,7 +339,9 @@ class SlotRuns:
         return SlotTimes(self._slot, start, recorded, sensed, exchanged, sample, algorithm.predicts)
 
     def _draw_messages(self, times: SlotTimes) -> SlotMessages:
-        """Draw and return the matchings and messages of the S slots of ``times`` for all R runs."""
+        """Draw and return which nodes exchange in the S slots of ``times``, and which messages
+        arrive, for all R runs.
+        """
         setup = self.setup
         shape, pairs = (len(times.start), len(setup.fresh)), setup.max_pairs
         decided = setup.decides or setup.may_miss
@@ -363,9 +377,11 @@ class SlotRuns:
         self, deliveries: Deliveries, times: SlotTimes, messages: SlotMessages
     ) -> None:
         """Write 1 into ``messages.up`` (1, S, E, W, L) for the messages that a replay of one run
-        delivers whatever was drawn.
+        delivers whatever was drawn: those of ``deliveries.chosen``, or all if it is None. A replay
+        repeats a run with other deliveries.
         """
         setup, each = self.setup, self.setup.directions_per_link
+        # (S, E, W): in which steps each directed link carries a message.
         is_sent = np.zeros(messages.up.shape[1:4], dtype=bool)
         is_sent[times.exchanged] = setup.talks
         if len(messages.active):
@@ -381,14 +397,16 @@ class SlotRuns:
             w = setup.index_of_direction[sender, receiver]
             # The messages of this direction in the block, in order, by slot and step.
             sent_slots, sent_steps = np.nonzero(is_sent[:, :, w])
+            # Messages are numbered from the beginning of the run: ``_sent`` came in earlier blocks.
+            # Messages are numbered from the beginning of the run: ``_sent`` came in earlier blocks.
             k = number - int(self._sent[w])
             if 0 <= k < len(sent_slots):
                 messages.up[0, sent_slots[k], sent_steps[k], w, 0] = 1
 
     def _missed_readings(self, messages: SlotMessages, count: int) -> np.ndarray:
         """Return (S, E, N) bool: nodes that send nothing in a step of the next S = ``count`` slots
-        because they have no reading; their messages are removed from ``messages.up``. There are E
-        exchange steps in a slot.
+        because they have no reading to send, as recorded sensors may miss one. Their messages are
+        removed from ``messages.up``. There are E exchange steps in a slot.
         """
         setup = self.setup
         if not setup.may_miss:
@@ -399,20 +417,25 @@ class SlotRuns:
         return unread
 
     def _draw_uniforms(self, sent: np.ndarray) -> FloatArray:
-        """Return a uniform number (B, S, E, N, L) for each node that is asked for a message in a
-        step, where ``sent`` (B, S, E, N, L) is 1, and 0 for the others; empty if the filter needs
-        none. Dimensions: B blocks of L runs, S slots of E exchange steps, N nodes.
+        """Return the uniform numbers (B, S, E, N, L) by which filters that send at random decide:
+        one for each node that is asked for a message in a step, where ``sent`` (B, S, E, N, L) is
+        1, and 0 for the others; empty if the filter needs none. Dimensions: B blocks of L runs, S
+        slots of E exchange steps, N nodes.
         """
         if not self.setup.algorithm.randomised or not self.setup.decides:
+            # Five dimensions, as kernels are compiled for.
             return np.zeros((0,) * 5)
         uniform = np.zeros(sent.shape)
         draw_uniforms(self._triggers, sent, uniform)
         return uniform
 
     def _next_states(self, count: int) -> tuple[FloatArray, FloatArray, np.ndarray]:
-        """Return the states of the next S = ``count`` slots relative to the moving origin and
+        """Return the true states of the next S = ``count`` slots relative to the moving origin and
         absolute, (B, S, n, L) each, and the slots (S,) bool in which the origin moves. The runs are
         side by side in B blocks of L lanes.
+
+        States of an unstable plant grow without bound; every ``setup.frame`` slots (a frame) the
+        present state becomes the origin, so that estimation errors keep their digits.
         """
         setup = self.setup
         slots = range(self._slot, self._slot + count)
@@ -435,9 +458,10 @@ class SlotRuns:
     def _draw_path(
         self, path: Path, states: np.ndarray, local: FloatArray, absolute: FloatArray
     ) -> None:
-        """Draw the next S slots of a path into ``local`` and ``absolute`` (B, S, n, L), the states
-        relative to the moving origin and absolute, from the random streams ``states`` (R, 4). The R
-        runs are side by side in B blocks of L lanes.
+        """Draw the next S slots of a ``path`` (of the plant, or of random regressors) into
+        ``local`` and ``absolute`` (B, S, n, L), the states relative to the moving origin and
+        absolute, from the random streams ``states`` (R, 4). The R runs are side by side in B blocks
+        of L lanes.
         """
         scratch = aligned((2, max(path.root.shape), LANES))
         draw_paths(MANY, path, states, normal_ziggurat(), self._slot, scratch, local, absolute)
@@ -445,9 +469,10 @@ class SlotRuns:
     def _draw_readings(
         self, times: SlotTimes, local: FloatArray, rebased: np.ndarray
     ) -> ReadingBlock:
-        """Draw and return the whitened readings of S slots at the states ``local`` (B, S, n, L); in
-        the slots ``rebased`` (S,) the origin moves to the state. The runs are side by side in B
-        blocks of L lanes.
+        """Draw and return the readings of S slots at the states ``local`` (B, S, n, L), whitened
+        (multiplied by the inverse root of R, so that their noise has unit covariance); in the slots
+        ``rebased`` (S,) the origin of all states moves to the present one. The runs are side by
+        side in B blocks of L lanes.
         """
         setup, count = self.setup, local.shape[1]
         shape = self._blocks, count, setup.estimators, setup.p
@@ -461,6 +486,7 @@ class SlotRuns:
             # The origin moves before the reading: the state in the new frame is 0.
             x = local.copy()
             x[:, rebased] = 0.0
+        # The states from which sensors with a random H draw it.
         k = setup.sensors.C.shape[2]
         regressor_states: FloatArray = unset((len(self._regressors), self._blocks, count, k, LANES))
         for path, (steps, states) in zip(regressor_states, self._regressors, strict=True):
@@ -483,8 +509,10 @@ class SlotRuns:
 
     def events(self, block: SlotBlock) -> tuple[np.ndarray, np.ndarray]:
         """Return the rows (K,) of the table of events, of dtype EVENT, of a block of slots of one
-        run, and the number of rows before each of its T samples, (T,).
+        run, and for each of the T samples in it the number of rows before it, (T,), with which a
+        run ends that diverges there.
         """
+        # Where Python made the messages it knows the events, but not in which slot nodes stopped.
         if self._events is not None:
             return self._events.rows(self._stopped[0, :, 0])
         before_sample = np.zeros(len(block.sampled), dtype=np.int64)
@@ -492,7 +520,8 @@ class SlotRuns:
 
     def first_events(self, block: SlotBlock) -> Iterator[np.ndarray]:
         """Yield the rows (K,) of the table of events, of dtype EVENT, of the first run of a batch
-        in a block of slots, for some slots at a time.
+        in a block of slots, for some slots at a time, so that their memory stays small: they are
+        hashed for the fingerprint of the batch.
         """
         size = max(1, LONG // max(1, self.setup.rows_of(1)))
         # Samples of a batch are counted from the first of the run.
@@ -505,7 +534,7 @@ class SlotRuns:
         self, block: SlotBlock, first: int, stop: int, before_sample: np.ndarray
     ) -> np.ndarray:
         """Return the rows (K,) of the table of events, of dtype EVENT, of the first run in the
-        slots with indices ``first`` to ``stop`` - 1 of a block, in the order of time; write the
+        slots with indices ``first`` to ``stop`` - 1 of a block, in the order of time. Write the
         number of rows before each of the T samples into ``before_sample`` (T,).
         """
         setup = self.setup
@@ -538,8 +567,8 @@ class SlotRuns:
         )  # fmt: skip
 
     def conserved(self) -> dict[str, FloatArray]:
-        """Return by name the sums over all nodes that exchanges conserve: (R, 2), their values at
-        the start and at the last sample.
+        """Return by name the sums over all nodes that exchanges conserve, such as the total weight
+        of push-sum: (R, 2), their values at the start and at the last sample of R runs.
         """
         conserved, sums = {}, by_run(self._conserved, self.runs)
         for k, (name, start) in enumerate(self.setup.conserved_at_start.items()):
@@ -551,12 +580,13 @@ class SlotRuns:
 
 def _pack_messages(up: np.ndarray, sent: np.ndarray) -> SlotMessages:
     """Return the messages ``up`` (1, S, E, W) and senders ``sent`` (1, S, E, N) of one run, which
-    Python made, in lane 0 of the arrays that kernels expect. Dimensions: S slots of E exchange
-    steps, W directed links, N nodes.
+    Python made, as kernels expect them: in lane 0 of arrays of L lanes, each of which would hold
+    another run. Dimensions: S slots of E exchange steps, W directed links, N nodes.
     """
     lane_arrays = [np.zeros((*values.shape, LANES), dtype=np.uint8) for values in (up, sent)]
     for lanes, values in zip(lane_arrays, (up, sent), strict=True):
         lanes[..., 0] = values
+    # The arrays of matched pairs stay empty: only kernels that draw messages use them.
     active, pairs = (np.zeros((0,) * d, dtype=np.int64) for d in (4, 3))
     return SlotMessages(lane_arrays[0], active, pairs, lane_arrays[1])
 
@@ -582,13 +612,17 @@ def run_slots(scenario: Scenario, streams: Streams, recorder: Recorder, progress
 def _record_block(
     scenario: Scenario, runs: SlotRuns, recorder: Recorder, progress: Progress
 ) -> bool:
-    """Simulate and record the next slots; return True if all estimates are finite and valid."""
+    """Simulate the next slots of one run, and pass their events and samples to ``recorder``; return
+    False if an estimate in a sample is not finite or not valid, at which the run ends.
+    """
     # A limited number of rows at a time: memory does not grow with the length of the run.
     block = runs.following(MAX_EVENT_ROWS)
     rows, rows_before = runs.events(block)
     if len(block.sampled):
+        # Start and present value of each conserved sum.
         sums = runs.conserved()
         recorder.sums = {name: (float(v[0, 0]), float(v[0, 1])) for name, v in sums.items()}
+    # One run: index 0 of all arrays.
     x, xhat, P, error = (values[0] for values in block.samples)
     times = block.times.start[block.sampled]
 
@@ -629,9 +663,10 @@ def slot_batches(
 def slot_batch(
     scenario: Scenario, seed: int, replicas: range, fingerprint: bool = False
 ) -> RunBatch:
-    """Simulate R consecutive ``replicas`` side by side, with random numbers from ``seed``, and
-    return their results; a run that diverges goes on to the end with invalid numbers, which
-    ``with_ends`` replaces. ``fingerprint``: with the hash of the events of the first run.
+    """Simulate R consecutive ``replicas`` (numbers of runs) side by side, with random numbers from
+    ``seed``, and return their results. A run that diverges goes on to the end with invalid numbers,
+    which ``with_ends`` replaces. ``fingerprint``: with the SHA-256 hash of the event rows of the
+    first run.
     """
     runs = SlotRuns(scenario, ReplicaStreams(seed, replicas.start, len(replicas)), store_all=True)
     assert runs.samples is not None
@@ -639,7 +674,7 @@ def slot_batch(
     events_hash = hashlib.sha256()
     while not runs.over:
         with np.errstate(over="ignore", invalid="ignore"):
-            block = runs.following(0, timed=fingerprint)
+            block = runs.following(max_events=0, timed=fingerprint)
         runs.count_events(block)
         for rows in runs.first_events(block) if fingerprint else ():
             events_hash.update(rows.data)
@@ -662,11 +697,14 @@ def slot_batch(
 
 def with_ends(batch: RunBatch, alone: Callable[[range, bool], Iterator[RunBatch]]) -> RunBatch:
     """Return the batch with every run that diverges replaced, in its arrays, by the same run
-    simulated ``alone``, a function of replicas and of whether their fingerprint is computed.
+    simulated ``alone``: in a batch it went on with invalid numbers, alone it ends where it
+    diverges, as its results demand.
 
-    In a batch a run that diverges goes on with invalid numbers; alone it ends where it diverges.
+    ``alone(replicas, fingerprint)`` simulates runs one by one and yields a batch of each;
+    ``fingerprint``: with the SHA-256 hash of the event rows.
     """
     for r in np.flatnonzero(batch.diverged).tolist():
+        # Only the first run of a batch has a fingerprint.
         fingerprint = r == 0 and bool(batch.fingerprint)
         (single,) = alone(batch.replicas[r : r + 1], fingerprint)
         if fingerprint:

@@ -160,9 +160,11 @@ class Visits(Struct):
 def empty_visits(
     filters: Filters, weights: FloatArray, places: int, series: tuple[LaneSeries, LaneSeries]
 ) -> Visits:
-    """Return an empty queue for such filters at F = ``places`` places, N for each of the runs
-    simulated together; ``weights`` (W,) are those of W directed links, ``series`` those of nodes
-    without increment sensors and with them.
+    """Return an empty queue of visits (predictions of one node, or of two that then combine) with
+    the arrays to process them, for filters that begin as ``filters``. It has F = ``places`` places,
+    rows of the state arrays: N for each of the runs simulated together. ``weights`` (W,) are those
+    of W directed links, ``series`` the power series of nodes without increment sensors and with
+    them.
     """
     n, capacity = filters.xhat.shape[1], max(MAX_VISITS, 4 * places)
     # Networks have few distinct weights: lanes look them up in a table, roots included.
@@ -187,6 +189,7 @@ def empty_visits(
         first=np.full(capacity + 2, -1, dtype=np.int64),
         pairs=np.zeros(capacity, dtype=np.int64),
         model=np.tile(model, places // len(nodes)),
+        # Column 4 is the first level (a gap of 2^level units) that is longer than all cells.
         longest=table.unit * 2.0 ** table.sizes[:, 4],
         weight_row=weight_row.astype(np.int64).reshape(-1),
         weight_table=np.stack([own, distinct, np.sqrt(own), np.sqrt(distinct)], axis=1),
@@ -214,9 +217,11 @@ def empty_visits(
 def append_visit(
     state: Simulation, visits: Visits, level: int, time: float, first: int, second: int
 ) -> int:
-    """Add a visit at ``time`` (seconds) of the nodes at the places ``first`` and ``second``
-    (NO_NODE or ALL_NODES: see VISIT) to ``visits.records`` and to the list of ``level``; return its
-    index. Its run and piece of the path are the present ones of ``state``.
+    """Add a visit, the prediction to ``time`` (seconds) of the nodes at the places ``first`` and
+    ``second`` (rows of ``state.xhat``; NO_NODE or ALL_NODES: see VISIT), to ``visits.records`` and
+    to the list of ``level``; return its index. Visits of one level have no node in common and are
+    computed side by side, level after level. Run and piece of the path are the present ones of
+    ``state``.
     """
     v = visits.count
     visits.count = v + 1
@@ -233,8 +238,9 @@ def append_visit(
 
 @kernel
 def queue_visit(state: Simulation, visits: Visits, time: float, place: int) -> None:
-    """Queue the prediction of the node at ``place`` (index in ``state.xhat``) to ``time``
-    (seconds), one level above its last visit; raises ``visits.level[place]``.
+    """Queue the prediction of the node at ``place`` (row of ``state.xhat``) to ``time`` (seconds),
+    a visit of one node: one level above the node's last visit, since levels are computed one after
+    another; raises ``visits.level[place]``.
     """
     level = visits.level[place] + 1
     visits.level[place] = level
@@ -265,10 +271,10 @@ def queue_sample(state: Simulation, visits: Visits, first: int) -> None:
 
 @kernel
 def process_visits(state: Simulation, visits: Visits) -> None:
-    """Process all queued visits, level by level, and empty the queue: a visit predicts one node to
-    a time, or two nodes that then combine their estimates, or stores a sample. Changes
-    ``state.xhat``, ``root`` and ``now`` of the nodes visited, and stores samples in
-    ``state.buffer``.
+    """Process all queued visits and empty the queue: a visit predicts one node to a time, or two
+    nodes that then combine their estimates, or stores a sample. Visits of one level have no node in
+    common and are computed side by side, level after level. Changes ``state.xhat``, ``root`` and
+    ``now`` of the nodes visited, and stores samples in ``state.buffer``.
     """
     for level in range(1, visits.top + 1):
         process_level(state, visits, visits.first[level])
@@ -280,8 +286,9 @@ def process_visits(state: Simulation, visits: Visits) -> None:
 
 @kernel
 def process_level(state: Simulation, visits: Visits, first: int) -> None:
-    """Process the visits of a level, a linked list in ``visits.records`` that begins with index
-    ``first``: predict all their nodes, then combine pairs of nodes, or store samples.
+    """Process the visits of one level, which have no node in common, a linked list in
+    ``visits.records`` that begins with index ``first``: predict all their nodes, as many side by
+    side as there are SIMD lanes, then combine pairs of nodes, or store samples.
     """
     v, pairs = first, 0
     while v != -1:
@@ -304,9 +311,10 @@ def process_level(state: Simulation, visits: Visits, first: int) -> None:
 
 @kernel
 def queue_prediction(state: Simulation, visits: Visits, v: int, place: int) -> None:
-    """Queue the node at ``place`` (index in ``state.xhat``) for its prediction to the time of visit
-    ``v`` (index in ``visits.records``) in a lane, or predict it at once if the gap is too long for
-    one step. Sets ``state.now[place]``; predicts all lanes if none is free any more.
+    """Queue the node at ``place`` (row of ``state.xhat``) for its prediction to the time of visit
+    ``v`` (index in ``visits.records``) in a SIMD lane, with other nodes in the other lanes; or
+    predict it at once if the gap is too long for one step. Sets ``state.now[place]``; predicts the
+    nodes in all lanes once these are full.
     """
     visit, now = visits.records[v], state.now[place]
     # A node may have several visits at one time: it is predicted with the first of them.
@@ -330,8 +338,9 @@ def queue_prediction(state: Simulation, visits: Visits, v: int, place: int) -> N
 
 @kernel
 def node_at(state: Simulation, run: int, place: int) -> int:
-    """Return the index (0 to N - 1) in ``state.nodes`` of the node at ``place`` (index in
-    ``state.xhat``), which belongs to run number ``run``.
+    """Return the index (0 to N - 1) in ``state.nodes`` of the node at ``place`` (row of
+    ``state.xhat``), which belongs to run number ``run``: the nodes of the runs that are simulated
+    together lie one run after the other in ``state.xhat``.
     """
     return place - (run - state.first_run) * len(state.nodes)
 
@@ -348,11 +357,13 @@ def ring_index(visits: Visits, number: int) -> int:
 def queue_interval(
     state: Simulation, visits: Visits, place: int, v: int, now: float, least: float
 ) -> None:
-    """Queue the next measurement interval of the sensing node at ``place`` (index in
-    ``state.xhat``), which has been predicted up to ``now`` (seconds) on its way to visit ``v``
-    (index in ``visits.records``); ``least`` is the lower bound of its length in seconds.
+    """Queue the next measurement interval (over which increments are used in one update) of the
+    sensing node at ``place`` (row of ``state.xhat``), which has been predicted up to ``now``
+    (seconds) on its way to the time of visit ``v`` (index in ``visits.records``); ``least`` is the
+    lower bound of the interval's length in seconds.
     """
-    # A node has one visit in a level at most, so the ring buffer has space for all.
+    # Visits of one level are processed together, and a node has one of them at most: the ring
+    # buffer has space for all.
     interval = visits.intervals[ring_index(visits, visits.after_intervals)]
     interval.place, interval.visit, interval.now, interval.least = place, v, now, least
     visits.after_intervals += 1
@@ -361,8 +372,9 @@ def queue_interval(
 
 @kernel
 def prefetch_path_and_noise(state: Simulation, visits: Visits, v: int, place: int) -> None:
-    """Prefetch into the processor's cache the path and the noise in the piece of visit ``v`` (index
-    in ``visits.records``), from which the node at ``place`` (index in ``state.xhat``) will read.
+    """Prefetch into the processor's cache what the node at ``place`` (row of ``state.xhat``) will
+    soon read for visit ``v`` (index in ``visits.records``): the path of the true state in the
+    visit's piece, and the noise of the node's sensor.
     """
     # Each run has its own path and noise, far from each other: waiting for them took 4 % of a run.
     path, visit = state.path, visits.records[v]
@@ -376,11 +388,12 @@ def prefetch_path_and_noise(state: Simulation, visits: Visits, v: int, place: in
 @kernel
 def process_intervals(state: Simulation, visits: Visits) -> None:
     """Predict all sensing nodes in the queue ``visits.intervals`` up to the times of their visits,
-    using their increments, L nodes at a time; empties the queue. Changes ``state.xhat`` and
-    ``root``.
+    using their increments, L nodes at a time, one in each SIMD lane; empties the queue. Changes
+    ``state.xhat`` and ``root``.
     """
     while visits.first_interval < visits.after_intervals:
-        # The next interval of a node is added while this one is processed.
+        # begin_interval() adds the next interval of a node behind the others, so the queue ends
+        # only when all nodes have reached the times of their visits.
         count = min(LANES, visits.after_intervals - visits.first_interval)
         for q in range(count):
             interval = visits.intervals[ring_index(visits, visits.first_interval + q)]
@@ -394,9 +407,10 @@ def process_intervals(state: Simulation, visits: Visits) -> None:
 
 @kernel
 def fill_rates(state: Simulation, visits: Visits, count: int) -> None:
-    """Write the rate of information trace(P G) in 1/s and trace(P) of the nodes in the first
-    ``count`` lanes, those of the next intervals in the ring buffer, into ``rate`` and ``trace``
-    (1, L), L lanes, of ``visits.readings``.
+    """Compute the rate of information trace(P G) in 1/s, G being the information rate of the
+    sensors, and trace(P) of the nodes in the first ``count`` lanes, on which the lengths of their
+    measurement intervals depend: into ``rate`` and ``trace`` (1, L), L lanes, of
+    ``visits.readings``. The nodes are those of the next intervals in the ring buffer.
     """
     size, readings = state.size, visits.readings
     for q in range(count):
@@ -411,8 +425,10 @@ def fill_rates(state: Simulation, visits: Visits, count: int) -> None:
 
 @kernel
 def begin_interval(state: Simulation, visits: Visits, q: int) -> None:
-    """Take the next interval from the ring buffer, whose node is in lane ``q``: assign it the lane,
-    or predict its node at once if P is too wide for one step. Queues the rest of the gap, if any.
+    """Take the next measurement interval from the ring buffer, whose node is in SIMD lane ``q``,
+    and decide how long it is: assign its prediction to the lane, or predict the node at once by
+    scalar kernels if P is too wide for one step. Queues the rest of the gap to the visit's time, if
+    any.
     """
     interval, readings = (
         visits.intervals[ring_index(visits, visits.first_interval)],
@@ -453,11 +469,13 @@ def assign_lane(
 
 @kernel
 def read_increments_in_lanes(state: Simulation, visits: Visits, count: int) -> None:
-    """Write the moments of the increments that the nodes in the first ``count`` SENSING lanes read,
-    each over the interval of its lane, into ``visits.readings.moments`` (q, L), q moments in L
-    lanes; lanes whose place is NO_NODE read nothing.
+    """Write the moments of the increments that the nodes in the first ``count`` SENSING lanes
+    (those of nodes with increment sensors) read, each over the interval of its lane, into
+    ``visits.readings.moments`` (q, L), q moments in L lanes; lanes whose place is NO_NODE read
+    nothing.
     """
     places, readings = visits.places[SENSING], visits.readings
+    # Lanes without a node take no noise.
     for q in range(LANES):
         readings.noise_row[q] = NO_NODE
     for q in range(count):
@@ -478,9 +496,9 @@ def read_increments_in_lanes(state: Simulation, visits: Visits, count: int) -> N
 def gather_states(
     state: Simulation, places: IntArray, count: int, x: FloatArray, S: FloatArray
 ) -> None:
-    """Copy the estimates and roots of the nodes at the first ``count`` of the ``places`` (L,),
-    indices in ``state.xhat``, into the L lanes of ``x`` (n, L) and ``S`` (n, n, L); the other
-    places become NO_NODE.
+    """Copy the estimates and roots of the nodes at the first ``count`` of the ``places`` (L,), rows
+    of ``state.xhat``, into the L SIMD lanes of ``x`` (n, L) and ``S`` (n, n, L), where they are
+    computed side by side; the other places become NO_NODE.
     """
     n = len(state.size)
     for q in range(count, LANES):
@@ -493,9 +511,10 @@ def gather_states(
 
 @kernel
 def scatter_states(state: Simulation, places: IntArray, x: FloatArray, S: FloatArray) -> None:
-    """Copy the estimates ``x`` (n, L) and roots ``S`` (n, n, L) in L lanes back to rows ``places``
-    (L,) of ``state.xhat`` and ``state.root``, except lanes with NO_NODE.
+    """Copy the estimates ``x`` (n, L) and roots ``S`` (n, n, L) of the nodes in L SIMD lanes back
+    to rows ``places`` (L,) of ``state.xhat`` and ``state.root``, except lanes with NO_NODE.
     """
+    # The last argument is the number of entries left, of which one call copies L at most.
     n = len(state.size)
     for first in range(0, n, LANES):
         scatter(MANY, x, first, state.xhat, places, n - first)
@@ -505,8 +524,9 @@ def scatter_states(state: Simulation, places: IntArray, x: FloatArray, S: FloatA
 
 @kernel
 def predict_unobserved(state: Simulation, visits: Visits) -> None:
-    """Predict the ``visits.waiting`` queued nodes without increment sensors, at most L, over the
-    gaps of their UNOBSERVED lanes, and empty these. Changes ``state.xhat`` and ``root``.
+    """Predict the ``visits.waiting`` queued nodes without increment sensors, at most L, side by
+    side over the gaps of their UNOBSERVED lanes (those of such nodes), and empty these. Changes
+    ``state.xhat`` and ``root``.
     """
     n, count, places = len(state.size), visits.waiting, visits.places[UNOBSERVED]
     if count == 0:
@@ -524,9 +544,9 @@ def predict_unobserved(state: Simulation, visits: Visits) -> None:
 
 @kernel
 def predict_sensing(state: Simulation, visits: Visits, count: int) -> None:
-    """Predict the nodes in the first ``count`` SENSING lanes, whose states are in ``visits.x`` and
-    ``S``, over the gaps of their lanes, correct them by their readings, and write them to
-    ``state.xhat`` and ``root``.
+    """Predict the nodes in the first ``count`` SENSING lanes (those of nodes with increment
+    sensors) over the gaps of their lanes, and correct them by their readings. Their states are in
+    ``visits.x`` and ``S``; the results are written to ``state.xhat`` and ``root``.
     """
     places = visits.places[SENSING]
     for q in range(count):
@@ -548,13 +568,15 @@ def predict_sensing(state: Simulation, visits: Visits, count: int) -> None:
 def evaluate_series(
     visits: Visits, kind: int, q: int, series: LaneSeries, rows: FloatArray
 ) -> None:
-    """Evaluate the ``series`` of the model in lane ``q`` of ``kind`` (UNOBSERVED or SENSING) at the
-    lane's gap; write the W' values into ``rows[q]`` of ``rows`` (L, W'), one row for each of L
+    """Evaluate the power series from which the node in lane ``q`` of ``kind`` (UNOBSERVED or
+    SENSING: without or with increment sensors) is predicted: that of its model in ``series``, at
+    the lane's gap. Write the W' values into ``rows[q]`` of ``rows`` (L, W'), one row for each of L
     lanes.
     """
     lane = visits.lanes[kind, q]
     row = series.row[lane.model]
     cell, since = cell_of(series.unit[row], lane.end - lane.now)
+    # The first cells, near a gap of 0, need more terms than the others.
     terms = series.series.shape[2] if cell < NEAR else series.far_terms
     fill_row(rows, q, series.series, terms, row, cell, since)
 
@@ -610,9 +632,9 @@ def predict_lanes(state: Simulation, visits: Visits, reads: bool) -> None:
 
 @kernel
 def combine_pairs(state: Simulation, visits: Visits, k: int, count: int) -> None:
-    """Combine the two nodes of each of the visits ``visits.pairs[k:k + count]``, one visit in each
-    of at most L lanes; the nodes that receive the other's estimate change in ``state.xhat`` and
-    ``root``.
+    """Combine the two nodes of each of the visits ``visits.pairs[k:k + count]`` (visits of two
+    nodes that exchange estimates), one visit in each of at most L lanes; the nodes that receive the
+    other's estimate change in ``state.xhat`` and ``root``.
     """
     records, places = visits.records, visits.places
     first_receives, second_receives = False, False
@@ -640,9 +662,10 @@ def combine_pairs(state: Simulation, visits: Visits, k: int, count: int) -> None
 
 @kernel
 def assign_receiver(visits: Visits, side: int, lane: int, direction: int, place: int) -> bool:
-    """Write the receiver at ``place`` (index in ``state.xhat``) and the weights of its incoming
-    directed link ``direction`` (index) into ``receiver_places`` and ``in_lanes`` of a ``lane``;
-    ``side`` 0: first node of the visit, 1: second. Return False if it receives nothing (NOT_HEARD).
+    """Enter one receiver of a visit, in a ``lane``, for the combination of both nodes: write its
+    ``place`` (row of ``state.xhat``) and the weights of its incoming directed link ``direction``
+    (index) into ``receiver_places`` and ``in_lanes``; ``side`` 0: first node of the visit, 1:
+    second. Return False if it receives nothing (NOT_HEARD).
     """
     if direction == NOT_HEARD:
         visits.receiver_places[side, lane] = NO_NODE
