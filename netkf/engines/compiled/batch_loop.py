@@ -71,7 +71,10 @@ def run_alone(state: Simulation) -> int:
 
 @cache
 def no_batch() -> BatchArrays:
-    """Return a batch of R = 0 runs, which the kernels take in place of one for a run on its own."""
+    """Return a batch of R = 0 runs, which a kernel for batches takes in place of one when it
+    simulates a run on its own, so that one compiled
+    kernel serves both.
+    """
     no_runs = np.zeros(0, dtype=np.int64)
     return BatchArrays(
         nodes=np.zeros(0, dtype=NODE),
@@ -91,12 +94,13 @@ def no_batch() -> BatchArrays:
 def simulate_runs(state: Simulation, batch_memory: IntArray, run: int, resumed: bool) -> int:
     """Simulate the runs of a batch from number ``run`` on, which goes on where it stopped if
     ``resumed``. Return the number of the run that needs a larger pool of messages, or the number of
-    runs at the end. For ``run`` = ALONE simulate ``state`` until it needs something from Python,
-    and return the request (WANT_... or DONE). ``batch_memory`` is the block of memory (int64 words)
-    of a BatchArrays.
+    runs at the end. For ``run`` = ALONE simulate ``state``, which is no run of a batch, until it
+    needs something from Python, and return the request (WANT_... or DONE). ``batch_memory`` is the
+    block of memory (int64 words) of a BatchArrays.
     """
     # The batch comes as an array, since numba dispatches on arrays much faster than on structs.
     if run == ALONE:
+        # No running sums, history or combination: filters that need these have a loop of their own.
         return event_loop(state, None, None, None)
     return simulate_from(state, struct_at(batch_memory, BatchArrays), run, resumed)
 
@@ -128,7 +132,8 @@ def begin(state: Simulation, batch: BatchArrays, run: int) -> None:
     """Set ``state`` to the beginning of run number ``run`` of a batch: the indices of its next
     tick, sample, piece of the path and so on, ``counts`` 0, and no polynomial of its path cached.
     """
-    state.run, place = run, run - state.first_run
+    # Polynomials of the path are cached for each of the runs that are simulated together.
+    state.run, cached = run, run - state.first_run
     state.frame_at = state.piece = state.grid_at = state.wake_at = state.instant_at = 0
     state.tick_at, state.ticks_stop = batch.first[run], batch.first[run + 1]
     state.first_delay = batch.first_delay[run]
@@ -136,14 +141,14 @@ def begin(state: Simulation, batch: BatchArrays, run: int) -> None:
     for kind in range(len(state.counts)):
         state.counts[kind] = 0
     for course in range(state.path.known.shape[1]):
-        state.path.known[place, course] = -1
+        state.path.known[cached, course] = -1
 
 
 @kernel
 def reset_filters(state: Simulation, batch: BatchArrays, first: int) -> None:
-    """Reset the nodes of a run to time 0: copy ``nodes``, ``xhat`` (N, n) and ``root`` (N, n, n) of
-    ``batch`` into ``state``, from the place ``first`` of ``state.xhat`` on, and set ``state.now``
-    to 0.
+    """Reset the filters of a run to time 0: copy ``nodes``, ``xhat`` (N, n) and ``root`` (N, n, n)
+    of ``batch`` into ``state``, to the rows from ``first`` on of ``state.xhat`` and ``root``, and
+    set ``state.now`` to 0 there.
     """
     n = batch.xhat.shape[1]
     for h in range(len(batch.nodes)):
@@ -166,7 +171,7 @@ def reset_messages(state: Simulation) -> None:
     # Chain the whole pool into the list of free messages.
     for m in range(len(state.pool)):
         state.pool[m].next = m + 1
-    # The heap needs no reset: only its first ``flying`` entries count.
+    # The heap needs no reset: only its first ``in_flight`` entries count.
     state.first_free = state.in_flight = state.order = state.receivers = state.absorbing = 0
     state.free_count, state.inbox_time = len(state.pool), 0.0
 
@@ -196,7 +201,7 @@ def finish(state: Simulation, batch: BatchArrays, run: int) -> None:
 @kernel
 def count_diverged_filters(state: Simulation, run: int, k: int) -> int:
     """Return how many of the N filters have an estimate or covariance that is not finite in sample
-    ``k`` of run number ``run``.
+    ``k`` of run number ``run``; such a run ends with that sample.
     """
     xhat, P, n, diverged = state.buffer.xhat, state.buffer.P, len(state.size), 0
     for h in range(len(state.nodes)):

@@ -45,8 +45,8 @@ MAX_BATCH_BYTES = 1 << 25
 
 
 def flow_batches(scenario: Scenario, seed: int, replicas: range) -> Iterator[RunBatch]:
-    """Yield the results of consecutive replicas (numbers of runs), as many runs at a time as memory
-    allows; ``seed`` is that of all their random numbers.
+    """Yield the results of consecutive replicas (numbers of runs) in continuous time, as many runs
+    at a time as memory allows; ``seed`` is that of all their random numbers.
     """
     keep_freed_memory()
     size = batch_size(scenario)
@@ -69,8 +69,8 @@ def _workspace(scenario: Scenario) -> Workspace:
 
 
 def _simulate(scenario: Scenario, workspace: Workspace, seed: int, replicas: range) -> RunBatch:
-    """Draw the random numbers of the runs ``replicas`` from ``seed``, simulate them, and return
-    their samples, counts of events and states.
+    """Draw the random numbers of the runs ``replicas`` from ``seed``, simulate them, all in one
+    kernel call where the scenario allows it, and return their samples, counts of events and states.
     """
     with np.errstate(over="ignore", invalid="ignore"):  # growth to infinity is reported
         if not drawn_together(scenario):
@@ -88,8 +88,9 @@ def _simulate(scenario: Scenario, workspace: Workspace, seed: int, replicas: ran
 def _run_by_run(
     scenario: Scenario, workspace: Workspace, draws: Iterable[Draws], replicas: range
 ) -> RunBatch:
-    """Simulate runs one by one, for scenarios that need Python during a run, and return their
-    results; ``draws`` has the random numbers of each of the ``replicas``.
+    """Simulate runs one after the other, for scenarios that need Python during a run (to draw more
+    numbers, or to move the origin), and return their results; ``draws`` has the random numbers of
+    each of the ``replicas``.
     """
     sink = batch_sink(scenario, replicas)
     for run_draws in draws:
@@ -100,19 +101,20 @@ def _run_by_run(
 
 
 def _all_at_once(scenario: Scenario, workspace: Workspace, draws: BatchDraws) -> RunBatch:
-    """Simulate the R runs of ``draws`` in one call of a kernel, and return their results; more
-    calls only if the kernel's pool of messages is too small.
+    """Simulate the R runs of ``draws`` in one call of a kernel, and return their results; it is
+    called again only if its pool of messages is too small.
     """
     start, runs = workspace.filters, len(draws.replicas)
     # np.empty: runs that diverge go on to the end, so that all samples are written.
     buffer = empty_samples((runs, len(scenario.times), *start.xhat.shape), make=np.empty)
     arrays = _batch_arrays(scenario, start, draws)
+    # Messages that take no time: several runs side by side in SIMD lanes.
     if is_immediate(scenario):
         group = together(len(start.nodes), runs)
-        state = workspace.begin(draws, False, buffer, group)
+        state = workspace.begin(draws, traced=False, buffer=buffer, together=group)
         simulate_together(state, workspace.visits(group), arrays, group)
     else:
-        simulate_batch(workspace.begin(draws, False, buffer), arrays)
+        simulate_batch(workspace.begin(draws, traced=False, buffer=buffer), arrays)
     x = draws.sampled_states(scenario.times)
     return RunBatch(
         replicas=draws.replicas,
@@ -130,9 +132,9 @@ def _all_at_once(scenario: Scenario, workspace: Workspace, draws: BatchDraws) ->
 
 
 def _batch_arrays(scenario: Scenario, start: Filters, draws: BatchDraws) -> BatchArrays:
-    """Return the arrays of a batch of R runs: the filters ``start`` at time 0, the ticks of its
-    runs in ``draws``, and space for results: ``lengths`` (R,), ``counts`` (R, kinds), ``diverged``
-    (R,).
+    """Return the arrays of a batch of R runs, which tell the kernel where each run begins: the
+    filters ``start`` at time 0, the ticks of its runs in ``draws``, and space for results:
+    ``lengths`` (R,), ``counts`` (R, kinds), ``diverged`` (R,).
     """
     runs = len(draws.replicas)
     return BatchArrays(
@@ -158,7 +160,9 @@ def drawn_together(scenario: Scenario) -> bool:
 
 @once_per_scenario
 def batch_size(scenario: Scenario) -> int:
-    """Return the number of runs that are drawn together, at least 1."""
+    """Return the number of runs that are drawn together, at least 1: as many as fit MAX_BATCH_BYTES
+    with their random numbers and samples.
+    """
     if not drawn_together(scenario):
         return 1
     # An estimate of the floats that one run draws and stores as samples.
@@ -180,8 +184,8 @@ def batch_size(scenario: Scenario) -> int:
 
 @once_per_scenario
 def quick_runs(scenario: Scenario) -> int:
-    """Return the number of runs, a power of two, that take some thirty milliseconds together, so
-    that preparing a batch costs little of its time.
+    """Return the number of runs, a power of two, that take some thirty milliseconds together: a
+    batch of fewer would spend too large a part of its time on preparations.
     """
     if not (drawn_together(scenario) and is_immediate(scenario)):
         return 1
@@ -192,8 +196,8 @@ def quick_runs(scenario: Scenario) -> int:
 
 
 def _expected_ticks(scenario: Scenario) -> float:
-    """Return the expected number of ticks of all clocks in a run, 0 if nobody sends on a clock; a
-    large number if a clock has no finite rate.
+    """Return the expected number of ticks of all clocks in a run, by which the memory of a batch is
+    estimated: 0 if nobody sends on a clock, a large number if a clock has no finite rate.
     """
     clock = scenario.network.activation
     if not (scenario.node_filter.talks and isinstance(clock, LinkClock)):
@@ -229,10 +233,18 @@ class BatchDraws:
         self.states: States = PathStates(scenario, np.empty(0))
 
     def window(self) -> Window:
-        """Return the ticks of all R runs, one run after the other in each array."""
+        """Return the ticks of all R runs, one run after the other in each array, in the form that a
+        single run has its ticks in.
+        """
         ticks = self.ticks
         return Window(
-            math.inf, *ticks[:4], arrival_bits=ticks.first_outcome if ticks.bits else None
+            end=math.inf,
+            t=ticks.t,
+            entity=ticks.entity,
+            first_outcome=ticks.first_outcome,
+            delay=ticks.delay,
+            # The same array holds the indices of outcomes or, if no message takes time, the bits.
+            arrival_bits=ticks.first_outcome if ticks.bits else None,
         )
 
     def path(self, together: int = 1) -> PathBlock:
@@ -246,7 +258,7 @@ class BatchDraws:
         return (RunDraws(self, self._scenario, run) for run in range(len(self.replicas)))
 
     def path_of(self, run: int) -> PathBlock:
-        """Return all steps of the path of run number ``run`` (0 to R - 1)."""
+        """Return all steps of the path of the true state in run number ``run`` (0 to R - 1)."""
         block, one = self._block, slice(run, run + 1)
         names = ("x_start", "x_end", "moments", "cubic")
         own: dict[str, Any] = {name: getattr(block, name)[one] for name in names}

@@ -20,11 +20,11 @@ from netkf.rng.numbers import NormalZiggurat, normal_of
 def read_increments(
     state: Simulation, run: int, h: int, piece: int, now: float, end: float, out: FloatArray
 ) -> None:
-    """Write the two moments (2 p,) of the increments that node ``h`` (index) of run number ``run``
-    reads over [now, end] (seconds) into ``out``, first moments of all p rows before the second
-    ones. The interval lies in the step of ``piece`` (index of a piece of the path);
-    ``scratch.state_moments`` has the moments of x over it. Noise that is used is taken away from
-    ``sensing.noise``.
+    """Compute the increments that node ``h`` (index) of run number ``run`` reads over [now, end]
+    (seconds), as two moments of each row: write them into ``out`` (2 p,), first moments of all p
+    rows before the second ones. The interval lies in the step of ``piece`` (index of a piece of the
+    path); ``scratch.state_moments`` has the moments of x over it. Noise that is used is taken away
+    from ``sensing.noise``.
     """
     sensing, early = state.sensing, state.scratch.early
     x, H, root, row = state.scratch.state_moments, sensing.H, sensing.root, 0
@@ -65,19 +65,20 @@ def draw_cut(sensing: Sensing, run: int, s: int, normals: FloatArray) -> None:
 
 @kernel(inlined=True)
 def find_course(state: Simulation, run: int, piece: int) -> int:
-    """Return the index c of the polynomial of x in a ``piece`` of the path (index), which is
-    ``path.course[run - state.first_run, c]`` (D, W): D coefficients of W integrals. It is computed
-    once for all nodes that read in the piece, and cached in ``path.course`` and ``path.known``.
+    """Return the index c of the polynomial of x in a ``piece`` of the path (index), from which the
+    moments of any part of the piece are computed: ``path.course[run - state.first_run, c]`` (D, W),
+    D coefficients of W integrals. It is computed once for all nodes that read in the piece, and
+    cached in ``path.course`` and ``path.known``.
     """
     path, k = state.path, run - state.first_run
-    place: int = piece & (path.known.shape[1] - 1)
-    # The same for all nodes that read a part of the piece.
-    if path.known[k, place] != piece:
-        path.known[k, place] = piece
-        length, course = path.stop[piece] - path.start[piece], path.course[k, place]
+    # The cache has 2^m entries: the index is the number of the piece modulo 2^m.
+    entry: int = piece & (path.known.shape[1] - 1)
+    if path.known[k, entry] != piece:
+        path.known[k, entry] = piece
+        length, course = path.stop[piece] - path.start[piece], path.course[k, entry]
         x_start, cubic = path.x_start[run], path.cubic[run]
         fill_course(state.size, course, path.table, length, x_start, cubic, piece)
-    return place
+    return entry
 
 
 @kernel
@@ -92,15 +93,16 @@ def fill_moments_of_piece(state: Simulation, run: int, piece: int, now: float, e
     if now == start and end == stop:
         copy_matrix(scratch.state_moments, path.moments[run, piece])
         return
+    # A part of it: integrate the polynomial of x in this piece.
     course = path.course[run - state.first_run, find_course(state, run, piece)]
-    seen, values = scratch.state_moments, scratch.values
-    fill_state_moments(state.size, seen, course, now - start, end - now, stop - start, values)
+    moments, values = scratch.state_moments, scratch.values
+    fill_state_moments(state.size, moments, course, now - start, end - now, stop - start, values)
 
 
 @kernel(inlined=True)
 def piece_of(path: PathBlock, piece: int, end: float) -> int:
-    """Return the index of the piece of the path that contains ``end`` (seconds), searched backwards
-    from the index ``piece``.
+    """Return the index of the piece of the path (a step of the sensing grid, or a part of one that
+    samples cut) that contains ``end`` (seconds), searched backwards from the index ``piece``.
     """
     # Back from the present piece: a node may be behind it.
     while piece > 0 and path.stop[piece - 1] >= end:
@@ -121,23 +123,23 @@ def fill_moments(state: Simulation, run: int, piece: int, now: float, end: float
         fill_moments_of_piece(state, run, k, now, end)
         return
     # The interval covers several pieces: sum their moments, from the last to the first.
-    seen, total, gap = state.scratch.state_moments, state.scratch.total, end - now
-    for i in range(seen.shape[1]):
+    moments, total, gap = state.scratch.state_moments, state.scratch.total, end - now
+    for i in range(moments.shape[1]):
         total[0, i] = total[1, i] = 0.0
     while True:
         first, last = max(now, path.start[k]), min(end, path.stop[k])
         fill_moments_of_piece(state, run, k, first, last)
         # P_1 of the whole interval on this part of it.
         middle, share = ((first - now) - (end - last)) / gap, (last - first) / gap
-        for i in range(seen.shape[1]):
+        for i in range(moments.shape[1]):
             # The moment with P_0 adds up; that with P_1 is shifted and scaled from the part to the
             # whole.
-            total[0, i] += seen[0, i]
-            total[1, i] += middle * seen[0, i] + share * seen[1, i]
+            total[0, i] += moments[0, i]
+            total[1, i] += middle * moments[0, i] + share * moments[1, i]
         if path.start[k] <= now:
             break
         k -= 1
-    copy_matrix(seen, total)
+    copy_matrix(moments, total)
 
 
 @kernel
@@ -154,9 +156,10 @@ def fill_readings(
 
 @kernel(inlined=True)
 def next_interval(rate: float, now: float, time: float, least: float) -> tuple[float, float]:
-    """Return until when (seconds) readings are used at once, from ``now`` to at most ``time``,
-    given the ``rate`` of information trace(P G) in 1/s; and the least length in seconds of the
-    following interval (``least`` of the call before, first 0).
+    """Return where the next measurement interval ends (seconds), over which readings are used in
+    one update: from ``now`` to at most ``time``, short against the ``rate`` of information trace(P
+    G) in 1/s. The second result is the least length in seconds of the following interval, which the
+    next call takes as ``least`` (first 0).
     """
     end, interval = time, usable(rate)
     if interval < time - now:
@@ -175,13 +178,13 @@ def advance_over_interval(
 ) -> None:
     """Predict node ``h`` (index in ``state.nodes``) of run number ``run`` from ``now`` to ``end``
     (seconds) and use all increments between them in one update. Changes row ``k`` of ``state.xhat``
-    and ``state.root``; ``piece`` is the index of a piece of the path in the step that ``end`` lies
-    in.
+    and ``state.root``, where the node's estimate is; ``piece`` is the index of a piece of the path
+    in the step that ``end`` lies in.
     """
     table, m, scratch, gap = state.table, state.nodes[h].model, state.scratch, end - now
     xhat, root, readings = state.xhat, state.root, scratch.moments[: state.gains.moments[m]]
-    # Predict first, with the moments of the reading used at the end: they belong to the whole
-    # interval.
+    # The flow of P includes the information of the readings already, the estimate does not. Predict
+    # first, with the moments of the reading used at the end: they belong to the whole interval.
     propagate_root(table, m, root, xhat, k, gap, state.flow_scratch)
     fill_readings(state, run, h, piece, now, end, readings)
     gains, reach = state.gains.series[m], state.gains.reach[m]
@@ -193,13 +196,14 @@ def predict_with_increments(
     state: Simulation, run: int, h: int, k: int, piece: int, now: float, time: float
 ) -> None:
     """Predict node ``h`` (index in ``state.nodes``) of run number ``run`` from ``now`` to ``time``
-    (seconds) with its increments, in as many intervals as P asks for. Changes row ``k`` of
-    ``state.xhat`` and ``state.root``; ``time`` lies in the ``piece`` of the path (index).
+    (seconds) and use its increments on the way, in as many intervals as P asks for: a wide P
+    changes fast while it is corrected. Changes row ``k`` of ``state.xhat`` and ``state.root``,
+    where the node's estimate is; ``time`` lies in the ``piece`` of the path (index).
     """
-    seen, least = state.table.whitened_H[state.nodes[h].model], 0.0
+    whitened_H, least = state.table.whitened_H[state.nodes[h].model], 0.0
     while now < time:
         # How much of the gap may be used at once depends on the rate of information, trace(P G).
-        rate = information_rate(ONE, state.size, seen, state.root[k])
+        rate = information_rate(ONE, state.size, whitened_H, state.root[k])
         end, least = next_interval(rate, now, time, least)
         advance_over_interval(state, run, h, k, piece, now, end)
         now = end

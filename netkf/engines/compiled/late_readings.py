@@ -44,7 +44,8 @@ class History(Struct):
 
 def empty_history(state: Simulation, lag: float, capacity: int) -> History:
     """Return a history of all N nodes at time 0, with ``capacity`` free entries, that remembers
-    events for ``lag`` seconds.
+    events (readings used, moves of the origin) for ``lag`` seconds, so that a reading that arrives
+    late can be used at its own time.
     """
     count, n = state.xhat.shape
     capacity = count + capacity
@@ -63,8 +64,8 @@ def empty_history(state: Simulation, lag: float, capacity: int) -> History:
 
 
 def add_past(history: History, at_least: int) -> None:
-    """Enlarge the pool of a history in place: double it, or add ``at_least`` entries if these are
-    more.
+    """Enlarge the pool of events of a history in place, when it is used up: double it, or add
+    ``at_least`` entries if these are more.
     """
     capacity = len(history.past)
     added = max(capacity, at_least)
@@ -82,9 +83,9 @@ def add_past(history: History, at_least: int) -> None:
 def use_instant(
     state: Simulation, instant: int, root: FloatArray, x: FloatArray, k: int, scale: float
 ) -> None:
-    """Update entry ``k`` of K estimates ``x`` (K, n) and of the roots of P ``root`` (K, n, n) with
-    all samples of an ``instant`` (index in ``state.instants``) in one update, stacked in the order
-    of sensors, with noise ``scale``^2 R.
+    """Update one estimate, entry ``k`` of K estimates ``x`` (K, n) and of the roots of P ``root``
+    (K, n, n), with all samples that a node takes at an ``instant`` (index in ``state.instants``) in
+    one update, stacked in the order of sensors, with noise ``scale``^2 R.
     """
     instants, scratch, n, row = state.instants, state.scratch, x.shape[1], 0
     # All sensors of the instant in one reading: R is block diagonal, and so is its root.
@@ -128,9 +129,9 @@ def copy_state(
 
 @kernel
 def allocate_past(history: History, time: float, instant: int, frame: int) -> int:
-    """Take a free entry of ``history`` for an event at ``time`` (seconds): the reading of
-    ``instant`` (index in Instants), or the beginning of the frame number ``frame``; the other one
-    is -1. Return the index of the entry; its state is not set yet.
+    """Take a free entry of ``history`` for an event of a node at ``time`` (seconds): the reading of
+    ``instant`` (index in Instants), or the move of the origin that begins frame number ``frame``;
+    the other one is -1. Return the index of the entry; its state is not set yet.
     """
     k = history.free[0]
     entry = history.past[k]
@@ -145,8 +146,9 @@ def remember(
     state: Simulation, history: History, h: int, time: float, instant: int, frame: int
 ) -> None:
     """Add the present state of node ``h`` to ``history``, as that after an event at ``time``
-    (seconds): the reading of ``instant`` (index in Instants), or the beginning of frame number
-    ``frame``; -1 for the other one.
+    (seconds), from which later readings are repeated if one before them comes late. The event is
+    the reading of ``instant`` (index in Instants), or the move of the origin that begins frame
+    number ``frame``; -1 for the other one.
     """
     k = allocate_past(history, time, instant, frame)
     # The events of a node are a linked list, the newest first.
@@ -157,8 +159,8 @@ def remember(
 
 @kernel
 def forget(history: History, h: int, since: float) -> None:
-    """Free the events in ``history`` of node ``h`` (index) that no late reading can reach: those
-    from ``since`` (seconds) on stay, and one before it.
+    """Free the events in ``history`` of node ``h`` (index) that no late reading can reach any more:
+    those from ``since`` (seconds) on stay, and one before it.
     """
     past = history.past
     k = history.newest[h]
@@ -167,6 +169,7 @@ def forget(history: History, h: int, since: float) -> None:
         k = past[k].before
     if k == -1:
         return
+    # Cut the list behind it; the entries cut off return to the list of free ones.
     freed = past[k].before
     past[k].before = -1
     while freed != -1:
@@ -180,7 +183,8 @@ def forget(history: History, h: int, since: float) -> None:
 @kernel
 def use_reading(state: Simulation, history: History, h: int, instant: int) -> None:
     """Update node ``h`` with the reading of ``instant`` (index in ``state.instants``), which is the
-    present one, and remember it in ``history``. Changes ``state.xhat[h]`` and ``root[h]``.
+    present one, and remember it in ``history``, in case that an earlier reading arrives later.
+    Changes ``state.xhat[h]`` and ``root[h]``.
     """
     use_instant(state, instant, state.root, state.xhat, h, 1.0)
     lag, time = history.lag, state.instants.t[instant]
@@ -209,7 +213,7 @@ def use_late_reading(state: Simulation, history: History, h: int, instant: int, 
         before = past[k].before
         past[k].before = later_events
         later_events, k = k, before
-    # The late reading becomes an entry of its own at its place in time.
+    # The late reading becomes an entry of its own between them; -1: it begins no frame.
     before, k = k, allocate_past(history, time, instant, -1)
     past[k].before = before
     # Go forward again: predict from the entry before, use the reading or move the origin, and store
@@ -219,6 +223,7 @@ def use_late_reading(state: Simulation, history: History, h: int, instant: int, 
         if past[k].time > past[before].time:
             gap = past[k].time - past[before].time
             propagate_root(state.table, model, root, x, k, gap, state.flow_scratch)
+        # 1.0: the noise of the reading is not scaled.
         if past[k].instant >= 0:
             use_instant(state, past[k].instant, root, x, k, 1.0)
         # A frame begins: move the origin of the estimate.

@@ -57,9 +57,9 @@ class Totals(Struct):
 def empty_totals(
     state: Simulation, receivers: np.ndarray, A: FloatArray, forgetting: float
 ) -> Totals:
-    """Return the running sums of N nodes at time 0: weight 1 at every node, and nothing sent yet.
-    ``receivers`` (N,) is the number of nodes that can hear each node, ``A`` (n, n) the plant's
-    matrix in 1/s, ``forgetting`` the rate in 1/s at which old information fades.
+    """Return the running sums of push-sum for N nodes at time 0: weight 1 at every node, and
+    nothing sent yet. ``receivers`` (N,) is the number of nodes that can hear each node, ``A`` (n,
+    n) the plant's matrix in 1/s, ``forgetting`` the rate in 1/s at which old information fades.
     """
     count, n = state.xhat.shape
     m, directions = 1 + n * n + n, len(state.directions)
@@ -82,8 +82,8 @@ def empty_totals(
 
 @kernel
 def fill_inverse(totals: Totals, gap: float) -> None:
-    """Write ``e^{-A gap}`` (n, n) into ``totals.scratch[0]``, for ``gap`` seconds, by scaling and
-    squaring.
+    """Write the inverse transition ``e^{-A gap}`` (n, n), by which information is predicted, into
+    ``totals.scratch[0]``, for ``gap`` seconds, by scaling and squaring.
     """
     A, out, term, product = totals.A, totals.scratch[0], totals.scratch[1], totals.scratch[2]
     n, norm = len(A), 0.0
@@ -114,9 +114,10 @@ def fill_inverse(totals: Totals, gap: float) -> None:
 
 @kernel
 def predict_total(totals: Totals, values: FloatArray, k: int, gap: float) -> None:
-    """Predict the total ``values[k]`` by ``gap`` seconds in place: ``U <- s Phi^-T U Phi^-1`` and
-    ``u <- s Phi^-T u``, with Phi = e^{A gap} and the fading s. ``values`` (K, 1 + n n + n) holds K
-    totals: weight w, U by rows, u.
+    """Predict one running total, the sum of all that a node has offered so far, by ``gap`` seconds
+    in place: ``U <- s Phi^-T U Phi^-1`` and ``u <- s Phi^-T u``, with Phi = e^{A gap} and the
+    factor s by which old information fades. It is ``values[k]`` of K totals ``values`` (K, 1 + n n
+    + n): weight w, information matrix U by rows, information vector u.
     """
     if not gap > 0.0:
         return
@@ -148,7 +149,8 @@ def predict_total(totals: Totals, values: FloatArray, k: int, gap: float) -> Non
 @kernel
 def offer_round(state: Simulation, totals: Totals, h: int, now: float) -> bool:
     """Offer a share of the mass of node ``h`` (index) at ``now`` (seconds) to each of its
-    receivers: add it to the total ``totals.sent[h]``, and subtract its weight from
+    receivers: the mass is its weight w, U = w / N P^-1 and u = U xhat. Adds the share to the total
+    ``totals.sent[h]`` of all that the node has offered, and subtracts the weight given away from
     ``totals.weight[h]``. Return False if the node has no receivers.
     """
     receivers, n, weight = totals.receivers[h], state.xhat.shape[1], totals.weight[h]
@@ -188,8 +190,8 @@ def offer_round(state: Simulation, totals: Totals, h: int, now: float) -> bool:
 
 @kernel
 def fill_inverse_root(out: FloatArray, root: FloatArray, h: int) -> None:
-    """Write the inverse of ``root[h]``, one of N lower triangular, regular matrices (N, n, n), into
-    ``out`` (n, n).
+    """Write the inverse of the lower triangular root S = ``root[h]`` of P, one of N (N, n, n), into
+    ``out`` (n, n), by forward substitution: information P^-1 is its transpose times it.
     """
     n = root.shape[1]
     for i in range(n):
@@ -202,10 +204,11 @@ def fill_inverse_root(out: FloatArray, root: FloatArray, h: int) -> None:
 
 @kernel
 def hear(state: Simulation, totals: Totals, h: int, now: float) -> None:
-    """Add the growth of each total in the inbox of node ``h`` (index) since its sender was last
-    heard, predicted to ``now`` (seconds), to the mass of the node: ``totals.weight[h]``,
-    ``state.xhat[h]`` and ``root[h]``. A total older than the last one heard adds nothing. The
-    totals are stored as ``totals.heard``.
+    """Let node ``h`` (index) absorb the totals in its inbox at ``now`` (seconds). A total is the
+    sum of all that its sender has offered so far, so that its growth since the sender was last
+    heard makes up for messages lost in between; the growth is added to the mass of the node,
+    ``totals.weight[h]``, ``state.xhat[h]`` and ``root[h]``. A total older than the last one heard
+    adds nothing. The totals are stored as ``totals.heard``.
     """
     gain, pool, heard, offered = totals.gain, state.pool, totals.heard, totals.offered
     # Two passes over the inbox: first the sum of all growth, because the totals are not stored as
@@ -246,9 +249,10 @@ def hear(state: Simulation, totals: Totals, h: int, now: float) -> None:
 
 @kernel
 def gain_mass(state: Simulation, totals: Totals, h: int, factor: float, share: float) -> None:
-    """Add the mass ``totals.gain`` = (weight, U (n, n), u (n,)) to node ``h`` (index): ``P^-1 <- (w
-    P^-1 + N U) / w+`` with the new weight w+, and the estimate likewise. Changes ``state.xhat[h]``
-    and ``root[h]``, the root of P. ``factor`` is (w+ / w)^1/2, ``share`` is N / w+.
+    """Add mass, ``totals.gain`` = (weight, U (n, n), u (n,)), which node ``h`` (index) has heard
+    from others, to its estimate: ``P^-1 <- (w P^-1 + N U) / w+`` with the new weight w+, and the
+    estimate likewise. Changes ``state.xhat[h]`` and ``root[h]``, the root of P. ``factor`` is (w+ /
+    w)^1/2, ``share`` is N / w+.
     """
     root, gain, n = state.root, totals.gain, state.xhat.shape[1]
     inner, half, vectors = totals.scratch[0], totals.scratch[1], totals.scratch[2]
@@ -277,9 +281,10 @@ def gain_mass(state: Simulation, totals: Totals, h: int, factor: float, share: f
 
 @kernel
 def update_root_by_gain(state: Simulation, h: int, values: FloatArray, vectors: FloatArray) -> None:
-    """Replace the root S = ``state.root[h]`` (n, n) of node ``h`` (index) by the lower triangular
-    root of ``S V D^-1 V' S'``, with the eigenvalues D on the diagonal of ``values`` (n, n), raised
-    to at least 1, and the eigenvectors V = ``vectors`` (n, n), in columns.
+    """Add the information that a node has heard to the root S = ``state.root[h]`` (n, n) of its P:
+    replace S by the lower triangular root of ``S V D^-1 V' S'``, the last step of ``gain_mass``.
+    The eigenvalues D are on the diagonal of ``values`` (n, n), raised to at least 1, and the
+    eigenvectors V = ``vectors`` (n, n) in columns; ``h`` is the index of the node.
     """
     root, F, n = state.root, state.flow_scratch.values, state.xhat.shape[1]
     wide, noise = state.flow_scratch.wide, state.flow_scratch.T
@@ -302,9 +307,9 @@ def update_root_by_gain(state: Simulation, h: int, values: FloatArray, vectors: 
 def move_by_gain(
     state: Simulation, h: int, gain: FloatArray, share: float, innovation: FloatArray
 ) -> None:
-    """Correct ``state.xhat[h]`` of node ``h`` (index) by the mass ``gain`` (1 + n n + n,) =
-    (weight, U by rows, u): ``xhat += P share (u - U xhat)`` with the new P; ``innovation`` (n,) is
-    scratch.
+    """Correct ``state.xhat[h]`` of node ``h`` (index) by the mass that it has heard, ``gain`` (1 +
+    n n + n,) = (weight, U by rows, u): ``xhat += P share (u - U xhat)`` with the new P and share =
+    N / w+, w+ being the new weight; ``innovation`` (n,) is scratch.
     """
     root, xhat, n = state.root, state.xhat, state.xhat.shape[1]
     # innovation = N / w+ (u - U xhat).
@@ -327,9 +332,10 @@ def move_by_gain(
 
 @kernel
 def add_reading(state: Simulation, totals: Totals, h: int, instant: int) -> None:
-    """Add the samples of an ``instant`` (index in ``state.instants``) to the mass of node ``h``:
-    ``U += H' R^-1 H`` and ``u += H' R^-1 y``, which counts N / w times in P^-1. Changes
-    ``state.xhat[h]`` and ``root[h]``.
+    """Add the samples of an ``instant`` (index in ``state.instants``) to the mass of node ``h``,
+    its weighted share of the information in the network: ``U += H' R^-1 H`` and ``u += H' R^-1 y``,
+    which counts N / w times in P^-1, w being the node's weight. Changes ``state.xhat[h]`` and
+    ``root[h]``.
     """
     # Equivalent to noise R w / N.
     scale = math.sqrt(totals.weight[h] / len(state.nodes))

@@ -361,10 +361,10 @@ class Filters(NamedTuple):
 
 @once_per_scenario
 def filters_at_start(scenario: Scenario) -> Filters:
-    """Return all N filters at time 0, or, if they are pooled, the one that reads all sensors (N =
-    1).
+    """Return all N filters at time 0, or, if they are pooled (one filter in place of those of all
+    nodes), the one that reads all sensors (N = 1).
     """
-    # A pooled filter is one node with the id -1 and the sensors of all.
+    # A pooled filter is one node with the id -1, which belongs to no node of the network.
     ids, pooled = scenario.nodes, scenario.node_filter.pooled
     models = (scenario.pooled_model,) if pooled else scenario.models
     # Nodes that share a model share its table.
@@ -389,8 +389,8 @@ def filters_at_start(scenario: Scenario) -> Filters:
 
 
 def _roots_of(covariances: list[FloatArray]) -> FloatArray:
-    """Return the stacked roots (N, n, n) of N covariances (n, n), many of which are the same
-    array.
+    """Return the stacked roots (N, n, n) of N covariances (n, n). Many of these are the same array,
+    whose root is computed once.
     """
     distinct = {id(cov): cov for cov in covariances}
     roots = {key: first_root(cov) for key, cov in distinct.items()}
@@ -398,8 +398,9 @@ def _roots_of(covariances: list[FloatArray]) -> FloatArray:
 
 
 def _stack_model_tables(models: list[FlowModel]) -> tuple[FlowTable, Gains]:
-    """Return the tables of M models with n states each: for prediction, with one more model without
-    sensors at the end (M + 1), and of gains (M).
+    """Return the tables of M models (matrices by which nodes predict and read) with n states each:
+    for prediction, with one more model without sensors at the end (M + 1), by which messages under
+    way are predicted, and of gains (M).
     """
     n = len(models[0].A)
     # A model without sensors has no gains; its entry keeps the numbering.
@@ -420,12 +421,12 @@ def _stack_model_tables(models: list[FlowModel]) -> tuple[FlowTable, Gains]:
 
 @once_per_scenario
 def entity_records(scenario: Scenario) -> tuple[np.ndarray, np.ndarray]:
-    """Return the records of E entities with a clock, ENTITY (E,), and of W directed links,
-    DIRECTED_LINK (W,), of a run that has not begun.
+    """Return the records of E entities with a clock of their own (links, directed links or nodes),
+    ENTITY (E,), and of W directed links, DIRECTED_LINK (W,), of a run that has not begun.
     """
     senders, index = senders_of(scenario), scenario.topology.index
     entities = np.zeros(len(senders.entities), dtype=ENTITY)
-    # (i, j) of a link or direction, (i, -1) of a node.
+    # (i, j) of a link or direction, (i, -1) of a node. The ids become indices below.
     ends = np.array([(*e, -1)[:2] for e in senders.entities], dtype=np.int64).reshape(-1, 2)
     index_of = np.vectorize(lambda node: index.get(node, -1), otypes=[np.int64])
     if len(ends):
@@ -443,11 +444,13 @@ def entity_records(scenario: Scenario) -> tuple[np.ndarray, np.ndarray]:
 def scratch_arrays(
     table: FlowTable, gains: Gains, instants: Instants, unrolled: bool
 ) -> tuple[Scratch, FlowScratch, UpdateScratch]:
-    """Return scratch arrays for all computations of a run with these ``instants``, in models with
-    these tables; ``unrolled`` ones have types that know n, so that kernels are compiled for it.
+    """Return scratch arrays for all computations of a run whose sampled sensors have these
+    ``instants``, in models with these tables. ``unrolled``: they have types that know n, so that
+    kernels are compiled for just this n, which is faster.
     """
     n, max_moments, width = table.levels.shape[3], int(gains.moments.max()), gains.series.shape[2]
     # Rows of the reading of each sample, then the largest sum over one instant.
+    # The 0 allows for runs without any sampled sensor.
     rows = np.concatenate([instants.rows, [0]])[instants.sensor]
     totals = np.concatenate([[0], np.cumsum(rows)])[instants.first]
     q = max(1, int(np.diff(totals).max(initial=0)))
@@ -468,8 +471,9 @@ def scratch_arrays(
 
 
 def empty_pool(capacity: int, n: int) -> tuple[np.ndarray, FloatArray, FloatArray, np.ndarray]:
-    """Return the pool of C = ``capacity`` MESSAGE records (C,), all free, the estimates (C, n) and
-    roots (C, n, n) that they carry, and the heap (C,) of messages under way.
+    """Return the pool of C = ``capacity`` messages that the event loop sends: MESSAGE records (C,),
+    all free, the estimates (C, n) and roots (C, n, n) that they carry, and the heap (C,) of
+    messages under way, ordered by arrival.
     """
     pool = np.zeros(capacity, dtype=MESSAGE)
     pool["next"] = np.arange(1, capacity + 1)
@@ -477,8 +481,9 @@ def empty_pool(capacity: int, n: int) -> tuple[np.ndarray, FloatArray, FloatArra
 
 
 def add_messages(state: Simulation, at_least: int) -> None:
-    """Enlarge ``pool``, ``pool_x``, ``pool_root`` and ``heap`` of ``state``: to twice as many
-    messages, or by ``at_least`` messages if these are more.
+    """Enlarge the pool of messages of ``state`` (``pool``, ``pool_x``, ``pool_root`` and ``heap``)
+    when the loop has used it up: to twice as many messages, or by ``at_least`` messages if these
+    are more.
     """
     # Doubling keeps the cost of copies proportional to the messages.
     capacity, n = len(state.pool), state.xhat.shape[1]
