@@ -99,7 +99,7 @@ def _arrival_rows(scenario: Scenario) -> list[AssumptionRow]:
 
 
 def _bounded_mean_row(scenario: Scenario) -> AssumptionRow:
-    """Return the row of the table on the condition of paper R (32), sufficient for a bounded mean of
+    """Return the row of the table on the condition of paper R (32), enough for a bounded mean of
     P: some gains make errors contract in the mean square. Its evidence is about the node at which
     readings arrive least sufficiently.
     """
