@@ -101,8 +101,8 @@ class Engine(ABC):
 
 
 def batch_sink(scenario: Scenario, replicas: range) -> BatchSink:
-    """Return a sink that collects the samples of the runs numbered ``replicas`` of a scenario in
-    one RunBatch.
+    """Return a sink, which a recorder passes samples to, that collects those of the runs numbered
+    ``replicas`` of a scenario in one RunBatch.
     """
     # A pooled filter is sampled once, not once for each node.
     filters = 1 if scenario.node_filter.pooled else len(scenario.nodes)
@@ -112,9 +112,9 @@ def batch_sink(scenario: Scenario, replicas: range) -> BatchSink:
 def broken(
     scenario: Scenario, xhat: FloatArray, P: FloatArray, without: np.ndarray | None = None
 ) -> list[int]:
-    """Return the ids of the nodes whose estimate (row of ``xhat`` (N, n)) or covariance (``P``
-    (N, n, n)) is not finite, or whose covariance is not positive semidefinite: they end a run as
-    diverged. ``without``: mask (N,) of nodes that have no covariance, whose P is ignored.
+    """Return the ids of the nodes whose estimates end a run as diverged: the estimate (row of
+    ``xhat`` (N, n)) or covariance (``P`` (N, n, n)) is not finite, or the covariance not positive
+    semidefinite. ``without``: mask (N,) of nodes that have no covariance, whose P is ignored.
     """
     # False broadcasts: every node then has a covariance to be looked at.
     intact = sound_mask(xhat, P, False if without is None else without)

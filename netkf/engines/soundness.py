@@ -47,7 +47,8 @@ def sound_mask(xhat: FloatArray, P: FloatArray, without: BoolArray | bool = Fals
 
 def _semidefinite(P: FloatArray) -> BoolArray:
     """Return a mask (...) of the symmetric matrices ``P`` (..., n, n) that are positive
-    semidefinite up to the share INDEFINITE of the largest eigenvalue.
+    semidefinite up to rounding: no eigenvalue is below minus the share INDEFINITE of the largest
+    one.
     """
     # A Cholesky factor of P plus a little is much cheaper than its eigenvalues, and nearly always
     # exists.

@@ -97,15 +97,16 @@ def is_immediate(scenario: Scenario) -> bool:
 
 
 def together(nodes: int, runs: int) -> int:
-    """Return how many of ``runs`` runs, each with ``nodes`` filters, are simulated together: as
-    many as have MAX_FILTERS filters in all, at least 1.
+    """Return how many of ``runs`` runs, each with ``nodes`` filters, are simulated together, so
+    that their nodes fill the SIMD lanes: as many as have MAX_FILTERS filters in all, at least 1.
     """
     return max(1, min(runs, MAX_FILTERS // nodes))
 
 
 def pause_of(state: Simulation, ticks: int, count: int) -> float:
     """Return the simulated time in seconds after which ``count`` runs with ``ticks`` ticks each
-    process their visits, predictions of nodes: as long as the queue of visits has space for.
+    process their queued visits (predictions of one node, or of two that then combine): as long as
+    the queue of visits has space for.
     """
     nodes = len(state.nodes)
     visits_per_run = (
@@ -116,9 +117,9 @@ def pause_of(state: Simulation, ticks: int, count: int) -> float:
 
 
 def simulate_together(state: Simulation, visits: Visits, batch: BatchArrays, group: int) -> None:
-    """Simulate all R runs of a batch up to the horizon, ``group`` of them at a time; the results
-    are in ``batch`` and the samples in ``state.buffer``. ``visits`` is an empty queue, scratch
-    space for ``group`` runs.
+    """Simulate all R runs of a batch up to the horizon, ``group`` of them at a time, whose nodes
+    are computed side by side in SIMD lanes; the results are in ``batch`` and the samples in
+    ``state.buffer``. ``visits`` is an empty queue, scratch space for ``group`` runs.
     """
     ticks = int(batch.first[-1]) // len(batch.lengths)
     pause, progress = pause_of(state, ticks, group), np.zeros(group, dtype=PROGRESS)
@@ -185,9 +186,10 @@ def simulate_group(
     pause: float,
 ) -> None:
     """Simulate together the G runs ``first`` to ``first`` + G - 1 of a batch, one for each entry of
-    ``progress`` (G,), and store their results in ``batch``. Node h of the k-th of these runs is at
-    the place k N + h of ``state.xhat``, ``root`` and ``now``. Every ``pause`` simulated seconds the
-    queued visits are processed.
+    ``progress`` (G,), and store their results in ``batch``. Node h of the k-th of these runs is in
+    row k N + h of ``state.xhat``, ``root`` and ``now``. Every ``pause`` simulated seconds the
+    queued visits, predictions of one node or of two that then combine, are processed for all runs
+    at once.
     """
     state.first_run = first
     for k in range(len(progress)):
@@ -212,8 +214,9 @@ def simulate_group(
 
 @kernel
 def suspend(state: Simulation, batch: BatchArrays, progress: np.ndarray, k: int) -> None:
-    """Store the position of the present run ``state.run`` in entry ``k`` of ``progress`` (G,), for
-    G runs simulated together, and its numbers of events in row ``state.run`` of ``batch.counts``.
+    """Store the position of the present run ``state.run``, the indices of its next tick, sample and
+    so on, in entry ``k`` of ``progress`` (G,), so that another of the G runs simulated together can
+    go on; and its numbers of events in row ``state.run`` of ``batch.counts``.
     """
     position = progress[k]
     position.tick_at, position.ticks_stop, position.first_delay = (
@@ -229,9 +232,9 @@ def suspend(state: Simulation, batch: BatchArrays, progress: np.ndarray, k: int)
 
 @kernel
 def resume(state: Simulation, batch: BatchArrays, progress: np.ndarray, k: int) -> None:
-    """Make run ``state.first_run`` + ``k`` the present one: restore its position in ``state`` from
-    entry ``k`` of ``progress`` (G,), for G runs simulated together, and its numbers of events from
-    ``batch.counts``.
+    """Make run ``state.first_run`` + ``k`` the present one: restore its position, the indices of
+    its next tick, sample and so on, in ``state`` from entry ``k`` of ``progress`` (G,), for G runs
+    simulated together, and its numbers of events from ``batch.counts``.
     """
     position = progress[k]
     state.tick_at, state.ticks_stop, state.first_delay = (
@@ -273,6 +276,7 @@ def queue_events(state: Simulation, visits: Visits, until: float) -> int:
     first, max_visits = (state.run - state.first_run) * nodes, nodes + 2 + state.most_messages
     while True:
         event, now = next_event(state)
+        # These filters have no history of readings.
         request = find_shortage(state, None, event, now)
         if request != GO_ON:
             return request
@@ -287,6 +291,7 @@ def queue_events(state: Simulation, visits: Visits, until: float) -> int:
             queue_visit(state, visits, now, first + state.sensing.index[state.wake_at])
             on_sense(state, now)
         else:
+            # A move of the origin or a sample: all nodes are predicted to it.
             for h in range(nodes):
                 queue_visit(state, visits, now, first + h)
             if event != ON_PROBE:
@@ -298,8 +303,9 @@ def queue_events(state: Simulation, visits: Visits, until: float) -> int:
 
 @kernel
 def end_of_ticks(state: Simulation) -> float:
-    """Return the time in seconds up to which only ticks happen: that of the next other event, or
-    the end of the present piece of the path or of the window of ticks, whichever comes first.
+    """Return the time in seconds up to which only ticks happen, so that ``queue_ticks`` need not
+    look for other events: that of the next other event, or the end of the present piece of the path
+    or of the window of ticks, whichever comes first.
     """
     path, ticks = state.path, state.ticks
     event = min(next_of(state.frames, state.frame_at), next_of(path.grid, state.grid_at))
@@ -346,9 +352,9 @@ def queue_tick(state: Simulation, visits: Visits, first: int, now: float) -> Non
 
 @kernel
 def count_tick(state: Simulation, sent: int, bits: int) -> None:
-    """Add the events that ``record_tick`` would record to ``state.counts``: a tick, ``sent``
-    messages, of which as many arrive and are absorbed as the arrival bits ``bits`` have ones; the
-    others are lost.
+    """Add the events that ``record_tick`` would record to ``state.counts``, for runs that store no
+    rows of events: a tick, ``sent`` messages, of which as many arrive and are absorbed as the
+    arrival bits ``bits`` have ones; the others are lost.
     """
     # bits & (bits - 1) clears the lowest one.
     arrived = 0
@@ -441,9 +447,9 @@ def queue_pairs(state: Simulation, visits: Visits, k: int, first: int, now: floa
 
 @kernel
 def set_receiving_link(visits: Visits, v: int, first: bool, direction: int) -> None:
-    """Write the index ``direction`` of a directed link into visit ``v`` (index in
-    ``visits.records``): over it the first node of the visit receives if ``first``, otherwise the
-    second one.
+    """Enter in visit ``v`` (index in ``visits.records``) of two nodes the index ``direction`` of a
+    directed link whose message arrives: over it the first node of the visit receives if ``first``,
+    otherwise the second one.
     """
     if first:
         visits.records[v].to_first = direction
@@ -453,9 +459,10 @@ def set_receiving_link(visits: Visits, v: int, first: bool, direction: int) -> N
 
 @kernel
 def fill_arrival_bits(state: Simulation, first: int, after: int, delays: int) -> None:
-    """Write ``state.ticks.arrival_bits`` of the ticks ``first`` to ``after`` - 1: bit m is 1 if
-    message m of a tick arrives. The outcomes of these ticks' run begin at index ``delays`` of
-    ``state.ticks.delay``, which holds the delay of each message, negative or nan if it is lost.
+    """Write ``state.ticks.arrival_bits`` of the ticks ``first`` to ``after`` - 1, in which visits
+    look up what arrives: bit m is 1 if message m of a tick arrives. The outcomes of these ticks'
+    run begin at index ``delays`` of ``state.ticks.delay``, which holds the delay of each message,
+    negative or nan if it is lost.
     """
     ticks, entities = state.ticks, state.entities
     for k in range(first, after):

@@ -52,14 +52,16 @@ def steps_to_the_end(scenario: Scenario) -> int:
 
 
 def increments(scenario: Scenario) -> list[tuple[int, PlacedSensor]]:
-    """Return all increment sensors as pairs (id of its node, sensor), in the order of nodes."""
+    """Return all increment sensors, which read integrals of the state between grid times, as pairs
+    (id of its node, sensor), in the order of nodes.
+    """
     by_node = scenario.increment_sensors.items()
     return [(node, sensor) for node, placed in by_node for sensor in placed]
 
 
 def blocks_at_once(scenario: Scenario) -> int:
     """Return the number of blocks, of BLOCK steps of the sensing grid each, that a run draws at
-    once.
+    once: few if many sensors need noise, so that memory stays small.
     """
     rows = [
         len(scenario.sensors[placed_sensor.entry].R) for _, placed_sensor in increments(scenario)
@@ -82,8 +84,9 @@ class Paths:
         sampled: FloatArray = NO_TIMES,
     ) -> None:
         """Make the random streams of the R runs, and ``frame_times`` (F,) in seconds, at which a
-        frame begins; nothing is drawn but initial states. ``blocks`` and ``sampled`` (T,): see the
-        class.
+        frame begins: the origin of all states moves to the present one then, so that those of an
+        unstable plant keep their digits. Nothing is drawn but initial states. ``blocks`` and
+        ``sampled`` (T,): see the class.
         """
         self._blocks = blocks
         # Separate streams for the path, for the states at probes and for those at samples, so that
@@ -117,7 +120,7 @@ class Paths:
 
     def block(self, block: Block, together: int = 1) -> PathBlock:
         """Return a block of steps of all R runs as arrays for the event loop, which simulates
-        ``together`` runs at a time: the block has a cache for so many.
+        ``together`` runs at a time: the block has a cache of path polynomials for so many.
         """
         ends, laws = block.ends, self._paths.laws
         n = laws.n
@@ -142,8 +145,9 @@ class Paths:
 
 
 def no_path(n: int) -> PathBlock:
-    """Return a path of one piece without an end, (1, 1, n) states that are 0, for runs in which
-    nothing senses increments.
+    """Return a path of one piece without an end, with (1, 1, n) states that are 0, for runs in
+    which nothing senses increments: the loop then asks for no path, but its kernels need the
+    arrays.
     """
     rows = {name: np.zeros((1, 1, n)) for name in ("x_start", "x_stop")}
     return PathBlock(
@@ -164,9 +168,9 @@ def no_path(n: int) -> PathBlock:
 
 @once_per_scenario
 def _sensor_fields(scenario: Scenario) -> tuple[dict[str, np.ndarray], list[tuple[int, int]]]:
-    """Return the fields of a Sensing that all runs share, for S increment sensors of at most p rows
-    (rows (S,), H (S, p, n), ...), and the keys of the streams of these sensors:
-    (node, number at the node).
+    """Return the fields of a Sensing (increment sensors as arrays) that all runs share, for S
+    sensors of at most p rows (rows (S,), H (S, p, n), ...), and the keys of the random streams of
+    these sensors: (node, number at the node).
     """
     placed = increments(scenario)
     # Many nodes may have the same sensor: its R is factored once.
@@ -244,9 +248,10 @@ def fill_noise(
     scales: FloatArray,
     out: FloatArray,
 ) -> None:
-    """Write normals with the standard deviations ``scales`` (2,) of the two moments into ``out``
-    (K, C, 2, >= p), for C steps: the next numbers of each stream k of the K = R S ``states`` (K, 4)
-    of R runs, which belongs to sensor k modulo S with ``rows`` (S,) p. Advances ``states``.
+    """Draw the noise of increment sensors over C steps, two moments for each row: write normals
+    with the standard deviations ``scales`` (2,) of the two moments into ``out`` (K, C, 2, >= p).
+    They are the next numbers of each stream k of the K = R S ``states`` (K, 4) of R runs, which
+    belongs to sensor k modulo S with ``rows`` (S,) p. Advances ``states``.
     """
     for k in range(len(out)):
         # Streams are numbered run by run, so the sensor is the remainder.

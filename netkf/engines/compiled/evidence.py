@@ -66,12 +66,14 @@ class EvidenceArrays(Struct):
 
 
 def empty_evidence(state: Simulation, A: FloatArray, roots: FloatArray) -> EvidenceArrays:
-    """Return the evidence of N nodes at time 0, priors only, from their roots of P, ``roots``
-    (1, N, n, n, 1), with space for the messages of ``state``. ``A`` (n, n) is the plant's matrix in
-    1/s.
+    """Return the arrays of belief propagation for N nodes at time 0. Evidence is information (a
+    matrix and a vector) about the state: at time 0 priors only, from the roots of P of all nodes,
+    ``roots`` (1, N, n, n, 1). There is space for the messages of ``state``. ``A`` (n, n) is the
+    plant's matrix in 1/s.
     """
     N, n = state.xhat.shape
     directions, p, shape = state.directions, len(state.scratch.y), (n, n + 1, 1)
+    # Directed links by receiver, then by sender: the last key counts first.
     incoming = np.lexsort((directions["sender"], directions["receiver"]))
     prior = np.zeros((N, *shape))
     for h in range(N):
@@ -99,8 +101,9 @@ def empty_evidence(state: Simulation, A: FloatArray, roots: FloatArray) -> Evide
 
 
 def enlarge_evidence(evidence: EvidenceArrays, capacity: int) -> None:
-    """Replace ``evidence.carried`` by an array for ``capacity`` messages, (capacity, n, n + 1, 1),
-    which begins with the present ones.
+    """Enlarge ``evidence.carried``, the evidence in messages under way, with the pool of messages:
+    to an array (capacity, n, n + 1, 1) for ``capacity`` messages, which begins with the present
+    ones.
     """
     carried = np.zeros((capacity, *evidence.carried.shape[1:]))
     carried[: len(evidence.carried)] = evidence.carried
@@ -109,10 +112,12 @@ def enlarge_evidence(evidence: EvidenceArrays, capacity: int) -> None:
 
 @kernel
 def predict_node_evidence(evidence: EvidenceArrays, h: int, gap: float) -> None:
-    """Predict all evidence of node ``h`` (index) by ``gap`` seconds without process noise, in
-    place: its ``prior``, ``own`` and ``received`` evidence.
+    """Predict all evidence of node ``h`` (index), information about the state, by ``gap`` seconds
+    without process noise, in place: its ``prior``, its ``own`` from readings, and what it has
+    ``received`` from each neighbour.
     """
     fill_inverse_transition(evidence.A, gap, evidence.maps)
+    # exp(-A gap), which takes information forward in time; the other maps are scratch.
     back, total, work = evidence.maps[0], evidence.total, evidence.work
     predict_part(ONE, evidence.prior[h], back, total, work)
     predict_part(ONE, evidence.own[h], back, total, work)
@@ -122,9 +127,10 @@ def predict_node_evidence(evidence: EvidenceArrays, h: int, gap: float) -> None:
 
 @kernel
 def update_belief(state: Simulation, evidence: EvidenceArrays, h: int) -> None:
-    """Compute the belief of node ``h`` (index), the sum of its prior and all evidence, and write
-    its estimate and root to ``state.xhat[h]`` and ``root[h]``. Moves the centre of the node's
-    ``prior``, ``own`` and ``received`` evidence to the new estimate.
+    """Compute the belief of node ``h`` (index), the sum of its prior and all evidence (information
+    from its own readings and from each neighbour), and write its estimate and root to
+    ``state.xhat[h]`` and ``root[h]``. Moves the centre, the state relative to which the vectors of
+    all this evidence are kept, to the new estimate.
     """
     total, work, centre = evidence.total, evidence.work, evidence.centre
     for i in range(state.xhat.shape[1]):
@@ -144,8 +150,9 @@ def update_belief(state: Simulation, evidence: EvidenceArrays, h: int) -> None:
 
 @kernel
 def add_samples(state: Simulation, evidence: EvidenceArrays, h: int, instant: int) -> None:
-    """Add the samples of an ``instant`` (index in ``state.instants``) to ``evidence.own[h]`` of
-    node ``h``, and update its belief in ``state.xhat[h]`` and ``root[h]``.
+    """Add the samples of an ``instant`` (index in ``state.instants``) to ``evidence.own[h]``, the
+    information that node ``h`` has from its own readings, and update its belief in
+    ``state.xhat[h]`` and ``root[h]``.
     """
     instants, n = state.instants, state.xhat.shape[1]
     for i in range(n):
@@ -153,7 +160,7 @@ def add_samples(state: Simulation, evidence: EvidenceArrays, h: int, instant: in
     for s in range(instants.first[instant], instants.first[instant + 1]):
         sensor, matrix = instants.sensor[s], instants.matrix[s]
         rows = instants.rows[sensor]
-        # L^-1 y and L^-1 H with L L' = R.
+        # L^-1 y and L^-1 H with L L' = R, by forward substitution: their noise is white.
         for i in range(rows):
             scale, y = 1.0 / instants.root[sensor, i, i], instants.y[s, i]
             for m in range(i):
@@ -173,9 +180,10 @@ def add_samples(state: Simulation, evidence: EvidenceArrays, h: int, instant: in
 
 @kernel
 def send_evidence(state: Simulation, evidence: EvidenceArrays, m: int, h: int) -> None:
-    """Write the sum of the evidence of node ``h``, without what the receiver sent, to
-    ``evidence.carried[m]`` of message ``m`` (index in the pool), and the node's estimate, to which
-    it is relative, to ``state.pool_x[m]``.
+    """Write what node ``h`` sends in belief propagation to ``evidence.carried[m]`` of message ``m``
+    (index in the pool): the sum of its evidence without what the receiver itself sent, which would
+    otherwise count twice. The node's estimate, to which the sum is relative, goes to
+    ``state.pool_x[m]``.
     """
     receiver = state.directions[state.pool[m].direction].receiver
     copy_state(state.size, state.pool_x, state.pool_root, m, state.xhat, state.root, h)
@@ -188,10 +196,10 @@ def send_evidence(state: Simulation, evidence: EvidenceArrays, m: int, h: int) -
 
 @kernel
 def absorb_evidence(state: Simulation, evidence: EvidenceArrays, h: int, now: float) -> None:
-    """Replace ``evidence.received`` of each sender in the inbox of node ``h`` (index) by what its
-    message carries, unless the present one was sent later; then update the belief in
-    ``state.xhat[h]`` and ``root[h]``. The estimates in the messages, the centres of their evidence,
-    are predicted to ``now`` (seconds) already.
+    """Let node ``h`` (index) absorb the evidence (information about the state) that messages in its
+    inbox carry: replace ``evidence.received`` of each sender, unless the present one was sent
+    later; then update the belief in ``state.xhat[h]`` and ``root[h]``. The estimates in the
+    messages, to which their evidence is relative, are predicted to ``now`` (seconds) already.
     """
     m, maps = state.nodes[h].inbox, evidence.maps
     while m != -1:

@@ -11,7 +11,8 @@ from netkf.linalg.compiling import kernel
 @kernel
 def arrives_first(pool: np.ndarray, a: int, b: int) -> bool:
     """Return True if message ``a`` arrives before message ``b`` (indices in ``pool`` (C,), C
-    MESSAGE records): by time, then by directed link, then by order sent.
+    MESSAGE records): by time, then by directed link, then by order sent. It orders the heap of
+    messages under way.
     """
     # Ties must not depend on the order of insertion: the order is that of the SimPy engine.
     first, second = pool[a], pool[b]

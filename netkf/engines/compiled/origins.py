@@ -19,10 +19,11 @@ def move_origin(
     k: int,
     offset: FloatArray,
 ) -> None:
-    """Add ``offset`` (n,) to all estimates at the time of frame ``k``, at which the origin of the
-    states moves, and to the estimates in messages under way the offset predicted back to the time
-    of sending. Changes ``state.xhat`` and ``state.pool_x``; and what ``totals``, ``history`` and
-    ``combination``, None if the filter has none, hold of estimates.
+    """Move the origin of all states at the beginning of frame ``k`` (for an unstable plant,
+    whose numbers would lose their digits): add ``offset`` (n,) to all estimates, and to
+    the estimates in messages under way the offset predicted back to the time of sending. Changes
+    ``state.xhat`` and ``state.pool_x``; and what ``totals``, ``history`` and ``combination``, None
+    if the filter has none, hold of estimates.
     """
     now = float(state.frames[k])
     # Covariances stay: only means refer to an origin.
@@ -47,9 +48,9 @@ def move_origin(
 def _shift_totals(
     scenario: Scenario, state: Simulation, totals: Totals, now: float, offset: FloatArray
 ) -> None:
-    """Add ``U offset`` to the ``u`` of all running sums (weight, U (n, n), u (n,)) that nodes have
-    sent or heard or that are under way; ``offset`` (n,) is first predicted from ``now`` (seconds)
-    back to the time that each sum refers to.
+    """Move the running sums of push-sum (weight, U (n, n), u (n,)) to a new origin: add ``U
+    offset`` to the ``u`` of all that nodes have sent or heard or that are under way; ``offset``
+    (n,) is first predicted from ``now`` (seconds) back to the time that each sum refers to.
     """
     for times, values in ((totals.sent_at, totals.sent), (totals.heard_at, totals.heard)):
         for k, time in enumerate(times.tolist()):

@@ -86,10 +86,11 @@ def draw_ticks(
     buffer: TickBuffer,
     counts: np.ndarray,
 ) -> bool:
-    """Append the ticks before ``end`` (seconds) of all entities of run number ``run`` to
-    ``buffer``, with their outcomes; messages that arrive take ``delay`` seconds. ``counts`` (2,)
-    are the numbers of ticks and outcomes in the buffer; advances these, ``clocks.next_tick`` and
-    the streams. Return False if the buffer is full before.
+    """Append the ticks before ``end`` (seconds) of all entities (links, directions or nodes with a
+    clock) of run number ``run`` to ``buffer``, with their outcomes; messages that arrive take
+    ``delay`` seconds. ``counts`` (2,) are the numbers of ticks and outcomes in the buffer; advances
+    these, ``clocks.next_tick`` and the streams. Return False if the buffer is full before; a call
+    with a larger one then goes on.
     """
     # Entity by entity, each from its own stream; put_in_time_order() sorts them afterwards.
     for e in range(len(clocks.first) - 1):
@@ -109,12 +110,14 @@ def draw_ticks_of(
     buffer: TickBuffer,
     counts: np.ndarray,
 ) -> bool:
-    """Append the ticks before ``end`` (seconds) of entity ``e`` (index within a run) of run number
-    ``run`` to ``buffer``, with their outcomes; messages that arrive take ``delay`` seconds.
-    Advances ``counts`` (2,), the numbers of ticks and outcomes in the buffer, the entity's
-    ``clocks.next_tick`` and its stream. Return False if the buffer is full before.
+    """Append the ticks before ``end`` (seconds) of entity ``e`` (index within a run of a link,
+    direction or node with a clock) of run number ``run`` to ``buffer``, with their outcomes;
+    messages that arrive take ``delay`` seconds. Advances ``counts`` (2,), the numbers of ticks and
+    outcomes in the buffer, the entity's ``clocks.next_tick`` and its stream. Return False if the
+    buffer is full before.
     """
     states, first, after = clocks.tick_streams, clocks.first[e], clocks.first[e + 1]
+    # Index over all runs. ``high`` and ``low`` are the two words of the stream's state.
     k = run * (len(clocks.first) - 1) + e
     now, rate, high, low = clocks.next_tick[k], clocks.rate[k], states[k, 0], states[k, 1]
     m, max_outcomes, complete = counts[0], len(buffer.delay) - (after - first), True
@@ -185,8 +188,9 @@ def _sorting(ticks: int) -> Sorting:
 def put_in_time_order(
     begin: float, end: float, count: int, buffer: TickBuffer, ordered: TickBuffer, sorting: Sorting
 ) -> None:
-    """Write the first ``count`` ticks of ``buffer``, which lie in [begin, end) seconds, into
-    ``ordered``, sorted by (time, entity); outcomes stay where they are. ``sorting`` is scratch.
+    """Sort the first ``count`` ticks of ``buffer``, which lie in [begin, end) seconds and were
+    drawn entity by entity, by (time, entity), the order in which they happen: write them into
+    ``ordered``. Outcomes stay where they are. ``sorting`` is scratch.
     """
     # Ticks are evenly spread, hence about one in each of ``count`` equal bins.
     place, source, scale = sorting.place, sorting.source, count / (end - begin)
@@ -252,10 +256,10 @@ def draw_all_ticks(
     sorting: Sorting,
     ticks: AllTicks,
 ) -> bool:
-    """Draw the ticks of all R runs up to the ``horizon`` (seconds) into ``ticks``, sorted by
-    (time, entity) in each run; messages that arrive take ``delay`` seconds. ``buffer``, ``counts``
-    (2,) and ``sorting`` are scratch. Advances the streams of ``clocks``. Return False if an array
-    is too small.
+    """Draw the ticks of all R runs up to the ``horizon`` (seconds) into ``ticks``, run after run,
+    sorted by (time, entity) in each run; messages that arrive take ``delay`` seconds. ``buffer``,
+    ``counts`` (2,) and ``sorting`` are scratch. Advances the streams of ``clocks``. Return False if
+    an array is too small: the caller restores the streams and starts again with more space.
     """
     for run in range(len(ticks.first) - 1):
         counts[0] = counts[1] = 0
@@ -291,8 +295,9 @@ def is_poisson(scenario: Scenario) -> bool:
 
 @once_per_scenario
 def _rates_and_probabilities(scenario: Scenario) -> tuple[FloatArray, FloatArray]:
-    """Return ticks per second (E,) of each of E entities of a run, the links or nodes that have a
-    clock of their own, and the delivery probability (W,) of each of W directed links.
+    """Return what the ticks of all runs are drawn by: ticks per second (E,) of each of E entities,
+    the links or nodes that have a clock of their own, and the delivery probability (W,) of each of
+    W directed links.
     """
     clock, senders = scenario.network.activation, senders_of(scenario)
     assert isinstance(clock, LinkClock)
@@ -365,7 +370,9 @@ class PoissonSchedules:
         return self._window(0, begin, end)
 
     def all(self) -> AllTicks:
-        """Return all ticks of all R runs up to the horizon, one run after the other."""
+        """Return all ticks of all R runs up to the horizon, one run after the other, for batches of
+        runs.
+        """
         states = self._clocks.next_tick, self._clocks.tick_streams, self._clocks.loss_streams
         # Copies of the streams: an attempt that runs out of space starts again from them.
         copies = [state.copy() for state in states]
@@ -403,9 +410,11 @@ class PoissonSchedules:
 
     def _window(self, run: int, begin: float, end: float) -> Window:
         """Draw and return the ticks of run number ``run`` in [begin, end) seconds, in the order of
-        time.
+        time. The buffer into which they are drawn is enlarged until all of them fit.
         """
         last, counts = min(end, self._horizon), np.zeros(2, dtype=np.int64)
+        # Space for the mean plus eight standard deviations of a Poisson count is nearly always
+        # enough.
         expected = self._rate * (last - begin)
         ticks = int(expected + 8.0 * math.sqrt(expected)) + 8
         sends = int(self._sends * ticks) + self._max_sends
@@ -462,7 +471,11 @@ def window_of(ticks: AllTicks, run: int) -> Window:
     """Return all ticks of run number ``run`` (0 to R - 1) as a window without an end."""
     own, outcomes = (slice(*first[run : run + 2]) for first in (ticks.first, ticks.first_delay))
     return Window(
-        math.inf, ticks.t[own], ticks.entity[own], ticks.first_outcome[own], ticks.delay[outcomes]
+        end=math.inf,
+        t=ticks.t[own],
+        entity=ticks.entity[own],
+        first_outcome=ticks.first_outcome[own],
+        delay=ticks.delay[outcomes],
     )
 
 

@@ -68,8 +68,9 @@ class Ticks(NamedTuple):
     delay: FloatArray
 
     def select(self, indices: np.ndarray, sizes: np.ndarray) -> Ticks:
-        """Return the M ticks with these ``indices`` (M,) in this order; a tick of entity e of E has
-        ``sizes[e]`` outcomes (E,).
+        """Return the M ticks with these ``indices`` (M,) in this order, each with its outcomes
+        (delays in seconds, or LOST). A tick of entity e of E (a link, direction or node with a
+        clock) has ``sizes[e]`` outcomes (E,), one for each message.
         """
         # Indices of the outcomes of these ticks, tick after tick in their new order.
         sent = sizes[self.entity]
@@ -80,7 +81,8 @@ class Ticks(NamedTuple):
 
     def window(self, end: float, sizes: np.ndarray) -> Window:
         """Return these ticks, which must be in the order of time, as a window up to ``end``
-        (seconds); a tick of entity e of E has ``sizes[e]`` outcomes (E,).
+        (seconds), in which the event loop takes them; a tick of entity e of E has ``sizes[e]``
+        outcomes (E,), one for each message.
         """
         sent = sizes[self.entity]
         return Window(end, self.t, self.entity, np.cumsum(sent) - sent, self.delay)
@@ -96,8 +98,9 @@ class TickSource:
     def __init__(
         self, scenario: Scenario, streams: Streams | ReplicaStreams, senders: Senders
     ) -> None:
-        """Make the random streams of all E entities, or, for clocks that are not Poisson,
-        generators and the origins of their ticks.
+        """Make the random streams of all E entities (links, directions or nodes with a clock), or,
+        for clocks that are not Poisson, generators and the origins from which their ticks are
+        counted.
         """
         clock, runs, entities = (
             scenario.network.activation,
@@ -150,8 +153,8 @@ class TickSource:
 
     def _exponential(self, indices: np.ndarray, counts: np.ndarray) -> FloatArray:
         """Return the times (M, max(counts)) in seconds of the next ``counts`` (M,) ticks of the
-        Poisson clocks of the entities ``indices`` (M,), infinite beyond the counts; see
-        ``Poisson.ticks``.
+        Poisson clocks of the entities ``indices`` (M,), infinite beyond the counts: sums of
+        exponential gaps, as ``Poisson.ticks`` draws them for one clock.
         """
         times = np.full((len(indices), counts.max() + 1), np.inf)
         times[:, 0] = self.last[indices]
@@ -163,7 +166,7 @@ class TickSource:
 
     def _ticks(self, k: int, count: int) -> FloatArray:
         """Return the times (count,) in seconds of the next ``count`` ticks of entity ``k``, fewer
-        if its clock ends.
+        if its clock ends, by calling the clock in Python, which may be a user's own.
         """
         assert isinstance(self._clock, LinkClock)
         origin, index, now = float(self._origins[k]), int(self.drawn[k]), float(self.last[k])
@@ -186,10 +189,13 @@ def delay_is_zero(channel: Channel) -> bool:
 
 
 def delivery_probabilities_of(scenario: Scenario, directions: tuple[Link, ...]) -> FloatArray:
-    """Return the delivery probabilities (W,) of the messages of W directed links."""
+    """Return the delivery probabilities (W,) of the messages of W directed links, for channels in
+    which they depend neither on a state of the link nor on the message.
+    """
     loss = scenario.network.channel.loss
     return np.array(
         [
+            # Message number 0 and a good state: the probability is the same for all others.
             loss.delivery_probability(direction, 0, False, scenario.table_probability(direction))
             for direction in directions
         ]
@@ -205,7 +211,8 @@ class Outcomes:
         self, scenario: Scenario, streams: Streams | ReplicaStreams, senders: Senders
     ) -> None:
         """Make the random streams of losses and delays of all runs, and tables of delivery
-        probabilities (W,) where these depend on the W directed links only.
+        probabilities (W,) where these depend on the W directed links only. ``senders`` says which
+        entities (links, directions or nodes) have a clock, and on which directed links each sends.
         """
         self._channel = channel = scenario.network.channel
         runs = streams.runs
@@ -267,8 +274,8 @@ class Outcomes:
 
     def _draw(self, sources: np.ndarray, counts: np.ndarray) -> tuple[np.ndarray, ...]:
         """Draw for the next ``counts`` (M,) messages of each of M streams ``sources`` (M,), K in
-        all: return uniform numbers, bad states of the channel (bool) and delays in seconds, (K,)
-        each.
+        all: return uniform numbers, which decide about losses, bad states of the channel (bool) and
+        delays in seconds, (K,) each.
         """
         total = int(counts.sum())
         if not self._has_table_law:
@@ -335,9 +342,9 @@ class Outcomes:
         lost: np.ndarray,
         delay: np.ndarray,
     ) -> FloatArray:
-        """Return the delays (K,) of K messages in seconds if their law depends on the message, for
-        ``counts`` (M,) messages on each of M ``directions`` (M,) with numbers from ``first`` (M,)
-        on. Messages that are ``lost`` (K,) keep ``delay`` (K,).
+        """Return the delays (K,) of K messages in seconds if their law depends on the message (its
+        direction and number), for ``counts`` (M,) messages on each of M ``directions`` (M,) with
+        numbers from ``first`` (M,) on. Messages that are ``lost`` (K,) keep ``delay`` (K,).
         """
         model, out, k = self._channel.delay, np.array(delay), 0
         for w, count, number in zip(directions, counts.tolist(), first.tolist(), strict=True):
@@ -358,8 +365,8 @@ class EntityDraws:
     def __init__(
         self, scenario: Scenario, streams: Streams | ReplicaStreams, senders: Senders
     ) -> None:
-        """Make the random streams of ticks and outcomes of all entities; the length of the blocks
-        that are drawn depends on their number.
+        """Make the random streams of ticks and outcomes of all entities (links, directions or nodes
+        with a clock); the length of the blocks that are drawn depends on their number.
         """
         self.count = len(senders.entities) * streams.runs
         self._clocks = TickSource(scenario, streams, senders)
@@ -383,7 +390,8 @@ class EntityDraws:
 
     def more(self, indices: np.ndarray) -> Ticks:
         """Draw and return the next block of ticks of M entities with the ``indices`` (M,), in
-        ascending order, with the outcomes of their messages: entity by entity.
+        ascending order, with the outcomes of their messages (delays in seconds, or LOST): entity by
+        entity.
         """
         first = self._clocks.drawn[indices]
         t, counts = self._clocks.more(indices, self._block[indices])
@@ -403,8 +411,8 @@ class Schedule:
     def __init__(
         self, scenario: Scenario, streams: Streams, senders: Senders | None = None
     ) -> None:
-        """Draw the first ticks of each entity, whose rate decides the length of all windows;
-        ``senders`` defaults to those of the scenario.
+        """Draw the first ticks of each entity (a link, direction or node with a clock), whose rate
+        decides the length of all windows; ``senders`` defaults to those of the scenario.
         """
         senders = senders_of(scenario) if senders is None else senders
         self._draws = draws = EntityDraws(scenario, streams, senders)
@@ -415,7 +423,9 @@ class Schedule:
         self._length = window_ticks / draws.rate if draws.rate > 0.0 else math.inf
 
     def following(self) -> Window:
-        """Return the next window of the ticks of the run; the last one ends at infinity."""
+        """Return the next window, all ticks of the run in the next interval of time in the order of
+        (time, entity); the last one ends at infinity.
+        """
         end, draws = self._end + self._length, self._draws
         # The last window has no end, so that the loop asks for no other.
         if not self._end < end < self._horizon:
@@ -450,8 +460,9 @@ class ReadingsSchedule:
         t: FloatArray,
         index: np.ndarray,
     ) -> None:
-        """Take the times ``t`` (K,) in seconds of all transmissions and the index ``index`` (K,) of
-        each sending node, and make the streams of their outcomes.
+        """Take the times ``t`` (K,) in seconds of all transmissions, which nodes make after their
+        samples, and the index ``index`` (K,) of each sending node, and make the streams of their
+        outcomes (delays or losses).
         """
         self._outcomes = Outcomes(scenario, streams, senders)
         self._t, self._index, self._begin = t, index, 0
@@ -484,7 +495,7 @@ class ReadingsSchedule:
 
 
 def all_windows(scenario: Scenario, streams: ReplicaStreams) -> list[Window]:
-    """Return all ticks of R runs up to the horizon, in one window for each run."""
+    """Return all ticks of R runs up to the horizon, drawn together, in one window for each run."""
     senders, runs = senders_of(scenario), streams.runs
     draws = EntityDraws(scenario, streams, senders)
     if not draws.count:

@@ -59,8 +59,9 @@ class DirectionDraws:
         )
 
     def draws(self) -> Iterator[Draw]:
-        """Yield the draws (uniform number, bad state, delay in seconds) of the channel for the
-        activations of this link, one after the other.
+        """Yield the draws of the channel for the activations of this link, one after the other: a
+        uniform number that decides about loss, whether the channel is in its bad state, and a delay
+        in seconds.
         """
         while True:
             # Drawn in blocks for speed; the numbers do not depend on the length of a block.
@@ -93,8 +94,8 @@ class SlotEvents:
     """Makes the messages and events of one run, slot after slot."""
 
     def __init__(self, scenario: Scenario, streams: Streams, setup: SlotSetup) -> None:
-        """Make the streams of matchings and of all directed links of one run; no slot has been made
-        yet.
+        """Make the streams of matchings (which pairs of nodes exchange) and of all directed links
+        of one run; no slot has been made yet.
         """
         self._scenario, self._setup, self._algorithm = scenario, setup, scenario.node_filter
         self._random = streams.generator("matching")
@@ -124,13 +125,15 @@ class SlotEvents:
         self._chosen_pairs: list[tuple[list[Link], set[Link] | None]] = []
 
     def asked(self) -> np.ndarray:
-        """Return ``asked`` (E, N): 1 if node h is asked for a message in step e of the next slot.
-        Draws the pairs of the slot. There are E exchange steps in a slot.
+        """Return ``asked`` (E, N): 1 if node h is asked for a message in step e of the next slot;
+        the filter then decides whether it sends one. Draws the pairs of the slot. There are E
+        exchange steps in a slot.
         """
         setup, index = self._setup, self._scenario.topology.index
         asked = np.zeros((len(setup.fresh), len(setup.nodes)), dtype=np.uint8)
         for step in self._iterate_steps(self._slot):
             self._chosen_pairs.append(self._choose_pairs(step))
+            # Links of the matching just drawn; broadcasts use all links.
             links = self._chosen_pairs[-1][0] if self._algorithm.pairwise else self._by_link
             asked[step.step, [index[node] for link in links for node in link]] = 1
         return asked
@@ -159,7 +162,8 @@ class SlotEvents:
 
     def _one_slot(self) -> np.ndarray:
         """Make all events of the present slot; return ``up`` (E, W), which is 1 where a message on
-        directed link w is used in step e. There are E exchange steps and W directed links.
+        directed link w arrives in time and is used in step e. There are E exchange steps and W
+        directed links.
         """
         setup, algorithm, slot = self._setup, self._algorithm, self._slot
         up = np.zeros((len(setup.fresh), len(self._directions)), dtype=np.uint8)
@@ -170,6 +174,7 @@ class SlotEvents:
         # First deliver messages that arrive until the slot begins.
         self._deliver(start)
         # Filters that predict are sampled at the beginning of the slot, the others at its end.
+        # None among the rows marks the sample.
         if sampled and algorithm.predicts:
             self._rows.append(None)
         # At the horizon only the sample matters: no events.
@@ -230,8 +235,8 @@ class SlotEvents:
         for row in self._rows:
             if row is None:
                 before.append(len(rows))
-            # The kernel has decided which nodes stop only after these rows were made: insert the
-            # stop rows here, by node.
+            # A node stops by permanently freezing its network estimate. The kernel has decided
+            # about that only after these rows were made: insert the stop rows here, by node.
             elif isinstance(row, StepEnd):
                 stops: list[Row] = [
                     (
@@ -258,8 +263,8 @@ class SlotEvents:
             self._rows.append(row)
 
     def _send_all(self, step: Step) -> None:
-        """Send all messages of a step, with a draw of the channel for each: they go into inboxes,
-        under way, or are lost, and their events are recorded.
+        """Send all messages of an exchange step, with a draw of the channel for each: they go into
+        inboxes, under way, or are lost, and their events are recorded.
         """
         broadcast, now, phase = not self._algorithm.pairwise, step.begin, step.phase
         pairs, up = self._chosen_pairs.pop(0) if self._chosen_pairs else self._choose_pairs(step)
@@ -284,8 +289,8 @@ class SlotEvents:
                     self._send(step, direction, draw if is_up else None)
 
     def _choose_pairs(self, step: Step) -> tuple[list[Link], set[Link] | None]:
-        """Return the links (pairs of node ids) that are used in a step, and the set of those that
-        are up (None: all).
+        """Return the links (pairs of node ids) that are used in a step, in the order of their
+        messages, and the set of those that are up (None: all); messages on the others are lost.
         """
         activation, topology = self._scenario.network.activation, self._scenario.topology
         links = list(topology.links)
@@ -345,8 +350,8 @@ class SlotEvents:
             heapq.heappush(self._in_flight, entry)
 
     def _deliver(self, until: float) -> None:
-        """Deliver the messages that arrive up to ``until`` (seconds): in time if the step in which
-        they were sent is still open, else late.
+        """Deliver the messages that arrive up to ``until`` (seconds): in time if the exchange step
+        in which they were sent is still open, else late, which the filter does not use.
         """
         while self._in_flight and self._in_flight[0][0] <= until:
             now, _, _, direction, number, sent, phase, exchange = heapq.heappop(self._in_flight)
@@ -359,8 +364,8 @@ class SlotEvents:
                 self._inbox.setdefault(receiver, {})[sender] = (number, now - sent)
 
     def _end_step(self, step: Step, up: np.ndarray) -> None:
-        """End a step: set ``up`` (W,) to 1 for the directed links of all messages in inboxes, which
-        are used now, record the absorptions, and empty the inboxes.
+        """End an exchange step: set ``up`` (W,) to 1 for the directed links of all messages in
+        inboxes, which are used now, record the absorptions, and empty the inboxes.
         """
         count = len(self._rows)
         # By receiver and sender, the order of the kernels and of SimPy.

@@ -106,8 +106,9 @@ class SlotSetup:
 
     def _set_stages(self, scenario: Scenario) -> None:
         """Set ``stages``, the readings and exchange steps of a slot in order, each with its phase
-        and its end in seconds after the slot begins, and ``fresh`` (E,): whether links draw anew in
-        each of the E exchange steps.
+        (the number of the exchange that it belongs to) and its end in seconds after the slot
+        begins, and ``fresh`` (E,): whether links draw losses anew in each of the E exchange steps,
+        or keep those of the step before.
         """
         algorithm, phase, step = self.algorithm, 0, 0
         length = scenario.phase_length if algorithm.talks else 0.0
@@ -174,9 +175,10 @@ class SlotSetup:
         self._set_kernel_sensors(scenario)
 
     def _set_kernel_sensors(self, scenario: Scenario) -> None:
-        """Set ``self.sensors``: the whitened H = L_b^-1 H (K, p, n) and noise factors L_b^-1 L
-        (K, p, p) of all K sensors that kernels read, and ``regressors``, the processes
-        (A, drive, start) of those with random H.
+        """Set ``self.sensors``, by which kernels draw readings: the whitened H = L_b^-1 H (K, p, n)
+        and noise factors L_b^-1 L (K, p, p) of all K sensors that kernels read, with the true R = L
+        L' and the believed R = L_b L_b'; and ``regressors``, the processes (A, drive, start) of
+        those with random H.
         """
         count, p, n = len(self.kernel_sensors), self.p, self.n
         H, noise = np.zeros((count, p, n)), np.zeros((count, p, p))
@@ -254,7 +256,9 @@ class SlotSetup:
         }
 
     def _make_links(self, scenario: Scenario) -> SlotLinks:
-        """Return the W directed links sorted by receiver, with their weights (W,)."""
+        """Return the W directed links sorted by receiver and sender, the order in which filters add
+        up messages, with their weights (W,).
+        """
         index = scenario.topology.index
         # By receiver and sender: the order in which a filter adds the messages it receives.
         incoming = sorted(
@@ -316,8 +320,8 @@ class SlotSetup:
         self._recorded_slots = self._slots_with_rows(scenario) if self.sends_readings.any() else {}
 
     def _slots_with_rows(self, scenario: Scenario) -> dict[int, set[int]]:
-        """Return, by index of the node, the slots with a reading, for nodes all of whose sensors
-        are recorded: only these may lack one.
+        """Return, by index of the node, the slots in which a node has a reading, for nodes all of
+        whose sensors are recorded: only these may lack one in some slots.
         """
         slots: dict[int, set[int]] = {}
         for s in self.recorded_sensors:
@@ -360,7 +364,9 @@ class SlotSetup:
         return min(len(self.nodes) // 2, len(self.ends)) if self.matching[0] >= 0 else 0
 
     def rows_of(self, slots: int) -> int:
-        """Return an upper bound of the number of events in ``slots`` slots."""
+        """Return an upper bound of the number of events in ``slots`` slots, for which rows are
+        allocated.
+        """
         pairs = self.max_pairs
         sends = self.directions_per_link * (pairs if self.matching[0] >= 0 else len(self.ends))
         # A send and its outcome for each direction, a tick for each pair, a round, and one
@@ -369,9 +375,10 @@ class SlotSetup:
         return slots * (len(self.sensing) + steps + len(self.nodes))
 
     def bytes_of_slot(self) -> int:
-        """Return the bytes of states, readings and messages that are drawn for one slot
-        of one run.
+        """Return the bytes of states, readings and messages that are drawn for one slot of one run,
+        by which the size of blocks of slots is chosen.
         """
+        # Readings, their H if it varies, and states.
         floats = self.estimators * self.p * (1 + self.varies * self.n) + 3 * self.n
         messages = len(self.fresh) * (len(self.directions) + 8 * self.max_pairs + 8)
         mask = self.decides or self.may_miss
@@ -388,7 +395,9 @@ class SlotSetup:
         return max(1, int(slots))
 
     def batch_runs(self) -> int:
-        """Return the number of runs that are simulated side by side."""
+        """Return the number of runs that are simulated side by side: as many as fit the memory for
+        their samples and for the numbers drawn for a slot.
+        """
         sample_bytes = max(1, 8 * len(self.samples) * self.estimators * (2 + self.n) * self.n)
         # A power of two, so that a batch is one node of the merge tree; at least a block of lanes,
         # unless not even that fits.
@@ -397,9 +406,10 @@ class SlotSetup:
         return int(min(max(power, LANES), max(1, MAX_BATCH_BYTES // sample_bytes)))
 
     def quick_runs(self) -> int:
-        """Return the number of runs that take some ten milliseconds together: a power of two, and
-        at least a block of lanes.
+        """Return the number of runs that take some ten milliseconds together, the smallest batch
+        worth its preparations: a power of two, and at least a block of lanes.
         """
+        # A rough count for one slot: a filter's prediction and update, and its messages.
         flops = self.estimators * (50 + 4 * self.n**3) + 10 * len(self.fresh) * len(self.directions)
         runs = min(QUICK_FLOPS // (max(1, self.slots) * flops), MAX_BATCH_RUNS)
         return int(max(LANES, 1 << (runs.bit_length() - 1) if runs else 0))

@@ -75,9 +75,9 @@ class PathStates:
         self._frame, self._frame_start, self._origin = 0, 0.0, np.zeros(scenario.plant.n)
 
     def local(self, times: FloatArray, path: PathBlock, pieces: np.ndarray) -> FloatArray:
-        """Return the states (T, n) relative to the origin at T ``times`` (T,) in seconds, of which
-        time k is an end of the piece ``pieces[k]`` of the ``path``; 0 at times at which a frame
-        begins.
+        """Return the states (T, n) relative to the moving origin at T ``times`` (T,) in seconds, of
+        which time k is an end of the piece ``pieces[k]`` of the ``path``; 0 at times at which a
+        frame begins, as the origin moves to the state there.
         """
         # A time is the end of its piece, or the start of the first one.
         ends = (times == path.stop[pieces])[:, None]
@@ -88,8 +88,9 @@ class PathStates:
         return np.asarray(x)
 
     def offset(self, k: int, path: PathBlock, piece: int) -> FloatArray:
-        """Return the local state (n,) just before frame ``k`` begins at ``frame_times[k]``, where
-        the ``piece`` (index) of the ``path`` ends, and make it the new origin.
+        """Return the local state (n,), that relative to the present origin, just before frame ``k``
+        begins at ``frame_times[k]``, where the ``piece`` (index) of the ``path`` ends, and make it
+        the new origin.
         """
         x, time = path.x_stop[0, piece], float(self.frame_times[k])
         with np.errstate(over="ignore", invalid="ignore"):
@@ -102,8 +103,9 @@ class PathStates:
     def states_at(
         self, times: FloatArray, path: PathBlock, pieces: np.ndarray
     ) -> tuple[FloatArray, FloatArray]:
-        """Return local and absolute states (T, n) each at T ``times`` (T,) in seconds in the
-        present frame, of which time k lies in the piece ``pieces[k]`` of the ``path``.
+        """Return the states (T, n) relative to the moving origin and absolute, at T ``times`` (T,)
+        in seconds in the present frame (the time since the origin moved last), of which time k lies
+        in the piece ``pieces[k]`` of the ``path``.
         """
         local = self.local(times, path, pieces)
         # No frame has begun: local states are absolute.
@@ -114,7 +116,8 @@ class PathStates:
 
     def _origin_at(self, times: FloatArray) -> FloatArray:
         """Return the absolute origin (T, n) of the present frame at T ``times`` (T,) in seconds:
-        the origin at the beginning of the frame, moved by the plant without noise.
+        the state at the beginning of the frame, moved by the plant without noise. States are kept
+        relative to it, so that those of an unstable plant keep their digits.
         """
         # An origin of 0 stays 0, and its transition may overflow.
         if self._moves is None or not self._origin.any():
