@@ -72,9 +72,10 @@ class Loss(Component):
     chance, weather, certain, changing = delivery_probability, next_state, deterministic, stateful
 
     def mean_delivery(self, link: Link, table_probability: float) -> float:
-        """Return the fraction of messages from link[0] to link[1] that arrive in the long run; nan
-        if it is unknown before a run. ``table_probability`` is the entry of the graph's table for
-        that direction.
+        """Return the fraction of messages from link[0] to link[1] that arrive in the long run, for
+        theory and summaries; nan if it is unknown before a run. ``table_probability`` is the entry
+        of the graph's table for that direction. By default the delivery probability of message 0 in
+        the good state: override it if others differ.
         """
         return self.delivery_probability(link, 0, False, table_probability)
 
@@ -201,7 +202,8 @@ class GilbertElliott(Loss):
 
     def next_state(self, bad: bool | None, random: np.random.Generator) -> bool:
         """Return True if the chain is in its bad state after a step from ``bad``, drawn with one
-        number of ``random``; the first state, after None, is drawn from the stationary law.
+        number of ``random``; the first state, after None, is drawn from the stationary law. Engines
+        call it once per activation of a link.
         """
         to_bad, to_good = self.transitions
         u = random.random()
@@ -220,11 +222,12 @@ class GilbertElliott(Loss):
         return 1.0 if self.deliver_good is None else self.deliver_good
 
     def mean_delivery(self, link: Link, table_probability: float) -> float:
-        """Return the mean delivery probability of any link under the stationary law;
-        ``table_probability`` is not used.
+        """Return the mean delivery probability of any link under the stationary law of its two
+        states; ``table_probability`` is not used.
         """
         to_bad, to_good = self.transitions
         bad = to_bad / (to_bad + to_good)
+        # Of both states, in proportion to their probabilities; message and table do not matter.
         return bad * self.delivery_probability(link, 0, True, 1.0) + (
             1.0 - bad
         ) * self.delivery_probability(link, 0, False, 1.0)
@@ -388,7 +391,10 @@ class ChannelSampler:
     """
 
     def __init__(self, channel: Channel, generator: Callable[[str], np.random.Generator]) -> None:
-        """Make the streams that the channel draws from, by ``generator(purpose)``."""
+        """Make the random streams that the channel draws from, by ``generator(purpose)``, one for
+        each purpose, so that losses, channel states and delays do not depend on each other's number
+        of draws.
+        """
         self._loss, self._delay = channel.loss, channel.delay
         self._fixed_delay = channel.delay.fixed or 0.0
         self._bad: bool | None = None
@@ -398,8 +404,8 @@ class ChannelSampler:
         self._delay_random = streams.get("delay")
 
     def draw(self) -> ChannelDraw:
-        """Return the random numbers of the next activation; a delay that is not random is fixed or
-        0.
+        """Return the random numbers of the next activation of the link, which decide whether and
+        when its messages arrive; a delay that is not random is the fixed one or 0.
         """
         uniform, bad, delay = 0.0, False, self._fixed_delay
         if self._loss_random is not None:
@@ -411,7 +417,8 @@ class ChannelSampler:
         return ChannelDraw(uniform, bad, delay)
 
     def draws(self, count: int) -> tuple[FloatArray, np.ndarray, FloatArray]:
-        """Return the next ``count`` uniform numbers, states and delays, (count,) each.
+        """Return the numbers of the next ``count`` activations: uniform numbers, states (True: bad)
+        and delays in seconds, (count,) each.
 
         They equal the results of ``count`` calls of ``draw``.
         """
@@ -439,7 +446,9 @@ def stream_purposes(channel: Channel) -> tuple[str, ...]:
 
 
 def draw_delays(delay: Delay, random: np.random.Generator, count: int) -> FloatArray:
-    """Return delays (count,) in seconds, equal to those of ``count`` calls of ``delay.draw``."""
+    """Return delays (count,) in seconds, equal to those of ``count`` calls of ``delay.draw``, but
+    drawn at once where the law is a built-in one.
+    """
     # By exact type: a subclass may override draw.
     if type(delay) is ExponentialDelay:
         return delay.mean * random.standard_exponential(count)
@@ -458,7 +467,7 @@ def delivery_probabilities(
     loss: Loss, link: Link, first: int, bad: np.ndarray, table_probability: float
 ) -> FloatArray:
     """Return the delivery probabilities (K,) of the messages numbered ``first``, ``first + 1``, ...
-    of a directed ``link`` (sender, receiver).
+    of a directed ``link`` (sender, receiver), by the loss model, which may be a user's own.
 
     ``bad`` (K,) holds the state of the link at each; ``table_probability`` is the entry of the
     graph's table for that direction. Raises ScenarioError for a value outside [0, 1].

@@ -46,8 +46,8 @@ class LinkClock(Clock):
     at: str = field(one_of(*AT), default="links")
 
     def entities(self, topology: Topology) -> tuple[Entity, ...]:
-        """Return the entities that have a clock, in order: node ids (i, j) of links,
-        (sender, receiver) of directions, or (node,).
+        """Return the entities that have a clock, in the order in which simultaneous ticks happen:
+        node ids (i, j) of links, (sender, receiver) of directions, or (node,).
         """
         if self.at == "nodes":
             return tuple((node,) for node in topology.nodes)
@@ -165,9 +165,10 @@ class Poisson(LinkClock):
         random: np.random.Generator,
         count: int,
     ) -> FloatArray:
-        """Return the next ``count`` ticks (count,) of ``entity`` in seconds, after ``now``, with
-        exponential gaps of mean 1 / rate drawn from ``random``: the ticks of clocks with equal
-        generators are in proportion. ``origin`` and ``index`` are not used.
+        """Return the next ``count`` ticks (count,) of ``entity`` (link, direction or node) in
+        seconds, after the last one at ``now``, with exponential gaps of mean 1 / rate drawn from
+        ``random``: the ticks of clocks with equal generators are in proportion. ``origin`` and
+        ``index`` are not used. Engines call it for one block of ticks after another.
         """
         return _accumulate(now, random.standard_exponential(count) / self.mean_rate(entity))
 
@@ -275,10 +276,12 @@ class Renewal(LinkClock):
         random: np.random.Generator,
         count: int,
     ) -> FloatArray:
-        """Return the next ``count`` ticks (count,) in seconds, after ``now``, with gaps drawn from
-        the distribution by ``random``; with constant gaps, the ticks from number ``index`` on,
-        which nothing is drawn for. ``entity`` and ``origin`` are not used.
+        """Return the next ``count`` ticks (count,) in seconds, after the last one at ``now``, with
+        gaps drawn from the distribution by ``random``; with constant gaps, the ticks from number
+        ``index`` on, which nothing is drawn for. ``entity`` and ``origin`` are not used. Engines
+        call it for one block of ticks after another.
         """
+        # Gaps of unit scale, scaled to their mean.
         shape = self.shape or 1.0
         if self.distribution == "gamma":
             gaps = random.standard_gamma(shape, count)
@@ -291,6 +294,7 @@ class Renewal(LinkClock):
             assert self.high is not None
             gaps = self.low + (self.high - self.low) * random.random(count)
         else:
+            # Tick number 0 is at one gap after time 0, as nothing is sent at time 0.
             return _lattice(0.0, self._mean, index + 1, count)
         return _accumulate(now, gaps)
 
@@ -325,8 +329,9 @@ class Periodic(LinkClock):
                 raise ScenarioError(name, "must be below the period", value, "give less")
 
     def origin(self, entity: Entity, random: Callable[[], np.random.Generator]) -> float:
-        """Return the phase in seconds; a random one is drawn from the generator that ``random``
-        returns.
+        """Return the phase in seconds, the time from which the ticks of ``entity`` are counted; a
+        random one is drawn from the generator that ``random`` returns. Engines call it once for
+        each entity and pass the result to ``ticks``.
         """
         if isinstance(self.phase, str):
             return self.period * float(random().random())
@@ -345,8 +350,9 @@ class Periodic(LinkClock):
         random: np.random.Generator,
         count: int,
     ) -> FloatArray:
-        """Return the ticks (count,) in seconds from number ``index`` on: lattice points ``origin +
-        k period``, each plus a jitter drawn from ``random``. ``entity`` and ``now`` are not used.
+        """Return the ticks (count,) of an entity in seconds from number ``index`` on: ``origin + k
+        period``, each plus a jitter drawn from ``random``. ``entity`` and ``now`` are not used.
+        Engines call it for one block of ticks after another.
         """
         # With phase 0 the lattice point at time 0 is no tick.
         times = _lattice(origin, self.period, index + (origin == 0.0), count)
@@ -378,6 +384,7 @@ class RecordedClock(LinkClock):
                 'set at = "directions", or remove the column',
             )
         table = read_columns(self.path, ("t", *columns))
+        # Nothing is sent at time 0 or before.
         early = np.flatnonzero(table["t"] <= 0.0)
         if early.size:
             raise ScenarioError(
@@ -413,12 +420,15 @@ class RecordedClock(LinkClock):
         count: int,
     ) -> FloatArray:
         """Return up to ``count`` recorded times (<= count,) of ``entity`` in seconds, from number
-        ``index`` on; nothing is drawn, and ``origin`` and ``now`` are not used.
+        ``index`` on, fewer at the end of the table, which ends the clock; nothing is drawn, and
+        ``origin`` and ``now`` are not used.
         """
         return self._instants.get(entity, np.empty(0))[index : index + count]
 
     def check(self, topology: Topology) -> None:
-        """Raise ScenarioError unless the graph has every listed link, direction or node."""
+        """Raise ScenarioError unless the graph has every link, direction or node that the table
+        lists.
+        """
         if self.at == "nodes":
             demand_nodes(self.path, (node for (node,) in self._times), topology)
         else:

@@ -64,7 +64,8 @@ class DeliveringLoss(Loss):
     def delivery_probability(
         self, link: Link, message: int, bad: bool, table_probability: float
     ) -> float:
-        """Return 1 for chosen messages, else the probability of the model ``given``.
+        """Return 1 for messages that the replay delivers whatever was drawn, ``deliveries.chosen``
+        (None: all), else the probability of the model ``given``, that of the run.
 
         ``message`` is the number of the message on its ``link``, ``bad`` the state of the channel,
         and ``table_probability`` the entry of the graph's table for the link.

@@ -116,7 +116,7 @@ class Topology:
 
     @cached_property
     def components(self) -> list[set[int]]:
-        """The (weakly) connected components, largest first."""
+        """The (weakly) connected components as sets of node ids, largest first."""
         from scipy.sparse import coo_array
         from scipy.sparse.csgraph import connected_components
 
@@ -131,8 +131,8 @@ class Topology:
 
 
 def demand_links(source: SourceFile, pairs: Iterable[Link], topology: Topology) -> None:
-    """Raise ScenarioError if a file names one of ``pairs`` (sender, receiver) that is not a link of
-    the graph.
+    """Raise ScenarioError if a file, such as one of recorded exchanges, names one of ``pairs``
+    (sender, receiver) that is not a link of the graph.
     """
     links = set(topology.links)
     if not topology.directed:
@@ -243,7 +243,9 @@ class Grid(Graph):
     columns: int = field(_count)
 
     def build(self, seed: int) -> Topology:
-        """Return the topology that links neighbours, with positions on the lattice."""
+        """Return the topology that links neighbours in rows and columns, with positions (column,
+        -row) for plots; ``seed`` is not used.
+        """
         _check_size(self.rows * self.columns, 2 * self.rows * self.columns)
         ids = np.arange(self.rows * self.columns).reshape(self.rows, self.columns)
         right = zip(ids[:, :-1].ravel().tolist(), ids[:, 1:].ravel().tolist(), strict=True)
@@ -296,7 +298,8 @@ class Regular(RandomGraph):
     degree: int = field(integer(low=0))
 
     def build(self, seed: int) -> Topology:
-        """Return a topology from ``networkx.random_regular_graph``.
+        """Return a topology from ``networkx.random_regular_graph``, drawn with the graph's own seed
+        or else with the root seed ``seed``.
 
         Raises ScenarioError if there is no graph with this degree.
         """
@@ -351,11 +354,12 @@ class Geometric(RandomGraph):
     radius: float = field(positive)
 
     def build(self, seed: int) -> Topology:
-        """Return a topology from ``networkx.random_geometric_graph``, with the positions of
-        nodes.
+        """Return a topology from ``networkx.random_geometric_graph``, drawn with the graph's own
+        seed or else with the root seed ``seed``, with the positions of nodes.
         """
         import networkx
 
+        # Refuse a graph whose expected number of links is too large before it is drawn.
         pairs = 0.5 * self.nodes * (self.nodes - 1)
         _check_size(self.nodes, int(pairs * _probability_within(min(self.radius, 1.0))))
 
@@ -370,7 +374,9 @@ class Geometric(RandomGraph):
 
 
 def _probability_within(radius: float) -> float:
-    """Return the probability that two points of the unit square are within ``radius`` <= 1."""
+    """Return the probability that two uniform points of the unit square are within ``radius`` <= 1
+    of each other, from which the expected number of links follows.
+    """
     return math.pi * radius**2 - 8.0 / 3.0 * radius**3 + 0.5 * radius**4
 
 
@@ -383,7 +389,9 @@ class Edges(Graph):
     directed: bool = field(boolean, default=False)
 
     def build(self, seed: int) -> Topology:
-        """Return the links as given; raises ScenarioError for a pair that is no link."""
+        """Return the links as given; raises ScenarioError for a pair that is no link (equal ends,
+        or an unknown node). ``seed`` is not used.
+        """
         for k, edge in enumerate(self.edges):
             if self.nodes is not None and max(edge) >= self.nodes:
                 rule = f"node ids must be 0 .. {self.nodes - 1}"
@@ -427,11 +435,14 @@ class CsvGraph(Graph):
     positions: SourceFile | None = field(source_file, default=None)
 
     def build(self, seed: int) -> Topology:
-        """Return the links of the table; raises ScenarioError if it is wrong or none are left."""
+        """Return the links of the table that reach the minimum, with their delivery probabilities;
+        raises ScenarioError if the table is wrong or no link is left. ``seed`` is not used.
+        """
         table = self._table()
         named = {node for link in table.probability for node in link}
         delivery, has_probabilities = self._add_reverse_links(table)
         links = self._links(delivery)
+        # Pairs listed from i to j only, in a table that lists others both ways.
         one_way = [] if self.directed else sorted(p for p in delivery if p[::-1] not in delivery)
         if has_probabilities and links.intersection(one_way):
             raise ScenarioError(
@@ -458,7 +469,9 @@ class CsvGraph(Graph):
         )
 
     def _table(self) -> _Table:
-        """Return the table of the file; raises ScenarioError for wrong or repeated rows."""
+        """Return the rows of the file as delivery probabilities by direction (sender, receiver);
+        raises ScenarioError for wrong or repeated rows.
+        """
         columns = read_columns(self.path, ("sender", "receiver"), ("delivery_probability",))
         senders = parse_integers(self.path, "sender", columns["sender"])
         receivers = parse_integers(self.path, "receiver", columns["receiver"])
@@ -477,8 +490,8 @@ class CsvGraph(Graph):
         return _Table(dict(zip(pairs, values, strict=True)), has_probabilities)
 
     def _add_reverse_links(self, table: _Table) -> _Table:
-        """Return the table with the reverse of each row, unless links are directed or listed both
-        ways.
+        """Return the table with the reverse of each row added, for a table that lists every
+        undirected link once; unchanged if links are directed or any is listed both ways.
 
         Raises ScenarioError if ``minimum`` needs probabilities that the table does not have.
         """

@@ -88,7 +88,9 @@ class Matching(SlotActivation):
             )
 
     def draw(self, topology: Topology, random: np.random.Generator) -> list[Link]:
-        """Draw the matching of one slot by the protocol: its pairs (i, j), i < j."""
+        """Draw the matching of one slot by the protocol, the pairs (i, j), i < j, of nodes that
+        exchange, none in two pairs. Both engines call it, or take the same numbers from ``random``.
+        """
         links = topology.links
         if not links:
             return []
@@ -102,20 +104,24 @@ class Matching(SlotActivation):
         return draws[self.protocol](topology, random)
 
     def _one_edge(self, topology: Topology, random: np.random.Generator) -> list[Link]:
-        """Return one link, drawn uniformly, or no link with probability ``lazy``."""
+        """Return one link, drawn uniformly, or no link with probability ``lazy``; both numbers are
+        drawn in any case, so that the stream goes on alike.
+        """
         lazy = random.random() < (self.lazy or 0.0)
         edge = topology.links[int(random.integers(len(topology.links)))]
         return [] if lazy else [edge]
 
     def _independent(self, topology: Topology, random: np.random.Generator) -> list[Link]:
-        """Return the links drawn with probability p that meet no other drawn link."""
+        """Return the links drawn with probability p that share no node with another drawn link."""
         uniform = random.random(len(topology.links))
         up = [link for link, u in zip(topology.links, uniform, strict=True) if u < (self.p or 0.0)]
+        # Number of drawn links at each node: a link alone at both ends is kept.
         busy = Counter(node for link in up for node in link)
         return [link for link in up if busy[link[0]] == busy[link[1]] == 1]
 
     def mean(self, topology: Topology) -> FloatArray:
-        """Return the exact mean matching ``Abar`` (N, N), in the order of the nodes.
+        """Return the exact mean ``Abar`` (N, N) of the permutation matrix of a matching, which
+        swaps the states of paired nodes, in the order of the nodes.
 
         Raises ScenarioError if the graph has too many links to compute it.
         """
@@ -124,19 +130,24 @@ class Matching(SlotActivation):
         for (i, j), value in probabilities.items():
             a, b = topology.index[i], topology.index[j]
             mean[a, b] = mean[b, a] = value
+        # On the diagonal: the node is in no pair.
         mean[np.diag_indices(len(mean))] = 1.0 - mean.sum(axis=1)
         return mean
 
     def _pairing_probabilities(self, topology: Topology) -> dict[Link, float]:
-        """Return the probability of each link to be paired in a slot, by link (i, j), i < j."""
+        """Return the exact probability of each link to be paired in a slot, by link (i, j), i < j;
+        raises ScenarioError if the protocol needs all matchings and the graph has too many links.
+        """
         links, degrees = topology.links, topology.degrees
         if self.protocol == "one-edge":
             return dict.fromkeys(links, (1.0 - (self.lazy or 0.0)) / max(len(links), 1))
         if self.protocol == "node-wakeup":
             size = len(topology.nodes)
+            # One end wakes up, and draws the other end among its neighbours.
             return {(i, j): (1.0 / degrees[i] + 1.0 / degrees[j]) / size for i, j in links}
         if self.protocol == "independent":
             p = self.p or 0.0
+            # The link is drawn, and none of the other links at both of its ends.
             return {(i, j): p * (1.0 - p) ** (degrees[i] + degrees[j] - 2) for i, j in links}
         if len(links) > MAX_EDGES:
             raise ScenarioError(
@@ -187,9 +198,7 @@ def _uniform_maximal(topology: Topology, random: np.random.Generator) -> list[Li
 
 
 def _choose_greedily(links: list[Link]) -> list[Link]:
-    """Return those of ``links`` that are chosen if each is taken in turn when both of its ends are
-    free.
-    """
+    """Return the matching that takes each of ``links`` in turn if both of its ends are still free."""
     matched: set[int] = set()
     chosen = []
     for i, j in links:
@@ -202,7 +211,9 @@ def _choose_greedily(links: list[Link]) -> list[Link]:
 
 @lru_cache(maxsize=8)
 def maximal_matchings(links: tuple[Link, ...]) -> tuple[tuple[Link, ...], ...]:
-    """Return all matchings to which no link can be added, each sorted, in sorted order."""
+    """Return all maximal matchings of a graph, sets of links without a common node to which no link
+    can be added, each sorted, in sorted order.
+    """
     matchings: set[tuple[Link, ...]] = set()
 
     def extend(chosen: tuple[Link, ...], free: tuple[Link, ...]) -> None:

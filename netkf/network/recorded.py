@@ -68,12 +68,14 @@ class MessageTable:
         return value
 
     def use(self, sent: Mapping[Link, int]) -> MessageUse:
-        """Return the use of the table by a run with ``sent`` messages on each directed link."""
+        """Return how a run with ``sent`` messages on each directed link used the table, so that
+        summaries can tell which rows were not needed and which messages were not listed.
+        """
         rows = sum(map(len, self.values.values()))
         used = sum(
             number < count for link, count in sent.items() for number in self.values.get(link, ())
         )
-        return MessageUse(rows, rows - used, sum(sent.values()) - used)
+        return MessageUse(rows=rows, unused=rows - used, beyond=sum(sent.values()) - used)
 
 
 def read_messages(
@@ -125,8 +127,9 @@ class RecordedLoss(Loss):
     def delivery_probability(
         self, link: Link, message: int, bad: bool, table_probability: float
     ) -> float:
-        """Return 1 if the table says that message number ``message`` on ``link`` arrives, else 0;
-        ``after`` decides if the message is not listed. The other arguments are not used.
+        """Return 1 if the table says that message number ``message`` on ``link`` (sender, receiver)
+        arrives, else 0; ``after`` decides if the message is not listed. The other arguments are not
+        used. Engines call it for each message.
         """
         value = _value_at("network.channel.loss", self.table, link, message, self.after)
         if value is None:
@@ -184,8 +187,9 @@ class RecordedDelay(Delay):
         return max(listed, default=0.0)
 
     def message_delay(self, link: Link, message: int, drawn: float) -> float:
-        """Return the recorded seconds of message number ``message`` on ``link``; if it is not
-        listed, 0, or nan (lost) with ``after`` "lose". ``drawn`` is not used.
+        """Return the recorded seconds that message number ``message`` on ``link`` (sender,
+        receiver) takes; if it is not listed, 0, or nan (lost) with ``after`` "lose". ``drawn`` is
+        not used. Engines call it for each message that is not lost.
         """
         value = _value_at("network.channel.delay", self.table, link, message, self.after)
         if value is None:
@@ -198,8 +202,9 @@ class RecordedDelay(Delay):
 
 
 def _value_at(key: str, table: MessageTable, link: Link, message: int, after: str) -> float | None:
-    """Return the value of message number ``message`` on ``link`` in the table, None if it is not
-    listed; ``after`` is the treatment of such messages, and errors name the scenario's ``key``.
+    """Return the value of message number ``message`` on ``link`` (sender, receiver) in the table,
+    None if it is not listed; ``after`` is the treatment of such messages. Errors name the ``key``
+    of the scenario that the table belongs to, as the message is asked for during a run.
     """
     # Asked for during a run, so the error must carry the whole path of its key.
     try:

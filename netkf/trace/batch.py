@@ -92,8 +92,9 @@ class BatchSink(Sink):
     def states(
         self, t: FloatArray, x: FloatArray, xhat: FloatArray, P: FloatArray, error: FloatArray
     ) -> None:
-        """Append K samples to those of the present run: t (K,) in seconds, x (K, n), xhat and error
-        (K, N, n), P (K, N, n, n), of which the first F of the N filters are kept.
+        """Append K samples to those of the present run; the recorder calls it. t (K,) in seconds, x
+        (K, n), xhat and error (K, N, n), P (K, N, n, n), of which the first F of the N filters are
+        kept.
         """
         run = len(self._status)
         first, last = self._lengths[run], self._lengths[run] + len(t)
@@ -106,8 +107,9 @@ class BatchSink(Sink):
 
     def finish(self, recorder: Recorder, status: str) -> None:
         """End the present run, with the counts and sums of its recorder and its ``status``
-        ("complete" or "diverged"); later samples belong to the next replica.
+        ("complete" or "diverged"); later samples belong to the next replica (number of a run).
         """
+        # A batch has the fingerprint of its first run only.
         if not self._status:
             self._fingerprint = recorder.fingerprint
         self._counts[len(self._status)] = recorder.counts
@@ -115,7 +117,7 @@ class BatchSink(Sink):
         self._sums.append(recorder.sums)
 
     def batch(self) -> RunBatch:
-        """Return the batch of all runs."""
+        """Return the samples and counts of all runs, once each of them is finished."""
         return RunBatch(
             replicas=self._replicas,
             times=self._times,

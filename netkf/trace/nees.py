@@ -27,8 +27,9 @@ def errors(e: FloatArray, P: FloatArray) -> tuple[FloatArray, FloatArray]:
 def fill_nees(
     e: FloatArray, P: FloatArray, out: FloatArray, factor: FloatArray, solved: FloatArray
 ) -> bool:
-    """Write NEES ``e' P^-1 e`` into ``out`` (K,), of K errors e (K, n) and covariances P (K, n, n),
-    nan where P is exactly singular; return False if a finite P is.
+    """Write the normalised squared errors (NEES) ``e' P^-1 e`` into ``out`` (K,), of K errors e (K,
+    n) and covariances P (K, n, n), nan where P is exactly singular; return False if a finite P is,
+    for which the caller then tests all ranks.
 
     ``factor`` (n, n) and ``solved`` (n, 1) are scratch.
     """
@@ -52,7 +53,7 @@ def fill_nees(
 
 def _is_regular(P: FloatArray) -> np.ndarray:
     """Return a mask (K,) of the K matrices P (K, n, n) that are finite and of full rank up to
-    rounding.
+    rounding: NEES is nan for the others.
     """
     regular = np.asarray(np.isfinite(P).all(axis=(1, 2)))
     ranks = np.linalg.matrix_rank(P[regular], hermitian=True)

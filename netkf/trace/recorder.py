@@ -131,7 +131,9 @@ class Recorder:
             self.flush()
 
     def flush(self) -> None:
-        """Pass the appended events on and wait until every sink has taken all of them."""
+        """Pass the appended events on and wait until every sink has taken all of them; engines call
+        it at the end of a run, and also after an error.
+        """
         with defer_signals():
             try:
                 self._flush_gathered()
@@ -142,7 +144,9 @@ class Recorder:
                     thread.shutdown()
 
     def _flush_gathered(self) -> None:
-        """Pass the appended events to all sinks, or only count them."""
+        """Pass the events gathered by ``append`` to all sinks, or only count them with
+        ``counts_only``.
+        """
         if not self._rows:
             return
         if self.counts_only:
@@ -155,7 +159,9 @@ class Recorder:
         self._run_or_submit(self._pass_on, rows)
 
     def extend(self, rows: np.ndarray) -> None:
-        """Record a block of EVENT ``rows`` (K,); the caller must not write to it afterwards."""
+        """Record a block of EVENT ``rows`` (K,), after the events appended one by one; the caller
+        must not write to it afterwards, since sinks keep it or take it in another thread.
+        """
         with defer_signals():  # a signal must not separate the count from the rows
             self._flush_gathered()
             if not len(rows):
@@ -176,7 +182,9 @@ class Recorder:
         self._counts += counts
 
     def _run_or_submit(self, function: Callable[..., None], *arguments: Any) -> None:
-        """Call ``function`` now, or in the recorder's thread after earlier calls if it has one."""
+        """Call ``function`` now, or in the recorder's thread after earlier calls if it has one (it
+        starts with the first long block): sinks get everything in order.
+        """
         if self._thread is None:
             function(*arguments)
         else:

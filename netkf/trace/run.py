@@ -106,7 +106,9 @@ class Run(NotebookTable):
 
     @cached_property
     def rounding_from(self) -> float:
-        """The first sample time at which rounding blurs ``error``, inf if none does."""
+        """The first sample time in seconds at which the rounding error of ``error`` is not small
+        against its standard deviation, inf if there is none.
+        """
         size = carried_size(self.x, self.error, self.exact_errors)
         return rounding_from(self.times, size, self.P, self.error)
 
@@ -118,7 +120,9 @@ class Run(NotebookTable):
         return plot_by_name(self, figure)
 
     def _notebook_table(self) -> pd.DataFrame:
-        """Return averages over the samples after time 0, a row per node."""
+        """Return averages over the samples after time 0, a row per node: the table that notebooks
+        display for a run.
+        """
         import pandas as pd
 
         after = self.times > 0.0
@@ -164,11 +168,12 @@ def event_columns(rows: np.ndarray, replica: int, first: int) -> dict[str, Any]:
 
 
 def rounding_from(times: FloatArray, x: FloatArray, P: FloatArray, e: FloatArray) -> float:
-    """Return the first of the ``times`` (T,), in seconds, at which the rounding error of x - xhat
-    exceeds 1 / BLUR of the standard deviation of the errors; inf if none does.
+    """Return the first of the ``times`` (T,), in seconds, from which on errors mean little: the
+    rounding error of x - xhat exceeds 1 / BLUR of the standard deviation of the errors; inf if it
+    never does.
 
-    The rounding error is that of states x (T, n), the standard deviation the smallest one of P
-    (T, N, n, n) or, where P is nan, the root mean square of the errors e (T, N, n).
+    The rounding error is that of states x (T, n), the standard deviation the smallest one of P (T,
+    N, n, n) or, where P is nan, the root mean square of the errors e (T, N, n).
     """
     if not len(times):
         return np.inf
@@ -195,17 +200,19 @@ def rounding(x: FloatArray) -> FloatArray:
 
 
 def blurred_samples(run: Run, matrices: FloatArray) -> np.ndarray:
-    """Return a mask (T, N) of the samples whose rounding error exceeds 1 / BLUR of the standard
-    deviation of the error in some direction.
+    """Return a mask (T, N) of the samples that tests of consistency leave out, since rounding blurs
+    them: the rounding error exceeds 1 / BLUR of the standard deviation of the error in some
+    direction.
 
-    ``matrices`` (T, N, n, n) are the covariances of the errors. Directions without uncertainty (see
-    CERTAIN) and matrices of nan do not count.
+    ``matrices`` (T, N, n, n) are the covariances of the errors. Directions without uncertainty
+    (variances below the share CERTAIN of the largest one) and matrices of nan do not count.
     """
     if not run.rounding.any():
         return np.zeros(matrices.shape[:2], dtype=bool)
     finite = np.asarray(np.isfinite(matrices).all(axis=(2, 3)))
     variances = np.linalg.eigvalsh(np.where(finite[..., None, None], matrices, 0.0))
     uncertain = variances > CERTAIN * variances[..., -1:]
+    # The least variance that is not 0 up to rounding.
     smallest = np.where(uncertain, variances, np.inf).min(axis=-1)
     return np.asarray((BLUR * run.rounding[:, None]) ** 2 > smallest)
 
@@ -227,7 +234,7 @@ def state_table(
 ) -> dict[str, Any]:
     """Return T samples of N ``nodes`` (ids) as named columns (T N,), those of
     trace.schema.state_columns, with a row for each time and node; ``replica`` is the number of the
-    run.
+    run. They are the table of states that is stored and that ``Run.states`` returns.
 
     Without known truth there are no columns of errors.
     """

@@ -95,9 +95,10 @@ class SampleTables:
 def _make_instants(
     scenario: Scenario, placed: list[tuple[int, PlacedSensor]], t: FloatArray, sensor: np.ndarray
 ) -> Instants:
-    """Return the instants at which nodes have samples, from the sorted times ``t`` (K,) in seconds
-    of all K samples and the ``sensor`` (K,) of each, an index in ``placed``, which pairs each
-    sensor with its node's id. Values ``y`` are 0 until they are read.
+    """Return the instants, each a time at which a node takes samples of one or several sensors and
+    uses them in one update: from the sorted times ``t`` (K,) in seconds of all K samples and the
+    ``sensor`` (K,) of each, an index in ``placed``, which pairs each sensor with its node's id.
+    Values ``y`` are 0 until they are read.
     """
     index = scenario.topology.index if placed else {}
     pooled, n = scenario.node_filter.pooled, scenario.plant.n

@@ -24,7 +24,8 @@ def record_samples(
     pass_rows_on: Callable[[int], None],
 ) -> bool:
     """Record K samples (times (K,), x (K, n), xhat (K, F, n), ... of F filters) up to the first one
-    that is not sound (engines.soundness); return True if all are sound.
+    that is not sound, at which the run ends as diverged: an estimate is not finite, or a covariance
+    not positive semidefinite. Return True if all are sound.
 
     ``pass_rows_on`` is called with the index of the first sample that is not sound, to record the
     events before it; later ones are dropped. If filters are pooled, ``samples`` have one estimator

@@ -35,8 +35,8 @@ def clock_processes(
     transmitter: Transmitter,
     nodes: dict[int, ClockedNode],
 ) -> list[Process]:
-    """Return one process for each link, direction or node that has a clock. ``nodes`` are the nodes
-    by id.
+    """Return one SimPy process for each link, direction or node that has a clock, which waits for
+    its ticks and then lets it send. ``nodes`` are the nodes by id.
 
     There are none with activation by readings: nodes then transmit after their samples.
     """
@@ -108,8 +108,9 @@ def _link_activations(
     transmitter: Transmitter,
     nodes: dict[int, ClockedNode],
 ) -> Activations:
-    """Return for each link (pair of node ids) an activation in which both ends exchange; ``nodes``
-    are the nodes by id.
+    """Return for each link (pair of node ids) an activation, a function that the process of its
+    clock calls at each tick with the time in seconds: both ends exchange. ``nodes`` are the nodes
+    by id.
     """
 
     # A factory for each link, so that the closure binds these ends and not those of the last link.
@@ -137,8 +138,9 @@ def _direction_activations(
     transmitter: Transmitter,
     nodes: dict[int, ClockedNode],
 ) -> Activations:
-    """Return for each direction (sender, receiver) of a link an activation in which its sender
-    pushes a message to its receiver; ``nodes`` are the nodes by id.
+    """Return for each direction (sender, receiver) of a link an activation, a function that the
+    process of its clock calls at each tick with the time in seconds: the sender pushes a message to
+    its receiver. ``nodes`` are the nodes by id.
     """
 
     def activation(link: tuple[int, int], entity: int) -> Activation:
@@ -166,10 +168,10 @@ def broadcasts(
     transmitter: Transmitter,
     nodes: dict[int, ClockedNode],
 ) -> dict[int, Activation]:
-    """Return for each node, by id, an activation that broadcasts one payload to all its receivers;
-    ``nodes`` are the nodes by id.
+    """Return for each node, by id, an activation, a function of the time in seconds, that
+    broadcasts one payload to all receivers of the node; ``nodes`` are the nodes by id.
 
-    Each receiver has an outcome of its own.
+    Each receiver has an outcome of its own (a loss or a delay).
     """
     directions: dict[int, list[Any]] = {node: [] for node in scenario.nodes}
     for k, (i, j) in enumerate(scenario.topology.directions):
@@ -209,8 +211,8 @@ def _node_activations(
     transmitter: Transmitter,
     nodes: dict[int, ClockedNode],
 ) -> Activations:
-    """Return for each node, as (id,), an activation in which it broadcasts; ``nodes`` are the nodes
-    by id.
+    """Return for each node, as (id,), an activation, a function that the process of its clock calls
+    at each tick with the time in seconds: the node broadcasts. ``nodes`` are the nodes by id.
     """
     transmit = broadcasts(scenario, recorder, transmitter, nodes)
 
@@ -235,8 +237,10 @@ def _transmit_after_samples(
     transmitter: Transmitter,
     nodes: dict[int, ClockedNode],
 ) -> None:
-    """Make every node broadcast, at the rank of ticks, after it has used a sample: sets
-    ``after_sample`` of those ``nodes`` (by id) that have sampled sensors.
+    """Make every node broadcast after it has used a sample, for networks without clocks in which
+    readings activate the nodes: sets ``after_sample`` of those ``nodes`` (by id) that have sampled
+    sensors, a function that they then call. The broadcast happens at the rank of ticks, after all
+    samples of that instant.
     """
     transmit = broadcasts(scenario, recorder, transmitter, nodes)
     # Only nodes with sampled sensors have samples to transmit after.

@@ -57,7 +57,7 @@ class SimpyEngine(Engine):
     ) -> str:
         """Simulate up to the horizon with the random numbers of ``streams``, pass events and
         samples to ``recorder``, and return the status, "complete" or "diverged". ``progress`` is
-        called with the simulated time in seconds.
+        called with the simulated time in seconds at each sample.
         """
         simulation = _Simulation(scenario, streams, recorder, progress)
         # Slots and clocks share the timeline, but no process.
@@ -120,8 +120,9 @@ class _Simulation:
         ]
 
     def _sampling(self, truth: Any, nodes: dict[int, ClockedNode], sums: _Sums) -> Process:
-        """Record the states of the plant and of all nodes at the probe times; ``nodes`` are by
-        id.
+        """Record the states of the plant and of all nodes at the probe times, those at which the
+        scenario asks for samples: a SimPy process. ``nodes`` are by id; ``sums`` are conserved sums
+        to record.
         """
         for time in self._scenario.times.tolist():
             yield self.timeline.at(time, Rank.PROBE, 0)
@@ -131,8 +132,8 @@ class _Simulation:
             self._record(time, truth.absolute(time), truth.local(time), nodes, sums)
 
     def _moving_origin(self, truth: Any, nodes: dict[int, ClockedNode]) -> Process:
-        """Move the origin of the coordinates of all ``nodes`` (by id) to the state at every frame
-        time.
+        """Move the origin of the coordinates of all ``nodes`` (by id) to the state of the plant at
+        every frame time: a SimPy process.
 
         Otherwise the state of an unstable plant becomes so large that errors lose their digits.
         """
@@ -175,8 +176,8 @@ class _Simulation:
     def _sampling_slots(
         self, truth: Any, schedule: SlotSchedule, nodes: dict[int, SlotNode], sums: _Sums
     ) -> Process:
-        """Record the states of the plant and of all ``nodes`` (by id) in slots: predictions at
-        their start, filtered states at their end.
+        """Record the states of the plant and of all ``nodes`` (by id) in slots, predictions at
+        their start, filtered states at their end, with the conserved ``sums``: a SimPy process.
         """
         predicts, recorder, slot = self._scenario.node_filter.predicts, self._recorder, 0
 
@@ -213,10 +214,12 @@ class _Simulation:
             slot += 1
 
     def _record(self, time: float, x: Any, local: Any, nodes: dict[int, Any], sums: _Sums) -> None:
-        """Record one sample at ``time`` (seconds) of the state ``x`` (n,) and of all ``nodes``, by
-        id; ``local`` (n,) is x relative to the origin of the estimates.
+        """Record one sample at ``time`` (seconds) of the state ``x`` (n,) of the plant and of all
+        ``nodes``, by id; ``local`` (n,) is x relative to the origin of the estimates, ``sums`` the
+        conserved sums.
 
-        Raises DivergedError if an estimate is not sound.
+        Raises DivergedError, which ends the run, if an estimate is not sound: not finite, or with a
+        P that is not positive semidefinite.
         """
         scenario, recorder = self._scenario, self._recorder
         # By identity: a pooled filter is asked once, and its estimate serves all nodes.
@@ -233,7 +236,7 @@ class _Simulation:
         recorder.flush_if_full()
         self._progress(time)
         # An estimate that is not sound ends the run; it is noticed at samples only.
-        diverged = broken(scenario, local_estimates, P, has_no_P)
+        diverged = broken(scenario, local_estimates, P, without=has_no_P)
         # Recorded after the sample, which has the diverged estimate.
         for node in diverged:
             recorder.append((time, DIVERGED, node, -1, -1, -1, NAN))
@@ -253,7 +256,8 @@ def _nodes(scenario: Scenario, make: Callable[[int, int, tuple[int, ...]], Any])
 
 def _identify(scenario: Scenario, node: int, entity: int) -> tuple[Any, ...]:
     """Return the arguments of Node (filter, id, index, model, start and NodeInfo) for the node with
-    the id ``node`` (-1: the pooled filter) and the index ``entity``.
+    the id ``node`` (-1: the pooled filter, one in place of those of all nodes) and the index
+    ``entity``.
     """
     model, first = scenario.believed_models[entity], scenario.nodes[entity]
     # -1: the pooled filter, which is not a node of the graph.
@@ -277,7 +281,9 @@ class _Sums:
         self.start = self._compute()
 
     def _compute(self) -> dict[str, float]:
-        """Return the conserved sums over all nodes by name."""
+        """Return the conserved sums over all nodes by name, quantities that exchanges should not
+        change (such as the total weight of push-sum).
+        """
         parts = [_conserved_terms(node.algorithm, node.state) for node in self._nodes]
         # fsum: rounding of this sum would look like a loss.
         return {name: math.fsum(t for part in parts for t in part[name]) for name in parts[0]}

@@ -62,8 +62,8 @@ class Node:
         self.inbox: dict[int, list[Envelope]] = {}
 
     def put(self, envelope: Envelope) -> None:
-        """Put a message into the inbox; if the filter has ``newest_only``, the newest of each
-        sender replaces the others.
+        """Put a message into the inbox, from which the filter absorbs all messages together; if the
+        filter has ``newest_only``, the newest of each sender replaces the others.
         """
         envelopes = self.inbox.setdefault(envelope.sender, [])
         if self.algorithm.newest_only and envelopes:
@@ -74,7 +74,9 @@ class Node:
             envelopes.append(envelope)
 
     def take_messages(self) -> tuple[list[Envelope], list[Message]]:
-        """Empty the inbox and return its envelopes and messages, ordered by sender."""
+        """Empty the inbox and return its contents, ordered by sender: the envelopes, from which
+        events are recorded, and the messages as the filter takes them.
+        """
         # A floating-point sum must not depend on the order of arrival.
         envelopes = [envelope for peer in sorted(self.inbox) for envelope in self.inbox[peer]]
         self.inbox.clear()
@@ -116,7 +118,9 @@ class ClockedNode(Node):
         """Called once the node has used its samples of an instant, with the nodes that sensed."""
 
     def predict_to(self, time: float) -> None:
-        """Predict the filter to ``time`` seconds, using the increments since its last event."""
+        """Predict the filter to ``time`` (seconds), using the increments since its last event, in
+        intervals that the filter allows. It is called before any event that concerns the node.
+        """
         if self._now >= time:
             return
         if not self._increments:
@@ -141,8 +145,9 @@ class ClockedNode(Node):
             self._now = end
 
     def _read(self, start: float, end: float) -> FloatArray:
-        """Return the moments (2 p,) of the increments of all sensors from ``start`` to ``end``, in
-        seconds.
+        """Return the moments (2 p,) of the increments that all sensors of the node read from
+        ``start`` to ``end``, in seconds: integrals over the interval with the weights 1 and P_1
+        (Legendre).
         """
         truth = self._truth
         x_moments = truth.moments(start, end)
@@ -152,8 +157,9 @@ class ClockedNode(Node):
         return np.asarray(stacked.reshape(-1))
 
     def sample(self, node: int, y: FloatArray, H: Any, R: FloatArray) -> None:
-        """Store a sample y (p,) of one sensor of ``node`` (id), with noise covariance R (p, p) and
-        H (p, n), or a function that linearises it; one update uses all samples of this instant.
+        """Store a sample y (p,) that one sensor of ``node`` (id) has just taken, with noise
+        covariance R (p, p) and H (p, n), or a function that linearises it: one update, scheduled
+        here, uses all samples of this instant.
         """
         # The first sample of an instant schedules the update, which then uses all of them.
         if not self._samples:
@@ -162,7 +168,8 @@ class ClockedNode(Node):
 
     def _use_samples(self, _: simpy.Event) -> None:
         """Update ``self.state`` by all samples of this instant together, and record which nodes
-        sensed.
+        sensed: the callback of the event that the first of them schedules. The event itself is not
+        used.
         """
         time, samples = self._timeline.now, self._samples
         self._samples = []
@@ -201,7 +208,9 @@ class ClockedNode(Node):
         self.put(envelope)
 
     def _absorb(self, _: simpy.Event) -> None:
-        """Absorb all messages that have arrived at this instant."""
+        """Absorb all messages that have arrived at this instant: the callback of the event that the
+        first of them schedules. The event itself is not used.
+        """
         time = self._timeline.now
         self.predict_to(time)
         messages = self.take_messages()[1]

@@ -63,9 +63,9 @@ def _increment_process(
     node: int,
     entity: int,
 ) -> Process:
-    """Make ``node`` (id) use its increments at each point of the sensing grid: predict ``carrier``,
-    the filter that uses them, up to that point. ``entity`` is the index of the node, which orders
-    simultaneous events.
+    """Make ``node`` (id) use its increments at each point of the sensing grid, the times at which
+    increment sensors are read: predict ``carrier``, the filter that uses them, up to that point.
+    ``entity`` is the index of the node, which orders simultaneous events.
     """
     # From grid point 1 on, since increments need an interval.
     k = 1
@@ -91,7 +91,9 @@ class SamplingProcess:
     R: FloatArray
 
     def run(self, timeline: Timeline, truth: Any, receiver: ClockedNode) -> Process:
-        """Read the truth at the sample times, and pass each sample to the node."""
+        """Read the state of ``truth`` at the sample times, and pass each sample to the node
+        ``receiver``, which uses all samples of an instant in one update.
+        """
         for k, time in enumerate(self.times.tolist()):
             yield timeline.at(time, Rank.SENSE, self.entity)
             # Relative to the moving origin, like the estimates.
@@ -102,7 +104,9 @@ class SamplingProcess:
 def increment_sensors(
     scenario: Scenario, streams: Streams, placed: list[tuple[int, PlacedSensor]]
 ) -> list[SensorPath]:
-    """Return the readings of the increment sensors ``placed`` (node, sensor) in one run."""
+    """Return what the increment sensors ``placed`` (node, sensor) read in one run: for each a path
+    that gives the moments of its readings over any interval.
+    """
     paths = []
     for node, placed_sensor in placed:
         sensor = scenario.sensors[placed_sensor.entry]

@@ -85,7 +85,9 @@ class SlotSchedule:
         return self._plant.slot_time(slot)
 
     def stages(self, slot: int) -> list[Stage]:
-        """Return the stages of a slot in their order."""
+        """Return the stages of a slot in their order, at whose times and ranks the processes of
+        nodes, sensors and messages act; the result is cached, as all of them ask for it.
+        """
         if slot not in self._cache:
             # All processes are in this slot or the one before.
             self._cache.pop(slot - 2, None)
@@ -93,12 +95,16 @@ class SlotSchedule:
         return self._cache[slot]
 
     def end(self, slot: int) -> tuple[float, int]:
-        """Return a time in seconds and a rank after all stages of a slot."""
+        """Return a time in seconds and a rank (its order among events of that time) after all
+        stages of a slot, at which filtered states are sampled.
+        """
         stages = self.stages(slot)
         return (stages[-1].time, stages[-1].rank + 1) if stages else (self.start(slot), FIRST_RANK)
 
     def _stages_of(self, slot: int) -> Generator[Stage, None, None]:
-        """Yield the stages of a slot in order: sends, absorptions, updates and predictions."""
+        """Yield the stages of a slot in order, by the filter's schedule: sends and absorptions of
+        each exchange, readings, updates and predictions.
+        """
         algorithm, start = self._algorithm, self.start(slot)
         now, rank, phase = start, FIRST_RANK + 1, 0
         # In slot 0 a filter that does not predict uses no reading: its sample is the initial state.
@@ -153,7 +159,9 @@ class SlotNode(Node):
         self._samples: list[tuple[FloatArray, Any]] = []
 
     def run_process(self, timeline: Timeline) -> Process:
-        """Run the process of the node: follow the schedule, slot after slot."""
+        """Follow the schedule, slot after slot, as a SimPy process: at each stage that concerns the
+        node's filter wait for its time and rank, and act.
+        """
         slot = 0
         # Readers and the slot clock follow the same stages; ranks order the processes.
         while self._schedule.runs(slot):
@@ -182,8 +190,9 @@ class SlotNode(Node):
         self._samples.append((y, H))
 
     def _update(self, time: float) -> None:
-        """Update ``self.state`` by all readings of this slot, at ``time`` (seconds); without
-        sensors they have no rows.
+        """Update ``self.state`` by all readings of this slot, at ``time`` (seconds), in one update;
+        a node without sensors gets a reading without rows, as its filter may count on one update a
+        slot.
         """
         model = self.model
         samples = [linearise(self.algorithm, self.state, y, H) for y, H in self._samples]
@@ -221,8 +230,8 @@ class SlotNode(Node):
         self.put(envelope)
 
     def _close(self, stage: Stage, slot: int) -> None:
-        """Close the inbox at the end of an exchange, absorb its messages into ``self.state``, and
-        record that; ``slot`` is the number of the slot.
+        """Close the inbox at the end of an exchange step, absorb its messages into ``self.state``,
+        and record that; ``slot`` is the number of the slot.
         """
         append, now, phase = self._recorder.append, stage.time, stage.phase
         envelopes, messages = self.take_messages()
@@ -245,8 +254,8 @@ class SlotNode(Node):
 
 
 def _finite_rows(y: FloatArray, H: FloatArray) -> np.ndarray:
-    """Return flags (p,) of the rows of a reading ``y`` (p,) with ``H`` (p, n) that have a value;
-    ``y`` may be empty if the whole reading is missing.
+    """Return flags (p,) of the rows of a reading ``y`` (p,) with ``H`` (p, n) that have a value,
+    since the filter uses only these; ``y`` may be empty if the whole reading is missing.
     """
     # A recorded sensor without a row has an empty y.
     return np.isfinite(y) if len(y) == len(H) else np.zeros(len(H), dtype=bool)
@@ -266,7 +275,7 @@ class Reader:
 
     def run_process(self, timeline: Timeline, truth: Any, sensors: list[Readings]) -> Process:
         """Read all ``sensors`` of the node at the "read" stage of every slot, in the state of the
-        ``truth``, and pass the readings to its filter.
+        ``truth``, and pass the readings to its filter: a SimPy process.
         """
         slot = 0
         while self._schedule.runs(slot):
@@ -310,7 +319,7 @@ class SlotClock:
         }
 
     def run_process(self, timeline: Timeline) -> Process:
-        """Tick at every "send" stage."""
+        """Let the nodes exchange messages at every "send" stage of every slot: a SimPy process."""
         slot = 0
         while self._schedule.runs(slot):
             for stage in self._schedule.stages(slot):
@@ -344,12 +353,14 @@ class SlotClock:
             # A recorded link that is down loses its messages, but its channel draws all the same.
             is_up = up is None or (i, j) in up
             both = payloads[i], payloads[j]
-            self._links[i, j].exchange(both, phase, stage.number, is_up, fresh)
+            self._links[i, j].exchange(
+                both, phase=phase, exchange=stage.number, up=is_up, fresh=fresh
+            )
 
     def _pairs(self, stage: Stage, slot: int, broadcast: bool) -> tuple[list[Any], set[Any] | None]:
-        """Return the links (pairs of node ids) that are used in a stage of slot number ``slot``,
-        and the subset of them that is up (None for all). ``broadcast``: nodes send on all links,
-        not in pairs.
+        """Return the links (pairs of node ids) that are used in an exchange step (``stage``) of
+        slot number ``slot``, and the subset of them that is up (None for all); messages on the
+        others are lost. ``broadcast``: nodes send on all links, not in pairs.
         """
         activation, topology = self._scenario.network.activation, self._scenario.topology
         links = list(topology.links)

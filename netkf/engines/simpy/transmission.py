@@ -75,8 +75,8 @@ class Transmitter:
         self._under_way: dict[tuple[Link, int], Envelope] = {}
 
     def sampler(self, link: Link) -> ChannelSampler:
-        """Return the sampler of losses and delays of ``link`` = (i, j): of the whole link with a
-        symmetric channel, else of the direction from i to j.
+        """Return the sampler of ``link`` = (i, j), which draws losses and delays: of the whole link
+        with a symmetric channel, else of the direction from i to j.
         """
         # The sampler makes its streams when it needs them, by purpose.
         return ChannelSampler(self._channel, partial(stream, self._streams, link))
@@ -129,9 +129,9 @@ class Transmitter:
     def _arrive(
         self, direction: DirectedLink, phase: int, envelope: Envelope, arrival: simpy.Event | None
     ) -> None:
-        """Deliver a message to its receiver, or record that it arrives too late. ``phase`` is the
-        number of its exchange in the slot, -1 under clocks; ``arrival`` is None for a message
-        without delay.
+        """Deliver a message to its receiver, or record that it arrives too late for its exchange.
+        ``phase`` is the number of its exchange in the slot, -1 under clocks; ``arrival`` is the
+        SimPy event that calls this, None for a message without delay.
         """
         now, (sender, receiver) = self._timeline.now, direction.link
         # A message without delay arrives inside the tick, and keeps its age of 0.
