@@ -198,7 +198,7 @@ def _uniform_maximal(topology: Topology, random: np.random.Generator) -> list[Li
 
 
 def _choose_greedily(links: list[Link]) -> list[Link]:
-    """Return the matching that takes each of ``links`` in turn if both of its ends are still free."""
+    """Return the matching that takes each of ``links`` in turn if both ends are still free."""
     matched: set[int] = set()
     chosen = []
     for i, j in links:

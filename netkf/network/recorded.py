@@ -81,9 +81,11 @@ class MessageTable:
 def read_messages(
     source: SourceFile, column: str, rule: str, allowed: Callable[[float], bool]
 ) -> MessageTable:
-    """Read a file ``sender,receiver,message,COLUMN``; a message may be repeated with equal value.
+    """Read a table of recorded losses or delays, a file ``sender,receiver,message,COLUMN`` with
+    COLUMN = ``column``; a message may be repeated with equal value.
 
-    Raises ScenarioError with the text ``rule`` for a value that is not ``allowed``.
+    Raises ScenarioError with the text ``rule`` for a value that is not ``allowed``, and for
+    different values of one message.
     """
     names = ("sender", "receiver", "message")
     table = read_columns(source, (*names, column))

@@ -72,8 +72,7 @@ def run_alone(state: Simulation) -> int:
 @cache
 def no_batch() -> BatchArrays:
     """Return a batch of R = 0 runs, which a kernel for batches takes in place of one when it
-    simulates a run on its own, so that one compiled
-    kernel serves both.
+    simulates a run on its own, so that one compiled kernel serves both.
     """
     no_runs = np.zeros(0, dtype=np.int64)
     return BatchArrays(

@@ -281,13 +281,15 @@ def gain_mass(state: Simulation, totals: Totals, h: int, factor: float, share: f
 
 @kernel
 def update_root_by_gain(state: Simulation, h: int, values: FloatArray, vectors: FloatArray) -> None:
-    """Add the information that a node has heard to the root S = ``state.root[h]`` (n, n) of its P:
-    replace S by the lower triangular root of ``S V D^-1 V' S'``, the last step of ``gain_mass``.
-    The eigenvalues D are on the diagonal of ``values`` (n, n), raised to at least 1, and the
-    eigenvectors V = ``vectors`` (n, n) in columns; ``h`` is the index of the node.
+    """Add the information that a node has heard to its P, the middle step of ``gain_mass``: replace
+    its root S = ``state.root[h]`` (n, n) by the lower triangular root of ``S (I + share S' U S)^-1
+    S' = S V D^-1 V' S'``. The eigenvalues D of the matrix in brackets are on the diagonal of
+    ``values`` (n, n), raised to at least 1, and its eigenvectors V = ``vectors`` (n, n) in columns;
+    ``h`` is the index of the node.
     """
     root, F, n = state.root, state.flow_scratch.values, state.xhat.shape[1]
     wide, noise = state.flow_scratch.wide, state.flow_scratch.T
+    # F = S V D^-1/2, a root that is not triangular yet.
     for i in range(n):
         for j in range(n):
             total = 0.0
@@ -308,8 +310,9 @@ def move_by_gain(
     state: Simulation, h: int, gain: FloatArray, share: float, innovation: FloatArray
 ) -> None:
     """Correct ``state.xhat[h]`` of node ``h`` (index) by the mass that it has heard, ``gain`` (1 +
-    n n + n,) = (weight, U by rows, u): ``xhat += P share (u - U xhat)`` with the new P and share =
-    N / w+, w+ being the new weight; ``innovation`` (n,) is scratch.
+    n n + n,) = (weight, information matrix U by rows, information vector u): ``xhat += P share (u -
+    U xhat)`` with the new P and share = N / w+, w+ being the new weight; ``innovation`` (n,) is
+    scratch.
     """
     root, xhat, n = state.root, state.xhat, state.xhat.shape[1]
     # innovation = N / w+ (u - U xhat).

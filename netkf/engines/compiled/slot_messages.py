@@ -94,8 +94,8 @@ def draw_matching(matchings: Matchings, ends: np.ndarray, r: int, active: np.nda
     their order; return how many. ``ends`` (links, 2) are the indices of the nodes at both ends of
     each link.
 
-    The numbers are those that ``Matching.draw`` takes from the same stream,
-    which advances, so that both engines simulate the same run.
+    The numbers are those that ``Matching.draw`` takes from the same stream, which advances, so
+    that both engines simulate the same run.
     """
     count, states = len(ends), matchings.states
     first, members = matchings.first, matchings.members

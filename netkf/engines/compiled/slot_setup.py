@@ -171,6 +171,7 @@ class SlotSetup:
             s for s, k in zip(self.assigned, kinds, strict=True) if k is RegressorSensor
         ]
         self.varies = bool(self.recorded_sensors or self.regressor_sensors)
+        # The same in all blocks of runs and all slots, hence 1, 1.
         self.H: FloatArray = aligned((1, 1, self.estimators, self.p, self.n, LANES))
         self._set_kernel_sensors(scenario)
 

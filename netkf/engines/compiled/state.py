@@ -431,6 +431,7 @@ def entity_records(scenario: Scenario) -> tuple[np.ndarray, np.ndarray]:
     index_of = np.vectorize(lambda node: index.get(node, -1), otypes=[np.int64])
     if len(ends):
         entities["sender"], entities["other"] = index_of(ends[:, 0]), index_of(ends[:, 1])
+    # The -1 above only fills the array and must not be taken for the id of a node.
     if senders.at != "links":
         entities["other"][:] = [index[e[1]] if len(e) > 1 else -1 for e in senders.entities]
     entities["first"], entities["after"] = senders.first[:-1], senders.first[1:]

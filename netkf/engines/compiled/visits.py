@@ -175,6 +175,7 @@ def empty_visits(
         "gains": (3 * n * q, LANES),
         **dict.fromkeys(("x", "other_x", "moved"), (n, LANES)),
         **dict.fromkeys(("S", "other_S", "V", "T"), (n, n, LANES)),
+        # For each direction the own and the message weight, and the roots of both.
         "in_lanes": (8, LANES),
     }
     for name, lane_table in (("unobserved", unobserved), ("sensing", sensing)):
@@ -594,8 +595,9 @@ def transpose_rows(rows: FloatArray, out: FloatArray) -> None:
 def copy_columns(
     columns: FloatArray, index: IntArray, first: int, count: int, out: FloatArray
 ) -> None:
-    """Copy ``count`` rows of ``columns`` (W', L), W' values in L lanes, to ``out`` (count, L): row
-    e comes from row ``index[first + e]``, since equal entries of a series are stored once.
+    """Copy the values of a power series, evaluated in L lanes with equal ones stored once, to where
+    a kernel expects each of them: row e of ``out`` (count, L) comes from row ``index[first + e]``
+    of ``columns`` (W', L), the W' distinct values.
     """
     for e in range(count):
         store(MANY, out, e, load(MANY, columns, index[first + e]))

@@ -191,8 +191,7 @@ class SlotNode(Node):
 
     def _update(self, time: float) -> None:
         """Update ``self.state`` by all readings of this slot, at ``time`` (seconds), in one update;
-        a node without sensors gets a reading without rows, as its filter may count on one update a
-        slot.
+        a node without sensors gets a reading without rows.
         """
         model = self.model
         samples = [linearise(self.algorithm, self.state, y, H) for y, H in self._samples]
