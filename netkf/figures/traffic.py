@@ -290,7 +290,7 @@ def links_figure(data: FigureData) -> Picture:
         omissions.append(f"the first {end:,.4g} s")
     note = "All messages are shown."
     if omissions:
-        note = f"Shown: {' of '.join(omissions)}; the claim counts all."
+        note = f"Shown: {' of '.join(omissions)}; the title counts all."
     finish_figure(figure, data.title(headline), data.caption(note))
     return figure
 
