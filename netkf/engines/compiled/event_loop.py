@@ -707,8 +707,9 @@ def intersect(state: Simulation, h: int, own: float, total: float) -> None:
 
 @kernel
 def on_probe(state: Simulation, totals: Totals | None) -> bool:
-    """Store a sample of all nodes in ``state.buffer``, and of the weights of running sums if
-    ``totals`` is not None; return False if there is no space for another one.
+    """Store a sample of all nodes in ``state.buffer`` at a time at which the scenario asks for one,
+    and for push-sum the terms of the total weight, which exchanges conserve (``totals`` is not
+    None). Return False if there is no space for another one.
     """
     store_sample(state, state.run, 0, state.samples)
     # Terms of the weight of the network: held by nodes, sent, and (to subtract) heard.

@@ -206,9 +206,11 @@ def absorb_evidence(state: Simulation, evidence: EvidenceArrays, h: int, now: fl
         message = state.pool[m]
         w, age = message.direction, now - message.sent
         if evidence.sent_at[w] <= message.sent:
+            # Predict a late message to now by exp(-A age), which is written to ``maps[0]``.
             if age > 0.0:
                 fill_inverse_transition(evidence.A, age, maps)
                 predict_part(ONE, evidence.carried[m], maps[0], evidence.total, evidence.work)
+            # The vector of its evidence becomes relative to this node's estimate.
             for i in range(state.xhat.shape[1]):
                 evidence.before[i, 0] = state.pool_x[m, i]
                 evidence.after[i, 0] = state.xhat[h, i]

@@ -211,11 +211,11 @@ def put_in_time_order(
     t, entity, outcome = ordered.t, ordered.entity, ordered.first_outcome
     for position in range(count):
         m, k = source[position], position
-        now, who = buffer.t[m], buffer.entity[m]
-        while k > 0 and (t[k - 1] > now or (t[k - 1] == now and entity[k - 1] > who)):
+        time, e = buffer.t[m], buffer.entity[m]
+        while k > 0 and (t[k - 1] > time or (t[k - 1] == time and entity[k - 1] > e)):
             t[k], entity[k], outcome[k] = t[k - 1], entity[k - 1], outcome[k - 1]
             k -= 1
-        t[k], entity[k], outcome[k] = now, who, buffer.first_outcome[m]
+        t[k], entity[k], outcome[k] = time, e, buffer.first_outcome[m]
 
 
 @kernel(inlined=True)
@@ -449,7 +449,8 @@ def _empty_buffer(ticks: int, sends: int) -> TickBuffer:
 
 
 def all_ticks(scenario: Scenario, streams: ReplicaStreams, bits: bool = False) -> AllTicks:
-    """Return all ticks of R runs up to the horizon. ``bits``: with arrival bits instead of
+    """Return all ticks of R runs up to the horizon, with their outcomes: the delay of each message,
+    or LOST. ``bits``: with arrival bits (bit m is 1 if message m of a tick arrives) instead of
     outcomes, which is possible if clocks are Poisson and no message takes time.
     """
     if is_poisson(scenario):

@@ -113,10 +113,14 @@ class SlotEvents:
             link: [direction.draws() for direction in both[:count]]
             for link, both in self._by_link.items()
         }
+        # The last draws of each link, for steps in which links keep them.
         self._last: dict[Link, list[Draw]] = {}
+        # A heap by (arrival, index of the direction, order); then direction, number, time of
+        # sending, phase and exchange of each message.
         self._in_flight: list[tuple[float, int, int, DirectionDraws, int, float, int, int]] = []
         self._slot, self._order, self._exchanges, self._open = 0, 0, 0, -1
         self._recording = True
+        # By receiver and sender: number and age of the message.
         self._inbox: dict[int, dict[int, tuple[int, float]]] = {}
         self._rows: list[Row | StepEnd | None] = []
         self._sent: np.ndarray | None = None

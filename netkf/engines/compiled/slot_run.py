@@ -112,11 +112,11 @@ class SlotRuns:
         self._blocks = blocks = blocks_of(runs)
         self._total = aligned((blocks, LANES))
         self._nodes = SlotNodes(
-            in_lanes(setup.xhat, blocks),
-            in_lanes(setup.root, blocks),
-            setup.F,
-            setup.root_Q,
-            setup.rows,
+            xhat=in_lanes(setup.xhat, blocks),
+            root=in_lanes(setup.root, blocks),
+            F=setup.F,
+            root_Q=setup.root_Q,
+            rows=setup.rows,
         )
         self._scratch = slot_scratch(setup.estimators, setup.n, setup.algorithm.unrolled)
         self._filter_arrays = setup.algorithm.slot_arrays(setup.states, setup.infos, runs)
@@ -190,20 +190,21 @@ class SlotRuns:
         chain: Any = setup.loss if setup.is_chain else None
         to_bad, to_good = chain.transitions if chain is not None else (0.0, 1.0)
         entities = setup.entities
+        draws_states = random_loss and setup.is_chain
         self._channels = Channels(
-            setup.ends,
-            setup.delivery,
-            self._in_lanes("loss", entities) if random_loss else no_streams,
-            self._in_lanes("weather", entities) if random_loss and setup.is_chain else no_streams,
-            # Losses and steps of the channel state: -1, nothing drawn yet; and no state yet.
-            np.full(shape, -1.0),
-            np.full(shape, -1.0),
-            np.full(shape, -1, dtype=np.int64),
-            to_bad,
-            to_good,
-            setup.talks,
-            setup.directions_per_link,
-            setup.streams_per_link,
+            ends=setup.ends,
+            delivery=setup.delivery,
+            loss_streams=self._in_lanes("loss", entities) if random_loss else no_streams,
+            state_streams=self._in_lanes("weather", entities) if draws_states else no_streams,
+            # -1: nothing drawn yet, and no channel state yet.
+            loss_uniform=np.full(shape, -1.0),
+            state_uniform=np.full(shape, -1.0),
+            bad=np.full(shape, -1, dtype=np.int64),
+            to_bad=to_bad,
+            to_good=to_good,
+            talks=setup.talks,
+            directions_per_link=setup.directions_per_link,
+            streams_per_link=setup.streams_per_link,
         )
         protocol, probability, first, members = setup.matching
         # Two words more than the state of a generator: for small integers numpy keeps half of a
@@ -245,13 +246,27 @@ class SlotRuns:
             part.reshape(*part.shape[:2], math.prod(part.shape[2:])) for part in samples
         )
         kernel_samples = SlotSamples(
-            x, xhat, P, error, self._stopped, self._conserved, absolute, local, setup.frame > 0,
-            self._total,
-        )  # fmt: skip
+            x=x,
+            xhat=xhat,
+            P=P,
+            error=error,
+            stopped=self._stopped,
+            conserved=self._conserved,
+            absolute=absolute,
+            local=local,
+            framed=setup.frame > 0,
+            total=self._total,
+        )
         plan = SlotPlan(
-            self._slot, times.sensed, times.exchanged, times.sample, messages.up, messages.sent,
-            self._draw_uniforms(messages.sent), WHOLE,
-        )  # fmt: skip
+            first=self._slot,
+            sensed=times.sensed,
+            exchanged=times.exchanged,
+            sample=times.sample,
+            up=messages.up,
+            sent=messages.sent,
+            uniform=self._draw_uniforms(messages.sent),
+            part=WHOLE,
+        )
         count, algorithm = len(times.start), setup.algorithm
         extra = algorithm.slot_gains(setup.states, self._filter_arrays, self._slot, count)
         kernel_arguments, slot_kernel = (
@@ -336,7 +351,15 @@ class SlotRuns:
         # Only event rows need the times: a batch without them saves the loop.
         if timed:
             start = np.array([plant.slot_time(slot) for slot in slots.tolist()])
-        return SlotTimes(self._slot, start, recorded, sensed, exchanged, sample, algorithm.predicts)
+        return SlotTimes(
+            first=self._slot,
+            start=start,
+            recorded=recorded,
+            sensed=sensed,
+            exchanged=exchanged,
+            sample=sample,
+            predicts=algorithm.predicts,
+        )
 
     def _draw_messages(self, times: SlotTimes) -> SlotMessages:
         """Draw and return which nodes exchange in the S slots of ``times``, and which messages
@@ -348,10 +371,11 @@ class SlotRuns:
         # Without matchings the arrays of pairs stay empty.
         matched = self.runs if setup.matching[0] >= 0 else 0
         messages = SlotMessages(
-            np.zeros((self._blocks, *shape, len(setup.directions), LANES), dtype=np.uint8),
-            np.empty((matched, *shape, pairs), dtype=np.int64),
-            np.zeros((matched, *shape), dtype=np.int64),
-            np.zeros(
+            up=np.zeros((self._blocks, *shape, len(setup.directions), LANES), dtype=np.uint8),
+            active=np.empty((matched, *shape, pairs), dtype=np.int64),
+            pair_count=np.zeros((matched, *shape), dtype=np.int64),
+            # Empty if every node sends that is asked.
+            sent=np.zeros(
                 (self._blocks, *shape, len(setup.nodes), LANES) if decided else (0,) * 5,
                 dtype=np.uint8,
             ),
@@ -559,12 +583,19 @@ class SlotRuns:
         )  # fmt: skip
 
     def _traced_nodes(self) -> TracedNodes:
-        """Return the nodes and incoming links, for the kernels that write or count events."""
+        """Return the nodes and incoming links as arrays, for the kernels that write the rows of
+        events or count the events.
+        """
         setup, links = self.setup, self.setup.links
         return TracedNodes(
-            setup.nodes, setup.sensing, links.first, links.sender, links.direction, self._sent,
-            self._stopped,
-        )  # fmt: skip
+            nodes=setup.nodes,
+            sensing=setup.sensing,
+            first=links.first,
+            sender=links.sender,
+            direction=links.direction,
+            sent=self._sent,
+            stopped=self._stopped,
+        )
 
     def conserved(self) -> dict[str, FloatArray]:
         """Return by name the sums over all nodes that exchanges conserve, such as the total weight
@@ -588,7 +619,7 @@ def _pack_messages(up: np.ndarray, sent: np.ndarray) -> SlotMessages:
         lanes[..., 0] = values
     # The arrays of matched pairs stay empty: only kernels that draw messages use them.
     active, pairs = (np.zeros((0,) * d, dtype=np.int64) for d in (4, 3))
-    return SlotMessages(lane_arrays[0], active, pairs, lane_arrays[1])
+    return SlotMessages(up=lane_arrays[0], active=active, pair_count=pairs, sent=lane_arrays[1])
 
 
 ROW_COLUMNS = ("t", "kind", "node", "peer", "message", "phase", "age")

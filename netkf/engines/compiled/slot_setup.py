@@ -272,10 +272,10 @@ class SlotSetup:
         )
         first = np.searchsorted(np.array(receivers, dtype=np.int64), np.arange(self.estimators + 1))
         return SlotLinks(
-            np.asarray(first, dtype=np.int64),
-            np.array(senders, dtype=np.int64),
-            np.array(directions, dtype=np.int64),
-            np.array(weights, dtype=np.float64),
+            first=np.asarray(first, dtype=np.int64),
+            sender=np.array(senders, dtype=np.int64),
+            direction=np.array(directions, dtype=np.int64),
+            weight=np.array(weights, dtype=np.float64),
         )
 
     def _set_channel(self, scenario: Scenario) -> None:
@@ -306,8 +306,8 @@ class SlotSetup:
             for w, direction in enumerate(self.directions)
             if w % each < self.streams_per_link
         ]
-        # Some filters send nothing in some phases (push-sum with asymptotic gains: no mass), or
-        # only from nodes that have sensors.
+        # Some filters send nothing in some phases, the exchanges of a slot (push-sum with
+        # asymptotic gains: no mass), or only from nodes that have sensors.
         sends = self.algorithm.sends_in_slots
         talks = [
             [sends(phase, direction[0] in scenario.placed_sensors) for direction in self.directions]
