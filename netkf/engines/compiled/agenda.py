@@ -81,8 +81,9 @@ PROGRESS = np.dtype([(name, np.int64) for name in _POSITIONS])
 
 
 def is_immediate(scenario: Scenario) -> bool:
-    """Return True if filters of a scenario can be simulated in lanes: convex combinations, messages
-    without delay, Poisson clocks, and no sensors that take samples.
+    """Return True if filters of a scenario can be simulated in SIMD lanes, as many nodes side by
+    side as a vector register holds: convex combinations, messages without delay, Poisson clocks,
+    and no sensors that take samples. Then no event depends on an estimate.
     """
     node_filter, network = scenario.node_filter, scenario.network
     return (
@@ -92,6 +93,7 @@ def is_immediate(scenario: Scenario) -> bool:
         and type(network.activation) is Poisson
         and delay_is_zero(network.channel)
         and getattr(node_filter, "max_age", math.inf) >= 0.0
+        # Each message of a tick has a bit of one integer.
         and int(np.diff(senders_of(scenario).first).max(initial=0)) <= MAX_LINKS_OF_CLOCK
     )
 

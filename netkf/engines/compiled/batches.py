@@ -279,7 +279,9 @@ class RunDraws:
     """The draws of one run of a batch. ``run`` is its number in the batch, from 0."""
 
     def __init__(self, batch: BatchDraws, scenario: Scenario, run: int) -> None:
-        """Take views of the draws of run number ``run`` (0 to R - 1) of a batch."""
+        """Take views of the draws of run number ``run`` (0 to R - 1) of a batch, for the event loop
+        of a single run.
+        """
         self._batch, self._run, self.instants = batch, run, batch.instants
         self.states: States = PathStates(scenario, batch.paths.frame_times)
         shared, count = batch.sensing, len(batch.sensing.rows)

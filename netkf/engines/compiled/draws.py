@@ -40,7 +40,9 @@ def blocks_to_the_end(scenario: Scenario) -> int:
 
 
 def steps_to_the_end(scenario: Scenario) -> int:
-    """Return the number of steps of the sensing grid that reach the horizon."""
+    """Return the number of steps of the sensing grid, the times at which increment sensors are
+    read, that reach the horizon.
+    """
     period = scenario.diffusion.sensing_period
     assert period is not None
     # A first guess from below; the loop counts the rest.
@@ -228,8 +230,8 @@ class Noise:
         )
 
     def following(self) -> None:
-        """Draw the noise of the next block of steps of all R runs and S sensors into
-        ``sensing.noise`` (R S steps, 2, p).
+        """Draw the noise of the next block of steps of all R runs and S sensors, two moments for
+        each row and step, into ``sensing.noise`` (R S steps, 2, p).
         """
         sensing = self.sensing
         # Streams of all runs and sensors, run by run.

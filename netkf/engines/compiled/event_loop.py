@@ -308,7 +308,8 @@ def record_event_with_age(
 def predict(state: Simulation, combination: CombinationState | None, h: int, time: float) -> None:
     """Predict node ``h`` (index in ``state.nodes``) from ``state.now[h]`` to ``time`` (seconds),
     using its increments, unless it is there already. Changes ``state.xhat[h]``, ``root[h]`` and
-    ``now[h]``, and for some combinations the node's prior or evidence in ``combination``.
+    ``now[h]``, and in ``combination`` (None for most filters) the prediction that consensus on
+    predictions sends, or the evidence of belief propagation.
     """
     node, now = state.nodes[h], state.now[h]
     # ``not <`` also returns for a time that is nan.
@@ -584,14 +585,14 @@ def on_absorb(
 
 @kernel
 def use_messages(state: Simulation, history: History, h: int, now: float) -> None:
-    """Update node ``h`` (index in ``state.nodes``) at ``now`` (seconds) with the readings in its
-    inbox, late ones at their own time. Changes ``state.xhat[h]``, ``root[h]`` and the node's
-    ``history``.
+    """Update node ``h`` (index in ``state.nodes``) at ``now`` (seconds) with the readings that
+    messages in its inbox refer to, late ones as if they had come at their own time. Changes
+    ``state.xhat[h]``, ``root[h]`` and the node's ``history``, its remembered events.
     """
     m = state.nodes[h].inbox
     while m != -1:
         message = state.pool[m]
-        # A reading that took no time is of the present instant.
+        # ``tag`` is the index of the instant. A reading that took no time is of the present one.
         if now - message.sent <= 0.0:
             use_reading(state, history, h, message.tag)
         else:

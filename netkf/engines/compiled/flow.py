@@ -351,7 +351,8 @@ class FlowRun:
         progress: Progress,
     ) -> None:
         """Set up the state of a run at time 0 from its random numbers ``draws``, in the arrays of
-        ``workspace``; ``progress`` is called with the simulated seconds.
+        ``workspace``, with the extra arrays that its filter needs; ``progress`` is called with the
+        simulated seconds.
         """
         self._scenario, self._recorder, self._progress = scenario, recorder, progress
         recorder.exact_errors = scenario.exact_errors
@@ -435,7 +436,9 @@ class FlowRun:
         state.frame_at = k + 1
 
     def _enlarge_pool(self) -> None:
-        """Enlarge the pool of messages and every array that has an entry for each of them."""
+        """Enlarge the pool of messages, which the event loop has used up, and every array that has
+        an entry for each of them.
+        """
         add_messages(self._state, self._state.most_messages)
         # ``offered`` has a row for each message: the total that it carries.
         if self._totals is not None:

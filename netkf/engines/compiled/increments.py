@@ -51,8 +51,9 @@ def noise_index(sensing: Sensing, run: int, s: int, step: int) -> int:
 
 @kernel
 def draw_cut(sensing: Sensing, run: int, s: int, normals: FloatArray) -> None:
-    """Draw standard ``normals`` (2, p) that divide the two noise moments of sensor ``s`` (0 to S -
-    1) of run number ``run`` within a step; advances that sensor's stream in ``sensing.cuts``.
+    """Draw what divides the noise of sensor ``s`` (0 to S - 1) of run number ``run`` when a reading
+    ends inside a step: standard ``normals`` (2, p) for the two noise moments of the step, from that
+    sensor's stream in ``sensing.cuts``, which advances.
     """
     ziggurat = NormalZiggurat(sensing.height, sensing.width, sensing.inside)
     states, stream = sensing.cuts, run * len(sensing.rows) + s

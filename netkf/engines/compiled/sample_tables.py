@@ -34,9 +34,9 @@ class SampleTables:
     def __init__(
         self, scenario: Scenario, streams: Streams, times: dict[tuple[int, int], FloatArray]
     ) -> None:
-        """Sort the samples of all sensors by time into ``instants``, without their values;
-        ``times`` (K,) in seconds are those of each sensor, by (node id, number of the sensor at the
-        node).
+        """Sort the samples of all sensors by time into ``instants`` (each a time at which a node
+        takes samples and uses them in one update), without their values; ``times`` (K,) in seconds
+        are those of each sensor, by (node id, number of the sensor at the node).
         """
         placed = [
             (node, placed_sensor)

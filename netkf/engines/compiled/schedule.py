@@ -129,9 +129,10 @@ class TickSource:
             )
 
     def more(self, indices: np.ndarray, counts: np.ndarray) -> tuple[FloatArray, np.ndarray]:
-        """Draw the next ``counts`` (M,) ticks of M entities with the ``indices`` (M,); return the
-        times (K,) in seconds of those before the horizon, entity by entity, and how many each
-        entity has, (M,). Advances ``last`` and ``drawn``.
+        """Draw the next ``counts`` (M,) ticks of M entities (links, directions or nodes with a
+        clock) with the ``indices`` (M,); return the times (K,) in seconds of those before the
+        horizon, entity by entity, and how many each entity has, (M,). Advances ``last`` and
+        ``drawn``.
         """
         if self._all_poisson:
             times, sizes = self._exponential(indices, counts), counts
@@ -316,9 +317,9 @@ class Outcomes:
     def _delivery_probability(
         self, directions: np.ndarray, counts: np.ndarray, first: np.ndarray, bad: np.ndarray
     ) -> FloatArray:
-        """Return the delivery probabilities (K,) of K messages, ``counts`` (M,) on each of M
-        ``directions`` (M,) with numbers from ``first`` (M,) on; ``bad`` (K,) is the state of the
-        channel.
+        """Return the delivery probabilities (K,) of K messages by the loss model, which may be a
+        user's own: ``counts`` (M,) messages on each of M ``directions`` (M,) with numbers from
+        ``first`` (M,) on; ``bad`` (K,) is the state of the channel.
         """
         loss, out, done = self._channel.loss, np.empty(len(bad)), 0
         # Probabilities that may depend on the state of the link and on the number of the message.

@@ -42,7 +42,9 @@ class Senders(NamedTuple):
 
 @once_per_scenario
 def senders_of(scenario: Scenario) -> Senders:
-    """Return the senders of a scenario; none if the filter sends no messages."""
+    """Return the senders of a scenario, which say what has a clock (links, directed links or nodes)
+    and on which directed links each tick sends; none if the filter sends no messages.
+    """
     topology, clock = scenario.topology, scenario.network.activation
     # In slots there is no link clock.
     if not scenario.node_filter.talks or not isinstance(clock, LinkClock):
@@ -67,8 +69,9 @@ def senders_of(scenario: Scenario) -> Senders:
 
 
 def _link_senders(links: tuple[Link, ...], directed: bool, symmetric: bool) -> Senders:
-    """Return the senders if links have clocks: an entity is a link of one direction if
-    ``directed``, else of two, which share one stream of losses and delays if ``symmetric``.
+    """Return the senders if links have clocks, so that both ends send at each tick of their link:
+    an entity is a link of one direction if ``directed``, else of two, which share one stream of
+    losses and delays if ``symmetric``.
     """
     if directed:
         indices = np.arange(len(links))

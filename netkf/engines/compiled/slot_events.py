@@ -317,8 +317,9 @@ class SlotEvents:
         return bool(self._setup.may_miss and self._unread[step.step, node])
 
     def _send(self, step: Step, direction: DirectionDraws, draw: Draw | None) -> None:
-        """Send one message on a directed link: record it, and put it into the receiver's inbox or
-        among those under way. It is lost if ``draw`` says so or is None (the link is down).
+        """Send one message on a directed link in an exchange step: record it, and put it into the
+        receiver's inbox or among those under way. It is lost if ``draw`` (uniform number, bad
+        state, delay) says so or is None (the link is down).
         """
         (sender, receiver), number, now = direction.ends, direction.messages, step.begin
         direction.messages = number + 1

@@ -61,8 +61,8 @@ class SlotSetup:
     """Times, links and sensors of a scenario in slots, and the states of its filters at slot 0."""
 
     def __init__(self, scenario: Scenario) -> None:
-        """Compute everything that all runs of a scenario share, in the attributes that the methods
-        set.
+        """Compute everything that all runs of a scenario in slots share: stages of a slot, sensors,
+        filters at slot 0, links and channel, in the attributes that the methods below set.
         """
         algorithm, topology = scenario.node_filter, scenario.topology
         self.algorithm: Filter = algorithm
@@ -350,7 +350,9 @@ class SlotSetup:
         return unread
 
     def _draws_everything(self, scenario: Scenario) -> bool:
-        """Return True if kernels can draw all messages; otherwise Python makes them one by one."""
+        """Return True if kernels can draw all messages of many slots and runs at once; otherwise
+        Python makes them one by one, which is slower but handles any channel.
+        """
         network = scenario.network
         # Which message has which number is known before the exchange, unless nodes may be silent.
         if self.deliveries is not None and (self.decides or self.may_miss):

@@ -70,8 +70,8 @@ def _tick_process(
     activate: Activation,
 ) -> Process:
     """Wait for each tick of the clock of ``entity`` (node ids of a link, or of a node) up to the
-    horizon, and call ``activate`` with its time in seconds. ``tick_order`` is the index of the
-    entity, which orders simultaneous ticks.
+    horizon, and call ``activate``, which lets its nodes send, with its time in seconds: a SimPy
+    process. ``tick_order`` is the index of the entity, which orders simultaneous ticks.
     """
     clock = scenario.network.activation
     assert isinstance(clock, LinkClock)

@@ -94,7 +94,9 @@ class _Simulation:
         recorder.exact_errors = scenario.exact_errors
 
     def clocks(self) -> list[Process]:
-        """Return the processes of a scenario in continuous time."""
+        """Return the SimPy processes of a scenario in continuous time: samples, moves of the
+        origin, sensors and clocks; they share a truth, the state of the plant.
+        """
         scenario, streams, timeline = self._scenario, self._streams, self.timeline
         truth = scenario.continuous_truth(streams)
 
@@ -149,7 +151,9 @@ class _Simulation:
             self._transmitter.shift(self._scenario.node_filter, offset)
 
     def slots(self) -> list[Process]:
-        """Return the processes of a scenario in slots."""
+        """Return the SimPy processes of a scenario in slots: samples, filters, readers of sensors
+        and the clock of exchanges; they share a truth, the state of the plant.
+        """
         scenario, streams, recorder = self._scenario, self._streams, self._recorder
         truth = scenario.slot_truth(streams)
         schedule, period = SlotSchedule(scenario), scenario.slot_plant.period

@@ -105,8 +105,8 @@ class ClockedNode(Node):
         increments: list[Any],
         *arguments: Any,
     ) -> None:
-        """Set up a node at time 0 with its increment sensors, which read the ``truth``;
-        ``arguments`` are those of Node.
+        """Set up a node at time 0 with its ``increments``, the paths of its increment sensors,
+        which read the ``truth``, the state of the plant; ``arguments`` are those of Node.
         """
         super().__init__(*arguments)
         self._timeline, self._recorder, self._truth = timeline, recorder, truth

@@ -54,7 +54,9 @@ class SlotSchedule:
     """Computes the stages of every slot from the schedule of the filter."""
 
     def __init__(self, scenario: Scenario) -> None:
-        """Take the schedule of the filter and the number of steps of each of its exchanges."""
+        """Take the filter's schedule, the order of predictions, readings and exchanges in a slot,
+        and the number of steps of each of its exchanges.
+        """
         self._algorithm, self._plant = scenario.node_filter, scenario.slot_plant
         self.horizon = scenario.horizon
         phases = self._algorithm.schedule or ()
