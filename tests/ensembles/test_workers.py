@@ -88,7 +88,8 @@ def test_what_a_task_raises_comes_with_its_traceback(ring, claim, kind):
 
 COMMAND = [sys.executable, "-m", "netkf"]
 # More runs than the command can finish, however late the test sees its first block.
-RUN = ["run", str(SCENARIOS / "poisson_ring.toml"), "--runs", "9999", "--trace", "full", "--no-plot"]
+RING = str(SCENARIOS / "poisson_ring.toml")
+RUN = ["run", RING, "--runs", "9999", "--trace", "full", "--no-plot"]
 
 
 @pytest.mark.parametrize(
