@@ -37,9 +37,12 @@ def adapt(algorithm: AnyFilter) -> Filter:
 
 
 class _Adapter(Filter):
-    """Forwards what both contracts share; class variables are copied from the wrapped filter."""
+    """A filter that calls the methods of ``inner``, a filter of a deprecated contract, and copies
+    its class variables.
+    """
 
     def __init__(self, inner: Any) -> None:
+        """Wrap ``inner``, a FlowFilter or SlotFilter."""
         # Filters are frozen dataclasses: attributes can only be set around their guard.
         for name in ("talks", "pooled", "inverts"):
             object.__setattr__(self, name, getattr(inner, name))
@@ -64,10 +67,10 @@ class _Adapter(Filter):
 
 
 class FlowAdapter(_Adapter):
-    """Runs a ``FlowFilter``: increments and messages under clocks, no samples."""
+    """Runs a ``FlowFilter`` in continuous time: with increments and messages, but no samples."""
 
     schedule = None
-    clocks = CLOCKS[:-1]  # all but after samples
+    clocks = CLOCKS[:-1]  # all but "readings": there are no samples after which to transmit
 
     def init(self, model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo) -> Any:
         """Return the wrapped filter's state at time 0 from ``mean`` (n,) and ``cov`` (n, n); flow
@@ -97,7 +100,8 @@ class FlowAdapter(_Adapter):
         """Return the state after all messages of an instant: calls the wrapped filter's ``absorb``
         with (weight, payload, age) of each.
         """
-        return self.inner.absorb(state, [tuple(message[1:]) for message in messages])
+        # Deprecated filters are not told the sender.
+        return self.inner.absorb(state, [(m.weight, m.payload, m.age) for m in messages])
 
     def max_measurement_interval(self, state: Any) -> float:
         """Return the seconds of increments that may be used at once, by the wrapped filter's
@@ -107,11 +111,14 @@ class FlowAdapter(_Adapter):
 
 
 class SlotAdapter(_Adapter):
-    """Runs a ``SlotFilter``, whose ``sense`` includes the prediction."""
+    """Runs a ``SlotFilter`` in slots. Its ``sense`` includes the prediction to the next slot, so
+    that the schedule has no phase "predict".
+    """
 
     clocks = ()
 
     def __init__(self, inner: SlotFilter) -> None:
+        """Wrap ``inner``, with its ``programme`` as the schedule of a slot."""
         super().__init__(inner)
         object.__setattr__(self, "schedule", tuple(inner.programme))
         for name in ("first_slot", "predicts", "pairwise", "one_way"):
@@ -140,7 +147,9 @@ class SlotAdapter(_Adapter):
         """Return the state after all messages of a step: calls the wrapped filter's ``absorb`` with
         (weight, payload, age) of each.
         """
-        return self.inner.absorb(state, exchange.phase, [tuple(m[1:]) for m in messages])
+        # Deprecated filters are not told the sender.
+        contents = [(m.weight, m.payload, m.age) for m in messages]
+        return self.inner.absorb(state, exchange.phase, contents)
 
     def steps(self, phase: int) -> int:
         """Return how often the wrapped filter repeats exchange number ``phase`` of a slot."""
@@ -157,12 +166,16 @@ class SlotAdapter(_Adapter):
         return bool(self.inner.stopped(state))
 
     def conserved(self, state: Any) -> Mapping[str, float | Sequence[float]]:
-        """Return the wrapped filter's conserved quantities by name."""
+        """Return the wrapped filter's quantities by name, each a number or the terms of a sum,
+        whose sums over all nodes no exchange should change.
+        """
         conserved: dict[str, float] = self.inner.conserved(state)
         return conserved
 
     @property
     def pair_weights(self) -> FloatArray | None:
-        """Return the wrapped filter's matrix of weights (N, N), or None."""
+        """The wrapped filter's matrix (N, N) of weights, entry [l, i] for messages from node l to
+        node i, or None if its method ``weight`` gives them.
+        """
         weights: FloatArray | None = self.inner.pair_weights
         return weights

@@ -1,4 +1,6 @@
-"""Covariance intersection in continuous time: the combination of paper D (8), (9) over clocks."""
+"""Covariance intersection in continuous time: the combination of Xie, Gan and Liu, paper D (8) and
+(9), in the hybrid filter of Tanwani, paper H.
+"""
 
 from __future__ import annotations
 
@@ -16,10 +18,11 @@ from netkf.algorithms.registry import built_in
 @dataclass(frozen=True, eq=False)
 class CovarianceIntersection(Hybrid):
     """The hybrid filter with covariance intersection in place of convex resets: weight ``epsilon``
-    for each active neighbour and the rest for oneself.
+    for each neighbour heard and the rest for the node itself.
 
-    P after a reset is at most the convex reset's, and the Riccati flow keeps that order, so H (12)
-    bounds E[P_i] here too; and P_i stays at least the covariance of the error, H (10).
+    P after a reset is at most that of the convex reset, and the Riccati equation keeps that order,
+    so the bound of paper H (12) on E[P_i] holds here too; and P_i stays at least the covariance of
+    the error, paper H (10).
     """
 
     combination: ClassVar[str] = "intersection"

@@ -3,9 +3,9 @@
 A filter is a frozen dataclass of parameters with pure functions on an immutable state (a NamedTuple
 of arrays that nothing changes in place). The engine calls ``predict`` for the time that passes,
 ``update`` with the readings of the node, ``emit`` when the node may transmit and ``absorb`` with
-everything that arrived at one instant. In slots the engine follows ``schedule``; under clocks it
-calls the same methods whenever something happens. Covariances are carried as roots,
-``P = root root'``, so that wide and narrow directions keep their digits.
+everything that arrived at one instant. In slots (discrete time) the engine follows ``schedule``;
+under clocks (continuous time) it calls the same methods whenever something happens. Covariances are
+carried as roots, ``P = root root'``, so that wide and narrow directions keep their digits.
 """
 
 from __future__ import annotations
@@ -104,11 +104,11 @@ class Exchange(NamedTuple):
     """The circumstances of ``emit`` or ``absorb``.
 
     time : simulated seconds
-    phase, step : number of the exchange in its slot, and of its repetition, from 0
+    phase, step : number of the exchange in its slot, and of its repetition, from 0; -1 under clocks
     slot : number of the slot, from 0; -1 under clocks
-    receivers : under clocks, for ``emit``, the nodes that may hear
-    uniform : in slots, for ``emit`` of a ``randomised`` filter, a number in [0, 1) of the node's
-              own
+    receivers : under clocks, for ``emit``, the ids of the nodes that may hear
+    uniform : in slots, for ``emit`` of a ``randomised`` filter, a uniform draw in [0, 1) from the
+              node's own stream
     """
 
     time: float = 0.0
@@ -145,8 +145,9 @@ class Reading(NamedTuple):
 
 
 class Increments(NamedTuple):
-    """Increments of sensors (p rows in all) over the last ``gap`` seconds: ``moments`` (2 p,) are
-    ``int dy`` and then ``int (2 (s - a) / gap - 1) dy``, see linalg/legendre.
+    """Increments of sensors (p rows in all) over the last ``gap`` seconds, from time a on:
+    ``moments`` (2 p,) are ``int dy`` and then ``int (2 (s - a) / gap - 1) dy`` over the times s in
+    the gap, see linalg/legendre.
     """
 
     moments: FloatArray
@@ -203,19 +204,20 @@ class Filter(Component):
     least ``absorb``. Class variables say where it runs:
 
     schedule  phases of a slot in their order, of "predict", "sense" and "exchange"; None: not in
-              slots. A filtered one predicts to a slot first, a prediction filter last
+              slots. "predict" comes first if samples show filtered estimates, after "sense" if they
+              show predictions
     clocks    what may make its nodes transmit in continuous time, of CLOCKS; (): nothing
     predicts  a sample in slots is the prediction with which the slot begins, else the estimate
               after the slot's exchanges
     first_slot  the first slot in which nodes exchange
     pairwise  in slots nodes exchange in pairs (a matching), else all with all neighbours
-    one_way   links may go one way, and nodes need not all be joined, in slots
+    one_way   in slots links may go one way, and the graph need not be connected
     inverts   covariances must never be singular
     talks     nodes exchange messages
-    pooled    one filter reads the sensors of all nodes at once
+    pooled    one filter reads the sensors of all nodes at once, and its estimate is every node's
     needs_samples  it cannot use increment sensors
-    slot_kernel    the compiled form of the filter in slots (algorithms.kernels.slots), of its own
-              class only; None: it runs in the SimPy engine
+    slot_kernel    the compiled form of the filter in slots (algorithms.kernels.slots), not used for
+                   derived classes; None: it runs in the SimPy engine
     unrolled       ``slot_kernel`` is compiled for each n up to 4, with unrolled loops: only where
                    that makes runs a tenth faster
     newest_only    of several messages of one sender at one instant the newest counts
@@ -252,6 +254,9 @@ class Filter(Component):
     unrolled: ClassVar[bool] = False
 
     def __init_subclass__(cls) -> None:
+        """Raise TypeError if a derived class has a method of the deprecated contracts, by name or
+        by its arguments.
+        """
         super().__init_subclass__()
         # A method by a former name would never be called: fail when the class is defined.
         for name, present in FORMER.items():
@@ -317,15 +322,16 @@ class Filter(Component):
     def shift(self, state: Any, offset: FloatArray) -> Any:
         """Return the state with ``offset`` (n,) added to the estimate and to everything like one.
 
-        Filters that are affine in readings and payloads commute with such a shift of the truth,
-        and their errors are then simulated to all digits on unstable plants (``commutes``). A class
-        that defines one of STEPS itself says so by defining ``shift`` too.
+        Engines call it when they move the origin of coordinates near to the true state, so that
+        errors on unstable plants keep their digits. That needs a filter that commutes with such a
+        shift (``commutes``), as those that are affine in readings and payloads do. A class that
+        defines one of STEPS itself says so by defining ``shift`` too.
         """
         return state._replace(xhat=state.xhat + offset)
 
     def shift_payload(self, payload: Any, offset: FloatArray) -> Any:
-        """Return a payload under way with ``offset`` (n,) added to the estimate in it; ``offset``
-        refers to the time of sending.
+        """Return a payload under way with ``offset`` (n,) added to the estimate in it, when the
+        engine calls ``shift`` for all states; ``offset`` refers to the time of sending.
         """
         return payload._replace(xhat=payload.xhat + offset)
 
@@ -339,13 +345,14 @@ class Filter(Component):
         """Return the seconds of increments that ``update`` may use at once from this state on.
 
         A large covariance shrinks fast, and the weights of readings change as fast: on the time
-        scale 1 / trace(P G), after a first guess or after a reset by a neighbour that knew less.
+        scale 1 / trace(P G), G = H' R^-1 H, after a first guess or after a reset by a neighbour
+        that knew less.
         """
         return float(state.model.max_interval(state.root))
 
     def steps(self, phase: int) -> int:
-        """Return how often exchange number ``phase`` of a slot, from 0, is repeated, in equal
-        times.
+        """Return how often exchange number ``phase`` of a slot, from 0, is repeated, at equal
+        intervals. A hook of derived classes; engines call ``exchange_steps``.
         """
         return 1
 
@@ -362,9 +369,9 @@ class Filter(Component):
         return True
 
     def sends_in_slots(self, phase: int, has_sensor: bool) -> bool:
-        """Return False if a node with or without a sensor sends nothing in exchange number
-        ``phase``; in slots in which its recorded sensors have no row it is like one without. For
-        compiled filters, ``emit`` says it for the others.
+        """Return False if a node that has a sensor (``has_sensor``) or has none sends nothing in
+        exchange number ``phase``; in slots in which its recorded sensors have no row it counts as
+        one without. Asked for compiled filters only; with others ``emit`` decides.
         """
         return True
 
@@ -378,12 +385,16 @@ class Filter(Component):
         return n + n * (n + 1) // 2
 
     def slot_stopping(self) -> int:
-        """Return the exchange in which nodes may stop for good (-1: none); for compiled filters."""
+        """Return the number of the exchange of a slot after which a node may freeze its network
+        estimate for good (``stopped``), -1 if there is none; for compiled filters.
+        """
         return -1
 
     def moves_estimates(self, phase: int) -> bool:
-        """Return False if exchange number ``phase`` of a slot leaves all estimates as they are; for
-        compiled filters.
+        """Return False if exchange number ``phase`` of a slot leaves all estimates as they are.
+
+        A stochastic trigger that wraps this filter asks: the innovation may then be computed before
+        or after that exchange.
         """
         return True
 
@@ -461,7 +472,9 @@ class Filter(Component):
 
 
 def _accepts(method: Any, count: int) -> bool:
-    """Return True if a method takes ``count`` arguments and none by the name of SlotFilter's."""
+    """Return True if a ``method`` takes ``count`` arguments, ``self`` included, and none is called
+    ``phase``, which only the deprecated SlotFilter passed.
+    """
     parameters = inspect.signature(method).parameters
     kinds = [parameter.kind for parameter in parameters.values()]
     several = inspect.Parameter.VAR_POSITIONAL in kinds

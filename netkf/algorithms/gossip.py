@@ -1,4 +1,8 @@
-"""The gossip interactive Kalman filter of Kar and Moura, paper G (10)."""
+"""The gossip interactive Kalman filter of Kar and Moura, paper G (10).
+
+``gossip_slots`` simulates many runs in the compiled engine, in place of the methods of ``Gossip``;
+the types of its arguments are described in ``kernels.slots``.
+"""
 
 from __future__ import annotations
 
@@ -43,6 +47,7 @@ def gossip_slots(
         for s in range(plan.up.shape[1]):
             # Samples show predictions: before the reading of the slot.
             store_sample_of_slot(nodes, plan, samples, scratch, b, s)
+            # Keep the estimates relative to an origin near the true state.
             rebase(nodes, readings, scratch, b, s)
             if plan.exchanged[s]:
                 swap_pairs(nodes, plan, links, scratch, b, s)
@@ -120,8 +125,9 @@ class Gossip(Filter):
         """
         if not messages:
             return state
-        _, _, pair, age = messages[-1]
-        xhat, root = state.model.extrapolate(pair.xhat, pair.root, age)
+        message = messages[-1]
+        pair = message.payload
+        xhat, root = state.model.extrapolate(pair.xhat, pair.root, message.age)
         return state._replace(xhat=xhat, root=root)
 
     shift = Filter.shift  # affine

@@ -1,4 +1,7 @@
-"""The hybrid Kalman-Bucy filter of Tanwani (CDC 2021), paper H (4), (7), (9)."""
+"""The hybrid Kalman-Bucy filter of Tanwani (CDC 2021), which is paper H here: (4), (7), (9).
+
+Between messages a node runs the Kalman-Bucy filter (4); messages reset estimate and covariance.
+"""
 
 from __future__ import annotations
 
@@ -17,10 +20,11 @@ from netkf.linalg.arrays import FloatArray
 @built_in("hybrid")
 @dataclass(frozen=True, eq=False)
 class Hybrid(Filter):
-    """Convex resets of estimate and covariance with weight ``epsilon`` for each neighbour heard.
+    """A Kalman-Bucy filter on the node's own readings whose estimate and covariance are reset to
+    convex combinations, with weight ``epsilon`` for each neighbour heard.
 
-    ``epsilon`` is the off-diagonal entry of ``Pi = I - epsilon L``, H (5): 0 < epsilon <= 1/max
-    degree. A message that took its time is predicted to its arrival first.
+    ``epsilon`` is the off-diagonal entry of ``Pi = I - epsilon L``, L the graph's Laplacian, paper
+    H (5): 0 < epsilon <= 1/max degree. A delayed message is predicted to its arrival first.
     """
 
     epsilon: float = field(number(above=0.0, high=1.0))
@@ -28,7 +32,7 @@ class Hybrid(Filter):
     paper: ClassVar[str] = "hybrid"
     combination: ClassVar[str] = "convex"
     P_by_design: ClassVar[tuple[str, str]] = ("", "larger")
-    schedule: ClassVar[tuple[str, ...] | None] = None
+    schedule: ClassVar[tuple[str, ...] | None] = None  # continuous time only
 
     def absorb(self, state: State, messages: Sequence[Message], exchange: Exchange) -> State:
         """Return the state after a reset by paper H (7) and (9): the convex combination of the
@@ -42,7 +46,7 @@ class Hybrid(Filter):
         self, state: State, messages: Sequence[Message]
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return weights (k,), estimates (k, n) and roots (k, n, n) of the node itself, first, and
-        of its k - 1 messages, predicted to now.
+        of its k - 1 messages, predicted to now. Derived classes may override it.
         """
         return weighted_pairs(state, messages)
 
@@ -54,6 +58,7 @@ class Hybrid(Filter):
 
     def largest_degree(self) -> float:
         """Return ``1 / epsilon``; with more neighbours the node's own weight would be negative."""
+        # A little more, so that rounding of 1 / epsilon excludes no whole number.
         return (1.0 + 1e-12) / self.epsilon
 
     shift = Filter.shift  # affine: the weights sum to one
