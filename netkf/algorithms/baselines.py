@@ -1,4 +1,8 @@
-"""The two baselines of every comparison: no communication, and all readings at one place."""
+"""The two baselines of every comparison: no communication, and all readings at one place.
+
+``local_slots`` simulates many runs in the compiled engine, in place of the classes' methods; the
+types of its arguments are described in ``kernels.slots``.
+"""
 
 from __future__ import annotations
 
@@ -44,6 +48,7 @@ def local_slots(
                 predict_all(nodes, scratch, b)
                 read_all(nodes, readings, scratch, b, s)
             store_sample_of_slot(nodes, plan, samples, scratch, b, s)
+            # Keep the estimates relative to an origin near the true state.
             rebase(nodes, readings, scratch, b, s)
 
 
@@ -64,13 +69,15 @@ class Local(Filter):
         """Return the state: nothing arrives."""
         return state
 
-    shift = Filter.shift  # affine
+    shift = Filter.shift  # affine in the readings
 
 
 @built_in("central")
 @dataclass(frozen=True, eq=False)
 class Central(Local):
-    """One Kalman(-Bucy) filter reads all sensors without delay or loss; every node shows it."""
+    """One Kalman(-Bucy) filter reads all sensors without delay or loss; its estimate is recorded
+    for every node.
+    """
 
     pooled: ClassVar[bool] = True
     slot_kernel = staticmethod(local_slots)

@@ -1,10 +1,14 @@
-"""The hybrid filter with constant gains, paper H Remark 1: simpler, and never better than Riccati
-gains.
+"""The hybrid filter of Tanwani (CDC 2021), paper H, with constant gains, Remark 1: simpler, and
+never better than Riccati gains.
 
     dxhat = A xhat dt + L (dy - H xhat dt),   dP/dt = (A - L H) P + P (A - L H)' + L R L' + Q
 
 for increments; a sample or a reading in slots moves the estimate by ``L (y - H xhat)`` and P to
-``(I - L H) P (I - L H)' + L R L'``. Resets are those of paper H (7) and (9).
+``(I - L H) P (I - L H)' + L R L'``. Messages reset estimate and P to convex combinations with
+those of the senders, paper H (7) and (9).
+
+``constant_gain_slots`` simulates many runs in the compiled engine, in place of the methods of
+``ConstantGain``; the types of its arguments are described in ``kernels.slots``.
 """
 
 from __future__ import annotations
@@ -65,11 +69,11 @@ class ConstantGainState(NamedTuple):
 
 
 class ConstantGainArrays(NamedTuple):
-    """Constant matrices of H filters, for whitened readings.
+    """Constant matrices of H filters of p rows at most, for whitened readings (noise variance 1).
 
     closed : (H, n, n), I - L H
     noise : (H, n, n), lower triangular root of L R L'
-    gain : (H, n, p), L times the root of R
+    gain : (H, n, p), L times the Cholesky factor of R
     """
 
     closed: FloatArray
@@ -101,10 +105,12 @@ def constant_gain_slots(
                 for h in range(len(nodes.rows)):
                     if nodes.rows[h] > 0:
                         correct_by_gain(nodes, readings, scratch, arrays, b, s, h)
+                # Messages are copies from before the exchange: all resets are simultaneous.
                 copy_pairs(nodes, scratch, b)
                 for h in range(len(nodes.rows)):
                     combine_convex_roots(nodes, plan, links, scratch, b, s, h)
             store_sample_of_slot(nodes, plan, samples, scratch, b, s)
+            # Keep the estimates relative to an origin near the true state.
             rebase(nodes, readings, scratch, b, s)
 
 
@@ -124,7 +130,8 @@ def correct_by_gain(
     last axis of both is that of the runs side by side.
     """
     lanes, n = scratch.lanes, nodes.xhat.shape[2]
-    # All innovations refer to the estimate before the reading, since L is the gain of all its rows.
+    # L (y - H xhat) in ``moved_mean``: all innovations refer to the estimate before the reading,
+    # since L is the gain of all its rows together.
     for i in range(n):
         store(lanes, scratch.moved_mean, i, 0.0)
     for k in range(nodes.rows[h]):
@@ -138,7 +145,7 @@ def correct_by_gain(
     for i in range(n):
         total = load(lanes, nodes.xhat, b, h, i) + load(lanes, scratch.moved_mean, i)
         store(lanes, nodes.xhat, b, h, i, total)
-    # (I - L H) P (I - L H)' + L R L' has the form of a prediction.
+    # (I - L H) P (I - L H)' + L R L' has the form of a prediction F P F' + Q.
     move_root(scratch, nodes.root, b, h, arrays.closed[h], arrays.noise[h])
 
 
@@ -171,8 +178,8 @@ class ConstantGain(Filter):
     def slot_arrays(
         self, states: Sequence[Any], infos: Sequence[NodeInfo], runs: int
     ) -> tuple[ConstantGainArrays]:
-        """Return ``I - L H`` (H, n, n), roots of ``L R L'`` (H, n, n) and gains L (H, n, p) of the
-        H nodes with these ``states``, for whitened readings; all ``runs`` share them.
+        """Return the last argument of ``constant_gain_slots``: the constant matrices of the H nodes
+        that start in these ``states``, which all ``runs`` share.
         """
         n = len(states[0].xhat)
         max_rows = max(1, *(state.gain.shape[1] for state in states))
@@ -208,7 +215,8 @@ class ConstantGain(Filter):
         if state.loop is None:
             xhat, root = state.model.predict(state.xhat, state.root, gap)
             return state._replace(xhat=xhat, root=root)
-        # The estimate moves without readings, which update() adds; P is that of the closed loop.
+        # The estimate moves without readings, which update() adds; P is that of the closed loop,
+        # dP/dt = (A - L H) P + P (A - L H)' + L R L' + Q.
         xhat, _ = state.model.extrapolate(state.xhat, state.root, gap)
         _, root = state.loop.predict(state.xhat, state.root, gap)
         return state._replace(xhat=xhat, root=root)
@@ -228,7 +236,7 @@ class ConstantGain(Filter):
             return state._replace(xhat=x[0])
         if not len(reading.y):
             return state
-        # P+ = (I - L H) P (I - L H)' + L R L' has the form of a prediction.
+        # P+ = (I - L H) P (I - L H)' + L R L' has the form of a prediction F P F' + Q.
         closed, noise = sample_maps(state.gain, reading.H, reading.R)
         x, H = state.xhat.reshape(1, -1).copy(), np.ascontiguousarray(reading.H)
         correct_by_innovation(x, 0, H, state.gain, reading.y, np.empty(len(state.xhat)))
@@ -249,8 +257,8 @@ class ConstantGain(Filter):
     shift = Filter.shift  # affine: the weights sum to one
 
     def max_measurement_interval(self, state: ConstantGainState) -> float:
-        """Return the seconds in which the gain lets the estimate follow the readings; infinity
-        without increments.
+        """Return the seconds of increments that ``update`` may use at once: a fixed part of
+        1 / |L H|, in which the gain lets the estimate follow them; infinity without increments.
         """
         return usable(gain_rate(state.gain, state.model.H) if state.loop is not None else 0.0)
 
@@ -283,8 +291,8 @@ class ConstantGain(Filter):
 
 
 def _check_kinds(scenario: Any, node: int, placed: Sequence[Any]) -> None:
-    """Raise ScenarioError if ``node`` has readings at several times, which one gain cannot weigh;
-    ``placed`` are its sensors.
+    """Raise ScenarioError if ``node``, an id, has readings at several times, which one gain cannot
+    weigh; ``placed`` are its sensors.
     """
     if scenario.slotted or len(placed) < 2:
         return

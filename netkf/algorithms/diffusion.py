@@ -1,4 +1,10 @@
-"""The diffusion filter of Xie, Gan and Liu: adapt, then combine by covariance intersection, D."""
+"""The diffusion filter of Xie, Gan and Liu, which is paper D here: each node updates with its own
+readings, then combines its estimate with the neighbours' by covariance intersection.
+
+``diffusion_slots`` simulates many runs in the compiled engine, in place of the methods of
+``DiffusionFilter``; the types of its arguments are described in ``kernels.slots``. A root [Z, z]
+(n, n + 1) of information stands for ``Z' Z = P^-1`` and the mean ``Z^-1 z`` relative to a centre.
+"""
 
 from __future__ import annotations
 
@@ -44,7 +50,7 @@ class DiffusionState(NamedTuple):
 
     xhat, root : estimate (n,) and root (n, n) of its covariance
     model : of the plant and the node's sensors
-    own : weight that the node gives to itself when all messages arrive
+    own : weight that the node gives to its own estimate when all messages arrive
     """
 
     xhat: FloatArray
@@ -59,7 +65,7 @@ class DiffusionState(NamedTuple):
 
 
 class DiffusionWeights(NamedTuple):
-    """The weights ``own`` (H,) that H filters give to themselves when all messages arrive;
+    """The weights ``own`` (H,) that H filters give to their own estimates when all messages arrive;
     ``keep_own``: whether the weights of lost messages are added to them.
     """
 
@@ -76,6 +82,7 @@ def applied_weights(lanes: Lanes, own: float, received: Any, keep_own: bool) -> 
     messages that arrived in each of L runs; ``keep_own``: lost weights go to the own one.
     """
     total, remainder = own + received, 1.0 - received
+    # Rounding may bring the sum of the others above 1.
     remainder = select(remainder > 0.0, remainder, 0.0)
     # "keep-own", or weights that are all 0: the own weight is 1 minus the others.
     is_zero = total == 0.0
@@ -117,13 +124,14 @@ def diffusion_slots(
         for s in range(plan.up.shape[1]):
             # Samples show predictions: before the reading of the slot.
             store_sample_of_slot(nodes, plan, samples, scratch, b, s)
+            # Keep the estimates relative to an origin near the true state.
             rebase(nodes, readings, scratch, b, s)
             if plan.sensed[s]:
                 read_all(nodes, readings, scratch, b, s)
                 predict_all(nodes, scratch, b)
             if plan.exchanged[s]:
-                # Copies of all estimates and the inverses of their roots, computed once for each
-                # sender: they are the messages.
+                # Messages: copies of all estimates from before the exchange, and the inverses of
+                # their roots, computed once for each sender.
                 for h in range(len(nodes.rows)):
                     for i in range(nodes.xhat.shape[2]):
                         store(
@@ -165,7 +173,8 @@ def combine_senders(
     # With own weight 1 the estimate stays to the last bit.
     if not any_lane(own != 1.0):
         return
-    # sum w_j P_j^-1 as roots: the own term first, then the others are merged into it.
+    # sum w_j P_j^-1 as a root [Z, z] relative to the own estimate: the own term first, then the
+    # others are merged into it.
     whiten(lanes, scratch.total, own, scratch.root, scratch.xhat, h, h)
     for m in range(links.first[h], links.first[h + 1]):
         arrived = load_flags(lanes, plan.up, b, s, 0, links.direction[m])
@@ -174,7 +183,8 @@ def combine_senders(
             weight = select(arrived, links.weight[m] / divisor, 0.0)
             whiten(lanes, scratch.whitened, weight, scratch.root, scratch.xhat, links.sender[m], h)
             merge_lanes(lanes, scratch.total, scratch.whitened)
-    # P = (sum w P^-1)^-1 and the mean, D (8) and (9).
+    # P = (sum w_j P_j^-1)^-1, paper D (8), and the mean P sum w_j P_j^-1 x_j, (9); in lanes with
+    # own weight 1 nothing changes.
     finish_lanes(
         lanes,
         nodes.root,
@@ -191,18 +201,21 @@ def combine_senders(
 @built_in("diffusion")
 @dataclass(frozen=True, eq=False)
 class DiffusionFilter(Filter):
-    """D Algorithm 1, (6)-(9), with any F in place of D's identity; slots show predictions.
+    """Paper D Algorithm 1, (6)-(9), with any F in place of the paper's identity; samples in slots
+    are predictions.
 
-    Under clocks a node combines what it heard at one instant, predicted to now where it took time.
+    Under clocks a node combines its estimate with those that it heard at one instant; those of
+    delayed messages are predicted to now first.
 
     weights entry [l][i] is the weight node i gives to what node l sends, in the order of node ids:
-            columns sum to 1, and D's theorems want the rows to (balanced); or "metropolis",
-            1 / (1 + the larger number of incoming links) for each link and the rest for oneself
+            columns sum to 1, and paper D's theorems need rows that sum to 1 too; or "metropolis",
+            1 / (1 + the larger number of incoming links) for each link and the rest for the node
     on_loss what becomes of the weight of a message that did not come (its row in the trace is
-            "lost" or "late"): "renormalise" divides the weights of what came, the own one
+            "lost" or "late"): "renormalise" divides the weights of those that came, the own one
             included, by their sum; "keep-own" adds it to the own one
 
-    Either way the weights sum to 1 and P stays consistent; a node that heard nothing predicts.
+    Either way the weights sum to 1 and P stays at least the covariance of the error; a node that
+    heard nothing keeps its estimate.
     """
 
     weights: str | FloatArray = field(
@@ -224,25 +237,26 @@ class DiffusionFilter(Filter):
     def slot_arrays(
         self, states: Sequence[Any], infos: Sequence[NodeInfo], runs: int
     ) -> tuple[DiffusionWeights]:
-        """Return the own weights (H,) of the H nodes that ``infos`` describes, and the rule for
-        lost messages.
+        """Return the last argument of ``diffusion_slots``: the own weights (H,) of the H nodes that
+        ``infos`` describes, and the rule for lost messages.
         """
         own = np.array([info.own_weight for info in infos], dtype=np.float64)
         return (DiffusionWeights(own, self.on_loss == "keep-own"),)
 
     def __post_init__(self) -> None:
+        """Raise ScenarioError if a weight is negative or a column does not sum to 1."""
         super().__post_init__()
         if not isinstance(self.weights, str):
             check_columns(self.weights)
 
     @property
     def pair_weights(self) -> FloatArray | None:
-        """The weights of N nodes (N, N), ``weights``, where they are a matrix, else None."""
+        """The matrix (N, N) of weights of N nodes, None for Metropolis weights."""
         return None if isinstance(self.weights, str) else self.weights
 
     def init(self, model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo) -> DiffusionState:
         """Return the first state of a node, with estimate ``mean`` (n,) and covariance ``cov``
-        (n, n); the node knows its own weight.
+        (n, n) and the weight of its own estimate from ``node``.
         """
         return DiffusionState(mean, first_root(cov), model, node.own_weight)
 
@@ -264,7 +278,7 @@ class DiffusionFilter(Filter):
 
     def share(self, own: float, arrived: list[float]) -> tuple[float, list[float]]:
         """Return the own weight and those of the messages that arrived, which sum to 1, from the
-        nominal ones ``own`` and ``arrived``, one for each message.
+        nominal ones ``own`` and ``arrived``, one for each message: the rule ``on_loss``, applied.
         """
         # fsum: the sum must not depend on the order of messages.
         own_weight, divisor = applied_weights_single(

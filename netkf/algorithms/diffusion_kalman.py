@@ -1,5 +1,10 @@
 """The diffusion Kalman filter: Cattivelli and Sayed, "Diffusion strategies for distributed Kalman
 filtering and smoothing", IEEE Trans. Automatic Control 55, 2010, Algorithm 1.
+
+In each slot nodes first exchange readings and update with all that they hear (step 1: the result is
+psi), then exchange psi and form weighted means (step 2). ``diffusion_kalman_slots`` simulates many
+runs in the compiled engine, in place of the methods of ``DiffusionKalman``; the types of its
+arguments are described in ``kernels.slots``.
 """
 
 from __future__ import annotations
@@ -33,13 +38,13 @@ from netkf.linalg.compiling import kernel
 from netkf.linalg.lanes import ONE
 
 READINGS, ESTIMATES = 0, 1
-"""The two exchanges of a slot."""
+"""Numbers of the two exchanges of a slot, ``Exchange.phase``."""
 
 
 class DiffusionKalmanState(NamedTuple):
     """The state of a node.
 
-    xhat : estimate (n,), psi between the exchanges
+    xhat : estimate (n,); between the two exchanges of a slot it is psi
     root : root (n, n) of P
     model : of the plant and the node's sensors
     reading : the node's own reading of this slot, or None
@@ -75,8 +80,10 @@ def diffusion_kalman_slots(
         for s in range(plan.up.shape[1]):
             if plan.sensed[s]:
                 predict_all(nodes, scratch, b)
+                # Step 1, psi: update with the own reading and those that arrive in exchange 0.
                 for h in range(len(nodes.rows)):
                     fuse_readings(nodes, readings, plan, links, scratch, True, b, s, h)
+                # Step 2, in exchange 1: xhat_i = psi_i + sum_l c_{l,i} (psi_l - psi_i).
                 # All differences before any estimate moves: the combination is simultaneous.
                 for h in range(len(nodes.rows)):
                     sum_differences(
@@ -85,6 +92,7 @@ def diffusion_kalman_slots(
                 for h in range(len(nodes.rows)):
                     add_to_estimate(scratch.lanes, nodes.xhat, b, h, scratch.xhat)
             store_sample_of_slot(nodes, plan, samples, scratch, b, s)
+            # Keep the estimates relative to an origin near the true state.
             rebase(nodes, readings, scratch, b, s)
 
 
@@ -94,9 +102,9 @@ def sum_differences_single(
 ) -> None:
     """Write into ``differences`` (1, n, 1) the weighted sum of x_j - x_0 over the estimates x_j
     that arrive at one node in one run; x (1, H, n, 1) holds its own estimate x_0 and those of its
-    senders, ``up`` (1, 1, 1, W, 1) flags their messages.
+    senders, ``links`` their weights, and ``up`` (1, 1, 1, W, 1) flags their messages.
 
-    Axes: W directed links, H nodes.
+    Axes: W directed links, H nodes. For ``combine_estimates``.
     """
     sum_differences(ONE, x, 0, 0, links, up, 0, 0, True, differences)
 
@@ -108,10 +116,10 @@ class DiffusionKalman(Filter):
 
     weights entry [l][i] is the weight c_{l,i} that node i gives to what node l sends, in the order
             of node ids: columns sum to 1; or "metropolis", 1 / (1 + max degree) for each link and
-            the rest for oneself
+            the rest for the node itself
 
-    The weight of an estimate that does not come stays with the node itself. P is that of the
-    readings a node has used; the combination leaves it as it is, so it is no bound on the error.
+    The weight of an estimate that does not come stays with the node itself. P counts the readings
+    that a node has used; the combination leaves it as it is, so it is no bound on the error.
     """
 
     weights: str | FloatArray = field(
@@ -128,13 +136,14 @@ class DiffusionKalman(Filter):
     unrolled: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
+        """Raise ScenarioError if a weight is negative or a column does not sum to 1."""
         super().__post_init__()
         if not isinstance(self.weights, str):
             check_columns(self.weights)
 
     @property
     def pair_weights(self) -> FloatArray | None:
-        """The weights of N nodes (N, N), ``weights``, where they are a matrix, else None."""
+        """The matrix (N, N) of weights of N nodes, None for Metropolis weights."""
         return None if isinstance(self.weights, str) else self.weights
 
     def sends_in_slots(self, phase: int, has_sensor: bool) -> bool:

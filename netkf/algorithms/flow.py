@@ -1,4 +1,4 @@
-"""Flow filters: the deprecated contract for user filters in continuous time.
+"""Flow filters: the deprecated contract for user filters in continuous time, and two helpers.
 
 New filters derive from ``netkf.algorithms.filter.Filter``; ``algorithms.adapters`` wraps a flow
 filter as one. A flow filter is a frozen dataclass of parameters. Its state is a NamedTuple of
@@ -29,7 +29,9 @@ Reading = Increments
 
 
 class FlowState(NamedTuple):
-    """Estimate ``xhat`` (n,), its covariance ``P`` (n, n) and the model they move by."""
+    """The state of a node: estimate ``xhat`` (n,), its covariance ``P`` (n, n) and the model of
+    plant and own sensors by which they move.
+    """
 
     xhat: FloatArray
     P: FloatArray
@@ -49,7 +51,8 @@ class Payload(NamedTuple):
 class FlowFilter(Component):
     """The deprecated contract of filters in continuous time.
 
-    The base class is the Kalman-Bucy filter of H (4a), (4b); filters differ mostly in ``absorb``.
+    The base class is a Kalman-Bucy filter on the node's own readings, Tanwani (CDC 2021), paper H
+    (4a), (4b); filters differ mostly in ``absorb``.
     ``talks`` says whether its nodes exchange messages, ``pooled`` whether one filter reads the
     sensors of all nodes at once, ``inverts`` that covariances must never be singular.
     """
@@ -72,8 +75,8 @@ class FlowFilter(Component):
         return state._replace(xhat=xhat, P=P)
 
     def measure(self, state: Any, reading: Reading) -> Any:
-        """Return the state after the increments of the gap that just passed: ``reading.moments`` (2
-        p,).
+        """Return the state after the increments of the gap that just passed, ``reading.moments``
+        (2 p,): only the estimate moves, since ``flow`` has counted them in P.
         """
         xhat = gain_update(state.model.gains, state.P, state.xhat, reading.moments, reading.gap)
         return state._replace(xhat=xhat)
@@ -82,7 +85,8 @@ class FlowFilter(Component):
         """Return the seconds of readings that ``measure`` may use at once from this state on.
 
         A large covariance shrinks fast, and the weights of readings change as fast: on the time
-        scale 1 / trace(P G), after a first guess or after a reset by a neighbour that knew less.
+        scale 1 / trace(P G), G = H' R^-1 H, after a first guess or after a reset by a neighbour
+        that knew less.
         """
         return usable(float((state.P * state.model.information).sum()))
 
@@ -116,7 +120,9 @@ def interval_end(now: float, time: float, length: float) -> float:
     """Return the end, in seconds, of a measurement interval that begins at ``now`` and lasts
     ``length`` seconds, but ends at ``time`` at the latest.
 
-    An interval too short to change the clock would repeat for ever; it ends at ``time`` instead.
+    Engines cut the time to the next event, ``time``, into such intervals, see
+    ``Filter.max_measurement_interval``. One too short to change the clock would repeat for ever; it
+    ends at ``time`` instead.
     """
     end = now + length
     return end if now < end < time else time
@@ -124,7 +130,7 @@ def interval_end(now: float, time: float, length: float) -> float:
 
 def predict(model: FlowModel, payload: Payload, age: float) -> Payload:
     """Return a ``payload``, estimate (n,) and covariance (n, n), predicted ``age`` seconds ahead by
-    the model, without readings.
+    the model, without readings; for ``absorb`` of user filters, to bring late messages up to now.
     """
     if age <= 0.0:
         return payload

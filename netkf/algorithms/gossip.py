@@ -130,4 +130,4 @@ class Gossip(Filter):
         xhat, root = state.model.extrapolate(pair.xhat, pair.root, message.age)
         return state._replace(xhat=xhat, root=root)
 
-    shift = Filter.shift  # affine
+    shift = Filter.shift  # affine in readings and messages
