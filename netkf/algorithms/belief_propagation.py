@@ -6,6 +6,14 @@ to a neighbour is the sum of the node's own evidence and of that of all its *oth
 topology", Neural Computation 13, 2001). On a tree no reading can arrive on two ways: a node's
 belief is the Kalman filter with all readings that have reached it, in any order of the messages.
 On a graph with loops readings return to where they came from and count again: P is too small.
+
+Evidence is information about the state x as a root [Z, z] (n, n + 1) with Z lower triangular:
+``Z (x - c) = z + v``, cov(v) = I, relative to a centre c (n,), so that the information is ``Z' Z``
+and its estimate ``c + Z^-1 z``. Independent pieces add up: their rows are stacked, and made
+triangular again. The centre of all evidence of a node is its belief ``xhat``.
+
+``belief_slots`` simulates many runs in the compiled engine, in place of the methods of
+``BeliefPropagation``; the types of its arguments are described in ``kernels.slots``.
 """
 
 from __future__ import annotations
@@ -53,8 +61,10 @@ from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
 from netkf.linalg.lanes import LANES, ONE, aligned, blocks_of, in_lanes, load, store
 
-MAX_STEPS = 10_000  # far beyond the diameter of any tree of use: a larger value is a slip
+MAX_STEPS = 10_000
+"""Far beyond the diameter of any tree of use: a larger value is a slip."""
 SLOT, ALL = "slot", "all"
+"""Values of ``BeliefPropagation.memory``."""
 
 
 class HeardEvidence(NamedTuple):
@@ -67,13 +77,13 @@ class HeardEvidence(NamedTuple):
 
 
 class BeliefState(NamedTuple):
-    """The state of a node; evidence (n, n + 1) is relative to ``xhat``, see kernels.beliefs.
+    """The state of a node; all evidence (n, n + 1), roots [Z, z], is relative to ``xhat``.
 
     xhat, root : the belief (n,) and the lower triangular root (n, n) of its covariance
     model : of the plant and the node's sensors
     prior : evidence of the estimate before the readings in ``own`` and ``received``
     own : evidence of the node's own readings
-    senders, received : ids of neighbours, and the evidence that each sent last
+    senders, received : ids of the neighbours heard, and the evidence that each sent last
     node : the node's id
     """
 
@@ -93,11 +103,12 @@ class BeliefState(NamedTuple):
 
 
 class Beliefs(NamedTuple):
-    """A payload; evidence is relative to ``xhat``, and a receiver leaves out its own in ``heard``.
+    """A payload for all neighbours; evidence is relative to ``xhat``. Each receiver sums all of it
+    but what the sender has from the receiver itself (``evidence_for``).
 
     xhat : the sender's belief (n,)
     own : evidence (n, n + 1) of the sender's own readings
-    senders, heard : ids of the sender's neighbours, and the evidence of each
+    senders, heard : ids of the neighbours that the sender has heard, and the evidence of each
     """
 
     xhat: FloatArray
@@ -107,12 +118,12 @@ class Beliefs(NamedTuple):
 
 
 class BeliefArrays(NamedTuple):
-    """Arrays of belief propagation for B blocks of L runs, in one block if nothing is kept; H
-    filters and W directions of links.
+    """Arrays of belief propagation for B blocks of L runs (B = 1 for all blocks if nothing is kept
+    from slot to slot); H filters and W directed links.
 
-    steps : steps of a slot
-    keeps : whether messages are kept from slot to slot
-    back : the inverse of F (n, n) if they are
+    steps : steps of exchange in a slot
+    keeps : whether messages are kept from slot to slot, ``memory`` "all"
+    back : the inverse of F (n, n) if they are, for the prediction of evidence
     prior, own : evidence of priors and own readings (B, H, n, n + 1, L)
     received : evidence received on each direction (B, W, n, n + 1, L)
     scratch : evidence that is sent, and scratch
@@ -145,7 +156,7 @@ def belief_slots(
     ``arrays`` in place, and writes ``samples`` in the slots that have one.
     """
     for b in range(plan.up.shape[0]):
-        # Without messages that are kept all blocks share the arrays of evidence.
+        # If no message is kept for the next slot, all blocks share the arrays of evidence.
         k, lanes = min(b, arrays.own.shape[0] - 1), scratch.lanes
         own, received = arrays.own[k], arrays.received[k]
         for s in range(plan.up.shape[1]):
@@ -157,7 +168,8 @@ def belief_slots(
                         scratch.xhat, arrays.scratch.work,
                     )  # fmt: skip
                 for e in range(arrays.steps):
-                    # All messages of a step are made before any arrives.
+                    # All messages of a step are made before any arrives: each sender's evidence
+                    # but that of the receiver.
                     for h in range(len(nodes.rows)):
                         first, last = links.first[h], links.first[h + 1]
                         gather_evidence(lanes, own, received, first, last, h, arrays.scratch)
@@ -175,7 +187,8 @@ def belief_slots(
                 for h in range(len(nodes.rows)):
                     update_beliefs(nodes, links, scratch, arrays, b, h)
             store_sample_of_slot(nodes, plan, samples, scratch, b, s)
-            # Evidence is relative to the estimate: it needs no shift.
+            # Keep the estimates relative to an origin near the true state; evidence is relative to
+            # the estimate, and needs no shift.
             rebase(nodes, readings, scratch, b, s)
 
 
@@ -224,10 +237,12 @@ def update_beliefs(
     Axes: L runs side by side.
     """
     lanes, beliefs, k = scratch.lanes, arrays.scratch, min(b, arrays.own.shape[0] - 1)
+    # total = prior + own + sum of received, relative to the prediction, ``scratch.xhat``.
     copy_part(lanes, arrays.prior[k, h], beliefs.total)
     add_part(lanes, beliefs.total, arrays.own[k, h], beliefs.work)
     for m in range(links.first[h], links.first[h + 1]):
         add_part(lanes, beliefs.total, arrays.received[k, m], beliefs.work)
+    # root = Z^-1 and xhat = centre + Z^-1 z.
     finish_lanes(
         lanes, nodes.root, nodes.xhat, b, h, scratch.xhat, beliefs.total, beliefs.work, False
     )  # fmt: skip
@@ -243,7 +258,7 @@ def update_beliefs(
 def add_part_single(parts: FloatArray, total: FloatArray, work: FloatArray) -> None:
     """Add all ``parts`` (K, n, n + 1, 1), K pieces of independent evidence of one run, to ``total``
     (n, n + 1, 1) in place; evidence is a root [Z, z] of information Z' Z. ``work`` of the shape of
-    ``total`` is scratch.
+    ``total`` is scratch. For ``merge_evidence``.
     """
     for k in range(len(parts)):
         add_part(ONE, total, parts[k], work)
@@ -295,15 +310,15 @@ def finish_single(
 class BeliefPropagation(Filter):
     """Nodes send each neighbour the sum of their own evidence and of that of all other neighbours.
 
-    steps   messages on each direction in a slot; with as many as the tree is wide, and no losses,
-            every node is the central filter
+    steps   messages on each directed link in a slot; with as many as the diameter of the tree, and
+            no losses, every node has the estimate of the central filter
     memory  "slot": messages are about the readings of one slot, and what a node then believes is
-            its prior of the next one; "all": about all readings so far, for plants without noise.
-            Under clocks always "all"
+            its prior of the next one; "all": about all readings so far, for plants without process
+            noise. Under clocks always as with "all"
 
     On a tree P is the covariance of the error for whatever is lost, late or out of order; with
-    loops it is too small. With process noise messages of older readings would no longer be
-    independent, and are not kept.
+    loops it is too small. With process noise, which enters them all, messages about older readings
+    would no longer be independent, and must not be kept.
     """
 
     steps: int = field(integer(low=1, high=MAX_STEPS), default=1)  # type: ignore[assignment]
@@ -325,6 +340,7 @@ class BeliefPropagation(Filter):
         and scratch.
         """
         keeps, H, n = self.memory == ALL, len(states), len(states[0].xhat)
+        # W directed links; D: the most that lead to one node.
         W, D = sum(info.degree for info in infos), max(info.degree for info in infos)
         blocks = blocks_of(runs) if keeps else 1
         part = n, n + 1, LANES
@@ -421,7 +437,7 @@ class BeliefPropagation(Filter):
             return state
         received = dict(zip(state.senders, state.received, strict=True))
         for message in messages:
-            # Messages may overtake each other: an older one knows nothing that the newer does not.
+            # Messages may overtake each other: an older one holds nothing that the newer lacks.
             sent = exchange.time - message.age
             if message.sender in received and received[message.sender].sent > sent:
                 continue
@@ -429,6 +445,7 @@ class BeliefPropagation(Filter):
             # In slots a message is used in the slot in which it was sent.
             if message.age > 0.0 and not isinstance(state.model, SlotModel):
                 evidence = predict_evidence(evidence, backward(state.model, message.age))
+            # The sender's belief, predicted to now, is the centre of its evidence.
             centre, _ = state.model.extrapolate(message.payload.xhat, state.root, message.age)
             evidence = recentre_evidence(evidence, centre, state.xhat)
             received[message.sender] = HeardEvidence(evidence, sent)
@@ -442,7 +459,9 @@ class BeliefPropagation(Filter):
 
 
 def is_forest(scenario: Any) -> bool:
-    """Return True if no loop leads through the links of a scenario, whatever their directions."""
+    """Return True if the links of a ``netkf.Scenario``, whatever their directions, form no loop;
+    then the P of belief propagation is right.
+    """
     topology = scenario.topology
     # A graph is a forest if and only if it has as many links as nodes less components.
     pairs = {frozenset(link) for link in topology.directions}
@@ -483,7 +502,7 @@ def evidence_for(node: int, payload: Beliefs) -> FloatArray:
 
 
 def evidence_of(root: FloatArray) -> FloatArray:
-    """Return an estimate with the lower triangular root (n, n) of its covariance as evidence
+    """Return an estimate whose covariance has the lower triangular ``root`` S (n, n) as evidence
     (n, n + 1) relative to itself: [S^-1, 0].
     """
     n = len(root)
@@ -496,8 +515,8 @@ def compute_belief(state: BeliefState) -> BeliefState:
     """Return the state with the belief, ``xhat`` (n,) and ``root`` (n, n), that follows from its
     prior and all evidence; the centre of the evidence moves to the new ``xhat``.
     """
-    # From all evidence, and not as an update of the old belief: on an unstable plant that may be so
-    # far off that digits are lost.
+    # From all evidence, and not as an update of the old belief: on an unstable plant the old one
+    # may be so far off that digits are lost.
     total = merge_evidence([state.prior, state.own, *(one.evidence for one in state.received)])
     n, before = len(total), state.xhat
     x, root, centre = np.zeros((1, 1, n, 1)), np.zeros((1, 1, n, n, 1)), np.array(before)

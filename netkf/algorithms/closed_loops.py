@@ -32,6 +32,6 @@ def sample_maps(L: FloatArray, H: FloatArray, R: FloatArray) -> tuple[FloatArray
 
 def gain_rate(L: FloatArray, H: FloatArray) -> float:
     """Return the rate (1/s) at which increments move an estimate through the gain L (n, p): the
-    Frobenius norm of L H, with H (p, n). Intervals of increments must be short against 1 / rate.
+    Frobenius norm of L H, with H (p, n). Increments of at most 1 / rate seconds are used at once.
     """
     return float(np.linalg.norm(L @ H))

@@ -11,7 +11,9 @@ then both are predicted, ``xhat = F xhat+`` and ``yhat = G F (G^+ yhat+ + (I - G
 (``kernels.pseudo_states`` computes both steps). The gains are those of the Gauss-Markov theorem: B
 and M minimise the mean square error of yhat+, and K that of xhat+. They follow from the joint
 covariance of the errors of all nodes, in which nothing depends on data, and which is computed as if
-no message were lost and no reading were missing.
+no message were lost and no reading were missing (``GainSequence``). ``pseudo_slots`` simulates many
+runs in the compiled engine, in place of the methods of ``ConsensusInnovations``; the types of its
+arguments are described in ``kernels.slots``.
 
 The text of the paper was not at hand: its construction (pseudo-states, gains by the Gauss-Markov
 theorem) is followed, without the numbers of its equations. The null space of G lies in that of each
@@ -57,18 +59,18 @@ from netkf.linalg.compiling import kernel
 from netkf.linalg.lanes import LANES, ONE, aligned, blocks_of, in_lanes, store
 
 NEGLIGIBLE = 1e-6
-"""Deviation of a difference, relative to those of its terms, that counts as rounding."""
+"""Standard deviation of a difference, relative to those of its terms, that counts as rounding."""
 CONVERGED = 1e-14
-"""Relative change of covariances in a slot below which gains count as constant: some roundings."""
+"""Relative change of covariances in a slot, of a few roundings, below which gains are constant."""
 
 
 class Design(NamedTuple):
-    """Everything that determines the gains, as keys of a cache.
+    """Everything that determines the gains of a network; hashable, as the key of a cache.
 
     n, nodes : numbers of states and of nodes
     F, Q, cov : matrices (n, n) as bytes; ``cov`` is that of x(0)
     information : H' R^-1 H (N, n, n) of the nodes, as bytes
-    heard : indices of the nodes that each node hears
+    heard : for each node the indices of the nodes that it hears
     """
 
     n: int
@@ -84,7 +86,7 @@ class NodeGains(NamedTuple):
     """The gains of one node in one slot.
 
     B : (d, n, n) for the d nodes that it hears, in the order of their indices
-    M, K : (n, n) of the pseudo-observation, and of the pseudo-state
+    M, K : (n, n), of the pseudo-observation in yhat, and of the pseudo-state in xhat
     predicted, root : lower triangular roots (n, n) of the covariance of x - xhat, after the
                       prediction to the slot and at its end
     """
@@ -142,12 +144,14 @@ def pseudo_states(F: FloatArray, information: FloatArray) -> PseudoStates:
 class GainSequence:
     """The gains of all nodes from slot 1 on, computed on demand.
 
-    The errors ``x - xhat_i`` of all nodes, then ``y - yhat_i``, are linear in independent inputs of
-    variance 1: ``_errors`` (2 N n, inputs) holds the coefficients, so that covariances are products
-    of its rows, and differences of nearly equal estimates lose no digits.
+    The errors ``x - xhat_i`` of all N nodes, then ``y - yhat_i``, are linear in independent inputs
+    of variance 1 (x(0), plant noise, sensor noise): ``_errors`` (2 N n, inputs) holds the
+    coefficients, so that covariances are products of its rows, and differences of nearly equal
+    estimates lose no digits.
     """
 
     def __init__(self, design: Design) -> None:
+        """Set the errors at the start of the network of a ``design``; no gain is computed yet."""
         n, N = design.n, design.nodes
         self._n = n
         self._neighbours = design.heard
@@ -177,7 +181,7 @@ class GainSequence:
         of gains.
 
         Slots after convergence share one row. Slot 0 gets that of slot 1, since nothing happens in
-        it.
+        it. For the compiled engine.
         """
         slots = np.maximum(np.arange(first, first + count), 1)
         self.at(int(slots[-1]))
@@ -210,6 +214,7 @@ class GainSequence:
         nodes = range(len(self._neighbours))
         self._errors = np.hstack([self._predict(), self._driven])
         predicted = [self._covariance_root(i) for i in nodes]
+        # The order of the filter: yhat from the exchange, then xhat from the new yhat.
         gains = self._correct_pseudo_states()
         K = [self._correct_state(i) for i in nodes]
         # Only products of rows matter: QR reduces the inputs to as many as there are rows.
@@ -252,15 +257,16 @@ class GainSequence:
             e = self._pseudo_error(i)
             observed = self._information[i] @ self._pseudo.inverse
             innovation = observed @ e
-            # The noise of the pseudo-observation has the covariance H' R^-1 H.
+            # Its noise H' R^-1 v has the covariance H' R^-1 H, in inputs (columns) of its own.
             stop = first + self._noises[i].shape[1]
             innovation[:, first:stop] = self._noises[i]
             first = stop
-            # yhat_i is corrected by the differences to its neighbours' and by the innovation.
+            # yhat_i is corrected by the differences yhat_l - yhat_i = e_i - e_l to its neighbours'
+            # and by the innovation.
             theta = np.concatenate([*(e - self._pseudo_error(j) for j in neighbours), innovation])
             sizes = [variances(e) + variances(self._pseudo_error(j)) for j in neighbours]
             sizes.append(np.square(observed) @ variances(e) + np.diag(self._information[i]))
-            gain = optimal_gain(e, theta, np.concatenate(sizes))
+            gain = optimal_gain(e, theta, np.concatenate(sizes))  # [B_i1, ..., B_id, M_i]
             # All yhat are corrected at once, from those before the exchange.
             corrected.append(e - gain @ theta)
             split = np.stack(np.split(gain, len(neighbours) + 1, axis=1))
@@ -280,7 +286,9 @@ class GainSequence:
 
 
 def without_zeros(matrix: FloatArray) -> FloatArray:
-    """Return the columns (n, k) of ``matrix`` (n, n) that are not zero."""
+    """Return the columns (n, k) of ``matrix`` (n, n) that are not zero: a root of the same matrix
+    with fewer inputs.
+    """
     return np.asarray(matrix[:, matrix.any(axis=0)])
 
 
@@ -320,9 +328,9 @@ class PseudoState(NamedTuple):
     model : of the plant and the node's sensors
     yhat : estimate (n,) of the pseudo-state
     pseudo : matrices of pseudo-states
-    reading : whitened y (p,) and H (p, n) of this slot, or None
+    reading : whitened y (p,) and H (p, n) of this slot, noise variance 1, or None
     slot : number of the slot
-    design, node_index : from which the gains follow
+    design, node_index : the network and the node's index in it, from which the gains follow
     """
 
     xhat: FloatArray
@@ -347,7 +355,9 @@ class PseudoState(NamedTuple):
 
 
 class PseudoEstimate(NamedTuple):
-    """A payload: the sender's ``yhat`` (n,) and index, and G (n, n), which all nodes know."""
+    """A payload: the sender's ``yhat`` (n,) and index. G (n, n), which all nodes know, is not sent:
+    ``shift_payload`` needs it.
+    """
 
     yhat: FloatArray
     node_index: int
@@ -357,8 +367,8 @@ class PseudoEstimate(NamedTuple):
 class PseudoArrays(NamedTuple):
     """Arrays of all H nodes for B blocks of L runs.
 
-    pseudo, gains : matrices of pseudo-states, gains of some slots
-    table_row : row (S,) of each slot in ``gains``
+    pseudo, gains : matrices of pseudo-states, and the gains of the slots being simulated
+    table_row : row (S,) of each of the S slots in ``gains``
     yhat : estimates of pseudo-states (B, H, n, L)
     corrected : (H, n, L), scratch
     state, z : (n, L), scratch
@@ -401,6 +411,7 @@ def pseudo_slots(
                     predict_mean(nodes, scratch, b, h)
                 correct_all(nodes, readings, plan, links, scratch, arrays, b, s)
             store_sample_of_slot(nodes, plan, samples, scratch, b, s)
+            # Keep xhat and, alike, yhat relative to an origin near the true state.
             rebase(nodes, readings, scratch, b, s)
             shift_pseudo(scratch.lanes, arrays.yhat, readings, arrays.pseudo.G, b, s)
 
@@ -423,6 +434,7 @@ def correct_all(
     Axes: L runs side by side.
     """
     lanes, k = scratch.lanes, arrays.table_row[s]
+    # yhat+ of each filter, into ``corrected``: innovation z, then B and M.
     for h in range(len(nodes.rows)):
         fill_pseudo_innovation(
             lanes, arrays.yhat, b, h, nodes.rows[h], arrays.pseudo.inverse, readings, s,
@@ -432,7 +444,8 @@ def correct_all(
             lanes, arrays.yhat, b, h, links, plan.up, s, arrays.gains.B[k], arrays.gains.M[k],
             arrays.z, arrays.corrected,
         )  # fmt: skip
-    # Only after all filters have used the estimates from before the exchange.
+    # yhat <- yhat+ and xhat <- xhat + K (yhat+ - G xhat), only after all filters have used the
+    # estimates from before the exchange.
     for h in range(len(nodes.rows)):
         correct_state(
             lanes, nodes.xhat, arrays.yhat, b, h, arrays.gains.K[k], arrays.pseudo.G,
@@ -447,9 +460,9 @@ def correct_all(
 def predict_pseudo_single(
     x: FloatArray, y: FloatArray, A: FloatArray, coupling: FloatArray, work: FloatArray
 ) -> None:
-    """Replace the estimate y (1, 1, n, 1) of the pseudo-state G x of one node in one run by
-    ``A y + coupling x`` with its estimate x (1, 1, n, 1) of the state; A and ``coupling`` are
-    (n, n), ``work`` (n, 1) is scratch.
+    """Replace the estimate y (1, 1, n, 1) of the pseudo-state G x of one node in one run by its
+    prediction ``A y + coupling x``, with the estimate x (1, 1, n, 1) of the state; A and
+    ``coupling`` (n, n) as in ``PseudoStates``, ``work`` (n, 1) is scratch.
     """
     predict_pseudo(ONE, x, y, 0, 0, A, coupling, work)
 
@@ -467,7 +480,7 @@ def correct_single(
     ``arrays.yhat`` (1, H, n, 1) are those of its senders, and ``up`` (1, 1, 1, W, 1) flags their
     messages.
 
-    Axes: W directed links.
+    Axes: W directed links. For ``correct_estimates``.
     """
     gains, pseudo = arrays.gains, arrays.pseudo
     y, state, z = arrays.yhat, arrays.state, arrays.z
@@ -479,9 +492,9 @@ def correct_single(
 @built_in("consensus-innovations")
 @dataclass(frozen=True, eq=False)
 class ConsensusInnovations(Filter):
-    """Estimates of the pseudo-state move towards those of the neighbours and the node's own
-    observation, and estimates of the state towards them, with gains that are optimal for the whole
-    network; all nodes know its sensors and links.
+    """Each node moves its estimate of the pseudo-state towards those of the neighbours and its own
+    observation, and its estimate of the state towards that, with gains that are optimal for the
+    whole network; all nodes know its sensors and links.
 
     P is the covariance of the error if no message is lost. A term whose message is lost is left
     out, and P is then too small.
@@ -513,7 +526,7 @@ class ConsensusInnovations(Filter):
         self, states: Sequence[Any], arrays: tuple[Any, ...], first: int, count: int
     ) -> tuple[PseudoArrays]:
         """Return ``arrays`` with the gains of ``count`` slots from number ``first`` on, which
-        follow from the network and the start that are in ``states``.
+        follow from the network and its start, the ``design`` of all ``states``.
         """
         rows, gains = gain_sequence(states[0].design).table(first, count)
         return (arrays[0]._replace(table_row=rows, gains=gains),)
@@ -612,9 +625,10 @@ def correct_estimates(
     state: PseudoState, gains: NodeGains, received: Sequence[FloatArray]
 ) -> tuple[FloatArray, FloatArray]:
     """Return the estimates xhat (n,) of the state and yhat (n,) of the pseudo-state of a node after
-    an exchange in which it ``received`` the estimates (n,) of pseudo-states to which the gains B
-    belong, one by one.
+    an exchange in which it ``received`` the estimates (n,) of pseudo-states; ``gains.B`` (d, n, n)
+    holds the gain of each of these d.
     """
+    # The kernel takes blocks, nodes and lanes: the node itself is number 0, its senders follow.
     n, y = len(state.xhat), np.stack([state.yhat, *received])[None, :, :, None]
     links, up = star_of([1.0] * len(received))
     readings = block_of_reading(*(state.reading or (np.zeros(0), np.zeros((0, n)))))

@@ -257,8 +257,8 @@ class ConstantGain(Filter):
     shift = Filter.shift  # affine: the weights sum to one
 
     def max_measurement_interval(self, state: ConstantGainState) -> float:
-        """Return the seconds of increments that ``update`` may use at once: a fixed part of
-        1 / |L H|, in which the gain lets the estimate follow them; infinity without increments.
+        """Return the seconds of increments that ``update`` may use at once: 1 / |L H|, the time
+        scale on which the gain moves the estimate; infinity without increments.
         """
         return usable(gain_rate(state.gain, state.model.H) if state.loop is not None else 0.0)
 

@@ -1,5 +1,12 @@
 """Event-triggered consensus on information: Battistelli, Chisci and Selvi, "A distributed Kalman
 filter with event-triggered communication and guaranteed stability", Automatica 93, 2018.
+
+In each slot a node predicts, updates with its reading, sends its estimate unless its neighbours can
+predict it well enough (they keep a copy of what it sent last), and combines by covariance
+intersection (Xie, Gan and Liu, paper D (8) and (9)): ``P^-1 = sum w_j P_j^-1`` and
+``P^-1 x = sum w_j P_j^-1 x_j``. ``triggered_ci_slots`` simulates many runs in the compiled engine,
+in place of the methods of ``EventTriggeredCi``; the types of its arguments are described in
+``kernels.slots``.
 """
 
 from __future__ import annotations
@@ -68,8 +75,9 @@ class TriggeredState(NamedTuple):
 
     xhat, root : estimate (n,) and root (n, n) of its covariance
     model : of the plant and the node's sensors
-    sent : the neighbours' copy of this node's estimate, None before the first message
-    senders, copies : ids of neighbours, and the copy of the estimate of each
+    sent : the neighbours' copy of this node's estimate (what it sent last, predicted to now), None
+           before the first message
+    senders, copies : ids of the neighbours heard so far, and the copy of the estimate of each
     """
 
     xhat: FloatArray
@@ -90,9 +98,9 @@ class TriggeredCiArrays(NamedTuple):
     estimates: those received last on each link, then what each node sends now, then what it sent
     last.
 
-    alpha : threshold of the mean
+    alpha : threshold of the mean, see ``EventTriggeredCi.thresholds``
     ratio : 1 + delta, threshold of the covariance
-    share : share of a silent neighbour's information that counts
+    share : part of the information of a silent neighbour's copy that counts, 1 / widening^2
     x, root : the copies (B, C, n, L) and their roots (B, C, n, n, L)
     has_copy : (B, C, L), 1 once there is a copy
     mean, inverse : (W + H, n, L) and (W + H, n, n, L), scratch
@@ -123,11 +131,11 @@ def triggered_ci_slots(
 
     Changes ``nodes.xhat`` (B, H, n, L), ``nodes.root`` (B, H, n, n, L) and the copies in ``arrays``
     in place, writes 0 into ``plan.sent`` and ``plan.up`` for messages that are not sent, and writes
-    ``samples``. ``plan.part`` says which part of a slot is simulated.
+    ``samples``. ``plan.part`` says which part of a slot is simulated: all, up to the decisions to
+    send (SENDING), or from the arrivals on (ARRIVING).
     """
     for b in range(plan.up.shape[0]):
         for s in range(plan.up.shape[1]):
-            # A part of the plan: up to the decisions to send, or from the arrivals on.
             if plan.part != ARRIVING and plan.sensed[s]:
                 predict_all(nodes, scratch, b)
                 predict_copies(nodes, scratch, arrays, b)
@@ -142,6 +150,7 @@ def triggered_ci_slots(
                     for h in range(len(nodes.rows)):
                         combine_copies(nodes, plan, links, scratch, arrays, b, s, h)
                 store_sample_of_slot(nodes, plan, samples, scratch, b, s)
+                # Keep estimates and copies relative to an origin near the true state.
                 rebase(nodes, readings, scratch, b, s)
                 if readings.rebased[s]:
                     rebase_copies(readings, scratch.lanes, arrays, b, s)
@@ -168,8 +177,8 @@ def rebase_copies(
     readings: ReadingBlock, lanes: Lanes, arrays: TriggeredCiArrays, b: int, s: int
 ) -> None:
     """Move the origin of all C copies of estimates in block ``b`` to the true state of slot ``s``:
-    subtract ``readings.local[b, s]`` (n, L) from each of ``arrays.x[b]`` (C, n, L). The caller does
-    so where that of the estimates moves.
+    subtract ``readings.local[b, s]`` (n, L) from each of ``arrays.x[b]`` (C, n, L). To be called
+    in the slots in which ``rebase`` moves the origin of the estimates.
 
     Axes: L runs side by side.
     """
@@ -222,10 +231,10 @@ def decide_estimate(
     writes 0 into ``plan.sent[b, s, 0, h]`` (L,) where it does not.
 
     Updates in ``arrays`` the copy of what the node sent last, where it sends, and the copy of what
-    it sends now.
+    it sends now. ``plan.sent`` (B, S, E, H, L) is 1 on entry where the node is asked for a message.
     """
     lanes, copies = scratch.lanes, (arrays.x, arrays.root)
-    # Copies in order: last received on each link, sent now by each node, sent last by each node.
+    # Indices in the C copies: W last received on each link, H sent now, H sent last by each node.
     own = len(links.sender) + h
     last = own + len(nodes.rows)
     near = is_near(
@@ -263,6 +272,9 @@ def combine_copies(
 
     Changes ``nodes.xhat[b, h]`` (n, L) and ``nodes.root[b, h]`` (n, n, L); the estimates that
     arrive replace the copies of their links in ``arrays``. Axes: L runs side by side.
+
+    As roots: information P^-1 = Z' Z is [Z, z] (n, n + 1) with the mean Z^-1 z relative to the
+    node's own estimate.
     """
     lanes = scratch.lanes
     n = nodes.xhat.shape[2]
@@ -306,6 +318,7 @@ def combine_copies(
             weight = select(has_copy, weight, 0.0)
             whiten(lanes, scratch.whitened, weight, arrays.inverse, arrays.mean, m, own)
             merge_lanes(lanes, scratch.total, scratch.whitened)
+    # root = Z^-1 and xhat = own + Z^-1 z, but unchanged in lanes without any copy.
     finish_lanes(
         lanes, nodes.root, nodes.xhat, b, h, scratch.xhat, scratch.total, scratch.whitened,
         has_no_copy,
@@ -323,15 +336,16 @@ def is_near_single(
     """Return True if the second of two estimates, a copy, is near the first, in one run: estimates
     ``x`` (1, 2, n, 1) with lower triangular roots ``root`` (1, 2, n, n, 1), and ``bounds``
     (alpha, 1 + delta) as in ``EventTriggeredCi.thresholds``. ``ratio`` (n, n + 1, 1) and ``work``
-    (n, n, 1) are scratch.
+    (n, n, 1) are scratch. For ``EventTriggeredCi.is_near``.
     """
     near: bool = is_near(ONE, x, root, x, root, (0, 0, 1), bounds, ratio, work)
     return near
 
 
 def _is_information_consensus(value: Any) -> Filter:
-    """Return ``value`` if it is an HCMCI filter with one step of consensus on information; raises
-    TypeError or ValueError, which the rule of the field turns into a ScenarioError.
+    """Return ``value`` if it is the filter ``Hcmci`` (no derived class) with one step of consensus
+    on information a slot; raises TypeError or ValueError, which the rule of the field turns into a
+    ScenarioError.
     """
     if not isinstance(value, Hcmci) or type(value) is not Hcmci:
         raise TypeError
@@ -359,15 +373,18 @@ class EventTriggeredCi(Filter):
     """Consensus on information with one step a slot, in which a node sends only if its neighbours
     could not predict its estimate well enough; else they use what they have predicted.
 
-    inner       consensus on information with one step a slot
+    inner       the filter that decides what is combined: ``hcmci`` with consensus on information
+                and one step a slot
     thresholds  [alpha, delta]: a node is silent while ``(xhat - xbar)' P^-1 (xhat - xbar) < alpha``
                 where xbar and Pbar are what it sent last, predicted to now, and while
                 ``P < (1 + delta) Pbar`` and ``Pbar < (1 + delta) P``
 
-    In place of a silent neighbour's pair there is xbar with ``(1 + alpha^1/2)^2 (1 + delta) Pbar``,
-    which bounds the second moment of its error (derived): with d = xhat - xbar that of e + d is at
-    most ``(1 + a) P + (1 + 1/a) d d'`` for any a, and ``d d' <= alpha P``. With thresholds 0 it is
-    consensus on information. A lost message is not noticed by its sender: links should be sure.
+    In place of a silent neighbour's (xhat, P) there is xbar with the enlarged covariance
+    ``(1 + alpha^1/2)^2 (1 + delta) Pbar``, which bounds the second moment of its error (derived
+    here, not in the paper): with d = xhat - xbar that of e + d is at most
+    ``(1 + a) P + (1 + 1/a) d d'`` for any a > 0, ``d d' <= alpha P``, and a = alpha^1/2 is best.
+    With thresholds 0 it is consensus on information. A sender does not notice that its message was
+    lost: links should lose none.
     """
 
     inner: Filter = field(INNER, default=Hcmci(consensus=INFORMATION))
@@ -384,7 +401,7 @@ class EventTriggeredCi(Filter):
 
     def decides_in_slots(self) -> bool:
         """Return True: a node sends nothing while its neighbours' copy of its estimate is near
-        enough.
+        enough. The engine then asks for decisions in ``SlotPlan.sent``.
         """
         return True
 
@@ -413,7 +430,9 @@ class EventTriggeredCi(Filter):
 
     @property
     def widening(self) -> float:
-        """The factor (1 + alpha^1/2) (1 + delta)^1/2 of the root of a silent neighbour's pair."""
+        """The factor (1 + alpha^1/2) (1 + delta)^1/2 of the root of a silent neighbour's
+        covariance, which enlarges it as the class describes.
+        """
         alpha, delta = self.thresholds
         return (1.0 + math.sqrt(alpha)) * math.sqrt(1.0 + delta)
 
@@ -478,8 +497,8 @@ class EventTriggeredCi(Filter):
         self, state: TriggeredState, messages: Sequence[Message], exchange: Exchange
     ) -> TriggeredState:
         """Return the state after covariance intersection of the node's estimate with those
-        received, which become the copies of their senders, and with the widened copies of silent
-        neighbours.
+        received, which become the copies of their senders, and with the copies of silent
+        neighbours, whose covariances are enlarged (``widening``).
         """
         copies = dict(zip(state.senders, state.copies, strict=True))
         received = {
