@@ -156,13 +156,15 @@ class SlotAdapter(_Adapter):
         return int(self.inner.steps(phase))
 
     def redraws_links(self, phase: int, step: int) -> bool:
-        """Return True if links draw new outcomes in repetition ``step`` of exchange number
-        ``phase``, by the wrapped filter's ``redraws``.
+        """Return True if links draw anew whether messages arrive in repetition ``step`` of exchange
+        number ``phase``, by the wrapped filter's ``redraws``.
         """
         return bool(self.inner.redraws(phase, step))
 
     def stopped(self, state: Any) -> bool:
-        """Return True once the wrapped filter has frozen its network estimate."""
+        """Return True once the wrapped filter has permanently frozen what it computes of the whole
+        network by exchanges.
+        """
         return bool(self.inner.stopped(state))
 
     def conserved(self, state: Any) -> Mapping[str, float | Sequence[float]]:

@@ -201,12 +201,14 @@ def predict_beliefs(nodes: SlotNodes, scratch: SlotScratch, arrays: BeliefArrays
     ``update_beliefs``; else ``nodes.root[b]`` (H, n, n, L) is predicted too, the predicted belief
     becomes ``arrays.prior``, and all other evidence is cleared. Axes: L runs side by side.
     """
+    # k is the block of evidence: there is one for all b if nothing is kept.
     lanes, beliefs, k = scratch.lanes, arrays.scratch, min(b, arrays.own.shape[0] - 1)
     if not arrays.keeps:
         predict_all(nodes, scratch, b)
     for h in range(len(nodes.rows)):
         if arrays.keeps:
             predict_mean(nodes, scratch, b, h)
+            # Z <- Z F^-1, as no noise enters; the centre moves to F xhat.
             predict_part(lanes, arrays.prior[k, h], arrays.back, beliefs.total, beliefs.work)
             predict_part(lanes, arrays.own[k, h], arrays.back, beliefs.total, beliefs.work)
         else:
@@ -236,6 +238,7 @@ def update_beliefs(
 
     Axes: L runs side by side.
     """
+    # k is the block of evidence: there is one for all b if nothing is kept.
     lanes, beliefs, k = scratch.lanes, arrays.scratch, min(b, arrays.own.shape[0] - 1)
     # total = prior + own + sum of received, relative to the prediction, ``scratch.xhat``.
     copy_part(lanes, arrays.prior[k, h], beliefs.total)
@@ -540,6 +543,7 @@ def backward(model: Any, gap: float) -> FloatArray:
     if isinstance(model, SlotModel):
         power = np.linalg.matrix_power(model.F, round(gap / model.period))
         return np.asarray(np.linalg.inv(power), dtype=np.float64)
+    # The kernel writes exp(-A gap) into the first matrix; the others are scratch.
     maps = np.empty((6, *model.A.shape))
     fill_inverse_transition(model.A, gap, maps)
     return np.asarray(maps[0])

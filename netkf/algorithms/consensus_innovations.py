@@ -567,6 +567,7 @@ class ConsensusInnovations(Filter):
         """
         slot, n = state.slot, len(state.xhat)
         xhat, yhat = state.xhat, state.yhat.reshape(1, 1, n, 1).copy()
+        # A gap is a whole number of slots. yhat first: it needs the xhat of the same slot.
         for _ in range(round(gap / state.model.period)):
             x = np.array(xhat).reshape(1, 1, n, 1)
             predict_pseudo_single(x, yhat, state.pseudo.A, state.pseudo.coupling, np.empty((n, 1)))

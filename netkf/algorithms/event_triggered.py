@@ -205,15 +205,14 @@ def copy_estimate(
 
     Axes: B blocks of runs, K estimates.
     """
+    target_x, target_root = target
     for i in range(x.shape[2]):
-        former, present = load(lanes, target[0], b, index, i), load(lanes, x, b, sender, i)
-        store(lanes, target[0], b, index, i, select(flags, present, former))
+        former, present = load(lanes, target_x, b, index, i), load(lanes, x, b, sender, i)
+        store(lanes, target_x, b, index, i, select(flags, present, former))
         for j in range(i + 1):
-            former, present = (
-                load(lanes, target[1], b, index, i, j),
-                load(lanes, root, b, sender, i, j),
-            )
-            store(lanes, target[1], b, index, i, j, select(flags, present, former))
+            former = load(lanes, target_root, b, index, i, j)
+            present = load(lanes, root, b, sender, i, j)
+            store(lanes, target_root, b, index, i, j, select(flags, present, former))
 
 
 @kernel

@@ -363,8 +363,9 @@ class Filter(Component):
         return self.steps(phase)
 
     def redraws_links(self, phase: int, step: int) -> bool:
-        """Return True if links draw new outcomes in repetition ``step``, from 0, of exchange number
-        ``phase`` of a slot; else each keeps its last one. The first step always draws.
+        """Return True if links draw anew whether messages arrive in repetition ``step``, from 0, of
+        exchange number ``phase`` of a slot; else each keeps its last outcome. The very first step
+        always draws.
         """
         return True
 
@@ -423,16 +424,19 @@ class Filter(Component):
         return arrays
 
     def carried_estimates(self, reported: FloatArray, arrays: tuple[Any, ...]) -> FloatArray:
-        """Return the estimates (B, H, n, L) with which nodes go on to the next slot: B blocks of L
-        runs, H nodes.
+        """Return the estimates (B, H, n, L) with which nodes go on to the next slot, B blocks of L
+        runs, H nodes: a stochastic trigger that wraps this filter computes innovations from them.
 
-        By default they are the ``reported`` ones (B, H, n, L), which samples hold; ``arrays`` are
-        those of ``slot_arrays``.
+        By default they are the ``reported`` ones (B, H, n, L), which samples hold; a filter whose
+        samples show something else, as fused tracks, takes them from its ``arrays``, those of
+        ``slot_arrays``.
         """
         return reported
 
     def stopped(self, state: Any) -> bool:
-        """Return True once the node has permanently frozen its network estimate."""
+        """Return True once the node has permanently frozen its network estimate: what it computes
+        of all nodes by exchanges, such as their number and information in push-sum.
+        """
         return False
 
     def conserved(self, state: Any) -> Mapping[str, float | Sequence[float]]:
