@@ -633,6 +633,7 @@ def correct_estimates(
     n, y = len(state.xhat), np.stack([state.yhat, *received])[None, :, :, None]
     links, up = star_of([1.0] * len(received))
     readings = block_of_reading(*(state.reading or (np.zeros(0), np.zeros((0, n)))))
+    # A table of one slot (K = 1) and one node (N = 1), of which the W links are those received on.
     gain_arrays = SlotGains(*(np.array(getattr(gains, name)) for name in SlotGains._fields))
     table = SlotGains(gain_arrays.B[None], *(part[None, None] for part in gain_arrays[1:]))
     x = np.array(state.xhat).reshape(1, 1, n, 1)

@@ -228,6 +228,7 @@ class ConstantGain(Filter):
         if isinstance(reading, Increments):
             assert state.loop is not None
             model, n = state.model, len(state.xhat)
+            # The kernel changes x[0] and the moments in place; its last argument is scratch.
             x = state.xhat.reshape(1, n).copy()
             correct_by_moments(
                 x, 0, model.A, state.loop.A, model.H, state.gain, reading.moments.copy(),
@@ -239,6 +240,7 @@ class ConstantGain(Filter):
         # P+ = (I - L H) P (I - L H)' + L R L' has the form of a prediction F P F' + Q.
         closed, noise = sample_maps(state.gain, reading.H, reading.R)
         x, H = state.xhat.reshape(1, -1).copy(), np.ascontiguousarray(reading.H)
+        # x[0] <- x[0] + L (y - H x[0]), in place; the last argument is scratch.
         correct_by_innovation(x, 0, H, state.gain, reading.y, np.empty(len(state.xhat)))
         return state._replace(xhat=x[0], root=predict_root_alone(state.root, closed, noise))
 

@@ -444,6 +444,7 @@ class EventTriggeredCi(Filter):
             channel.loss.mean_delivery(link, scenario.table_probability(link)) == 1.0
             for link in scenario.topology.directions
         )
+        # A random delay (``fixed`` is None) may bring a message too late for its slot.
         if lossless and channel.delay.fixed is not None:
             return ()
         return (
