@@ -1,6 +1,21 @@
 """The stochastic event trigger: Han, Mo, Wu, Weerakkody, Sinopoli and Shi, "Stochastic
 event-triggered sensor schedule for remote state estimation", IEEE Trans. Automatic Control 60,
 2015; the closed-loop schedule.
+
+After a reading y a node is silent with probability exp(-z' Y z / 2): z = y - H xbar is the
+innovation, xbar the prediction, and the matrix Y the trigger. z' Y z is called the news of the
+reading. To receivers silence is as informative as a reading H xbar with noise R + Y^-1.
+
+Two filters implement this. ``ScheduledReadings`` sends readings, and receivers use silence.
+``TriggeredMessages`` wraps any other filter in slots, which takes silence for a lost message.
+``StochasticTrigger``, the class of scenario files, chooses between them.
+
+Kernels simulate L runs at once (lanes, the last axis) in B blocks, with the structs of
+``kernels.slots``: ``nodes`` (estimates and roots of H filters), ``readings`` (whitened, so that
+noise has variance 1), ``plan`` (the events of S slots), ``links``, ``samples`` (output) and
+``scratch``. Estimates are relative to an origin near the true state, which moves in some slots
+(``rebase``, ``shift``), so that large states cost no digits. A kernel ``*_single`` runs one node
+in one run, so that the SimPy engine rounds like the compiled one.
 """
 
 from __future__ import annotations
@@ -65,7 +80,7 @@ from netkf.linalg.lanes import (
 )
 
 NOWHERE = np.zeros(1, dtype=bool)
-"""Flags of a block of one slot: not in this slot."""
+"""Flags (1,) of a plan of one slot: what they flag does not happen in it."""
 
 
 def trigger_matrix(Y: float | FloatArray, rows: int) -> FloatArray:
@@ -76,15 +91,15 @@ def trigger_matrix(Y: float | FloatArray, rows: int) -> FloatArray:
 
 
 def entries_at(scenario: Any, node: int) -> list[int]:
-    """Return the indices, in ``scenario.sensors``, of the sensors of a node with the id
-    ``node``.
+    """Return the indices, in the ``sensors`` of a ``netkf.Scenario``, of the sensors of the node
+    with the id ``node``.
     """
     return [placed_sensor.entry for placed_sensor in scenario.placed_sensors.get(node, ())]
 
 
 def whitened_trigger(Y: float | FloatArray, R: FloatArray) -> FloatArray:
     """Return ``L' Y L`` (p, p) with ``L L' = R`` (p, p), the trigger for whitened readings; Y is
-    (p, p) or a multiple of the identity.
+    (p, p) or a number, that multiple of the identity.
     """
     # z' Y z for z = L u, where u is the whitened innovation.
     root = np.linalg.cholesky(R)
@@ -92,15 +107,15 @@ def whitened_trigger(Y: float | FloatArray, R: FloatArray) -> FloatArray:
 
 
 def silence_noise(R: FloatArray, Y: float | FloatArray) -> FloatArray:
-    """Return ``R + Y^-1`` (p, p), the noise of the reading that silence is equivalent to, for R
-    (p, p) and Y (p, p) or a multiple of the identity.
+    """Return ``R + Y^-1`` (p, p), the noise covariance of the reading that silence is equivalent
+    to, for R (p, p) and Y (p, p) or a number, that multiple of the identity.
     """
     return np.asarray(R + np.linalg.inv(trigger_matrix(Y, len(R))))
 
 
 def news_of(reading: Reading, xhat: FloatArray, Y: float | FloatArray) -> float:
-    """Return ``z' Y z`` with the innovation ``z = y - H xhat`` (p,) of a reading with p > 0 rows;
-    ``xhat`` is (n,), Y (p, p) or a multiple of the identity.
+    """Return the news ``z' Y z`` of a reading with p > 0 rows, for its innovation
+    ``z = y - H xhat`` (p,); ``xhat`` is (n,), Y (p, p) or a number, that multiple of the identity.
     """
     y, H = whiten_reading(*reading[:3])
     p, n = H.shape
@@ -113,8 +128,9 @@ def news_of(reading: Reading, xhat: FloatArray, Y: float | FloatArray) -> float:
 
 @kernel
 def weigh_news_single(x: FloatArray, readings: ReadingBlock, Y: FloatArray, z: FloatArray) -> float:
-    """Return the news ``z' Y z`` of one whitened reading in one run, with its innovation z = y - H
-    x and the estimate x (1, 1, n, 1); Y (1, p, p) is for whitened rows, ``z`` (p, 1) is scratch.
+    """Return the news ``z' Y z`` of one whitened reading in one run, for its innovation
+    z = y - H x and the estimate x (1, 1, n, 1); Y (1, p, p) is for whitened rows, ``z`` (p, 1) is
+    scratch.
     """
     news: float = weigh_news(ONE, x, readings, (0, 0, 0), len(z), Y, z)
     return news
@@ -134,8 +150,11 @@ def whitened_triggers(models: Sequence[Any], Y: float | FloatArray) -> FloatArra
 
 
 def silence_whitening(weight: FloatArray) -> FloatArray:
-    """Return C^-1 (p, p) with the Cholesky factor C of ``I + W^-1``, the noise of whitened rows
-    that stand for silence: C^-1 whitens them again. W = ``weight`` (p, p), zeros beyond its rows.
+    """Return C^-1 (p, p) with the Cholesky factor C of ``I + W^-1``: that is ``R + Y^-1`` after
+    whitening by R, the noise of the reading that stands for silence, and C^-1 whitens it again.
+
+    W = ``weight`` (p, p) is the trigger for whitened rows, with zeros beyond the rows of the node,
+    as the result has.
     """
     # A trigger is positive definite: zeros on the diagonal are rows that the node does not have.
     rows, inverse = int((weight.diagonal() > 0.0).sum()), np.zeros(weight.shape)
@@ -145,14 +164,15 @@ def silence_whitening(weight: FloatArray) -> FloatArray:
 
 
 class ScheduledArrays(NamedTuple):
-    """Sensors and predictions for B blocks of L runs of H nodes: W + H sensors, those of the sender
-    of each of W directions as its receiver knows them, then the own one of each node.
+    """What ``scheduled_slots`` keeps for B blocks of L runs of H nodes, among it tables of W + H
+    sensors: that of the sender of each of W directed links, as its receiver knows it from
+    messages, then each node's own.
 
-    trigger : (H, p, p), for whitened rows
+    trigger : (H, p, p), Y for whitened rows
     silence : (H, p, p), see ``silence_whitening``
-    H : whitened rows (B, W + H, p, n, L)
+    H : whitened rows (B, W + H, p, n, L) of the last reading of each sensor
     known : (B, W + H, L), 1 once a reading of the sensor has arrived
-    prior : predictions of a slot (B, H, n, L)
+    prior : predictions (B, H, n, L) of the slot, to which news and silence refer
     z, row : (p, L) and (n, L), scratch
     """
 
@@ -181,11 +201,11 @@ def scheduled_slots(
 
     Changes ``nodes.xhat`` (B, H, n, L), ``nodes.root`` (B, H, n, n, L) and the known sensors in
     ``arrays`` in place, writes 0 into ``plan.sent`` and ``plan.up`` for messages that are not sent,
-    and writes ``samples``. ``plan.part`` says which part of a slot is simulated.
+    and writes ``samples``. ``plan.part`` says which part of a slot is simulated: up to the
+    decisions to send (SENDING), from the arrivals on (ARRIVING), or both.
     """
     for b in range(plan.up.shape[0]):
         for s in range(plan.up.shape[1]):
-            # A part of the plan: up to the decisions to send, or from the arrivals on.
             if plan.part != ARRIVING and plan.sensed[s]:
                 predict_all(nodes, scratch, b)
                 # Silence is about the prediction, which readings replace in ``nodes``.
@@ -219,7 +239,8 @@ def schedule_reading(
 ) -> None:
     """Decide whether node ``h`` of block ``b`` sends its reading of slot ``s``, in each of L runs:
     with probability 1 - exp(-z' Y z / 2), where z is its innovation with respect to the prediction
-    in ``arrays.prior``. Writes 0 into ``plan.sent[b, s, 0, h]`` (L,) where it is silent.
+    in ``arrays.prior``. Writes 0 into ``plan.sent[b, s, 0, h]`` (L,) where it is silent or has no
+    reading.
     """
     lanes = scratch.lanes
     news = weigh_news(
@@ -228,7 +249,7 @@ def schedule_reading(
     # Through memory, since each lane (run) decides by itself.
     store(lanes, scratch.row, 0, news)
     for q in range(len(lanes)):
-        # The first reading is always sent.
+        # The first reading is always sent: receivers learn H from it, and know the sensor then.
         probability = silence_probability(scratch.row[0, q])
         known = arrays.known[b, len(links.sender) + h, q] == 1
         silent = known and plan.uniform[b, s, 0, h, q] < probability
@@ -255,6 +276,7 @@ def update_by_sensors(
 
     Axes: L runs side by side.
     """
+    # The own reading counts only if it was sent: else all nodes would not hold one estimate.
     sent = load_flags(scratch.lanes, plan.sent, b, s, 0, h)
     own = len(links.sender) + h
     update_by_sensor(nodes, readings, scratch, arrays, b, s, h, h, own, sent)
@@ -287,6 +309,7 @@ def update_by_sensor(
     lanes, rows = scratch.lanes, nodes.rows[sender]
     known = load_flags(lanes, arrays.known, b, index)
     if any_lane(arrived):
+        # A fixed H has one block and one slot.
         d, t = min(b, readings.H.shape[0] - 1), min(s, readings.H.shape[1] - 1)
         # Store H: later silence is equivalent to a reading with it.
         for k in range(rows):
@@ -295,7 +318,8 @@ def update_by_sensor(
                 present = load(lanes, readings.H, d, t, sender, k, i)
                 store(lanes, arrays.H, b, index, k, i, select(arrived, present, former))
         update_by_reading(nodes, readings, scratch, b, s, h, sender, arrived)
-    # A sensor without any reading so far may not exist: its silence has no meaning.
+    # Silence: lanes without an arrival in which the sensor is known. One without any reading so far
+    # may not exist, and its silence has no meaning.
     silent = select(arrived, 0.0, select(known, 1.0, 0.0)) > 0.0
     if any_lane(silent):
         use_silence(nodes, scratch, arrays, b, h, sender, index, silent)
@@ -313,9 +337,9 @@ def use_silence(
     index: int,
     silent: Any,
 ) -> None:
-    """Update filter ``h`` of block ``b`` with a reading ``H xbar`` of noise ``R + Y^-1``, which the
-    silence of filter ``sender`` is equivalent to, in the lanes where it is ``silent`` (flags (L,)):
-    changes ``nodes.xhat[b, h]`` (n, L) and ``nodes.root[b, h]`` (n, n, L).
+    """Update filter ``h`` of block ``b`` with a reading ``H xbar`` of noise ``R + Y^-1``, to which
+    the silence of filter ``sender`` is equivalent, in the lanes flagged in ``silent`` (L,): changes
+    ``nodes.xhat[b, h]`` (n, L) and ``nodes.root[b, h]`` (n, n, L).
 
     ``arrays.H[b, index]`` (p, n, L) is the sender's whitened H, and ``arrays.prior[b, h]`` (n, L)
     the prediction xbar.
@@ -332,11 +356,13 @@ def use_silence(
             # The innovation H xbar - H xhat: zero until other readings of the slot move xhat.
             difference = load(lanes, arrays.prior, b, h, i) - load(lanes, nodes.xhat, b, h, i)
             innovation += total * difference
+        # Row k of C^-1 H S with the root S of P: zeros, which change nothing, in other lanes.
         for j in range(n):
             total = spread(lanes, 0.0)
             for i in range(j, n):
                 total += load(lanes, arrays.row, i) * load(lanes, nodes.root, b, h, i, j)
             store(lanes, scratch.row, j, select(silent, total, 0.0))
+        # Kalman update by this row; the gain is ``gains`` times the factor that is returned.
         gains = scratch.gains
         step = innovation * rotate_lanes(lanes, scratch.size, nodes.root, b, h, scratch.row, gains)
         for i in range(n):
@@ -345,14 +371,15 @@ def use_silence(
 
 
 class ScheduledState(NamedTuple):
-    """The state of a node.
+    """The state of a node of ``ScheduledReadings``.
 
     xhat, root : estimate (n,) and root (n, n) of its covariance
     model : of the plant and the node's sensors
     prior : prediction (n,) of this slot
-    reading : own reading, or None
+    reading : own reading of this slot, or None
     sent : whether it was sent in this slot
-    senders, sensors : ids of nodes with known sensors (-1: itself), and (H, R) of each
+    senders, sensors : ids of the nodes whose sensors are known from a reading that arrived (-1:
+                       the node itself), and (H, R) of each
     """
 
     xhat: FloatArray
@@ -374,8 +401,9 @@ class ScheduledState(NamedTuple):
 class ScheduledReadings(Filter):
     """Every node broadcasts its reading y or is silent, and its receivers use the silence, too.
 
-    Silence is as informative as a reading ``H xbar`` with noise ``R + Y^-1``. Own readings count
-    when they are sent, and the first is sent.
+    Silence is as informative as a reading ``H xbar`` with noise ``R + Y^-1``. A node uses its own
+    reading like its receivers, only if it is sent, so that all have one estimate; the first is
+    always sent.
     """
 
     Y: float | FloatArray
@@ -396,9 +424,9 @@ class ScheduledReadings(Filter):
     def slot_arrays(
         self, states: Sequence[Any], infos: Sequence[NodeInfo], runs: int
     ) -> tuple[ScheduledArrays]:
-        """Return the arrays of the compiled ``slot_kernel`` for ``runs`` runs of H nodes with W
-        directed links, counted from ``infos``: triggers, and empty tables of the W + H sensors that
-        nodes know of each other and of themselves.
+        """Return the arrays of the compiled ``slot_kernel`` for ``runs`` runs of H nodes that start
+        in these ``states``, with W directed links, counted from ``infos``: triggers, and empty
+        tables of the W + H sensors that nodes know of each other and of themselves.
         """
         models, blocks = [state.model for state in states], blocks_of(runs)
         (H, n), W = (len(models), len(states[0].xhat)), sum(info.degree for info in infos)
@@ -424,7 +452,7 @@ class ScheduledReadings(Filter):
 
     def init(self, model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo) -> ScheduledState:
         """Return the first state of a node, with estimate ``mean`` (n,) and covariance ``cov``
-        (n, n), to which no sensor is known yet.
+        (n, n), which knows no sensor yet, not even its own.
         """
         return ScheduledState(mean, first_root(cov), model, mean)
 
@@ -442,8 +470,8 @@ class ScheduledReadings(Filter):
     def emit(
         self, state: ScheduledState, exchange: Exchange
     ) -> tuple[ScheduledState, Reading | None]:
-        """Return the state and the payload: the reading, or None, which says that it was near its
-        prediction.
+        """Return the state and the payload: the reading, or with probability exp(-z' Y z / 2)
+        None, nothing is sent.
         """
         reading = state.reading
         if reading is None:
@@ -471,7 +499,7 @@ class ScheduledReadings(Filter):
             if sender in arrived:
                 xhat, root = sample_update(xhat, root, arrived[sender].y, H, R)
             else:
-                # No innovation with respect to the prediction.
+                # Silence: a reading that equals its prediction, of larger noise.
                 noise = silence_noise(R, self.Y)
                 xhat, root = sample_update(xhat, root, H @ state.prior, H, noise)
         senders = tuple(sorted(sensors))
@@ -494,14 +522,14 @@ class ScheduledReadings(Filter):
 
 
 class TriggerArrays(NamedTuple):
-    """Decisions of H nodes for B blocks of L runs.
+    """Decisions of H nodes of ``TriggeredMessages`` for B blocks of L runs.
 
-    trigger : (H, p, p), for whitened rows
+    trigger : (H, p, p), Y for whitened rows
     news : (B, H, L), z' Y z of the last reading
     undecided : (B, H, L), 1 until it is decided whether the node sends after this reading
     silent : (B, H, L), 1 if it sends nothing until the next reading
     has_sent : (B, H, L), 1 once the node has sent after a reading
-    x, z : predictions (B, H, n, L) and (p, L), scratch
+    x, z : scratch, predictions (B, H, n, L) and an innovation (p, L)
     """
 
     trigger: FloatArray
@@ -515,7 +543,7 @@ class TriggerArrays(NamedTuple):
 
 def trigger_arrays(models: Sequence[Any], Y: float | FloatArray, runs: int) -> TriggerArrays:
     """Return the arrays of H nodes with these ``models`` in ``runs`` runs, before they have read
-    anything; the trigger Y is (p, p) or a multiple of the identity.
+    anything; the trigger Y is (p, p) or a number, that multiple of the identity.
     """
     trigger, shape = whitened_triggers(models, Y), (blocks_of(runs), len(models))
     return TriggerArrays(
@@ -530,27 +558,30 @@ def trigger_arrays(models: Sequence[Any], Y: float | FloatArray, runs: int) -> T
 
 
 class TriggerPlan(NamedTuple):
-    """The order of events in the slots of a wrapped filter.
+    """The order of events in the slots of a wrapped filter: news are computed outside of its
+    kernel, and need the prediction that the kernel will have at the reading.
 
     first : index of the first exchange step after the reading
-    predicted : whether estimates are predicted before the reading
-    framed : whether the origin moves before the reading
-    split : whether an exchange before the reading changes estimates; it is then simulated by a call
-            of its own
+    predict_first : whether estimates are predicted before the reading
+    rebase_first : whether the origin of estimates moves (``rebase``) before the reading, as in
+                   filters that sample their predictions; else it moves at the end of the slot
+    split : whether an exchange before the reading changes estimates; the kernel is then called
+            twice a slot, up to the reading and from it on
     """
 
     first: int
-    predicted: bool
-    framed: bool
+    predict_first: bool
+    rebase_first: bool
     split: bool
 
 
 def trigger_plan(inner: Filter) -> TriggerPlan | None:
-    """Return the order of steps in the slots of the filter ``inner``; None if its innovations
-    cannot be computed from outside.
+    """Return the order of events in the slots of the filter ``inner``; None if its innovations
+    cannot be computed outside of its kernel.
     """
     schedule = inner.schedule or ()
     before = schedule[: schedule.index("sense")]
+    # The number of exchanges before the reading, and whether they change estimates.
     early = before.count("exchange")
     moves = any(inner.moves_estimates(phase) for phase in range(early))
     # A slot is split into its exchanges and the rest by calling the kernel twice, with one of both
@@ -572,8 +603,8 @@ def decide_senders(
     order: TriggerPlan,
     s: int,
 ) -> None:
-    """Decide which nodes send in slot ``s``, in all B blocks: in steps before the reading by the
-    reading of the slot before, then by this one; ``order`` says which steps come before.
+    """Decide which nodes send in slot ``s``, in all B blocks: in exchange steps before the reading
+    by the news of the slot before, then by those of this one; ``order`` says which come before.
 
     Writes 0 into ``plan.sent[:, s]`` (B, E, H, L) and ``plan.up[:, s]`` (B, E, W, L) for messages
     that are not sent, and stores news and decisions in ``arrays``. Axes: E exchange steps, W
@@ -584,7 +615,9 @@ def decide_senders(
         for e in range(order.first):
             decide_step(plan, arrays, b, s, e)
         if plan.sensed[s] and not order.split:
-            store_news(nodes, readings, arrays, scratch, b, s, order.predicted, order.framed)
+            store_news(
+                nodes, readings, arrays, scratch, b, s, order.predict_first, order.rebase_first
+            )
         for e in range(order.first, plan.sent.shape[2]):
             decide_step(plan, arrays, b, s, e)
         for e in range(plan.sent.shape[2]):
@@ -604,7 +637,8 @@ def decide_step(plan: SlotPlan, arrays: TriggerArrays, b: int, s: int, e: int) -
             if plan.sent[b, s, e, h, q] == 0:
                 continue
             if arrays.undecided[b, h, q] == 1:
-                # After its first reading a node always sends.
+                # After its first reading a node always sends, and without a reading (negative
+                # news) too.
                 news, u = arrays.news[b, h, q], plan.uniform[b, s, e, h, q]
                 silent = arrays.has_sent[b, h, q] == 1 and u < silence_probability(news)
                 arrays.undecided[b, h, q], arrays.silent[b, h, q] = 0, silent
@@ -622,24 +656,27 @@ def store_news(
     scratch: SlotScratch,
     b: int,
     s: int,
-    predicted: bool,
-    framed: bool,
+    predict_first: bool,
+    rebase_first: bool,
 ) -> None:
     """Store the news ``z' Y z`` of the readings of all H nodes of block ``b`` in slot ``s`` in
-    ``arrays.news[b]`` (H, L), and mark their decisions as open, with respect to the estimates after
-    the steps that precede the reading: a move of the origin (``framed``) and a prediction
-    (``predicted``).
+    ``arrays.news[b]`` (H, L), and mark each node as undecided, so that it decides anew whether to
+    send.
 
-    Axes: L runs side by side.
+    The innovation z = y - H x needs the estimate x at the reading, while ``nodes.xhat`` (unchanged)
+    is that before the filter's kernel has simulated the slot. So do in a copy, ``arrays.x``, what
+    the kernel does before the reading: move the origin that estimates are relative to
+    (``rebase_first``), and predict (``predict_first``). Axes: L runs side by side.
     """
     lanes = scratch.lanes
     for h in range(len(nodes.rows)):
         for i in range(nodes.xhat.shape[2]):
             x = load(lanes, nodes.xhat, b, h, i)
-            if framed and readings.rebased[s]:
+            if rebase_first and readings.rebased[s]:
+                # As ``rebase`` does: the true state of this slot becomes the origin.
                 x -= load(lanes, readings.local, b, s, i)
             store(lanes, arrays.x, b, h, i, x)
-        if predicted:
+        if predict_first:
             transform_mean(scratch, arrays.x, b, h, nodes.F)
         news = weigh_news(
             lanes, arrays.x, readings, (b, s, h), nodes.rows[h], arrays.trigger, arrays.z
@@ -654,8 +691,8 @@ def store_news_of_slot(
     nodes: SlotNodes, readings: ReadingBlock, arrays: TriggerArrays, scratch: SlotScratch
 ) -> None:
     """Store the news ``z' Y z`` of the readings of all nodes and blocks of one slot in
-    ``arrays.news`` (B, H, L), where all steps before the reading are done: ``nodes.xhat`` holds the
-    predictions.
+    ``arrays.news`` (B, H, L), and mark the nodes as undecided. All that precedes the reading in
+    the slot is done: ``nodes.xhat`` holds the predictions.
 
     Axes: B blocks of L runs, H filters.
     """
@@ -664,8 +701,8 @@ def store_news_of_slot(
 
 
 class TriggeredSlots:
-    """The kernel of a filter with a trigger: in each slot it decides which nodes send, and runs the
-    kernel of the ``inner`` filter with their messages.
+    """The ``slot_kernel`` of ``TriggeredMessages``, called like any other: in each slot it decides
+    which nodes send, and runs the kernel of the ``inner`` filter with their messages.
     """
 
     def __init__(self, inner: Filter, order: TriggerPlan) -> None:
@@ -693,10 +730,11 @@ class TriggeredSlots:
 
         ``plan.part`` says whether only the decisions are wanted (SENDING), only what follows from
         the messages that arrive (ARRIVING), or both. ``plan.sent`` flags the nodes that are asked
-        for a message, and then those that send one. If the order of a slot is ``split``, the
-        decisions are about estimates between the exchange and the reading: the inner kernel is
-        called for each of the two.
+        for a message, and then those that send one. If the order of a slot is ``split``, news
+        refer to the estimates between the exchange and the reading: the inner kernel is called
+        once for the exchange, then for the reading and all that follows.
         """
+        # Innovations refer to the estimates with which nodes go on, not to those they report.
         carried_nodes = nodes._replace(xhat=self._inner.carried_estimates(nodes.xhat, more))
         for s in range(plan.up.shape[1]):
             asked = plan.sent[:, s : s + 1].copy()
@@ -708,7 +746,7 @@ class TriggeredSlots:
                 continue
             slot_readings, slot_plan, slot_samples = single_slot(readings, plan, samples, s)
             if self._decides:
-                # The filter decides by itself, whatever the trigger says.
+                # The filter decides on all that are asked; below, a message needs both decisions.
                 slot_plan = slot_plan._replace(sent=asked, part=plan.part)
             arguments = (
                 links,
@@ -720,7 +758,7 @@ class TriggeredSlots:
                 self._kernel(nodes, slot_readings, slot_plan._replace(sensed=NOWHERE), *arguments)
                 if plan.sensed[s]:
                     store_news_of_slot(carried_nodes, slot_readings, arrays, scratch)
-                # The sample and the new origin come with the exchange.
+                # The first call has written the sample and moved the origin: not again.
                 slot_readings, no_sample = slot_readings._replace(rebased=NOWHERE), np.full(1, -1)
                 slot_plan = slot_plan._replace(exchanged=NOWHERE, sample=no_sample)
             self._kernel(nodes, slot_readings, slot_plan, *arguments)
@@ -732,8 +770,9 @@ class TriggeredSlots:
 def single_slot(
     readings: ReadingBlock, plan: SlotPlan, samples: SlotSamples, s: int
 ) -> tuple[ReadingBlock, SlotPlan, SlotSamples]:
-    """Return readings, plan and samples of slot ``s`` alone, as blocks of one slot, for a kernel
-    whose filters do not decide who sends.
+    """Return ``readings``, ``plan`` and ``samples`` of slot ``s`` alone, with S = 1, for
+    ``TriggeredSlots``, which calls a kernel slot by slot. The plan's ``sent`` and ``uniform`` are
+    empty, for filters that do not decide who sends.
     """
     at = slice(s, s + 1)
 
@@ -741,6 +780,7 @@ def single_slot(
         """Return the values (B, 1, ...) of slot ``s`` from those of all slots (B, S, ...)."""
         return np.ascontiguousarray(values[:, at])
 
+    # A fixed H has one slot already.
     local, fixed = at_slot(readings.local), readings.H.shape[1] == 1
     H = readings.H if fixed else at_slot(readings.H)
     alone = ReadingBlock(at_slot(readings.y), H, local, readings.rebased[at])
@@ -782,7 +822,8 @@ class WrappedState(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class TriggeredMessages(Filter):
-    """A filter whose nodes send nothing after readings that bring little news.
+    """The filter ``inner`` with nodes that, after a reading, send nothing with probability
+    exp(-z' Y z / 2), where z is its innovation.
 
     The filter takes a message that is not sent for one that is lost. Nodes always use their own
     readings, and those without a reading send.
@@ -809,7 +850,7 @@ class TriggeredMessages(Filter):
         none or its innovations cannot be computed from outside.
         """
         inner, plan = self.inner, trigger_plan(self.inner)
-        # A kernel is that of its own class only: it ignores what a derived class changes.
+        # A user's class inherits the kernel of its base, which ignores what it overrides.
         is_compiled = type(inner) in built_in_filters().values() and inner.slot_kernel is not None
         return TriggeredSlots(inner, plan) if is_compiled and plan is not None else None
 
@@ -831,8 +872,8 @@ class TriggeredMessages(Filter):
     def slot_gains(
         self, states: Sequence[Any], arrays: tuple[Any, ...], first: int, count: int
     ) -> tuple[Any, ...]:
-        """Return the ``arrays`` unchanged, whatever the slots: the wrapped filter's gains are asked
-        for slot by slot.
+        """Return the ``arrays`` of ``slot_arrays`` unchanged, whatever the slots: ``slot_kernel``
+        asks the wrapped filter for the gains of each slot.
         """
         return arrays
 
@@ -857,8 +898,8 @@ class TriggeredMessages(Filter):
         return WrappedState(self.inner.update(state.inner, reading), news, state.has_sent)
 
     def emit(self, state: WrappedState, exchange: Exchange) -> tuple[WrappedState, Any]:
-        """Return the state after sending, with the decision, and the payload of the wrapped filter,
-        or None until the next reading if the node is silent.
+        """Return the state after sending, with the decision whether the node is silent until its
+        next reading, and the payload of the wrapped filter, or None if it is silent.
         """
         silent = state.silent
         if silent is None:
@@ -866,7 +907,7 @@ class TriggeredMessages(Filter):
             silent = state.has_sent and exchange.uniform < silence_probability(state.news)
             has_sent = state.has_sent or state.news >= 0.0
             state = state._replace(silent=silent, has_sent=has_sent)
-        # As if the message were lost: the filter has sent it.
+        # The wrapped filter's state changes as if it had sent: silence is a lost message.
         inner, payload = self.inner.emit(state.inner, exchange)
         return state._replace(inner=inner), None if silent else payload
 
@@ -895,6 +936,7 @@ class TriggeredMessages(Filter):
         return self.inner.conserved(state.inner)
 
 
+# All else that a filter says of itself is what the wrapped filter says.
 for _name in set(FORWARDED) - vars(TriggeredMessages).keys():
     setattr(TriggeredMessages, _name, forwarded(_name))
 
