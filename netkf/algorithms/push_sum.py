@@ -1,9 +1,30 @@
-"""The push-sum filter: distributed Kalman filtering on links that fail, P Fig. 1.
+"""The push-sum filter: distributed Kalman filtering on links that fail, paper P Fig. 1 (Battilotti,
+Cacace and d'Angelo 2023).
 
-A node learns the number of nodes and the information of all sensors by push-sum, one round a slot,
-and its gain from them; its estimate is averaged with those of its neighbours in ``gamma`` steps.
-What differs from P Fig. 1: the lost sums of (5), and of (3) and (4) under failures, are those that
-keep the mass; the stop rule of step 2.3 fires when all links of a node are down and is one choice.
+In slots node i does the steps of P Fig. 1:
+
+1. It starts with a mass: weight w (1 at a leader, 0 elsewhere), number n~ = 1 and information
+   C~ = H' R^-1 H of its own sensors.
+2. Push-sum, once a slot: it sends its share, mass / (degree + 1), to each neighbour, and keeps its
+   own and those that failed links did not deliver (3)-(5). So the sums of w, n~ and C~ over all
+   nodes are conserved, and n~ / w and C~ / w (6) tend to the number N of nodes and the
+   information G of all sensors: its estimates N^(i) and G^(i) of the network.
+3. It predicts, and P <- (P^-1 + G^(i))^-1 (7).
+4. It corrects its estimate by its own reading, with N^(i) times the gain (8): the result is z.
+5. It averages z with those of its neighbours in ``gamma`` steps (9).
+
+With asymptotic gains N, G and P_inf (12) are known from the start, and step 2 is left out.
+Differences from the paper: sums that (3)-(5) lost in print are those that conserve mass. The stop
+rule of step 2.3 is a choice, since it also fires when all links of a node are down.
+
+With ``running_sums`` a node sends, instead of shares, the total of all shares so far: a lost
+message loses no mass. Under clocks the filter is that of ``algorithms.running_sums``.
+
+Kernels simulate L runs at once (lanes, the last axis) in B blocks, with the structs of
+``kernels.slots``: ``nodes`` (estimates and roots of H filters), ``readings`` (whitened, so that
+noise has variance 1), ``plan`` (the events of S slots), ``links``, ``samples`` (output) and
+``scratch``. A kernel ``*_single`` runs one node in one run, for the SimPy engine: both engines
+round alike.
 """
 
 from __future__ import annotations
@@ -68,10 +89,12 @@ from netkf.linalg.lanes import (
 )
 
 MASS, AVERAGE = 0, 1
-"""The two exchanges of a slot."""
+"""The two exchanges of a slot, steps 2 and 5: their numbers, ``phase`` in methods."""
 
 MAX_STEPS = 100_000
+"""The largest ``gamma``: a larger one is a slip."""
 MAX_DOUBLINGS = 60
+"""Iterations of ``asymptotic_root``; k of them reach 2^k slots."""
 MAX_SPREAD = 1e14
 """The largest ``|G| |P|`` at which double precision can still detect a steady covariance."""
 
@@ -88,8 +111,8 @@ class NetworkInformation(NamedTuple):
 
 
 class NodeSums(NamedTuple):
-    """Running sums of one node: the total (2 + n^2,) that it has ever ``offered`` to each of its
-    neighbours, and the last totals that it ``heard``, by sender.
+    """Running sums of one node in slots: the total (2 + n^2,) of all shares that it has ever
+    ``offered`` to each of its neighbours, and the last totals that it ``heard``, by sender.
     """
 
     offered: FloatArray
@@ -97,14 +120,14 @@ class NodeSums(NamedTuple):
 
 
 class PushSumState(NamedTuple):
-    """The state of a node.
+    """The state of a node in slots; under clocks it is a ``RunningSums``.
 
-    xhat, root : estimate (n,), z between the exchanges, and root (n, n) of its covariance
+    xhat, root : estimate (n,), z of steps 4 and 5, and root (n, n) of its covariance
     model : of the plant and the node's sensors
     mass : (2 + n^2,), weight w, number n~ and information C~ of paper P (3)-(5)
     network : the node's estimate of the network, from its mass
-    stopped : whether that is frozen
-    degree : nominal number of links
+    stopped : whether the stop rule has frozen that estimate
+    degree : number of its links, failed ones included
     sums : running sums, if mass is exchanged by them, else None
     """
 
@@ -126,10 +149,11 @@ class PushSumState(NamedTuple):
 class PushSumArrays(NamedTuple):
     """Arrays and settings of H nodes for B blocks of L runs; a mass has m = 2 + n n numbers.
 
-    mass, degree : (B, H, m, L) masses, and nominal degrees (H,)
+    mass, degree : (B, H, m, L) masses, and numbers (H,) of each node's links, failed ones included
     information, number : estimates of the network, G^(i) (B, H, n, n, L) and N^(i) (B, H, L)
     alone : (H, n, n), information of each node's own sensors
-    rule, tolerance, delta, gamma, asymptotic : settings; ``rule`` is an index in RULES
+    rule, tolerance, delta, gamma, asymptotic : settings of ``PushSum``; ``rule`` is its stop rule,
+                                                an index in RULES
     limit : (n, n), root of P_inf, with asymptotic gains
     running : whether masses are exchanged by running sums
     offered, heard : then the totals that nodes have offered (B, H, m, L), and those last heard on
@@ -166,8 +190,8 @@ class PushSumArrays(NamedTuple):
 def drop_mass_of_stopped(
     arrays: PushSumArrays, plan: SlotPlan, links: SlotLinks, samples: SlotSamples, b: int, s: int
 ) -> None:
-    """Drop the messages with mass of nodes of block ``b`` that stopped before slot ``s``, which
-    send none by the paper's rule: writes 0 into ``plan.sent[b, s, MASS]`` (H, L) and
+    """Drop the messages with mass of nodes of block ``b`` that stopped before slot ``s``: by the
+    paper's stop rule they send none. Writes 0 into ``plan.sent[b, s, MASS]`` (H, L) and
     ``plan.up[b, s, MASS]`` (W, L). Nothing happens under another rule in ``arrays``.
 
     Axes: W directed links, H nodes, L runs side by side.
@@ -192,7 +216,8 @@ def push_sum_slots(
 
     Changes ``nodes.xhat`` (B, H, n, L), ``nodes.root`` (B, H, n, n, L) and the masses and network
     estimates in ``arrays`` in place, and writes ``samples``. ``plan.part`` says which part of a
-    slot is simulated.
+    slot is simulated: up to the messages that are sent (SENDING), from their arrival on (ARRIVING),
+    or both.
     """
     for b in range(plan.up.shape[0]):
         for s in range(plan.up.shape[1]):
@@ -200,8 +225,8 @@ def push_sum_slots(
                 drop_mass_of_stopped(arrays, plan, links, samples, b, s)
             if plan.part == SENDING:
                 continue
-            # Step 3: with asymptotic gains the covariance is the limit, and only the mean is
-            # predicted.
+            # Step 3. With asymptotic gains the covariance is P_inf, and ``correct`` predicts the
+            # mean.
             if plan.sensed[s] and not arrays.asymptotic:
                 predict_all(nodes, scratch, b)
             # Step 2 before the correction, so that the gain uses the mass of this slot.
@@ -227,11 +252,11 @@ def push_sum_slots(
 def write_conserved_sums(
     arrays: PushSumArrays, links: SlotLinks, samples: SlotSamples, scratch: SlotScratch, b: int
 ) -> None:
-    """Write each node's part of the conserved sums of block ``b``, of the weight w (total 1) and of
-    n~ (total N), from the masses in ``arrays`` into ``samples.conserved[b]`` (H, 2, L); with
-    running sums including what is under way to it.
+    """Write each node's part of the sums that exchanges conserve in block ``b``, of the weight w
+    (total 1) and of the number n~ (total N), from the masses in ``arrays`` into
+    ``samples.conserved[b]`` (H, 2, L); with running sums including the mass under way to it.
 
-    Axes: H nodes, L runs side by side.
+    Runs report how far the sums drift. Axes: H nodes, L runs side by side.
     """
     for h in range(len(arrays.degree)):
         for k in range(2):
@@ -256,8 +281,8 @@ def exchange_mass(
     s: int,
 ) -> None:
     """Exchange mass once in slot ``s`` of block ``b``, paper P steps 2.1 to 2.3: all H nodes send
-    shares of their mass (weight, number of nodes and information), mix what arrives, and update
-    their estimates of the network.
+    shares of their mass (weight, number of nodes and information), add those that arrive to what
+    they keep, and update their estimates of the network.
 
     Changes in block ``b`` of ``arrays`` ``mass``, ``information``, ``number`` and the running sums,
     and writes the slot into ``samples.stopped[b]`` (H, L) where a node stops. Axes: L runs side by
@@ -298,9 +323,9 @@ def silence_stopped(plan: SlotPlan, samples: SlotSamples, b: int, s: int) -> Non
 
 @kernel
 def add_to_totals(arrays: PushSumArrays, scratch: SlotScratch, b: int) -> None:
-    """Add the share of each of H nodes of block ``b``, ``arrays.share`` (H, m, L), to the total
-    that it has offered to each of its neighbours, ``arrays.offered[b]`` (H, m, L). A share is a
-    part of a node's mass, of m = 2 + n n numbers.
+    """Add the share of each of H nodes of block ``b``, ``arrays.share`` (H, m, L), to the total of
+    all its shares so far, ``arrays.offered[b]`` (H, m, L): its message to each neighbour. A share
+    is a part of a node's mass, of m = 2 + n n numbers.
 
     Axes: L runs side by side.
     """
@@ -397,8 +422,8 @@ def update_network_estimate(
     received: Any,
     slot: int,
 ) -> None:
-    """Update the estimates of the number of nodes and of the information of all sensors of node
-    ``h`` of block ``b`` from its mass, paper P (6), and apply the stop rule; ``received`` (L,) is
+    """Update the network estimate of node ``h`` of block ``b`` from its mass, paper P (6): the
+    number of nodes and the information of all sensors. Apply the stop rule; ``received`` (L,) is
     the number of shares that arrived in slot number ``slot``.
 
     Changes ``arrays.information[b, h]`` (n, n, L) and ``arrays.number[b, h]`` (L,), except where
@@ -455,16 +480,16 @@ def correct(
     s: int,
     h: int,
 ) -> None:
-    """Correct filter ``h`` of block ``b`` by its reading of slot ``s``, step 4, with the
-    information and the number of nodes of the whole network, as it knows them, in place of its own:
-    paper P (7) and (8). With asymptotic gains also predict it, step 3.
+    """Correct filter ``h`` of block ``b`` by its reading of slot ``s``, steps 3 and 4, with the
+    information and the number of nodes of the whole network, as it estimates them: paper P (7) and
+    (8). With asymptotic gains also predict its mean.
 
     Changes ``nodes.xhat[b, h]`` (n, L) and ``nodes.root[b, h]`` (n, n, L). Axes: L runs side by
     side.
     """
     n, lanes = nodes.xhat.shape[2], scratch.lanes
     if arrays.asymptotic:
-        # Asymptotic gains: xhat <- F xhat, and P_inf for the root.
+        # xhat <- F xhat, and P_inf for the root.
         predict_mean(nodes, scratch, b, h)
         for i in range(n):
             for j in range(i + 1):
@@ -541,13 +566,15 @@ def correct_root_single(
 @built_in("push-sum")
 @dataclass(frozen=True, eq=False)
 class PushSum(Filter):
-    """In slots P Fig. 1, steps 1-6, samples are filtered; under node clocks broadcast rounds by
-    running sums (algorithms.running_sums), which need none of the settings.
+    """In slots the filter of P Fig. 1, whose samples show estimates after readings; under node
+    clocks broadcast rounds by running sums (``algorithms.running_sums``), which use none of the
+    settings. All methods serve both: under clocks the state is a ``RunningSums``.
 
     gamma      averaging steps a slot
     delta      the averaging gain is 1 / delta, P (9)
     leader     the node whose weight starts at 1
-    asymptotic gains from the limits N and P_inf, P (12), from slot 1 on; no mass is exchanged
+    asymptotic whether gains come from the limits N and P_inf, P (12), from slot 1 on; no mass is
+               exchanged
     links      "fresh": links fail anew in each averaging step; "held": once for all of a slot
     stop       "never"; "paper": P step 2.3, the node sends no more mass once its C~ moved by less
                than ``tolerance`` (spectral norm); "safe": it goes on exchanging but freezes G^(i)
@@ -555,7 +582,7 @@ class PushSum(Filter):
                were up and its weight positive
     running_sums  mass is exchanged by totals (Hadjicostis, Vaidya and Dominguez-Garcia, IEEE Trans.
                Automatic Control 61, 2016): a message holds all that its sender ever offered, so
-               that one that is lost, in one direction alone too, only postpones
+               that a lost one, even in one direction alone, only delays mass
     """
 
     gamma: int = field(integer(low=1, high=MAX_STEPS), default=None)
@@ -579,23 +606,22 @@ class PushSum(Filter):
     slot_kernel = staticmethod(push_sum_slots)
 
     def sends_in_slots(self, phase: int, has_sensor: bool) -> bool:
-        """Return True unless the exchange with number ``phase`` is of mass and the gains are
-        asymptotic.
+        """Return True if nodes send messages in the exchange with number ``phase``, with a sensor
+        or without: not in that of mass if the gains are asymptotic.
         """
-        # Exchange MASS carries nothing if the gains are known beforehand.
         return phase == AVERAGE or not self.asymptotic
 
     def payload_numbers(self, n: int, rows: int, phase: int) -> int:
-        """Return the size of a message about n states in numbers of 64 bits: w, n~ and C~, or z;
-        under clocks (``phase`` -1) a weight, information and its vector.
+        """Return the size of a message about n states in numbers of 64 bits: mass w, n~, C~, or an
+        estimate z; under clocks (``phase`` -1) a weight, an information P^-1 and P^-1 xhat.
         """
         if phase == AVERAGE:
             return n
         return n * (n + 1) // 2 + (2 if phase == MASS else 1 + n)
 
     def slot_stopping(self) -> int:
-        """Return the number of the exchange of a slot after which nodes may stop: that of mass, or
-        -1 if none ever stops.
+        """Return the number of the exchange of a slot after which nodes may freeze their network
+        estimates: that of mass, or -1 if none ever does.
         """
         # Without exchanges of mass there is nothing to stop.
         return MASS if not self.asymptotic and self.stop != "never" else -1
@@ -607,7 +633,9 @@ class PushSum(Filter):
         return phase == AVERAGE
 
     def decides_in_slots(self) -> bool:
-        """Return True for the paper's rule: a node that has stopped sends no mass."""
+        """Return True under the paper's stop rule, by which a node that has stopped sends no
+        mass: the compiled kernel then writes who sends into ``SlotPlan.sent``.
+        """
         return not self.asymptotic and self.stop == "paper"
 
     def slot_arrays(
@@ -657,8 +685,9 @@ class PushSum(Filter):
         )
 
     def init(self, model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo) -> Any:
-        """Return the state of step 1, with estimate ``mean`` (n,) and covariance ``cov`` (n, n):
-        the leader has the weight; with asymptotic gains every node knows the limits.
+        """Return the state at time 0, P step 1, with estimate ``mean`` (n,) and covariance ``cov``
+        (n, n): the leader has the weight; with asymptotic gains every node knows the limits. A
+        ``RunningSums`` under clocks, else a ``PushSumState``.
         """
         if not isinstance(model, SlotModel):
             # A model without slots: clocks, where running sums are kept.
@@ -679,12 +708,13 @@ class PushSum(Filter):
 
     @property
     def _keeps_totals(self) -> bool:
-        """True if masses are exchanged in slots, by running sums."""
+        """True if the mass of slots is exchanged by running sums."""
         return self.running_sums and not self.asymptotic
 
     def predict(self, state: Any, gap: float) -> Any:
-        """Return the state ``gap`` seconds later: estimate, covariance and, in running sums, all
-        information.
+        """Return the state ``gap`` seconds later, with estimate and covariance predicted (P
+        step 3); under clocks also the totals of information that the node has sent and heard, which
+        then refer to the plant's state of that time.
         """
         if isinstance(state, RunningSums):
             return running_sums.predict_sums(state, gap)
@@ -703,8 +733,9 @@ class PushSum(Filter):
         return self.links == "fresh" or step == 0
 
     def emit(self, state: Any, exchange: Exchange) -> tuple[Any, Any]:
-        """Return the state after sending and the payload: the node's share of its mass (2 + n n,),
-        step 2.1, or z (n,), step 5.1; under clocks the next offer of running sums.
+        """Return the state after sending and the payload: in the first exchange of a slot the
+        node's share of its mass (2 + n n,), step 2.1, or with running sums the total of all shares
+        so far, in the second z (n,), step 5.1; under clocks an ``Offer``.
         """
         if isinstance(state, RunningSums):
             return running_sums.offer(state)
@@ -714,15 +745,14 @@ class PushSum(Filter):
         if state.sums is not None:
             offered = state.sums.offered + share(state.mass, state.degree)
             return state._replace(sums=state.sums._replace(offered=offered)), offered
-        # None: nothing is sent, but the links draw all the same.
+        # None sends nothing; links draw their outcomes all the same.
         silent = self.asymptotic or (self.stop == "paper" and state.stopped)
         return state, None if silent else share(state.mass, state.degree)
 
     def absorb(self, state: Any, messages: Sequence[Message], exchange: Exchange) -> Any:
-        """Return the state after all messages of a step: in the first exchange of a slot with its
-        mass mixed and its network estimate updated, steps 2.2 and 2.3, in the second with its
-        estimate averaged with those of its neighbours, step 5.2; under clocks with the growth of
-        all running sums added.
+        """Return the state after all messages of a step: in the first exchange of a slot with the
+        new mass and network estimate, steps 2.2 and 2.3, in the second with its estimate averaged
+        with those of its neighbours, step 5.2; under clocks with the growth of all totals added.
         """
         if isinstance(state, RunningSums):
             return running_sums.absorb_totals(state, messages)
@@ -744,9 +774,9 @@ class PushSum(Filter):
         return self._learn_network(state._replace(mass=mass), state.mass, all_up)
 
     def _learn_network(self, state: PushSumState, before: FloatArray, all_up: bool) -> PushSumState:
-        """Return the state with the network estimate that follows from its mass, paper P (6), and
-        with ``stopped`` by the stop rule. ``before`` (2 + n n,) is the mass before the step;
-        ``all_up``: all links of the node were up.
+        """Return the ``state`` after an exchange of mass with the network estimate that follows
+        from its mass, paper P (6), and with ``stopped`` by the stop rule. ``before`` (2 + n n,) is
+        the mass before the exchange; ``all_up``: all links of the node were up.
         """
         # Frozen by the safe rule: the mass was mixed, but the estimate is not updated any more.
         if state.stopped:
@@ -765,8 +795,8 @@ class PushSum(Filter):
         return state._replace(network=estimate, stopped=stopped)
 
     def update(self, state: Any, reading: Reading) -> Any:
-        """Return the state after a reading by steps 3 and 4, paper P (7) and (8), from the
-        prediction of the slot.
+        """Return the state after a reading, paper P (7) and (8), from the prediction of the slot;
+        under clocks after a Kalman update that counts the reading N / w times.
         """
         if isinstance(state, RunningSums):
             return running_sums.update_sums(state, reading)
@@ -783,8 +813,9 @@ class PushSum(Filter):
         return not isinstance(state, RunningSums) and bool(state.stopped)
 
     def conserved(self, state: Any) -> Mapping[str, float | Sequence[float]]:
-        """Return the weight w and the number n~ of a node by name, or the terms of both with
-        running sums; their sums over all nodes are 1 and N.
+        """Return the weight w and the number n~ of a node by name, whose sums over all nodes are 1
+        and N; with running sums each as a list of terms, which adds to the node's mass the totals
+        that it offered to its neighbours and subtracts those it heard: mass under way counts.
         """
         if isinstance(state, RunningSums):
             return running_sums.weights(state)
@@ -800,8 +831,8 @@ class PushSum(Filter):
         }
 
     def shift(self, state: Any, offset: FloatArray) -> Any:
-        """Return the state with ``offset`` (n,) added to the estimate: averaging weights sum to
-        one.
+        """Return the state with ``offset`` (n,) added to the estimate, for a move of the origin:
+        averaging weights sum to one, so that nothing else changes.
         """
         if isinstance(state, RunningSums):
             return running_sums.shift(state, offset)
@@ -892,8 +923,9 @@ class PushSum(Filter):
 
 
 def _heard_totals(state: PushSumState, sums: NodeSums, messages: Sequence[Message]) -> PushSumState:
-    """Return the state whose mass (2 + n n,) is its own share plus the growth of the totals it
-    hears, which become the last ones heard in its ``sums``.
+    """Return the state after an exchange of mass in slots by running sums: its mass (2 + n n,) is
+    the share it keeps plus the growth of the totals in ``messages``, which become the last ones
+    heard in its ``sums``.
     """
     heard, nothing = dict(sums.heard), np.zeros(state.mass.shape)
     gained = [message.payload - heard.get(message.sender, nothing) for message in messages]
@@ -951,9 +983,9 @@ def conserve_mass(mass: FloatArray, received: Sequence[FloatArray], degree: int)
 
 
 def network(mass: FloatArray, model: SlotModel) -> NetworkInformation:
-    """Return the information of all sensors C~ / w (n, n) and the number of nodes n~ / w,
-    paper P (6), from the ``mass`` (2 + n n,) of a node, or the node's own values while its weight
-    is exactly 0.
+    """Return a node's network estimate, paper P (6): the information of all sensors C~ / w (n, n)
+    and the number of nodes n~ / w, from its ``mass`` (2 + n n,); while its weight is exactly 0 its
+    own information, by ``model``, and 1.
     """
     alone = model.information
     information, number = np.empty((*alone.shape, 1)), np.empty((1, 1))
@@ -975,9 +1007,10 @@ def correct_root_alone(root: FloatArray, information: FloatArray) -> FloatArray:
 
 
 def average_estimates(z: FloatArray, received: Sequence[FloatArray], delta: float) -> FloatArray:
-    """Return ``z`` (n,) plus 1 / delta of the differences to the estimates (n,) that were
-    ``received``, paper P (9).
+    """Return ``z + sum_j (z_j - z) / delta`` (n,), paper P (9), for a node's ``z`` (n,) and the
+    estimates z_j (n,) that it ``received``.
     """
+    # The kernel of slots on a star: the node itself, and one link from each sender.
     x = np.stack([z, *received])[None, :, :, None]
     links, up = star_of([0.0] * len(received))
     average(ONE, x, 0, links, up, 0, 0, np.empty((1, len(z), 1)), 1.0 / delta)
@@ -992,7 +1025,8 @@ def asymptotic_root(F: FloatArray, Q: FloatArray, information: FloatArray) -> Fl
     By structure-preserving doubling: k steps give the covariance of 2^k slots (Chu, Fan, Lin and
     Wang, Int. J. Control 77, 2004).
     """
-    # The iterates of the doubling, which begin with F', the information G and P = Q.
+    # With W = (I + G P)^-1: A <- A W A, G <- G + A W G A', P <- P + A' P W A, from F', the
+    # information G and P = Q.
     A, G, P = F.T, information, Q
     with np.errstate(over="ignore", invalid="ignore"):
         for _ in range(MAX_DOUBLINGS):
