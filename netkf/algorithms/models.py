@@ -1,4 +1,10 @@
-"""Models: what a node assumes about the plant and its own sensors, in both models of time."""
+"""Models: what a node assumes about the plant and its own sensors, in continuous time
+(``FlowModel``) and in slots (``SlotModel``).
+
+Covariances are carried as roots S, ``P = S S'``. An increment sensor gives dy, the integral of its
+output over an interval; a sample is a reading at one instant. Tables hold what a kernel needs to
+compute a flow over any gap without matrix exponentials at run time.
+"""
 
 from __future__ import annotations
 
@@ -19,14 +25,16 @@ from netkf.linalg.arrays import FloatArray, square_root, symmetric
 from netkf.linalg.compiling import kernel
 
 MAX_RELATIVE_GAIN = 1.0
-"""Largest integral of trace(P G) over increments that are used in one update, see ``usable``."""
+"""Largest integral of trace(P G), G = H' R^-1 H, over the increments that are used in one update,
+see ``usable``.
+"""
 TABLES = 32
 """Flow tables in the cache, at most 256 KiB each."""
 
 
 class Backward(NamedTuple):
-    """Transition of information over a gap: ``inverse`` (n, n) is e^{-A gap}, and ``fading`` is the
-    factor that keeps it bounded (algorithms.running_sums).
+    """Transition of an information matrix U over a gap, ``fading inverse' U inverse``: ``inverse``
+    (n, n) is e^{-A gap}, and the factor ``fading`` <= 1 keeps it bounded (algorithms.running_sums).
     """
 
     inverse: FloatArray
@@ -77,7 +85,7 @@ class FlowModel:
 
     @cached_property
     def riccati(self) -> RiccatiTable:
-        """Table of the Riccati flow of the covariance P (n, n) with this node's readings."""
+        """Table of the Riccati flow of the covariance P (n, n) with this node's increments."""
         return riccati_table(self.A, self.Q, self.information, self.horizon)
 
     @cached_property
@@ -87,12 +95,12 @@ class FlowModel:
 
     @cached_property
     def gains(self) -> GainTable:
-        """Table of the gains with which this node's increments are used."""
+        """Table of the gains with which this node's increments update its estimate."""
         return gain_table(self.A, self.Q, self.H, self.R, self.interval)
 
     @cached_property
     def flow(self) -> FlowTable:
-        """Table of the flow of the root (n, n) of P with this node's readings."""
+        """Table of the flow of the root (n, n) of P with this node's increments."""
         return _shared_flow_table(self.A, self.Q, self.H, self.R, self.horizon)
 
     @cached_property
@@ -107,9 +115,9 @@ class FlowModel:
         return max(0.0, -float(np.linalg.eigvals(self.A).real.min()))
 
     def backward(self, gap: float) -> Backward:
-        """Return the transition of information about the state to ``gap`` seconds later:
-        ``e^{-A gap}`` (n, n) and the factor by which old information fades, so that it stays
-        bounded.
+        """Return the transition that turns information about the state now into information about
+        the state ``gap`` seconds later: ``e^{-A gap}`` (n, n), and the factor by which old
+        information fades, so that it stays bounded where the plant decays.
         """
         # A constant state: the exponential would be I up to rounding, and nothing fades.
         if not self.A.any():
@@ -121,8 +129,8 @@ class FlowModel:
         self, xhat: FloatArray, root: FloatArray, gap: float
     ) -> tuple[FloatArray, FloatArray]:
         """Return the estimate (n,) and the root (n, n) of its covariance ``gap`` seconds after
-        ``xhat`` (n,) and ``root`` (n, n); the root counts the gap's readings, the estimate does
-        not.
+        ``xhat`` (n,) and ``root`` (n, n); the root counts the increments of the gap, the estimate
+        not yet (``gain_update``).
         """
         root, xhat = flow_root(self.flow, root, xhat, gap)
         return xhat, root
@@ -141,9 +149,12 @@ class FlowModel:
     def gain_update(
         self, xhat: FloatArray, root: FloatArray, moments: FloatArray, gap: float
     ) -> FloatArray:
-        """Return the estimate (n,) after the increments of the last ``gap`` seconds with these
-        ``moments`` (2 p,), from the prediction ``xhat`` (n,) and ``root`` (n, n) at the end of the
-        gap; see algorithms/kernels/gains.
+        """Return the estimate (n,) after the increments of the last ``gap`` seconds, from the
+        prediction ``xhat`` (n,) and ``root`` (n, n) at the end of the gap; see
+        algorithms/kernels/gains.
+
+        ``moments`` (2 p,) are ``int dy`` and then ``int (2 (s - a) / gap - 1) dy`` over the gap,
+        which begins at time a.
         """
         return gain_update_root(self.gains, root, xhat, moments, gap)
 
@@ -151,7 +162,7 @@ class FlowModel:
         """Return the longest measurement interval, in seconds, for a covariance with this root
         (n, n), see ``Filter.max_measurement_interval``.
         """
-        # trace(P G) = |R^-1/2 H S|^2, without forming P.
+        # trace(P G) = |R^-1/2 H S|^2, without forming P = S S' and G = H' R^-1 H.
         HS = self.flow.whitened_H[0] @ root
         return usable(float((HS * HS).sum()))
 
@@ -213,14 +224,15 @@ class SlotModel:
 @kernel
 def usable(rate: float) -> float:
     """Return the longest interval (seconds) of increments for one update, for ``rate = trace(P G)``
-    in 1/s: P changes on the time scale 1 / rate, see ``Filter.max_measurement_interval``.
+    in 1/s with ``G = H' R^-1 H``: P changes on the time scale 1 / rate, see
+    ``Filter.max_measurement_interval``.
     """
     return MAX_RELATIVE_GAIN / rate if rate > 0.0 else math.inf
 
 
 def first_root(cov: FloatArray) -> FloatArray:
-    """Return the lower triangular root (n, n) of an initial covariance ``cov`` (n, n), which may be
-    singular.
+    """Return the lower triangular S (n, n) with ``S S' = cov``, for an initial covariance ``cov``
+    (n, n), which may be singular.
     """
     return lower_root(square_root(cov))
 

@@ -1,4 +1,5 @@
-"""Push-sum in continuous time: broadcast rounds by running sums, each node by its own clock.
+"""Push-sum in continuous time: broadcast rounds by running sums, each node by its own clock; the
+methods of ``push_sum.PushSum`` under clocks.
 
 The network's information is a mass that is spread over the nodes. Node i holds the weight w_i,
 which starts at 1, and with N nodes its share of the information is ``(w_i / N) P_i^-1`` and
@@ -39,8 +40,9 @@ offers nothing.
 
 
 class Offer(NamedTuple):
-    """The payload of a broadcast: its ``number`` at its sender, from 0, and the running ``total``
-    (1 + n n + n,) of weight w, information U by rows and ``u = U xhat``.
+    """The payload of a broadcast: its ``number`` among those of its sender, from 0, and the running
+    ``total`` (1 + n n + n,) of all shares so far: weight w, information U by rows and
+    ``u = U xhat``.
     """
 
     number: int
@@ -52,11 +54,12 @@ class RunningSums(NamedTuple):
 
     xhat, root : estimate (n,) and root (n, n) of its covariance
     model : of the plant and the node's sensors
-    weight : w
-    sent : total (1 + n n + n,) to each receiver, of w, information U and ``u = U xhat``
-    rounds : number of broadcasts
-    heard : number and total heard last, by sender
-    receivers, nodes : number of nodes that can hear, and of all
+    weight : w, the node's part of the N of all nodes
+    sent : total (1 + n n + n,) of the shares offered to each receiver so far, of w, information U
+           and ``u = U xhat``
+    rounds : number of broadcasts so far
+    heard : the newest offer heard, by sender; its total refers to the present state
+    receivers, nodes : number of nodes that can hear this one, and N
     """
 
     xhat: FloatArray
@@ -76,8 +79,8 @@ class RunningSums(NamedTuple):
 
 
 def start(model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo) -> RunningSums:
-    """Return the state at time 0, with estimate ``mean`` (n,), covariance ``cov`` (n, n) and weight
-    1, and nothing sent, of a ``node`` that knows how many can hear it.
+    """Return the state at time 0, with estimate ``mean`` (n,), covariance ``cov`` (n, n), weight 1
+    and nothing sent; ``node`` says how many nodes can hear it, and how many there are.
     """
     n = len(mean)
     return RunningSums(
@@ -94,8 +97,8 @@ def start(model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo) -> Runn
 
 
 def predict_sums(state: RunningSums, gap: float) -> RunningSums:
-    """Return the state ``gap`` seconds later: estimate and root are predicted, and all totals, sent
-    and heard, refer to the later state.
+    """Return the state ``gap`` seconds later: estimate and root are predicted, and all totals of
+    information, sent and heard, are made to refer to the plant's later state.
     """
     xhat, root = state.model.predict(state.xhat, state.root, gap)
     # Totals that were heard move too: the next ones, which are compared with them, will have moved.
@@ -105,8 +108,8 @@ def predict_sums(state: RunningSums, gap: float) -> RunningSums:
 
 
 def predict_offer(offer: Offer, back: Backward) -> Offer:
-    """Return an offer whose total refers to a later state; ``back`` is the transition of
-    information over the time between.
+    """Return the ``offer`` with its total made to refer to a later state of the plant; ``back`` is
+    the transition of information over the time between.
     """
     return offer._replace(total=_move_total(offer.total, back))
 
@@ -124,12 +127,14 @@ def _move_total(total: FloatArray, back: Backward) -> FloatArray:
 
 
 def offer(state: RunningSums) -> tuple[RunningSums, Offer | None]:
-    """Return the state after one round, and its offer; None if nobody can hear. Estimate and
-    covariance stay: all masses shrink by one factor.
+    """Return the state after one round, and its offer; None if nobody can hear. The node gives a
+    share 1 / (d + 1) of its mass to each of d receivers: its weight shrinks, while estimate and
+    covariance, ratios of masses, stay.
     """
     if state.receivers == 0:
         return state, None
     n = len(state.xhat)
+    # The mass (w, U, u): U = (w / N) P^-1 with P^-1 = S^-T S^-1 for the root S.
     inverse = scipy.linalg.solve_triangular(state.root, np.eye(n), lower=True)
     U = (state.weight / state.nodes) * (inverse.T @ inverse)
     mass = np.concatenate([[state.weight], U.reshape(-1), U @ state.xhat])
@@ -147,12 +152,14 @@ def offer(state: RunningSums) -> tuple[RunningSums, Offer | None]:
 
 
 def absorb_totals(state: RunningSums, messages: Sequence[Message]) -> RunningSums:
-    """Return the state whose mass has grown by the growth of each total since it was last heard; an
-    older total adds nothing. Changes ``xhat``, ``root``, ``weight`` and ``heard``.
+    """Return the state after all offers in ``messages``: its mass gains the growth of each sender's
+    total since it was last heard, while an offer older than that adds nothing. ``xhat``, ``root``,
+    ``weight`` and ``heard`` differ.
     """
     gained, heard = np.zeros_like(state.sent), dict(state.heard)
     for message in messages:
         new_offer: Offer = message.payload
+        # A total refers to the time of sending.
         if message.age > 0.0:
             new_offer = predict_offer(new_offer, state.model.backward(message.age))
         last_offer = heard.get(message.sender)
@@ -162,22 +169,26 @@ def absorb_totals(state: RunningSums, messages: Sequence[Message]) -> RunningSum
             new_offer.total if last_offer is None else new_offer.total - last_offer.total
         )
         heard[message.sender] = new_offer
+    # No weight arrived: with only old totals nothing has changed.
     if not gained[0] > 0.0:
         return state
     n, weight = len(state.xhat), state.weight + float(gained[0])
     U, u = gained[1 : 1 + n * n].reshape(n, n), gained[1 + n * n :]
-    # P^-1 <- (w P^-1 + N U) / w+ in roots; eigenvalues below 1 would be negative information.
+    # P^-1 <- (w P^-1 + N U) / w+ with the new weight w+. With ``scaled`` T, T T' = (w+ / w) P, it
+    # is T^-T (I + (N / w+) T' U T) T^-1; eigenvalues of the bracket below 1 would be negative
+    # information, by rounding.
     scaled = np.sqrt(weight / state.weight) * state.root
     share = state.nodes / weight
     values, vectors = np.linalg.eigh(np.eye(n) + 0.5 * share * (scaled.T @ (U + U.T) @ scaled))
     root = lower_root(scaled @ (vectors / np.sqrt(np.maximum(values, 1.0))))
+    # xhat <- xhat + P (N / w+) (u - U xhat) with the new P.
     xhat = state.xhat + root @ (root.T @ (share * (u - U @ state.xhat)))
     return state._replace(xhat=xhat, root=root, weight=weight, heard=heard)
 
 
 def update_sums(state: RunningSums, reading: Reading) -> RunningSums:
-    """Return the state after a reading: ``U += H' R^-1 H`` and ``u += H' R^-1 y``, that is N / w
-    times as much in P^-1, or a reading with noise R w / N.
+    """Return the state after a ``reading``: ``U += H' R^-1 H`` and ``u += H' R^-1 y``. Since
+    ``U = (w / N) P^-1``, that is a Kalman update by a reading with noise covariance R w / N.
     """
     if not len(reading.y):
         return state
@@ -187,8 +198,8 @@ def update_sums(state: RunningSums, reading: Reading) -> RunningSums:
 
 
 def weights(state: RunningSums) -> dict[str, list[float]]:
-    """Return the terms of the node's weight, plus the totals it sent, less those it heard, by the
-    name "weight": summed over all nodes they are N.
+    """Return as "weight" terms whose sum over all nodes is N, so that a run can report its drift:
+    the node's weight, plus the total that it sent to each receiver, less the totals it heard.
     """
     heard = [-float(offer.total[0]) for offer in state.heard.values()]
     sent = [float(state.sent[0])] * state.receivers
@@ -196,8 +207,8 @@ def weights(state: RunningSums) -> dict[str, list[float]]:
 
 
 def shift(state: RunningSums, offset: FloatArray) -> RunningSums:
-    """Return the state with ``offset`` (n,) added to the estimate and ``U offset`` to
-    every ``u``.
+    """Return the state with ``offset`` (n,) added to the estimate, for a move of the origin, and
+    ``U offset`` to every ``u = U xhat``.
     """
     heard = {sender: shift_offer(offer, offset) for sender, offer in state.heard.items()}
     sent = _shift_total(state.sent, offset)
