@@ -1,5 +1,17 @@
-"""The Kalman filter with intermittent observations, paper R (15)-(18); late readings are used
-exactly.
+"""The Kalman filter with intermittent observations, paper R (15)-(18) (Kar, Sinopoli and Moura):
+a node uses the readings that arrive, its own and its neighbours'.
+
+In slots the state is a prediction: after the readings of a slot it is predicted to the next one.
+Under clocks a message takes time, and its reading may be late. It is used exactly, as if it had
+come in time: the node remembers its past events, goes back to before the reading, and repeats all
+that came after it.
+
+The origin of coordinates moves now and then to near the true state, so that large states cost no
+digits (``shift``, ``rebase``). A move is an event of the past too.
+
+Kernels simulate L runs at once (lanes, the last axis) in B blocks, with the structs of
+``kernels.slots``: ``nodes`` (estimates and roots of H filters), ``readings``, ``plan`` (the events
+of S slots), ``links``, ``samples`` (output) and ``scratch``.
 """
 
 from __future__ import annotations
@@ -29,7 +41,7 @@ from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
 
 SLACK = 1.0 + 1e-6
-"""Factor of the time span that is remembered, since ages are rounded."""
+"""Factor by which the past that is remembered is longer than needed, since ages are rounded."""
 
 TIME_TOLERANCE = 1e-14
 """Relative difference up to which times count as equal, since the time of a state is a
@@ -38,13 +50,14 @@ sum of gaps.
 
 
 class Past(NamedTuple):
-    """One event in the past of a node, to repeat when a late reading arrives.
+    """One event in the past of a node, the start, a reading or a move of the origin, to repeat when
+    a late reading arrives.
 
     time : in seconds
     reading : the reading that was used, or None
-    offset : shift (n,) of the frame of coordinates, or None
+    offset : what a move of the origin added to the estimate (n,), or None
     xhat, root : estimate (n,) and root (n, n) right after the event
-    before : the event before it
+    before : the event before it, None if that is forgotten or there is none
     """
 
     time: float
@@ -60,10 +73,10 @@ class IntermittentState(NamedTuple):
 
     xhat, root : estimate (n,) and root (n, n) of its covariance
     model : of the plant and the node's sensors
-    unsent : own reading of this instant that has not been sent yet, or None
-    time : seconds that the state refers to
+    unsent : own reading of this instant, which may still be sent, or None
+    time : of the last prediction or reading, in seconds
     past : the newest event, linked to those before it, as far back as a late reading may reach
-    lag : length of that past in seconds; 0: none is stored
+    lag : length of that past in seconds; 0: no events are stored
     """
 
     xhat: FloatArray
@@ -97,7 +110,7 @@ def intermittent_slots(
     """
     for b in range(plan.up.shape[0]):
         for s in range(plan.up.shape[1]):
-            # Samples show predictions: before the reading of the slot.
+            # Samples show the predictions with which the slot begins.
             store_sample_of_slot(nodes, plan, samples, scratch, b, s)
             rebase(nodes, readings, scratch, b, s)
             if plan.sensed[s]:
@@ -175,12 +188,11 @@ class Intermittent(Filter):
         """Return the seconds of its past that a node must keep for late readings, if no message
         takes longer than ``max_delay`` seconds.
         """
-        # No message is older than the longest delay.
         return SLACK * min(self.max_age, max_delay)
 
     def predict(self, state: IntermittentState, gap: float) -> IntermittentState:
-        """Return the state ``gap`` seconds later, without the unsent reading: one of an earlier
-        instant is never sent.
+        """Return the state ``gap`` seconds later, without an unsent reading: a reading is sent at
+        its own instant or never.
         """
         xhat, root = state.model.predict(state.xhat, state.root, gap)
         return state._replace(xhat=xhat, root=root, time=state.time + gap, unsent=None)
@@ -205,7 +217,7 @@ class Intermittent(Filter):
         """
         for message in messages:
             reading: Reading = message.payload
-            # In slots a message of the exchange is always of now.
+            # In slots a message is used in the slot in which it was sent.
             if exchange.slot >= 0 or message.age <= 0.0:
                 state = _use_reading(state, reading)
             else:
@@ -219,19 +231,19 @@ class Intermittent(Filter):
         return age <= self.max_age
 
     def shift(self, state: IntermittentState, offset: FloatArray) -> IntermittentState:
-        """Return the state with ``offset`` (n,) added to the estimate; the past keeps the
-        coordinates of its time, and the shift becomes an event of it.
+        """Return the state with ``offset`` (n,) added to the estimate, for a move of the origin.
+        The past keeps the coordinates of its time, and the move becomes its newest event.
         """
         xhat = state.xhat + offset
-        # A late reading that goes back over this time must shift again on its way forward.
+        # After a late reading, the way forward from before this time must shift again.
         if state.lag > 0.0:
             past = Past(state.time, None, offset, xhat, state.root, state.past)
             state = state._replace(past=past)
         return state._replace(xhat=xhat)
 
     def shift_payload(self, payload: Reading, offset: FloatArray) -> Reading:
-        """Return the payload unchanged by ``offset`` (n,): a reading keeps the coordinates of its
-        time.
+        """Return the ``payload`` of a message under way, unchanged by ``offset`` (n,): a reading
+        keeps the coordinates of its time, to which the receiver goes back.
         """
         return payload
 
@@ -248,7 +260,7 @@ def _use_reading(state: IntermittentState, reading: Reading) -> IntermittentStat
     if state.lag <= 0.0:
         return state
     time, past = reading.time, state.past
-    # Once in each interval of length lag, so that dropping old events costs little.
+    # Forget old events once in each interval of length lag: each time copies those that stay.
     if time // state.lag > past.time // state.lag:
         past = _drop_old(past, time - state.lag)
     return state._replace(time=time, past=Past(time, reading, None, xhat, root, past))
@@ -294,7 +306,7 @@ def _drop_old(past: Past, since: float) -> Past:
     event: Past | None = past
     while event is not None:
         recent.append(event)
-        # One entry before ``since`` stays: a reading of that time starts from it.
+        # One entry before ``since`` stays: a late reading of that time starts from it.
         if event.time < since:
             break
         event = event.before

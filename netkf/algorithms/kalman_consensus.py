@@ -1,5 +1,16 @@
 """The Kalman-consensus filter: Olfati-Saber, "Kalman-consensus filter: optimality, stability, and
 performance", CDC 2009, Algorithm 1 (first proposed in CDC 2007, Algorithm 3).
+
+With predictions xbar_j, the readings heard and a consensus term give ``xhat = xbar + M (y - S xbar)
++ gamma P sum_j (xbar_j - xbar)``: y and S are sums of H' R^-1 y and H' R^-1 H over these readings,
+P is the covariance of xbar, M = (P^-1 + S)^-1, and gamma = epsilon / (1 + |P|).
+
+Kernels simulate L runs at once (lanes, the last axis) in B blocks, with the structs of
+``kernels.slots``: ``nodes`` (estimates and roots of H filters), ``readings`` (whitened, so that
+noise has variance 1), ``plan`` (the events of S slots), ``links``, ``samples`` (output) and
+``scratch``. Estimates are relative to an origin near the true state, which moves in some slots
+(``rebase``, ``shift``), so that large states cost no digits. A kernel ``*_single`` runs one node
+in one run, for the SimPy engine: both engines round alike.
 """
 
 from __future__ import annotations
@@ -42,7 +53,7 @@ class KcfState(NamedTuple):
 
     xhat, root : estimate (n,) and root (n, n) of P
     model : of the plant and the node's sensors
-    prior, prior_root : prediction of this instant and its root
+    prior, prior_root : prediction (n,) of this instant and its root (n, n), before any reading
     reading : the node's own reading of this instant, or None
     """
 
@@ -137,15 +148,14 @@ def consensus_term_single(
 @dataclass(frozen=True, eq=False)
 class Kcf(Filter):
     """Kalman update with the node's own and its neighbours' readings, plus a consensus term on
-    predictions, ``xhat = xbar + M (y - S xbar) + gamma P sum_j (xbar_j - xbar)`` with
-    ``M = (P^-1 + S)^-1`` and ``gamma = epsilon / (1 + |P|)``, Algorithm 1.
+    predictions, ``epsilon / (1 + |P|) P sum_j (xbar_j - xbar)``, Algorithm 1.
 
     epsilon         the strength of the consensus term
     share_readings  whether nodes send their readings beside their predictions (Algorithm 1); if
                     not, the update is with the node's own alone
 
     P counts the readings and leaves the consensus term out: it is no bound on the error. Under
-    clocks a reading is used by those who hear it without delay.
+    clocks a reading is used only by nodes that receive it without delay.
     """
 
     epsilon: float = field(number(low=0.0), default=0.1)
@@ -170,8 +180,9 @@ class Kcf(Filter):
         return (KcfArrays(self.epsilon, self.share_readings),)
 
     def payload_numbers(self, n: int, rows: int, phase: int) -> int:
-        """Return the size of a message about n states in numbers of 64 bits: (u, U, xbar), or xbar
-        alone from a node without ``rows`` or if readings are not shared.
+        """Return the size of a message about n states in numbers of 64 bits: (u, U, xbar) with
+        u = H' R^-1 y and U = H' R^-1 H, or xbar alone from a node without ``rows`` of readings or
+        if readings are not shared.
         """
         return 2 * n + n * (n + 1) // 2 if rows and self.share_readings else n
 
@@ -181,8 +192,8 @@ class Kcf(Filter):
         return KcfState(mean, root, model, mean, root)
 
     def predict(self, state: KcfState, gap: float) -> KcfState:
-        """Return the state ``gap`` seconds later; a reading of an earlier instant is not sent any
-        more.
+        """Return the state ``gap`` seconds later, a prediction without a reading: one of an earlier
+        instant is not sent any more.
         """
         xhat, root = state.model.predict(state.xhat, state.root, gap)
         return KcfState(xhat, root, state.model, xhat, root)
@@ -195,8 +206,8 @@ class Kcf(Filter):
         return state._replace(xhat=xhat, root=root, reading=reading)
 
     def emit(self, state: KcfState, exchange: Exchange) -> tuple[KcfState, Shared]:
-        """Return the state, unchanged, and the payload: the message (u, U, xbar) of Algorithm 1,
-        with the reading in place of u and U.
+        """Return the state, unchanged, and the payload: the prediction, and unless readings are not
+        shared the reading, which stands for u and U in the message (u, U, xbar) of Algorithm 1.
         """
         return state, Shared(state.prior, state.reading if self.share_readings else None)
 
@@ -212,7 +223,8 @@ class Kcf(Filter):
             # A late reading belongs to another instant.
             if reading is not None and (exchange.slot >= 0 or message.age <= 0.0):
                 xhat, root = sample_update(xhat, root, reading.y, reading.H, reading.R)
-        # Only the means are needed: the gain of the consensus term is the node's own P.
+        # Only the means are needed, since the gain of the consensus term is the node's own P: any
+        # root serves as second argument.
         predictions = [
             state.model.extrapolate(message.payload.xhat, state.root, message.age)[0]
             for message in messages
@@ -221,8 +233,8 @@ class Kcf(Filter):
         return state._replace(xhat=xhat + term, root=root)
 
     def shift(self, state: KcfState, offset: FloatArray) -> KcfState:
-        """Return the state with ``offset`` (n,) added to estimate and prediction: the consensus
-        term is made of differences.
+        """Return the state with ``offset`` (n,) added to estimate and prediction, for a move of the
+        origin: the consensus term is made of differences.
         """
         return state._replace(xhat=state.xhat + offset, prior=state.prior + offset)
 

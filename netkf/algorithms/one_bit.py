@@ -1,6 +1,16 @@
 """The sign-of-innovations filter: Ribeiro, Giannakis and Roumeliotis, "SOI-KF: Distributed Kalman
 filtering with low-cost communications using the sign of innovations", IEEE Trans. Signal Processing
 54, 2006.
+
+In each slot one node, whose turn it is, sends the signs of the innovations of its reading, one bit
+for each row, and it and all who hear it correct their estimates by these bits.
+
+Kernels simulate L runs at once (lanes, the last axis) in B blocks, with the structs of
+``kernels.slots``: ``nodes`` (estimates and roots of H filters), ``readings`` (whitened, so that
+noise has variance 1), ``plan`` (the events of S slots), ``links``, ``samples`` (output) and
+``scratch``. Estimates are relative to an origin near the true state, which moves in some slots
+(``rebase``, ``shift``), so that large states cost no digits. A kernel ``*_single`` runs one node
+in one run, for the SimPy engine: both engines round alike.
 """
 
 from __future__ import annotations
@@ -63,7 +73,7 @@ class Bits(NamedTuple):
 class OneBitState(NamedTuple):
     """The state of a node.
 
-    xhat, root : estimate (n,) and root (n, n) of P
+    xhat, root : estimate (n,) and root (n, n) of its covariance P
     model : of the plant and the node's sensors
     reading : the node's own reading of this slot, or None
     turn, nodes : the node sends in slots k with ``k % nodes == turn``
@@ -83,7 +93,7 @@ class OneBitState(NamedTuple):
 
 
 class BitArrays(NamedTuple):
-    """Scratch for L runs: the ``signs`` (p, L) of the rows of a reading that are sent in a slot."""
+    """Scratch for L runs: the ``signs`` (p, L) of the innovations that are sent in a slot."""
 
     signs: FloatArray
 
@@ -104,7 +114,8 @@ def one_bit_slots(
 
     Changes ``nodes.xhat`` (B, H, n, L) and ``nodes.root`` (B, H, n, n, L) in place, writes 0 into
     ``plan.sent`` and ``plan.up`` for messages that are not sent, and writes ``samples``.
-    ``plan.part`` says which part of a slot is simulated.
+    ``plan.part`` says which part of a slot is simulated: up to the messages that are sent
+    (SENDING), from their arrival on (ARRIVING), or both.
     """
     for b in range(plan.up.shape[0]):
         for s in range(plan.up.shape[1]):
@@ -156,7 +167,9 @@ def has_read(readings: ReadingBlock, rows: int, b: int, s: int, h: int) -> bool:
 
 @kernel
 def has_links(links: SlotLinks, h: int) -> bool:
-    """Return True if a link begins or ends at filter ``h``; others are never asked for messages."""
+    """Return True if a link begins or ends at filter ``h``: only then is it asked for messages, and
+    uses its own bits.
+    """
     linked = links.first[h] < links.first[h + 1]
     for m in range(len(links.sender)):
         linked |= links.sender[m] == h
@@ -255,9 +268,10 @@ def use_bit(
     or True): changes ``x[b, h]`` of x (B, H, n, L) and ``root[b, h]`` of root (B, H, n, n, L).
 
     ``index`` [s, sender, k] is slot, filter and row in ``readings.H``; ``row`` and ``gains`` (n, L)
-    are scratch. With ``p = h P h'``, ``P - (2 / pi) P h' h P / (p + 1)`` is the Kalman update with
-    noise ``r = (pi / 2 - 1) p + pi / 2``, and ``P h' sqrt(2 / pi / (p + 1))`` is its gain times
-    ``sqrt(pi / 2 (p + 1))``. Axes: B blocks of runs, H filters.
+    are scratch. The paper's update with noise variance 1 is
+    ``x + sqrt(2 / pi) P h' / sqrt(p + 1) sign`` and ``P - (2 / pi) P h' h P / (p + 1)`` with
+    ``p = h P h'``. The latter is a Kalman update with noise ``r = (pi / 2 - 1) p + pi / 2``, and
+    the former its gain times ``sqrt(pi / 2 (p + 1)) sign``. Axes: B blocks of runs, H filters.
     """
     s, sender, k = index
     n = x.shape[2]
@@ -269,15 +283,15 @@ def use_bit(
         total = spread(lanes, 0.0)
         for i in range(j, n):
             total += load(lanes, readings.H, c, t, sender, k, i) * load(lanes, root, b, h, i, j)
-        # A row of zeros changes nothing.
+        # Zeros in lanes where it has not arrived: a row of zeros changes nothing.
         total = select(arrived, total, 0.0)
         square += total * total
         store(lanes, row, j, total)
+    # ``row`` becomes h S / sqrt(r): an observation of unit noise.
     scale = 1.0 / root_of((HALF_PI - 1.0) * square + HALF_PI)
     for j in range(n):
         store(lanes, row, j, scale * load(lanes, row, j))
-    # ``row`` is scaled to unit noise; the Kalman gain of such an observation is ``gains`` times
-    # ``inverse_deviation``.
+    # The Kalman gain of such an observation is ``gains`` times ``inverse_deviation``.
     inverse_deviation = rotate_lanes(lanes, row, root, b, h, row, gains)
     step = sign * inverse_deviation * scale * root_of(HALF_PI * (square + 1.0))
     for i in range(n):
@@ -314,7 +328,8 @@ def use_bits_single(
 class OneBit(Filter):
     """Nodes take turns: in slot k the node of index k mod N broadcasts the signs of its
     innovations, one bit for each row of its reading, and all who hear it correct by them,
-    ``xhat + sqrt(2 / pi) P h' / sqrt(h P h' + r) b`` and ``P - (2 / pi) P h' h P / (h P h' + r)``.
+    ``xhat + sqrt(2 / pi) P h' / sqrt(h P h' + r) b`` and ``P - (2 / pi) P h' h P / (h P h' + r)``
+    for the sign b of a row h of H with noise variance r.
 
     It is the paper's filter if all nodes receive all bits. A node that misses some continues with
     another estimate, to which later bits do not refer. Readings enter as bits only, also the
@@ -348,7 +363,7 @@ class OneBit(Filter):
 
     def init(self, model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo) -> OneBitState:
         """Return the first state of a node, with estimate ``mean`` (n,) and covariance ``cov``
-        (n, n); the node knows its turn.
+        (n, n); it knows its turn from its index ``node.place``.
         """
         return OneBitState(mean, first_root(cov), model, None, node.place, node.nodes)
 
@@ -385,8 +400,9 @@ class OneBit(Filter):
 def apply_bits(
     state: OneBitState, use: Any, y: FloatArray, H: FloatArray, signs: FloatArray
 ) -> OneBitState:
-    """Return the state after ``use`` of the bits of a whitened reading y (p,), H (p, n), a kernel:
-    ``send_bits_single`` writes the ``signs`` (p,) in place, ``use_bits_single`` reads them.
+    """Return the state corrected by the bits of a whitened reading y (p,), H (p, n), which the
+    kernel ``use`` applies: ``send_bits_single``, for the sender, writes the ``signs`` (p,) in
+    place, ``use_bits_single``, for a receiver, reads them and ignores y.
     """
     n = len(state.xhat)
     x = np.array(state.xhat).reshape(1, 1, n, 1)

@@ -23,8 +23,9 @@ message loses no mass. Under clocks the filter is that of ``algorithms.running_s
 Kernels simulate L runs at once (lanes, the last axis) in B blocks, with the structs of
 ``kernels.slots``: ``nodes`` (estimates and roots of H filters), ``readings`` (whitened, so that
 noise has variance 1), ``plan`` (the events of S slots), ``links``, ``samples`` (output) and
-``scratch``. A kernel ``*_single`` runs one node in one run, for the SimPy engine: both engines
-round alike.
+``scratch``. Estimates are relative to an origin near the true state, which moves in some slots
+(``rebase``, ``shift``), so that large states cost no digits. A kernel ``*_single`` runs one node
+in one run, for the SimPy engine: both engines round alike.
 """
 
 from __future__ import annotations
