@@ -12,6 +12,17 @@ they combine and in how often they count it:
 * ICF: the sum of the pair of the reading and 1/N of that of the prediction, counted N times (Kamal,
   Farrell and Roy-Chowdhury, "Information weighted consensus filters and their application in
   distributed camera networks", IEEE Trans. Automatic Control 58, 2013).
+
+A node holds K such pairs, ``parts``, and a ``Recipe`` says how the filters differ. A pair is stored
+as a root [Z, z] (n, n + 1), ``Omega = Z' Z`` and ``q = Omega c + Z' z``, relative to a centre c,
+the node's prediction, so that differences of near states lose no digits.
+
+Kernels simulate L runs at once (lanes, the last axis) in B blocks, with the structs of
+``kernels.slots``: ``nodes`` (estimates and roots of H filters), ``readings`` (whitened, so that
+noise has variance 1), ``plan`` (the events of S slots), ``links``, ``samples`` (output) and
+``scratch``. Estimates are relative to an origin near the true state, which moves in some slots
+(``rebase``, ``shift``), so that large states cost no digits. A kernel
+``*_single`` runs one node in one run, for the SimPy engine: both engines round alike.
 """
 
 from __future__ import annotations
@@ -56,10 +67,11 @@ INFORMATION, MEASUREMENTS, HYBRID = "information", "measurements", "hybrid"
 
 
 class Recipe(NamedTuple):
-    """How the K pairs of a node begin, and how its estimate follows from them after the last step.
+    """How the K pairs of a node begin a slot, and how its estimate follows from them after the last
+    step: the information of the estimate is a sum.
 
-    shares : (K, 2), multiples of the information of the prediction and of the reading
-    counts : (K + 1,), multiples of each pair after the last step, and of the node's own prediction
+    shares : (K, 2), multiples of the information of the prediction and of the reading in each pair
+    counts : (K + 1,), multiples of each pair in the sum, then of the node's own prediction
     """
 
     shares: FloatArray
@@ -77,9 +89,9 @@ class ConsensusState(NamedTuple):
     xhat, root : estimate (n,) and root (n, n) of its covariance; the prediction until the last step
                  of a slot
     model : of the plant and the node's sensors
-    recipe : how often pairs count
-    parts : roots (K, n, n + 1) of the node's pairs after its reading, see ``kernels.information``;
-            None outside of a slot
+    recipe : of what pairs are made, and how often each counts
+    parts : roots (K, n, n + 1) of the node's pairs, from its reading to the last step of a slot,
+            else None
     """
 
     xhat: FloatArray
@@ -95,15 +107,18 @@ class ConsensusState(NamedTuple):
 
 
 class Pairs(NamedTuple):
-    """A payload: roots (K, n, n + 1) of K pairs, relative to ``xhat`` (n,)."""
+    """A payload: roots ``parts`` (K, n, n + 1) of K pairs, relative to ``xhat`` (n,), the sender's
+    prediction.
+    """
 
     xhat: FloatArray
     parts: FloatArray
 
 
 class ConsensusArrays(NamedTuple):
-    """The ``steps`` of a slot, the recipe, ``shares`` (K, 2) and ``counts`` (K + 1,), and the K
-    pairs of all H nodes of a block, ``parts`` (2, K, H, n, n + 1, L), before and after a step.
+    """The ``steps`` of a slot, the ``Recipe`` as ``shares`` (K, 2) and ``counts`` (K + 1,), and two
+    copies of the K pairs of all H nodes of a block, ``parts`` (2, K, H, n, n + 1, L): each step
+    reads one and writes the other.
     """
 
     steps: int
@@ -192,9 +207,9 @@ def begin_part_single(
 def mix_parts_single(
     parts: FloatArray, links: SlotLinks, up: Any, centre: FloatArray, work: Any
 ) -> None:
-    """Do a consensus step of one node in one run: read copy 0 of its K information pairs, the first
-    of H nodes in ``parts`` (2, K, H, n, n + 1, 1), and of those of its senders, and write copy 1 of
-    its own.
+    """Do a consensus step of one node in one run, the first of H nodes in ``parts``
+    (2, K, H, n, n + 1, 1), the others its senders: read copy 0 of the K information pairs of all,
+    and write copy 1 of its own.
 
     ``centre`` (H, n, 1) are the means that pairs are relative to, ``up`` (1, 1, 1, W, 1) flags the
     messages of W senders, and ``work`` (2, n, n + 1, 1) is scratch.
@@ -212,9 +227,9 @@ def write_estimate_single(
     centre: FloatArray,
     work: FloatArray,
 ) -> None:
-    """Write the estimate x (1, 1, n, 1) and its root (1, 1, n, n, 1) of one node in one run from
-    its K information pairs ``parts[0]`` of ``parts`` (2, K, 1, n, n + 1, 1) and its prediction,
-    which count as often as ``counts`` (K + 1,) says.
+    """Write the estimate x (1, 1, n, 1) and its root (1, 1, n, n, 1) of one node in one run: its
+    information is the sum of ``counts[k]`` times pair k of ``parts[0]``, of ``parts``
+    (2, K, 1, n, n + 1, 1), and ``counts[K]`` times that of the prediction.
 
     ``root`` and ``centre`` (1, n, 1) hold the prediction; ``inverse`` (1, n, n, 1) and ``work``
     (2, n, n + 1, 1) are scratch.
@@ -225,7 +240,8 @@ def write_estimate_single(
 
 @dataclass(frozen=True, eq=False)
 class InformationConsensus(Filter):
-    """Consensus on information pairs; ``recipe`` of a derived class says which ones.
+    """Consensus on information pairs, ``steps`` times a slot; ``recipe`` of a derived class says
+    which ones.
 
     The weights are Metropolis', ``1 / (1 + max degree)`` for each link; the weight of a message
     that does not come stays with the node itself, so that weights always sum to one.
@@ -248,7 +264,7 @@ class InformationConsensus(Filter):
         """
 
     def exchange_steps(self, phase: int) -> int:
-        """Return ``steps``, the number of steps of the only exchange of a slot."""
+        """Return the setting ``steps``, the number of steps of the only exchange of a slot."""
         return self.steps
 
     def slot_arrays(
@@ -272,13 +288,13 @@ class InformationConsensus(Filter):
 
     def init(self, model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo) -> ConsensusState:
         """Return the first state of a node, with estimate ``mean`` (n,) and covariance ``cov``
-        (n, n); the node knows how many nodes there are.
+        (n, n), and the recipe for the number of nodes, which ``node`` tells.
         """
         return ConsensusState(mean, first_root(cov), model, self.recipe(node.nodes))
 
     def update(self, state: ConsensusState, reading: Any) -> ConsensusState:
-        """Return the state with its first pairs, made of the prediction and the ``reading``; under
-        clocks the state after a Kalman update.
+        """Return the state with the pairs with which the slot begins, made of the prediction and
+        the ``reading``; under clocks the state after a Kalman update.
         """
         if not isinstance(state.model, SlotModel):
             updated: ConsensusState = super().update(state, reading)
@@ -310,8 +326,8 @@ class InformationConsensus(Filter):
         return state._replace(xhat=xhat, root=root, parts=None)
 
     def _intersect(self, state: ConsensusState, messages: Sequence[Message]) -> ConsensusState:
-        """Return the state after one step of consensus under clocks, on the pairs of those heard,
-        predicted to now.
+        """Return the state after one step of consensus under clocks: the information pair of its
+        estimate becomes the weighted sum of it and those of ``messages``, predicted to now.
         """
         weights, means, roots = weighted_pairs(state, messages)
         xhat, root = intersect_roots(weights, means, roots)
@@ -330,10 +346,11 @@ class Hcmci(InformationConsensus):
     consensus       "hybrid": the pairs of the prediction and of the reading, each by itself;
                     "information" (CI): that of both together, P is never below the covariance of
                     the error; "measurements" (CM): that of the reading alone
-    novelty_weight  how often the combined pair of the readings counts, omega of the paper; by
-                    default N, the number of nodes, which is right in the limit of many steps
+    novelty_weight  how often the pair of the readings counts after the last step, omega of the
+                    paper; by default N, the number of nodes, which is right in the limit of many
+                    steps, where that pair is the average of all readings
 
-    Under clocks "information" alone: each message heard is one step of it.
+    Under clocks only "information" is allowed: all messages of an instant are one step of it.
     """
 
     consensus: str = field(one_of(HYBRID, INFORMATION, MEASUREMENTS), default=HYBRID)
@@ -343,9 +360,9 @@ class Hcmci(InformationConsensus):
     one_way: ClassVar[bool] = True
 
     def recipe(self, nodes: int) -> Recipe:
-        """Return the recipe of the paper's Algorithm for a network of N ``nodes`` and the variant
-        that was chosen: from which shares of prediction and reading the pairs begin, and how often
-        each counts in the estimate.
+        """Return the recipe for a network of N ``nodes`` and the variant that was chosen: from
+        which shares of prediction and reading the pairs begin, and how often each counts in the
+        estimate.
         """
         omega = float(nodes) if self.novelty_weight is None else self.novelty_weight
         # Rows: shares of prediction and reading in a pair; then how often each pair counts, and the
@@ -401,8 +418,8 @@ class Icf(InformationConsensus):
 
 
 def first_parts(state: ConsensusState, reading: Reading) -> FloatArray:
-    """Return the roots (K, n, n + 1) of the K information pairs that a node begins a slot with,
-    from its prediction and its ``reading``.
+    """Return the roots (K, n, n + 1) of the K information pairs with which a node begins a slot,
+    from its prediction in ``state`` and its ``reading``.
     """
     n, (y, H, R) = len(state.xhat), reading[:3]
     if len(y):
@@ -429,7 +446,7 @@ def mix_node_parts(xhat: FloatArray, parts: FloatArray, messages: Sequence[Messa
     its own ``parts`` (K, n, n + 1), relative to ``xhat`` (n,), and those in the payloads of
     ``messages``.
     """
-    # The kernel of slots on a network of one node and its senders.
+    # The kernel of slots on a star: node 0 is this one, the others are its senders.
     K, n, _ = parts.shape
     stack = np.zeros((2, K, 1 + len(messages), n, n + 1, 1))
     centre = np.stack([xhat, *(message.payload.xhat for message in messages)])[..., None]
@@ -443,7 +460,7 @@ def mix_node_parts(xhat: FloatArray, parts: FloatArray, messages: Sequence[Messa
 
 def estimate_of(state: ConsensusState, parts: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return estimate (n,) and root (n, n) of a node from its K information pairs after the last
-    step, the roots ``parts`` (K, n, n + 1), and its prediction.
+    step, the roots ``parts`` (K, n, n + 1), and its prediction in ``state``, as its recipe says.
     """
     K, n, _ = parts.shape
     stack = np.zeros((2, K, 1, n, n + 1, 1))

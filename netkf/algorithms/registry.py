@@ -3,6 +3,9 @@
 A filter's file says what the rest of the package must know of it: its name in scenario files, the
 paper whose theory and checks apply to it (packages ``netkf.theory.<paper>`` and
 ``netkf.checks.<paper>``), and how it combines messages (``Filter.combination``).
+
+A user's class that derives from a built-in one is still covered by its theorems unless it overrides
+a method or class variable on which they rely: ``own_attributes`` and ``overridden`` tell.
 """
 
 from __future__ import annotations
@@ -20,10 +23,10 @@ from netkf.core.fields import as_class
 
 F = TypeVar("F", bound=type[Filter])
 
-_REGISTERED: dict[str, type[Filter]] = {}
+_REGISTERED: dict[str, type[Filter]] = {}  # by name, see choice_name
 
 WEIGHING = ("share", "max_measurement_interval", "steps", "exchange_steps", "redraws_links")
-"""Methods besides STEPS that theorems rely on; other weights of links are known to the theory."""
+"""Methods that theorems rely on, besides STEPS, the methods that define a filter."""
 
 LINK_WEIGHTS = ("weight", "pair_weights")
 """Methods that a derived class may override without losing the theory, which asks it for its
@@ -36,8 +39,9 @@ TRAITS = ("schedule", "clocks", "predicts", "first_slot", "pairwise", "talks", "
 
 
 def built_in(kind: str, **choice: str) -> Callable[[F], F]:
-    """Register a filter class under its ``kind`` in scenario files; where several classes share a
-    kind, a key and its value are the ``choice`` of this one.
+    """Return a decorator that registers a filter class under its ``kind`` in scenario files; where
+    several classes share a kind, a key and its value are the ``choice`` of this one, as in
+    ``@built_in("track-fusion", rule="ci")``.
     """
 
     def register(cls: F) -> F:
@@ -74,16 +78,16 @@ def built_in_filters() -> dict[str, type[Filter]]:
 
 
 def built_in_class(algorithm: object) -> type[Filter] | None:
-    """Return the built-in class of the filter ``algorithm``, or the one that its class is derived
-    from; None if there is none.
+    """Return the built-in class of the filter ``algorithm``, or the nearest from which its class
+    derives; None if there is none.
     """
     classes = set(built_in_filters().values())
     return next((cls for cls in type(algorithm).__mro__ if cls in classes), None)
 
 
 def base_filter(algorithm: Filter) -> Filter:
-    """Return the built-in filter that a user's filter ``algorithm`` derives from, with the same
-    parameters.
+    """Return a filter of the built-in class from which a user's filter ``algorithm`` derives, with
+    the same parameters.
 
     Raises TypeError if it derives from none.
     """
@@ -95,10 +99,11 @@ def base_filter(algorithm: Filter) -> Filter:
 
 
 def own_attributes(algorithm: object) -> list[str]:
-    """Return the attributes of the built-in class that a user's class defines anew, sorted.
+    """Return the attributes of the built-in class that the class of a user's filter ``algorithm``
+    defines anew, sorted; [] if it derives from none.
 
     Methods, class variables, weights and private helpers alike; fields and dunder names are left
-    out.
+    out. Checks of papers do not certify such a class.
     """
     base = built_in_class(algorithm)
     if base is None:
@@ -115,10 +120,11 @@ def own_attributes(algorithm: object) -> list[str]:
 
 
 def overridden(algorithm: object, base: type | None = None) -> list[str]:
-    """Return the methods and class variables that a user's class defines anew, other than weights
-    of links.
+    """Return the methods and class variables, of those on which theorems rely, that the class of a
+    user's filter ``algorithm`` defines anew: theorems about the built-in class do not hold for it.
 
-    Theorems about the built-in class (``base``) do not hold for it.
+    ``base`` is that class, by default the one from which it derives. Weights of links are not
+    listed: the theory asks the filter for them.
     """
     base = base or built_in_class(algorithm)
     cls = type(algorithm)

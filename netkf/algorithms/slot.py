@@ -1,11 +1,11 @@
-"""Slot filters: the former contract of filters in slots, for classes of users; kernels of slots.
+"""Slot filters: the deprecated contract of filters in slots, kept for users' classes.
 
 New filters derive from ``netkf.algorithms.filter.Filter``; ``algorithms.adapters`` makes one of a
-slot filter. Each slot is a short programme of phases that the filter declares, such as
-``("exchange", "sense")``. An exchange has one step or several; in each every node may send once
-and then absorbs all that arrived before the inbox closed. In a sense phase it is handed the
-reading of the slot. States are NamedTuples of arrays that nothing changes in place. Covariances
-are carried as square roots, ``P = root root'``.
+slot filter. Each slot is a short sequence of phases that the filter declares, its ``programme``,
+such as ``("exchange", "sense")``. An exchange has one step or several; in each every node may send
+once and then absorbs all that arrived before its inbox closed, at the end of the step. In a sense
+phase it is given the reading of the slot. States are NamedTuples of arrays that nothing changes in
+place. Covariances are carried as square roots, ``P = root root'``.
 """
 
 from __future__ import annotations
@@ -39,14 +39,17 @@ __all__ = [
     "SlotState",
     "update_and_predict",
 ]
-"""Filters and models have moved; classes of users may still ask for them here."""
+"""Filters and models have moved; users' classes may still import them from here."""
 
 Messages = Sequence[tuple[float, Any, float]]
+"""(weight, payload, age) of each message: the weight that the receiver gives it, and its seconds
+under way.
+"""
 
 
 class SlotState(NamedTuple):
     """The state of a node: estimate ``xhat`` (n,), ``root`` (n, n) of its covariance, the
-    ``model``, and a ``kept`` reading or None.
+    ``model``, and a reading that it has ``kept`` to send it, or None.
     """
 
     xhat: FloatArray
@@ -74,14 +77,15 @@ class Role(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class SlotFilter(Component):
-    """The contract of every filter in slots.
+    """The deprecated contract of filters in slots: the engine calls these methods, and class
+    variables say how.
 
     ``programme`` lists the phases of a slot, "exchange" or "sense"; ``first_slot`` is the first in
     which nodes exchange; ``predicts`` says that a sample shows the prediction with which a slot
     begins, else what is known after its reading; ``pairwise`` that nodes exchange in pairs (a
     matching), else all with all neighbours; ``one_way`` that links may go one way and that nodes
-    need not all be joined; ``inverts`` that covariances must never be singular. ``talks``,
-    ``pooled``: as for flow filters.
+    need not all be joined; ``inverts`` that covariances must never be singular; ``talks`` that
+    nodes exchange messages; ``pooled`` that one filter reads the sensors of all nodes at once.
     """
 
     programme: ClassVar[tuple[str, ...]] = ("exchange", "sense")
@@ -98,25 +102,28 @@ class SlotFilter(Component):
         return SlotState(mean, square_root(cov), model)
 
     def place(self, state: Any, role: Role) -> Any:
-        """Return the state at slot 0 of a node that knows its role; asked for after ``init``."""
+        """Return the ``state`` of ``init`` completed for a node that knows its ``role``; called
+        once, before slot 0.
+        """
         return state
 
     def steps(self, phase: int) -> int:
-        """Return how often exchange number ``phase`` of a slot is repeated; its time is shared
-        evenly.
+        """Return how often exchange number ``phase`` of a slot, from 0, is repeated, in equal
+        times.
         """
         return 1
 
     def redraws(self, phase: int, step: int) -> bool:
-        """Return True if links draw new outcomes in repetition ``step`` of exchange number
-        ``phase``, else each keeps its last one; True in the first.
+        """Return True if links draw new outcomes (which messages arrive) in repetition ``step``,
+        from 0, of exchange number ``phase``; else each keeps its last one. The first step always
+        draws.
         """
         return True
 
     @abstractmethod
     def sense(self, state: Any, reading: Reading) -> Any:
-        """Return the state once the node's reading of this slot is known; p is 0 without
-        sensors.
+        """Return the state after the node's reading of this slot, which has no rows if the node has
+        no sensors.
         """
 
     def emit(self, state: Any, phase: int) -> Any:
@@ -124,8 +131,8 @@ class SlotFilter(Component):
         return None
 
     def absorb(self, state: Any, phase: int, messages: Messages) -> Any:
-        """Return the state when the inbox of that step closes; called for every node, with all
-        ``(weight, payload, age)`` that arrived in time in the order of their senders.
+        """Return the state when the inbox of a step of exchange number ``phase`` closes; called for
+        every node, with all ``messages`` that arrived in time, in the order of their senders.
         """
         return state
 
@@ -141,20 +148,20 @@ class SlotFilter(Component):
         return {}
 
     def weight(self, degree: int, peer_degree: int) -> float:
-        """Return the weight a node of ``degree`` links gives to a message of a
-        ``peer_degree`` one.
+        """Return the weight that a node of ``degree`` links gives to a message of one of
+        ``peer_degree`` links, by default the Metropolis weight.
         """
         return 1.0 / (1.0 + max(degree, peer_degree))
 
     @property
     def pair_weights(self) -> FloatArray | None:
-        """Weights of N nodes (N, N) in the order of their ids: entry [l, i] is the weight node i
-        gives to a message of node l. None where ``weight`` says it.
+        """Weights of N nodes (N, N) in the order of their ids: entry [l, i] is the weight that node
+        i gives to a message of node l. None if ``weight`` gives the weights.
         """
         return None
 
     def largest_degree(self) -> float:
-        """Return the largest number of links a node may have."""
+        """Return the largest number of links that a node may have."""
         return np.inf
 
     def estimate(self, state: Any) -> tuple[FloatArray, FloatArray]:
@@ -165,9 +172,9 @@ class SlotFilter(Component):
 def update_and_predict(
     xhat: FloatArray, root: FloatArray, model: SlotModel, reading: Reading
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the next prediction (n,) and the root (n, n) of its covariance, from a prediction
-    ``xhat`` (n,), any ``root`` (n, n) of its covariance, and the reading of the slot, which may
-    have no rows.
+    """Return the prediction (n,) of the next slot and the lower triangular root (n, n) of its
+    covariance, from a prediction ``xhat`` (n,), any ``root`` (n, n) of its covariance, and the
+    reading of the slot, which may have no rows. For users' slot filters that predict last.
     """
     root = lower_root(root)
     if len(reading.y):

@@ -1,4 +1,6 @@
-"""Checks of the first estimates of filters whose nodes know how the errors of others correlate."""
+"""Checks of the first estimates in a scenario, for filters whose nodes compute how the errors of
+other nodes correlate with theirs, which is known only if all start alike.
+"""
 
 from __future__ import annotations
 
@@ -10,8 +12,8 @@ from netkf.core.errors import ScenarioError
 
 
 def require_common_start(scenario: Any, why: str, other: str) -> None:
-    """Raise ScenarioError unless all nodes of a ``netkf.Scenario`` start with one mean and one
-    covariance. The message ends with the reason ``why`` they must, and names the ``other`` filter
+    """Raise ScenarioError unless all nodes of a ``netkf.Scenario`` start with the same mean and the
+    same covariance. ``why``, the reason, ends the rule in the message; ``other`` names a filter
     that does not need it.
     """
     starts = [scenario.initial_estimate(node) for node in scenario.nodes]

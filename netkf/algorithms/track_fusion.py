@@ -6,6 +6,17 @@
   with inverse covariance intersection", Automatica 79, 2017.
 * With known cross-covariances: Bar-Shalom and Campo, "The effect of the common process noise on the
   two-sensor fused-track covariance", IEEE Trans. Aerospace and Electronic Systems 22, 1986.
+
+A track is a node's estimate. By the first two rules (``PairFusion``) nodes fuse estimates in place
+of their own. By the third (``BarShalomCampo``) each node's own track is a Kalman filter on its own
+readings; fused estimates are only reported. Its joint covariance holds E[e_i e_j'] (n, n) of the
+errors of all pairs of tracks.
+
+Kernels simulate L runs at once (lanes, the last axis) in B blocks, with the structs of
+``kernels.slots``: ``nodes`` (estimates and roots of H filters), ``readings`` (whitened, so that
+noise has variance 1), ``plan`` (the events of S slots), ``links``, ``samples`` (output) and
+``scratch``. Estimates are relative to an origin near the true state, which moves in some slots
+(``rebase``, ``shift``), so that large states cost no digits.
 """
 
 from __future__ import annotations
@@ -50,15 +61,18 @@ from netkf.linalg.lanes import blocks_of, in_lanes, load, store
 from netkf.linalg.small import copy_matrix
 
 TRACE, DETERMINANT = "trace", "determinant"
-INTERSECTION = 'rule = "ci"'
+INTERSECTION = 'rule = "ci"'  # the filter that error messages recommend
 COMBINATIONS, MAX_DIRECTION_BITS = 64, 62
-"""Combinations of tracks in the cache of a node, and directions that have a bit of their own."""
+"""Combinations of tracks in the cache of a node, and incoming links that have a bit of their own in
+its keys.
+"""
 
 
 class FusionArrays(NamedTuple):
     """The rule of fusion and scratch, for one estimate of n states at a time.
 
-    inverse, trace : rule and criterion, as in ``fuse_pair``
+    inverse : whether the rule is inverse covariance intersection, else covariance intersection
+    trace : whether the weight minimises the trace of P, else its determinant
     pair : (2 n + 2, n), scratch of ``fuse_pair``
     x, root : (n,) and (n, n), estimate that is fused, and its root
     other_x, other : (n,) and (n, n), those of a sender
@@ -186,7 +200,9 @@ class PairFusion(Filter):
         return (FusionArrays(self.inverse, self.minimise == TRACE, *scratch),)
 
     def absorb(self, state: State, messages: Sequence[Message], exchange: Exchange) -> State:
-        """Return the state after fusion with each estimate heard, predicted to now."""
+        """Return the state after fusion with each estimate heard, predicted to now, one after the
+        other.
+        """
         pair = state.xhat, state.root
         for message in messages:
             payload = message.payload
@@ -223,22 +239,23 @@ class InverseIntersection(PairFusion):
 
 
 class Track(NamedTuple):
-    """A payload: the sender's own track ``xhat`` (n,), and its whitened sensors H (p, n)."""
+    """A payload: the sender's own track ``xhat`` (n,), and the whitened H (p, n) of its sensors."""
 
     xhat: FloatArray
     H: FloatArray
 
 
 class TrackState(NamedTuple):
-    """The state of a node.
+    """The state of a node of ``BarShalomCampo``.
 
     xhat, root : the node's own track (n,) and its root (n, n)
     model : of the plant and the node's sensors
     fused, fused_root : the reported estimate (n,) and its root (n, n)
     slot : number of the slot
-    senders, sensors : ids of nodes heard of (-1: itself, first), and the whitened H of each
-    joint : (m, m, n, n), covariances of the errors of these m tracks
-    start : covariance (n, n) with which all of them began
+    senders, sensors : ids of the m nodes whose sensors it knows, first -1 for itself, then those it
+                       has heard, and the whitened H of each
+    joint : (m, m, n, n), covariances E[e_i e_j'] of the errors of their tracks
+    start : covariance (n, n) of the error with which all tracks began
     """
 
     xhat: FloatArray
@@ -259,11 +276,13 @@ class TrackState(NamedTuple):
 
 
 class CombinationCache(NamedTuple):
-    """Combinations that were computed for one node in one slot, C at most.
+    """Combinations that were computed for one node in one slot, C at most: all runs in which it
+    hears the same nodes share one.
 
-    key : (C,), a bit for each direction on which a track arrived, -1 for a free entry
-    rank : (C,), rank of the differences of the tracks
-    gain, root : (C, n, k n) and (C, n, n), see ``combine_tracks``
+    key : (C,), a number with a bit for each incoming link on which a track arrived; -1: free entry
+    rank : (C,), rank of the differences of the tracks; 0: all tracks are the same
+    gain : (C, n, k n), gains of the differences of up to k tracks to the own one
+    root : (C, n, n), root of the covariance of the combination
     """
 
     key: np.ndarray
@@ -273,16 +292,17 @@ class CombinationCache(NamedTuple):
 
 
 class TrackArrays(NamedTuple):
-    """Tracks of all H nodes for B blocks of L runs.
+    """What ``track_slots`` keeps of all H nodes for B blocks of L runs.
 
-    xhat, root : own tracks (B, H, n, L) and (B, H, n, n, L)
-    Q, H : (n, n) and whitened sensors (H, p, n)
-    joint, pairs : covariances (K, n, n) of the pairs (K, 2) of tracks that some node may combine
-    first : (H + 1,), pairs of track i begin at ``first[i]``
-    closed : (H, n, n), scratch
+    xhat, root : own tracks (B, H, n, L) and their roots (B, H, n, n, L)
+    Q, H : process noise covariance (n, n) and whitened sensors (H, p, n)
+    joint, pairs : covariances E[e_i e_j'] (K, n, n), the same in all runs, of the pairs (i, j),
+                   (K, 2), of tracks that some node may combine
+    first : (H + 1,), pairs (i, .) begin at ``first[i]``
+    closed : (H, n, n), scratch, I - K_i H_i of each node
     tracks, block : scratch, indices (D + 1,) of the tracks to combine, the own one first, and their
                     joint covariance (D + 1, D + 1, n, n), for at most D senders
-    scratch, cache : of combinations
+    scratch, cache : for combinations
     """
 
     xhat: FloatArray
@@ -315,6 +335,7 @@ def track_slots(
     Changes the tracks and their covariances ``joint`` in ``arrays``, writes the reported estimates
     into ``nodes.xhat`` (B, H, n, L) and ``nodes.root`` (B, H, n, n, L), and ``samples``.
     """
+    # The own tracks as nodes of a Kalman filter; ``nodes`` are the reported estimates.
     tracks = SlotNodes(arrays.xhat, arrays.root, nodes.F, nodes.root_Q, nodes.rows)
     work = arrays.scratch.work
     # Slot by slot: the covariances of tracks are the same in all runs.
@@ -375,7 +396,7 @@ def combine_received(
         if plan.up[b, s, 0, links.direction[m], q]:
             count += 1
             arrays.tracks[count] = links.sender[m]
-            # The key of the combination has a bit for each direction on which a track arrives.
+            # The key of the combination has a bit for each incoming link on which a track arrives.
             key += 1 << min(m - links.first[h], MAX_DIRECTION_BITS)
     if count == 0:
         return
@@ -398,10 +419,11 @@ def combine_received(
 @kernel
 def combination_of(arrays: TrackArrays, key: int, count: int, degree: int) -> int:
     """Return the index in ``arrays.cache`` of the combination of the own track with ``count``
-    others, whose indices are in ``arrays.tracks``; compute it if the cache lacks it. ``key`` has a
-    bit for each of the ``degree`` directions to the node on which a track arrived.
+    others, the first ``count + 1`` indices in ``arrays.tracks``; compute it if the cache lacks it.
+    ``key`` has a bit for each of the node's ``degree`` incoming links on which a track arrived.
     """
     cache = arrays.cache
+    # A hash of the key; a combination with the same hash is overwritten.
     k = (key ^ (key >> 6) ^ (key >> 12)) % len(cache.key)
     # With more directions than bits a key is not unique: always compute.
     if degree > MAX_DIRECTION_BITS or cache.key[k] != key:
@@ -437,12 +459,12 @@ def pair_of(arrays: TrackArrays, i: int, j: int) -> int:
 @built_in("track-fusion", rule="cross-covariance")
 @dataclass(frozen=True, eq=False)
 class BarShalomCampo(Filter):
-    """Every node runs a Kalman filter on its own readings, sends this track, and shows the best
+    """Every node runs a Kalman filter on its own readings, sends this track, and reports the best
     linear combination of it and the tracks heard in this slot, Bar-Shalom and Campo 1986.
 
     Messages carry the sender's sensors, from which the receiver computes the cross-covariances of
-    the tracks: the common process noise and the common start correlate them. What is shown does not
-    enter the tracks. Of more than two tracks it is the combination with the least covariance.
+    the tracks: the common process noise and the common start correlate them. What is reported does
+    not enter the tracks. Of more than two tracks it is the combination with the least covariance.
     """
 
     paper: ClassVar[str] = "track_fusion"
@@ -495,8 +517,9 @@ class BarShalomCampo(Filter):
         )
 
     def carried_estimates(self, reported: FloatArray, arrays: tuple[Any, ...]) -> FloatArray:
-        """Return the own tracks (B, H, n, L) in ``arrays``, with which nodes go on, instead of the
-        combinations that are ``reported`` (B, H, n, L): B blocks of L runs, H nodes.
+        """Return the own tracks (B, H, n, L) in ``arrays``, from ``slot_arrays``, with which nodes
+        go on, instead of the combinations that are ``reported`` (B, H, n, L): B blocks of L runs, H
+        nodes. A trigger refers to them.
         """
         tracks: TrackArrays = arrays[0]
         return tracks.xhat
@@ -523,8 +546,8 @@ class BarShalomCampo(Filter):
         return n
 
     def init(self, model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo) -> TrackState:
-        """Return the first state of a node, with estimate ``mean`` (n,) and covariance ``cov``
-        (n, n), which shows its own track.
+        """Return the first state of a node, whose own track, with estimate ``mean`` (n,) and
+        covariance ``cov`` (n, n), is also reported.
         """
         root, joint = first_root(cov), np.array(cov)[None, None]
         sensors = (whitened_sensors(model),)
@@ -532,7 +555,7 @@ class BarShalomCampo(Filter):
 
     def predict(self, state: TrackState, gap: float) -> TrackState:
         """Return the state ``gap`` seconds, a slot, later: own track and joint covariance are
-        predicted, and the own track is shown.
+        predicted, and the own track is reported until tracks arrive.
         """
         xhat, root = state.model.predict(state.xhat, state.root, gap)
         joint = predicted_joint(state.joint, state.model)
@@ -542,7 +565,7 @@ class BarShalomCampo(Filter):
 
     def update(self, state: TrackState, reading: Reading) -> TrackState:
         """Return the state with the own track updated by the reading, and the covariances of all
-        tracks by their sensors.
+        known tracks as if each had used a reading of its sensors.
         """
         tracked: TrackState = super().update(state, reading)
         joint = updated_joint(state.joint, state.sensors)
@@ -555,7 +578,7 @@ class BarShalomCampo(Filter):
     def absorb(
         self, state: TrackState, messages: Sequence[Message], exchange: Exchange
     ) -> TrackState:
-        """Return the state that shows the best combination of the own track and those heard."""
+        """Return the state that reports the best combination of the own track and those heard."""
         if not messages:
             return state
         state = add_senders(state, messages)
@@ -565,19 +588,19 @@ class BarShalomCampo(Filter):
         return state._replace(fused=state.xhat + gain @ differences, fused_root=root)
 
     def estimate(self, state: TrackState) -> tuple[FloatArray, FloatArray]:
-        """Return the combination that is shown, (n,), and its covariance (n, n)."""
+        """Return the combination that is reported, (n,), and its covariance (n, n)."""
         return state.fused, state.P
 
     def shift(self, state: TrackState, offset: FloatArray) -> TrackState:
-        """Return the state with ``offset`` (n,) added to the track and to the combination: tracks
-        enter by their differences.
+        """Return the state with ``offset`` (n,) added to the track and to the combination, for a
+        move of the origin: tracks enter by their differences.
         """
         return state._replace(xhat=state.xhat + offset, fused=state.fused + offset)
 
 
 def whitened_sensors(model: SlotModel) -> FloatArray:
-    """Return the whitened H (p, n) of a node's sensors: H times the inverse of the Cholesky factor
-    of R.
+    """Return the whitened H (p, n) of a node's sensors, ``L^-1 H`` with ``L L' = R``, whose noise
+    has variance 1 in each row.
     """
     H: FloatArray = np.asarray(model.H, dtype=np.float64)
     return whiten_reading(np.zeros(len(H)), H, model.R)[1] if len(H) else H
@@ -585,7 +608,7 @@ def whitened_sensors(model: SlotModel) -> FloatArray:
 
 def stacked_sensors(sensors: Sequence[FloatArray]) -> tuple[FloatArray, np.ndarray]:
     """Return the whitened ``sensors`` of m nodes, (p_i, n) each, as one array (m, p, n) with zeros
-    below, and the rows (m,) of each.
+    below, and the number of rows (m,) of each, for kernels.
     """
     rows = np.array([len(H) for H in sensors])
     stack = np.zeros((len(sensors), max(int(rows.max()), 1), sensors[0].shape[1]))
@@ -596,7 +619,7 @@ def stacked_sensors(sensors: Sequence[FloatArray]) -> tuple[FloatArray, np.ndarr
 
 def combined_pairs(infos: Sequence[NodeInfo]) -> np.ndarray:
     """Return the pairs (K, 2) of indices of tracks that some of the N nodes in ``infos`` may
-    combine, in lexical order.
+    combine, in lexical order: both orders of each pair, and each track with itself.
 
     Axes: K pairs of tracks.
     """

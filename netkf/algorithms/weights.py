@@ -1,4 +1,4 @@
-"""The check of weights that a scenario gives for pairs of nodes."""
+"""The check of the weights that a scenario gives for pairs of nodes, for diffusion filters."""
 
 from __future__ import annotations
 
@@ -8,11 +8,13 @@ from netkf.core.errors import ScenarioError
 from netkf.linalg.arrays import FloatArray
 
 METROPOLIS = "metropolis"
+"""The value in scenario files for weights 1 / (1 + larger degree of both ends) instead of a matrix.
+"""
 
 
 def check_columns(weights: FloatArray) -> None:
     """Raise ScenarioError unless the ``weights`` (N, N) of N nodes are not negative and each
-    column, what one node gives to all senders and to itself, sums to 1.
+    column sums to 1: entry [l, i] is the weight that node i gives to node l, itself included.
     """
     if (weights < 0.0).any():
         # Weights come from files: the message names the entry.
@@ -23,7 +25,6 @@ def check_columns(weights: FloatArray) -> None:
             float(weights[tuple(where)]),
             "give weights from 0 to 1",
         )
-    # Column i holds what node i gives, itself included.
     sums = weights.sum(axis=0)
     wrong = np.flatnonzero(np.abs(sums - 1.0) > 1e-9)
     if wrong.size:
