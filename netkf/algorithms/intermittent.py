@@ -115,7 +115,8 @@ def intermittent_slots(
             rebase(nodes, readings, scratch, b, s)
             if plan.sensed[s]:
                 for h in range(len(nodes.rows)):
-                    # Readings one after the other: with independent noise that equals one update.
+                    # The own reading and, by True, those that arrive, one after the other: with
+                    # independent noise that equals one update.
                     fuse_readings(nodes, readings, plan, links, scratch, True, b, s, h)
                 predict_all(nodes, scratch, b)
 
@@ -177,8 +178,8 @@ class Intermittent(Filter):
 
     @property
     def max_age(self) -> float:
-        """Seconds beyond which a reading that arrives is too old to use; infinity
-        without a window.
+        """Seconds beyond which a reading that arrives is too old to use: 0 if late ones are
+        dropped, infinity without a window.
         """
         if self.late == "drop":
             return 0.0
@@ -250,7 +251,7 @@ class Intermittent(Filter):
 
 def _use_reading(state: IntermittentState, reading: Reading) -> IntermittentState:
     """Return the state after a ``reading`` of the present instant, with updated estimate and root;
-    if late readings are used exactly, the reading is an event of the past from now on.
+    if late readings are used exactly, the reading joins the past events, to be repeated after one.
     """
     # A reading without rows changes nothing.
     if not len(reading.y):

@@ -100,12 +100,16 @@ class FlowModel:
 
     @cached_property
     def flow(self) -> FlowTable:
-        """Table of the flow of the root (n, n) of P with this node's increments."""
+        """Table from which ``flow_root`` computes the root (n, n) of P after any gap, with this
+        node's increments.
+        """
         return _shared_flow_table(self.A, self.Q, self.H, self.R, self.horizon)
 
     @cached_property
     def unobserved_flow(self) -> FlowTable:
-        """Table of the flow of the root (n, n) of P without readings."""
+        """Table from which ``flow_root`` computes the root (n, n) of P after any gap, without
+        readings.
+        """
         nothing = np.zeros((0, len(self.A)))
         return _shared_flow_table(self.A, self.Q, nothing, np.zeros((0, 0)), self.horizon)
 

@@ -151,8 +151,10 @@ def silence_others(
 
 @kernel
 def has_read(readings: ReadingBlock, rows: int, b: int, s: int, h: int) -> bool:
-    """Return True if filter ``h`` of block ``b``, with ``rows`` rows, has a reading in slot ``s``,
-    the same in all runs: y and H are zero if a recorded sensor has no row.
+    """Return True if filter ``h`` of block ``b``, with ``rows`` rows, has a reading in slot ``s``.
+
+    A recorded sensor may have none in a slot: then y and H are zero, in all runs alike, so that
+    the first lane tells.
     """
     # A fixed H has one block and one slot.
     c, t = min(b, readings.H.shape[0] - 1), min(s, readings.H.shape[1] - 1)

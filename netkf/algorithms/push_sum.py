@@ -296,6 +296,7 @@ def exchange_mass(
     if arrays.running:
         add_to_totals(arrays, scratch, b)
     for h in range(H):
+        # Until a node stops, ``stopped`` is later than all slots.
         for q in range(len(scratch.lanes)):
             arrays.silent[q] = samples.stopped[b, h, q] < slot
         if arrays.running:
@@ -517,8 +518,9 @@ def add_gain_single(
     scratch: FloatArray,
 ) -> None:
     """Correct the estimate x (1, 1, n, 1) of one filter in one run in place, paper P (8):
-    ``x += number S S' H' (y - H x)`` with its root S (1, 1, n, n, 1) and a whitened reading y
-    (1, 1, 1, p, 1), H (1, 1, 1, p, n, 1); ``scratch`` is (2, n, 1).
+    ``x += number S S' H' (y - H x)`` with its root S (1, 1, n, n, 1), the ``number`` N^(i) of nodes
+    that it believes in, and a whitened reading y (1, 1, 1, p, 1), H (1, 1, 1, p, n, 1); ``scratch``
+    is (2, n, 1).
     """
     add_gain(ONE, x, root, 0, 0, number, y, 0, H, y.shape[3], scratch[0], scratch[1])
 
@@ -557,9 +559,9 @@ def learn_network_single(
 def correct_root_single(
     root: FloatArray, information: FloatArray, remainder: FloatArray, scratch: SlotScratch
 ) -> None:
-    """Replace the root (1, 1, n, n, 1) of one filter in one run by that of ``(P^-1 + G)^-1``, P
-    (7), with the information G = ``information`` (1, 1, n, n, 1); ``remainder`` (n, n, 1) is
-    scratch.
+    """Replace the root (1, 1, n, n, 1) of one filter's P in one run by that of ``(P^-1 + G)^-1``,
+    paper P (7), with the information G = ``information`` (1, 1, n, n, 1) that it believes all
+    sensors give; ``remainder`` (n, n, 1) and ``scratch`` are scratch.
     """
     correct_root(root, 0, 0, information, remainder, scratch)
 
@@ -654,7 +656,7 @@ class PushSum(Filter):
         mass = np.stack([state.mass for state in states])
         m, running = mass.shape[1], self._keeps_totals
         W = sum(info.degree for info in infos) if running else 0
-        shapes = (m,), (m,), (n, n), (n, n), (1,), (1,), (n, n)
+        shapes = (m,), (m,), (n, n), (n, n), (1,), (1,), (n, n)  # of MassStep's fields
         return (
             PushSumArrays(
                 mass=in_lanes(mass, blocks),
@@ -704,7 +706,14 @@ class PushSum(Filter):
             network_estimate = NetworkInformation(node.information, float(node.nodes), root)
         sums = NodeSums(np.zeros(mass.shape), {}) if self._keeps_totals else None
         return PushSumState(
-            mean, first_root(cov), model, mass, network_estimate, False, node.degree, sums
+            xhat=mean,
+            root=first_root(cov),
+            model=model,
+            mass=mass,
+            network=network_estimate,
+            stopped=False,
+            degree=node.degree,
+            sums=sums,
         )
 
     @property

@@ -434,13 +434,13 @@ class ScheduledReadings(Filter):
         p, entries = weights.shape[1], W + H
         return (
             ScheduledArrays(
-                weights,
-                np.stack([silence_whitening(one) for one in weights]),
-                aligned((blocks, entries, p, n, LANES)),
-                np.zeros((blocks, entries, LANES), dtype=np.uint8),
-                aligned((blocks, H, n, LANES)),
-                aligned((p, LANES)),
-                aligned((n, LANES)),
+                trigger=weights,
+                silence=np.stack([silence_whitening(one) for one in weights]),
+                H=aligned((blocks, entries, p, n, LANES)),
+                known=np.zeros((blocks, entries, LANES), dtype=np.uint8),
+                prior=aligned((blocks, H, n, LANES)),
+                z=aligned((p, LANES)),
+                row=aligned((n, LANES)),
             ),
         )
 
@@ -584,8 +584,9 @@ def trigger_plan(inner: Filter) -> TriggerPlan | None:
     # The number of exchanges before the reading, and whether they change estimates.
     early = before.count("exchange")
     moves = any(inner.moves_estimates(phase) for phase in range(early))
-    # A slot is split into its exchanges and the rest by calling the kernel twice, with one of both
-    # left out. That fails if exchanges or a prediction are on both sides of the reading.
+    # If exchanges change estimates before the reading, the kernel is called twice a slot: for the
+    # exchanges alone, then for the rest. Its plan cannot leave out only the exchanges before the
+    # reading, nor separate a prediction from the reading.
     if moves and (early < schedule.count("exchange") or "predict" in before):
         return None
     first = sum(inner.exchange_steps(phase) for phase in range(early))
@@ -706,10 +707,12 @@ class TriggeredSlots:
     """
 
     def __init__(self, inner: Filter, order: TriggerPlan) -> None:
+        """Take the wrapped filter, which has a kernel, and its ``trigger_plan``."""
         self._inner = inner
         self._kernel = inner.slot_kernel
         self._order = order
         self._decides = inner.decides_in_slots()
+        # The engine looks for the compiled code of a kernel by its name.
         self.__name__ = self._kernel.__name__
 
     def __call__(
@@ -742,6 +745,7 @@ class TriggeredSlots:
                 decide_senders(
                     carried_nodes, readings, plan, links, scratch, arrays, self._order, s
                 )
+            # The trigger alone decides who sends: the inner kernel runs when messages have arrived.
             if plan.part == SENDING and not self._decides:
                 continue
             slot_readings, slot_plan, slot_samples = single_slot(readings, plan, samples, s)

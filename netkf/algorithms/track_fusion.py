@@ -491,28 +491,28 @@ class BarShalomCampo(Filter):
             for name in ("xhat", "root")
         )
         cache = CombinationCache(
-            np.full(COMBINATIONS, -1),
-            np.zeros(COMBINATIONS, dtype=np.int64),
-            np.zeros((COMBINATIONS, n, max(max_degree, 1) * n)),
-            np.zeros((COMBINATIONS, n, n)),
+            key=np.full(COMBINATIONS, -1),
+            rank=np.zeros(COMBINATIONS, dtype=np.int64),
+            gain=np.zeros((COMBINATIONS, n, max(max_degree, 1) * n)),
+            root=np.zeros((COMBINATIONS, n, n)),
         )
         sensors, _ = stacked_sensors([state.sensors[0] for state in states])
         pairs = combined_pairs(infos)
         first = np.searchsorted(pairs[:, 0], np.arange(H + 1))
         return (
             TrackArrays(
-                xhat,
-                root,
-                np.array(states[0].model.Q),
-                sensors,
-                np.tile(start, (len(pairs), 1, 1)),
-                pairs,
-                first,
-                np.zeros((H, n, n)),
-                np.zeros(max_degree + 1, dtype=np.int64),
-                np.zeros((max_degree + 1, max_degree + 1, n, n)),
-                track_scratch(max_degree, n),
-                cache,
+                xhat=xhat,
+                root=root,
+                Q=np.array(states[0].model.Q),
+                H=sensors,
+                joint=np.tile(start, (len(pairs), 1, 1)),
+                pairs=pairs,
+                first=first,
+                closed=np.zeros((H, n, n)),
+                tracks=np.zeros(max_degree + 1, dtype=np.int64),
+                block=np.zeros((max_degree + 1, max_degree + 1, n, n)),
+                scratch=track_scratch(max_degree, n),
+                cache=cache,
             ),
         )
 
@@ -551,7 +551,18 @@ class BarShalomCampo(Filter):
         """
         root, joint = first_root(cov), np.array(cov)[None, None]
         sensors = (whitened_sensors(model),)
-        return TrackState(mean, root, model, mean, root, 0, (-1,), sensors, joint, joint[0, 0])
+        return TrackState(
+            xhat=mean,
+            root=root,
+            model=model,
+            fused=mean,
+            fused_root=root,
+            slot=0,
+            senders=(-1,),
+            sensors=sensors,
+            joint=joint,
+            start=joint[0, 0],
+        )
 
     def predict(self, state: TrackState, gap: float) -> TrackState:
         """Return the state ``gap`` seconds, a slot, later: own track and joint covariance are
