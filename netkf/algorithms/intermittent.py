@@ -213,8 +213,8 @@ class Intermittent(Filter):
     def absorb(
         self, state: IntermittentState, messages: Sequence[Message], exchange: Exchange
     ) -> IntermittentState:
-        """Return the state after the readings of this instant, and after late ones as if they had
-        come in time.
+        """Return the state after the readings in ``messages``, each used as if it had come at the
+        time when it was taken.
         """
         for message in messages:
             reading: Reading = message.payload
@@ -251,7 +251,7 @@ class Intermittent(Filter):
 
 def _use_reading(state: IntermittentState, reading: Reading) -> IntermittentState:
     """Return the state after a ``reading`` of the present instant, with updated estimate and root;
-    if late readings are used exactly, the reading joins the past events, to be repeated after one.
+    if late readings are used exactly, the reading joins the past events, which a late one repeats.
     """
     # A reading without rows changes nothing.
     if not len(reading.y):

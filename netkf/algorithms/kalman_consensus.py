@@ -107,7 +107,8 @@ def kcf_slots(
         for s in range(plan.up.shape[1]):
             if plan.sensed[s]:
                 predict_all(nodes, scratch, b)
-                # Consensus is on predictions and their covariances: before any reading is used.
+                # Consensus is on predictions and their covariances: before any reading is used. The
+                # sum has no weights (False).
                 for h in range(len(nodes.rows)):
                     sum_differences(
                         scratch.lanes, nodes.xhat, b, h, links, plan.up, s, 0, False, scratch.xhat

@@ -346,7 +346,9 @@ class OneBit(Filter):
     slot_kernel = staticmethod(one_bit_slots)
 
     def decides_in_slots(self) -> bool:
-        """Return True: a node is silent except in its turn."""
+        """Return True: a node is silent except in its turn, and the compiled ``slot_kernel`` writes
+        which nodes send.
+        """
         return True
 
     def slot_arrays(

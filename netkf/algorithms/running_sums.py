@@ -216,15 +216,15 @@ def shift(state: RunningSums, offset: FloatArray) -> RunningSums:
 
 
 def shift_offer(offer: Offer, offset: FloatArray) -> Offer:
-    """Return the offer with ``U offset`` added to its vector ``u``, for an ``offset`` (n,) of the
-    state.
+    """Return the ``offer`` with ``U offset`` added to its vector ``u = U xhat``, for a move of the
+    origin by which estimates change by ``offset`` (n,).
     """
     return offer._replace(total=_shift_total(offer.total, offset))
 
 
 def _shift_total(total: FloatArray, offset: FloatArray) -> FloatArray:
-    """Return a ``total`` (1 + n n + n,) of (w, U, u) after a shift of the state by ``offset`` (n,):
-    ``u + U offset``.
+    """Return a ``total`` (1 + n n + n,) of (w, U, u) after a move of the origin by which estimates
+    change by ``offset`` (n,): ``u + U offset``.
     """
     n, out = len(offset), total.copy()
     out[1 + n * n :] += total[1 : 1 + n * n].reshape(n, n) @ offset

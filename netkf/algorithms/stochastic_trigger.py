@@ -418,7 +418,9 @@ class ScheduledReadings(Filter):
     slot_kernel = staticmethod(scheduled_slots)
 
     def decides_in_slots(self) -> bool:
-        """Return True: a node may keep its reading to itself."""
+        """Return True: a node may keep its reading to itself, and the compiled ``slot_kernel``
+        writes which nodes send.
+        """
         return True
 
     def slot_arrays(
@@ -859,7 +861,9 @@ class TriggeredMessages(Filter):
         return TriggeredSlots(inner, plan) if is_compiled and plan is not None else None
 
     def decides_in_slots(self) -> bool:
-        """Return True: a node may send nothing after a reading."""
+        """Return True: a node may send nothing after a reading, and the compiled ``slot_kernel``
+        writes which nodes send.
+        """
         return True
 
     def slot_arrays(
@@ -936,7 +940,9 @@ class TriggeredMessages(Filter):
         return self.inner.stopped(state.inner)
 
     def conserved(self, state: WrappedState) -> Any:
-        """Return the conserved quantities of the wrapped filter."""
+        """Return by name the quantities of the wrapped filter whose sums over all nodes exchanges
+        conserve.
+        """
         return self.inner.conserved(state.inner)
 
 

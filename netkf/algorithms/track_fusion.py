@@ -425,7 +425,7 @@ def combination_of(arrays: TrackArrays, key: int, count: int, degree: int) -> in
     cache = arrays.cache
     # A hash of the key; a combination with the same hash is overwritten.
     k = (key ^ (key >> 6) ^ (key >> 12)) % len(cache.key)
-    # With more directions than bits a key is not unique: always compute.
+    # With more links than bits a key is not unique: always compute.
     if degree > MAX_DIRECTION_BITS or cache.key[k] != key:
         cache.key[k] = key
         for a in range(count + 1):
