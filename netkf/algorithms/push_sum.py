@@ -1020,7 +1020,8 @@ def average_estimates(z: FloatArray, received: Sequence[FloatArray], delta: floa
     """Return ``z + sum_j (z_j - z) / delta`` (n,), paper P (9), for a node's ``z`` (n,) and the
     estimates z_j (n,) that it ``received``.
     """
-    # The kernel of slots on a star: the node itself, and one link from each sender.
+    # The kernel of slots on a star: the node itself, and one link from each sender; it does not use
+    # weights of links.
     x = np.stack([z, *received])[None, :, :, None]
     links, up = star_of([0.0] * len(received))
     average(ONE, x, 0, links, up, 0, 0, np.empty((1, len(z), 1)), 1.0 / delta)

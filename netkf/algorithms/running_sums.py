@@ -109,7 +109,7 @@ def predict_sums(state: RunningSums, gap: float) -> RunningSums:
 
 def predict_offer(offer: Offer, back: Backward) -> Offer:
     """Return the ``offer`` with its total made to refer to a later state of the plant; ``back`` is
-    the transition of information over the time between.
+    the model's transition of information over the time between.
     """
     return offer._replace(total=_move_total(offer.total, back))
 

@@ -510,8 +510,8 @@ class ScheduledReadings(Filter):
         )
 
     def shift(self, state: ScheduledState, offset: FloatArray) -> ScheduledState:
-        """Return the state with ``offset`` (n,) added to estimate and prediction, and ``H offset``
-        to the reading: the trigger looks at innovations.
+        """Return the state with ``offset`` (n,) added to estimate and prediction, for a move of the
+        origin, and ``H offset`` to the reading: innovations do not change.
         """
         reading = state.reading
         if reading is not None:
@@ -519,7 +519,9 @@ class ScheduledReadings(Filter):
         return state._replace(xhat=state.xhat + offset, prior=state.prior + offset, reading=reading)
 
     def shift_payload(self, payload: Reading, offset: FloatArray) -> Reading:
-        """Return the reading with ``H offset`` added, for an ``offset`` (n,) of the state."""
+        """Return the reading under way with ``H offset`` added, for a move of the origin by which
+        estimates change by ``offset`` (n,).
+        """
         return payload._replace(y=payload.y + payload.H @ offset)
 
 
@@ -897,7 +899,7 @@ class TriggeredMessages(Filter):
 
     def update(self, state: WrappedState, reading: Reading) -> WrappedState:
         """Return the state after a reading, which the wrapped filter uses; its news is kept for the
-        decision.
+        decision whether to send, which is open again.
         """
         news = NO_READING
         if len(reading.y):
@@ -930,8 +932,8 @@ class TriggeredMessages(Filter):
         return self.inner.estimate(state.inner)
 
     def shift(self, state: WrappedState, offset: FloatArray) -> WrappedState:
-        """Return the state with the wrapped filter shifted by ``offset`` (n,); the trigger looks at
-        innovations, which do not move.
+        """Return the state with ``offset`` (n,) added to the wrapped filter's estimate, for a move
+        of the origin: innovations do not change, and so the trigger's news neither.
         """
         return state._replace(inner=self.inner.shift(state.inner, offset))
 
