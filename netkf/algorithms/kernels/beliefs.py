@@ -1,4 +1,6 @@
-"""Kernels of belief propagation: sums of evidence about the state, kept apart by sender.
+"""Kernels of Gaussian belief propagation: sums of evidence about the state, kept apart by sender.
+
+A node sends a neighbour all its evidence but that which came from there: it would count twice.
 
 Evidence is an information pair as a root (Z, z), n by n + 1, see ``kernels.information``: Z is
 lower triangular, and z is relative to a centre c (n,), ``Z (x - c) = z + v`` with cov(v) = I. In a
@@ -6,7 +8,13 @@ block of runs filter ``h`` holds the evidence of its own readings, ``own[h]`` (H
 for each direction m of ``SlotLinks`` the evidence that its sender sent last, ``received[m]``
 (W, n, n + 1, L), both relative to its own centre. A ``part`` is one such array (n, n + 1, L).
 
-``lanes`` is ONE for a single run or MANY for L runs side by side (``netkf.linalg.lanes``).
+In a slot, one time step, nodes read, exchange messages in E steps and predict, in the order of the
+filter. ``links`` lists the W directed links by receiver: those to filter h have the numbers
+``links.first[h]`` to ``links.first[h + 1]`` - 1; ``up`` (B, S, E, W, L) flags the messages that
+arrive.
+
+``lanes`` is ONE for a single run or MANY for a block of L runs side by side: ``load``, ``store``
+and ``select`` handle the L numbers of an entry as one SIMD value (``netkf.linalg.lanes``).
 """
 
 from __future__ import annotations
@@ -21,13 +29,13 @@ from netkf.linalg.lanes import ONE, Lanes, any_lane, load, load_flags, select, s
 
 
 class BeliefScratch(NamedTuple):
-    """Evidence (n, n + 1, L) that H nodes send over W directions in L runs, and scratch.
+    """Evidence (n, n + 1, L) that H nodes send over W directed links in L runs, and scratch.
 
     all : (H, n, n + 1, L), sum of all evidence of each node
-    others : (W, n, n + 1, L), for each direction the evidence of its receiver without that of its
-             sender
-    suffix : (D + 1, n, n + 1, L), entry k is the sum of the evidence of directions k to D - 1 of
-             the D directions to one node
+    others : (W, n, n + 1, L), for each directed link the evidence of its receiver without that of
+             its sender: the message on the opposite link
+    suffix : (D + 1, n, n + 1, L), entry k is the sum of the evidence received on links k to D - 1
+             of the D links to one node
     total, work : (n, n + 1, L), scratch
     """
 
@@ -110,6 +118,8 @@ def predict_part(
 
     Axes: L runs side by side.
     """
+    # Z (x - c) = Z back (x+ - c+) for x+ - c+ = back^-1 (x - c); Z back is not triangular, so its
+    # rows are merged one by one into a triangular root.
     n = len(part)
     clear_part(lanes, total)
     for k in range(n):
@@ -173,7 +183,7 @@ def gather_evidence(
     ``own`` (H, n, n + 1, L) is evidence by node, ``received`` (W, n, n + 1, L) by direction. Axes:
     W directed links, H nodes, L runs side by side.
     """
-    D = last - first
+    D = last - first  # number of incoming links
     # The sum without direction k is a prefix sum plus a suffix sum: nothing is subtracted.
     clear_part(lanes, scratch.suffix[D])
     for k in range(D - 1, 0, -1):

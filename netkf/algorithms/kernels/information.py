@@ -1,13 +1,22 @@
-"""Kernels of consensus on information: weighted sums of information pairs, carried as roots.
+"""Kernels of consensus on information (CI, HCMCI, ICF): weighted sums of information pairs, carried
+as roots.
 
 An information pair (Omega, q), with Omega = P^-1 and q = P^-1 x for an estimate x, is stored as a
 root (Z, z), n by n + 1, with ``Omega = Z' Z`` and ``q = Omega c + Z' z``. Z is lower triangular,
 and z is relative to a centre c (n,), the estimate of the node that holds the pair, so that
 differences of near states lose no digits. Omega may be singular, as that of a single reading is.
+Pairs add up by ``merge_lanes``, which triangularises one root on top of the other.
 
-Stacks ``parts`` (2, K, H, n, n + 1, L) hold K pairs of each of H nodes, before and after a step.
+Stacks ``parts`` (2, K, H, n, n + 1, L) hold K pairs of each of H nodes, before and after a step of
+the exchanges: one pair (prediction and reading together) or two (apart), as the filter has it.
 
-``lanes`` is ONE for a single run or MANY for L runs side by side (``netkf.linalg.lanes``).
+In a slot, one time step, nodes read, exchange messages in E steps and predict, in the order of the
+filter. ``links`` lists the W directed links by receiver: those to filter h have the numbers
+``links.first[h]`` to ``links.first[h + 1]`` - 1; ``up`` (B, S, E, W, L) flags the messages that
+arrive.
+
+``lanes`` is ONE for a single run or MANY for a block of L runs side by side: ``load``, ``store``
+and ``select`` handle the L numbers of an entry as one SIMD value (``netkf.linalg.lanes``).
 """
 
 from __future__ import annotations
@@ -71,7 +80,7 @@ def add_reading_pair(
     """
     b, s, h = index
     n, factor = len(total), share**0.5
-    # A fixed H has one block and one slot.
+    # A fixed H is stored for one block and one slot only.
     d, t = min(b, H.shape[0] - 1), min(s, H.shape[1] - 1)
     for k in range(rows):
         # Merge a row [H, y - H c], as the last row of a lower triangular root.

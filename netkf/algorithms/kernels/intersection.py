@@ -1,8 +1,12 @@
-"""Kernels of covariance intersection, paper D (8) and (9), for filters in slots, on lanes.
+"""Kernels of covariance intersection, paper D (8) and (9) (Xie, Gan and Liu), on lanes.
 
-Information is carried as a root too, ``P^-1 = Z' Z``; the formulas are those of ``root_update``.
+``P^-1 = sum w_j P_j^-1`` and ``P^-1 x = sum w_j P_j^-1 x_j``: ``invert_lanes`` and ``whiten`` make
+the terms, ``merge_lanes`` adds them, and ``finish_lanes`` writes P and x. Information is carried as
+a root too, ``P^-1 = Z' Z``. Diffusion, consensus on information, event-triggered consensus and
+belief propagation use these kernels; ``root_update`` has the same formulas for one run.
 
-``lanes`` is ONE for a single run or MANY for L runs side by side (``netkf.linalg.lanes``).
+``lanes`` is ONE for a single run or MANY for a block of L runs side by side: ``load``, ``store``
+and ``select`` handle the L numbers of an entry as one SIMD value (``netkf.linalg.lanes``).
 """
 
 from __future__ import annotations
@@ -20,8 +24,8 @@ def invert_lanes(lanes: Lanes, out: FloatArray, root: FloatArray, b: int, h: int
     """Write the inverse of ``root[b, h]`` (n, n, L), the lower triangular root of filter ``h`` of
     block ``b``, into ``out[h]`` of ``out`` (H, n, n, L).
 
-    Pivots are raised to SINGULAR times the length of their row, see ``root_update.invert_root``.
-    Axes: H filters, L runs side by side.
+    Pivots are raised to SINGULAR (2^-25) times the length of their row: soon after a start from
+    P = 0 some are rounding. That makes P no smaller. Axes: H filters, L runs side by side.
     """
     # The floor grows with the whole root, so that a zero row is not inverted on its own scale.
     n, smallest = root.shape[2], spread(lanes, TINY)

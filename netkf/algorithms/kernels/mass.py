@@ -1,13 +1,21 @@
-"""Kernels of the push-sum filter: mixing of mass, the quotients of paper P (6), and averaging.
+"""Kernels of the push-sum filter (paper P: Battilotti, Cacace and d'Angelo 2023): mixing of mass,
+the quotients of P (6), the update (7) and (8), and the averaging (9).
 
-A mass (2 + n n,) holds the weight w, the number of nodes n~ and the information C~ of
-paper P (3)-(5). The order of every sum is fixed, since the rounding of masses decides in which slot
-a node stops.
+Push-sum computes sums over the network: nodes pass on shares of their mass, whose totals never
+change, and the quotient of two totals is the same at all nodes in the end. A mass (2 + n n,) holds
+the weight w, the number of nodes n~ and the information C~ of paper P (3)-(5). The order of every
+sum is fixed, since the rounding of masses decides in which slot a node stops (``stopping``).
 
 Node ``h`` of block ``b`` has index ``[b, h]`` of stacks with lanes (``netkf.linalg.lanes``): masses
 (B, H, m, L), roots (B, H, n, n, L).
 
-``lanes`` is ONE for a single run or MANY for L runs side by side (``netkf.linalg.lanes``).
+In a slot, one time step, nodes read, exchange messages in E steps and predict, in the order of the
+filter. ``links`` lists the W directed links by receiver: those to filter h have the numbers
+``links.first[h]`` to ``links.first[h + 1]`` - 1; ``up`` (B, S, E, W, L) flags the messages that
+arrive.
+
+``lanes`` is ONE for a single run or MANY for a block of L runs side by side: ``load``, ``store``
+and ``select`` handle the L numbers of an entry as one SIMD value (``netkf.linalg.lanes``).
 """
 
 from __future__ import annotations
@@ -30,8 +38,8 @@ def split_mass(
 
     Axes: B blocks of L runs, H nodes.
     """
-    # P (3)-(5) with equal weights 1 / (degree + 1). The quotient is computed once: all neighbours
-    # receive the same bits.
+    # P (3)-(5) with equal weights 1 / (degree + 1); the degree counts links that fail, too, since a
+    # node cannot know which will. One quotient for all: all neighbours receive the same bits.
     for i in range(mass.shape[2]):
         store(lanes, share, h, i, load(lanes, mass, b, h, i) / (degree + 1))
 
@@ -42,7 +50,7 @@ def keep_share(
 ) -> None:
     """Add ``times`` (L,) times its own ``share[h]`` (m, L) to the mass that node ``h`` of block
     ``b`` received, ``mass[b, h]`` of ``mass`` (B, H, m, L), m = 2 + n n, in place, paper P (3)-(5),
-    except in lanes with the flag ``unchanged`` (L,).
+    except in lanes with the flag ``unchanged`` (L,), where ``mass[b, h]`` stays as it is.
 
     ``times`` is 1 for the node itself plus 1 for each of its links that failed. Axes: B blocks of L
     runs, H nodes.
@@ -75,6 +83,7 @@ def learn_network(
 
     Axes: B blocks of L runs, H nodes.
     """
+    # w is 0 until the first mass from the leader arrives, which begins with all the weight.
     n, weight = information.shape[0], load(lanes, mass, b, h, 0)
     is_empty = weight == 0.0
     for i in range(n):
@@ -144,7 +153,7 @@ def largest_row(lanes: Lanes, remainder: FloatArray, v: FloatArray) -> Any:
     """Write the row of ``remainder`` (n, n, L) with the largest diagonal entry into ``v`` (n, L),
     lane by lane; return that entry (L,).
     """
-    # Diagonal pivoting reveals the rank of G.
+    # For correct_root: pivoting by the diagonal reveals the rank of G.
     n, pivot = len(remainder), load(lanes, remainder, 0, 0)
     for j in range(n):
         store(lanes, v, j, load(lanes, remainder, 0, j))
@@ -184,7 +193,7 @@ def add_gain(
     runs, S slots, H nodes.
     """
     n = x.shape[2]
-    # A fixed H has one block and one slot.
+    # A fixed H is stored for one block and one slot only.
     d, t = min(b, H.shape[0] - 1), min(s, H.shape[1] - 1)
     # H' (y - H x); the noise is white with variance 1, so no R^-1 appears.
     for i in range(n):

@@ -1,10 +1,18 @@
-"""Kernels that use the messages of neighbours: readings, the consensus term of the KCF, convex
-combinations.
+"""Kernels by which filters use the messages of neighbours: readings, the consensus term of the
+Kalman consensus filter (KCF), convex combinations of paper H (Tanwani 2021).
+
+Diffusion, KCF, intermittent, constant-gain and track-fusion filters share them.
 
 Filter ``h`` of a block has index ``[b, h]`` of stacks with lanes (``netkf.linalg.lanes``):
 estimates (B, H, n, L), lower triangular roots (B, H, n, n, L).
 
-``lanes`` is ONE for a single run or MANY for L runs side by side (``netkf.linalg.lanes``).
+In a slot, one time step, nodes read, exchange messages in E steps and predict, in the order of the
+filter. ``links`` lists the W directed links by receiver: those to filter h have the numbers
+``links.first[h]`` to ``links.first[h + 1]`` - 1; ``up`` (B, S, E, W, L) flags the messages that
+arrive.
+
+``lanes`` is ONE for a single run or MANY for a block of L runs side by side: ``load``, ``store``
+and ``select`` handle the L numbers of an entry as one SIMD value (``netkf.linalg.lanes``).
 """
 
 from __future__ import annotations
@@ -91,7 +99,7 @@ def scale_by_covariance(
             # An entry off the diagonal counts twice.
             square += total * total if i == j else 2.0 * total * total
     gain = epsilon / (1.0 + root_of(square))
-    # P d = S (S' d): P itself is not stored.
+    # P d = S (S' d) for d = differences[h]: P itself is not stored.
     for j in range(n):
         total = spread(lanes, 0.0)
         for i in range(j, n):
@@ -172,7 +180,8 @@ def combine_convex_roots(
     block ``b`` by the convex combination of it and those that arrive in slot ``s``, paper H (7) and
     (9), from the copies of all filters in ``scratch`` (see ``copy_pairs``).
 
-    The weights of messages that do not arrive go to the own estimate. Axes: L runs side by side.
+    The weights of messages that do not arrive go to the own estimate. The slot has one step of the
+    exchanges, hence ``plan.up[b, s, 0]``. Axes: L runs side by side.
     """
     lanes, n = scratch.lanes, nodes.xhat.shape[2]
     received_weight = spread(lanes, 0.0)
@@ -191,7 +200,8 @@ def combine_convex_roots(
             continue
         sender, weight = links.sender[m], select(arrived, links.weight[m], 0.0)
         factor = root_of(weight)
-        # P + w P_j = A A' with A = [S, sqrt(w) S_j], made triangular by reflections.
+        # x += w (x_j - x_h) and P + w P_j = A A' with A = [S, sqrt(w) S_j], made triangular by
+        # reflections.
         for i in range(n):
             for j in range(n):
                 store(lanes, scratch.moved, i, j, 0.0)

@@ -1,9 +1,24 @@
-"""Kernels of consensus plus innovations: estimates yhat of the pseudo-state ``y = G x``.
+"""Kernels of consensus plus innovations (Das and Moura 2017): estimates yhat of the pseudo-state.
+
+With the information ``G = sum_i H_i' R_i^-1 H_i`` of all sensors the pseudo-state is ``y = G x``,
+and ``H_i' R_i^-1`` times its reading shows node i a part of it. In each slot, with the gains B, M
+and K that the caller has computed for it,
+
+    yhat+ = yhat + sum_l B_l (yhat_l - yhat) + M z,   z = H' R^-1 (reading - H G^+ yhat)
+    xhat+ = xhat + K (yhat+ - G xhat)
+
+and then both are predicted. G^+ is the pseudo-inverse, since sensors may leave states unseen.
 
 Filter ``h`` of a block has index ``[b, h]`` of stacks with lanes (``netkf.linalg.lanes``):
 estimates of states and of pseudo-states (B, H, n, L).
 
-``lanes`` is ONE for a single run or MANY for L runs side by side (``netkf.linalg.lanes``).
+In a slot, one time step, nodes read, exchange messages in E steps and predict, in the order of the
+filter. ``links`` lists the W directed links by receiver: those to filter h have the numbers
+``links.first[h]`` to ``links.first[h + 1]`` - 1; ``up`` (B, S, E, W, L) flags the messages that
+arrive.
+
+``lanes`` is ONE for a single run or MANY for a block of L runs side by side: ``load``, ``store``
+and ``select`` handle the L numbers of an entry as one SIMD value (``netkf.linalg.lanes``).
 """
 
 from __future__ import annotations
@@ -29,7 +44,7 @@ def predict_pseudo(
 ) -> None:
     """Predict the estimate of the pseudo-state G x of filter ``h`` of block ``b`` to the next slot:
     replace yhat = ``y[b, h]`` (n, L) by ``A yhat + coupling xhat``, with xhat = ``x[b, h]`` of the
-    present slot.
+    present slot: ``A = G F G^+`` and ``coupling = G F (I - G^+ G)`` for the transition F of a slot.
 
     ``x`` and ``y`` are (B, H, n, L), ``A`` and ``coupling`` (n, n); ``predicted`` (n, L) is
     scratch. Axes: B blocks of L runs, H filters.
@@ -65,7 +80,7 @@ def fill_pseudo_innovation(
     scratch for ``G^+ yhat``. Axes: B blocks of L runs, H filters.
     """
     n = len(inverse)
-    # A fixed H has one block and one slot.
+    # A fixed H is stored for one block and one slot only.
     c, t = min(b, readings.H.shape[0] - 1), min(s, readings.H.shape[1] - 1)
     # state = G^+ yhat.
     for i in range(n):

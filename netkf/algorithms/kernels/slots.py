@@ -353,7 +353,7 @@ def update_by_reading(
     lanes, size, n = scratch.lanes, scratch.size, len(scratch.size)
     row = local_lanes_vector(size, lanes, scratch.row)
     gains = local_lanes_vector(size, lanes, scratch.gains)
-    # A fixed H has one block and one slot.
+    # A fixed H is stored for one block and one slot only.
     c, t = min(b, readings.H.shape[0] - 1), min(s, readings.H.shape[1] - 1)
     for k in range(nodes.rows[sender]):
         # Scalar update with unit noise: h S and the innovation y - h x with all earlier rows used.

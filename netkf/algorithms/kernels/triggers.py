@@ -1,9 +1,13 @@
-"""Kernels of event triggers: the news in a reading, and whether a copy is near enough.
+"""Kernels of event triggers, by which a node decides whether to send: ``weigh_news`` of the
+stochastic trigger (Han et al. 2015), which sends a reading with much news, and ``is_near`` of
+event-triggered consensus (Battistelli, Chisci and Selvi 2018), which sends an estimate only when it
+is no longer near the copy of the last one that was sent, which sender and receivers both predict.
 
 Filter ``h`` of a block has index ``[b, h]`` of stacks with lanes (``netkf.linalg.lanes``):
 estimates (B, H, n, L), lower triangular roots (B, H, n, n, L).
 
-``lanes`` is ONE for a single run or MANY for L runs side by side (``netkf.linalg.lanes``).
+``lanes`` is ONE for a single run or MANY for a block of L runs side by side: ``load``, ``store``
+and ``select`` handle the L numbers of an entry as one SIMD value (``netkf.linalg.lanes``).
 """
 
 from __future__ import annotations
@@ -38,14 +42,14 @@ def weigh_news(
     z: FloatArray,
 ) -> Any:
     """Return the news ``z' Y z`` (L,) of the whitened reading with ``rows`` rows at ``index`` [b,
-    s, h], block, slot and filter, with its innovation z = y - H x; NO_READING in lanes without a
-    reading.
+    s, h], block, slot and filter, with its innovation z = y - H x and the trigger's weights Y;
+    NO_READING in lanes without a reading.
 
     x (B, H, n, L) are the estimates, Y = ``Y[h]`` of (H, p, p) is for whitened rows, ``z`` (p, L)
     is scratch. Axes: B blocks of runs, H filters.
     """
     b, s, h = index
-    # A fixed H has one block and one slot.
+    # A fixed H is stored for one block and one slot only.
     d, t = min(b, readings.H.shape[0] - 1), min(s, readings.H.shape[1] - 1)
     news = magnitudes = spread(lanes, 0.0)
     for k in range(rows):
@@ -59,7 +63,8 @@ def weigh_news(
     for k in range(rows):
         for j in range(rows):
             news += Y[h, k, j] * load(lanes, z, k) * load(lanes, z, j)
-    # A slot in which a recorded sensor has no row holds zeros: no reading.
+    # Rounding below 0 counts as 0. A slot in which a recorded sensor has no row holds zeros in y
+    # and H: no reading.
     return select(magnitudes > 0.0, select(news > 0.0, news, 0.0), NO_READING)
 
 
@@ -75,9 +80,9 @@ def is_near(
     ratio: FloatArray,
     work: FloatArray,
 ) -> Any:
-    """Return flags (L,) of the runs in which a copy is near the estimate, ``|S^-1 (x - xbar)|^2 <
-    alpha`` and ``P < (1 + delta) Pbar`` and ``Pbar < (1 + delta) P``, for ``bounds``
-    (alpha, 1 + delta).
+    """Return flags (L,) of the runs in which a copy is near the estimate, so that the node need not
+    send: ``|S^-1 (x - xbar)|^2 < alpha`` and ``P < (1 + delta) Pbar`` and ``Pbar < (1 + delta) P``,
+    for ``bounds`` (alpha, 1 + delta).
 
     ``index`` is [b, h, k]: x and the root S of P are ``x[b, h]`` (n, L) and ``root[b, h]``
     (n, n, L), of filter h of block b; xbar and the root of Pbar are ``copies_x[b, k]`` and
