@@ -1,8 +1,10 @@
 """Random Riccati recursions of many chains side by side, in square-root form.
 
 In each slot a mode m selects one of several readings for a chain: ``f_m(P) = F P F' + Q - F P H_m'
-(H_m P H_m' + R_m)^-1 H_m P F'``, paper R (17) and paper G (11); a reading of no rows is ``f_0``,
-paper R (16).
+(H_m P H_m' + R_m)^-1 H_m P F'``, R (17) of paper R (Kar, Sinopoli and Moura: intermittent
+observations) and G (11) of paper G (Kar and Moura: gossip); a reading of no rows is ``f_0``, R
+(16). P is the covariance of the one-step prediction. The theory and the checks of both papers draw
+or enumerate sequences of modes and need the covariances they lead to.
 """
 
 from __future__ import annotations
@@ -19,7 +21,7 @@ from netkf.algorithms.kernels.square_root import lower_triangular, step_root
 from netkf.linalg.arrays import FloatArray, as_kernel_array
 from netkf.linalg.compiling import kernel
 
-FEW = 4096  # chain steps below which threads cost more than they save
+FEW = 4096  # slots of all chains together, below which threads cost more than they save
 
 
 class ReadingModes(NamedTuple):
@@ -63,7 +65,7 @@ def move_roots(
     lower_roots = np.ascontiguousarray(lower_triangular(roots))
     F = as_kernel_array(F)
     low_Q = np.ascontiguousarray(lower_triangular(root_Q))
-    # One byte per mode where it suffices, an eighth of an int64.
+    # One byte per mode where it suffices, an eighth of an int64: there may be millions of them.
     mode_type = np.uint8 if len(modes.rows) < 256 else np.int64
     sequences = np.ascontiguousarray(sequences, dtype=mode_type)
     # More threads than chains or cores would only wait.
@@ -100,7 +102,7 @@ def trace_paths(
 ) -> Iterator[FloatArray]:
     """Yield for each of K chains the lower triangular roots (T, n, n) after each mode of its
     sequence, a row of ``sequences`` (K, T) of indices in ``modes``, from ``roots`` (K, n, n) on; F
-    and ``root_Q`` are (n, n).
+    and ``root_Q`` are (n, n). One path at a time is in memory.
 
     Axes: T slots.
     """

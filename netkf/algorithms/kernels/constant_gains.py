@@ -1,8 +1,12 @@
-"""Kernels of filters with constant gains: corrections by increments over a gap, and by samples.
+"""Kernels of filters with constant gains L: corrections by increments over a gap, and by samples.
 
-Over a gap from a to b such a filter gives dy(s) the weight e^{(A - L H)(b - s)} L. It is projected
-on the Legendre polynomials P_0 and P_1 of the gap, since a reading is given by the moments of dy
-with these two (``linalg.legendre``).
+The increments of a sensor are ``dy = H x dt + dv``. Over a gap from a to b, of g seconds, such a
+filter gives dy(s) the weight e^{(A - L H)(b - s)} L. It is projected on the Legendre polynomials
+P_0 and P_1 of the gap, since a reading is given by the moments m_j = int P_j dy, j = 0 and 1
+(``linalg.legendre``). With u = b - s, the time that is left, these are P_j(1 - 2 u / g).
+
+Exponentials and their integrals are power series over a short step, doubled until it is the gap
+(scaling and squaring), since a series over a long gap loses its digits.
 """
 
 from __future__ import annotations
@@ -11,7 +15,7 @@ from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
 from netkf.linalg.small import multiply_square
 
-TERMS = 18  # of the exponential, for a norm of at most 1/2
+TERMS = 18  # of the exponential series: enough for a norm of at most 1/2
 
 
 @kernel
@@ -19,8 +23,9 @@ def fill_legendre_integrals(
     M: FloatArray, sign: float, gap: float, J_1: FloatArray, second: FloatArray, work: FloatArray
 ) -> None:
     """Write ``int_0^g e^{sign M u} P_j(1 - 2 u / g) du`` (n, n) over a ``gap`` g in seconds for the
-    Legendre polynomials P_0 and P_1 into ``J_1`` and ``second``, with M (n, n); ``work`` (4, n, n)
-    is scratch.
+    Legendre polynomials P_0 (into ``J_1``) and P_1 (into ``second``), with M (n, n). ``sign`` is 1
+    or, to go back in time, -1. ``work`` (4, n, n) is scratch, whose first matrix is e^{sign M g}
+    afterwards.
     """
     n, norm, J_2 = len(M), 0.0, work[3]
     for i in range(n):
@@ -36,7 +41,7 @@ def fill_legendre_integrals(
     for _ in range(doublings):
         double_gap(step, J_1, work)
         step *= 2.0
-    # P_1(1 - 2 u / g) = 1 - 2 u / g = 2 (g - u) / g - 1.
+    # P_1(1 - 2 u / g) = 1 - 2 u / g = 2 (g - u) / g - 1, and J_2 = int_0^g (g - u) e^{sign M u} du.
     for i in range(n):
         for j in range(n):
             second[i, j] = 2.0 * J_2[i, j] / gap - J_1[i, j]
@@ -48,7 +53,7 @@ def fill_exponential_integrals(
 ) -> None:
     """Write ``J_1 = int_0^s e^{M u} du`` (n, n) for a ``step`` of s seconds, and e^{M s} and ``J_2
     = int_0^s (s - u) e^{M u} du`` into the first and the last of ``work`` (4, n, n), by power
-    series; M (n, n) is multiplied by ``sign``.
+    series, for ``sign`` times M (n, n) instead of M. The other two of ``work`` are scratch.
     """
     n, E, term, product, J_2 = len(M), work[0], work[1], work[2], work[3]
     for i in range(n):
@@ -73,6 +78,8 @@ def double_gap(step: float, J_1: FloatArray, work: FloatArray) -> None:
     ``work[3]`` of ``work`` (4, n, n), in place: J_2 <- J_2 + s J_1 + E J_2, J_1 <- J_1 + E J_1 and
     E <- E E. See ``fill_exponential_integrals``, which writes them for a first step.
     """
+    # int_0^2s = int_0^s + int_s^2s, and in the second one e^{M u} = E e^{M (u - s)}. In J_2 the
+    # first part has the factor 2 s - u = s + (s - u). J_2 goes first, since it needs the old J_1.
     n, E, product, J_2 = len(J_1), work[0], work[2], work[3]
     multiply_square(product, E, J_2)
     for i in range(n):
@@ -91,8 +98,9 @@ def double_gap(step: float, J_1: FloatArray, work: FloatArray) -> None:
 @kernel
 def fill_inverse_transition(A: FloatArray, gap: float, maps: FloatArray) -> None:
     """Write ``e^{-A g}`` (n, n) for a ``gap`` of g seconds into the first of ``maps`` (6, n, n);
-    the others are scratch. A is (n, n).
+    the others are scratch. A is (n, n). Belief propagation predicts evidence by it.
     """
+    # The integrals are not needed here; the exponential is a by-product of theirs.
     fill_legendre_integrals(A, -1.0, gap, maps[4], maps[5], maps[:4])
 
 
@@ -109,8 +117,8 @@ def correct_by_moments(
     work: FloatArray,
 ) -> None:
     """Correct the open-loop prediction ``x[k]`` (n,) at the end of a ``gap`` in seconds, entry
-    ``k`` of x (K, n), in place by the ``moments`` (2 p,) of the increments of the gap, with gain L
-    (>= n, >= p) and H (>= p, n).
+    ``k`` of x (K, n), in place by the ``moments`` (2 p,) of the increments of the gap, p with P_0
+    and then p with P_1; the gain L is (>= n, >= p) and H (>= p, n).
 
     A is (n, n) and ``closed`` (n, n) is A - L H; the moments are overwritten with the innovations;
     ``work`` (6, n, n) is scratch. Axes: K estimates.
@@ -125,7 +133,8 @@ def correct_by_moments(
                 moments[i] -= H[i, j] * first[j, m] * x[k, m]
                 moments[p + i] -= H[i, j] * second[j, m] * x[k, m]
     fill_legendre_integrals(closed, 1.0, gap, first, second, integrals_work)
-    # x += sum over j = 0, 1 of (2 j + 1) / g int e^{(A - L H) u} P_j du L m_j.
+    # x += sum over j = 0, 1 of (2 j + 1) / g int e^{(A - L H) u} P_j du L m_j: the projection of
+    # the weight on P_j, whose square has the integral g / (2 j + 1).
     for j in range(n):
         L_m0, L_m1 = 0.0, 0.0
         for i in range(p):
@@ -145,6 +154,7 @@ def correct_by_innovation(
 
     Axes: K estimates.
     """
+    # All rows use the old x, since L is a gain for all rows together.
     n = x.shape[1]
     for i in range(n):
         updated[i] = x[k, i]

@@ -7,9 +7,11 @@ Between messages every node has the covariance P_i and the error e_i = x - xhat_
 
 where G_i = H_i' R_i^-1 H_i is the information per second that the filter assumes, and Gt_i = H_i'
 R_i^-1 Rt_i R_i^-1 H_i that of the true noise Rt_i through the same gain; Qt is the true Q. At an
-instant of messages both are mixed with the weights of paper H (7), (9). The integrator is the
-classical Runge-Kutta method of order 4, with steps short against all rates, so that its error is
-far below what sizing and tables need.
+instant of messages both are mixed with the weights of paper H (7), (9) (Tanwani 2021). The
+integrator is the classical Runge-Kutta method of order 4, with steps short against all rates, so
+that its error is far below what averages over runs need: ``theory.hybrid.path_moments`` has from it
+the mean squared errors of a run, given the times of its messages. Indices i, j are nodes; a, b, c,
+d are states.
 """
 
 from __future__ import annotations
@@ -139,7 +141,8 @@ def run_moments(
     K, P0, S0 = np.empty_like(P), np.empty_like(P), np.empty_like(S)
     dP, dS = np.empty((4, *P.shape)), np.empty((4, *S.shape))
     now, m, t = 0.0, 0, 0
-    # From event to event: the next messages, or the next of ``times``.
+    # From event to event: the next messages, or the next of ``times``, messages first. A gap of 0
+    # takes no step.
     while t < len(times):
         until = times[t]
         if m < len(instants) and instants[m] <= until:
@@ -149,7 +152,7 @@ def run_moments(
             h = (until - now) / count
             P0[:] = P
             S0[:] = S
-            # Runge-Kutta of order 4: the slopes at 0, h / 2 (twice) and h.
+            # Runge-Kutta of order 4: the slopes at 0, h / 2 (twice) and h, weighted 1, 2, 2, 1.
             for s in range(4):
                 if s > 0:
                     share = h if s == 3 else 0.5 * h

@@ -1,4 +1,4 @@
-"""Kernels that fuse two estimates of unknown correlation, with the optimal weight.
+"""Kernels of track fusion: they fuse two estimates of unknown correlation, with the optimal weight.
 
 With ``P_a = W W'`` and ``P_b = W diag(b) W'`` both covariances are diagonal in one basis W, and so
 is the fused one. The weight w minimises the trace or determinant of
@@ -22,7 +22,7 @@ from netkf.algorithms.kernels.square_root import reflect
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
 
-SWEEPS, BISECTIONS = 40, 60
+SWEEPS, BISECTIONS = 40, 60  # at most, of Jacobi rotations; and for full precision of w in [0, 1]
 ORTHOGONAL = 1e-15
 """Cosine of columns that count as orthogonal."""
 EQUAL = 1e-9
@@ -47,7 +47,8 @@ def common_basis(
             for m in range(j, i):
                 value -= own[i, m] * U[m, j]
             U[i, j] = value / own[i, i] if j <= i else 0.0
-    # One-sided Jacobi rotations make the columns of T orthogonal: T V = U diag(b)^1/2.
+    # One-sided Jacobi rotations make the columns of T orthogonal: T V = U diag(b)^1/2. So T T' =
+    # U diag(b) U', and P_b = own T T' own' = W diag(b) W'. T is in the memory of U.
     for _ in range(SWEEPS):
         if orthogonalise(U) <= ORTHOGONAL:
             break
@@ -101,6 +102,7 @@ def fused_variance(w: float, b: float, inverse: bool) -> float:
     ``b`` (weight 1 - w), by inverse covariance intersection if ``inverse``, else by covariance
     intersection.
     """
+    # 1/p = 1 + 1/b - 1/m with m = w + (1 - w) b, or 1/p = w + (1 - w) / b.
     if inverse:
         mixed = w + (1.0 - w) * b
         return b * mixed / ((1.0 + b) * mixed - b)
@@ -191,7 +193,7 @@ def fuse_pair(
         for m in range(i):
             value -= root[i, m] * whitened[m]
         whitened[i] = value / root[i, i]
-    # x += W diag(gain) W^-1 (other_x - x), with W^-1 = U' root^-1.
+    # x += W diag(gain) W^-1 (other_x - x), with W^-1 = U' root^-1; W becomes W diag(p)^1/2.
     for k in range(n):
         component = 0.0
         for i in range(n):
@@ -216,6 +218,8 @@ def other_gain(p: float, w: float, b: float, inverse: bool) -> float:
     (own, weight ``w``), ``b`` (other, weight 1 - w) and ``p`` (fused); ``inverse`` as in
     ``fused_variance``.
     """
+    # p times the information that the other one adds to 1/p: (1 - w) / b, or, of inverse
+    # intersection, 1/b less its share (1 - w) of the common part 1/m, m = w + (1 - w) b.
     if inverse:
         return p * (1.0 / b - (1.0 - w) / (w + (1.0 - w) * b))
     return p * (1.0 - w) / b

@@ -5,8 +5,10 @@ here inverts a covariance or subtracts one from another: samples are used by Giv
 columns, which keep columns of very different sizes apart (a first covariance of 1e12 beside a
 sensor of 1e-9), and combinations are one orthogonal elimination.
 
-Kernels work in place on entry ``k`` of stacks, root (K, n, n) and x (K, n), and take their scratch
-from :func:`update_scratch`; wrappers for Python take one node and return new arrays:
+Kernels work in place on entry ``k`` of stacks, root (K, n, n) and x (K, n), for the compiled event
+loop, and take their scratch from :func:`update_scratch`. Wrappers for Python take one node and
+return new arrays, for the filters, so that both engines compute the same bits. ``lanes`` is ONE for
+a single run or MANY for L of them as one SIMD value (``netkf.linalg.lanes``):
 
 =================================  ============================================================
 ``sample_root``                    kernel: use one sample ``y = H x + v`` (p rows)
@@ -40,13 +42,14 @@ SINGULAR = 2.0**-25
 2^-50, at which a pivot of the covariance itself would be rounding.
 """
 NEGLIGIBLE = 1e-40  # share of a squared pivot that changes neither it nor the rows below it
-TINY = 1e-200
+TINY = 1e-200  # the same for a pivot of 0, yet above underflow
 
 
 class UpdateScratch(Struct):
     """The ``size`` n of states, and scratch arrays: C (p, p), HS (p, n) and gains (p, n) of a
-    sample, with p >= 1 its largest number of rows; ``S`` and ``wide`` (n, n), ``whitened``
-    (n, n + 1) and ``total`` (n, n + 1) of combinations.
+    sample, with p >= 1 its largest number of rows; ``S`` and ``wide`` (n, n) of convex
+    combinations; ``whitened`` and ``total`` (n, n + 1), one term and the sum of an intersection, as
+    [Z, z].
     """
 
     size: Size
@@ -269,7 +272,8 @@ def add_root(
 ) -> None:
     """Add to the estimate ``x[k]`` (n,) and the covariance P of ``root[k]`` (n, n), in place,
     ``weight`` >= 0 times those of entry ``m`` of ``other_x`` (M, n) and ``other`` (M, n, n): one
-    term of the convex combinations, paper H (7) and (9). All roots are lower triangular.
+    term of the convex combinations of paper H (7) and (9) (Tanwani 2021). All roots are lower
+    triangular; ``scale_root`` comes first, with the own weight.
 
     Axes: M other estimates.
     """
@@ -291,6 +295,7 @@ def absorb_columns(lanes: Lanes, size: Size, S: FloatArray, wide: FloatArray) ->
     """Replace S (n, n, L) by the lower triangular root of ``S S' + wide wide'`` in each of L lanes
     (runs side by side); both are lower triangular, and ``wide`` (n, n, L) is overwritten.
     """
+    # [S, wide] is made lower triangular from the right, row by row.
     for i in range(len(size)):
         pivot, below = load(lanes, S, i, i), spread(lanes, 0.0)
         for j in range(i + 1):
@@ -315,7 +320,8 @@ def combine_roots(
     return x[0], root[0]
 
 
-# Covariance intersection, D (8) and (9): information is a root too, P^-1 = Z' Z.
+# Covariance intersection, (8) and (9) of paper D (Xie, Gan and Liu): P^-1 = sum w_j P_j^-1 and
+# P^-1 x = sum w_j P_j^-1 x_j. Information is a root too, P^-1 = Z' Z.
 
 
 @kernel(inlined=True)
@@ -342,8 +348,9 @@ def add_to_intersection(
     """Add ``weight`` times the information of the estimate ``x[k]`` (n,) with the root ``root[k]``
     (n, n) to ``scratch.total`` (n, n + 1), one term of paper D (8).
 
-    Means are relative to ``centre[m]`` (n,), the same for all terms of one intersection. Changes
-    ``scratch.total`` and ``scratch.whitened`` only; a weight of 0 adds nothing.
+    Means are relative to ``centre[m]`` (n,), any point near them that is the same for all terms of
+    one intersection. Changes ``scratch.total`` and ``scratch.whitened`` only; a weight of 0 adds
+    nothing.
     """
     whitened, total, n = scratch.whitened, scratch.total, x.shape[1]
     if weight <= 0.0:

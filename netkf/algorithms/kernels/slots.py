@@ -1,9 +1,11 @@
 """Structs and kernels that all compiled filters in slots share.
 
-A filter's kernel (``Filter.slot_kernel``) simulates H filters over S slots of R runs in one call,
-in place. Its arguments are :class:`SlotNodes` (states of the filters), :class:`ReadingBlock` and
-:class:`SlotPlan` (readings and messages drawn for these slots), :class:`SlotLinks` (the network),
-:class:`SlotSamples` (output) and :class:`SlotScratch`.
+In a slot, one time step, nodes read their sensors, exchange messages in E steps and predict, in the
+order of the filter. A filter's kernel (``Filter.slot_kernel``), which the compiled engine calls,
+simulates H filters over S slots of R runs in one call, in place. Its arguments are
+:class:`SlotNodes` (states of the filters), :class:`ReadingBlock` and :class:`SlotPlan` (readings
+and messages drawn for these slots), :class:`SlotLinks` (the network), :class:`SlotSamples` (output)
+and :class:`SlotScratch`.
 
 Runs are side by side in blocks of L lanes (``netkf.linalg.lanes``): an entry of filter ``h`` of run
 ``b L + q`` has the indices ``[b, ..., h, ..., q]``, and kernels compute all lanes of a filter at
@@ -40,7 +42,7 @@ from netkf.linalg.lanes import (
 from netkf.linalg.local import local_lanes_matrix, local_lanes_vector
 from netkf.linalg.structs import Size, sized
 
-TINY = 1e-200  # far below any length that counts, yet above underflow
+TINY = 1e-200  # far below any length of a row that counts, yet above underflow
 
 
 class SlotNodes(NamedTuple):
@@ -60,7 +62,8 @@ class SlotNodes(NamedTuple):
 
 
 class ReadingBlock(NamedTuple):
-    """Whitened readings of S slots in B blocks of L runs; H filters have at most p rows each.
+    """Whitened readings ``y = H x + v`` of S slots in B blocks of L runs; H filters have at most p
+    rows each. A filter without a reading in a slot has rows of zeros, which change nothing.
 
     y : (B, S, H, p, L)
     H : (B, S, H, p, n, L), or (1, 1, H, p, n, L) if it is fixed
@@ -85,7 +88,7 @@ class SlotPlan(NamedTuple):
     first : number of the first slot
     sensed, exchanged : (S,), whether nodes read and predict, and whether they exchange
     sample : (S,), index of the slot's sample, -1: none
-    up : (B, S, E, W, L), 1 if a message arrives on a direction in a step of the exchanges
+    up : (B, S, E, W, L), 1 if a message arrives on a directed link in a step of the exchanges
     sent : (B, S, E, H, L), 1 if a node is asked for a message
     uniform : (B, S, E, H, L), uniform number for the decision of a node that is asked
     part : WHOLE, SENDING or ARRIVING
@@ -131,7 +134,9 @@ class SlotSamples(NamedTuple):
                  filters side by side
     error : (R, T, H n), x - xhat
     stopped : (B, H, L), slot in which each filter permanently froze its network estimate
-    conserved : (B, H, K, L), its shares of K conserved sums at the last sample
+    conserved : (B, H, K, L), shares of each filter in K sums over the network that messages
+    conserve
+                (push-sum), at the last sample
     absolute, local : (B, S, n, L), true states in all slots, in the coordinates of the plant and
                       relative to the moving origin that estimates refer to
     framed : whether the origin moves; otherwise both are the same
@@ -179,7 +184,9 @@ class SlotScratch(NamedTuple):
 
 
 def slot_scratch(H: int, n: int, unrolled: bool, lanes: Lanes = MANY) -> SlotScratch:
-    """Return scratch for H filters of n states; ``unrolled``: of a type that knows a small n."""
+    """Return scratch for H filters of n states and L ``lanes``; ``unrolled``: of a type that knows
+    n, if it is small, so that kernels are compiled for this n with their loops unrolled.
+    """
     L = len(lanes)
     shapes: list[tuple[int, ...]] = [*[(n, L)] * 3, *[(n, n, L)] * 2, *[(n, n + 1, L)] * 2]
     shapes += [(H, n, L), (H, n, n, L)]
@@ -202,8 +209,8 @@ def whiten_reading(y: FloatArray, H: FloatArray, R: FloatArray) -> tuple[FloatAr
 
 
 def block_of_reading(y: FloatArray, H: FloatArray) -> ReadingBlock:
-    """Return a whitened reading y (p,), H (p, n) as a block of one filter, one slot and
-    one lane.
+    """Return a whitened reading y (p,), H (p, n) as a block of one filter, one slot and one lane,
+    so that filters in Python call the kernels of slots and get the same bits.
     """
     n = H.shape[1]
     return ReadingBlock(
@@ -217,7 +224,8 @@ def block_of_reading(y: FloatArray, H: FloatArray) -> ReadingBlock:
 def star_of(weights: Sequence[float]) -> tuple[SlotLinks, np.ndarray]:
     """Return links and flags of a star: from senders 1, 2, ... to the one receiver 0, with the
     ``weights`` (one of each of W senders), and the array ``up`` (1, 1, 1, W, 1) that lets all their
-    messages arrive.
+    messages arrive. A filter in Python, which has only the messages that arrived, passes them to
+    the kernels of slots in this way.
 
     Axes: W directed links.
     """
@@ -310,7 +318,7 @@ def rebase(nodes: SlotNodes, readings: ReadingBlock, scratch: SlotScratch, b: in
     (H, n, L).
 
     An origin near the state keeps estimates small, so that large absolute states cost no digits.
-    Axes: H filters, L runs side by side.
+    Filters are affine in it: errors do not change. Axes: H filters, L runs side by side.
     """
     # Only the mean moves: a covariance does not depend on the origin.
     if readings.rebased[s]:
@@ -356,7 +364,8 @@ def update_by_reading(
     # A fixed H is stored for one block and one slot only.
     c, t = min(b, readings.H.shape[0] - 1), min(s, readings.H.shape[1] - 1)
     for k in range(nodes.rows[sender]):
-        # Scalar update with unit noise: h S and the innovation y - h x with all earlier rows used.
+        # Scalar update with unit noise by row h of H: h S, and the innovation y - h x with all
+        # earlier rows used.
         innovation = load(lanes, readings.y, b, s, sender, k)
         for j in range(n):
             total = spread(lanes, 0.0)
@@ -367,6 +376,7 @@ def update_by_reading(
             store(lanes, row, j, select(arrived, total, 0.0))
             weight = load(lanes, readings.H, c, t, sender, k, j)
             innovation -= weight * load(lanes, nodes.xhat, b, h, j)
+        # x += K (y - h x), with the gain K = gains / (standard deviation of the innovation).
         step = innovation * rotate_lanes(lanes, size, nodes.root, b, h, row, gains)
         for i in range(n):
             x = load(lanes, nodes.xhat, b, h, i)
@@ -562,6 +572,7 @@ def predict_root_single(
     that of ``F S S' F' + Q``; F and the lower triangular ``root_Q`` are (n, n), and ``moved`` and
     ``noise`` (n, n, 1) are scratch.
     """
+    # F[0] (n,) serves as the size n.
     predict_root(ONE, F[0], root, 0, 0, F, root_Q, moved, noise)
 
 

@@ -3,7 +3,9 @@
 For ``P = S S'`` one orthogonal triangularisation of ``[[H S, root(R), 0], [F S, 0, root(Q)]]``
 gives the innovation's root, the gain and the root of the next covariance: nothing is subtracted, so
 nothing cancels after an outage, where covariance forms lose eps * P (Kailath, Sayed and Hassibi,
-Linear Estimation, section 12.3).
+Linear Estimation, section 12.3). ``reflect`` and ``reflect_row`` are the steps of the
+triangularisation, which other kernels use as well: Householder reflections of columns, that is from
+the right, which leave [A, B] [A, B]' as it is.
 """
 
 from __future__ import annotations
@@ -70,16 +72,19 @@ def reflect_row(
     ``active`` lanes (flags (L,) of runs side by side).
 
     wide and T are (n, n, L), T lower triangular. Row ``i`` has the squared length ``square`` (L,);
-    in ``wide`` its entries are in columns ``i`` to ``end`` - 1.
+    in ``wide`` its entries are in columns ``i`` to ``end`` - 1. Row ``i`` itself is not cleared
+    right of its diagonal.
     """
+    # With v = row i + signed e_i the reflection is I - v v' / (length head), which turns row i into
+    # -signed e_i; then column i changes its sign if needed.
     n, pivot = len(size), load(lanes, wide, i, i)
     length = root_of(select(active, square, 1.0))
     # The sign that does not cancel in pivot + signed; the column is flipped so that its diagonal is
     # nonnegative.
     signed = select(pivot >= 0.0, length, -length)
     head = magnitude(pivot + signed)
-    scale = select(active, 1.0 / (length * head), 0.0)
-    inverse = scale * head
+    scale = select(active, 1.0 / (length * head), 0.0)  # 2 / v' v
+    inverse = scale * head  # 1 / length
     store(lanes, wide, i, i, select(active, length, pivot))
     for r in range(i + 1, n):
         first = load(lanes, wide, r, i)
@@ -88,8 +93,9 @@ def reflect_row(
             inner += load(lanes, wide, i, j) * load(lanes, wide, r, j)
         for j in range(i + 1):
             inner += load(lanes, T, i, j) * load(lanes, T, r, j)
-        share = (inner + signed * first) * scale
-        # The part of row r along row i: the reflection turns row i into its length.
+        share = (inner + signed * first) * scale  # v' (row r) 2 / v' v
+        # Entry (r, i) is the part of row r along row i: row i becomes (length, 0, ..., 0), and the
+        # product of both rows is kept.
         store(lanes, wide, r, i, select(active, inner * inverse, first))
         for j in range(i + 1, end):
             store(lanes, wide, r, j, load(lanes, wide, r, j) - share * load(lanes, wide, i, j))
@@ -109,8 +115,9 @@ def step_root(
     rows: np.ndarray,
     work: FloatArray,
 ) -> None:
-    """Replace root ``chain`` of ``roots`` (K, n, n), lower triangular, by that of f_m(P),
-    paper R (17): update with reading ``m`` of M and predict.
+    """Replace root ``chain`` of ``roots`` (K, n, n), lower triangular, by that of
+    ``f_m(P) = F P F' + Q - F P H_m' (H_m P H_m' + R_m)^-1 H_m P F'``, R (17) of paper R (Kar,
+    Sinopoli and Moura): update with reading ``m`` of M and predict.
 
     F and ``root_Q`` are (n, n); H (M, p, n), ``root_R`` (M, p, p) and ``rows`` (M,) give the
     readings, of which the first ``rows[m]`` rows count. ``work`` (>= p + n, >= 2 n + p) is scratch.
@@ -132,7 +139,8 @@ def step_root(
     # n + p + (i - p), because root_Q is lower triangular.
     for i in range(p + n):
         reflect(work, i, p + n, n + p + max(0, i - p + 1))
-    # The post-array is [[C, 0], [K C, S+]]: its lower right block is the root of f_m(P).
+    # The post-array is [[C, 0], [K C, S+]] with C C' = H P H' + R and the gain K of the predictor:
+    # its lower right block is the root of f_m(P).
     for i in range(n):
         for j in range(i + 1):
             roots[chain, i, j] = work[p + i, p + j]

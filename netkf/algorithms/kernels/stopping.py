@@ -1,7 +1,10 @@
-"""When a node of the push-sum filter freezes its network estimate: paper P step 2.3 and a safe
-form.
+"""When a node of the push-sum filter freezes its network estimate, the information G^(i) of all
+sensors and the number N^(i) of nodes: step 2.3 of paper P (Battilotti, Cacace and d'Angelo 2023),
+and a safe form.
 
-Both engines call these kernels, so that rounding is the same and a node stops in the same slot.
+The rule of the paper also fires when all links of a node fail in one step, with a wrong estimate
+for ever. Both engines call these kernels, so that rounding is the same and a node stops in the same
+slot.
 """
 
 from __future__ import annotations
@@ -110,6 +113,7 @@ def has_converged(
     step: the number of nodes N^(i) from ``former_number`` to ``number``, and the information G^(i)
     (n, n) from ``former`` to ``information``, in the Frobenius norm.
     """
+    # ``not <`` rejects nan.
     if not abs(number - former_number) < tolerance * number:
         return False
     change = square = 0.0

@@ -2,7 +2,8 @@
 combination.
 
 A track is the estimate of a node from its own sensors. The common process noise and the common
-initial error correlate the errors e_i of tracks (Bar-Shalom and Campo 1986). ``joint`` (K, n, n)
+initial error correlate the errors e_i of tracks (Bar-Shalom and Campo 1986), so that a combination
+that took them as independent would claim too small a covariance. ``joint`` (K, n, n)
 holds ``P_ij = E[e_i e_j']`` for K ``pairs`` (i, j) of tracks (K, 2), among them all pairs (i, i).
 P_ij is computed from itself, P_ii and P_jj alone, so that its bits do not depend on which other
 pairs there are.
@@ -32,7 +33,7 @@ class TrackScratch(NamedTuple):
     cross_cov, white_cov : (n, k n), covariances of e_own with d and with u
     variance_scale, order : (k n,), sum of the variances of e_own and e_a for each entry of d, and
                             the order of pivots
-    weights : (n, (k + 1) n), of the errors of all tracks in that of the combination
+    weights : (n, (k + 1) n), of the errors of all tracks in the error of the combination
     work : (n, n)
     """
 
@@ -113,7 +114,8 @@ def update_joint(
             close_track(joint[k], H[i], rows[i], closed[i], work)
     for k in range(len(joint)):
         i, j = pairs[k, 0], pairs[k, 1]
-        # Noises of different nodes are independent and add nothing. Without rows C_i = I.
+        # e_i <- C_i e_i - K_i v_i: noises v_i of different nodes are independent and add nothing.
+        # Without rows C_i = I.
         if i != j and rows[i] + rows[j] > 0:
             multiply_both(closed[i], joint[k], closed[j], work)
 
@@ -138,6 +140,8 @@ def close_row(P: FloatArray, h: FloatArray, closed: FloatArray, k: FloatArray) -
     """Update P (n, n) by one whitened row h (n,), ``P <- (I - k h) P (I - k h)' + k k'`` with the
     gain ``k = P h' / (h P h' + 1)``, and multiply ``closed`` by ``I - k h`` from the left. ``k``
     (n,) is scratch.
+
+    This is the Joseph form: a rounding error of k changes P in second order only.
     """
     n, variance = len(P), 1.0
     for i in range(n):
@@ -280,7 +284,8 @@ def write_combined_root(
     for a in range(count + 1):
         for j in range(n):
             for i in range(n):
-                # (W joint) for row i and error j of track a; then times W'.
+                # (W joint) for row i and error j of track a; then times W', into the lower
+                # triangle.
                 total = 0.0
                 for b in range(count + 1):
                     for k in range(n):
