@@ -1,5 +1,10 @@
 """The gains of a Kalman-Bucy filter for the two moments of a reading of an interval [a, b].
 
+A sensor ``dy = H x dt + dv`` with noise of covariance R per second gives a filter of an interval
+only its moments ``int P_j dy`` with the Legendre polynomials P_0 and P_1 (``linalg.legendre``). The
+filter predicts estimate and covariance P to b (``riccati`` or ``root_flow``), then corrects the
+estimate.
+
 Exactly, ``xhat(b) = exp(A g) xhat(a) + int k(s) (dy - H xhat_open(s) ds)`` with the weight ``k(s) =
 Phi(b, s) P(s) H' R^-1`` and the open-loop prediction ``xhat_open``. Since the Hamiltonian flow is
 symplectic, ``k(s) = Y(s)' H' R^-1`` with ``[X; Y](s) = exp(-M (b - s)) [I; P(b)]``: the weight is
@@ -27,8 +32,8 @@ MAX_INTERVAL = 8.0  # |M| g beyond which two moments do not describe a reading w
 
 
 class GainTable(NamedTuple):
-    """Power series in the interval g (seconds) of U (n, 2p), W (n, 2p) and the predictor C (2p, n),
-    for readings of p rows.
+    """Power series in the interval g (seconds) of the gains U + P(b) W, U and W (n, 2p), and of the
+    predictor C (2p, n) of the moments, for readings of p rows.
 
     n, moments : number of states, and 2p
     series : (terms, 6 n p + 1), the coefficients of U, W and C by rows, and their reach in the
@@ -43,8 +48,8 @@ class GainTable(NamedTuple):
 def gain_table(
     A: FloatArray, Q: FloatArray, H: FloatArray, R: FloatArray, longest: float
 ) -> GainTable:
-    """Tabulate the gains of a plant with A and Q (n, n) and a sensor with H (p, n) and R (p, p) for
-    intervals up to ``longest`` seconds.
+    """Return the table of the gains of a plant with A and Q (n, n) and a sensor with H (p, n) and R
+    (p, p) for intervals up to ``longest`` seconds.
 
     Raises ValueError if that is above :func:`longest_interval`.
     """
@@ -65,6 +70,7 @@ def gain_table(
     weight = np.array([1.0, 3.0])  # 2 j + 1
     # [X; Y] = E [I; P] and k = Y' H' R^-1: the block of Y that multiplies I gives U, the one that
     # multiplies P gives W. M belongs to P / scale, so only the first of them is scaled back.
+    # Indices: moment j, power k of g, states a and b, row p of the reading.
     from_Y = np.einsum("j,jk,kba,bp->kajp", weight, c, E[:, n:, :n] * scale, HR)
     from_P = np.einsum("j,jk,kba,bp->kajp", weight, c, E[:, n:, n:], HR)
     # C = moments of H exp(-A (b - s)): the reading that x(b), taken back without noise, predicts.

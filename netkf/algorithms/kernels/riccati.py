@@ -1,5 +1,10 @@
 """The flow of the Riccati equation dP = A P + P A' + Q - P G P over gaps of any length.
 
+P is the covariance of a Kalman-Bucy filter between messages, for a plant ``dx = A x dt + noise`` of
+covariance Q per second and sensors that give the information ``G = H' R^-1 H`` per second. The
+theory of paper H (Tanwani 2021) and filters of the deprecated contract (``algorithms.flow``) use
+these covariances; other filters carry roots of P, which ``root_flow`` moves.
+
 The flow is the linear-fractional action of ``exp(M gap)`` with the Hamiltonian ``M = [[-A', G], [Q,
 A]]``: if ``[X; Y] = exp(M gap) [I; P]`` then ``P(gap) = Y X^-1``. One exponential over a long gap
 loses every digit, so a gap is cut into whole units, in which ``|M| unit <= 1``, and a rest. The
@@ -32,7 +37,8 @@ class RiccatiTable(NamedTuple):
     n      : number of states
     unit   : gap that the series covers, seconds
     series : (terms, 5 n n + 1) Taylor coefficients of the blocks of ``exp(M g)`` and of
-             ``exp(A g)``, with their reach, see linalg/series
+             ``exp(A g)``, and in the last column their reach, the longest gap for which the terms
+             so far suffice (linalg/series)
     unobserved : (terms, 2 n n + 1) those of ``exp(A g)`` and of W where G = 0, else no row
     transition, F, G, Q : (levels, n, n) ``exp(A g)`` and the triple for ``g = unit * 2^level``
     """
@@ -91,8 +97,8 @@ def hamiltonian(A: FloatArray, Q: FloatArray, G: FloatArray) -> tuple[FloatArray
 
 
 def riccati_table(A: FloatArray, Q: FloatArray, G: FloatArray, longest: float) -> RiccatiTable:
-    """Tabulate the Riccati flow ``dP = A P + P A' + Q - P G P`` for gaps up to ``longest`` seconds;
-    ``A, Q, G`` are (n, n).
+    """Return the table of the Riccati flow ``dP = A P + P A' + Q - P G P`` for gaps up to
+    ``longest`` seconds; ``A, Q, G`` are (n, n).
     """
     n = len(A)
     M, scale = hamiltonian(A, Q, G)
@@ -138,8 +144,8 @@ def _doubling_tables(
     # Doubling also doubles the relative error, so it works in extended precision (where the
     # machine has it): after 2^14 units a table in double would have lost 1e-12.
     n, wide = len(A), np.longdouble
-    # exp(M unit) gives the first triple: with [X; Y] = E [I; P], F = X^-T, G = X^-1 E12 and Q = E21
-    # X^-1.
+    # E = exp(M unit) gives the first triple: with [X; Y] = E [I; P], F = E11^-T, G = E11^-1 E12 and
+    # Q = E21 E11^-1. Extended precision needs 24 terms, more than TAYLOR_TERMS.
     E = np.tensordot(wide(unit) ** np.arange(24), exponential_series(M.astype(wide), 24), 1)
     inverse = _invert_extended(E[:n, :n])
     F, G, Q = inverse.T, inverse @ E[:n, n:], E[n:, :n] @ inverse
@@ -153,14 +159,14 @@ def _doubling_tables(
             G, Q = symmetric(G), symmetric(Q)
             for table, value in zip(tables, (transition, F, G / scale, Q * scale), strict=True):
                 table[level] = value
-            # Two equal gaps in a row: W = (I + G Q)^-1 joins the noise of the first with the
-            # information of the second.
-            W = _invert_extended(np.eye(n) + G @ Q)
+            # Two equal gaps in a row: V = (I + G Q)^-1 joins the noise of the first with the
+            # information of the second. G and Q are symmetric, so that V' = (I + Q G)^-1.
+            V = _invert_extended(np.eye(n) + G @ Q)
             transition, F, G, Q = (
                 transition @ transition,
-                F @ W.T @ F,
-                G + F.T @ W @ G @ F,
-                Q + F @ Q @ W @ F.T,
+                F @ V.T @ F,
+                G + F.T @ V @ G @ F,
+                Q + F @ Q @ V @ F.T,
             )
     return tables  # type: ignore[return-value]
 
@@ -211,7 +217,7 @@ def propagate_riccati(
 ) -> tuple[FloatArray, FloatArray]:
     """Return the covariance (n, n) after the Riccati flow of a ``table`` over ``gap`` >= 0 seconds
     from P (n, n), and ``exp(A gap) x`` (n,): the covariance counts the readings of the gap, the
-    estimate does not.
+    estimate does not (``gains.gain_update`` corrects it by them).
     """
     P, x = P.copy(), x.copy()  # C-contiguous, so that one version of this code is compiled
     # One step for each binary digit 1 of the number of whole units, with its tabulated triple.

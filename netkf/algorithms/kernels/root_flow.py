@@ -1,5 +1,8 @@
 """The Riccati flow on roots: covariances ``P = S S'`` stay accurate however large they are.
 
+By it Kalman-Bucy filters move from event to event, in both engines, for a plant ``dx = A x dt +
+noise`` of covariance Q per second and sensors ``dy = H x dt + dv`` with noise of covariance R.
+
 Over a gap g, ``P(g) = Q_g + F P (I + G_g P)^-1 F'`` and ``x(g) = exp(A g) x``, where G_g is the
 information that the sensors give during the gap. With ``G_g = Gamma' Gamma`` and ``Q_g = T T'``
 the root moves in three steps that subtract nothing: each row of Gamma is a scalar observation of
@@ -12,8 +15,9 @@ is not computed as a root of G. ``dG/dg = F(s)' H' R^-1 H F(s)``, hence with the
 
     Gamma = sqrt(g) [c_0; c_1 / sqrt(3); c_2 / sqrt(5); ...],   c_j of order g^j.
 
-c_j is a power series in g, and as many of them are used as P and g need. If P G is small enough
-for this rounding to be harmless, which is nearly always so, a gap takes one step instead: with
+c_j is a power series in g, and as many of them are used as P and g need. P is called *wide* for a
+gap that needs this, and *narrow* if P G is small enough for the rounding to be harmless, which is
+nearly always so (NARROW). Then a gap takes one step instead: with
 ``I + S' G_g S = V V'`` and V upper triangular, S V^-T is triangular and a root of
 ``P (I + G_g P)^-1``. Gaps are divided into cells of length ``unit``; Q_g, F and G_g are power
 series around the middle of the cell that the gap lies in.
@@ -54,17 +58,17 @@ from netkf.linalg.local import local_matrix, local_vector
 from netkf.linalg.series import fill_series, with_reach
 from netkf.linalg.structs import Size, Struct, sized, struct_at
 
-CELLS, CELL_BYTES = 32, 1 << 18  # of one model at most
-NARROW = 64.0  # trace(P) trace(G) of a gap up to which rounding of G is harmless
+CELLS, CELL_BYTES = 32, 1 << 18  # of one model at most: the tables should fit a processor's cache
+NARROW = 64.0  # trace(P) trace(G) of a gap up to which rounding of G is harmless: P is narrow
 TERMS = 27  # of the power series: enough for |M| unit <= UNIT, odd
 CELL_TERMS = 13  # about as many as a cell needs
-UNIT = 0.125
+UNIT = 0.125  # largest norm of M over a unit, a cell's length, M the Hamiltonian
 BLOCKS = 13  # Legendre coefficients at most: the next one is below 1e-40 of the first
 NEGLIGIBLE = 1e-18  # trace(P dG) of information that may be left out
 GROWTH = 2.0**8  # of F over one level at most, where something is observed
 PIVOT = 2.0**-48  # least pivot of Q_g, relative to its diagonal
 
-WIDE = np.longdouble
+WIDE = np.longdouble  # extended precision where the machine has it, for tables only
 
 
 class FlowTable(Struct):
@@ -72,7 +76,7 @@ class FlowTable(Struct):
 
     unit   : (M,) length of a cell, seconds
     sizes  : (M, 5) rows q of a block of Gamma, number of blocks (0: nothing is observed), whether
-             there is noise, number of levels, and that of the first one longer than all cells
+             there is noise, number of levels, and the level that is as long as all cells together
     size   : (M,) trace of G, 1/s
     reach  : (M, cells, terms, 1) up to which gap the terms so far are enough, see linalg/series
     series : (M, cells, terms, width) Taylor coefficients: Q_g (lower triangle by rows), exp(A g)
@@ -140,8 +144,8 @@ def flow_scratch(table: FlowTable, unrolled: bool = False) -> FlowScratch:
 def flow_table(
     A: FloatArray, Q: FloatArray, H: FloatArray, R: FloatArray, longest: float
 ) -> FlowTable:
-    """Tabulate one model, the flow of the covariance of a Kalman-Bucy filter: ``A, Q`` (n, n),
-    ``H`` (p, n), ``R`` (p, p); p may be 0.
+    """Return the table of one model, the flow of the covariance of a Kalman-Bucy filter: ``A, Q``
+    (n, n), ``H`` (p, n), ``R`` (p, p); p may be 0.
 
     The table is fast for gaps up to ``longest`` seconds; longer ones take several steps.
     """
@@ -149,7 +153,8 @@ def flow_table(
     whitened_H = whiten_observation(H, R)
     M, scale = hamiltonian(A, Q, whitened_H.T @ whitened_H)
     size = np.abs(A)
-    norm = float(size.sum(axis=0).max() + size.sum(axis=1).max())  # exp(A s) Q exp(A' s)
+    # Q_g = int exp(A s) Q exp(A' s) ds grows by A from both sides.
+    norm = float(size.sum(axis=0).max() + size.sum(axis=1).max())
     if len(whitened_H):
         norm = max(norm, float(np.abs(M).sum(axis=0).max()))
     # A power of two, so that multiples of the unit and its halves are exact.
@@ -486,7 +491,8 @@ def propagate_root(
 
     Axes: K estimates.
     """
-    # A gap beyond all cells: first take whole steps of the first level that is longer than these.
+    # The cells cover 2^octaves units (column 4 of sizes). Of a longer gap, first take whole steps
+    # of the level of that length.
     octaves = table.sizes[m, 4]
     if gap >= table.unit[m] * (1 << octaves):
         gap = propagate_by_levels(table, m, octaves, root, x, k, gap, scratch)
@@ -508,7 +514,8 @@ def trace_of(size: Size, table: FlowTable, m: int, root: FloatArray, k: int) -> 
 
     Axes: K estimates.
     """
-    # Without observation G = 0, and any P is narrow: the trace need not be computed.
+    # Without observation (no block of Gamma, column 1 of sizes) G = 0, and any P is narrow: the
+    # trace need not be computed.
     return 0.0 if table.sizes[m, 1] == 0 else float(trace_of_root(ONE, size, root[k]))
 
 
@@ -517,7 +524,7 @@ def is_narrow(table: FlowTable, m: int, gap: float, trace: float) -> bool:
     """Return True if a P of this ``trace`` is small enough to be moved over ``gap`` seconds in one
     step by model ``m`` of the table: the rounding of G_g times P is harmless.
     """
-    # ``not >=``: a nan counts as narrow, so that it takes the short way.
+    # table.size is trace(G). ``not >=``: a nan counts as narrow, so that it takes the short way.
     return not table.size[m] * gap * trace >= NARROW
 
 
@@ -588,6 +595,8 @@ def propagate_level(
     Gamma P)^-1 F' + T T'`` and ``x <- exp(A g) x``. Gamma' Gamma is the information of the readings
     of these g seconds, and T T' the noise.
     """
+    # Index in the third axis of levels: 0 exp(A g), 1 F, 2 Gamma, 3 T. Column 1 of sizes is 0 where
+    # nothing is observed.
     n, levels, T, observed = len(scratch.size), table.levels, scratch.T, scratch.observed
     if table.sizes[m, 1] > 0:
         # Gamma_r S for each row r of Gamma, both triangular, as an observation of unit noise.
@@ -704,6 +713,7 @@ def propagate_by_series(
     information G_g of the readings (see ``fill_values``). ``reads``: use G_g first; otherwise the
     caller has done so.
     """
+    # Work on copies that the compiler can keep in registers (local_matrix), and store them last.
     size, n, observed = scratch.size, len(scratch.size), table.sizes[m, 1] > 0
     S, mean = local_matrix(size, scratch.S), local_vector(size, scratch.mean)
     for i in range(n):
@@ -933,9 +943,9 @@ def gain_root(
     values: FloatArray,
 ) -> None:
     """Correct the prediction ``x[k]`` (n,) at the end of a ``gap`` in seconds, entry ``k`` of x
-    (K, n), in place by the ``moments`` (2 p,) of its readings, which are overwritten with the
-    innovations ``moments - C x``: ``x += (U + S S' W) innovations``, with the root S = ``root[k]``
-    (n, n).
+    (K, n), in place by the Legendre ``moments`` (2 p,) of its readings, which are overwritten with
+    the innovations ``moments - C x``: ``x += (U + S S' W) innovations``, with the root S =
+    ``root[k]`` (n, n).
 
     U and W (n, 2 p) and C (2 p, n) are power series in the gap, the rows of ``series`` (terms, ...)
     of a GainTable; ``reach[:, column]`` (terms,) is the longest gap for which the terms so far
@@ -954,9 +964,9 @@ def use_moments(
     values: FloatArray,
     moments: FloatArray,
 ) -> None:
-    """Correct the predictions x (n, L) of L lanes in place by the ``moments`` (q, L) of their
-    readings, which are overwritten with the innovations ``moments - C x``: ``x += (U + S S' W)
-    innovations``, with lower triangular roots S (n, n, L).
+    """Correct the predictions x (n, L) of L lanes in place by the Legendre ``moments`` (q, L) of
+    their readings (gains.py), which are overwritten with the innovations ``moments - C x``:
+    ``x += (U + S S' W) innovations``, with lower triangular roots S (n, n, L).
 
     ``values`` (3 q n, L) holds U and W (n, q) and C (q, n) at the gap; C is overwritten.
     """
@@ -998,7 +1008,8 @@ def propagate_one(
     table: IntArray, scratch: IntArray, root: FloatArray, x: FloatArray, gap: float
 ) -> None:
     """Propagate ``root`` (1, n, n) and ``x`` (1, n) of one node in place over ``gap`` seconds by a
-    table of one model. ``table`` and ``scratch`` are the memory of a FlowTable and a FlowScratch.
+    table of one model. ``table`` and ``scratch`` are the memory of a FlowTable and a FlowScratch,
+    since numba takes long to determine the type of a struct that Python passes.
     """
     propagate_root(struct_at(table, FlowTable), 0, root, x, 0, gap, struct_at(scratch, FlowScratch))
 
@@ -1040,8 +1051,8 @@ def gain_update_root(
     table: GainTable, root: FloatArray, x: FloatArray, moments: FloatArray, gap: float
 ) -> FloatArray:
     """Return ``xhat(b)`` (n,) at the end b of an interval of ``gap`` seconds, from the open-loop
-    prediction ``x`` (n,), the ``root`` (n, n) at b, the ``moments`` (2 p,) of the readings of the
-    interval and the ``table`` of the node's gains.
+    prediction ``x`` (n,), the ``root`` (n, n) at b, the Legendre ``moments`` (2 p,) of the readings
+    of the interval and the ``table`` of the node's gains. The arguments are not changed.
     """
     if table.moments == 0:
         return x

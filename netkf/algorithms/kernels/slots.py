@@ -63,7 +63,8 @@ class SlotNodes(NamedTuple):
 
 class ReadingBlock(NamedTuple):
     """Whitened readings ``y = H x + v`` of S slots in B blocks of L runs; H filters have at most p
-    rows each. A filter without a reading in a slot has rows of zeros, which change nothing.
+    rows each. A recorded sensor without a reading in a slot has rows of zeros, which change
+    nothing.
 
     y : (B, S, H, p, L)
     H : (B, S, H, p, n, L), or (1, 1, H, p, n, L) if it is fixed
