@@ -57,8 +57,8 @@ def move_roots(
     roots: FloatArray, sequences: np.ndarray, F: FloatArray, root_Q: FloatArray, modes: ReadingModes
 ) -> FloatArray:
     """Return the lower triangular roots (K, n, n) of K chains after T slots with the modes
-    ``sequences`` (K, T), indices in ``modes``, from their ``roots`` (K, n, n) before; F and
-    ``root_Q`` are (n, n).
+    ``sequences`` (K, T), indices in ``modes``, from any ``roots`` (K, n, n) before, triangular or
+    not; F and ``root_Q``, any root of Q, are (n, n).
 
     Uses all cores if there is enough to do.
     """

@@ -8,7 +8,9 @@ differences of near states lose no digits. Omega may be singular, as that of a s
 Pairs add up by ``merge_lanes``, which triangularises one root on top of the other.
 
 Stacks ``parts`` (2, K, H, n, n + 1, L) hold K pairs of each of H nodes, before and after a step of
-the exchanges: one pair (prediction and reading together) or two (apart), as the filter has it.
+the exchanges: one pair (prediction and reading together) or two (apart), as the filter has it. Its
+``shares`` and ``counts`` are the multiples with which pairs begin and are summed up in the end: ICF
+begins with the reading and 1/N of the prediction, and counts their mean over N nodes N times.
 
 In a slot, one time step, nodes read, exchange messages in E steps and predict, in the order of the
 filter. ``links`` lists the W directed links by receiver: those to filter h have the numbers

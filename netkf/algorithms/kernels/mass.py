@@ -238,7 +238,8 @@ def average(
     directed links, H nodes.
     """
     H, n = len(links.first) - 1, z.shape[2]
-    # All differences before any estimate moves: the step is simultaneous.
+    # All differences before any estimate moves: the step is simultaneous. It is a consensus step,
+    # which contracts differences if delta exceeds half the largest eigenvalue of the Laplacian.
     for h in range(H):
         for i in range(n):
             own, total = load(lanes, z, b, h, i), spread(lanes, 0.0)

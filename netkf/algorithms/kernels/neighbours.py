@@ -154,7 +154,8 @@ def fuse_readings(
 @kernel
 def copy_pairs(nodes: SlotNodes, scratch: SlotScratch, b: int) -> None:
     """Copy (xhat, root) of all H filters of block ``b`` to ``scratch.xhat`` (H, n, L) and
-    ``scratch.root`` (H, n, n, L): the messages that they send.
+    ``scratch.root`` (H, n, n, L): the messages that they send. Then filters can be updated one
+    after the other, all from the values before the exchange.
 
     Axes: L runs side by side.
     """

@@ -531,7 +531,8 @@ def is_narrow(table: FlowTable, m: int, gap: float, trace: float) -> bool:
 @kernel(inlined=True)
 def takes_one_step(table: FlowTable, m: int, gap: float, trace: float) -> bool:
     """Return True if ``propagate_root`` moves a P of this ``trace`` over ``gap`` seconds in one
-    step, by the series of a cell, with model ``m`` of the table.
+    step, by the series of a cell, with model ``m`` of the table: only then the compiled engine can
+    do so in SIMD lanes.
     """
     longest = table.unit[m] * (1 << table.sizes[m, 4])
     return bool(gap < longest and is_narrow(table, m, gap, trace))
@@ -914,7 +915,8 @@ def transform_root(
 @kernel(inlined=True, fused=True)
 def information_rate(lanes: Lanes, size: Size, whitened_H: FloatArray, S: FloatArray) -> Any:
     """Return the rate of information ``trace(P G)`` (L,) in 1/s, of roots S (n, n, L) and of
-    ``whitened_H`` (q, n, L) = R^-1/2 H.
+    ``whitened_H`` (q, n, L) = R^-1/2 H. By it the compiled engine decides how long an interval may
+    be whose readings are used at once.
 
     Axes: L runs side by side.
     """

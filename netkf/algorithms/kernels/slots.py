@@ -579,7 +579,7 @@ def predict_root_single(
 
 def predict_root_alone(root: FloatArray, F: FloatArray, root_Q: FloatArray) -> FloatArray:
     """Return the lower triangular root (n, n) of ``F S S' F' + Q`` for the lower triangular
-    ``root`` S and ``root_Q`` (n, n each), for one filter.
+    ``root`` S and ``root_Q`` (n, n each), for one filter in Python: the same bits as in a block.
     """
     n = len(F)
     moved = np.array(root).reshape(1, 1, n, n, 1)

@@ -218,6 +218,7 @@ def fill_difference_covariances(joint: FloatArray, count: int, scratch: TrackScr
             scratch.variance_scale[a * n + i] = joint[0, 0, i, i] + joint[1 + a, 1 + a, i, i]
             for j in range(n):
                 scratch.cross_cov[i, a * n + j] = joint[0, 0, i, j] - joint[0, 1 + a, i, j]
+                # E[d_a d_b'] = E[e_own d_b'] - E[e_a d_b'].
                 for b in range(count):
                     first = joint[0, 0, i, j] - joint[0, 1 + b, i, j]
                     second = joint[1 + a, 0, i, j] - joint[1 + a, 1 + b, i, j]
