@@ -17,10 +17,10 @@ is not computed as a root of G. ``dG/dg = F(s)' H' R^-1 H F(s)``, hence with the
 
 c_j is a power series in g, and as many of them are used as P and g need. P is called *wide* for a
 gap that needs this, and *narrow* if P G is small enough for the rounding to be harmless, which is
-nearly always so (NARROW). Then a gap takes one step instead: with
-``I + S' G_g S = V V'`` and V upper triangular, S V^-T is triangular and a root of
-``P (I + G_g P)^-1``. Gaps are divided into cells of length ``unit``; Q_g, F and G_g are power
-series around the middle of the cell that the gap lies in.
+nearly always so (NARROW). Then a gap takes one step instead: with ``I + S' G_g S = V V'`` and V
+upper triangular, S V^-T is triangular and a root of ``P (I + G_g P)^-1``. Gaps are divided into
+cells of length ``unit``; Q_g, F and G_g are power series around the middle of the cell that the gap
+lies in. Longer gaps take tabulated steps of 1, 2, 4, ... units, the levels.
 
 API. :func:`flow_table` tabulates one model, :func:`stack_tables` puts the tables of several
 models side by side (a table is a stack of one); m is the index of a model in the stack. Kernels

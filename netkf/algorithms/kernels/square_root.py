@@ -75,8 +75,7 @@ def reflect_row(
     in ``wide`` its entries are in columns ``i`` to ``end`` - 1. Row ``i`` itself is not cleared
     right of its diagonal.
     """
-    # With v = row i + signed e_i the reflection is I - v v' / (length head), which turns row i into
-    # -signed e_i; then column i changes its sign if needed.
+    # With v = row i + signed e_i the reflection is I - v v' / (length head).
     n, pivot = len(size), load(lanes, wide, i, i)
     length = root_of(select(active, square, 1.0))
     # The sign that does not cancel in pivot + signed; the column is flipped so that its diagonal is
