@@ -1,4 +1,12 @@
-"""The diffusion plant dx = A x dt + B dw."""
+"""The diffusion plant dx = A x dt + B dw.
+
+Its state is drawn at three kinds of times: on the *sensing grid* k h, if sensors read increments
+over steps of h seconds; at *sample times*, when a sensor reads the state at an instant; and at
+*probe times*, when the run records the state. Each kind has a random stream of its own, so that
+the path on the grid is the same whatever is sampled or recorded. On an unstable plant states may be
+relative to an origin that is moved to the state at regular times; the interval between two moves is
+a *frame* (``truth`` says why).
+"""
 
 from __future__ import annotations
 
@@ -23,7 +31,7 @@ NO_TIMES = np.empty(0)
 
 @dataclass(frozen=True, eq=False)
 class Diffusion(Plant):
-    """``dx = A x dt + B dw``, H (1), with x(0) Gaussian of ``mean`` and ``cov``.
+    """``dx = A x dt + B dw``, paper H (1), with x(0) Gaussian of ``mean`` and ``cov``.
 
     ``A`` (n, n), ``B`` (n, m); ``sensing_period`` is the step h of the sensors in seconds.
     """
@@ -56,7 +64,7 @@ class Diffusion(Plant):
 
     @cached_property
     def moves(self) -> Transitions:
-        """The exact discretisation over any gap."""
+        """The exact discretisation over an interval of any length."""
         return Transitions(self.A, self.B)
 
     def path(
@@ -73,8 +81,8 @@ class Diffusion(Plant):
         (K,) and ``probe_times`` (P,), increasing, in seconds.
 
         ``random`` draws x(0) and the steps, ``sampling`` only the states at times ``sampled`` off
-        the grid, ``probing`` only those at probe times off both. With ``frames`` states are local
-        to frames that begin before the ``horizon`` (seconds), see ``truth``.
+        the grid, ``probing`` only those at probe times off both. With ``frames`` states are
+        relative to the origin of their frame; frames begin before the ``horizon`` (seconds).
         """
         steps, probes = GeneratorNormals([random]), GeneratorNormals([probing])
         samples = GeneratorNormals([] if sampling is None else [sampling])
@@ -95,7 +103,7 @@ class Diffusion(Plant):
         ``probe_times`` (increasing, seconds), one-dimensional arrays.
 
         ``sampling`` draws only the states at times ``sampled`` off the grid, ``probing`` those at
-        probe times off both. With ``frames`` states are local to frames, see ``truth``.
+        probe times off both. With ``frames`` states are relative to the origin of their frame.
         """
         start = self.starts(normals)
         cuts = [] if sampling is None or not len(sampled) else [Cuts(sampled, sampling)]
@@ -124,9 +132,10 @@ class Diffusion(Plant):
     ) -> SampledTruth:
         """Return a path without a sensing grid: it has states only at ``samples`` (K,), ``probes``
         (P,) and frame times (seconds), up to the ``horizon``. ``random`` draws x(0) and the states
-        at samples, ``probing`` those at probes. With ``frames`` states are local to frames, see
-        ``truth``.
+        at samples, ``probing`` those at probes. With ``frames`` states are relative to the origin
+        of their frame. Used if all sensors take samples, so that nothing needs the grid.
         """
+        # Drawn at the frame times also without frames: then the path is the same.
         marks = multiples(frame_period(self.A), horizon)
         start = self.start(random)
         times = TruthTimes(samples, probes, marks)
@@ -136,13 +145,15 @@ class Diffusion(Plant):
 def default_sensing_period(
     plant: Diffusion, informations: list[FloatArray], longest: float
 ) -> float:
-    """Return the sensing period (seconds) for which error covariances are within 1e-3 of the exact.
+    """Return the sensing period (seconds) of a scenario that gives none: one for which error
+    covariances are within 1e-3 of those in the limit of period 0.
 
     ``informations`` are the matrices H' R^-1 H (n, n) of the nodes that sense, ``longest`` is the
     longest interval (seconds) that one update of their filters can use (algorithms/kernels/gains).
-    The period is a fraction of the fastest time constant of the plant and of the stationary
-    Kalman-Bucy filter of each node, rounded down to 1, 2 or 5 times a power of ten. It depends on
-    nothing else, so that all filters and networks see the same truth.
+    The period is half the shortest time constant of the plant and of the stationary Kalman-Bucy
+    filter of each node, or less where ``longest`` or the plant's ``longest_period`` demands it,
+    rounded down to 1, 2 or 5 times a power of ten. It depends on nothing else, so that all
+    algorithms and networks see the same truth.
     """
     fastest = float(np.abs(np.linalg.eigvals(plant.A)).max())
     for G in informations:

@@ -1,7 +1,9 @@
-"""The laws of the steps of a diffusion, shared by all its paths on one sensing grid.
+"""The Gaussian laws of the steps of a diffusion, shared by all its paths on one sensing grid.
 
-A step is described by 3 n numbers: the state at its end and the two moments ``int x dt`` and
-``int x P_1 dt`` over it, with the Legendre polynomial P_1 of the step.
+The sensing grid is the times k h at which increments of sensors are drawn. A step of it is
+described by 3 n numbers: the state at its end and the two moments ``int x dt`` (*plain*) and
+``int x P_1 dt`` (*tilted*) over it, with the Legendre polynomial P_1, -1 .. 1 over the step. A
+*piece* is a step, or a part of one that was cut at a time at which the state is needed.
 """
 
 from __future__ import annotations
@@ -28,7 +30,7 @@ from netkf.linalg.small import matmul
 MAX_LAWS = 256  # cached laws of states inside a step
 MAX_GRIDS = 256  # cached parts of the sensing grid
 DEPENDENT = 1e-9  # a remainder below this share of the row's norm is rounding
-_NODES, _WEIGHTS = gauss_legendre(20)
+_NODES, _WEIGHTS = gauss_legendre(20)  # on [0, 1]
 
 
 def grid_time(period: float, k: int) -> float:
@@ -42,11 +44,14 @@ class GridLaws:
     """The laws of all paths of ``dx = A x dt + B dw`` on the sensing grid of one ``period`` (s);
     ``A`` (n, n), ``B`` (n, m).
 
-    to_end, to_moments  power series of the response to the state at the start of a step,
-                        (terms, n n + 1) and (terms, 2 n n + 1)
+    to_end, to_moments  power series in the gap of the response to the state at the start of a
+                        step, of its end (terms, n n + 1) and moments (terms, 2 n n + 1); the last
+                        column has the longest gap (s) for which the terms so far suffice
     response            (3, n, n) that response over one period
-    noise_factor        (3 n, 3 n) lower triangular root of the covariance of end and moments
-    course_table        the table that ``paths.fill_course`` uses
+    noise_factor        (3 n, 3 n) lower triangular root of the covariance of end and moments, given
+                        the state at the start
+    course_table        (D, 2 n, W) coefficients of the integrals of x inside a piece, for
+                        ``paths.fill_course``
 
     Laws of states inside a step are computed on demand and cached.
     """
@@ -199,14 +204,15 @@ def _response_series(A: FloatArray, longest: float) -> tuple[FloatArray, FloatAr
 
 def course_width(n: int) -> int:
     """Return the number of columns W of ``course_table``: 2 n (two integrals of n states), rounded
-    up to whole lanes.
+    up to a multiple of LANES, the numbers that one instruction of ``paths.fill_course`` handles.
     """
     return -(-2 * n // LANES) * LANES
 
 
 def course_table(to_end: FloatArray, n: int, longest: float) -> FloatArray:
     """Return the table (D, 2 n, W) from which ``paths.fill_course`` computes the coefficients
-    (D, W) of the course of x over a piece of at most ``longest`` seconds.
+    (D, W) of the course of x over a piece of at most ``longest`` seconds: the integrals of x and of
+    x u from its start up to u, the share of the piece that has passed, as polynomials in u.
 
     Rows 0 .. n - 1 are the factors of the state at the start, to be scaled by powers of the length
     of the piece; the other n those of the coefficients of the cubic. ``to_end`` (terms, n n + 1) is

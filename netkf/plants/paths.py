@@ -1,15 +1,23 @@
 """The path of a diffusion in one run, drawn block by block of steps of the sensing grid.
 
-The path is drawn exactly on the sensing grid ``t_k = k h``: each step gives ``x(t_{k+1})`` and the
-two moments of x over the step, ``int x dt`` and ``int x P_1 dt`` with the Legendre polynomial P_1
-of the step (linalg/legendre). All come from one stream and do not depend on the network.
+The path is drawn exactly on the sensing grid ``t_k = k h``, over whose steps sensors read
+increments: each step gives ``x(t_{k+1})`` and the two moments of x over the step, ``int x dt``
+(*plain* in the code) and ``int x P_1 dt`` (*tilted*) with the Legendre polynomial P_1, -1 .. 1 over
+the step (linalg/legendre). All come from one stream and do not depend on the network.
 
 A filter that the network wakes between grid points needs the moments over part of a step. There the
 path is approximated by the response to the state at the grid point plus the cubic that agrees with
 the end and the two moments of the step; the error in a reading is of third order in h, less than
-1e-4 h^3 of the noise intensity. Where a state is *sampled* or *probed* off the grid, the step is
-cut beforehand: state and moments are drawn from their exact law given the step, from separate
-streams, sample times first. ``truth`` explains frames.
+1e-4 h^3 of the noise intensity. Where a state is *sampled* (read by a sensor at an instant) or
+*probed* (recorded by the run) off the grid, the step is cut into pieces beforehand: state and
+moments at the cut are drawn from their exact law given the step, from separate streams, sample
+times first.
+
+On an unstable plant states may be *local*: relative to an origin that is moved to the state at
+regular times. The interval between two moves is a *frame* (``truth`` says why).
+
+Some kernels take a ``size`` of which only the length n, the number of states, matters: it can be
+known when they are compiled.
 """
 
 from __future__ import annotations
@@ -54,6 +62,9 @@ class Block(NamedTuple):
     Of the pieces: ``start, end`` (K,) in seconds, states ``x_start, x_end`` (B, K, n), ``moments``
     (B, K, 2, n) and ``cubic`` (B, K, 3, n) as in PathStep, and the index ``step`` (K,) of the step
     that each belongs to. ``ends`` (S,) are the end times of the steps.
+
+    The first six fields are those of PathStep, in its order. The block of a single path (``of``)
+    has states, moments and cubics without the first axis.
     """
 
     start: FloatArray
@@ -66,7 +77,9 @@ class Block(NamedTuple):
     ends: FloatArray
 
     def of(self, k: int) -> Block:
-        """Return the block of path ``k``: arrays (K, ...) without the axis of paths."""
+        """Return the block of path ``k`` alone: ``x_start``, ``x_end``, ``moments`` and ``cubic``
+        lose their first axis, which counts the B paths; the times and ``step`` are those of all.
+        """
         return self._replace(
             x_start=self.x_start[k],
             x_end=self.x_end[k],
@@ -74,10 +87,14 @@ class Block(NamedTuple):
             cubic=self.cubic[k],
         )
 
+    def piece(self, k: int) -> PathStep:
+        """Return piece ``k`` of the block of a single path."""
+        return PathStep(*(array[k] for array in self[: len(PathStep._fields)]))
+
 
 class Cuts(NamedTuple):
-    """Increasing ``times`` (T,), in seconds, at which steps are cut, and the normals of each
-    run.
+    """Increasing ``times`` (T,), in seconds, at which steps are cut, and the streams of standard
+    normals, one for each run, that draw the states there.
     """
 
     times: FloatArray
@@ -112,8 +129,8 @@ class DiffusionPaths:
         self._x, self._drawn = start, 0
 
     def following(self, blocks: int = 1, most: int | None = None) -> Block:
-        """Draw and return the next S steps of the sensing grid: ``blocks`` times BLOCK of them, at
-        most ``most``.
+        """Return the next S steps of the sensing grid, drawn now and cut at the sample and probe
+        times within: ``blocks`` times BLOCK of them, but at most ``most``.
         """
         laws, (paths, n) = self.laws, self._x.shape
         total = blocks * BLOCK if most is None else min(most, blocks * BLOCK)
@@ -161,7 +178,7 @@ class DiffusionPaths:
         # Index of the piece that contains each time.
         owners = np.searchsorted(block.end, times)
         normals = source.draw((len(times), 3 * self.laws.n))
-        # A piece with m cuts becomes m + 1 rows, copies of it at first.
+        # A piece with m cuts becomes m + 1 rows of the arrays, copies of it at first.
         counts = 1 + np.bincount(owners, minlength=len(block.end))
         # A piece with several cuts is cut at the first time, then its remainder at the second, ...:
         # ``turn`` numbers the cuts of a piece from 0.
@@ -253,7 +270,7 @@ def split_pieces(
     pieces    of K' >= K rows: states at the starts and ends (B, K', n), moments (B, K', 2, n) and
               cubics (B, K', 3, n)
 
-    Vectors of 3 n numbers hold a state x and the two moments, one after the other.
+    Vectors of 3 n numbers hold a state x and its plain and tilted moments, one after the other.
     """
     x_start, x_end, moments, _ = pieces
     n, length, before = x_start.shape[2], lengths[0], lengths[1]
@@ -310,7 +327,8 @@ def add_response(
     """Write ``out`` = ``values`` + ``sign`` R x[run, row], both (3 n,), where R (3 n, n) is
     ``responses[which]`` (3, n, n): the response of end state and moments to the state at the start.
     ``responses`` is (W, 3, n, n), for W intervals; ``x`` (B, K, n) has the states of B paths at K
-    pieces.
+    pieces. ``split_pieces`` removes the response from a piece (sign -1) to get what the noise
+    contributed, and adds it to the parts (sign 1).
     """
     n = x.shape[2]
     for m in range(3):
@@ -359,9 +377,10 @@ def fill_cubic(
     piece ``row`` (0 to K - 1) of path ``run`` (0 to B - 1): the coefficients, times ``length``, of
     u, u^2 and u^3 of the cubic on 0 <= u <= 1 that is 0 at u = 0 and ``end`` at u = 1.
 
-    Over ``length`` seconds its integral is ``plain`` and that of its product with P_1 ``tilted``.
+    Over ``length`` seconds its integral is ``plain`` and that of its product with P_1 ``tilted``:
+    it stands for what the noise contributed to x, of which just these three numbers are drawn.
     """
-    # With e = length end, M_0 = plain and S_1 = 3 tilted the four conditions give
+    # With e = length end, M_0 = plain and S_1 = 3 tilted these conditions give the coefficients
     # 6 M_0 - 10 S_1 + 3 e, 30 S_1 - 6 M_0 - 12 e and 10 e - 20 S_1.
     last, slope = length * end, 3.0 * tilted
     cubic[run, row, 0, i] = 6.0 * plain - 10.0 * slope + 3.0 * last
@@ -424,12 +443,13 @@ class DiffusionPath:
     """The path of one run: states and moments at times that do not decrease.
 
     Blocks of steps are drawn when a time beyond the last one is asked for. With frames, those that
-    begin before the ``horizon`` (seconds) have ``frame_times`` (F,).
+    begin before the ``horizon`` (seconds) do so at ``frame_times`` (F,); the caller calls
+    ``rebase`` at each of them, in their order.
     """
 
     def __init__(self, paths: DiffusionPaths, horizon: float = 0.0) -> None:
-        """Begin the path of one run, the first of ``paths``, at time 0; frames begin before
-        ``horizon`` (seconds).
+        """Begin the path of one run, the first of ``paths``, at time 0; ``horizon`` (seconds) is
+        the end of the run.
         """
         self.laws, self.period, self._paths = paths.laws, paths.laws.period, paths
         self.frame_times = self._frame_times(horizon)
@@ -457,7 +477,7 @@ class DiffusionPath:
             k += 1
         if k != self._piece:
             self._piece = k
-            self._step = PathStep(*(array[k] for array in block[:6]))
+            self._step = block.piece(k)
             self._step_end = float(block.ends[block.step[k]])
             self._first = int(np.searchsorted(block.step, block.step[k]))
         return self._step
@@ -467,8 +487,8 @@ class DiffusionPath:
         return self._step_end
 
     def moments(self, start: float, end: float) -> FloatArray:
-        """Return the two moments (2, n) of x over [start, end] seconds, its integrals with P_0 and
-        P_1, inside one sensing step: the one last asked for or a later one.
+        """Return the two moments (2, n) of x over [start, end] seconds, its integrals with P_0 = 1
+        and P_1 of that interval, inside one sensing step: the one last asked for or a later one.
         """
         step = self._at(end)
         if start >= step.start:
@@ -483,10 +503,11 @@ class DiffusionPath:
         assert block is not None
         total = np.zeros((2, self.laws.n))
         while True:
-            piece = PathStep(*(array[k] for array in block[:6]))
+            piece = block.piece(k)
             first, last = max(start, piece.start), min(end, piece.end)
             moments = state_moments(self.laws, piece, first, last)
-            # On [first, last] P_1 of the whole interval is middle + share P_1 of [first, last].
+            # On [first, last] P_1 of [start, end] is middle + share P_1 of [first, last] with
+            # share = (last - first) / gap.
             middle = ((first - start) - (end - last)) / gap
             total[0] += moments[0]
             total[1] += middle * moments[0] + (last - first) / gap * moments[1]
@@ -554,7 +575,7 @@ class DiffusionPath:
 
 def state_moments(laws: GridLaws, step: PathStep, start: float, end: float) -> FloatArray:
     """Return the two moments (2, n) of x over [start, end] seconds inside a piece ``step`` of the
-    path, its integrals with P_0 and P_1.
+    path: its integrals with the Legendre polynomials P_0 = 1 and P_1 of that interval.
     """
     n = len(step.x_start)
     # The moments of a whole piece were drawn from their exact law; those of a part are approximated
@@ -632,8 +653,9 @@ def fill_state_moments(
 
 @kernel(inlined=True, fused=True)
 def fill_integrals(out: FloatArray, course: FloatArray, first: float, last: float) -> None:
-    """Evaluate the polynomials ``u sum_d u^d course[d]`` (W,) of a ``course`` (D, W), D
-    coefficients each, at u = ``first`` into ``out[:W]`` and at u = ``last`` into ``out[W : 2 W]``.
+    """Write the values of the W polynomials ``u sum_d u^d course[d]`` of a ``course`` (D, W), the D
+    coefficients that ``fill_course`` wrote, at u = ``first`` into ``out[:W]`` and at u = ``last``
+    into ``out[W : 2 W]``; ``fill_moments_between`` makes moments of them.
     """
     width, top = course.shape[1], len(course) - 1
     # Horner's rule at both points in one loop: each product waits for the one before it, so two
@@ -658,8 +680,9 @@ def fill_moments_between(
     first: Any,
     share: Any,
 ) -> None:
-    """Write the moments ``out`` (2, n, L) of x over u in [first, first + share] of a piece, in L
-    lanes, (L,) each, where u is the share of the piece that has passed; ``size`` has length n.
+    """Write the two moments of x over u in [first, first + share] of a piece into ``out``
+    (2, n, L), where u is the share of the piece that has passed, in L lanes (runs side by side, or
+    one) with ``first`` and ``share`` (L,) each; ``size`` has length n.
 
     ``integrals`` (2 W, L), W = ``width``, are those that ``fill_integrals`` wrote for both ends.
     ``lanes`` is a tuple of length L.

@@ -24,9 +24,12 @@ class Plant(Component):
     """
 
     former_names: ClassVar[Mapping[str, str]] = {"is_random": "drawn", "truth_known": "shown"}
+    """Attributes and their former names, which users' subclasses may still set (core.fields)."""
 
     is_random: ClassVar[bool] = True
-    """True if runs draw the state from the model; else the model is only the filters' belief."""
+    """True if runs draw the state from the model; else the model is what the filters assume of a
+    state that is recorded or unknown.
+    """
     truth_known: ClassVar[bool] = True
     """True if the state is known, so that errors can be computed."""
 
@@ -50,11 +53,13 @@ class Plant(Component):
 
     @cached_property
     def start_root(self) -> FloatArray:
-        """The factor (n, n) of ``start_cov`` that standard normals are multiplied with."""
+        """A root S (n, n) of ``start_cov = S S'``, by which standard normals are multiplied."""
         return noise_root(self.start_cov)
 
     def starts(self, normals: Normals) -> FloatArray:
-        """Draw x(0) = mean + root z of B runs, (B, n), one for each stream of ``normals``."""
+        """Return x(0) = mean + root z of B runs, (B, n), with z drawn from ``normals``, which has
+        one stream for each run.
+        """
         # A product for each run: its state has the same bits whatever the other runs are.
         deviations = product(normals.draw((1, self.n)), self.start_root.T)
         return np.asarray(self.start_mean + deviations[:, 0])

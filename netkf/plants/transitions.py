@@ -66,11 +66,12 @@ class Transitions:
         """
         doublings = self._doublings(distinct)
         units = np.ldexp(distinct, -doublings)
-        Phi, L = self._unit_transition(units), noise_factors(self._unit_noise(units))[0]
+        Phi = self._unit_transition(units)
+        L, _ = noise_factors(self._unit_noise(units))
         with np.errstate(over="ignore", invalid="ignore"):  # unstable A over a very long gap
             for level in range(int(doublings.max(initial=0))):
                 k = np.flatnonzero(doublings > level)
-                L[k] = noise_factors(np.concatenate([L[k], product(Phi[k], L[k])], axis=2))[0]
+                L[k], _ = noise_factors(np.concatenate([L[k], product(Phi[k], L[k])], axis=2))
                 Phi[k] = product(Phi[k], Phi[k])
         return Phi, L
 
@@ -87,14 +88,15 @@ class Transitions:
 
     def bridges(self, before: FloatArray, after: FloatArray) -> FloatArray:
         """Return D (K, n, 2 n) with ``z = D [z1; z2]`` for K gaps that consist of two parts of
-        ``before`` and ``after`` seconds (K,).
+        ``before`` and ``after`` seconds (K,): with it a state inside a gap can be drawn when the
+        state at its end is known already.
 
         z are the standard normals of a whole gap, z1 and z2 those of its parts: L z = Phi2 L1 z1 +
         L2 z2. The rows of D are orthonormal or zero.
         """
         pairs, index = np.unique(np.stack([before, after]), axis=1, return_inverse=True)
-        L1, (Phi2, L2) = self.laws(pairs[0])[1], self.laws(pairs[1])
-        directions = noise_factors(np.concatenate([product(Phi2, L1), L2], axis=2))[1]
+        (_, L1), (Phi2, L2) = self.laws(pairs[0]), self.laws(pairs[1])
+        _, directions = noise_factors(np.concatenate([product(Phi2, L1), L2], axis=2))
         return np.asarray(directions[index.reshape(-1)])
 
     def _doublings(self, gaps: FloatArray) -> np.ndarray:
@@ -163,11 +165,14 @@ def _powers(gaps: FloatArray, terms: int) -> FloatArray:
 
 
 GROWTH = 10.0 * math.log(2.0)
-"""Logarithm of the factor by which an unstable state may grow within a frame, 2^10."""
+"""Logarithm of the factor by which an unstable state may grow within a frame, 2^10. A frame is an
+interval after which states are taken relative to a new origin, so that errors keep their digits.
+"""
 
 
 def frame_period(A: FloatArray) -> float | None:
-    """Return the seconds g from one frame to the next for ``dx = A x dt``, ``A`` (n, n) in 1/s.
+    """Return the seconds g after which the states of ``dx = A x dt``, ``A`` (n, n) in 1/s, are
+    taken relative to a new origin: the length of a frame.
 
     The growth e^{a g} is 2^10 for the spectral abscissa a of A; None if a <= 0.
     """
@@ -182,7 +187,8 @@ def _round_seconds(seconds: float) -> float:
 
 
 def frame_slots(F: FloatArray) -> int | None:
-    """Return the slots from one frame to the next for ``x[k+1] = F x[k]``, F (n, n).
+    """Return the number k of slots after which the states of ``x[k+1] = F x[k]``, F (n, n), are
+    taken relative to a new origin: the length of a frame.
 
     The growth r^k of the spectral radius r of F is at most 2^10, or k = 1; None if r <= 1.
     """

@@ -106,9 +106,9 @@ class ReportSource:
 
     @property
     def knowledge(self) -> str:
-        """Which messages estimates sampled at t include: ``until`` (arrived at t or earlier),
-        ``before`` (earlier than t: slots whose samples are predictions) or ``slot`` (also those of
-        the slot that begins at t: slots whose samples are filtered).
+        """Return which messages the estimates sampled at time t include: ``until`` (arrived at t
+        or earlier), ``before`` (earlier than t: slots whose samples are predictions) or ``slot``
+        (also those of the slot that begins at t: slots whose samples are filtered).
         """
         if not self.scenario.slotted:
             return "until"

@@ -384,8 +384,14 @@ def _check_sensing_period(scenario: DerivedScenario) -> None:
 
 
 def _longest_step(scenario: DerivedScenario, model: FlowModel) -> float:
-    """Return the longest step in seconds in which a filter may use increments of ``model``."""
-    return longest_interval(*scenario.belief, model.H, model.R)
+    """Return the longest step in seconds of which a filter can use the increment, the integral of
+    dy = H x dt + dv over that step, with H (p, n) and R (p, p) of its ``model``.
+
+    Beyond it the series for the filter's gain loses digits. It depends on the A and B B' that the
+    filters assume, ``scenario.belief``, which may differ from those of the plant.
+    """
+    A, Q = scenario.belief
+    return longest_interval(A, Q, model.H, model.R)
 
 
 def _check_slots(scenario: DerivedScenario) -> None:

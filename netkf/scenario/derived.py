@@ -369,7 +369,9 @@ class DerivedScenario(ScenarioModel):
 
     @cached_property
     def own_weights(self) -> dict[int, float]:
-        """The weight of each node's own estimate if messages of all its neighbours arrive."""
+        """The weight (in [0, 1], by node id) that each node gives to its own estimate when it
+        averages it with those of its neighbours, if messages of all of them arrive: 1 minus theirs.
+        """
         own_weights = dict.fromkeys(self.nodes, 1.0)
         for sender, receiver in self.topology.directions:
             own_weights[receiver] -= self.weight(receiver, sender)

@@ -163,9 +163,9 @@ class DelayedJumps:
 
     @cached_property
     def _message_noise(self) -> tuple[FloatArray, FloatArray]:
-        """What the plant's noise of the delay adds to the moments of messages: its covariance F(s)
-        (k + 1, n, M) with the errors s seconds earlier, at the k + 1 points s of the delay, the
-        same for all messages, and its own covariance (n, n).
+        """Return what the plant's noise during the delay adds to the second moments of the errors
+        of messages: its covariance F(s) (k + 1, n, M) with the errors s seconds earlier, at the
+        k + 1 points s of the delay, the same for all messages, and its own covariance (n, n).
 
         An impulse of the plant's noise moves errors by h, ``dh/ds = B h + G e^{U s}``, and messages
         that are under way by e^{A s}: ``F(s) = e^{A s} int_0^{d - s} e^{A u} Q h(u)' du``.
