@@ -1,7 +1,10 @@
 """The linear plant in slots, x[k+1] = F x[k] + w[k], and its readings.
 
-The path and the noise of each sensor are drawn slot by slot from separate streams, so that they do
-not depend on the network.
+Slot k is the time k times a period. The path and the noise of each sensor are drawn slot by slot
+from separate random streams, so that they do not depend on the network.
+
+On an unstable plant states may be *local*: relative to an origin that is moved to the state every
+so many slots, the *rebase*. The interval between two rebases is a *frame* (``truth`` says why).
 """
 
 from __future__ import annotations
@@ -56,8 +59,8 @@ class LinearPlant(Plant):
         return self.slot_time(slot) >= horizon - 1e-9 * self.period
 
     def truth(self, random: np.random.Generator, frames: bool = False) -> Truth:
-        """Return the truth of one run, drawn from ``random``; with ``frames`` the states of an
-        unstable plant are local to frames, see ``truth``.
+        """Return the true states of one run, drawn from ``random``; with ``frames`` those of an
+        unstable plant can be read relative to the origin of their frame.
         """
         start = self.start_mean + apply(self.start_root, random.standard_normal(self.n))
         slots = frame_slots(self.F) if frames else None
@@ -65,7 +68,7 @@ class LinearPlant(Plant):
 
     @cached_property
     def noise_root(self) -> FloatArray:
-        """The factor (n, n) of Q that standard normals are multiplied with."""
+        """A root S (n, n) of ``Q = S S'``, by which standard normals are multiplied."""
         return noise_root(self.Q)
 
     @cached_property
@@ -77,7 +80,7 @@ class LinearPlant(Plant):
 class Truth(Protocol):
     """The state of one run in slots; slots must be asked for in increasing order.
 
-    ``truth`` explains frames: after ``rebase`` of a slot its local state is zero.
+    After ``rebase`` of a slot, which begins a frame, its local state is zero.
     """
 
     @property
@@ -96,8 +99,9 @@ class Truth(Protocol):
         """
 
     def rebase(self, slot: int) -> FloatArray:
-        """Return the shift (n,) to subtract from estimates at a slot that begins a frame: its local
-        state. Called once for each of them, when that slot's state has been sampled.
+        """Return the local state (n,) of a slot that begins a frame, and make it zero from now on;
+        the engine subtracts the same vector from all estimates. The engine calls this once for each
+        such slot, when that slot's state has been recorded.
         """
 
 
@@ -136,8 +140,8 @@ class LinearPath:
         """
         self._steps, self._root, self._random = steps, root, random
         self.frame_slots = frame_slots
-        # States (S, n) of the slots from ``_first`` on, each before a rebase, and the state after a
-        # rebase from which the recursion goes on.
+        # Local states (S, n) of the slots from ``_first`` on, each before a rebase, and, with
+        # frames, the state after a rebase from which the recursion goes on.
         self._first, self._x, self._last = 0, start[None], start
         self._rebased = 0  # slot of the last rebase
         # Absolute position of the origin of each frame, by the slot at which the frame begins.
@@ -162,15 +166,15 @@ class LinearPath:
         return np.asarray(self._x[slot - self._first])
 
     def _next_states(self, noise: FloatArray) -> FloatArray:
-        """Return the states (BLOCK + 1, n), each before a rebase, from the last one drawn on.
+        """Return the local states (BLOCK + 1, n), each before a rebase, from the last one drawn on.
 
-        ``noise`` (BLOCK, n) is what each step adds.
+        ``noise`` (BLOCK, n) is the w of each step. Also notes the origins of new frames.
         """
         frame, first = self.frame_slots, self._first
         if frame is None:
             return np.asarray(self._steps.states(self._x[-1:], noise[None, None])[0])
         frame_start = max(slot for slot in self._origins if slot <= first)
-        # Earlier origins are not asked for again.
+        # Origins before the previous frame are not asked for again.
         self._origins = {
             slot: x for slot, x in self._origins.items() if slot >= frame_start - frame
         }
@@ -260,7 +264,9 @@ class SlotReadings:
 
 
 class Blocks:
-    """Standard normal vectors (size,) from ``random``, drawn many at a time."""
+    """Standard normal vectors (size,) from ``random``, drawn many at a time: one call of the
+    generator for each would take longer than the draw.
+    """
 
     def __init__(self, random: np.random.Generator, size: int) -> None:
         self._random, self._size, self._used = random, size, 0

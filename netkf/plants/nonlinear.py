@@ -36,14 +36,17 @@ GRAPH = "graph"
 
 
 class Linearised:
-    """Linearises readings of a sensor at one of its nodes, as the extended Kalman filter does."""
+    """A function that linearises the readings of a sensor at one of its nodes. Filters are given it
+    in the place of H, and call it with a reading and their own estimate.
+    """
 
     def __init__(self, sensor: NonlinearSensor, node: int) -> None:
         self._sensor, self._node = sensor, node
 
     def __call__(self, y: FloatArray, xhat: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the reading ``y`` (p,) of a sensor linearised at the estimate ``xhat`` (n,): ``y -
-        h(xhat) + J xhat`` (p,) and the Jacobian J (p, n).
+        """Return the reading ``y`` (p,) of a sensor linearised at the estimate ``xhat`` (n,):
+        ``y - h(xhat) + J xhat`` (p,) and the Jacobian J (p, n), which a linear filter uses as
+        reading and H.
         """
         J = np.asarray(self._sensor.jacobian(xhat, self._node), dtype=np.float64)
         expected = np.asarray(self._sensor.h(xhat, self._node), dtype=np.float64)
@@ -55,7 +58,8 @@ class NonlinearSensor(Sensor):
     """The contract of nonlinear sensors, ``y = h(x) + v``, cov(v) = R (p, p), in every slot or, in
     continuous time, whenever the clock ``sampling`` ticks.
 
-    A class defines ``h`` and ``jacobian``, and ``difference`` where readings are angles.
+    A class defines ``h`` and ``jacobian``, and ``difference`` where readings are angles. Before a
+    run the scenario calls ``located`` and ``check_state``.
     """
 
     R: FloatArray = field(definite_covariance)
@@ -100,8 +104,8 @@ class NonlinearSensor(Sensor):
     def slot_path(
         self, node: int, period: float, generator: Callable[[str], np.random.Generator]
     ) -> Any:
-        """Return the readings of the sensor on ``node`` in one run in slots, with noise from the
-        stream "noise" that ``generator`` returns.
+        """Return the readings of the sensor on ``node`` (id) in one run in slots, with noise from
+        the stream "noise" that ``generator`` returns; ``period`` is not used.
         """
         return NonlinearReadings(self, node, generator("noise"))
 
@@ -166,7 +170,10 @@ class NonlinearSamples:
         return self._readings.reading(k, x), self._readings.matrix(k)
 
     def several(self, ks: Sequence[int], x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Raise TypeError: without an estimate there is no H (S, p, n) of samples ``ks``."""
+        """Raise TypeError: without an estimate there is no H (S, p, n) of samples ``ks``.
+
+        Callers, which compute readings ahead of the filters, must use it for linear sensors only.
+        """
         raise TypeError("readings of nonlinear sensors have no H before an estimate")
 
 
@@ -183,9 +190,9 @@ class PositionedSensor(NonlinearSensor):
     states: tuple[int, ...] = field(list_of(integer(low=0), "numbers of states"), default=(0, 1))
 
     rows: ClassVar[int] = 0
-    """Length of a reading."""
+    """Number p of the values of a reading, which subclasses set."""
     turns: ClassVar[bool] = False
-    """Whether the last row of a reading is an angle."""
+    """Whether the last of these values is an angle."""
 
     def located(self, positions: dict[int, tuple[float, float]] | None) -> NonlinearSensor:
         """Return the sensor with its nodes at the ``positions`` of the graph, coordinates by node
@@ -231,16 +238,16 @@ class PositionedSensor(NonlinearSensor):
         return np.asarray(x[list(self.states)] - positions[self.nodes.index(node)])
 
     def placed_columns(self, derivatives: FloatArray, n: int) -> FloatArray:
-        """Return the Jacobian (p, n) by the state from ``derivatives`` (p, d) by the target's
-        position: zeros in the columns of other states.
+        """Return the Jacobian (p, n) by the state, of n components, from ``derivatives`` (p, d) by
+        the target's position: zeros in the columns of other components.
         """
         jacobian = np.zeros((len(derivatives), n))
         jacobian[:, list(self.states)] = derivatives
         return jacobian
 
     def difference(self, y: FloatArray, expected: FloatArray) -> FloatArray:
-        """Return ``y - expected`` (p,) of a reading y (p,) and the ``expected`` one (p,), with
-        angles wrapped to [-pi, pi).
+        """Return ``y - expected`` (p,) of a reading y (p,) and the ``expected`` one (p,), with an
+        angle, the last value if the class ``turns``, wrapped to [-pi, pi).
         """
         innovation = y - expected
         if self.turns:

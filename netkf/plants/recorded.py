@@ -1,7 +1,8 @@
 """Plants and sensors whose truth or readings come from tables, in both models of time.
 
-``demand`` raises, before a run starts, if the table lacks a state that the run needs. Readings may
-be missing: a node whose table has no row for a slot has no reading in that slot.
+The checks of a scenario call the methods ``require_...``, which raise, before a run starts, if the
+table lacks a state that the run needs. Readings may be missing: a node whose table has no row for a
+slot has no reading in that slot.
 """
 
 from __future__ import annotations
@@ -81,7 +82,7 @@ class RecordedPlant(LinearPlant):
         return index_by_slot(self.path, rows, self.period, "")
 
     def require_slots(self, slots: Iterable[int]) -> None:
-        """Raise ScenarioError if the table has no state for one of the slots."""
+        """Raise ScenarioError if the table has no state for one of the ``slots`` (numbers)."""
         _demand_rows(self.path, self.table, slots, self.period, "state")
 
     def truth(self, random: np.random.Generator, frames: bool = False) -> RecordedPath:
@@ -100,7 +101,7 @@ class UnknownDiffusion(Diffusion):
 
     @property
     def recorded_truth(self) -> RecordedTruth:
-        """The truth of a run: nan at all times."""
+        """The true state of a run as engines read it: nan at all times."""
         return RecordedTruth(NO_TIMES, np.empty((0, self.n)), self.n)
 
     def require_times(self, times: FloatArray, what: str) -> None:
@@ -136,7 +137,7 @@ class RecordedDiffusion(Diffusion):
 
     @property
     def recorded_truth(self) -> RecordedTruth:
-        """The states of the table."""
+        """The true state of a run as engines read it: that of the table, nan at other times."""
         return RecordedTruth(*self.table, self.n)
 
     def require_times(self, times: FloatArray, what: str) -> None:
@@ -182,9 +183,9 @@ class RecordedSensor(Sensor):
 
     ``H`` (p, n) and ``R`` (p, p) are what the filters take them to be. A table with columns
     ``phi0,...`` (one for each state, p = 1) holds the H of every reading; ``H`` may then be left
-    out, or else is not looked at. ``nodes`` are by default all
-    that the table lists; rows of other nodes may be there for other ``[[sensors]]``, which may have
-    more or fewer components: what a row has beyond its own p must be empty, nan or 0.
+    out, and is ignored if it is given. ``nodes`` are by default all that the table lists; rows of
+    other nodes may be there for other ``[[sensors]]``, which may have more or fewer components:
+    what a row has beyond its own p must be empty, nan or 0.
     """
 
     is_random: ClassVar[bool] = False
@@ -215,7 +216,7 @@ class RecordedSensor(Sensor):
 
     @cached_property
     def _regressors(self) -> list[str]:
-        """Names of the columns ``phi0, phi1, ...`` that the file has."""
+        """Names of the columns ``phi0, phi1, ...`` that the file has, none if H does not vary."""
         header = read_header(self.path)
         count = sum(_column_number(name, "phi") >= 0 for name in header)
         return [f"phi{k}" for k in range(count)]
@@ -233,7 +234,7 @@ class RecordedSensor(Sensor):
 
     @cached_property
     def _lines(self) -> tuple[list[str], list[tuple[int, list[str]]]]:
-        """Header and numbered lines of the file."""
+        """Names of the columns, and line number and entries, as text, of each row of the file."""
         outputs = tuple(f"y{k}" for k in range(self._outputs))
         return read_rows(self.path, ("t", "node", *outputs, *self._regressors))
 
@@ -260,7 +261,9 @@ class RecordedSensor(Sensor):
 
     @cached_property
     def _rows(self) -> dict[int, list[tuple[float, FloatArray]]]:
-        """Times in seconds and values (y, then phi) of all lines, by node."""
+        """Time in seconds and values (y, then phi) of all rows, by the ids of ``nodes``, in the
+        order of the file. Raises ScenarioError for an entry that is no number.
+        """
         header, lines = self._lines
         p = self._outputs
         names = ("t", *(f"y{k}" for k in range(p)), *self._regressors)
@@ -286,8 +289,8 @@ class RecordedSensor(Sensor):
                 raise ScenarioError("path", rule, entries[index], "leave it empty or correct H")
 
     def table(self, node: int, period: float) -> Table:
-        """Return the readings (p,) of a node, or readings and regressors (1 + n,), by slot of
-        ``period`` seconds.
+        """Return the readings (p,) of a node (id), or with regressors reading and phi together
+        (1 + n,), by number of the slot of ``period`` seconds.
 
         Raises ScenarioError for a time that is not the start of a slot and for two rows of a slot.
         """
@@ -318,8 +321,8 @@ class RecordedSensor(Sensor):
         return np.array([t for t, _ in self._rows[node]])
 
     def rows(self, node: int) -> tuple[FloatArray, FloatArray]:
-        """Return the increasing times (K,) in seconds and the readings (K, p) of a node; with
-        regressors, (K, 1 + n).
+        """Return the increasing times (K,) in seconds and the readings (K, p) of a node (id); with
+        regressors the rows are reading and phi together, (K, 1 + n).
 
         Raises ScenarioError for a time below 0 and for two rows at one time.
         """

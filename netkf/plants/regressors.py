@@ -22,7 +22,7 @@ from netkf.plants.sensors import Sensor
 
 @dataclass(frozen=True, eq=False)
 class RegressorSensor(Sensor):
-    """``y_k = phi_k' x_k + v_k``, cov(v) = R, with ``phi_k = C s_k``, D (1) and section VI.
+    """``y_k = phi_k' x_k + v_k``, cov(v) = R, with ``phi_k = C s_k``, paper D (1), section VI.
 
     ``s_0 = start`` and ``s_k = A s_{k-1} + B xi_k``, cov(xi) = ``xi_cov``, independent of all else
     and from node to node. ``A`` (m, m), ``B`` (m, q), ``C`` (n, m), ``start`` (m,),
@@ -53,7 +53,7 @@ class RegressorSensor(Sensor):
 
     @cached_property
     def drive(self) -> FloatArray:
-        """The factor (m, q) of the noise of the regressor's state, B times a root of xi_cov."""
+        """The matrix B S (m, q) that maps standard normals to ``B xi_k``, with xi_cov = S S'."""
         return product(self.B, noise_root(self.xi_cov))
 
     def slot_path(

@@ -32,8 +32,8 @@ class Samples(Protocol):
 
 
 class DrawnSamples:
-    """Samples ``y = H x + v``, cov(v) = R, with H (p, n) and R (p, p); v is the Cholesky factor of
-    R times the next p standard normals of ``random``.
+    """Samples ``y = H x + v``, cov(v) = R, with H (p, n) and R (p, p), of a linear sensor; v is the
+    Cholesky factor of R times the next p standard normals of ``random``.
     """
 
     def __init__(self, H: FloatArray, R: FloatArray, random: np.random.Generator) -> None:
@@ -127,7 +127,9 @@ class RecordedSampling(Clock):
 
 
 def _sampling(value: object) -> Clock | None:
-    """Return the clock of a sensor, None for "continuous"; the rule of its field."""
+    """Return the clock of a sensor, None for "continuous": the conversion of ``Rule`` for the field
+    ``sampling``, which reports the TypeError for other values as a ScenarioError.
+    """
     if isinstance(value, str) and value == "continuous":
         return None
     if not isinstance(value, Clock):

@@ -1,8 +1,9 @@
 """Sensors: the contract, the fixed linear one, and its readings in continuous time.
 
-The noise of a sensor is drawn on the sensing grid from the sensor's own stream, as its two moments
-over each step, ``int dv`` and ``int P_1 dv`` with the Legendre polynomial P_1 of the step. When the
-network wakes a node inside a step, the step is cut: the moments of the first part are drawn from
+The noise of a sensor is drawn on the sensing grid, the times k h of the plant's sensing period h,
+from the sensor's own stream, as its two moments over each step, ``int dv`` (*plain*) and
+``int P_1 dv`` (*tilted*) with the Legendre polynomial P_1, -1 .. 1 over the step. When the network
+wakes a node inside a step, the step is cut: the moments of the first part are drawn from
 their exact law given those of the whole, from a second stream, and the moments of the remaining
 part follow. The noise on the grid therefore does not depend on the network.
 """
@@ -44,7 +45,9 @@ class Sensor(Component):
     """The contract of sensors: each of ``nodes`` has one, with independent noise."""
 
     is_random: ClassVar[bool] = True
-    """True if runs draw the readings from H and R; else H and R are only the filters' belief."""
+    """True if runs draw the readings from H and R; else H and R are what filters assume of readings
+    that are recorded.
+    """
 
     nodes: tuple[int, ...] = field(list_of(integer(), "node ids"))
 
@@ -65,9 +68,10 @@ class Sensor(Component):
     def slot_path(
         self, node: int, period: float, generator: Callable[[str], np.random.Generator]
     ) -> Readings:
-        """Return the readings of the sensor on ``node`` in one run, in slots of ``period`` seconds.
+        """Return the readings of the sensor on ``node`` (id) in one run, in slots of ``period``
+        seconds. The engine calls this once for each sensor and run, over a plant in slots.
 
-        ``generator`` returns the random stream of that sensor for a purpose.
+        ``generator`` returns the random stream of that sensor for a purpose, a short text.
         """
 
     def sample_times(
@@ -78,7 +82,8 @@ class Sensor(Component):
         horizon: float,
     ) -> FloatArray:
         """Return the times (K,) in seconds, below the ``horizon``, at which the sensor on ``node``
-        samples; ``ordinal`` is its number among the sensors of that node.
+        samples; ``ordinal`` is its number among the sensors of that node and ``generator`` returns
+        its random stream for a purpose. Called once for each sampling sensor and run.
 
         There are none by default: only sensors in continuous time with a clock sample.
         """
@@ -89,7 +94,7 @@ class Sensor(Component):
     ) -> Samples:
         """Return the samples of the sensor on ``node`` (id) at its ``sample_times`` below the
         ``horizon`` (seconds) in one run; ``generator`` returns the random stream of that sensor for
-        a purpose.
+        a purpose. To be defined by sensors that have sample times.
         """
         raise NotImplementedError
 
@@ -140,7 +145,7 @@ class LinearSensor(Sensor):
     def samples(
         self, node: int, generator: Callable[[str], np.random.Generator], horizon: float
     ) -> DrawnSamples:
-        """Return the samples of the sensor on ``node`` in one run, with noise from the stream
+        """Return the samples of the sensor on ``node`` (id) in one run, with noise from the stream
         "noise" that ``generator`` returns.
         """
         return DrawnSamples(self.H, self.R, generator("noise"))
@@ -162,9 +167,8 @@ class LinearSensor(Sensor):
 
 
 class SensorPath:
-    """Increments dy of one sensor with H (p, n) and R (p, p) on one node; intervals must be asked
-    for in order of time. ``random`` draws the noise on the sensing grid, ``cutting`` that of parts
-    of steps.
+    """The increments dy = H x dt + dv that one sensor on one node reads in one run, by intervals
+    that must be asked for in order of time, without gaps.
     """
 
     def __init__(
@@ -174,9 +178,9 @@ class SensorPath:
         random: np.random.Generator,
         cutting: np.random.Generator,
     ) -> None:
-        """Begin at time 0: H (p, n), R (p, p), generators ``random`` of the noise in steps of the
-        sensing grid and ``cutting`` of that in parts of a step, which is divided where a node is
-        needed within it. With two generators the noise on the grid does not depend on the network.
+        """Begin at time 0: H (p, n), R (p, p) with cov(dv) = R dt, generators ``random`` of the
+        noise in steps of the sensing grid and ``cutting`` of that in parts of a step, which is cut
+        where the network wakes the node within it.
         """
         self.H = H
         # The noise is drawn with unit intensity and multiplied by the Cholesky factor of R.
@@ -191,8 +195,8 @@ class SensorPath:
     def moments(
         self, truth: DiffusionPath, x_moments: FloatArray, start: float, end: float
     ) -> FloatArray:
-        """Return the two moments (2, p) of dy, its integrals with P_0 and P_1, over [start, end]
-        seconds, inside the truth's present step.
+        """Return the two moments (2, p) of dy over [start, end] seconds, its integrals with P_0 = 1
+        and P_1, inside the step of the sensing grid that ``truth`` was last asked for.
 
         ``x_moments`` (2, n) are those of x over the same interval; ``start`` is the end of the
         interval of the previous call.

@@ -1,7 +1,12 @@
 """Kernels that draw the states and the readings of a plant in slots for many runs at once.
 
-Runs are side by side in B blocks of L lanes (``netkf.linalg.lanes``). Each draws from separate
-streams, so that a run has the same bits alone and in a batch.
+Runs are side by side in B blocks of L lanes (``netkf.linalg.lanes``): L runs are the last axis of
+arrays, and one instruction handles them all. Each draws from separate streams, so that a run has
+the same bits alone and in a batch. Arrays ``states`` of integers are the states of these streams,
+one a row; ``ziggurat`` has the tables for normal numbers.
+
+On an unstable plant the state may be *local*: relative to an origin that is moved to the state
+every so many slots, the *rebase*. The interval between two rebases is a *frame* (``truth``).
 """
 
 from __future__ import annotations
@@ -172,9 +177,11 @@ class SlotSensors(NamedTuple):
 
     estimator (M,) index of the filter that uses the readings of the sensor
     row, rows (M,) first row and number of rows of the sensor in the stacked reading of that filter
-    H         (M, p, n) whitened observation matrix; for a random H the whitening factor of its one
-              row in H[m, 0, 0]
-    noise     (M, p, p) factor of the noise
+    H         (M, p, n) whitened observation matrix: L_b^-1 times that of the sensor, where the
+              filter assumes the noise covariance R = L_b L_b'; for a random H, of one row,
+              H[m, 0, 0] is L_b^-1
+    noise     (M, p, p) root of the covariance of the whitened noise: L_b^-1 L with the true
+              R = L L'
     driven    (M,) index d of the sensor's regressor if H is random, else -1
     C         (D, n, k) the random row of regressor d is C[d] s with its state s (k,)
     """
@@ -200,8 +207,8 @@ def draw_readings(
     y: FloatArray,
     H: FloatArray,
 ) -> None:
-    """Write the readings ``y`` (B, S, H', p, L) of all M sensors in S slots of R runs (B blocks of
-    L), for H' filters, and ``H`` (B, S, H', p, n, L) where it is random.
+    """Write the readings ``y`` (B, S, N, p, L) of all M sensors in S slots of R runs (B blocks of
+    L), for N filters, and ``H`` (B, S, N, p, n, L) where it is random.
 
     x (B, S, n, L) are the states, ``regressors`` (D, B, S, k, L) those of D regressors of k
     components. Run r draws the noise of sensor m from row r M + m of ``states`` (R M, >= 4);
@@ -237,8 +244,8 @@ def read_row(
     H: FloatArray,
 ) -> None:
     """Write row ``i`` of the reading of sensor ``m`` in slot ``s`` (index) of the L runs of block
-    ``b`` into ``y`` (B, S, H', p, L), for H' filters, and that row into ``H`` (B, S, H', p, n, L)
-    if it is random.
+    ``b`` into ``y`` (B, S, N, p, L), for N filters, and the observation row into ``H``
+    (B, S, N, p, n, L) if it is random.
 
     x (B, S, n, L) are the states, ``regressors`` (D, B, S, k, L) those of D regressors of k
     components, for B blocks and S slots, ``normals`` (p, L) the standard normals of the reading.
@@ -253,7 +260,7 @@ def read_row(
     for j in range(x.shape[2]):
         weight = spread(lanes, sensors.H[m, i, j])
         if d >= 0:
-            # H[j] = (C s)[j] times the whitening factor
+            # H[j] = (C s)[j] times the whitening factor L_b^-1
             weight = spread(lanes, 0.0)
             for k in range(sensors.C.shape[2]):
                 weight += sensors.C[d, j, k] * load(lanes, regressors, d, b, s, k)

@@ -2,9 +2,12 @@
 
 Errors ``x - xhat`` of affine filters do not change when the truth, the readings and all estimates
 are shifted along a solution of ``dc = A c dt``. On an unstable plant the state is therefore reset
-to zero at every *frame time* (a rebase), which starts a new frame. ``local`` states are relative to
-the origin of the present frame, which moves with the plant; they keep the digits that ``absolute``
-states lose as they grow.
+to zero at every *frame time* (a *rebase*), which starts a new *frame*. ``local`` states are
+relative to the origin of the present frame, which moves with the plant; they keep the digits that
+``absolute`` states lose as they grow.
+
+*Samples* are the times at which a sensor reads the state at an instant, *probes* those at which the
+run records it. They have separate random streams, so that recording does not change the path.
 """
 
 from __future__ import annotations
@@ -55,7 +58,8 @@ def multiples(period: float | None, horizon: float) -> FloatArray:
 
 
 def origins(Phi: FloatArray, offsets: FloatArray) -> FloatArray:
-    """Return the absolute position (F + 1, n) of each frame's origin at the start of the frame.
+    """Return the position (F + 1, n), in the plant's coordinates, of the origin of each of F + 1
+    frames at the start of the frame.
 
     The first is 0, then ``c[k+1] = Phi[k] c[k] + offsets[k]``: ``Phi`` (F, n, n) are the
     transitions over the F frames that end by a rebase, ``offsets`` (F, n) the local states before
@@ -75,8 +79,8 @@ def origins(Phi: FloatArray, offsets: FloatArray) -> FloatArray:
 def absolute_states(
     moves: Transitions, frame_times: FloatArray, offsets: FloatArray, t: FloatArray, x: FloatArray
 ) -> FloatArray:
-    """Return absolute states (K, n) at K times ``t`` (K,) in seconds from local states ``x``
-    (K, n).
+    """Return the states (K, n) in the plant's coordinates at K times ``t`` (K,) in seconds, from
+    local states ``x`` (K, n).
 
     A frame begins at 0 and at each of ``frame_times`` (F,), in seconds; ``offsets`` (F, n) are the
     local states just before these rebases. At a frame time ``x`` is local to the new frame.
@@ -92,8 +96,8 @@ def absolute_states(
 
 
 class TruthTimes(NamedTuple):
-    """Times in seconds of samples (K,), of probes (P,) and of the marks (F,) at which frames may
-    begin.
+    """Times in seconds of samples (K,), of probes (P,) and of the ``marks`` (F,) at which frames
+    begin if they are used.
     """
 
     samples: FloatArray
@@ -123,6 +127,7 @@ class SampledTruth:
         transitions of the plant, and marks are frame times if ``frames``.
         """
         self._moves = moves
+        # Samples and marks are drawn first, one after the other, then probes between them.
         samples, probes, marks = at
         self.frame_times = marks if frames else np.empty(0)
         times = np.unique(np.concatenate([[0.0], samples, marks]))
@@ -208,12 +213,14 @@ def _bridge_gap(
     """Return states (P, n) at P increasing ``probes`` (P,) given the ``states`` (K, n) at ``times``
     (K,), both in seconds.
 
-    ``normals`` (K - 1, n) are those of the gaps between the times. A state is in the frame of the
-    last time before it. After the last of ``times`` the path is drawn without a condition.
+    ``normals`` (K - 1, n) are those z from which the state at the end of each gap between the times
+    was drawn, ``x <- Phi x + L z``. A state is in the frame of the last time before it. After the
+    last of ``times`` the path is drawn without a condition.
 
     A probe divides a gap, or what follows the previous probe in it, in two parts with normals z1
     and z2. Given the normals z = D [z1; z2] of the whole, [z1; z2] = D' z + (I - D' D) w with
-    standard normal w (see Transitions.bridges).
+    standard normal w (see Transitions.bridges); z2 is the z of the part that the next probe in the
+    gap divides.
     """
     n = moves.n
     x_probes, z_gap = np.empty((len(probes), n)), np.empty(0)
@@ -246,7 +253,9 @@ def _bridge_gap(
 
 
 class RecordedTruth:
-    """States (K, n) at recorded times (K,) in seconds, matched to 1e-9 s; nan at other times."""
+    """Known states (K, n) at recorded ``times`` (K,) in seconds, which increase; nan at other times
+    than these, up to 1e-9 s.
+    """
 
     frame_times = np.empty(0)
 
@@ -262,7 +271,7 @@ class RecordedTruth:
     absolute = local
 
     def rebase(self, k: int) -> FloatArray:
-        """Raise IndexError: a recorded truth has no frames."""
+        """Raise IndexError: a recorded truth has no frame number ``k``."""
         raise IndexError(k)
 
     def states(self, times: FloatArray) -> tuple[FloatArray, FloatArray]:
