@@ -111,7 +111,7 @@ class Diffusion(Plant):
         return DiffusionPaths(self.laws, start, normals, [*cuts, Cuts(probe_times, probing)], steps)
 
     def start(self, random: np.random.Generator) -> FloatArray:
-        """Draw and return x(0) (n,)."""
+        """Return x(0) (n,), drawn from ``random``."""
         return np.asarray(self.starts(GeneratorNormals([random]))[0])
 
     @property

@@ -171,6 +171,7 @@ def fill_impulses(
             for j in range(m):
                 last = plain = tilted = 0.0
                 for c in range(n):
+                    # Plain and tilted moment over the remaining interval.
                     mean, slope = responses[i * n + c], responses[(n + i) * n + c]
                     last += Phi[i * n + c] * B[c, j]
                     plain += mean * B[c, j]
@@ -183,7 +184,7 @@ def fill_impulses(
 def _response_series(A: FloatArray, longest: float) -> tuple[FloatArray, FloatArray]:
     """Return power series in the gap g <= ``longest`` (seconds) of ``exp(A g)``, (terms, n n + 1),
     and of its two moments over the gap, (terms, 2 n n + 1), for ``A`` (n, n) in 1/s. The last
-    column is the reach of each term, see linalg/series.
+    column has the longest gap for which the terms so far suffice, see linalg/series.
     """
     n, norm_times_gap = len(A), float(np.abs(A).sum(axis=0).max()) * longest
     # The term |A g|^k / k! bounds the rest of the series from some k on.
@@ -194,6 +195,7 @@ def _response_series(A: FloatArray, longest: float) -> tuple[FloatArray, FloatAr
     exponential = [np.eye(n)]
     for k in range(1, terms):
         exponential.append(product(exponential[-1], A) / k)
+    # A moment, an integral over the gap, has one power of g more than the exponential.
     end, moments = np.stack(exponential), np.zeros((terms + 1, 2, n, n))
     moments[1:] = forward_coefficients(terms).T[:, :, None, None] * end[:, None]
     to_end, to_moments = (
@@ -223,14 +225,14 @@ def course_table(to_end: FloatArray, n: int, longest: float) -> FloatArray:
     terms = max(needed, 4)  # a cubic has 4
     table = np.zeros((terms, 2 * n, course_width(n)))
     # int_0^u v^d dv = u^(d+1) / (d + 1) and int_0^u v v^d dv = u^(d+2) / (d + 2).
-    plain, tilted = 1.0 / np.arange(1, terms + 1), 1.0 / np.arange(2, terms + 2)
+    of_x, of_xu = 1.0 / np.arange(1, terms + 1), 1.0 / np.arange(2, terms + 2)
     response = np.zeros((terms, n, n))
     response[:needed] = to_end[:needed, :-1].reshape(needed, n, n)
-    table[:, :n, :n] = np.swapaxes(response, 1, 2) * plain[:, None, None]
-    table[:, :n, n : 2 * n] = np.swapaxes(response, 1, 2) * tilted[:, None, None]
+    table[:, :n, :n] = np.swapaxes(response, 1, 2) * of_x[:, None, None]
+    table[:, :n, n : 2 * n] = np.swapaxes(response, 1, 2) * of_xu[:, None, None]
     # The cubic has no term of degree 0.
     for d in range(1, 4):
-        table[d, n:, :n], table[d, n:, n : 2 * n] = plain[d] * np.eye(n), tilted[d] * np.eye(n)
+        table[d, n:, :n], table[d, n:, n : 2 * n] = of_x[d] * np.eye(n), of_xu[d] * np.eye(n)
     return table
 
 

@@ -185,15 +185,17 @@ class LinearPath:
             parts.append(x[1:])
             self._last, start = x[-1], end
             if (first + end) % frame == 0:
-                self._origins[first + end] = self._move_origin(first + end) + x[-1]
+                self._origins[first + end] = self._origin_at(first + end) + x[-1]
                 self._last = np.zeros(len(x[-1]))
         return np.concatenate(parts)
 
-    def _move_origin(self, slot: int) -> FloatArray:
-        """Return the absolute position (n,) at ``slot`` of the origin of the frame before a rebase
-        in that slot: it moves as x[k+1] = F x[k] from the start of the frame.
+    def _origin_at(self, slot: int) -> FloatArray:
+        """Return the position (n,) at ``slot``, in the plant's coordinates, of the origin to which
+        ``_state_at(slot)`` is relative: it moves as x[k+1] = F x[k] from the start of its frame. At
+        a slot that begins a frame it is the old origin.
         """
         assert self.frame_slots is not None
+        # Slots 1 .. frame_slots belong to the origin of slot 0, and so on.
         frame_start = max(slot - 1, 0) // self.frame_slots * self.frame_slots
         x = self._origins[frame_start]
         with np.errstate(over="ignore", invalid="ignore"):
@@ -213,7 +215,7 @@ class LinearPath:
         coordinates.
         """
         x = self._state_at(slot)
-        return x if self.frame_slots is None else self._move_origin(slot) + x
+        return x if self.frame_slots is None else self._origin_at(slot) + x
 
     state = absolute
 
@@ -226,6 +228,7 @@ class SlotReadings:
     def __init__(self, H: FloatArray, R: FloatArray, random: np.random.Generator) -> None:
         self._H, self._root = H, cholesky(R)
         self._noise = Blocks(random, len(R))
+        # The last slot whose noise has been drawn, and that noise.
         self._slot, self._v = -1, np.zeros(len(R))
 
     def matrix(self, slot: int) -> FloatArray:

@@ -126,14 +126,14 @@ class NonlinearSensor(Sensor):
     def samples(
         self, node: int, generator: Callable[[str], np.random.Generator], horizon: float
     ) -> Samples:
-        """Return the samples of the sensor on ``node`` in one run, with noise from the stream
-        "noise" that ``generator`` returns.
+        """Return the samples of the sensor on ``node`` (id) in one run, with noise from the stream
+        "noise" that ``generator`` returns; they do not depend on the ``horizon``.
         """
         return NonlinearSamples(self, node, generator("noise"))
 
 
 class NonlinearReadings(SlotReadings):
-    """The readings of a nonlinear sensor at one node, one a slot.
+    """The readings of a nonlinear sensor at one node (id), one a slot, with noise from ``random``.
 
     ``matrix`` returns the function that linearises a reading instead of a matrix.
     """
@@ -144,7 +144,7 @@ class NonlinearReadings(SlotReadings):
 
     def matrix(self, slot: int) -> Any:
         """Return the function that linearises a reading of this sensor at an estimate; it is the
-        same in all slots.
+        same in every ``slot``.
         """
         return Linearised(self._sensor, self._node)
 
@@ -158,7 +158,9 @@ class NonlinearReadings(SlotReadings):
 
 
 class NonlinearSamples:
-    """The samples of a nonlinear sensor at one node in continuous time."""
+    """The samples of a nonlinear sensor at one node (id) in continuous time, with noise from
+    ``random``.
+    """
 
     def __init__(self, sensor: NonlinearSensor, node: int, random: np.random.Generator) -> None:
         self._readings = NonlinearReadings(sensor, node, random)

@@ -121,8 +121,8 @@ class DiffusionPaths:
         cuts: Sequence[Cuts],
         frame_steps: int | None = None,
     ) -> None:
-        """Begin B paths at time 0 in the states ``start`` (B, n); the other arguments are those of
-        the class.
+        """Begin B paths at time 0 in the states ``start`` (B, n); ``laws`` are those of the plant's
+        steps, the other arguments are explained at the class.
         """
         self.laws, self._normals, self._cuts = laws, normals, cuts
         self.frame_steps = frame_steps
@@ -549,12 +549,14 @@ class DiffusionPath:
         start = 0.0 if k == 0 else float(self.frame_times[k - 1])
         with np.errstate(over="ignore", invalid="ignore"):
             # New origin = e^{A g} (previous origin) + local state.
-            self._origin = self._move_origin(time - start) + step.x_end
+            self._origin = self._origin_after(time - start) + step.x_end
         self._frame = k + 1
         return step.x_end
 
-    def _move_origin(self, gap: float) -> FloatArray:
-        """Return the origin (n,) of the present frame ``gap`` seconds after its start."""
+    def _origin_after(self, gap: float) -> FloatArray:
+        """Return the position (n,), in the plant's coordinates, of the origin of the present frame
+        ``gap`` seconds after the frame began: it moves as dx = A x dt.
+        """
         # An origin at 0 stays there; the product would be nan where the transition overflows.
         if self._moves is None or not self._origin.any():
             return self._origin
@@ -568,7 +570,7 @@ class DiffusionPath:
         if not self._frame:
             return x
         with np.errstate(over="ignore", invalid="ignore"):
-            return x + self._move_origin(time - float(self.frame_times[self._frame - 1]))
+            return x + self._origin_after(time - float(self.frame_times[self._frame - 1]))
 
     state = absolute
 
@@ -583,6 +585,7 @@ def state_moments(laws: GridLaws, step: PathStep, start: float, end: float) -> F
     if start == step.start and end == step.end:
         return step.moments
     since, gap, length = start - step.start, end - start, step.end - step.start
+    # The integrals of x from the start of the piece as polynomials, then their differences.
     table = laws.course_table
     size, out, course = np.zeros(n), np.empty((2, n)), np.empty((len(table), table.shape[2]))
     fill_course(size, course, table, length, step.x_start[None], step.cubic[None], 0)

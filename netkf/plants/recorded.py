@@ -55,7 +55,9 @@ class UnknownPlant(LinearPlant):
     truth_known: ClassVar[bool] = False
 
     def truth(self, random: np.random.Generator, frames: bool = False) -> RecordedPath:
-        """Return a path of nan (n,) in all slots; nothing is drawn."""
+        """Return a path of nan (n,) in all slots, without ``frames``; nothing is drawn from
+        ``random``.
+        """
         return RecordedPath({}, np.full(self.n, math.nan))
 
 
@@ -86,7 +88,9 @@ class RecordedPlant(LinearPlant):
         _demand_rows(self.path, self.table, slots, self.period, "state")
 
     def truth(self, random: np.random.Generator, frames: bool = False) -> RecordedPath:
-        """Return the states of the table, nan in slots without a row; nothing is drawn."""
+        """Return the states of the table, nan in slots without a row; nothing is drawn from
+        ``random``, and a recorded path has no ``frames``.
+        """
         return RecordedPath(self.table, np.full(self.n, math.nan))
 
 
@@ -105,7 +109,7 @@ class UnknownDiffusion(Diffusion):
         return RecordedTruth(NO_TIMES, np.empty((0, self.n)), self.n)
 
     def require_times(self, times: FloatArray, what: str) -> None:
-        """Accept any ``times`` (K,): no state is known, so that none can be missing."""
+        """Accept any ``times`` (K,) and any use ``what``: no state is known, so none is missing."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,7 +129,9 @@ class RecordedDiffusion(Diffusion):
 
     @cached_property
     def table(self) -> tuple[FloatArray, FloatArray]:
-        """Times (K,), increasing, and states (K, n)."""
+        """Increasing times (K,) in seconds and states (K, n); raises ScenarioError for two rows of
+        one time.
+        """
         times, states = _states(self.path, self.n)
         order = np.argsort(times, kind="stable")
         times, states = times[order], states[order]
@@ -172,7 +178,7 @@ class RecordedPath:
     local = absolute = state
 
     def rebase(self, slot: int) -> FloatArray:
-        """Raise IndexError: a recorded path has no frames."""
+        """Raise IndexError: a recorded path has no frames, so that none begins at ``slot``."""
         raise IndexError(slot)
 
 
@@ -280,8 +286,9 @@ class RecordedSensor(Sensor):
     def _demand_empty(
         self, line: int, header: list[str], entries: list[str], surplus: list[int]
     ) -> None:
-        """Raise ScenarioError for a value in one of the ``surplus`` columns y_k, k >= p, which have
-        no row in H.
+        """Raise ScenarioError for a value in one of the ``surplus`` columns (indices), those y_k,
+        k >= p, that have no row in H. ``entries`` are the texts of the row in this ``line`` of the
+        file, under the names in ``header``.
         """
         for index in surplus:
             if entries[index].strip().lower() not in ("", "nan", "0", "0.0"):
@@ -309,7 +316,7 @@ class RecordedSensor(Sensor):
         horizon: float,
     ) -> FloatArray:
         """Return the times (K,) in seconds of the table's rows of ``node`` (id), below the
-        ``horizon``; nothing is drawn.
+        ``horizon``, whatever its ``ordinal``; nothing is drawn from ``generator``.
         """
         times = self.rows(node)[0]
         return times[: int(np.searchsorted(times, horizon))]
@@ -343,14 +350,16 @@ class RecordedSensor(Sensor):
     def samples(
         self, node: int, generator: Callable[[str], np.random.Generator], horizon: float
     ) -> RecordedSamples:
-        """Return the samples of the table's rows of ``node`` (id); nothing is drawn."""
+        """Return the samples of the table's rows of ``node`` (id), also those beyond the
+        ``horizon``; nothing is drawn from ``generator``.
+        """
         return RecordedSamples(self.H, self.rows(node)[1])
 
     def slot_path(
         self, node: int, period: float, generator: Callable[[str], np.random.Generator]
     ) -> RecordedReadings:
         """Return the readings of the table's rows of ``node`` (id) in slots of ``period`` seconds;
-        nothing is drawn.
+        nothing is drawn from ``generator``.
         """
         return RecordedReadings(self.H, self.table(node, period))
 
@@ -392,7 +401,9 @@ class RecordedReadings:
 
 
 def _column_number(name: str, letter: str = "y") -> int:
-    """Return the number of a column, 3 for ``y3`` with ``letter`` "y"; -1 for other names."""
+    """Return the number in the ``name`` of a column, 3 for "y3" with ``letter`` "y"; -1 for names
+    of another form.
+    """
     number = name.removeprefix(letter)
     return int(number) if name.startswith(letter) and number.isdecimal() else -1
 
@@ -402,8 +413,8 @@ def index_by_slot(
 ) -> Table:
     """Return the values of ``rows`` (t, values) by the slot of ``period`` seconds that begins at t.
 
-    Raises ScenarioError for a time that is not the start of a slot and for two rows of a slot;
-    ``whose`` names the owner of the rows in the message.
+    Raises ScenarioError for a time that is not the start of a slot and for two rows of a slot, with
+    the name of the file ``source`` and ``whose``, the owner of the rows, such as " of node 3".
     """
     table: Table = {}
     for t, values in rows:
@@ -421,8 +432,8 @@ def index_by_slot(
 def _demand_rows(
     source: SourceFile, table: Table, slots: Iterable[int], period: float, what: str
 ) -> None:
-    """Raise ScenarioError if one of the ``slots`` has no row in ``table``; ``what`` names its
-    content and ``period`` (seconds) turns a slot into a time in the message.
+    """Raise ScenarioError if one of the ``slots`` has no row in ``table``, read from ``source``;
+    ``what`` names its content and ``period`` (seconds) turns a slot into a time in the message.
     """
     missing = next((slot for slot in slots if slot not in table), None)
     if missing is not None:

@@ -60,7 +60,9 @@ class Sensor(Component):
         return False
 
     def matrix_of(self, n: int) -> FloatArray:
-        """Return H (p, n) of the first reading, for a state of n components."""
+        """Return H (p, n) of the first reading, for a state of n components; the filters' models
+        are made with it before a run.
+        """
         H: FloatArray = self.H  # type: ignore[attr-defined]
         return H
 
@@ -105,10 +107,12 @@ def sampling_ticks(
     generator: Callable[[str], np.random.Generator],
     horizon: float,
 ) -> FloatArray:
-    """Return the times (K,) in seconds, below the ``horizon``, at which a sensor samples.
+    """Return the times (K,) in seconds, below the ``horizon``, at which the ``clock`` of a sensor
+    ticks, so that it samples.
 
-    ``entity`` is the node and the number of the sensor among those of that node. Streams:
-    "sampling" and "sampling phase". ``generator`` returns the sensor's stream for such a purpose.
+    ``entity`` is the node and the number of the sensor among those of that node. ``generator``
+    returns the sensor's random streams for the purposes "sampling" and, for the phase of a periodic
+    clock, "sampling phase".
     """
     phase = partial(generator, "sampling phase")
     return generate_ticks(clock, entity, phase, generator("sampling"), horizon, "sampling")
@@ -146,7 +150,7 @@ class LinearSensor(Sensor):
         self, node: int, generator: Callable[[str], np.random.Generator], horizon: float
     ) -> DrawnSamples:
         """Return the samples of the sensor on ``node`` (id) in one run, with noise from the stream
-        "noise" that ``generator`` returns.
+        "noise" that ``generator`` returns; they do not depend on the ``horizon``.
         """
         return DrawnSamples(self.H, self.R, generator("noise"))
 
@@ -160,8 +164,8 @@ class LinearSensor(Sensor):
     def slot_path(
         self, node: int, period: float, generator: Callable[[str], np.random.Generator]
     ) -> SlotReadings:
-        """Return the readings of the sensor on ``node`` in one run in slots, with noise from the
-        stream "noise" that ``generator`` returns.
+        """Return the readings of the sensor on ``node`` (id) in one run in slots, with noise from
+        the stream "noise" that ``generator`` returns; ``period`` is not used.
         """
         return SlotReadings(self.H, self.R, generator("noise"))
 
@@ -312,17 +316,21 @@ def divide(
     seconds; they are drawn from their exact law given the two moments of the whole. The formulas
     avoid cancellation when a part is short. ``lanes`` is a tuple of length L.
     """
+    # Parts with the shares u and w and the moments m_0, m_1 and r_0, r_1, and the whole:
+    #   whole = m_0 + r_0,    tilted = u m_1 - w m_0 + w r_1 + u r_0
+    # since P_1 of the whole is -w + u P_1 on the first part and u + w P_1 on the rest.
     w = 1.0 - u
-    # At least 1 / 4 for every u in [0, 1], so that the divisions below are safe.
+    # v = 1 - 3 u w = u^3 + w^3, at least 1 / 4 for u in [0, 1]: the divisions below are safe.
     variance = 1.0 - 3.0 * u * w
     root, size = root_of(variance), root_of(u * w * length)
     size_first, size_slope = size * root, size / root
     size_other = size_slope / ROOT_3
     for k in range(rest.shape[1]):
-        # The first moments of the parts have the means u whole - 3 u w tilted and
-        # w whole + 3 u w tilted; their noise has opposite signs, since they add up to ``whole``.
+        # Given whole and tilted, m_0 has the mean u whole - 3 u w tilted and the variance
+        # u w length v (``early``); r_0 is what is left of ``whole``.
         whole, tilted = load(lanes, rest, 0, k), load(lanes, rest, 1, k)
-        # That noise also enters the second moments, as ``slope``; ``other`` is independent of it.
+        # Then u m_1 + w r_1 is known, v tilted + early, of which u^2 / v and w^2 / v are the means
+        # of m_1 and r_1: ``slope`` is early / v. The noise left to them is (w, -u) other.
         normal = load(lanes, normals, 0, k)
         early, slope = size_first * normal, size_slope * normal
         other = size_other * load(lanes, normals, 1, k)

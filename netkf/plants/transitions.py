@@ -103,20 +103,22 @@ class Transitions:
         """Return the number of halvings (K,) after which the power series applies to each of K
         ``gaps`` (K,), in seconds.
         """
+        # The least d with |A| g / 2^d <= UNIT_SIZE.
         sizes = np.maximum(gaps * (self._norm / UNIT_SIZE), 1.0)
         return np.ceil(np.log2(sizes)).astype(np.int64)
 
     def _unit_transition(self, gaps: FloatArray) -> FloatArray:
-        """Return exp(A g) (K, n, n) by its power series, for K ``gaps`` g (K,) in seconds within
-        one unit.
+        """Return exp(A g) (K, n, n) by its power series, for K ``gaps`` g (K,) in seconds so short
+        that |A| g <= UNIT_SIZE.
         """
         n, terms = self.n, len(self._series)
         powers = _powers(gaps, terms)
         return product(powers, self._series.reshape(terms, n * n)).reshape(-1, n, n)
 
     def _unit_noise(self, gaps: FloatArray) -> FloatArray:
-        """Return a factor (K, n, 10 m) of the noise covariance of K ``gaps`` (K,) in seconds within
-        one unit: columns ``e^{A s} B sqrt(weight)`` at the 10 quadrature nodes s.
+        """Return a factor S (K, n, 10 m) of the noise covariance S S' over K ``gaps`` g (K,) in
+        seconds so short that |A| g <= UNIT_SIZE: columns ``e^{A s} B sqrt(weight)`` at the 10
+        quadrature nodes s.
         """
         terms, n, m = self._response.shape
         powers = _powers(gaps[:, None] * _NODES, terms)
@@ -142,6 +144,7 @@ def noise_factors(noise: FloatArray) -> tuple[FloatArray, FloatArray]:
         scale[scale == 0.0] = 1.0  # scaled rows: the squares of small numbers do not underflow
         remainder = row / scale[:, None]
         row_norm = norm(remainder)
+        # Subtract the components along the rows of D so far, and then those left by rounding.
         for _ in range(2):
             components = apply(D[:, :k], remainder)
             S[:, k, :k] += components * scale[:, None]

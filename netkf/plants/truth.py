@@ -35,7 +35,9 @@ class ContinuousTruth(Protocol):
 
     @property
     def frame_times(self) -> FloatArray:
-        """(F,) increasing, inside the run; empty unless frames are used."""
+        """(F,) increasing times in seconds, inside the run, at which the origin of states is moved
+        and a new frame begins; empty unless frames are used.
+        """
 
     def local(self, time: float) -> FloatArray:
         """Return x (n,) at ``time`` (seconds), relative to the origin of the present frame."""
@@ -84,6 +86,7 @@ def absolute_states(
 
     A frame begins at 0 and at each of ``frame_times`` (F,), in seconds; ``offsets`` (F, n) are the
     local states just before these rebases. At a frame time ``x`` is local to the new frame.
+    ``moves`` gives the transitions of the plant.
     """
     starts = np.concatenate([[0.0], frame_times])
     at_start = origins(moves.transitions(np.diff(starts)), offsets)
@@ -183,8 +186,8 @@ def _draw_states(
     """Return states (K, n) at ``times`` (K,) in seconds, each before a rebase, and the standard
     normals (K - 1, n) of the gaps.
 
-    ``x <- Phi x + L z`` from ``start`` (n,) on; at times marked in ``rebased`` (K,) it restarts
-    from 0.
+    ``x <- Phi x + L z`` from ``start`` (n,) on, with Phi and L of each gap from ``moves`` and z
+    drawn from ``random``; at times marked in ``rebased`` (K,) it restarts from 0.
     """
     gaps = np.diff(times)
     states = np.empty((len(times), moves.n))
@@ -219,10 +222,11 @@ def _bridge_gap(
 
     A probe divides a gap, or what follows the previous probe in it, in two parts with normals z1
     and z2. Given the normals z = D [z1; z2] of the whole, [z1; z2] = D' z + (I - D' D) w with
-    standard normal w (see Transitions.bridges); z2 is the z of the part that the next probe in the
-    gap divides.
+    standard normal w, drawn from ``probing`` (see ``moves.bridges``); z2 is the z of the part that
+    the next probe in the gap divides.
     """
     n = moves.n
+    # z_gap: the normals of the present gap, or of its part after the probes so far.
     x_probes, z_gap = np.empty((len(probes), n)), np.empty(0)
     gap = np.searchsorted(times, probes) - 1  # index of the gap that contains each probe
     # Each part begins at the last time before the probe, or at the probe before it in the same gap.
@@ -235,6 +239,7 @@ def _bridge_gap(
         before, after = probes[block] - starts[block], ends[block] - probes[block]
         Phi, L = moves.laws(before)
         unconditional = np.isinf(after)
+        # D is not used after the last time; 0 stands for the infinite gap there.
         D = moves.bridges(before, np.where(unconditional, 0.0, after))
         w = probing.standard_normal((len(before), 2 * n))
         for k in range(len(before)):
@@ -292,7 +297,8 @@ def nearest_row(times: FloatArray, time: float) -> int | None:
 
 def demand_rows(source: SourceFile, times: FloatArray, needed: FloatArray, use: str) -> None:
     """Raise ScenarioError for the first of the ``needed`` times (M,) that is not among the
-    ``times`` (K,) of the table, in seconds; ``use`` says in the message what the state is for.
+    ``times`` (K,) of the table in the file ``source``, all in seconds; ``use`` says in the message
+    what the state is for.
     """
     for time in needed.tolist():
         if nearest_row(times, time) is None:

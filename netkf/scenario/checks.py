@@ -159,14 +159,16 @@ def _check_sensors(scenario: DerivedScenario) -> None:
 
 
 def _check_speed(scenario: DerivedScenario) -> None:
-    """Raise ScenarioError if the plant or a filter is too fast for the horizon.
+    """Raise ScenarioError if the plant or a filter is too fast for the horizon, in continuous time.
 
     The rate of the plant is at most the norm ||A||_1. That of a Kalman-Bucy filter in steady state
-    is near sqrt(max|G| max|Q|), where G = H' R^-1 H.
+    is near sqrt(max|G| max|Q|), where G = H' R^-1 H. More time constants than the limit suggest a
+    wrong unit of time.
     """
     delay, A = scenario.network.channel.delay.fixed or 0.0, scenario.diffusion.A
+    # A message with a fixed delay is predicted over the delay, which may exceed the horizon.
     longest = max(scenario.horizon, delay)
-    believed_A, Q = scenario.belief
+    believed_A, Q = scenario.belief  # A and B B' that the filters assume
     linear_sensors = [sensor for sensor in scenario.sensors if sensor.linear]
     informations = [sensor.H.T @ np.linalg.solve(sensor.R, sensor.H) for sensor in linear_sensors]
     max_information = max((float(np.abs(G).max()) for G in informations), default=0.0)
@@ -196,7 +198,11 @@ def _list_ids(nodes: tuple[int, ...]) -> str:
 
 
 def _check_network(scenario: DerivedScenario) -> None:
-    """Raise ScenarioError if graph, activation, channel and filter do not fit."""
+    """Raise ScenarioError if graph, activation, channel and filter do not fit.
+
+    The activation decides when nodes send: clocks in continuous time, matchings or broadcasts in
+    slots. A filter that does not talk sends nothing and needs none.
+    """
     network, topology, node_filter = scenario.network, scenario.topology, scenario.node_filter
     for key, part in (
         ("network.activation", network.activation),
@@ -326,7 +332,9 @@ def _check_believed_noise(scenario: DerivedScenario) -> None:
 
 
 def _check_degrees(scenario: DerivedScenario) -> None:
-    """Raise ScenarioError if a node has more links than the filter's gain allows."""
+    """Raise ScenarioError if a node has more links than the filter allows: it gives the weight
+    epsilon to each neighbour, and its own weight, the rest of 1, must not be negative.
+    """
     algorithm = scenario.filter.algorithm
     if not algorithm.talks or not scenario.topology.links:
         return
@@ -341,9 +349,10 @@ def _check_degrees(scenario: DerivedScenario) -> None:
 
 
 def _check_sensing_period(scenario: DerivedScenario) -> None:
-    """Raise ScenarioError if the sensing period of increments is too short or too long.
+    """Raise ScenarioError if the sensing period, the step in seconds over which sensors read
+    increments dy, is too short or too long.
 
-    The limits follow from the horizon, the plant, and the most precise node's filter.
+    The limits follow from the horizon, the plant, and the filter of the most precise node.
     """
     period, horizon = scenario.diffusion.sensing_period, scenario.horizon
     assert period is not None
@@ -395,7 +404,11 @@ def _longest_step(scenario: DerivedScenario, model: FlowModel) -> float:
 
 
 def _check_slots(scenario: DerivedScenario) -> None:
-    """Raise ScenarioError if sample times, activation or phases do not fit slots."""
+    """Raise ScenarioError if state samples are off the slots, or if the activation or the length of
+    an exchange phase does not fit the filter or the slots.
+
+    A filter's ``schedule`` lists the phases of a slot; nodes send in those named "exchange".
+    """
     plant, node_filter = scenario.slot_plant, scenario.node_filter
     times_off_slots = [
         t

@@ -19,6 +19,9 @@ def check_time(scenario: DerivedScenario) -> None:
     """Raise ScenarioError if filter or activation need slots over a diffusion, or the reverse."""
     algorithm, node_filter = scenario.filter.algorithm, scenario.node_filter
     slotted, remedy = scenario.slotted, "change the plant or choose another kind"
+    # A Filter runs in slots if it has a ``schedule`` of their phases, and in continuous time if it
+    # names ``clocks`` that may make it send, or never sends. FlowFilter and SlotFilter, deprecated
+    # contracts, are for one model of time each.
     if slotted:
         fits = not isinstance(algorithm, FlowFilter) and node_filter.schedule is not None
     else:

@@ -1,4 +1,6 @@
-"""What engines and theory compute from a scenario: models, weights, true states, message rates."""
+"""Values that engines and theory compute from the fields of a scenario: models, weights, true
+states, message rates.
+"""
 
 from __future__ import annotations
 
@@ -43,7 +45,9 @@ class DerivedScenario(ScenarioModel):
     """A scenario with everything that engines and theory compute from its fields.
 
     A "believed" matrix is the one that the filters use: that of ``filter.model`` where it is given,
-    else the true one.
+    else the true one. A scenario is in slots (``slotted``) or in continuous time, where sensors
+    give increments dy = H x dt + dv or take samples y = H x + v. "Pooled" is a central filter that
+    reads the sensors of all nodes.
     """
 
     @cached_property
@@ -56,7 +60,8 @@ class DerivedScenario(ScenarioModel):
 
     @cached_property
     def slot_models(self) -> tuple[SlotModel, ...]:
-        """The believed model of each node in slots, in the order of ``nodes``.
+        """The believed model of each node in slots, in the order of ``nodes``: F, Q, and H and R of
+        its sensors together.
 
         A random H is that of slot 0.
         """
@@ -73,7 +78,9 @@ class DerivedScenario(ScenarioModel):
 
     @cached_property
     def node_infos(self) -> tuple[NodeInfo, ...]:
-        """The facts that each node may use about itself and the network, in order of ``nodes``."""
+        """The facts that each node's filter is given at its start about the node and the network,
+        in the order of ``nodes``.
+        """
         total_information = np.zeros((self.plant.n, self.plant.n))
         for information in self._informations:
             total_information = total_information + information
@@ -120,7 +127,9 @@ class DerivedScenario(ScenarioModel):
 
     @cached_property
     def pooled_slot_model(self) -> SlotModel:
-        """``believed_pooled_model`` in slots."""
+        """The believed model of a central filter, which reads the sensors of all nodes, in
+        slots.
+        """
         return self._slot_model(self._stack_sensors(self._pooled_sensors, believed=True))
 
     @cached_property
@@ -157,9 +166,9 @@ class DerivedScenario(ScenarioModel):
 
         It can be asked, in increasing order, for the states at sample times, probe times and frame
         times. Its class is ``DiffusionPath`` if sensors give increments, else ``SampledTruth`` or
-        ``RecordedTruth``. ``frames``, by default ``exact_errors``, says whether states are relative
-        to a moving origin. Raises ScenarioError if a recorded truth has no row for one of the
-        times.
+        ``RecordedTruth``. ``frames``, by default ``exact_errors``, says whether local states are
+        relative to an origin that moves. Raises ScenarioError if a recorded truth has no row for
+        one of the times.
         """
         frames = self.exact_errors if frames is None else frames
         times_of_sensors = sample_times(self, streams)
@@ -177,7 +186,9 @@ class DerivedScenario(ScenarioModel):
         )
 
     def slot_truth(self, streams: Streams) -> Any:
-        """Return the true state of one run in slots, in frames (moving origins) if errors are."""
+        """Return the true state of one run in slots, a plants.linear.Truth; if ``exact_errors``,
+        its local states are relative to an origin that moves.
+        """
         return self.slot_plant.truth(streams.generator("plant"), self.exact_errors)
 
     @cached_property
@@ -202,7 +213,9 @@ class DerivedScenario(ScenarioModel):
     def move_back(self, offset: FloatArray, age: float) -> FloatArray:
         """Return exp(-A age) ``offset`` (n,): the offset of states ``age`` seconds earlier.
 
-        In slots this is ``offset`` itself: messages from slots before the present one are not used.
+        When the origin of states moves (``exact_errors``), engines shift the estimates in messages
+        under way by it, which refer to the time of sending. In slots this is ``offset`` itself:
+        messages from slots before the present one are not used.
         """
         if self.slotted:
             return offset
@@ -314,7 +327,9 @@ class DerivedScenario(ScenarioModel):
 
     @cached_property
     def pooled_model(self) -> FlowModel:
-        """``believed_pooled_model`` in continuous time."""
+        """The believed model of a central filter, which reads the increments of all nodes, in
+        continuous time.
+        """
         return self._model(self._stack_sensors(self._pooled_sensors, believed=True), {})
 
     @property
@@ -337,6 +352,7 @@ class DerivedScenario(ScenarioModel):
         H, R = H_and_R
         key = b"".join((H.tobytes(), b"|", R.tobytes()))
         if key not in models:
+            # The longest gap to predict over, and the longest step whose increment is used at once.
             period = self.diffusion.sensing_period or 0.0
             models[key] = FlowModel(*self.belief, H, R, self.horizon, min(period, self.horizon))
         return models[key]
@@ -357,9 +373,11 @@ class DerivedScenario(ScenarioModel):
         return xhat, P
 
     def weight(self, receiver: int, sender: int) -> float:
-        """Return the weight that ``receiver`` gives to messages of ``sender``.
+        """Return the weight that ``receiver`` (id) gives to the estimate of ``sender`` (id) when it
+        averages estimates: pi_ij of paper H (7), a_ji of paper D (8).
 
-        It is pi_ij of paper H (7) and a_ji of paper D (8).
+        The weights are those of the filter's matrix ``pair_weights``, rows senders and columns
+        receivers, or else depend on the degrees of both nodes.
         """
         node_filter, topology = self.node_filter, self.topology
         pair_weights = node_filter.pair_weights
@@ -379,7 +397,8 @@ class DerivedScenario(ScenarioModel):
         return {node: max(weight, 0.0) for node, weight in own_weights.items()}
 
     def effective_rates(self) -> dict[Link, float]:
-        """Return the mean rate of delivered messages on each directed link, per second.
+        """Return the mean rate of delivered messages on each directed link, per second, from which
+        the theory computes its bounds in continuous time.
 
         Keys are (sender, receiver); values are nan if they are unknown before a run. Empty in slots
         and for filters that exchange no messages.

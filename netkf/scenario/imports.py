@@ -293,6 +293,7 @@ def _iterate_path_file_folders() -> Iterator[Path]:
     """Yield the folders that ``.pth`` files add to the import path, as editable installs do."""
     for folder in _package_folders():
         for file in sorted(folder.glob("*.pth")):
+            # A line of a .pth file is a folder, a comment, or code that begins with "import".
             for line in file.read_text(encoding="utf-8", errors="replace").splitlines():
                 if line.strip() and not line.startswith(("#", "import ", "import\t")):
                     yield (folder / line.strip()).resolve()

@@ -64,6 +64,7 @@ def sensed_slots(scenario: DerivedScenario) -> range:
     state is sampled.
     """
     plant = scenario.slot_plant
+    # The first slot at or after the horizon; the quotient may be off by rounding.
     end = max(int(scenario.horizon / plant.period) - 1, 0)
     while not plant.over(end, scenario.horizon):
         end += 1
@@ -73,10 +74,14 @@ def sensed_slots(scenario: DerivedScenario) -> range:
 
 
 def _check_exchanges(scenario: DerivedScenario) -> None:
-    """Raise ScenarioError if recorded exchanges do not fit the steps of the filter."""
+    """Raise ScenarioError if recorded broadcasts name an exchange that the filter does not have.
+
+    A filter has one or more exchange phases in a slot, each of one or more steps.
+    """
     activation, node_filter = scenario.network.activation, scenario.node_filter
     if not isinstance(activation, RecordedSlots) or activation.matching:
         return
+    # The schedule lists the phases of a slot; ``recorded`` counts only the exchanges among them.
     phases = (node_filter.schedule or ()).count("exchange")
     for slot, phase, step in activation.recorded:
         steps = node_filter.exchange_steps(phase) if phase < phases else 0
@@ -93,7 +98,9 @@ def _check_exchanges(scenario: DerivedScenario) -> None:
 
 
 def exchange_slots(scenario: DerivedScenario) -> range:
-    """Return the slots in which nodes exchange messages."""
+    """Return the slots in which nodes exchange messages: from the filter's first to the last in
+    which it is given readings.
+    """
     return range(scenario.node_filter.first_slot, sensed_slots(scenario).stop)
 
 

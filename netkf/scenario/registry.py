@@ -253,6 +253,8 @@ def name_of(family: str, component: Component) -> str:
 
 
 def kind_name(component: Component, family: str = "filter") -> str:
-    """Return the name of a component for messages: that in KINDS, else that of its class."""
+    """Return the name of a component of a ``family`` for messages: that in KINDS, else that of its
+    class.
+    """
     name = name_of(family, component)
     return type(component).__name__.lower() if ":" in name else name

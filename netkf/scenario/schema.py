@@ -178,7 +178,8 @@ def _kind_schema(
 ) -> Schema:
     """Return the schema of a table of one name in registry.KINDS, read as an object of ``cls``.
 
-    Its key ``kind`` may be missing if ``is_default``.
+    Its key ``kind`` may be missing if ``is_default``; ``shared_keys`` are keys that tables of all
+    kinds have besides the fields of ``cls``.
     """
     kind, choice = split_choice(name)
     constants = {key: {"const": value} for key, value in {"kind": kind, **choice}.items()}

@@ -3,6 +3,8 @@
 Importing a user's module executes it, so that a file is first checked as if no module could be
 imported. Tables are built from the inside out: one of a user's class then gives NOT_IMPORTED
 instead of an object, and so does every table that contains it; other keys are checked all the same.
+In all functions ``origin`` says from where classes may be imported, and if they may be at all, and
+``value`` is a table as TOML gives it, or an object that was built before.
 """
 
 from __future__ import annotations
@@ -93,7 +95,8 @@ def change_table(table: dict[str, Any], changes: Mapping[str, Any]) -> dict[str,
 
 
 def _set_key(target: Any, keys: list[str], value: Any, path: str) -> Any:
-    """Return a copy of a table, list or component in which one inner value is replaced or added.
+    """Return a copy of ``target``, a table, list or component, in which one inner value is replaced
+    or added; that of a component is a table.
 
     ``keys`` lead to that value; a missing table on the way is added. ``path`` names the key path
     in errors.
@@ -200,8 +203,8 @@ def _build_object(
 def _check_keys(
     fields: dict[str, dataclasses.Field[Any]], values: dict[str, Any], other_keys: tuple[str, ...]
 ) -> None:
-    """Raise ScenarioError for a key that is not a field, and for a missing field without default;
-    ``other_keys`` are listed among the allowed ones.
+    """Raise ScenarioError for a key of ``values`` that is not in ``fields`` (by name), and for a
+    missing field without default; ``other_keys`` are listed among the allowed ones.
     """
     for key, value in values.items():
         if key not in fields:

@@ -1,4 +1,8 @@
-"""Writing of scenarios: the tables of a scenario file, and their TOML text."""
+"""Writing of scenarios: the tables of a scenario file, and their TOML text.
+
+Tables leave out keys whose values equal their defaults, unless they are made ``with_defaults``:
+those of a run's own copy of its scenario, which must not change when defaults of netkf do.
+"""
 
 from __future__ import annotations
 
