@@ -117,9 +117,10 @@ class NonlinearSensor(Sensor):
         horizon: float,
     ) -> FloatArray:
         """Return the sample times (K,) in seconds, below the ``horizon``, of the sensor on ``node``
-        with the number ``ordinal`` there, drawn from its streams "sampling" and "sampling phase"
-        that ``generator`` returns.
+        (id) with the number ``ordinal`` there, drawn from its streams "sampling" and "sampling
+        phase" that ``generator`` returns.
         """
+        # Only sensors with a clock are asked.
         assert self.sampling is not None
         return sampling_ticks(self.sampling, (node, ordinal), generator, horizon)
 

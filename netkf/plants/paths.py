@@ -457,7 +457,8 @@ class DiffusionPath:
         # Number of the present frame, and absolute position of its origin at its start.
         self._frame, self._origin = 0, np.zeros(self.laws.n)
         self._block: Block | None = None
-        # Indices of the first piece of the present step, and of the piece last asked for.
+        # Indices of the first piece of the present step, and of the piece last asked for; that
+        # piece, of which there is none yet, and the end of its step.
         self._first = self._piece = 0
         self._step, self._step_end = PathStep(0.0, 0.0, *[np.empty(0)] * 4), 0.0
 

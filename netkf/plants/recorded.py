@@ -211,6 +211,7 @@ class RecordedSensor(Sensor):
             object.__setattr__(self, "nodes", self.listed)
         if not self.nodes:
             raise ScenarioError("path", f"{self.path.name} has no rows", None, "add some")
+        # The first row is y, phi0, phi1, ...: its phi' stands for H where one is needed at once.
         if self.varying and any(self._rows.values()):
             row = next(rows[0][1] for rows in self._rows.values() if rows)
             object.__setattr__(self, "H", readonly_array(row[None, 1:]))
@@ -251,7 +252,7 @@ class RecordedSensor(Sensor):
 
     @cached_property
     def row_times(self) -> list[tuple[int, float]]:
-        """Node and time (seconds) of every row."""
+        """Node id and time (seconds) of every row, in the order of the file."""
         header, lines = self._lines
         indices = [header.index("t"), header.index("node")]
         numbers = [

@@ -139,8 +139,8 @@ class LinearSensor(Sensor):
         horizon: float,
     ) -> FloatArray:
         """Return the sample times (K,) in seconds, below the ``horizon``, of the sensor on ``node``
-        with the number ``ordinal`` there, drawn from its streams "sampling" and "sampling phase"
-        that ``generator`` returns.
+        (id) with the number ``ordinal`` there, drawn from its streams "sampling" and "sampling
+        phase" that ``generator`` returns.
         """
         # Only sensors with a clock are asked.
         assert self.sampling is not None
@@ -190,6 +190,7 @@ class SensorPath:
         # The noise is drawn with unit intensity and multiplied by the Cholesky factor of R.
         self._root = cholesky(R)
         self._random, self._cutting = random, cutting
+        # Normals of the next steps, how many of these are used, and the end of the present step.
         self._drawn = np.empty((0, 2, len(R)))
         self._used = 0
         self._end = 0.0

@@ -47,7 +47,7 @@ class ContinuousTruth(Protocol):
 
     def rebase(self, k: int) -> FloatArray:
         """Return the shift (n,) to subtract from estimates at ``frame_times[k]``: the local state
-        just before frame ``k`` begins there.
+        just before, to which the origin moves. The engine calls this once for each k, in order.
         """
 
 

@@ -41,6 +41,7 @@ def check_nonlinear(scenario: DerivedScenario, key: str, sensor: NonlinearSensor
     ``key`` is the key path of the sensor.
     """
     try:
+        # First as it is: a wrong field is reported before positions that the graph lacks.
         for candidate in (sensor, sensor.located(scenario.topology.positions)):
             candidate.check_state(scenario.plant.n)
     except ScenarioError as error:

@@ -49,7 +49,8 @@ def find_unimportable_class(scenario: Any, in_script: bool = True) -> str | None
 
 
 def find_module_files(scenario: Component) -> dict[str, Path | None]:
-    """Return the file of each module of users' classes, by module name.
+    """Return the file of each module of users' classes, by module name, of which a run's directory
+    gets a copy.
 
     It is None if the module is not a file in the folder of the scenario.
     """
@@ -69,7 +70,8 @@ def _is_file_of(path: Path, module_name: str) -> bool:
 
 
 def explain_user_error(scenario: Any, error: Exception) -> str | None:
-    """Return ``module:Class failed in method: error`` for an error in a user's class.
+    """Return the message ``module:Class failed in method: error`` for an error in a user's class,
+    which tells the user that the mistake is in their code.
 
     ``scenario`` is a scenario or a tuple of components. The class is the one whose method stands
     deepest in the traceback, else (without "in method") the first of users' classes. Returns None

@@ -190,7 +190,10 @@ def _kind_schema(
 
 
 def _time_model_rules() -> list[Schema]:
-    """Return if-then schemas: the model of time of the plant limits activation and filter."""
+    """Return two if-then schemas: a plant in slots, and one in continuous time, limits the kinds of
+    activation and filter.
+    """
+    # Plants of these kinds are in slots if they have F, and in continuous time if they have A.
     recorded = {"enum": ["recorded", "unknown"]}
 
     def plant_schema(kind: Schema, *keys: str) -> Schema:

@@ -60,7 +60,9 @@ def record_usage(scenario: DerivedScenario, sent: Mapping[Link, int] | None) -> 
 
 
 def usage_notes(usage: Mapping[str, Use]) -> tuple[str, ...]:
-    """Return a line for each table with unused rows, and for each with messages not listed."""
+    """Return a line for each table with unused rows, and for each with messages not listed, from
+    the result of ``record_usage``: notes below the summary of a run.
+    """
     notes = []
     for key, use in usage.items():
         if use["unused"]:
