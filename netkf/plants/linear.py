@@ -106,7 +106,10 @@ class Truth(Protocol):
 
 
 class Readings(Protocol):
-    """The readings of one sensor on one node in slots."""
+    """The readings of one sensor on one node in slots, which must be asked for in increasing order.
+
+    For a nonlinear sensor ``matrix`` returns a function that linearises a reading.
+    """
 
     def matrix(self, slot: int) -> FloatArray:
         """Return H (p, n) in slot number ``slot``, not before the last one asked for."""

@@ -175,7 +175,7 @@ class DiffusionPaths:
         """Return the block cut further at C ``times`` (C,) in seconds, none of which is an end of a
         piece; states and moments there are drawn from ``source``.
         """
-        # Index of the piece that contains each time.
+        # owners: the index of the piece that contains each time.
         owners = np.searchsorted(block.end, times)
         normals = source.draw((len(times), 3 * self.laws.n))
         # A piece with m cuts becomes m + 1 rows of the arrays, copies of it at first.
@@ -611,7 +611,7 @@ def fill_course(
     ``u sum_d u^d out[d, :n]``, and that of x u is ``u^2 sum_d u^d out[d, n : 2 n]``: from them
     the moments of x over any part of the piece are computed. W is 2 n rounded up to whole lanes.
 
-    x is the response e^{A s} x to the state at the start plus a cubic, the contribution of the
+    x is e^{A s} x_start, s seconds after the start, plus a cubic for the contribution of the
     noise. ``x_start`` (K, n) are the states at the starts of K pieces and ``cubic`` (K, 3, n) the
     coefficients of u, u^2 and u^3, times the length. Rows 0 .. n - 1 of each ``table[d]``
     (D, 2 n, W) multiply the former, for a length of 1, and the other n rows the latter

@@ -18,7 +18,10 @@ from netkf.plants.linear import SlotReadings
 
 
 class Samples(Protocol):
-    """The samples of one sensor on one node in one run, numbered k = 0, 1, ... in order of time."""
+    """The samples of one sensor on one node in one run, numbered k = 0, 1, ... in order of time.
+
+    For a nonlinear sensor a function that linearises the reading takes the place of H.
+    """
 
     def reading(self, k: int, x: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return ``y`` (p,) and ``H`` (p, n) of sample number ``k``, at which the state is x (n,);

@@ -268,13 +268,13 @@ def fill_reading(
     s: int,
 ) -> None:
     """Write the two moments of dy of sensor ``s``, which has ``rows`` rows, in L lanes into ``out``
-    (2 q, L); ``size`` has length n.
+    (2 q, L), where the sensors of one filter have q rows together; ``size`` has length n.
 
     Its first moments begin at ``out[row]``, its second moments at ``out[q + row]``. ``x_moments``
     (2, n, L) are those of x, ``noise`` (2, p, L) those of unit white noise; H of S sensors is
     (S, p, n, L), root (S, p, p, L) and lower triangular. ``lanes`` is a tuple of length L.
     """
-    # First moments of all rows come before the second ones, as filters stack sensors.
+    # First moments of the rows of all sensors come before the second ones, as filters expect.
     half = len(out) // 2
     # moment_m(dy) = H moment_m(x) + root moment_m(noise)
     for m in range(2):

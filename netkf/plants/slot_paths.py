@@ -175,7 +175,8 @@ def draw_paths(
 class SlotSensors(NamedTuple):
     """M sensors whose readings are drawn from the model; p is the largest number of rows.
 
-    estimator (M,) index of the filter that uses the readings of the sensor
+    estimator (M,) index of the filter that uses the readings of the sensor, that of its node or the
+              one that all nodes share
     row, rows (M,) first row and number of rows of the sensor in the stacked reading of that filter
     H         (M, p, n) whitened observation matrix: L_b^-1 times that of the sensor, where the
               filter assumes the noise covariance R = L_b L_b'; for a random H, of one row,
