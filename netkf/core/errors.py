@@ -31,6 +31,7 @@ class WriteError(NetkfError, OSError):
         self.filename = str(path)
 
     def __str__(self) -> str:
+        """Return the reason and the path as one line."""
         return f"cannot write: {self.strerror} ({shorten(self.filename, 1000)})"
 
 
@@ -60,10 +61,10 @@ class ScenarioError(NetkfError, ValueError):
         return ScenarioError(self.key, self.rule, self.value, self.remedy, self.file or file)
 
     def __str__(self) -> str:
-        # All texts are limited: they may contain names of keys, classes and files of any length.
         """Return the mistake as one line, ``file: key: rule; got value; remedy``, each part
         shortened.
         """
+        # All texts are limited: they may contain names of keys, classes and files of any length.
         file, key = shorten(self.file, 1000), shorten(self.key, 120)
         rule, remedy = shorten(self.rule, 1000), shorten(self.remedy, 700)
         got = "" if self.value is None else f"; got {quote(self.value)}"

@@ -124,6 +124,7 @@ class Component:
         )
 
     def __hash__(self) -> int:
+        """Return a hash that equal components share: values may be arrays, which have none."""
         return hash((type(self), len(dataclasses.fields(self))))
 
 
@@ -320,7 +321,7 @@ def either(first: Rule, second: Rule, is_second: Callable[[Any], bool]) -> Rule:
 
 def has_depth(depth: int) -> Callable[[Any], bool]:
     """Return a predicate of a value: True if it is lists or an array nested at least ``depth``
-    deep.
+    deep, as ``either`` needs it to tell a matrix from a list of matrices.
     """
 
     def measure_depth(value: Any) -> int:
@@ -483,6 +484,7 @@ class SourceFile:
     folder: Path
 
     def __repr__(self) -> str:
+        """Return the quoted path as written, without the folder."""
         return repr(self.name)
 
     @property

@@ -31,4 +31,5 @@ class NotebookTable:
         return f"<div>{line}{rows}</div>"
 
     def __dir__(self) -> list[str]:
+        """Return the public names, which completion at a prompt offers."""
         return sorted(name for name in super().__dir__() if not name.startswith("_"))

@@ -27,6 +27,7 @@ class SharedCache:
     """
 
     def __init__(self, cache: Any, name: str) -> None:
+        """Wrap numba's ``cache`` of the function ``name``, which names its lock files."""
         self._cache, self._name = cache, name
         self._waiting = ExitStack()
 

@@ -113,6 +113,9 @@ class Kernel:
     def __init__(
         self, loops: Callable[..., Any], options: dict[str, Any], compact: bool = False
     ) -> None:
+        """Wrap the Python function ``loops``; ``options`` are those of numba's njit, and
+        ``compact`` is that of :func:`kernel`.
+        """
         self._loops, self._options, self._compact = loops, options, compact
         update_wrapper(self, loops)
 
@@ -121,6 +124,7 @@ class Kernel:
         return self._python_dispatcher(*args, **kwargs)
 
     def __reduce__(self) -> str:
+        """Return the name of the kernel in its module: pickle stores that, and not the code."""
         return self._loops.__qualname__
 
     @property

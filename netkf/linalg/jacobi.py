@@ -42,7 +42,8 @@ def rotate(a: FloatArray, vectors: FloatArray, p: int, q: int) -> None:
     """Apply the Jacobi rotation a <- J' a J, V <- V J in the plane (p, q) that makes a[p, q] 0, to
     the symmetric ``a`` (n, n) and V = ``vectors`` (n, n) in place.
     """
-    # t = tan(angle), the smaller of both solutions: |t| <= 1. An infinite tilt is an angle of 0.
+    # tilt = cot(2 angle); t = tan(angle), the smaller of both solutions: |t| <= 1. An infinite tilt
+    # is an angle of 0.
     n, tilt = len(a), (a[q, q] - a[p, p]) / (2.0 * a[p, q])
     t = math.copysign(1.0, tilt) / (abs(tilt) + math.sqrt(1.0 + tilt * tilt))
     # Cosine and sine from the tangent: square roots have the same bits on every CPU.

@@ -46,6 +46,7 @@ class ValueModel(models.PrimitiveModel):
     """A vector of doubles."""
 
     def __init__(self, manager: Any, kind: LaneValue) -> None:
+        """Tell numba's ``manager`` of data models that ``kind`` is a vector of LLVM."""
         super().__init__(manager, kind, ir.VectorType(DOUBLE, kind.count))
 
 
@@ -54,6 +55,7 @@ class FlagsModel(models.PrimitiveModel):
     """A vector of bits."""
 
     def __init__(self, manager: Any, kind: LaneFlags) -> None:
+        """Tell numba's ``manager`` of data models that ``kind`` is a vector of LLVM."""
         super().__init__(manager, kind, ir.VectorType(BIT, kind.count))
 
 
@@ -139,6 +141,7 @@ def _as_vector(builder: Any, pointer: Any, element: Any, count: int) -> Any:
 
 @_register_type(names.load)
 def _load(lanes: Any, _array: Any, *_place: Any) -> Any:
+    """Return the type of a call of ``load`` in kernels: a value of L lanes."""
     return value_type(len(lanes))
 
 
@@ -153,6 +156,7 @@ def lower_load(context: Any, builder: Any, sig: Any, args: Any) -> Any:
 
 @_register_type(names.store)
 def _store(_lanes: Any, _array: Any, *_place: Any) -> Any:
+    """Return the type of a call of ``store`` in kernels: none."""
     return types.none
 
 
@@ -171,16 +175,19 @@ def lower_store(context: Any, builder: Any, sig: Any, args: Any) -> Any:
 
 @_register_type(names.turn)
 def _turn(_lanes: Any, _rows: Any, _column: Any, _out: Any) -> Any:
+    """Return the type of a call of ``turn`` in kernels: none."""
     return types.none
 
 
 @_register_type(names.gather)
 def _gather(_lanes: Any, _array: Any, _places: Any, _first: Any, _out: Any) -> Any:
+    """Return the type of a call of ``gather`` in kernels: none."""
     return types.none
 
 
 @_register_type(names.scatter)
 def _scatter(*_: Any) -> Any:
+    """Return the type of a call of ``scatter`` in kernels: none."""
     return types.none
 
 
@@ -322,6 +329,7 @@ def _exchange_blocks(builder: Any, a: Any, b: Any, half: int) -> tuple[Any, Any]
     their off-diagonal blocks exchanged.
     """
     count = a.type.count
+    # Masks of LLVM's shufflevector: entry q < count is a[q], entry count + q is b[q].
     upper = [q if not q & half else count + q - half for q in range(count)]
     lower = [q + half if not q & half else count + q for q in range(count)]
     masks = (ir.Constant(ir.VectorType(I32, count), places) for places in (upper, lower))
@@ -331,6 +339,7 @@ def _exchange_blocks(builder: Any, a: Any, b: Any, half: int) -> tuple[Any, Any]
 
 @_register_type(names.prefetch)
 def _prefetch(_array: Any, *_place: Any) -> Any:
+    """Return the type of a call of ``prefetch`` in kernels: none."""
     return types.none
 
 
@@ -349,6 +358,7 @@ def lower_prefetch(context: Any, builder: Any, sig: Any, args: Any) -> Any:
 
 @_register_type(names.spread)
 def _spread_type(lanes: Any, _number: Any) -> Any:
+    """Return the type of a call of ``spread`` in kernels: a value of L lanes."""
     return value_type(len(lanes))
 
 
@@ -362,6 +372,7 @@ def lower_spread(context: Any, builder: Any, sig: Any, args: Any) -> Any:
 
 @_register_type(names.load_flags)
 def _load_flags(lanes: Any, _array: Any, *_place: Any) -> Any:
+    """Return the type of a call of ``load_flags`` in kernels: flags of L lanes."""
     return flags_type(len(lanes))
 
 
@@ -378,6 +389,7 @@ def lower_load_flags(context: Any, builder: Any, sig: Any, args: Any) -> Any:
 
 @_register_type(names.store_flags)
 def _store_flags(_lanes: Any, _array: Any, *_place: Any) -> Any:
+    """Return the type of a call of ``store_flags`` in kernels: none."""
     return types.none
 
 
@@ -400,6 +412,9 @@ def lower_store_flags(context: Any, builder: Any, sig: Any, args: Any) -> Any:
 
 @_register_type(names.select)
 def _select(flags: Any, chosen: Any, other: Any) -> Any:
+    """Return the type of a call of ``select`` in kernels: a value of as many lanes
+    as the widest argument; None if the first are no flags.
+    """
     are_flags = isinstance(flags, LaneFlags | types.Boolean)
     count = max(_count(flags), _count(chosen), _count(other))
     return value_type(count) if are_flags else None
@@ -417,6 +432,7 @@ def lower_select(context: Any, builder: Any, sig: Any, args: Any) -> Any:
 
 @_register_type(names.any_lane)
 def _any_lane(_flags: Any) -> Any:
+    """Return the type of a call of ``any_lane`` in kernels: a bool."""
     return types.boolean
 
 
@@ -433,6 +449,7 @@ for _operation in (operator.and_, operator.or_):
 
     @_register_type(_operation)
     def _combine_flags(a: Any, b: Any) -> Any:
+        """Return the type of ``a & b`` or ``a | b``: that of both flags, None for other types."""
         return a if isinstance(a, LaneFlags) and a == b else None
 
 
@@ -539,6 +556,7 @@ for _operation, _name in (
 
 @_register_type(operator.neg)
 def _negative(value: Any) -> Any:
+    """Return the type of ``-value``: that of the value of L lanes, None for other types."""
     return value if isinstance(value, LaneValue) else None
 
 

@@ -84,7 +84,9 @@ def by_run(values: Any, runs: int) -> Any:
 
 
 def load(lanes: Lanes, array: FloatArray, *place: int) -> Any:
-    """Return, in kernels, ``array[place]`` (L,) as one value of L lanes."""
+    """Return, in kernels, ``array[place]`` (L,) as one value of L lanes; ``place`` are the
+    indices of all axes but the last.
+    """
     raise _only_in_kernels()
 
 
@@ -178,4 +180,5 @@ def with_sign(size: Any, sign: Any) -> Any:
 
 
 def _only_in_kernels() -> TypeError:
+    """Return the error that Python gets from the functions that numba replaces in kernels."""
     return TypeError("values of lanes exist in kernels only")

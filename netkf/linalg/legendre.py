@@ -17,6 +17,9 @@ MOMENTS = 2
 def forward_coefficients(terms: int) -> FloatArray:
     """Return (2, terms) the integrals ``int_0^1 u^k P_j(2 u - 1) du`` of Legendre polynomials, for
     ``exp(M (s - a))`` integrated from a.
+
+    With u = (s - a) / g: ``int exp(M (s - a)) P_j ds`` is the sum over k of row j, entry k, times
+    ``M^k g^(k + 1) / k!``.
     """
     k = np.arange(terms)
     # P_0 = 1 and P_1 = 2 u - 1, so the second row is 2 / (k + 2) - 1 / (k + 1).
@@ -26,6 +29,8 @@ def forward_coefficients(terms: int) -> FloatArray:
 def backward_coefficients(terms: int) -> FloatArray:
     """Return (2, terms) the integrals ``int_0^1 u^k P_j(1 - 2 u) du`` of Legendre polynomials, for
     ``exp(-M (b - s))`` integrated from b.
+
+    As ``forward_coefficients``, with u = (b - s) / g and -M.
     """
     # P_1 is odd about the middle: looking back from b changes its sign.
     return np.asarray(forward_coefficients(terms) * np.array([[1.0], [-1.0]]))

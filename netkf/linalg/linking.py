@@ -189,6 +189,7 @@ class _OwnCode:
         return getattr(self._library, name)
 
     def _get_module_for_linking(self) -> Any:
+        """Return the LLVM module that numba links into a caller: own functions only."""
         # The method of the class: an inner library overrides it to include its callees.
         return type(self._library)._get_module_for_linking(self._library)
 

@@ -48,9 +48,11 @@ def _register(function: Callable[..., Any], dimensions: int, lanes: bool) -> Non
             return others[-1]
 
         def with_lanes(size: Any, lanes: Any, scratch: Any) -> Any:
+            """Return the type of a call of the functions for lanes."""
             return typed(size, lanes, scratch)
 
         def without(size: Any, scratch: Any) -> Any:
+            """Return the type of a call of the functions without lanes."""
             return typed(size, scratch)
 
         return with_lanes if lanes else without

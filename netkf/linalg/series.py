@@ -14,8 +14,9 @@ from netkf.linalg.lanes import LANES, MANY, load, store
 
 ROUNDING = 2.0**-56  # negligible remainder, relative to the largest term of an entry (eps / 16)
 NOTHING = 1e-30  # the same relative to the largest entry, for entries that vanish
+# Tuples whose length is the order of a polynomial, which the compiler knows from their type.
 ORDER_7, ORDER_8, ORDER_9, ORDER_12, ORDER_16 = (0,) * 7, (0,) * 8, (0,) * 9, (0,) * 12, (0,) * 16
-MANY_TERMS = (8, 10)
+MANY_TERMS = (8, 10)  # numbers of terms for which fill_row() has unrolled loops
 OCTAVES, STEPS = 8, 4  # gaps that are tried: halvings of the longest, and steps for each halving
 
 
@@ -120,7 +121,8 @@ def fill_row(
     out: FloatArray, row: int, series: FloatArray, terms: int, m: int, cell: int, gap: float
 ) -> None:
     """Write the sum of ``gap^k series[m, cell, k]`` (W,) over k < ``terms`` into row ``row`` of
-    ``out`` (L, W), for model ``m`` and a cell of gaps, at ``gap`` seconds from its centre.
+    ``out`` (L, W), for model ``m`` and cell ``cell``, an interval of gaps, at ``gap`` seconds from
+    its centre.
 
     ``series`` (M, cells, K, W) has K >= ``terms`` coefficients for each of M models; its width W is
     a multiple of L lanes. The numbers of terms in MANY_TERMS have unrolled loops.

@@ -15,6 +15,7 @@ from functools import cache
 from typing import Any
 
 Patch = tuple[Any, str, Callable[..., Any]]
+"""A replacement in numba: (class or module, name of its function, new function)."""
 
 NOT_NEEDED = (
     *("WithLifting", "InlineClosureLikes", "RewriteDynamicRaises", "MakeFunctionToJitFunction"),
@@ -245,6 +246,7 @@ def _only_with_listeners(notify: Callable[..., Any]) -> Callable[..., Any]:
     listeners: Any = event._registered
 
     def notify_listeners(*args: Any, **kwargs: Any) -> None:
+        """Notify as numba does if any kind of event has a listener."""
         if any(listeners.values()):
             notify(*args, **kwargs)
 

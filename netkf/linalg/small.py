@@ -56,8 +56,11 @@ def symmetrize(P: FloatArray) -> FloatArray:
 
 @kernel
 def solve_inplace(L: FloatArray, out: FloatArray, n: int) -> None:
-    """Replace ``out`` (n, c) by ``L^-1 out``, by Gaussian elimination with partial pivoting as in
-    LAPACK; the first ``n`` rows of L (., n) are overwritten. ``out`` is nan if L is singular.
+    """Replace the first ``n`` rows of ``out`` (>= n, c) by ``L^-1 out``, by Gaussian elimination
+    with partial pivoting as in LAPACK; they become nan if L is singular.
+
+    L is any matrix (n, n), the first rows and columns of the argument (>= n, >= n), and is
+    overwritten.
     """
     columns = out.shape[1]
     for k in range(n):

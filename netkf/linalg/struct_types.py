@@ -105,7 +105,7 @@ class Fields(AttributeTemplate):
     key = StructType
 
     def generic_resolve(self, struct: StructType, name: str) -> Any:
-        """Return the type of a field, or None."""
+        """Return the numba type of field ``name`` of a struct, None if there is no such field."""
         return next(
             (field_type for field_name, _, field_type in struct.fields if field_name == name), None
         )
@@ -193,4 +193,5 @@ def _struct_from_memory(_: Any, memory: Any, cls: ClassType) -> Any:
 
 @overload(struct_at, inline="always")
 def _struct_at(memory, cls):  # noqa: ANN001, ANN202, ARG001
+    """Return the implementation of ``struct_at`` that numba compiles into a kernel in its place."""
     return lambda memory, cls: _struct_from_memory(memory, cls)  # noqa: PLW0108 - of the same parameter names

@@ -158,10 +158,10 @@ class Struct(metaclass=StructClass):
         return _rebuilt, (base, n, {name: getattr(self, name) for name in self.struct_fields})
 
     def __getattr__(self, name: str) -> Any:
-        # Numbers are read from the memory, where kernels may have changed them.
         """Return the present value of a number, which ``memory`` holds; other fields are plain
         attributes.
         """
+        # Numbers are read from the memory, where kernels may have changed them.
         kind = self.struct_kinds.get(name)
         if kind is not np.int64 and kind is not np.float64:
             raise AttributeError(name)

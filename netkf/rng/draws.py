@@ -9,7 +9,10 @@ unchanged. Exponentials come from the ziggurat of Marsaglia and Tsang (2000) wit
 
 A state is a row (high, low, high of the increment, low of the increment) of 64-bit words: a 128-bit
 number ``state = 2^64 high + low``, and the odd increment that tells streams apart. All arithmetic
-is modulo 2^64.
+is modulo 2^64. ``states`` (K, >= 4) may have more columns: ``rng.numbers`` keeps two there.
+
+Batched engines draw for L runs at once with SIMD instructions (``linalg.lanes``): runs are in
+blocks of L, one in each lane, and their states are (B, K, 4, L).
 """
 
 from __future__ import annotations
@@ -32,7 +35,9 @@ _U = np.uint64
 CHEAP = _U(0xDA942042E4DD58B5)  # the multiplier of PCG64DXSM, see numpy/random/src/pcg64
 # The multiplier of 128 bits that PCG64DXSM seeds with.
 FULL_HIGH, FULL_LOW = _U(0x2360ED051FC65DA4), _U(0x4385DF649FCCF645)
+# HALF masks the lower 32 bits of a word, LAYER the 8 bits that choose a layer of the ziggurat.
 ZERO, ONE, HALF, LAYER = _U(0), _U(1), _U(0xFFFFFFFF), _U(0xFF)
+# Shift counts, unsigned like the words that they shift.
 S3, S8, S11, S32, S48, S63 = _U(3), _U(8), _U(11), _U(32), _U(48), _U(63)
 TO_UNIT = 2.0**-53  # spacing of numpy's uniform numbers
 EXPONENTIAL_TAIL = 7.69711747013104972  # where numpy's exponential ziggurat begins its tail
@@ -64,6 +69,7 @@ def high_word_by_halves(a: Any, b: Any) -> Any:
 
     It equals ``linalg.words.high_word``, but compilers can vectorise it.
     """
+    # a = 2^32 a1 + a0 and b = 2^32 b1 + b0: the four partial products with their carries.
     a1, a0, b1, b0 = a >> S32, a & HALF, b >> S32, b & HALF
     low, cross = a0 * b0, a1 * b0
     middle = (low >> S32) + (cross & HALF) + a0 * b1
@@ -165,6 +171,7 @@ def exponential_of(
     Each number of a stream waits for the state after the one before; a state in memory would take
     longer. ``states[k]`` is only read and written for the rare numbers outside the fast path.
     """
+    # As in next_exponential: 8 bits choose a layer, 53 bits a point across it.
     word = scramble(high, low) >> S3
     layer = int(word & LAYER)
     word >>= S8
@@ -228,7 +235,7 @@ def seed_states(words: np.ndarray, states: np.ndarray) -> None:
 def fill_units(states: np.ndarray, which: np.ndarray, counts: np.ndarray, out: FloatArray) -> None:
     """Write the next ``counts[m]`` uniform numbers of stream ``which[m]`` of the ``states``
     (K, >= 4) of K streams into ``out``, for each of M entries m in turn; ``counts`` and ``which``
-    are (M,), ``out`` (sum of counts,).
+    are (M,), ``out`` (sum of counts,). Steps the states.
     """
     index = 0
     for m in range(len(which)):
@@ -243,7 +250,7 @@ def fill_exponentials(
 ) -> None:
     """Write the next ``counts[m]`` exponential numbers of mean 1 of stream ``which[m]`` of the
     ``states`` (K, >= 4) of K streams into ``out``, for each of M entries m in turn; ``counts`` and
-    ``which`` are (M,), ``out`` (sum of counts,).
+    ``which`` are (M,), ``out`` (sum of counts,). Steps the states.
     """
     index = 0
     for m in range(len(which)):
@@ -261,13 +268,16 @@ class StreamBatch:
     def __init__(
         self, streams: Streams | ReplicaStreams, purpose: str, entities: Sequence[tuple[int, ...]]
     ) -> None:
+        """Seed one stream of ``purpose`` for each of ``entities``: tuples of ids, such as (node,)
+        or (sender, receiver).
+        """
         words = streams.seed_words(purpose, entities)
         self.states = np.empty(words.shape, dtype=np.uint64)
         seed_states(words, self.states)
 
     def in_lanes(self, runs: int) -> np.ndarray:
         """Return the states (B, K, 4, L) of the K streams of each of ``runs`` runs, side by side in
-        B blocks of L lanes; idle lanes are 0.
+        B blocks of L lanes, as ``next_units`` takes them; idle lanes are 0.
         """
         count = len(self.states) // runs
         by_lane = np.zeros((blocks_of(runs) * LANES, count, 4), dtype=np.uint64)

@@ -32,7 +32,7 @@ class GeneratorNormals:
 
 
 class StreamNormals:
-    """Streams with the seed ``words`` (K, 4), drawn in compiled code.
+    """K streams with the seed ``words`` (K, 4) of ``Streams.seed_words``, drawn in compiled code.
 
     They give the same numbers as numpy generators with these seeds.
     """

@@ -30,6 +30,7 @@ from netkf.rng.draws import (
 )
 
 _U = np.uint64
+# MANTISSA masks the lower 52 bits of a word; S1 and S9 are shift counts.
 MANTISSA, S1, S9 = _U(0x000FFFFFFFFFFFFF), _U(1), _U(9)
 TAIL_START = 3.6541528853610087963519472518
 INVERSE_TAIL_START = 0.27366123732975827203338247596
@@ -67,6 +68,7 @@ def normal_of(
     streams, and the state after it, for a loop that keeps the state (high, low) in registers;
     ``states[k]`` is read and written only for the rare numbers outside the fast path.
     """
+    # As in next_normal: 8 bits choose a layer, one the sign, 52 a point across the layer.
     word = scramble(high, low)
     layer = int(word & LAYER)
     size = (word >> S9) & MANTISSA
@@ -110,6 +112,8 @@ def _tail(states: np.ndarray, k: int, negative: bool) -> float:
     """Return a normal number x with |x| > TAIL_START, ``negative`` or positive, by rejection
     (Marsaglia 1964), from stream ``k`` of the ``states`` (K, >= 4) of K streams.
     """
+    # TAIL_START + x, with x exponential of mean 1 / TAIL_START, is accepted with probability
+    # exp(-x^2 / 2), by an exponential y of mean 1.
     while True:
         x = -INVERSE_TAIL_START * math.log1p(-next_unit(states, k))
         y = -math.log1p(-next_unit(states, k))
@@ -160,6 +164,7 @@ def shuffle(states: np.ndarray, k: int, order: np.ndarray, count: int) -> None:
     """
     for i in range(count):
         order[i] = i
+    # The smallest 2^b - 1 that is at least ``count``; the loop below shrinks it with i.
     mask = ONE
     while mask < _U(count):
         mask = (mask << ONE) | ONE

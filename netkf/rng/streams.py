@@ -164,6 +164,7 @@ def _small_ids(entities: tuple[tuple[int, ...], ...]) -> np.ndarray | None:
 
 
 WORD, MASK = 1 << 32, (1 << 32) - 1
+"""Number of values of a 32-bit word, and the largest."""
 
 
 @cache
