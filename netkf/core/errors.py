@@ -51,7 +51,10 @@ class ScenarioError(NetkfError, ValueError):
         super().__init__(key, rule, value, remedy, file)
 
     def under(self, prefix: str) -> ScenarioError:
-        """Return this error with ``prefix``, the table that holds the key, before the key."""
+        """Return this error with ``prefix``, the table that holds the key, before the key.
+
+        The reader of the table calls it: the error names the key alone.
+        """
         separator = "" if not self.key or self.key.startswith("[") else "."
         key = f"{prefix}{separator}{self.key}"
         return ScenarioError(key, self.rule, self.value, self.remedy, self.file)

@@ -249,14 +249,16 @@ def seconds_spent() -> float:
 
 
 def announce(function: Callable[..., Any]) -> None:
-    """Print a note, once per function and process, if the code of a function is not on disk yet."""
+    """Print a note to stderr, once per function and process, if the code of a function is not on
+    disk yet, before a call that takes seconds to compile it.
+    """
     if function in _announced:
         return
     _announced.add(function)
     folder = _cache_folder(os.environ.get("NUMBA_CACHE_DIR", ""))
     if not any(folder.rglob(f"*.{function.__name__}-*.nbi")):
-        words = "netkf: compiling, once after an installation (5 to 15 s) ..."
-        print(words, file=sys.stderr, flush=True)
+        note = "netkf: compiling, once after an installation (5 to 15 s) ..."
+        print(note, file=sys.stderr, flush=True)
 
 
 def source_digest(*rooms: str) -> str:
@@ -310,7 +312,9 @@ def _folder_of_process() -> Path:
 
 
 def _remove_old_folders(folder: Path) -> None:
-    """Remove the folders of all but the newest states of the sources."""
+    """Remove from ``folder`` the compiled code of all but the newest states of the sources, so that
+    with the one that is made next MAX_CACHED_STATES remain.
+    """
     folders = [path for path in folder.glob("netkf-*") if path.is_dir()]
     # A few are kept, so that switching between branches does not compile anew.
     for old in sorted(folders, key=lambda path: path.stat().st_mtime)[: -MAX_CACHED_STATES + 1]:

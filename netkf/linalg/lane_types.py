@@ -455,13 +455,13 @@ for _operation in (operator.and_, operator.or_):
 
 @lower_builtin(operator.and_, LaneFlags, LaneFlags)
 def lower_and(_context: Any, builder: Any, _sig: Any, args: Any) -> Any:
-    """Emit the conjunction of flags."""
+    """Emit ``a & b`` of two flags of L lanes, the LLVM values in ``args``, as numba asks."""
     return builder.and_(*args)
 
 
 @lower_builtin(operator.or_, LaneFlags, LaneFlags)
 def lower_or(_context: Any, builder: Any, _sig: Any, args: Any) -> Any:
-    """Emit the disjunction of flags."""
+    """Emit ``a | b`` of two flags of L lanes, the LLVM values in ``args``, as numba asks."""
     return builder.or_(*args)
 
 
@@ -562,7 +562,7 @@ def _negative(value: Any) -> Any:
 
 @lower_builtin(operator.neg, LaneValue)
 def lower_negative(_context: Any, builder: Any, _sig: Any, args: Any) -> Any:
-    """Emit the negated value."""
+    """Emit ``-value`` of L lanes, the LLVM value in ``args``, as numba asks."""
     return builder.fneg(args[0])
 
 

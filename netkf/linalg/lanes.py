@@ -105,7 +105,7 @@ def gather(
 
     ``array`` (K, W), with K places, and ``out`` (W, L) are taken as matrices, whatever their axes,
     and have memory behind their last entries (``with_spare``). Where a place (L,) is negative, lane
-    q gets something.
+    q gets some other row.
     """
     raise _only_in_kernels()
 

@@ -151,8 +151,8 @@ def fill_blocks(
 ) -> None:
     """Write ``sum_k gap^k series[m, cell, k]`` (W,) over k <= len(order) into row ``row`` of
     ``out`` (L, W), by Horner's scheme for blocks of L entries at a time; ``series`` is
-    (M, cells, K, W), with K coefficients of W entries for each of M models and of the cells of
-    gaps.
+    (M, cells, K, W), with K coefficients of W entries for each of M models and each cell (interval)
+    of gaps; ``m`` and ``cell`` choose one, and ``gap`` is in seconds from the centre of the cell.
     """
     for j in range(0, series.shape[3], LANES):
         total = load(MANY, series, m, cell, len(order), j)

@@ -60,6 +60,7 @@ class Struct(metaclass=StructClass):
     """Address of the first byte of ``memory``."""
 
     def __init_subclass__(cls) -> None:
+        """Take the fields from the annotations; the first instance determines their layout."""
         cls.struct_fields = tuple(cls.__annotations__)
         cls.struct_offsets, cls.struct_kinds = {}, {}
 

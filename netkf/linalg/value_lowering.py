@@ -274,6 +274,7 @@ class ValueLower(Lower):
         if self.typeof(expr.value.name) != types.range_iter64_type:
             return None
         state, builder = self.loadvar(expr.value.name), self.builder
+        # The structure of _iterator(): next value, stop, step and number of steps to go.
         next_value, step, remaining = (builder.extract_value(state, k) for k in (0, 2, 3))
         count = builder.load(remaining)
         valid = builder.icmp_signed(">", count, ZERO)
