@@ -432,13 +432,8 @@ def reduce_group(
     from which rounding blurs their errors.
     """
     filters, n = b.error.shape[2:]
-    entries, complete, sample_counts, totals, averages = (
-        filters * n,
-        True,
-        b.sample_counts,
-        scratch.totals,
-        sums.averages,
-    )
+    entries, complete = filters * n, True
+    sample_counts, totals, averages = b.sample_counts, scratch.totals, sums.averages
     gather_samples(
         lanes,
         b.error_rows,

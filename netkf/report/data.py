@@ -14,7 +14,7 @@ from netkf.report.directories import ReportSource
 from netkf.report.innovations import innovation_columns
 from netkf.report.messages import (
     ThinnedMessages,
-    count_traffic,
+    bin_messages,
     information_age,
     thin_messages,
 )
@@ -96,7 +96,7 @@ def run_data(
         "senses": _event_columns(run, ("sense",), budget.messages // 2, packer),
         "marks": _event_columns(run, MARKS, MAX_MARKS, packer),
         "innovations": innovation_columns(readings, run.nodes, budget.messages // 4, packer),
-        "traffic": count_traffic(messages, horizon, BINS),
+        "traffic": bin_messages(messages, horizon, BINS),
         "totals": {
             "events": len(run.log),
             "messages": len(messages),

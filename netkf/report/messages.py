@@ -151,7 +151,7 @@ def information_age(
         return np.asarray(total / np.where(links > 0.0, links, np.nan))
 
 
-def count_traffic(messages: np.ndarray, horizon: float, bins: int) -> dict[str, list[int]]:
+def bin_messages(messages: np.ndarray, horizon: float, bins: int) -> dict[str, list[int]]:
     """Return for each outcome (delivered, lost, ...) the numbers (bins,) of messages sent in each
     of ``bins`` equal intervals of a run of ``horizon`` seconds, for a chart on the page;
     ``messages`` are its MESSAGE rows (M,), one for each message sent.

@@ -9,13 +9,19 @@ covariance of the integral of the prediction error e: de = A e ds + dw with cov(
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from netkf.algorithms.filter import Filter, Increments, NodeInfo, Reading
 from netkf.linalg.arrays import FloatArray, square_root
 from netkf.theory.numerics.prediction import LinearSDE
+
+if TYPE_CHECKING:
+    _Filter = Filter
+else:
+    # The recorded filter is the next base class, see record_increments.
+    _Filter = object
 
 
 class WhitenedInnovation(NamedTuple):
@@ -94,6 +100,72 @@ def _expected_increments_of_models() -> Callable[[Any], ExpectedIncrements]:
     return expected_increments
 
 
+class _IncrementRecorder(_Filter):
+    """The methods of a filter on TimedState: they unwrap the state, call the method of the next
+    base class, that of the recorded filter, and wrap again.
+
+    Arguments and results are those of :class:`netkf.Filter`, with TimedState for states: times and
+    gaps in seconds, ``mean`` and ``offset`` (n,), ``cov`` (n, n). ``record_increments`` sets the
+    attributes.
+    """
+
+    _intervals: list[WhitenedInnovation]
+    _expected_increments: Callable[[Any], ExpectedIncrements]
+
+    def init(self, model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo) -> TimedState:
+        """Return the state at time 0 with the estimate ``mean`` (n,), ``cov`` (n, n)."""
+        inner = super().init(model, mean, cov, node)
+        return TimedState(inner, -1 if self.pooled else node.node, 0.0, (mean, None))
+
+    def predict(self, state: TimedState, gap: float) -> TimedState:
+        """Return the state predicted over ``gap`` seconds, with the estimate before it."""
+        start = super().estimate(state.inner)
+        return TimedState(super().predict(state.inner, gap), state.node, state.time + gap, start)
+
+    def update(self, state: TimedState, reading: Increments | Reading) -> TimedState:
+        """Update by ``reading`` as the filter does; of increments (an interval of a continuous
+        sensor), append the whitened innovation from the estimate at its start first.
+        """
+        xhat, P = state.start
+        if isinstance(reading, Increments) and P is not None and np.isfinite(P).all():
+            # The first half of the moments is the integral of dy.
+            y = reading.moments[: len(reading.moments) // 2]
+            expected = self._expected_increments(state.inner.model)
+            whitened = expected.whitened_innovation(xhat, P, y, reading.gap)
+            self._intervals.append(WhitenedInnovation(state.time, state.node, whitened))
+        return state._replace(inner=super().update(state.inner, reading))
+
+    def emit(self, state: TimedState, exchange: Any) -> tuple[TimedState, Any]:
+        """Return the state and the payload of its message, as the filter does."""
+        inner, payload = super().emit(state.inner, exchange)
+        return state._replace(inner=inner), payload
+
+    def absorb(self, state: TimedState, messages: Sequence[Any], exchange: Any) -> TimedState:
+        """Return the state after ``messages``, as the filter does."""
+        inner = super().absorb(state.inner, messages, exchange)  # type: ignore[safe-super]
+        return state._replace(inner=inner)
+
+    def estimate(self, state: TimedState) -> tuple[FloatArray, FloatArray | None]:
+        """Return xhat (n,) and P (n, n) or None, as the filter does."""
+        return super().estimate(state.inner)
+
+    def shift(self, state: TimedState, offset: FloatArray) -> TimedState:
+        """Return the state with the estimate moved by ``offset`` (n,)."""
+        return state._replace(inner=super().shift(state.inner, offset))
+
+    def max_measurement_interval(self, state: TimedState) -> float:
+        """Return the longest interval of increments that one update may use, in seconds."""
+        return super().max_measurement_interval(state.inner)
+
+    def stopped(self, state: TimedState) -> bool:
+        """Return True once the filter has frozen its network estimate."""
+        return super().stopped(state.inner)
+
+    def conserved(self, state: TimedState) -> Any:
+        """Return the conserved quantities of the filter."""
+        return super().conserved(state.inner)
+
+
 def record_increments(algorithm: Filter, intervals: list[WhitenedInnovation]) -> Filter:
     """Return a filter with the estimates of ``algorithm`` that also appends, for each interval of
     continuous readings, the innovation times the inverse Cholesky factor of its covariance to
@@ -101,70 +173,14 @@ def record_increments(algorithm: Filter, intervals: list[WhitenedInnovation]) ->
 
     Its states are TimedState, which wrap those of ``algorithm``.
     """
-    expected_increments = _expected_increments_of_models()
-    base: Any = type(algorithm)
-
-    class RecordingFilter(base):  # type: ignore[misc]
-        """The filter on TimedState: methods unwrap the state, call the filter and wrap again.
-
-        Arguments and results are those of :class:`netkf.Filter`, with TimedState for states: times
-        and gaps in seconds, ``mean`` and ``offset`` (n,), ``cov`` (n, n).
-        """
-
-        def init(self, model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo) -> TimedState:
-            """Return the state at time 0 with the estimate ``mean`` (n,), ``cov`` (n, n)."""
-            inner = base.init(self, model, mean, cov, node)
-            return TimedState(inner, -1 if base.pooled else node.node, 0.0, (mean, None))
-
-        def predict(self, state: TimedState, gap: float) -> TimedState:
-            """Return the state predicted over ``gap`` seconds, with the estimate before it."""
-            start = base.estimate(self, state.inner)
-            inner = base.predict(self, state.inner, gap)
-            return TimedState(inner, state.node, state.time + gap, start)
-
-        def update(self, state: TimedState, reading: Increments | Reading) -> TimedState:
-            """Update by ``reading`` as the filter does; of increments (an interval of a continuous
-            sensor), append the innovation from the estimate at its start to ``intervals`` first.
-            """
-            xhat, P = state.start
-            if isinstance(reading, Increments) and P is not None and np.isfinite(P).all():
-                # The first half of the moments is the integral of dy.
-                y = reading.moments[: len(reading.moments) // 2]
-                expected = expected_increments(state.inner.model)
-                whitened = expected.whitened_innovation(xhat, P, y, reading.gap)
-                intervals.append(WhitenedInnovation(state.time, state.node, whitened))
-            return state._replace(inner=base.update(self, state.inner, reading))
-
-        def emit(self, state: TimedState, exchange: Any) -> tuple[TimedState, Any]:
-            """Return the state and the payload of its message, as the filter does."""
-            inner, payload = base.emit(self, state.inner, exchange)
-            return state._replace(inner=inner), payload
-
-        def absorb(self, state: TimedState, messages: Sequence[Any], exchange: Any) -> TimedState:
-            """Return the state after ``messages``, as the filter does."""
-            return state._replace(inner=base.absorb(self, state.inner, messages, exchange))
-
-        def estimate(self, state: TimedState) -> tuple[FloatArray, FloatArray | None]:
-            """Return xhat (n,) and P (n, n) or None, as the filter does."""
-            estimate: tuple[FloatArray, FloatArray | None] = base.estimate(self, state.inner)
-            return estimate
-
-        def shift(self, state: TimedState, offset: FloatArray) -> TimedState:
-            """Return the state with the estimate moved by ``offset`` (n,)."""
-            return state._replace(inner=base.shift(self, state.inner, offset))
-
-        def max_measurement_interval(self, state: TimedState) -> float:
-            return float(base.max_measurement_interval(self, state.inner))
-
-        def stopped(self, state: TimedState) -> bool:
-            return bool(base.stopped(self, state.inner))
-
-        def conserved(self, state: TimedState) -> Any:
-            return base.conserved(self, state.inner)
-
-    # Errors name the class by them, and the module says whether it is a user's class.
-    RecordingFilter.__name__, RecordingFilter.__module__ = base.__name__, base.__module__
+    base = type(algorithm)
+    # Errors name the class by its name, and the module says whether it is a user's class.
+    cls: Any = type(base.__name__, (_IncrementRecorder, base), {"__module__": base.__module__})
     # Copied instead of constructed: its parameters have been checked already.
-    recording: Any = object.__new__(RecordingFilter)
-    recording.__dict__.update(algorithm.__dict__)
+    recording: Any = object.__new__(cls)
+    recording.__dict__.update(
+        algorithm.__dict__,
+        _intervals=intervals,
+        _expected_increments=_expected_increments_of_models(),
+    )
     return recording  # type: ignore[no-any-return]

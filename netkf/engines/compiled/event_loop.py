@@ -213,7 +213,7 @@ def predict_participants(
         h = participant(state, event, k)
         # The sender of a message that is lost needs no prediction, unless it reads increments.
         if not lost or state.nodes[h].sensors > state.nodes[h].sensor:
-            predict(state, combination, h, now)
+            predict_node(state, combination, h, now)
 
 
 @kernel
@@ -305,7 +305,9 @@ def record_event_with_age(
 
 
 @kernel
-def predict(state: Simulation, combination: CombinationState | None, h: int, time: float) -> None:
+def predict_node(
+    state: Simulation, combination: CombinationState | None, h: int, time: float
+) -> None:
     """Predict node ``h`` (index in ``state.nodes``) from ``state.now[h]`` to ``time`` (seconds),
     using its increments, unless it is there already. Changes ``state.xhat[h]``, ``root[h]`` and
     ``now[h]``, and in ``combination`` (None for most filters) the prediction that consensus on
@@ -503,7 +505,7 @@ def absorb_messages(
     """
     sort_indices(state.waiting, state.receivers)
     while state.receivers > 0:
-        predict(state, combination, state.waiting[state.absorbing], now)
+        predict_node(state, combination, state.waiting[state.absorbing], now)
         on_absorb(state, totals, history, combination, now)
 
 

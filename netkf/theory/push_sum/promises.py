@@ -47,17 +47,6 @@ def slot_promises(scenario: Scenario) -> dict[str, Any]:
         covariance = push_sum_error_covariance(scenario)
         return [float(trace) for trace in np.trace(covariance, axis1=1, axis2=2)]
 
-    def exact_gamma() -> int:
-        """Return the least gamma (number of averaging steps in a slot) with stable mean-square
-        errors; raises TheoryError for large N n.
-        """
-        if not searches_gamma(scenario):
-            raise TheoryError(
-                f"not looked for: the nodes have more than {MAX_SEARCHED} states together; "
-                "netkf.theory.exact_minimum_gamma looks for it however long it takes"
-            )
-        return exact_minimum_gamma(scenario, most=MAX_STEPS)
-
     def cut() -> list[float]:
         """Return the interval of the probability that failing links disconnect the network."""
         probability = disconnection_probability(scenario)
@@ -69,30 +58,44 @@ def slot_promises(scenario: Scenario) -> dict[str, Any]:
         """
         return corollary_2(scenario)._asdict()
 
-    def leader() -> int:
-        """Return the slots of a leader's election by max-consensus until all nodes know the leader
-        (the one node that starts with a push-sum weight) with probability AGREEMENT.
-        """
-        probabilities = leader_agreement(scenario, MAX_LEADER_SLOTS)
-        undecided = probabilities < AGREEMENT
-        if undecided.all():
-            raise TheoryError(f"not within {MAX_LEADER_SLOTS} slots")
-        return int(undecided.sum())
-
     functions: dict[str, Callable[[], Any]] = {
         "limit_trace": limit,
         "central_trace": central,
         "error_traces": by_node,
         "radius": lambda: push_sum_radius(scenario),
         "laplacian_radius": lambda: consensus_gain_bound(scenario).radius,
-        "exact_minimum_gamma": exact_gamma,
+        "exact_minimum_gamma": lambda: _exact_gamma(scenario),
         "minimum_gamma_mean": lambda: minimum_gamma(scenario, "mean"),
         "minimum_gamma_mean_square": lambda: minimum_gamma(scenario, "mean-square"),
         "corollary_2": corollary,
-        "leader_slots": leader,
+        "leader_slots": lambda: _leader_slots(scenario),
         "disconnection_probability": cut,
     }
     return {name: _value_or_reason(function) for name, function in functions.items()}
+
+
+def _exact_gamma(scenario: Scenario) -> int:
+    """Return the least gamma (number of averaging steps in a slot), up to MAX_STEPS, with stable
+    mean-square errors; raises TheoryError if the network is too large to look for it quickly.
+    """
+    if not searches_gamma(scenario):
+        raise TheoryError(
+            f"not looked for: the nodes have more than {MAX_SEARCHED} states together; "
+            "netkf.theory.exact_minimum_gamma looks for it however long it takes"
+        )
+    return exact_minimum_gamma(scenario, most=MAX_STEPS)
+
+
+def _leader_slots(scenario: Scenario) -> int:
+    """Return the slots of a leader's election by max-consensus until all nodes know the leader (the
+    one node that starts with a push-sum weight) with probability AGREEMENT; raises TheoryError if
+    there are more than MAX_LEADER_SLOTS.
+    """
+    probabilities = leader_agreement(scenario, MAX_LEADER_SLOTS)
+    undecided = probabilities < AGREEMENT
+    if undecided.all():
+        raise TheoryError(f"not within {MAX_LEADER_SLOTS} slots")
+    return int(undecided.sum())
 
 
 def _value_or_reason(function: Callable[[], Any]) -> dict[str, Any]:
