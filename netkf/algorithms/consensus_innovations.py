@@ -558,7 +558,17 @@ class ConsensusInnovations(Filter):
         design = Design(*size, F, Q, start, information, network.heard)
         pseudo = pseudo_states(model.F, network.information.sum(axis=0))
         root = lower_root(square_root(cov))
-        return PseudoState(mean, root, model, pseudo.G @ mean, pseudo, None, 0, design, node.place)
+        return PseudoState(
+            xhat=mean,
+            root=root,
+            model=model,
+            yhat=pseudo.G @ mean,
+            pseudo=pseudo,
+            reading=None,
+            slot=0,
+            design=design,
+            node_index=node.place,
+        )
 
     def predict(self, state: PseudoState, gap: float) -> PseudoState:
         """Return the state ``gap`` seconds later: the estimates of the state and of the
@@ -603,9 +613,10 @@ class ConsensusInnovations(Filter):
         return state._replace(xhat=xhat, yhat=yhat, root=gains.root)
 
     def shift(self, state: PseudoState, offset: FloatArray) -> PseudoState:
-        """Return the state with ``offset`` (n,) added to the estimate of the plant's state x, G
-        ``offset`` to that of the pseudo-state G x, and H ``offset`` to the reading; gains multiply
-        differences, and do not change.
+        """Return the state for coordinates with another origin, to which engines change: with
+        ``offset`` (n,) added to the estimate of the plant's state x, G ``offset`` to that of the
+        pseudo-state G x, and H ``offset`` to the reading. Gains multiply differences, and do not
+        change.
         """
         reading = state.reading
         if reading is not None:
@@ -616,8 +627,8 @@ class ConsensusInnovations(Filter):
         )
 
     def shift_payload(self, payload: PseudoEstimate, offset: FloatArray) -> PseudoEstimate:
-        """Return the payload with G ``offset`` added to the pseudo-state, for an ``offset`` (n,) of
-        the state.
+        """Return the payload of a message under way with G ``offset`` added to its pseudo-state,
+        for a move of the origin by which states change by ``offset`` (n,).
         """
         return payload._replace(yhat=payload.yhat + payload.G @ offset)
 

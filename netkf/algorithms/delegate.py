@@ -65,7 +65,9 @@ class Delegate(Filter):
         return self.wrapped.estimate(state)
 
     def shift(self, state: Any, offset: FloatArray) -> Any:
-        """Return the wrapped filter's state with ``offset`` (n,) added to the estimate."""
+        """Return the wrapped filter's state with ``offset`` (n,) added to the estimate, for a move
+        of the origin.
+        """
         return self.wrapped.shift(state, offset)
 
 

@@ -251,7 +251,9 @@ class DiffusionFilter(Filter):
 
     @property
     def pair_weights(self) -> FloatArray | None:
-        """The matrix (N, N) of weights of N nodes, None for Metropolis weights."""
+        """The matrix (N, N) of weights, entry [l, i] for messages from node l to node i; None for
+        Metropolis weights, which the method ``weight`` gives.
+        """
         return None if isinstance(self.weights, str) else self.weights
 
     def init(self, model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo) -> DiffusionState:

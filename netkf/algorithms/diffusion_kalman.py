@@ -143,7 +143,9 @@ class DiffusionKalman(Filter):
 
     @property
     def pair_weights(self) -> FloatArray | None:
-        """The matrix (N, N) of weights of N nodes, None for Metropolis weights."""
+        """The matrix (N, N) of weights, entry [l, i] for messages from node l to node i; None for
+        Metropolis weights, which the method ``weight`` gives.
+        """
         return None if isinstance(self.weights, str) else self.weights
 
     def sends_in_slots(self, phase: int, has_sensor: bool) -> bool:
@@ -199,8 +201,8 @@ class DiffusionKalman(Filter):
     shift = Filter.shift  # affine: the weights sum to one
 
     def shift_payload(self, payload: Any, offset: FloatArray) -> Any:
-        """Return the payload shifted by ``offset`` (n,): estimates move, readings keep the
-        coordinates of their time.
+        """Return the payload of a message under way, for a move of the origin by which estimates
+        change by ``offset`` (n,): readings keep the coordinates of their time.
         """
         return payload if isinstance(payload, Reading) else payload + offset
 

@@ -524,8 +524,8 @@ class EventTriggeredCi(Filter):
         )
 
     def shift(self, state: TriggeredState, offset: FloatArray) -> TriggeredState:
-        """Return the state with ``offset`` (n,) added to the estimate and to all copies: the
-        triggers look at differences.
+        """Return the state with ``offset`` (n,) added to the estimate and to all copies, for a move
+        of the origin: the triggers look at differences.
         """
         sent = state.sent
         if sent is not None:

@@ -330,8 +330,9 @@ class Filter(Component):
         return state._replace(xhat=state.xhat + offset)
 
     def shift_payload(self, payload: Any, offset: FloatArray) -> Any:
-        """Return a payload under way with ``offset`` (n,) added to the estimate in it, when the
-        engine calls ``shift`` for all states; ``offset`` refers to the time of sending.
+        """Return a payload under way with ``offset`` (n,) added to the estimate in it. Engines
+        call it when they move the origin, with ``shift`` for all states; ``offset`` is the move at
+        the time of sending.
         """
         return payload._replace(xhat=payload.xhat + offset)
 
@@ -380,8 +381,8 @@ class Filter(Component):
         """Return the size, in numbers of 64 bits, of a message that a node with ``rows`` rows of
         readings sends about ``n`` states in exchange number ``phase`` of a slot (-1 under clocks).
 
-        Of a symmetric matrix one triangle counts; by default a message is an estimate with its
-        covariance.
+        Comparisons of filters report the traffic that it gives. Of a symmetric matrix one triangle
+        counts; by default a message is an estimate with its covariance.
         """
         return n + n * (n + 1) // 2
 

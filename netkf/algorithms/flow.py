@@ -75,8 +75,9 @@ class FlowFilter(Component):
         return state._replace(xhat=xhat, P=P)
 
     def measure(self, state: Any, reading: Reading) -> Any:
-        """Return the state after the increments of the gap that just passed, ``reading.moments``
-        (2 p,): only the estimate moves, since ``flow`` has counted them in P.
+        """Return the state after the increments dy of p sensor rows over the gap that just passed,
+        of which ``reading.moments`` (2 p,) holds ``int dy`` and ``int P_1 dy``, P_1 the Legendre
+        polynomial on the gap: only the estimate moves, since ``flow`` has counted them in P.
         """
         xhat = gain_update(state.model.gains, state.P, state.xhat, reading.moments, reading.gap)
         return state._replace(xhat=xhat)

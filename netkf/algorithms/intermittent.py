@@ -243,8 +243,9 @@ class Intermittent(Filter):
         return state._replace(xhat=xhat)
 
     def shift_payload(self, payload: Reading, offset: FloatArray) -> Reading:
-        """Return the ``payload`` of a message under way, unchanged by ``offset`` (n,): a reading
-        keeps the coordinates of its time, to which the receiver goes back.
+        """Return the ``payload`` of a message under way, for a move of the origin by which
+        estimates change by ``offset`` (n,): unchanged, since a reading keeps the coordinates of its
+        time, to which the receiver goes back.
         """
         return payload
 

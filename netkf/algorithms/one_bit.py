@@ -397,7 +397,9 @@ class OneBit(Filter):
     shift = Filter.shift  # signs of innovations do not depend on the origin
 
     def shift_payload(self, payload: Bits, offset: FloatArray) -> Bits:
-        """Return the payload unchanged by ``offset`` (n,): bits have no coordinates."""
+        """Return the payload of a message under way, for a move of the origin by which estimates
+        change by ``offset`` (n,): unchanged, since bits have no coordinates.
+        """
         return payload
 
 

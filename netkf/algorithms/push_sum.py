@@ -700,7 +700,7 @@ class PushSum(Filter):
         weight = 1.0 if node.node == self.leader else 0.0
         mass = np.concatenate([[weight, 1.0], information.reshape(-1)])
         network_estimate = NetworkInformation(information, 1.0)
-        # Every node knows the whole network from the start.
+        # With asymptotic gains every node knows G = node.information, of all sensors, and N.
         if self.asymptotic:
             root = asymptotic_root(model.F, model.Q, node.information)
             network_estimate = NetworkInformation(node.information, float(node.nodes), root)
@@ -849,7 +849,9 @@ class PushSum(Filter):
         return state._replace(xhat=state.xhat + offset)
 
     def shift_payload(self, payload: Any, offset: FloatArray) -> Any:
-        """Return the payload shifted by ``offset`` (n,): estimates move, mass does not."""
+        """Return the payload of a message under way, for a move of the origin by which estimates
+        change by ``offset`` (n,): mass does not change.
+        """
         if isinstance(payload, Offer):
             return running_sums.shift_offer(payload, offset)
         # A mass is longer than an estimate: 2 + n^2 > n entries.
@@ -1006,8 +1008,9 @@ def network(mass: FloatArray, model: SlotModel) -> NetworkInformation:
 def correct_root_alone(root: FloatArray, information: FloatArray) -> FloatArray:
     """Return the root (n, n) of ``(P^-1 + G)^-1 = P (I + G P)^-1``, paper P (7), for the lower
     triangular ``root`` (n, n) of P, possibly singular, and the information G = ``information``
-    (n, n).
+    (n, n). For the SimPy engine and the asymptotic gains, one node of one run at a time.
     """
+    # The kernel takes arrays with axes of blocks, nodes and lanes, here of length 1 each.
     n = len(root)
     result, information_lanes = (np.array(a).reshape(1, 1, n, n, 1) for a in (root, information))
     correct_root_single(

@@ -898,13 +898,14 @@ class TriggeredMessages(Filter):
         return state._replace(inner=self.inner.predict(state.inner, gap))
 
     def update(self, state: WrappedState, reading: Reading) -> WrappedState:
-        """Return the state after a reading, which the wrapped filter uses; its news is kept for the
-        decision whether to send, which is open again.
+        """Return the state after a reading, which the wrapped filter uses; its news is kept for
+        ``emit``, which decides anew whether the node sends.
         """
         news = NO_READING
         if len(reading.y):
             # Before the filter uses the reading: news is relative to the prediction.
             news = news_of(reading, self.inner.estimate(state.inner)[0], self.Y)
+        # The field ``silent`` is None again, that is undecided.
         return WrappedState(self.inner.update(state.inner, reading), news, state.has_sent)
 
     def emit(self, state: WrappedState, exchange: Exchange) -> tuple[WrappedState, Any]:

@@ -482,7 +482,7 @@ class BarShalomCampo(Filter):
     ) -> tuple[TrackArrays]:
         """Return the arrays of the compiled ``slot_kernel`` for ``runs`` runs of H nodes that start
         in these ``states`` and hear the nodes in ``infos``: the tracks with their covariances, and
-        scratch.
+        scratch. A tuple of one, since kernels take any number of such arguments.
         """
         H, n, start = len(states), len(states[0].xhat), states[0].start
         max_degree = max(info.degree for info in infos)
@@ -490,6 +490,7 @@ class BarShalomCampo(Filter):
             in_lanes(np.stack([getattr(state, name) for state in states]), blocks_of(runs))
             for name in ("xhat", "root")
         )
+        # Scratch of the kernel for the combinations of one slot; key -1: a free entry.
         cache = CombinationCache(
             key=np.full(COMBINATIONS, -1),
             rank=np.zeros(COMBINATIONS, dtype=np.int64),
@@ -497,6 +498,8 @@ class BarShalomCampo(Filter):
             root=np.zeros((COMBINATIONS, n, n)),
         )
         sensors, _ = stacked_sensors([state.sensors[0] for state in states])
+        # Pairs (i, j) of tracks that some node may combine, ordered by i: those of i begin at
+        # first[i]. All tracks start with one common error, whose covariance is ``start``.
         pairs = combined_pairs(infos)
         first = np.searchsorted(pairs[:, 0], np.arange(H + 1))
         return (

@@ -230,13 +230,15 @@ def _use_compile_settings(dispatcher: Any, config: Any) -> None:
                 with linked_once(), without_collection():
                     return compile_for(*args, **kwargs)
             except numba_error:
-                # Once more without the replacements, for an error message with the source line.
+                # Once more without the replacements, for an error message with the source line. The
+                # lock of the cache, which the failed attempt holds, would block this one.
                 dispatcher._cache.release()
                 return compile_for(*args, **kwargs)
         finally:
             config.OPT = level
             # LLVM options cannot be unset: this is the value that numba's own level implies.
             set_option("netkf", f"-unroll-threshold={UNROLLED_BY_NUMBA}")
+            # Other processes wait at the lock for this code.
             dispatcher._cache.release()
             _compile_times.append(time.perf_counter() - started)
 

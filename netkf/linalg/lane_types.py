@@ -46,7 +46,9 @@ class ValueModel(models.PrimitiveModel):
     """A vector of doubles."""
 
     def __init__(self, manager: Any, kind: LaneValue) -> None:
-        """Tell numba's ``manager`` of data models that ``kind`` is a vector of LLVM."""
+        """Make an LLVM vector the representation of the numba type ``kind``. numba calls it with
+        its ``manager`` of all such data models.
+        """
         super().__init__(manager, kind, ir.VectorType(DOUBLE, kind.count))
 
 
@@ -55,7 +57,9 @@ class FlagsModel(models.PrimitiveModel):
     """A vector of bits."""
 
     def __init__(self, manager: Any, kind: LaneFlags) -> None:
-        """Tell numba's ``manager`` of data models that ``kind`` is a vector of LLVM."""
+        """Make an LLVM vector the representation of the numba type ``kind``. numba calls it with
+        its ``manager`` of all such data models.
+        """
         super().__init__(manager, kind, ir.VectorType(BIT, kind.count))
 
 

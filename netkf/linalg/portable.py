@@ -169,9 +169,12 @@ def gauss_legendre(count: int) -> tuple[FloatArray, FloatArray]:
     return np.array(nodes), np.array(weights)
 
 
-def _legendre(count: int, x: Decimal) -> tuple[Decimal, Decimal]:
-    """Return the Legendre polynomial of degree ``count`` at x, and its derivative."""
+def _legendre(degree: int, x: Decimal) -> tuple[Decimal, Decimal]:
+    """Return, for Newton's method, the Legendre polynomial P of this ``degree`` >= 1 at x, |x| < 1,
+    and its derivative, with the digits of the decimal context.
+    """
     previous, value = Decimal(1), x
-    for k in range(2, count + 1):
+    for k in range(2, degree + 1):
+        # k P_k = (2 k - 1) x P_(k-1) - (k - 1) P_(k-2)
         previous, value = value, ((2 * k - 1) * x * value - (k - 1) * previous) / k
-    return value, count * (x * value - previous) / (x * x - 1)
+    return value, degree * (x * value - previous) / (x * x - 1)

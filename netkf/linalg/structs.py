@@ -105,7 +105,10 @@ class Struct(metaclass=StructClass):
 
     @classmethod
     def _lay_out(cls, values: dict[str, Any]) -> None:
-        """Set ``struct_kinds`` and ``struct_offsets`` from the annotations and the first values."""
+        """Set ``struct_offsets``, in words of ``memory``, and ``struct_kinds`` from the annotations
+        and the first values. A kind is a type of numbers, the class of a struct, (dtype, ndim) of
+        an array, or the length of a tuple.
+        """
         word, offsets = 0, dict[str, int]()
         kinds = dict[str, Any]()
         for name in cls.struct_fields:
@@ -144,8 +147,10 @@ class Struct(metaclass=StructClass):
             # Integers and floats share the words, seen as one or the other type.
             self.memory.view(kind)[word] = value
         elif isinstance(kind, int):
+            # A tuple, ``size``: only its length matters, which is part of the numba type.
             self.__dict__[name] = value
         else:
+            # A struct: the dictionary keeps it alive too.
             if type(value) is not kind:
                 raise TypeError(f"{type(self).__name__}.{name} is a {kind.__name__}")
             self.memory[word] = value.address

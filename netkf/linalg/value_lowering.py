@@ -169,8 +169,9 @@ class ValueLower(Lower):
         self, names: set[str], block_of: dict[str, int], using_blocks: dict[str, set[int]]
     ) -> set[str]:
         """Return those of ``names`` that some block uses without being dominated by the block that
-        assigns them; ``block_of`` is the block that assigns each name, ``using_blocks`` the others
-        that use it.
+        assigns them (some path to the use misses the assignment): they cannot be SSA values, and
+        stay on the stack. ``block_of`` is the offset of the block that assigns each name,
+        ``using_blocks`` those of the others that use it.
         """
         # The first block dominates all.
         names = {name for name in names if block_of[name] != self.firstblk}

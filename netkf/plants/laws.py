@@ -195,7 +195,8 @@ def _response_series(A: FloatArray, longest: float) -> tuple[FloatArray, FloatAr
     exponential = [np.eye(n)]
     for k in range(1, terms):
         exponential.append(product(exponential[-1], A) / k)
-    # A moment, an integral over the gap, has one power of g more than the exponential.
+    # int_0^g (A s)^k / k! P_j ds = f_jk A^k g^(k + 1) / k!, with f = forward_coefficients(terms): a
+    # moment, an integral over the gap, has one power of g more than the exponential.
     end, moments = np.stack(exponential), np.zeros((terms + 1, 2, n, n))
     moments[1:] = forward_coefficients(terms).T[:, :, None, None] * end[:, None]
     to_end, to_moments = (

@@ -78,10 +78,10 @@ class RecordedPlant(LinearPlant):
 
     @cached_property
     def table(self) -> Table:
-        """The states (n,) by slot number."""
+        """The states (n,) by slot number; raises ScenarioError for a mistake in the file."""
         times, states = _states(self.path, self.n)
         rows = list(zip(times.tolist(), states, strict=True))
-        return index_by_slot(self.path, rows, self.period, "")
+        return index_by_slot(self.path, rows, self.period, whose="")
 
     def require_slots(self, slots: Iterable[int]) -> None:
         """Raise ScenarioError if the table has no state for one of the ``slots`` (numbers)."""
@@ -302,7 +302,7 @@ class RecordedSensor(Sensor):
 
         Raises ScenarioError for a time that is not the start of a slot and for two rows of a slot.
         """
-        return index_by_slot(self.path, self._rows[node], period, f" of node {node}")
+        return index_by_slot(self.path, self._rows[node], period, whose=f" of node {node}")
 
     def require_slot_times(self, period: float) -> None:
         """Raise ScenarioError if the table does not fit slots of ``period`` seconds."""

@@ -126,9 +126,9 @@ def riccati_table(A: FloatArray, Q: FloatArray, G: FloatArray, longest: float) -
 
 
 def _side_by_side(unit: float, *parts: FloatArray) -> FloatArray:
-    """Return the coefficients of some power series of matrices, ``parts`` (terms, n, n) each, as
-    rows (terms, size + 1), with their reach in the last column: the gap, up to ``unit`` seconds,
-    for which the terms so far suffice.
+    """Return a table (terms, size + 1) of some power series of matrices, ``parts`` (terms, n, n)
+    each, whose ``size`` entries stand side by side in a row; the last column is the reach of a row:
+    the gap, up to ``unit`` seconds, for which the terms so far suffice.
     """
     rows = np.concatenate([part.reshape(len(part), -1) for part in parts], axis=1)
     return with_reach(rows, unit)

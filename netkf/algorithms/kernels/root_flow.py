@@ -302,7 +302,9 @@ def transitions_at(
 
 
 def wide_zeros(*shape: int) -> Any:
-    """Return zeros of this ``shape`` in extended precision."""
+    """Return zeros of this ``shape`` in extended precision (not "wide" in the sense of P), in which
+    tables are computed before they are rounded to double.
+    """
     return np.zeros(shape, dtype=WIDE)
 
 
@@ -342,7 +344,9 @@ def information_blocks(
 
 
 def legendre_moment(k: int, j: int) -> float:
-    """Return ``int_0^1 u^k P_j(2 u - 1) du`` = k!^2 / ((k - j)! (k + j + 1)!)."""
+    """Return ``int_0^1 u^k P_j(2 u - 1) du`` = k!^2 / ((k - j)! (k + j + 1)!) for k >= j: what the
+    term u^k of a power series adds to its Legendre coefficient c_j, apart from the factor 2 j + 1.
+    """
     value = math.factorial(k) ** 2
     return value / (math.factorial(k - j) * math.factorial(k + j + 1))
 
