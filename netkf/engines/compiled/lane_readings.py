@@ -185,8 +185,12 @@ def begin_reading(
             readings.normals[0, i, q], readings.normals[1, i, q] = normals[0, i], normals[1, i]
     k = piece_of(path, piece, end)
     start, stop = path.start[k], path.stop[k]
-    # A whole piece, or several: their moments are known already, no polynomial is needed.
-    if now < start or (now == start and end == stop):
+    # A whole piece: its moments are drawn already, no polynomial is needed.
+    if now == start and end == stop:
+        set_moments(readings, q, path.moments[run, k])
+        return
+    # Several pieces, or parts of them.
+    if now < start:
         fill_moments(state, run, piece, now, end)
         set_moments(readings, q, state.scratch.state_moments)
         return
