@@ -371,9 +371,12 @@ class Filter(Component):
         return True
 
     def sends_in_slots(self, phase: int, has_sensor: bool) -> bool:
-        """Return False if a node that has a sensor (``has_sensor``) or has none sends nothing in
-        exchange number ``phase``; in slots in which its recorded sensors have no row it counts as
-        one without. Asked for compiled filters only; with others ``emit`` decides.
+        """Return False if a node with a sensor (``has_sensor`` True), or without one (False), sends
+        nothing in exchange number ``phase`` of a slot, from 0. By default all nodes send.
+
+        The compiled engine asks, to deliver and count the messages of senders only. In a slot
+        in which recorded sensors of a node have no row it counts as one without. In the SimPy
+        engine ``emit`` decides instead, by returning None as the payload.
         """
         return True
 

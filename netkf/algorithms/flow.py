@@ -92,13 +92,15 @@ class FlowFilter(Component):
         return usable(float((state.P * state.model.information).sum()))
 
     def emit(self, state: Any) -> Any:
-        """Return the payload that the node sends now."""
+        """Return the payload that the node sends now: its estimate (n,) and covariance (n, n)."""
         return Payload(state.xhat, state.P)
 
     @abstractmethod
     def absorb(self, state: Any, messages: Sequence[tuple[float, Any, float]]) -> Any:
-        """Return the state after using all ``(weight, payload, age)`` that arrived at this instant
-        together, at most one from each neighbour. Payloads must not be changed.
+        """Return the state after using all messages that arrived at this instant together, at most
+        one from each neighbour. Each is a tuple (weight, payload, age): the weight given to its
+        sender (``weight``), what the sender's ``emit`` returned, and the seconds since then, by
+        which ``predict`` brings a payload up to now. Payloads must not be changed.
         """
 
     def estimate(self, state: Any) -> tuple[FloatArray, FloatArray]:

@@ -221,7 +221,10 @@ class SlotModel:
         raise TypeError("increments belong to continuous time")
 
     def max_interval(self, root: FloatArray) -> float:
-        """Return infinity: there are no increments in slots."""
+        """Return the longest measurement interval in seconds: infinity, whatever the ``root``
+        (n, n), since slots have no increments that an interval would limit; see
+        ``Filter.max_measurement_interval``.
+        """
         return math.inf
 
 

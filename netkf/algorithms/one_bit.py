@@ -126,6 +126,7 @@ def one_bit_slots(
                 drop_silent(plan, links, b, s, 0)
             if plan.part == SENDING:
                 continue
+            # False in slot 0, whose sample shows the initial estimates.
             if plan.sensed[s]:
                 predict_all(nodes, scratch, b)
                 share_bits(nodes, readings, plan, links, scratch, arrays, turn, b, s)
@@ -372,16 +373,20 @@ class OneBit(Filter):
         return OneBitState(mean, first_root(cov), model, None, node.place, node.nodes)
 
     def update(self, state: OneBitState, reading: Reading) -> OneBitState:
-        """Return the state with the reading kept for the exchange of the slot."""
+        """Return the state with the ``reading``, if it has rows, kept for ``emit`` in the same
+        slot; the estimate moves only there, by the bits.
+        """
         return state._replace(reading=reading if len(reading.y) else None)
 
     def emit(self, state: OneBitState, exchange: Exchange) -> tuple[OneBitState, Bits | None]:
-        """Return in the node's turn the state corrected by the bits of its reading, and these bits
-        as the payload; else the state and None.
+        """Return, in the node's turn and if it has a reading, the state corrected by the bits of
+        the reading, and as the payload these bits with the whitened rows H; else the unchanged
+        state and None.
         """
         if state.reading is None or exchange.slot % state.nodes != state.turn:
             return state, None
         y, H = whiten_reading(*state.reading[:3])
+        # ``send_bits_single`` writes the signs, in place, before they become the payload.
         signs = np.zeros(len(y))
         return apply_bits(state, send_bits_single, y, H, signs), Bits(signs, H)
 
@@ -391,6 +396,7 @@ class OneBit(Filter):
         """Return the state corrected by the bits of the sender whose turn it is."""
         for message in messages:
             signs, H = message.payload
+            # ``use_bits_single`` ignores the reading y, which the receiver does not know.
             state = apply_bits(state, use_bits_single, np.zeros(len(signs)), H, signs)
         return state
 

@@ -353,10 +353,11 @@ def promised_filter(algorithm: Any) -> Any:
 
 def check_upper_bound(samples: RunSamples, level: float) -> Finding:
     """Check that P of the runs is at least Sigma, the exact covariance of the errors given the
-    events of the run, by the least eigenvalue of P - Sigma.
+    events of the run, by the least eigenvalue of P - Sigma. The finding names the first run, time
+    and node where P is smaller by more than rounding.
 
-    ``runs.P`` and ``runs.Sigma`` are (R, K, N, n, n). No interval is estimated, so that ``level``
-    is not used.
+    ``runs.P`` and ``runs.Sigma`` are (R, K, N, n, n); only the first ``max_replayed`` runs have a
+    Sigma. No interval is estimated, so that ``level`` is not used.
     """
     max_runs = max_replayed(samples.scenario)
     P, Sigma = samples.runs.P[:max_runs], samples.runs.Sigma[:max_runs]
@@ -364,9 +365,8 @@ def check_upper_bound(samples: RunSamples, level: float) -> Finding:
     # Covariances that are not finite count as below Sigma; eigvalsh needs finite entries.
     gap = np.nan_to_num(P - Sigma, nan=-1e300, posinf=1e300, neginf=-1e300)
     shortfall = np.maximum(-np.linalg.eigvalsh(gap)[..., 0], 0.0)
-    message = (
-        f"least eigenvalue of P - Sigma relative to its trace in {shortfall.size:,} covariances"
-    )
+    count = f"{shortfall.size:,} covariances"
+    message = f"least eigenvalue of P - Sigma relative to trace(Sigma) in {count}"
     # Size of the values, of the terms whose rounding errors they inherit, and relative tolerance.
     limits = size, samples.largest_terms(samples.runs.replayed[:max_runs]), BOUND_TOLERANCE
     finding = compare_identities(shortfall, *limits, message)
@@ -430,6 +430,7 @@ def check_bias(samples: RunSamples, level: float) -> Finding:
 
     The interval of the finding misses the truth with at most the probability ``level``.
     """
+    # Only these runs have exact covariances.
     max_runs = max_replayed(samples.scenario)
     bias, Sigma = samples.runs.bias[:max_runs], samples.runs.Sigma[:max_runs]
     bias = bias[np.isfinite(bias).all(axis=(1, 2))]

@@ -198,11 +198,15 @@ class GossipSamples(RunSamples):
         """Return S = ``count`` simulated switched chains, with their covariances (K, S, n, n) after
         K increasing numbers of ``slots``; ``purpose`` names the random stream that they are drawn
         from. A chain starts at a uniformly drawn node, with the P(0) of that node.
+
+        Each chain also runs from a covariance about 1000 times larger through the same nodes
+        (``restarted``), to test whether the law of P still depends on P(0).
         """
         # Square roots of P(0) (N, n, n), which the recursions work with.
         starts, random = initial_roots(self.scenario), Streams(self.seed).generator(purpose)
         positions = _draw_chains(self.matching, slots[-1], count, random)
         table, start_roots = gossip_modes(self.scenario), starts[positions[:, 0]]
+        # The identity makes the second start larger even where P(0) = 0.
         larger_roots = FAR_START * start_roots + np.eye(start_roots.shape[-1])
         restarted = table.covariances(larger_roots, positions, slots[-1:])[0]
         return ChainSamples(table.covariances(start_roots, positions, slots), restarted, positions)

@@ -23,20 +23,26 @@ class PaperChecks(ABC):
     summary_type: ClassVar[type[ReplicaSummary]] = ReplicaSummary
 
     def summarise(self, scenario: Scenario, run: Run) -> ReplicaSummary:
-        """Return the summary of a run whose samples are at ``check_times``."""
+        """Return what the tests need of one ``run``, an instance of ``summary_type``; called once
+        for each run, whose samples are at ``check_times``.
+        """
         return summarise_exactly(scenario, run)
 
     def collect(self, scenario: Scenario, stacked: Any, seed: int) -> RunSamples:
-        """Return the samples that the tests take, from stacked summaries.
+        """Return the object that every test of a promise gets; called once, after the last run.
 
-        ``seed`` is that of the runs; tests that draw reference samples derive theirs from it.
+        ``stacked`` is a ``summary_type`` with the summaries of all R runs: each field has a first
+        axis of length R. ``seed`` is that of the runs; tests that simulate reference samples seed
+        their random streams with it.
         """
         return RunSamples(scenario, stacked, seed)
 
     @abstractmethod
     def assumptions(self, scenario: Scenario) -> list[Assumption]:
-        """Return the assumptions of the tests beyond those of the paper itself."""
+        """Return the assumptions of the tests beyond those of the paper itself, each with whether
+        it holds for the scenario: a promise is tested only if those that it ``needs`` hold.
+        """
 
     @abstractmethod
     def promises(self, scenario: Scenario) -> tuple[Promise, ...]:
-        """Return the promises about a scenario."""
+        """Return the promises of the paper that are tested for a scenario."""

@@ -273,9 +273,10 @@ def distance_to_law(
 
 def band_around(value: float, width: float, detectable: float = math.nan) -> Interval:
     """Return the interval ``value`` +- ``width``, clipped to [0, 1], for a distance between two
-    distribution functions; the width shrinks as 1 / sqrt(runs).
+    distribution functions; in forecasts for more runs the width shrinks as 1 / sqrt(runs).
 
-    ``detectable`` is the distance that it would have shown with probability POWER.
+    ``width`` is the half width at the level of the interval. ``detectable`` is the true distance at
+    which the interval would exclude 0 with probability POWER, nan if unknown.
     """
 
     def limits(value: float, factor: float) -> tuple[float, float]:

@@ -37,7 +37,7 @@ def check_exact_covariance(samples: RunSamples, level: float) -> Finding:
     gap = np.nan_to_num(np.abs(P - Sigma).max(axis=(-1, -2)), nan=1e300, posinf=1e300)
     # Size of the values, of the terms whose rounding errors they inherit, and relative tolerance.
     limits = size, samples.largest_terms(samples.runs.replayed[:max_runs]), EXACT_TOLERANCE
-    message = f"largest entry of P - Sigma relative to its trace in {gap.size:,} covariances"
+    message = f"largest entry of P - Sigma relative to trace(Sigma) in {gap.size:,} covariances"
     return with_departure(compare_identities(gap, *limits, message), samples, gap, limits)
 
 

@@ -29,7 +29,9 @@ class Rule:
     """A requirement on a value: its text, the conversion that enforces it, and the remedy.
 
     requirement  text that begins with "must be"
-    convert      returns the value to store, or raises TypeError, ValueError or OverflowError
+    convert      returns the value to store, or raises TypeError, ValueError or OverflowError;
+                 messages of these are not used, since the user is shown ``requirement``, but those
+                 of _SpecificError and ScenarioError are
     remedy       text that tells the user how to correct a value that breaks the rule
     schema       JSON Schema that accepts every value of a file that obeys the rule; empty: any
     """
@@ -160,7 +162,9 @@ def number(
     ]
 
     def convert(value: Any) -> float:
-        """Return the value as a finite float within the limits."""
+        """Return the value as a finite float within the limits, else raise TypeError or ValueError
+        (see Rule).
+        """
         if isinstance(value, bool) or not isinstance(value, (int, float, np.integer, np.floating)):
             raise TypeError
         result = float(value)
@@ -209,7 +213,9 @@ def integer(low: int | None = None, high: int | None = None) -> Rule:
     """Return the rule for an integer from ``low`` to ``high``; None means no limit."""
 
     def convert(value: Any) -> int:
-        """Return the value as an int within the limits."""
+        """Return the value as an int within the limits, else raise TypeError or ValueError (see
+        Rule).
+        """
         if isinstance(value, bool) or not isinstance(value, (int, np.integer)):
             raise TypeError
         if (low is not None and value < low) or (high is not None and value > high):
@@ -276,7 +282,7 @@ def instance_of(*classes: type) -> Rule:
     """Return the rule for an object of one of the classes."""
 
     def convert(value: Any) -> Any:
-        """Return the value if it is of one of the classes."""
+        """Return the value if it is of one of the classes, else raise TypeError (see Rule)."""
         if not isinstance(value, classes):
             raise TypeError
         return value
@@ -289,7 +295,7 @@ def one_of(*names: str) -> Rule:
     """Return the rule for a text that is one of ``names``."""
 
     def convert(value: Any) -> str:
-        """Return the value if it is one of the names."""
+        """Return the value if it is one of the names, else raise ValueError (see Rule)."""
         if value not in names:
             raise ValueError
         return str(value)

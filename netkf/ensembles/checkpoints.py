@@ -68,12 +68,14 @@ class BlockCheckpoints:
     """Statistics of the finished blocks, one file each, written atomically."""
 
     def __init__(self, directory: Path, scenario: Scenario) -> None:
+        """Serve the blocks of runs of ``scenario`` in a run ``directory``; nothing is read yet."""
         self._folder, self._scenario = directory / BLOCKS_FOLDER, scenario
         self._numbers: set[int] = set()
 
     def stored_block_size(self) -> int | None:
         """Return the number of runs in a block (consecutive replicas whose results are one file),
-        from the first readable file; None without one.
+        from the first readable file; None without one. A resumed command must go on with blocks of
+        this size, or it could not use the stored ones.
         """
         for file in self._block_paths():
             with contextlib.suppress(DamagedError), _open_block(file) as arrays:

@@ -36,8 +36,8 @@ class Moments(NamedTuple):
 
 
 def moments_of(values: FloatArray, size: FloatArray) -> Moments:
-    """Return the mean and M2 (sum of squared deviations) of R observations ``values`` (R, S, C),
-    each of S rows of C quantities.
+    """Return the number (S,), mean (S, C) and M2 (S, C), the sum of squared deviations, of R
+    observations ``values`` (R, S, C), each of S rows of C quantities.
 
     Neighbours are merged pairwise, in a binary tree over R. ``size`` (R, S) is 1 where an
     observation exists and 0 where it does not. Both arrays are overwritten.
@@ -45,6 +45,8 @@ def moments_of(values: FloatArray, size: FloatArray) -> Moments:
     _, rows, columns = values.shape
     mean, M2 = np.empty((rows, columns)), np.empty((rows, columns))
     merge_leaves(size, values, np.empty((len(values), 1, columns)), mean, M2)
+    # Merged in place: row 0 now holds the number of all observations. Copied, so that the result
+    # does not keep ``size`` in memory.
     return Moments(size[0].copy(), mean, M2)
 
 

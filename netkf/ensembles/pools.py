@@ -79,6 +79,7 @@ class LocalPool(Pool):
     ahead = 1
 
     def __init__(self) -> None:
+        """Make a pool whose first block has one run; see ``_note_duration`` for the next ones."""
         self._size = 1
 
     def submit(self, job: Job) -> Future[Any]:
@@ -184,6 +185,8 @@ class RemotePool(Pool):
     """A pool outside this process, to which each scenario is sent pickled, packed once."""
 
     def __init__(self) -> None:
+        """Make a pool that has packed no scenario yet."""
+        # The last scenario and its packed form, to be reused for its other blocks.
         self._packed: tuple[object, PackedScenario] | None = None
 
     def submit(self, job: Job) -> Future[Any]:
@@ -211,8 +214,10 @@ class ExecutorPool(RemotePool):
     """A user's concurrent.futures executor, which is not shut down."""
 
     def __init__(self, executor: Executor) -> None:
+        """Make a pool that submits its blocks to ``executor``."""
         super().__init__()
         self._executor = executor
+        # Executors do not tell their number of workers; those of the standard library have it here.
         self.width = getattr(executor, "_max_workers", None) or cores()
 
     def _send(self, job: Job) -> Future[Any]:
@@ -302,6 +307,7 @@ class ProcessPool(RemotePool):
     """Own worker processes, each with one BLAS thread and without the user's script as __main__."""
 
     def __init__(self, workers: int) -> None:
+        """Make a pool of at most ``workers`` processes, which are started as blocks need them."""
         super().__init__()
         self.width = workers
         self._workers = WorkerProcesses(workers)

@@ -162,11 +162,12 @@ def _gather(
 def _make_blocks(
     pool: Pool, job: Job, together: int | None, known: Mapping[int, Callable[[], Any]]
 ) -> Iterator[Job]:
-    """Yield the parts (blocks of replicas) of ``job`` that are to be simulated, in order: those not
-    ``known`` (number of a block -> function that loads its result), of the job's block size or, if
-    that is 0, of sizes that the pool chooses as blocks are submitted.
+    """Yield the blocks of replicas of ``job`` that are to be simulated, in order, each as a Job.
 
-    ``together`` is the smallest size of a block in this process, None for the default.
+    Blocks have the job's block size, and those in ``known`` (number of a block -> function that
+    loads its result) are left out; if that size is 0, the pool chooses a size, a power of two, each
+    time a block is submitted. ``together`` is the smallest size of a block in this process, a power
+    of two, None for the default.
     """
     if job.size:
         for number in range(-(-job.stop // job.size)):
@@ -181,7 +182,9 @@ def _make_blocks(
         if pool.ahead == 1:  # blocks run one at a time, in this process
             size = max(size, min_size)
         if start:
-            size = min(size, start & -start)  # a block is a node of the tree
+            # A block must be a node of the tree: ``start`` must be a multiple of its size. The
+            # largest power of two that divides ``start`` is ``start & -start``.
+            size = min(size, start & -start)
         yield job._replace(start=start, size=size)
         start += size
 

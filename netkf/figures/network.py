@@ -136,6 +136,7 @@ def draw_network(
         positions = get_positions(data.scenario.topology)
     _draw_links(axes, data, positions)
     dots = _draw_nodes(axes, data, positions, values)
+    # Labels are placed, in points, just outside the marker, whose side or diameter is sqrt(area).
     distance = 1.0 + 0.5 * math.sqrt(_dot_area(data))
     if len(data.nodes) <= MAX_LABELLED_NODES:
         for node in data.nodes:
@@ -159,7 +160,9 @@ def draw_network(
 
 
 def _dot_area(data: FigureData) -> float:
-    """Return the area of a node's marker in square points."""
+    """Return the area of a node's marker in square points: smaller in large networks, so that
+    markers do not cover each other, but never too small to see its colour.
+    """
     return max(10.0, min(80.0, 3000.0 / len(data.nodes)))
 
 

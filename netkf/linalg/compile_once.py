@@ -32,6 +32,7 @@ class SharedCache:
         self._waiting = ExitStack()
 
     def __getattr__(self, name: str) -> Any:
+        """Return the attribute ``name`` of numba's cache: all that is not defined here."""
         return getattr(self._cache, name)
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:

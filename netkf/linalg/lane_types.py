@@ -216,13 +216,15 @@ def lower_turn(context: Any, builder: Any, sig: Any, args: Any) -> Any:
 
 @lower_builtin(names.gather, types.BaseTuple, types.Array, types.Array, types.Integer, types.Array)
 def lower_gather(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-    """Emit one vector load per lane, for lane q of L entries from column ``first`` on of row
-    ``places[q]`` of ``array`` (K, W), and the transposition of these into the L rows of ``out``
-    (W, L) from ``first`` on. Where ``places[q]`` is negative, row 0 is read.
+    """Emit a gather of rows into lanes: for each lane q, one vector load of the L entries of row
+    ``places[q]`` of ``array`` (K, W) from column ``first`` on; then the transposition of the L
+    vectors, which is stored in the L rows of ``out`` (W, L) from number ``first`` on. Where
+    ``places[q]`` is negative, row 0 is read, only to load from valid memory.
 
     numba calls it for ``gather(lanes, array, places, first, out)``: ``sig`` has the types of the
     call, ``args`` its LLVM values.
     """
+    # ``lanes`` is a tuple of L zeros: its type tells L.
     count = len(sig.args[0])
     array, out = (_Matrix(builder, sig.args[k], args[k]) for k in (1, 4))
     begin, zero = context.cast(builder, args[3], sig.args[3], types.intp), ir.Constant(I64, 0)
@@ -234,6 +236,7 @@ def lower_gather(context: Any, builder: Any, sig: Any, args: Any) -> Any:
     for k, value in enumerate(_transposed(builder, vectors)):
         row = builder.add(begin, ir.Constant(I64, k))
         builder.store(value, out.line(row, count), align=8)
+    # numba wants an LLVM value also for a function that returns nothing.
     return context.get_dummy_value()
 
 

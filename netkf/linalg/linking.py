@@ -180,12 +180,17 @@ def _internalise(optimize: Callable[..., Any]) -> Callable[..., Any]:
 
 
 class _OwnCode:
-    """A library as numba links it, reduced to its own functions without its callees."""
+    """A library as numba links it, reduced to its own functions without its callees.
+
+    It stands for ``library`` in lists of callees; only ``_get_module_for_linking`` differs.
+    """
 
     def __init__(self, library: Any) -> None:
+        """Wrap a numba code ``library``."""
         self._library = library
 
     def __getattr__(self, name: str) -> Any:
+        """Return the attribute ``name`` of the wrapped library: all that is not defined here."""
         return getattr(self._library, name)
 
     def _get_module_for_linking(self) -> Any:

@@ -122,7 +122,7 @@ def fill_row(
 ) -> None:
     """Write the sum of ``gap^k series[m, cell, k]`` (W,) over k < ``terms`` into row ``row`` of
     ``out`` (L, W), for model ``m`` and cell ``cell``, an interval of gaps, at ``gap`` seconds from
-    its centre.
+    the gap that the cell is expanded around: 0 in the first cell, the middle in the others.
 
     ``series`` (M, cells, K, W) has K >= ``terms`` coefficients for each of M models; its width W is
     a multiple of L lanes. The numbers of terms in MANY_TERMS have unrolled loops.

@@ -96,11 +96,16 @@ class Struct(metaclass=StructClass):
 
     @classmethod
     def struct_size(cls) -> int:
-        """Return the number of int64 words of a struct."""
+        """Return the number of int64 words of ``memory``: the end of the last field, which is one
+        word for a number or the address of a struct, and one word for the address of an array plus
+        one for each of its dimensions.
+        """
         last = cls.struct_fields[-1]
         kind = cls.struct_kinds[last]
+        # An int is the length of a sized tuple. It takes no word, so this one is spare.
         if isinstance(kind, int):
             return cls.struct_offsets[last] + 1
+        # kind[1] is the number of dimensions of an array (dtype, dimensions).
         return cls.struct_offsets[last] + 1 + (kind[1] if isinstance(kind, tuple) else 0)
 
     @classmethod

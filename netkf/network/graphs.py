@@ -194,7 +194,7 @@ class Cycle(Graph):
     nodes: int = field(integer(low=3, high=MAX_NODES))
 
     def build(self, seed: int) -> Topology:
-        """Return the topology with links (k, k + 1) and (0, nodes - 1)."""
+        """Return the topology with links (k, k + 1) and (0, nodes - 1); ``seed`` is not used."""
         return _make_topology(
             range(self.nodes), [(k, (k + 1) % self.nodes) for k in range(self.nodes)]
         )
@@ -207,7 +207,7 @@ class PathGraph(Graph):
     nodes: int = field(_count)
 
     def build(self, seed: int) -> Topology:
-        """Return the topology with links (k, k + 1)."""
+        """Return the topology with links (k, k + 1); ``seed`` is not used."""
         return _make_topology(range(self.nodes), [(k, k + 1) for k in range(self.nodes - 1)])
 
 
@@ -218,7 +218,10 @@ class Complete(Graph):
     nodes: int = field(_count)
 
     def build(self, seed: int) -> Topology:
-        """Return the topology that links all pairs."""
+        """Return the topology that links all pairs; ``seed`` is not used.
+
+        Raises ScenarioError beyond MAX_LINKS links.
+        """
         _check_size(self.nodes, self.nodes * (self.nodes - 1) // 2)
         pairs = [(i, j) for i in range(self.nodes) for j in range(i + 1, self.nodes)]
         return _make_topology(range(self.nodes), pairs)
@@ -231,7 +234,7 @@ class Star(Graph):
     nodes: int = field(_count)
 
     def build(self, seed: int) -> Topology:
-        """Return the topology with links (0, k)."""
+        """Return the topology with links (0, k); ``seed`` is not used."""
         return _make_topology(range(self.nodes), [(0, k) for k in range(1, self.nodes)])
 
 
@@ -337,9 +340,14 @@ class ErdosRenyi(RandomGraph):
     p: float = field(probability)
 
     def build(self, seed: int) -> Topology:
-        """Return a topology from ``networkx.fast_gnp_random_graph``."""
+        """Return a topology from ``networkx.fast_gnp_random_graph``, drawn with the graph's own
+        seed or else with the root seed ``seed``.
+
+        Raises ScenarioError for a graph that is too large.
+        """
         import networkx
 
+        # Refuse a graph whose expected number of links is too large before it is drawn.
         _check_size(self.nodes, int(0.5 * self.p * self.nodes * (self.nodes - 1)))
         return _from_networkx(
             self._draw(seed, lambda s: networkx.fast_gnp_random_graph(self.nodes, self.p, s))

@@ -327,6 +327,7 @@ def _judge_age(
 
     ``received`` are the MESSAGE rows (M,) of the messages sent to that node, lost ones included.
     """
+    # The latest arrivals (T,) that the estimates sampled at ``run.times`` (T,) include, in seconds.
     cutoffs = source.cutoffs(run.times)
     ages: FloatArray = information_age(received, (worst.node,), run.times, cutoffs)[:, 0]
     age = ages[int(np.searchsorted(run.times, worst.time))]

@@ -58,7 +58,9 @@ class Ziggurat(NamedTuple):
 
 @cache
 def ziggurat() -> Ziggurat:
-    """Return the tables of numpy's ziggurat for exponential numbers."""
+    """Return the tables of numpy's ziggurat for exponential numbers of mean 1, loaded once; "fe",
+    "we" and "ke" are numpy's names of heights, widths and inside limits.
+    """
     with np.load(Path(__file__).with_name("ziggurat.npz")) as tables:
         return Ziggurat(tables["fe"], tables["we"], tables["ke"])
 

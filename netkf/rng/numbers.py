@@ -55,7 +55,9 @@ class NormalZiggurat(NamedTuple):
 
 @cache
 def normal_ziggurat() -> NormalZiggurat:
-    """Return the 256 layers of numpy's ziggurat for normal numbers."""
+    """Return the 256 layers of numpy's ziggurat for standard normal numbers, loaded once; "fi",
+    "wi" and "ki" are numpy's names of heights, widths and inside limits.
+    """
     with np.load(Path(__file__).with_name("ziggurat_normal.npz")) as tables:
         return NormalZiggurat(tables["fi"], tables["wi"], tables["ki"])
 

@@ -106,7 +106,9 @@ class DerivedScenario(ScenarioModel):
 
     @property
     def _network_info(self) -> NetworkInfo | None:
-        """Information matrices and senders of all nodes; None if the filter does not need them."""
+        """The believed information (N, n, n) of each node's sensors, and for each node the sorted
+        indices of the nodes it can hear; None unless the filter ``needs_network``.
+        """
         if not self.node_filter.needs_network:
             return None
         senders: dict[int, list[int]] = {node: [] for node in self.nodes}

@@ -433,10 +433,14 @@ class KeptReadings:
         return self.reading_time(int(rows[k])) if k >= 0 and rows[k] >= start else np.nan
 
     def reading_time(self, row: int) -> float:
-        """Return the time at which the reading used at a row was taken."""
+        """Return the time in seconds at which the reading that a node used at ``row`` of the log
+        was taken.
+        """
         time = float(self._times[row])
         if not self._scenario.slotted:
             return time
+        # Readings are taken at the start of a slot. A filter may use them after exchanges of that
+        # slot, and the log has the time of use.
         plant = self._scenario.slot_plant
         return plant.slot_time(int(plant.slots_of(np.array([time]))[0]))
 

@@ -40,13 +40,15 @@ def format_sweep(lines: pd.DataFrame, keys: Sequence[str]) -> str:
 
 
 def _format_short(value: Any) -> str:
-    """Return a value as a short text."""
+    """Return the value of a varied key as a text of at most MAX_LENGTH characters for a cell of the
+    table; longer texts are cut and end with "...".
+    """
     text = f"{value:g}" if isinstance(value, float) else str(value)
     return text if len(text) <= MAX_LENGTH else f"{text[: MAX_LENGTH - 3]}..."
 
 
 def _format_with_error(value: float | None, error: float | None) -> str:
-    """Return a value with its standard error as text."""
+    """Return a value with its standard error, if known, as text: ``1.2 +- 0.1``."""
     return format_number(value) + format_standard_error(error)
 
 

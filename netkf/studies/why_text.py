@@ -342,8 +342,9 @@ def _source_table(explanation: Explanation) -> str:
 
 
 def _replay_table(explanation: Explanation) -> str:
-    """Return the table of replays, runs repeated with some missing messages delivered: trace P, its
-    change, and the error if the truth is known.
+    """Return the table of replays, runs repeated with some missing messages delivered: the number
+    of these messages, trace P, its change in percent, and the length of the error if the truth is
+    known.
     """
     truth = any(math.isfinite(w.error) for w in explanation.what_ifs)
     header = ["replayed with", "messages", "trace P", "change", *(["error"] if truth else [])]
@@ -352,6 +353,7 @@ def _replay_table(explanation: Explanation) -> str:
             w.label,
             _count_messages(w),
             format_number(w.trace),
+            # The first row is the run as it was, from which the others are changes.
             "" if k == 0 else relative_change(w.trace, explanation.trace),
             *([format_number(w.error)] if truth else []),
         ]
@@ -361,7 +363,7 @@ def _replay_table(explanation: Explanation) -> str:
 
 
 def _count_messages(what_if: WhatIf) -> str:
-    """Return the number of messages of a replay as text."""
+    """Return as text the number of missing messages that a replay delivers."""
     return "all" if what_if.messages is None else str(len(what_if.messages))
 
 

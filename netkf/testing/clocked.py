@@ -61,7 +61,9 @@ class ClockTrial(Trial):
         by the kind of ``clock``, and ``shift`` (n,), if any, moves the truth on the way.
         """
         self._clock, self._increments = clock, increments
+        # The drift per second in continuous time; a :class:`System` states slots of one second.
         self._A = system.M - np.eye(len(system.M))
+        # Seconds since the start, and the number of messages sent, which decides which are lost.
         self._time, self._count = 0.0, 0
         self._in_flight: list[MessageInFlight] = []
         super().__init__(watched, system, shift)

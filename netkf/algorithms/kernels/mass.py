@@ -89,7 +89,8 @@ def learn_network(
     for i in range(n):
         # One triangle is computed and mirrored: G is symmetric bit for bit.
         for j in range(i + 1):
-            # The mean of both triangles, since C~ is symmetric only up to rounding.
+            # The mean of both triangles, since C~ is symmetric only up to rounding. Where w is 0
+            # these are nan or infinite: kernels do not raise, and ``select`` discards them.
             upper = load(lanes, mass, b, h, 2 + i * n + j) / weight
             lower = load(lanes, mass, b, h, 2 + j * n + i) / weight
             value = select(is_empty, alone[h, i, j], 0.5 * (upper + lower))

@@ -66,8 +66,11 @@ def common_basis(
 
 @kernel
 def orthogonalise(T: FloatArray) -> float:
-    """Rotate each pair of columns of T (n, n) once, in place, so that the two become orthogonal;
-    return the largest cosine that was found between two columns.
+    """Do one sweep of one-sided Jacobi rotations of T (n, n), regular, in place: each pair of
+    columns in turn is rotated to be orthogonal.
+
+    Return the largest |cosine| between two columns before their rotation. A later rotation spoils
+    earlier pairs a little, so the caller repeats sweeps until it is at most ORTHOGONAL.
     """
     n, largest = len(T), 0.0
     for p in range(n - 1):
@@ -82,7 +85,7 @@ def orthogonalise(T: FloatArray) -> float:
             if cosine <= ORTHOGONAL:
                 continue
             # The Jacobi rotation that makes columns p and q orthogonal: cotangent is that of twice
-            # its angle.
+            # its angle. Of the two roots the smaller tangent is taken, for which sweeps converge.
             cotangent = 0.5 * (qq - pp) / pq
             tangent = math.copysign(1.0, cotangent) / (
                 abs(cotangent) + math.sqrt(1.0 + cotangent * cotangent)

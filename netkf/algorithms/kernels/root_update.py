@@ -190,6 +190,7 @@ def sample_root(
         total = y[r]
         for m in range(r):
             total -= C[r, m] * y[m]
+        # C[r, r] is 0 only if R is singular and row r has no variance: its gain is 0 too.
         y[r] = total / C[r, r] if C[r, r] != 0.0 else 0.0
         # x += gains' C^-1 (y - H x) = K (y - H x).
         for i in range(n):

@@ -87,7 +87,8 @@ class SlotPlan(NamedTuple):
     directed links and H filters.
 
     first : number of the first slot
-    sensed, exchanged : (S,), whether nodes read and predict, and whether they exchange
+    sensed, exchanged : (S,), whether nodes read and predict, and whether they exchange;
+        nodes do not read or predict in slot 0 if its sample shows their initial estimates
     sample : (S,), index of the slot's sample, -1: none
     up : (B, S, E, W, L), 1 if a message arrives on a directed link in a step of the exchanges
     sent : (B, S, E, H, L), 1 if a node is asked for a message

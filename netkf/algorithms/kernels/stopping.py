@@ -42,7 +42,7 @@ class MassStep(NamedTuple):
 def has_stopped(rule: int, tolerance: float, step: MassStep, all_up: bool) -> bool:
     """Return True if a node stops after this ``step`` by ``rule``, an index in RULES. NEVER: it
     does not. PAPER: if it has information, whose change has a spectral norm below ``tolerance``.
-    SAFE: if its network estimate changed by less than ``tolerance`` (relative) while all its links
+    SAFE: if its network estimate changed by at most ``tolerance`` (relative) while all its links
     were up (``all_up``) and its weight is positive.
     """
     if rule == PAPER:
@@ -85,16 +85,17 @@ def moved_within(before: FloatArray, mass: FloatArray, bound: float, work: Float
 
 @kernel
 def has_positive_pivots(work: FloatArray) -> bool:
-    """Return True if elimination of the symmetric ``work`` (n, n) meets positive pivots only; it
-    works in place.
+    """Return True if the symmetric ``work`` (n, n) is positive definite: if its elimination meets
+    positive pivots only. Overwrites ``work``, of which only the lower triangle is used.
     """
     n = len(work)
     for k in range(n):
+        # ``not >`` rejects nan.
         if not work[k, k] > 0.0:
             return False
         for i in range(k + 1, n):
-            # LDL' elimination of the lower triangle; by Sylvester's law the pivots carry the
-            # inertia.
+            # LDL' elimination of the lower triangle. By Sylvester's law of inertia the pivots D
+            # have the signs of the eigenvalues.
             factor = work[i, k] / work[k, k]
             for j in range(k + 1, i + 1):
                 work[i, j] -= factor * work[j, k]
@@ -109,7 +110,7 @@ def has_converged(
     number: float,
     tolerance: float,
 ) -> bool:
-    """Return True if a node's network estimate changed by less than ``tolerance`` (relative) in a
+    """Return True if a node's network estimate changed by at most ``tolerance`` (relative) in a
     step: the number of nodes N^(i) from ``former_number`` to ``number``, and the information G^(i)
     (n, n) from ``former`` to ``information``, in the Frobenius norm.
     """
@@ -122,4 +123,5 @@ def has_converged(
             difference = information[i, j] - former[i, j]
             change += difference * difference
             square += information[i, j] * information[i, j]
+    # <=, so that an information of 0 that stays 0 has converged.
     return math.sqrt(change) <= tolerance * math.sqrt(square)

@@ -317,8 +317,8 @@ def end_of_ticks(state: Simulation) -> float:
 
 @kernel
 def queue_ticks(state: Simulation, visits: Visits, first: int, until: float) -> None:
-    """Queue the visits, predictions of nodes that send and receive, of the next tick, and of all
-    later ticks before ``until`` (seconds) while the queue has space. ``first`` is the place of the
+    """Queue the visits (predictions of nodes that send or receive) of the next tick, and of all
+    later ticks before ``until`` (seconds) while the queue has space. ``first`` is the row of the
     run's first node in ``state.xhat``.
     """
     ticks, space = state.ticks, len(visits.records) - 2 - state.most_messages
@@ -330,9 +330,9 @@ def queue_ticks(state: Simulation, visits: Visits, first: int, until: float) -> 
 
 @kernel
 def queue_tick(state: Simulation, visits: Visits, first: int, now: float) -> None:
-    """Queue the visits, predictions of nodes that send and receive, of the next tick, at ``now``
+    """Queue the visits (predictions of nodes that send or receive) of the next tick, at ``now``
     (seconds); record or count its messages and their absorption, and advance ``state.tick_at``.
-    ``first`` is the place of the run's first node in ``state.xhat``.
+    ``first`` is the row of the run's first node in ``state.xhat``.
     """
     ticks, nodes, k = state.ticks, state.nodes, state.tick_at
     entity, bits = state.entities[ticks.entity[k]], ticks.arrival_bits[k]
@@ -345,9 +345,12 @@ def queue_tick(state: Simulation, visits: Visits, first: int, now: float) -> Non
     if bits != 0:
         queue_pairs(state, visits, k, first, now)
         return
-    # The sender of a message that is lost needs no prediction, unless it reads increments.
+    # All messages are lost, so nothing is combined. A node without increment sensors (``sensor`` to
+    # ``sensors`` - 1) needs no visit: it can be predicted over the whole gap later. Increments are
+    # used up to each transmission, as the SimPy engine does, so that both use equal intervals.
     if nodes[entity.sender].sensors > nodes[entity.sender].sensor:
         queue_visit(state, visits, now, first + entity.sender)
+    # The clock of a link makes both of its ends send.
     if state.clock_kind == LINKS and nodes[entity.other].sensors > nodes[entity.other].sensor:
         queue_visit(state, visits, now, first + entity.other)
 
@@ -377,8 +380,9 @@ def record_tick(
 ) -> None:
     """Append to ``state.rows`` a tick at ``now`` (seconds) of node i (and j, -1: none), its
     messages on the directed links ``outgoing[begin:after]``, of which number m - ``begin`` arrives
-    if that bit of ``bits`` is 1, and their absorption. Counts these messages in ``directions`` and
-    the transmission in ``nodes[i].sent``; i and j are indices of nodes.
+    if that bit of ``bits`` is 1, and their absorption at ``now`` (messages take no time). Count
+    these messages in ``directions`` and the transmission in ``nodes[i].sent``; i and j are indices
+    of nodes.
     """
     nodes, receivers = state.nodes, 0
     record_event(state, now, TICK, nodes[i].id, nodes[j].id if j >= 0 else -1, -1)
@@ -398,6 +402,7 @@ def record_tick(
             receivers += 1
         else:
             record_event(state, now, LOST, sender_id, receiver_id, number)
+    # Receivers absorb in the order of their indices, as in the SimPy engine.
     sort_indices(state.waiting, receivers)
     for m in range(receivers):
         record_event_with_age(state, now, ABSORB, nodes[state.waiting[m]].id, -1, -1, 0.0)
@@ -461,10 +466,10 @@ def set_receiving_link(visits: Visits, v: int, first: bool, direction: int) -> N
 
 @kernel
 def fill_arrival_bits(state: Simulation, first: int, after: int, delays: int) -> None:
-    """Write ``state.ticks.arrival_bits`` of the ticks ``first`` to ``after`` - 1, in which visits
-    look up what arrives: bit m is 1 if message m of a tick arrives. The outcomes of these ticks'
-    run begin at index ``delays`` of ``state.ticks.delay``, which holds the delay of each message,
-    negative or nan if it is lost.
+    """Write ``state.ticks.arrival_bits`` of the ticks ``first`` to ``after`` - 1 of one run, in
+    which visits look up what arrives: bit m is 1 if message m of a tick arrives (a tick has at most
+    MAX_LINKS_OF_CLOCK messages). ``state.ticks.delay`` holds the delay of each message in seconds,
+    negative or nan if it is lost; those of this run begin at index ``delays``.
     """
     ticks, entities = state.ticks, state.entities
     for k in range(first, after):

@@ -128,10 +128,11 @@ def simulate_from(state: Simulation, batch: BatchArrays, run: int, resumed: bool
 
 @kernel
 def begin(state: Simulation, batch: BatchArrays, run: int) -> None:
-    """Set ``state`` to the beginning of run number ``run`` of a batch: the indices of its next
-    tick, sample, piece of the path and so on, ``counts`` 0, and no polynomial of its path cached.
+    """Set ``state`` to time 0 of run number ``run`` of a batch: the indices (``..._at``, ``piece``,
+    ``row``) of its next tick, sample, piece of the path and so on, the event counts 0, and no
+    polynomial of its path cached. ``reset_filters`` resets the estimates.
     """
-    # Polynomials of the path are cached for each of the runs that are simulated together.
+    # ``path.known`` (G, C) belongs to the G runs that are simulated together: take this run's row.
     state.run, cached = run, run - state.first_run
     state.frame_at = state.piece = state.grid_at = state.wake_at = state.instant_at = 0
     state.tick_at, state.ticks_stop = batch.first[run], batch.first[run + 1]
@@ -139,6 +140,7 @@ def begin(state: Simulation, batch: BatchArrays, run: int) -> None:
     state.probe_at = state.row = state.samples = 0
     for kind in range(len(state.counts)):
         state.counts[kind] = 0
+    # -1 is the number of no piece: entries left by the previous run must not be found.
     for course in range(state.path.known.shape[1]):
         state.path.known[cached, course] = -1
 

@@ -28,8 +28,9 @@ from netkf.linalg.structs import Struct
 
 
 class EvidenceArrays(Struct):
-    """Evidence (n, n + 1, 1), see kernels.beliefs, of N nodes, W directed links and C messages. It
-    is relative to the estimate of the node that holds it.
+    """Evidence of N nodes, W directed links and C messages, relative to the estimate of the node
+    that holds it. Evidence is a root [Z, z] (n, n + 1, 1) of an information matrix Z' Z and vector
+    Z' z, see kernels.beliefs; the last axis is the one run that is simulated.
 
     prior, own : (N, ...), priors, and evidence of own readings
     received, sent_at : (W, ...), evidence that was received last on each link, and the time (W,) at
@@ -66,14 +67,15 @@ class EvidenceArrays(Struct):
 
 
 def empty_evidence(state: Simulation, A: FloatArray, roots: FloatArray) -> EvidenceArrays:
-    """Return the arrays of belief propagation for N nodes at time 0. Evidence is information (a
-    matrix and a vector) about the state: at time 0 priors only, from the roots of P of all nodes,
-    ``roots`` (1, N, n, n, 1). There is space for the messages of ``state``. ``A`` (n, n) is the
-    plant's matrix in 1/s.
+    """Return the arrays of belief propagation for N nodes at time 0, with space for the messages of
+    ``state``. Evidence is information about the state, a root [Z, z] (n, n + 1, 1) of its matrix
+    and vector: at time 0 there are priors only, from the roots of P of all nodes, ``roots`` (1, N,
+    n, n, 1). ``A`` (n, n) is the plant's matrix in 1/s.
     """
     N, n = state.xhat.shape
     directions, p, shape = state.directions, len(state.scratch.y), (n, n + 1, 1)
-    # Directed links by receiver, then by sender: the last key counts first.
+    # Directed links by receiver, then by sender (lexsort sorts by its last key first), so that the
+    # incoming links of a node are neighbours.
     incoming = np.lexsort((directions["sender"], directions["receiver"]))
     prior = np.zeros((N, *shape))
     for h in range(N):

@@ -164,8 +164,7 @@ def next_interval(rate: float, now: float, time: float, least: float) -> tuple[f
     """
     end, interval = time, usable(rate)
     if interval < time - now:
-        # A lower bound that is set once per gap, otherwise an exploding P asks for ever shorter
-        # intervals.
+        # A lower bound that is set once per gap: a diverging P would make intervals ever shorter.
         if least == 0.0:
             least = MIN_GAP_SHARE * (time - now)
         end = interval_end(now, time, max(interval, least))
@@ -197,13 +196,16 @@ def predict_with_increments(
     state: Simulation, run: int, h: int, k: int, piece: int, now: float, time: float
 ) -> None:
     """Predict node ``h`` (index in ``state.nodes``) of run number ``run`` from ``now`` to ``time``
-    (seconds) and use its increments on the way, in as many intervals as P asks for: a wide P
-    changes fast while it is corrected. Changes row ``k`` of ``state.xhat`` and ``state.root``,
-    where the node's estimate is; ``time`` lies in the ``piece`` of the path (index).
+    (seconds) and use its increments on the way. Changes row ``k`` of ``state.xhat`` and
+    ``state.root``, where the node's estimate is; ``time`` lies in piece ``piece`` (index) of the
+    path.
+
+    Each update uses the increments of one interval, which must be short enough that P changes
+    little over it; the larger P, the shorter the interval (``next_interval``).
     """
     whitened_H, least = state.table.whitened_H[state.nodes[h].model], 0.0
     while now < time:
-        # How much of the gap may be used at once depends on the rate of information, trace(P G).
+        # The length of the interval follows from the rate of information trace(P G), G = H' R^-1 H.
         rate = information_rate(ONE, state.size, whitened_H, state.root[k])
         end, least = next_interval(rate, now, time, least)
         advance_over_interval(state, run, h, k, piece, now, end)

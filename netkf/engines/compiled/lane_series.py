@@ -87,7 +87,7 @@ def unobserved_series(filters: Filters) -> LaneSeries:
 
 def sensing_series(filters: Filters, period: float) -> LaneSeries:
     """Return the power series in the gap g, up to ``period`` seconds, of all models with increment
-    sensors, in this order of values: A model is the matrices with which a node predicts and reads.
+    sensors. A model is the matrices with which a node predicts and reads. The order of values:
 
     Q_g, exp(A g), F, G_g : noise, transition without readings, transition and information of the
         readings (Q_g and G_g as lower triangles); P moves to ``Q_g + F P (I + G_g P)^-1 F'``
@@ -157,11 +157,14 @@ def padded_gains(filters: Filters) -> FloatArray:
 
 
 def _united(series: FloatArray, unit: FloatArray, selected: np.ndarray) -> LaneSeries:
-    """Return the table of ``series`` (M, cells, terms, E) of E values in M models, ready to be
-    evaluated: equal columns stored once, cells divided where that saves terms, only as many terms
-    as the cells of ``unit`` (M,) seconds need, and the width padded to whole lanes. ``selected``
-    flags their models in the FlowTable, which has others too.
+    """Return the power series ``series`` (M, cells, terms, E) of E values in M models as a table
+    that is quick to evaluate: equal columns are stored once, cells of ``unit`` (M,) seconds are
+    divided into shorter ones, which need fewer terms, terms below rounding are left out, and the
+    width is padded to whole lanes.
+
+    ``selected`` (models of the FlowTable,) is True for the M models of ``series``.
     """
+    # Number the distinct columns in the order in which they first occur.
     indices: dict[bytes, int] = {}
     # 0.0 and not -0.0: they are the same number.
     columns = np.ascontiguousarray(np.moveaxis(series, -1, 0)) + 0.0
@@ -179,6 +182,7 @@ def _united(series: FloatArray, unit: FloatArray, selected: np.ndarray) -> LaneS
         series=padded,
         unit=unit,
         column=column.astype(np.int64),
+        # Meaningful for selected models only: the number of selected ones before each.
         row=np.cumsum(selected) - 1,
         far_terms=number_of_terms(needed[NEAR:], terms),
     )

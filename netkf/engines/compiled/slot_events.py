@@ -369,8 +369,9 @@ class SlotEvents:
                 self._inbox.setdefault(receiver, {})[sender] = (number, now - sent)
 
     def _end_step(self, step: Step, up: np.ndarray) -> None:
-        """End an exchange step: set ``up`` (W,) to 1 for the directed links of all messages in
-        inboxes, which are used now, record the absorptions, and empty the inboxes.
+        """End an exchange step: set ``up`` (W,) to 1 for those of the W directed links whose
+        messages are in inboxes (the filters' kernel uses these), record one swap for each message
+        or one absorption for each receiver, and empty the inboxes.
         """
         count = len(self._rows)
         # By receiver and sender, the order of the kernels and of SimPy.
@@ -384,6 +385,7 @@ class SlotEvents:
             if not self._algorithm.pairwise:
                 oldest = max(age for _, age in arrived.values())
                 self._append_row((step.end, ABSORB, node, -1, -1, step.phase, oldest))
+        # Mark the place for stop rows, which ``rows`` inserts once the kernel has decided on them.
         if step.step == self._setup.stages.stopping and self._recording:
             self._rows.append(StepEnd(step.slot, step.end, len(self._rows) - count))
         self._inbox.clear()

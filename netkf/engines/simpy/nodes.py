@@ -84,8 +84,9 @@ class Node:
         return envelopes, messages
 
     def shift(self, offset: FloatArray) -> None:
-        """Add ``offset`` (n,) to the estimate in ``self.state``: the origin of the coordinates has
-        moved.
+        """Add ``offset`` (n,) to the estimate in ``self.state``, after the engine has moved the
+        origin of the coordinates. It moves the origin to the present state of the plant now and
+        then, so that errors x - xhat keep their digits while an unstable plant grows.
         """
         self.state = self.algorithm.shift(self.state, offset)
 
@@ -105,17 +106,21 @@ class ClockedNode(Node):
         increments: list[Any],
         *arguments: Any,
     ) -> None:
-        """Set up a node at time 0 with its ``increments``, the paths of its increment sensors,
-        which read the ``truth``, the state of the plant; ``arguments`` are those of Node.
+        """Set up a node at time 0 whose increment sensors ``increments`` (none: empty) read the
+        path ``truth`` of the plant's state. Events are scheduled on ``timeline`` and recorded by
+        ``recorder``; ``arguments`` are those of Node.
         """
         super().__init__(*arguments)
         self._timeline, self._recorder, self._truth = timeline, recorder, truth
         self._increments = increments
+        # The time in seconds to which the filter is predicted.
         self._now = 0.0
         # The samples of the present instant, until the update that uses all of them.
         self._samples: list[tuple[int, FloatArray, Any, FloatArray]] = []
         self.after_sample: Any = None
-        """Called once the node has used its samples of an instant, with the nodes that sensed."""
+        """Function called with the time in seconds once the node has used its samples of an
+        instant; None unless readings make the node transmit.
+        """
 
     def predict_to(self, time: float) -> None:
         """Predict the filter to ``time`` (seconds), using the increments since its last event, in

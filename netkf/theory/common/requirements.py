@@ -14,19 +14,24 @@ from netkf.scenario.scenario import Scenario
 def require_scenario(functions: dict[str, Any]) -> dict[str, Any]:
     """Wrap each function whose first parameter is a Scenario, so that it refuses anything else.
 
-    Returns the wrapped functions by name. They raise ScenarioError, which says how to load one.
+    ``functions`` are the public objects of ``netkf.theory`` by name. Returns the wrapped functions
+    by name, and leaves out classes and functions of other arguments. A wrapped function raises
+    ScenarioError, which says how to load a scenario, since a path is the usual mistake.
     """
     wrapped = {}
     for name, function in functions.items():
         if inspect.isfunction(function):
             first = next(iter(inspect.signature(function).parameters.values()), None)
+            # Modules postpone the evaluation of annotations (PEP 563), so that they are strings.
             if first is not None and first.annotation == "Scenario":
                 wrapped[name] = _check_first_argument(name, function)
     return wrapped
 
 
 def _check_first_argument(name: str, function: Callable[..., Any]) -> Callable[..., Any]:
-    """Return the function with a check that its first argument is a Scenario."""
+    """Return the ``function``, public as ``netkf.theory.<name>``, with a check that its first
+    argument is a Scenario.
+    """
 
     @wraps(function)
     def checked(scenario: Any, *args: Any, **kwargs: Any) -> Any:

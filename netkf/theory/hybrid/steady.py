@@ -290,13 +290,18 @@ def _guess(points: list[tuple[float, float]], low: float, high: float, fine: flo
     """Return a factor on all link rates close to the threshold above which the bound on the mean of
     P has a steady state, extrapolated from the last two ``points``, pairs (factor, 1 / max P).
 
-    The inverse of the covariances falls to 0 at the threshold, which lies between ``low`` and
-    ``high``; it is sought to the relative accuracy ``fine``.
+    1 / max P falls to 0 at the threshold, which lies between ``low`` (no steady state) and
+    ``high`` (a steady state) and is sought to the relative accuracy ``fine``. The guess lies
+    between them too; it is their geometric mean if the extrapolation does not.
     """
     (f, inverse), (g, following) = points[-2:]
+    # The secant through both points meets 0 at ``root``. It usually lies slightly above the
+    # threshold, since both points do.
     root = g - following * (f - g) / (inverse - following) if inverse != following else high
     above = root * (1.0 + 0.4 * fine)
-    # From two points above, the guess lies above too: the next one is as far below it.
+    # First try a factor just above ``root``, to lower ``high``. Once ``high`` is about that close,
+    # try one as far below ``root`` as ``high`` is above it, to raise ``low``. As ``above`` exceeds
+    # ``root`` by less than fine / 2, both ends together then meet the accuracy.
     factor = above if above < 0.5 * (root + high) else 2.0 * root - high
     return factor if low < factor < high else float(np.sqrt(low * high))
 

@@ -72,8 +72,11 @@ class ReadingExchangeRule(ErrorRule):
             arrivals.sort()
 
     def _update(self, name: Hashable, nodes: Sequence[int]) -> None:
-        """Update the error ``name`` and the root of its P by the readings of the ``nodes``
-        (indices) that have some.
+        """Update the error ``name`` and the root of its P by the readings that the ``nodes``
+        (indices) took at the present time; nodes without one are skipped.
+
+        ``name`` is the index of an estimate, or ("version", index, T) for its version that ends at
+        T. Nodes that use the same reading use the same columns of noise, hence the same noise.
         """
         for node in nodes:
             if node in self._observations:
