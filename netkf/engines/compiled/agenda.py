@@ -290,8 +290,7 @@ def queue_events(state: Simulation, visits: Visits, until: float) -> int:
         if event == ON_TICK:
             queue_ticks(state, visits, first, min(until, end_of_ticks(state)))
         elif event == ON_SENSE:
-            queue_visit(state, visits, now, first + state.sensing.index[state.wake_at])
-            on_sense(state, now)
+            queue_readings(state, visits, first, now)
         else:
             # A move of the origin or a sample: all nodes are predicted to it.
             for h in range(nodes):
@@ -301,6 +300,21 @@ def queue_events(state: Simulation, visits: Visits, until: float) -> int:
             queue_sample(state, visits, first)
             if not count_sample(state):
                 return WANT_SAMPLES
+
+
+@kernel
+def queue_readings(state: Simulation, visits: Visits, first: int, now: float) -> None:
+    """Queue the visits, predictions of nodes with increment sensors, of the next reading at
+    ``now`` (seconds), a point of the sensing grid, and of the other nodes' readings at this point
+    while the queue has space. ``first`` is the row of the run's first node in ``state.xhat``.
+    """
+    while True:
+        queue_visit(state, visits, now, first + state.sensing.index[state.wake_at])
+        on_sense(state, now)
+        # ``wake_at`` is 0 again after the last node. A run with rows goes node by node, since each
+        # event checks the space for its rows.
+        if state.traced or state.wake_at == 0 or visits.count == len(visits.records):
+            return
 
 
 @kernel
