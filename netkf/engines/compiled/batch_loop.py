@@ -25,6 +25,7 @@ class BatchArrays(Struct):
     nodes, xhat, root : filters at time 0, (N,), (N, n) and (N, n, n)
     first, first_delay : (R + 1,), run r has the ticks ``first[r]`` to ``first[r + 1]`` - 1, whose
                          outcomes begin at ``first_delay[r]``
+    x, error : true states at the T sample times (R, T, n), and x - xhat (R, T, N, n)
     lengths, counts : number of samples (R,), and of events by kind (R, len(KINDS))
     diverged : (R,), 1 if the last sample is not finite
     carriers : number of nodes that share one filter, if filters are pooled
@@ -36,6 +37,8 @@ class BatchArrays(Struct):
     root: FloatArray
     first: IntArray
     first_delay: IntArray
+    x: FloatArray
+    error: FloatArray
     lengths: IntArray
     counts: IntArray
     diverged: IntArray
@@ -81,6 +84,8 @@ def no_batch() -> BatchArrays:
         root=np.zeros((0, 0, 0)),
         first=no_runs,
         first_delay=no_runs,
+        x=np.zeros((0, 0, 0)),
+        error=np.zeros((0, 0, 0, 0)),
         lengths=no_runs,
         counts=np.zeros((0, len(KINDS)), dtype=np.int64),
         diverged=no_runs,
@@ -179,11 +184,12 @@ def reset_messages(state: Simulation) -> None:
 
 @kernel
 def finish(state: Simulation, batch: BatchArrays, run: int) -> None:
-    """Store the results of run number ``run`` in ``batch``: its number of samples ``lengths``, its
-    events ``counts`` and whether it has ``diverged``; up to the first sample that is not finite if
-    there is one.
+    """Store the results of run number ``run`` in ``batch``: its errors, its number of samples
+    ``lengths``, its events ``counts`` and whether it has ``diverged``; but for the errors, up to
+    the first sample that is not finite if there is one.
     """
     buffer = state.buffer
+    fill_errors(batch, buffer.xhat, run, state.samples)
     for kind in range(batch.counts.shape[1]):
         batch.counts[run, kind] = state.counts[kind]
     for k in range(state.samples):
@@ -197,6 +203,19 @@ def finish(state: Simulation, batch: BatchArrays, run: int) -> None:
             batch.counts[run, DIVERGED] += diverged * batch.carriers
             batch.diverged[run] = 1
             return
+
+
+@kernel
+def fill_errors(batch: BatchArrays, xhat: FloatArray, run: int, samples: int) -> None:
+    """Write x - xhat of the first ``samples`` samples of run number ``run`` into ``batch.error``,
+    from its states ``batch.x`` and the estimates ``xhat`` (R, T, N, n) of all R runs.
+    """
+    # No origin moves in these runs: local and absolute states are the same.
+    x, error = batch.x, batch.error
+    for k in range(samples):
+        for h in range(error.shape[2]):
+            for i in range(error.shape[3]):
+                error[run, k, h, i] = x[run, k, i] - xhat[run, k, h, i]
 
 
 @kernel

@@ -115,15 +115,13 @@ def _all_at_once(scenario: Scenario, workspace: Workspace, draws: BatchDraws) ->
         simulate_together(state, workspace.visits(group), arrays, group)
     else:
         simulate_batch(workspace.begin(draws, traced=False, buffer=buffer), arrays)
-    x = draws.sampled_states(scenario.times)
     return RunBatch(
         replicas=draws.replicas,
         times=scenario.times,
-        x=x,
+        x=arrays.x,
         xhat=buffer.xhat,
         P=buffer.P,
-        # No origin moves in these runs: local and absolute states are the same.
-        error=x[:, :, None] - buffer.xhat,
+        error=arrays.error,
         lengths=arrays.lengths,
         counts=arrays.counts,
         status=np.where(arrays.diverged > 0, DIVERGED, COMPLETE),
@@ -134,15 +132,17 @@ def _all_at_once(scenario: Scenario, workspace: Workspace, draws: BatchDraws) ->
 def _batch_arrays(scenario: Scenario, start: Filters, draws: BatchDraws) -> BatchArrays:
     """Return the arrays of a batch of R runs, which tell the kernel where each run begins: the
     filters ``start`` at time 0, the ticks of its runs in ``draws``, and space for results:
-    ``lengths`` (R,), ``counts`` (R, kinds), ``diverged`` (R,).
+    ``error`` (R, T, N, n), ``lengths`` (R,), ``counts`` (R, kinds), ``diverged`` (R,).
     """
-    runs = len(draws.replicas)
+    runs, x = len(draws.replicas), draws.sampled_states(scenario.times)
     return BatchArrays(
         nodes=start.nodes,
         xhat=start.xhat,
         root=start.root,
         first=draws.ticks.first,
         first_delay=draws.ticks.first_delay,
+        x=x,
+        error=np.empty((*x.shape[:2], *start.xhat.shape)),
         lengths=np.zeros(runs, dtype=np.int64),
         counts=np.zeros((runs, len(KINDS)), dtype=np.int64),
         diverged=np.zeros(runs, dtype=np.int64),
@@ -271,8 +271,9 @@ class BatchDraws:
         block = self._block
         # Times of samples are ends of pieces or, at time 0, the start of the first.
         pieces = np.searchsorted(block.end, times)
-        ends = (times == block.end[pieces])[:, None]
-        return np.where(ends, block.x_end[:, pieces], block.x_start[:, pieces])
+        x, starts = block.x_end.take(pieces, axis=1), times != block.end[pieces]
+        x[:, starts] = block.x_start[:, pieces[starts]]
+        return x
 
 
 class RunDraws:
