@@ -44,7 +44,6 @@ def local_slots(
     """
     for b in range(plan.up.shape[0]):
         for s in range(plan.up.shape[1]):
-            # False in slot 0, whose sample shows the initial estimates.
             if plan.sensed[s]:
                 predict_all(nodes, scratch, b)
                 read_all(nodes, readings, scratch, b, s)

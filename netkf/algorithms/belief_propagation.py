@@ -160,7 +160,6 @@ def belief_slots(
         k, lanes = min(b, arrays.own.shape[0] - 1), scratch.lanes
         own, received = arrays.own[k], arrays.received[k]
         for s in range(plan.up.shape[1]):
-            # False in slot 0, whose sample shows the initial estimates.
             if plan.sensed[s]:
                 predict_beliefs(nodes, scratch, arrays, b)
                 for h in range(len(nodes.rows)):

@@ -402,7 +402,6 @@ def pseudo_slots(
     """
     for b in range(plan.up.shape[0]):
         for s in range(plan.up.shape[1]):
-            # False in slot 0, whose sample shows the initial estimates.
             if plan.sensed[s]:
                 for h in range(len(nodes.rows)):
                     predict_pseudo(

@@ -100,7 +100,6 @@ def constant_gain_slots(
     """
     for b in range(plan.up.shape[0]):
         for s in range(plan.up.shape[1]):
-            # False in slot 0, whose sample shows the initial estimates.
             if plan.sensed[s]:
                 predict_all(nodes, scratch, b)
                 for h in range(len(nodes.rows)):

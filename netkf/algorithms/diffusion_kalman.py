@@ -78,7 +78,6 @@ def diffusion_kalman_slots(
     """
     for b in range(plan.up.shape[0]):
         for s in range(plan.up.shape[1]):
-            # False in slot 0, whose sample shows the initial estimates.
             if plan.sensed[s]:
                 predict_all(nodes, scratch, b)
                 # Step 1, psi: update with the own reading and those that arrive in exchange 0.

@@ -105,7 +105,6 @@ def kcf_slots(
     """
     for b in range(plan.up.shape[0]):
         for s in range(plan.up.shape[1]):
-            # False in slot 0, whose sample shows the initial estimates.
             if plan.sensed[s]:
                 predict_all(nodes, scratch, b)
                 # Consensus is on predictions and their covariances: before any reading is used. The

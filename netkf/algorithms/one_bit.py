@@ -126,7 +126,6 @@ def one_bit_slots(
                 drop_silent(plan, links, b, s, 0)
             if plan.part == SENDING:
                 continue
-            # False in slot 0, whose sample shows the initial estimates.
             if plan.sensed[s]:
                 predict_all(nodes, scratch, b)
                 share_bits(nodes, readings, plan, links, scratch, arrays, turn, b, s)
