@@ -144,38 +144,35 @@ def diffusion(case):
 
 
 def laws(A, B, H, V):
-    """Taylor coefficients (BINS, ORDER + 1, E) of ``by_hand.flow``'s laws in the gap, and the law
-    of state and integral over STEP.
+    """Coefficients (BINS, ORDER + 1, E) of ``by_hand.flow``'s laws as polynomials in the gap, and
+    the law of state and both integrals over STEP.
     """
-    (n, p), double = (len(A), len(H)), np.zeros((2 * len(A),) * 2)
-    double[:n, :n], double[n:, :n] = A, np.eye(n)
-    spread = np.zeros((2 * n, 2 * n))
-    spread[:n, :n] = B @ B.T
+    n, chain, spread = len(A), *(np.zeros((3 * len(A),) * 2) for _ in range(2))
+    chain[:n, :n], chain[n:, : 2 * n], spread[:n, :n] = A, np.eye(2 * n), B @ B.T
 
     def over(gap):
-        """Transition and covariance (2 n, 2 n), Van Loan."""
-        block = np.block([[-double, spread], [np.zeros_like(double), double.T]])
+        """Transition and covariance (3 n, 3 n), Van Loan."""
+        block = np.block([[-chain, spread], [np.zeros_like(chain), chain.T]])
         M = scipy.linalg.expm(block * gap)
-        F = M[2 * n :, 2 * n :].T
-        return F, F @ M[: 2 * n, 2 * n :]
+        F = M[3 * n :, 3 * n :].T
+        return F, F @ M[: 3 * n, 3 * n :]
 
-    def entries(F, Q, V):
-        low_n, low_p = np.tril_indices(n), np.tril_indices(p)
-        parts = F[:n, :n], Q[:n, :n][low_n], H @ F[n:, :n], Q[:n, n:] @ H.T
-        return np.concatenate([*(part.ravel() for part in parts), (H @ Q[n:, n:] @ H.T + V)[low_p]])
-
-    table = []
-    for k in range(BINS):
-        gap = (k + 0.5) * SPAN / BINS
+    def entries(gap):
         F, Q = over(gap)
-        coefficients, factor = [entries(F, Q, V * gap)], 1.0
-        for j in range(1, ORDER + 1):  # derivatives in the gap
-            F, Q = double @ F, double @ Q + Q @ double.T + (spread if j == 1 else 0.0)
-            factor /= j
-            coefficients.append(factor * entries(F, Q, V * (j == 1)))
-        table.append(coefficients)
+        # Moments of H x with 1 and 2 s / gap - 1, from both integrals.
+        T = np.kron([[1.0, 0.0], [1.0, -2.0 / gap]], H)
+        S0 = T @ Q[n:, n:] @ T.T + np.kron(np.diag([gap, gap / 3.0]), V)
+        low, low_S0 = np.tril_indices(n), np.tril_indices(len(T))
+        parts = F[:n, :n], Q[:n, :n][low], T @ F[n:, :n], Q[:n, n:] @ T.T, S0[low_S0]
+        return np.concatenate([part.ravel() for part in parts])
+
+    # Interpolated between Chebyshev points.
+    points = np.polynomial.chebyshev.chebpts1(ORDER + 1) * 0.5 * SPAN / BINS
+    middles = (np.arange(BINS) + 0.5) * SPAN / BINS
+    values = np.array([[entries(middle + point) for point in points] for middle in middles])
+    table = np.linalg.solve(np.vander(points, increasing=True), values)
     F, Q = over(STEP)
-    return np.array(table), (F, root_of(Q))
+    return table, (F, root_of(Q))
 
 
 def hybrid(case):
@@ -185,7 +182,7 @@ def hybrid(case):
     table, step_law = laws(np.array(case.plant.A), np.array(case.plant.B), H, V)
     rows = np.array([len(H) * (node in seen) for node in case.nodes])
     clock = case.network.activation.rate, delivery(case), case.filter.algorithm.epsilon
-    before = ((0,) * len(H),)
+    before = ((0,) * 2 * len(H),)
     times = np.array(case.times)
     sensor = H, np.linalg.cholesky(V)
     after = times, step_law, table, started(case), sensor, rows, ends_of(case), clock
