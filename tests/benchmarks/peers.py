@@ -1,4 +1,4 @@
-"""The same jobs with other people's tools: filterpy and Stone Soup objects in a loop over ticks,
+"""The same jobs with other people's tools: filterpy and Stone Soup objects in a loop over events,
 filterpy and simdkalman on series of readings, batched numpy, scipy's solve_ivp on the stacked bound
 (12), a plain numpy loop for the random Riccati equation.
 
@@ -8,6 +8,7 @@ pair against each other.
 
 import datetime
 import heapq
+import math
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -16,42 +17,61 @@ import scipy.integrate
 import scipy.linalg
 
 from netkf.theory.hybrid.coupled import coupled_riccati
+from tests.benchmarks.jobs import Results, root_of
 
 EPOCH = datetime.datetime(2000, 1, 1)
 
 
-class Tick(NamedTuple):
-    """A tick of a link, and the laws (F, Q) of the time since the last ones of its ends."""
+class Event(NamedTuple):
+    """What happens at a time: ``nodes`` are predicted and use what their sensors have read, then
+    the two of a ``link``, if any, swap; or the states of all are kept, at a ``probe``.
+
+    ``path`` is F and a root of Q over the time since the last event, for the true state; ``laws``
+    are the gap in seconds, F and Q since the last time of each of the nodes.
+    """
 
     t: float
-    link: tuple[int, int]
-    delivered: bool
-    gaps: tuple[float, ...]
-    laws: tuple[tuple[np.ndarray, np.ndarray], ...]
+    nodes: list[int]
+    link: tuple[int, int] | None
+    probe: bool
+    path: tuple[np.ndarray, np.ndarray]
+    laws: list[tuple[float, np.ndarray, np.ndarray]]
 
 
-def clocks(case, most):
-    """The first ``most`` ticks of Poisson clocks, from a heap of the next tick of each link: t, the
-    link, and whether messages arrive.
+def clocks(case):
+    """The ticks of Poisson clocks, from a heap of the next tick of each link: t, the link, and
+    whether messages arrive.
     """
     random = np.random.default_rng(1)
     mean, delivery = 1.0 / case.network.activation.rate, case.network.channel.loss.delivery
     heap = [(random.exponential(mean), link) for link in case.topology.links]
     heapq.heapify(heap)
-    for _ in range(most):
+    while heap[0][0] < case.horizon:
         t, link = heap[0]
         yield t, link, random.random() < delivery
         heapq.heapreplace(heap, (t + random.exponential(mean), link))
 
 
-def with_laws(case, ticks):
-    """A list of Tick: no transition matrix is worked out while others are timed."""
-    now, found = dict.fromkeys(case.nodes, 0.0), []
+def events_of(case, ticks):
+    """All events of a run with these ``ticks``: as in netkf, nodes with sensors read at each point
+    of the sensing grid and at each tick of theirs, other nodes are predicted when a message
+    arrives, and all at probes. A list: no transition matrix is worked out while others are timed.
+    """
+    seen, period = sensors(case), case.diffusion.sensing_period
+    grid = np.arange(1, round(case.horizon / period)) * period
+    # Later entries win: a probe is a point of the grid too.
+    due = {float(t): (list(seen), None, False) for t in grid if np.abs(t - case.times).min() > 1e-9}
+    due |= {float(t): (case.nodes, None, True) for t in case.times}
     for t, link, delivered in ticks:
-        gaps = tuple(t - now[node] for node in link)
-        now.update(dict.fromkeys(link, t))
-        laws = tuple(discrete(case.diffusion, gap) for gap in gaps)
-        found.append(Tick(t, link, delivered, gaps, laws))
+        due[t] = (link, link, False) if delivered else ([h for h in link if h in seen], None, False)
+    last, before, found = dict.fromkeys(case.nodes, 0.0), 0.0, []
+    for t, (touched, link, probe) in sorted(due.items()):
+        nodes = [node for node in touched if last[node] < t]
+        F, Q = discrete(case.diffusion, t - before)
+        laws = [(t - last[node], *discrete(case.diffusion, t - last[node])) for node in nodes]
+        found.append(Event(t, nodes, link, probe, (F, root_of(Q)), laws))
+        last.update(dict.fromkeys(nodes, t))
+        before = t
     return found
 
 
@@ -64,34 +84,46 @@ def discrete(truth, gap):
 
 
 def sensors(case):
-    """node -> (H, R) of those that have a sensor."""
-    return {node: case.observation_matrices(node) for node in case.sensing_nodes}
+    """node -> (H, R, a root of R) of those that have a sensor."""
+    found = {}
+    for node in case.sensing_nodes:
+        H, R = case.observation_matrices(node)
+        found[node] = H, R, np.linalg.cholesky(R)
+    return found
 
 
-def filterpy_job(case, ticks):
-    """Number of ticks, states and covariances, with one KalmanFilter a node."""
+def filterpy_job(case, events):
+    """Results of a run (without the axis of runs), with one KalmanFilter a node; a reading is the
+    mean over its gap, whose noise has covariance R / gap.
+    """
     from filterpy.kalman import KalmanFilter
 
     n, epsilon, seen = case.plant.n, case.filter.algorithm.epsilon, sensors(case)
-    random, nodes = np.random.default_rng(2), {}
+    random, nodes, kept = np.random.default_rng(2), {}, []
     for node in case.nodes:
         nodes[node] = KalmanFilter(dim_x=n, dim_z=len(seen[node][1]) if node in seen else 1)
         nodes[node].P = np.array(case.initial_estimate(node)[1])
-    for _, link, delivered, gaps, laws in ticks:
-        for h, gap, (F, Q) in zip(link, gaps, laws, strict=True):
+    x = random.multivariate_normal(case.plant.start_mean, case.plant.start_cov)
+    for event in events:
+        F, root = event.path
+        x = F @ x + root @ random.standard_normal(n)
+        for h, (gap, F, Q) in zip(event.nodes, event.laws, strict=True):
             nodes[h].predict(F=F, Q=Q)
             if h in seen:
-                H, R = seen[h]
-                nodes[h].update(random.normal(size=(len(R), 1)), R=R / gap, H=H)
-        if delivered:
-            a, b = (nodes[h] for h in link)
+                H, R, root = seen[h]
+                y = H @ x + root @ random.standard_normal(len(R)) / math.sqrt(gap)
+                nodes[h].update(y[:, None], R=R / gap, H=H)
+        if event.link:
+            a, b = (nodes[h] for h in event.link)
             mean, cov = epsilon * (b.x - a.x), epsilon * (b.P - a.P)
             a.x, a.P, b.x, b.P = a.x + mean, a.P + cov, b.x - mean, b.P - cov
-    every = [nodes[node] for node in case.nodes]
-    return len(ticks), np.array([k.x[:, 0] for k in every]), np.array([k.P for k in every])
+        if event.probe:
+            means = np.array([nodes[h].x[:, 0] for h in case.nodes])
+            kept.append((x, means, np.array([nodes[h].P for h in case.nodes])))
+    return Results(*map(np.array, zip(*kept, strict=True)))
 
 
-def stone_soup_job(case, ticks):
+def stone_soup_job(case, events):
     """The same with Stone Soup's states, predictor and updater."""
     from stonesoup.models.measurement.linear import LinearGaussian
     from stonesoup.models.transition.linear import LinearGaussianTransitionModel
@@ -113,34 +145,38 @@ def stone_soup_job(case, ticks):
         def covar(self, **_):
             return self.law[1]
 
-    random, nodes, plant = np.random.default_rng(2), {}, Plant()
+    random, nodes, plant, kept = np.random.default_rng(2), {}, Plant(), []
     predictor, updater = KalmanPredictor(plant), KalmanUpdater(None)
     for node in case.nodes:
         cov = np.array(case.initial_estimate(node)[1])
         nodes[node] = GaussianState(np.zeros((n, 1)), cov, timestamp=EPOCH)
-    for t, link, delivered, gaps, laws in ticks:
-        moment = EPOCH + datetime.timedelta(seconds=t)
-        for h, gap, law in zip(link, gaps, laws, strict=True):
+    x = random.multivariate_normal(case.plant.start_mean, case.plant.start_cov)
+    for event in events:
+        moment = EPOCH + datetime.timedelta(seconds=event.t)
+        F, root = event.path
+        x = F @ x + root @ random.standard_normal(n)
+        for h, (gap, *law) in zip(event.nodes, event.laws, strict=True):
             plant.law = law
             nodes[h] = predictor.predict(nodes[h], timestamp=moment)
             if h in seen:
-                H, R = seen[h]
+                H, R, root = seen[h]
+                y = H @ x + root @ random.standard_normal(len(R)) / math.sqrt(gap)
                 model = LinearGaussian(n, list(range(len(R))), R / gap)
                 model.matrix = lambda H=H, **_: H
-                reading = Detection(
-                    random.normal(size=(len(R), 1)), timestamp=moment, measurement_model=model
-                )
+                reading = Detection(y[:, None], timestamp=moment, measurement_model=model)
                 nodes[h] = updater.update(SingleHypothesis(nodes[h], reading))
-        if delivered:
-            i, j = link
+        if event.link:
+            i, j = event.link
             a, b = nodes[i], nodes[j]
             mean = epsilon * (b.state_vector - a.state_vector)
             cov = epsilon * (b.covar - a.covar)
             nodes[i] = GaussianState(a.state_vector + mean, a.covar + cov, timestamp=moment)
             nodes[j] = GaussianState(b.state_vector - mean, b.covar - cov, timestamp=moment)
-    every = [nodes[node] for node in case.nodes]
-    means = np.array([np.asarray(k.state_vector, dtype=float)[:, 0] for k in every])
-    return len(ticks), means, np.array([np.asarray(k.covar) for k in every])
+        if event.probe:
+            every = [nodes[h] for h in case.nodes]
+            means = np.array([np.asarray(k.state_vector, dtype=float)[:, 0] for k in every])
+            kept.append((x, means, np.array([np.asarray(k.covar) for k in every])))
+    return Results(*map(np.array, zip(*kept, strict=True)))
 
 
 def series(case, count):
@@ -159,7 +195,7 @@ def series(case, count):
 def pooled(case):
     """H and R of all sensors together."""
     seen = sensors(case).values()
-    return np.concatenate([H for H, _ in seen]), scipy.linalg.block_diag(*(R for _, R in seen))
+    return np.concatenate([H for H, *_ in seen]), scipy.linalg.block_diag(*(R for _, R, _ in seen))
 
 
 def simdkalman_filter(case, readings):

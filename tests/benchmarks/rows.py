@@ -15,9 +15,6 @@ MANY = 1000
 TOGETHER = 50
 """Runs of a hand-written kernel in one call."""
 
-TICKS = 2000
-"""Ticks that filterpy and Stone Soup make in one measurement."""
-
 
 def ensembles(case, least=8):
     """Runs of netkf."""
@@ -44,9 +41,10 @@ def batched_numpy():
 
 
 def hybrid_job(job):
-    """Ticks of 50 nodes, n = 4: objects of another package against netkf's whole runs."""
+    """Runs of 50 nodes, n = 4, by the tick: objects of another package against netkf."""
     case = cases.planar(50)
-    ticks = peers.with_laws(case, peers.clocks(case, TICKS))
+    ticks = list(peers.clocks(case))
+    events = peers.events_of(case, ticks)
     ensemble = netkf.monte_carlo(case, 16, workers=1)
     each = ensemble.messages["sent"] / 2.0 / 16  # both ends of a link send when it ticks
 
@@ -54,7 +52,7 @@ def hybrid_job(job):
         netkf.monte_carlo(case, max(1, round(count / each)), workers=1)
 
     least = round(16 * each)
-    return Side(mine, least, 100 * least), Side(lambda _: job(case, ticks), TICKS, TICKS)
+    return Side(mine, least, 100 * least), Side(lambda _: job(case, events), len(ticks), len(ticks))
 
 
 def central(job, count):

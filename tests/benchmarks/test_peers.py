@@ -13,31 +13,46 @@ def small():
     return cases.planar(18, 2.0, 8).replace({"probe": 2.0})
 
 
-@pytest.mark.parametrize("job", [peers.filterpy_job, peers.stone_soup_job])
-def test_a_job_by_hand_makes_the_covariances_of_a_run(small, job):
-    pytest.importorskip("filterpy" if job is peers.filterpy_job else "stonesoup")
-    # Readings at ticks are not readings in continuous time: sensors too poor to matter.
+JOBS = {"filterpy": peers.filterpy_job, "stonesoup": peers.stone_soup_job}
+
+
+def counted(events, case, kind):
+    """Readings on the sensing grid, or swaps."""
+    if kind == "absorb":
+        return 2 * sum(event.link is not None for event in events)
+    alone = [e for e in events if e.link is None and not e.probe and len(e.nodes) > 2]
+    return sum(len(event.nodes) for event in alone)
+
+
+@pytest.mark.parametrize("package", JOBS)
+def test_a_job_by_others_has_the_events_and_covariances_of_a_run(small, package):
+    pytest.importorskip(package)
+    # These filters take a reading's mean over a gap for a reading at its end: P is up to 4 % off.
+    run = netkf.simulate(small)
+    events = peers.events_of(small, peers.ticks_of(run))
+    for kind in ("sense", "absorb"):
+        assert counted(events, small, kind) == (run.events.kind == kind).sum() > 50
+    results = JOBS[package](small, events)
+    size = np.abs(run.P).max(axis=(2, 3), keepdims=True)
+    np.testing.assert_allclose(results.P / size, run.P / size, rtol=0, atol=0.04)
+
+
+@pytest.mark.parametrize("package", JOBS)
+def test_a_job_by_others_has_the_very_covariances_where_readings_say_nothing(small, package):
+    pytest.importorskip(package)
     poor = {"nodes": [0, 3], "H": [[1.0, 0, 0, 0], [0, 0, 1.0, 0]], "R": [[1e9, 0], [0, 1e9]]}
     case = small.replace({"sensors": [poor]})
     run = netkf.simulate(case)
-    ticks = peers.with_laws(case, peers.ticks_of(run))
-    made, _, P = job(case, ticks)
-    assert made == (run.events.kind == "tick").sum() > 100
-    last = dict.fromkeys(case.nodes, 0.0)
-    for tick in ticks:
-        last.update(dict.fromkeys(tick.link, tick.t))
-    for k, node in enumerate(case.nodes):  # a run goes on to its horizon
-        F, Q = peers.discrete(case.diffusion, case.horizon - last[node])
-        np.testing.assert_allclose(F @ P[k] @ F.T + Q, run.P[-1, k], rtol=0, atol=1e-5)
+    results = JOBS[package](case, peers.events_of(case, peers.ticks_of(run)))
+    np.testing.assert_allclose(results.P, run.P, rtol=0, atol=1e-5)
 
 
-def test_both_jobs_by_hand_have_the_same_ticks_and_states(small):
-    pytest.importorskip("filterpy")
-    pytest.importorskip("stonesoup")
-    ticks = peers.with_laws(small, peers.clocks(small, 200))
-    theirs, others = peers.filterpy_job(small, ticks), peers.stone_soup_job(small, ticks)
-    assert theirs[0] == others[0] == 200
-    for a, b in zip(theirs[1:], others[1:], strict=True):
+def test_jobs_by_others_have_the_same_states(small):
+    for package in JOBS:
+        pytest.importorskip(package)
+    events = peers.events_of(small, list(peers.clocks(small)))
+    theirs, others = (job(small, events) for job in JOBS.values())
+    for a, b in zip(theirs, others, strict=True):
         np.testing.assert_allclose(a, b, rtol=0, atol=1e-9)
 
 
