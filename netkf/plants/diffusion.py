@@ -114,7 +114,7 @@ class Diffusion(Plant):
         """Return x(0) (n,), drawn from ``random``."""
         return np.asarray(self.starts(GeneratorNormals([random]))[0])
 
-    @property
+    @cached_property
     def frame_steps(self) -> int | None:
         """Steps of the sensing grid from one frame to the next; None for a stable plant."""
         period = frame_period(self.A)

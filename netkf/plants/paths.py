@@ -22,6 +22,7 @@ known when they are compiled.
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -166,7 +167,7 @@ class DiffusionPaths:
             first, last = np.searchsorted(cuts.times, times[[0, -1]], side="right")
             block_times = cuts.times[first:last]
             # A time at the end of a piece needs no cut.
-            inside = block_times[~np.isin(block_times, block.end)]
+            inside = block_times[block.end[np.searchsorted(block.end, block_times)] != block_times]
             if len(inside):
                 block = self._cut(block, inside, cuts.normals)
         return block
@@ -203,11 +204,12 @@ class DiffusionPaths:
             # The conditional law depends only on the length and on the position of the cut: cuts
             # with the same law are drawn together. Values that differ by rounding count as equal.
             starts = pieces.start[rows[cuts]]
-            lengths = np.round(pieces.end[rows[cuts]] - starts, 12)
-            positions = np.round(times[cuts] - starts, 12)
-            laws = np.unique(np.stack([lengths, positions]), axis=1, return_inverse=True)[1].ravel()
-            for law in range(int(laws.max()) + 1):
-                group = cuts[laws == law]
+            lengths = np.round(pieces.end[rows[cuts]] - starts, 12).tolist()
+            positions = np.round(times[cuts] - starts, 12).tolist()
+            groups = defaultdict[tuple[float, float], list[int]](list)
+            for cut, length, position in zip(cuts.tolist(), lengths, positions, strict=True):
+                groups[length, position].append(cut)
+            for group in map(np.array, groups.values()):
                 self._split(
                     pieces, rows[group], stops[group], times[group], np.take(normals, group, axis=1)
                 )

@@ -44,14 +44,20 @@ MAX_BATCH_BYTES = 1 << 25
 """Limit of the bytes that are drawn for a batch, samples included."""
 
 
-def flow_batches(scenario: Scenario, seed: int, replicas: range) -> Iterator[RunBatch]:
+def flow_batches(
+    scenario: Scenario, seed: int, replicas: range, fingerprint: bool = False
+) -> Iterator[RunBatch]:
     """Yield the results of consecutive replicas (numbers of runs) in continuous time, as many runs
-    at a time as memory allows; ``seed`` is that of all their random numbers.
+    at a time as memory allows; ``seed`` is that of all their random numbers. With ``fingerprint``,
+    the first batch is the first run alone, and has the fingerprint of its events.
     """
     keep_freed_memory()
-    size = batch_size(scenario)
+    size, start = batch_size(scenario), replicas.start
     workspace = _workspace(scenario) if size > 1 else Workspace(scenario)
-    for first in range(replicas.start, replicas.stop, size):
+    if fingerprint and replicas:
+        yield _simulate(scenario, workspace, seed, replicas[:1], rows=True)
+        start += 1
+    for first in range(start, replicas.stop, size):
         yield _simulate(scenario, workspace, seed, range(first, min(first + size, replicas.stop)))
 
 
@@ -68,14 +74,18 @@ def _workspace(scenario: Scenario) -> Workspace:
     return workspace
 
 
-def _simulate(scenario: Scenario, workspace: Workspace, seed: int, replicas: range) -> RunBatch:
+def _simulate(
+    scenario: Scenario, workspace: Workspace, seed: int, replicas: range, rows: bool = False
+) -> RunBatch:
     """Draw the random numbers of the runs ``replicas`` from ``seed``, simulate them, all in one
-    kernel call where the scenario allows it, and return their samples, counts of events and states.
+    kernel call where the scenario allows it, and return their samples, counts of events and states;
+    with ``rows`` also the fingerprint of the first one's events, whose rows are written for it.
     """
     with np.errstate(over="ignore", invalid="ignore"):  # growth to infinity is reported
-        if not drawn_together(scenario):
+        # Runs that are drawn together write no rows.
+        if rows or not drawn_together(scenario):
             sources = (Source(scenario, Streams(seed, replica)) for replica in replicas)
-            return _run_by_run(scenario, workspace, sources, replicas)
+            return _run_by_run(scenario, workspace, sources, replicas, rows)
         draws = BatchDraws(scenario, seed, replicas)
         # simulate_batch() handles neither state outside the Simulation (SPECIAL) nor moves of the
         # origin, which Python does run by run.
@@ -86,15 +96,19 @@ def _simulate(scenario: Scenario, workspace: Workspace, seed: int, replicas: ran
 
 
 def _run_by_run(
-    scenario: Scenario, workspace: Workspace, draws: Iterable[Draws], replicas: range
+    scenario: Scenario,
+    workspace: Workspace,
+    draws: Iterable[Draws],
+    replicas: range,
+    rows: bool = False,
 ) -> RunBatch:
     """Simulate runs one after the other, for scenarios that need Python during a run (to draw more
     numbers, or to move the origin), and return their results; ``draws`` has the random numbers of
-    each of the ``replicas``.
+    each of the ``replicas``. ``rows``: write rows of events, of which a fingerprint is made.
     """
     sink = batch_sink(scenario, replicas)
     for run_draws in draws:
-        recorder = Recorder([sink], counts_only=True)
+        recorder = Recorder([sink], counts_only=not rows)
         run = FlowRun(scenario, workspace, run_draws, recorder, silent)
         sink.finish(recorder, run.to_the_end())
     return sink.batch()

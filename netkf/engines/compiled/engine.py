@@ -113,10 +113,7 @@ class CompiledEngine(Engine):
         """
         alone = partial(super().run_many, scenario, seed)
         if not scenario.slotted:
-            # Batches write no rows of events, which a fingerprint needs.
-            first = replicas[: int(fingerprint)]
-            yield from alone(first, fingerprint)
-            yield from flow_batches(scenario, seed, replicas[len(first) :])
+            yield from flow_batches(scenario, seed, replicas, fingerprint)
         # Messages made in Python come one run at a time.
         elif not slot_setup(scenario).is_drawn:
             yield from alone(replicas, fingerprint)

@@ -201,7 +201,7 @@ class Workspace:
         self._waiting = np.zeros(len(self._start.nodes), dtype=np.int64)
         size, n = self._start.xhat.shape
         self._pool = empty_pool(FIRST_MESSAGES, n)
-        self._rows = np.empty(FIRST_ROWS, dtype=EVENT)
+        self._rows = np.empty(0, dtype=EVENT)
         self._probes = np.array(scenario.times, dtype=np.float64)
         kind = COMBINATIONS.index(scenario.node_filter.combination)
         # Terms of conserved sums: weights held, totals sent and totals heard.
@@ -210,6 +210,7 @@ class Workspace:
         scratch = max(1, min(MAX_BUFFERED_SAMPLES, SAMPLES_ROOM // (size * n * n)))
         self._buffer = empty_samples((1, scratch, size, n), terms)
         self._visits: Visits | None = None
+        self._scratch: tuple[Any, ...] = ()
         # Code compiled for each n makes filters that combine estimates 1.5 times faster. It does
         # not help filters of sums and of readings: these share one event loop for all n.
         self._unrolled = scenario.node_filter.combination not in SPECIAL
@@ -245,9 +246,11 @@ class Workspace:
         # All messages are free: a linked list in the order of the pool.
         pool["next"] = np.arange(1, len(pool) + 1)
         path = draws.path(together)
-        scratch, flow_arrays, update_arrays = scratch_arrays(
-            start.table, start.gains, instants, self._unrolled
-        )
+        # Scratch depends on the sizes of samples: runs without samples share one Instants.
+        if not self._scratch or self._scratch[0] is not instants:
+            arrays = scratch_arrays(start.table, start.gains, instants, self._unrolled)
+            self._scratch = instants, *arrays
+        _, scratch, flow_arrays, update_arrays = self._scratch
         nodes, n = start.xhat.shape
         xhat, root = with_spare((together * nodes, n)), with_spare((together * nodes, n, n))
         xhat[:], root[:] = np.tile(start.xhat, (together, 1)), np.tile(start.root, (together, 1, 1))
@@ -275,7 +278,8 @@ class Workspace:
             frames=draws.states.frame_times,
             probes=self._probes,
             buffer=self._buffer if buffer is None else buffer,
-            rows=self._rows,
+            # The recorder keeps the rows of a traced run, so the next one gets others.
+            rows=np.empty(FIRST_ROWS, dtype=EVENT) if traced else self._rows,
             counts=np.zeros(len(schema.KINDS), dtype=np.int64),
             scratch=scratch,
             flow_scratch=flow_arrays,

@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from netkf.engines.compiled.per_scenario import once_per_scenario
 from netkf.engines.compiled.state import Instants
 from netkf.linalg.arrays import FloatArray
 from netkf.plants.sampling import Samples
@@ -38,6 +39,9 @@ class SampleTables:
         takes samples and uses them in one update), without their values; ``times`` (K,) in seconds
         are those of each sensor, by (node id, number of the sensor at the node).
         """
+        if not scenario.sampled_sensors:
+            self._sensors, self.instants = [], _no_instants(scenario)
+            return
         placed = [
             (node, placed_sensor)
             for node, sensors in scenario.sampled_sensors.items()
@@ -66,7 +70,6 @@ class SampleTables:
             for k, ((node, placed_sensor), indices) in enumerate(zip(placed, parts, strict=True))
         ]
         self.instants = _make_instants(scenario, placed, t[order], sensor[order])
-        self._matrices: list[FloatArray] = []
 
     def read(self, states: FloatArray, times: FloatArray, after: float, until: float) -> None:
         """Fill in the values ``instants.y`` (and H, where it varies) of the samples taken in
@@ -90,6 +93,12 @@ class SampleTables:
                 instants.rows
             ):  # a sensor with an H for each sample
                 instants.H[instants.matrix[indices], :p] = H
+
+
+@once_per_scenario
+def _no_instants(scenario: Scenario) -> Instants:
+    """Return the instants of all runs of a scenario without sampled sensors: none."""
+    return _make_instants(scenario, [], np.empty(0), np.empty(0, dtype=np.int64))
 
 
 def _make_instants(
