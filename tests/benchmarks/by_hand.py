@@ -17,10 +17,11 @@ import numpy as np
 
 kernel = numba.njit(nogil=True, error_model="numpy", fastmath=True, cache=True, forceinline=True)
 
-STEP = 0.25
+STEP = 0.125
 """Seconds: of the grid on which the path of a diffusion is drawn, and the longest time over which
-readings are summed up, in two moments, before they are used: P is 2e-5 larger for it than that of
-a Kalman-Bucy filter in these examples.
+readings are summed up, in two moments, before they are used. P is a millionth larger for it than
+that of a Kalman-Bucy filter in these examples, about what netkf's readings are off; a grid twice as
+wide makes that 2e-5, and a run of few nodes a quarter faster.
 """
 
 SPAN, BINS, ORDER = 1.0, 16, 4
