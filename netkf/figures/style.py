@@ -70,6 +70,8 @@ RC: dict[str, Any] = {
 }
 FORMATS = ("png", "svg", "pdf")
 RESOLUTION = 130  # dots per inch
+MAX_DRAWN = 1e250
+"""Limit of the axes: matplotlib cannot place ticks near the largest number of a float."""
 LOG_MEDIANS = 100.0
 """Ratio of the largest value to the median above which a y axis is logarithmic."""
 POINTS_PER_INCH = 72.0
@@ -230,11 +232,13 @@ def message_figure(headline: str, message: str, caption: Sequence[str]) -> Pictu
 
 def set_scale(axes: Any, values: FloatArray) -> None:
     """Set the scale and the limits of the y axis for ``values`` (any shape): logarithmic if the
-    largest one is more than LOG_MEDIANS times their median.
+    largest one is more than LOG_MEDIANS times their median. Values above MAX_DRAWN, of runs that
+    grow without bound, lie outside the axes.
     """
-    positive = values[np.isfinite(values) & (values > 0.0)]
+    positive = np.minimum(values[np.isfinite(values) & (values > 0.0)], MAX_DRAWN)
     if positive.size and positive.max() > LOG_MEDIANS * np.median(positive):
-        axes.set_yscale("log")
+        # Limits first: a new scale would compute its own, which can overflow.
         axes.set_ylim(positive.min() * 0.7, positive.max() * 1.5)
+        axes.set_yscale("log")
     elif positive.size:
         axes.set_ylim(0.0, positive.max() * 1.06)

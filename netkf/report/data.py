@@ -46,9 +46,9 @@ class Budget(NamedTuple):
     messages: int
     values: int
 
-    def halve(self) -> Budget:
-        """Return a budget of half the size."""
-        return Budget(self.messages // 2, self.values // 2)
+    def scaled(self, share: float) -> Budget:
+        """Return a budget of this ``share`` of the size."""
+        return Budget(int(share * self.messages), int(share * self.values))
 
 
 def run_data(
@@ -56,6 +56,7 @@ def run_data(
     run: StoredRun,
     messages: np.ndarray,
     readings: Innovations | str | None,
+    layout: list[list[float]],
     budget: Budget,
     packer: Packer,
 ) -> dict[str, Any]:
@@ -63,8 +64,9 @@ def run_data(
     values; its scripts read the keys.
 
     ``messages`` are the MESSAGE rows (M,) of the run, one for each message sent; ``readings`` its
-    innovations or the reason why there are none; ``budget`` limits the numbers of messages and
-    sample values. Columns of numbers are added to ``packer``, and the data refer to them.
+    innovations or the reason why there are none; ``layout`` the ``positions`` of its nodes;
+    ``budget`` limits the numbers of messages and sample values. Columns of numbers are added to
+    ``packer``, and the data refer to them.
     """
     worst = None if source.worst is None else source.worst.explained
     horizon = float(source.scenario.horizon)
@@ -82,7 +84,7 @@ def run_data(
         "n": run.x.shape[1],
         "nodes": list(run.nodes),
         "sensors": [node for node in run.nodes if node in source.scenario.placed_sensors],
-        "positions": positions(source, run),
+        "positions": layout,
         "knowledge": source.knowledge,
         "flow": _flow_kind(source),
         "continuous": sorted(source.scenario.increment_sensors),
@@ -123,8 +125,8 @@ def thinning_rules(data: dict[str, Any]) -> list[str]:
     if data["samples"]["step"] > 1:
         rules.append(
             f"of {totals['samples']:,} sample times the page holds {data['samples']['count']:,}: "
-            f"every {data['samples']['step']}th, the last, and the worst instant of each node. "
-            "Averages are of all samples"
+            f"every {data['samples']['step']}th, the last, and the worst instants of the nodes "
+            "with the largest errors. Averages are of all samples"
         )
     if totals["links"] > len(data["links"]):
         rules.append(
@@ -147,7 +149,8 @@ def sample_indices(run: StoredRun, max_values: int, instant: float) -> np.ndarra
     """Return the sorted indices (K,) of the K samples of a run that a page holds.
 
     They are all samples, or if these have more than ``max_values`` numbers every k-th, the last
-    one, the one at ``instant`` (seconds), and that with the largest error of each node.
+    one, the one at ``instant`` (seconds), and that with the largest error of each node, in the
+    order of these errors until they are as many as fit into ``max_values``.
     """
     n, count = run.x.shape[1], len(run.nodes)
     # The numbers of a sample: for each node xhat, the upper triangle of P, squared error, NEES,
@@ -162,7 +165,10 @@ def sample_indices(run: StoredRun, max_values: int, instant: float) -> np.ndarra
     indices = {*range(0, total, step), at_instant, total - 1}
     if run.truth_known:
         error = np.where(np.isfinite(run.sq_error), run.sq_error, -1.0)
-        indices |= set(error.argmax(axis=0).tolist())
+        worst_first = np.argsort(-error.max(axis=0), kind="stable")
+        # A dictionary keeps the order of its keys, and each of them once.
+        worst = dict.fromkeys(error.argmax(axis=0)[worst_first].tolist())
+        indices.update(list(worst)[:max_samples])
     return np.array(sorted(indices))
 
 

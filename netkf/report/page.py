@@ -16,7 +16,7 @@ from netkf.core.errors import ScenarioError, WriteError
 from netkf.core.version import __version__
 from netkf.report import tables
 from netkf.report.claims import describe_differences, describe_source
-from netkf.report.data import Budget, run_data, thinning_rules
+from netkf.report.data import Budget, positions, run_data, thinning_rules
 from netkf.report.directories import ReportSource, read_source
 from netkf.report.filter_figure import filters_figure
 from netkf.report.innovations import read_innovations
@@ -77,12 +77,14 @@ class _AnalysedSource(NamedTuple):
     messages : the MESSAGE rows of its run, one for each message sent; none without a run
     worst    : the explanation of its worst sample, or the reason why there is none
     readings : the innovations of its run, or the reason why there are none
+    layout   : [x, y] of its nodes in the live views, see ``positions``
     """
 
     source: ReportSource
     messages: np.ndarray
     worst: Explanation | str | None = None
     readings: Innovations | str | None = None
+    layout: list[list[float]] | None = None
 
     @property
     def is_live(self) -> bool:
@@ -148,14 +150,16 @@ def make_page(
     data_limits = Budget(BUDGET.messages // len(entries), BUDGET.values // len(entries))
     while True:
         page = _assemble_page(entries, comparison, command, data_limits)
-        if len(page.encode("utf-8")) <= MAX_BYTES or data_limits.messages < MIN_BUDGET:
+        size = len(page.encode("utf-8"))
+        if size <= MAX_BYTES or data_limits.messages < MIN_BUDGET:
             return page
-        data_limits = data_limits.halve()
+        # In proportion, so that a large page takes few attempts; a part of it never shrinks.
+        data_limits = data_limits.scaled(min(0.5, 0.9 * MAX_BYTES / size))
 
 
 def _analyse_directory(directory: Path, replica: int | None, trust: bool) -> _AnalysedSource:
     """Read a directory of the page and do what takes long once: join its messages, explain its
-    worst sample by replays, and compute its innovations.
+    worst sample by replays, compute its innovations, and place its nodes.
 
     Raises ScenarioError if netkf did not write the directory, or if its files are damaged.
     """
@@ -167,7 +171,8 @@ def _analyse_directory(directory: Path, replica: int | None, trust: bool) -> _An
             messages = join_messages(source.run.log)
         except ValueError as error:
             raise DamagedError(f"events.parquet: {error}") from None
-    return _AnalysedSource(source, messages, explain_worst(source), read_innovations(source))
+    entry = _AnalysedSource(source, messages, explain_worst(source), read_innovations(source))
+    return entry._replace(layout=positions(source, source.run)) if entry.is_live else entry
 
 
 def _merge_verdict(entries: list[_AnalysedSource]) -> list[_AnalysedSource]:
@@ -228,10 +233,11 @@ def _assemble_page(
     packer = Packer()  # collects columns of numbers as one compressed text
     runs = [
         run_data(
-            entry.source, entry.source.run, entry.messages, entry.readings, data_limits, packer
+            *(entry.source, entry.source.run, entry.messages, entry.readings, entry.layout),
+            *(data_limits, packer),
         )
         for entry in entries
-        if entry.is_live and entry.source.run is not None
+        if entry.source.run is not None and entry.layout is not None
     ]
     rules = [rule for data in runs for rule in thinning_rules(data)]
     packed, sizes = packer.text()

@@ -14,6 +14,7 @@ from netkf.figures.style import (
     SERIES,
     break_lines,
     new_figure,
+    set_scale,
     style_context,
     text_width,
 )
@@ -113,3 +114,14 @@ def test_names_are_no_formulas_and_have_no_control_characters():
         figure.draw(figure.canvas.get_renderer())
     assert "\x1b" not in text.get_text()
     assert mpl.cbook.is_math_text(text.get_text()) is False
+
+
+@pytest.mark.parametrize("values", [[1.0, 1.0, 1.7e308], [1e300, 1.2e308], [5e-324, 1e-300, 1.0]])
+def test_axes_have_limits_for_all_numbers(values):
+    figure = new_figure(4.0, 3.0)
+    axes = figure.add_subplot()
+    axes.plot(values)
+    set_scale(axes, np.array([*values, np.inf, np.nan, 0.0, -1.0]))
+    figure.canvas.draw()
+    low, high = axes.get_ylim()
+    assert 0.0 <= low < high < np.inf

@@ -5,6 +5,7 @@ import hashlib
 import json
 import re
 import shutil
+from types import SimpleNamespace
 
 import matplotlib
 import numpy as np
@@ -20,7 +21,7 @@ from netkf.ensembles.pools import PoolOptions
 from netkf.figures.style import SEQUENTIAL
 from netkf.report import page as pages
 from netkf.report.claims import describe_source
-from netkf.report.data import Budget
+from netkf.report.data import Budget, sample_indices
 from netkf.report.directories import read_source
 from netkf.report.markup import script_json
 from netkf.report.mending import explain_worst
@@ -337,6 +338,24 @@ def test_larger_pages_are_thinned_until_they_fit(ring, monkeypatch):
     text = make_page([ring])
     assert len(text.encode()) <= whole - 5_000
     assert "Left out: of" in text
+
+
+def test_samples_of_large_networks_are_thinned_although_each_node_has_its_worst_one():
+    random, (times, nodes, n) = np.random.default_rng(1), (200, 500, 2)
+    run = SimpleNamespace(
+        nodes=range(nodes),
+        times=np.arange(float(times)),
+        x=np.zeros((times, n)),
+        truth_known=True,
+        sq_error=random.exponential(size=(times, nodes)),
+    )
+    worst = np.unravel_index(run.sq_error.argmax(), run.sq_error.shape)[0]
+    each = nodes * (n + n * (n + 1) // 2 + 4) + n + 1
+    assert len(sample_indices(run, times * each, 77.0)) == times
+    for most in (5, 20):
+        kept = sample_indices(run, most * each, 77.0)
+        assert most < len(kept) <= 2 * most + 3
+        assert {0, int(worst), 77, times - 1} <= {*kept.tolist()}
 
 
 @pytest.mark.parametrize("name", ["library", "slots"])
