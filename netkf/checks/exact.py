@@ -497,7 +497,8 @@ def check_expected_nees(samples: RunSamples, level: float) -> Finding:
     if np.isnan(runs.e[:max_runs]).all():
         return find_nothing(NEES_TOLERANCE)
     if not len(tested):
-        return find_unknown("NEES does not exist: P is singular or not finite", NEES_TOLERANCE)
+        reason = "NEES does not exist: P is singular, or P or the errors are not finite"
+        return find_unknown(reason, NEES_TOLERANCE)
     # Factors that scale each NEES to the expected value n: its expected value is the weights' sum.
     intervals, sizes = [], weights.sum(axis=2, keepdims=True)
     units = np.divide(n, sizes, out=np.zeros(sizes.shape), where=sizes > 0.0)

@@ -68,6 +68,8 @@ class RunConsistency(NamedTuple):
     covariance_given: np.ndarray
 
 
+# Errors of a filter that is unstable grow until their squares overflow: the verdicts say so.
+@np.errstate(over="ignore", invalid="ignore")
 def run_consistency(
     scenario: Scenario, seed: int, replica: int, engine: str | Engine = "auto"
 ) -> RunConsistency:
@@ -354,6 +356,7 @@ def _without_horizon(scenario: Scenario) -> Scenario:
     return dataclasses.replace(scenario, probe=times) if any(over_end) else scenario
 
 
+@np.errstate(over="ignore", invalid="ignore")  # as in run_consistency
 def judge_consistency(
     scenario: Scenario, runs: Sequence[RunConsistency], confidence: float
 ) -> Consistency:
@@ -458,7 +461,7 @@ def _verdict(scenario: Scenario, excess: float, width: float, expected: float | 
     """
     n = scenario.plant.n
     if not math.isfinite(excess):
-        return "no NEES: P is singular or not finite"
+        return "no NEES: P is singular, or P or the errors are not finite"
     if expected is None:
         side = "near n" if abs(excess) <= width else "above n" if excess > 0.0 else "below n"
         return f"{side}; what it should be is not known"

@@ -115,7 +115,7 @@ def format_consistency(consistency: Consistency) -> str:
     rows = [
         [
             str(row.node),
-            f"{format_number(row.nees)} +- {row.width:.1g}",
+            format_number(row.nees) + (f" +- {row.width:.1g}" if math.isfinite(row.width) else ""),
             format_number(row.expected),
             f"{row.inside:.0%}",
             format_number(row.nis),

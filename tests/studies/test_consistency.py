@@ -16,6 +16,7 @@ from netkf.studies.consistency import (
     judge_consistency,
     run_consistency,
 )
+from netkf.studies.tables import format_consistency
 from tests.checks.broken import Overconfident
 from tests.conftest import SCENARIOS
 
@@ -149,3 +150,21 @@ def test_the_summary_of_many_runs_has_chi_square_bounds(tmp_path, capsys):
     assert found["inside"] == pytest.approx(((means >= low) & (means <= high)).mean())
     words = f"95% in {low:.4g} .. {high:.4g} where P is exact, here {found['inside']:.0%}"
     assert words in capsys.readouterr().out
+
+
+@pytest.mark.filterwarnings("error")
+def test_errors_beyond_all_numbers_are_reported_without_a_warning():
+    # Too few exchanges for a long path: the estimates grow by a factor a slot.
+    nodes = 40
+    changes = {
+        "network.graph": {"kind": "path", "nodes": nodes},
+        "filter.gamma": 1,
+        "filter.delta": 2.0,
+        "sensors.0.nodes": [0],
+        "sensors.1.nodes": [nodes - 1],
+        "horizon": 600.0,
+        "probe": 10.0,
+    }
+    found = netkf.consistency(netkf.load(SCENARIOS / "push_sum_planar.toml", changes), 10)
+    assert any("errors are not finite" in row.verdict for row in found.rows)
+    assert "nan" not in format_consistency(found)
