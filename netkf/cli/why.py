@@ -20,6 +20,7 @@ from netkf.core.printable import shorten
 
 if TYPE_CHECKING:
     from netkf.studies.why import Why
+    from netkf.trace.run import Run
 
 
 def _declare(parser: argparse.ArgumentParser) -> None:
@@ -84,11 +85,12 @@ def _explain(options: argparse.Namespace) -> int:
     """
     from netkf.studies.why import why
 
+    run: Run | Path = options.directory
     node, at = options.node, options.at
     if node is None:
-        node, at = _find_worst_sample(options)
+        run, node, at = _find_worst_sample(options)
     explanation = why(
-        options.directory,
+        run,
         node,
         at,
         replica=options.replica,
@@ -108,16 +110,17 @@ def _explain(options: argparse.Namespace) -> int:
     return 0
 
 
-def _find_worst_sample(options: argparse.Namespace) -> tuple[int, float]:
-    """Return the node and the time (s) of the worst sample of a run, that with the largest error of
-    the worst node after the start-up of its filter, and print a note on it.
+def _find_worst_sample(options: argparse.Namespace) -> tuple[Run, int, float]:
+    """Return a run that is read back, and the node and the time (s) of its worst sample, that with
+    the largest error of the worst node after the start-up of its filter; print a note on it.
 
     Raises ScenarioError if the directory has no samples of a single run.
     """
     from netkf.report.directories import read_source
 
-    samples = read_source(options.directory, options.replica, options.trust).worst
-    if samples is None:
+    source = read_source(options.directory, options.replica, options.trust)
+    samples = source.worst
+    if samples is None or source.run is None:
         rule = "has no samples of a run, of which the worst could be explained"
         remedy = "name a run, or an ensemble with --trace full"
         raise ScenarioError(shorten(options.directory), rule, None, remedy)
@@ -129,7 +132,7 @@ def _find_worst_sample(options: argparse.Namespace) -> tuple[int, float]:
             "after the start-up; --node and --at choose another sample"
         ]
     )
-    return worst.node, worst.time
+    return source.run, worst.node, worst.time
 
 
 def _write_explanation(explanation: Why, directory: Path) -> None:

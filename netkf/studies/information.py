@@ -397,9 +397,15 @@ class KeptReadings:
         """
         self._scenario, self._times, self._at = scenario, log["t"], at
         sensed = np.flatnonzero(log["kind"] == CODES["sense"])
+        # Sorted by node: the rows of a node are neighbours, in their order.
+        nodes = log["node"][sensed]
+        order = np.argsort(nodes, kind="stable")
+        sensed, nodes = sensed[order], nodes[order]
+        sensing = np.array(list(scenario.sensing_nodes), dtype=nodes.dtype)
+        starts, ends = (np.searchsorted(nodes, sensing, side) for side in ("left", "right"))
         self._rows = {
-            node: self._with_values(node, sensed[log["node"][sensed] == node])
-            for node in scenario.sensing_nodes
+            node: self._with_values(node, sensed[start:end])
+            for node, start, end in zip(scenario.sensing_nodes, starts, ends, strict=True)
         }
 
     def _with_values(self, node: int, rows: IntArray) -> IntArray:

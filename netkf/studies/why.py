@@ -332,9 +332,12 @@ class _Evidence:
         lost, late, replaced by another or still under way.
         """
         messages = self.messages
-        direct = (messages.sender == sender) & (messages.receiver == self._node)
-        used = np.flatnonzero(direct & (messages.outcome == USED))
-        unused = np.flatnonzero(direct & (messages.outcome != USED))
+        # Messages are sorted by sender. Ids of its type: others would be compared in a copy.
+        ids = np.array([sender, sender + 1], dtype=messages.sender.dtype)
+        first, after = np.searchsorted(messages.sender, ids)
+        direct = first + np.flatnonzero(messages.receiver[first:after] == self._node)
+        is_used = messages.outcome[direct] == USED
+        used, unused = direct[is_used], direct[~is_used]
         if not len(used):
             return None, len(unused)
         last = int(used[np.argmax(messages.used_row[used])])
