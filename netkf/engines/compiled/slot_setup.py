@@ -127,12 +127,14 @@ class SlotSetup:
                     step += 1
                 phase += 1
         numbers, phases, ends = zip(*stages, strict=True)
+        # The last step of each exchange; -1 for readings, whose phase is -1.
+        last_step = {phase: step for step, phase, _ in stages}
         self.decides = algorithm.decides_in_slots()
         self.stages = Stages(
             np.array(numbers, dtype=np.int64),
             np.array(phases, dtype=np.int64),
             np.array(ends, dtype=np.float64),
-            algorithm.slot_stopping(),
+            last_step.get(algorithm.slot_stopping(), -1),
         )
         self.fresh = np.array(fresh, dtype=bool)
         self.phases = [phase for step, phase, _ in stages if step >= 0]
