@@ -43,7 +43,7 @@ class _Adapter(Filter):
 
     def __init__(self, inner: Any) -> None:
         """Wrap ``inner``, a FlowFilter or SlotFilter."""
-        # Filters are frozen dataclasses: attributes can only be set around their guard.
+        # Filters are frozen dataclasses, in which a plain assignment raises an error.
         for name in ("talks", "pooled", "inverts"):
             object.__setattr__(self, name, getattr(inner, name))
         object.__setattr__(self, "inner", inner)

@@ -62,7 +62,7 @@ from netkf.linalg.compiling import kernel
 from netkf.linalg.lanes import LANES, ONE, aligned, blocks_of, in_lanes, load, store
 
 MAX_STEPS = 10_000
-"""Far beyond the diameter of any tree of use: a larger value is a slip."""
+"""Far beyond the diameter of any tree of use: a larger value is a mistake."""
 SLOT, ALL = "slot", "all"
 """Values of ``BeliefPropagation.memory``."""
 
@@ -245,7 +245,7 @@ def update_beliefs(
     add_part(lanes, beliefs.total, arrays.own[k, h], beliefs.work)
     for m in range(links.first[h], links.first[h + 1]):
         add_part(lanes, beliefs.total, arrays.received[k, m], beliefs.work)
-    # root = Z^-1 and xhat = centre + Z^-1 z.
+    # root = Z^-1 and xhat = centre + Z^-1 z in all lanes (False: none keeps its former estimate).
     finish_lanes(
         lanes, nodes.root, nodes.xhat, b, h, scratch.xhat, beliefs.total, beliefs.work, False
     )  # fmt: skip

@@ -187,6 +187,7 @@ class GainSequence:
         self.at(int(slots[-1]))
         slots = np.minimum(slots, len(self._gains))
         slot_gains = self._gains[slots[0] - 1 : slots[-1]]
+        # Flat, slot by slot and node by node: the B of all nodes of a slot become its W directions.
         node_gains = [one for gains in slot_gains for one in gains]
         K, N, n = len(slot_gains), len(self._neighbours), self._n
         B, *other_gains = (

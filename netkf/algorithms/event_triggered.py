@@ -270,10 +270,9 @@ def combine_copies(
     (9).
 
     Changes ``nodes.xhat[b, h]`` (n, L) and ``nodes.root[b, h]`` (n, n, L); the estimates that
-    arrive replace the copies of their links in ``arrays``. Axes: L runs side by side.
-
-    As roots: information P^-1 = Z' Z is [Z, z] (n, n + 1) with the mean Z^-1 z relative to the
-    node's own estimate.
+    arrive replace the copies of their links in ``arrays``. Information P^-1 = Z' Z is added up as
+    roots [Z, z] (n, n + 1) with the mean Z^-1 z relative to the node's own estimate. Axes: L runs
+    side by side.
     """
     lanes = scratch.lanes
     n = nodes.xhat.shape[2]

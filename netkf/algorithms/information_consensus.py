@@ -62,7 +62,7 @@ from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
 from netkf.linalg.lanes import LANES, ONE, aligned, load, store
 
-MAX_STEPS = 10_000  # consensus has converged long before: a larger value is a slip
+MAX_STEPS = 10_000  # consensus has converged long before: a larger value is a mistake
 INFORMATION, MEASUREMENTS, HYBRID = "information", "measurements", "hybrid"
 
 

@@ -301,8 +301,8 @@ def _use_late(state: IntermittentState, reading: Reading, now: float) -> Intermi
 
 
 def _drop_old(past: Past, since: float) -> Past:
-    """Return the past without the events that no late reading can reach: those after ``since``
-    (seconds) stay, and one before it.
+    """Return the past without the events that no late reading can reach: those from ``since``
+    (seconds) on stay, and one before it.
     """
     recent: list[Past] = []
     event: Past | None = past

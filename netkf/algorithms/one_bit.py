@@ -293,7 +293,8 @@ def use_bit(
     scale = 1.0 / root_of((HALF_PI - 1.0) * square + HALF_PI)
     for j in range(n):
         store(lanes, row, j, scale * load(lanes, row, j))
-    # The Kalman gain of such an observation is ``gains`` times ``inverse_deviation``.
+    # The Kalman gain of such an observation is ``gains`` times ``inverse_deviation``. The argument
+    # ``size`` is ``row``, of length n.
     inverse_deviation = rotate_lanes(lanes, row, root, b, h, row, gains)
     step = sign * inverse_deviation * scale * root_of(HALF_PI * (square + 1.0))
     for i in range(n):

@@ -93,7 +93,7 @@ MASS, AVERAGE = 0, 1
 """The two exchanges of a slot, steps 2 and 5: their numbers, ``phase`` in methods."""
 
 MAX_STEPS = 100_000
-"""The largest ``gamma``: a larger one is a slip."""
+"""The largest ``gamma``: a larger one is a mistake."""
 MAX_DOUBLINGS = 60
 """Iterations of ``asymptotic_root``; k of them reach 2^k slots."""
 MAX_SPREAD = 1e14
@@ -734,6 +734,7 @@ class PushSum(Filter):
         """Return the steps of exchange number ``phase`` of a slot: 1 for the mass, ``gamma`` for
         the estimates.
         """
+        # gamma is None under clocks, which have no steps.
         return self.gamma or 1 if phase == AVERAGE else 1
 
     def redraws_links(self, phase: int, step: int) -> bool:

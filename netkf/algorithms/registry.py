@@ -116,6 +116,8 @@ def own_attributes(algorithm: object) -> list[str]:
         if hasattr(base, name) and not name.startswith("__")
     }
     fields = {field.name for field in dataclasses.fields(base)}
+    # Python itself sets ``_abc_impl`` and ``_is_protocol`` on classes that derive from an ABC or a
+    # protocol.
     return sorted(names - fields - {"_abc_impl", "_is_protocol"})
 
 

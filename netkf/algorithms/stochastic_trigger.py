@@ -999,12 +999,14 @@ class StochasticTrigger(Delegate):
                 'write inner = { kind = "intermittent" }, or another one',
             )
         inner.check_scenario(scenario)
+        # A number fits readings of any number of rows.
         if not isinstance(self.Y, np.ndarray):
             return
         for node in scenario.nodes:
             sensors = [scenario.sensors[k] for k in entries_at(scenario, node)]
             rows = sum(len(sensor.R) for sensor in sensors)
             recorded = [isinstance(getattr(one, "path", None), SourceFile) for one in sensors]
+            # One sensor lacks all of its rows or none: only with several may some be missing.
             if len(sensors) > 1 and any(recorded):
                 raise ScenarioError(
                     "filter.Y",

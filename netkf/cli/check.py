@@ -83,9 +83,9 @@ def _check(scenario: Scenario, options: argparse.Namespace) -> int:
     from netkf.checks.points import sampling_note
     from netkf.checks.report import verdict_json, verdict_text
 
+    # The verdict in --out to which --resume adds runs.
     earlier = _open_verdict_directory(scenario, options)
-    # ``earlier``: the verdict in --out that --resume adds runs to.
-    # The same command again: it may have been stopped after it wrote its verdict.
+    # The same command may have been given before, and stopped after it wrote its verdict.
     is_complete = earlier is not None and options.until is None and earlier.runs == options.runs
     if earlier is not None and is_complete:
         verdict = earlier

@@ -53,7 +53,7 @@ class ScenarioError(NetkfError, ValueError):
     def under(self, prefix: str) -> ScenarioError:
         """Return this error with ``prefix``, the table that holds the key, before the key.
 
-        The reader of the table calls it: the error names the key alone.
+        The code that reads the table calls it: a rule that raises knows only the key inside it.
         """
         separator = "" if not self.key or self.key.startswith("[") else "."
         key = f"{prefix}{separator}{self.key}"

@@ -421,6 +421,7 @@ def _convert_definite_covariance(value: Any) -> FloatArray:
     result = _convert_symmetric(value)
     eigenvalues = np.linalg.eigvalsh(result)
     smallest, largest = eigenvalues[0], eigenvalues[-1]
+    # Its inverse must not consist of rounding errors, nor exceed MAX_MAGNITUDE.
     if not smallest > max(1e-14 * abs(largest), 1.0 / MAX_MAGNITUDE):
         raise _SpecificError(f"must be positive definite (least eigenvalue {smallest:.3g})")
     return result

@@ -41,9 +41,9 @@ class Rank(IntEnum):
 
 
 MIN_GAP_SHARE, LONGER = 1e-9, 1.02
-"""The least part of a gap whose readings are used at once, however short the interval, and by what
-it grows from one interval to the next: a covariance beyond all bounds, which no reading shrinks as
-it should, takes a thousand of them and not a billion.
+"""Lower bound of the first measurement interval of a gap, as a share of the gap, and the factor by
+which the bound grows from one interval to the next. The larger P, the shorter the intervals; with
+the bound even a diverging P divides a gap into about a thousand of them and not into a billion.
 """
 
 Progress = Callable[[float], None]

@@ -27,9 +27,9 @@ from netkf.runs.files import BLOCKS_FOLDER, write_atomically, writing_file
 from netkf.scenario.scenario import Scenario
 from netkf.trace.schema import EVENT
 
-PARTS = ("samples", "averages", "messages")
-MARK = b"\nsha256 "
-SEAL_BYTES = len(MARK) + 64
+PARTS = ("samples", "averages", "messages")  # attributes of RunStatistics that are Moments
+MARK = b"\nsha256 "  # begins the last line of a block's file
+SEAL_BYTES = len(MARK) + 64  # length of that line, with the SHA-256 in hexadecimal
 CHUNK = 1 << 20  # bytes hashed at once
 MAX_BLOCK = 1 << 32  # a number of runs beyond that is damage
 

@@ -44,7 +44,8 @@ NOTE_SECONDS = 1.0
 class FinishedEnsemble:
     """The result of ``runs_to_directory``: the directory, its summary, and the data for pictures.
 
-    ``simulated`` is the number of runs that were not resumed from blocks, in ``seconds``.
+    ``simulated`` is the number of runs that were not resumed from blocks, ``seconds`` the
+    wall-clock time until their results were written, without pictures.
     """
 
     directory: Path

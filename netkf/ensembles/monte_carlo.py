@@ -30,18 +30,23 @@ LOAD = "load it first: netkf.monte_carlo(netkf.load(path), runs)"
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Ensemble(NotebookTable):
-    """What many runs of one scenario came to.
+    """Means over many runs of one scenario, with standard errors; e = x - xhat is the error.
 
-    times (T,), nodes (N,), ``runs`` (T,): how many have that sample (runs that diverge end early);
-    mean_P and mean_error (T, N, n, n): means of P and of e e', e = x - xhat; mean_nees (T, N);
-    se_P, se_error, se_nees: their standard errors entry by entry, nan for a single run. ``average``
-    and ``se_average`` (N + 1, 3): mean square error, mean trace of P and mean NEES, each averaged
-    over the samples after time 0, of the nodes in their order and, last, of all of them together.
-    ``messages``: how many were sent, delivered, lost and still in flight in all runs; ``diverged``:
-    how many runs did. ``fingerprint`` is that of replica 0. From ``rounding_from`` on, inf in most
-    cases, rounding of the state blurs the errors: they and NEES are nan there and left out of
-    averages. P and NEES are nan where the filter gives no covariance. ``scenario`` is what was
-    simulated.
+    times         : (T,) sample times in seconds
+    nodes         : (N,) ids
+    runs          : (T,) number of runs that have each sample; runs that diverge end early
+    mean_P, mean_error, mean_nees : (T, N, n, n), (T, N, n, n), (T, N) means over runs of P, e e'
+                    and NEES; P and NEES are nan if the filter gives no covariance
+    se_P, se_error, se_nees : standard errors of these, entry by entry, nan for a single run
+    average, se_average : (N + 1, 3) mean square error, mean trace of P and mean NEES over the
+                    samples after time 0, of each node and, last, of all nodes; standard errors
+    messages      : numbers of messages sent, delivered, lost and in flight at the end, and of
+                    transmissions except in slots, in all runs
+    diverged, events : number of runs that diverged, and of events in all runs
+    fingerprint   : digest of the events of replica 0
+    rounding_from : time in seconds from which rounding of the state blurs the errors, else inf:
+                    from then on errors and NEES are nan, and left out of averages
+    scenario      : the scenario that was simulated
     """
 
     times: FloatArray
@@ -101,7 +106,7 @@ class Ensemble(NotebookTable):
 
     @cached_property
     def table(self) -> pd.DataFrame:
-        """A row a time and node; columns as trace.schema.ensemble_columns."""
+        """One row per time and node, with the columns trace.schema.ensemble_columns."""
         import pandas as pd
 
         return pd.DataFrame(ensemble_table(self))
@@ -117,16 +122,15 @@ def monte_carlo(
     engine: str = "auto",
     progress: Progress | None = None,
 ) -> Ensemble:
-    """Simulate replicas 0 .. runs - 1 and keep their means and standard errors.
+    """Simulate replicas 0 .. runs - 1 and return their means and standard errors.
 
     Replica 0 is the run of ``netkf.simulate(scenario, seed)``. The result is the same to the last
-    bit for any number of ``workers`` (processes; by default as many as there are cores, or this one
-    where the runs are done before others have started), for any ``executor`` of concurrent.futures
-    and for any Dask ``scheduler`` ("tcp://HOST:PORT"). ``progress(done, wanted)`` is called as runs
-    are done.
+    bit for any number of ``workers`` (processes; by default this one, and as many as there are
+    cores once that saves time), for any ``executor`` of concurrent.futures and for any Dask
+    ``scheduler`` ("tcp://HOST:PORT"). ``progress(done, wanted)`` is called as runs complete.
 
-    Raises ScenarioError for arguments that are wrong and EngineError where the engine cannot run
-    the scenario, a plugged-in class fails, or workers die again and again.
+    Raises ScenarioError for wrong arguments, and EngineError if the engine cannot run the scenario,
+    a plugged-in class fails, or workers die again and again.
     """
     if not isinstance(scenario, Scenario):
         raise ScenarioError("", "monte_carlo takes a netkf.Scenario", scenario, LOAD)

@@ -149,7 +149,8 @@ class AdaptivePool(LocalPool):
 
     def _note_duration(self, job: Job, seconds: float) -> None:
         """Add the ``seconds`` of a block, without compilation, to the estimate of seconds for each
-        run; not those of the first block of a scenario, which mostly fills caches, if it was quick.
+        run; not those of the first block of a scenario, which mostly fills caches, unless it took
+        more than 1 s.
         """
         super()._note_duration(job, seconds)
         self._spent += seconds

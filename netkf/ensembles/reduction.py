@@ -37,7 +37,9 @@ from netkf.trace.nees import errors, fill_nees
 from netkf.trace.run import BLUR, ROUNDING
 
 NUMBERS_AT_ONCE = 512
-"""Number of values of a run that are processed together: some lines of the cache."""
+"""Number of columns, over all samples, of a run that are processed together: 4 KiB, so that those
+of L runs fit the nearest cache.
+"""
 MAX_SCRATCH_ENTRIES = 1 << 15
 """Largest number of entries of all P of a sample for which scratch is kept (some 10 MB)."""
 
@@ -107,7 +109,7 @@ class ReductionScratch(Struct):
     error, P, x, columns : (S F n, L), (S F n n, L), (S n, L), (S C, L) the same in lanes
     totals : (F, 3, L) sums for the averages
     z, factor, nees, not_definite : (n, L), (n, n, L), (L,), (L,) of one sample: error, factor of P,
-             NEES, and 1 where P is not positive definite
+             NEES, and the number of pivots that are not positive, 0 where P is positive definite
     error_used, P_used : (L,) 1 where the sample counts in averages of errors, and of P
     rows, work, size : (L, S, C), (L, S, C), (L, S) columns of each run, their M2 and number
     node_size, mean, M2 : (D, S), (D, S, C), (D, S, C) of the nodes of the tree over runs that wait
@@ -199,8 +201,8 @@ class _ScratchCache(threading.local):
         """Return the arrays that ``reduce_runs`` overwrites, for ``filters`` filters of n states;
         at most ``largest`` runs are merged into one result.
 
-        The arrays, whose contents are left from the last use, are kept for the next call, which
-        gets larger ones if it needs them.
+        The arrays, whose contents are left from the last use, are kept for the next call, unless P
+        has more than MAX_SCRATCH_ENTRIES entries; that call gets larger ones if it needs them.
         """
         if filters * n * n > MAX_SCRATCH_ENTRIES:
             return reduction_scratch(filters, n, largest)
@@ -371,6 +373,8 @@ def merge_whole(lanes: Lanes, scratch: ReductionScratch, count: int, node: int) 
     rows, work, mean_of, M2_of = scratch.rows, scratch.work, scratch.mean, scratch.M2
     for s in range(count):
         scratch.node_size[node, s] = 1.0 * len(lanes)
+    # c counts the columns of all samples, one sample after the other: load() and store() take the L
+    # neighbours from there on, also beyond the row of the first sample.
     for c in range(0, count * rows.shape[2], len(lanes)):
         stride = 1
         while stride < len(lanes):
@@ -573,9 +577,9 @@ def fill_single_nees(
     the SIMD lane of that run, by Gaussian elimination with pivoting.
 
     It is for samples whose P is not positive definite, for which the factorisation without pivoting
-    of all lanes fails. Sets ``sums.regular[r]`` to False if P is singular; ``reduce_batch`` then
-    computes the NEES of that run otherwise and calls again with ``b.has_nees[r]``, upon which it is
-    taken from ``b.known_nees``.
+    of all lanes fails. Sets ``sums.regular[r]`` to False if P is singular. ``reduce_batch`` then
+    computes the NEES of that run by ``errors``, and starts again with it: with ``b.has_nees[r]``
+    NEES is taken from ``b.known_nees``.
     """
     error, P = b.error[r, t, f : f + 1], b.P[r, t, f : f + 1]
     if not fill_nees(error, P, scratch.single_nees, scratch.single_factor, scratch.single_solved):
@@ -702,6 +706,7 @@ def mark_blurred(
         size = magnitude(load(lanes, scratch.x, index))
         largest = select(size > largest, size, largest)
     bound = ROUNDING * BLUR * largest
+    # The factor 0.5 leaves a margin for rounding of the squares.
     surely_sharp = (min_variance < np.inf) & (bound * bound < 0.5 * min_variance)
     if any_lane(select(surely_sharp, 0.0, 1.0) > 0.0):
         for r in range(first, first + active):

@@ -75,8 +75,8 @@ def find_stored_blocks(
     if manifest["runs"]["wanted"] != plan.runs:
         rule, value = "the run was begun with another number of runs", manifest["runs"]["wanted"]
         raise ScenarioError("--resume", rule, value, "give the same --runs")
-    # Another version or machine may round differently: the merged results would be those of no
-    # single run.
+    # Another version or machine may round differently: the merged results would not be those of
+    # any command without interruption.
     requirements = {
         "scenario": (plan.scenario, "give the same scenario, seed and settings"),
         "trace": (plan.trace, "give the same --trace"),

@@ -46,8 +46,9 @@ class RunStatistics(NamedTuple):
     totals        : (2,) number of events and of diverged runs
     conserved     : for each conserved sum its moments at start and end (1, 2), and the largest
                     relative drift
-    rounding_from : time of the first sample of any run at which rounding blurs the errors, else inf
-    fingerprint   : of replica 0
+    rounding_from : seconds, time of the first sample of any run at which rounding blurs the errors,
+                    else inf
+    fingerprint   : digest of the events of replica 0, once the statistics of all runs are merged
     traces        : traces that were kept, in the order of replicas
     """
 
@@ -153,9 +154,10 @@ class RunValues(NamedTuple):
     pieces   : K slices of the runs, each a node of the tree over all runs
     samples  : moments (T, F (2 u + 1)) of F filters for each piece
     copies   : number of nodes for which a filter stands: N for a pooled filter, else 1
-    averages : (R, N + 1, 3)
-    messages : (R, 5)
-    events, diverged, rounding_from : (R,)
+    averages : (R, N + 1, 3) squared error, trace of P and NEES, of each node and of all
+    messages : (R, 5) the counts MESSAGES
+    events, diverged, rounding_from : (R,) number of events; True if the run diverged; first sample
+               time (s) at which rounding blurs the errors, else inf
     sums     : (R, 2) each conserved sum at start and end
     """
 

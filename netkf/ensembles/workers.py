@@ -55,7 +55,7 @@ class _Worker:
         receiver, self._jobs = multiprocessing.Pipe(duplex=False)
         self.results, sender = multiprocessing.Pipe(duplex=False)
         self.task: _Task | None = None
-        self._known = ""
+        self._known = ""  # digest of the last scenario that was sent
         self._process = process_context().Process(target=_serve, args=(receiver, sender))
         try:
             start_server()
@@ -167,6 +167,7 @@ class WorkerProcesses:
             if worker is None and len(self._workers) >= self._width:
                 return
             task = self._waiting.popleft()
+            # The future of a task whose worker died is running already.
             if not task.future.running() and not task.future.set_running_or_notify_cancel():
                 continue  # it was cancelled
             if worker is None:

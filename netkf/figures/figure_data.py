@@ -44,7 +44,7 @@ class FigureData:
     node_averages              : averages over time of each node, as in summary.json
     status                     : how the runs ended, as in manifest.json
     diverged                   : number of runs of an ensemble that diverged
-    rounding_from              : time (s) from which on rounding blurs errors
+    rounding_from              : time (s) from which on rounding blurs errors, else inf
     se_error, se_trace, se_nees: (T, N) standard errors of those means, None for a single run
     first_component            : (T, N) first component of the estimates, None for an ensemble
     delivered                  : messages delivered over each link, by its two nodes

@@ -39,8 +39,8 @@ def select_evenly(indices: np.ndarray, max_count: int = MAX_LINES) -> np.ndarray
 def draw_nodes(axes: Any, data: FigureData, values: FloatArray, se: FloatArray | None) -> None:
     """Draw one line for each column of ``values`` (T, N), those of nodes with a sensor on top.
 
-    With ``se`` (T, N) the values are roots, ``se`` are the standard errors of their squares, and
-    each line has its 95% interval.
+    ``se`` (T, N), if given, are the standard errors of the squares of ``values``: each line gets
+    its 95% interval.
     """
     width = 1.1 if len(data.nodes) <= 12 else 0.6
     groups = (

@@ -36,7 +36,7 @@ ROOMS = (
     "ensembles",
     "theory/numerics",
 )
-"""Rooms of netkf whose functions and constants can become part of compiled code."""
+"""Folders of netkf whose functions and constants can become part of compiled code."""
 
 MAX_CACHED_STATES = 4
 """Number of states of the sources for which compiled code is kept on disk."""
@@ -264,7 +264,9 @@ def announce(function: Callable[..., Any]) -> None:
 
 
 def source_digest(*rooms: str) -> str:
-    """Return 16 hexadecimal digits of the SHA-256 of netkf's modules, or of those of ``rooms``."""
+    """Return 16 hexadecimal digits of the SHA-256 of netkf's modules: of those in the folders
+    ``rooms`` (paths relative to netkf), or of all if none is given.
+    """
     digest = hashlib.sha256()
     files = [file for room in rooms or ("",) for file in (ROOT / room).rglob("*.py")]
     for file in sorted(files):
@@ -276,8 +278,8 @@ def source_digest(*rooms: str) -> str:
 @cache
 def _cache_folder(chosen: str) -> Path:
     """Return the folder of compiled code: one for each state of the sources."""
-    # A kernel may contain constants and kernels of any of these rooms; any change of their sources
-    # gives a new folder, so that compiled code is never out of date.
+    # A kernel may contain constants and kernels of any of ROOMS; any change of their sources gives
+    # a new folder, so that compiled code is never out of date.
     name = f"netkf-{source_digest(*ROOMS)}"
     parent = _first_writable(chosen, ROOT)
     if not (parent / name).exists():

@@ -7,8 +7,8 @@ import math
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
 
-SWEEPS = 30
-ROUNDING = 2.0**-54
+SWEEPS = 30  # at most; convergence takes far fewer
+ROUNDING = 2.0**-54  # relative size of an entry that is too small to change the diagonal
 
 
 @kernel(compact=True)

@@ -599,6 +599,7 @@ def _instruction(function: Any, name: str, arguments: int) -> None:
             _broadcast(context, builder, v, k, count) for v, k in zip(args, sig.args, strict=True)
         ]
         value_kind = values[0].type
+        # Intrinsics are named by their type: llvm.sqrt.f64 or, for eight lanes, llvm.sqrt.v8f64.
         full = f"llvm.{name}.{'f64' if count == 1 else f'v{count}f64'}"
         kinds = ir.FunctionType(value_kind, [value_kind] * arguments)
         instruction = cgutils.get_or_insert_function(builder.module, kinds, full)

@@ -4,7 +4,8 @@ Arrays hold the runs of a block along their last axis, L of them. ``load(lanes, 
 ``array[i, j]`` (L,) as one value, with which kernels compute as with a number: ``+ - * /``,
 comparisons, and the functions below. ``lanes`` is a tuple of L zeros, whose length is known when
 the kernel is compiled; with one lane the value is a plain float, so that the same kernel serves a
-single run. Operations are those of floats, lane by lane: a run has the same bits in any company.
+single run. Operations are those of floats, lane by lane: a run has the same bits, whichever runs
+are beside it.
 
 A comparison gives flags: one truth value for each lane. An array without a last axis of lanes gives
 L neighbours from ``array[place]`` on; with one lane that is the entry itself.

@@ -283,6 +283,7 @@ def _variable_collector() -> Callable[..., Any]:
     """
     from numba.core import ir
 
+    # A leaf holds no variables; ``entries`` and ``values`` are those of a sequence and of a dict.
     leaf, variable, instruction, entries, values = range(5)
     roles: dict[type, int] = {}
 

@@ -147,6 +147,7 @@ class ValueLower(Lower):
         block_of: dict[str, int] = {}
         used_early: set[str] = set()
         using_blocks: dict[str, set[int]] = defaultdict(set)
+        # Blocks in the order in which they are lowered: a use that comes first has no value yet.
         for offset, block in sorted(self.blocks.items()):
             for statement in block.body:
                 source = statement.value if isinstance(statement, numba_ir.Assign) else statement
@@ -385,6 +386,7 @@ def _written_only(all_instructions: list[Any], readers: Counter[int]) -> set[int
         for instruction in all_instructions
         if type(instruction) is instructions.StoreInstr
     ]
+    # Operand 1 of a store is the address that it writes to: all readers of the variable are stores.
     writers = Counter([id(store.operands[1]) for store in stores])
     unread = {
         id(variable)

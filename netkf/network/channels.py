@@ -94,7 +94,7 @@ class NoLoss(Loss):
 
     @property
     def deterministic(self) -> bool:
-        """True."""
+        """True: every delivery probability is 1."""
         return True
 
     def delivery_probability(
@@ -159,6 +159,7 @@ class GilbertElliott(Loss):
         possible.
         """
         super().__post_init__()
+        # One of two forms, each with two required fields: transition probabilities, or means.
         chain = {name: getattr(self, name) for name in ("to_bad", "to_good")}
         means = {name: getattr(self, name) for name in ("mean_loss", "mean_burst")}
         if any(value is not None for value in means.values()):
@@ -177,6 +178,7 @@ class GilbertElliott(Loss):
                 raise ScenarioError(
                     name, "is missing", None, "give to_bad and to_good, or mean_loss and mean_burst"
                 )
+        # The means imply to_bad = mean_loss / (1 - mean_loss) / mean_burst, which may exceed 1.
         if self.transitions[0] > 1.0:
             raise ScenarioError(
                 "mean_burst",
@@ -197,7 +199,7 @@ class GilbertElliott(Loss):
 
     @property
     def stateful(self) -> bool:
-        """True."""
+        """True: each activation draws the next state of the chain."""
         return True
 
     def next_state(self, bad: bool | None, random: np.random.Generator) -> bool:
@@ -288,7 +290,7 @@ class NoDelay(Delay):
 
     @property
     def fixed(self) -> float | None:
-        """Return 0."""
+        """0 seconds."""
         return 0.0
 
 
@@ -304,7 +306,7 @@ class ConstantDelay(Delay):
 
     @property
     def fixed(self) -> float | None:
-        """``seconds``."""
+        """The field ``seconds``."""
         return self.seconds
 
 
@@ -334,7 +336,7 @@ class UniformDelay(Delay):
 
     @property
     def longest(self) -> float:
-        """``high``."""
+        """The field ``high``, in seconds."""
         return self.high
 
     def draw(self, random: np.random.Generator) -> float:

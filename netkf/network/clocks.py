@@ -183,6 +183,7 @@ class Poisson(LinkClock):
                 rule = again if entity in listed else f"must name a {what} of the graph"
                 raise ScenarioError(f"rates[{k}]", rule, list(entry[:-1]), "remove or correct it")
             listed.add(entity)
+        # Without a default rate each entity needs one of its own.
         unlisted = sorted(entities - listed)
         if self.rate is None and unlisted:
             first = unlisted[0][0] if len(unlisted[0]) == 1 else unlisted[0]
@@ -237,6 +238,7 @@ class Renewal(LinkClock):
             if value is not None and name not in needed + one_of:
                 rule = f"means nothing for {self.distribution} gaps"
                 raise ScenarioError(name, rule, value, "remove it")
+        # Of mean, rate and scale the distribution takes one, or none at all (uniform).
         names = [name for name in one_of if getattr(self, name) is not None]
         if one_of and len(names) != 1:
             rule = f"exactly one of {', '.join(one_of)} must be given"
@@ -369,6 +371,7 @@ class RecordedClock(LinkClock):
     path: SourceFile = field(source_file)
 
     def __post_init__(self) -> None:
+        """Check the fields and read the table; raises ScenarioError for a mistake in either."""
         super().__post_init__()
         _ = self._times  # a mistake in the file is found on construction
 

@@ -40,7 +40,7 @@ class Deliveries:
 class DeliveringLoss(Loss):
     """The loss model ``given`` of the run, except that the messages of ``deliveries`` arrive.
 
-    All but the chosen messages have the same draws and fates as in the run.
+    All but the chosen messages have the same draws and outcomes as in the run.
     """
 
     given: Loss = field(instance_of(Loss))

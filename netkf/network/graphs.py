@@ -323,8 +323,8 @@ class Regular(RandomGraph):
             if 2 * degree < N:
                 sparse: networkx.Graph[Any] = networkx.random_regular_graph(degree, N, state)
                 return sparse
-            # networkx pairs stubs at random, which rarely succeeds for dense graphs. The complement
-            # of a random regular graph is one too.
+            # networkx joins free ends of links at random, which rarely succeeds for dense graphs.
+            # The complement of a random regular graph is one too.
             complement = networkx.random_regular_graph(N - 1 - degree, N, state)
             dense: networkx.Graph[Any] = networkx.complement(complement)
             return dense

@@ -282,6 +282,7 @@ class RecordedSlots(SlotActivation):
     path: SourceFile = field(source_file)
 
     def __post_init__(self) -> None:
+        """Check the fields and read the table; raises ScenarioError for a mistake in either."""
         super().__post_init__()
         _ = self._pairs  # a mistake in the file is found on construction
 
@@ -305,6 +306,7 @@ class RecordedSlots(SlotActivation):
         ):
             phase, step = (0, 0) if matching else (columns["phase"][row], columns["step"][row])
             listed = pairs.setdefault((slot, phase, step), [])
+            # A pair has no direction, and may be listed from either end.
             link = (min(i, j), max(i, j)) if matching else (i, j)
             if matching and link not in listed and (i == j or _shares_node(link, listed)):
                 rule = f"{self.path.name}: a node may be paired once a slot"

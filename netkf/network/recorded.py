@@ -112,6 +112,7 @@ class RecordedLoss(Loss):
     after: str = field(_after, default="deliver")
 
     def __post_init__(self) -> None:
+        """Check the fields and read the table; raises ScenarioError for a mistake in either."""
         super().__post_init__()
         _ = self.table  # a mistake in the file is found on construction
 
@@ -164,6 +165,7 @@ class RecordedDelay(Delay):
     after: str = field(_after, default="deliver")
 
     def __post_init__(self) -> None:
+        """Check the fields and read the table; raises ScenarioError for a mistake in either."""
         super().__post_init__()
         _ = self.table  # a mistake in the file is found on construction
 

@@ -151,9 +151,9 @@ def default_sensing_period(
     ``informations`` are the matrices H' R^-1 H (n, n) of the nodes that sense, ``longest`` is the
     longest interval (seconds) that one update of their filters can use (algorithms/kernels/gains).
     The period is half the shortest time constant of the plant and of the stationary Kalman-Bucy
-    filter of each node, or less where ``longest`` or the plant's ``longest_period`` demands it,
-    rounded down to 1, 2 or 5 times a power of ten. It depends on nothing else, so that all
-    algorithms and networks see the same truth.
+    filter of each node (1 s if they have none), or less where ``longest`` or the plant's
+    ``longest_period`` demands it, rounded down to 1, 2 or 5 times a power of ten. It depends on
+    nothing else, so that all algorithms and networks see the same truth.
     """
     fastest = float(np.abs(np.linalg.eigvals(plant.A)).max())
     for G in informations:
@@ -164,4 +164,5 @@ def default_sensing_period(
     bound = min(0.5 / fastest if fastest > 0.0 else 1.0, longest, plant.longest_period)
     power = 10.0 ** math.floor(math.log10(bound))
     digit = next(d for d in (5.0, 2.0, 1.0) if d * power <= bound * (1.0 + 1e-9))
+    # Rounded, since the product may differ from the decimal number in its last bit.
     return float(f"{digit * power:.12g}")

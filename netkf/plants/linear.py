@@ -261,7 +261,7 @@ class SlotReadings:
         """
         H = self.matrices(slots)
         offsets = np.array(slots) - self._slot - 1
-        # ``apply`` multiplies each vector by itself: readings have the same bits however many slots
+        # ``apply`` handles the vectors one by one: readings have the same bits however many slots
         # are asked for together.
         normals = self._noise.draws(int(offsets[-1]) + 1)[offsets]
         noise = apply(self._root, normals)

@@ -5,13 +5,13 @@ increments: each step gives ``x(t_{k+1})`` and the two moments of x over the ste
 (*plain* in the code) and ``int x P_1 dt`` (*tilted*) with the Legendre polynomial P_1, -1 .. 1 over
 the step (linalg/legendre). All come from one stream and do not depend on the network.
 
-A filter that the network wakes between grid points needs the moments over part of a step. There the
-path is approximated by the response to the state at the grid point plus the cubic that agrees with
-the end and the two moments of the step; the error in a reading is of third order in h, less than
-1e-4 h^3 of the noise intensity. Where a state is *sampled* (read by a sensor at an instant) or
-*probed* (recorded by the run) off the grid, the step is cut into pieces beforehand: state and
-moments at the cut are drawn from their exact law given the step, from separate streams, sample
-times first.
+A filter that has an event between grid points, such as a tick or a message, needs the moments over
+part of a step. There the path is approximated by the response to the state at the grid point plus
+the cubic that agrees with the end and the two moments of the step; the error in a reading is of
+third order in h, less than 1e-4 h^3 of the noise intensity. Where a state is *sampled* (read by a
+sensor at an instant) or *probed* (recorded by the run) off the grid, the step is cut into pieces
+beforehand: state and moments at the cut are drawn from their exact law given the step, from
+separate streams, sample times first.
 
 On an unstable plant states may be *local*: relative to an origin that is moved to the state at
 regular times. The interval between two moves is a *frame* (``truth`` says why).

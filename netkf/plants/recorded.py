@@ -419,6 +419,7 @@ def index_by_slot(
     """
     table: Table = {}
     for t, values in rows:
+        # Decimal times of a file are multiples of the period up to rounding only.
         slot = round(t / period)
         if slot < 0 or abs(t - slot * period) > 1e-9 * max(period, abs(t)):
             rule = f"{source.name}: t must be a slot, a multiple of the period {period:g}"

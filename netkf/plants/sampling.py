@@ -90,6 +90,7 @@ class RecordedSampling(Clock):
     path: SourceFile = field(source_file)
 
     def __post_init__(self) -> None:
+        """Check the fields and read the table; raises ScenarioError for a mistake in either."""
         super().__post_init__()
         _ = self._times  # a mistake in the file is found on construction
 

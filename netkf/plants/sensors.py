@@ -2,10 +2,11 @@
 
 The noise of a sensor is drawn on the sensing grid, the times k h of the plant's sensing period h,
 from the sensor's own stream, as its two moments over each step, ``int dv`` (*plain*) and
-``int P_1 dv`` (*tilted*) with the Legendre polynomial P_1, -1 .. 1 over the step. When the network
-wakes a node inside a step, the step is cut: the moments of the first part are drawn from
-their exact law given those of the whole, from a second stream, and the moments of the remaining
-part follow. The noise on the grid therefore does not depend on the network.
+``int P_1 dv`` (*tilted*) with the Legendre polynomial P_1, -1 .. 1 over the step. At an
+event of the node inside a step, such as a tick or a message, the step is cut: the moments of the
+first part are drawn from their exact law given those of the whole, from a second stream, and the
+moments of the remaining part follow. The noise on the grid therefore does not depend on the
+network.
 """
 
 from __future__ import annotations
@@ -184,7 +185,7 @@ class SensorPath:
     ) -> None:
         """Begin at time 0: H (p, n), R (p, p) with cov(dv) = R dt, generators ``random`` of the
         noise in steps of the sensing grid and ``cutting`` of that in parts of a step, which is cut
-        where the network wakes the node within it.
+        at events of the node inside it.
         """
         self.H = H
         # The noise is drawn with unit intensity and multiplied by the Cholesky factor of R.
@@ -212,7 +213,7 @@ class SensorPath:
             self._unread, self._end = self._draw(truth.period), step_end
         if end < step_end:
             # Normals for cuts come from a second stream, so that the noise on the grid does not
-            # depend on when nodes wake.
+            # depend on the times of events.
             normals = self._cutting.standard_normal(self._unread.shape)
             length = step_end - start
             noise, self._unread = cut(self._unread, normals, (end - start) / length, length)

@@ -310,8 +310,9 @@ def _message_columns(thinned: ThinnedMessages, run: StoredRun, packer: Packer) -
     """Return the messages of a run for the live views: columns as added to ``packer``, their
     number, and the rule by which they were thinned.
 
-    ``travel`` is 0 for a message that took no time, else the time (s) at which it ended; ``number``
-    is the difference from the previous row modulo 2^32.
+    ``travel`` is 0 for a message that took no time, else the time (s) at which it ended, inf if it
+    is under way; ``age`` is 0 if it is unknown; ``number`` is the difference from the previous row
+    modulo 2^32.
     """
     messages = thinned.messages
     nodes = np.array(run.nodes)

@@ -32,6 +32,7 @@ from netkf.rng.draws import (
 _U = np.uint64
 # MANTISSA masks the lower 52 bits of a word; S1 and S9 are shift counts.
 MANTISSA, S1, S9 = _U(0x000FFFFFFFFFFFFF), _U(1), _U(9)
+# Where numpy's normal ziggurat begins its tail, and the reciprocal of that.
 TAIL_START = 3.6541528853610087963519472518
 INVERSE_TAIL_START = 0.27366123732975827203338247596
 HAS_HALF, KEPT_HALF = 4, 5

@@ -115,7 +115,8 @@ def _record_samples(algorithm: Filter, samples: list[RecordedSample]) -> Filter:
         """Move the ``state`` by ``offset`` (n,) as the filter does."""
         return base.shift(self, state, offset)
 
-    # Shifted coordinates are given up for a class that defines ``update`` but not ``shift``.
+    # Engines do not move the origin of the states for a class that defines ``update`` without
+    # ``shift`` (``commutes``); then the replay would round differently from the run.
     methods = {"update": update, "shift": shift, "__module__": base.__module__}
     # Copied instead of constructed: its parameters have been checked already.
     recording: Any = object.__new__(type(base.__name__, (base,), methods))

@@ -120,9 +120,12 @@ class RunDirectory:
 
     @cached_property
     def samples(self) -> pd.DataFrame | None:
-        """Samples after time 0 of all runs, None if the directory does not have them all.
+        """Samples after time 0 of all runs, one row per run, time and node; None if the directory
+        does not have them all.
 
-        Raises ScenarioError if states.parquet is damaged.
+        Columns are run, t (s), node, sq_error, nees, mean_trace (the trace of P; the name is that
+        of its average), the diagonal of P, and the true states x0, x1, ... Raises ScenarioError if
+        states.parquet is damaged.
         """
         file = self.directory / "states.parquet"
         if not file.exists() or self.runs < 2:
@@ -259,8 +262,8 @@ def compare(directories: Sequence[str | Path], confidence: float = 0.95) -> Comp
     If two ensembles have the same seed and the same truth, and both kept the states of all runs
     (``--trace full``), differences are taken run by run; else by the standard errors of both
     (Welch). The intervals of all rows and directories hold together with probability
-    ``confidence`` (Bonferroni). A single run says nothing about certainty. Raises ScenarioError for
-    a directory that is not that of a finished run.
+    ``confidence`` (Bonferroni). A difference from a single run has no interval. Raises
+    ScenarioError for a directory that is not that of a finished run.
     """
     runs = _read_all(directories)
     confidence = number(above=0.0, below=1.0)("--confidence", confidence)

@@ -152,10 +152,11 @@ def compare_filters(
     the network, and compare errors, consistency and traffic run by run.
 
     A filter is a kind (``"hcmci"``), a table (``{"kind": "hcmci", "steps": 3}``) or an object of
-    netkf.parts; the start and the model of the scenario's own filter hold for all of them, and its
-    settings for its own kind. A filter that cannot run there says why in its row. All marks of
-    differences are right together with probability ``confidence``. ``runs``, ``seed`` and the other
-    options are those of ``netkf.monte_carlo``, for each filter.
+    netkf.parts. All begin with the initial estimate of the scenario's own filter and use its model,
+    unless a table has others; the scenario's own kind, given by name, also has its settings. The
+    row of a filter that cannot run in the scenario has the reason. All marks of differences are
+    right together with probability ``confidence``. ``runs``, ``seed`` and the other options are
+    those of ``netkf.monte_carlo``, for each filter.
 
     Raises ScenarioError if no filter can run, or if there is no such kind.
     """

@@ -55,7 +55,7 @@ class RunConsistency(NamedTuple):
     samples      : (T, N) NEES after time 0, nan if rounding blurs the error
     nees, expected : (N,) means over time of NEES and of its expected value, nan if unknown
     nis, expected_nis : (N,) means over time of NIS and of its expected value, nan if unknown
-    blurred_from : (1,) first time at which an error is left out, inf without one
+    blurred_from : (1,) first time (s) at which an error is left out, inf without one
     covariance_given : (1,) True if the filter gives a covariance
     """
 
@@ -235,6 +235,8 @@ class _Innovations:
         if Sigma is not None:
             Sigma = plant.F @ Sigma @ plant.F.T + plant.Q if model_is_true else None
         predicted = plant.F @ e + noise
+        # x - xhat of the next slot, with the plant's F, F' of the model: F x + w - F' xhat
+        # = F e + w + (F - F') xhat.
         if not model_is_true:
             predicted = predicted + (plant.F - F) @ run.xhat[k, i]
         return predicted, F @ P @ F.T + Q, Sigma
@@ -256,7 +258,8 @@ def _plant_noise(scenario: Scenario, streams: Streams, slots: list[int]) -> list
 class NodeConsistency:
     """The consistency of one node over all runs.
 
-    nees, width  : mean NEES over runs and samples, and the half width of its interval
+    nees         : mean NEES over runs and samples
+    width        : half width of the interval of NEES minus its expected value (n if unknown)
     expected     : expected value of NEES, nan if unknown
     inside       : share of samples whose mean NEES over the runs lies in the chi-square bounds
     nis, expected_nis : mean NIS and its expected value, nan if unknown

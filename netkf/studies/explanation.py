@@ -1,4 +1,4 @@
-"""What an explanation says about a node at an instant, as plain values."""
+"""The explanation of the estimate of a node at an instant, as plain values."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from netkf.network.deliveries import MessageKey
 from netkf.studies.message_sets import SmallestSet
 
 GOOD_ENOUGH = 0.05
-"""By default a set is good enough if it brings the trace of P as close as that, relatively, to the
-one of the run in which every message came.
+"""By default a set of messages suffices if it brings the trace of P to at most 1 + GOOD_ENOUGH
+times that of the run with every message delivered.
 """
 
 
@@ -31,17 +31,20 @@ class Missing:
 
 @dataclass(frozen=True)
 class InformationSource:
-    """What had reached the node from one other, ``node``. Times are in seconds, nan if unknown.
+    """The information of one ``node``, the source, that had reached the node asked about. Times are
+    in seconds, nan if unknown.
 
-    neighbour       it can send to the node directly
-    heard, arrived  when the last message from it that was used was sent, and arrived
-    unheard         messages from it that were sent since then and not used
-    known           the last moment whose knowledge can have reached the node, over any way
-    reading         its newest reading whose information can have reached the node
-    route           the nodes on the way of that, this one first
-    with_more       its newest reading that could have come with at most 1, 2, .. more messages
-    without_losses  its newest reading that could have come if every message had
-    missing         the fewest messages that had to come for a newer reading, of up to MAX_MISSING
+    sensor          the source has a sensor
+    neighbour       the source can send to the node asked about directly
+    heard, arrived  when the last used message from the source was sent, and when it arrived
+    unheard         number of messages from the source sent since then and not used
+    known           last time up to which information of the source can have arrived, on any path
+    reading         time of its newest reading whose information can have arrived
+    route           ids of the nodes on the path of its newest information, the source first
+    with_more       times of its newest reading with at most 1, 2, ... missing messages delivered
+    without_losses  time of its newest reading with every message delivered
+    missing         the fewest missing messages that would have brought a newer reading; empty if
+                    there is none, or if more would be needed than the search allowed
     """
 
     node: int
@@ -60,8 +63,8 @@ class InformationSource:
 
 @dataclass(frozen=True)
 class WhatIf:
-    """A replay in which ``messages`` came, or all where that is None: the trace of P at the node,
-    and the length of its error (nan without a known truth).
+    """A replay with the missing ``messages`` delivered, or all messages for None: the trace of P at
+    the node, and the length of its error (nan without a known truth).
     """
 
     label: str
@@ -72,11 +75,13 @@ class WhatIf:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Explanation:
-    """Why ``node`` knew at ``at`` seconds what it knew, in one run of a scenario.
+    """The explanation of the estimate of ``node`` at ``at`` seconds in one run of a scenario.
 
-    ``trace`` is that of its covariance P and ``error`` the length of its error. ``sources`` tells
-    what had reached it from whom, ``what_ifs`` what P would have been in replays, the run as it was
-    first, and ``smallest`` which messages would have sufficed (None if the filter gives no P).
+    ``trace`` is that of its covariance P and ``error`` the length of its error. ``sources`` has the
+    information that had reached it from each node, ``what_ifs`` P and error in replays, the run as
+    it was first, and ``smallest`` the smallest set of missing messages that would have sufficed
+    (None if the filter gives no P). ``missing`` has all messages that were not used, by their
+    identity, and ``notes`` sentences on the limits of the replays.
     """
 
     scenario: str

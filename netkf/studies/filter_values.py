@@ -26,7 +26,7 @@ class FilterValues(NamedTuple):
     """Values of R runs, averages over the samples after time 0 (R,) each.
 
     square   : squared error, mean of all nodes
-    worst    : largest error of any node at any sample
+    worst    : largest error of any node at any sample (not an average)
     nees     : e' P^-1 e, mean of all nodes
     diverged : True if the run ended early
     """
@@ -142,7 +142,8 @@ def estimate_quantities(
             base_value, influence_difference = base[name][0], influence - base[name][1]
             width = _width(influence_difference, level)
             gap = value - base_value
-            # For certain, not by chance. Filters that are one algorithm differ by rounding.
+            # The interval excludes 0, and the difference is not mere rounding, by which two forms
+            # of one algorithm differ.
             real = runs > 1 and abs(gap) > max(width, ROUNDING * abs(value))
             quantity = quantity._replace(
                 difference=gap, low=gap - width, high=gap + width, real=bool(real)

@@ -27,7 +27,7 @@ from netkf.trace.schema import CODES
 IntArray = np.ndarray
 NEVER = -1
 OUTCOMES = ("used", "lost", "late", "refused", "under way", "unused")
-"""Fate of a message at the end of a log. Late messages arrived after the exchange of their slot,
+"""Outcome of a message at the end of a log. Late messages arrived after the exchange of their slot,
 refused ones were too old for the filter, unused ones were replaced by another message of the same
 instant.
 """
@@ -40,9 +40,9 @@ class Messages:
 
     ``sender``, ``receiver`` and ``number`` (M,) name them; ``sent`` and ``arrived`` (M,) are times
     in seconds (nan: not arrived), ``phase`` (M,) the exchange of the slot (-1 under clocks),
-    ``outcome`` (M,) is an index of OUTCOMES. ``sent_row`` and
-    ``used_row`` (M,) are the rows of the log at which the message was sent and at which its
-    receiver used what had arrived (NEVER if it did not arrive in time).
+    ``outcome`` (M,) is an index of OUTCOMES. ``sent_row`` and ``used_row`` (M,) are the rows of the
+    log at which the message was sent and at which its receiver used what had arrived (NEVER if it
+    did not arrive in time).
     """
 
     sender: IntArray
@@ -65,8 +65,9 @@ class Messages:
 
 
 def match_messages(log: IntArray, swaps: bool, slotted: bool) -> Messages:
-    """Return the M messages of an EVENT ``log`` (E,), which must begin with the run: when each was
-    sent, arrived and used, or why it was not used.
+    """Return the M messages of an EVENT ``log`` (E,): when each was sent, arrived and used, or why
+    it was not used. The log must begin with the run, so that the messages of each directed link
+    have the numbers 0, 1, ...
 
     With ``swaps`` a receiver uses one message of an instant only, that of the sender with the
     largest id. A message with a ``late`` event was too late if the run is ``slotted``, else
@@ -174,6 +175,7 @@ def at_once(messages: Messages, log: IntArray) -> Messages:
 
     The time at which they would have arrived is unknown; so ages found with these are lower bounds.
     """
+    # The last row of the instant of sending.
     last = np.searchsorted(log["t"], messages.sent, side="right") - 1
     used = np.where(messages.outcome == USED, messages.used_row, last)
     return replace(messages, used_row=used)

@@ -37,8 +37,8 @@ class RunMetrics(NamedTuple):
     mean_square, trace : (R, N) squared error and trace of P, averaged over the samples after time 0
     messages           : (R, 5) counts in the order of ``ensembles.statistics.MESSAGES``
     diverged           : (R, 1) 1 if the run ended early
-    rounding_from      : (R, 1) time from which rounding blurs errors, which are averaged over the
-                         samples before it; not finite without one
+    rounding_from      : (R, 1) time (s) from which rounding blurs errors, which are averaged over
+                         the samples before it; not finite without one
     """
 
     mean_square: FloatArray

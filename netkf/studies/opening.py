@@ -33,8 +33,8 @@ RESULTS = (*MEANS, *(f"{name}_se" for name in MEANS), "bound", "central")
 class StoredSweep(NotebookTable):
     """A sweep that is read back from ``directory``.
 
-    ``scenario`` is what was varied, ``keys`` the paths of its keys that were varied, ``table`` has
-    a row for each point as ``netkf.sweep`` returns it: fewer than were wanted if ``status`` is
+    ``scenario`` is the base scenario, ``keys`` the paths of its keys that were varied, ``table``
+    has a row for each point as ``netkf.sweep`` returns it: fewer than were wanted if ``status`` is
     interrupted or failed.
     """
 

@@ -45,7 +45,7 @@ def shared_pool(runs: int, options: PoolOptions) -> Iterator[Pool]:
     pool = make_pool(runs, options, open_ended=True)
     done = False
     try:
-        # replicate_blocks() closes its pool; that of this one does nothing.
+        # replicate_blocks() closes the pool that it is given; _OpenPool.close() does nothing.
         yield _OpenPool(pool)
         done = True
     finally:

@@ -166,7 +166,8 @@ def _shorten(scenario: Scenario, at: float, to_horizon: bool) -> Scenario:
     """
     times = scenario.times
     probe = np.append(times[times < at], at)
-    # Events at ``at`` itself, and in slots those of its slot, belong to the state.
+    # Events at ``at`` itself, and in slots those of its slot, belong to the state: a replay ends a
+    # slot later, or by more seconds than times are rounded by.
     margin = scenario.slot_plant.period if scenario.slotted else max(1e-9, 1e-12 * at)
     end = scenario.horizon if to_horizon else min(scenario.horizon, at + margin)
     return _with(scenario, probe=probe, horizon=end)

@@ -31,6 +31,7 @@ FIRST_BATCH, FIRST_EXPECTED = 32, 8
 """Runs before the first decision about a value: of simulated errors, and of expected ones."""
 END_RATIO = 1.25
 """Ratio of values below which the search ends once one of them is undecided."""
+# Number of values that a search tries at most, by how they are decided.
 MAX_PROBES = {"theory": 40, "simulation": 16, "both": 16}
 DIGITS = {"theory": 4, "simulation": 2, "both": 2}
 """Significant digits of the values that are tried."""
@@ -213,8 +214,8 @@ def decide_by_simulation(problem: SizingProblem, plan: SimulationPlan, value: fl
 
 
 def _is_futile(probe: Probe, target: Target, runs: int) -> bool:
-    """Return True if after a quarter of ``runs``, the most allowed, more than FUTILE times as many
-    are forecast to decide the value of the ``probe``.
+    """Return True if at least a quarter of ``runs``, the largest number allowed, are simulated and
+    the value of the ``probe`` is forecast to need more than FUTILE times ``runs``.
     """
     return probe.runs >= runs // 4 and _runs_to_decide(probe, target) > FUTILE * runs
 
@@ -226,7 +227,7 @@ def _runs_to_decide(probe: Probe, target: Target) -> float:
     width, distance = 0.5 * (probe.high - probe.low), abs(probe.quantity - target.limit)
     if not math.isfinite(width):
         return math.nan
-    # Widths fall with the root of the number of runs.
+    # Widths fall with the root of the number of runs; 10 % are added as a margin.
     return 1.1 * probe.runs * (width / distance) ** 2 if distance > 0.0 else math.inf
 
 

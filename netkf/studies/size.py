@@ -70,9 +70,8 @@ def size(
     where it does not. By simulation, runs are added at each value until an interval decides, at
     most ``runs``; all values share the same random draws, and all decisions together are right with
     probability ``confidence``. If the exact covariance of the errors given the events of a run is
-    known and cheap (small networks in slots) it replaces the squared errors, which takes far fewer
-    runs. The quantity is assumed to be monotone in the key; that is checked at the values that are
-    tried.
+    known and cheap (small networks) it replaces the squared errors, which takes far fewer runs. The
+    quantity is assumed to be monotone in the key; that is checked at the values that are tried.
 
     ``seed``, ``workers``, ``executor``, ``scheduler`` and ``engine`` are those of
     ``netkf.monte_carlo``; ``progress`` is called with a line of text as simulations go on. Raises

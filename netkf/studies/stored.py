@@ -93,8 +93,8 @@ def _read_filter(row: dict[str, Any]) -> ComparedFilter:
     sent, size = (int(row[k]) if math.isfinite(row[k]) else math.nan for k in TRAFFIC)
     return ComparedFilter(
         filter=row["filter"],
-        # A filter that cannot run there sends nothing that could be counted. Its consistency would
-        # not tell: one run leaves that of the others unknown too.
+        # Traffic is nan only for filters that cannot run. Consistency does not tell them apart: it
+        # is "-" for all filters if there is a single run.
         quantities={} if math.isnan(sent) else quantities,
         consistency=row["consistency"],
         transmissions=sent,

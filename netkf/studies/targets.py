@@ -141,7 +141,7 @@ def quantity_by_simulation(
         mean = columns.mean(axis=0)
         error = columns.std(axis=0, ddof=1) / math.sqrt(runs)
     width = float(scipy.special.stdtrit(runs - 1, 1.0 - level / (2.0 * count))) * error
-    # Estimate, lower and upper end of the worst column.
+    # The largest mean lies between the largest lower and the largest upper end of all columns.
     ends = np.array([mean.max(), (mean - width).max(), (mean + width).max()])
     if central is not None:
         ends /= central

@@ -44,10 +44,10 @@ from netkf.trace.run import Run
 if TYPE_CHECKING:
     import pandas as pd
 
-MAX_MISSING = 3
+MAX_MISSING = 3  # largest size of a set of missing messages that is searched
 MIN_REPLAYS, MAX_REPLAYS, MAX_EVENTS = 10, 1000, 5_000_000
-"""Limits of the default number of replays, and the number of events that all of them may have;
-those that look for the smallest set, and those with newer readings of single nodes.
+"""The default number of replays is MAX_EVENTS over the events of one replay, within the two limits.
+It holds for those that search the smallest set, and again for those with newer readings of nodes.
 """
 
 
@@ -86,18 +86,18 @@ def why(
     replays: int | None = None,
     trust: bool = False,
 ) -> Why:
-    """Explain what ``node`` knew at ``at`` seconds in a run: whom it had heard, how old its
-    information was, which messages were missing, and what its covariance would have been had they
-    come, by replays of the run.
+    """Explain the estimate of ``node`` at ``at`` seconds in a run: which messages it had used, how
+    old its information was, which messages were missing, and, by replays of the run, its covariance
+    with missing messages delivered.
 
     ``run`` is a run in memory or the directory of one; of an ensemble with all traces ``replica``
     (default 0) names one. ``scenario`` is only needed for a run that does not know its own.
-    ``below`` is the trace of P that the smallest set of messages has to reach; by default that of
-    the run without losses, but for 5 %. The set has at most ``most`` messages, and at most
-    ``replays`` replays look for it, by default 10 to 1000. ``trust`` imports classes of modules in
+    ``below`` is the trace of P that the smallest set of missing messages has to reach, by default
+    1.05 times that with every message delivered. The set has at most ``most`` messages, and at most
+    ``replays`` replays search it, by default 10 to 1000. ``trust`` imports classes of modules in
     the directory.
 
-    Raises ScenarioError for a node, time or run that is not there, and for a run without events.
+    Raises ScenarioError for a node, time or run that does not exist, and for a run without events.
     """
     run, run_scenario = _check_run(run, scenario, replica, trust)
     at = _check_instant(run, run_scenario, node, at)

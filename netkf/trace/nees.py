@@ -11,7 +11,8 @@ from netkf.linalg.small import solve_inplace
 
 def errors(e: FloatArray, P: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return the squared error ``e' e`` (...) and NEES ``e' P^-1 e`` (...) of errors e (..., n) and
-    covariances P (..., n, n); NEES is nan where P is singular or nan.
+    covariances P (..., n, n); NEES is nan where P is nan or exactly singular. If some P is exactly
+    singular, it is also nan where others are singular up to rounding.
     """
     n, shape = e.shape[-1], e.shape[:-1]
     flat, nees = np.ascontiguousarray(e).reshape(-1, n), np.empty(shape)
@@ -28,10 +29,11 @@ def fill_nees(
     e: FloatArray, P: FloatArray, out: FloatArray, factor: FloatArray, solved: FloatArray
 ) -> bool:
     """Write the normalised squared errors (NEES) ``e' P^-1 e`` into ``out`` (K,), of K errors e (K,
-    n) and covariances P (K, n, n), nan where P is exactly singular; return False if a finite P is,
-    for which the caller then tests all ranks.
+    n) and covariances P (K, n, n), nan where P is exactly singular; return False if some finite P
+    is exactly singular.
 
-    ``factor`` (n, n) and ``solved`` (n, 1) are scratch.
+    The caller then tests the ranks of all P, which takes longer. ``factor`` (n, n) and ``solved``
+    (n, 1) are scratch.
     """
     regular, n = True, e.shape[1]
     for k in range(len(e)):

@@ -176,7 +176,7 @@ class Recorder:
             self._run_or_submit(self._pass_on, rows)
 
     def add_counts(self, counts: np.ndarray) -> None:
-        """Add ``counts`` (len(KINDS),) of events by kind, where events are only counted."""
+        """Add ``counts`` (len(KINDS),) of events by kind; only with ``counts_only``."""
         assert self.counts_only, "events are recorded"
         self._flush_gathered()
         self._counts += counts

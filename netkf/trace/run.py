@@ -18,7 +18,7 @@ from netkf.trace.schema import CODES, EVENT_COLUMNS, KINDS, state_columns
 if TYPE_CHECKING:
     import pandas as pd
 
-ROUNDING = 4.0 * np.finfo(float).eps
+ROUNDING = 4.0 * np.finfo(float).eps  # rounding error of x - xhat as a share of the size of x
 BLUR, CERTAIN = 100.0, 1e-14
 """Errors with a standard deviation below BLUR times their rounding error are not judged; variances
 below the share CERTAIN of the largest one are rounding errors.

@@ -27,11 +27,13 @@ tick     the link node - peer activated
 send     node sent message number ``message`` to peer
 lost     that message (node to peer) was lost by the channel
 deliver  node received message number ``message`` from peer, ``age`` seconds after it was sent
-late     the same, but the inbox that it was meant for had closed; it counts as lost
+late     the same, but it was not used and counts as lost: in slots its exchange had ended, under
+         clocks the filter refused it, for example as too old
 absorb   node used all messages of t in one reset; ``age`` is that of the oldest message
 swap     node replaced its estimate and covariance by those of peer
 round    a step of exchange number ``phase`` of the slot begins, in which every node sends
 stop     node has stopped learning from the others in exchange number ``phase``
+crash, restart  recorded by no engine; they keep the codes of the kinds after them as they were
 diverged the estimate of node was no longer finite, or its covariance no longer finite and positive
          semidefinite
 transmit node transmitted once, as its transmission number ``message``, to all that may hear it

@@ -51,9 +51,9 @@ def fill_legendre_integrals(
 def fill_exponential_integrals(
     M: FloatArray, sign: float, step: float, J_1: FloatArray, work: FloatArray
 ) -> None:
-    """Write ``J_1 = int_0^s e^{M u} du`` (n, n) for a ``step`` of s seconds, and e^{M s} and ``J_2
-    = int_0^s (s - u) e^{M u} du`` into the first and the last of ``work`` (4, n, n), by power
-    series, for ``sign`` times M (n, n) instead of M. The other two of ``work`` are scratch.
+    """Write for a ``step`` of s seconds, by power series, ``J_1 = int_0^s e^{N u} du`` (n, n), and
+    e^{N s} and ``J_2 = int_0^s (s - u) e^{N u} du`` into the first and the last of ``work``
+    (4, n, n); N is ``sign`` times M (n, n). The other two of ``work`` are scratch.
     """
     n, E, term, product, J_2 = len(M), work[0], work[1], work[2], work[3]
     for i in range(n):
@@ -61,7 +61,7 @@ def fill_exponential_integrals(
             identity = 1.0 if i == j else 0.0
             E[i, j] = term[i, j] = identity
             J_1[i, j], J_2[i, j] = step * identity, 0.5 * step * step * identity
-    # (M s)^k / k!, integrated once and twice.
+    # ``term`` is (N s)^k / k!; the integrals of its power u^k add it to J_1 and J_2.
     for k in range(1, TERMS):
         multiply_square(product, term, M)
         for i in range(n):

@@ -248,4 +248,5 @@ def write_estimate(
     for k in range(K):
         weigh_part(lanes, work, spread(lanes, counts[k]), parts, (t, k, h), centre, h)
         merge_lanes(lanes, total, work)
+    # False: no lane keeps its former estimate.
     finish_lanes(lanes, root, xhat, b, h, centre, total, work, False)

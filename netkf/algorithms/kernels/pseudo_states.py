@@ -7,7 +7,7 @@ and K that the caller has computed for it,
     yhat+ = yhat + sum_l B_l (yhat_l - yhat) + M z,   z = H' R^-1 (reading - H G^+ yhat)
     xhat+ = xhat + K (yhat+ - G xhat)
 
-and then both are predicted. G^+ is the pseudo-inverse, since sensors may leave states unseen.
+and then both are predicted. G^+ is the pseudo-inverse, since sensors may leave states unobserved.
 
 Filter ``h`` of a block has index ``[b, h]`` of stacks with lanes (``netkf.linalg.lanes``):
 estimates of states and of pseudo-states (B, H, n, L).

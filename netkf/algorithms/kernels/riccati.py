@@ -153,7 +153,7 @@ def _doubling_tables(
         wide(unit) ** np.arange(24), exponential_series(A.astype(wide), 24), 1
     )
     tables = tuple(np.empty((levels, n, n)) for _ in range(4))
-    with np.errstate(over="ignore", invalid="ignore"):  # an unstable blind plant overflows late
+    with np.errstate(over="ignore", invalid="ignore"):  # an unstable plant overflows late
         for level in range(levels):
             # Symmetry would drift by rounding, and doubling would amplify the drift.
             G, Q = symmetric(G), symmetric(Q)

@@ -219,7 +219,9 @@ def pack_series(
 
 
 def whiten_observation(H: FloatArray, R: FloatArray) -> FloatArray:
-    """Return ``R^-1/2 H`` as at most n rows (q, n), for H (p, n) and R (p, p)."""
+    """Return ``R^-1/2 H`` (q, n) for H (p, n) and R (p, p): with q = p rows, or, if p > n, n rows
+    with the same ``H' R^-1 H``.
+    """
     p, n = H.shape
     if p == 0:
         return np.zeros((0, n))

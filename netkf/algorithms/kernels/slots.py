@@ -137,8 +137,7 @@ class SlotSamples(NamedTuple):
     error : (R, T, H n), x - xhat
     stopped : (B, H, L), slot in which each filter permanently froze its network estimate
     conserved : (B, H, K, L), shares of each filter in K sums over the network that messages
-    conserve
-                (push-sum), at the last sample
+                conserve (push-sum), at the last sample
     absolute, local : (B, S, n, L), true states in all slots, in the coordinates of the plant and
                       relative to the moving origin that estimates refer to
     framed : whether the origin moves; otherwise both are the same

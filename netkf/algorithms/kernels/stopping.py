@@ -2,8 +2,8 @@
 sensors and the number N^(i) of nodes: step 2.3 of paper P (Battilotti, Cacace and d'Angelo 2023),
 and a safe form.
 
-The rule of the paper also fires when all links of a node fail in one step, with a wrong estimate
-for ever. Both engines call these kernels, so that rounding is the same and a node stops in the same
+The rule of the paper also fires when all links of a node fail in one step, and then freezes a wrong
+estimate. Both engines call these kernels, so that rounding is the same and a node stops in the same
 slot.
 """
 

@@ -78,6 +78,7 @@ def multiply_both(left: FloatArray, P: FloatArray, right: FloatArray, work: Floa
     scratch.
     """
     n = len(P)
+    # work = left P, complete before P changes; then P = work right'.
     for a in range(n):
         for c in range(n):
             total = 0.0

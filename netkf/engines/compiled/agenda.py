@@ -92,6 +92,7 @@ def is_immediate(scenario: Scenario) -> bool:
         and not scenario.sampled_sensors
         and type(network.activation) is Poisson
         and delay_is_zero(network.channel)
+        # A negative max_age makes even messages of age 0 too old.
         and getattr(node_filter, "max_age", math.inf) >= 0.0
         # Each message of a tick has a bit of one integer.
         and int(np.diff(senders_of(scenario).first).max(initial=0)) <= MAX_LINKS_OF_CLOCK
@@ -106,9 +107,9 @@ def together(nodes: int, runs: int) -> int:
 
 
 def pause_of(state: Simulation, ticks: int, count: int) -> float:
-    """Return the simulated time in seconds after which ``count`` runs with ``ticks`` ticks each
-    process their queued visits (predictions of one node, or of two that then combine): as long as
-    the queue of visits has space for.
+    """Return the simulated seconds between two times at which ``count`` runs, with ``ticks`` ticks
+    each, process their queued visits (predictions of one node, or of two that then combine): so
+    long that the visits of all these runs fill most of the queue.
     """
     nodes = len(state.nodes)
     visits_per_run = (
@@ -162,6 +163,7 @@ def simulate_agenda(
     """
     visits = struct_at(visits_memory, Visits)
     if len(progress) == 0:
+        # A new window of ticks, whose arrival bits are not filled in yet.
         if state.tick_at == 0:
             fill_arrival_bits(state, 0, state.ticks_stop, 0)
         request = run_agenda(state, visits, NEVER)
@@ -274,6 +276,7 @@ def queue_events(state: Simulation, visits: Visits, until: float) -> int:
     PAUSE or FULL). Moves the positions ``tick_at``, ``grid_at``, ... of ``state`` behind these
     events.
     """
+    # No event queues more visits: one for each node and a sample, or one for each receiver.
     nodes = len(state.nodes)
     first, max_visits = (state.run - state.first_run) * nodes, nodes + 2 + state.most_messages
     while True:
@@ -381,6 +384,7 @@ def count_tick(state: Simulation, sent: int, bits: int) -> None:
         arrived, bits = arrived + 1, bits & (bits - 1)
     counts = state.counts
     counts[TICK] += 1
+    # Only clocks of nodes make transmissions, see ``record_tick``.
     counts[TRANSMIT] += state.clock_kind >= NODES
     counts[SEND] += sent
     counts[LOST] += sent - arrived

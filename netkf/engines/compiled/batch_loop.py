@@ -116,6 +116,7 @@ def simulate_from(state: Simulation, batch: BatchArrays, run: int, resumed: bool
     number of the run that needs a larger pool of messages, or the number of runs at the end.
     """
     while run < len(batch.lengths):
+        # A resumed run keeps its state: only its pool of messages has been enlarged.
         if not resumed:
             state.first_run = run
             reset_filters(state, batch, 0)
@@ -184,9 +185,9 @@ def reset_messages(state: Simulation) -> None:
 
 @kernel
 def finish(state: Simulation, batch: BatchArrays, run: int) -> None:
-    """Store the results of run number ``run`` in ``batch``: its errors, its number of samples
-    ``lengths``, its events ``counts`` and whether it has ``diverged``; but for the errors, up to
-    the first sample that is not finite if there is one.
+    """Store the results of run number ``run`` in ``batch``: the errors of all its samples, and
+    whether it has ``diverged``, that is, has a sample that is not finite. Its number of samples
+    ``lengths`` and its events ``counts`` are those up to the first such sample, or to the end.
     """
     buffer = state.buffer
     fill_errors(batch, buffer.xhat, run, state.samples)

@@ -37,7 +37,7 @@ from netkf.trace.batch import COMPLETE, DIVERGED, RunBatch
 from netkf.trace.recorder import Recorder
 from netkf.trace.schema import KINDS
 
-MAX_BATCH_RUNS = 512
+MAX_BATCH_RUNS = 512  # runs of a batch
 QUICK_VISITS = 1 << 18
 """Visits of nodes that take some thirty milliseconds; preparing a batch takes one or two."""
 MAX_BATCH_BYTES = 1 << 25
@@ -211,7 +211,7 @@ def quick_runs(scenario: Scenario) -> int:
 
 def _expected_ticks(scenario: Scenario) -> float:
     """Return the expected number of ticks of all clocks in a run, by which the memory of a batch is
-    estimated: 0 if nobody sends on a clock, a large number if a clock has no finite rate.
+    estimated: 0 if no clock makes nodes send, a large number if a clock has no finite rate.
     """
     clock = scenario.network.activation
     if not (scenario.node_filter.talks and isinstance(clock, LinkClock)):

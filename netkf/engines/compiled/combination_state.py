@@ -105,6 +105,7 @@ def combination_state_of(scenario: Scenario, state: Simulation) -> CombinationSt
     if state.combination_kind not in (BEST, INVERSE, GAINS, PREDICTIONS, BELIEFS):
         return None
     algorithm: Any = scenario.node_filter
+    # ``lanes`` must be a view of the roots: a copy would miss what the loop changes.
     (N, n), root = state.xhat.shape, np.ascontiguousarray(state.root)
     assert root is state.root or np.shares_memory(root, state.root)
     prior_root = state.root.copy()
@@ -171,6 +172,7 @@ def _make_gains(scenario: Scenario, state: Simulation) -> dict[str, Any]:
                 scenario.noise_covariance(placed_sensor.entry, believed=True),
             )
             fields["sampled"][k], fields["noise"][k] = sample_maps(node_gains[k], H, R)
+    # Without closed loops any table will do, as no node uses it.
     fields["table"] = stack_tables(tables) if tables else state.table
     return fields
 

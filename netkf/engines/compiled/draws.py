@@ -27,8 +27,8 @@ from netkf.scenario.scenario import Scenario
 MAX_STEP_BLOCKS = 16  # blocks of steps that are drawn at once
 MAX_NORMALS = 1 << 20  # normals of all sensors that are drawn at once
 COURSES = 16
-"""Pieces of a run whose courses are kept at a time, a power of two: nodes are at much the same
-time, and all of them would not fit the processor's cache.
+"""Pieces of a run whose courses (polynomials of the path) are cached at a time, a power of two: the
+times of the nodes differ by few pieces, and all courses would not fit the processor's cache.
 """
 
 

@@ -91,6 +91,8 @@ def event_loop(
     ``history`` (past events) and ``combination`` (see CombinationState) hold the extra state that
     some filters need, None for the others; all of these are changed.
     """
+    # With running sums a sender must be predicted even if all of its messages are lost, since its
+    # totals grow; with a history find_shortage() must check free entries before each absorption.
     absorbs_at_once = totals is None and history is None
     while True:
         # Check first that the event has everything it needs: if not, nothing has changed, and the
@@ -152,7 +154,7 @@ def find_shortage(state: Simulation, history: History | None, event: int, now: f
         request = WANT_STEPS
     elif now == NEVER:
         request = DONE
-    # Each reading that is used needs an entry of the history.
+    # Each reading that is used needs an entry of the history, of which ``free[1]`` are free.
     elif history is not None and history.free[1] < max_readings(state, event):
         request = WANT_PAST
     return request

@@ -141,6 +141,7 @@ def update_belief(state: Simulation, evidence: EvidenceArrays, h: int) -> None:
     add_part(ONE, total, evidence.own[h], work)
     for k in range(evidence.first[h], evidence.first[h + 1]):
         add_part(ONE, total, evidence.received[evidence.direction[k]], work)
+    # False: the one lane takes the new estimate.
     finish_lanes(ONE, evidence.roots, evidence.lanes, 0, h, centre, total, work, False)
     before, after = centre[h], evidence.lanes[0, h]
     recentre_part(ONE, evidence.prior[h], before, after, evidence.prior[h])

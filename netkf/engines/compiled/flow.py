@@ -72,7 +72,9 @@ from netkf.trace.recorder import Recorder
 from netkf.trace.run import StateSamples
 from netkf.trace.schema import EVENT
 
+# Entries at the start of a run: the pool of messages, event rows, and the free ones of a history.
 FIRST_MESSAGES, FIRST_ROWS, FIRST_PAST = 64, 4096, 256
+# Most samples in the buffer of a run, and most float64 in their covariances together.
 MAX_BUFFERED_SAMPLES, SAMPLES_ROOM = 256, 1 << 18
 AT_START = (
     *(

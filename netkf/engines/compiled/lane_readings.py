@@ -87,7 +87,9 @@ def empty_readings(filters: Filters) -> LaneReadings:
         "x": (2, n, LANES),
         **dict.fromkeys(("noise", "early", "normals"), (2, p, LANES)),
     }
+    # A lane has space for one sensor: a node with several of them does not fit.
     several = (filters.nodes["sensors"] - filters.nodes["sensor"]).max() > 1
+    # -1: nothing is loaded in a lane yet.
     unknown: dict[str, Any] = {
         name: np.full(LANES, -1, dtype=np.int64) for name in ("model", "kind", "noise_row")
     }

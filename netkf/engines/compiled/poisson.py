@@ -30,8 +30,8 @@ from netkf.rng.streams import ReplicaStreams, Streams
 from netkf.scenario.scenario import Scenario
 
 TICKS, TICKS_A_LINK, MAX_WINDOW_TICKS = 1 << 15, 4, 1 << 20
-"""Ticks in a window: TICKS, whose arrays fit the processor's cache, or TICKS_A_LINK per entity if
-these are more, since each entity has a fixed cost in a window.
+"""Ticks in a window: TICKS, whose arrays fit the processor's cache, or, if these are more,
+TICKS_A_LINK per entity, since each entity has a fixed cost in a window; at most MAX_WINDOW_TICKS.
 """
 
 

@@ -35,7 +35,7 @@ from netkf.scenario.scenario import Scenario
 # Ticks drawn at once for an entity, doubling each time: slow clocks draw few that are not used.
 FIRST_BLOCK, MAX_BLOCK_SLOTS = 8, 1024
 TICKS_A_LINK = 256  # ticks of an entity in a window, which share its fixed cost
-MAX_WINDOW_TICKS, MIN_WINDOW_TICKS = 1 << 20, 1 << 12
+MAX_WINDOW_TICKS, MIN_WINDOW_TICKS = 1 << 20, 1 << 12  # limits for all entities together
 LOST = -1.0  # no delay is negative
 
 

@@ -131,8 +131,8 @@ def _free_links(matchings: Matchings, ends: np.ndarray, r: int, active: np.ndarr
     at both ends of each link.
 
     MAXIMAL goes through the links in random order and takes each one whose ends are both free.
-    INDEPENDENT wakes each link with a probability and takes those that share no node with another
-    link that is awake.
+    INDEPENDENT draws each link with a probability and takes those that share no node with another
+    link drawn.
     """
     count, pairs, states = len(ends), 0, matchings.states
     order, busy = matchings.order, matchings.busy
@@ -155,7 +155,7 @@ def _free_links(matchings: Matchings, ends: np.ndarray, r: int, active: np.ndarr
             )
             pairs += free
         return pairs
-    # INDEPENDENT: ``order`` is 1 for links that are awake, ``busy`` counts those at each node.
+    # INDEPENDENT: ``order`` is 1 for links that are drawn, ``busy`` counts those at each node.
     for k in range(count):
         order[k] = 1 if next_unit(states, r) < matchings.probability else 0
         busy[ends[k, 0]] += order[k]
@@ -360,7 +360,7 @@ def mark_paired_senders(
     ``sent`` (B, S, E, N, L). The filters then decide which of them send.
 
     Dimensions are B blocks of L runs, S slots of E exchange steps, N nodes, at most A pairs.
-    ``pair_count`` (R, S, E) is the number of pairs of each of the R = B L runs, and the first so
+    ``pair_count`` (R, S, E) is the number of pairs of each of the R <= B L runs, and the first so
     many entries of ``active`` (R, S, E, A) are the indices of their links. ``lanes`` is a tuple of
     length L.
     """

@@ -422,7 +422,6 @@ class SlotRuns:
             # The messages of this direction in the block, in order, by slot and step.
             sent_slots, sent_steps = np.nonzero(is_sent[:, :, w])
             # Messages are numbered from the beginning of the run: ``_sent`` came in earlier blocks.
-            # Messages are numbered from the beginning of the run: ``_sent`` came in earlier blocks.
             k = number - int(self._sent[w])
             if 0 <= k < len(sent_slots):
                 messages.up[0, sent_slots[k], sent_steps[k], w, 0] = 1

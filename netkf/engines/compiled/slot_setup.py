@@ -107,8 +107,9 @@ class SlotSetup:
     def _set_stages(self, scenario: Scenario) -> None:
         """Set ``stages``, the readings and exchange steps of a slot in order, each with its phase
         (the number of the exchange that it belongs to) and its end in seconds after the slot
-        begins, and ``fresh`` (E,): whether links draw losses anew in each of the E exchange steps,
-        or keep those of the step before.
+        begins; of the E exchange steps ``phases`` (E,), and ``fresh`` (E,): whether links draw
+        losses anew in the step, or keep those of the step before; and ``decides``, whether the
+        filter decides which nodes send.
         """
         algorithm, phase, step = self.algorithm, 0, 0
         length = scenario.phase_length if algorithm.talks else 0.0
@@ -142,7 +143,9 @@ class SlotSetup:
     def _set_sensors(self, scenario: Scenario) -> None:
         """Assign each sensor to a filter and to its rows there (``assigned``), and set ``rows``
         (H,), the number of rows of each of the H filters, and p, the most. A pooled filter reads
-        the sensors of all nodes.
+        the sensors of all nodes. Sensors are also listed by what reads them: Python
+        (``recorded_sensors``) or kernels (``kernel_sensors``, among them ``regressor_sensors``);
+        ``varies`` is True if some H is not fixed, ``H`` (1, 1, H, p, n, L) holds those that are.
         """
         pooled = self.algorithm.pooled
         self.estimators = 1 if pooled else len(scenario.nodes)
@@ -181,7 +184,7 @@ class SlotSetup:
         """Set ``self.sensors``, by which kernels draw readings: the whitened H = L_b^-1 H (K, p, n)
         and noise factors L_b^-1 L (K, p, p) of all K sensors that kernels read, with the true R = L
         L' and the believed R = L_b L_b'; and ``regressors``, the processes (A, drive, start) of
-        those with random H.
+        those with random H. Copies each fixed H into the rows of its filter in ``self.H``.
         """
         count, p, n = len(self.kernel_sensors), self.p, self.n
         H, noise = np.zeros((count, p, n)), np.zeros((count, p, p))
@@ -281,13 +284,17 @@ class SlotSetup:
         )
 
     def _set_channel(self, scenario: Scenario) -> None:
-        """Set ``delivery`` (2, W), the delivery probabilities of the W directed links in the good
-        and the bad state of the channel, ``entities``, the streams that losses are drawn from, and
-        ``talks`` (E, W): which directions send in which of the E exchange steps.
+        """Set the loss model ``loss`` (that of the run, if this is a replay that delivers the
+        messages of ``deliveries``) and whether it is a Markov chain (``is_chain``); ``delivery``
+        (2, W), the delivery probabilities of the W directed links in the good and the bad state of
+        the channel, all 1 unless ``has_known_probabilities``; and ``entities``, the first
+        ``streams_per_link`` directions of each link, from whose streams losses are drawn. Of the E
+        exchange steps set ``talks`` (E, W), which directions send in them, and ``sends_readings``
+        (E,), whether messages are readings.
         """
         channel, each = scenario.network.channel, self.directions_per_link
         self.loss, bad = channel.loss, (False, True)
-        # A replay draws as its run does, and then delivers the messages that it was told to.
+        # A replay draws as its run does, and then delivers the chosen messages.
         self.deliveries: Deliveries | None = None
         if isinstance(channel.loss, DeliveringLoss):
             self.loss, self.deliveries = channel.loss.given, channel.loss.deliveries

@@ -81,6 +81,9 @@ SPECIAL = ("readings", "sums", *COMBINATIONS[BEST:])
 
 LINKS, DIRECTIONS, NODES, AFTER_READINGS = range(4)
 CLOCKS = ("links", "directions", "nodes", "readings")
+"""The values of ``Senders.at`` in the order of these constants. From NODES on nodes broadcast: one
+transmission to all receivers.
+"""
 
 
 class Gains(Struct):

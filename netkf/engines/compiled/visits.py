@@ -57,7 +57,9 @@ MAX_VISITS = 1 << 14
 """Length of the queue of visits, so that it fits the processor's cache."""
 
 NO_NODE, ALL_NODES, NOT_HEARD, HAS_SENSORS, UNKNOWN = -1, -2, -1, -1, -1
+"""Values in place of an index, see VISIT and Visits; UNKNOWN: no weights are loaded in a lane."""
 UNOBSERVED, SENSING = 0, 1
+"""Both kinds of lanes: of nodes without increment sensors, and of nodes with them."""
 
 _NUMBERS = ("next", "first", "second", "to_first", "to_second", "run", "piece")
 VISIT = np.dtype([*((name, np.int32) for name in _NUMBERS), ("time", np.float64)], align=True)

@@ -20,7 +20,7 @@ from netkf.trace.recorder import NAN, Recorder
 from netkf.trace.schema import CODES
 
 TICK, TRANSMIT = CODES["tick"], CODES["transmit"]
-FIRST_BLOCK, MAX_BLOCK = 8, 1024
+FIRST_BLOCK, MAX_BLOCK = 8, 1024  # ticks of a clock that are drawn at once: at first, and at most
 
 Process = Generator[simpy.Event, Any, None]
 Activation = Callable[[float], None]
