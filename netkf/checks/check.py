@@ -59,6 +59,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 MIN_RUNS = 10
+"""Smallest number of runs of a check."""
 TWIN_RUNS = 10
 """Replicas of a user's class that are also run with the built-in filter that it derives from."""
 TWIN_TOLERANCE = 1e-6

@@ -60,6 +60,7 @@ def _mass_conserved(samples: RunSamples, level: float) -> Finding:
     return finding._replace(replica=first_wrong(drift, *limits))
 
 
+# What promises need: parts of names or sources in the table of assumptions, see ``Promise.needs``.
 REACH, START = "exact errors are within reach", "the filters start"
 PROMISES = (
     Promise(

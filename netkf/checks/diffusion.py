@@ -136,6 +136,7 @@ def _draw_squares(Sigma: FloatArray, random: np.random.Generator) -> FloatArray:
     return np.asarray(e[:, :, None] * e[:, None, :])
 
 
+# What promises need: parts of names or sources in the table of assumptions, see ``Promise.needs``.
 STABLE = ("D Assumption 3.1", "D Assumption 3.2")
 REACH = "exact errors are within reach"
 PROMISES = (

@@ -28,6 +28,7 @@ def check_nees_bound(samples: RunSamples, level: float) -> Finding:
         return find_nothing(NEES_TOLERANCE)
     ratios, single_level = nees[:, finite] / n, level / len(finite)
     means, spreads = ratios.mean(axis=0), ratios.std(axis=0, ddof=1) / math.sqrt(samples.count)
+    # The point reported: that with the largest mean plus two standard errors.
     k = int(np.argmax(means + 2.0 * spreads))
     intervals = [
         student_interval(float(mean), float(spread), samples.count, single_level)

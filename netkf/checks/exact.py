@@ -68,6 +68,9 @@ MAX_ERRORS = 64
 MIN_VARIANCE = 1e-8
 """Relative variance below which a direction is left out, because its errors are rounding."""
 BOUND_TOLERANCE, BIAS_TOLERANCE = 1e-8, 0.5
+"""Shortfall of P relative to tr Sigma that rounding may cause in any case, and tolerated bias in
+standard deviations of an error.
+"""
 SINGULAR = 1e-12
 """Ratio of smallest to largest eigenvalue below which a covariance counts as singular."""
 

@@ -243,8 +243,8 @@ def _walks_bound(samples: GossipSamples, level: float) -> Finding:
     covariance that the last WINDOW readings which updated the node's pair give alone, from an
     unknown state.
 
-    The bound is large (UNKNOWN) where these readings do not detect the state. No interval is
-    estimated, so that ``level`` is not used.
+    The bound is of the order of UNKNOWN^2 where these readings do not detect the state. No interval
+    is estimated, so that ``level`` is not used.
     """
     P, bound = samples.runs.P, samples.runs.bounds
     size = np.trace(bound, axis1=-2, axis2=-1)
@@ -254,7 +254,7 @@ def _walks_bound(samples: GossipSamples, level: float) -> Finding:
         finite = np.isfinite(gap).all(axis=(-1, -2))
     shortfall = np.full(finite.shape, np.inf)
     shortfall[finite] = np.maximum(-np.linalg.eigvalsh(gap[finite])[..., 0], 0.0)
-    detected = size < UNKNOWN
+    detected = size < UNKNOWN  # far below UNKNOWN^2, the variance of an unknown state
     largest = f"{size[detected].max():.4g}" if detected.any() else "none"
     message = (
         f"in {detected.mean():.0%} of all cases the last {WINDOW} readings detect the state; "
@@ -444,6 +444,7 @@ def _token_memory(chain: ChainSamples) -> float:
     )
 
 
+# What promises need: parts of names or sources in the table of assumptions, see ``Promise.needs``.
 CHAIN = ("every exchange is a swap", "slots are independent")
 LAWS = (*CHAIN, "every node is watched")
 STABLE = (*CHAIN, "G C.1", "G S.1", "G D.1")

@@ -271,6 +271,7 @@ def _with_faster_links(scenario: Scenario, factor: float) -> Scenario:
         raise TheoryError(f"links cannot tick so fast: {error}") from None
 
 
+# What promises need: parts of names or sources in the table of assumptions, see ``Promise.needs``.
 EVENTS = ("the filters know", "the filters start", "P_i(0) >=", "exact errors are within reach")
 PROMISES = (
     Promise(

@@ -66,7 +66,11 @@ from netkf.trace.run import Run
 from netkf.trace.schema import CODES
 
 BOUND_TOLERANCE, SUPPORT_TOLERANCE = 1e-8, 1e-6
+"""Relative to tr P: shortfall below the path without losses that rounding may cause in any case;
+and the same for the distance from a point of the support, and the spread that counts as vanished.
+"""
 PROBABILITY_TOLERANCE = 0.05
+"""Tolerated error of the share of readings that arrive; twice that in cells of a scalar law."""
 MAX_PATHS = 2000
 """Number of reference paths whose averages over the slots are compared with those of the runs."""
 CELLS = 12
@@ -605,6 +609,7 @@ def _scalar_law_exact(samples: IntermittentSamples, level: float) -> Finding:
     return find_largest(intervals, LAW_TOLERANCE, "distance from the exact distribution function")
 
 
+# What promises need: parts of names or sources in the table of assumptions, see ``Promise.needs``.
 FRESH, KNOWN = ("readings arrive independently",), ("the filters know", "the filters start")
 LIMIT = (*FRESH, "stabilisable", "positive definite", "detectable at every node", "(12), Theorem 9")
 PROMISES = (

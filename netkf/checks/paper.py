@@ -24,7 +24,7 @@ class PaperChecks(ABC):
 
     def summarise(self, scenario: Scenario, run: Run) -> ReplicaSummary:
         """Return what the tests need of one ``run``, an instance of ``summary_type``; called once
-        for each run, whose samples are at ``check_times``.
+        for each run, whose samples are at ``probe_times``.
         """
         return summarise_exactly(scenario, run)
 

@@ -9,6 +9,7 @@ from netkf.linalg.arrays import FloatArray, IntArray
 from netkf.scenario.scenario import Scenario
 
 HORIZON_SHARES = (0.125, 0.25, 0.5, 1.0)
+"""Times, as shares of the horizon, at which promises are checked in continuous time."""
 POOLED_ERRORS, MAX_POOLED = 192, 24
 """Largest number of errors (nodes times states times sample times) of a run that are whitened
 together, and largest number of sample times. Many times of one run tell as much about a covariance

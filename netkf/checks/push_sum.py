@@ -64,6 +64,7 @@ from netkf.theory.push_sum.certified_gamma import searches_gamma
 from netkf.trace.run import Run
 
 STEADY_TOLERANCE = 0.01
+"""Distance from a limit, relative to its largest entry, that counts as reached."""
 SQUARE_TOLERANCE, BIAS_TOLERANCE = 0.3, 0.45
 """Tolerated relative difference of mean squares, and bias in standard deviations of an error."""
 HEAVY_TAILS = 0.885
@@ -274,8 +275,8 @@ def _gamma_certified(samples: PushSumSamples, level: float) -> Finding:
 def _many_steps(samples: PushSumSamples, level: float) -> Finding:
     """Check that with ever more averaging steps in a slot (gamma) the steady error covariances
     (N, n, n), and the covariance of the noise that averaging leaves (P Lemma 4), come to their
-    limits: compute them for gamma = 1, 2, 4, ... until they agree to STEADY_TOLERANCE or gamma
-    exceeds MAX_STEPS.
+    limits: compute them for gamma = 1, 2, 4, ..., below MAX_STEPS, until they agree to
+    STEADY_TOLERANCE.
 
     No runs are looked at and no interval is estimated, so that ``level`` is not used.
     """
@@ -312,6 +313,7 @@ def _relative_distance(P: FloatArray, limit: FloatArray) -> float:
     return float(np.abs(P - limit).max() / np.abs(limit).max())
 
 
+# What promises need: parts of names or sources in the table of assumptions, see ``Promise.needs``.
 LAWS = ("P Assumption 2", "P Assumption 1", "P Assumption 3", "no gain is frozen")
 FOLLOWED = (
     "mean squares have a variance",

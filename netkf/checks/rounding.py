@@ -7,7 +7,7 @@ import numpy as np
 from netkf.checks.evidence import Finding, find_identity
 from netkf.linalg.arrays import ArrayLike, FloatArray
 
-EPS = float(np.finfo(np.float64).eps)
+EPS = float(np.finfo(np.float64).eps)  # 2.2e-16
 OPERATIONS = 1e3
 """Number of relative errors EPS that may accumulate in one computed entry."""
 

@@ -23,7 +23,7 @@ REPLAY_TOLERANCE = 1e-7  # of P, relative: two ways to compute it differ by roun
 class ReplicaSummary:
     """The statistics of one run at K times and N sampled nodes.
 
-    P, e       : (K, N, n, n), (K, N, n) covariances and errors, nan if rounding blurs them
+    P, e       : (K, N, n, n), (K, N, n) covariances, and errors: nan where rounding blurs them
     nees       : (K, N) normalised estimation error squared, e' P^-1 e
     replayed   : (K, N, n, n) P by the equations of the filter, from the events of the run
     mean, Sigma : (K, N, n), (K, N, n, n) mean and covariance of the errors given the events

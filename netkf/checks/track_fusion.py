@@ -18,7 +18,7 @@ from netkf.checks.samples import RunSamples, with_departure
 from netkf.scenario.scenario import Scenario
 from netkf.theory.track_fusion.steady_errors import tracks_in_slots
 
-EXACT_TOLERANCE = 1e-8
+EXACT_TOLERANCE = 1e-8  # relative to the trace: rounding
 START_FACTOR, STEADY_TOLERANCE = 10.0, 1e-3
 """Safety factor on the effect of the start, radius^slots times its size; and the relative effect
 below which P counts as steady.
@@ -69,6 +69,7 @@ def check_steady(samples: RunSamples, level: float) -> Finding:
     finding = find_identity(float((gap / size).max()), allowed, message)
     if allowed < STEADY_TOLERANCE:
         return finding
+    # The radius^slots for which the effect of the start is half of what counts as steady.
     allowed_remainder = STEADY_TOLERANCE * float(size.min()) / (2.0 * START_FACTOR * terms)
     slots = math.log(allowed_remainder) / math.log(radius)
     return finding._replace(early=True, horizon=slots * samples.scenario.slot_plant.period)

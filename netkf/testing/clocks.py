@@ -30,7 +30,7 @@ BLOCKS = ((600,), (1,) * 600, (7, 64, 1, 256, 272))
 """Ways to ask for 600 ticks: the number of ticks in each block."""
 CHAINS, LENGTH = 800, 100
 """Simulated runs of all entities together, and ticks in a run."""
-MAX_ENTITIES = 12
+MAX_ENTITIES = 12  # links, directions or nodes whose clocks are checked
 INTERLEAVED_TICKS = 40
 """Ticks of each entity that are compared alone and with ticks of other entities in between."""
 RATE_TOLERANCE = 2e-3

@@ -79,6 +79,7 @@ def _is_significant_if_skewed(values: FloatArray, mean: float, error: float, lim
     if error <= NEGLIGIBLE * abs(mean):
         return True
     t, root = mean / error, math.sqrt(len(values))
+    # The sample skewness over sqrt(N), as all terms of the transformation have it.
     skewness = float(((values - mean) ** 3).mean()) / (error * root) ** 3 / root
     corrected = t + skewness * t**2 / 3.0 + skewness**2 * t**3 / 27.0 + skewness / 6.0
     return abs(corrected) > limit

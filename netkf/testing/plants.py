@@ -40,6 +40,7 @@ STARTS, STEPS, LENGTH = 40_000, 100_000, 400
 FEW_STARTS = 10
 """Draws of x(0) where it is not random."""
 GRID_STEPS, MAX_RUNS = 51_200, 2000
+"""Steps on the sensing grid in all runs together, and largest number of runs off that grid."""
 SHORT_LENGTH = 130
 """Slots in which paths are compared exactly."""
 ROUNDING, FRAME_TOLERANCE = 1e-9, 1e-6

@@ -45,12 +45,15 @@ READINGS, LENGTH, MAX_NODES = 100_000, 250, 8
 STEPS, RUNS = 500, 10
 """Steps of increments in a run, and runs."""
 REGRESSOR_RUNS, REGRESSOR_SLOTS = 2000, 12
+"""Runs in which the law of H of a RegressorSensor is tested, and slots in a run."""
 SHORT_LENGTH = 40
 """Readings that are compared exactly."""
 TIMES_RUNS, EXPECTED_SAMPLES = 400, 50.0
 """Runs in which samples are counted, and the mean number of them in a run."""
 ROUNDING = 1e-9
+"""Scaled difference (:func:`scaled_difference`) up to which readings count as equal."""
 DERIVATIVE_STEP, DERIVATIVE_TOLERANCE = 1e-5, 1e-6
+"""Step of the state in differences of h, and their tolerated error over 1 + the largest entry."""
 MAX_STATES = 12
 """Largest number of components of a state with which a nonlinear sensor is tried."""
 

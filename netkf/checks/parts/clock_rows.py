@@ -40,6 +40,9 @@ from netkf.linalg.arrays import FloatArray
 from netkf.scenario.scenario import Scenario
 
 RATE_TOLERANCE, DISPERSION_TOLERANCE = 0.05, 0.25
+"""Tolerated relative error of a rate; and of the variance of Poisson counts, or correlation of two
+clocks.
+"""
 FIRST_TICK, SPREAD = 1.0, 2.0
 """Slack, in ticks of one run, for the transient of a renewal clock that starts with the run; and
 safety factor on the dispersion index of its counts, which replaces c^2 of an unknown gap law.

@@ -38,6 +38,7 @@ from netkf.network.recorded import RecordedLoss
 from netkf.scenario.scenario import Scenario
 
 PROBABILITY_TOLERANCE = 0.05
+"""Tolerated error of a share of messages or slots."""
 MIN_EVENTS = 20
 """Runs with at least one event (a loss, a delivery) from which their sample variance is used."""
 

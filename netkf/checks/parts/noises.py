@@ -270,8 +270,8 @@ def _whitened_noises(
 
 
 def _typical_states(scenario: Scenario, random: np.random.Generator, count: int) -> FloatArray:
-    """Return ``count`` Gaussian states (count, n) for sensors to read, with the mean of x(0), and
-    the covariance of x(0) plus the noise of ten steps: of the size that the plant's states have.
+    """Return ``count`` Gaussian states (count, n) for sensors to read, of the size that the plant's
+    states have: with the mean of x(0) and the covariance of :func:`_typical_covariance`.
     """
     root = square_root(_typical_covariance(scenario))
     plant: Any = scenario.plant
@@ -279,7 +279,9 @@ def _typical_states(scenario: Scenario, random: np.random.Generator, count: int)
 
 
 def _typical_covariance(scenario: Scenario) -> FloatArray:
-    """Return the covariance (n, n) of x(0) plus the noise of ten steps."""
+    """Return the covariance (n, n) of x(0) plus that of the plant's noise in ten slots, or ten
+    seconds in continuous time.
+    """
     plant: Any = scenario.plant
     return np.asarray(plant.start_cov + 10.0 * np.asarray(plant.Q))
 

@@ -82,7 +82,8 @@ def _step_variance(samples: PartSamples, level: float) -> Finding:
 
 
 def _step_mean(samples: PartSamples, level: float) -> Finding:
-    """Compare the means of the plant's noise with zero.
+    """Compare the means of the plant's noise, and its correlations with the states before, with
+    zero.
 
     The interval of the finding misses the truth with at most the probability ``level``.
     """
@@ -90,7 +91,7 @@ def _step_mean(samples: PartSamples, level: float) -> Finding:
 
 
 def _step_correlation(samples: PartSamples, level: float) -> Finding:
-    """Compare the correlations of the plant's noise with zero.
+    """Compare the correlations of the plant's noise, between its entries and in time, with zero.
 
     The interval of the finding misses the truth with at most the probability ``level``.
     """
@@ -109,7 +110,8 @@ def _reading_variance(samples: PartSamples, level: float) -> Finding:
 
 
 def _reading_mean(samples: PartSamples, level: float) -> Finding:
-    """Compare the means of the readings' noise with zero.
+    """Compare the means of the readings' noise, and its correlations with the states read, with
+    zero.
 
     The interval of the finding misses the truth with at most the probability ``level``.
     """
@@ -117,7 +119,7 @@ def _reading_mean(samples: PartSamples, level: float) -> Finding:
 
 
 def _reading_correlation(samples: PartSamples, level: float) -> Finding:
-    """Compare the correlations of the readings' noise with zero.
+    """Compare the correlations of the readings' noise, between readings and in time, with zero.
 
     The interval of the finding misses the truth with at most the probability ``level``.
     """

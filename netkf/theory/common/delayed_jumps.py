@@ -38,9 +38,11 @@ from netkf.theory.common.jumps import ClockJumps, LyapunovInverse
 from netkf.theory.common.random_links import Directions
 
 MIN_POINTS, MAX_POINTS = 12, 80
+"""Limits of the number of intervals between the collocation points of a delay."""
 MAX_DENSE, MAX_DENSE_MEAN = 1200, 600
 """Unknowns up to which the boundary value problem, and the map of means over d, are matrices."""
 KRYLOV_VECTORS, MAX_ROUNDS = 40, 10
+"""Vectors between restarts of GMRES, and rounds of iterative refinement."""
 FIRST_TOLERANCE, TOLERANCE, CORRECTION = 1e-7, 1e-12, 1e-3
 """Relative tolerances of the first solution of the boundary value problem, of the refined one, and
 of each correction that refines it."""
@@ -235,6 +237,9 @@ class DelayedJumps:
     def _solve_without_messages(self, right: FloatArray) -> FloatArray:
         """Return the solution K (k + 1, M, M) of the problem with this ``right``-hand side, of the
         same shape, if no message is heard (H = 0); GMRES uses it as preconditioner.
+
+        It is exact if entry 0 of ``right`` is symmetric: that of K then solves a Lyapunov equation.
+        The effect of an antisymmetric part, which only residuals have, is approximate.
         """
         equation = symmetric(right[:1])
         first = 2.0 * (right[:1] - equation) + self._lyapunov(equation)

@@ -119,7 +119,8 @@ class ClockJumps:
     nodes      : N
     drift      : (M, M) of the errors between events
     noise      : (M, M) covariance per second, that of readings included
-    samples    : (node, rate per second, L H) of nodes that take samples
+    samples    : (node, rate per second, L H (n, n)) of nodes that take samples, which multiply the
+                 node's error by I - L H
     directions : the links, None if nothing is sent
     ticks      : (rate per second, indices of directions) of each clock at which nodes transmit
     """

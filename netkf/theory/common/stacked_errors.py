@@ -23,6 +23,9 @@ from netkf.theory.numerics.stack import GaussianStack
 from netkf.theory.numerics.updates import Observation
 
 STATE, OFFSET = "state", "offset"
+"""Names of two vectors of the stack that are no estimates: the true state, and the constant input
+that carries the errors' means.
+"""
 Term = tuple[Hashable, FloatArray]
 """An estimate and the matrix (n, n) by which its error is multiplied."""
 
@@ -157,7 +160,9 @@ class StackedErrors:
             del self.owner[name]
 
     def replace(self, name: Hashable, form: Hashable) -> None:
-        """Move estimate ``name`` to ``form``, which keeps its owner."""
+        """Overwrite the estimate ``form`` by the estimate ``name``, which is removed. The owner of
+        ``form`` stays the same.
+        """
         self.stack.rename(name, form)
         del self.owner[name]
 

@@ -196,6 +196,8 @@ def _from_tick_to_tick(
     noise = to_arrival @ (C @ noise @ C.T + sample_noise) @ to_arrival.T + arrival_noise
     transition = to_arrival @ C @ to_tick
     steps = np.stack([transition[_node_slice(k, n), _node_slice(k, n)] for k in range(N)])
+    # ``steps`` has the whole way from exchange to exchange, so that nothing is left to predict:
+    # F = I and Q = 0.
     return SlotJumps(np.eye(n), np.zeros((n, n)), steps, symmetric(noise), directions)
 
 

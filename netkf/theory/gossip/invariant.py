@@ -16,7 +16,7 @@ from netkf.theory.intermittent.riccati import couple_from_the_past
 from netkf.theory.numerics.matrices import as_integer
 
 MAX_SAMPLES_AT_ONCE = 2000  # bounds the memory of the arrays
-FAR_START_DEVIATIONS = 1e3  # standard deviations of the upper start, in units of those of the plant
+FAR_START_DEVIATIONS = 1e3  # standard deviations of the upper start, in units of sqrt(tr Q + 1)
 
 
 class SwitchedSamples(NamedTuple):

@@ -27,13 +27,13 @@ from netkf.theory.numerics.updates import Observation
 
 TOLERANCE = 1e-10  # relative, of the solver
 DEFECT_TOLERANCE = 1e-7  # relative, of the finished solution
-MAX_CHECKED_STEPS = 200
-MAX_EXPLICIT_EVALUATIONS = 20_000
-OVERFLOW = 1e150
+MAX_CHECKED_STEPS = 200  # steps of a piece whose defect is computed
+MAX_EXPLICIT_EVALUATIONS = 20_000  # of the slope, or Taylor coefficients; more mean a stiff problem
+OVERFLOW = 1e150  # entry of P from which the solution is given up
 MAX_ROUNDS, ROUND_TOLERANCE = 40, 1e-8  # of Picard iteration
 ROUNDING = 4e-16  # of the largest entry of all nodes: what arrives at a node is rounded to that
 GROWTH = 10.0  # factor by which a solution may grow before tolerances are chosen anew
-PARTS = (1, 40, 400)  # the solver's steps are at most this fraction of a piece, try after try
+PARTS = (1, 40, 400)  # try after try, a step of the solver lasts at most a piece over this number
 Slope = Callable[[float, FloatArray], FloatArray]
 """dy/dt of the flat packed solution y, from t (seconds) and y."""
 
@@ -158,8 +158,9 @@ class _PiecewiseSolution:
         then solved piece by piece; nothing arrives in the first one. A piece is one delay long, so
         that all that arrives in it is known; if the delay is much shorter than the time between
         messages, a piece is half that time long, and its own arrivals are found by Picard
-        iteration, which reduces the error by a factor 2 k in round k. Pieces end where the solution
-        jumps, since sensors sample there, and where messages sent at jumps arrive.
+        iteration: with h the length of the piece and c the rate of arrivals its error after k
+        rounds falls like (c h)^k / k!, here with c h = 1/2. Pieces end where the solution jumps,
+        since sensors sample there, and where messages sent at jumps arrive.
         """
         delay = self._packed.equations.delay
         while self._piece_ends[-1] < last:

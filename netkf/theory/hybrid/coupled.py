@@ -37,7 +37,8 @@ from netkf.theory.hybrid.samples import (
     transmits_at_samples,
 )
 
-RELATIVE_TOLERANCE, ABSOLUTE_TOLERANCE = 1e-12, 1e-8  # between rates that count as equal
+# Between rates that count as equal; the absolute one in 1/s.
+RELATIVE_TOLERANCE, ABSOLUTE_TOLERANCE = 1e-12, 1e-8
 RESIDUAL_TOLERANCE = 1e-9  # of the left null vector, relative
 
 

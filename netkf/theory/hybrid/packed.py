@@ -19,7 +19,7 @@ from netkf.linalg.arrays import FloatArray
 from netkf.theory.hybrid.coupled import CoupledRiccati
 from netkf.theory.hybrid.samples import PoissonSamples
 
-NO_INFORMATION = 1e-15  # eigenvalues of G, its diagonal made 1, that are rounding
+NO_INFORMATION = 1e-15  # eigenvalue of G, scaled to a unit diagonal, up to which it is rounding
 MAX_PRODUCTS = 1 << 20  # entries of gains times unit matrices at once
 ELIMINATION_WORK = 3e9  # multiplications up to which elimination is taken
 
@@ -57,6 +57,7 @@ class PackedRiccati:
         self._exchange = scipy.sparse.csr_array(equations.coupling - leave)
         self._sensed = np.flatnonzero(np.abs(equations.G).max(axis=(1, 2)) > 0.0)
         self._C = _low_rank_factors(equations.G[self._sensed])
+        # The same C with the nodes last, (n, r, S), for ``series``.
         self._across = np.ascontiguousarray(self._C.transpose(1, 2, 0))
 
     def shift(self, A: FloatArray, Q: FloatArray) -> PackedRiccati:
@@ -164,8 +165,8 @@ class PackedRiccati:
         series = np.empty((order + 1, *Y.shape))
         series[0] = Y
         # With G = C C' at nodes with a sensor, coefficient k of P G P is the sum of M_i M_j' over
-        # i + j = k with M = P C. Nodes come last, so that numpy runs along them; the half with i <=
-        # j and its transpose are enough.
+        # i + j = k with M = P C. Nodes come last, so that numpy runs along them. The terms with
+        # i < j are computed, those with i > j are their transposes, and i = j adds one for even k.
         n, r, sensed = self._across.shape
         products = np.empty((order, n, r, sensed))
         for k in range(order):
@@ -304,4 +305,5 @@ def _low_rank_factors(G: FloatArray) -> FloatArray:
     positive = values > NO_INFORMATION
     rank = int(positive.sum(axis=1).max(initial=0))
     C = scale[:, :, None] * vectors * np.sqrt(np.where(positive, values, 0.0))[:, None, :]
+    # Eigenvalues increase, so that the positive ones are among the last ``rank``.
     return np.ascontiguousarray(C[:, :, C.shape[2] - rank :])

@@ -17,7 +17,7 @@ from netkf.scenario.scenario import Scenario
 from netkf.trace.run import Run
 from netkf.trace.schema import CODES
 
-STEP = 0.1  # of the integration, times the fastest rate
+STEP = 0.1  # step of the integration (seconds) times the fastest rate (1/s)
 MAX_ERRORS = 120  # of all nodes together
 
 
@@ -71,9 +71,10 @@ def _require_exact_model(scenario: Scenario) -> None:
 def _arrivals_in_order(
     scenario: Scenario, run: Run
 ) -> tuple[FloatArray, np.ndarray, np.ndarray, np.ndarray, FloatArray]:
-    """Return the arrivals of a run as arrays: the instants (T,) in seconds, the index (T + 1,) of
-    the first message of each instant and their end, and of the M messages the indices of receivers
-    and senders and the weights, (M,) each.
+    """Return the arrivals of a run as arrays: the T instants (T,) in seconds, and of the M messages
+    the indices of receivers and senders and the weights, (M,) each.
+
+    The second array (T + 1,) has the index of the first message of each instant, then M.
     """
     rows = run.log[run.log["kind"] == CODES["deliver"]]
     index = scenario.topology.index

@@ -190,6 +190,7 @@ def sample_jumps(scenario: Scenario) -> tuple[SampleJump, ...]:
         R = scenario.noise_covariance(placed_sensor.entry, believed=True)
         for k, time in enumerate(times[node, ordinal].tolist()):
             H = sensor.H if path is None else path.reading(k, np.zeros(n))[1]
+            # The bound has no true noise: R only fills the field of its root.
             by_time.setdefault(time, {}).setdefault(index[node], []).append(Observation(H, R, R))
     everyone = range(len(scenario.nodes))
     jumps = []

@@ -29,10 +29,10 @@ from netkf.theory.hybrid.samples import transmits_at_samples
 
 MAX_GROWTH = 1e9  # of P relative to its start, beyond which it is taken to grow without bound
 RESIDUAL = 1e-9  # of H(12), relative to its terms: a fixed point up to rounding
-MAX_STEPS = 400  # implicit steps of the search for gains
-MAX_FACTOR = 1e6  # up to which the search for a steady state looks
+MAX_STEPS = 400  # implicit steps of the search for gains, those that are rejected included
+MAX_FACTOR = 1e6  # largest factor on the link rates that the search for the threshold tries
 NEWTON_TOLERANCE = 1e-7  # of a change of P, relative to the slope that it has to undo
-POWER_STEPS = 60  # of the power method
+POWER_STEPS = 60  # of the power method, each of which gives a valid bound
 IMPLICIT_STEPS = 3  # of Newton's method for an implicit step of H(12)
 NEWTON_STEPS = 12  # convergence is quadratic: more would not help
 MAX_FACTORED = 3000  # nodes of a network without small cuts up to which its coupling is factored
@@ -163,15 +163,18 @@ def _find_stabilising(packed: PackedRiccati, first: FloatArray | None = None) ->
     """
     equations, n = packed.equations, len(packed.equations.A)
     size = max(float(np.abs(x).max()) for x in (equations.Q, equations.start, [[1e-12]]))
+    # The multiple of I makes P positive definite where start and Q are singular.
     P = equations.start + equations.Q + 1e-3 * size * np.eye(n) if first is None else first
     sampling = sum(float(group.rate.max(initial=0.0)) for group in equations.samples)
     leaving = float(packed.leaving.max()) + sampling
-    drift = float(np.abs(equations.A).max()) + 1e-9
+    drift = float(np.abs(equations.A).max()) + 1e-9  # 1/s, above 0
+    # Seconds: short against all rates from the start, long from a state that is nearly steady.
     step = 0.1 / (drift + leaving) if first is None else 1.0 / drift
     for _ in range(MAX_STEPS):
         if is_stable(packed.linear(P)):
             return P
-        # One implicit step of dP/dt = H12(P): 0 = H12(P+) + (P - P+) / step.
+        # One implicit step of dP/dt = H12(P): 0 = H12(P+) + (P - P+) / step, which is the steady
+        # equation with A - I / (2 step) for A and Q + P / step for Q. A step that fails is halved.
         shift = equations.A - 0.5 / step * np.eye(n)
         following = _implicit_step(packed.shift(shift, equations.Q + P / step), P)
         if following is None:

@@ -242,13 +242,14 @@ def _critical_bounds(F: FloatArray, H: FloatArray, search: _GainSearch) -> tuple
         """Return the least spectral radius over gains if readings arrive with probability ``g``."""
         return search.best((1.0 - g, g))[0]
 
-    # Without an unstable mode the mean is bounded for every probability.
+    # Without a mode outside the unit circle the mean is bounded for every positive probability.
     if alpha <= 1.0:
         return lower, lower
     if np.linalg.matrix_rank(H) == 1:
         # Closed form for one output: 1 - 1 / (product of the squares of unstable eigenvalues).
         growing = np.maximum(moduli, 1.0)
         return lower, float(-np.expm1(-2.0 * np.log(growing).sum()))
+    # The lower bound suffices: both bounds are equal, and the radius has no root above it.
     if radius(lower) <= 1.0 + 1e-13:
         return lower, lower
     if not radius(1.0) < 1.0:
@@ -436,10 +437,10 @@ def invariant_samples(
     F and Q are (n, n), H (p, n), R (p, p); readings arrive with probability ``delivery``. Coupling
     from the past (Propp and Wilson, 1996): each draw has its own arrivals, drawn backwards from the
     present; the equation runs through the last T of them from P*, the least point of the support,
-    and from a covariance a million times larger. T is doubled until the two ends differ by at most
-    1e-9: then every start in the infinite past leads there. (A forward chain that stops when it has
-    forgotten its start would favour draws with recent arrivals.) Raises TheoryError if no invariant
-    law exists or the ends do not meet.
+    and from a million times P* + tr(P*) I. T is doubled until the two ends differ by at most 1e-9,
+    relative: then every start in the infinite past leads there. (A forward chain that stops when it
+    has forgotten its start would favour draws with recent arrivals.) Raises TheoryError if no
+    invariant law exists or the ends do not meet.
     """
     F, Q, H, R = check_system(F, Q, H, R)
     delivery = check_delivery(delivery)

@@ -6,8 +6,9 @@ distribution function then obeys a recursion with one branch,
 
     P(X <= x) = g P(X <= f_1^-1(x)) below the hole,   g + (1 - g) P(X <= f_0^-1(x)) above it,
 
-and the quantile function its inverse. In the example of R, F = sqrt 2 and H = Q = R = 1, outages
-of n slots or more have probability (1-g)^n and the hole above them is (2^(n+1) + 1, ...).
+and the quantile function its inverse. In the example of R, F = sqrt 2 and H = Q = R = 1, P lies
+above the hole (2^(n+1) - 1, 2^n (2 + sqrt 2) - 1) after an outage of n slots or more, which has the
+probability (1-g)^n.
 """
 
 from __future__ import annotations
@@ -39,7 +40,8 @@ class ScalarLaw:
 
     def without(self, P: FloatArray) -> FloatArray:
         """Return ``f_0(P) = F^2 P + Q`` elementwise, an array of the shape of P."""
-        with np.errstate(over="ignore"):  # at a hole's lower edge all earlier slots are outages
+        # The lower edge of a hole is a quantile whose earlier slots are all outages: it overflows.
+        with np.errstate(over="ignore"):
             return np.asarray(self.F**2 * P + self.Q)
 
     def with_reading(self, P: FloatArray) -> FloatArray:

@@ -49,11 +49,14 @@ def spectral_radius(T: PositiveMap, shape: Shape) -> float:
 
 
 def fixed_point(T: PositiveMap, Q: FloatArray, radius: float) -> FloatArray:
-    """Return the solution (S, M, M) of ``X = T(X) + Q`` by GMRES with refinement.
+    """Return the solution (S, M, M) of ``X = T(X) + Q`` by iterative refinement of elimination or,
+    for large stacks, of GMRES.
 
     T is a positive map on stacks of S symmetric matrices, of spectral ``radius`` below 1, and Q
-    (S, M, M) such a stack. The residual is below RESIDUAL (1 - radius), relative to the standard
-    deviations of row and column. Raises TheoryError if that is not reached.
+    (S, M, M) such a stack. The residual is below RESIDUAL max(1 - radius, 1e-3), relative to the
+    standard deviations of row and column. If that is not reached by GMRES, stacks of up to
+    MAX_DENSE_FALLBACK numbers are solved by elimination without a check of the residual; others
+    raise TheoryError.
     """
     # The error of the solution is up to 1 / (1 - radius) times the residual.
     tolerance = RESIDUAL * max(1.0 - radius, 1e-3)

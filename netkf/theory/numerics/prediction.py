@@ -55,7 +55,7 @@ class Prediction(NamedTuple):
 
 class ShortExponential:
     """``exp(M s)`` (d, d) by its Taylor series for 0 <= s <= ``unit`` seconds, at which |M| s =
-    MAX_NORM, for M (d, d) per second.
+    MAX_NORM in the 1-norm, for M (d, d) per second.
 
     terms : (TERMS, d, d) coefficients of the powers of s / unit
     """
@@ -374,6 +374,8 @@ def _balancing_scale(A: FloatArray, Q: FloatArray, G: FloatArray) -> float:
     of A, Q and G, each (n, n), have about equal norms, so that steps are longest.
     """
     q, g = float(np.abs(Q).max(initial=0.0)), float(np.abs(G).max(initial=0.0))
+    # Equal blocks Q / c and G c need c = sqrt(q / g). Without G, c = q makes Q / c of size 1;
+    # without Q, c makes G c as large as A.
     if g == 0.0:
         return q or 1.0
     rate = max(float(np.abs(A).max(initial=0.0)), 1e-12)

@@ -461,7 +461,7 @@ def flow_gramian(
     """Return F (n, n) and Gamma (K p, n) of a gap with continuous readings, from which the
     covariance at its end follows for any covariance P at its start.
 
-    F is the transition ``X(g)^-T`` without readings' effect on P(0), Gamma' Gamma the information
+    F is the error's transition ``X(g)^-T`` for P = 0 at the start, Gamma' Gamma the information
     that the readings of the gap give about the state at its start. ``blocks`` (K + 1, 4, n, n) are
     those of ``flow_blocks``, ``whitened`` (p, n) is R^-1/2 H, and ``root_weights`` (K,) are the
     square roots of the quadrature weights in seconds.

@@ -22,6 +22,7 @@ def one_bit_update(P: ArrayLike, H: ArrayLike, R: ArrayLike) -> FloatArray:
     definiteness are wrong.
     """
     size = np.asarray(P, dtype=np.float64)
+    # P is checked in the place of Q; F is not used.
     _, result, H_, R_ = check_system(np.eye(len(np.atleast_2d(size))), P, H, R)
     # Whitened rows have independent noises of variance 1: they are used one after the other.
     for h in np.linalg.solve(np.linalg.cholesky(R_), H_):

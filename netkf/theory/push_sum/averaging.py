@@ -2,11 +2,12 @@
 
 One step is ``M = I - 1/delta sum of b_ij e_i (e_i - e_j)' + b_ji e_j (e_j - e_i)'`` over links,
 with b_ij = 1 if i hears j, independent between links. With ``d = Y_ii - Y_ij - Y_ji + Y_jj`` of
-each link,
+each link, E[M Y M'] is E[M] Y E[M]' plus, in the four blocks of each link,
 
-    E[M Y M'] = E[M] Y E[M]' + 1/delta^2 sum over links of +-cov(b, b) d,
+    var(b_ij) d / delta^2 at (i, i),    var(b_ji) d / delta^2 at (j, j),
+    - cov(b_ij, b_ji) d / delta^2 at (i, j) and (j, i),
 
-where each term changes only the four blocks of its link: a step costs two sparse products. If each
+so that a step costs two sparse products. If each
 step has its own draw, the moments of M^gamma are gamma such steps; if one draw is held over the
 slot, M^gamma is a polynomial in the same b, and all outcomes are enumerated.
 """

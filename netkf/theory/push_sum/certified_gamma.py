@@ -70,7 +70,8 @@ def _bound_constants(scenario: Scenario) -> GammaConstants:
     # The mean of all A_i = (I - K_i H_i) F is (I - P_inf G) F, the error dynamics of the central
     # filter, P (34).
     central = steps.closed.mean(axis=0)
-    # P (54), from the path, which has the least algebraic connectivity of all connected graphs.
+    # P (54) as printed: half of 2 (1 - cos(pi / N)), the algebraic connectivity of the path, which
+    # is the least of all connected graphs.
     gap = (1.0 - np.cos(np.pi / N)) / law.delta
     theta = 1.0 - float(law.hears.min(initial=1.0)) * gap
     cut = _disconnection_bound(scenario, law)

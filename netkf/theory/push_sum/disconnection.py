@@ -33,7 +33,7 @@ MAX_ROOTS = 12  # first nodes of an elimination order that are tried
 MAX_OPEN = 40  # open nodes at a time; with more there are far too many partitions
 MAX_SAMPLES, MIN_SAMPLES, NODE_SAMPLES = 200_000, 2_000, 2e7  # the last: samples times nodes
 MAX_DRAWS = 2_000_000  # draws of links in one array
-CONFIDENCE = 0.99
+CONFIDENCE = 0.99  # of the interval of an estimated probability
 
 Edge = tuple[Any, Any]
 

@@ -53,8 +53,8 @@ def require_known_errors(scenario: Scenario, run: Run) -> None:
 
 
 class AveragingRule(ErrorRule):
-    """Rule by which errors change in slots: push-sum masses are exchanged once in a slot (phase 0),
-    estimates averaged in gamma steps (phase 1), and then updated by readings.
+    """Rule by which errors change in a slot: push-sum masses are exchanged once (exchange 0), then
+    estimates are predicted, updated by readings, and averaged in gamma steps (exchange 1).
     """
 
     takes_messages = False
@@ -125,11 +125,11 @@ class AveragingRule(ErrorRule):
     def sense(self, time: float, observations: EstimatorObservations) -> None:
         """Update the estimates of all nodes with their readings (push-sum paper, step 4), by the
         total information G and the number N of nodes that each has learned from push-sum, its
-        equations 6 to 8. Changes errors and roots of P.
-
-        It is called at each sensing time of the run. Columns of ``_z``: 0 the weight, 1 the mass
-        whose ratio to the weight is N, from 2 on that for G. Called by the replay at every time of
+        equations 6 to 8. Changes errors and roots of P. Called by the replay at every time of
         readings.
+
+        Columns of ``_z``: 0 the weight, 1 the mass whose ratio to the weight is N, from 2 on that
+        for G.
         """
         n, errors = self.errors.n, self.errors
         heard = self._z[:, 0] > 0.0  # before any weight arrives a node knows its own sensor only

@@ -24,6 +24,7 @@ def trigger_rate(P: ArrayLike, H: ArrayLike, R: ArrayLike, Y: ArrayLike) -> floa
     ``exp(-z' Y z / 2)`` (Han et al. 2015). Raises TheoryError if shapes or definiteness are wrong.
     """
     spread = np.asarray(P, dtype=np.float64)
+    # P is checked in the place of Q; F is not used.
     _, C, H_, R_ = check_system(np.eye(len(np.atleast_2d(spread))), P, H, R)
     Pi = H_ @ C @ H_.T + R_
     return float(1.0 - np.linalg.det(np.eye(len(R_)) + Pi @ as_covariance("Y", Y, len(R_))) ** -0.5)
