@@ -504,7 +504,8 @@ def _mean_diverges(samples: IntermittentSamples, level: float) -> Finding:
     # The lower bound counts only the slots without a reading, so it needs no H. The outage factor
     # is (1 - g) alpha^2, with g the probability that a reading arrives.
     H = np.zeros((0, len(F)))
-    g = 1.0 - factors[node] / alpha**2
+    # It is 0 without a neighbour that has a sensor; the bounds need a probability above that.
+    g = max(1.0 - factors[node] / alpha**2, np.finfo(np.float64).tiny)
     start = scenario.initial_estimate(node)[1]
     lower = mean_covariance_bounds(F, Q, H, H[:, :0], g, 2 * slots, start).lower
     traces = np.trace(lower, axis1=1, axis2=2)

@@ -294,6 +294,7 @@ def _many_steps(samples: PushSumSamples, level: float) -> Finding:
         if first_distance is None:
             first_distance = error_distance
         gamma *= 2
+    converged = distance <= STEADY_TOLERANCE
     if scenario.filters_know_the_truth:
         central = push_sum_limits(scenario).P
         distance = max(distance, _relative_distance(limits.covariance[None], central))
@@ -303,7 +304,7 @@ def _many_steps(samples: PushSumSamples, level: float) -> Finding:
         f"{first_distance:.3g}"
     )
     margin = STEADY_TOLERANCE - distance
-    return Finding((margin, margin, margin), 0.0, message, early=gamma >= MAX_STEPS)
+    return Finding((margin, margin, margin), 0.0, message, early=not converged)
 
 
 def _relative_distance(P: FloatArray, limit: FloatArray) -> float:

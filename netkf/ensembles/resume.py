@@ -90,7 +90,7 @@ def find_stored_blocks(
             raise ScenarioError(
                 "--resume", rule, _describe_difference(manifest.get(key), planned), remedy
             )
-    remedy = "remove it: the blocks prove themselves"
+    remedy = "remove it: each block is checked by a digest of its own"
     _require(out / "manifest.json", lambda: check_seal(manifest), remedy)
     _check_scenario(out, scenario)
     finished = manifest["status"] in FINAL_STATUSES

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import shlex
 from collections.abc import Sequence
 from dataclasses import replace
@@ -34,6 +35,7 @@ from netkf.runs.documents import FINAL_STATUSES, DamagedError
 from netkf.runs.files import write_text
 from netkf.runs.innovations import Innovations
 from netkf.runs.stored import StoredRun
+from netkf.scenario.writing import toml_text
 from netkf.studies.compare import Comparison, compare, damage_named
 from netkf.studies.explanation import Explanation
 from netkf.studies.stored import StoredComparison
@@ -450,11 +452,19 @@ def _source_command(source: ReportSource) -> str:
     subcommands = {"sweep": "sweep", "verdict": "check", "filters": "compare-filters"}
     subcommand = subcommands.get(source.kind, "run")
     command = f"netkf {subcommand} {shlex.quote(source.label + '/scenario.toml')}"
+    if source.kind == "run" and source.manifest.get("replica"):
+        command += f" --replica {source.manifest['replica']}"
     if source.kind in ("ensemble", "filters"):
-        command += f" --runs {source.runs}"
+        command += f" --runs {source.manifest['runs']['wanted']}"
     if source.kind == "sweep":
-        for key, values in source.manifest.get("vary", {}).items():
-            command += f" --vary {shlex.quote(key + '=' + ','.join(map(str, values)))}"
+        varied = source.manifest.get("vary", {})
+        points = math.prod(len(values) for values in varied.values())
+        command += f" --runs {source.manifest['runs']['wanted'] // max(1, points)}"
+        for key, values in varied.items():
+            command += f" --vary {shlex.quote(key + '=' + ','.join(map(toml_text, values)))}"
+    if source.kind == "verdict" and source.verdict is not None:
+        verdict = source.verdict
+        command += f" --runs {verdict['runs']} --confidence {verdict['confidence']:g}"
     if source.filters is not None:
         command += f" --filters {shlex.quote(_filter_option(source.filters))}"
     return command

@@ -108,8 +108,9 @@ def _set_key(target: Any, keys: list[str], value: Any, path: str) -> Any:
     key, inner_keys = keys[0], keys[1:]
     if isinstance(target, (list, tuple)):
         if not key.isdecimal() or int(key) >= len(target):
+            remedy = f"give one of 0 .. {len(target) - 1}" if target else "give the whole list"
             raise ScenarioError(
-                path, f"has no entry {key!r} in a list of {len(target)}", None, "count from 0"
+                path, f"has no entry {key!r} in a list of {len(target)}", None, remedy
             )
         index = int(key)
         entry = _set_key(target[index], inner_keys, value, path)

@@ -13,7 +13,6 @@ from netkf.network.matchings import RecordedSlots
 from netkf.network.recorded import RecordedDelay, RecordedLoss
 from netkf.plants.recorded import RecordedSensor
 from netkf.plants.sampling import RecordedSampling
-from netkf.plants.sensors import LinearSensor
 from netkf.scenario.derived import DerivedScenario
 from netkf.scenario.records import count_state_rows, exchange_slots, sensed_slots
 
@@ -111,8 +110,8 @@ def _find_sensor_uses(scenario: DerivedScenario) -> dict[str, Use]:
         component: RecordedSampling | RecordedSensor
         if isinstance(sensor, RecordedSensor):
             key, component = f"sensors[{k}]", sensor
-        elif isinstance(sensor, LinearSensor) and isinstance(sensor.sampling, RecordedSampling):
-            key, component = f"sensors[{k}].sampling", sensor.sampling
+        elif isinstance(sampling := getattr(sensor, "sampling", None), RecordedSampling):
+            key, component = f"sensors[{k}].sampling", sampling
         else:
             continue
         table = (type(component).__name__, component.path)

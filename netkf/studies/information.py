@@ -492,12 +492,12 @@ def newest_information(
 
 def _age_key(reading: float, known: float) -> tuple[float, float]:
     """Return a key that sorts information by age, oldest first: by the time of its newest
-    ``reading``, then by the time up to which it is ``known``, both in seconds, missing ones (nan)
-    first.
+    ``reading``, none (nan) first, then by the time up to which it is ``known``, the end of the log
+    (nan) last; both in seconds.
     """
     return (
         -np.inf if np.isnan(reading) else reading,
-        -np.inf if np.isnan(known) else known,
+        np.inf if np.isnan(known) else known,
     )
 
 

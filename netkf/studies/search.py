@@ -259,7 +259,8 @@ class Search:
         else:
             misses = good.value
             # One more value shows whether the quantity is monotone at all.
-            self._probe(self._value_between(low, high) or low)
+            middle = self._value_between(low, high)
+            self._probe(low if middle is None else middle)
         problem, probes = self._problem, tuple(self.probes)
         return Sizing(
             key=problem.key,

@@ -226,7 +226,7 @@ def format_comparison(comparison: Comparison) -> str:
     if "one run" in methods:
         lines += [
             "",
-            "differences of single runs are not marked: one run says nothing about luck",
+            "differences of single runs are not marked: they may be chance",
         ]
     return "\n".join(lines)
 

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 MAX_ROWS, MAX_LISTED = 20, 4
+COUNT_WORDS = ("no", "one", "two", "three")
 
 
 def source_table(explanation: Explanation) -> pd.DataFrame:
@@ -234,7 +235,9 @@ def _missed_reading_sentences(
         others = len(kept_from_newer) - MAX_LISTED
         yield f"Newer readings of {others} other nodes would have come too, with these or others."
     if sensors and not kept_from_newer:
-        yield "No newer reading was kept away by up to three messages that did not come."
+        count = len(sensors[0].with_more)
+        messages = "one message" if count == 1 else f"up to {COUNT_WORDS[count]} messages"
+        yield f"No newer reading was kept away by {messages} that did not come."
 
 
 def _smallest_sentences(explanation: Explanation) -> Iterator[str]:

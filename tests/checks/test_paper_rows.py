@@ -47,6 +47,14 @@ def test_averages_over_one_path():
     assert growing.margin[0] == pytest.approx(60 * np.log(2 * 0.7), rel=0.02)
 
 
+def test_the_mean_diverges_at_a_node_without_a_neighbour_that_has_a_sensor():
+    far = load("intermittent_scalar", **{"network.graph": {"kind": "path", "nodes": 3}})
+    samples = collect(intermittent.CHECKS, far, 20)
+    growing = intermittent._mean_diverges(samples, LEVEL)
+    assert "at node 2 outages alone" in growing.message
+    assert growing.margin[0] == pytest.approx(60 * np.log(2), rel=0.02)
+
+
 def test_all_sensors_together():
     """G (27)-(29): broken for the switched chain of another matching."""
     made = load("gossip_ring", horizon=40.0, probe=1.0)

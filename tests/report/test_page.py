@@ -4,6 +4,7 @@ import base64
 import hashlib
 import json
 import re
+import shlex
 import shutil
 from types import SimpleNamespace
 
@@ -557,3 +558,21 @@ def test_a_summary_without_its_parts_is_refused_in_one_line(ring, tmp_path):
 def test_sweeps_are_not_compared(ring, sweep):
     with pytest.raises(ScenarioError, match="compares runs and ensembles"):
         make_page([ring, sweep])
+
+
+@pytest.mark.parametrize(
+    ("command", "options"),
+    [
+        ("run", "--replica 2"),
+        ("run", "--runs 4"),
+        ("sweep", "--runs 3 --vary network.channel.symmetric=true,false"),
+        ("check", "--runs 60 --confidence 0.9"),
+    ],
+)
+def test_the_command_that_computes_results_again_is_the_one_that_did(tmp_path, command, options):
+    out = tmp_path / "out"
+    settings = [*shlex.split(options), "--set", "horizon=10.0", "--seed", "7"]
+    main([command, str(SCENARIOS / "gossip_ring.toml"), *settings, "--out", str(out), "--no-plot"])
+    shown = Page(make_page([out])).shown
+    assert f"netkf {command} {out / 'scenario.toml'} {options}" in shown
+    assert netkf.load(out / "scenario.toml").seed == 7

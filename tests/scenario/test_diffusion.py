@@ -196,3 +196,13 @@ def test_assumptions_of_section_vi_hold_and_their_breaking_is_seen(regression):
     assert not held(blind)["the sensors together excite every direction (sufficient)"][0]
     turning = regression.replace({"plant.F": (0.9 * np.eye(3)).tolist()})
     assert not held(turning)["the parameter is a random walk"][0]
+
+
+def test_a_message_that_takes_its_whole_phase_arrives(regression):
+    length = regression.phase_length
+    late = regression.replace({"network.channel.delay": {"kind": "constant", "seconds": length}})
+    log = netkf.simulate(late.replace({"horizon": 20.0})).events
+    assert held(late)["every message arrives"][0]
+    assert (log.kind == "deliver").sum() == (log.kind == "send").sum() > 0
+    longer = {"network.channel.delay": {"kind": "constant", "seconds": 1.1 * length}}
+    assert not held(regression.replace(longer))["every message arrives"][0]

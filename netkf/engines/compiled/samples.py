@@ -38,7 +38,7 @@ def record_samples(
         return True
     sound = sound_mask(xhat, P).all(axis=1)
     # The trace shows a row for each node, though all of them share a pooled filter.
-    if scenario.filter.algorithm.pooled:
+    if scenario.node_filter.pooled:
         nodes = len(scenario.nodes)
         xhat, P, error = (np.repeat(values, nodes, axis=1) for values in (xhat, P, error))
     # argmin finds the first False.

@@ -249,7 +249,7 @@ class SlotEvents:
                         self._scenario.nodes[k],
                         -1,
                         -1,
-                        self._setup.stages.stopping,
+                        self._setup.phases[self._setup.stages.stopping],
                         NAN,
                     )
                     for k in np.flatnonzero(stopped == row.slot).tolist()

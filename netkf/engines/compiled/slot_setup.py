@@ -93,7 +93,7 @@ class SlotSetup:
         it is sampled), ``last``, the slot at the horizon, ``samples`` (T,), the slots with a
         sample, and ``sample_times`` (T,) in seconds.
         """
-        plant, last = scenario.slot_plant, 0
+        plant = scenario.slot_plant
         # A guess below the last slot: the plant itself decides, free of this division's rounding.
         last = max(0, int(scenario.horizon / plant.period) - 2)
         while not plant.over(last, scenario.horizon):

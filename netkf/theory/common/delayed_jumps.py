@@ -242,7 +242,7 @@ class DelayedJumps:
         The effect of an antisymmetric part, which only residuals have, is approximate.
         """
         equation = symmetric(right[:1])
-        first = 2.0 * (right[:1] - equation) + self._lyapunov(equation)
+        first = (right[:1] - equation) + self._lyapunov(equation)
         return self._apply_inverse(np.concatenate([first, right[1:] + first]))
 
     @cached_property

@@ -10,6 +10,7 @@ from netkf.core.errors import TheoryError
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.evidence import RECORDED_CHANNEL, UNKNOWN_LAW, AssumptionRow, is_recorded
 from netkf.theory.common.plant_assumptions import start_rows
+from netkf.theory.common.random_links import all_messages_arrive
 from netkf.theory.diffusion.information import (
     MAX_REGRESSORS,
     few_regressors,
@@ -160,17 +161,9 @@ def _arrival_row(scenario: Scenario) -> AssumptionRow:
     """Return the assumption, as a row of the table, that every message arrives in time, so that
     weights are fixed.
     """
-    channel = scenario.network.channel
-    rates = [
-        channel.loss.mean_delivery(link, scenario.table_probability(link))
-        for link in scenario.topology.directions
-    ]
-    fixed = channel.delay.fixed
-    # A message that takes a whole phase comes after its exchange and is not used.
-    in_time = fixed is not None and fixed < scenario.phase_length
-    if is_recorded(channel):
+    if is_recorded(scenario.network.channel):
         return ("every message arrives", "D (8)", None, RECORDED_CHANNEL)
-    all_arrive = in_time and all(rate == 1.0 for rate in rates)
+    all_arrive = all_messages_arrive(scenario)
     policy = getattr(scenario.filter.algorithm, "on_loss", "")
     evidence = f"a message may be lost or late; weights then change ({policy}): P stays consistent"
     if not all_arrive:
