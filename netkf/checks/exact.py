@@ -454,6 +454,11 @@ def check_bias(samples: RunSamples, level: float) -> Finding:
     return finding._replace(most_runs=max_runs)
 
 
+def gaussian_radius(level: float, n: int) -> float:
+    """Return the radius that a standard Gaussian vector (n,) exceeds with probability ``level``."""
+    return math.sqrt(2.0 * float(scipy.special.gammainccinv(n / 2.0, level)))
+
+
 def _length_interval(spread: FloatArray, z: FloatArray, level: float) -> Interval:
     """Return an interval for the length |spread m| of a bias, where ``z`` (k,) is normal with mean
     m and covariance I and ``spread`` (d, k) turns m into the bias. It excludes 0 if and only if
@@ -461,7 +466,7 @@ def _length_interval(spread: FloatArray, z: FloatArray, level: float) -> Interva
 
     The interval misses the truth with at most the probability ``level``.
     """
-    reach = math.sqrt(2.0 * float(scipy.special.gammainccinv(len(z) / 2.0, level)))
+    reach = gaussian_radius(level, len(z))
     sizes = np.linalg.svd(spread, compute_uv=False)
     smallest = float(sizes[-1]) if len(sizes) == len(z) else 0.0
     value, max_reach = float(np.linalg.norm(spread @ z)), reach * float(sizes[0])

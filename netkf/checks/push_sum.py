@@ -25,6 +25,7 @@ from netkf.checks.exact import (
     check_bias,
     check_error_covariance,
     few_errors,
+    gaussian_radius,
     max_replayed,
     summarise_exactly,
     with_promised_filter,
@@ -60,17 +61,15 @@ from netkf.theory import (
     push_sum_noise,
     push_sum_radius,
 )
+from netkf.theory.push_sum.assumptions import HEAVY_TAIL_RADIUS
 from netkf.theory.push_sum.certified_gamma import searches_gamma
+from netkf.theory.push_sum.promises import MAX_STEPS as MAX_CERTIFIED
 from netkf.trace.run import Run
 
 STEADY_TOLERANCE = 0.01
 """Distance from a limit, relative to its largest entry, that counts as reached."""
 SQUARE_TOLERANCE, BIAS_TOLERANCE = 0.3, 0.45
 """Tolerated relative difference of mean squares, and bias in standard deviations of an error."""
-HEAVY_TAILS = 0.885
-"""Mean-square radius above which squared errors have too heavy tails for a test of their mean."""
-MAX_CERTIFIED = 20
-"""Largest gamma (number of averaging steps in a slot) up to which the exact minimum is searched."""
 MAX_STEPS = 4096
 """Averaging steps up to which errors are compared with those of the central filter."""
 
@@ -205,7 +204,7 @@ def _check_unbiased(samples: PushSumSamples, level: float) -> Finding:
     nodes, intervals = samples.nodes, []
     count, n = len(samples.followed), samples.scenario.plant.n
     max_runs = max_replayed(samples.scenario)
-    radius = _gaussian_radius(level / len(nodes), n) / math.sqrt(count)
+    radius = gaussian_radius(level / len(nodes), n) / math.sqrt(count)
     for i, node in enumerate(nodes):
         bias = float(np.linalg.norm(samples.standardised[:, i].mean(axis=0)))
         detectable = radius + float(scipy.special.ndtri(POWER)) / math.sqrt(count)
@@ -214,11 +213,6 @@ def _check_unbiased(samples: PushSumSamples, level: float) -> Finding:
         intervals.append((distance, f"at node {node}"))
     message = "largest bias, in standard deviations of an error,"
     return find_largest(intervals, BIAS_TOLERANCE, message)._replace(most_runs=max_runs)
-
-
-def _gaussian_radius(level: float, n: int) -> float:
-    """Return the radius that a standard Gaussian vector (n,) exceeds with probability ``level``."""
-    return float(np.sqrt(2.0 * scipy.special.gammainccinv(n / 2.0, level)))
 
 
 @gaussian_test
@@ -416,8 +410,8 @@ class PushSumChecks(PaperChecks):
             # Errors have a steady mean square if the mean-square radius is below 1, and a fourth
             # moment, as a test of mean squares needs, if it is well below.
             radius = push_sum_radius(with_promised_filter(scenario))
-            light = radius <= HEAVY_TAILS
-            evidence = f"mean-square radius {radius:.4g}, light tails below {HEAVY_TAILS}"
+            light = radius <= HEAVY_TAIL_RADIUS
+            evidence = f"mean-square radius {radius:.4g}, light tails below {HEAVY_TAIL_RADIUS}"
         except TheoryError as error:
             light, evidence = False, str(error)
         return [

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from netkf.core.errors import NetkfError
-from netkf.figures.figure_data import NORMAL_QUANTILE, FigureData, UnavailableError
+from netkf.figures.figure_data import FigureData, UnavailableError
 from netkf.figures.panels import draw_nees
 from netkf.figures.style import (
     EXACT,
@@ -26,9 +26,8 @@ from netkf.runs.innovations import (
     MIN_READINGS,
     Innovations,
     autocorrelations,
-    chi_square_interval,
 )
-from netkf.runs.summary import CONFIDENCE, nees_bounds
+from netkf.runs.summary import CONFIDENCE, NORMAL_QUANTILE, chi_square_interval, nees_bounds
 
 BINS = 40  # of time, few enough that each has many readings
 MAX_DOTS = 4000  # readings that are drawn one by one

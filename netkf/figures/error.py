@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from netkf.figures.consistency import draw_nis, require_innovations
-from netkf.figures.figure_data import NORMAL_QUANTILE, FigureData, UnavailableError
+from netkf.figures.figure_data import FigureData, UnavailableError
 from netkf.figures.panels import draw_covariances, draw_errors
 from netkf.figures.style import (
     EXACT,
@@ -25,6 +25,7 @@ from netkf.figures.style import (
     set_scale,
 )
 from netkf.linalg.arrays import FloatArray
+from netkf.runs.summary import NORMAL_QUANTILE
 
 QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
 MARKED_SAMPLES = 3  # worst samples that the figure of quantiles marks

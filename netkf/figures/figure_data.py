@@ -26,8 +26,6 @@ from netkf.trace.run import Run
 
 SIMULATE = "get it from netkf.simulate, netkf.monte_carlo or netkf.open"
 NO_TRUTH = "There is no ground truth in this run, so that its errors are unknown."
-NORMAL_QUANTILE = 1.96
-"""Standard errors on each side of a mean in a 95% interval."""
 
 
 class UnavailableError(Exception):

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from matplotlib.collections import LineCollection
 
-from netkf.figures.figure_data import NO_TRUTH, NORMAL_QUANTILE, FigureData
+from netkf.figures.figure_data import NO_TRUTH, FigureData
 from netkf.figures.style import (
     EXACT,
     INK,
@@ -21,7 +21,13 @@ from netkf.figures.style import (
 )
 from netkf.linalg.arrays import FloatArray
 from netkf.runs.labels import covariance_bias
-from netkf.runs.summary import CONFIDENCE, NO_COVARIANCE, PromisedTraces, nees_bounds
+from netkf.runs.summary import (
+    CONFIDENCE,
+    NO_COVARIANCE,
+    NORMAL_QUANTILE,
+    PromisedTraces,
+    nees_bounds,
+)
 
 MAX_LINES = 60
 """Curves of single nodes in one panel; of larger networks evenly spaced nodes are drawn."""

@@ -12,7 +12,7 @@ import numpy as np
 
 from netkf.algorithms.registry import built_in_filters
 from netkf.core.errors import NetkfError, TheoryError
-from netkf.figures.figure_data import NORMAL_QUANTILE, FigureData, UnavailableError
+from netkf.figures.figure_data import FigureData, UnavailableError
 from netkf.figures.style import (
     EXACT,
     INK,
@@ -28,6 +28,7 @@ from netkf.figures.style import (
 )
 from netkf.linalg.arrays import FloatArray
 from netkf.network.channels import Bernoulli
+from netkf.runs.summary import NORMAL_QUANTILE
 from netkf.scenario.scenario import Scenario
 from netkf.theory import invariant_samples
 from netkf.theory.hybrid.coupled import reason_without_bound

@@ -20,6 +20,18 @@ MANY_TERMS = (8, 10)  # numbers of terms for which fill_row() has unrolled loops
 OCTAVES, STEPS = 8, 4  # gaps that are tried: halvings of the longest, and steps for each halving
 
 
+def exponential_terms(size: float) -> int:
+    """Return the number of terms of the power series of exp(M), at least 8, that are needed for a
+    norm ``size`` of M: size^k / k!, which bounds the rest of the series from some k on, is then
+    below rounding.
+    """
+    terms, term = 1, 1.0
+    while term > 1e-18 or terms < 8:
+        term *= size / terms
+        terms += 1
+    return terms
+
+
 def with_reach(series: FloatArray, longest: float) -> FloatArray:
     """Return a table (terms, size + 1) for ``sum_k gap^k series[k]`` with ``series`` (terms, size),
     for gaps up to ``longest`` seconds.

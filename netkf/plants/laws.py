@@ -24,7 +24,7 @@ from netkf.linalg.portable import (
     pseudo_inverse,
     symmetric_root,
 )
-from netkf.linalg.series import polynomial, with_reach
+from netkf.linalg.series import exponential_terms, polynomial, with_reach
 from netkf.linalg.small import matmul
 
 MAX_LAWS = 256  # cached laws of states inside a step
@@ -186,12 +186,7 @@ def _response_series(A: FloatArray, longest: float) -> tuple[FloatArray, FloatAr
     and of its two moments over the gap, (terms, 2 n n + 1), for ``A`` (n, n) in 1/s. The last
     column has the longest gap for which the terms so far suffice, see linalg/series.
     """
-    n, norm_times_gap = len(A), float(np.abs(A).sum(axis=0).max()) * longest
-    # The term |A g|^k / k! bounds the rest of the series from some k on.
-    terms, term = 1, 1.0
-    while term > 1e-18 or terms < 8:
-        term *= norm_times_gap / terms
-        terms += 1
+    n, terms = len(A), exponential_terms(float(np.abs(A).sum(axis=0).max()) * longest)
     exponential = [np.eye(n)]
     for k in range(1, terms):
         exponential.append(product(exponential[-1], A) / k)

@@ -129,6 +129,17 @@ class DiffusionPaths:
         self.frame_steps = frame_steps
         self._x, self._drawn = start, 0
 
+    def frame_times(self, horizon: float) -> FloatArray:
+        """Return the times (F,) in seconds, below the ``horizon``, at which a new frame begins:
+        every ``frame_steps`` steps, at points of the sensing grid.
+        """
+        steps, period = self.frame_steps, self.laws.period
+        if steps is None:
+            return np.empty(0)
+        count = int(horizon / (steps * period)) + 2
+        times = np.array([grid_time(period, steps * k) for k in range(1, count)])
+        return np.asarray(times[times < horizon])
+
     def following(self, blocks: int = 1, most: int | None = None) -> Block:
         """Return the next S steps of the sensing grid, drawn now and cut at the sample and probe
         times within: ``blocks`` times BLOCK of them, but at most ``most``.
@@ -454,7 +465,7 @@ class DiffusionPath:
         the end of the run.
         """
         self.laws, self.period, self._paths = paths.laws, paths.laws.period, paths
-        self.frame_times = self._frame_times(horizon)
+        self.frame_times = paths.frame_times(horizon)
         self._moves = Transitions(self.laws.A, self.laws.B) if len(self.frame_times) else None
         # Number of the present frame, and absolute position of its origin at its start.
         self._frame, self._origin = 0, np.zeros(self.laws.n)
@@ -517,15 +528,6 @@ class DiffusionPath:
             if piece.start <= start:
                 return total
             k -= 1
-
-    def _frame_times(self, horizon: float) -> FloatArray:
-        """Return the times (F,) in seconds, below the horizon, at which a new frame begins."""
-        steps = self._paths.frame_steps
-        if steps is None:
-            return np.empty(0)
-        count = int(horizon / (steps * self.period)) + 2
-        times = np.array([self.grid(steps * k) for k in range(1, count)])
-        return np.asarray(times[times < horizon])
 
     def local(self, time: float) -> FloatArray:
         """Return x (n,) in the present frame at a grid, sample or probe ``time`` (seconds), not

@@ -13,16 +13,15 @@ from netkf.report.packing import Packer
 from netkf.runs.innovations import (
     Innovations,
     autocorrelations,
-    chi_square_interval,
     compute_innovations,
 )
+from netkf.runs.summary import NORMAL_QUANTILE, chi_square_interval
 from netkf.runs.tables import format_number
 
 MAX_EVENTS = 200_000
 """Events of a run up to which a page replays it for its readings, which takes some seconds."""
 CONFIDENCE = 0.99
 """Probability that the intervals of all nodes contain their means if P is exact."""
-NORMAL_QUANTILE = 1.96  # 95 % of a normal distribution lie within as many standard deviations
 
 
 class NodeMeans(NamedTuple):

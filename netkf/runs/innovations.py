@@ -10,7 +10,6 @@ import dataclasses
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.special import gammaincinv
 
 from netkf.algorithms.filter import Filter, Reading
 from netkf.core.errors import NetkfError
@@ -189,17 +188,6 @@ def _whiten(sample: RecordedSample) -> FloatArray:
     S = reading.H @ P @ reading.H.T + reading.R
     v = reading.y - reading.H @ xhat
     return np.asarray(np.linalg.solve(np.linalg.cholesky(S), v))
-
-
-def chi_square_interval(freedom: FloatArray, probability: float) -> tuple[FloatArray, FloatArray]:
-    """Return the lower and upper ends (M,) of intervals for chi-square variables divided by their
-    degrees of ``freedom`` (M,).
-
-    Each interval holds its variable with the given ``probability``; the tails are equally probable.
-    """
-    tail = 0.5 * (1.0 - probability)
-    low, high = (2.0 * gammaincinv(0.5 * freedom, q) / freedom for q in (tail, 1.0 - tail))
-    return np.asarray(low), np.asarray(high)
 
 
 def innovation_series(recorded: Innovations) -> dict[int, FloatArray]:

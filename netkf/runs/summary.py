@@ -26,6 +26,8 @@ from netkf.trace.run import carried_size, rounding_from
 from netkf.trace.schema import CODES
 
 CONFIDENCE = 0.95
+NORMAL_QUANTILE = 1.96
+"""Standard deviations within which a normal variable lies with the probability CONFIDENCE."""
 MAX_BOUND_BYTES, SERIES_TERMS = 1.5 * 2**30, 30
 """Largest memory of a bound that is computed, and the terms of the series that computing it stores.
 """
@@ -133,15 +135,25 @@ def select_averaged_samples(
     return SampleIndices(np.flatnonzero(exact), np.flatnonzero(covariances))
 
 
+def chi_square_interval(freedom: Any, probability: float) -> tuple[FloatArray, FloatArray]:
+    """Return the lower and upper ends (M,) of intervals for chi-square variables divided by their
+    degrees of ``freedom`` (M,), or those of one interval for a number.
+
+    Each interval holds its variable with the given ``probability``; the tails are equally probable.
+    """
+    tail = 0.5 * (1.0 - probability)
+    low, high = (2.0 * gammaincinv(0.5 * freedom, q) / freedom for q in (tail, 1.0 - tail))
+    return np.asarray(low), np.asarray(high)
+
+
 def nees_bounds(n: int, runs: int = 1) -> tuple[float, float]:
     """Return the ends of the interval that holds the mean NEES of one sample over ``runs`` runs
     with probability CONFIDENCE if P is exact.
 
     The sum over the runs is chi-square with ``runs n`` degrees of freedom, n states.
     """
-    ends = 0.5 * (1.0 - CONFIDENCE), 0.5 * (1.0 + CONFIDENCE)
-    low, high = (2.0 * float(gammaincinv(0.5 * runs * n, end)) / runs for end in ends)
-    return low, high
+    low, high = chi_square_interval(runs * n, CONFIDENCE)
+    return n * float(low), n * float(high)
 
 
 @dataclass(frozen=True, eq=False)

@@ -25,7 +25,7 @@ from netkf.algorithms.kernels.riccati import exponential_series, hamiltonian
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
 from netkf.linalg.legendre import MOMENTS, backward_coefficients
-from netkf.linalg.series import polynomial, with_reach
+from netkf.linalg.series import exponential_terms, polynomial, with_reach
 from netkf.linalg.small import add_matmul, matvec
 
 MAX_INTERVAL = 8.0  # |M| g beyond which two moments do not describe a reading well enough
@@ -62,7 +62,7 @@ def gain_table(
     # The tolerance admits an interval that was computed from MAX_INTERVAL itself.
     if size > MAX_INTERVAL * (1.0 + 1e-9):
         raise ValueError(f"an interval of {longest:g} s is too long for the gains of this sensor")
-    terms = _count_terms(size)
+    terms = exponential_terms(size)
     # k(s) looks back from the end b, hence exp(-M (b - s)).
     E = exponential_series(-M, terms)
     c = backward_coefficients(terms)
@@ -100,16 +100,6 @@ def longest_interval_for(A: FloatArray, Q: FloatArray, G: FloatArray) -> float:
     norm = float(np.abs(M).sum(axis=0).max())
     # No dynamics and no information: every interval is short enough.
     return MAX_INTERVAL / norm if norm > 0.0 else math.inf
-
-
-def _count_terms(size: float) -> int:
-    """Return how many terms of the power series of exp(M) are needed for a norm ``size`` of M."""
-    # Until size^k / k!, the next term of the exponential series, is below double rounding.
-    terms, term = 1, 1.0
-    while term > 1e-18 or terms < 8:
-        term *= size / terms
-        terms += 1
-    return terms
 
 
 @kernel(allocates=True)

@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 
 from netkf.algorithms.closed_loops import closed_loop, gain_rate, sample_maps
-from netkf.algorithms.flow import interval_end
 from netkf.algorithms.kernels.constant_gains import correct_by_innovation, correct_by_moments
 from netkf.algorithms.kernels.neighbours import scale_by_covariance
 from netkf.algorithms.kernels.pair_fusion import fuse_pair
@@ -24,10 +23,8 @@ from netkf.algorithms.kernels.root_flow import (
     stack_tables,
 )
 from netkf.algorithms.kernels.slots import predict_root
-from netkf.algorithms.models import usable
-from netkf.engines.base import LONGER, MIN_GAP_SHARE
 from netkf.engines.compiled.evidence import EvidenceArrays, empty_evidence
-from netkf.engines.compiled.increments import fill_readings
+from netkf.engines.compiled.increments import fill_readings, next_interval
 from netkf.engines.compiled.late_readings import copy_state, use_instant
 from netkf.engines.compiled.state import (
     BELIEFS,
@@ -198,14 +195,9 @@ def predict_with_gain(
     are short against the rate of the error in the closed loop, over which readings are used at
     once. Changes row ``h`` of ``state.xhat`` and ``state.root``.
     """
-    piece, m, longest = state.piece, combination.model[h], usable(combination.rate[h])
-    least = MIN_GAP_SHARE * (time - now)
+    piece, m, least = state.piece, combination.model[h], 0.0
     while now < time:
-        end = time
-        if longest < time - now:
-            # The lower bound grows, so that a fast gain does not ask for endlessly many intervals.
-            end = interval_end(now, time, max(longest, least))
-            least *= LONGER
+        end, least = next_interval(combination.rate[h], now, time, least)
         gap = end - now
         # The mean moves open loop, and P by the closed loop A - L H, which includes the readings.
         for i in range(combination.x.shape[1]):

@@ -106,13 +106,7 @@ class Paths:
             scenario.exact_errors,
         )
         self._senses, self._horizon = bool(scenario.increment_sensors), scenario.horizon
-        steps, laws = self._paths.frame_steps, self._paths.laws
-        self.frame_times = np.empty(0)
-        # A frame begins every ``steps`` steps of the grid, at grid times, bit for bit.
-        if steps is not None:
-            count = int(scenario.horizon / (steps * laws.period)) + 2
-            times = np.array([grid_time(laws.period, steps * k) for k in range(1, count)])
-            self.frame_times = times[times < scenario.horizon]
+        self.frame_times = self._paths.frame_times(scenario.horizon)
 
     def following(self, max_steps: int | None = None) -> Block:
         """Return the next steps of all runs together, at most ``max_steps``; the last ones reach

@@ -380,10 +380,8 @@ class PoissonSchedules:
         # more ticks the loop tries again with more space.
         expected, spread = self._rate * self._horizon, 8.0
         while True:
-            max_ticks = int(expected + spread * math.sqrt(expected)) + 8
-            total = (
-                int(self._runs * expected + spread * math.sqrt(self._runs * expected)) + max_ticks
-            )
+            max_ticks = _space_for_count(expected, spread)
+            total = _space_for_count(self._runs * expected, spread) + max_ticks
             buffer, ticks = self._space(max_ticks), self._space_for_all(total)
             scratch = buffer, np.zeros(2, dtype=np.int64), _sorting(max_ticks)
             arguments = self._clocks, self._horizon, self._delay, ziggurat()
@@ -416,7 +414,7 @@ class PoissonSchedules:
         # Space for the mean plus eight standard deviations of a Poisson count is nearly always
         # enough.
         expected = self._rate * (last - begin)
-        ticks = int(expected + 8.0 * math.sqrt(expected)) + 8
+        ticks = _space_for_count(expected, 8.0)
         sends = int(self._sends * ticks) + self._max_sends
         while True:
             self._enlarge_buffer(ticks, sends)
@@ -440,6 +438,13 @@ class PoissonSchedules:
             size = min(len(source), len(target))
             target[:size] = source[:size]
         self._buffer = larger
+
+
+def _space_for_count(expected: float, deviations: float) -> int:
+    """Return a number that a Poisson count with the mean ``expected`` hardly ever exceeds: so many
+    standard ``deviations`` above the mean, and some more for small means.
+    """
+    return int(expected + deviations * math.sqrt(expected)) + 8
 
 
 def _empty_buffer(ticks: int, sends: int) -> TickBuffer:

@@ -9,7 +9,6 @@ not used.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from functools import lru_cache
 from typing import Literal, NamedTuple
 
@@ -21,7 +20,7 @@ from netkf.linalg.arrays import FloatArray
 from netkf.scenario.scenario import Scenario
 from netkf.theory.push_sum.averaging import Averaging
 from netkf.theory.push_sum.disconnection import disconnection_probability
-from netkf.theory.push_sum.estimation_steps import EstimationSteps, estimation_steps
+from netkf.theory.push_sum.estimation_steps import estimation_steps
 from netkf.theory.push_sum.limits import consensus_gain_bound
 from netkf.theory.push_sum.mean_square import mean_radius, radius
 
@@ -257,11 +256,6 @@ def exact_minimum_gamma(
     if _check_moment(moment) == "mean-square":
         measure = radius
     for gamma in range(1, most + 1):
-        if measure(_with_gamma(steps, gamma)) < 1.0:
+        if measure(steps.with_gamma(gamma)) < 1.0:
             return gamma
     raise TheoryError(f"no gamma up to {most} has a {moment} radius below 1")
-
-
-def _with_gamma(steps: EstimationSteps, gamma: int) -> EstimationSteps:
-    """Return the estimation steps with another gamma."""
-    return replace(steps, averaging=replace(steps.averaging, gamma=gamma))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -11,6 +11,7 @@ from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray, symmetric
 from netkf.network.matchings import Broadcast
 from netkf.scenario.scenario import Scenario
+from netkf.theory.numerics.matrices import as_integer
 from netkf.theory.push_sum.averaging import Averaging
 from netkf.theory.push_sum.limits import PushSumLimits, push_sum_filter, push_sum_limits
 
@@ -35,6 +36,13 @@ class EstimationSteps:
     sensor_noise: FloatArray
     Q: FloatArray
     limits: PushSumLimits
+
+    def with_gamma(self, gamma: int) -> EstimationSteps:
+        """Return the steps of a filter that averages ``gamma`` times in a slot. Raises TheoryError
+        unless that is a whole number of at least 1.
+        """
+        averaging = replace(self.averaging, gamma=as_integer("gamma", gamma, 1))
+        return replace(self, averaging=averaging)
 
     @cached_property
     def scale(self) -> FloatArray:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -12,7 +11,6 @@ import scipy.linalg
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray, symmetric
 from netkf.scenario.scenario import Scenario
-from netkf.theory.numerics.matrices import as_integer
 from netkf.theory.push_sum.covariance import covariance_of_steps
 from netkf.theory.push_sum.estimation_steps import EstimationSteps, estimation_steps
 from netkf.theory.push_sum.limits import consensus_gain_bound
@@ -69,7 +67,7 @@ def push_sum_noise(scenario: Scenario, gammas: Sequence[int]) -> FloatArray:
     transform = np.kron(T * np.sign(T[0, 0]), np.eye(n))
     covariances = []
     for gamma in gammas:
-        moment = _with_gamma(steps, gamma).averaging.second_moment(steps.noise)
+        moment = steps.with_gamma(gamma).averaging.second_moment(steps.noise)
         covariances.append(symmetric(transform.T @ moment @ transform))
     return np.array(covariances)
 
@@ -87,16 +85,10 @@ def push_sum_covariances(scenario: Scenario, gammas: Sequence[int]) -> FloatArra
     covariances = np.full((len(gammas), N, n, n), np.nan)
     for k, gamma in enumerate(gammas):
         try:
-            covariances[k] = covariance_of_steps(_with_gamma(steps, gamma))
+            covariances[k] = covariance_of_steps(steps.with_gamma(gamma))
         except TheoryError:
             continue
     return covariances
-
-
-def _with_gamma(steps: EstimationSteps, gamma: int) -> EstimationSteps:
-    """Return the estimation steps with another gamma, a whole number of at least 1."""
-    law = replace(steps.averaging, gamma=as_integer("gamma", gamma, 1))
-    return replace(steps, averaging=law)
 
 
 def _require_averaging(scenario: Scenario, steps: EstimationSteps) -> None:
