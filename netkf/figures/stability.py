@@ -16,6 +16,7 @@ from netkf.figures.figure_data import FigureData, UnavailableError
 from netkf.figures.style import (
     EXACT,
     INK,
+    LOG_RATIO,
     LOST,
     RELAY,
     SENSING,
@@ -48,8 +49,6 @@ START_SHARE = 0.2
 """Share of a run whose samples are left out of the distribution of P."""
 MAX_TRACE = 1e100
 """Largest trace of P that is drawn: logarithmic axes overflow beyond."""
-LOG_RATIO = 20.0
-"""Ratio of the largest to the smallest value above which an axis is logarithmic."""
 MAX_TEXT = 24
 """Characters of a value on an axis."""
 

@@ -72,6 +72,8 @@ FORMATS = ("png", "svg", "pdf")
 RESOLUTION = 130  # dots per inch
 MAX_DRAWN = 1e250
 """Limit of the axes: matplotlib cannot place ticks near the largest number of a float."""
+LOG_RATIO = 20.0
+"""Ratio of the largest to the smallest value above which an axis is logarithmic."""
 LOG_MEDIANS = 100.0
 """Ratio of the largest value to the median above which a y axis is logarithmic."""
 POINTS_PER_INCH = 72.0

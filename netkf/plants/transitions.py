@@ -11,7 +11,7 @@ from netkf.linalg.portable import apply, gauss_legendre, norm, product
 
 UNIT_SIZE = 0.5  # largest norm of A times a gap for which one power series is used
 DEPENDENT = 1e-9  # a remainder below this share of the row's norm counts as rounding
-MAX_LAWS = 32
+MAX_CACHED_LAWS = 32
 """Cached sets of gaps."""
 _NODES, _WEIGHTS = gauss_legendre(10)  # exact to rounding for gaps of that size
 
@@ -52,7 +52,7 @@ class Transitions:
         distinct, index = np.unique(gaps, return_inverse=True)
         key = distinct.tobytes()
         if key not in self._laws:
-            if len(self._laws) >= MAX_LAWS:
+            if len(self._laws) >= MAX_CACHED_LAWS:
                 self._laws.clear()
             self._laws[key] = self._distinct_laws(distinct)
         Phi, L = self._laws[key]

@@ -15,7 +15,12 @@ from netkf.report.directories import ReportSource
 from netkf.report.markup import bullets, paragraph, table_box
 from netkf.runs.files import to_json_value
 from netkf.runs.summary import CONFIDENCE, nees_bounds
-from netkf.runs.tables import COLUMNS, format_number, format_standard_error
+from netkf.runs.tables import (
+    COLUMNS,
+    format_count,
+    format_number,
+    format_with_error,
+)
 from netkf.studies.compare import Comparison, Entry
 from netkf.studies.compare_filters import QUANTITIES
 from netkf.studies.filter_values import Quantity
@@ -77,7 +82,7 @@ def summary_section(source: ReportSource) -> str:
     caption = f"Averages over time{'; ' + runs if runs else ''}: {source.label}"
     messages = summary["messages"]
     counts = ", ".join(
-        f"{_format_count(messages[name])} {label}"
+        f"{format_count(messages[name])} {label}"
         for name, label in (
             ("sent", "sent"),
             ("delivered", "delivered"),
@@ -92,9 +97,7 @@ def summary_section(source: ReportSource) -> str:
 
 def _summary_cells(row: dict[str, Any]) -> list[str]:
     """Return the values of a row of the summary with their standard errors as text."""
-    return [
-        format_number(row[key]) + format_standard_error(row.get(f"{key}_se")) for key in COLUMNS
-    ]
+    return [format_with_error(row[key], row.get(f"{key}_se")) for key in COLUMNS]
 
 
 def _bound_notes(source: ReportSource) -> list[str]:
@@ -126,11 +129,6 @@ def _explain_limit(label: str) -> str:
     )
 
 
-def _format_count(value: Any) -> str:
-    """Return a count as text, with one decimal if it is a mean over runs."""
-    return f"{value:,}" if isinstance(value, int) else f"{value:,.1f}"
-
-
 def comparison_section(comparison: Comparison) -> str:
     """Return a table of the differences of the runs in two directories, A and B, below a sentence
     that counts the certain ones (whose intervals exclude 0), as HTML.
@@ -138,7 +136,7 @@ def comparison_section(comparison: Comparison) -> str:
     rows = []
     for quantity, node, (first, second) in comparison.rows:  # node -1: all nodes
         label = quantity if node < 0 else f"{quantity} of node {node}"
-        values = (_format_value(first), _format_value(second))
+        values = [format_with_error(entry.value, entry.se) for entry in (first, second)]
         rows.append([label, *values, *_difference_cells(second)])
     names = [
         f"{letter}: {label}" for letter, label in zip("AB", comparison.directories, strict=True)
@@ -156,11 +154,6 @@ def comparison_section(comparison: Comparison) -> str:
             "differences are certain"
         )
     return paragraph(sentence) + table_box("Differences of B from A", header, rows)
-
-
-def _format_value(entry: Entry) -> str:
-    """Return a value with its standard error as text."""
-    return format_number(entry.value) + format_standard_error(entry.se)
 
 
 def _difference_cells(entry: Entry) -> list[str]:
@@ -211,7 +204,7 @@ def _quantity_cells(quantity: Quantity) -> list[str]:
     """Return the texts of three cells: the value, its difference from that of the first filter with
     its interval, and whether the difference is certain.
     """
-    value = format_number(quantity.value) + format_standard_error(quantity.se)
+    value = format_with_error(quantity.value, quantity.se)
     if not math.isfinite(quantity.difference):
         return [value, "-", "-"]
     interval = f"{format_number(quantity.low)} .. {format_number(quantity.high)}"
@@ -240,9 +233,7 @@ def _format_cell(value: Any, error: Any) -> str:
     if isinstance(value, (int, np.integer)):
         return f"{int(value):,}"
     if isinstance(value, (float, np.floating)):
-        return format_number(float(value)) + format_standard_error(
-            None if error is None else float(error)
-        )
+        return format_with_error(float(value), None if error is None else float(error))
     return str(value)
 
 

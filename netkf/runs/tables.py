@@ -30,6 +30,11 @@ def format_number(value: float | None) -> str:
     return f"{value:.4g}"
 
 
+def format_with_error(value: float | None, error: float | None) -> str:
+    """Return a value with its standard error, if known, as text: ``1.2 +- 0.1``."""
+    return format_number(value) + format_standard_error(error)
+
+
 def format_standard_error(error: float | None) -> str:
     """Return a standard error as `` +- 0.1``; empty if it is None or not finite."""
     if error is None or not math.isfinite(error):
@@ -159,14 +164,14 @@ def _message_line(messages: dict[str, Any]) -> str:
     transmissions = messages.get("transmissions")
     if transmissions is None or math.isnan(transmissions):  # in slots they are not counted
         transmissions = messages["sent"]
-    line = f"messages: {_format_count(messages['sent'])} sent"
+    line = f"messages: {format_count(messages['sent'])} sent"
     # A broadcast is one transmission and a message to each node in range.
     if transmissions != messages["sent"]:
-        line += f" in {_format_count(transmissions)} transmissions"
-    line += f", {_format_count(messages['delivered'])} delivered"
-    line += f", {_format_count(messages['lost'])} lost"
+        line += f" in {format_count(transmissions)} transmissions"
+    line += f", {format_count(messages['delivered'])} delivered"
+    line += f", {format_count(messages['lost'])} lost"
     if messages["in_flight"]:
-        line += f", {_format_count(messages['in_flight'])} on their way at the end"
+        line += f", {format_count(messages['in_flight'])} on their way at the end"
     return line
 
 
@@ -184,6 +189,6 @@ def _describe_conserved(sums: dict[str, dict[str, float]]) -> str:
     return ", ".join(totals) + (drifting if worst > DRIFT_TOLERANCE else "")
 
 
-def _format_count(value: float) -> str:
+def format_count(value: float) -> str:
     """Return a count as text, or a mean of counts (a float) with one decimal."""
     return f"{value:,}" if isinstance(value, int) else f"{value:,.1f}"

@@ -8,6 +8,7 @@ from typing import Any
 from netkf.core.printable import shorten
 from netkf.figures.style import (
     BLUE,
+    LOG_RATIO,
     MUTED,
     finish_figure,
     new_figure,
@@ -66,7 +67,7 @@ def _draw_quantity(axes: Any, rows: list[ComparedFilter], name: str, label: str)
     )
     axes.set_xlabel(label)
     positive = [value for value in values if math.isfinite(value) and value > 0.0]
-    if positive and max(positive) > 20.0 * min(positive):
+    if positive and max(positive) > LOG_RATIO * min(positive):
         axes.set_xscale("log")
     elif name != "nees_ratio":
         axes.set_xlim(left=0.0)

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from netkf.core.printable import shorten
-from netkf.runs.tables import format_number, format_standard_error, format_table, shorten_rows
+from netkf.runs.tables import format_number, format_table, format_with_error, shorten_rows
 from netkf.studies.compare import Comparison, Entry
 from netkf.studies.compare_filters import QUANTITIES, FilterComparison
 from netkf.studies.consistency import Consistency
@@ -30,7 +30,7 @@ def format_sweep(lines: pd.DataFrame, keys: Sequence[str]) -> str:
     rows = [
         [
             *(_format_short(row[key]) for key in keys),
-            *(_format_with_error(row[name], row.get(f"{name}_se")) for name in COLUMNS),
+            *(format_with_error(row[name], row.get(f"{name}_se")) for name in COLUMNS),
             f"{row['sent']:,.6g}",
             row["status"],
         ]
@@ -45,11 +45,6 @@ def _format_short(value: Any) -> str:
     """
     text = f"{value:g}" if isinstance(value, float) else str(value)
     return text if len(text) <= MAX_LENGTH else f"{text[: MAX_LENGTH - 3]}..."
-
-
-def _format_with_error(value: float | None, error: float | None) -> str:
-    """Return a value with its standard error, if known, as text: ``1.2 +- 0.1``."""
-    return format_number(value) + format_standard_error(error)
 
 
 def format_sizing(sizing: Sizing) -> str:
@@ -184,7 +179,7 @@ def _format_quantity(cells: Quantity) -> tuple[str, str]:
         difference = f"{cells.difference:+.4g}"
         difference += f" +- {width:.2g}" if math.isfinite(width) else ""
         difference += "*" if cells.real else ""
-    return _format_with_error(cells.value, cells.se), difference
+    return format_with_error(cells.value, cells.se), difference
 
 
 def format_comparison(comparison: Comparison) -> str:
@@ -233,4 +228,4 @@ def format_comparison(comparison: Comparison) -> str:
 
 def _format_marked(entry: Entry) -> str:
     """Return a value as text, with a star if its difference is certain."""
-    return _format_with_error(entry.value, entry.se) + (" *" if entry.real else "  ")
+    return format_with_error(entry.value, entry.se) + (" *" if entry.real else "  ")

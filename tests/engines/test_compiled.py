@@ -377,9 +377,9 @@ def test_windows_rows_visits_and_mail_end_anywhere(ring, monkeypatch, delay):
     monkeypatch.setattr(f"{module}.draws.MAX_STEP_BLOCKS", 1)
     monkeypatch.setattr(f"{module}.visits.MAX_VISITS", 1)
     monkeypatch.setattr(f"{module}.poisson.TICKS", 5)
-    monkeypatch.setattr(f"{module}.poisson.TICKS_A_LINK", 0)
+    monkeypatch.setattr(f"{module}.poisson.MIN_TICKS_PER_ENTITY", 0)
     monkeypatch.setattr(f"{module}.schedule.MIN_WINDOW_TICKS", 5)
-    monkeypatch.setattr(f"{module}.schedule.TICKS_A_LINK", 1)
+    monkeypatch.setattr(f"{module}.schedule.TICKS_PER_ENTITY", 1)
     pieces = netkf.simulate(busy, engine="compiled")
     assert pieces.fingerprint == whole.fingerprint
     np.testing.assert_array_equal(pieces.P, whole.P)

@@ -75,7 +75,7 @@ from netkf.trace.schema import EVENT
 # Entries at the start of a run: the pool of messages, event rows, and the free ones of a history.
 FIRST_MESSAGES, FIRST_ROWS, FIRST_PAST = 64, 4096, 256
 # Most samples in the buffer of a run, and most float64 in their covariances together.
-MAX_BUFFERED_SAMPLES, SAMPLES_ROOM = 256, 1 << 18
+MAX_BUFFERED_SAMPLES, MAX_BUFFERED_FLOATS = 256, 1 << 18
 AT_START = (
     *(
         "run",
@@ -209,8 +209,8 @@ class Workspace:
         # Terms of conserved sums: weights held, totals sent and totals heard.
         terms = 2 * size + len(self._senders.directions) if kind == SUMS else 0
         # Space for many samples, within a budget of floats.
-        scratch = max(1, min(MAX_BUFFERED_SAMPLES, SAMPLES_ROOM // (size * n * n)))
-        self._buffer = empty_samples((1, scratch, size, n), terms)
+        samples = max(1, min(MAX_BUFFERED_SAMPLES, MAX_BUFFERED_FLOATS // (size * n * n)))
+        self._buffer = empty_samples((1, samples, size, n), terms)
         self._visits: Visits | None = None
         self._scratch: tuple[Any, ...] = ()
         # Code compiled for each n makes filters that combine estimates 1.5 times faster. It does

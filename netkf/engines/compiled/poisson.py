@@ -15,6 +15,7 @@ import numpy as np
 from netkf.engines.compiled.per_scenario import once_per_scenario
 from netkf.engines.compiled.schedule import (
     LOST,
+    MAX_WINDOW_TICKS,
     Schedule,
     Window,
     all_windows,
@@ -29,9 +30,10 @@ from netkf.rng.draws import StreamBatch, Ziggurat, exponential_of, next_unit, zi
 from netkf.rng.streams import ReplicaStreams, Streams
 from netkf.scenario.scenario import Scenario
 
-TICKS, TICKS_A_LINK, MAX_WINDOW_TICKS = 1 << 15, 4, 1 << 20
+TICKS, MIN_TICKS_PER_ENTITY = 1 << 15, 4
 """Ticks in a window: TICKS, whose arrays fit the processor's cache, or, if these are more,
-TICKS_A_LINK per entity, since each entity has a fixed cost in a window; at most MAX_WINDOW_TICKS.
+MIN_TICKS_PER_ENTITY for each entity, since each has a fixed cost in a window; at most
+MAX_WINDOW_TICKS.
 """
 
 
@@ -357,7 +359,9 @@ class PoissonSchedules:
         if self._rate > 0.0:
             entities = len(senders.entities)
             # A window of some thousand ticks, more of them where there are many links.
-            self._length = max(TICKS, min(TICKS_A_LINK * entities, MAX_WINDOW_TICKS)) / self._rate
+            self._length = (
+                max(TICKS, min(MIN_TICKS_PER_ENTITY * entities, MAX_WINDOW_TICKS)) / self._rate
+            )
         self._end, self._buffer = 0.0, _empty_buffer(0, 0)
 
     def following(self) -> Window:

@@ -34,7 +34,7 @@ from netkf.scenario.scenario import Scenario
 
 # Ticks drawn at once for an entity, doubling each time: slow clocks draw few that are not used.
 FIRST_BLOCK, MAX_BLOCK_SLOTS = 8, 1024
-TICKS_A_LINK = 256  # ticks of an entity in a window, which share its fixed cost
+TICKS_PER_ENTITY = 256  # ticks of an entity in a window, which share its fixed cost
 MAX_WINDOW_TICKS, MIN_WINDOW_TICKS = 1 << 20, 1 << 12  # limits for all entities together
 LOST = -1.0  # no delay is negative
 
@@ -417,7 +417,7 @@ class Schedule:
         """
         senders = senders_of(scenario) if senders is None else senders
         self._draws = draws = EntityDraws(scenario, streams, senders)
-        window_ticks = min(max(TICKS_A_LINK * draws.count, MIN_WINDOW_TICKS), MAX_WINDOW_TICKS)
+        window_ticks = min(max(TICKS_PER_ENTITY * draws.count, MIN_WINDOW_TICKS), MAX_WINDOW_TICKS)
         self._horizon, self._end = scenario.horizon, 0.0
         self._waiting = draws.more(np.arange(draws.count)) if draws.count else NO_TICKS
         # The rate of the first blocks decides the length of all windows.

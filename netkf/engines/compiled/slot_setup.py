@@ -414,8 +414,8 @@ class SlotSetup:
         # A power of two, so that a batch is one node of the merge tree; at least a block of lanes,
         # unless not even that fits.
         runs_in_memory = min(BATCH_BYTES // sample_bytes, BLOCK_BYTES // (8 * self.bytes_of_slot()))
-        power = 1 << max(0, int(min(runs_in_memory, MAX_BATCH_RUNS)).bit_length() - 1)
-        return int(min(max(power, LANES), max(1, MAX_BATCH_BYTES // sample_bytes)))
+        power = 1 << max(0, int(min(runs_in_memory, MAX_SLOT_RUNS)).bit_length() - 1)
+        return int(min(max(power, LANES), max(1, MAX_BLOCK_BYTES // sample_bytes)))
 
     def quick_runs(self) -> int:
         """Return the number of runs that take some ten milliseconds together, the smallest batch
@@ -423,7 +423,7 @@ class SlotSetup:
         """
         # A rough count for one slot: a filter's prediction and update, and its messages.
         flops = self.estimators * (50 + 4 * self.n**3) + 10 * len(self.fresh) * len(self.directions)
-        runs = min(QUICK_FLOPS // (max(1, self.slots) * flops), MAX_BATCH_RUNS)
+        runs = min(QUICK_FLOPS // (max(1, self.slots) * flops), MAX_SLOT_RUNS)
         return int(max(LANES, 1 << (runs.bit_length() - 1) if runs else 0))
 
 
@@ -431,8 +431,9 @@ BLOCK_BYTES = 1 << 24
 """Bytes drawn for one call of a filter's kernel. They exceed the caches of a core, but kernels read
 them once and in order, which costs less than more calls would.
 """
-BATCH_BYTES, MAX_BATCH_BYTES, MAX_BATCH_RUNS = 1 << 26, 1 << 29, 1024
-"""Limits of a batch: bytes of its samples, the same if it is only a block of lanes, and runs."""
+BATCH_BYTES, MAX_BLOCK_BYTES, MAX_SLOT_RUNS = 1 << 26, 1 << 29, 1024
+"""Limits of a batch in slots: bytes of its samples, the same if it is only a block of lanes, and
+runs."""
 QUICK_FLOPS = 1 << 25
 """Floating-point operations that take some ten milliseconds."""
 
