@@ -95,9 +95,11 @@ MASS, AVERAGE = 0, 1
 MAX_STEPS = 100_000
 """The largest ``gamma``: a larger one is a mistake."""
 MAX_DOUBLINGS = 60
-"""Iterations of ``asymptotic_root``; k of them reach 2^k slots."""
-MAX_SPREAD = 1e14
-"""The largest ``|G| |P|`` at which double precision can still detect a steady covariance."""
+"""Iterations of ``_steady_prediction``; k of them reach 2^k slots."""
+UNITS, SAME = 3.0, 1e-4
+"""Factor of other units in which P_inf is computed once more, and relative difference up to which
+both results are one covariance and not rounding errors.
+"""
 
 
 class NetworkInformation(NamedTuple):
@@ -1036,6 +1038,22 @@ def asymptotic_root(F: FloatArray, Q: FloatArray, information: FloatArray) -> Fl
     """Return the root of P_inf (n, n), paper P (12): the steady covariance of a filter with F and Q
     (n, n) that has all the ``information`` (n, n) in each slot, after its reading; None if there is
     none.
+    """
+    P = _steady_prediction(F, Q, information)
+    # Without a steady state P doubles until rounding of G stops it, at a P made of rounding errors,
+    # which are others in other units.
+    again = _steady_prediction(F, Q / UNITS, UNITS * information)
+    if P is None or again is None:
+        return None
+    if np.abs(UNITS * again - P).max() > SAME * np.abs(P).max():
+        return None
+    # P is the predicted covariance: use the reading to get that of P (12).
+    return correct_root_alone(lower_root(square_root(P)), information)
+
+
+def _steady_prediction(F: FloatArray, Q: FloatArray, information: FloatArray) -> FloatArray | None:
+    """Return the steady predicted covariance (n, n) of a filter with F and Q (n, n) that has all
+    the ``information`` (n, n) in each slot; None if the iteration finds none.
 
     By structure-preserving doubling: k steps give the covariance of 2^k slots (Chu, Fan, Lin and
     Wang, Int. J. Control 77, 2004).
@@ -1058,9 +1076,5 @@ def asymptotic_root(F: FloatArray, Q: FloatArray, information: FloatArray) -> Fl
             # Rounding would make G and P unsymmetric, and doubling would amplify that.
             A, G, step, P = A @ left, symmetric(G + A @ right @ A.T), next_P - P, next_P
             if np.abs(step).max() <= 1e-15 * np.abs(P).max():
-                # Without a steady state P doubles until rounding of G stops it: not a solution.
-                if np.abs(G).max() * np.abs(P).max() > MAX_SPREAD:
-                    return None
-                # P is the predicted covariance: use the reading to get that of P (12).
-                return correct_root_alone(lower_root(square_root(P)), information)
+                return P
     return None

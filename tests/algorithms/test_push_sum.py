@@ -137,6 +137,21 @@ def test_no_asymptotic_covariance_where_a_growing_mode_is_not_seen():
     # The difference of the two states is never seen and walks away; rounding ends its doubling.
     for scale in (1.0, 2.0, 3.0):
         assert asymptotic_root(np.eye(2), np.eye(2), np.full((2, 2), scale)) is None
+    h = np.array([[0.0, 0.0, 1.0], [1.0, 1.0, 1.0]])
+    assert asymptotic_root(np.eye(3), np.eye(3), h.T @ np.diag([1.0, 2.0]) @ h) is None
+    # So do states of which no sensor sees one direction, growing, resting or at constant speed.
+    for seed in range(10):
+        random = np.random.default_rng(seed)
+        T = np.linalg.qr(random.standard_normal((4, 4)))[0]
+        speeds = np.kron(np.eye(2), [[1.0, 0.25], [0.0, 1.0]])
+        for modes, hidden in ((np.diag([1.0, 1.0, 0.5, 1.02]), 3), (speeds, 0), (np.eye(4), 0)):
+            H = random.standard_normal((2, 4))
+            H[:, hidden] = 0.0
+            H = H @ T.T
+            assert asymptotic_root(T @ modes @ T.T, np.eye(4), H.T @ H) is None
+        # One that is seen poorly is known poorly.
+        H = np.array([[1e-3, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]]) @ T.T
+        assert asymptotic_root(T @ speeds @ T.T, np.eye(4), H.T @ H) is not None
     # Wide, yet there: an unstable mode behind a reading with a noise of 1e13.
     P = asymptotic_root(np.array([[1.5]]), np.eye(1), np.array([[1e-13]]))
     assert P is not None
