@@ -4,6 +4,7 @@ import tracemalloc
 
 import numpy as np
 import pytest
+import scipy.sparse
 
 import netkf
 from netkf import theory
@@ -196,3 +197,11 @@ def test_a_steady_bound_with_many_unknowns_is_left_out_of_the_report(tmp_path, m
     assert found["steady_bound"]["trace"] is None
     assert "18 unknowns, more than 5" in found["steady_bound"]["reason"]
     assert found["bound_at_horizon"]["trace"] is not None
+
+
+@pytest.mark.parametrize("unit", [1.0, 1e-10, 1e10])
+def test_rates_are_balanced_in_all_units_of_time_or_in_none(unit):
+    c = unit * scipy.sparse.csr_array([[0.0, 1.0], [3.0, 0.0]])
+    assert not coupled._is_symmetric(c)
+    assert coupled._is_symmetric(c + c.T * (1.0 + 1e-13))
+    np.testing.assert_allclose(coupled._stationary(c), [0.75, 0.25])

@@ -37,8 +37,10 @@ from netkf.linalg.arrays import FloatArray, symmetric
 from netkf.theory.common.jumps import ClockJumps, LyapunovInverse
 from netkf.theory.common.random_links import Directions
 
-MIN_POINTS, MAX_POINTS = 12, 80
-"""Limits of the number of intervals between the collocation points of a delay."""
+MIN_POINTS, MAX_POINTS, POINTS_PER_CHANGE = 12, 80, 1.2
+"""Limits of the number of intervals between the collocation points of a delay, and how many more
+than the least are taken for each change of the errors by a factor e.
+"""
 MAX_DENSE, MAX_DENSE_MEAN = 1200, 600
 """Unknowns up to which the boundary value problem, and the map of means over d, are matrices."""
 KRYLOV_VECTORS, MAX_ROUNDS = 40, 10
@@ -108,11 +110,12 @@ class DelayedJumps:
         growth = float(np.linalg.norm(self.A, 2))
         changes = self.delay * (B + growth + G * np.exp(growth * self.delay))
         # The Chebyshev series of e^{c x} over [0, 1] falls like (c / 4)^k / k!.
-        points = MIN_POINTS + int(min(np.ceil(1.2 * changes), 10.0 * MAX_POINTS))
+        points = MIN_POINTS + int(min(np.ceil(POINTS_PER_CHANGE * changes), 10.0 * MAX_POINTS))
         if points > MAX_POINTS:
+            most = (MAX_POINTS - MIN_POINTS) / POINTS_PER_CHANGE
             raise TheoryError(
                 f"errors change {changes:.3g} times during a delay of {self.delay:g} s; exact mean "
-                "squares are computed for at most 50: give a shorter delay or lower rates"
+                f"squares are computed for at most {most:.0f}: give a shorter delay or lower rates"
             )
         return points
 

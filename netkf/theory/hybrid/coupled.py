@@ -37,8 +37,7 @@ from netkf.theory.hybrid.samples import (
     transmits_at_samples,
 )
 
-# Between rates that count as equal; the absolute one in 1/s.
-RELATIVE_TOLERANCE, ABSOLUTE_TOLERANCE = 1e-12, 1e-8
+EQUAL_RATES = 1e-8  # difference of rates that count as equal, as a share of the largest rate
 RESIDUAL_TOLERANCE = 1e-9  # of the left null vector, relative
 
 
@@ -233,7 +232,7 @@ def has_balanced_rates(scenario: Scenario) -> bool | None:
 def _is_symmetric(c: scipy.sparse.csr_array) -> bool:
     """Return True if the rates c (N, N), per second, are symmetric up to rounding."""
     difference, size = abs(c - c.T), abs(c.T)
-    return bool((difference - RELATIVE_TOLERANCE * size).max() <= ABSOLUTE_TOLERANCE)
+    return bool(difference.max() <= EQUAL_RATES * size.max())
 
 
 def left_weights(scenario: Scenario) -> FloatArray:
