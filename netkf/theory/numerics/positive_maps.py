@@ -54,20 +54,21 @@ def fixed_point(T: PositiveMap, Q: FloatArray, radius: float) -> FloatArray:
 
     T is a positive map on stacks of S symmetric matrices, of spectral ``radius`` below 1, and Q
     (S, M, M) such a stack. The residual is below RESIDUAL max(1 - radius, 1e-3), relative to the
-    standard deviations of row and column. If that is not reached by GMRES, stacks of up to
-    MAX_DENSE_FALLBACK numbers are solved by elimination without a check of the residual; others
-    raise TheoryError.
+    standard deviations of row and column. If GMRES does not reach that, elimination is tried for
+    stacks of up to MAX_DENSE_FALLBACK numbers. Raises TheoryError if neither does.
     """
     # The error of the solution is up to 1 / (1 - radius) times the residual.
     tolerance = RESIDUAL * max(1.0 - radius, 1e-3)
-    is_small, X = _count_numbers(Q.shape) <= MAX_DENSE, np.array(Q)
-    for _ in range(MAX_ROUNDS):
-        residual = Q + T(X) - X
-        if _is_small(residual, X, tolerance):
-            return symmetric(X)
-        X = X + (_solve_by_elimination(T, residual) if is_small else _by_gmres(T, residual))
-    if not is_small and _count_numbers(Q.shape) <= MAX_DENSE_FALLBACK:
-        return _solve_by_elimination(T, Q)
+    count = _count_numbers(Q.shape)
+    solvers = [_by_gmres] if count > MAX_DENSE else []
+    solvers += [_solve_by_elimination] if count <= max(MAX_DENSE, MAX_DENSE_FALLBACK) else []
+    for solve in solvers:
+        X = np.array(Q)
+        for _ in range(MAX_ROUNDS):
+            residual = Q + T(X) - X
+            if _is_small(residual, X, tolerance):
+                return symmetric(X)
+            X = X + solve(T, residual)
     raise TheoryError(f"the mean squares were solved to {np.abs(residual).max():.1e} only")
 
 
