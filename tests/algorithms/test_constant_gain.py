@@ -3,9 +3,11 @@
 import numpy as np
 import pytest
 import scipy.integrate
+import scipy.linalg
 
 import netkf
 from netkf import theory
+from netkf.algorithms.kernels.constant_gains import fill_inverse_transition
 from netkf.theory.common.errors import error_law
 from tests.algorithms.test_literature import clocked, heard_by_slot, scenario_of, textbook
 from tests.engines.linearity import engine_covariance
@@ -115,3 +117,14 @@ def test_gains_that_do_not_fit_are_refused(tmp_path):
     ):
         with pytest.raises(netkf.ScenarioError, match=words):
             scenario_of({"kind": "constant-gain", "gain": gain}, tmp_path)
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 5, 8])
+def test_inverse_transitions_are_matrix_exponentials(n):
+    maps = np.empty((3, n, n))
+    for seed in range(5):
+        A = np.random.default_rng(seed).standard_normal((n, n))
+        for gap in (0.0, 1e-6, 0.3, 4.0):
+            fill_inverse_transition(A, gap, maps)
+            expected = scipy.linalg.expm(-A * gap)
+            np.testing.assert_allclose(maps[0], expected, rtol=1e-10, atol=1e-13 * expected.max())

@@ -97,11 +97,35 @@ def double_gap(step: float, J_1: FloatArray, work: FloatArray) -> None:
 
 @kernel
 def fill_inverse_transition(A: FloatArray, gap: float, maps: FloatArray) -> None:
-    """Write ``e^{-A g}`` (n, n) for a ``gap`` of g seconds into the first of ``maps`` (6, n, n);
-    the others are scratch. A is (n, n). Belief propagation predicts evidence by it.
+    """Write the inverse transition ``e^{-A g}`` (n, n), by which information is predicted over a
+    ``gap`` of g seconds, into the first of ``maps`` (>= 3, n, n), by scaling and squaring; the
+    second and third are scratch. A is (n, n).
     """
-    # The integrals are not needed here; the exponential is a by-product of theirs.
-    fill_legendre_integrals(A, -1.0, gap, maps[4], maps[5], maps[:4])
+    out, term, product = maps[0], maps[1], maps[2]
+    n, norm = len(A), 0.0
+    for i in range(n):
+        # The largest row sum of |A| gap bounds the norm of A gap.
+        row = 0.0
+        for j in range(n):
+            row += abs(A[i, j]) * gap
+            out[i, j] = term[i, j] = 1.0 if i == j else 0.0
+        norm = max(norm, row)
+    # exp(-A g) = exp(-A g / 2^k)^(2^k), with a norm of at most 1/2 for the power series.
+    halvings, step = 0, -gap
+    while norm > 0.5:
+        norm, step, halvings = 0.5 * norm, 0.5 * step, halvings + 1
+    # For a norm of 0 the result is the identity.
+    for k in range(1, TERMS if norm > 0.0 else 1):
+        multiply_square(product, term, A)
+        for i in range(n):
+            for j in range(n):
+                term[i, j] = product[i, j] * step / k
+                out[i, j] += term[i, j]
+    for _ in range(halvings):
+        multiply_square(product, out, out)
+        for i in range(n):
+            for j in range(n):
+                out[i, j] = product[i, j]
 
 
 @kernel

@@ -10,6 +10,7 @@ import math
 
 import numpy as np
 
+from netkf.algorithms.kernels.constant_gains import fill_inverse_transition
 from netkf.algorithms.kernels.root_flow import transform_root
 from netkf.algorithms.running_sums import MIN_ACCURACY
 from netkf.engines.compiled.late_readings import use_instant
@@ -18,10 +19,7 @@ from netkf.linalg.arrays import FloatArray, IntArray
 from netkf.linalg.compiling import kernel
 from netkf.linalg.jacobi import diagonalise
 from netkf.linalg.lanes import ONE
-from netkf.linalg.small import multiply_square
 from netkf.linalg.structs import Struct
-
-TERMS = 18  # of the exponential series, for a norm of at most 1/2
 
 
 class Totals(Struct):
@@ -81,38 +79,6 @@ def empty_totals(
 
 
 @kernel
-def fill_inverse(totals: Totals, gap: float) -> None:
-    """Write the inverse transition ``e^{-A gap}`` (n, n), by which information is predicted, into
-    ``totals.scratch[0]``, for ``gap`` seconds, by scaling and squaring.
-    """
-    A, out, term, product = totals.A, totals.scratch[0], totals.scratch[1], totals.scratch[2]
-    n, norm = len(A), 0.0
-    for i in range(n):
-        # The largest row sum of |A| gap bounds the norm of A gap.
-        row = 0.0
-        for j in range(n):
-            row += abs(A[i, j]) * gap
-            out[i, j] = term[i, j] = 1.0 if i == j else 0.0
-        norm = max(norm, row)
-    # exp(-A g) = exp(-A g / 2^k)^(2^k), with a norm of at most 1/2 for the power series.
-    halvings, step = 0, -gap
-    while norm > 0.5:
-        norm, step, halvings = 0.5 * norm, 0.5 * step, halvings + 1
-    # For a norm of 0 the result is the identity.
-    for k in range(1, TERMS if norm > 0.0 else 1):
-        multiply_square(product, term, A)
-        for i in range(n):
-            for j in range(n):
-                term[i, j] = product[i, j] * step / k
-                out[i, j] += term[i, j]
-    for _ in range(halvings):
-        multiply_square(product, out, out)
-        for i in range(n):
-            for j in range(n):
-                out[i, j] = product[i, j]
-
-
-@kernel
 def predict_total(totals: Totals, values: FloatArray, k: int, gap: float) -> None:
     """Predict one running total, the sum of all that a node has offered so far, by ``gap`` seconds
     in place: ``U <- s Phi^-T U Phi^-1`` and ``u <- s Phi^-T u``, with Phi = e^{A gap} and the
@@ -122,7 +88,7 @@ def predict_total(totals: Totals, values: FloatArray, k: int, gap: float) -> Non
     if not gap > 0.0:
         return
     # Phi^-1 = exp(-A gap); information moves by Phi^-T from the left and by Phi^-1 from the right.
-    fill_inverse(totals, gap)
+    fill_inverse_transition(totals.A, gap, totals.scratch)
     inverse, half, predicted_u = totals.scratch[0], totals.scratch[1], totals.scratch[2]
     # Forgetting multiplies information by s = exp(-2 f gap).
     n, fading = len(inverse), math.exp(-2.0 * totals.forgetting * gap)
