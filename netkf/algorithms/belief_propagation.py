@@ -544,7 +544,7 @@ def backward(model: Any, gap: float) -> FloatArray:
         power = np.linalg.matrix_power(model.F, round(gap / model.period))
         return np.asarray(np.linalg.inv(power), dtype=np.float64)
     # The kernel writes exp(-A gap) into the first matrix; the others are scratch.
-    maps = np.empty((6, *model.A.shape))
+    maps = np.empty((3, *model.A.shape))
     fill_inverse_transition(model.A, gap, maps)
     return np.asarray(maps[0])
 

@@ -18,6 +18,7 @@ from netkf.figures.style import (
     INK,
     LOG_RATIO,
     LOST,
+    MAX_DRAWN,
     RELAY,
     SENSING,
     SEQUENTIAL,
@@ -47,8 +48,6 @@ LAW_SAMPLES = 2000
 """Samples of the invariant law of P."""
 START_SHARE = 0.2
 """Share of a run whose samples are left out of the distribution of P."""
-MAX_TRACE = 1e100
-"""Largest trace of P that is drawn: logarithmic axes overflow beyond."""
 MAX_TEXT = 24
 """Characters of a value on an axis."""
 
@@ -291,9 +290,9 @@ def law_figure(data: FigureData) -> Picture:
     # The first samples still depend on P(0).
     after_start = data.times >= START_SHARE * data.times[-1]
     traces = data.trace[after_start]
-    traces = np.where(traces < MAX_TRACE, traces, np.nan)
+    traces = np.where(traces < MAX_DRAWN, traces, np.nan)
     if not np.isfinite(traces).any():
-        raise UnavailableError(f"All traces of P are above {MAX_TRACE:g} or not finite.")
+        raise UnavailableError(f"All traces of P are above {MAX_DRAWN:g} or not finite.")
     figure = new_figure(7.4, 4.4)
     axes = figure.add_subplot()
     groups = (

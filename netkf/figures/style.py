@@ -70,8 +70,8 @@ RC: dict[str, Any] = {
 }
 FORMATS = ("png", "svg", "pdf")
 RESOLUTION = 130  # dots per inch
-MAX_DRAWN = 1e250
-"""Limit of the axes: matplotlib cannot place ticks near the largest number of a float."""
+MAX_DRAWN = 1e100
+"""Limit of the axes: logarithmic ones overflow near the largest number of a float."""
 LOG_RATIO = 20.0
 """Ratio of the largest to the smallest value above which an axis is logarithmic."""
 LOG_MEDIANS = 100.0

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import ctypes
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,6 +16,7 @@ __all__ = [
     "ArrayLike",
     "FloatArray",
     "IntArray",
+    "address_of",
     "block_diagonal",
     "readonly_array",
     "is_semidefinite",
@@ -21,6 +24,15 @@ __all__ = [
     "square_root",
     "symmetric",
 ]
+
+
+def address_of(array: Any) -> int:
+    """Return the address of the first byte of a C-contiguous numpy ``array``."""
+    try:
+        # A quarter of the time of ``array.ctypes.data``, of which a run needs some hundred.
+        return ctypes.addressof(ctypes.c_char.from_buffer(array))
+    except (TypeError, ValueError):  # read-only, or empty
+        return int(array.ctypes.data)
 
 
 def readonly_array(value: ArrayLike) -> FloatArray:

@@ -24,11 +24,12 @@ calls often take ``struct.memory``, and begin with ``struct = struct_at(memory, 
 
 from __future__ import annotations
 
-import ctypes
 from typing import Any, ClassVar, TypeVar, dataclass_transform
 
 import numpy as np
 from numpy.typing import NDArray
+
+from netkf.linalg.arrays import address_of
 
 FloatArray = NDArray[np.float64]
 NUMBERS = {"int": np.int64, "float": np.float64}
@@ -91,7 +92,7 @@ class Struct(metaclass=StructClass):
         if not cls.struct_offsets:
             cls._lay_out(values)
         object.__setattr__(self, "memory", np.zeros(cls.struct_size(), dtype=np.int64))
-        object.__setattr__(self, "address", _address_of(self.memory))
+        object.__setattr__(self, "address", address_of(self.memory))
         for name, value in values.items():
             setattr(self, name, value)
 
@@ -145,7 +146,7 @@ class Struct(metaclass=StructClass):
             # wrong memory.
             if (value.dtype, value.ndim) != kind or not value.flags.c_contiguous:
                 raise TypeError(f"{type(self).__name__}.{name} is a C-contiguous array {kind}")
-            self.memory[word] = _address_of(value)
+            self.memory[word] = address_of(value)
             self.memory[word + 1 : word + 1 + value.ndim] = value.shape
             # The dictionary keeps the array alive, since the memory holds its address only.
             self.__dict__[name] = value
@@ -178,15 +179,6 @@ class Struct(metaclass=StructClass):
         if kind is not np.int64 and kind is not np.float64:
             raise AttributeError(name)
         return self.memory.view(kind)[self.struct_offsets[name]].item()
-
-
-def _address_of(array: Any) -> int:
-    """Return the address of the first byte of a C-contiguous numpy ``array``."""
-    try:
-        # A quarter of the time of ``array.ctypes.data``, of which a run needs some hundred.
-        return ctypes.addressof(ctypes.c_char.from_buffer(array))
-    except (TypeError, ValueError):  # read-only, or empty
-        return int(array.ctypes.data)
 
 
 Derived = TypeVar("Derived", bound=Struct)

@@ -235,8 +235,13 @@ def _assemble_page(
     packer = Packer()  # collects columns of numbers as one compressed text
     runs = [
         run_data(
-            *(entry.source, entry.source.run, entry.messages, entry.readings, entry.layout),
-            *(data_limits, packer),
+            entry.source,
+            entry.source.run,
+            entry.messages,
+            entry.readings,
+            entry.layout,
+            data_limits,
+            packer,
         )
         for entry in entries
         if entry.source.run is not None and entry.layout is not None

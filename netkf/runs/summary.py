@@ -146,13 +146,13 @@ def chi_square_interval(freedom: Any, probability: float) -> tuple[FloatArray, F
     return np.asarray(low), np.asarray(high)
 
 
-def nees_bounds(n: int, runs: int = 1) -> tuple[float, float]:
+def nees_bounds(n: int, runs: int = 1, confidence: float = CONFIDENCE) -> tuple[float, float]:
     """Return the ends of the interval that holds the mean NEES of one sample over ``runs`` runs
-    with probability CONFIDENCE if P is exact.
+    with probability ``confidence`` if P is exact.
 
     The sum over the runs is chi-square with ``runs n`` degrees of freedom, n states.
     """
-    low, high = chi_square_interval(runs * n, CONFIDENCE)
+    low, high = chi_square_interval(runs * n, confidence)
     return n * float(low), n * float(high)
 
 

@@ -29,7 +29,7 @@ from netkf.linalg.arrays import FloatArray, block_diagonal
 from netkf.rng.streams import Streams
 from netkf.runs.labels import covariance_bias
 from netkf.runs.simulate import choose_engine, simulate
-from netkf.runs.summary import NO_COVARIANCE, chi_square_interval
+from netkf.runs.summary import NO_COVARIANCE, nees_bounds
 from netkf.scenario.scenario import Scenario
 from netkf.theory import error_covariance
 from netkf.trace.nees import errors
@@ -368,8 +368,7 @@ def judge_consistency(
     """
     # ``level`` is the probability that some interval misses.
     n, count, level = scenario.plant.n, len(runs), 1.0 - confidence
-    # Chi-square bounds on the mean NEES of a sample over the runs: its sum has n runs degrees.
-    low, high = (n * float(end) for end in chi_square_interval(n * count, confidence))
+    low, high = nees_bounds(n, count, confidence)
     shares_inside = _share_inside(runs, low, high)
     # Bonferroni over the nodes, two-sided.
     quantile = float(scipy.special.stdtrit(count - 1, 1.0 - 0.5 * level / len(scenario.nodes)))

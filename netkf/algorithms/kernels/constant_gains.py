@@ -114,8 +114,7 @@ def fill_inverse_transition(A: FloatArray, gap: float, maps: FloatArray) -> None
     halvings, step = 0, -gap
     while norm > 0.5:
         norm, step, halvings = 0.5 * norm, 0.5 * step, halvings + 1
-    # For a norm of 0 the result is the identity.
-    for k in range(1, TERMS if norm > 0.0 else 1):
+    for k in range(1, TERMS):
         multiply_square(product, term, A)
         for i in range(n):
             for j in range(n):

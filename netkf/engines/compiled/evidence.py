@@ -43,7 +43,7 @@ class EvidenceArrays(Struct):
 
     Scratch: ``centre`` (N, n, 1), ``before`` and ``after`` (n, 1), whitened readings y
     (1, 1, 1, p, 1) and H (1, 1, 1, p, n, 1), ``total`` and ``work`` (n, n + 1, 1), ``maps``
-    (6, n, n).
+    (3, n, n).
     """
 
     prior: FloatArray
@@ -98,7 +98,7 @@ def empty_evidence(state: Simulation, A: FloatArray, roots: FloatArray) -> Evide
         H=np.zeros((1, 1, 1, p, n, 1)),
         total=np.zeros(shape),
         work=np.zeros(shape),
-        maps=np.zeros((6, n, n)),
+        maps=np.zeros((3, n, n)),
     )
 
 

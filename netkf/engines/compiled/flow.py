@@ -203,7 +203,6 @@ class Workspace:
         self._waiting = np.zeros(len(self._start.nodes), dtype=np.int64)
         size, n = self._start.xhat.shape
         self._pool = empty_pool(FIRST_MESSAGES, n)
-        self._rows = np.empty(0, dtype=EVENT)
         self._probes = np.array(scenario.times, dtype=np.float64)
         kind = COMBINATIONS.index(scenario.node_filter.combination)
         # Terms of conserved sums: weights held, totals sent and totals heard.
@@ -281,7 +280,7 @@ class Workspace:
             probes=self._probes,
             buffer=self._buffer if buffer is None else buffer,
             # The recorder keeps the rows of a traced run, so the next one gets others.
-            rows=np.empty(FIRST_ROWS, dtype=EVENT) if traced else self._rows,
+            rows=np.empty(FIRST_ROWS if traced else 0, dtype=EVENT),
             counts=np.zeros(len(schema.KINDS), dtype=np.int64),
             scratch=scratch,
             flow_scratch=flow_arrays,

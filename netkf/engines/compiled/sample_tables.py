@@ -49,17 +49,14 @@ class SampleTables:
         ]
         counts = [len(times[node, placed_sensor.ordinal]) for node, placed_sensor in placed]
         # All samples of all sensors in one list, sensor by sensor.
-        t = np.concatenate(
-            [np.empty(0), *(times[n, placed_sensor.ordinal] for n, placed_sensor in placed)]
-        )
+        t = np.concatenate([times[n, placed_sensor.ordinal] for n, placed_sensor in placed])
         sensor = np.repeat(np.arange(len(placed)), counts)
         # Sorted by (time, sensor), the order in which one update stacks them.
         order = np.lexsort((sensor, t))
         # The inverse permutation: where the samples of each sensor have gone.
         position = np.empty(len(t), dtype=np.int64)
         position[order] = np.arange(len(t))
-        cuts = np.cumsum(counts)[:-1]
-        parts = np.split(position, cuts) if placed else []
+        parts = np.split(position, np.cumsum(counts)[:-1])
         self._sensors = [
             SampledSensor(
                 times[node, placed_sensor.ordinal],
