@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
-import re
+import sys
 from pathlib import Path
 from typing import Any
 
 from docutils.nodes import SkipNode
 from latex2mathml.converter import convert
+from sphinx.util.inspect import TypeAliasForwardRef
 
-from netkf import __version__
+from netkf import __version__, parts
 from netkf.scenario.schema_page import schema_page
+
+sys.path.insert(0, str(Path(__file__).parent))
+
+from docstrings import restructured
 
 project = "netkf"
 author = "The netkf developers"
@@ -46,57 +51,46 @@ nitpick_ignore_regex = [
 
 autodoc_member_order = "bysource"
 autodoc_typehints = "signature"
-autodoc_default_options = {"show-inheritance": True}
 autodoc_preserve_defaults = True
+autodoc_type_aliases = {"ArrayLike": "ArrayLike", "FloatArray": "ndarray", "IntArray": "ndarray"}
 
-CODE = re.compile(r"(``.+?``|`.+?`)", re.DOTALL)
-MARKUP = re.compile(r"([\\*|_])")
-ARRAY = re.compile(r"~?(?:numpy\.)?ndarray\[tuple\[.*?\], ~?(?:numpy\.)?dtype\[[^\]]*\]+")
-ARRAY_LIKE = re.compile(r"_Buffer \| _SupportsArray.*?_NestedSequence\[complex \| bytes \| str\]")
+TypeAliasForwardRef.__repr__ = lambda self: self.name  # inside other types, and of properties
 BLOCK = "overflow-x: auto; overflow-y: hidden; padding: 0.4em 0"
-INDENTED = re.compile(r"^(\s{4,})")
 
 
-def literal_text(app: Any, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
-    """Show docstrings as they are written: plain text with code between backticks.
-
-    Matrices and bars of norms would else be read as reStructuredText; indented lines and lists
-    are blocks of code.
-    """
-    lines[:] = [_literal(line) for line in _blocks(lines)]
+def readable_text(app: Any, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
+    """Show docstrings, and for the class of a kind how a scenario file names it."""
+    lines[:] = [*KIND_LINES.get(name, []), *restructured(lines)]
 
 
-def _literal(line: str) -> str:
-    if INDENTED.match(line):
-        return line
-    parts = CODE.split(line)
-    return "".join(
-        f"``{part.strip('`')}``" if k % 2 else MARKUP.sub(r"\\\1", part)
-        for k, part in enumerate(parts)
-    )
+TABLES = {
+    "plant": "[plant]",
+    "continuous plant": "[plant]",
+    "sensor": "[[sensors]]",
+    "sampling": "sensors.sampling",
+    "graph": "network.graph",
+    "activation": "network.activation",
+    "slot activation": "network.activation",
+    "loss": "network.channel.loss",
+    "delay": "network.channel.delay",
+    "filter": "[filter]",
+    "slot filter": "[filter]",
+}
+"""The table of a scenario file that holds the keys of a family of classes."""
 
 
-def _blocks(lines: list[str]) -> list[str]:
-    """The lines with a ``::`` before each indented block."""
-    found: list[str] = []
-    for line in lines:
-        after_text = not found or not INDENTED.match(found[-1])
-        if INDENTED.match(line) and after_text and (not found or found[-1] != "::"):
-            found += ["", "::", ""]
-        elif line.strip() and found and INDENTED.match(found[-1]) and not INDENTED.match(line):
-            found.append("")
-        found.append(line)
-    return found
-
-
-def short_types(
-    app: Any, what: str, name: str, obj: Any, options: Any, signature: str, returns: str
-) -> tuple[str, str]:
-    """Write types of numpy as a reader would."""
-    return tuple(
-        text and ARRAY_LIKE.sub("ArrayLike", ARRAY.sub("ndarray", text))
-        for text in (signature, returns)
-    )
+def kind_lines() -> dict[str, list[str]]:
+    """Return for each class of ``netkf.parts`` a line with the keys that choose it in a file."""
+    found: dict[str, list[str]] = {}
+    for family, classes in parts.kinds().items():
+        for kind, cls in classes.items():
+            first, *further = kind.split()
+            keys = [f'kind = "{first}"', *(key.replace("=", ' = "') + '"' for key in further)]
+            text = f"``{', '.join(keys)}`` of ``{TABLES[family]}``"
+            texts = found.setdefault(f"netkf.parts.{cls.__name__}", [])
+            if text not in texts:
+                texts.append(text)
+    return {name: [f"In a scenario file {', '.join(texts)}.", ""] for name, texts in found.items()}
 
 
 def inline_mathml(translator: Any, node: Any) -> None:
@@ -120,9 +114,11 @@ def write_keys(app: Any) -> None:
         page.write_text(text, encoding="utf-8")
 
 
+KIND_LINES = kind_lines()
+
+
 def setup(app: Any) -> None:
-    """Connect the page of keys, and the reading of docstrings and signatures."""
+    """Connect the page of keys, and the reading of docstrings."""
     app.add_html_math_renderer("mathml", (inline_mathml, None), (block_mathml, None))
     app.connect("builder-inited", write_keys)
-    app.connect("autodoc-process-signature", short_types)
-    app.connect("autodoc-process-docstring", literal_text)
+    app.connect("autodoc-process-docstring", readable_text)
