@@ -1,6 +1,7 @@
 """The command line as a user meets it."""
 
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -13,7 +14,7 @@ import pytest
 import netkf
 from netkf.cli.main import main
 from netkf.cli.options import parse_changes
-from tests.conftest import SCENARIOS
+from tests.conftest import ROOT, SCENARIOS
 
 RING = str(SCENARIOS / "poisson_ring.toml")
 
@@ -128,7 +129,15 @@ def test_nothing_is_claimed_to_be_kept_where_nothing_was_written(capsys, monkeyp
     assert capsys.readouterr().err == "netkf: interrupted\n"
 
 
-@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full here")
+def is_full_device():
+    """True if /dev/full is that device, and not a file that somebody made in its place."""
+    try:
+        return os.stat("/dev/full").st_rdev == os.makedev(1, 7)
+    except OSError:
+        return False
+
+
+@pytest.mark.skipif(not is_full_device(), reason="no device /dev/full here")
 def test_a_full_disk_is_told_in_one_line(tmp_path):
     arguments = ["run", RING, "--set", "horizon=2.0", "--no-plot", "--out", str(tmp_path / "out")]
     code = f"import sys; from netkf.cli.main import main; sys.exit(main({arguments!r}))"
@@ -142,3 +151,35 @@ def test_a_full_disk_is_told_in_one_line(tmp_path):
         )
     assert done.returncode == 2
     assert done.stderr == "netkf: cannot write: No space left on device\n"
+
+
+def test_refusals_do_not_wait_for_matplotlib(tmp_path):
+    run = tmp_path / "run"
+    assert main(["run", RING, "--set", "horizon=2.0", "--no-plot", "--out", str(run)]) == 0
+    (tmp_path / "a.png").mkdir()
+    os.symlink("nowhere", tmp_path / "b.png")
+    refused = [
+        *(["plot", "run", "--figure", "eror"], ["plot", "absent"], ["plot", "run", "--figure", ""]),
+        *(["plot", "run", "--out", "run/summary.json"], ["plot", "run", "--out", "b.png"]),
+        *(["plot", "run", "run", "--out", "c.png"], ["plot", "run", "--format", "gif"]),
+        *(["report", "absent"], ["report", "run", "--out", "run/summary.json"]),
+        *(["report", "run", "--out", "b.png"], ["report", "run", "--out", "run"]),
+        *(["report", "run", "run", "run"], ["report", "run", "--replica", "x"]),
+    ]
+    code = (
+        "import sys\nfrom netkf.cli.main import main\n"
+        f"for arguments in {refused}:\n"
+        "    try:\n        print(main(arguments))\n"
+        "    except SystemExit as end:\n        print(end.code)\n"
+        "print([name for name in sys.modules if name.startswith('matplotlib')])"
+    )
+    done = subprocess.run(
+        [sys.executable, "-W", "error", "-c", code],
+        check=False,
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+    )
+    assert done.stdout.split("\n") == ["2"] * len(refused) + ["[]", ""]
+    assert len(done.stderr.splitlines()) == len(refused)

@@ -68,7 +68,7 @@ def _save_verdict(directory: Path, scenario: Scenario, verdict: Verdict, text: s
     columns: dict[str, Any] = _result_columns(verdict.results)
     np.savez_compressed(results, **columns)
     with write_atomically(directory / RESULTS) as part:
-        part.write_bytes(results.getbuffer())
+        part.write_bytes(results.getvalue())
     with write_atomically(directory / "verdict.csv") as part:
         verdict.table.to_csv(part, index=False)
     write_text(directory / "verdict.txt", text + "\n")

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import argparse
+from importlib.util import find_spec
 from pathlib import Path
 
 from netkf.cli.options import Command, add_trust
-from netkf.core.errors import ScenarioError
-
-FORMATS = ("png", "svg", "pdf")
-"""As in netkf.figures.style, which imports matplotlib."""
+from netkf.core.errors import ScenarioError, suggest_nearest
+from netkf.figures.names import FIGURE_NAMES, FORMATS
 
 
 def _declare(parser: argparse.ArgumentParser) -> None:
@@ -22,8 +21,7 @@ def _declare(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="NAME[,NAME]",
-        help="figures to draw: overview, error, quantiles, ratios, network, nees, nis, whiteness, "
-        "age, links, stability, law, delivery (default: all)",
+        help=f"figures to draw: {', '.join(FIGURE_NAMES)} (default: all)",
     )
     parser.add_argument(
         "--out", type=Path, help="file or directory of the figures (default: DIR/figures)"
@@ -38,35 +36,60 @@ def _run(options: argparse.Namespace) -> int:
     Raises ScenarioError without matplotlib, for unknown figures, and for one file of several
     figures.
     """
-    try:
-        from netkf.figures.catalogue import plot_to_files
-    except ImportError:
-        rule, remedy = "needs matplotlib", "install it: pip install 'netkf[plot]'"
-        raise ScenarioError("plot", rule, None, remedy) from None
     from netkf.studies.opening import open as open_directory
 
+    if find_spec("matplotlib") is None:
+        rule, remedy = "needs matplotlib", "install it: pip install 'netkf[plot]'"
+        raise ScenarioError("plot", rule, None, remedy)
     # Empty: all figures.
     names = tuple(name for text in options.figure for name in _figure_names(text))
+    if options.out is not None:
+        _check_output(options.out, len(options.directories))
     has_several = len(options.directories) > 1
-    if has_several and options.out is not None and options.out.suffix.removeprefix(".") in FORMATS:
-        rule, remedy = "is one file for several directories", "name a directory"
-        raise ScenarioError("--out", rule, str(options.out), remedy)
     for directory in options.directories:
         if options.out is None:
             out = directory / "figures"
         else:
             out = options.out / directory.name if has_several else options.out
         result = open_directory(directory, trust=options.trust)
+        # After all that can be refused: importing matplotlib takes a second.
+        from netkf.figures.catalogue import plot_to_files
+
         for path in plot_to_files(result, names, out, options.format or "png"):
             print(path)
     return 0
 
 
+def _check_output(out: Path, directories: int) -> None:
+    """Raise ScenarioError or WriteError if ``out`` cannot be the file or folder of the figures
+    of this number of ``directories``.
+    """
+    from netkf.runs.files import require_own
+
+    if out.is_dir():
+        return
+    if out.suffix.removeprefix(".").lower() in FORMATS:
+        if directories > 1:
+            rule, remedy = "is one file for several directories", "name a directory"
+            raise ScenarioError("--out", rule, str(out), remedy)
+        require_own(out)
+    elif out.exists():
+        rule, remedy = "cannot be made (File exists)", "name a directory, or a new file NAME.png"
+        raise ScenarioError("--out", rule, str(out), remedy)
+
+
 def _figure_names(text: str) -> list[str]:
-    """Return the names of a list separated by commas; raises ScenarioError if it is empty."""
+    """Return the names of a list separated by commas; raises ScenarioError if it is empty or one is
+    not known.
+    """
     names = [name.strip() for name in text.split(",") if name.strip()]
     if not names:
         raise ScenarioError("--figure", "must name figures", text, "leave it out to draw all")
+    for name in names:
+        if name not in FIGURE_NAMES:
+            hint = suggest_nearest(name, FIGURE_NAMES)
+            remedy = f"{hint}figures are {', '.join(FIGURE_NAMES)}"
+            raise ScenarioError("figure", "is not known", name, remedy)
     return names
 
 

@@ -133,7 +133,7 @@ class BlockCheckpoints:
         np.savez(block, **arrays)
         block.write(MARK + _digest(block, block.tell()))
         with write_atomically(self._block_path(number)) as part:
-            part.write_bytes(block.getbuffer())
+            part.write_bytes(block.getvalue())
         self._numbers.add(number)
 
     def load(self, number: int) -> RunStatistics:

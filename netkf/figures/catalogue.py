@@ -10,6 +10,7 @@ from netkf.core.errors import ScenarioError, suggest_nearest
 from netkf.figures.consistency import nees_figure, nis_figure, whiteness_figure
 from netkf.figures.error import error_figure, quantiles_figure, ratios_figure
 from netkf.figures.figure_data import FigureData, UnavailableError, reduce_result
+from netkf.figures.names import FORMATS
 from netkf.figures.network import network_figure
 from netkf.figures.pictures import overview
 from netkf.figures.stability import (
@@ -18,7 +19,7 @@ from netkf.figures.stability import (
     stability_figure,
     sweep_figure,
 )
-from netkf.figures.style import FORMATS, Picture, message_figure, style_context, write_figure
+from netkf.figures.style import Picture, message_figure, style_context, write_figure
 from netkf.figures.traffic import age_figure, delivery_figure, links_figure
 from netkf.runs.files import make_directory
 

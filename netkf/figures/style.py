@@ -68,7 +68,6 @@ RC: dict[str, Any] = {
     "pdf.fonttype": 42,
     "svg.hashsalt": "netkf",
 }
-FORMATS = ("png", "svg", "pdf")
 RESOLUTION = 130  # dots per inch
 MAX_DRAWN = 1e100
 """Limit of the axes: logarithmic ones overflow near the largest number of a float."""
@@ -161,7 +160,7 @@ def text_width(text: str, size: float, weight: str = "normal") -> float:
 
 
 def write_figure(figure: Figure, path: Path) -> None:
-    """Write a figure, whole or not at all, in the format of the suffix, one of FORMATS.
+    """Write a figure, whole or not at all, in the format of the suffix, one of ``names.FORMATS``.
 
     Raises WriteError if the file cannot be written.
     """

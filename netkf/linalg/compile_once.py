@@ -1,7 +1,7 @@
 """A cache of compiled code on disk for several processes: one compiles, the others wait.
 
-Without it, processes that start side by side would all compile the same kernels, and numba would
-lose entries of its index file, which it reads, changes and writes without a lock.
+Without it, processes that start side by side would all compile the same kernels, and entries of
+an index file, which is read, changed and written, would be lost.
 """
 
 from __future__ import annotations
@@ -21,18 +21,22 @@ and interval at which the lock is tried.
 """
 
 
+LOCK_FLAGS = os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0)
+"""A lock file is made where it is, not where a link points to."""
+
+
 class SharedCache:
-    """The cache of a numba dispatcher with locks between processes; all other attributes are those
-    of numba's own cache.
+    """A cache of a numba dispatcher with locks between processes; all other attributes are those
+    of the cache that it wraps.
     """
 
     def __init__(self, cache: Any, name: str) -> None:
-        """Wrap numba's ``cache`` of the function ``name``, which names its lock files."""
+        """Wrap a ``cache`` of the function ``name``, which names its lock files."""
         self._cache, self._name = cache, name
         self._waiting = ExitStack()
 
     def __getattr__(self, name: str) -> Any:
-        """Return the attribute ``name`` of numba's cache: all that is not defined here."""
+        """Return the attribute ``name`` of the wrapped cache: all that is not defined here."""
         return getattr(self._cache, name)
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
@@ -66,7 +70,7 @@ class SharedCache:
         try:
             folder = Path(self._cache.cache_path)
             folder.mkdir(parents=True, exist_ok=True)
-            descriptor = os.open(folder / name, os.O_RDWR | os.O_CREAT, 0o600)
+            descriptor = os.open(folder / name, LOCK_FLAGS, 0o600)
         except OSError:
             # A full or read-only disk, for instance: compiling twice is better than failing.
             yield

@@ -9,15 +9,20 @@ from __future__ import annotations
 import atexit
 import hashlib
 import os
+import re
 import shutil
 import sys
 import tempfile
 import time
+import warnings
 from collections.abc import Callable
+from contextlib import suppress
 from functools import cache, cached_property, update_wrapper
+from importlib import import_module
 from pathlib import Path
 from typing import Any, TypeVar, cast, overload
 
+from netkf.linalg.code_files import CodeFiles, make_own_folder
 from netkf.linalg.compile_once import SharedCache
 from netkf.linalg.linking import linked_once
 from netkf.linalg.shortcuts import kernel_compiler, without_collection
@@ -51,6 +56,7 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 _OPTIONS: Any = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
 _announced: set[Callable[..., Any]] = set()
 _compile_times: list[float] = []
+_folders_of_process: set[Path] = set()
 
 
 @overload
@@ -95,6 +101,7 @@ def kernel(
 def _numba() -> Any:
     """Return the module numba, with the types that kernels use registered."""
     # Imported by the first call of a kernel: importing netkf must not import numba.
+    _configure_numba()
     import numba
 
     from netkf.linalg import (  # noqa: F401 - register types
@@ -105,6 +112,27 @@ def _numba() -> Any:
     )
 
     return numba
+
+
+@cache
+def _configure_numba() -> None:
+    """Import numba without the settings, such as the folder of compiled code, that a file in the
+    current folder may have: it may be anyone's.
+    """
+    is_told = "numba" not in sys.modules and os.path.isfile(".numba_config.yaml")
+    yaml = sys.modules.get("yaml")
+    if is_told:
+        sys.modules["yaml"] = None  # type: ignore[assignment] # numba then cannot read the file
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            config: Any = import_module("numba.core.config")
+    finally:
+        if is_told:
+            sys.modules.pop("yaml")
+            sys.modules.update({"yaml": yaml} if yaml is not None else {})
+    # It is looked for again whenever something is compiled.
+    config._config_fname = ""
 
 
 class Kernel:
@@ -150,20 +178,13 @@ class Kernel:
     def _python_dispatcher(self) -> Callable[..., Any]:
         """The numba dispatcher for calls by Python; cached on disk with all its callees."""
         numba = _numba()
-        config = numba.config
-        cache_dir = config.CACHE_DIR
-        # numba invalidates its cache by the file of the function alone, while callees may change:
-        # hence a folder for each state of all sources.
-        config.CACHE_DIR = str(_cache_folder(cache_dir))
-        try:
-            dispatcher: Any = numba.njit(
-                cache=True, pipeline_class=self._compiler, **self._options
-            )(self._loops)
-        finally:
-            config.CACHE_DIR = cache_dir
+        dispatcher: Any = numba.njit(pipeline_class=self._compiler, **self._options)(self._loops)
+        # Not numba's own cache, which executes what it finds, and whose files are known by the file
+        # of the function alone, while callees may change.
+        files = CodeFiles(self._loops, _cache_folder(numba.config.CACHE_DIR))
         # Of several processes that need the same code one compiles, and the others wait.
-        dispatcher._cache = SharedCache(dispatcher._cache, self._loops.__name__)
-        _use_compile_settings(dispatcher, config)
+        dispatcher._cache = SharedCache(files, self._loops.__name__)
+        _use_compile_settings(dispatcher, numba.config)
         return cast(Callable[..., Any], dispatcher)
 
 
@@ -259,8 +280,10 @@ def announce(function: Callable[..., Any]) -> None:
     _announced.add(function)
     folder = _cache_folder(os.environ.get("NUMBA_CACHE_DIR", ""))
     if not any(folder.rglob(f"*.{function.__name__}-*.nbi")):
-        note = "netkf: compiling, once after an installation (5 to 15 s) ..."
-        print(note, file=sys.stderr, flush=True)
+        when = "once for each kind of filter"
+        if not _folders_of_process.isdisjoint((folder, folder.parent)):
+            when = "in each process: NUMBA_CACHE_DIR names no folder that only you can write"
+        print(f"netkf: compiling (5 to 15 s), {when} ...", file=sys.stderr, flush=True)
 
 
 def source_digest(*rooms: str) -> str:
@@ -280,37 +303,51 @@ def _cache_folder(chosen: str) -> Path:
     """Return the folder of compiled code: one for each state of the sources."""
     # A kernel may contain constants and kernels of any of ROOMS; any change of their sources gives
     # a new folder, so that compiled code is never out of date.
-    name = f"netkf-{source_digest(*ROOMS)}"
-    parent = _first_writable(chosen, ROOT)
-    if not (parent / name).exists():
-        _remove_old_folders(parent)
-    return parent / name
+    folder = _first_writable(chosen, ROOT) / f"netkf-{source_digest(*ROOMS)}"
+    if not folder.exists():
+        _remove_old_folders(folder.parent)
+    return folder if _is_own_folder(folder) else _folder_of_process()
 
 
 def _first_writable(chosen: str, root: Path) -> Path:
-    """Return the first writable folder: ``chosen`` if it is not empty, else ``__pycache__`` of
-    ``root`` or the user's cache folder; else a temporary one of this process.
+    """Return the first folder that can be written, and only by this user: ``chosen`` if it is not
+    empty, else ``__pycache__`` of ``root`` or the user's cache folder; else a temporary one of this
+    process.
     """
-    home = Path(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache"))
     # ``chosen`` is NUMBA_CACHE_DIR. An installation may be read-only.
-    places = [Path(chosen)] if chosen else [root / "__pycache__", home / "netkf"]
+    places = [Path(chosen)] if chosen else [root / "__pycache__", *_user_folders()]
     # Never numba's own default folder, whose code may be out of date.
-    return next((place for place in places if _is_writable(place)), None) or _folder_of_process()
+    return next((place for place in places if _is_own_folder(place)), None) or _folder_of_process()
 
 
-def _is_writable(folder: Path) -> bool:
-    """Return True if the folder exists, or can be made, and can be written."""
+def _user_folders() -> list[Path]:
+    """Return netkf's cache folder of this user, if there is one."""
+    given, home = os.environ.get("XDG_CACHE_HOME", ""), os.path.expanduser("~")
+    if os.path.isabs(given):
+        return [Path(given) / "netkf"]
+    # A relative path, also the "~" of a user without a home, is in the current folder, whose files
+    # may be anyone's; an empty HOME gives "/".
+    return [] if home == os.sep else [Path(home) / ".cache" / "netkf"]
+
+
+def _is_own_folder(folder: Path) -> bool:
+    """Return True if the folder exists, or can be made, and only this user can write it."""
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        return os.access(folder, os.R_OK | os.W_OK | os.X_OK)
+        return make_own_folder(folder)
     except (OSError, ValueError):  # ValueError: a name that no folder can have
         return False
 
 
 def _folder_of_process() -> Path:
-    """Return a new temporary folder, which is removed when the process ends."""
+    """Return a new temporary folder, which is removed when the process ends, or one that there
+    cannot be if none can be made.
+    """
     # Cached code is executed: a fixed name in a shared folder could be another user's.
-    folder = Path(tempfile.mkdtemp(prefix="netkf-"))
+    try:
+        folder = Path(tempfile.mkdtemp(prefix="netkf-"))
+    except OSError:  # all is read-only
+        folder = Path(os.devnull, "netkf")
+    _folders_of_process.add(folder)
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
     return folder
 
@@ -319,7 +356,19 @@ def _remove_old_folders(folder: Path) -> None:
     """Remove from ``folder`` the compiled code of all but the newest states of the sources, so that
     with the one that is made next MAX_CACHED_STATES remain.
     """
-    folders = [path for path in folder.glob("netkf-*") if path.is_dir()]
+    # Others' folders may have similar names.
+    folders = [path for path in folder.glob("netkf-*") if _holds_code_only(path)]
     # A few are kept, so that switching between branches does not compile anew.
-    for old in sorted(folders, key=lambda path: path.stat().st_mtime)[: -MAX_CACHED_STATES + 1]:
-        shutil.rmtree(old, ignore_errors=True)
+    with suppress(OSError):  # another process may do the same
+        for old in sorted(folders, key=lambda path: path.stat().st_mtime)[: -MAX_CACHED_STATES + 1]:
+            shutil.rmtree(old, ignore_errors=True)
+
+
+def _holds_code_only(folder: Path) -> bool:
+    """Return True if a folder is one of compiled code by its name and by what it holds."""
+    if not re.fullmatch("netkf-[0-9a-f]{16}", folder.name) or folder.is_symlink():
+        return False
+    return all(
+        path.is_dir() or path.suffix in (".nbi", ".nbc", ".lock") or ".tmp." in path.name
+        for path in folder.rglob("*")
+    )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import math
 import shlex
 from collections.abc import Sequence
@@ -32,7 +33,7 @@ from netkf.report.mending import (
 from netkf.report.messages import MESSAGE, join_messages
 from netkf.report.packing import Packer
 from netkf.runs.documents import FINAL_STATUSES, DamagedError
-from netkf.runs.files import write_text
+from netkf.runs.files import require_own, write_text
 from netkf.runs.innovations import Innovations
 from netkf.runs.stored import StoredRun
 from netkf.scenario.writing import toml_text
@@ -117,7 +118,12 @@ def write_report(
 
 
 def _require_page(path: Path) -> None:
-    """Raise ScenarioError if ``path`` is a file other than a page, which would be overwritten."""
+    """Raise ScenarioError if ``path`` is a file other than a page, which would be overwritten, and
+    WriteError if it is no file of its own.
+    """
+    require_own(path)
+    if path.is_dir():
+        raise WriteError(OSError(errno.EISDIR, ""), path)
     if not path.is_file():
         return
     try:

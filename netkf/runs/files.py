@@ -9,6 +9,7 @@ import json
 import math
 import os
 import shutil
+import stat
 from collections.abc import Collection, Iterable, Iterator
 from pathlib import Path
 from typing import Any
@@ -26,18 +27,41 @@ from netkf.scenario.writing import resolve_defaults, to_toml
 def writing_file(path: Path) -> Iterator[None]:
     """Turn every OSError of the body into a WriteError about ``path``.
 
-    Raises WriteError before the body runs if ``path`` has a NUL character or no file name.
+    Raises WriteError before the body runs if ``path`` has a NUL character or no file name, or is a
+    device, a pipe, a socket or a link.
     """
     if "\0" in str(path):
         raise WriteError(OSError(errno.EINVAL, ""), path)
     if not path.name:
         raise WriteError(OSError(errno.EISDIR, ""), path)
+    require_own(path)
     try:
         yield
     except WriteError:
         raise
     except OSError as error:
         raise WriteError(error, path) from error
+
+
+_FOREIGN_KINDS = {
+    stat.S_IFCHR: "a device",
+    stat.S_IFBLK: "a device",
+    stat.S_IFIFO: "a pipe",
+    stat.S_IFSOCK: "a socket",
+    stat.S_IFLNK: "a link",
+}
+
+
+def require_own(path: Path) -> None:
+    """Raise WriteError if ``path`` is a device, a pipe, a socket or a link: files are renamed to
+    their paths when they are complete, which would take its place, for root even that of /dev/null.
+    """
+    try:
+        kind = _FOREIGN_KINDS.get(stat.S_IFMT(os.lstat(path).st_mode))
+    except (OSError, ValueError):  # there is none, or there can be none
+        return
+    if kind is not None:
+        raise WriteError(OSError(f"it is {kind}, not a file of its own; choose another"), path)
 
 
 def publish(temporary: Path, path: Path) -> None:
@@ -64,6 +88,8 @@ def write_atomically(path: Path) -> Iterator[Path]:
     WriteError if the body raises OSError or the file cannot be renamed.
     """
     temporary = path.parent / f"{path.name}.part"
+    # Before the block that removes it: what is not a file here is nobody's temporary file.
+    require_own(temporary)
     try:
         with writing_file(path):
             yield temporary

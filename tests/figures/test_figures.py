@@ -9,6 +9,7 @@ import pytest
 import netkf
 from netkf.cli.main import main
 from netkf.figures.catalogue import FIGURES, FigureSet
+from netkf.figures.names import FIGURE_NAMES
 from netkf.figures.style import style_context
 from tests.figures.conftest import KINDS
 
@@ -209,6 +210,10 @@ def test_a_map_that_takes_minutes_is_drawn_on_request_only(results, monkeypatch,
     drawn.clear()
     assert main(["plot", str(folder), "--figure", "stability"]) == 0
     assert "steady state" in drawn["stability"].get_suptitle()
+
+
+def test_figures_are_known_by_name_before_they_are_drawn():
+    assert set(FIGURE_NAMES) == set(FIGURES)
 
 
 def test_a_missing_matplotlib_is_one_line(results, monkeypatch, capsys, tmp_path):

@@ -1,0 +1,9 @@
+"""Names of figures and formats of their files, for whom matplotlib is not imported yet."""
+
+FORMATS = ("png", "svg", "pdf")
+"""Formats of picture files, which are their suffixes."""
+FIGURE_NAMES = (
+    *("overview", "error", "quantiles", "ratios", "network", "nees", "nis", "whiteness"),
+    *("age", "links", "stability", "law", "delivery"),
+)
+"""The figures of runs and ensembles; a sweep has ``stability`` only."""
