@@ -51,7 +51,7 @@ def test_what_is_no_file_of_its_own_is_not_replaced(tmp_path, place):
         except PermissionError:  # a container without device nodes
             continue
         kind = path.lstat().st_mode
-        with pytest.raises(WriteError, match="it is a (pipe|link|device), not a file of its own"):
+        with pytest.raises(WriteError, match=r"it is a (pipe|link|device), not a file of its own"):
             write_text(tmp_path / "page", "text")
         assert path.lstat().st_mode == kind
         assert list(tmp_path.iterdir()) == [path]
