@@ -57,6 +57,7 @@ class CodeFiles:
         """Return the compile result of a signature, or None."""
         from numba.core.compiler import CompileResult
 
+        compile_result: Any = CompileResult
         # Refreshed, or the context may lack what the code refers to.
         target_context.refresh()
         key = self._key(sig, target_context.codegen())
@@ -65,7 +66,7 @@ class CodeFiles:
         if data is None or _digest(data).hex() != expected:
             return None
         try:
-            return CompileResult._rebuild(target_context, *pickle.loads(data))
+            return compile_result._rebuild(target_context, *pickle.loads(data))
         except Exception:  # a module that it names may have changed
             return None
 
@@ -73,12 +74,13 @@ class CodeFiles:
         """Save the compile result of a signature, unless it refers to addresses of this process or
         the files cannot be written.
         """
-        from numba.core.serialize import dumps
+        from numba.core import serialize
 
         bound = result.library.has_dynamic_globals or any(not x.can_cache for x in result.lifted)
         if bound or not self._made_from:
             return
         key = self._key(sig, result.codegen)
+        dumps: Any = serialize.dumps
         data = dumps(result._reduce())
         index = json.dumps({**self._read_index(), key: _digest(data).hex()}).encode()
         with suppress(OSError):
@@ -104,8 +106,9 @@ class CodeFiles:
 
     def _key(self, sig: Any, codegen: Any) -> str:
         """Return the digest of a signature, the processor, and the function with its constants."""
-        from numba.core.serialize import dumps
+        from numba.core import serialize
 
+        dumps: Any = serialize.dumps
         cells = self._function.__closure__ or ()
         constants = dumps(tuple(cell.cell_contents for cell in cells))
         parts = [str(sig), *map(str, codegen.magic_tuple())]
