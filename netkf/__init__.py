@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from netkf.scenario.model import Belief, Filtering, Network
     from netkf.scenario.reading import load
     from netkf.scenario.scenario import Scenario
+    from netkf.scenario.stamps import Time
     from netkf.studies.compare import compare
     from netkf.studies.compare_filters import compare_filters
     from netkf.studies.consistency import consistency
@@ -38,6 +39,7 @@ _MODULE_OF = {
     "Network": "netkf.scenario.model",
     "Run": "netkf.trace.run",
     "Scenario": "netkf.scenario.scenario",
+    "Time": "netkf.scenario.stamps",
     "compare": "netkf.studies.compare",
     "compare_filters": "netkf.studies.compare_filters",
     "consistency": "netkf.studies.consistency",
@@ -70,6 +72,7 @@ __all__ = [
     "Scenario",
     "ScenarioError",
     "TheoryError",
+    "Time",
     "check",
     "compare",
     "compare_filters",

@@ -104,6 +104,7 @@ from netkf.plants.sensors import LinearSensor, Sensor
 from netkf.scenario.model import Belief, Filtering, Network
 from netkf.scenario.registry import KINDS
 from netkf.scenario.scenario import Scenario
+from netkf.scenario.stamps import Time
 
 SlotLocal, SlotCentral = Local, Central
 """Former names of Local and Central in slots."""
@@ -210,6 +211,7 @@ __all__ = [
     "Star",
     "State",
     "StochasticTrigger",
+    "Time",
     "Topology",
     "UniformDelay",
     "UnknownDiffusion",

@@ -1,12 +1,23 @@
-"""Reading of the CSV files of scenarios; errors name the file and the line."""
+"""Reading of the tables of scenarios; errors name the file and the line.
+
+Every recorded table goes through here. Columns are separated by commas, semicolons or tabs, as the
+line of their names shows; with semicolons and tabs numbers may have decimal commas. Lines that
+begin with # are comments, wherever they stand; empty lines say nothing. A file may be compressed by
+gzip. Columns of STAMPS hold times: numbers or ISO 8601, counted from ``[time] origin``.
+"""
 
 from __future__ import annotations
 
 import csv
+import gzip
+import io
+import itertools
 import math
+import zlib
 from array import array
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
+from typing import NamedTuple
 
 import numpy as np
 
@@ -14,125 +25,292 @@ from netkf.core.errors import ScenarioError
 from netkf.core.fields import MAX_MAGNITUDE, SourceFile
 from netkf.linalg.arrays import FloatArray
 
-MAX_BYTES = 256 << 20  # of a file; it limits the memory that reading takes
+MAX_BYTES = 256 << 20  # of a table, unpacked; it limits the memory that reading takes
 MAX_ID = 2**53  # larger integers are not exact as floating-point numbers
+STAMPS = ("t", "from", "until")
+"""The columns that hold times, in every table."""
+SEPARATORS = ",;\t"
+_FOREIGN = {
+    b"PK": "it is a zip file or a spreadsheet; save the table as CSV",
+    b"\xff\xfe": "it is UTF-16 text; save it as UTF-8",
+    b"\xfe\xff": "it is UTF-16 text; save it as UTF-8",
+}
+"""What files are that begin so, and what to do."""
+
+
+class Columns(dict[str, FloatArray]):
+    """The columns of a table by name, each (K,), for its K rows; stamps in simulated seconds.
+
+    source, lines : the file, and the number (K,) of each row's line in it
+    half_digits : (K,), half of the last digit of each stamp t in seconds; empty without such a
+                  column
+    """
+
+    def __init__(self, source: SourceFile, lines: np.ndarray, half_digits: FloatArray) -> None:
+        super().__init__()
+        self.source, self.lines, self.half_digits = source, lines, half_digits
+
+    def where(self, *rows: int) -> str:
+        """Return the name of the file and the lines of ``rows`` (indices), as messages begin."""
+        listed = " and ".join(str(self.lines[row]) for row in sorted(rows))
+        return f"{self.source.name} line{'s' if len(rows) > 1 else ''} {listed}"
+
+    def integers(self, name: str) -> list[int]:
+        """Return the column ``name`` as K integers, ids or counts; raises ScenarioError, with the
+        line, for a value that is not an integer from 0 to MAX_ID.
+        """
+        column = self[name]
+        wrong = np.flatnonzero((column != np.round(column)) | (column < 0) | (column > MAX_ID))
+        if wrong.size:
+            rule = f"{self.where(int(wrong[0]))}: {name} must be an integer from 0 to 2^53"
+            raise ScenarioError("path", rule, float(column[wrong[0]]), "correct it")
+        return [int(value) for value in column]
 
 
 def read_columns(
-    source: SourceFile, required: tuple[str, ...], optional: tuple[str, ...] = ()
-) -> dict[str, FloatArray]:
-    """Return the named columns, each (rows,), by name; optional ones only if they are there.
+    source: SourceFile,
+    required: tuple[str, ...],
+    optional: tuple[str, ...] = (),
+    gaps: Collection[str] = (),
+) -> Columns:
+    """Return the named columns, optional ones only if they are there. Entries of columns in
+    ``gaps`` may be empty or nan, and are nan then.
 
     Raises ScenarioError, with the file and the line, for a missing column, a row of another length
-    than the header, or an entry that is not a finite number.
+    than the header, or an entry that is not a finite number, or no stamp in a column of STAMPS.
     """
-    numbers = array("d")
-    with _open_table(source) as (header, rows):
-        _require_columns(source, header, required)
-        names = [name for name in (*required, *optional) if name in header]
-        indices = [header.index(name) for name in names]
-        for line, row in rows:
-            numbers.extend(parse_finite_numbers(source, line, header, row, indices))
-    columns = np.array(numbers, dtype=np.float64).reshape(-1, len(names)).T
-    return dict(zip(names, columns, strict=True))
+    numbers, lines, half_digits = array("d"), array("q"), array("d")
+    with _open_table(source) as sheet:
+        _require_columns(source, sheet, required)
+        names = [name for name in (*required, *optional) if name in sheet.header]
+        for name in names:
+            if sheet.header.count(name) > 1:
+                rule = f"{source.name} must have one column {name}"
+                raise ScenarioError("path", rule, sheet.header, "rename the others")
+        places = [(sheet.header.index(name), name in STAMPS, name in gaps) for name in names]
+        entries = _Entries(source, sheet)
+        for line, row in sheet.rows:
+            entries.begin(line, row)
+            lines.append(line)
+            for column, is_stamp, may_miss in places:
+                if is_stamp:
+                    numbers.append(entries.stamp(column))
+                else:
+                    numbers.append(entries.number(column, may_miss))
+                if sheet.header[column] == "t":
+                    half_digits.append(source.stamps.half_digit(row[column].replace(",", ".")))
+    columns = Columns(source, np.array(lines, dtype=np.int64), np.array(half_digits))
+    table = np.array(numbers, dtype=np.float64).reshape(len(lines), len(names))
+    columns.update(zip(names, np.ascontiguousarray(table.T), strict=True))
+    return columns
 
 
 def read_header(source: SourceFile) -> list[str]:
     """Return the names of the columns; raises ScenarioError if the file is not a table."""
-    with _open_table(source) as (header, _):
-        return header
+    with _open_table(source) as sheet:
+        return sheet.header
 
 
-def read_rows(
-    source: SourceFile, required: tuple[str, ...]
-) -> tuple[list[str], list[tuple[int, list[str]]]]:
-    """Return the names of the columns, and (line number, entries) of every row that is not empty.
-
-    Raises ScenarioError if the file is not a table or lacks a required column.
+class _Sheet(NamedTuple):
+    """An open table: names of columns, rows with the numbers of their lines, the separator, and the
+    comments above the names, by line.
     """
-    with _open_table(source) as (header, rows):
-        _require_columns(source, header, required)
-        return header, list(rows)
+
+    header: list[str]
+    rows: Iterator[tuple[int, list[str]]]
+    separator: str
+    comments: dict[int, str]
 
 
-def _require_columns(source: SourceFile, header: list[str], required: tuple[str, ...]) -> None:
-    """Raise ScenarioError if the header lacks a required column."""
-    missing = [name for name in required if name not in header]
-    if missing:
-        rule = f"{source.name} must have the columns {', '.join(required)}"
-        raise ScenarioError("path", rule, header, f"add the column {missing[0]}")
+class _Entries:
+    """The entries of one row after the other, as numbers."""
 
+    def __init__(self, source: SourceFile, sheet: _Sheet) -> None:
+        self._source, self._header, self._separator = source, sheet.header, sheet.separator
+        self._line, self._row = 0, [""]
+        # The first lines with a decimal comma and a decimal point: a table must not mix them.
+        self._commas: dict[str, int] = {}
 
-@contextmanager
-def _open_table(
-    source: SourceFile,
-) -> Iterator[tuple[list[str], Iterator[tuple[int, list[str]]]]]:
-    """Open a CSV file for a block; give the names of its columns and an iterator of its rows.
+    def begin(self, line: int, row: list[str]) -> None:
+        """Go to the ``row`` in this ``line``; raises ScenarioError if it is too long or short."""
+        self._line, self._row = line, row
+        if len(row) != len(self._header):
+            rule = f"{self._source.name} line {line} must have {len(self._header)} entries"
+            remedy = "correct the row"
+            if len(row) > len(self._header) and self._separator == ",":
+                remedy += "; with decimal commas separate columns by semicolons"
+            raise ScenarioError("path", rule, row, remedy)
 
-    The iterator gives (line number, entries) of rows that are not empty. Raises ScenarioError if
-    the file, also while it is iterated, cannot be read as a table.
-    """
-    try:
-        size = source.full.stat().st_size
-        if size > MAX_BYTES:
-            rule = f"{source.name} must have at most {MAX_BYTES >> 20} MiB"
-            raise ScenarioError("path", rule, f"{size:,} bytes", "leave out rows")
-        with source.full.open(newline="", encoding="utf-8-sig") as file:
-            reader = csv.reader(file)
-            header = [name.strip() for name in next(reader, [])]
-            yield header, ((reader.line_num, row) for row in reader if row)
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        rule = f"{source.name} cannot be read as a UTF-8 table of comma-separated values"
-        raise ScenarioError("path", rule, str(error), "correct the file") from None
-
-
-def parse_finite_numbers(
-    source: SourceFile, line: int, header: list[str], entries: list[str], indices: list[int]
-) -> list[float]:
-    """Return the ``entries`` (texts) of a row in the columns with these ``indices`` as numbers, one
-    for each index; ``header`` has the names of all columns.
-
-    Raises ScenarioError if one is not a finite number of at most MAX_MAGNITUDE, or if the row is
-    not as long as the header. ``line`` is the row's line number in the file.
-    """
-    where = f"{source.name} line {line}"
-    if len(entries) != len(header):
-        raise ScenarioError(
-            "path", f"{where} must have {len(header)} entries", entries, "correct the row"
-        )
-    numbers = []
-    for column in indices:
+    def number(self, column: int, may_miss: bool) -> float:
+        """Return the entry in the column with this index; nan if it is empty or nan and
+        ``may_miss``. Raises ScenarioError if it is not a finite number of at most MAX_MAGNITUDE.
+        """
+        text = self._row[column].strip()
+        if may_miss and text.lower() in ("", "nan"):
+            return math.nan
+        number = self._with_point(text)
         try:
-            value = float(entries[column])
+            value = math.nan if "_" in text else float(number)
         except ValueError:
             value = math.nan
         if not math.isfinite(value):
-            raise ScenarioError(
-                "path",
-                f"{where}: {header[column]} must be a finite number",
-                entries[column],
-                "correct the row, or leave it out",
-            )
+            remedy = "write a decimal point, no commas" if "," in text else "correct the entry"
+            raise self._refusal(column, "must be a finite number", remedy)
+        return self._limited(column, value)
+
+    def stamp(self, column: int) -> float:
+        """Return the time in the column with this index, in simulated seconds; raises ScenarioError
+        if it is neither a number nor an ISO 8601 time.
+        """
+        stamp = self._with_point(self._row[column].strip())
+        try:
+            value = self._source.stamps.seconds(stamp)
+        except ValueError:
+            value = math.nan
+        if not math.isfinite(value):
+            rule = "must be a finite number or an ISO 8601 time"
+            raise self._refusal(column, rule, "correct the entry")
+        return self._limited(column, value)
+
+    def _with_point(self, text: str) -> str:
+        """Return a number with a decimal point for a decimal comma, if the columns are not
+        separated by commas; raises ScenarioError if the table mixes both.
+        """
+        if self._separator == "," or ":" in text:
+            return text
+        for sign in ",.":
+            if sign in text:
+                self._commas.setdefault(sign, self._line)
+        if len(self._commas) == 2:
+            rule = f"{self._source.name} must not mix decimal commas and points"
+            lines = " and ".join(f"line {line} has {sign!r}" for sign, line in self._commas.items())
+            raise ScenarioError("path", f"{rule}: {lines}", text, "write all numbers alike")
+        return text.replace(",", ".") if text.count(",") == 1 else text
+
+    def _limited(self, column: int, value: float) -> float:
+        """Return ``value``; raises ScenarioError if it is larger than MAX_MAGNITUDE."""
         if abs(value) > MAX_MAGNITUDE:
-            rule = f"{where}: {header[column]} must be at most {MAX_MAGNITUDE:g} in size"
-            raise ScenarioError(
-                "path", rule, entries[column], "correct the row, or choose other units"
-            )
-        numbers.append(value)
-    return numbers
+            rule = f"must be at most {MAX_MAGNITUDE:g} in size"
+            raise self._refusal(column, rule, "correct it, or choose other units")
+        return value
+
+    def _refusal(self, column: int, rule: str, remedy: str) -> ScenarioError:
+        """Return the error that the entry in the column with this index breaks a ``rule``."""
+        where = f"{self._source.name} line {self._line}: {self._header[column]}"
+        return ScenarioError("path", f"{where} {rule}", self._row[column], remedy)
 
 
-def parse_integers(source: SourceFile, name: str, column: FloatArray) -> list[int]:
-    """Return the values of the column ``name`` (K,) of a table, ids or counts, as K integers.
+def _require_columns(source: SourceFile, sheet: _Sheet, required: tuple[str, ...]) -> None:
+    """Raise ScenarioError if the header lacks a required column; the remedy says why it may."""
+    header = sheet.header
+    missing = [name for name in required if name not in header]
+    if not missing:
+        return
+    rule = f"{source.name} must have the columns {', '.join(required)}"
+    alike = [name for name in header if name.casefold() == missing[0].casefold()]
+    named = [line for line, text in sheet.comments.items() if missing[0] in _words(text)]
+    remedy = f"add the column {missing[0]}"
+    if named:
+        remedy = f"remove the # before the names of the columns in line {named[-1]}"
+    elif alike:
+        remedy = f"write {missing[0]} for {alike[0]}"
+    elif len(header) == 1 and missing[0] in _words(header[0]):
+        remedy = "separate the columns by commas, semicolons or tabs"
+    elif all(map(_is_number, header)):
+        remedy = "write the names of the columns in the first line"
+    raise ScenarioError("path", rule, header, remedy)
 
-    Raises ScenarioError if a value is not an integer from 0 to MAX_ID.
+
+def _words(text: str) -> list[str]:
+    """Return the words of a line, whatever separates them."""
+    for sign in "#,;|:":
+        text = text.replace(sign, " ")
+    return text.split()
+
+
+def _is_number(text: str) -> bool:
+    """Return True if a text is a number."""
+    try:
+        float(text.replace(",", "."))
+    except ValueError:
+        return False
+    return True
+
+
+class _TooLargeError(Exception):
+    """A table has more than MAX_BYTES."""
+
+
+class _Bounded(io.RawIOBase):
+    """The bytes of a file, at most MAX_BYTES: a small compressed file may hold very many."""
+
+    def __init__(self, file: io.BufferedIOBase | io.BufferedReader) -> None:
+        self._file, self._left = file, MAX_BYTES
+
+    def readable(self) -> bool:
+        """Return True: it is opened to be read."""
+        return True
+
+    def readinto(self, buffer: memoryview) -> int:  # type: ignore[override]
+        """Fill ``buffer`` with the next bytes and return their number."""
+        data = self._file.read(len(buffer))
+        self._left -= len(data)
+        if self._left < 0:
+            raise _TooLargeError
+        buffer[: len(data)] = data
+        return len(data)
+
+
+class _Lines:
+    """The lines of a file without comments; ``number`` is that of the last one, from 1 on, and
+    ``comments`` are those so far above the first line that is none.
     """
-    invalid = (column != np.round(column)) | (column < 0) | (column > MAX_ID)
-    if invalid.any():
-        raise ScenarioError(
-            "path",
-            f"{source.name}: {name} must hold integers from 0 to 2^53",
-            float(column[invalid][0]),
-            "correct the row",
-        )
-    return [int(value) for value in column]
+
+    def __init__(self, file: io.TextIOWrapper) -> None:
+        self._file, self.number = file, 0
+        self.comments: dict[int, str] = {}
+
+    def __iter__(self) -> Iterator[str]:
+        """Yield the lines that are no comments."""
+        is_first = True
+        for line in self._file:
+            self.number += 1
+            if not line.lstrip().startswith("#"):
+                is_first = is_first and not line.strip()
+                yield line
+            elif is_first:
+                self.comments[self.number] = line
+
+
+@contextmanager
+def _open_table(source: SourceFile) -> Iterator[_Sheet]:
+    """Open a table for a block.
+
+    Raises ScenarioError if the file, also while its rows are iterated, cannot be read as a table.
+    """
+    start = b""
+    try:
+        with source.full.open("rb") as packed:
+            start = packed.read(2)
+            packed.seek(0)
+            is_packed = start == b"\x1f\x8b"
+            unpacked = gzip.GzipFile(fileobj=packed) if is_packed else packed
+            buffered = io.BufferedReader(_Bounded(unpacked), 1 << 16)
+            with io.TextIOWrapper(buffered, newline="", encoding="utf-8-sig") as file:
+                lines = _Lines(file)
+                texts = (line for line in lines if line.strip())
+                names = next(texts, "")
+                separator = next((s for s in ";\t" if s in names), ",")
+                reader = csv.reader(itertools.chain([names], texts), delimiter=separator)
+                header = [name.strip() for name in next(reader, [])]
+                rows = ((lines.number, row) for row in reader if any(map(str.strip, row)))
+                yield _Sheet(header, rows, separator, lines.comments)
+    except _TooLargeError:
+        rule = f"{source.name} must have at most {MAX_BYTES >> 20} MiB"
+        remedy = "split readings among several [[sensors]] entries, or write fewer digits"
+        raise ScenarioError("path", rule, None, remedy) from None
+    except (OSError, EOFError, zlib.error, UnicodeDecodeError, csv.Error) as error:
+        rule = f"{source.name} cannot be read as a UTF-8 table"
+        encoding = "save it as UTF-8" if isinstance(error, UnicodeDecodeError) else ""
+        remedy = _FOREIGN.get(start, encoding or "correct the file")
+        raise ScenarioError("path", rule, str(error), remedy) from None

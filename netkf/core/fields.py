@@ -19,6 +19,7 @@ from typing import Any, ClassVar, TypeVar
 import numpy as np
 
 from netkf.core.errors import ScenarioError
+from netkf.core.stamps import TimeBase
 from netkf.linalg.arrays import FloatArray, is_semidefinite, readonly_array
 
 Method = TypeVar("Method", bound=Callable[..., Any])
@@ -485,10 +486,13 @@ def tuple_of(*rules: Rule, description: str) -> Rule:
 
 @dataclass(frozen=True, repr=False)
 class SourceFile:
-    """A file that a scenario refers to: its path ``name`` as written, relative to ``folder``."""
+    """A file that a scenario refers to: its path ``name`` as written, relative to ``folder``, and
+    what the ``stamps`` in it mean.
+    """
 
     name: str
     folder: Path
+    stamps: TimeBase = TimeBase()
 
     def __repr__(self) -> str:
         """Return the quoted path as written, without the folder."""
@@ -529,7 +533,7 @@ def _convert_source_file(value: Any) -> SourceFile:
             raise _SpecificError(f"no such file in {source.folder}")
     except (OSError, RuntimeError) as error:  # a loop of links, a name that is too long
         raise _SpecificError("must be the path of a file that can be read") from error
-    return SourceFile(name, source.folder)
+    return dataclasses.replace(source, name=name)
 
 
 def as_path(name: str, value: object, remedy: str = "give it as text or a pathlib.Path") -> Path:

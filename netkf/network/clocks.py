@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from netkf.core.clock import Clock, Entity
-from netkf.core.csv_files import parse_integers, read_columns, read_header
+from netkf.core.csv_files import read_columns, read_header
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import (
     Rule,
@@ -396,7 +396,7 @@ class RecordedClock(LinkClock):
                 float(table["t"][early[0]]),
                 "shift the times or remove the row",
             )
-        ids = zip(*(parse_integers(self.path, name, table[name]) for name in columns), strict=True)
+        ids = zip(*map(table.integers, columns), strict=True)
         times: dict[Entity, list[float]] = {}
         for t, entity in zip(table["t"].tolist(), ids, strict=True):
             key = tuple(sorted(entity)) if self.at == "links" else entity

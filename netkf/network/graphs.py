@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from netkf.core.csv_files import parse_integers, read_columns, read_header
+from netkf.core.csv_files import read_columns, read_header
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import (
     Component,
@@ -481,8 +481,7 @@ class CsvGraph(Graph):
         raises ScenarioError for wrong or repeated rows.
         """
         columns = read_columns(self.path, ("sender", "receiver"), ("delivery_probability",))
-        senders = parse_integers(self.path, "sender", columns["sender"])
-        receivers = parse_integers(self.path, "receiver", columns["receiver"])
+        senders, receivers = columns.integers("sender"), columns.integers("receiver")
         has_probabilities = "delivery_probability" in columns
         ones = [1.0] * len(senders)
         values = columns["delivery_probability"].tolist() if has_probabilities else ones
@@ -554,7 +553,7 @@ class CsvGraph(Graph):
                 rule = f"{source.name} must have the columns node, x, y"
                 raise ScenarioError("", rule, list(names), "add what is missing")
             columns = read_columns(source, names)
-            ids = parse_integers(source, names[0], columns[names[0]])
+            ids = columns.integers(names[0])
         except ScenarioError as error:
             # These errors name "path", which here is the key of the other table.
             raise ScenarioError("positions", error.rule, error.value, error.remedy) from None

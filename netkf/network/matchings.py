@@ -13,7 +13,7 @@ from functools import cache, cached_property, lru_cache
 
 import numpy as np
 
-from netkf.core.csv_files import parse_integers, read_columns, read_header
+from netkf.core.csv_files import read_columns, read_header
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import (
     Component,
@@ -299,7 +299,7 @@ class RecordedSlots(SlotActivation):
         if not matching:
             names = ("slot", "phase", "step", "node", "peer")
         table = read_columns(self.path, names)
-        columns = {name: parse_integers(self.path, name, table[name]) for name in names}
+        columns = {name: table.integers(name) for name in names}
         pairs: dict[tuple[int, int, int], list[Link]] = {}
         for row, (slot, i, j) in enumerate(
             zip(columns["slot"], columns["node"], columns["peer"], strict=True)

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from netkf.core.csv_files import parse_integers, read_columns
+from netkf.core.csv_files import read_columns
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import SourceFile, field, one_of, source_file
 from netkf.network.channels import Delay, Loss
@@ -89,7 +89,7 @@ def read_messages(
     """
     names = ("sender", "receiver", "message")
     table = read_columns(source, (*names, column))
-    keys = zip(*(parse_integers(source, name, table[name]) for name in names), strict=True)
+    keys = zip(*map(table.integers, names), strict=True)
     values: dict[Link, dict[int, float]] = {}
     for (sender, receiver, message), value in zip(keys, table[column].tolist(), strict=True):
         listed = values.setdefault((sender, receiver), {})

@@ -15,13 +15,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from netkf.core.csv_files import (
-    parse_finite_numbers,
-    parse_integers,
-    read_columns,
-    read_header,
-    read_rows,
-)
+from netkf.core.csv_files import Columns, read_columns, read_header
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import (
     SourceFile,
@@ -240,10 +234,13 @@ class RecordedSensor(Sensor):
         return 1 if self.varying or H is None else len(H)
 
     @cached_property
-    def _lines(self) -> tuple[list[str], list[tuple[int, list[str]]]]:
-        """Names of the columns, and line number and entries, as text, of each row of the file."""
+    def _columns(self) -> Columns:
+        """The columns of the table. Entries that have no row in H may be empty."""
         outputs = tuple(f"y{k}" for k in range(self._outputs))
-        return read_rows(self.path, ("t", "node", *outputs, *self._regressors))
+        required = ("t", "node", *outputs, *self._regressors)
+        others = tuple(name for name in read_header(self.path) if _column_number(name) >= 0)
+        surplus = tuple(name for name in others if name not in outputs)
+        return read_columns(self.path, required, surplus, gaps=surplus)
 
     @cached_property
     def listed(self) -> tuple[int, ...]:
@@ -253,13 +250,8 @@ class RecordedSensor(Sensor):
     @cached_property
     def row_times(self) -> list[tuple[int, float]]:
         """Node id and time (seconds) of every row, in the order of the file."""
-        header, lines = self._lines
-        indices = [header.index("t"), header.index("node")]
-        numbers = [
-            parse_finite_numbers(self.path, line, header, row, indices) for line, row in lines
-        ]
-        nodes = parse_integers(self.path, "node", np.array([node for _, node in numbers]))
-        return list(zip(nodes, (t for t, _ in numbers), strict=True))
+        columns = self._columns
+        return list(zip(columns.integers("node"), columns["t"].tolist(), strict=True))
 
     @property
     def _ids(self) -> list[int]:
@@ -269,32 +261,21 @@ class RecordedSensor(Sensor):
     @cached_property
     def _rows(self) -> dict[int, list[tuple[float, FloatArray]]]:
         """Time in seconds and values (y, then phi) of all rows, by the ids of ``nodes``, in the
-        order of the file. Raises ScenarioError for an entry that is no number.
+        order of the file. Raises ScenarioError for a value that has no row in H.
         """
-        header, lines = self._lines
-        p = self._outputs
-        names = ("t", *(f"y{k}" for k in range(p)), *self._regressors)
-        indices = [header.index(name) for name in names]
-        surplus = [k for k, name in enumerate(header) if _column_number(name) >= p]
+        columns, p = self._columns, self._outputs
+        values = [columns[name] for name in (*(f"y{k}" for k in range(p)), *self._regressors)]
+        surplus = [name for name in columns if _column_number(name) >= p]
         rows: dict[int, list[tuple[float, FloatArray]]] = {node: [] for node in self.nodes}
-        for node, (line, entries) in zip(self._ids, lines, strict=True):
+        for k, (node, t) in enumerate(self.row_times):
             if node in rows:
-                t, *y = parse_finite_numbers(self.path, line, header, entries, indices)
-                self._demand_empty(line, header, entries, surplus)
-                rows[node].append((t, np.array(y)))
+                for name in surplus:
+                    if columns[name][k] != 0.0 and not math.isnan(columns[name][k]):
+                        rule = f"{columns.where(k)}: {name} has no row in H"
+                        remedy = "leave it empty or correct H"
+                        raise ScenarioError("path", rule, float(columns[name][k]), remedy)
+                rows[node].append((t, np.array([column[k] for column in values])))
         return rows
-
-    def _demand_empty(
-        self, line: int, header: list[str], entries: list[str], surplus: list[int]
-    ) -> None:
-        """Raise ScenarioError for a value in one of the ``surplus`` columns (indices), those y_k,
-        k >= p, that have no row in H. ``entries`` are the texts of the row in this ``line`` of the
-        file, under the names in ``header``.
-        """
-        for index in surplus:
-            if entries[index].strip().lower() not in ("", "nan", "0", "0.0"):
-                rule = f"{self.path.name} line {line}: {header[index]} has no row in H"
-                raise ScenarioError("path", rule, entries[index], "leave it empty or correct H")
 
     def table(self, node: int, period: float) -> Table:
         """Return the readings (p,) of a node (id), or with regressors reading and phi together

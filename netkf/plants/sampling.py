@@ -10,7 +10,7 @@ from typing import Protocol
 import numpy as np
 
 from netkf.core.clock import Clock, Entity
-from netkf.core.csv_files import parse_integers, read_columns
+from netkf.core.csv_files import read_columns
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import Rule, SourceFile, field, source_file
 from netkf.linalg.arrays import FloatArray
@@ -98,7 +98,7 @@ class RecordedSampling(Clock):
     def _times(self) -> dict[int, FloatArray]:
         """Increasing sampling times (K,) in seconds, by node id."""
         table = read_columns(self.path, ("t", "node"))
-        nodes = np.array(parse_integers(self.path, "node", table["node"]), dtype=np.int64)
+        nodes = np.array(table.integers("node"), dtype=np.int64)
         early = np.flatnonzero(table["t"] <= 0.0)
         if early.size:
             rule = f"{self.path.name}: t must be above 0, the first sample comes after the start"

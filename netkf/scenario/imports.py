@@ -22,6 +22,7 @@ from types import ModuleType
 from typing import Any, NamedTuple
 
 from netkf.core.errors import ScenarioError, quote
+from netkf.core.stamps import TimeBase
 
 REMEDY = "add --trust if you trust its author (in Python: trust=True)"
 MAX_HOPS = 50
@@ -33,12 +34,13 @@ class Origin(NamedTuple):
 
     With ``trust`` any module may be imported, also those in that folder and the current folder;
     else see ``_AllowedPaths``. Without ``imports`` nothing is imported: ``find_class`` returns None
-    for a class that is not loaded yet.
+    for a class that is not loaded yet. ``stamps`` says how its tables are read.
     """
 
     folder: Path
     trust: bool = True
     imports: bool = True
+    stamps: TimeBase = TimeBase()
 
 
 def find_class(kind: str, origin: Origin) -> Any:

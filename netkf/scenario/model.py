@@ -41,6 +41,7 @@ from netkf.plants.nonlinear import NonlinearSensor
 from netkf.plants.plant import Plant
 from netkf.plants.recorded import RecordedSensor
 from netkf.plants.sensors import LinearSensor, Sensor
+from netkf.scenario.stamps import Time, restamp
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,6 +142,19 @@ class ScenarioModel(Component):
     probe: float | FloatArray = field(either(seconds, array(1, "list of times"), has_depth(1)))
     claim: str = field(line, default="")
     seed: int = field(integer(low=0), default=0)
+    time: Time = field(instance_of(Time), default=Time())
+
+    def __post_init__(self) -> None:
+        """Check the fields, and read tables anew that were read without ``time``; raises
+        ScenarioError for a mistake in either.
+        """
+        super().__post_init__()
+        for name in ("plant", "sensors", "network", "filter"):
+            value = getattr(self, name)
+            try:
+                object.__setattr__(self, name, restamp(value, self.time.stamps))
+            except ScenarioError as error:
+                raise error.under(name) from None
 
     @property
     def is_linear(self) -> bool:

@@ -13,6 +13,7 @@ from netkf.scenario.checks import check_scenario
 from netkf.scenario.derived import DerivedScenario
 from netkf.scenario.records import record_notes
 from netkf.scenario.sampling import sampling_notes
+from netkf.scenario.stamps import stamp_notes
 from netkf.scenario.tables import change_keys
 
 FORMER_ATTRIBUTES = {
@@ -42,6 +43,7 @@ class Scenario(DerivedScenario):
     probe    period of the state samples in seconds, or increasing times in [0, horizon]
     claim    what the scenario shows, one line
     seed     root seed of all random numbers
+    time     what the stamps of recorded tables mean, ``[time]``
 
     All fields are checked on construction, alone and against each other; ScenarioError names the
     first mistake in one line.
@@ -100,4 +102,5 @@ class Scenario(DerivedScenario):
             *self.node_filter.scenario_notes(self),
             *record_notes(self),
             *sampling_notes(self),
+            *stamp_notes(self),
         )

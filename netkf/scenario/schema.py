@@ -20,6 +20,7 @@ from netkf.network.channels import Channel
 from netkf.scenario.model import Belief, Filtering, Network, ScenarioModel
 from netkf.scenario.registry import KINDS, list_kinds
 from netkf.scenario.scenario import Scenario
+from netkf.scenario.stamps import Time
 from netkf.scenario.tables import FORMAT
 
 Schema = dict[str, Any]
@@ -33,6 +34,7 @@ NESTED_TABLES: dict[tuple[type[Component], str], Schema] = {
     (ScenarioModel, "sensors"): {"type": "array", "items": {"$ref": "#/$defs/sensor"}},
     (ScenarioModel, "network"): {"$ref": "#/$defs/network"},
     (ScenarioModel, "filter"): {"$ref": "#/$defs/filter"},
+    (ScenarioModel, "time"): {"$ref": "#/$defs/time"},
     (Network, "graph"): {"$ref": "#/$defs/graph"},
     (Network, "activation"): {"$ref": "#/$defs/activation"},
     (Network, "channel"): {"$ref": "#/$defs/channel"},
@@ -86,6 +88,7 @@ def scenario_schema() -> Schema:
     definitions = {name: _family_schema(name, families) for name, families in FAMILIES.items()}
     definitions["network"] = _table_schema(list_keys(Network))
     definitions["channel"] = _table_schema(list_keys(Channel))
+    definitions["time"] = _table_schema(list_keys(Time))
     definitions["model"] = _table_schema(list_keys(Belief))
     return {
         "$schema": DIALECT,

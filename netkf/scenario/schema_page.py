@@ -10,10 +10,12 @@ from netkf.scenario.model import Belief, Filtering, Network
 from netkf.scenario.registry import KINDS
 from netkf.scenario.scenario import Scenario
 from netkf.scenario.schema import TableKey, list_keys, summary
+from netkf.scenario.stamps import Time
 from netkf.scenario.writing import part_as_table, toml_text
 
 TABLES: dict[str, type[Component]] = {
     "The file": Scenario,
+    "time": Time,
     "network": Network,
     "network.channel": Channel,
     "filter, beside its kind": Filtering,

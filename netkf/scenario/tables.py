@@ -23,6 +23,7 @@ from netkf.scenario.imports import Origin
 from netkf.scenario.model import Belief, Filtering, Network
 from netkf.scenario.plugins import describe_error, explain_user_error, is_netkf_class
 from netkf.scenario.registry import KINDS, SLOTTED, find_kind, list_names_of_kind
+from netkf.scenario.stamps import Time
 from netkf.scenario.writing import as_table, part_as_table
 
 FORMAT = 1  # version of scenario files
@@ -150,6 +151,12 @@ def _build(cls: type[S], table: Mapping[str, Any], origin: Origin) -> Any:
     if integer()("format", version) != FORMAT:
         raise ScenarioError("format", f"must be {FORMAT}", version, "this netkf reads no other")
     values.setdefault("sensors", [])
+    # First of all: tables are read with it.
+    if "time" in values:
+        values["time"] = _call_under(
+            "time", lambda value: _build_object(Time, _as_dict(value), origin), values["time"]
+        )
+        origin = origin._replace(stamps=values["time"].stamps)
     if "plant" in values:
         values["plant"] = _call_under("plant", partial(_build_plant, origin), values["plant"])
     plant = values.get("plant")
@@ -190,7 +197,9 @@ def _build_object(
     values = dict(values)
     for name, value in values.items():
         if rules[name] is source_file and isinstance(value, str):
-            values[name] = SourceFile(value, origin.folder)
+            values[name] = SourceFile(value, origin.folder, origin.stamps)
+        elif isinstance(value, SourceFile):
+            values[name] = dataclasses.replace(value, stamps=origin.stamps)
     if any(map(_has_missing_class, values.values())):
         # No object can be made yet, but mistakes in other fields are found before any import.
         for name, value in values.items():

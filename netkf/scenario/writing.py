@@ -69,6 +69,9 @@ def _scenario_table(
     ``with_defaults``: keys at their defaults are written too.
     """
     table = _field_values(scenario, with_defaults)
+    table.pop("time", None)
+    if time := _field_values(scenario.time, with_defaults):
+        table["time"] = time
     table["plant"] = _kind_table("plant", plant, with_defaults)
     table["sensors"] = [_sensor_table(sensor, with_defaults) for sensor in scenario.sensors]
     table["network"] = _network_table(network, with_defaults)

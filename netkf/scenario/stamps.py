@@ -1,0 +1,142 @@
+"""The table ``[time]``: what the stamps of recorded tables mean."""
+
+from __future__ import annotations
+
+import dataclasses
+import datetime
+from collections.abc import Iterator
+from dataclasses import dataclass
+from decimal import Decimal
+from typing import Any
+
+import numpy as np
+
+from netkf.core.errors import ScenarioError
+from netkf.core.fields import MAX_SECONDS, Component, Rule, SourceFile, field, one_of
+from netkf.core.stamps import UNITS, TimeBase
+from netkf.linalg.arrays import FloatArray
+from netkf.network.clocks import RecordedClock
+from netkf.plants.recorded import RecordedDiffusion, RecordedPlant, RecordedSensor
+from netkf.plants.sampling import RecordedSampling
+
+LATE = 100.0  # seconds; records that begin earlier need no note
+
+
+def _convert_origin(value: Any) -> int | float | str:
+    """Return an origin as a number or a text that is a number or an ISO 8601 time."""
+    if isinstance(value, bool):
+        raise TypeError
+    if isinstance(value, datetime.datetime | datetime.date):
+        value = value.isoformat()
+    if isinstance(value, int | np.integer):
+        value = int(value)
+    elif isinstance(value, float | np.floating):
+        value = float(value)
+    elif not isinstance(value, str) or len(value) > 100:
+        raise TypeError
+    if abs(_origin_seconds(value)) > MAX_SECONDS:
+        raise ValueError
+    result: int | float | str = value
+    return result
+
+
+def _origin_seconds(value: int | float | str) -> Decimal:
+    """Return an origin in seconds, as written; raises ValueError if it is no time."""
+    text = value if isinstance(value, str) else repr(value)
+    return TimeBase().exact(text)
+
+
+_origin = Rule(
+    "must be a number of seconds or an ISO 8601 time",
+    _convert_origin,
+    'write the stamp of simulated 0, such as 1248275404.5 or "2009-07-22T15:10:04.5Z"',
+    {"type": ["number", "string"]},
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Time(Component):
+    """What the stamps of recorded tables mean, those in columns t, from and until.
+
+    origin  the stamp of simulated 0: seconds, or an ISO 8601 time (UTC where it names no zone);
+            stamps of all tables count from it. Default 0, which ISO 8601 stamps take for 1970
+    unit    unit of stamps that are numbers: "s", "ms", "us" or "ns"
+    """
+
+    origin: int | float | str | None = field(_origin, default=None)
+    unit: str = field(one_of(*UNITS), default="s")
+
+    @property
+    def stamps(self) -> TimeBase:
+        """The unit and the origin as tables are read with."""
+        return TimeBase(self.unit, Decimal(0) if self.origin is None else self._seconds)
+
+    @property
+    def _seconds(self) -> Decimal:
+        """The origin in seconds, with all of its digits."""
+        assert self.origin is not None
+        return _origin_seconds(self.origin)
+
+
+def restamp(value: Any, stamps: TimeBase) -> Any:
+    """Return a component, or a tuple of components, whose tables are read with these ``stamps``;
+    the same object if they are already. Raises ScenarioError for what a table then has wrong.
+    """
+    if isinstance(value, SourceFile):
+        return value if value.stamps == stamps else dataclasses.replace(value, stamps=stamps)
+    if isinstance(value, tuple) and value and isinstance(value[0], Component):
+        items = tuple(_restamp_at(f"[{k}]", item, stamps) for k, item in enumerate(value))
+        return value if all(map(_is_same, items, value)) else items
+    if not isinstance(value, Component):
+        return value
+    fields = {f.name: getattr(value, f.name) for f in dataclasses.fields(value) if f.init}
+    changed = {name: _restamp_at(name, item, stamps) for name, item in fields.items()}
+    changed = {name: item for name, item in changed.items() if item is not fields[name]}
+    return dataclasses.replace(value, **changed) if changed else value
+
+
+def _is_same(a: object, b: object) -> bool:
+    """Return True if both are one object."""
+    return a is b
+
+
+def _restamp_at(key: str, value: Any, stamps: TimeBase) -> Any:
+    """Return ``restamp(value, stamps)``; put ``key`` before the keys of its errors."""
+    try:
+        return restamp(value, stamps)
+    except ScenarioError as error:
+        raise error.under(key) from None
+
+
+def stamp_notes(scenario: Any) -> tuple[str, ...]:
+    """Return a line if every record of a scenario begins long after 0, more than half the horizon
+    and ten times its own length: what its stamps are counted from is not what the run begins at.
+    """
+    times = [t for t in _recorded_times(scenario) if t.size]
+    if scenario.time.origin is not None or not times:
+        return ()
+    first, last = min(t.min() for t in times), max(t.max() for t in times)
+    if first < max(LATE, 10.0 * (last - first), 0.5 * scenario.horizon):
+        return ()
+    return (
+        f"all records begin long after 0, the first at t = {float(first)!r}: the run begins at 0, "
+        f"with mean and cov of that time. If it should begin with the records, write [time] origin "
+        f"= {float(np.floor(first)):.0f}, and count horizon and probe from there",
+    )
+
+
+def _recorded_times(scenario: Any) -> Iterator[FloatArray]:
+    """Yield the times (K,) in seconds of the rows of each recorded table of a scenario."""
+    for sensor in scenario.sensors:
+        if isinstance(sensor, RecordedSensor):
+            yield np.array([t for _, t in sensor.row_times])
+        clock = getattr(sensor, "sampling", None)
+        if isinstance(clock, RecordedSampling):
+            yield from map(clock.recorded_times, clock.listed)
+    if isinstance(scenario.network.activation, RecordedClock):
+        yield scenario.network.activation.rows
+    plant = scenario.plant
+    if isinstance(plant, RecordedDiffusion):
+        yield plant.table[0]
+    elif isinstance(plant, RecordedPlant):
+        yield plant.period * np.array(list(plant.table), dtype=np.float64)
