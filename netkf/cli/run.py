@@ -174,10 +174,11 @@ def _print_ensemble(completed: Any, runs: int) -> None:
     """Print the duration of an ensemble of ``runs`` runs (a FinishedEnsemble), the number of
     diverged runs, and its directory.
     """
-    ensemble, seconds = completed.ensemble, max(completed.seconds, 1e-9)
+    ensemble = completed.ensemble
+    # No rate: the time may count compiling, in this process or in workers.
     print(
         f"averages over {runs:,} runs, +- one standard error; {completed.simulated:,} "
-        f"simulated in {seconds:.2f} s, {completed.simulated / seconds:,.1f} per second"
+        f"simulated in {completed.seconds:.2f} s"
     )
     if ensemble.diverged:
         message = f"{ensemble.diverged:,} of {runs:,} runs diverged and ended early"

@@ -5,6 +5,7 @@ curves that show the same numbers.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -17,9 +18,11 @@ from netkf.runs.files import to_json_value
 from netkf.runs.summary import CONFIDENCE, nees_bounds
 from netkf.runs.tables import (
     COLUMNS,
+    columns_of,
     format_count,
     format_number,
     format_with_error,
+    has_bound,
 )
 from netkf.studies.compare import Comparison, Entry
 from netkf.studies.compare_filters import QUANTITIES
@@ -73,11 +76,12 @@ def summary_section(source: ReportSource) -> str:
     summary = source.summary
     if not summary:
         return paragraph("There is no summary: the runs ended before it was written")
-    rows = [[str(row["node"]), *_summary_cells(row)] for row in summary["nodes"]]
+    columns = columns_of(summary)
+    rows = [[str(row["node"]), *_summary_cells(row, columns)] for row in summary["nodes"]]
     listed = rows[:MAX_ROWS]
     if len(rows) > MAX_ROWS:
-        listed.append([f"({len(rows) - MAX_ROWS:,} more)", *[""] * len(COLUMNS)])
-    listed.append(["all", *_summary_cells(summary["overall"])])
+        listed.append([f"({len(rows) - MAX_ROWS:,} more)", *[""] * len(columns)])
+    listed.append(["all", *_summary_cells(summary["overall"], columns)])
     runs = f"averages over {source.runs:,} runs, +- one standard error" if source.runs > 1 else ""
     caption = f"Averages over time{'; ' + runs if runs else ''}: {source.label}"
     messages = summary["messages"]
@@ -92,27 +96,28 @@ def summary_section(source: ReportSource) -> str:
         if messages.get(name) is not None
     )
     notes = [f"messages: {counts}", *_bound_notes(source), *summary.get("notes", [])]
-    return table_box(caption, ["node", *COLUMNS.values()], listed) + bullets(notes)
+    return table_box(caption, ["node", *columns.values()], listed) + bullets(notes)
 
 
-def _summary_cells(row: dict[str, Any]) -> list[str]:
+def _summary_cells(row: dict[str, Any], columns: Iterable[str]) -> list[str]:
     """Return the values of a row of the summary with their standard errors as text."""
-    return [format_with_error(row[key], row.get(f"{key}_se")) for key in COLUMNS]
+    return [format_with_error(row[key], row.get(f"{key}_se")) for key in columns]
 
 
 def _bound_notes(source: ReportSource) -> list[str]:
     """Return notes below the table of averages on what trace P is compared with: its bound by
     theory, the limit of the bound, and the trace of a centralised filter.
     """
-    summary = source.summary
-    notes = [] if any(row["bound"] for row in summary["nodes"]) else [f"bound: {summary['bound']}"]
-    if source.promised is not None:
-        label = source.promised.limit_label
+    summary, promised = source.summary, source.promised
+    concerned = promised is None or promised.limit_label  # the hybrid paper is about the filter
+    notes = [f"bound: {summary['bound']}"] if concerned and not has_bound(summary) else []
+    if promised is not None:
+        label = promised.limit_label
         limits = {label: summary["limit"], "centralised filter": summary["central"]}
         traces = [f"{name} {format_number(value)}" for name, value in limits.items() if value]
         notes += [f"traces to compare: {', '.join(traces)}"] if traces else []
         notes += [_explain_limit(label)] if summary["limit"] else []
-        notes += source.promised.notes
+        notes += promised.notes
     return notes
 
 

@@ -7,11 +7,15 @@ from __future__ import annotations
 
 from netkf.algorithms.registry import overridden
 from netkf.scenario.scenario import Scenario
-from netkf.theory.hybrid.coupled import has_balanced_rates
+from netkf.theory.hybrid.coupled import concerns_hybrid_paper, has_balanced_rates
 
 
 def limit_label(scenario: Scenario) -> str:
-    """Return the name of the limit that the bound on P approaches as the link rates grow."""
+    """Return the name of the limit that the bound on P approaches as the link rates grow; empty if
+    the hybrid paper, whose bound it is, is not about the filter.
+    """
+    if not concerns_hybrid_paper(scenario):
+        return ""
     balanced = has_balanced_rates(scenario)
     name = "limit S of H(13)" if balanced else "weighted limit (not S of H(13))"
     return name + delay_suffix(scenario)

@@ -33,6 +33,7 @@ from netkf.theory import (
 from netkf.theory.assumptions import assumption_rows
 from netkf.theory.common.mean_square import has_linear_errors, is_quickly_solved
 from netkf.theory.common.papers import paper_function
+from netkf.theory.hybrid.coupled import concerns_hybrid_paper
 from netkf.theory.hybrid.steady import steady_by_node
 
 CLOSE_TO_S = 0.1  # distance from S, as a share of its Frobenius norm, to find link rates for
@@ -200,7 +201,9 @@ def promises_text(scenario: Scenario, promises: dict[str, Any]) -> str:
         trace = central["reason"] or format_number(central["trace"])
         lines += ["", f"trace of P*, the prediction covariance with all readings: {trace}"]
         return "\n".join([*lines, *_steady_error_lines(scenario, promises)])
-    lines += [*_bound_lines(scenario, promises), *_limit_lines(scenario, promises)]
+    if concerns_hybrid_paper(scenario):
+        lines += _bound_lines(scenario, promises)
+    lines += _limit_lines(scenario, promises)
     return "\n".join([*lines, *_steady_error_lines(scenario, promises)])
 
 
@@ -257,16 +260,15 @@ def _limit_lines(scenario: Scenario, promises: dict[str, Any]) -> list[str]:
     """Return the lines of ``netkf theory`` on traces to compare P with: limits for ever faster
     links, a centralised filter, and the link rate that comes close to the limit.
     """
-    error_limit = "limit of the true error covariance (derived)" + delay_suffix(scenario)
-    labels = {
-        "limit_covariance": f"{limit_label(scenario)}, as links tick ever faster",
-        "true_limit_covariance": error_limit,
-        "central_covariance": "centralised filter with all readings",
-    }
+    labels = {"central_covariance": "centralised filter with all readings"}
+    if concerns_hybrid_paper(scenario):
+        error_limit = "limit of the true error covariance (derived)" + delay_suffix(scenario)
+        limit = f"{limit_label(scenario)}, as links tick ever faster"
+        labels = {"limit_covariance": limit, "true_limit_covariance": error_limit, **labels}
     lines = ["", "traces to compare"]
     for name, label in labels.items():
-        limit = promises[name]
-        lines.append(f"  {label}: {limit['reason'] or format_number(limit['trace'])}")
+        value = promises[name]
+        lines.append(f"  {label}: {value['reason'] or format_number(value['trace'])}")
     if promises["link_rate"]["reason"] is None:
         lines.append(_link_rate_line(promises["link_rate"]))
     note = mismatch_note(scenario)

@@ -164,7 +164,8 @@ class PromisedTraces:
     limit       : trace of the limit S of H(13), nan if it does not exist
     central     : trace of the covariance of the centralised filter, nan if it does not exist
     reason      : why there is no bound, or empty
-    limit_label : name of the limit in tables and pictures
+    limit_label : name of the limit in tables and pictures; empty if the hybrid paper, whose bound
+                  and limit these are, is not about the filter
     notes       : sentences to print beside them
     """
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
 from netkf.core.printable import one_line
@@ -21,6 +21,8 @@ COLUMNS = {
     "mean_nees": "NEES",
 }
 """Headers of the columns of averages, by the key in summary.json."""
+BOUND_COLUMNS = ("bound", "ratio")
+"""Keys of the columns that a table leaves out if no node has a bound."""
 
 
 def format_number(value: float | None) -> str:
@@ -32,14 +34,8 @@ def format_number(value: float | None) -> str:
 
 def format_with_error(value: float | None, error: float | None) -> str:
     """Return a value with its standard error, if known, as text: ``1.2 +- 0.1``."""
-    return format_number(value) + format_standard_error(error)
-
-
-def format_standard_error(error: float | None) -> str:
-    """Return a standard error as `` +- 0.1``; empty if it is None or not finite."""
-    if error is None or not math.isfinite(error):
-        return ""
-    return f" +- {error:.1g}"
+    known = error is not None and math.isfinite(error)
+    return format_number(value) + (f" +- {error:.1g}" if known else "")
 
 
 def format_table(header: list[str], rows: list[list[str]], left_columns: int = 0) -> str:
@@ -75,11 +71,11 @@ def summary_table(
     """Return the table that `netkf run` prints, from the contents of summary.json.
 
     It has a row for each node (the best and the worst of large networks) and one for all nodes,
-    followed by ``notes``, the limits to compare traces with (``limit`` is the name of the first),
-    NEES and messages.
+    followed by ``notes``, the limits to compare traces with (``limit`` is the name of the first,
+    empty if no bound is known for any network with this filter), NEES and messages.
     """
     lines = list(_node_table(summary))
-    if all(row["bound"] is None for row in summary["nodes"]):
+    if limit and not has_bound(summary):
         lines.append(f"bound: {summary['bound']}")
     lines += [f"note: {note}" for note in (*summary["notes"], *notes)]
     lines += _limit_lines(summary, limit)
@@ -91,33 +87,41 @@ def summary_table(
     return "\n".join(lines)
 
 
+def has_bound(summary: dict[str, Any]) -> bool:
+    """Return True if theory gives a bound on the mean of P of any node."""
+    return any(row["bound"] is not None for row in summary["nodes"])
+
+
+def columns_of(summary: dict[str, Any]) -> dict[str, str]:
+    """Return the headers of the columns of averages that a table of this summary has, by key."""
+    left_out = () if has_bound(summary) else BOUND_COLUMNS
+    return {key: header for key, header in COLUMNS.items() if key not in left_out}
+
+
 def _node_table(summary: dict[str, Any]) -> Iterator[str]:
     """Yield the lines of the table of averages by node: the table, what it omits, and an empty
-    line; of large networks only the nodes with the largest and smallest errors are listed.
+    line; of large networks only the nodes with the largest and smallest errors, the largest first.
     """
+    columns = columns_of(summary)
     nodes = sorted(summary["nodes"], key=lambda row: row["node"])
-    listed = _best_and_worst(nodes) if len(nodes) > MAX_NODES else nodes
-    omitted = len(nodes) - len(listed)
-    rows = [_row_cells(str(row["node"]), row) for row in listed]
+    names = [str(row["node"]) for row in nodes]
+    rows = [_row_cells(*row, columns) for row in zip(names, nodes, strict=True)]
+    omitted = max(len(nodes) - MAX_NODES, 0)
+    half = MAX_NODES // 2
     if omitted:
-        rows.append([f"({omitted} more)", *[""] * len(COLUMNS)])
-    rows.append(_row_cells("all", summary["overall"]))
-    yield format_table(["node", *COLUMNS.values()], rows)
+        known = any(row["rms_error"] is not None for row in nodes)
+        ranking = "rms_error" if known else "mean_trace"
+        order = sorted(range(len(nodes)), key=lambda k: -_sort_key(nodes[k][ranking]))
+        gap = [f"({omitted} more)", *[""] * len(columns)]
+        rows = [*(rows[k] for k in order[:half]), gap, *(rows[k] for k in order[-half:])]
+    rows.append(_row_cells("all", summary["overall"], columns))
+    yield format_table(["node", *columns.values()], rows)
     if omitted:
-        half = MAX_NODES // 2
         yield (
-            f"the {half} nodes with the largest and the {half} with the smallest RMS error; all "
-            "are in summary.json"
+            f"the {half} nodes with the largest and the {half} with the smallest "
+            f"{COLUMNS[ranking]}; all are in summary.json"
         )
     yield ""
-
-
-def _best_and_worst(nodes: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return the MAX_NODES rows with the largest and the smallest RMS errors, in their order."""
-    ranked = sorted(nodes, key=lambda row: -_sort_key(row["rms_error"]))
-    half = MAX_NODES // 2
-    extremes = {row["node"] for row in (*ranked[:half], *ranked[-half:])}
-    return [row for row in nodes if row["node"] in extremes]
 
 
 def _sort_key(value: float | None) -> float:
@@ -125,12 +129,9 @@ def _sort_key(value: float | None) -> float:
     return math.inf if value is None or not math.isfinite(value) else value
 
 
-def _row_cells(name: str, row: dict[str, Any]) -> list[str]:
+def _row_cells(name: str, row: dict[str, Any], columns: Iterable[str]) -> list[str]:
     """Return the cells of a row of averages that begins with ``name``."""
-    return [
-        name,
-        *(format_number(row[key]) + format_standard_error(row.get(f"{key}_se")) for key in COLUMNS),
-    ]
+    return [name, *(format_with_error(row[key], row.get(f"{key}_se")) for key in columns)]
 
 
 def _limit_lines(summary: dict[str, Any], limit: str) -> list[str]:

@@ -17,20 +17,23 @@ from netkf.studies.search import Sizing
 if TYPE_CHECKING:
     import pandas as pd
 
-COLUMNS = ("worst_rms", "mean_rms", "mean_trace", "bound", "central")
+PROMISED = ("bound", "central")
+COLUMNS = ("worst_rms", "mean_rms", "mean_trace", *PROMISED)
 MAX_ROWS = 40  # rows that fit onto a screen
 MAX_LENGTH = 30  # characters of a cell
 
 
 def format_sweep(lines: pd.DataFrame, keys: Sequence[str]) -> str:
     """Return the table of a sweep (``lines``, one for each point of the grid) for a terminal, with
-    the values of the varied ``keys``; of long tables the first and last rows.
+    the values of the varied ``keys``; of long tables the first and last rows. What theory gives for
+    no point has no column.
     """
-    header = [*keys, *(name.replace("_", " ") for name in COLUMNS), "messages", "status"]
+    columns = [name for name in COLUMNS if name not in PROMISED or lines[name].notna().any()]
+    header = [*keys, *(name.replace("_", " ") for name in columns), "messages", "status"]
     rows = [
         [
             *(_format_short(row[key]) for key in keys),
-            *(format_with_error(row[name], row.get(f"{name}_se")) for name in COLUMNS),
+            *(format_with_error(row[name], row.get(f"{name}_se")) for name in columns),
             f"{row['sent']:,.6g}",
             row["status"],
         ]

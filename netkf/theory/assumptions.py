@@ -19,7 +19,7 @@ from netkf.theory.common.evidence import (
 )
 from netkf.theory.common.papers import paper_function
 from netkf.theory.common.plant_assumptions import slot_plant_rows, start_rows
-from netkf.theory.hybrid.coupled import has_balanced_rates
+from netkf.theory.hybrid.coupled import concerns_hybrid_paper, has_balanced_rates
 from netkf.theory.hybrid.samples import (
     randomly_sampled_sensors,
     sampling_clock,
@@ -31,6 +31,8 @@ if TYPE_CHECKING:
     import pandas as pd
 
 COLUMNS = ["assumption", "source", "holds", "evidence"]
+ANY = "any filter"
+"""The source of assumptions that no paper makes for the scenario's filter."""
 
 
 def assumptions(scenario: Scenario) -> pd.DataFrame:
@@ -47,8 +49,8 @@ def assumptions(scenario: Scenario) -> pd.DataFrame:
 def assumption_rows(scenario: Scenario) -> list[AssumptionRow]:
     """Return a row for each assumption on a scenario: text, equation, whether it holds, and why.
 
-    In continuous time they are those of H, in slots those of the filter's paper or, without one, of
-    any filter in slots.
+    In continuous time they are those of H if it is about the filter, else those of any filter; in
+    slots those of the filter's paper or, without one, of any filter in slots.
     """
     rows = _slot_rows(scenario) if scenario.slotted else _clock_rows(scenario)
     if not scenario.is_linear:
@@ -68,10 +70,16 @@ def _slot_rows(scenario: Scenario) -> list[AssumptionRow]:
 
 
 def _clock_rows(scenario: Scenario) -> list[AssumptionRow]:
-    """Return the assumptions of the hybrid paper, as rows of the table, for a scenario in
-    continuous time.
+    """Return the assumptions for a scenario in continuous time, as rows of the table: those of the
+    hybrid paper, or of any filter if the paper is not about this one.
     """
-    rows = _plant_rows(scenario)
+    if not concerns_hybrid_paper(scenario):
+        # Of what H assumes, this decides about errors of every filter.
+        general = [*_graph_rows(scenario), *_plant_rows(scenario), *start_rows(scenario, ANY)]
+        return [
+            (name, source if "H " not in source else ANY, *rest) for name, source, *rest in general
+        ]
+    rows = [*_plant_rows(scenario), *_sampling_rows(scenario)]
     if scenario.filter.algorithm.talks:
         network = [*_link_clock_rows(scenario), *_channel_rows(scenario)]
         rows = [*_graph_rows(scenario), *rows, *network]
@@ -97,8 +105,8 @@ def _graph_rows(scenario: Scenario) -> list[AssumptionRow]:
 
 
 def _plant_rows(scenario: Scenario) -> list[AssumptionRow]:
-    """Return the assumptions, as rows of the table, on controllability, observability, the filters'
-    model and the times of sampled sensors.
+    """Return the assumptions, as rows of the table, on controllability, observability and the
+    filters' model.
     """
     plant = scenario.diffusion
     # (A, B) is controllable if and only if (A', B') is observable; Q = B B' has the same kernel.
@@ -116,7 +124,6 @@ def _plant_rows(scenario: Scenario) -> list[AssumptionRow]:
             *_judge_observability(scenario),
         ),
         true_model_row(scenario, "H (4)", "same A, B and R"),
-        *_sampling_rows(scenario),
     ]
 
 

@@ -126,3 +126,33 @@ def test_a_run_with_samples_at_known_times_says_that_its_bound_has_a_cycle():
     assert promised.notes[0] == (
         "steady state of the bound: samples at known times lead to a cycle, not to a steady state"
     )
+
+
+def test_tables_say_nothing_of_a_paper_that_is_not_about_the_filter(build, tmp_path):
+    words, table = said(build(filter={"kind": "covariance-intersection", "epsilon": 0.3}), tmp_path)
+    assert "at 3 s" in words
+    assert table.splitlines()[0].split()[-3:] == ["bound", "ratio", "NEES"]
+    other = tmp_path / "other"
+    other.mkdir()
+    sampling = {"kind": "periodic", "period": 0.5}
+    sensors = [{"nodes": [0], "H": [[1.0]], "R": [[0.5]], "sampling": sampling}]
+    gossip = build(sensors=sensors, filter={"kind": "gossip"})
+    words, table = said(gossip, other)
+    assert "H(" not in words + table
+    assert table.splitlines()[0].split() == ["node", "RMS", "error", "mean", "trace", "P", "NEES"]
+    assert "bound" not in table
+
+
+def test_a_long_table_lists_the_worst_first():
+    keys = ("mean_trace", "bound", "ratio", "mean_nees")
+    nodes = [{"node": k, "rms_error": float(k % 37), **dict.fromkeys(keys)} for k in range(40)]
+    messages = {"sent": 0, "delivered": 0, "lost": 0, "in_flight": 0}
+    summary = {"nodes": nodes, "overall": nodes[0], "limit": None, "central": None, "notes": []}
+    lines = summary_table({**summary, "bound": "", "messages": messages}).splitlines()[2:33]
+    errors = [float(line.split()[1]) for line in lines if "more" not in line]
+    assert errors == sorted(errors, reverse=True)
+    assert errors[0] == 36.0
+    for row in nodes:  # without a truth the largest covariances come first
+        row |= {"rms_error": None, "mean_trace": float(row["node"])}
+    lines = summary_table({**summary, "bound": "", "messages": messages}).splitlines()[2:33]
+    assert [line.split()[0] for line in lines[:2]] == ["39", "38"]

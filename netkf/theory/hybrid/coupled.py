@@ -90,6 +90,15 @@ class CoupledRiccati(NamedTuple):
         return self._replace(coupling=factor * self.coupling)
 
 
+def concerns_hybrid_paper(scenario: Scenario) -> bool:
+    """Return True if results of the hybrid paper are about the scenario's filter: the hybrid filter
+    and covariance intersection, and in continuous time any filter that does not talk.
+    """
+    if not scenario.slotted and not scenario.filter.algorithm.talks:
+        return True
+    return scenario.node_filter.paper == "hybrid"
+
+
 def reason_without_bound(scenario: Scenario) -> str | None:
     """Return the reason why H Theorem 2 of the hybrid paper, that the solution of the coupled
     Riccati equations H(12) bounds the mean of P, does not apply to a scenario; None if it applies.
@@ -98,7 +107,7 @@ def reason_without_bound(scenario: Scenario) -> str | None:
     if not scenario.slotted and not algorithm.talks:
         return _reason_of_samples(scenario)
     name = type(algorithm).__name__
-    if scenario.node_filter.paper != "hybrid":
+    if not concerns_hybrid_paper(scenario):
         return (
             f"H(12) is about the hybrid filter in continuous time, not about {kind_name(algorithm)}"
         )
