@@ -75,9 +75,10 @@ def _clock_rows(scenario: Scenario) -> list[AssumptionRow]:
     """
     if not concerns_hybrid_paper(scenario):
         # Of what H assumes, this decides about errors of every filter.
-        general = [*_graph_rows(scenario), *_plant_rows(scenario), *start_rows(scenario, ANY)]
+        rows = [*_graph_rows(scenario), *_plant_rows(scenario), *start_rows(scenario, ANY)]
         return [
-            (name, source if "H " not in source else ANY, *rest) for name, source, *rest in general
+            (name, ANY if source.startswith("H ") else source, holds, evidence)
+            for name, source, holds, evidence in rows
         ]
     rows = [*_plant_rows(scenario), *_sampling_rows(scenario)]
     if scenario.filter.algorithm.talks:
