@@ -7,10 +7,15 @@ topology", Neural Computation 13, 2001). On a tree no reading can arrive on two 
 belief is the Kalman filter with all readings that have reached it, in any order of the messages.
 On a graph with loops readings return to where they came from and count again: P is too small.
 
-Evidence is information about the state x as a root [Z, z] (n, n + 1) with Z lower triangular:
-``Z (x - c) = z + v``, cov(v) = I, relative to a centre c (n,), so that the information is ``Z' Z``
-and its estimate ``c + Z^-1 z``. Independent pieces add up: their rows are stacked, and made
-triangular again. The centre of all evidence of a node is its belief ``xhat``.
+Evidence is information about coordinates e of the state ``x = W e``, as a root [Z, z] (n, n + 1)
+with Z lower triangular: ``Z (e - c) = z + v``, cov(v) = I, relative to a centre c (n,), so that the
+information is ``Z' Z`` and its estimate ``c + Z^-1 z``. Independent pieces add up: their rows are
+stacked, and made triangular again. The centre of all evidence of a node is its belief ``xhat``.
+
+What is kept is predicted with the plant. Pulled back by the inverse transition, the information
+about a mode that decays would soon be so large that the others lose their digits; so W follows the
+plant (``modes.ModeFrame``): such modes are those of time 0, and information about them stays as it
+is. Where nothing is kept, W is the identity.
 
 ``belief_slots`` simulates many runs in the compiled engine, in place of the methods of
 ``BeliefPropagation``; the types of its arguments are described in ``kernels.slots``.
@@ -28,17 +33,19 @@ from netkf.algorithms.filter import Exchange, Filter, Message, NodeInfo, Reading
 from netkf.algorithms.kernels.beliefs import (
     BeliefScratch,
     add_part,
+    add_reading_to_part,
     clear_part,
     copy_part,
     gather_evidence,
     predict_part,
+    predict_part_single,
     receive_evidence,
     recentre_part,
+    set_growing,
     write_prior,
     write_prior_single,
 )
-from netkf.algorithms.kernels.constant_gains import fill_inverse_transition
-from netkf.algorithms.kernels.information import add_reading_pair
+from netkf.algorithms.kernels.constant_gains import inverse_transition
 from netkf.algorithms.kernels.intersection import finish_lanes
 from netkf.algorithms.kernels.slots import (
     ReadingBlock,
@@ -47,13 +54,16 @@ from netkf.algorithms.kernels.slots import (
     SlotPlan,
     SlotSamples,
     SlotScratch,
+    move_root,
     predict_all,
     predict_mean,
+    predict_root_alone,
     rebase,
     store_sample_of_slot,
     whiten_reading,
 )
 from netkf.algorithms.models import SlotModel, first_root
+from netkf.algorithms.modes import ModeFrame, flow_frame, slot_frame, still_frame
 from netkf.algorithms.registry import built_in
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import field, integer, one_of
@@ -81,6 +91,8 @@ class BeliefState(NamedTuple):
 
     xhat, root : the belief (n,) and the lower triangular root (n, n) of its covariance
     model : of the plant and the node's sensors
+    frame, W : of the coordinates e of evidence, ``x = W e`` with W (n, n)
+    centre : (n,), the belief as an e; of its first ``frame.growing`` entries see ``centre_at``
     prior : evidence of the estimate before the readings in ``own`` and ``received``
     own : evidence of the node's own readings
     senders, received : ids of the neighbours heard, and the evidence that each sent last
@@ -90,6 +102,9 @@ class BeliefState(NamedTuple):
     xhat: FloatArray
     root: FloatArray
     model: Any
+    frame: ModeFrame
+    W: FloatArray
+    centre: FloatArray
     prior: FloatArray
     own: FloatArray
     senders: tuple[int, ...]
@@ -106,12 +121,13 @@ class Beliefs(NamedTuple):
     """A payload for all neighbours; evidence is relative to ``xhat``. Each receiver sums all of it
     but what the sender has from the receiver itself (``evidence_for``).
 
-    xhat : the sender's belief (n,)
+    xhat, centre : the sender's belief (n,), and as an e, see ``BeliefState``
     own : evidence (n, n + 1) of the sender's own readings
     senders, heard : ids of the neighbours that the sender has heard, and the evidence of each
     """
 
     xhat: FloatArray
+    centre: FloatArray
     own: FloatArray
     senders: tuple[int, ...]
     heard: tuple[FloatArray, ...]
@@ -123,7 +139,9 @@ class BeliefArrays(NamedTuple):
 
     steps : steps of exchange in a slot
     keeps : whether messages are kept from slot to slot, ``memory`` "all"
-    back : the inverse of F (n, n) if they are, for the prediction of evidence
+    inverse, growing, back : of the ``ModeFrame`` of evidence
+    W : (S, n, n), its W in each slot that is simulated
+    centre : (B, H, n, L), centres of the evidence of each filter
     prior, own : evidence of priors and own readings (B, H, n, n + 1, L)
     received : evidence received on each direction (B, W, n, n + 1, L)
     scratch : evidence that is sent, and scratch
@@ -131,7 +149,11 @@ class BeliefArrays(NamedTuple):
 
     steps: int
     keeps: bool
+    inverse: FloatArray
+    growing: int
     back: FloatArray
+    W: FloatArray
+    centre: FloatArray
     prior: FloatArray
     own: FloatArray
     received: FloatArray
@@ -158,14 +180,15 @@ def belief_slots(
     for b in range(plan.up.shape[0]):
         # If no message is kept for the next slot, all blocks share the arrays of evidence.
         k, lanes = min(b, arrays.own.shape[0] - 1), scratch.lanes
-        own, received = arrays.own[k], arrays.received[k]
+        own, received, centre = arrays.own[k], arrays.received[k], arrays.centre[k]
         for s in range(plan.up.shape[1]):
             if plan.sensed[s]:
                 predict_beliefs(nodes, scratch, arrays, b)
+                W = arrays.W[min(s, len(arrays.W) - 1)]
                 for h in range(len(nodes.rows)):
-                    add_reading_pair(
-                        lanes, own[h], 1.0, readings.y, readings.H, (b, s, h), nodes.rows[h],
-                        scratch.xhat, arrays.scratch.work,
+                    add_reading_to_part(
+                        lanes, own[h], readings.y, readings.H, (b, s, h), nodes.rows[h],
+                        scratch.xhat, W, arrays.scratch.work,
                     )  # fmt: skip
                 for e in range(arrays.steps):
                     # All messages of a step are made before any arrives: each sender's evidence
@@ -181,11 +204,11 @@ def belief_slots(
                             plan.up,
                             (b, s, e),
                             h,
-                            scratch.xhat,
+                            centre,
                             arrays.scratch,
                         )
                 for h in range(len(nodes.rows)):
-                    update_beliefs(nodes, links, scratch, arrays, b, h)
+                    update_beliefs(nodes, links, scratch, arrays, W, b, h)
             store_sample_of_slot(nodes, plan, samples, scratch, b, s)
             # Keep the estimates relative to an origin near the true state; evidence is relative to
             # the estimate, and needs no shift.
@@ -208,19 +231,24 @@ def predict_beliefs(nodes: SlotNodes, scratch: SlotScratch, arrays: BeliefArrays
     for h in range(len(nodes.rows)):
         if arrays.keeps:
             predict_mean(nodes, scratch, b, h)
-            # Z <- Z F^-1, as no noise enters; the centre moves to F xhat.
-            predict_part(lanes, arrays.prior[k, h], arrays.back, beliefs.total, beliefs.work)
-            predict_part(lanes, arrays.own[k, h], arrays.back, beliefs.total, beliefs.work)
         else:
             write_prior(lanes, nodes.root, b, h, arrays.prior[k, h])
             clear_part(lanes, arrays.own[k, h])
         for i in range(nodes.xhat.shape[2]):
             store(lanes, scratch.xhat, h, i, load(lanes, nodes.xhat, b, h, i))
-    for m in range(arrays.received.shape[1]):
-        if arrays.keeps:
-            predict_part(lanes, arrays.received[k, m], arrays.back, beliefs.total, beliefs.work)
-        else:
+        set_growing(
+            lanes, arrays.centre[k, h], scratch.xhat[h], arrays.inverse, arrays.growing
+        )  # fmt: skip
+    if not arrays.keeps:
+        for m in range(arrays.received.shape[1]):
             clear_part(lanes, arrays.received[k, m])
+    elif arrays.growing > 0:
+        # Z <- Z back, as no noise enters; information about other modes stays as it is.
+        for h in range(len(nodes.rows)):
+            predict_part(lanes, arrays.prior[k, h], arrays.back, beliefs.total, beliefs.work)
+            predict_part(lanes, arrays.own[k, h], arrays.back, beliefs.total, beliefs.work)
+        for m in range(arrays.received.shape[1]):
+            predict_part(lanes, arrays.received[k, m], arrays.back, beliefs.total, beliefs.work)
 
 
 @kernel
@@ -229,12 +257,14 @@ def update_beliefs(
     links: SlotLinks,
     scratch: SlotScratch,
     arrays: BeliefArrays,
+    W: FloatArray,
     b: int,
     h: int,
 ) -> None:
     """Compute the belief of filter ``h`` of block ``b``, the sum of its prior and all evidence
     (information): writes ``nodes.xhat[b, h]`` (n, L) and ``nodes.root[b, h]`` (n, n, L). If
-    messages are kept, the evidence of the filter in ``arrays`` is made relative to the new belief.
+    messages are kept, the evidence of the filter in ``arrays`` is made relative to the new belief;
+    W (n, n) is that of the slot.
 
     Axes: L runs side by side.
     """
@@ -245,16 +275,33 @@ def update_beliefs(
     add_part(lanes, beliefs.total, arrays.own[k, h], beliefs.work)
     for m in range(links.first[h], links.first[h + 1]):
         add_part(lanes, beliefs.total, arrays.received[k, m], beliefs.work)
-    # root = Z^-1 and xhat = centre + Z^-1 z in all lanes (False: none keeps its former estimate).
+    if not arrays.keeps:
+        # root = Z^-1 and xhat = centre + Z^-1 z in all lanes (False: none keeps its estimate).
+        finish_lanes(
+            lanes, nodes.root, nodes.xhat, b, h, scratch.xhat, beliefs.total, beliefs.work, False
+        )  # fmt: skip
+        return
     finish_lanes(
-        lanes, nodes.root, nodes.xhat, b, h, scratch.xhat, beliefs.total, beliefs.work, False
+        lanes, beliefs.root, beliefs.step, 0, 0, beliefs.origin, beliefs.total, beliefs.work, False
     )  # fmt: skip
-    if arrays.keeps:
-        before, after = scratch.xhat[h], nodes.xhat[b, h]
-        for part in (arrays.prior[k, h], arrays.own[k, h]):
-            recentre_part(lanes, part, before, after, part)
-        for m in range(links.first[h], links.first[h + 1]):
-            recentre_part(lanes, arrays.received[k, m], before, after, arrays.received[k, m])
+    # root = W Z^-1, made triangular, and xhat = centre + W Z^-1 z.
+    n, origin, step = nodes.xhat.shape[2], beliefs.origin[0], beliefs.step[0, 0]
+    for i in range(n):
+        moved = load(lanes, scratch.xhat, h, i)
+        for j in range(n):
+            moved += W[i, j] * load(lanes, step, j)
+            if j <= i:
+                store(lanes, nodes.root, b, h, i, j, load(lanes, beliefs.root, 0, 0, i, j))
+        store(lanes, nodes.xhat, b, h, i, moved)
+        if i >= arrays.growing:
+            moved = load(lanes, arrays.centre, k, h, i) + load(lanes, step, i)
+            store(lanes, arrays.centre, k, h, i, moved)
+    # There is no plant noise where messages are kept: ``root_Q`` is zero.
+    move_root(scratch, nodes.root, b, h, W, nodes.root_Q)
+    for part in (arrays.prior[k, h], arrays.own[k, h]):
+        recentre_part(lanes, part, origin, step, part)
+    for m in range(links.first[h], links.first[h + 1]):
+        recentre_part(lanes, arrays.received[k, m], origin, step, arrays.received[k, m])
 
 
 @kernel
@@ -269,24 +316,18 @@ def add_part_single(parts: FloatArray, total: FloatArray, work: FloatArray) -> N
 
 @kernel
 def add_reading_single(
-    y: FloatArray, H: FloatArray, centre: FloatArray, total: FloatArray, work: FloatArray
+    y: FloatArray,
+    H: FloatArray,
+    xhat: FloatArray,
+    W: FloatArray,
+    total: FloatArray,
+    work: FloatArray,
 ) -> None:
     """Add a whitened reading of one node in one run, y (1, 1, 1, p, 1) and H (1, 1, 1, p, n, 1), to
-    the evidence ``total`` (n, n + 1, 1), a root [Z, z] of information relative to ``centre``
-    (1, n, 1), in place; ``work`` (n, n + 1, 1) is scratch.
+    the evidence ``total`` (n, n + 1, 1), a root [Z, z] of information relative to ``xhat``
+    (1, n, 1) about e in ``x = W e``, W (n, n), in place; ``work`` (n, n + 1, 1) is scratch.
     """
-    add_reading_pair(ONE, total, 1.0, y, H, (0, 0, 0), y.shape[3], centre, work)
-
-
-@kernel
-def predict_part_single(
-    part: FloatArray, back: FloatArray, total: FloatArray, work: FloatArray
-) -> None:
-    """Predict the evidence ``part`` (n, n + 1, 1) of one run, a root [Z, z] of information, in
-    place to a later state of a plant without noise: ``Z <- Z back``, where ``back`` (n, n) is the
-    inverse transition. ``total`` and ``work`` (n, n + 1, 1) are scratch.
-    """
-    predict_part(ONE, part, back, total, work)
+    add_reading_to_part(ONE, total, y, H, (0, 0, 0), y.shape[3], xhat, W, work)
 
 
 @kernel
@@ -343,23 +384,38 @@ class BeliefPropagation(Filter):
         and scratch.
         """
         keeps, H, n = self.memory == ALL, len(states), len(states[0].xhat)
+        frame = states[0].frame
         # W directed links; D: the most that lead to one node.
         W, D = sum(info.degree for info in infos), max(info.degree for info in infos)
         blocks = blocks_of(runs) if keeps else 1
         part = n, n + 1, LANES
         shapes = [(H, *part), (W, *part), (D + 1, *part), part, part]
-        model = states[0].model
+        shapes += [(1, 1, n, n, LANES), (1, 1, n, LANES), (1, n, LANES)]
         return (
             BeliefArrays(
                 self.steps,
                 keeps,
-                backward(model, model.period) if keeps else np.eye(n),
+                frame.inverse,
+                frame.growing,
+                frame.back,
+                np.array([states[0].W]),
+                in_lanes(np.stack([state.centre for state in states]), blocks),
                 in_lanes(np.stack([state.prior for state in states]), blocks),
                 aligned((blocks, H, *part)),
                 aligned((blocks, W, *part)),
                 BeliefScratch(*(aligned(shape) for shape in shapes)),
             ),
         )
+
+    def slot_gains(
+        self, states: Sequence[Any], arrays: tuple[Any, ...], first: int, count: int
+    ) -> tuple[BeliefArrays]:
+        """Return ``arrays`` with the coordinates W of evidence in ``count`` slots from number
+        ``first`` on, if messages are kept.
+        """
+        if self.memory == SLOT:
+            return arrays
+        return (arrays[0]._replace(W=states[0].frame.slots(first, count)),)
 
     def check_scenario(self, scenario: Any) -> None:
         """Raise ScenarioError if messages are kept (``memory`` "all", or clocks) and the plant of a
@@ -398,22 +454,42 @@ class BeliefPropagation(Filter):
         """Return the first state of a node, with estimate ``mean`` (n,) and covariance ``cov``
         (n, n), in which nothing was read or heard.
         """
-        root = first_root(cov)
-        prior, no_evidence = evidence_of(root), np.zeros((len(mean), len(mean) + 1))
-        return BeliefState(mean, root, model, prior, no_evidence, (), (), node.node)
+        root, n = first_root(cov), len(mean)
+        if isinstance(model, SlotModel):
+            frame = still_frame(n) if self.memory == SLOT else slot_frame(model.F)
+        else:
+            frame = flow_frame(model.A)
+        return BeliefState(
+            xhat=mean,
+            root=root,
+            model=model,
+            frame=frame,
+            W=frame.basis,
+            centre=frame.inverse @ mean,
+            prior=transform_evidence(evidence_of(root), frame.basis),
+            own=np.zeros((n, n + 1)),
+            senders=(),
+            received=(),
+            node=node.node,
+        )
 
     def predict(self, state: BeliefState, gap: float) -> BeliefState:
         """Return the state ``gap`` seconds later: with the belief predicted, and the evidence if
         messages are kept; otherwise the predicted belief is the prior, and all other evidence is
         dropped.
         """
-        xhat, root = state.model.predict(state.xhat, state.root, gap)
+        model, frame = state.model, state.frame
+        xhat, root = model.predict(state.xhat, state.root, gap)
         state = state._replace(xhat=xhat, root=root)
-        if isinstance(state.model, SlotModel) and self.memory == SLOT:
+        if not isinstance(model, SlotModel):
+            state = state._replace(W=state.W @ inverse_transition(-frame.forward, gap))
+            return pull_back(state, gap)
+        if self.memory == SLOT:
             no_evidence = np.zeros_like(state.own)
             return state._replace(prior=evidence_of(root), own=no_evidence, senders=(), received=())
-        back = backward(state.model, gap)
-        return map_evidence(state, lambda evidence: predict_evidence(evidence, back))
+        for _ in range(round(gap / model.period)):
+            state = pull_back(state._replace(W=state.W @ frame.forward), model.period)
+        return state
 
     def update(self, state: BeliefState, reading: Reading) -> BeliefState:
         """Return the state after a sample: its evidence is added to that of the node's own
@@ -428,7 +504,7 @@ class BeliefPropagation(Filter):
         of each neighbour, of which a receiver leaves out its own.
         """
         heard = tuple(one.evidence for one in state.received)
-        return state, Beliefs(state.xhat, state.own, state.senders, heard)
+        return state, Beliefs(state.xhat, state.centre, state.own, state.senders, heard)
 
     def absorb(
         self, state: BeliefState, messages: Sequence[Message], exchange: Exchange
@@ -444,13 +520,16 @@ class BeliefPropagation(Filter):
             sent = exchange.time - message.age
             if message.sender in received and received[message.sender].sent > sent:
                 continue
-            evidence = evidence_for(state.node, message.payload)
+            payload = message.payload
+            evidence = evidence_for(state.node, payload)
             # In slots a message is used in the slot in which it was sent.
             if message.age > 0.0 and not isinstance(state.model, SlotModel):
-                evidence = predict_evidence(evidence, backward(state.model, message.age))
+                evidence = transform_evidence(evidence, backward(state, message.age))
             # The sender's belief, predicted to now, is the centre of its evidence.
-            centre, _ = state.model.extrapolate(message.payload.xhat, state.root, message.age)
-            evidence = recentre_evidence(evidence, centre, state.xhat)
+            xhat, _ = state.model.extrapolate(payload.xhat, state.root, message.age)
+            before = centre_at(payload.centre, xhat, state.frame)
+            after = centre_at(state.centre, state.xhat, state.frame)
+            evidence = recentre_evidence(evidence, before, after)
             received[message.sender] = HeardEvidence(evidence, sent)
         senders = tuple(sorted(received))
         return compute_belief(
@@ -490,9 +569,9 @@ def add_to_own_evidence(state: BeliefState, reading: Reading) -> FloatArray:
     # The kernel takes blocks, slots, nodes and lanes: one of each here.
     y = y.reshape(1, 1, 1, -1, 1)
     H = H.reshape(1, 1, 1, -1, n, 1)
-    centre = np.array(state.xhat).reshape(1, n, 1)
+    xhat = np.array(state.xhat).reshape(1, n, 1)
     total = np.array(state.own)[..., None]
-    add_reading_single(y, H, centre, total, np.empty(total.shape))
+    add_reading_single(y, H, xhat, state.W, total, np.empty(total.shape))
     return np.ascontiguousarray(total[..., 0])
 
 
@@ -521,11 +600,23 @@ def compute_belief(state: BeliefState) -> BeliefState:
     # From all evidence, and not as an update of the old belief: on an unstable plant the old one
     # may be so far off that digits are lost.
     total = merge_evidence([state.prior, state.own, *(one.evidence for one in state.received)])
-    n, before = len(total), state.xhat
-    x, root, centre = np.zeros((1, 1, n, 1)), np.zeros((1, 1, n, n, 1)), np.array(before)
-    finish_single(root, x, centre.reshape(1, n, 1), total[..., None], np.empty((n, n + 1, 1)))
-    state = state._replace(xhat=x.reshape(n), root=root.reshape(n, n))
-    return map_evidence(state, lambda evidence: recentre_evidence(evidence, before, state.xhat))
+    n = len(total)
+    step, root, origin = np.zeros((1, 1, n, 1)), np.zeros((1, 1, n, n, 1)), np.zeros(n)
+    finish_single(root, step, origin.reshape(1, n, 1), total[..., None], np.empty((n, n + 1, 1)))
+    move = step.reshape(n)
+    state = state._replace(
+        xhat=state.xhat + state.W @ move,
+        root=predict_root_alone(root.reshape(n, n), state.W, np.zeros((n, n))),
+        centre=state.centre + move,
+    )
+    return map_evidence(state, lambda evidence: recentre_evidence(evidence, origin, move))
+
+
+def centre_at(centre: FloatArray, xhat: FloatArray, frame: ModeFrame) -> FloatArray:
+    """Return the belief ``xhat`` (n,) as an e (n,): its first entries, of growing modes, are those
+    of the present; the others, of time 0, are those of ``centre`` (n,).
+    """
+    return np.concatenate([frame.inverse[: frame.growing] @ xhat, centre[frame.growing :]])
 
 
 def map_evidence(state: BeliefState, change: Callable[[FloatArray], FloatArray]) -> BeliefState:
@@ -536,22 +627,29 @@ def map_evidence(state: BeliefState, change: Callable[[FloatArray], FloatArray])
     return state._replace(prior=change(state.prior), own=change(state.own), received=received)
 
 
-def backward(model: Any, gap: float) -> FloatArray:
-    """Return the inverse (n, n) of the plant's transition over a ``gap`` in seconds, by the
-    ``model`` of a node (SlotModel or FlowModel).
+def pull_back(state: BeliefState, gap: float) -> BeliefState:
+    """Return the state with all evidence predicted over a ``gap`` in seconds, a slot's if there are
+    slots; only that about growing modes changes.
     """
-    if isinstance(model, SlotModel):
-        power = np.linalg.matrix_power(model.F, round(gap / model.period))
-        return np.asarray(np.linalg.inv(power), dtype=np.float64)
-    # The kernel writes exp(-A gap) into the first matrix; the others are scratch.
-    maps = np.empty((3, *model.A.shape))
-    fill_inverse_transition(model.A, gap, maps)
-    return np.asarray(maps[0])
+    if state.frame.growing == 0:
+        return state
+    back = backward(state, gap)
+    return map_evidence(state, lambda evidence: transform_evidence(evidence, back))
 
 
-def predict_evidence(evidence: FloatArray, back: FloatArray) -> FloatArray:
-    """Return ``evidence`` (n, n + 1), a root [Z, z] of information, predicted to a later state of a
-    plant without noise: Z times ``back`` (n, n), the inverse transition.
+def backward(state: BeliefState, gap: float) -> FloatArray:
+    """Return the inverse (n, n) of the transition of e over a ``gap`` in seconds, a slot's if there
+    are slots, with which evidence is predicted.
+    """
+    if isinstance(state.model, SlotModel):
+        return state.frame.back
+    return inverse_transition(-state.frame.back, gap)
+
+
+def transform_evidence(evidence: FloatArray, back: FloatArray) -> FloatArray:
+    """Return ``evidence`` (n, n + 1), a root [Z, z] of information about some e, as that about the
+    e' (n,) of ``e = back e'``, such as a later one of a plant without noise: Z times ``back``
+    (n, n).
     """
     predicted = np.array(evidence)[..., None]
     back = np.ascontiguousarray(back)

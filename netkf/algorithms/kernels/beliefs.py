@@ -8,6 +8,10 @@ block of runs filter ``h`` holds the evidence of its own readings, ``own[h]`` (H
 for each direction m of ``SlotLinks`` the evidence that its sender sent last, ``received[m]``
 (W, n, n + 1, L), both relative to its own centre. A ``part`` is one such array (n, n + 1, L).
 
+Evidence is about the coordinates e of a state ``x = W e`` (``modes.ModeFrame``), in which the
+information about decaying modes does not grow; W (n, n) is the identity where nothing is kept. The
+estimate is an x, the centre of evidence as an e.
+
 In a slot, one time step, nodes read, exchange messages in E steps and predict, in the order of the
 filter. ``links`` lists the W directed links by receiver: those to filter h have the numbers
 ``links.first[h]`` to ``links.first[h + 1]`` - 1; ``up`` (B, S, E, W, L) flags the messages that
@@ -37,6 +41,9 @@ class BeliefScratch(NamedTuple):
     suffix : (D + 1, n, n + 1, L), entry k is the sum of the evidence received on links k to D - 1
              of the D links to one node
     total, work : (n, n + 1, L), scratch
+    root, step : of a new belief, in coordinates e: root (1, 1, n, n, L) of its covariance, and its
+                 difference (1, 1, n, L) to the former centre
+    origin : (1, n, L), zeros
     """
 
     all: FloatArray
@@ -44,6 +51,9 @@ class BeliefScratch(NamedTuple):
     suffix: FloatArray
     total: FloatArray
     work: FloatArray
+    root: FloatArray
+    step: FloatArray
+    origin: FloatArray
 
 
 @kernel
@@ -108,6 +118,61 @@ def recentre_part(
 
 
 @kernel
+def add_reading_to_part(
+    lanes: Lanes,
+    part: FloatArray,
+    y: FloatArray,
+    H: FloatArray,
+    index: tuple[int, int, int],
+    rows: int,
+    xhat: FloatArray,
+    W: FloatArray,
+    work: FloatArray,
+) -> None:
+    """Add a whitened reading of ``rows`` rows to the evidence ``part`` (n, n + 1, L), a root [Z, z]
+    of information, in place: the rows ``[H W, y - H xhat]``, relative to ``xhat[h]`` of ``xhat``
+    (H, n, L), for coordinates e of the state ``x = W e``, with W (n, n).
+
+    The reading is that at ``index`` [b, s, h], block, slot and node, of y (B, S, H, p, L) and H
+    (B, S, H, p, n, L); ``work`` (n, n + 1, L) is scratch. Axes: B blocks of L runs, S slots, H
+    nodes.
+    """
+    b, s, h = index
+    n = len(part)
+    # A fixed H is stored for one block and one slot only.
+    d, t = min(b, H.shape[0] - 1), min(s, H.shape[1] - 1)
+    for k in range(rows):
+        # Merge one row, as the last row of a lower triangular root.
+        clear_part(lanes, work)
+        innovation = load(lanes, y, b, s, h, k)
+        for j in range(n):
+            innovation -= load(lanes, H, d, t, h, k, j) * load(lanes, xhat, h, j)
+            entry = spread(lanes, 0.0)
+            for i in range(n):
+                entry += load(lanes, H, d, t, h, k, i) * W[i, j]
+            store(lanes, work, n - 1, j, entry)
+        store(lanes, work, n - 1, n, innovation)
+        merge_lanes(lanes, part, work)
+
+
+@kernel
+def set_growing(
+    lanes: Lanes, centre: FloatArray, xhat: FloatArray, inverse: FloatArray, growing: int
+) -> None:
+    """Set the first ``growing`` entries of the centre e of evidence, ``centre`` (n, L), to those of
+    the estimate ``xhat`` (n, L), ``inverse xhat`` with ``inverse`` (n, n): they are of the present,
+    and the others of time 0 (``algorithms.modes``).
+
+    Axes: L runs side by side.
+    """
+    for i in range(growing):
+        total = spread(lanes, 0.0)
+        for j in range(len(inverse)):
+            total += inverse[i, j] * load(lanes, xhat, j)
+        store(lanes, centre, i, total)
+
+
+@kernel
 def predict_part(
     lanes: Lanes, part: FloatArray, back: FloatArray, total: FloatArray, work: FloatArray
 ) -> None:
@@ -133,6 +198,17 @@ def predict_part(
         store(lanes, work, n - 1, n, load(lanes, part, k, n))
         merge_lanes(lanes, total, work)
     copy_part(lanes, total, part)
+
+
+@kernel
+def predict_part_single(
+    part: FloatArray, back: FloatArray, total: FloatArray, work: FloatArray
+) -> None:
+    """Turn the evidence ``part`` (n, n + 1, 1) of one run, a root [Z, z] of information about some
+    e, in place into that about the e' of ``e = back e'``: ``Z <- Z back``. ``total`` and ``work``
+    (n, n + 1, 1) are scratch.
+    """
+    predict_part(ONE, part, back, total, work)
 
 
 @kernel
@@ -212,7 +288,7 @@ def receive_evidence(
     step of the exchanges.
 
     The message is ``scratch.all`` of the sender or, if it hears node h itself, ``scratch.others``;
-    it is moved to the centre of node h. ``centre`` (H, n, L) are the centres of all nodes. Axes: B
+    it is moved to the centre of node h. ``centre`` (H, n, L) are those of all nodes. Axes: B
     blocks of L runs, S slots, E exchange steps, W directed links, H nodes.
     """
     b, s, e = index

@@ -11,39 +11,49 @@ import numpy as np
 
 from netkf.algorithms.kernels.beliefs import (
     add_part,
+    add_reading_to_part,
     copy_part,
     predict_part,
+    predict_part_single,
     recentre_part,
+    set_growing,
     write_prior_single,
 )
 from netkf.algorithms.kernels.constant_gains import fill_inverse_transition
-from netkf.algorithms.kernels.information import add_reading_pair
 from netkf.algorithms.kernels.intersection import finish_lanes
+from netkf.algorithms.kernels.root_flow import transform_root
+from netkf.algorithms.modes import flow_frame
 from netkf.engines.compiled.late_readings import copy_state
 from netkf.engines.compiled.state import Simulation
 from netkf.linalg.arrays import FloatArray, IntArray
 from netkf.linalg.compiling import kernel
 from netkf.linalg.lanes import ONE
+from netkf.linalg.small import multiply_square
 from netkf.linalg.structs import Struct
 
 
 class EvidenceArrays(Struct):
     """Evidence of N nodes, W directed links and C messages, relative to the estimate of the node
     that holds it. Evidence is a root [Z, z] (n, n + 1, 1) of an information matrix Z' Z and vector
-    Z' z, see kernels.beliefs; the last axis is the one run that is simulated.
+    Z' z, see kernels.beliefs; the last axis is the one run that is simulated. It is about the e of
+    a state ``x = W e``, see ``algorithms.modes.ModeFrame``.
 
     prior, own : (N, ...), priors, and evidence of own readings
     received, sent_at : (W, ...), evidence that was received last on each link, and the time (W,) at
                         which it was sent; -inf: none yet
     carried : (C, ...), evidence in messages
+    belief, carried_belief : (N, n, 1) and (C, n, 1), the estimates of nodes, and those in messages,
+                             as an e
+    frames : W of each node (N, n, n)
+    inverse, growing : of the ModeFrame
+    forward, back : of the ModeFrame, with a minus
     first, direction : the incoming links of node h are ``direction[first[h]:first[h + 1]]``, in the
                        order of senders
     lanes, roots : views of the estimates (1, N, n, 1) and roots (1, N, n, n, 1) of the Simulation
-    A : (n, n), of the plant
 
-    Scratch: ``centre`` (N, n, 1), ``before`` and ``after`` (n, 1), whitened readings y
-    (1, 1, 1, p, 1) and H (1, 1, 1, p, n, 1), ``total`` and ``work`` (n, n + 1, 1), ``maps``
-    (3, n, n).
+    Scratch: ``before`` (n, 1), ``step`` (1, N, n, 1), ``origin`` (N, n, 1), zeros, whitened
+    readings y (1, 1, 1, p, 1) and H (1, 1, 1, p, n, 1), ``total`` and ``work`` (n, n + 1, 1),
+    ``maps`` (3, n, n).
     """
 
     prior: FloatArray
@@ -55,10 +65,16 @@ class EvidenceArrays(Struct):
     direction: IntArray
     lanes: FloatArray
     roots: FloatArray
-    A: FloatArray
-    centre: FloatArray
+    belief: FloatArray
+    carried_belief: FloatArray
+    frames: FloatArray
+    inverse: FloatArray
+    growing: int
+    forward: FloatArray
+    back: FloatArray
     before: FloatArray
-    after: FloatArray
+    step: FloatArray
+    origin: FloatArray
     y: FloatArray
     H: FloatArray
     total: FloatArray
@@ -74,12 +90,14 @@ def empty_evidence(state: Simulation, A: FloatArray, roots: FloatArray) -> Evide
     """
     N, n = state.xhat.shape
     directions, p, shape = state.directions, len(state.scratch.y), (n, n + 1, 1)
+    frame, total, work = flow_frame(A), np.zeros(shape), np.zeros(shape)
     # Directed links by receiver, then by sender (lexsort sorts by its last key first), so that the
     # incoming links of a node are neighbours.
     incoming = np.lexsort((directions["sender"], directions["receiver"]))
     prior = np.zeros((N, *shape))
     for h in range(N):
         write_prior_single(roots, h, prior[h])
+        predict_part_single(prior[h], frame.basis, total, work)
     return EvidenceArrays(
         prior=prior,
         own=np.zeros((N, *shape)),
@@ -90,41 +108,58 @@ def empty_evidence(state: Simulation, A: FloatArray, roots: FloatArray) -> Evide
         direction=incoming.astype(np.int64),
         lanes=state.xhat.reshape(1, N, n, 1),
         roots=roots,
-        A=np.array(A),
-        centre=np.zeros((N, n, 1)),
+        belief=np.ascontiguousarray((state.xhat @ frame.inverse.T)[..., None]),
+        carried_belief=np.zeros((len(state.pool), n, 1)),
+        frames=np.array([frame.basis] * N),
+        inverse=frame.inverse,
+        growing=frame.growing,
+        forward=-frame.forward,
+        back=-frame.back,
         before=np.zeros((n, 1)),
-        after=np.zeros((n, 1)),
+        step=np.zeros((1, N, n, 1)),
+        origin=np.zeros((N, n, 1)),
         y=np.zeros((1, 1, 1, p, 1)),
         H=np.zeros((1, 1, 1, p, n, 1)),
-        total=np.zeros(shape),
-        work=np.zeros(shape),
+        total=total,
+        work=work,
         maps=np.zeros((3, n, n)),
     )
 
 
 def enlarge_evidence(evidence: EvidenceArrays, capacity: int) -> None:
-    """Enlarge ``evidence.carried``, the evidence in messages under way, with the pool of messages:
-    to an array (capacity, n, n + 1, 1) for ``capacity`` messages, which begins with the present
+    """Enlarge ``evidence.carried`` and ``carried_belief``, of messages under way, with the pool of
+    messages: to arrays (capacity, ...) for ``capacity`` messages, which begin with the present
     ones.
     """
-    carried = np.zeros((capacity, *evidence.carried.shape[1:]))
-    carried[: len(evidence.carried)] = evidence.carried
-    evidence.carried = carried
+    more = capacity - len(evidence.carried)
+    evidence.carried, evidence.carried_belief = (
+        np.concatenate([old, np.zeros((more, *old.shape[1:]))])
+        for old in (evidence.carried, evidence.carried_belief)
+    )
 
 
 @kernel
 def predict_node_evidence(evidence: EvidenceArrays, h: int, gap: float) -> None:
     """Predict all evidence of node ``h`` (index), information about the state, by ``gap`` seconds
     without process noise, in place: its ``prior``, its ``own`` from readings, and what it has
-    ``received`` from each neighbour.
+    ``received`` from each neighbour. That about modes that do not grow stays as it is, and W of the
+    node moves instead.
     """
-    fill_inverse_transition(evidence.A, gap, evidence.maps)
-    # exp(-A gap), which takes information forward in time; the other maps are scratch.
-    back, total, work = evidence.maps[0], evidence.total, evidence.work
-    predict_part(ONE, evidence.prior[h], back, total, work)
-    predict_part(ONE, evidence.own[h], back, total, work)
-    for k in range(evidence.first[h], evidence.first[h + 1]):
-        predict_part(ONE, evidence.received[evidence.direction[k]], back, total, work)
+    n, maps, W, work = len(evidence.inverse), evidence.maps, evidence.frames[h], evidence.work
+    if evidence.growing < n:
+        fill_inverse_transition(evidence.forward, gap, maps)
+        multiply_square(maps[1], W, maps[0])
+        for i in range(n):
+            for j in range(n):
+                W[i, j] = maps[1, i, j]
+    if evidence.growing > 0:
+        # The inverse transition of the modes that grow, which takes information forward in time.
+        fill_inverse_transition(evidence.back, gap, maps)
+        back, total = maps[0], evidence.total
+        predict_part(ONE, evidence.prior[h], back, total, work)
+        predict_part(ONE, evidence.own[h], back, total, work)
+        for k in range(evidence.first[h], evidence.first[h + 1]):
+            predict_part(ONE, evidence.received[evidence.direction[k]], back, total, work)
 
 
 @kernel
@@ -134,21 +169,30 @@ def update_belief(state: Simulation, evidence: EvidenceArrays, h: int) -> None:
     ``state.xhat[h]`` and ``root[h]``. Moves the centre, the state relative to which the vectors of
     all this evidence are kept, to the new estimate.
     """
-    total, work, centre = evidence.total, evidence.work, evidence.centre
-    for i in range(state.xhat.shape[1]):
-        centre[h, i, 0] = state.xhat[h, i]
+    total, work, n = evidence.total, evidence.work, state.xhat.shape[1]
     copy_part(ONE, evidence.prior[h], total)
     add_part(ONE, total, evidence.own[h], work)
     for k in range(evidence.first[h], evidence.first[h + 1]):
         add_part(ONE, total, evidence.received[evidence.direction[k]], work)
-    # False: the one lane takes the new estimate.
-    finish_lanes(ONE, evidence.roots, evidence.lanes, 0, h, centre, total, work, False)
-    before, after = centre[h], evidence.lanes[0, h]
-    recentre_part(ONE, evidence.prior[h], before, after, evidence.prior[h])
-    recentre_part(ONE, evidence.own[h], before, after, evidence.own[h])
+    # The root Z^-1 of the covariance of e and its step Z^-1 z; False: the one lane takes both.
+    finish_lanes(
+        ONE, evidence.roots, evidence.step, 0, h, evidence.origin, total, work, False
+    )  # fmt: skip
+    W, step, origin = evidence.frames[h], evidence.step[0, h], evidence.origin[h]
+    values, noise = state.flow_scratch.values, state.flow_scratch.T
+    for i in range(n):
+        for j in range(n):
+            state.xhat[h, i] += W[i, j] * step[j, 0]
+            values[i * n + j], noise[i, j] = W[i, j], 0.0
+        if i >= evidence.growing:
+            evidence.belief[h, i, 0] += step[i, 0]
+    # W Z^-1, made triangular.
+    transform_root(ONE, state.size, state.root[h], values, 0, state.flow_scratch.wide, noise)
+    recentre_part(ONE, evidence.prior[h], origin, step, evidence.prior[h])
+    recentre_part(ONE, evidence.own[h], origin, step, evidence.own[h])
     for k in range(evidence.first[h], evidence.first[h + 1]):
         received = evidence.received[evidence.direction[k]]
-        recentre_part(ONE, received, before, after, received)
+        recentre_part(ONE, received, origin, step, received)
 
 
 @kernel
@@ -158,8 +202,6 @@ def add_samples(state: Simulation, evidence: EvidenceArrays, h: int, instant: in
     ``state.xhat[h]`` and ``root[h]``.
     """
     instants, n = state.instants, state.xhat.shape[1]
-    for i in range(n):
-        evidence.centre[h, i, 0] = state.xhat[h, i]
     for s in range(instants.first[instant], instants.first[instant + 1]):
         sensor, matrix = instants.sensor[s], instants.matrix[s]
         rows = instants.rows[sensor]
@@ -174,9 +216,9 @@ def add_samples(state: Simulation, evidence: EvidenceArrays, h: int, instant: in
                 for m in range(i):
                     entry -= instants.root[sensor, i, m] * evidence.H[0, 0, 0, m, j, 0]
                 evidence.H[0, 0, 0, i, j, 0] = scale * entry
-        add_reading_pair(
-            ONE, evidence.own[h], 1.0, evidence.y, evidence.H, (0, 0, 0), rows,
-            evidence.centre[h : h + 1], evidence.work,
+        add_reading_to_part(
+            ONE, evidence.own[h], evidence.y, evidence.H, (0, 0, 0), rows,
+            evidence.lanes[0, h : h + 1], evidence.frames[h], evidence.work,
         )  # fmt: skip
     update_belief(state, evidence, h)
 
@@ -191,6 +233,8 @@ def send_evidence(state: Simulation, evidence: EvidenceArrays, m: int, h: int) -
     receiver = state.directions[state.pool[m].direction].receiver
     copy_state(state.size, state.pool_x, state.pool_root, m, state.xhat, state.root, h)
     copy_part(ONE, evidence.own[h], evidence.carried[m])
+    for i in range(len(evidence.inverse)):
+        evidence.carried_belief[m, i, 0] = evidence.belief[h, i, 0]
     for k in range(evidence.first[h], evidence.first[h + 1]):
         w = evidence.direction[k]
         if state.directions[w].sender != receiver:
@@ -209,17 +253,17 @@ def absorb_evidence(state: Simulation, evidence: EvidenceArrays, h: int, now: fl
         message = state.pool[m]
         w, age = message.direction, now - message.sent
         if evidence.sent_at[w] <= message.sent:
-            # Predict a late message to now by exp(-A age), which is written to ``maps[0]``.
-            if age > 0.0:
-                fill_inverse_transition(evidence.A, age, maps)
+            # Predict what a late message says of growing modes to now.
+            if age > 0.0 and evidence.growing > 0:
+                fill_inverse_transition(evidence.back, age, maps)
                 predict_part(ONE, evidence.carried[m], maps[0], evidence.total, evidence.work)
-            # The vector of its evidence becomes relative to this node's estimate.
+            # Its evidence becomes relative to this node's estimate.
             for i in range(state.xhat.shape[1]):
                 evidence.before[i, 0] = state.pool_x[m, i]
-                evidence.after[i, 0] = state.xhat[h, i]
-            recentre_part(
-                ONE, evidence.carried[m], evidence.before, evidence.after, evidence.received[w]
-            )
+            before, after = evidence.carried_belief[m], evidence.belief[h]
+            set_growing(ONE, before, evidence.before, evidence.inverse, evidence.growing)
+            set_growing(ONE, after, evidence.lanes[0, h], evidence.inverse, evidence.growing)
+            recentre_part(ONE, evidence.carried[m], before, after, evidence.received[w])
             evidence.sent_at[w] = message.sent
         m = message.next
     update_belief(state, evidence, h)
