@@ -73,6 +73,8 @@ from netkf.linalg.lanes import LANES, ONE, aligned, blocks_of, in_lanes, load, s
 
 MAX_STEPS = 10_000
 """Far beyond the diameter of any tree of use: a larger value is a mistake."""
+MAX_LOSS = float(np.log(1e6))
+"""Largest factor, as a logarithm, by which evidence about some modes may outgrow that of others."""
 SLOT, ALL = "slot", "all"
 """Values of ``BeliefPropagation.memory``."""
 
@@ -419,7 +421,8 @@ class BeliefPropagation(Filter):
 
     def check_scenario(self, scenario: Any) -> None:
         """Raise ScenarioError if messages are kept (``memory`` "all", or clocks) and the plant of a
-        ``netkf.Scenario`` has process noise, which would make them dependent.
+        ``netkf.Scenario`` has process noise, which would make them dependent, or modes whose
+        evidence would lose its digits before the horizon.
         """
         if scenario.slotted and self.memory == SLOT:
             return
@@ -433,6 +436,17 @@ class BeliefPropagation(Filter):
                 "them, and they would not be independent",
                 float(np.abs(Q).max()),
                 f"write {slots}" if scenario.slotted else f"use a plant in slots with {slots}",
+            )
+        key, A = ("F", scenario.slot_belief[0]) if scenario.slotted else ("A", scenario.belief[0])
+        frame = slot_frame(A) if scenario.slotted else flow_frame(A)
+        steps = scenario.horizon / (scenario.slot_plant.period if scenario.slotted else 1.0)
+        if frame.excess * steps > MAX_LOSS:
+            raise ScenarioError(
+                f"plant.{key}",
+                "has modes that grow and modes that decay in nearly one direction, between which "
+                "evidence that is kept loses its digits",
+                A.tolist(),
+                f"use a horizon below {MAX_LOSS / frame.excess * scenario.horizon / steps:.3g}",
             )
 
     def scenario_notes(self, scenario: Any) -> tuple[str, ...]:

@@ -1,5 +1,6 @@
 """Belief propagation: its textbook, exactness on trees in any order, and loops."""
 
+import mpmath
 import numpy as np
 import pytest
 import scipy.linalg
@@ -214,6 +215,91 @@ def test_too_sure_on_a_ring_under_clocks(tmp_path):
     table = netkf.check(scenario, 10, confidence=0.999, workers=1).table.set_index("promise")
     assert table.loc[EXACT, "verdict"] == "not promised"
     assert "broken" not in set(table["verdict"])
+
+
+# Modes that decay, whose information is pulled back for thousands of slots.
+
+H_1, H_2, R_1, R_2 = [[1.0, 0.5]], [[0.2, 1.0]], 0.1, 0.3
+PAIR = {"graph": {"kind": "path", "nodes": 2}, "activation": BROADCAST}
+MODES = {
+    "both decay": [[0.947, 0.251], [-0.049, 0.563]],
+    "one grows slowly": [[1.01, 0.2], [0.0, 0.5]],
+    "one grows fast": [[1.2, 0.2], [0.1, 0.03]],
+    "constant and fast": [[1.0, 0.2], [0.0, 0.03]],
+    "defective": [[1.0, 1.0], [0.0, 1.0]],
+    "rotation": [[0.98, 0.19], [-0.2, 0.97]],
+}
+
+
+def exact_covariances(F, slots):
+    """P (K, 2, 2) of the Kalman filter with all readings, computed with 60 digits."""
+    mpmath.mp.dps = 60
+    F, P, found = mpmath.matrix(F), mpmath.eye(2), []
+    readings = [(mpmath.matrix(H), mpmath.mpf(R)) for H, R in ((H_1, R_1), (H_2, R_2))]
+    for slot in range(1, max(slots) + 1):
+        P = F * P * F.T
+        for H, R in readings:
+            PH = P * H.T
+            P = P - PH * PH.T / ((H * PH)[0] + R)
+        if slot in slots:
+            found.append([[float(P[i, j]) for j in range(2)] for i in range(2)])
+    return np.array(found)
+
+
+@pytest.mark.parametrize("name", MODES)
+def test_evidence_is_kept_for_thousands_of_slots(name, tmp_path):
+    F, engines = MODES[name], ("compiled", "simpy") if "fast" in name else ("compiled",)
+    plant = {**STILL, "F": F, "cov": [[1.0, 0.0], [0.0, 1.0]]}
+    sensors = [{"nodes": [0], "H": H_1, "R": [[R_1]]}, {"nodes": [1], "H": H_2, "R": [[R_2]]}]
+    slots = [1, 2, 10, 20, 40, 60, 100, 500, 2000]
+    more = {"plant": plant, "sensors": sensors, "network": PAIR, "horizon": 2001.0}
+    more["probe"] = [float(slot) for slot in slots]
+    scenario = scenario_of({**BELIEF, "memory": "all"}, tmp_path, **more)
+    central = netkf.simulate(scenario_of(CENTRAL, tmp_path, **more), engine="compiled")
+    P = exact_covariances(F, slots)[:, None]
+    for run in [netkf.simulate(scenario, engine=engine) for engine in engines]:
+        # Where numbers are below the smallest ones both are zero.
+        size = np.trace(P, axis1=-2, axis2=-1)[..., None, None] + 1e-290
+        assert (np.abs(run.P - P) / size).max() < 1e-12
+        error = np.abs(run.xhat - central.xhat) / (1e-290 + np.abs(central.x)[:, None])
+        assert error.max() < 1e-9
+    close(error_law(scenario, run).P / size, run.P / size, 1e-9)
+
+
+@pytest.mark.parametrize("rates", [(-0.02, -6.0), (0.05, -6.0)])
+def test_evidence_is_kept_under_clocks(rates, tmp_path):
+    """Samples, losses and late messages over 60 time constants of the plant."""
+    slow, fast = rates
+    plant = {**DRIFTING, "A": [[slow, 0.8], [0.0, fast]]}
+    channel = {"delay": {"kind": "exponential", "mean": 0.4}, **LOSSY}
+    network = {"graph": TREE, "activation": {"kind": "poisson", "rate": 3.0, "at": "nodes"}}
+    more = {"plant": plant, "network": {**network, "channel": channel}, "horizon": 60.0}
+    sampling = {"kind": "poisson", "rate": 2.0}
+    scenario = clocked(BELIEF, tmp_path, {}, sampling, probe=10.0, **more)
+    expected = None
+    for engine in ("compiled", "simpy"):
+        run = netkf.simulate(scenario, engine=engine)
+        if expected is None:
+            expected = batch(scenario, run)
+            close(theory.error_covariance(scenario, run), run.P, 1e-9)
+        size = np.trace(expected, axis1=-2, axis2=-1)[..., None, None]
+        assert (np.abs(run.P[-1] - expected) / size).max() < 1e-9
+
+
+def test_modes_that_nothing_tells_apart_are_refused(tmp_path):
+    """Units do not matter; a growing and a decaying mode that nearly have one direction do."""
+    more = {"network": PAIR, "sensors": [{"nodes": [0], "H": H_1, "R": [[1.0]]}]}
+    plant = {**STILL, "F": [[1.3, 1e6], [0.0, 0.7]], "cov": [[1e12, 0.0], [0.0, 1.0]]}
+    scenario_of({**BELIEF, "memory": "all"}, tmp_path, plant=plant, **more)
+    J = np.array([[1.02, 1.0, 0.0], [0.0, 1.0, 1.0], [0.0, 0.0, 0.98]])
+    T = np.linalg.qr(np.random.default_rng(1).standard_normal((3, 3)))[0]
+    zeros, eye = np.zeros((3, 3)).tolist(), np.eye(3).tolist()
+    close_modes = {**plant, "F": (T @ J @ T.T).tolist(), "Q": zeros, "cov": eye}
+    more["sensors"] = [{"nodes": [0], "H": [[1.0, 0.0, 0.0]], "R": [[1.0]]}]
+    scenario_of({**BELIEF, "memory": "all"}, tmp_path, plant=close_modes, **more)
+    close_modes["F"] = (T @ (J + np.diag([1e5, 1e5], 1)) @ T.T).tolist()
+    with pytest.raises(netkf.ScenarioError, match=r"plant.F: has modes that grow and modes"):
+        scenario_of({**BELIEF, "memory": "all"}, tmp_path, plant=close_modes, **more, horizon=1e4)
 
 
 def test_unstable_plants_keep_their_digits(tmp_path):

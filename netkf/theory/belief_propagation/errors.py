@@ -3,6 +3,10 @@
 Readings ``y = H x + v`` that were put together say ``u = U x + s``, with the sums U and s of
 ``H' R^-1 H`` and ``H' R^-1 v``. A node with the prior error e_0 that knows them has the error
 ``e = (I - P U) e_0 - P s``, ``P = (P_0^-1 + U)^-1``, whatever was counted twice in U and s.
+
+Information that is kept is about the coordinates of a ``ModeFrame``, ``x = W e``, so that none of
+it is pulled back through a mode that decays; there the prior is one more piece of it, with
+``s = -P_0^-1 e_0``.
 """
 
 from __future__ import annotations
@@ -14,6 +18,7 @@ import numpy as np
 import scipy.linalg
 
 from netkf.algorithms.belief_propagation import ALL
+from netkf.algorithms.modes import ModeFrame, flow_frame, slot_frame, still_frame
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray
 from netkf.scenario.scenario import Scenario
@@ -50,8 +55,24 @@ class BeliefRule(ErrorRule):
             estimator: {} for estimator in range(errors.estimators)
         }
         self._evidence: set[Hashable] = set()
+        self._frame = self._make_frame()
+        self._W = self._frame.basis
         for estimator in range(errors.estimators):
-            errors.copy(estimator, _prior_name(estimator), estimator)
+            if not self._keeps:
+                errors.copy(estimator, _prior_name(estimator), estimator)
+                continue
+            # S^-1 W for the root S of P_0.
+            Z = np.linalg.solve(errors.roots[estimator], self._W)
+            weighted = np.linalg.solve(errors.roots[estimator], errors.stack.form(estimator))
+            self._put_evidence(_prior_name(estimator), Z.T @ Z, -Z.T @ weighted)
+
+    def _make_frame(self) -> ModeFrame:
+        """Return the coordinates of evidence."""
+        if not self._keeps:
+            return still_frame(self.errors.n)
+        if self.scenario.slotted:
+            return slot_frame(self.scenario.slot_belief[0])
+        return flow_frame(self.scenario.belief[0])
 
     def _put_evidence(self, name: Hashable, U: FloatArray, s: FloatArray) -> None:
         """Set an item of evidence ``name`` in the stack of errors: its information U (n, n), and
@@ -80,15 +101,18 @@ class BeliefRule(ErrorRule):
         noise, in ``columns``, is not needed. Called by the replay between events.
         """
         if gap > 0.0:
-            self._predict_evidence(np.asarray(scipy.linalg.expm(-gap * self.scenario.belief[0])))
+            self._W = self._W @ scipy.linalg.expm(gap * self._frame.forward)
+            self._predict_evidence(np.asarray(scipy.linalg.expm(gap * self._frame.back)))
 
     def _predict_evidence(self, back: FloatArray) -> None:
         """Predict all evidence (U, s) to a later state: ``U <- back' U back``, ``s <- back' s``.
 
-        ``back`` (n, n) is F^-1, which takes the later state to the earlier one that the evidence is
-        about. There is no term for process noise: evidence is kept only for plants without it.
+        ``back`` (n, n) takes the later state to the earlier one that the evidence is about. There
+        is no term for process noise: evidence is kept only for plants without it.
         """
         stack = self.errors.stack
+        if self._frame.growing == 0:
+            return
         for name in self._evidence:
             U = stack.matrices[stack.index(name)]
             self._put_evidence(name, back.T @ U @ back, back.T @ stack.form(name))
@@ -98,9 +122,8 @@ class BeliefRule(ErrorRule):
         filter keeps none, drop it and take the present estimates as priors.
         """
         if self._keeps:
-            self._predict_evidence(
-                np.asarray(np.linalg.inv(self.scenario.slot_belief[0]), dtype=np.float64)
-            )
+            self._W = self._W @ self._frame.forward
+            self._predict_evidence(self._frame.back)
             return
         self._drop_evidence(list(self._evidence))
         for estimator, received in self._received.items():
@@ -116,10 +139,11 @@ class BeliefRule(ErrorRule):
         columns = self.errors.reading_noises(observations)
         for estimator, observation in observations.items():
             # A reading adds U = H' R^-1 H and, in errors, s = H' R^-1 v.
-            weighted = np.linalg.solve(observation.R, observation.H).T
+            H = observation.H @ self._W
+            weighted = np.linalg.solve(observation.R, H).T
             U, s = self._sum_evidence([_own_name(estimator)])
             s[:, columns[estimator]] += weighted @ observation.root
-            self._put_evidence(_own_name(estimator), U + weighted @ observation.H, s)
+            self._put_evidence(_own_name(estimator), U + weighted @ H, s)
         for estimator in observations:
             self._update_belief(estimator)
 
@@ -132,6 +156,14 @@ class BeliefRule(ErrorRule):
         U, s = self._sum_evidence(
             [_own_name(estimator), *((estimator, j) for j in self._received[estimator])]
         )
+        if self._keeps:
+            prior, stack = _prior_name(estimator), errors.stack
+            spread = np.linalg.cholesky(U + stack.matrices[stack.index(prior)])
+            root = self._W @ scipy.linalg.solve_triangular(spread, eye, lower=True).T
+            s = scipy.linalg.solve_triangular(spread, s + stack.form(prior), lower=True)
+            errors.stack.put(estimator, -root @ s)
+            errors.roots[estimator] = triangular_root(root)
+            return
         # P = (P_prior^-1 + U)^-1 = S (I + S' U S)^-1 S', with P_prior = S S' that may be singular.
         S = errors.roots[_prior_name(estimator)]
         spread = np.linalg.cholesky(eye + S.T @ U @ S)
