@@ -156,6 +156,7 @@ def _shared_frame(entries: bytes, n: int, slotted: bool) -> ModeFrame:
         # That of all modes on one side always exists.
         if split is not None:
             break
+    assert split is not None
     basis, inverse, modal, k = split
     back, forward = (np.eye(n), np.eye(n)) if slotted else (np.zeros((n, n)), np.zeros((n, n)))
     back[:k, :k] = np.linalg.inv(modal[:k, :k]) if slotted else -modal[:k, :k]
